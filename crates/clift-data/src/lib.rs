@@ -1,0 +1,12 @@
+//! Posed photos in, clips out: cameras, RealEstate10K chunks, synthetic scenes, samplers and the loader.
+//!
+//! This crate does not depend on Burn: its clips and batches are plain host arrays, and
+//! `clift_model::Views::upload` is the one place where they meet a device.
+
+pub mod camera;
+pub mod clip;
+pub mod error;
+
+pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
+pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
+pub use error::DataError;

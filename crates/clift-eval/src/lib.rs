@@ -1,0 +1,1 @@
+//! Metrics, baselines, evaluation sweeps and their pictures

@@ -1,0 +1,1 @@
+//! Compressive light-field tokens in Burn: encoder, K-means, condenser, renderer

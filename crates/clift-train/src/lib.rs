@@ -1,0 +1,1 @@
+//! The two-stage trainer: stage 1, cluster cache, stage 2, checkpoints and resume

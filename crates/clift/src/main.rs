@@ -1,0 +1,5 @@
+//! The `clift` binary.
+
+fn main() -> std::process::ExitCode {
+    clift::main()
+}

@@ -1,0 +1,5 @@
+//! The command line under test: cargo hands the path of a package's own binary to its tests.
+
+fn main() -> std::process::ExitCode {
+    clift::main()
+}
