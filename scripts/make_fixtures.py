@@ -343,8 +343,8 @@ def encoder_like_features(rng: np.random.Generator) -> torch.Tensor:
 
 
 def make_kmeans() -> Fixture:
-    """Inertia of scikit-learn's K-means (one k-means++ start, Lloyd) for seeds 0..4."""
-    rng, counts, num_seeds = np.random.default_rng(9), (8, 64, 256), 5
+    """Inertia of scikit-learn's K-means (one k-means++ start, Lloyd) for seeds 0..39."""
+    rng, counts, num_seeds = np.random.default_rng(9), (8, 64, 256), 40
     fixture = {"input.num_clusters": np.array(counts, dtype=np.int64)}
     for name, features in dict(blobs=blob_features(rng), encoder_like=encoder_like_features(rng)).items():
         inertia = np.empty((len(counts), num_seeds))

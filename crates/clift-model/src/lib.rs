@@ -1,1 +1,39 @@
-//! Compressive light-field tokens in Burn: encoder, K-means, condenser, renderer
+//! Compressive light-field tokens in Burn: the paper, tensors in, tensors out.
+//!
+//! Posed context views become light-field tokens ([`Encoder`]), latent K-means ([`KMeans`]) picks
+//! `num_storage_tokens` of them, the neural [`Condenser`] writes the rest into those, and the
+//! [`Renderer`] draws a target view from the result. [`Clift`] holds the three networks.
+//!
+//! Modules take a [`burn::tensor::Device`]; all devices are named in [`device`].
+
+pub mod attention;
+pub mod block;
+pub mod cluster_attention;
+pub mod clusters;
+pub mod condenser;
+pub mod config;
+pub mod device;
+pub mod encoder;
+pub mod error;
+pub mod feed_forward;
+pub mod init;
+pub mod kmeans;
+pub mod model;
+pub mod patch;
+pub mod rays;
+pub mod renderer;
+#[cfg(test)]
+pub(crate) mod testing;
+pub mod views;
+pub mod weights;
+
+pub use clusters::{ClusterIndex, Clusters, SceneClusters};
+pub use condenser::Condenser;
+pub use config::{CondenserConfig, ModelConfig, Variant};
+pub use encoder::Encoder;
+pub use error::ModelError;
+pub use init::Init;
+pub use kmeans::KMeans;
+pub use model::Clift;
+pub use renderer::Renderer;
+pub use views::{Cameras, Views};

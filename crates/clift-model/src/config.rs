@@ -1,0 +1,153 @@
+//! The shape of the network, as the `[model]` section of a config holds it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ModelError;
+
+/// Which published network the blocks follow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Variant {
+    /// The paper's equations: pre-norm blocks, two condenser blocks (paper section 3).
+    #[default]
+    Paper,
+}
+
+/// Sizes of the encoder, the condenser and the renderer. The defaults are the paper's.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ModelConfig {
+    /// Which published network the blocks follow.
+    pub variant: Variant,
+    /// Width of a token.
+    pub dim: usize,
+    /// Attention heads in every block; divides `dim`.
+    pub num_heads: usize,
+    /// Hidden width of the feed-forward networks.
+    pub feed_forward_dim: usize,
+    /// Self-attention blocks of the encoder.
+    pub num_encoder_blocks: usize,
+    /// Decoder blocks of the renderer.
+    pub num_renderer_blocks: usize,
+    /// Side of a square patch in pixels: one token per patch.
+    pub patch_size: usize,
+    /// The condenser of stage 2.
+    pub condenser: CondenserConfig,
+}
+
+/// The neural condenser (paper section 3.2, equations 1-4).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CondenserConfig {
+    /// Condenser blocks; the paper has two.
+    pub num_blocks: usize,
+    /// Whether each step inside a block adds to its input ("Add & LayerNorm" of the paper's text),
+    /// or replaces it, as equations 1-3 print it.
+    pub residual: bool,
+}
+
+impl Default for ModelConfig {
+    fn default() -> Self {
+        Self {
+            variant: Variant::Paper,
+            dim: 768,
+            num_heads: 8,
+            feed_forward_dim: 2048,
+            num_encoder_blocks: 6,
+            num_renderer_blocks: 6,
+            patch_size: 8,
+            condenser: CondenserConfig::default(),
+        }
+    }
+}
+
+impl Default for CondenserConfig {
+    fn default() -> Self {
+        Self { num_blocks: 2, residual: true }
+    }
+}
+
+impl ModelConfig {
+    /// Values of one context patch: RGB and six ray coordinates per pixel (576 for 8 x 8).
+    pub fn context_patch_len(&self) -> usize {
+        self.patch_size * self.patch_size * 9
+    }
+
+    /// Values of one target patch: six ray coordinates per pixel (384 for 8 x 8).
+    pub fn ray_patch_len(&self) -> usize {
+        self.patch_size * self.patch_size * 6
+    }
+
+    /// Values of one rendered patch: RGB per pixel (192 for 8 x 8).
+    pub fn rgb_patch_len(&self) -> usize {
+        self.patch_size * self.patch_size * 3
+    }
+
+    /// How many tokens `num_views` views of `width` by `height` pixels give.
+    ///
+    /// # Errors
+    /// [`ModelError::NotDivisible`] when a side is not a positive multiple of the patch.
+    pub fn num_tokens(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
+        let patch_size = self.patch_size;
+        if height == 0 || width == 0 || !height.is_multiple_of(patch_size) || !width.is_multiple_of(patch_size) {
+            return Err(ModelError::NotDivisible { width, height, patch_size });
+        }
+        Ok(num_views * (height / patch_size) * (width / patch_size))
+    }
+
+    /// Checks every value against its range.
+    ///
+    /// # Errors
+    /// [`ModelError::BadConfig`] naming the key, the value and the fix.
+    pub fn validate(&self) -> Result<(), ModelError> {
+        let positive = [
+            ("model.dim", self.dim),
+            ("model.num_heads", self.num_heads),
+            ("model.feed_forward_dim", self.feed_forward_dim),
+            ("model.num_encoder_blocks", self.num_encoder_blocks),
+            ("model.num_renderer_blocks", self.num_renderer_blocks),
+            ("model.patch_size", self.patch_size),
+            ("model.condenser.num_blocks", self.condenser.num_blocks),
+        ];
+        for (key, value) in positive {
+            if value == 0 {
+                return Err(ModelError::BadConfig { key, value: value.to_string(), fix: "write at least 1".into() });
+            }
+        }
+        if !self.dim.is_multiple_of(self.num_heads) {
+            return Err(ModelError::BadConfig {
+                key: "model.num_heads",
+                value: self.num_heads.to_string(),
+                fix: format!("write a divisor of model.dim = {}", self.dim),
+            });
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_default_is_the_papers_network() {
+        let config = ModelConfig::default();
+        config.validate().expect("the default is valid");
+        assert_eq!([config.context_patch_len(), config.ray_patch_len(), config.rgb_patch_len()], [576, 384, 192]);
+        assert_eq!(config.num_tokens(4, 256, 256).expect("divides"), 4096);
+        assert_eq!(config.num_tokens(4, 256, 448).expect("divides"), 7168);
+    }
+
+    #[test]
+    fn heads_that_do_not_divide_the_width_are_refused_by_name() {
+        let message = ModelConfig { num_heads: 7, ..ModelConfig::default() }.validate().unwrap_err().to_string();
+        assert_eq!(message, "`model.num_heads` = 7: write a divisor of model.dim = 768");
+    }
+
+    #[test]
+    fn an_image_that_is_not_whole_patches_is_refused() {
+        let error = ModelConfig::default().num_tokens(1, 250, 256).unwrap_err();
+        assert_eq!(error.to_string(), "an image of 256 x 250 does not divide into patches of 8 x 8");
+        assert!(ModelConfig::default().num_tokens(1, 0, 256).is_err());
+    }
+}

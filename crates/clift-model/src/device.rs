@@ -1,0 +1,118 @@
+//! Every device this project runs on, by the name a config or a command line gives it.
+
+use burn::tensor::Device;
+use serde::{Deserialize, Serialize};
+
+use crate::ModelError;
+
+/// A device by name.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DeviceName {
+    /// Burn's CPU backend, the default.
+    #[default]
+    Flex,
+    /// The older CPU backend: a second opinion for numerical tests.
+    Ndarray,
+    /// Any GPU through WebGPU (Vulkan, Metal, DX12); needs the cargo feature `wgpu`.
+    Wgpu,
+}
+
+impl DeviceName {
+    /// All names, in the order they are listed to a user.
+    pub const ALL: [Self; 3] = [Self::Flex, Self::Ndarray, Self::Wgpu];
+
+    /// The name as it is typed.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Flex => "flex",
+            Self::Ndarray => "ndarray",
+            Self::Wgpu => "wgpu",
+        }
+    }
+
+    /// Whether this build contains the device.
+    pub fn is_built(self) -> bool {
+        match self {
+            Self::Flex | Self::Ndarray => true,
+            Self::Wgpu => cfg!(feature = "wgpu"),
+        }
+    }
+
+    /// Opens the device, without autodiff.
+    ///
+    /// # Errors
+    /// [`ModelError::NoDevice`] when this build does not contain it (the message says how to build
+    /// one that does) or no adapter is found.
+    pub fn open(self) -> Result<Device, ModelError> {
+        match self {
+            Self::Flex => Ok(Device::flex()),
+            // Upstream retires this backend in favour of flex; it stays as an independent check.
+            #[allow(deprecated)]
+            Self::Ndarray => Ok(Device::ndarray()),
+            Self::Wgpu => open_wgpu(),
+        }
+    }
+}
+
+impl std::fmt::Display for DeviceName {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+impl std::str::FromStr for DeviceName {
+    type Err = ModelError;
+
+    fn from_str(name: &str) -> Result<Self, ModelError> {
+        Self::ALL.into_iter().find(|device| device.as_str() == name).ok_or_else(|| ModelError::NoDevice {
+            name: name.into(),
+            reason: format!("unknown; the names are {}", Self::ALL.map(Self::as_str).join(", ")),
+        })
+    }
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn open_wgpu() -> Result<Device, ModelError> {
+    Err(ModelError::NoDevice {
+        name: "wgpu".into(),
+        reason: "this build has no GPU support; rebuild with `cargo build --release --features wgpu`, \
+                 or choose `flex` (`--device flex`)"
+            .into(),
+    })
+}
+
+#[cfg(feature = "wgpu")]
+fn open_wgpu() -> Result<Device, ModelError> {
+    use burn::tensor::{DeviceKind, DeviceType};
+    // Asking wgpu for a device where there is no adapter panics, so look first.
+    let adapters = std::panic::catch_unwind(|| Device::enumerate(DeviceType::Wgpu).into_vec().len()).unwrap_or(0);
+    if adapters == 0 {
+        return Err(ModelError::NoDevice {
+            name: "wgpu".into(),
+            reason: "no adapter was found; install a Vulkan driver (for software rendering: Mesa's lavapipe)".into(),
+        });
+    }
+    Ok(Device::wgpu(DeviceKind::DefaultDevice))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_round_trip_and_unknown_ones_list_the_known() {
+        for name in DeviceName::ALL {
+            assert_eq!(name.as_str().parse::<DeviceName>().expect("a listed name"), name);
+        }
+        let message = "cuda".parse::<DeviceName>().unwrap_err().to_string();
+        assert_eq!(message, "device `cuda`: unknown; the names are flex, ndarray, wgpu");
+    }
+
+    #[cfg(not(feature = "wgpu"))]
+    #[test]
+    fn a_build_without_wgpu_says_how_to_get_it() {
+        let message = DeviceName::Wgpu.open().unwrap_err().to_string();
+        assert!(message.contains("--features wgpu"), "{message}");
+    }
+}

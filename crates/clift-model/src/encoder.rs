@@ -1,0 +1,42 @@
+//! The multi-view encoder: posed pictures to light-field tokens (paper section 3.1).
+// B scenes, V views, N tokens, D width
+
+use burn::module::Module;
+use burn::nn::Linear;
+use burn::tensor::Tensor;
+
+use crate::block::EncoderBlock;
+use crate::patch::patchify;
+use crate::rays::plucker;
+use crate::{Init, ModelConfig, Views};
+
+/// Patch embedding and self-attention over all tokens of all views. The result is not normalised:
+/// K-means, condenser and renderer all work on the raw residual stream.
+#[derive(Module, Debug)]
+pub struct Encoder {
+    patch_embed: Linear,
+    blocks: Vec<EncoderBlock>,
+    #[module(skip)]
+    patch_size: usize,
+}
+
+impl Encoder {
+    /// Makes an encoder of the sizes of `config`.
+    pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        Self {
+            patch_embed: init.linear(config.context_patch_len(), config.dim),
+            blocks: (0..config.num_encoder_blocks).map(|_| EncoderBlock::new(config, init)).collect(),
+            patch_size: config.patch_size,
+        }
+    }
+
+    /// Encodes context views into light-field tokens, one per patch.
+    ///
+    /// # Shapes
+    /// - returns `[batch, views * (height / patch) * (width / patch), dim]`, ordered by view, row, column
+    pub fn forward(&self, context: &Views) -> Tensor<3> {
+        let pixels = Tensor::cat(vec![context.images.clone(), plucker(&context.cameras)], 4); // [B, V, H, W, 9]
+        let tokens = self.patch_embed.forward(patchify(pixels, self.patch_size));
+        self.blocks.iter().fold(tokens, |tokens, block| block.forward(tokens))
+    }
+}

@@ -1,0 +1,73 @@
+//! What can go wrong with a model, its input or its weights, one documented variant per failure.
+
+use std::path::PathBuf;
+
+/// A failure of this crate. A message says what, where, expected and got, with the path last.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ModelError {
+    /// A configuration value is out of its range.
+    #[error("`{key}` = {value}: {fix}")]
+    BadConfig {
+        /// Dotted key, as in the TOML file.
+        key: &'static str,
+        /// The value found.
+        value: String,
+        /// What to write instead.
+        fix: String,
+    },
+    /// A host array does not have the length its shape asks for.
+    #[error("{what}: expected {expected} values for the shape, got {got}")]
+    WrongLength {
+        /// Which array.
+        what: &'static str,
+        /// Product of the shape.
+        expected: usize,
+        /// Length of the array.
+        got: usize,
+    },
+    /// A host array holds a NaN or an infinity.
+    #[error("{what} holds {value} at position {position}")]
+    NotFinite {
+        /// Which array.
+        what: &'static str,
+        /// The value found.
+        value: f32,
+        /// Its index in the array.
+        position: usize,
+    },
+    /// An image does not divide into patches.
+    #[error("an image of {width} x {height} does not divide into patches of {patch_size} x {patch_size}")]
+    NotDivisible {
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+        /// Side of a patch.
+        patch_size: usize,
+    },
+    /// Cluster indices contradict each other.
+    #[error("bad clusters: {what}")]
+    BadClusters {
+        /// The contradiction, with the indices that show it.
+        what: String,
+    },
+    /// A device name is unknown, or this build does not have it.
+    #[error("device `{name}`: {reason}")]
+    NoDevice {
+        /// The name asked for.
+        name: String,
+        /// Why it cannot be had, and what would help.
+        reason: String,
+    },
+    /// A weight file could not be read or written.
+    #[error("{action} the weights failed: {reason}: {path}", path = path.display())]
+    Weights {
+        /// What was being done ("reading", "writing").
+        action: &'static str,
+        /// The reason.
+        reason: String,
+        /// The file.
+        path: PathBuf,
+    },
+}

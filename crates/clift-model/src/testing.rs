@@ -1,0 +1,205 @@
+//! What the inline tests share: the devices to run on, the fixtures, and comparisons.
+
+use std::path::PathBuf;
+
+use burn::tensor::{DType, Device, Tensor, TensorData};
+use safetensors::{Dtype, SafeTensors};
+
+use crate::device::DeviceName;
+
+/// Every device of this build that opens: flex, ndarray, and wgpu where an adapter is found.
+pub fn devices() -> Vec<Device> {
+    DeviceName::ALL.into_iter().filter(|name| name.is_built()).filter_map(|name| name.open().ok()).collect()
+}
+
+/// The CPU devices, which have f64.
+pub fn cpu_devices() -> Vec<Device> {
+    [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().expect("a CPU device")).into()
+}
+
+/// Values in f64, row-major.
+pub fn to_vec<const D: usize>(tensor: Tensor<D>) -> Vec<f64> {
+    tensor.into_data().convert::<f64>().try_to_vec::<f64>().expect("f64 after conversion")
+}
+
+/// Largest absolute difference over the largest absolute expected value.
+pub fn relative_error<const D: usize>(got: &Tensor<D>, expected: &Tensor<D>) -> f64 {
+    assert_eq!(got.dims(), expected.dims(), "shapes differ");
+    let (got, expected) = (to_vec(got.clone()), to_vec(expected.clone()));
+    assert!(got.iter().all(|value| value.is_finite()), "the result is not finite");
+    let scale = expected.iter().fold(0.0_f64, |scale, value| scale.max(value.abs())).max(f64::MIN_POSITIVE);
+    got.iter().zip(&expected).fold(0.0_f64, |error, (a, b)| error.max((a - b).abs())) / scale
+}
+
+/// Asserts that two tensors are equal to `tolerance` of the largest expected value.
+#[track_caller]
+pub fn assert_close<const D: usize>(got: &Tensor<D>, expected: &Tensor<D>, tolerance: f64) {
+    let error = relative_error(got, expected);
+    assert!(error <= tolerance, "relative error {error:.3e} above {tolerance:.1e}");
+}
+
+/// One file of `data-fixtures/reference`, written by `scripts/make_fixtures.py`.
+pub struct Fixture {
+    bytes: Vec<u8>,
+}
+
+impl Fixture {
+    /// Reads `data-fixtures/reference/<name>.safetensors`.
+    pub fn open(name: &str) -> Self {
+        let path = Self::path(name);
+        let bytes = std::fs::read(&path).unwrap_or_else(|error| panic!("{error}: {}", path.display()));
+        Self { bytes }
+    }
+
+    /// Where a fixture lies.
+    pub fn path(name: &str) -> PathBuf {
+        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join(format!("../../data-fixtures/reference/{name}.safetensors"))
+    }
+
+    /// Names of all tensors that start with `prefix`, without it.
+    pub fn names(&self, prefix: &str) -> Vec<String> {
+        let file = SafeTensors::deserialize(&self.bytes).expect("a fixture is valid");
+        file.names().into_iter().filter_map(|name| name.strip_prefix(prefix)).map(String::from).collect()
+    }
+
+    /// A float tensor in f32.
+    pub fn tensor<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
+        Tensor::from_data(TensorData::new(self.values(name).1, self.shape(name)), (device, DType::F32))
+    }
+
+    /// A float tensor in f64.
+    pub fn tensor_f64<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
+        Tensor::from_data(TensorData::new(self.values(name).1, self.shape(name)), (device, DType::F64))
+    }
+
+    /// Integers.
+    pub fn integers(&self, name: &str) -> Vec<i64> {
+        self.values(name).0
+    }
+
+    /// Shape of a tensor.
+    pub fn shape(&self, name: &str) -> Vec<usize> {
+        let file = SafeTensors::deserialize(&self.bytes).expect("a fixture is valid");
+        file.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}")).shape().to_vec()
+    }
+
+    fn values(&self, name: &str) -> (Vec<i64>, Vec<f64>) {
+        let file = SafeTensors::deserialize(&self.bytes).expect("a fixture is valid");
+        let view = file.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let data = view.data();
+        let floats = |values: Vec<f64>| (Vec::new(), values);
+        match view.dtype() {
+            Dtype::F32 => {
+                floats(data.as_chunks::<4>().0.iter().map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect())
+            }
+            Dtype::F64 => floats(data.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect()),
+            Dtype::I64 => {
+                (data.as_chunks::<8>().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect(), Vec::new())
+            }
+            other => panic!("{name} is {other:?}"),
+        }
+    }
+}
+
+/// Uniform values in `[-1, 1)` from a seed, the same on every device; f64 where the device is a CPU
+/// device, f32 otherwise.
+pub fn random<const D: usize>(shape: [usize; D], seed: u64, device: &Device) -> Tensor<D> {
+    use rand::{RngExt, SeedableRng};
+    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let values: Vec<f64> = (0..shape.iter().product()).map(|_| rng.random_range(-1.0..1.0)).collect();
+    let dtype = if device.supports_dtype(DType::F64) { DType::F64 } else { DType::F32 };
+    Tensor::from_data(TensorData::new(values, shape), (device, dtype))
+}
+
+/// Asserts that the gradient of `f` under a random cotangent equals central differences in f64,
+/// to `tolerance` of its largest entry.
+///
+/// The step 1e-5 leaves an error of about 1e-10 from the third derivative and 1e-11 from rounding.
+#[track_caller]
+pub fn check_gradients<const COUNT: usize>(
+    inputs: [Tensor<3>; COUNT],
+    f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
+    tolerance: f64,
+) {
+    let tracked = inputs.clone().map(|input| input.autodiff().require_grad());
+    let output = f(tracked.clone());
+    let cotangent = random(output.dims(), 99, &inputs[0].device());
+    let grads = (output * cotangent.clone().autodiff()).sum().backward();
+    let loss = |inputs: [Tensor<3>; COUNT]| to_vec((f(inputs) * cotangent.clone()).sum())[0];
+    let step = 1e-5;
+    for position in 0..COUNT {
+        let analytic = to_vec(tracked[position].grad(&grads).expect("every input is tracked"));
+        let shape = inputs[position].dims();
+        let values = to_vec(inputs[position].clone());
+        let moved = |index: usize, by: f64| {
+            let mut values = values.clone();
+            values[index] += by;
+            let mut inputs = inputs.clone();
+            inputs[position] =
+                Tensor::from_data(TensorData::new(values, shape), (&inputs[position].device(), DType::F64));
+            loss(inputs)
+        };
+        let numeric: Vec<f64> =
+            (0..values.len()).map(|index| (moved(index, step) - moved(index, -step)) / (2.0 * step)).collect();
+        let scale = numeric.iter().fold(0.0_f64, |scale, value| scale.max(value.abs()));
+        for (index, (a, n)) in analytic.iter().zip(&numeric).enumerate() {
+            assert!((a - n).abs() <= tolerance * scale, "input {position}, entry {index}: {a} against {n}");
+        }
+    }
+}
+
+/// Loads the tensors of a fixture whose names start with `prefix` into a module, in PyTorch's
+/// layout, and demands that every one is used and none is missing.
+pub fn load_weights<M: burn::module::Module>(mut module: M, fixture: &Fixture, prefix: &str) -> M {
+    use burn::store::{ModuleSnapshot, PyTorchToBurnAdapter, SafetensorsStore};
+    let mut store = SafetensorsStore::from_bytes(Some(fixture.bytes.clone()))
+        .with_from_adapter(PyTorchToBurnAdapter)
+        .with_key_remapping(format!("^{prefix}"), "")
+        .allow_partial(true);
+    let result = module.load_from(&mut store).expect("the fixture loads");
+    assert!(result.missing.is_empty(), "missing in the fixture: {:?}", result.missing);
+    assert_eq!(result.applied.len(), fixture.names(prefix).len(), "every weight of the fixture is used");
+    module
+}
+
+/// Asserts that the gradient of every parameter of a module equals the fixture's.
+#[track_caller]
+pub fn weight_gradients<M: burn::module::Module>(
+    module: &M,
+    grads: &burn::tensor::Gradients,
+    fixture: &Fixture,
+    prefix: &str,
+    tolerance: f64,
+) {
+    use burn::module::{ModuleVisitor, Param};
+    struct Compare<'a> {
+        grads: &'a burn::tensor::Gradients,
+        fixture: &'a Fixture,
+        prefix: &'a str,
+        path: Vec<String>,
+        tolerance: f64,
+        compared: usize,
+    }
+    impl ModuleVisitor for Compare<'_> {
+        fn enter_module(&mut self, name: &str, _container: &str) {
+            self.path.push(name.into());
+        }
+        fn exit_module(&mut self, _name: &str, _container: &str) {
+            self.path.pop();
+        }
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            let path = self.path.join(".").replace("gamma", "weight").replace("beta", "bias");
+            let name = format!("{}{path}", self.prefix);
+            let got = param.val().grad(self.grads).unwrap_or_else(|| panic!("{path} has no gradient"));
+            let expected: Tensor<D> = self.fixture.tensor(&name, &got.device());
+            // PyTorch stores linear weights as [outputs, inputs].
+            let expected = if D == 2 { expected.swap_dims(0, 1) } else { expected };
+            let error = relative_error(&got, &expected);
+            assert!(error <= self.tolerance, "{path}: relative error {error:.3e} above {:.1e}", self.tolerance);
+            self.compared += 1;
+        }
+    }
+    let mut compare = Compare { grads, fixture, prefix, path: Vec::new(), tolerance, compared: 0 };
+    module.visit(&mut compare);
+    assert_eq!(compare.compared, fixture.names(prefix).len(), "every gradient of the fixture is compared");
+}

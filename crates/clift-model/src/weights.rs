@@ -1,0 +1,178 @@
+//! Weight files: safetensors in PyTorch's layout, and the hash that names a set of weights.
+
+use std::path::Path;
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::store::{BurnToPyTorchAdapter, ModuleSnapshot, PyTorchToBurnAdapter, SafetensorsStore};
+use burn::tensor::Tensor;
+use sha2::{Digest, Sha256};
+
+use crate::ModelError;
+
+/// Which parameters of a file went into a module.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Loaded {
+    /// Parameters that were set from the file.
+    pub applied: Vec<String>,
+    /// Parameters of the module that the file lacks; they keep their values.
+    pub missing: Vec<String>,
+    /// Tensors of the file that the module has no place for.
+    pub unused: Vec<String>,
+}
+
+impl Loaded {
+    /// Demands that file and module hold the same parameters.
+    ///
+    /// # Errors
+    /// [`ModelError::Weights`] with the first few names that differ.
+    pub fn require_all(&self, path: &Path) -> Result<(), ModelError> {
+        if self.missing.is_empty() && self.unused.is_empty() {
+            return Ok(());
+        }
+        let some = |names: &[String]| names.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
+        let reason = format!(
+            "the file does not hold this model: {} parameters missing ({}), {} without a place ({})",
+            self.missing.len(),
+            some(&self.missing),
+            self.unused.len(),
+            some(&self.unused)
+        );
+        Err(ModelError::Weights { action: "reading", reason, path: path.into() })
+    }
+}
+
+/// Writes the parameters of a module under the names and in the layout PyTorch gives them
+/// (linear weights `[outputs, inputs]`), to a temporary name that is then renamed.
+///
+/// # Errors
+/// [`ModelError::Weights`].
+pub fn save<M: Module>(module: &M, path: &Path) -> Result<(), ModelError> {
+    let error = |reason: String| ModelError::Weights { action: "writing", reason, path: path.into() };
+    let temporary = path.with_extension("safetensors.tmp");
+    let mut store = SafetensorsStore::from_file(&temporary)
+        .with_to_adapter(BurnToPyTorchAdapter)
+        .overwrite(true)
+        .metadata("format", "clift-1");
+    module.save_into(&mut store).map_err(|e| error(e.to_string()))?;
+    let synced = std::fs::File::open(&temporary).and_then(|file| file.sync_all());
+    synced.and_then(|()| std::fs::rename(&temporary, path)).map_err(|e| error(e.to_string()))
+}
+
+/// Reads parameters written by [`save`] into a module and says which.
+///
+/// # Errors
+/// [`ModelError::Weights`] when the file cannot be read, a shape differs or a value is not finite.
+pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError> {
+    let error = |reason: String| ModelError::Weights { action: "reading", reason, path: path.into() };
+    if !path.is_file() {
+        return Err(error("there is no such file".into()));
+    }
+    let mut store =
+        SafetensorsStore::from_file(path).with_from_adapter(PyTorchToBurnAdapter).validate(false).allow_partial(true);
+    let result = module.load_from(&mut store).map_err(|e| error(e.to_string()))?;
+    if let Some(first) = result.errors.first() {
+        return Err(error(format!("{first:?}")));
+    }
+    if let Some(name) = first_non_finite(module) {
+        return Err(error(format!("{name} is not finite")));
+    }
+    let missing = result.missing.into_iter().map(|(name, _)| name).collect();
+    Ok(Loaded { applied: result.applied, missing, unused: result.unused })
+}
+
+/// Hash of all parameters of a module: their paths, shapes and values, as 64 hexadecimal digits.
+/// Equal weights have equal hashes on every device.
+pub fn hash<M: Module>(module: &M) -> String {
+    let mut sha = Sha256::new();
+    visit(module, |name, shape, values| {
+        sha.update(name.as_bytes());
+        sha.update(format!("{shape:?}"));
+        values.iter().for_each(|value| sha.update(value.to_le_bytes()));
+    });
+    sha.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Path of the first parameter with a NaN or an infinity.
+pub fn first_non_finite<M: Module>(module: &M) -> Option<String> {
+    let mut found = None;
+    visit(module, |name, _, values| {
+        if found.is_none() && values.iter().any(|value| !value.is_finite()) {
+            found = Some(name.to_owned());
+        }
+    });
+    found
+}
+
+/// Calls `f` with path, shape and values of every parameter, in the module's order.
+fn visit<M: Module>(module: &M, f: impl FnMut(&str, &[usize], &[f32])) {
+    struct Visitor<F> {
+        path: Vec<String>,
+        f: F,
+    }
+    impl<F: FnMut(&str, &[usize], &[f32])> ModuleVisitor for Visitor<F> {
+        fn enter_module(&mut self, name: &str, _container: &str) {
+            self.path.push(name.into());
+        }
+        fn exit_module(&mut self, _name: &str, _container: &str) {
+            self.path.pop();
+        }
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            let data = param.val().into_data().convert::<f32>();
+            let values = data.as_slice::<f32>().expect("converted to f32");
+            (self.f)(&self.path.join("."), &param.val().dims(), values);
+        }
+    }
+    module.visit(&mut Visitor { path: Vec::new(), f });
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::Device;
+
+    use super::*;
+    use crate::{Clift, ModelConfig};
+
+    fn model(seed: u64) -> Clift {
+        let config = ModelConfig {
+            dim: 16,
+            num_heads: 2,
+            feed_forward_dim: 24,
+            num_encoder_blocks: 1,
+            num_renderer_blocks: 1,
+            ..ModelConfig::default()
+        };
+        Clift::new(&config, seed, &Device::flex())
+    }
+
+    #[test]
+    fn weights_survive_a_file_to_the_bit() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("model.safetensors");
+        save(&model(1), &path).expect("writes");
+        let mut other = model(2);
+        assert_ne!(hash(&other), hash(&model(1)));
+        load(&mut other, &path).expect("reads").require_all(&path).expect("the same model");
+        assert_eq!(hash(&other), hash(&model(1)));
+    }
+
+    #[test]
+    fn a_file_of_another_model_is_named_with_what_differs() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("model.safetensors");
+        save(&model(1).encoder, &path).expect("writes");
+        let loaded = load(&mut model(2), &path).expect("nothing fits, nothing breaks");
+        let message = loaded.require_all(&path).unwrap_err().to_string();
+        assert!(message.contains("86 parameters missing (condenser.blocks.0"), "{message}");
+    }
+
+    #[test]
+    fn truncated_and_missing_files_are_errors() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("model.safetensors");
+        assert!(load(&mut model(1), &path).unwrap_err().to_string().contains("no such file"));
+        save(&model(1), &path).expect("writes");
+        let bytes = std::fs::read(&path).expect("reads");
+        std::fs::write(&path, &bytes[..bytes.len() / 2]).expect("writes");
+        assert!(load(&mut model(1), &path).is_err());
+    }
+}
