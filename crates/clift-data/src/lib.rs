@@ -6,7 +6,11 @@
 pub mod camera;
 pub mod clip;
 pub mod error;
+pub mod order;
+pub mod sampler;
 
 pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
 pub use error::DataError;
+pub use order::SceneOrder;
+pub use sampler::BoundedSampler;
