@@ -8,9 +8,13 @@ pub mod clip;
 pub mod error;
 pub mod order;
 pub mod sampler;
+pub mod split;
+pub mod synthetic;
 
 pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
 pub use error::DataError;
 pub use order::SceneOrder;
 pub use sampler::BoundedSampler;
+pub use split::Split;
+pub use synthetic::{SyntheticConfig, SyntheticSource};

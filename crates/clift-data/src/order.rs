@@ -45,6 +45,11 @@ pub(crate) fn between(rng: &mut impl Rng, low: usize, high: usize) -> usize {
     low + below(rng, high - low + 1)
 }
 
+/// Draws uniformly from `[0, 1)`, in steps of `2^-53`.
+pub(crate) fn unit(rng: &mut impl Rng) -> f64 {
+    (rng.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
+}
+
 /// Draws `count` distinct values of `0..range` uniformly, in increasing order (Floyd's algorithm).
 pub(crate) fn distinct(rng: &mut impl Rng, range: usize, count: usize) -> Vec<usize> {
     let mut drawn = Vec::with_capacity(count);
@@ -140,7 +145,7 @@ impl SceneOrder {
     }
 }
 
-/// The 32-byte ChaCha key is the four numbers themselves: distinct numbers cannot meet in one stream.
+/// The 32-byte key of the cipher is the four numbers themselves: distinct numbers cannot meet in one stream.
 fn keyed_rng(seed: u64, purpose: &str, step: u64, item: u64) -> ChaCha8Rng {
     let mut key = [0; 32];
     for (bytes, value) in key.chunks_exact_mut(8).zip([seed, purpose_tag(purpose), step, item]) {
@@ -154,7 +159,7 @@ fn purpose_tag(purpose: &str) -> u64 {
     purpose.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
 }
 
-/// The finaliser of SplitMix64: a bijection of 64 bits that spreads every input bit over the output.
+/// The finaliser of `SplitMix64`: a bijection of 64 bits that spreads every input bit over the output.
 fn mix(value: u64) -> u64 {
     let value = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
     let value = (value ^ (value >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
