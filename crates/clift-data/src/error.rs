@@ -48,6 +48,25 @@ pub enum DataError {
         /// How many there are.
         count: usize,
     },
+    /// A batch slot found no usable scene within its tries.
+    #[error(
+        "no usable scene for slot {slot} of step {step} in {attempts} tries; the last, {key}, failed with: {reason}"
+    )]
+    NoUsableScene {
+        /// Step of the batch.
+        step: u64,
+        /// Slot of the batch.
+        slot: usize,
+        /// How many scenes were tried.
+        attempts: u32,
+        /// Key of the last scene tried.
+        key: String,
+        /// Why the last one failed.
+        reason: String,
+    },
+    /// The code that makes a batch panicked.
+    #[error(transparent)]
+    WorkerPanic(#[from] crate::loader::WorkerPanic),
 }
 
 impl DataError {
