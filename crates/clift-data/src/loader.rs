@@ -59,10 +59,8 @@ where
     /// Starts making the items of `start_step..end_step`.
     ///
     /// With `threads = 0`, `make` runs in the thread that iterates, one item at a time. `depth` is the most items
-    /// held or being made at any time, at least 1; more threads than that would idle, so no more are started.
-    ///
-    /// # Panics
-    /// When the operating system refuses to start a thread.
+    /// held or being made at any time, at least 1; more threads than that would idle, so no more are started. Where
+    /// the operating system refuses a thread, fewer do the work: the items are the same.
     pub fn new(
         make: impl Fn(u64) -> Result<T, E> + Send + Sync + 'static,
         start_step: u64,
@@ -81,9 +79,9 @@ where
             wanted: Condvar::new(),
         });
         let workers = (0..threads.min(depth))
-            .map(|_| {
+            .filter_map(|_| {
                 let shared = Arc::clone(&shared);
-                std::thread::spawn(move || shared.work())
+                std::thread::Builder::new().name("clift-loader".into()).spawn(move || shared.work()).ok()
             })
             .collect();
         Self { shared, workers, next_step: start_step }

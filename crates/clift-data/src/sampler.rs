@@ -123,11 +123,11 @@ impl BoundedSampler {
     /// Draws the views of one item from a scene of `num_frames` frames.
     ///
     /// The contexts are distinct and sorted: both ends of the stretch, and inner frames drawn uniformly. The
-    /// targets lie between the ends, inclusive, in the order drawn. Expects a sampler that [`validate`]s and a
-    /// `num_context` within its bounds.
+    /// targets lie between the ends, inclusive, in the order drawn. Expects a sampler that [`validate`]s.
     ///
     /// # Errors
-    /// [`DataError::NotEnoughFrames`] when the scene is not longer than the smallest gap at `step`.
+    /// [`DataError::NotEnoughFrames`] when the scene is not longer than the smallest gap at `step`;
+    /// [`DataError::BadConfig`] when `num_context` is outside `[min_context, max_context]`.
     ///
     /// [`validate`]: Self::validate
     pub fn sample(
@@ -137,6 +137,11 @@ impl BoundedSampler {
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
+        let Self { min_context, max_context, .. } = self;
+        if !(min_context..=max_context).contains(&&num_context) {
+            let problem = format!("is {num_context}; the sampler is set to {min_context} to {max_context}");
+            return Err(DataError::bad_config("num_context", problem));
+        }
         let [min_gap, max_gap] = self.gap_bounds(step, num_context);
         if num_frames <= min_gap {
             return Err(DataError::NotEnoughFrames { needed: min_gap + 1, got: num_frames });
@@ -157,7 +162,7 @@ impl BoundedSampler {
     }
 
     fn gap_divisor(&self, num_context: usize) -> usize {
-        (self.max_context / num_context).max(1)
+        (self.max_context / num_context.max(1)).max(1)
     }
 }
 
@@ -246,6 +251,14 @@ mod tests {
         let error = sampler().sample(25, 0, 4, &mut rng).unwrap_err();
         assert_eq!(error.to_string(), "not enough frames: 26 needed, 25 in the scene");
         assert!(sampler().sample(0, 0, 4, &mut rng).is_err());
+    }
+
+    #[test]
+    fn a_number_of_contexts_outside_the_bounds_is_refused() {
+        for num_context in [0, 1, 3, 7] {
+            let error = sampler().sample(200, 0, num_context, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err();
+            assert_eq!(error.to_string(), format!("num_context is {num_context}; the sampler is set to 4 to 6"));
+        }
     }
 
     #[test]
