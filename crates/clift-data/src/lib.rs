@@ -3,10 +3,22 @@
 //! This crate does not depend on Burn: its clips and batches are plain host arrays, and
 //! `clift_model::Views::upload` is the one place where they meet a device.
 
+pub mod batch;
 pub mod camera;
 pub mod clip;
 pub mod error;
+pub mod loader;
+pub mod order;
+pub mod sampler;
+pub mod split;
+pub mod synthetic;
 
+pub use batch::{ClipBatch, SkippedScene, TrainingClips};
 pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
 pub use error::DataError;
+pub use loader::Prefetcher;
+pub use order::SceneOrder;
+pub use sampler::BoundedSampler;
+pub use split::Split;
+pub use synthetic::{SyntheticConfig, SyntheticSource};

@@ -1,0 +1,266 @@
+//! The training batch of a step: which scenes, which views, and what was left out.
+
+use std::fmt;
+use std::sync::Arc;
+
+use crate::clip::{Clip, SceneSource, ViewIndices};
+use crate::error::DataError;
+use crate::order::{SceneOrder, item_rng};
+use crate::sampler::BoundedSampler;
+
+/// Scenes tried for one slot before the batch fails.
+pub const MAX_ATTEMPTS: u32 = 16;
+
+/// Reads the given frames of a scene as a clip.
+pub type ReadClip = dyn Fn(usize, &ViewIndices) -> Result<Clip, DataError> + Send + Sync;
+
+/// The clips of one training step, all with the same numbers of context and target views.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ClipBatch {
+    /// Step the batch is for.
+    pub step: u64,
+    /// One clip per slot.
+    pub clips: Vec<Clip>,
+    /// Scenes left out on the way, with the reason.
+    pub skipped: Vec<SkippedScene>,
+}
+
+/// A scene that a batch wanted and could not use.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SkippedScene {
+    /// Key of the scene.
+    pub key: String,
+    /// Why it was left out.
+    pub reason: String,
+}
+
+/// Makes the batch of any step, as a pure function of (seed, step): scene order, views and replacements for scenes
+/// that cannot be used. Wrapped in a [`Prefetcher`](crate::loader::Prefetcher) it is the training loader.
+pub struct TrainingClips {
+    source: Arc<dyn SceneSource>,
+    read: Arc<ReadClip>,
+    sampler: BoundedSampler,
+    order: SceneOrder,
+    seed: u64,
+}
+
+impl TrainingClips {
+    /// Prepares batches of `batch_size` clips from `source`, whose frames `read` turns into clips.
+    ///
+    /// `seed` decides everything random; give each stage of a run its own
+    /// ([`derive_seed`](crate::order::derive_seed)).
+    ///
+    /// # Errors
+    /// [`DataError::BadConfig`] when the sampler does not validate, there is no scene or `batch_size` is 0.
+    pub fn new(
+        source: Arc<dyn SceneSource>,
+        read: Arc<ReadClip>,
+        sampler: BoundedSampler,
+        batch_size: usize,
+        seed: u64,
+    ) -> Result<Self, DataError> {
+        sampler.validate()?;
+        let order = SceneOrder::new(seed, source.num_scenes(), batch_size)?;
+        Ok(Self { source, read, sampler, order, seed })
+    }
+
+    /// Makes the batch of `step`.
+    ///
+    /// A scene that is too short or cannot be read is listed in [`ClipBatch::skipped`], and its slot takes the
+    /// scene it would have had one step later, then two, up to [`MAX_ATTEMPTS`] scenes. The replacement is drawn
+    /// with its own randomness, so the other slots do not notice.
+    ///
+    /// # Errors
+    /// [`DataError::NoUsableScene`] when a slot's scenes all fail.
+    pub fn batch(&self, step: u64) -> Result<ClipBatch, DataError> {
+        let num_context = self.sampler.num_context(self.seed, step);
+        let mut batch = ClipBatch { step, clips: Vec::new(), skipped: Vec::new() };
+        for slot in 0..self.order.batch_size() {
+            let clip = self.fill_slot(step, slot, num_context, &mut batch.skipped)?;
+            batch.clips.push(clip);
+        }
+        Ok(batch)
+    }
+
+    fn fill_slot(
+        &self,
+        step: u64,
+        slot: usize,
+        num_context: usize,
+        skipped: &mut Vec<SkippedScene>,
+    ) -> Result<Clip, DataError> {
+        let mut last = SkippedScene { key: String::new(), reason: String::new() };
+        for attempt in 0..MAX_ATTEMPTS {
+            let scene = self.order.scene(step.saturating_add(u64::from(attempt)), slot);
+            match self.read_scene(scene, step, slot, attempt, num_context) {
+                Ok(clip) => return Ok(clip),
+                Err(error) => {
+                    last = SkippedScene { key: self.source.key(scene).into(), reason: error.to_string() };
+                    skipped.push(last.clone());
+                }
+            }
+        }
+        let SkippedScene { key, reason } = last;
+        Err(DataError::NoUsableScene { step, slot, attempts: MAX_ATTEMPTS, key, reason })
+    }
+
+    fn read_scene(
+        &self,
+        scene: usize,
+        step: u64,
+        slot: usize,
+        attempt: u32,
+        num_context: usize,
+    ) -> Result<Clip, DataError> {
+        let num_frames = self.source.cameras(scene)?.len();
+        let mut rng = item_rng(self.seed, step, slot as u32, attempt, "views");
+        let views = self.sampler.sample(num_frames, step, num_context, &mut rng)?;
+        (self.read)(scene, &views)
+    }
+}
+
+impl fmt::Debug for TrainingClips {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("TrainingClips")
+            .field("sampler", &self.sampler)
+            .field("order", &self.order)
+            .field("seed", &self.seed)
+            .finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{Camera, IntrinsicsNorm, Pose};
+    use crate::clip::{Frame, Views};
+    use crate::loader::Prefetcher;
+    use std::collections::BTreeSet;
+
+    /// Scenes without pictures, of these numbers of frames.
+    struct Lengths(Vec<usize>, Vec<String>);
+
+    impl Lengths {
+        fn new(lengths: Vec<usize>) -> Arc<Self> {
+            let keys = (0..lengths.len()).map(|scene| format!("scene-{scene}")).collect();
+            Arc::new(Self(lengths, keys))
+        }
+    }
+
+    impl SceneSource for Lengths {
+        fn num_scenes(&self) -> usize {
+            self.0.len()
+        }
+        fn key(&self, scene: usize) -> &str {
+            &self.1[scene]
+        }
+        fn find(&self, key: &str) -> Option<usize> {
+            self.1.iter().position(|other| other == key)
+        }
+        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+            let intrinsics_norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
+            Ok(vec![Camera { intrinsics_norm, c2w: Pose::IDENTITY }; self.0[scene]])
+        }
+        fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+            Err(DataError::OutOfRange { what: "frame", index: frame, count: self.0[scene] })
+        }
+    }
+
+    fn clips(lengths: Vec<usize>, batch_size: usize, seed: u64) -> TrainingClips {
+        let source = Lengths::new(lengths);
+        let keys = source.1.clone();
+        let read = move |scene: usize, views: &ViewIndices| {
+            let only = |frame_index: &[usize]| Views {
+                width: 0,
+                height: 0,
+                images: Vec::new(),
+                c2w: vec![Pose::IDENTITY; frame_index.len()],
+                intrinsics: Vec::new(),
+                frame_index: frame_index.to_vec(),
+            };
+            Ok(Clip { key: keys[scene].clone(), context: only(&views.context), target: only(&views.target) })
+        };
+        TrainingClips::new(source, Arc::new(read), BoundedSampler::default(), batch_size, seed).unwrap()
+    }
+
+    fn mixed() -> TrainingClips {
+        clips((0..40).map(|scene| if scene % 3 == 0 { 10 } else { 200 }).collect(), 4, 9)
+    }
+
+    #[test]
+    fn batches_are_the_same_with_any_number_of_threads_and_from_any_start() {
+        let expected: Vec<ClipBatch> = (0..30).map(|step| mixed().batch(step).unwrap()).collect();
+        for threads in [0, 1, 3] {
+            for start in [0, 11] {
+                let clips = mixed();
+                let loader = Prefetcher::new(move |step| clips.batch(step), start, 30, threads, 4);
+                let batches: Vec<ClipBatch> = loader.map(|batch| batch.unwrap()).collect();
+                assert_eq!(batches, expected[start as usize..], "{threads} threads from step {start}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_batch_has_the_same_number_of_views_in_every_clip_and_batches_differ() {
+        let clips = clips(vec![200; 40], 5, 9);
+        let batches: Vec<ClipBatch> = (0..40).map(|step| clips.batch(step).unwrap()).collect();
+        for batch in &batches {
+            let counts: BTreeSet<_> =
+                batch.clips.iter().map(|clip| (clip.context.num_views(), clip.target.num_views())).collect();
+            assert_eq!(counts.len(), 1);
+        }
+        let counts: BTreeSet<_> = batches.iter().map(|batch| batch.clips[0].context.num_views()).collect();
+        assert_eq!(counts, [4, 5, 6].into());
+        assert_ne!(batches[0].clips, batches[8].clips);
+    }
+
+    #[test]
+    fn an_epoch_of_good_scenes_reads_each_once() {
+        let clips = clips(vec![200; 40], 5, 9);
+        let keys: BTreeSet<String> =
+            (0..8).flat_map(|step| clips.batch(step).unwrap().clips).map(|clip| clip.key).collect();
+        assert_eq!(keys.len(), 40);
+    }
+
+    #[test]
+    fn short_scenes_are_replaced_and_listed_with_their_reason() {
+        let batches: Vec<ClipBatch> = (0..10).map(|step| mixed().batch(step).unwrap()).collect();
+        let skipped: Vec<_> = batches.iter().flat_map(|batch| &batch.skipped).collect();
+        let short: BTreeSet<&str> = skipped.iter().map(|scene| scene.key.as_str()).collect();
+        assert_eq!(short.len(), 14, "every third of 40 scenes is too short");
+        assert!(skipped.iter().all(|scene| scene.reason == "not enough frames: 26 needed, 10 in the scene"));
+        for batch in &batches {
+            assert_eq!(batch.clips.len(), 4);
+            assert!(batch.clips.iter().all(|clip| !short.contains(clip.key.as_str())));
+        }
+    }
+
+    #[test]
+    fn a_replacement_does_not_change_the_other_slots() {
+        let good = clips(vec![200; 40], 4, 9);
+        let (whole, patched) = (good.batch(3).unwrap(), mixed().batch(3).unwrap());
+        let mut same = 0;
+        for (whole, patched) in whole.clips.iter().zip(&patched.clips) {
+            if whole.key == patched.key {
+                assert_eq!(whole, patched);
+                same += 1;
+            }
+        }
+        assert!(same >= 1 && !patched.skipped.is_empty(), "{same} slots agree, {:?}", patched.skipped);
+    }
+
+    #[test]
+    fn a_source_of_short_scenes_fails_naming_the_last_reason() {
+        let error = clips(vec![10; 40], 4, 9).batch(2).unwrap_err().to_string();
+        assert!(error.starts_with("no usable scene for slot 0 of step 2 in 16 tries"), "{error}");
+        assert!(error.ends_with("failed with: not enough frames: 26 needed, 10 in the scene"), "{error}");
+    }
+
+    #[test]
+    fn a_sampler_that_cannot_hold_is_refused_at_the_start() {
+        let sampler = BoundedSampler { num_targets: 0, ..Default::default() };
+        let read = |_: usize, _: &ViewIndices| unreachable!("nothing is read");
+        let made = TrainingClips::new(Lengths::new(vec![9]), Arc::new(read), sampler, 1, 0);
+        assert!(made.unwrap_err().to_string().starts_with("num_targets is 0"));
+    }
+}

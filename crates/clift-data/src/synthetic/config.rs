@@ -1,0 +1,138 @@
+//! What synthetic scenes look like, and what of it cannot be.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::DataError;
+use crate::split::Split;
+
+/// Most scenes of one source: the table of key blocks is then below 1 MiB.
+pub(super) const MAX_SCENES: usize = 32_000_000;
+
+/// What synthetic scenes look like. Lengths are in the scene's own unit; a room is 3 to 4 units wide.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SyntheticConfig {
+    /// Seed of all scenes. Seeds, like splits, share no scene.
+    pub seed: u64,
+    /// Family of scenes, `"train"` or `"test"`. No scene is in both, whatever the seed.
+    pub split: Split,
+    /// Scenes in the source, up to 32 million; unused ones cost nothing.
+    pub num_scenes: usize,
+    /// Frames along each camera path.
+    pub num_frames: usize,
+    /// Columns of a frame.
+    pub width: usize,
+    /// Rows of a frame.
+    pub height: usize,
+    /// Horizontal field of view in degrees, up to 100. Pixels are square.
+    pub fov_deg: f64,
+    /// Smallest and largest distance from the middle of a room to its walls; 1 or more.
+    pub room_half_size: [f64; 2],
+    /// Fewest and most boxes and balls in a room; a crowded room may hold fewer.
+    pub num_objects: [usize; 2],
+    /// Length of the camera path from the first to the last frame, before small swings. Longer is harder.
+    pub path_length: f64,
+    /// Cycles of the wall patterns per unit of length; patterns on objects are twice as fine. Finer is harder.
+    pub texture_frequency: f64,
+    /// Strength of highlights and reflections, which change with the view: 0 is matt, 1 is polished.
+    pub specular: f64,
+    /// Rays per pixel, a square number.
+    pub samples_per_pixel: usize,
+}
+
+impl Default for SyntheticConfig {
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            split: Split::Train,
+            num_scenes: 10_000,
+            num_frames: 16,
+            width: 32,
+            height: 32,
+            fov_deg: 75.0,
+            room_half_size: [1.5, 2.0],
+            num_objects: [3, 5],
+            path_length: 4.0,
+            texture_frequency: 0.4,
+            specular: 0.4,
+            samples_per_pixel: 4,
+        }
+    }
+}
+
+impl SyntheticConfig {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`DataError::BadConfig`] naming the first field that cannot hold.
+    pub fn validate(&self) -> Result<(), DataError> {
+        let fail = |key: &str, problem: String| Err(DataError::bad_config(key, problem));
+        for (key, count, most) in [
+            ("num_scenes", self.num_scenes, MAX_SCENES),
+            ("num_frames", self.num_frames, 100_000),
+            ("width", self.width, 16_384),
+            ("height", self.height, 16_384),
+        ] {
+            if count == 0 || count > most {
+                return fail(key, format!("is {count}; use 1 to {most}"));
+            }
+        }
+        let [fewest, most] = self.num_objects;
+        if fewest > most || most > 100 {
+            return fail("num_objects", format!("is [{fewest}, {most}]; use [fewest, most] up to 100"));
+        }
+        let [small, large] = self.room_half_size;
+        if !(small >= 1.0 && large >= small && large <= 100.0) {
+            return fail("room_half_size", format!("is [{small}, {large}]; use [smallest, largest] from 1 to 100"));
+        }
+        for (key, value, low, high) in [
+            ("fov_deg", self.fov_deg, 10.0, 100.0),
+            ("path_length", self.path_length, 0.01, 1_000.0),
+            ("texture_frequency", self.texture_frequency, 0.0, 100.0),
+            ("specular", self.specular, 0.0, 1.0),
+        ] {
+            if !(low..=high).contains(&value) {
+                return fail(key, format!("is {value}; use {low} to {high}"));
+            }
+        }
+        let samples = self.samples_per_pixel;
+        if samples == 0 || samples > 256 || samples.isqrt().pow(2) != samples {
+            return fail("samples_per_pixel", format!("is {samples}; use a square number such as 1, 4, 9 or 16"));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_config_names_the_key_the_value_and_the_fix() {
+        let check = |change: fn(&mut SyntheticConfig)| {
+            let mut config = SyntheticConfig::default();
+            change(&mut config);
+            config.validate().unwrap_err().to_string()
+        };
+        assert_eq!(check(|c| c.num_frames = 0), "num_frames is 0; use 1 to 100000");
+        assert!(check(|c| c.num_scenes = MAX_SCENES + 1).starts_with("num_scenes is 32000001"));
+        assert!(check(|c| c.width = 0).starts_with("width is 0"));
+        assert!(check(|c| c.height = 20_000).starts_with("height is 20000"));
+        assert!(check(|c| c.fov_deg = f64::NAN).starts_with("fov_deg is NaN"));
+        assert!(check(|c| c.room_half_size = [2.0, 1.0]).starts_with("room_half_size is [2, 1]"));
+        assert!(check(|c| c.room_half_size = [0.5, 1.0]).starts_with("room_half_size is [0.5, 1]"));
+        assert!(check(|c| c.num_objects = [4, 2]).starts_with("num_objects is [4, 2]"));
+        assert!(check(|c| c.path_length = 0.0).starts_with("path_length is 0"));
+        assert!(check(|c| c.texture_frequency = -1.0).starts_with("texture_frequency is -1"));
+        assert!(check(|c| c.specular = 1.5).starts_with("specular is 1.5"));
+        assert!(check(|c| c.samples_per_pixel = 6).starts_with("samples_per_pixel is 6"));
+    }
+
+    #[test]
+    fn an_unknown_key_is_refused_and_a_missing_one_takes_its_default() {
+        let parsed: Result<SyntheticConfig, _> = serde_json::from_str(r#"{"sed": 1}"#);
+        assert!(parsed.unwrap_err().to_string().contains("sed"));
+        let parsed: SyntheticConfig = serde_json::from_str(r#"{"split": "test"}"#).unwrap();
+        assert_eq!(parsed, SyntheticConfig { split: Split::Test, ..Default::default() });
+    }
+}

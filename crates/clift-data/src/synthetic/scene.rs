@@ -1,0 +1,215 @@
+//! What is in a scene: a box-shaped room, boxes and balls on its floor, a lamp and a camera path.
+
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use super::SyntheticConfig;
+use super::path::{CLEARANCE, CameraPath};
+use super::texture::Texture;
+use super::vector::Vector;
+use crate::order::{between, unit};
+
+/// How often an object is drawn again, a little smaller, before the room counts as full.
+const MAX_PLACEMENTS: u32 = 60;
+
+/// Geometry of an object.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Shape {
+    Ball {
+        radius: f32,
+    },
+    /// Half edge lengths, and the turn about the vertical as (cosine, sine).
+    Block {
+        half_size: Vector,
+        turn: [f32; 2],
+    },
+}
+
+/// A thing in the room.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Object {
+    pub shape: Shape,
+    pub center: Vector,
+    pub texture: Texture,
+    /// 0 is matt, 1 is polished.
+    pub gloss: f32,
+}
+
+impl Object {
+    /// Radius of the upright cylinder around the object.
+    pub fn reach(&self) -> f32 {
+        match self.shape {
+            Shape::Ball { radius } => radius,
+            Shape::Block { half_size, .. } => half_size.0[0].hypot(half_size.0[2]),
+        }
+    }
+}
+
+/// A scene: the room is centred on the origin, x right, y down, z forward.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Scene {
+    pub half_size: Vector,
+    /// Textures at -x, +x, -y (ceiling), +y (floor), -z, +z.
+    pub walls: [Texture; 6],
+    pub objects: Vec<Object>,
+    pub lamp: Vector,
+    pub path: CameraPath,
+}
+
+impl Scene {
+    /// Draws a scene; a config that validates always gives one.
+    pub fn draw(rng: &mut ChaCha8Rng, config: &SyntheticConfig) -> Self {
+        let [small, large] = config.room_half_size;
+        let mut half = || small + (large - small) * unit(rng);
+        let (wide, deep) = (half(), half());
+        let tall = small * (0.6 + 0.15 * unit(rng));
+        let half_size = [wide, tall, deep];
+        let path = CameraPath::draw(rng, half_size, config.path_length);
+        let lamp = [wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35)];
+
+        let hue = unit(rng);
+        let frequency = config.texture_frequency;
+        let walls = [0, 1, 2, 3, 4, 5].map(|side| {
+            let (hue, saturation, value, frequency) = match side {
+                2 => (hue, 0.1, 0.9, 0.5 * frequency),
+                3 => (0.05 + 0.1 * unit(rng), 0.35, 0.75, frequency),
+                // Four walls a quarter turn of hue apart, so that no two look alike.
+                _ => {
+                    let quarter = [0.0, 0.5, 0.0, 0.0, 0.25, 0.75][side] + swing(rng, 0.05);
+                    let value = if side < 2 { 0.95 } else { 0.7 };
+                    (hue + quarter, 0.5 + 0.3 * unit(rng), value, frequency)
+                }
+            };
+            Texture::draw(rng, hue, saturation, value, frequency)
+        });
+
+        let mut scene = Self {
+            half_size: Vector::from_f64(half_size),
+            walls,
+            objects: Vec::new(),
+            lamp: Vector::from_f64(lamp),
+            path,
+        };
+        for _ in 0..between(rng, config.num_objects[0], config.num_objects[1]) {
+            let object = (0..MAX_PLACEMENTS).find_map(|attempt| scene.try_object(rng, config, attempt));
+            scene.objects.extend(object);
+        }
+        scene
+    }
+
+    /// Draws an object on the floor, or gives none where it would touch the path, a wall or another object.
+    fn try_object(&self, rng: &mut impl Rng, config: &SyntheticConfig, attempt: u32) -> Option<Object> {
+        let scale = config.room_half_size[0] * 0.96_f64.powi(attempt as i32);
+        let mut size = |low: f64, high: f64| (scale * (low + (high - low) * unit(rng))) as f32;
+        let (radius, edges) = (size(0.13, 0.26), [size(0.1, 0.2), size(0.1, 0.34), size(0.1, 0.2)]);
+        let (sin, cos) = (unit(rng) as f32 * std::f32::consts::TAU).sin_cos();
+        let is_ball = unit(rng) < 0.5;
+        let (shape, height) = if is_ball {
+            (Shape::Ball { radius }, radius)
+        } else {
+            (Shape::Block { half_size: Vector(edges), turn: [cos, sin] }, edges[1])
+        };
+
+        let [wide, floor, deep] = self.half_size.0;
+        let center = Vector([wide * swing(rng, 1.0) as f32, floor - height, deep * swing(rng, 1.0) as f32]);
+        let hue = unit(rng);
+        let texture = Texture::draw(rng, hue, 0.75, 0.95, 2.0 * config.texture_frequency);
+        let object = Object { shape, center, texture, gloss: unit(rng) as f32 };
+        self.has_room_for(&object).then_some(object)
+    }
+
+    fn has_room_for(&self, object: &Object) -> bool {
+        let (x, z, reach) = (object.center.0[0], object.center.0[2], object.reach());
+        let from_axis = x.hypot(z);
+        let [nearest, farthest] = self.path.radius_bounds().map(|radius| radius as f32);
+        let clearance = CLEARANCE as f32;
+        let off_path = from_axis + reach + clearance < nearest || from_axis - reach - clearance > farthest;
+        let inside = x.abs() + reach < self.half_size.0[0] && z.abs() + reach < self.half_size.0[2];
+        let apart = self
+            .objects
+            .iter()
+            .all(|other| (x - other.center.0[0]).hypot(z - other.center.0[2]) > reach + other.reach() + 0.02);
+        off_path && inside && apart
+    }
+}
+
+/// Draws uniformly from `[-size, size)`.
+fn swing(rng: &mut impl Rng, size: f64) -> f64 {
+    size * (2.0 * unit(rng) - 1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::order::step_rng;
+
+    /// Distance from a point to an object's surface, 0 inside.
+    fn distance(object: &Object, point: Vector) -> f32 {
+        let from_center = point - object.center;
+        match object.shape {
+            Shape::Ball { radius } => (from_center.length() - radius).max(0.0),
+            Shape::Block { half_size, turn } => {
+                let local = from_center.turned(turn).0;
+                Vector([0, 1, 2].map(|i| (local[i].abs() - half_size.0[i]).max(0.0))).length()
+            }
+        }
+    }
+
+    fn scenes(config: &SyntheticConfig) -> Vec<Scene> {
+        (0..200).map(|index| Scene::draw(&mut step_rng(3, index, "test"), config)).collect()
+    }
+
+    #[test]
+    fn the_camera_stays_clear_of_walls_and_objects() {
+        // f32 in the room, f64 on the path: 1e-5 covers the difference.
+        let least = CLEARANCE as f32 - 1e-5;
+        let crowded = SyntheticConfig {
+            room_half_size: [1.0, 3.0],
+            num_objects: [20, 30],
+            path_length: 20.0,
+            ..Default::default()
+        };
+        for config in [SyntheticConfig::default(), crowded] {
+            for scene in scenes(&config) {
+                for time in 0..=500 {
+                    let position = Vector::from_f64(scene.path.position(f64::from(time) / 500.0));
+                    for axis in 0..3 {
+                        let to_wall = scene.half_size.0[axis] - position.0[axis].abs();
+                        assert!(to_wall > least, "{to_wall} from a wall, {position:?} in {:?}", scene.half_size);
+                    }
+                    for object in &scene.objects {
+                        let apart = distance(object, position);
+                        assert!(apart > least, "{apart} from {object:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn objects_stand_on_the_floor_inside_the_room_and_apart() {
+        for scene in scenes(&SyntheticConfig::default()) {
+            for (i, object) in scene.objects.iter().enumerate() {
+                let height = match object.shape {
+                    Shape::Ball { radius } => radius,
+                    Shape::Block { half_size, .. } => half_size.0[1],
+                };
+                assert!((object.center.0[1] + height - scene.half_size.0[1]).abs() < 1e-5);
+                assert!(
+                    [0, 2].iter().all(|&axis| object.center.0[axis].abs() + object.reach() < scene.half_size.0[axis])
+                );
+                for other in &scene.objects[i + 1..] {
+                    let [x, _, z] = (object.center - other.center).0;
+                    assert!(x.hypot(z) > object.reach() + other.reach());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn rooms_hold_as_many_objects_as_asked_for_by_default() {
+        let counts: Vec<usize> = scenes(&SyntheticConfig::default()).iter().map(|scene| scene.objects.len()).collect();
+        assert!(counts.iter().all(|count| (3..=5).contains(count)), "{counts:?}");
+        assert!([3, 4, 5].iter().all(|wanted| counts.contains(wanted)));
+    }
+}
