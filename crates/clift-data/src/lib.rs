@@ -6,6 +6,8 @@
 pub mod camera;
 pub mod clip;
 pub mod error;
+pub mod image;
+pub mod lanczos;
 
 pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
