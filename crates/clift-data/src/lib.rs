@@ -8,6 +8,8 @@ pub mod clip;
 pub mod error;
 pub mod image;
 pub mod lanczos;
+pub mod pickle;
+mod unpickle;
 
 pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
