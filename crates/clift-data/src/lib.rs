@@ -3,14 +3,20 @@
 //! This crate does not depend on Burn: its clips and batches are plain host arrays, and
 //! `clift_model::Views::upload` is the one place where they meet a device.
 
+mod archive;
 pub mod camera;
+pub mod chunk;
+mod chunk_table;
 pub mod clip;
 pub mod error;
 pub mod image;
 pub mod lanczos;
+pub mod ledger;
 pub mod pickle;
 mod unpickle;
 
 pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
+pub use chunk::{ChunkSource, SceneFilters, Split};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
 pub use error::DataError;
+pub use ledger::{Ledger, Skip};
