@@ -7,6 +7,7 @@ mod archive;
 pub mod camera;
 pub mod chunk;
 mod chunk_table;
+pub mod chunk_writer;
 pub mod clip;
 pub mod error;
 pub mod image;
@@ -17,6 +18,7 @@ mod unpickle;
 
 pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
 pub use chunk::{ChunkSource, SceneFilters, Split};
+pub use chunk_writer::{SceneRecord, write_chunks};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
 pub use error::DataError;
 pub use ledger::{Ledger, Skip};
