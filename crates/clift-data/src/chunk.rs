@@ -217,6 +217,7 @@ fn read_index(path: &Path) -> Result<BTreeMap<String, String>, DataError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
     use safetensors::SafeTensors;
 
     const ALL: SceneFilters = SceneFilters { min_frames: 0, max_fov_deg: None };
@@ -318,6 +319,22 @@ mod tests {
         let message = source.frame(0, 0).unwrap_err().to_string();
         assert!(message.contains("has another checksum") && message.ends_with("000000.torch"), "{message}");
         assert!(source.frame(0, 1).is_ok());
+    }
+
+    proptest! {
+        #[test]
+        fn a_chunk_with_bytes_changed_never_panics(
+            changes in proptest::collection::vec((0.0..1.0, any::<bool>(), any::<u8>()), 1..8),
+        ) {
+            let mut bytes = mini_chunk();
+            // Half of the changes hit the pickle and the first headers, half anywhere, the directory included.
+            for (at, near_start, byte) in changes {
+                let range = if near_start { 3000 } else { bytes.len() };
+                bytes[(at * range as f64) as usize] = byte;
+            }
+            let (_folder, source) = with_chunk(&bytes, &["00000000000000a1"]);
+            let _ = (source.cameras(0), source.timestamps(0), source.frame(0, 0));
+        }
     }
 
     #[test]

@@ -19,13 +19,16 @@ const MAX_DECODE_BYTES: u64 = 512 << 20;
 /// Decodes a JPEG or PNG file to 8-bit RGB; grey becomes RGB, an alpha channel is dropped.
 ///
 /// # Errors
-/// [`DataError::BadImage`], which names `key` and `frame`: another format, broken data, or more than [`MAX_SIDE`] on a
-/// side.
+/// [`DataError::BadImage`], which names `key` and `frame`: another format, broken or truncated data, or more than
+/// [`MAX_SIDE`] on a side.
 pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<Frame, DataError> {
     let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
     let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {
         return Err(bad(format!("its {} bytes are neither JPEG nor PNG", bytes.len())));
     };
+    if format == ImageFormat::Jpeg && !has_jpeg_end(bytes) {
+        return Err(bad(format!("its JPEG data of {} bytes is truncated", bytes.len())));
+    }
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_SIDE);
     limits.max_image_height = Some(MAX_SIDE);
@@ -38,6 +41,12 @@ pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<Frame, DataError>
         return Err(bad(format!("it is {width}x{height}")));
     }
     Ok(Frame { width: width as usize, height: height as usize, rgb: picture.into_raw() })
+}
+
+/// Whether an end marker follows the last scan; the decoder fills what is missing of a truncated JPEG with grey.
+fn has_jpeg_end(bytes: &[u8]) -> bool {
+    let last_scan = bytes.windows(2).rposition(|pair| pair == [0xff, 0xda]);
+    last_scan.is_some_and(|scan| bytes[scan..].windows(2).any(|pair| pair == [0xff, 0xd9]))
 }
 
 /// Encodes a frame as JPEG of `quality` in `1..=100`.
@@ -173,8 +182,15 @@ mod tests {
     #[test]
     fn an_unreadable_jpeg_names_scene_and_frame() {
         let jpeg = encode_jpeg(&ramp(40, 24), 90).unwrap();
-        let message = decode(&jpeg[..40], "00ff", 7).unwrap_err().to_string();
+        for length in [40, jpeg.len() / 2, jpeg.len() - 2] {
+            let message = decode(&jpeg[..length], "00ff", 7).unwrap_err().to_string();
+            assert!(message.starts_with("frame 7 of scene 00ff cannot be decoded: "), "{message}");
+            assert!(message.contains("truncated"), "{message}");
+        }
+        let broken = b"\xff\xd8\xff\xe0\x00\x04\xff\xda\x00\x02\xff\xd9"; // a scan without tables or sizes
+        let message = decode(broken, "00ff", 7).unwrap_err().to_string();
         assert!(message.starts_with("frame 7 of scene 00ff cannot be decoded: "), "{message}");
+        assert_eq!(decode(&[&jpeg[..], &[0; 9]].concat(), "00ff", 7).unwrap().width, 40); // padding is common
         let message = decode(b"GIF89a....", "00ff", 7).unwrap_err().to_string();
         assert!(message.ends_with("its 10 bytes are neither JPEG nor PNG"), "{message}");
     }

@@ -1,8 +1,8 @@
 //! Pillow's 8-bit LANCZOS resize, bit for bit.
 //!
-//! Two passes, columns then rows, each with weights in 22-bit fixed point and a result rounded to 8 bits. Libraries
-//! with the same filter keep weights in 16 bits and differ by one level in some pixels, and a metric protocol that
-//! starts from resized photos should start from the same ones.
+//! Two passes, columns then rows, each with weights in 22-bit fixed point and a result rounded to 8 bits. Published
+//! numbers start from photos resized like this. `fast_image_resize` 6.1 keeps weights in 16 bits: four times as fast
+//! (0.5 against 2.2 ms a photo), but other values in 8 % of a real photo and by up to 35 levels at hard edges.
 
 use std::f64::consts::PI;
 
