@@ -86,7 +86,9 @@ def write_poses(folder):
     # `turned` puts the mean rotation half a turn from the world's axes, where quaternions of one sign cancel.
     for case, base in [("benign", Rotation.identity()), ("turned", Rotation.from_rotvec([0.0, np.pi, 0.0]))]:
         poses = np.tile(np.eye(4), (7, 1, 1))
-        poses[:, :3, :3] = (base * Rotation.from_rotvec(rng.normal(0, 0.2, (7, 3)))).as_matrix()
+        turns = rng.normal(0, 0.2, (7, 3))
+        turns[:, 1] = abs(turns[:, 1]) * np.where(np.arange(7) % 2, -1, 1)  # on both sides of half a turn
+        poses[:, :3, :3] = (base * Rotation.from_rotvec(turns)).as_matrix()
         poses[:, :3, 3] = rng.normal(0, 2.0, (7, 3)) + [30.0, -20.0, 10.0]
         context, target = poses[:4], poses[4:]
         tensors[f"{case}.context"] = context.copy()
