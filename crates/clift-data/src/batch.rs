@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use crate::clip::{Clip, SceneSource, ViewIndices};
 use crate::error::DataError;
+use crate::ledger::Skip;
 use crate::order::{SceneOrder, item_rng};
 use crate::sampler::BoundedSampler;
 
@@ -22,16 +23,7 @@ pub struct ClipBatch {
     /// One clip per slot.
     pub clips: Vec<Clip>,
     /// Scenes left out on the way, with the reason.
-    pub skipped: Vec<SkippedScene>,
-}
-
-/// A scene that a batch wanted and could not use.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct SkippedScene {
-    /// Key of the scene.
-    pub key: String,
-    /// Why it was left out.
-    pub reason: String,
+    pub skipped: Vec<Skip>,
 }
 
 /// Makes the batch of any step, as a pure function of (seed, step): scene order, views and replacements for scenes
@@ -87,20 +79,20 @@ impl TrainingClips {
         step: u64,
         slot: usize,
         num_context: usize,
-        skipped: &mut Vec<SkippedScene>,
+        skipped: &mut Vec<Skip>,
     ) -> Result<Clip, DataError> {
-        let mut last = SkippedScene { key: String::new(), reason: String::new() };
+        let mut last = Skip { key: String::new(), reason: String::new() };
         for attempt in 0..MAX_ATTEMPTS {
             let scene = self.order.scene(step.saturating_add(u64::from(attempt)), slot);
             match self.read_scene(scene, step, slot, attempt, num_context) {
                 Ok(clip) => return Ok(clip),
                 Err(error) => {
-                    last = SkippedScene { key: self.source.key(scene).into(), reason: error.to_string() };
+                    last = Skip { key: self.source.key(scene).into(), reason: error.to_string() };
                     skipped.push(last.clone());
                 }
             }
         }
-        let SkippedScene { key, reason } = last;
+        let Skip { key, reason } = last;
         Err(DataError::NoUsableScene { step, slot, attempts: MAX_ATTEMPTS, key, reason })
     }
 

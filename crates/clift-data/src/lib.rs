@@ -3,21 +3,41 @@
 //! This crate does not depend on Burn: its clips and batches are plain host arrays, and
 //! `clift_model::Views::upload` is the one place where they meet a device.
 
+mod archive;
 pub mod batch;
 pub mod camera;
+pub mod chunk;
+mod chunk_table;
+pub mod chunk_writer;
 pub mod clip;
+pub mod clip_reader;
 pub mod error;
+pub mod image;
+pub mod index;
+pub mod info;
+pub mod lanczos;
+pub mod ledger;
 pub mod loader;
+pub mod normalize;
 pub mod order;
+pub mod pickle;
 pub mod sampler;
 pub mod split;
 pub mod synthetic;
+mod unpickle;
 
-pub use batch::{ClipBatch, SkippedScene, TrainingClips};
+pub use batch::{ClipBatch, TrainingClips};
 pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
+pub use chunk::{ChunkSource, SceneFilters};
+pub use chunk_writer::{SceneRecord, write_chunks};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
+pub use clip_reader::{ClipOptions, ClipReader};
 pub use error::DataError;
+pub use index::{EvaluationIndex, EvaluationItem};
+pub use info::{SourceInfo, Spread};
+pub use ledger::{Ledger, Skip};
 pub use loader::Prefetcher;
+pub use normalize::{PoseRotation, PoseScale, SceneFrame};
 pub use order::SceneOrder;
 pub use sampler::BoundedSampler;
 pub use split::Split;

@@ -1,0 +1,118 @@
+//! The ZIP archive that `torch.save` writes: members are stored uncompressed, so each can be read on its own.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use zip::{CompressionMethod, ZipArchive};
+
+use crate::error::DataError;
+
+/// Bytes of one member of an archive, or a part of them: 24 bytes, because a data set has millions.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Span {
+    /// Where the member's local header starts in the file. Where its data starts is read from there when it is
+    /// needed: looking it up for every member at opening would touch every page of every chunk.
+    header_start: u64,
+    /// First byte within the member.
+    start: u32,
+    /// How many bytes.
+    length: u32,
+    /// Checksum of the whole member; zero for a part, which cannot be checked.
+    crc32: u32,
+    is_whole: bool,
+}
+
+impl Span {
+    /// How many bytes.
+    pub fn len(&self) -> u64 {
+        u64::from(self.length)
+    }
+
+    /// The part of `length` bytes from `start`, if the member has that many.
+    pub fn part(self, start: u64, length: u64) -> Option<Self> {
+        if start == 0 && length == self.len() {
+            return Some(self);
+        }
+        let end = start.checked_add(length)?;
+        (self.is_whole && end <= self.len()).then_some(Self {
+            start: start as u32,
+            length: length as u32,
+            is_whole: false,
+            ..self
+        })
+    }
+
+    /// Reads the bytes from the archive at `path`; `None` if its header is not where the directory says, it ends
+    /// early, or the checksum differs.
+    pub fn read(&self, path: &Path) -> Result<Vec<u8>, DataError> {
+        let bad = |what: &str| DataError::BadChunk {
+            what: format!("the member at byte {} {what}; fetch the file again", self.header_start),
+            path: path.to_path_buf(),
+        };
+        let mut file = File::open(path).map_err(DataError::io("opening the chunk", path))?;
+        let mut header = [0; 30]; // "PK\3\4" first, the lengths of name and extra field last
+        file.seek(SeekFrom::Start(self.header_start)).map_err(DataError::io("reading the chunk", path))?;
+        file.read_exact(&mut header).map_err(|_| bad("lies behind the end of the file"))?;
+        if header[..4] != *b"PK\x03\x04" {
+            return Err(bad("has no local header"));
+        }
+        let length_at = |at: usize| u64::from(u16::from_le_bytes([header[at], header[at + 1]]));
+        let data_start = self.header_start + 30 + length_at(26) + length_at(28) + u64::from(self.start);
+        file.seek(SeekFrom::Start(data_start)).map_err(DataError::io("reading the chunk", path))?;
+        // The length was checked against the size of the file at opening, so this allocation is bounded by it.
+        let mut bytes = vec![0; self.length as usize];
+        file.read_exact(&mut bytes).map_err(|_| bad("lies behind the end of the file"))?;
+        if self.is_whole && crc32fast::hash(&bytes) != self.crc32 {
+            return Err(bad("has another checksum than its directory says"));
+        }
+        Ok(bytes)
+    }
+}
+
+/// The directory of one archive.
+pub(crate) struct Archive {
+    members: HashMap<String, Span>,
+}
+
+impl Archive {
+    /// Reads the directory. Member names lose the archive's own top folder: `data.pkl`, `data/0`.
+    pub fn open(path: &Path) -> Result<Self, DataError> {
+        let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
+        let file = File::open(path).map_err(DataError::io("opening the chunk", path))?;
+        let file_bytes = file.metadata().map_err(DataError::io("opening the chunk", path))?.len();
+        let archive = ZipArchive::new(BufReader::new(file)).map_err(|error| {
+            bad(format!("no readable ZIP archive of {file_bytes} bytes, perhaps truncated ({error})"))
+        })?;
+        let mut members = HashMap::with_capacity(archive.len());
+        for index in 0..archive.len() {
+            let entry = archive.by_index_data(index).map_err(|error| bad(error.to_string()))?;
+            let raw_name = entry.name().map_err(|error| bad(error.to_string()))?;
+            let name = raw_name.split_once('/').map_or(&*raw_name, |(_, name)| name);
+            if entry.compression() != CompressionMethod::Stored || entry.encrypted() {
+                return Err(bad(format!("member {name} is compressed, expected the stored members of torch.save")));
+            }
+            let length = u32::try_from(entry.size()).map_err(|_| bad(format!("member {name} exceeds 4 GiB")))?;
+            if entry.header_start().saturating_add(entry.size()) > file_bytes {
+                return Err(bad(format!("member {name} lies behind the end of the file")));
+            }
+            let span =
+                Span { header_start: entry.header_start(), start: 0, length, crc32: entry.crc32(), is_whole: true };
+            members.insert(name.to_owned(), span);
+        }
+        let archive = Self { members };
+        if let Some(order) = archive.member("byteorder") {
+            let order = order.read(path)?;
+            if order != b"little" {
+                return Err(bad(format!("byte order {:?}, expected little", String::from_utf8_lossy(&order))));
+            }
+        }
+        Ok(archive)
+    }
+
+    /// A member by its name without the top folder.
+    pub fn member(&self, name: &str) -> Option<Span> {
+        self.members.get(name).copied()
+    }
+}

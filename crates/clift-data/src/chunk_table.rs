@@ -1,0 +1,141 @@
+//! What one chunk holds: for each of its scenes, where cameras, time stamps and frames lie in the file.
+
+use std::path::Path;
+
+use crate::archive::{Archive, Span};
+use crate::camera::Camera;
+use crate::error::DataError;
+use crate::pickle::{ElementType, MAX_BYTES, Pickle, Tensor, Value};
+
+/// One scene of a chunk. Pictures and cameras stay in the file.
+pub(crate) struct SceneTable {
+    pub key: String,
+    pub url: String,
+    timestamps: Span,
+    cameras: Span,
+    camera_type: ElementType,
+    pub images: Vec<Span>,
+}
+
+/// The scenes of one chunk, in its order.
+pub(crate) struct ChunkTable {
+    pub scenes: Vec<SceneTable>,
+}
+
+impl ChunkTable {
+    /// Reads a chunk's directory and pickle, and checks that every tensor has the shape the format asks for and
+    /// lies within its storage.
+    pub fn read(path: &Path) -> Result<Self, DataError> {
+        let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
+        let archive = Archive::open(path)?;
+        let member = archive
+            .member("data.pkl")
+            .ok_or_else(|| bad("no member data.pkl, so torch.save did not write it".into()))?;
+        if member.len() > MAX_BYTES as u64 {
+            return Err(bad(format!("data.pkl has {} bytes, more than the limit of {MAX_BYTES}", member.len())));
+        }
+        let pickle = Pickle::parse(&member.read(path)?, path)?;
+        // A chunk is a list of scenes; one scene per file (a bare dict) is a common variant.
+        let scenes: Vec<&Value> = match pickle.root() {
+            Value::List(items) => items.iter().map(|id| pickle.get(*id)).collect(),
+            scene @ Value::Dict(_) => vec![scene],
+            _ => return Err(bad("the outermost object is neither a list of scenes nor a scene".into())),
+        };
+        let scenes = scenes
+            .into_iter()
+            .enumerate()
+            .map(|(position, scene)| {
+                SceneTable::from_pickle(&pickle, scene, &archive)
+                    .map_err(|what| bad(format!("scene {position}: {what}")))
+            })
+            .collect::<Result<_, _>>()?;
+        Ok(Self { scenes })
+    }
+}
+
+impl SceneTable {
+    fn from_pickle(pickle: &Pickle, scene: &Value, archive: &Archive) -> Result<Self, String> {
+        let item = |name: &str| pickle.item(scene, name).ok_or_else(|| format!("no entry `{name}`"));
+        let Value::Str(key) = item("key")? else { return Err("`key` is no string".into()) };
+        let url = match pickle.item(scene, "url") {
+            Some(Value::Str(url)) => url.clone(),
+            _ => String::new(),
+        };
+        let in_scene = |what: String| format!("key {key:?}: {what}");
+        let Value::List(image_ids) = item("images")? else { return Err(in_scene("`images` is no list".into())) };
+        let num_frames = image_ids.len() as u64;
+        let mut images = Vec::with_capacity(image_ids.len());
+        for (frame, id) in image_ids.iter().enumerate() {
+            let (span, _) = locate(pickle.get(*id), &[None], &[ElementType::U8], archive)
+                .map_err(|what| in_scene(format!("`images[{frame}]`: {what}")))?;
+            images.push(span);
+        }
+        let (cameras, camera_type) =
+            locate(item("cameras")?, &[Some(num_frames), Some(18)], &[ElementType::F32, ElementType::F64], archive)
+                .map_err(|what| in_scene(format!("`cameras`: {what}")))?;
+        let (timestamps, _) = locate(item("timestamps")?, &[Some(num_frames)], &[ElementType::I64], archive)
+            .map_err(|what| in_scene(format!("`timestamps`: {what}")))?;
+        Ok(Self { key: key.clone(), url, timestamps, cameras, camera_type, images })
+    }
+
+    /// Reads every camera of the scene.
+    pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera>, DataError> {
+        let bytes = self.cameras.read(path)?;
+        let numbers: Vec<f64> = match self.camera_type {
+            ElementType::F64 => bytes.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect(),
+            _ => bytes.as_chunks().0.iter().map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect(),
+        };
+        let (rows, _) = numbers.as_chunks::<18>();
+        let camera = |(frame, row): (usize, &[f64; 18])| {
+            Camera::from_re10k(*row).map_err(|source| DataError::BadChunk {
+                what: format!("scene {}, frame {frame}: {source}", self.key),
+                path: path.to_path_buf(),
+            })
+        };
+        rows.iter().enumerate().map(camera).collect()
+    }
+
+    /// Reads the time stamp of every frame.
+    pub fn read_timestamps(&self, path: &Path) -> Result<Vec<i64>, DataError> {
+        let bytes = self.timestamps.read(path)?;
+        Ok(bytes.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect())
+    }
+}
+
+/// Where a tensor's bytes lie, after checking type, shape (`None` is any size), layout and bounds.
+fn locate(
+    value: &Value,
+    shape: &[Option<u64>],
+    element_types: &[ElementType],
+    archive: &Archive,
+) -> Result<(Span, ElementType), String> {
+    let Value::Tensor(tensor) = value else { return Err("no tensor".into()) };
+    let Tensor { storage, offset, .. } = &**tensor;
+    let element_type = storage.element_type;
+    if !element_types.contains(&element_type) {
+        return Err(format!("elements are {element_type:?}, expected one of {element_types:?}"));
+    }
+    let matches = tensor.shape.len() == shape.len()
+        && tensor.shape.iter().zip(shape).all(|(got, expected)| expected.is_none_or(|expected| *got == expected));
+    if !matches {
+        let expected: Vec<_> = shape.iter().map(|size| size.map_or("any".into(), |size| size.to_string())).collect();
+        return Err(format!("shape is {:?}, expected [{}]", tensor.shape, expected.join(", ")));
+    }
+    if !tensor.is_contiguous() {
+        return Err(format!("stride is {:?}, expected a contiguous tensor", tensor.stride));
+    }
+    let member = archive
+        .member(&format!("data/{}", storage.key))
+        .ok_or_else(|| format!("its storage data/{} is not in the archive", storage.key))?;
+    let size = element_type.num_bytes();
+    let span = tensor
+        .shape
+        .iter()
+        .try_fold(size, |product, size| product.checked_mul(*size))
+        .zip(offset.checked_mul(size))
+        .and_then(|(length, start)| member.part(start, length))
+        .ok_or_else(|| {
+            format!("shape {:?} at offset {offset} exceeds its storage of {} bytes", tensor.shape, member.len())
+        })?;
+    Ok((span, element_type))
+}

@@ -1,0 +1,261 @@
+//! Writes scenes in the chunk layout: files that `torch.load` and [`crate::ChunkSource`] read.
+
+use std::collections::BTreeMap;
+use std::io::{Cursor, Write};
+use std::path::Path;
+
+use tempfile::NamedTempFile;
+use zip::result::ZipResult;
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipWriter};
+
+use crate::camera::Camera;
+use crate::error::DataError;
+
+/// Size at which a chunk is closed, in bytes of pictures: 100 MB, as in the published RealEstate10K chunks.
+pub const DEFAULT_CHUNK_BYTES: u64 = 100_000_000;
+
+/// One scene to write.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SceneRecord {
+    /// Unique key.
+    pub key: String,
+    /// Where it comes from; may be empty.
+    pub url: String,
+    /// One per frame: microseconds for RealEstate10K, frame numbers for DL3DV.
+    pub timestamps: Vec<i64>,
+    /// One per frame.
+    pub cameras: Vec<Camera>,
+    /// One JPEG or PNG file per frame.
+    pub images: Vec<Vec<u8>>,
+}
+
+/// Writes `000000.torch, 000001.torch, ..` and, when all are written, `index.json` into `folder`; returns how many
+/// scenes there are. A chunk is closed once its pictures have `target_bytes` or more. Every file appears under its
+/// name only when it is complete, and an existing `index.json` is not overwritten.
+///
+/// # Errors
+/// Whatever an item carries, [`DataError::Io`] from writing, [`DataError::BadIndex`] for an existing index, two scenes
+/// of one key, or a scene whose lists differ in length.
+pub fn write_chunks(
+    folder: &Path,
+    scenes: impl IntoIterator<Item = Result<SceneRecord, DataError>>,
+    target_bytes: u64,
+) -> Result<usize, DataError> {
+    std::fs::create_dir_all(folder).map_err(DataError::io("making the folder", folder))?;
+    let index_path = folder.join("index.json");
+    let bad = |what: String| DataError::BadIndex { what, path: index_path.clone() };
+    if index_path.exists() {
+        return Err(bad("it exists already; choose an empty folder".into()));
+    }
+    let mut index = BTreeMap::new();
+    let mut num_chunks = 0;
+    let mut pending = Vec::new();
+    let mut pending_bytes = 0;
+    for scene in scenes {
+        let scene = scene?;
+        let (timestamps, cameras, images) = (scene.timestamps.len(), scene.cameras.len(), scene.images.len());
+        if timestamps != images || cameras != images {
+            let key = &scene.key;
+            return Err(bad(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps")));
+        }
+        if index.insert(scene.key.clone(), chunk_name(num_chunks)).is_some() {
+            return Err(bad(format!("scene {} comes twice", scene.key)));
+        }
+        pending_bytes += scene.images.iter().map(|image| image.len() as u64).sum::<u64>();
+        pending.push(scene);
+        if pending_bytes >= target_bytes {
+            write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
+            num_chunks += 1;
+            pending.clear();
+            pending_bytes = 0;
+        }
+    }
+    if !pending.is_empty() {
+        write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
+    }
+    let text = serde_json::to_vec_pretty(&index).map_err(|error| bad(error.to_string()))?;
+    write_whole(&index_path, &text)?;
+    Ok(index.len())
+}
+
+fn chunk_name(number: usize) -> String {
+    format!("{number:06}.torch")
+}
+
+fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
+    let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
+    let bytes = pack(&prefix, scenes).map_err(|error| DataError::io("packing a chunk", path)(error.into()))?;
+    write_whole(path, &bytes)
+}
+
+/// Writes a temporary file beside `path` and renames it, so that no reader ever sees half a file.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let io = |error| DataError::io("writing", path)(error);
+    let mut file = NamedTempFile::new_in(folder).map_err(io)?;
+    file.write_all(bytes).map_err(io)?;
+    file.as_file().sync_all().map_err(io)?;
+    file.persist(path).map_err(|error| io(error.error))?;
+    Ok(())
+}
+
+/// Packs scenes as `torch.save` would: pickle first, then the storages, stored and aligned to 64 bytes.
+fn pack(prefix: &str, scenes: &[SceneRecord]) -> ZipResult<Vec<u8>> {
+    let mut pickle = PickleWriter { bytes: b"\x80\x02".to_vec(), storages: Vec::new() };
+    pickle.raw(b"](");
+    for scene in scenes {
+        pickle.scene(scene);
+    }
+    pickle.raw(b"e.");
+    let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
+    let mut member = |name: &str, alignment: u16, bytes: &[u8]| {
+        zip.start_file(format!("{prefix}/{name}"), options.with_alignment(alignment))?;
+        zip.write_all(bytes)?;
+        ZipResult::Ok(())
+    };
+    member("data.pkl", 1, &pickle.bytes)?;
+    member("byteorder", 1, b"little")?;
+    for (number, storage) in pickle.storages.iter().enumerate() {
+        member(&format!("data/{number}"), 64, storage)?;
+    }
+    member("version", 1, b"3\n")?;
+    Ok(zip.finish()?.into_inner())
+}
+
+/// A pickle of protocol 2 and the storages it refers to.
+struct PickleWriter {
+    bytes: Vec<u8>,
+    storages: Vec<Vec<u8>>,
+}
+
+impl PickleWriter {
+    fn scene(&mut self, scene: &SceneRecord) {
+        let timestamps = scene.timestamps.iter().flat_map(|time| time.to_le_bytes()).collect();
+        let rows = scene.cameras.iter().flat_map(Camera::to_re10k);
+        let cameras = rows.flat_map(|number| (number as f32).to_le_bytes()).collect();
+        let num_frames = scene.images.len();
+        self.raw(b"}(");
+        self.string("url");
+        self.string(&scene.url);
+        self.string("timestamps");
+        self.tensor("LongStorage", timestamps, &[num_frames]);
+        self.string("cameras");
+        self.tensor("FloatStorage", cameras, &[num_frames, 18]);
+        self.string("images");
+        self.raw(b"](");
+        for image in &scene.images {
+            self.tensor("ByteStorage", image.clone(), &[image.len()]);
+        }
+        self.raw(b"e");
+        self.string("key");
+        self.string(&scene.key);
+        self.raw(b"u");
+    }
+
+    /// A contiguous tensor that is the whole of a new storage.
+    fn tensor(&mut self, storage_type: &str, storage: Vec<u8>, shape: &[usize]) {
+        self.raw(b"ctorch._utils\n_rebuild_tensor_v2\n((");
+        self.string("storage");
+        self.raw(format!("ctorch\n{storage_type}\n").as_bytes());
+        self.string(&self.storages.len().to_string());
+        self.string("cpu");
+        self.integer(shape.iter().product());
+        self.raw(b"tQ");
+        self.integer(0); // offset
+        self.raw(b"(");
+        for size in shape {
+            self.integer(*size);
+        }
+        self.raw(b"t(");
+        for dimension in 0..shape.len() {
+            self.integer(shape[dimension + 1..].iter().product());
+        }
+        self.raw(b"t\x89ccollections\nOrderedDict\n)RtR"); // requires no gradient, has no hooks
+        self.storages.push(storage);
+    }
+
+    fn string(&mut self, text: &str) {
+        self.raw(b"X");
+        self.raw(&(text.len() as u32).to_le_bytes());
+        self.raw(text.as_bytes());
+    }
+
+    /// LONG1 with eight bytes: one opcode for every size.
+    fn integer(&mut self, value: usize) {
+        self.raw(&[0x8a, 8]);
+        self.raw(&(value as u64).to_le_bytes());
+    }
+
+    fn raw(&mut self, bytes: &[u8]) {
+        self.bytes.extend_from_slice(bytes);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ChunkSource, SceneFilters, SceneSource, Split};
+
+    fn record(key: &str, num_frames: usize) -> SceneRecord {
+        let camera = |frame: usize| {
+            let mut row = [0.0; 18];
+            row[..4].copy_from_slice(&[0.9, 1.6, 0.5, 0.5]);
+            (row[6], row[11], row[16]) = (1.0, 1.0, 1.0);
+            row[9] = frame as f64;
+            Camera::from_re10k(row).unwrap()
+        };
+        SceneRecord {
+            key: key.into(),
+            url: format!("https://example.org/{key}"),
+            timestamps: (0..num_frames as i64).map(|frame| frame * 33_367 + (1 << 33)).collect(),
+            cameras: (0..num_frames).map(camera).collect(),
+            images: (0..num_frames).map(|frame| vec![frame as u8; 100 + frame]).collect(),
+        }
+    }
+
+    #[test]
+    fn written_scenes_are_read_back_equal() {
+        let folder = tempfile::tempdir().unwrap();
+        let records = [record("b", 3), record("a", 5), record("c", 1)];
+        // 303, 510 and 100 bytes of pictures: the second scene closes the first chunk.
+        let written = write_chunks(&folder.path().join("test"), records.clone().map(Ok), 400).unwrap();
+        assert_eq!(written, 3);
+        let index = std::fs::read_to_string(folder.path().join("test/index.json")).unwrap();
+        let index: BTreeMap<String, String> = serde_json::from_str(&index).unwrap();
+        let expected = [("a", "000000.torch"), ("b", "000000.torch"), ("c", "000001.torch")];
+        assert_eq!(index, expected.map(|(key, file)| (key.to_owned(), file.to_owned())).into());
+
+        let source = ChunkSource::open(folder.path(), Split::Test, &SceneFilters::default()).unwrap();
+        assert_eq!(source.num_scenes(), 3);
+        for record in &records {
+            let scene = source.find(&record.key).unwrap();
+            assert_eq!(source.url(scene).unwrap(), record.url);
+            assert_eq!(source.timestamps(scene).unwrap(), record.timestamps);
+            assert_eq!(source.num_frames(scene).unwrap(), record.images.len());
+            for (frame, image) in record.images.iter().enumerate() {
+                assert_eq!(source.encoded_frame(scene, frame).unwrap(), *image);
+            }
+            for (got, expected) in source.cameras(scene).unwrap().iter().zip(&record.cameras) {
+                assert_eq!(got.c2w, expected.c2w); // whole numbers, so f32 loses nothing
+                assert!((got.intrinsics_norm.fx - 0.9).abs() < 1e-7); // f32
+            }
+        }
+    }
+
+    #[test]
+    fn uneven_lists_doubled_keys_and_an_existing_index_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut uneven = record("a", 3);
+        uneven.timestamps.pop();
+        let message = write_chunks(folder.path(), [Ok(uneven)], 1).unwrap_err().to_string();
+        assert!(message.contains("scene a has 3 images, 3 cameras, 2 time stamps"), "{message}");
+        let message =
+            write_chunks(folder.path(), [Ok(record("a", 1)), Ok(record("a", 1))], 1000).unwrap_err().to_string();
+        assert!(message.contains("scene a comes twice"), "{message}");
+        write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap();
+        let message = write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap_err().to_string();
+        assert!(message.contains("it exists already"), "{message}");
+    }
+}

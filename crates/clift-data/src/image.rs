@@ -1,0 +1,207 @@
+//! Pictures: decoding and encoding files, and fitting a frame with its intrinsics to the model's size.
+
+use std::io::Cursor;
+
+use image::codecs::jpeg::JpegEncoder;
+use image::codecs::png::PngEncoder;
+use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
+
+use crate::camera::{Intrinsics, IntrinsicsNorm};
+use crate::clip::Frame;
+use crate::error::DataError;
+use crate::lanczos::resize_lanczos;
+
+/// Most columns or rows of a picture that is decoded.
+pub const MAX_SIDE: u32 = 16_384;
+/// Most memory that decoding one picture may take: 8,192 x 8,192 RGB and the decoder's own copy.
+const MAX_DECODE_BYTES: u64 = 512 << 20;
+
+/// Decodes a JPEG or PNG file to 8-bit RGB; grey becomes RGB, an alpha channel is dropped.
+///
+/// # Errors
+/// [`DataError::BadImage`], which names `key` and `frame`: another format, broken or truncated data, or more than
+/// [`MAX_SIDE`] on a side.
+pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<Frame, DataError> {
+    let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
+    let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {
+        return Err(bad(format!("its {} bytes are neither JPEG nor PNG", bytes.len())));
+    };
+    if format == ImageFormat::Jpeg && !has_jpeg_end(bytes) {
+        return Err(bad(format!("its JPEG data of {} bytes is truncated", bytes.len())));
+    }
+    let mut limits = Limits::default();
+    limits.max_image_width = Some(MAX_SIDE);
+    limits.max_image_height = Some(MAX_SIDE);
+    limits.max_alloc = Some(MAX_DECODE_BYTES);
+    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
+    reader.limits(limits);
+    let picture = reader.decode().map_err(|error| bad(error.to_string()))?.into_rgb8();
+    let (width, height) = picture.dimensions();
+    if width == 0 || height == 0 {
+        return Err(bad(format!("it is {width}x{height}")));
+    }
+    Ok(Frame { width: width as usize, height: height as usize, rgb: picture.into_raw() })
+}
+
+/// Whether an end marker follows the last scan; the decoder fills what is missing of a truncated JPEG with grey.
+fn has_jpeg_end(bytes: &[u8]) -> bool {
+    let last_scan = bytes.windows(2).rposition(|pair| pair == [0xff, 0xda]);
+    last_scan.is_some_and(|scan| bytes[scan..].windows(2).any(|pair| pair == [0xff, 0xd9]))
+}
+
+/// Encodes a frame as JPEG of `quality` in `1..=100`.
+pub fn encode_jpeg(frame: &Frame, quality: u8) -> Result<Vec<u8>, DataError> {
+    let mut bytes = Vec::new();
+    encode(JpegEncoder::new_with_quality(&mut bytes, quality), frame)?;
+    Ok(bytes)
+}
+
+/// Encodes a frame as PNG, without loss.
+pub fn encode_png(frame: &Frame) -> Result<Vec<u8>, DataError> {
+    let mut bytes = Vec::new();
+    encode(PngEncoder::new(&mut bytes), frame)?;
+    Ok(bytes)
+}
+
+fn encode(encoder: impl ImageEncoder, frame: &Frame) -> Result<(), DataError> {
+    let &Frame { width, height, ref rgb } = frame;
+    let bad = |what: String| DataError::Encode { width, height, what };
+    if rgb.len() != width * height * 3 {
+        return Err(bad(format!("it has {} values, expected {}", rgb.len(), width * height * 3)));
+    }
+    encoder
+        .write_image(rgb, width as u32, height as u32, ExtendedColorType::Rgb8)
+        .map_err(|error| bad(error.to_string()))
+}
+
+/// Rescales a frame until it just covers `width` by `height`, crops the centre, and moves its intrinsics along
+/// (pixelSplat's protocol). Focal lengths follow the rescaled picture. The principal point keeps its normalised
+/// position, which is what the published numbers use and is half a pixel off where the rescaled picture has an odd
+/// margin; `exact_principal_point` moves it with the crop instead.
+///
+/// # Errors
+/// [`DataError::Upscale`] when the target is larger than the frame.
+pub fn fit(
+    frame: &Frame,
+    intrinsics_norm: IntrinsicsNorm,
+    width: usize,
+    height: usize,
+    exact_principal_point: bool,
+) -> Result<(Frame, Intrinsics), DataError> {
+    if width > frame.width || height > frame.height {
+        return Err(DataError::Upscale { width, height, from_width: frame.width, from_height: frame.height });
+    }
+    let (scaled_width, scaled_height) = covering_size((frame.width, frame.height), (width, height));
+    let (column, row) = ((scaled_width - width) / 2, (scaled_height - height) / 2);
+    let scaled = resize_lanczos(frame, scaled_width, scaled_height);
+    let in_scaled = intrinsics_norm.to_pixels(scaled_width, scaled_height);
+    let (cx, cy) = if exact_principal_point {
+        (in_scaled.cx - column as f64, in_scaled.cy - row as f64)
+    } else {
+        (intrinsics_norm.cx * width as f64, intrinsics_norm.cy * height as f64)
+    };
+    let cropped = crop(&scaled, column, row, width, height);
+    Ok((cropped, Intrinsics { fx: in_scaled.fx, fy: in_scaled.fy, cx, cy }))
+}
+
+/// The smallest size with the aspect ratio of `from` that covers `to`; both as (width, height).
+fn covering_size(from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
+    let scale = (to.1 as f64 / from.1 as f64).max(to.0 as f64 / from.0 as f64);
+    let side = |from: usize| (from as f64 * scale).round_ties_even() as usize;
+    (side(from.0), side(from.1))
+}
+
+fn crop(frame: &Frame, column: usize, row: usize, width: usize, height: usize) -> Frame {
+    let rows = frame.rgb.chunks_exact(frame.width * 3).skip(row).take(height);
+    let rgb = rows.flat_map(|pixels| &pixels[column * 3..(column + width) * 3]).copied().collect();
+    Frame { width, height, rgb }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ramp(width: usize, height: usize) -> Frame {
+        let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 77])).collect();
+        Frame { width, height, rgb }
+    }
+
+    #[test]
+    fn fitted_sizes_crops_and_focal_factors_equal_the_protocols_table() {
+        // (source) -> (target): rescaled size, crop offset, factor of fx, exact principal point, all as width first.
+        let table = [
+            ((640, 360), (256, 256), (455, 256), (99, 0), 1.777_34, 128.5),
+            ((480, 270), (448, 256), (455, 256), (3, 0), 1.015_625, 224.5),
+            ((960, 540), (448, 256), (455, 256), (3, 0), 1.015_625, 224.5),
+            ((640, 360), (448, 256), (455, 256), (3, 0), 1.015_625, 224.5),
+        ];
+        for (from, to, scaled, offset, factor, exact) in table {
+            assert_eq!(covering_size(from, to), scaled);
+            assert_eq!(((scaled.0 - to.0) / 2, (scaled.1 - to.1) / 2), offset);
+            let norm = IntrinsicsNorm { fx: 0.9, fy: 1.6, cx: 0.5, cy: 0.5 };
+            let frame = Frame { width: from.0, height: from.1, rgb: vec![9; from.0 * from.1 * 3] };
+            let (fitted, protocol) = fit(&frame, norm, to.0, to.1, false).unwrap();
+            assert_eq!((fitted.width, fitted.height, fitted.rgb.len()), (to.0, to.1, to.0 * to.1 * 3));
+            assert!((protocol.fx / to.0 as f64 / norm.fx - factor).abs() < 1e-5, "{protocol:?}"); // printed to 5 digits
+            assert_eq!((protocol.fy, protocol.cx, protocol.cy), (1.6 * 256.0, to.0 as f64 / 2.0, 128.0));
+            let (_, moved) = fit(&frame, norm, to.0, to.1, true).unwrap();
+            assert_eq!((moved.fx, moved.cx, moved.cy), (protocol.fx, exact, 128.0));
+        }
+    }
+
+    #[test]
+    fn a_crop_without_rescaling_takes_the_centre_pixels() {
+        let frame = ramp(9, 4);
+        let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.6, cy: 0.5 };
+        let (fitted, intrinsics) = fit(&frame, norm, 4, 4, true).unwrap();
+        for y in 0..4 {
+            for x in 0..4 {
+                let (got, expected) = ((y * 4 + x) * 3, (y * 9 + x + 2) * 3);
+                assert_eq!(fitted.rgb[got..got + 3], frame.rgb[expected..expected + 3]);
+            }
+        }
+        assert!((intrinsics.cx - 3.4).abs() < 1e-12, "{intrinsics:?}"); // 0.6 * 9 - 2
+    }
+
+    #[test]
+    fn upscaling_is_refused_with_both_sizes() {
+        let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
+        let message = fit(&ramp(64, 36), norm, 32, 48, false).unwrap_err().to_string();
+        assert!(message.contains("32x48") && message.contains("64x36"), "{message}");
+    }
+
+    #[test]
+    fn png_round_trips_exactly_and_jpeg_within_a_few_levels() {
+        let frame = ramp(40, 24);
+        assert_eq!(decode(&encode_png(&frame).unwrap(), "k", 0).unwrap(), frame);
+        let jpeg = decode(&encode_jpeg(&frame, 95).unwrap(), "k", 0).unwrap();
+        let worst = jpeg.rgb.iter().zip(&frame.rgb).map(|(a, b)| a.abs_diff(*b)).max();
+        assert!(worst.is_some_and(|worst| worst < 16), "{worst:?}"); // colour is stored at half resolution
+    }
+
+    #[test]
+    fn an_unreadable_jpeg_names_scene_and_frame() {
+        let jpeg = encode_jpeg(&ramp(40, 24), 90).unwrap();
+        for length in [40, jpeg.len() / 2, jpeg.len() - 2] {
+            let message = decode(&jpeg[..length], "00ff", 7).unwrap_err().to_string();
+            assert!(message.starts_with("frame 7 of scene 00ff cannot be decoded: "), "{message}");
+            assert!(message.contains("truncated"), "{message}");
+        }
+        let broken = b"\xff\xd8\xff\xe0\x00\x04\xff\xda\x00\x02\xff\xd9"; // a scan without tables or sizes
+        let message = decode(broken, "00ff", 7).unwrap_err().to_string();
+        assert!(message.starts_with("frame 7 of scene 00ff cannot be decoded: "), "{message}");
+        assert_eq!(decode(&[&jpeg[..], &[0; 9]].concat(), "00ff", 7).unwrap().width, 40); // padding is common
+        let message = decode(b"GIF89a....", "00ff", 7).unwrap_err().to_string();
+        assert!(message.ends_with("its 10 bytes are neither JPEG nor PNG"), "{message}");
+    }
+
+    #[test]
+    fn a_png_that_claims_to_be_huge_is_refused_before_memory_is_taken() {
+        let mut png = encode_png(&ramp(4, 4)).unwrap();
+        png[16..24].copy_from_slice(&[0, 1, 0, 0, 0, 1, 0, 0]); // 65,536 x 65,536
+        let checksum = crc32fast::hash(&png[12..29]).to_be_bytes();
+        png[29..33].copy_from_slice(&checksum);
+        let message = decode(&png, "k", 0).unwrap_err().to_string();
+        assert!(message.contains("limit") || message.contains("exceeds"), "{message}");
+    }
+}

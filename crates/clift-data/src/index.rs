@@ -1,0 +1,214 @@
+//! Evaluation indices: which frames of which scenes are given and which are measured.
+
+use std::collections::HashMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use serde::de::{Deserializer, MapAccess, Visitor};
+
+use crate::clip::{SceneSource, ViewIndices};
+use crate::error::DataError;
+use crate::ledger::Ledger;
+
+/// An index as published: `{key: {"context": [..], "target": [..]} | null | {}}`, in the order of the file.
+#[derive(Clone, Debug)]
+pub struct EvaluationIndex {
+    path: PathBuf,
+    /// Every key with its views; `None` for null and empty entries.
+    entries: Vec<(String, Option<ViewIndices>)>,
+    positions: HashMap<String, usize>,
+}
+
+/// One scene to evaluate.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct EvaluationItem {
+    /// Position in the source.
+    pub scene: usize,
+    /// Frames, checked against the scene.
+    pub views: ViewIndices,
+}
+
+impl EvaluationIndex {
+    /// Reads an index file.
+    ///
+    /// # Errors
+    /// [`DataError::Io`], or [`DataError::BadIndex`] for another form, a doubled key, or an entry with contexts but no
+    /// targets or the reverse.
+    pub fn read(path: &Path) -> Result<Self, DataError> {
+        let text = std::fs::read(path).map_err(DataError::io("reading the evaluation index", path))?;
+        let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
+        let file: IndexFile = serde_json::from_slice(&text).map_err(|error| {
+            bad(format!("expected {{key: {{\"context\": [..], \"target\": [..]}} or null}}, got {error}"))
+        })?;
+        let mut positions = HashMap::with_capacity(file.0.len());
+        let mut entries = Vec::with_capacity(file.0.len());
+        for (key, entry) in file.0 {
+            let views = match entry.map(|Entry { context, target }| (context, target)) {
+                None => None,
+                Some((context, target)) if context.is_empty() && target.is_empty() => None,
+                Some((context, target)) if context.is_empty() || target.is_empty() => {
+                    let (contexts, targets) = (context.len(), target.len());
+                    return Err(bad(format!("scene {key} has {contexts} context and {targets} target frames")));
+                }
+                Some((context, target)) => Some(ViewIndices { context, target }),
+            };
+            if positions.insert(key.clone(), entries.len()).is_some() {
+                return Err(bad(format!("scene {key} comes twice")));
+            }
+            entries.push((key, views));
+        }
+        Ok(Self { path: path.to_path_buf(), entries, positions })
+    }
+
+    /// How many keys there are, null and empty entries included.
+    pub fn num_keys(&self) -> usize {
+        self.entries.len()
+    }
+
+    /// The entries that have views, in the order of the file.
+    pub fn usable(&self) -> impl Iterator<Item = (&str, &ViewIndices)> {
+        self.entries.iter().filter_map(|(key, views)| Some((key.as_str(), views.as_ref()?)))
+    }
+
+    /// What is evaluated of `key`, a scene of `num_frames` frames; `None` for a null or empty entry.
+    ///
+    /// # Errors
+    /// [`DataError::MissingIndexKey`] if the index does not have the key, [`DataError::BadIndex`] if it asks for a
+    /// frame that the scene does not have.
+    pub fn views(&self, key: &str, num_frames: usize) -> Result<Option<&ViewIndices>, DataError> {
+        let position = self.positions.get(key);
+        let position =
+            position.ok_or_else(|| DataError::MissingIndexKey { key: key.to_owned(), path: self.path.clone() })?;
+        let Some(views) = &self.entries[*position].1 else { return Ok(None) };
+        match views.context.iter().chain(&views.target).find(|frame| **frame >= num_frames) {
+            Some(frame) => Err(DataError::BadIndex {
+                what: format!("it asks for frame {frame} of scene {key}, which has {num_frames} frames"),
+                path: self.path.clone(),
+            }),
+            None => Ok(Some(views)),
+        }
+    }
+
+    /// The scenes of `source` to evaluate, in the order of the file, and what is left out: null entries, empty
+    /// entries, and keys that the source does not have.
+    ///
+    /// # Errors
+    /// As [`EvaluationIndex::views`], and whatever reading a scene's cameras gives.
+    pub fn select(&self, source: &dyn SceneSource) -> Result<(Vec<EvaluationItem>, Ledger), DataError> {
+        let mut ledger = Ledger::new(self.num_keys());
+        let mut items = Vec::new();
+        for (key, views) in &self.entries {
+            if views.is_none() {
+                ledger.skip(key, "without views in the evaluation index");
+            } else if let Some(scene) = source.find(key) {
+                let views = self.views(key, source.cameras(scene)?.len())?;
+                items.extend(views.map(|views| EvaluationItem { scene, views: views.clone() }));
+            } else {
+                ledger.skip(key, "not in the data");
+            }
+        }
+        Ok((items, ledger))
+    }
+}
+
+/// A JSON map in the order of the file.
+struct IndexFile(Vec<(String, Option<Entry>)>);
+
+/// Frames of one scene; published indices carry further fields, which are ignored.
+#[derive(Deserialize)]
+struct Entry {
+    #[serde(default)]
+    context: Vec<usize>,
+    #[serde(default)]
+    target: Vec<usize>,
+}
+
+impl<'de> Deserialize<'de> for IndexFile {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct InOrder;
+        impl<'de> Visitor<'de> for InOrder {
+            type Value = IndexFile;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a map from scene keys")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<IndexFile, A::Error> {
+                let mut entries = Vec::new();
+                while let Some(entry) = map.next_entry()? {
+                    entries.push(entry);
+                }
+                Ok(IndexFile(entries))
+            }
+        }
+        deserializer.deserialize_map(InOrder)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ChunkSource, SceneFilters, Split};
+
+    fn index(json: &str) -> Result<EvaluationIndex, DataError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("index.json");
+        std::fs::write(&path, json).unwrap();
+        EvaluationIndex::read(&path)
+    }
+
+    #[test]
+    fn null_and_empty_entries_are_kept_apart_from_usable_ones_in_file_order() {
+        let index = index(
+            r#"{"c": {"context": [5, 1], "target": [2, 2], "overlap": 0.5}, "b": null, "d": {}, "a": {"context": [0], "target": [0]}}"#,
+        )
+        .unwrap();
+        assert_eq!(index.num_keys(), 4);
+        assert_eq!(index.usable().map(|(key, _)| key).collect::<Vec<_>>(), ["c", "a"]);
+        let views = ViewIndices { context: vec![5, 1], target: vec![2, 2] };
+        assert_eq!(index.views("c", 6).unwrap(), Some(&views));
+        assert_eq!(index.views("b", 6).unwrap(), None);
+        assert_eq!(index.views("d", 6).unwrap(), None);
+    }
+
+    #[test]
+    fn a_key_that_is_missing_is_an_error_that_names_key_and_file() {
+        let message = index(r#"{"a": null}"#).unwrap().views("00ff", 9).unwrap_err().to_string();
+        assert!(message.starts_with("scene 00ff is not in the evaluation index: "), "{message}");
+        assert!(message.ends_with("index.json"), "{message}");
+    }
+
+    #[test]
+    fn a_frame_that_the_scene_does_not_have_is_an_error() {
+        let index = index(r#"{"a": {"context": [0, 5], "target": [1]}}"#).unwrap();
+        let message = index.views("a", 5).unwrap_err().to_string();
+        assert!(message.contains("it asks for frame 5 of scene a, which has 5 frames"), "{message}");
+    }
+
+    #[test]
+    fn other_forms_are_refused_with_the_reason() {
+        let message = |json: &str| index(json).unwrap_err().to_string();
+        assert!(message("[]").contains("expected {key:"), "{}", message("[]"));
+        assert!(message(r#"{"a": {"context": [-1], "target": [1]}}"#).contains("-1"));
+        assert!(message(r#"{"a": {"context": [1]}}"#).contains("scene a has 1 context and 0 target frames"));
+        assert!(message(r#"{"a": null, "a": null}"#).contains("scene a comes twice"));
+    }
+
+    #[test]
+    fn selecting_counts_what_is_left_out() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
+        let source = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
+        let (items, ledger) =
+            EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&source).unwrap();
+        let views = ViewIndices { context: vec![0, 2, 5, 7], target: vec![1, 3, 4, 6] };
+        assert_eq!(items, [EvaluationItem { scene: 0, views }]);
+        assert_eq!(ledger.to_string(), "1 of 3 scenes used; 2 without views in the evaluation index");
+
+        let train = ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap();
+        let (items, ledger) =
+            EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&train).unwrap();
+        assert!(items.is_empty());
+        assert_eq!(ledger.counts()["not in the data"], 1);
+    }
+}

@@ -1,0 +1,133 @@
+//! A short description of a source, for people: counts, sizes, fields of view, extents.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use crate::camera::Camera;
+use crate::clip::SceneSource;
+use crate::error::DataError;
+
+/// Smallest, median and largest of some numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Spread {
+    /// Smallest.
+    pub min: f64,
+    /// The middle one; the mean of the middle two of an even count.
+    pub median: f64,
+    /// Largest.
+    pub max: f64,
+}
+
+impl Spread {
+    /// The spread of at least one number; `None` of none.
+    pub fn of(mut numbers: Vec<f64>) -> Option<Self> {
+        numbers.sort_by(f64::total_cmp);
+        let (min, max) = (*numbers.first()?, *numbers.last()?);
+        let middle = numbers.len() / 2;
+        let median =
+            if numbers.len() % 2 == 1 { numbers[middle] } else { f64::midpoint(numbers[middle - 1], numbers[middle]) };
+        Some(Self { min, median, max })
+    }
+}
+
+impl fmt::Display for Spread {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let digits = f.precision().unwrap_or(0);
+        let Self { min, median, max } = self;
+        write!(f, "{min:.digits$} / {median:.digits$} / {max:.digits$}")
+    }
+}
+
+/// What a source holds. Spreads and sizes are `None` for a source without scenes.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SourceInfo {
+    /// How many scenes there are.
+    pub num_scenes: usize,
+    /// Frames per scene.
+    pub num_frames: Option<Spread>,
+    /// Columns and rows of the first frame of the first scene.
+    pub image_size: Option<[usize; 2]>,
+    /// The wider of the two fields of view, one number per frame.
+    pub fov_deg: Option<Spread>,
+    /// Largest distance along a world axis of a camera centre from the scene's mean centre, one number per scene.
+    pub extent: Option<Spread>,
+}
+
+impl SourceInfo {
+    /// Reads every scene's cameras and one frame.
+    pub fn read(source: &dyn SceneSource) -> Result<Self, DataError> {
+        let (mut lengths, mut fields, mut extents) = (Vec::new(), Vec::new(), Vec::new());
+        let mut first_picture = None;
+        for scene in 0..source.num_scenes() {
+            let cameras = source.cameras(scene)?;
+            if first_picture.is_none() && !cameras.is_empty() {
+                let frame = source.frame(scene, 0)?;
+                first_picture = Some([frame.width, frame.height]);
+            }
+            lengths.push(cameras.len() as f64);
+            extents.push(extent(&cameras));
+            fields.extend(cameras.iter().map(Camera::fov_deg).map(|(x, y)| x.max(y)));
+        }
+        Ok(Self {
+            num_scenes: source.num_scenes(),
+            num_frames: Spread::of(lengths),
+            image_size: first_picture,
+            fov_deg: Spread::of(fields),
+            extent: Spread::of(extents),
+        })
+    }
+}
+
+fn extent(cameras: &[Camera]) -> f64 {
+    let count = cameras.len() as f64;
+    let axis = |i: usize| {
+        let mean: f64 = cameras.iter().map(|camera| camera.c2w.translation[i] / count).sum();
+        cameras.iter().map(|camera| (camera.c2w.translation[i] - mean).abs()).fold(0.0, f64::max)
+    };
+    axis(0).max(axis(1)).max(axis(2))
+}
+
+impl fmt::Display for SourceInfo {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} scenes", self.num_scenes)?;
+        if let Some(frames) = self.num_frames {
+            write!(f, "; frames {frames} (min / median / max)")?;
+        }
+        if let Some([width, height]) = self.image_size {
+            write!(f, "; {width}x{height}")?;
+        }
+        if let Some(fov) = self.fov_deg {
+            write!(f, "; field of view {fov:.1} deg")?;
+        }
+        if let Some(extent) = self.extent {
+            write!(f, "; extent {extent:.3}")?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ChunkSource, SceneFilters, Split};
+    use std::path::Path;
+
+    #[test]
+    fn the_median_of_an_even_count_is_between_the_middle_two() {
+        assert_eq!(Spread::of(vec![4.0, 1.0, 2.0, 8.0]), Some(Spread { min: 1.0, median: 3.0, max: 8.0 }));
+        assert_eq!(Spread::of(vec![5.0]), Some(Spread { min: 5.0, median: 5.0, max: 5.0 }));
+        assert_eq!(Spread::of(Vec::new()), None);
+    }
+
+    #[test]
+    fn a_source_is_described_by_counts_size_field_of_view_and_extent() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
+        let source = ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap();
+        let text = SourceInfo::read(&source).unwrap().to_string();
+        // 2 atan(0.5 / 0.9) = 58.1 degrees; centres are 0, 0.1, .., 0.7 along x, 0.35 from their mean.
+        let expected = "2 scenes; frames 8 / 8 / 8 (min / median / max); 64x36; \
+            field of view 58.1 / 58.1 / 58.1 deg; extent 0.350 / 0.350 / 0.350";
+        assert_eq!(text, expected);
+    }
+}

@@ -1,0 +1,362 @@
+//! The machine behind [`crate::pickle`]: a stack, a memo, and the opcodes that `torch.save` writes.
+
+use std::collections::HashMap;
+
+use crate::pickle::{ElementType, Global, MAX_BYTES, MAX_VALUES, Storage, Tensor, Value, ValueId};
+
+/// Deepest nesting of unfinished lists, dicts and tuples; chunks need five.
+const MAX_DEPTH: usize = 32;
+/// Most dimensions of a tensor.
+const MAX_DIMENSIONS: usize = 4;
+/// Longest name of a storage; `torch.save` numbers them.
+const MAX_STORAGE_KEY_BYTES: usize = 32;
+
+/// Reads a pickle into its values and the place of the outermost one.
+pub(crate) fn unpickle(bytes: &[u8]) -> Result<(Vec<Value>, ValueId), Stop> {
+    let mut reader =
+        Reader { bytes, at: 0, values: Vec::new(), stack: Vec::new(), marks: Vec::new(), memo: HashMap::new() };
+    match reader.run() {
+        Ok(root) => Ok((reader.values, root)),
+        Err(Stop::Bad(what)) => Err(Stop::Bad(format!("{what} (at byte {})", reader.at))),
+        Err(refused) => Err(refused),
+    }
+}
+
+/// Why reading stopped.
+pub(crate) enum Stop {
+    /// A Python name that is not allowed.
+    Refused(String),
+    /// Anything else.
+    Bad(String),
+}
+
+impl From<&str> for Stop {
+    fn from(what: &str) -> Self {
+        Self::Bad(what.to_owned())
+    }
+}
+
+/// The pickle machine: a stack, marks into it, and a memo.
+struct Reader<'a> {
+    bytes: &'a [u8],
+    at: usize,
+    values: Vec<Value>,
+    stack: Vec<ValueId>,
+    marks: Vec<usize>,
+    memo: HashMap<u32, ValueId>,
+}
+
+impl Reader<'_> {
+    fn run(&mut self) -> Result<ValueId, Stop> {
+        if self.bytes.len() > MAX_BYTES {
+            return Err(Stop::Bad(format!("it has {} bytes, more than the limit of {MAX_BYTES}", self.bytes.len())));
+        }
+        loop {
+            match self.u8()? {
+                b'.' => return self.pop(),
+                0x80 => match self.u8()? {
+                    2..=5 => {}
+                    version => return Err(Stop::Bad(format!("protocol {version}, expected 2 to 5"))),
+                },
+                0x95 => drop(self.take(8)?), // FRAME: a length that only matters to streams
+                b'(' if self.marks.len() == MAX_DEPTH => {
+                    return Err(Stop::Bad(format!("nested deeper than {MAX_DEPTH} levels")));
+                }
+                b'(' => self.marks.push(self.stack.len()),
+                opcode => {
+                    if !(self.read_scalar(opcode)? || self.read_container(opcode)? || self.read_reference(opcode)?) {
+                        return Err(Stop::Bad(format!("opcode {opcode:#04x}, which torch.save does not write")));
+                    }
+                }
+            }
+        }
+    }
+
+    /// Numbers, strings, `None`, `True`, `False`.
+    fn read_scalar(&mut self, opcode: u8) -> Result<bool, Stop> {
+        let value = match opcode {
+            b'N' => Value::None,
+            0x88 => Value::Bool(true),
+            0x89 => Value::Bool(false),
+            b'J' => Value::Int(i64::from(i32::from_le_bytes(self.array()?))),
+            b'K' => Value::Int(i64::from(self.u8()?)),
+            b'M' => Value::Int(i64::from(u16::from_le_bytes(self.array()?))),
+            0x8a => {
+                let length = self.u8()? as usize;
+                let digits = self.take(length)?;
+                if length > 8 {
+                    return Err("an integer of more than 64 bits".into());
+                }
+                let negative = digits.last().is_some_and(|high| high & 0x80 != 0);
+                let mut extended = [if negative { 0xff } else { 0 }; 8];
+                extended[..length].copy_from_slice(digits);
+                Value::Int(i64::from_le_bytes(extended))
+            }
+            b'G' => Value::Float(f64::from_be_bytes(self.array()?)),
+            b'X' => {
+                let length = u32::from_le_bytes(self.array()?) as usize;
+                Value::Str(self.text(length)?)
+            }
+            0x8c => {
+                let length = self.u8()? as usize;
+                Value::Str(self.text(length)?)
+            }
+            _ => return Ok(false),
+        };
+        self.push(value)?;
+        Ok(true)
+    }
+
+    /// Lists, tuples and dicts.
+    fn read_container(&mut self, opcode: u8) -> Result<bool, Stop> {
+        match opcode {
+            b']' => self.push(Value::List(Vec::new()))?,
+            b'}' => self.push(Value::Dict(Vec::new()))?,
+            b')' => self.push(Value::Tuple(Vec::new()))?,
+            0x85..=0x87 => {
+                let mut items = Vec::new();
+                for _ in 0..opcode - 0x84 {
+                    items.push(self.pop()?);
+                }
+                items.reverse();
+                self.push(Value::Tuple(items))?;
+            }
+            b't' => {
+                let items = self.pop_to_mark()?;
+                self.push(Value::Tuple(items))?;
+            }
+            b'a' => {
+                let item = self.pop()?;
+                self.extend_list(&[item])?;
+            }
+            b'e' => {
+                let items = self.pop_to_mark()?;
+                self.extend_list(&items)?;
+            }
+            b's' => {
+                let value = self.pop()?;
+                let key = self.pop()?;
+                self.extend_dict(&[key, value])?;
+            }
+            b'u' => {
+                let items = self.pop_to_mark()?;
+                self.extend_dict(&items)?;
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// The memo, Python names, storages and calls.
+    fn read_reference(&mut self, opcode: u8) -> Result<bool, Stop> {
+        match opcode {
+            b'q' => {
+                let slot = u32::from(self.u8()?);
+                self.remember(slot)?;
+            }
+            b'r' => {
+                let slot = u32::from_le_bytes(self.array()?);
+                self.remember(slot)?;
+            }
+            0x94 => self.remember(self.memo.len() as u32)?,
+            b'h' => {
+                let slot = u32::from(self.u8()?);
+                self.recall(slot)?;
+            }
+            b'j' => {
+                let slot = u32::from_le_bytes(self.array()?);
+                self.recall(slot)?;
+            }
+            b'c' => {
+                let (module, name) = (self.line()?, self.line()?);
+                self.push(Value::Global(global(&module, &name)?))?;
+            }
+            0x93 => {
+                let (name, module) = (self.pop()?, self.pop()?);
+                let (Value::Str(name), Value::Str(module)) = (self.get(name), self.get(module)) else {
+                    return Err("a Python name that is not a string".into());
+                };
+                let global = global(module, name)?;
+                self.push(Value::Global(global))?;
+            }
+            b'Q' => {
+                let id = self.pop()?;
+                let storage = self.storage(id)?;
+                self.push(Value::Storage(Box::new(storage)))?;
+            }
+            b'R' => {
+                let (arguments, callee) = (self.pop()?, self.pop()?);
+                let value = self.call(callee, arguments)?;
+                self.push(value)?;
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// `("storage", <storage type>, key, device, number of elements)`
+    fn storage(&self, id: ValueId) -> Result<Storage, Stop> {
+        let Value::Tuple(fields) = self.get(id) else { return Err("a storage that is not a tuple".into()) };
+        let [kind, storage_type, key, _device, num_elements] = fields[..] else {
+            return Err(Stop::Bad(format!("a storage of {} fields, expected 5", fields.len())));
+        };
+        match (self.get(kind), self.get(storage_type), self.get(key), self.get(num_elements)) {
+            (Value::Str(kind), Value::Global(Global::Storage(element_type)), Value::Str(key), Value::Int(count))
+                if kind == "storage" && key.len() <= MAX_STORAGE_KEY_BYTES && *count >= 0 =>
+            {
+                Ok(Storage { element_type: *element_type, key: key.clone(), num_elements: *count as u64 })
+            }
+            _ => Err("a storage whose fields are not (\"storage\", type, name, device, count)".into()),
+        }
+    }
+
+    /// The only two calls that are understood; both only describe data.
+    fn call(&self, callee: ValueId, arguments: ValueId) -> Result<Value, Stop> {
+        let Value::Tuple(arguments) = self.get(arguments) else {
+            return Err("a call whose arguments are no tuple".into());
+        };
+        match (self.get(callee), &arguments[..]) {
+            (Value::Global(Global::OrderedDict), []) => Ok(Value::Dict(Vec::new())),
+            (Value::Global(Global::RebuildTensor), [storage, offset, shape, stride, ..]) => {
+                let (Value::Storage(storage), Value::Int(offset)) = (self.get(*storage), self.get(*offset)) else {
+                    return Err("a tensor without a storage".into());
+                };
+                let offset = u64::try_from(*offset).map_err(|_| Stop::from("a tensor with a negative offset"))?;
+                let (shape, stride) = (self.counts(*shape)?, self.counts(*stride)?);
+                if shape.len() != stride.len() {
+                    return Err("a tensor with more sizes than strides, or fewer".into());
+                }
+                Ok(Value::Tensor(Box::new(Tensor { storage: (**storage).clone(), offset, shape, stride })))
+            }
+            _ => Err("a call of something other than a tensor or an empty OrderedDict".into()),
+        }
+    }
+
+    /// A short tuple of non-negative integers.
+    fn counts(&self, id: ValueId) -> Result<Vec<u64>, Stop> {
+        let Value::Tuple(items) = self.get(id) else { return Err("a tensor whose sizes are no tuple".into()) };
+        if items.len() > MAX_DIMENSIONS {
+            return Err(Stop::Bad(format!("a tensor of {} dimensions, more than {MAX_DIMENSIONS}", items.len())));
+        }
+        let count = |id: &ValueId| match self.get(*id) {
+            Value::Int(count) => u64::try_from(*count).map_err(|_| "a tensor with a negative size or stride".into()),
+            _ => Err("a tensor with a size or stride that is no integer".into()),
+        };
+        items.iter().map(count).collect()
+    }
+
+    fn get(&self, id: ValueId) -> &Value {
+        &self.values[id.0 as usize]
+    }
+
+    fn push(&mut self, value: Value) -> Result<(), Stop> {
+        if self.values.len() == MAX_VALUES {
+            return Err(Stop::Bad(format!("more than {MAX_VALUES} values")));
+        }
+        self.stack.push(ValueId(self.values.len() as u32));
+        self.values.push(value);
+        Ok(())
+    }
+
+    fn pop(&mut self) -> Result<ValueId, Stop> {
+        if self.stack.len() == self.marks.last().copied().unwrap_or(0) {
+            return Err("an opcode without its operands".into());
+        }
+        self.stack.pop().ok_or_else(|| "an opcode without its operands".into())
+    }
+
+    fn pop_to_mark(&mut self) -> Result<Vec<ValueId>, Stop> {
+        let mark = self.marks.pop().ok_or("an opcode without its mark")?;
+        Ok(self.stack.split_off(mark))
+    }
+
+    /// The value an opcode works on without taking it off the stack.
+    fn top(&self) -> Result<ValueId, Stop> {
+        let floor = self.marks.last().copied().unwrap_or(0);
+        self.stack[floor..].last().copied().ok_or_else(|| "an opcode without its operands".into())
+    }
+
+    fn extend_list(&mut self, items: &[ValueId]) -> Result<(), Stop> {
+        let list = self.top()?;
+        let Value::List(list) = &mut self.values[list.0 as usize] else {
+            return Err("an append to something other than a list".into());
+        };
+        list.extend_from_slice(items);
+        Ok(())
+    }
+
+    fn extend_dict(&mut self, items: &[ValueId]) -> Result<(), Stop> {
+        let dict = self.top()?;
+        let Value::Dict(dict) = &mut self.values[dict.0 as usize] else {
+            return Err("an item set on something other than a dict".into());
+        };
+        if !items.len().is_multiple_of(2) {
+            return Err("a dict key without a value".into());
+        }
+        dict.extend(items.chunks_exact(2).map(|pair| (pair[0], pair[1])));
+        Ok(())
+    }
+
+    fn remember(&mut self, slot: u32) -> Result<(), Stop> {
+        let value = self.top()?;
+        if self.memo.len() == MAX_VALUES {
+            return Err(Stop::Bad(format!("more than {MAX_VALUES} remembered values")));
+        }
+        self.memo.insert(slot, value);
+        Ok(())
+    }
+
+    fn recall(&mut self, slot: u32) -> Result<(), Stop> {
+        let value = *self.memo.get(&slot).ok_or_else(|| Stop::Bad(format!("memo slot {slot} was never set")))?;
+        self.stack.push(value);
+        Ok(())
+    }
+
+    fn take(&mut self, length: usize) -> Result<&[u8], Stop> {
+        let rest = &self.bytes[self.at..];
+        let taken = rest.get(..length).ok_or("it ends in the middle of a value")?;
+        self.at += length;
+        Ok(taken)
+    }
+
+    fn array<const LENGTH: usize>(&mut self) -> Result<[u8; LENGTH], Stop> {
+        let mut array = [0; LENGTH];
+        array.copy_from_slice(self.take(LENGTH)?);
+        Ok(array)
+    }
+
+    fn u8(&mut self) -> Result<u8, Stop> {
+        Ok(self.array::<1>()?[0])
+    }
+
+    fn text(&mut self, length: usize) -> Result<String, Stop> {
+        let bytes = self.take(length)?.to_vec();
+        String::from_utf8(bytes).map_err(|_| "a string that is not UTF-8".into())
+    }
+
+    /// A line of text without its newline.
+    fn line(&mut self) -> Result<String, Stop> {
+        let length = self.bytes[self.at..].iter().position(|&byte| byte == b'\n');
+        let line = self.text(length.ok_or("it ends in the middle of a name")?)?;
+        self.at += 1;
+        Ok(line)
+    }
+}
+
+/// Looks a Python name up in the allow-list.
+fn global(module: &str, name: &str) -> Result<Global, Stop> {
+    Ok(match (module, name) {
+        ("torch._utils", "_rebuild_tensor_v2") => Global::RebuildTensor,
+        ("collections", "OrderedDict") => Global::OrderedDict,
+        ("torch", "ByteStorage") => Global::Storage(ElementType::U8),
+        ("torch", "IntStorage") => Global::Storage(ElementType::I32),
+        ("torch", "LongStorage") => Global::Storage(ElementType::I64),
+        ("torch", "FloatStorage") => Global::Storage(ElementType::F32),
+        ("torch", "DoubleStorage") => Global::Storage(ElementType::F64),
+        _ => {
+            // A name from a hostile file: short enough for a terminal, and without control characters.
+            let name: String = format!("{module}.{name}").chars().take(120).collect();
+            return Err(Stop::Refused(name.escape_debug().to_string()));
+        }
+    })
+}
