@@ -3,5 +3,7 @@
 pub mod baseline;
 pub mod error;
 pub mod metrics;
+pub mod picture;
+pub mod sheet;
 
 pub use error::EvalError;
