@@ -1,0 +1,132 @@
+//! What a method must beat: the nearest context view, and the mean of all of them.
+
+use clift_data::{Pose, Views};
+
+use crate::error::EvalError;
+
+/// Poses closer than this, relative to the largest distance or in radians, count as equally near:
+/// rounding must not choose between cameras that turn on the spot.
+const TIE: f64 = 1e-9;
+
+/// Finds the context view whose camera centre is nearest to the target's.
+///
+/// Ties go to the smaller rotation angle, then to the lower index.
+///
+/// # Errors
+/// [`EvalError::NoContext`] when `context_c2w` is empty.
+pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, EvalError> {
+    let distances: Vec<f64> = context_c2w.iter().map(|c2w| distance(*c2w, target_c2w)).collect();
+    let nearest = distances.iter().copied().reduce(f64::min).ok_or(EvalError::NoContext)?;
+    let tie = TIE * distances.iter().copied().fold(0.0, f64::max);
+    let near: Vec<usize> = (0..distances.len()).filter(|&i| distances[i] <= nearest + tie).collect();
+
+    let angles: Vec<f64> = near.iter().map(|&i| rotation_angle_rad(context_c2w[i], target_c2w)).collect();
+    let smallest = angles.iter().copied().fold(f64::INFINITY, f64::min);
+    let first = angles.iter().position(|&angle| angle <= smallest + TIE).ok_or(EvalError::NoContext)?;
+    Ok(near[first])
+}
+
+/// Copies the nearest context view's picture, `[height, width, 3]` in [0, 1].
+///
+/// # Errors
+/// [`EvalError::NoContext`] without context views.
+pub fn nearest_image(context: &Views, target_c2w: Pose) -> Result<Vec<f32>, EvalError> {
+    let nearest = nearest_view(&context.c2w, target_c2w)?;
+    let size = context.height * context.width * 3;
+    Ok(context.images[nearest * size..][..size].iter().map(|&value| f32::from(value) / 255.0).collect())
+}
+
+/// Averages the context views' pictures, `[height, width, 3]` in [0, 1].
+///
+/// # Errors
+/// [`EvalError::NoContext`] without context views.
+pub fn mean_image(context: &Views) -> Result<Vec<f32>, EvalError> {
+    if context.num_views() == 0 {
+        return Err(EvalError::NoContext);
+    }
+    let mut sums = vec![0_u32; context.height * context.width * 3];
+    for image in context.images.chunks_exact(sums.len()) {
+        for (sum, &value) in sums.iter_mut().zip(image) {
+            *sum += u32::from(value);
+        }
+    }
+    let scale = 255.0 * context.num_views() as f64;
+    Ok(sums.into_iter().map(|sum| (f64::from(sum) / scale) as f32).collect())
+}
+
+fn distance(a: Pose, b: Pose) -> f64 {
+    a.translation.iter().zip(b.translation).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+}
+
+/// Angle of the rotation between two poses, from its sine and cosine so that small angles are exact too.
+fn rotation_angle_rad(a: Pose, b: Pose) -> f64 {
+    let r = a.inverse().after(b).rotation;
+    let axis = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]];
+    let twice_sine = axis.iter().map(|value| value * value).sum::<f64>().sqrt();
+    twice_sine.atan2(r[0][0] + r[1][1] + r[2][2] - 1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use clift_data::Intrinsics;
+
+    use super::*;
+
+    fn pose(x: f64, yaw_deg: f64) -> Pose {
+        let (sin, cos) = yaw_deg.to_radians().sin_cos();
+        Pose { rotation: [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]], translation: [x, 0.0, 0.0] }
+    }
+
+    fn views(poses: &[Pose], images: Vec<u8>) -> Views {
+        let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
+        Views {
+            width: 1,
+            height: 1,
+            images,
+            c2w: poses.to_vec(),
+            intrinsics: vec![intrinsics; poses.len()],
+            frame_index: (0..poses.len()).collect(),
+        }
+    }
+
+    #[test]
+    fn the_nearest_camera_centre_wins_whatever_its_rotation() {
+        assert_eq!(nearest_view(&[pose(1.0, 0.0), pose(0.5, 90.0)], pose(0.0, 0.0)).unwrap(), 1);
+    }
+
+    #[test]
+    fn at_equal_distance_the_smaller_angle_wins_and_then_the_lower_index() {
+        let target = pose(0.0, 10.0);
+        assert_eq!(nearest_view(&[pose(1.0, 40.0), pose(-1.0, 5.0)], target).unwrap(), 1);
+        assert_eq!(nearest_view(&[pose(1.0, 20.0), pose(-1.0, 0.0)], target).unwrap(), 0);
+    }
+
+    #[test]
+    fn rounding_does_not_decide_a_tie() {
+        let turned_on_the_spot = [pose(1.0 - 1e-14, 90.0), pose(1.0, 1.0)];
+        assert_eq!(nearest_view(&turned_on_the_spot, pose(0.0, 0.0)).unwrap(), 1);
+    }
+
+    #[test]
+    fn the_rotation_angle_is_right_from_tiny_to_half_a_turn() {
+        for angle_deg in [0.0, 1e-6, 30.0, 90.0, 150.0, 180.0] {
+            let angle = rotation_angle_rad(pose(0.0, 0.0), pose(0.0, angle_deg)).to_degrees();
+            // Products of sines and cosines near 1 round at 1e-16; 1e-12 degrees is above that.
+            assert!((angle - angle_deg).abs() < 1e-12, "{angle} is not {angle_deg}");
+        }
+    }
+
+    #[test]
+    fn the_mean_image_averages_every_view_and_the_nearest_one_is_copied() {
+        let context = views(&[pose(0.0, 0.0), pose(1.0, 0.0)], vec![0, 51, 255, 255, 102, 255]);
+        assert_eq!(mean_image(&context).unwrap(), [0.5, 0.3, 1.0]);
+        assert_eq!(nearest_image(&context, pose(0.9, 0.0)).unwrap(), [1.0, 0.4, 1.0]);
+    }
+
+    #[test]
+    fn no_context_is_an_error() {
+        let empty = views(&[], Vec::new());
+        assert!(matches!(mean_image(&empty), Err(EvalError::NoContext)));
+        assert!(matches!(nearest_image(&empty, Pose::IDENTITY), Err(EvalError::NoContext)));
+    }
+}

@@ -1,0 +1,54 @@
+//! What can go wrong between a rendering and a report, one documented variant per failure.
+
+use std::path::PathBuf;
+
+/// A failure of this crate. A message says what, where, expected and got, with the path last.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum EvalError {
+    /// A file could not be read or written.
+    #[error("{action} failed: {source}: {path}", path = path.display())]
+    Io {
+        /// What was being done, as a verb phrase ("writing the summary").
+        action: &'static str,
+        /// The operating system's reason.
+        source: std::io::Error,
+        /// The file.
+        path: PathBuf,
+    },
+    /// Two images that are to be compared do not hold the same number of values.
+    #[error("the images differ in size: expected {expected} values like the target, got {got} in the prediction")]
+    SizeMismatch {
+        /// Values of the target, or of the shape that was given.
+        expected: usize,
+        /// Values of the other image.
+        got: usize,
+    },
+    /// An image holds a NaN or an infinity, so a metric of it means nothing.
+    #[error("the {image} is not finite: value {index} is {value}")]
+    NotFinite {
+        /// `"prediction"` or `"target"`.
+        image: &'static str,
+        /// Where, counted in values.
+        index: usize,
+        /// The NaN or infinity.
+        value: f32,
+    },
+    /// SSIM has no window that lies wholly inside the image.
+    #[error("SSIM needs at least {min} x {min} pixels, got {width} x {height}", min = crate::metrics::SSIM_MIN_SIZE_PX)]
+    TooSmallForSsim {
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+    },
+    /// A baseline was asked for a scene that has no context view.
+    #[error("a baseline needs at least one context view, got none")]
+    NoContext,
+    /// A view was reported twice, which would count it twice in every mean.
+    #[error("{view} was already measured: a view counts once")]
+    DuplicateView {
+        /// Scene, frame, variant and token counts.
+        view: String,
+    },
+}
