@@ -51,4 +51,31 @@ pub enum EvalError {
         /// Scene, frame, variant and token counts.
         view: String,
     },
+    /// A count or share of tokens that cannot be had.
+    #[error("`{text}` tokens: {reason}")]
+    BadTokenCount {
+        /// What was written.
+        text: String,
+        /// Why it cannot be had, and what can.
+        reason: String,
+    },
+    /// The condensed variant was asked for without a condenser.
+    #[error("the condensed variant needs the weights of stage 2")]
+    NoCondenser,
+    /// The model refused its input or its weights.
+    #[error(transparent)]
+    Model(#[from] clift_model::ModelError),
+    /// A tensor could not be read back from its device.
+    #[error("reading a rendering from its device failed: {reason}")]
+    Tensor {
+        /// The device's reason.
+        reason: String,
+    },
+}
+
+impl EvalError {
+    /// Wraps a device's error; for `map_err`.
+    pub(crate) fn tensor(reason: impl std::fmt::Debug) -> Self {
+        Self::Tensor { reason: format!("{reason:?}") }
+    }
 }

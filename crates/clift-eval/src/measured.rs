@@ -121,6 +121,11 @@ impl Accumulator {
         }
     }
 
+    /// Whether a view of a setting has been added.
+    pub fn contains(&self, scene: &str, frame: usize, setting: Setting) -> bool {
+        self.views.get(&setting).is_some_and(|views| views.contains_key(&(scene.to_owned(), frame)))
+    }
+
     /// Notes what a setting costs.
     pub fn set_cost(&mut self, setting: Setting, cost: Cost) {
         self.costs.insert(setting, cost);

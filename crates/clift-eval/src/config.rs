@@ -1,0 +1,50 @@
+//! What is evaluated, as the `[eval]` section of a config holds it.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::token_count::TokenCount;
+
+/// Which scenes and views are rendered, with how many tokens.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EvalConfig {
+    /// Token counts a scene is stored with.
+    pub storage: Vec<TokenCount>,
+    /// Evaluation index with the context and target frames of every scene. Without one, contexts are
+    /// spread evenly over each clip and targets lie between them.
+    pub index: Option<PathBuf>,
+    /// Most scenes that are evaluated; 0 for all.
+    pub num_scenes: usize,
+    /// Context views of a scene without an index.
+    pub num_context: usize,
+    /// Target views of a scene without an index.
+    pub num_targets: usize,
+    /// Scenes of which a picture sheet is written.
+    pub num_sheets: usize,
+    /// Steps between validations during training; 0 for none.
+    pub every: u64,
+    /// Scenes of a validation.
+    pub num_validation_scenes: usize,
+    /// Token count of a stage-2 validation.
+    pub validation_storage: TokenCount,
+}
+
+impl Default for EvalConfig {
+    fn default() -> Self {
+        // The ratios of the paper's main experiment.
+        let shares = [1.0 / 16.0, 0.125, 0.25, 0.5, 0.75, 1.0];
+        Self {
+            storage: shares.map(TokenCount::Share).into(),
+            index: None,
+            num_scenes: 0,
+            num_context: 4,
+            num_targets: 3,
+            num_sheets: 4,
+            every: 0,
+            num_validation_scenes: 4,
+            validation_storage: TokenCount::Share(0.125),
+        }
+    }
+}

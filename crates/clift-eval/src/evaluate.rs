@@ -1,0 +1,247 @@
+//! The sweep: every scene encoded once, rendered with every variant at every token count.
+
+use std::time::Instant;
+
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use clift_data::order::{derive_seed, item_rng};
+use clift_data::{Clip, Views as HostViews};
+use clift_model::{Cameras, Clusters, Condenser, Encoder, KMeans, Renderer};
+use rand::seq::SliceRandom;
+
+use crate::baseline::{mean_image, nearest_image};
+use crate::measured::{Accumulator, Measured, Setting, Variant};
+use crate::metrics::{SSIM_MIN_SIZE_PX, psnr, ssim};
+use crate::picture::{Picture, error_map};
+use crate::sheet::{Cell, Row, sheet};
+use crate::token_count::TokenCount;
+use crate::upload::{upload_cameras, upload_views};
+use crate::EvalError;
+
+/// Target views rendered at once: bounds memory for clips with a hundred targets.
+const VIEWS_PER_PASS: usize = 8;
+
+/// The networks of an evaluation, on a device without autodiff.
+#[derive(Clone, Debug)]
+pub struct Networks {
+    /// Encoder, the same for both stages.
+    pub encoder: Encoder,
+    /// Stage-1 renderer: draws random subsets and uncondensed centroids.
+    pub renderer: Renderer,
+    /// Condenser and stage-2 renderer, once there are.
+    pub condensed: Option<(Condenser, Renderer)>,
+}
+
+/// Settings of a sweep.
+#[derive(Clone, Debug)]
+pub struct Sweep {
+    /// Token counts a scene is stored with.
+    pub storage: Vec<TokenCount>,
+    /// Which variants are rendered; [`Variant::Clift`] needs [`Networks::condensed`].
+    pub variants: Vec<Variant>,
+    /// Latent K-means.
+    pub kmeans: KMeans,
+    /// Seed of K-means and of the random subsets; each scene derives its own from it and its key.
+    pub seed: u64,
+}
+
+/// A rendered picture, `height * width * 3` values of RGB, with what was measured of it.
+struct Rendered {
+    setting: Setting,
+    pixels: Vec<Vec<f32>>,
+    measured: Vec<Measured>,
+}
+
+/// Renders and measures the targets of one scene; returns a sheet of pictures when asked for.
+///
+/// Sampling per scene as in the paper: one random subset shared by all its targets.
+///
+/// # Errors
+/// [`EvalError::BadTokenCount`] for a count the scene does not have, [`EvalError::NotFinite`] for a
+/// rendering that is not finite, and whatever the model refuses.
+pub fn evaluate_scene(
+    networks: &Networks,
+    clip: &Clip,
+    sweep: &Sweep,
+    with_sheet: bool,
+    into: &mut Accumulator,
+) -> Result<Option<Picture>, EvalError> {
+    let device = networks.renderer.device();
+    let lift = networks.encoder.forward(&upload_views(&[&clip.context], &device)?); // [1, N, D]
+    let num_tokens = lift.dims()[1];
+    let mut renderings = baselines(clip)?;
+    for &count in &sweep.storage {
+        let num_storage_tokens = count.of(num_tokens)?;
+        let seed = derive_seed(sweep.seed, &clip.key);
+        let index = KMeansOnce::new(&sweep.kmeans, &lift, num_storage_tokens, seed);
+        for &variant in &sweep.variants {
+            let (tokens, renderer) = match variant {
+                Variant::Random => (random_subset(&lift, num_storage_tokens, seed), &networks.renderer),
+                Variant::Kmeans => (index.clusters()?.upload(&device).gather_centroids(lift.clone()), &networks.renderer),
+                Variant::Clift => {
+                    let (condenser, renderer) = networks.condensed.as_ref().ok_or(EvalError::NoCondenser)?;
+                    (condenser.forward(lift.clone(), &index.clusters()?.upload(&device)), renderer)
+                }
+                Variant::Patch | Variant::NearestView | Variant::MeanImage => continue,
+            };
+            let setting = Setting { variant, num_storage_tokens, num_render_tokens: num_storage_tokens };
+            renderings.push(render(renderer, tokens, &clip.target, setting)?);
+        }
+    }
+    for rendering in &renderings {
+        for (&frame, &measured) in clip.target.frame_index.iter().zip(&rendering.measured) {
+            // A target drawn twice is one view.
+            if !into.contains(&clip.key, frame, rendering.setting) {
+                into.add(&clip.key, frame, rendering.setting, measured)?;
+            }
+        }
+    }
+    if with_sheet { Ok(Some(scene_sheet(clip, &renderings)?)) } else { Ok(None) }
+}
+
+/// K-means of one count, computed when the first variant asks.
+struct KMeansOnce<'a> {
+    kmeans: &'a KMeans,
+    lift: &'a Tensor<3>,
+    num_clusters: usize,
+    seed: u64,
+    clusters: std::cell::OnceCell<Clusters>,
+}
+
+impl<'a> KMeansOnce<'a> {
+    fn new(kmeans: &'a KMeans, lift: &'a Tensor<3>, num_clusters: usize, seed: u64) -> Self {
+        Self { kmeans, lift, num_clusters, seed, clusters: std::cell::OnceCell::new() }
+    }
+
+    fn clusters(&self) -> Result<&Clusters, EvalError> {
+        if let Some(clusters) = self.clusters.get() {
+            return Ok(clusters);
+        }
+        let fit = self.kmeans.fit(self.lift.clone(), self.num_clusters, &[self.seed])?;
+        Ok(self.clusters.get_or_init(|| fit.clusters))
+    }
+}
+
+/// `count` tokens of one scene without replacement, in order.
+fn random_subset(lift: &Tensor<3>, count: usize, seed: u64) -> Tensor<3> {
+    let mut index: Vec<i64> = (0..lift.dims()[1] as i64).collect();
+    index.shuffle(&mut item_rng(seed, 0, 0, 0, "random subset"));
+    index.truncate(count);
+    index.sort_unstable();
+    let index = Tensor::<1, Int>::from_data(TensorData::new(index, [count]), &lift.device());
+    lift.clone().select(1, index)
+}
+
+fn render(renderer: &Renderer, tokens: Tensor<3>, target: &HostViews, setting: Setting) -> Result<Rendered, EvalError> {
+    let device = tokens.device();
+    let mut rendered = Rendered { setting, pixels: Vec::new(), measured: Vec::new() };
+    let frame_len = target.height * target.width * 3;
+    let cameras = upload_cameras(&[target], &device)?;
+    for start in (0..target.num_views()).step_by(VIEWS_PER_PASS) {
+        let count = VIEWS_PER_PASS.min(target.num_views() - start);
+        let cameras = Cameras {
+            c2w: cameras.c2w.clone().narrow(1, start, count),
+            intrinsics: cameras.intrinsics.clone().narrow(1, start, count),
+            ..cameras
+        };
+        let started = Instant::now();
+        let images = renderer.forward(tokens.clone(), &cameras); // [1, T, H, W, 3]
+        let values: Vec<f32> = images.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)?;
+        let render_s = started.elapsed().as_secs_f64() / count as f64;
+        for (view, pixels) in values.chunks(frame_len).enumerate() {
+            let measured = measure(pixels, target, start + view)?;
+            rendered.measured.push(Measured { render_s: Some(render_s), ..measured });
+            rendered.pixels.push(pixels.to_vec());
+        }
+    }
+    Ok(rendered)
+}
+
+fn baselines(clip: &Clip) -> Result<Vec<Rendered>, EvalError> {
+    let mean = mean_image(&clip.context)?;
+    let mut nearest = Vec::new();
+    for &pose in &clip.target.c2w {
+        nearest.push(nearest_image(&clip.context, pose)?);
+    }
+    let means = vec![mean; clip.target.num_views()];
+    [(Variant::NearestView, nearest), (Variant::MeanImage, means)]
+        .into_iter()
+        .map(|(variant, pixels)| {
+            let views = pixels.iter().enumerate();
+            let measured = views.map(|(view, pixels)| measure(pixels, &clip.target, view)).collect::<Result<_, _>>()?;
+            Ok(Rendered { setting: Setting::baseline(variant), pixels, measured })
+        })
+        .collect()
+}
+
+/// Ground truth of one target in `[0, 1]`.
+fn truth(target: &HostViews, view: usize) -> Vec<f32> {
+    let len = target.height * target.width * 3;
+    target.images[view * len..(view + 1) * len].iter().map(|&value| f32::from(value) / 255.0).collect()
+}
+
+fn measure(pixels: &[f32], target: &HostViews, view: usize) -> Result<Measured, EvalError> {
+    let truth = truth(target, view);
+    let (height, width) = (target.height, target.width);
+    let large_enough = height.min(width) >= SSIM_MIN_SIZE_PX;
+    let ssim = if large_enough { Some(ssim(pixels, &truth, height, width)?) } else { None };
+    Ok(Measured::quality(psnr(pixels, &truth)?, ssim))
+}
+
+/// Columns: contexts, target, nearest view, then the fewest and the most tokens of the best variant
+/// there is, and the error of the last.
+fn scene_sheet(clip: &Clip, renderings: &[Rendered]) -> Result<Picture, EvalError> {
+    let best = [Variant::Clift, Variant::Kmeans, Variant::Random];
+    let best = best.into_iter().find(|variant| renderings.iter().any(|r| r.setting.variant == *variant));
+    let mut shown: Vec<&Rendered> = renderings.iter().filter(|r| Some(r.setting.variant) == best).collect();
+    shown.sort_by_key(|r| r.setting.num_storage_tokens);
+    shown.dedup_by_key(|r| r.setting.num_storage_tokens);
+    if shown.len() > 2 {
+        shown = vec![shown[0], shown[shown.len() - 1]];
+    }
+    let nearest = renderings.iter().find(|r| r.setting.variant == Variant::NearestView);
+
+    let (height, width) = (clip.target.height, clip.target.width);
+    let frame_len = height * width * 3;
+    let contexts: Vec<Picture> = clip
+        .context
+        .images
+        .chunks(frame_len)
+        .map(|rgb| Picture::from_rgb8(rgb, height, width))
+        .collect::<Result<_, _>>()?;
+    let mut columns = vec!["contexts".to_owned(), "target".into(), "nearest view".into()];
+    for rendered in &shown {
+        columns.push(format!("{}, {} tokens", rendered.setting.variant.name(), rendered.setting.num_storage_tokens));
+    }
+    columns.push("error".into());
+    let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
+
+    let mut rows = Vec::new();
+    for (view, frame) in clip.target.frame_index.iter().enumerate() {
+        let truth = truth(&clip.target, view);
+        let cell = |picture: Picture, caption: String| Cell { pictures: vec![picture], caption };
+        let mut cells = vec![
+            Cell { pictures: contexts.clone(), caption: String::new() },
+            cell(Picture::from_unit(&truth, height, width)?, String::new()),
+        ];
+        for rendered in nearest.iter().chain(&shown) {
+            let caption = format!("{:.2} dB", rendered.measured[view].psnr);
+            cells.push(cell(Picture::from_unit(&rendered.pixels[view], height, width)?, caption));
+        }
+        if let Some(last) = shown.last() {
+            cells.push(cell(error_map(&last.pixels[view], &truth, height, width)?, String::new()));
+        }
+        rows.push(Row { label: format!("frame {frame}"), cells });
+    }
+    Ok(sheet(&clip.key, &columns, &rows))
+}
+
+trait OnDevice {
+    fn device(&self) -> Device;
+}
+
+impl OnDevice for Renderer {
+    fn device(&self) -> Device {
+        use burn::module::Module;
+        self.devices().into_iter().next().unwrap_or_else(Device::flex)
+    }
+}

@@ -1,0 +1,39 @@
+//! Clips of the data crate as tensors of the model crate.
+
+use burn::tensor::{Device, Tensor};
+use clift_data::Views as HostViews;
+use clift_model::views::{Cameras, Views, upload_images};
+
+use crate::EvalError;
+
+/// Puts one set of views per scene together on a device.
+///
+/// # Shapes
+/// - `scenes`: sets of the same number of views of the same size
+/// - returns `[batch, views, ..]`
+///
+/// # Errors
+/// [`EvalError::Model`] when the sets differ in number or size, or a camera is not finite.
+pub fn upload_views(scenes: &[&HostViews], device: &Device) -> Result<Views, EvalError> {
+    let cameras = upload_cameras(scenes, device)?;
+    Ok(Views { images: upload_pictures(scenes, device)?, cameras })
+}
+
+/// The pictures alone, RGB in `[0, 1]`, `[batch, views, height, width, 3]`. See [`upload_views`].
+pub fn upload_pictures(scenes: &[&HostViews], device: &Device) -> Result<Tensor<5>, EvalError> {
+    let images: Vec<u8> = scenes.iter().flat_map(|views| &views.images).copied().collect();
+    Ok(upload_images(&images, shape(scenes), device)?)
+}
+
+/// The cameras alone. See [`upload_views`].
+pub fn upload_cameras(scenes: &[&HostViews], device: &Device) -> Result<Cameras, EvalError> {
+    let c2w: Vec<f32> = scenes.iter().flat_map(|views| &views.c2w).flat_map(|pose| pose.to_matrix()).collect();
+    let intrinsics = scenes.iter().flat_map(|views| &views.intrinsics);
+    let intrinsics: Vec<f32> = intrinsics.flat_map(|k| [k.fx, k.fy, k.cx, k.cy].map(|value| value as f32)).collect();
+    Ok(Cameras::upload(&c2w, &intrinsics, shape(scenes), device)?)
+}
+
+/// `[batch, views, height, width]` of the first scene; the uploads check the others against it.
+fn shape(scenes: &[&HostViews]) -> [usize; 4] {
+    scenes.first().map_or([0; 4], |first| [scenes.len(), first.num_views(), first.height, first.width])
+}
