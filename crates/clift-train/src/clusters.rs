@@ -1,0 +1,240 @@
+//! The offline cluster cache: latent K-means of every training scene, made once from the frozen encoder.
+//!
+//! A folder with `index.json` (what was clustered with which encoder) and `clusters.bin` (per entry the
+//! cluster of every token and the token of every cluster, little-endian u16).
+
+use std::fs::File;
+use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use clift_data::order::{below, derive_seed, item_rng};
+use clift_data::{ClipReader, Ledger, ViewIndices};
+use clift_eval::upload_views;
+use clift_model::{Encoder, SceneClusters};
+use serde::{Deserialize, Serialize};
+
+use crate::TrainError;
+use crate::config::Config;
+use crate::events::{Event, Sink, Stage};
+
+const VERSION: u32 = 1;
+
+/// One clustered context set of a scene.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Entry {
+    /// Key of the scene.
+    pub key: String,
+    /// Frames of the contexts.
+    pub context: Vec<usize>,
+    /// Tokens of the scene.
+    pub num_tokens: usize,
+    /// Clusters.
+    pub num_storage_tokens: usize,
+    /// Where the entry starts in `clusters.bin`.
+    pub offset_bytes: u64,
+}
+
+/// What `index.json` holds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Index {
+    version: u32,
+    /// Hash of the encoder's weights.
+    encoder: String,
+    /// The settings that decide the clusters, as JSON.
+    settings: serde_json::Value,
+    skipped: Ledger,
+    entries: Vec<Entry>,
+}
+
+/// An open cluster cache.
+#[derive(Debug)]
+pub struct ClusterCache {
+    folder: PathBuf,
+    index: Index,
+}
+
+impl ClusterCache {
+    /// Opens the cache of a run.
+    ///
+    /// # Errors
+    /// [`TrainError::StaleClusters`] when it was made with another encoder or other settings,
+    /// [`TrainError::BadFile`] when it is damaged.
+    pub fn open(folder: &Path, config: &Config, encoder: &str) -> Result<Self, TrainError> {
+        let path = folder.join("index.json");
+        let text = std::fs::read(&path).map_err(TrainError::io("reading the cluster cache", &path))?;
+        let index: Index = serde_json::from_slice(&text).map_err(TrainError::bad_file("cluster cache", &path))?;
+        let stale = |reason: String| TrainError::StaleClusters { reason, path: folder.into() };
+        if index.version != VERSION {
+            return Err(stale(format!("it has version {}, this program writes {VERSION}", index.version)));
+        }
+        if index.encoder != encoder {
+            let short = |hash: &str| hash.chars().take(12).collect::<String>();
+            let reason =
+                format!("its tokens are of encoder {}, the run's is {}", short(&index.encoder), short(encoder));
+            return Err(stale(reason));
+        }
+        if index.settings != settings(config) {
+            return Err(stale("its data, sampler or K-means settings are not this run's".into()));
+        }
+        let data = folder.join("clusters.bin");
+        let found = std::fs::metadata(&data).map_err(TrainError::io("opening the cluster cache", &data))?.len();
+        let expected: u64 = index.entries.iter().map(Entry::num_bytes).sum();
+        if found != expected {
+            let reason = format!("{found} bytes, {expected} expected");
+            return Err(TrainError::BadFile { what: "cluster cache", reason, path: data });
+        }
+        Ok(Self { folder: folder.into(), index })
+    }
+
+    /// Clusters every training scene `num_passes` times, each time with one context set and one count
+    /// of the grid, and opens the result. Written to a temporary folder that is then renamed.
+    ///
+    /// # Errors
+    /// Whatever the disk or the model gives; a scene that cannot be read is skipped and noted.
+    pub fn make(
+        folder: &Path,
+        config: &Config,
+        reader: &ClipReader,
+        encoder: &Encoder,
+        encoder_hash: &str,
+        device: &burn::tensor::Device,
+        sink: &mut dyn Sink,
+    ) -> Result<Self, TrainError> {
+        let temporary = folder.with_extension("tmp");
+        if temporary.exists() {
+            std::fs::remove_dir_all(&temporary).map_err(TrainError::io("removing an unfinished cache", &temporary))?;
+        }
+        std::fs::create_dir_all(&temporary).map_err(TrainError::io("making the cluster cache", &temporary))?;
+        let data_path = temporary.join("clusters.bin");
+        let writing = "writing the cluster cache";
+        let mut data = BufWriter::new(File::create(&data_path).map_err(TrainError::io(writing, &data_path))?);
+
+        let total = reader.source.num_scenes();
+        let num_scenes = if config.clusters.num_scenes == 0 { total } else { config.clusters.num_scenes.min(total) };
+        let mut skipped = Ledger::new(num_scenes);
+        let mut entries = Vec::new();
+        let mut offset_bytes = 0;
+        for pass in 0..config.clusters.num_passes {
+            for scene in 0..num_scenes {
+                match cluster_scene(config, reader, encoder, device, pass, scene) {
+                    Ok((context, clusters)) => {
+                        let bytes = encode(&clusters)?;
+                        data.write_all(&bytes).map_err(TrainError::io(writing, &data_path))?;
+                        entries.push(Entry {
+                            key: reader.source.key(scene).into(),
+                            context,
+                            num_tokens: clusters.assignment().len(),
+                            num_storage_tokens: clusters.centroid_index().len(),
+                            offset_bytes,
+                        });
+                        offset_bytes += bytes.len() as u64;
+                    }
+                    Err(TrainError::Data(error)) => {
+                        let (key, reason) = (reader.source.key(scene), error.to_string());
+                        if pass == 0 {
+                            skipped.skip(key, reason.clone());
+                        }
+                        sink.event(&Event::Skipped { key: key.into(), reason });
+                    }
+                    Err(other) => return Err(other),
+                }
+                let done = (pass * num_scenes + scene + 1) as u64;
+                let total = (config.clusters.num_passes * num_scenes) as u64;
+                sink.event(&Event::Progress { stage: Stage::Clusters, done, total });
+            }
+        }
+        let data = data.into_inner().map_err(|error| TrainError::io(writing, &data_path)(error.into_error()))?;
+        data.sync_all().map_err(TrainError::io(writing, &data_path))?;
+        let index =
+            Index { version: VERSION, encoder: encoder_hash.into(), settings: settings(config), skipped, entries };
+        let index_path = temporary.join("index.json");
+        let text = serde_json::to_vec(&index).map_err(TrainError::bad_file("cluster cache", &index_path))?;
+        crate::files::write(&index_path, &text)?;
+        std::fs::rename(&temporary, folder).map_err(TrainError::io("renaming the cluster cache", folder))?;
+        Self::open(folder, config, encoder_hash)
+    }
+
+    /// What was clustered.
+    pub fn entries(&self) -> &[Entry] {
+        &self.index.entries
+    }
+
+    /// Scenes that could not be clustered.
+    pub fn skipped(&self) -> &Ledger {
+        &self.index.skipped
+    }
+
+    /// Reads the clusters of one entry.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`], and [`clift_model::ModelError::BadClusters`] for indices that contradict each other.
+    pub fn read(&self, entry: &Entry) -> Result<SceneClusters, TrainError> {
+        let path = self.folder.join("clusters.bin");
+        let mut bytes = vec![0; entry.num_bytes() as usize];
+        File::open(&path)
+            .and_then(|mut file| {
+                file.seek(SeekFrom::Start(entry.offset_bytes))?;
+                file.read_exact(&mut bytes)
+            })
+            .map_err(TrainError::io("reading the cluster cache", &path))?;
+        let mut values: Vec<u32> =
+            bytes.as_chunks::<2>().0.iter().map(|bytes| u32::from(u16::from_le_bytes(*bytes))).collect();
+        let centroids = values.split_off(entry.num_tokens);
+        Ok(SceneClusters::new(values, centroids)?)
+    }
+}
+
+impl Entry {
+    fn num_bytes(&self) -> u64 {
+        2 * (self.num_tokens + self.num_storage_tokens) as u64
+    }
+}
+
+/// The settings that decide which clusters come out.
+fn settings(config: &Config) -> serde_json::Value {
+    let data = &config.data;
+    serde_json::json!({
+        "seed": config.seed,
+        "source": data.source,
+        "root": data.root,
+        "synthetic": data.synthetic,
+        "size": [data.width, data.height],
+        "poses": [serde_json::json!(data.pose_rotation), serde_json::json!(data.pose_scale)],
+        "exact_principal_point": data.exact_principal_point,
+        "filters": data.filters,
+        "views": data.views,
+        "clusters": config.clusters,
+    })
+}
+
+fn cluster_scene(
+    config: &Config,
+    reader: &ClipReader,
+    encoder: &Encoder,
+    device: &burn::tensor::Device,
+    pass: usize,
+    scene: usize,
+) -> Result<(Vec<usize>, SceneClusters), TrainError> {
+    let seed = derive_seed(config.seed, "clusters");
+    let views = &config.data.views;
+    let mut rng = item_rng(seed, pass as u64, scene as u32, 0, "context and count");
+    let num_context = views.min_context + below(&mut rng, views.max_context - views.min_context + 1);
+    let num_frames = reader.source.cameras(scene)?.len();
+    // Past the warm-up: the gaps that stage 1 ends with.
+    let context = views.sample(num_frames, views.warm_up_steps, num_context, &mut rng)?.context;
+    let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
+    let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
+    let count = config.clusters.grid[below(&mut rng, config.clusters.grid.len())].of(lift.dims()[1])?;
+    let fit = config.clusters.kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
+    Ok((context, fit.clusters.scenes()[0].clone()))
+}
+
+fn encode(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {
+    let ids = clusters.assignment().iter().chain(clusters.centroid_index());
+    ids.map(|&id| u16::try_from(id).map(u16::to_le_bytes))
+        .collect::<Result<Vec<_>, _>>()
+        .map(|pairs| pairs.concat())
+        .map_err(|_| TrainError::NoScenes { reason: "a scene has more than 65,536 tokens".into() })
+}

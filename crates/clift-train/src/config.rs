@@ -1,0 +1,333 @@
+//! One config file per experiment: `[data] [model] [loss] [stage1] [clusters] [stage2] [checkpoint] [eval]`.
+
+use std::path::PathBuf;
+
+use clift_data::{BoundedSampler, ClipOptions, PoseRotation, PoseScale, SceneFilters, SyntheticConfig};
+use clift_eval::{EvalConfig, TokenCount};
+use clift_model::device::DeviceName;
+use clift_model::{KMeans, ModelConfig};
+use serde::{Deserialize, Serialize};
+
+use crate::TrainError;
+
+/// A whole experiment.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Directory that receives everything the run writes.
+    pub run_dir: PathBuf,
+    /// Decides weights, scene order, views and token choices.
+    #[serde(default)]
+    pub seed: u64,
+    /// Where tensors live: `flex`, `ndarray` or `wgpu`.
+    #[serde(default)]
+    pub device: DeviceName,
+    /// Scenes and views.
+    pub data: DataConfig,
+    /// Sizes of the network.
+    #[serde(default)]
+    pub model: ModelConfig,
+    /// The training loss, the same in both stages.
+    #[serde(default)]
+    pub loss: LossConfig,
+    /// Encoder and renderer.
+    pub stage1: Stage1Config,
+    /// The offline cluster cache between the stages.
+    #[serde(default)]
+    pub clusters: ClustersConfig,
+    /// Condenser, with the encoder frozen.
+    pub stage2: Stage2Config,
+    /// How often the state of a run is saved.
+    #[serde(default)]
+    pub checkpoint: CheckpointConfig,
+    /// What is evaluated, during training and after it.
+    #[serde(default)]
+    pub eval: EvalConfig,
+}
+
+/// Where scenes come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SourceKind {
+    /// Ray-traced rooms made on the fly.
+    #[default]
+    Synthetic,
+    /// `{train,test}/NNNNNN.torch` with `index.json` under `root`, as pixelSplat has them.
+    Chunks,
+}
+
+/// Scenes and how views are drawn from them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DataConfig {
+    /// Where scenes come from.
+    pub source: SourceKind,
+    /// Folder with `train/` and `test/`; for chunks.
+    pub root: Option<PathBuf>,
+    /// Columns of every view, a multiple of the patch.
+    pub width: usize,
+    /// Rows of every view, a multiple of the patch.
+    pub height: usize,
+    /// How the mean orientation of the contexts is taken.
+    pub pose_rotation: PoseRotation,
+    /// Which cameras set the scale of a scene: contexts only, or targets as well (the reference's numbers).
+    pub pose_scale: PoseScale,
+    /// Whether the principal point follows the crop exactly; published numbers are made without.
+    pub exact_principal_point: bool,
+    /// Which scenes of the files are used.
+    pub filters: SceneFilters,
+    /// The synthetic scenes.
+    pub synthetic: SyntheticConfig,
+    /// How context and target frames are drawn for training.
+    pub views: BoundedSampler,
+    /// Threads that prepare batches; 0 prepares them between the steps.
+    pub num_threads: usize,
+    /// Batches prepared ahead.
+    pub num_prefetch: usize,
+}
+
+impl Default for DataConfig {
+    fn default() -> Self {
+        Self {
+            source: SourceKind::Synthetic,
+            root: None,
+            width: 256,
+            height: 256,
+            pose_rotation: PoseRotation::default(),
+            pose_scale: PoseScale::default(),
+            exact_principal_point: false,
+            filters: SceneFilters::default(),
+            synthetic: SyntheticConfig::default(),
+            views: BoundedSampler::default(),
+            num_threads: 1,
+            num_prefetch: 4,
+        }
+    }
+}
+
+impl DataConfig {
+    /// How frames and poses are prepared.
+    pub fn clip_options(&self) -> ClipOptions {
+        ClipOptions {
+            width: self.width,
+            height: self.height,
+            pose_rotation: self.pose_rotation,
+            pose_scale: self.pose_scale,
+            exact_principal_point: self.exact_principal_point,
+        }
+    }
+}
+
+/// The training loss: mean squared error plus a weighted perceptual term (paper section 3.3).
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LossConfig {
+    /// Weight of the perceptual term; the paper has 0.5. This version has none: leave it at 0.
+    pub perceptual_weight: f64,
+}
+
+/// AdamW with warm-up and cosine decay.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OptimizerConfig {
+    /// Highest learning rate.
+    pub learning_rate: f64,
+    /// Steps until it is reached.
+    pub warm_up_steps: u64,
+    /// Decoupled weight decay, on every parameter as in the reference.
+    pub weight_decay: f64,
+    /// Gradients are scaled down to this global norm.
+    pub max_grad_norm: f64,
+    /// Steps in a row with a loss or gradient that is not finite before the run stops.
+    pub max_bad_steps: u32,
+}
+
+impl Default for OptimizerConfig {
+    fn default() -> Self {
+        Self { learning_rate: 4e-4, warm_up_steps: 2500, weight_decay: 0.05, max_grad_norm: 1.0, max_bad_steps: 3 }
+    }
+}
+
+/// Stage 1: encoder and renderer, on random subsets of the tokens.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Stage1Config {
+    /// Optimiser updates.
+    pub steps: u64,
+    /// Scenes per update.
+    pub batch_size: usize,
+    /// Parts a batch is worked off in: less memory, the same update.
+    pub accumulate: usize,
+    /// Smallest and largest share of the tokens the renderer is given; drawn per step.
+    pub keep_tokens: [f64; 2],
+    /// A run directory or a `model.safetensors` to start from.
+    pub init_from: Option<PathBuf>,
+    /// The update rule.
+    pub optimizer: OptimizerConfig,
+}
+
+impl Default for Stage1Config {
+    fn default() -> Self {
+        Self {
+            steps: 90_000,
+            batch_size: 64,
+            accumulate: 1,
+            keep_tokens: [0.25, 1.0],
+            init_from: None,
+            optimizer: OptimizerConfig::default(),
+        }
+    }
+}
+
+/// The offline cluster cache: latent K-means of the trained encoder's tokens.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ClustersConfig {
+    /// Token counts that stage 2 trains on. Departs from the reference, which draws any ratio per
+    /// scene and pads: a shared grid makes dense batches.
+    pub grid: Vec<TokenCount>,
+    /// Context sets per scene.
+    pub num_passes: usize,
+    /// Scenes that are clustered; 0 for all.
+    pub num_scenes: usize,
+    /// Latent K-means.
+    pub kmeans: KMeans,
+}
+
+impl Default for ClustersConfig {
+    fn default() -> Self {
+        let shares = [1.0 / 32.0, 1.0 / 16.0, 0.125, 0.1875, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0];
+        Self { grid: shares.map(TokenCount::Share).into(), num_passes: 3, num_scenes: 0, kmeans: KMeans::default() }
+    }
+}
+
+/// Stage 2: condenser at the full rate, renderer at a fraction of it, encoder frozen.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Stage2Config {
+    /// Optimiser updates.
+    pub steps: u64,
+    /// Scenes per update.
+    pub batch_size: usize,
+    /// Parts a batch is worked off in: less memory, the same update.
+    pub accumulate: usize,
+    /// Learning rate of the renderer over that of the condenser.
+    pub renderer_lr_factor: f64,
+    /// The update rule.
+    pub optimizer: OptimizerConfig,
+}
+
+impl Default for Stage2Config {
+    fn default() -> Self {
+        Self {
+            steps: 50_000,
+            batch_size: 80,
+            accumulate: 1,
+            renderer_lr_factor: 0.1,
+            optimizer: OptimizerConfig::default(),
+        }
+    }
+}
+
+/// How often the state of a run is saved.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CheckpointConfig {
+    /// Steps between checkpoints; 0 saves at the end of a stage only.
+    pub every: u64,
+    /// How many of the latest are kept.
+    pub keep: usize,
+}
+
+impl Default for CheckpointConfig {
+    fn default() -> Self {
+        Self { every: 1000, keep: 2 }
+    }
+}
+
+impl Config {
+    /// Checks every value that no type can check.
+    ///
+    /// # Errors
+    /// [`TrainError::BadConfig`] naming the key, the value and the fix.
+    pub fn validate(&self) -> Result<(), TrainError> {
+        self.model.validate()?;
+        self.model.num_tokens(1, self.data.height, self.data.width)?;
+        self.data.views.validate()?;
+        match self.data.source {
+            SourceKind::Synthetic => self.data.synthetic.validate()?,
+            SourceKind::Chunks if self.data.root.is_none() => {
+                return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
+            }
+            SourceKind::Chunks => {}
+        }
+        if self.loss.perceptual_weight != 0.0 {
+            let fix = "the perceptual term is not built yet; write 0 to train on the mean squared error";
+            return Err(bad("loss.perceptual_weight", self.loss.perceptual_weight, fix));
+        }
+        for (key, value) in [
+            ("stage1.batch_size", self.stage1.batch_size),
+            ("stage2.batch_size", self.stage2.batch_size),
+            ("clusters.num_passes", self.clusters.num_passes),
+            ("clusters.grid (length)", self.clusters.grid.len()),
+            ("eval.storage (length)", self.eval.storage.len()),
+            ("eval.num_context", self.eval.num_context),
+            ("eval.num_targets", self.eval.num_targets),
+            ("data.num_prefetch", self.data.num_prefetch),
+            ("checkpoint.keep", self.checkpoint.keep),
+        ] {
+            if value == 0 {
+                return Err(bad(key, value, "write at least 1"));
+            }
+        }
+        for (key, accumulate, batch_size) in [
+            ("stage1.accumulate", self.stage1.accumulate, self.stage1.batch_size),
+            ("stage2.accumulate", self.stage2.accumulate, self.stage2.batch_size),
+        ] {
+            if !(1..=batch_size).contains(&accumulate) {
+                return Err(bad(key, accumulate, &format!("write 1 to {batch_size}, the batch size")));
+            }
+        }
+        let [low, high] = self.stage1.keep_tokens;
+        if !(low > 0.0 && low <= high && high <= 1.0) {
+            return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
+        }
+        for (stage, optimizer) in [("stage1", &self.stage1.optimizer), ("stage2", &self.stage2.optimizer)] {
+            for (key, value) in [("learning_rate", optimizer.learning_rate), ("max_grad_norm", optimizer.max_grad_norm)]
+            {
+                if !(value > 0.0 && value.is_finite()) {
+                    return Err(bad(&format!("{stage}.optimizer.{key}"), value, "write a positive number"));
+                }
+            }
+        }
+        let factor = self.stage2.renderer_lr_factor;
+        if !(0.0..=1.0).contains(&factor) {
+            return Err(bad("stage2.renderer_lr_factor", factor, "write 0 to 1"));
+        }
+        Ok(())
+    }
+}
+
+fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {
+    TrainError::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_out_of_range_are_named_with_the_fix() {
+        let mut config = Config::default();
+        config.validate().expect("the default is valid");
+        config.stage1.keep_tokens = [0.5, 0.25];
+        let message = config.validate().unwrap_err().to_string();
+        assert_eq!(message, "`stage1.keep_tokens` = [0.5, 0.25]: write 0 < smallest <= largest <= 1");
+        config.stage1.keep_tokens = [0.25, 1.0];
+        config.loss.perceptual_weight = 0.5;
+        assert!(config.validate().unwrap_err().to_string().contains("not built yet"));
+        config.loss.perceptual_weight = 0.0;
+        config.data.source = SourceKind::Chunks;
+        assert!(config.validate().unwrap_err().to_string().starts_with("`data.root` = missing"));
+    }
+}
