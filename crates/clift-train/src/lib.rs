@@ -2,8 +2,11 @@
 
 pub mod diagnostic;
 pub mod document;
+pub mod events;
 mod keys;
 mod mistakes;
 mod overrides;
+pub mod schedule;
+pub mod sinks;
 
 pub use document::{ConfigError, Override, read_config};
