@@ -188,7 +188,7 @@ pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> R
 ///
 /// Matplotlib's `inferno`, whose lightness grows evenly, as a polynomial of degree 6.
 pub fn error_colour(share: f32) -> [u8; 3] {
-    const COEFFICIENTS: [[f32; 3]; 7] = [
+    const COEFFICIENTS: [[f64; 3]; 7] = [
         [0.000_219, 0.001_651, -0.019_481],
         [0.106_513, 0.563_956, 3.932_712],
         [11.602_493, -3.972_854, -15.942_394],
@@ -197,7 +197,7 @@ pub fn error_colour(share: f32) -> [u8; 3] {
         [-71.319_43, 32.626_064, 73.209_52],
         [25.131_126, -12.242_669, -23.070_325],
     ];
-    let share = share.clamp(0.0, 1.0);
+    let share = f64::from(share.clamp(0.0, 1.0));
     [0, 1, 2].map(|channel| {
         let value = COEFFICIENTS.iter().rev().fold(0.0, |sum, coefficients| sum * share + coefficients[channel]);
         (value.clamp(0.0, 1.0) * 255.0).round() as u8

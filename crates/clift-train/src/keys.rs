@@ -1,0 +1,166 @@
+//! The keys a configuration type knows, asked of the type itself, and the nearest one to a mistake.
+
+use serde::de::value::{Error, StrDeserializer};
+use serde::de::{DeserializeOwned, DeserializeSeed, Deserializer, Error as _, IntoDeserializer, MapAccess, Visitor};
+
+/// Keys of a struct and of the structs in it; a value that is no struct has none.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(crate) struct Keys {
+    /// Each key with what it holds; `None` where any key may stand or none can.
+    pub(crate) fields: Option<Vec<(&'static str, Keys)>>,
+}
+
+impl Keys {
+    /// Asks `T` for its keys. Deserialisation is started once per key and abandoned when it says what it expects.
+    pub(crate) fn of<T: DeserializeOwned>() -> Self {
+        Self::below::<T>(&mut Vec::new())
+    }
+
+    fn below<T: DeserializeOwned>(path: &mut Vec<&'static str>) -> Self {
+        let mut names = None;
+        let _abandoned = T::deserialize(Probe { path, names: &mut names });
+        let fields = names.filter(|_| path.len() < 8).map(|names| {
+            let below = names.iter().map(|&name| {
+                path.push(name);
+                let keys = Self::below::<T>(path);
+                path.pop();
+                (name, keys)
+            });
+            below.collect()
+        });
+        Self { fields }
+    }
+
+    pub(crate) fn get(&self, key: &str) -> Option<&Self> {
+        self.fields.as_ref()?.iter().find(|(name, _)| *name == key).map(|(_, keys)| keys)
+    }
+
+    pub(crate) fn names(&self) -> impl Iterator<Item = &'static str> {
+        self.fields.iter().flatten().map(|(name, _)| *name)
+    }
+
+    /// The key most like `key`, if one is so near that it may be a slip.
+    pub(crate) fn nearest(&self, key: &str) -> Option<&'static str> {
+        nearest(key, self.names())
+    }
+
+    /// Sections below this one that know exactly `key`, as dotted paths.
+    pub(crate) fn sections_with(&self, key: &str) -> Vec<String> {
+        let mut found = Vec::new();
+        for (name, keys) in self.fields.iter().flatten() {
+            if keys.get(key).is_some() {
+                found.push((*name).to_owned());
+            }
+            found.extend(keys.sections_with(key).into_iter().map(|section| format!("{name}.{section}")));
+        }
+        found
+    }
+}
+
+/// The candidate with the fewest typing slips, if those are at most a third of the word.
+pub(crate) fn nearest<'a>(word: &str, candidates: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    candidates
+        .map(|candidate| (strsim::damerau_levenshtein(word, candidate), candidate))
+        .filter(|(slips, candidate)| *slips <= (word.len().max(candidate.len()) / 3).max(1))
+        .min_by_key(|(slips, _)| *slips)
+        .map(|(_, candidate)| candidate)
+}
+
+/// Walks down `path` and notes the names of the struct found there.
+struct Probe<'a> {
+    path: &'a [&'static str],
+    names: &'a mut Option<&'static [&'static str]>,
+}
+
+impl<'de> Deserializer<'de> for Probe<'_> {
+    type Error = Error;
+
+    fn deserialize_any<V: Visitor<'de>>(self, _visitor: V) -> Result<V::Value, Error> {
+        Err(Error::custom("a probe holds no value"))
+    }
+
+    fn deserialize_struct<V: Visitor<'de>>(
+        self,
+        _name: &'static str,
+        fields: &'static [&'static str],
+        visitor: V,
+    ) -> Result<V::Value, Error> {
+        if self.path.is_empty() {
+            *self.names = Some(fields);
+            return self.deserialize_any(visitor);
+        }
+        visitor.visit_map(self)
+    }
+
+    fn deserialize_option<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
+        visitor.visit_some(self)
+    }
+
+    fn deserialize_newtype_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Error> {
+        visitor.visit_newtype_struct(self)
+    }
+
+    serde::forward_to_deserialize_any! {
+        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char str string bytes byte_buf unit unit_struct
+        seq tuple tuple_struct map enum identifier ignored_any
+    }
+}
+
+impl<'de> MapAccess<'de> for Probe<'_> {
+    type Error = Error;
+
+    fn next_key_seed<K: DeserializeSeed<'de>>(&mut self, seed: K) -> Result<Option<K::Value>, Error> {
+        let Some(key) = self.path.first() else { return Ok(None) };
+        let key: StrDeserializer<'_, Error> = key.into_deserializer();
+        seed.deserialize(key).map(Some)
+    }
+
+    fn next_value_seed<V: DeserializeSeed<'de>>(&mut self, seed: V) -> Result<V::Value, Error> {
+        seed.deserialize(Probe { path: &self.path[1..], names: &mut *self.names })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use serde::Deserialize;
+
+    use super::*;
+
+    #[derive(Deserialize)]
+    #[serde(default, deny_unknown_fields)]
+    #[derive(Default)]
+    #[allow(dead_code)] // only their names matter
+    struct Outer {
+        seed: u64,
+        inner: Option<Inner>,
+        free: BTreeMap<String, f64>,
+    }
+
+    #[derive(Deserialize)]
+    #[allow(dead_code)] // only their names matter
+    struct Inner {
+        num_heads: usize,
+        dim: usize,
+    }
+
+    #[test]
+    fn a_type_tells_its_keys_and_those_of_its_sections() {
+        let keys = Keys::of::<Outer>();
+        assert_eq!(keys.names().collect::<Vec<_>>(), ["seed", "inner", "free"]);
+        assert_eq!(keys.get("inner").unwrap().names().collect::<Vec<_>>(), ["num_heads", "dim"]);
+        assert_eq!(keys.get("seed").unwrap().fields, None);
+        assert_eq!(keys.get("free").unwrap().fields, None);
+        assert_eq!(keys.sections_with("dim"), ["inner"]);
+    }
+
+    #[test]
+    fn the_nearest_key_is_a_slip_away_or_none_is_named() {
+        let near = |word| nearest(word, ["num_heads", "dim", "steps"].into_iter());
+        assert_eq!(near("num_head"), Some("num_heads"));
+        assert_eq!(near("step"), Some("steps"));
+        assert_eq!(near("din"), Some("dim"));
+        assert_eq!(near("learning_rate"), None);
+    }
+}
