@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// One scene that was left out.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Skip {
     /// Key of the scene.
     pub key: String,
@@ -15,7 +15,7 @@ pub struct Skip {
 }
 
 /// How many scenes there were and which were left out. Prints as `2 of 3 scenes used; 1 shorter than 46 frames`.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ledger {
     /// Scenes looked at, used or not.
     pub num_scenes: usize,

@@ -8,6 +8,7 @@ use clift_data::{Clip, Views as HostViews};
 use clift_model::{Cameras, Clusters, Condenser, Encoder, KMeans, Renderer};
 use rand::seq::SliceRandom;
 
+use crate::EvalError;
 use crate::baseline::{mean_image, nearest_image};
 use crate::measured::{Accumulator, Measured, Setting, Variant};
 use crate::metrics::{SSIM_MIN_SIZE_PX, psnr, ssim};
@@ -15,7 +16,6 @@ use crate::picture::{Picture, error_map};
 use crate::sheet::{Cell, Row, sheet};
 use crate::token_count::TokenCount;
 use crate::upload::{upload_cameras, upload_views};
-use crate::EvalError;
 
 /// Target views rendered at once: bounds memory for clips with a hundred targets.
 const VIEWS_PER_PASS: usize = 8;
@@ -76,7 +76,9 @@ pub fn evaluate_scene(
         for &variant in &sweep.variants {
             let (tokens, renderer) = match variant {
                 Variant::Random => (random_subset(&lift, num_storage_tokens, seed), &networks.renderer),
-                Variant::Kmeans => (index.clusters()?.upload(&device).gather_centroids(lift.clone()), &networks.renderer),
+                Variant::Kmeans => {
+                    (index.clusters()?.upload(&device).gather_centroids(lift.clone()), &networks.renderer)
+                }
                 Variant::Clift => {
                     let (condenser, renderer) = networks.condensed.as_ref().ok_or(EvalError::NoCondenser)?;
                     (condenser.forward(lift.clone(), &index.clusters()?.upload(&device)), renderer)

@@ -16,6 +16,15 @@ pub struct Clift {
     pub renderer: Renderer,
 }
 
+/// What stage 1 trains.
+#[derive(Module, Debug)]
+pub struct Stage1 {
+    /// Posed pictures to light-field tokens.
+    pub encoder: Encoder,
+    /// Tokens and a camera to a picture.
+    pub renderer: Renderer,
+}
+
 impl Clift {
     /// Makes a model with random weights, the same for a seed on every device.
     pub fn new(config: &ModelConfig, seed: u64, device: &Device) -> Self {
@@ -26,6 +35,11 @@ impl Clift {
         let condenser = Condenser::new(config, &mut init);
         Self { encoder, condenser, renderer }
     }
+
+    /// The networks of stage 1, sharing this model's parameters.
+    pub fn stage1(&self) -> Stage1 {
+        Stage1 { encoder: self.encoder.clone(), renderer: self.renderer.clone() }
+    }
 }
 
 #[cfg(test)]
@@ -35,13 +49,6 @@ mod tests {
     use super::*;
     use crate::testing::{Fixture, assert_close, devices, load_weights, weight_gradients};
     use crate::{Cameras, Views};
-
-    /// Encoder and renderer alone: what the fixture holds.
-    #[derive(Module, Debug)]
-    struct Stage1 {
-        encoder: Encoder,
-        renderer: Renderer,
-    }
 
     #[test]
     fn encoder_and_renderer_equal_pytorchs_with_the_gradients_of_the_loss() {
@@ -56,8 +63,7 @@ mod tests {
         };
         for device in devices() {
             let device = device.autodiff();
-            let Clift { encoder, renderer, .. } = Clift::new(&config, 0, &device);
-            let model = load_weights(Stage1 { encoder, renderer }, &fixture, "weight.");
+            let model = load_weights(Clift::new(&config, 0, &device).stage1(), &fixture, "weight.");
             let cameras = |kind: &str| Cameras {
                 height: 16,
                 width: 24,

@@ -6,7 +6,9 @@
 use std::fs::File;
 use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
+use burn::tensor::Device;
 use clift_data::order::{below, derive_seed, item_rng};
 use clift_data::{ClipReader, Ledger, ViewIndices};
 use clift_eval::upload_views;
@@ -48,6 +50,105 @@ struct Index {
     entries: Vec<Entry>,
 }
 
+/// What the cache of a run is made from.
+pub struct ClusterJob<'a> {
+    /// Settings of the run.
+    pub config: &'a Config,
+    /// Training scenes.
+    pub reader: &'a ClipReader,
+    /// The trained encoder, without autodiff.
+    pub encoder: &'a Encoder,
+    /// Its hash.
+    pub encoder_hash: &'a str,
+    /// Where it lives.
+    pub device: &'a Device,
+}
+
+impl ClusterJob<'_> {
+    /// Clusters every training scene `num_passes` times, each time with one context set and one count
+    /// of the grid, and opens the result. Written to a temporary folder that is then renamed.
+    ///
+    /// # Errors
+    /// Whatever the disk or the model gives; a scene that cannot be read is skipped and noted.
+    pub fn make(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
+        let Self { config, reader, encoder_hash, .. } = *self;
+        let temporary = folder.with_extension("tmp");
+        if temporary.exists() {
+            std::fs::remove_dir_all(&temporary).map_err(TrainError::io("removing an unfinished cache", &temporary))?;
+        }
+        std::fs::create_dir_all(&temporary).map_err(TrainError::io("making the cluster cache", &temporary))?;
+        let data_path = temporary.join("clusters.bin");
+        let writing = "writing the cluster cache";
+        let mut data = BufWriter::new(File::create(&data_path).map_err(TrainError::io(writing, &data_path))?);
+
+        let total = reader.source.num_scenes();
+        let num_scenes = if config.clusters.num_scenes == 0 { total } else { config.clusters.num_scenes.min(total) };
+        let total_sets = (config.clusters.num_passes * num_scenes) as u64;
+        let started = std::time::Instant::now();
+        sink.event(&Event::StageStarted { stage: Stage::Clusters, done: 0, num_steps: total_sets });
+        let mut skipped = Ledger::new(num_scenes);
+        let mut entries = Vec::new();
+        let mut offset_bytes = 0;
+        for pass in 0..config.clusters.num_passes {
+            for scene in 0..num_scenes {
+                match self.cluster_scene(pass, scene) {
+                    Ok((context, clusters)) => {
+                        let bytes = encode(&clusters)?;
+                        data.write_all(&bytes).map_err(TrainError::io(writing, &data_path))?;
+                        entries.push(Entry {
+                            key: reader.source.key(scene).into(),
+                            context,
+                            num_tokens: clusters.assignment().len(),
+                            num_storage_tokens: clusters.centroid_index().len(),
+                            offset_bytes,
+                        });
+                        offset_bytes += bytes.len() as u64;
+                    }
+                    Err(TrainError::Data(error)) => {
+                        let (key, reason) = (reader.source.key(scene), error.to_string());
+                        if pass == 0 {
+                            skipped.skip(key, reason.clone());
+                        }
+                        sink.event(&Event::Skipped { key: key.into(), reason });
+                    }
+                    Err(other) => return Err(other),
+                }
+                let done = (pass * num_scenes + scene + 1) as u64;
+                sink.event(&Event::Progress { stage: Stage::Clusters, done, total: total_sets });
+                if stop.load(Ordering::Relaxed) {
+                    return Err(TrainError::Interrupted { step: done });
+                }
+            }
+        }
+        sink.event(&Event::StageFinished { stage: Stage::Clusters, elapsed_s: started.elapsed().as_secs_f64() });
+        let data = data.into_inner().map_err(|error| TrainError::io(writing, &data_path)(error.into_error()))?;
+        data.sync_all().map_err(TrainError::io(writing, &data_path))?;
+        let index =
+            Index { version: VERSION, encoder: encoder_hash.into(), settings: settings(config), skipped, entries };
+        let index_path = temporary.join("index.json");
+        let text = serde_json::to_vec(&index).map_err(TrainError::bad_file("cluster cache", &index_path))?;
+        crate::files::write(&index_path, &text)?;
+        std::fs::rename(&temporary, folder).map_err(TrainError::io("renaming the cluster cache", folder))?;
+        ClusterCache::open(folder, config, encoder_hash)
+    }
+
+    fn cluster_scene(&self, pass: usize, scene: usize) -> Result<(Vec<usize>, SceneClusters), TrainError> {
+        let Self { config, reader, encoder, device, .. } = *self;
+        let seed = derive_seed(config.seed, "clusters");
+        let views = &config.data.views;
+        let mut rng = item_rng(seed, pass as u64, scene as u32, 0, "context and count");
+        let num_context = views.min_context + below(&mut rng, views.max_context - views.min_context + 1);
+        let num_frames = reader.source.cameras(scene)?.len();
+        // Past the warm-up: the gaps that stage 1 ends with.
+        let context = views.sample(num_frames, views.warm_up_steps, num_context, &mut rng)?.context;
+        let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
+        let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
+        let count = config.clusters.grid[below(&mut rng, config.clusters.grid.len())].of(lift.dims()[1])?;
+        let fit = config.clusters.kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
+        Ok((context, fit.clusters.scenes()[0].clone()))
+    }
+}
+
 /// An open cluster cache.
 #[derive(Debug)]
 pub struct ClusterCache {
@@ -86,74 +187,6 @@ impl ClusterCache {
             return Err(TrainError::BadFile { what: "cluster cache", reason, path: data });
         }
         Ok(Self { folder: folder.into(), index })
-    }
-
-    /// Clusters every training scene `num_passes` times, each time with one context set and one count
-    /// of the grid, and opens the result. Written to a temporary folder that is then renamed.
-    ///
-    /// # Errors
-    /// Whatever the disk or the model gives; a scene that cannot be read is skipped and noted.
-    pub fn make(
-        folder: &Path,
-        config: &Config,
-        reader: &ClipReader,
-        encoder: &Encoder,
-        encoder_hash: &str,
-        device: &burn::tensor::Device,
-        sink: &mut dyn Sink,
-    ) -> Result<Self, TrainError> {
-        let temporary = folder.with_extension("tmp");
-        if temporary.exists() {
-            std::fs::remove_dir_all(&temporary).map_err(TrainError::io("removing an unfinished cache", &temporary))?;
-        }
-        std::fs::create_dir_all(&temporary).map_err(TrainError::io("making the cluster cache", &temporary))?;
-        let data_path = temporary.join("clusters.bin");
-        let writing = "writing the cluster cache";
-        let mut data = BufWriter::new(File::create(&data_path).map_err(TrainError::io(writing, &data_path))?);
-
-        let total = reader.source.num_scenes();
-        let num_scenes = if config.clusters.num_scenes == 0 { total } else { config.clusters.num_scenes.min(total) };
-        let mut skipped = Ledger::new(num_scenes);
-        let mut entries = Vec::new();
-        let mut offset_bytes = 0;
-        for pass in 0..config.clusters.num_passes {
-            for scene in 0..num_scenes {
-                match cluster_scene(config, reader, encoder, device, pass, scene) {
-                    Ok((context, clusters)) => {
-                        let bytes = encode(&clusters)?;
-                        data.write_all(&bytes).map_err(TrainError::io(writing, &data_path))?;
-                        entries.push(Entry {
-                            key: reader.source.key(scene).into(),
-                            context,
-                            num_tokens: clusters.assignment().len(),
-                            num_storage_tokens: clusters.centroid_index().len(),
-                            offset_bytes,
-                        });
-                        offset_bytes += bytes.len() as u64;
-                    }
-                    Err(TrainError::Data(error)) => {
-                        let (key, reason) = (reader.source.key(scene), error.to_string());
-                        if pass == 0 {
-                            skipped.skip(key, reason.clone());
-                        }
-                        sink.event(&Event::Skipped { key: key.into(), reason });
-                    }
-                    Err(other) => return Err(other),
-                }
-                let done = (pass * num_scenes + scene + 1) as u64;
-                let total = (config.clusters.num_passes * num_scenes) as u64;
-                sink.event(&Event::Progress { stage: Stage::Clusters, done, total });
-            }
-        }
-        let data = data.into_inner().map_err(|error| TrainError::io(writing, &data_path)(error.into_error()))?;
-        data.sync_all().map_err(TrainError::io(writing, &data_path))?;
-        let index =
-            Index { version: VERSION, encoder: encoder_hash.into(), settings: settings(config), skipped, entries };
-        let index_path = temporary.join("index.json");
-        let text = serde_json::to_vec(&index).map_err(TrainError::bad_file("cluster cache", &index_path))?;
-        crate::files::write(&index_path, &text)?;
-        std::fs::rename(&temporary, folder).map_err(TrainError::io("renaming the cluster cache", folder))?;
-        Self::open(folder, config, encoder_hash)
     }
 
     /// What was clustered.
@@ -207,28 +240,6 @@ fn settings(config: &Config) -> serde_json::Value {
         "views": data.views,
         "clusters": config.clusters,
     })
-}
-
-fn cluster_scene(
-    config: &Config,
-    reader: &ClipReader,
-    encoder: &Encoder,
-    device: &burn::tensor::Device,
-    pass: usize,
-    scene: usize,
-) -> Result<(Vec<usize>, SceneClusters), TrainError> {
-    let seed = derive_seed(config.seed, "clusters");
-    let views = &config.data.views;
-    let mut rng = item_rng(seed, pass as u64, scene as u32, 0, "context and count");
-    let num_context = views.min_context + below(&mut rng, views.max_context - views.min_context + 1);
-    let num_frames = reader.source.cameras(scene)?.len();
-    // Past the warm-up: the gaps that stage 1 ends with.
-    let context = views.sample(num_frames, views.warm_up_steps, num_context, &mut rng)?.context;
-    let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
-    let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
-    let count = config.clusters.grid[below(&mut rng, config.clusters.grid.len())].of(lift.dims()[1])?;
-    let fit = config.clusters.kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
-    Ok((context, fit.clusters.scenes()[0].clone()))
 }
 
 fn encode(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {

@@ -14,6 +14,8 @@ pub enum Stage {
     Clusters,
     /// Condenser, with the renderer at a smaller rate.
     Stage2,
+    /// The measurement of held-out views after training.
+    Eval,
 }
 
 impl Stage {
@@ -23,6 +25,7 @@ impl Stage {
             Self::Stage1 => "stage1",
             Self::Clusters => "clusters",
             Self::Stage2 => "stage2",
+            Self::Eval => "eval",
         }
     }
 }
@@ -33,9 +36,9 @@ pub struct StepEvent {
     /// Which stage.
     pub stage: Stage,
     /// Updates so far in this stage, from 1.
-    pub step: usize,
+    pub step: u64,
     /// Updates the stage will have.
-    pub num_steps: usize,
+    pub num_steps: u64,
     /// Training loss of the batch.
     pub loss: f64,
     /// PSNR of the batch in dB.
@@ -56,9 +59,9 @@ pub enum Event {
         /// Which stage.
         stage: Stage,
         /// Steps done before: 0, or the step of the checkpoint it resumes from.
-        done: usize,
+        done: u64,
         /// Steps (scenes, for the clusters) it will have.
-        num_steps: usize,
+        num_steps: u64,
     },
     /// An update was made.
     Step(StepEvent),
@@ -67,16 +70,16 @@ pub enum Event {
         /// Which stage.
         stage: Stage,
         /// How many are done.
-        done: usize,
+        done: u64,
         /// How many there are.
-        total: usize,
+        total: u64,
     },
     /// Held-out views were measured.
     Evaluated {
         /// Which stage.
         stage: Stage,
         /// Updates so far in this stage.
-        step: usize,
+        step: u64,
         /// Mean PSNR in dB.
         psnr: f64,
         /// Mean SSIM; `None` for pictures below 11 pixels.

@@ -1,12 +1,33 @@
-//! The two-stage trainer: stage 1, cluster cache, stage 2, checkpoints and resume
+//! The two-stage trainer: stage 1, cluster cache, stage 2, checkpoints and resume.
+//!
+//! [`Run`] is an experiment in its directory. The training loop is [`trainer::StagePlan::train`], the
+//! same for both stages; they differ in the batches they build.
 
+pub mod checkpoint;
+pub mod clusters;
+pub mod config;
 pub mod diagnostic;
 pub mod document;
+pub mod error;
 pub mod events;
+mod files;
+pub mod held_out;
 mod keys;
+pub mod loss;
 mod mistakes;
+pub mod optim;
 mod overrides;
+pub mod run;
+pub mod scenes;
 pub mod schedule;
 pub mod sinks;
+pub mod stage1;
+pub mod stage2;
+pub mod step;
+pub mod trainer;
 
+pub use config::Config;
 pub use document::{ConfigError, Override, read_config};
+pub use error::TrainError;
+pub use events::{Event, Sink, Stage};
+pub use run::{Run, RunOptions};

@@ -7,7 +7,7 @@ const START: f64 = 1e-8;
 /// cosine down to 0 at step `num_steps`.
 ///
 /// A run no longer than its warm-up never leaves the line; beyond `num_steps` the rate stays 0.
-pub fn warm_up_cosine(step: usize, base: f64, num_warm_up_steps: usize, num_steps: usize) -> f64 {
+pub fn warm_up_cosine(step: u64, base: f64, num_warm_up_steps: u64, num_steps: u64) -> f64 {
     if step <= num_warm_up_steps {
         return START + (base - START) * step as f64 / num_warm_up_steps as f64;
     }
@@ -29,7 +29,7 @@ mod tests {
         let fixture = SafeTensors::deserialize(&bytes).unwrap();
         let expected = fixture.tensor("output.lr").unwrap();
         for (i, bytes) in expected.data().as_chunks::<8>().0.iter().enumerate() {
-            let (rate, expected) = (warm_up_cosine(i + 1, 1e-3, 3, 10), f64::from_le_bytes(*bytes));
+            let (rate, expected) = (warm_up_cosine(i as u64 + 1, 1e-3, 3, 10), f64::from_le_bytes(*bytes));
             // The same formula in f64; the two cosines may differ in the last bit, 1e-16 of 1e-3.
             assert!((rate - expected).abs() < 1e-18, "step {}: {rate} is not {expected}", i + 1);
         }

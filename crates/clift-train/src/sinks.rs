@@ -12,7 +12,7 @@ use crate::events::{Event, Sink, Stage, StepEvent};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MetricsLine {
     /// Updates so far in this stage, from 1.
-    pub step: usize,
+    pub step: u64,
     /// Which stage.
     pub stage: Stage,
     /// Training loss of the batch.
@@ -59,7 +59,7 @@ impl MetricsFile {
     /// # Errors
     /// The operating system's, and `InvalidData` with the line's number for a line before the last that is no
     /// metrics line: the file is then someone else's, and is left alone.
-    pub fn open(path: &Path, stage: Stage, step: usize) -> std::io::Result<Self> {
+    pub fn open(path: &Path, stage: Stage, step: u64) -> std::io::Result<Self> {
         if path.exists() {
             drop_after(path, stage, step)?;
         }
@@ -93,7 +93,7 @@ impl Sink for MetricsFile {
     }
 }
 
-fn drop_after(path: &Path, stage: Stage, step: usize) -> std::io::Result<()> {
+fn drop_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut kept = tempfile::NamedTempFile::new_in(folder)?;
     let mut broken: Option<usize> = None;
@@ -142,13 +142,13 @@ impl Sink for Tee<'_> {
 mod tests {
     use super::*;
 
-    fn step(stage: Stage, step: usize) -> Event {
+    fn step(stage: Stage, step: u64) -> Event {
         let event =
             StepEvent { stage, step, num_steps: 9, loss: 0.5, psnr: 20.0, lr: 1e-3, grad_norm: 2.0, step_s: 0.25 };
         Event::Step(event)
     }
 
-    fn write(path: &Path, from: (Stage, usize), steps: &[(Stage, usize)]) {
+    fn write(path: &Path, from: (Stage, u64), steps: &[(Stage, u64)]) {
         let mut sink = MetricsFile::open(path, from.0, from.1).unwrap();
         for &(stage, number) in steps {
             sink.event(&step(stage, number));
@@ -156,7 +156,7 @@ mod tests {
         sink.finish().unwrap();
     }
 
-    fn steps(path: &Path) -> Vec<(Stage, usize)> {
+    fn steps(path: &Path) -> Vec<(Stage, u64)> {
         let text = std::fs::read_to_string(path).unwrap();
         let lines = text.lines().map(|line| serde_json::from_str::<MetricsLine>(line).unwrap());
         lines.map(|line| (line.stage, line.step)).collect()

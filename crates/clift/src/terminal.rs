@@ -74,8 +74,8 @@ pub struct PlainLines<W> {
     out: W,
     since_line_s: f64,
     /// Steps and seconds since the stage started or resumed.
-    pace: (usize, f64),
-    shown_tenth: usize,
+    pace: (u64, f64),
+    shown_tenth: u64,
 }
 
 impl<W: Write> PlainLines<W> {
@@ -161,7 +161,7 @@ fn duration(seconds: f64) -> String {
 mod tests {
     use super::*;
 
-    fn step(step: usize, step_s: f64) -> Event {
+    fn step(step: u64, step_s: f64) -> Event {
         let stage = Stage::Stage1;
         Event::Step(StepEvent {
             stage,

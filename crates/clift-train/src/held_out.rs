@@ -1,0 +1,148 @@
+//! Measuring a run on views it never trained on: during training and at its end.
+
+use std::path::Path;
+
+use burn::module::Module;
+use clift_data::order::derive_seed;
+use clift_data::{ClipReader, EvaluationItem, Ledger};
+use clift_eval::{Accumulator, Networks, Summary, Sweep, TokenCount, Variant, evaluate_scene};
+use clift_model::Clift;
+
+use crate::TrainError;
+use crate::config::Config;
+use crate::events::{Event, Sink, Stage};
+use crate::scenes::evaluation_items;
+
+/// The held-out views of a run.
+pub struct HeldOut<'a> {
+    config: &'a Config,
+    reader: ClipReader,
+    items: Vec<EvaluationItem>,
+    ledger: Ledger,
+}
+
+impl<'a> HeldOut<'a> {
+    /// Chooses at most `num_scenes` scenes (0: all) of `reader` and their views.
+    ///
+    /// # Errors
+    /// As [`evaluation_items`].
+    pub fn new(config: &'a Config, reader: ClipReader, num_scenes: usize) -> Result<Self, TrainError> {
+        let (items, ledger) = evaluation_items(&config.eval, &reader, num_scenes)?;
+        Ok(Self { config, reader, items, ledger })
+    }
+
+    /// Measures a model during training: all tokens in stage 1, one count of condensed ones in stage 2.
+    /// Writes the first sheet to `folder`.
+    ///
+    /// # Errors
+    /// As [`evaluate_scene`]; a scene that cannot be read is skipped.
+    pub fn validate(
+        &self,
+        model: &Clift,
+        stage: Stage,
+        step: u64,
+        folder: &Path,
+        sink: &mut dyn Sink,
+    ) -> Result<(), TrainError> {
+        let (storage, variant) = match stage {
+            Stage::Stage2 => (self.config.eval.validation_storage, Variant::Clift),
+            _ => (TokenCount::Share(1.0), Variant::Kmeans),
+        };
+        let sweep = self.sweep(vec![storage], vec![variant]);
+        let networks = networks(model.clone(), Some(model.clone()));
+        let mut measured = Accumulator::default();
+        for (i, item) in self.items.iter().take(self.config.eval.num_validation_scenes).enumerate() {
+            let sheet = self.evaluate_item(&networks, item, &sweep, i == 0, &mut measured, sink)?;
+            if let Some(sheet) = sheet {
+                std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
+                sheet.write_png(&folder.join(format!("step-{step:09}.png")))?;
+            }
+        }
+        let summary = measured.summary();
+        if let Some(point) = summary.points.first() {
+            let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
+            sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
+        }
+        Ok(())
+    }
+
+    /// Runs the whole sweep and writes `summary.json`, `views.csv` and the picture sheets to `folder`.
+    ///
+    /// # Errors
+    /// As [`evaluate_scene`]; scenes that cannot be read are skipped and counted.
+    pub fn evaluate(&self, networks: &Networks, folder: &Path, sink: &mut dyn Sink) -> Result<Summary, TrainError> {
+        let started = std::time::Instant::now();
+        let variants = [Variant::Random, Variant::Kmeans, Variant::Clift];
+        let variants = variants.into_iter().filter(|v| *v != Variant::Clift || networks.condensed.is_some());
+        let sweep = self.sweep(self.config.eval.storage.clone(), variants.collect());
+        let total = self.items.len() as u64;
+        sink.event(&Event::StageStarted { stage: Stage::Eval, done: 0, num_steps: total });
+        let mut measured = Accumulator::default();
+        for skip in &self.ledger.skips {
+            measured.skip(&skip.key);
+        }
+        let sheets = folder.join("sheets");
+        std::fs::create_dir_all(&sheets).map_err(TrainError::io("making a folder", &sheets))?;
+        for (i, item) in self.items.iter().enumerate() {
+            let with_sheet = i < self.config.eval.num_sheets;
+            if let Some(sheet) = self.evaluate_item(networks, item, &sweep, with_sheet, &mut measured, sink)? {
+                let key = self.reader.source.key(item.scene);
+                sheet.write_png(&sheets.join(format!("{}.png", file_name(key))))?;
+            }
+            sink.event(&Event::Progress { stage: Stage::Eval, done: i as u64 + 1, total });
+        }
+        let summary = measured.summary();
+        if summary.num_views == 0 {
+            return Err(TrainError::NoScenes { reason: "every scene of the evaluation failed".into() });
+        }
+        summary.write(&folder.join("summary.json"))?;
+        measured.write_views(&folder.join("views.csv"))?;
+        sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
+        Ok(summary)
+    }
+
+    /// What could not be chosen.
+    pub fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    fn sweep(&self, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
+        let seed = derive_seed(self.config.seed, "eval");
+        Sweep { storage, variants, kmeans: self.config.clusters.kmeans.clone(), seed }
+    }
+
+    fn evaluate_item(
+        &self,
+        networks: &Networks,
+        item: &EvaluationItem,
+        sweep: &Sweep,
+        with_sheet: bool,
+        measured: &mut Accumulator,
+        sink: &mut dyn Sink,
+    ) -> Result<Option<clift_eval::picture::Picture>, TrainError> {
+        match self.reader.read(item.scene, &item.views) {
+            Ok(clip) => Ok(evaluate_scene(networks, &clip, sweep, with_sheet, measured)?),
+            Err(error) => {
+                let key = self.reader.source.key(item.scene);
+                measured.skip(key);
+                sink.event(&Event::Skipped { key: key.into(), reason: error.to_string() });
+                Ok(None)
+            }
+        }
+    }
+}
+
+/// The networks of an evaluation: the stage-1 model, and the stage-2 model where there is one.
+pub fn networks(stage1: Clift, stage2: Option<Clift>) -> Networks {
+    let (stage1, stage2) = (stage1.valid(), stage2.map(|model| model.valid()));
+    Networks {
+        encoder: stage1.encoder,
+        renderer: stage1.renderer,
+        condensed: stage2.map(|model| (model.condenser, model.renderer)),
+    }
+}
+
+/// A key as a file name: anything but letters, digits, `-`, `_` and `.` becomes `_`.
+fn file_name(key: &str) -> String {
+    key.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect()
+}

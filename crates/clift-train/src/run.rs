@@ -1,0 +1,362 @@
+//! A run: its directory, what it resumes, and the order of its stages.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use burn::tensor::Device;
+use clift_data::{ClipReader, SceneSource, Split};
+use clift_eval::Summary;
+use clift_model::{Clift, weights};
+use serde::{Deserialize, Serialize};
+
+use crate::TrainError;
+use crate::clusters::{ClusterCache, ClusterJob};
+use crate::config::Config;
+use crate::events::{Event, Sink, Stage};
+use crate::held_out::{HeldOut, networks};
+use crate::scenes::{self, FirstScenes};
+use crate::stage1::Stage1Batches;
+use crate::stage2::Stage2Batches;
+use crate::trainer::StagePlan;
+
+/// What the command line adds to a config.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RunOptions {
+    /// Do this stage alone.
+    pub only: Option<Stage>,
+    /// Train and evaluate on the first scenes of the training data.
+    pub overfit: Option<usize>,
+    /// Start over: an existing run directory is moved aside.
+    pub fresh: bool,
+}
+
+/// What `run.json` holds.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RunFile {
+    version: u32,
+    overfit: Option<usize>,
+}
+
+const VERSION: u32 = 1;
+
+/// Keys that may change between the start of a run and its resumption.
+const FREE_KEYS: [&str; 6] = ["run_dir", "device", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
+
+/// An open run.
+pub struct Run {
+    config: Config,
+    overfit: Option<usize>,
+    device: Device,
+}
+
+impl Run {
+    /// Opens the run directory of a config, new or to be resumed, and writes the resolved config to it.
+    ///
+    /// # Errors
+    /// [`TrainError::OtherRun`] when the directory holds a run with other settings.
+    pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+        config.validate()?;
+        let device = config.device.open()?;
+        let folder = &config.run_dir;
+        if options.fresh && folder.exists() {
+            let moved = free_name(folder);
+            std::fs::rename(folder, &moved).map_err(TrainError::io("moving the former run aside", folder))?;
+            sink.event(&Event::Message(format!("moved the former run to {}", moved.display())));
+        }
+        let config_path = folder.join("config.toml");
+        let run_path = folder.join("run.json");
+        if config_path.exists() {
+            refuse_other_run(&config_path, &run_path, &config, options.overfit)?;
+        }
+        std::fs::create_dir_all(folder).map_err(TrainError::io("making the run directory", folder))?;
+        let text = toml::to_string_pretty(&config).map_err(TrainError::bad_file("config", &config_path))?;
+        let run = RunFile { version: VERSION, overfit: options.overfit };
+        let json = serde_json::to_vec_pretty(&run).map_err(TrainError::bad_file("run file", &run_path))?;
+        crate::files::write(&run_path, &json)?;
+        crate::files::write(&config_path, text.as_bytes())?;
+        Ok(Self { config, overfit: options.overfit, device })
+    }
+
+    /// Opens a run that exists, to evaluate it.
+    ///
+    /// # Errors
+    /// [`TrainError::BadFile`] for a damaged `run.json`, and what the device gives.
+    pub fn reopen(config: Config) -> Result<Self, TrainError> {
+        config.validate()?;
+        let run = read_run_file(&config.run_dir.join("run.json"))?;
+        let device = config.device.open()?;
+        Ok(Self { config, overfit: run.overfit, device })
+    }
+
+    /// Does what is left of the run, or of one stage, and evaluates it. Returns the evaluation of a
+    /// whole run.
+    ///
+    /// # Errors
+    /// [`TrainError::Missing`] when `only` names a stage whose predecessor has not run, and whatever
+    /// the stages give.
+    pub fn train(
+        &self,
+        only: Option<Stage>,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Option<Summary>, TrainError> {
+        let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
+        let reader = self.reader(Split::Train, sink)?;
+        let held_out = HeldOut::new(&self.config, self.held_out_reader(sink)?, self.config.eval.num_validation_scenes)?;
+
+        let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
+            self.train_stage1(&reader, &held_out, stop, sink)?
+        } else {
+            self.load_stage1(only)?
+        };
+        let hash = weights::hash(&stage1.encoder);
+        if wanted(Stage::Clusters) || wanted(Stage::Stage2) {
+            let cache = self.clusters(only, &reader, &stage1, &hash, stop, sink)?;
+            if wanted(Stage::Stage2) && !self.weights(Stage::Stage2).exists() {
+                self.train_stage2(&reader, cache, &held_out, stage1, stop, sink)?;
+            }
+        }
+        if only.is_some() { Ok(None) } else { self.evaluate(&self.folder("eval"), sink).map(Some) }
+    }
+
+    /// Evaluates the run's weights and writes the results to `folder`.
+    ///
+    /// # Errors
+    /// [`TrainError::Missing`] without the weights of stage 1, and whatever the evaluation gives.
+    pub fn evaluate(&self, folder: &Path, sink: &mut dyn Sink) -> Result<Summary, TrainError> {
+        let stage1 = self.load_stage1(Some(Stage::Eval))?;
+        let path = self.weights(Stage::Stage2);
+        let stage2 = if path.exists() {
+            let mut model = self.new_model();
+            weights::load(&mut model, &path)?.require_all(&path)?;
+            Some(model)
+        } else {
+            sink.event(&Event::Message("stage 2 has not run: evaluating the stage-1 weights alone".into()));
+            None
+        };
+        let reader = self.held_out_reader(sink)?;
+        let held_out = HeldOut::new(&self.config, reader, self.config.eval.num_scenes)?;
+        if !held_out.ledger().skips.is_empty() {
+            sink.event(&Event::Message(format!("evaluation: {}", held_out.ledger())));
+        }
+        held_out.evaluate(&networks(stage1, stage2), folder, sink)
+    }
+
+    fn train_stage1(
+        &self,
+        reader: &ClipReader,
+        held_out: &HeldOut,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Clift, TrainError> {
+        let config = &self.config;
+        let mut model = self.new_model();
+        if let Some(from) = &config.stage1.init_from {
+            init_from(&mut model, from, sink)?;
+        }
+        let batches = Stage1Batches::new(config, reader)?;
+        let validate = |model: &Clift, stage, step, sink: &mut dyn Sink| {
+            held_out.validate(model, stage, step, &self.folder("stage1").join("samples"), sink)
+        };
+        let plan = StagePlan {
+            stage: Stage::Stage1,
+            num_steps: config.stage1.steps,
+            accumulate: config.stage1.accumulate,
+            optimizer: &config.stage1.optimizer,
+            renderer_lr_factor: 1.0,
+            validate_every: config.eval.every,
+            validate: &validate,
+            batches: Arc::new(move |step| batches.batch(step)),
+            data: &config.data,
+            checkpoint: &config.checkpoint,
+            folder: self.folder("stage1"),
+            device: &self.device.clone().autodiff(),
+        };
+        let model = plan.train(model, stop, sink)?;
+        weights::save(&model.stage1(), &self.weights(Stage::Stage1))?;
+        Ok(model)
+    }
+
+    fn train_stage2(
+        &self,
+        reader: &ClipReader,
+        cache: ClusterCache,
+        held_out: &HeldOut,
+        stage1: Clift,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<(), TrainError> {
+        let config = &self.config;
+        let batches = Stage2Batches::new(config, reader, Arc::new(cache))?;
+        let validate = |model: &Clift, stage, step, sink: &mut dyn Sink| {
+            held_out.validate(model, stage, step, &self.folder("stage2").join("samples"), sink)
+        };
+        let plan = StagePlan {
+            stage: Stage::Stage2,
+            num_steps: config.stage2.steps,
+            accumulate: config.stage2.accumulate,
+            optimizer: &config.stage2.optimizer,
+            renderer_lr_factor: config.stage2.renderer_lr_factor,
+            validate_every: config.eval.every,
+            validate: &validate,
+            batches: Arc::new(move |step| batches.batch(step)),
+            data: &config.data,
+            checkpoint: &config.checkpoint,
+            folder: self.folder("stage2"),
+            device: &self.device.clone().autodiff(),
+        };
+        let mut model = self.new_model();
+        (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+        let model = plan.train(model, stop, sink)?;
+        Ok(weights::save(&model, &self.weights(Stage::Stage2))?)
+    }
+
+    fn clusters(
+        &self,
+        only: Option<Stage>,
+        reader: &ClipReader,
+        model: &Clift,
+        encoder_hash: &str,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<ClusterCache, TrainError> {
+        let folder = self.folder("clusters");
+        if folder.exists() {
+            return ClusterCache::open(&folder, &self.config, encoder_hash);
+        }
+        if only == Some(Stage::Stage2) {
+            return Err(TrainError::Missing {
+                stage: "stage2",
+                what: "the cluster cache",
+                first: "--only clusters",
+                path: folder,
+            });
+        }
+        use burn::module::Module;
+        let encoder = model.encoder.valid();
+        ClusterJob { config: &self.config, reader, encoder: &encoder, encoder_hash, device: &self.device }
+            .make(&folder, stop, sink)
+    }
+
+    /// The run's training weights on the autodiff device.
+    fn new_model(&self) -> Clift {
+        Clift::new(&self.config.model, self.config.seed, &self.device.clone().autodiff())
+    }
+
+    fn load_stage1(&self, only: Option<Stage>) -> Result<Clift, TrainError> {
+        let path = self.weights(Stage::Stage1);
+        if !path.exists() {
+            let stage = only.map_or("stage2", Stage::name);
+            let what = "the weights of stage 1";
+            return Err(TrainError::Missing { stage, what, first: "--only stage1", path });
+        }
+        let mut model = self.new_model();
+        let mut stage1 = model.stage1();
+        weights::load(&mut stage1, &path)?.require_all(&path)?;
+        (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+        Ok(model)
+    }
+
+    fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
+        let (source, ledger) = scenes::open(&self.config.data, split)?;
+        sink.event(&Event::Message(format!("{split}: {ledger}")));
+        let source: Arc<dyn SceneSource> = match self.overfit {
+            Some(count) => Arc::new(FirstScenes::of(source, count)),
+            None => source,
+        };
+        Ok(ClipReader { source, options: self.config.data.clip_options() })
+    }
+
+    /// The test split, or the training scenes themselves under `--overfit`.
+    fn held_out_reader(&self, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
+        self.reader(if self.overfit.is_some() { Split::Train } else { Split::Test }, sink)
+    }
+
+    fn folder(&self, name: &str) -> PathBuf {
+        self.config.run_dir.join(name)
+    }
+
+    fn weights(&self, stage: Stage) -> PathBuf {
+        self.folder(stage.name()).join("model.safetensors")
+    }
+}
+
+/// Starts from another run or a weight file, and says what was and was not loaded.
+fn init_from(model: &mut Clift, from: &Path, sink: &mut dyn Sink) -> Result<(), TrainError> {
+    let path = if from.is_dir() { from.join("stage1").join("model.safetensors") } else { from.into() };
+    let mut stage1 = model.stage1();
+    let loaded = weights::load(&mut stage1, &path)?;
+    if loaded.applied.is_empty() {
+        let reason = "none of its tensors has a place in this model".to_owned();
+        return Err(TrainError::bad_file("weight file for stage1.init_from", &path)(reason));
+    }
+    (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+    let list = |names: &[String]| if names.is_empty() { "none".into() } else { names.join(", ") };
+    sink.event(&Event::Message(format!(
+        "loaded {} parameters from {}; left as they were: {}; unused in the file: {}",
+        loaded.applied.len(),
+        path.display(),
+        list(&loaded.missing),
+        list(&loaded.unused)
+    )));
+    Ok(())
+}
+
+fn read_run_file(path: &Path) -> Result<RunFile, TrainError> {
+    let text = std::fs::read(path).map_err(TrainError::io("reading the run file", path))?;
+    serde_json::from_slice(&text).map_err(TrainError::bad_file("run file", path))
+}
+
+fn refuse_other_run(
+    config_path: &Path,
+    run_path: &Path,
+    config: &Config,
+    overfit: Option<usize>,
+) -> Result<(), TrainError> {
+    let text = std::fs::read_to_string(config_path).map_err(TrainError::io("reading the run's config", config_path))?;
+    let bad = || TrainError::bad_file("config", config_path);
+    let old: toml::Table = text.parse().map_err(|error: toml::de::Error| bad()(error.message().to_owned()))?;
+    let new = toml::Table::try_from(config).map_err(|error| bad()(error.to_string()))?;
+    let (mut old, mut new) = (flatten(old), flatten(new));
+    let flag = |overfit: Option<usize>| overfit.map_or("off".into(), |count| count.to_string());
+    old.insert("--overfit".into(), flag(read_run_file(run_path)?.overfit));
+    new.insert("--overfit".into(), flag(overfit));
+
+    let keys: std::collections::BTreeSet<_> = old.keys().chain(new.keys()).collect();
+    let free = |key: &str| FREE_KEYS.iter().any(|free| key == *free || (free.ends_with('.') && key.starts_with(free)));
+    let show = |value: Option<&String>| value.cloned().unwrap_or_else(|| "not set".into());
+    let differences: Vec<String> = keys
+        .into_iter()
+        .filter(|key| !free(key) && old.get(*key) != new.get(*key))
+        .map(|key| format!("  {key}: {} -> {}", show(old.get(key)), show(new.get(key))))
+        .collect();
+    if differences.is_empty() {
+        return Ok(());
+    }
+    let path = config.run_dir.clone();
+    Err(TrainError::OtherRun { differences: differences.join("\n"), path })
+}
+
+/// Dotted keys and their values as text.
+fn flatten(table: toml::Table) -> BTreeMap<String, String> {
+    let mut flat = BTreeMap::new();
+    let mut pending: Vec<(String, toml::Value)> = table.into_iter().collect();
+    while let Some((key, value)) = pending.pop() {
+        match value {
+            toml::Value::Table(inner) => pending.extend(inner.into_iter().map(|(k, v)| (format!("{key}.{k}"), v))),
+            other => {
+                flat.insert(key, other.to_string());
+            }
+        }
+    }
+    flat
+}
+
+/// `runs/tiny` becomes `runs/tiny.1`, or the first number that is free.
+fn free_name(folder: &Path) -> PathBuf {
+    let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    (1..).map(|i| folder.with_file_name(format!("{name}.{i}"))).find(|path| !path.exists()).unwrap_or_default()
+}

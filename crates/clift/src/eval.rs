@@ -1,0 +1,30 @@
+//! `clift eval`.
+
+use clift_train::{Config, Run, read_config};
+
+use crate::args::EvalArgs;
+use crate::terminal;
+
+/// Evaluates a run and prints the table.
+pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
+    let (mut config, overrides) = read_config::<Config>(&args.run.join("config.toml"), &args.set)?;
+    for change in overrides {
+        eprintln!("--set {change}");
+    }
+    // A run may have been moved since it was trained.
+    config.run_dir.clone_from(&args.run);
+    config.device = args.device.unwrap_or(config.device);
+    if !args.storage.is_empty() {
+        config.eval.storage.clone_from(&args.storage);
+    }
+    if args.index.is_some() {
+        config.eval.index.clone_from(&args.index);
+    }
+    let folder = args.out.clone().unwrap_or_else(|| args.run.join("eval"));
+    let mut sink = terminal::sink();
+    let summary = Run::reopen(config)?.evaluate(&folder, sink.as_mut())?;
+    drop(sink);
+    println!("{summary}");
+    println!("results: {}", folder.display());
+    Ok(())
+}

@@ -1,0 +1,35 @@
+//! `clift train`.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Context;
+use clift_train::{Config, Run, RunOptions, read_config};
+
+use crate::args::TrainArgs;
+use crate::terminal;
+
+/// Trains what the config says and prints the evaluation.
+pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
+    let (mut config, overrides) = read_config::<Config>(&args.config, &args.set)?;
+    for change in overrides {
+        eprintln!("--set {change}");
+    }
+    config.device = args.device.unwrap_or(config.device);
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).context("listening for Ctrl-C")?;
+
+    let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh };
+    let mut sink = terminal::sink();
+    let folder = config.run_dir.clone();
+    let run = Run::open(config, &options, sink.as_mut())?;
+    let summary = run.train(args.only, &stop, sink.as_mut())?;
+    drop(sink);
+    if let Some(summary) = summary {
+        println!("{summary}");
+        println!("results: {}", folder.join("eval").display());
+    }
+    Ok(())
+}
