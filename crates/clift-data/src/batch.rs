@@ -154,7 +154,7 @@ mod tests {
             Ok(vec![Camera { intrinsics_norm, c2w: Pose::IDENTITY }; self.0[scene]])
         }
         fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-            Err(DataError::OutOfRange { what: "frame", index: frame, count: self.0[scene] })
+            Err(DataError::NoSuchFrame { key: self.1[scene].clone(), frame, num_frames: self.0[scene] })
         }
     }
 

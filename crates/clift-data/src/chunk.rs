@@ -141,7 +141,8 @@ impl ChunkSource {
 
     /// The table of a scene, with the path of its chunk.
     fn table(&self, scene: usize) -> Result<(&Path, &SceneTable), DataError> {
-        let Entry { key, chunk } = &self.scenes[scene];
+        let num_scenes = self.scenes.len();
+        let Entry { key, chunk } = self.scenes.get(scene).ok_or(DataError::NoSuchScene { scene, num_scenes })?;
         let Chunk { path, table } = &self.chunks[*chunk];
         let table = if let Some(table) = table.get() {
             table
@@ -326,10 +327,12 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_that_does_not_exist_is_an_error() {
+    fn a_frame_or_scene_that_does_not_exist_is_an_error() {
         let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Test, &ALL).unwrap();
         let message = source.frame(0, 8).unwrap_err().to_string();
         assert_eq!(message, "scene 00000000000000b1 has 8 frames, so there is no frame 8 (counted from 0)");
+        let message = source.frame(1, 0).unwrap_err().to_string();
+        assert_eq!(message, "there are 1 scenes, so there is no scene 1 (counted from 0)");
     }
 
     #[test]

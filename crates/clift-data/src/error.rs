@@ -147,15 +147,13 @@ pub enum DataError {
         /// Frames the scene has.
         got: usize,
     },
-    /// No scene, or no frame of a scene, is at the position asked for.
-    #[error("no {what} {index}: there are {count}")]
-    OutOfRange {
-        /// What was asked for ("scene", "frame").
-        what: &'static str,
+    /// A scene was asked for that the source does not have.
+    #[error("there are {num_scenes} scenes, so there is no scene {scene} (counted from 0)")]
+    NoSuchScene {
         /// Position asked for.
-        index: usize,
-        /// How many there are.
-        count: usize,
+        scene: usize,
+        /// How many scenes the source has.
+        num_scenes: usize,
     },
     /// A batch slot found no usable scene within its tries.
     #[error(

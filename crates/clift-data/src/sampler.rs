@@ -172,7 +172,7 @@ impl BoundedSampler {
 /// themselves, with replacement, where there is no candidate at all.
 ///
 /// # Errors
-/// [`DataError::OutOfRange`] when a context is not a frame of the scene; [`DataError::BadConfig`] when there are
+/// [`DataError::NotEnoughFrames`] when a context is not a frame of the scene; [`DataError::BadConfig`] when there are
 /// no contexts.
 pub fn targets_excluding(
     context: &[usize],
@@ -184,7 +184,7 @@ pub fn targets_excluding(
         return Err(DataError::bad_config("context", "is empty; targets lie between its first and last frame"));
     };
     if last >= num_frames {
-        return Err(DataError::OutOfRange { what: "frame", index: last, count: num_frames });
+        return Err(DataError::NotEnoughFrames { needed: last + 1, got: num_frames });
     }
     let mut candidates: Vec<usize> = (first..=last).filter(|frame| !context.contains(frame)).collect();
     if candidates.len() >= num_targets {
@@ -348,7 +348,8 @@ mod tests {
     #[test]
     fn stage_two_contexts_beyond_the_scene_are_refused() {
         let mut rng = item_rng(1, 0, 0, 0, "test");
-        assert_eq!(targets_excluding(&[3, 20], 20, 3, &mut rng).unwrap_err().to_string(), "no frame 20: there are 20");
+        let message = targets_excluding(&[3, 20], 20, 3, &mut rng).unwrap_err().to_string();
+        assert_eq!(message, "not enough frames: 21 needed, 20 in the scene");
         assert!(targets_excluding(&[], 20, 3, &mut rng).is_err());
     }
 

@@ -51,9 +51,9 @@ impl SyntheticSource {
     }
 
     fn scene(&self, scene: usize) -> Result<Scene, DataError> {
-        let count = self.config.num_scenes;
-        if scene >= count {
-            return Err(DataError::OutOfRange { what: "scene", index: scene, count });
+        let num_scenes = self.config.num_scenes;
+        if scene >= num_scenes {
+            return Err(DataError::NoSuchScene { scene, num_scenes });
         }
         let purpose = match self.config.split {
             Split::Train => "synthetic train scene",
@@ -94,10 +94,11 @@ impl SceneSource for SyntheticSource {
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-        let scene = self.scene(scene)?;
+        let position = scene;
+        let scene = self.scene(position)?;
         let SyntheticConfig { num_frames, width, height, samples_per_pixel, specular, .. } = self.config;
         if frame >= num_frames {
-            return Err(DataError::OutOfRange { what: "frame", index: frame, count: num_frames });
+            return Err(DataError::NoSuchFrame { key: self.key(position).to_owned(), frame, num_frames });
         }
         let camera = self.camera(&scene, frame);
         Ok(trace::render(&scene, &camera, width, height, samples_per_pixel.isqrt(), specular as f32))
@@ -225,8 +226,10 @@ mod tests {
     #[test]
     fn scenes_and_frames_beyond_the_end_are_refused() {
         let source = source(|c| c.num_scenes = 5);
-        assert_eq!(source.frame(5, 0).unwrap_err().to_string(), "no scene 5: there are 5");
-        assert_eq!(source.frame(4, 16).unwrap_err().to_string(), "no frame 16: there are 16");
+        let message = |scene, frame| source.frame(scene, frame).unwrap_err().to_string();
+        assert_eq!(message(5, 0), "there are 5 scenes, so there is no scene 5 (counted from 0)");
+        let missing = "scene synthetic-0-train-00004 has 16 frames, so there is no frame 16 (counted from 0)";
+        assert_eq!(message(4, 16), missing);
         assert!(source.cameras(5).is_err());
     }
 
