@@ -90,7 +90,7 @@ fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
 }
 
 /// Writes a temporary file beside `path` and renames it, so that no reader ever sees half a file.
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
+pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     let io = |error| DataError::io("writing", path)(error);
     let mut file = NamedTempFile::new_in(folder).map_err(io)?;

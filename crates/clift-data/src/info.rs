@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::camera::Camera;
@@ -46,7 +47,7 @@ pub struct SourceInfo {
     pub num_scenes: usize,
     /// Frames per scene.
     pub num_frames: Option<Spread>,
-    /// Columns and rows of the first frame of the first scene.
+    /// Columns and rows of the first frame there is.
     pub image_size: Option<[usize; 2]>,
     /// The wider of the two fields of view, one number per frame.
     pub fov_deg: Option<Spread>,
@@ -55,24 +56,25 @@ pub struct SourceInfo {
 }
 
 impl SourceInfo {
-    /// Reads every scene's cameras and one frame.
+    /// Reads every scene's cameras, on all cores, and one frame.
     pub fn read(source: &dyn SceneSource) -> Result<Self, DataError> {
-        let (mut lengths, mut fields, mut extents) = (Vec::new(), Vec::new(), Vec::new());
-        let mut first_picture = None;
-        for scene in 0..source.num_scenes() {
+        let scenes = (0..source.num_scenes()).into_par_iter().map(|scene| {
             let cameras = source.cameras(scene)?;
-            if first_picture.is_none() && !cameras.is_empty() {
-                let frame = source.frame(scene, 0)?;
-                first_picture = Some([frame.width, frame.height]);
-            }
-            lengths.push(cameras.len() as f64);
-            extents.push(extent(&cameras));
-            fields.extend(cameras.iter().map(Camera::fov_deg).map(|(x, y)| x.max(y)));
-        }
+            let fov_deg: Vec<f64> = cameras.iter().map(Camera::fov_deg).map(|(x, y)| x.max(y)).collect();
+            Ok((cameras.len(), fov_deg, extent(&cameras)))
+        });
+        let scenes: Vec<_> = scenes.collect::<Result<_, DataError>>()?;
+        let first_picture = match scenes.iter().position(|(num_frames, ..)| *num_frames > 0) {
+            Some(scene) => Some(source.frame(scene, 0)?),
+            None => None,
+        };
+        let lengths = scenes.iter().map(|(num_frames, ..)| *num_frames as f64).collect();
+        let fields = scenes.iter().flat_map(|(_, fov_deg, _)| fov_deg).copied().collect();
+        let extents = scenes.iter().map(|(.., extent)| *extent).collect();
         Ok(Self {
             num_scenes: source.num_scenes(),
             num_frames: Spread::of(lengths),
-            image_size: first_picture,
+            image_size: first_picture.map(|frame| [frame.width, frame.height]),
             fov_deg: Spread::of(fields),
             extent: Spread::of(extents),
         })

@@ -1,0 +1,167 @@
+//! Writes the scenes of any source as chunks, and an evaluation index beside them.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use crate::chunk_writer::{SceneRecord, write_chunks, write_whole};
+use crate::clip::{Frame, SceneSource, ViewIndices};
+use crate::error::DataError;
+use crate::image::{encode_jpeg, encode_png};
+
+/// How frames are stored.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Encoding {
+    /// Without loss.
+    #[default]
+    Png,
+    /// With a quality in `1..=100`.
+    Jpeg(u8),
+}
+
+impl Encoding {
+    fn encode(self, frame: &Frame) -> Result<Vec<u8>, DataError> {
+        match self {
+            Self::Png => encode_png(frame),
+            Self::Jpeg(quality) => encode_jpeg(frame, quality),
+        }
+    }
+}
+
+/// What was written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Written {
+    /// Scenes.
+    pub num_scenes: usize,
+    /// Frames of all scenes.
+    pub num_frames: usize,
+    /// Bytes of the encoded frames.
+    pub image_bytes: u64,
+}
+
+/// Writes every scene of `source` into `folder` as [`write_chunks`] does. Time stamps are frame numbers.
+///
+/// `written` is told how many scenes are ready after each one. Frames of a scene are read on all cores.
+///
+/// # Errors
+/// Whatever reading a scene, encoding a frame and [`write_chunks`] give.
+pub fn write_source(
+    source: &dyn SceneSource,
+    folder: &Path,
+    encoding: Encoding,
+    target_bytes: u64,
+    mut written: impl FnMut(usize),
+) -> Result<Written, DataError> {
+    let mut total = Written::default();
+    let scenes = (0..source.num_scenes()).map(|scene| {
+        let cameras = source.cameras(scene)?;
+        let images: Vec<Vec<u8>> = (0..cameras.len())
+            .into_par_iter()
+            .map(|frame| encoding.encode(&source.frame(scene, frame)?))
+            .collect::<Result<_, _>>()?;
+        total.num_scenes += 1;
+        total.num_frames += images.len();
+        total.image_bytes += images.iter().map(|image| image.len() as u64).sum::<u64>();
+        written(total.num_scenes);
+        let timestamps = (0..images.len() as i64).collect();
+        Ok(SceneRecord { key: source.key(scene).to_owned(), url: String::new(), timestamps, cameras, images })
+    });
+    write_chunks(folder, scenes, target_bytes)?;
+    Ok(total)
+}
+
+/// Contexts from the first to the last of `num_frames` frames, and targets spread over the frames between them;
+/// `None` for fewer frames than views, or fewer than 2 contexts.
+pub fn spread_views(num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
+    if num_context < 2 || num_frames < num_context + num_targets {
+        return None;
+    }
+    let spread = |place: usize, count: usize, of: usize| (place * (of - 1) + (count - 1) / 2) / (count - 1);
+    let context: Vec<usize> = (0..num_context).map(|place| spread(place, num_context, num_frames)).collect();
+    let rest: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();
+    // With two to spare the ends are left out, which lie next to a context.
+    let has_spare = rest.len() >= num_targets + 2;
+    let place = |target: usize| if has_spare { spread(target + 1, num_targets + 2, rest.len()) } else { target };
+    let target = (0..num_targets).map(|target| rest[place(target)]).collect();
+    Some(ViewIndices { context, target })
+}
+
+/// Writes an evaluation index of every scene of `source`, with the views of [`spread_views`] (`null` where there are
+/// too few frames); returns how many scenes have views.
+///
+/// # Errors
+/// Whatever reading cameras gives, and [`DataError::Io`].
+pub fn write_evaluation_index(
+    path: &Path,
+    source: &dyn SceneSource,
+    num_context: usize,
+    num_targets: usize,
+) -> Result<usize, DataError> {
+    #[derive(Serialize)]
+    struct Entry {
+        context: Vec<usize>,
+        target: Vec<usize>,
+    }
+    let mut entries = BTreeMap::new();
+    for scene in 0..source.num_scenes() {
+        let views = spread_views(source.cameras(scene)?.len(), num_context, num_targets);
+        entries.insert(source.key(scene), views.map(|ViewIndices { context, target }| Entry { context, target }));
+    }
+    let bad = |error: serde_json::Error| DataError::BadIndex { what: error.to_string(), path: path.to_path_buf() };
+    let text = serde_json::to_vec(&entries).map_err(bad)?;
+    write_whole(path, &text)?;
+    Ok(entries.values().flatten().count())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{EvaluationIndex, SyntheticConfig, SyntheticSource};
+
+    fn source(num_frames: usize) -> SyntheticSource {
+        let config = SyntheticConfig { num_scenes: 3, num_frames, width: 8, height: 8, ..Default::default() };
+        SyntheticSource::new(config).unwrap()
+    }
+
+    #[test]
+    fn views_run_from_the_first_to_the_last_frame_and_targets_are_no_contexts() {
+        for num_frames in 7..200 {
+            let ViewIndices { context, target } = spread_views(num_frames, 4, 3).unwrap();
+            assert_eq!((context[0], context[3]), (0, num_frames - 1));
+            assert_eq!((context.len(), target.len()), (4, 3));
+            assert!(context.is_sorted_by(|a, b| a < b) && target.is_sorted_by(|a, b| a < b), "{context:?} {target:?}");
+            assert!(target.iter().all(|frame| !context.contains(frame) && *frame < num_frames));
+        }
+        assert_eq!(spread_views(16, 4, 3).unwrap().context, [0, 5, 10, 15]);
+        assert!([spread_views(6, 4, 3), spread_views(9, 1, 3), spread_views(0, 0, 0)].iter().all(Option::is_none));
+    }
+
+    #[test]
+    fn a_written_index_selects_every_scene_with_enough_frames() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("evaluation_index.json");
+        for (num_frames, expected) in [(16, 3), (6, 0)] {
+            let source = source(num_frames);
+            assert_eq!(write_evaluation_index(&path, &source, 4, 3).unwrap(), expected);
+            let (items, ledger) = EvaluationIndex::read(&path).unwrap().select(&source).unwrap();
+            assert_eq!((items.len(), ledger.num_scenes), (expected, 3));
+            assert!(items.iter().all(|item| Some(&item.views) == spread_views(16, 4, 3).as_ref()));
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_counted_scene_by_scene_and_jpeg_is_smaller_at_a_low_quality() {
+        let bytes = [Encoding::Jpeg(10), Encoding::Jpeg(95)].map(|encoding| {
+            let folder = tempfile::tempdir().unwrap();
+            let mut seen = Vec::new();
+            let written = write_source(&source(4), folder.path(), encoding, 1, |done| seen.push(done)).unwrap();
+            assert_eq!(seen, [1, 2, 3]);
+            assert_eq!((written.num_scenes, written.num_frames), (3, 12));
+            assert!(folder.path().join("000002.torch").exists() && folder.path().join("index.json").exists());
+            written.image_bytes
+        });
+        assert!(bytes[0] < bytes[1], "{bytes:?}");
+    }
+}
