@@ -29,6 +29,8 @@ pub struct Networks {
     pub renderer: Renderer,
     /// Condenser and stage-2 renderer, once there are.
     pub condensed: Option<(Condenser, Renderer)>,
+    /// Where they live.
+    pub device: Device,
 }
 
 /// Settings of a sweep.
@@ -65,8 +67,8 @@ pub fn evaluate_scene(
     with_sheet: bool,
     into: &mut Accumulator,
 ) -> Result<Option<Picture>, EvalError> {
-    let device = networks.renderer.device();
-    let lift = networks.encoder.forward(&upload_views(&[&clip.context], &device)?); // [1, N, D]
+    let device = &networks.device;
+    let lift = networks.encoder.forward(&upload_views(&[&clip.context], device)?); // [1, N, D]
     let num_tokens = lift.dims()[1];
     let mut renderings = baselines(clip)?;
     for &count in &sweep.storage {
@@ -77,11 +79,11 @@ pub fn evaluate_scene(
             let (tokens, renderer) = match variant {
                 Variant::Random => (random_subset(&lift, num_storage_tokens, seed), &networks.renderer),
                 Variant::Kmeans => {
-                    (index.clusters()?.upload(&device).gather_centroids(lift.clone()), &networks.renderer)
+                    (index.clusters()?.upload(device).gather_centroids(lift.clone()), &networks.renderer)
                 }
                 Variant::Clift => {
                     let (condenser, renderer) = networks.condensed.as_ref().ok_or(EvalError::NoCondenser)?;
-                    (condenser.forward(lift.clone(), &index.clusters()?.upload(&device)), renderer)
+                    (condenser.forward(lift.clone(), &index.clusters()?.upload(device)), renderer)
                 }
                 Variant::Patch | Variant::NearestView | Variant::MeanImage => continue,
             };
@@ -235,15 +237,4 @@ fn scene_sheet(clip: &Clip, renderings: &[Rendered]) -> Result<Picture, EvalErro
         rows.push(Row { label: format!("frame {frame}"), cells });
     }
     Ok(sheet(&clip.key, &columns, &rows))
-}
-
-trait OnDevice {
-    fn device(&self) -> Device;
-}
-
-impl OnDevice for Renderer {
-    fn device(&self) -> Device {
-        use burn::module::Module;
-        self.devices().into_iter().next().unwrap_or_else(Device::flex)
-    }
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use burn::module::Module;
+use burn::tensor::Device;
 use clift_data::order::derive_seed;
 use clift_data::{ClipReader, EvaluationItem, Ledger};
 use clift_eval::{Accumulator, Networks, Summary, Sweep, TokenCount, Variant, evaluate_scene};
@@ -19,19 +19,20 @@ pub struct HeldOut<'a> {
     reader: ClipReader,
     items: Vec<EvaluationItem>,
     ledger: Ledger,
+    device: Device,
 }
 
 impl<'a> HeldOut<'a> {
-    /// Chooses at most `num_scenes` scenes (0: all) of `reader` and their views.
+    /// Chooses at most `num_scenes` scenes (0: all) of `reader` and their views, to be measured on `device`.
     ///
     /// # Errors
     /// As [`evaluation_items`].
-    pub fn new(config: &'a Config, reader: ClipReader, num_scenes: usize) -> Result<Self, TrainError> {
+    pub fn new(config: &'a Config, reader: ClipReader, num_scenes: usize, device: &Device) -> Result<Self, TrainError> {
         let (items, ledger) = evaluation_items(&config.eval, &reader, num_scenes)?;
-        Ok(Self { config, reader, items, ledger })
+        Ok(Self { config, reader, items, ledger, device: device.clone() })
     }
 
-    /// Measures a model during training: all tokens in stage 1, one count of condensed ones in stage 2.
+    /// Measures a model without autodiff during training: all tokens in stage 1, one count of condensed ones in stage 2.
     /// Writes the first sheet to `folder`.
     ///
     /// # Errors
@@ -49,7 +50,12 @@ impl<'a> HeldOut<'a> {
             _ => (TokenCount::Share(1.0), Variant::Kmeans),
         };
         let sweep = self.sweep(vec![storage], vec![variant]);
-        let networks = networks(model.clone(), Some(model.clone()));
+        let networks = Networks {
+            encoder: model.encoder.clone(),
+            renderer: model.renderer.clone(),
+            condensed: Some((model.condenser.clone(), model.renderer.clone())),
+            device: self.device.clone(),
+        };
         let mut measured = Accumulator::default();
         for (i, item) in self.items.iter().take(self.config.eval.num_validation_scenes).enumerate() {
             let sheet = self.evaluate_item(&networks, item, &sweep, i == 0, &mut measured, sink)?;
@@ -129,16 +135,6 @@ impl<'a> HeldOut<'a> {
                 Ok(None)
             }
         }
-    }
-}
-
-/// The networks of an evaluation: the stage-1 model, and the stage-2 model where there is one.
-pub fn networks(stage1: Clift, stage2: Option<Clift>) -> Networks {
-    let (stage1, stage2) = (stage1.valid(), stage2.map(|model| model.valid()));
-    Networks {
-        encoder: stage1.encoder,
-        renderer: stage1.renderer,
-        condensed: stage2.map(|model| (model.condenser, model.renderer)),
     }
 }
 

@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use burn::module::Module;
 use burn::tensor::Device;
 use clift_data::{ClipReader, SceneSource, Split};
-use clift_eval::Summary;
+use clift_eval::{Networks, Summary};
 use clift_model::{Clift, weights};
 use serde::{Deserialize, Serialize};
 
@@ -15,11 +16,11 @@ use crate::TrainError;
 use crate::clusters::{ClusterCache, ClusterJob};
 use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
-use crate::held_out::{HeldOut, networks};
+use crate::held_out::HeldOut;
 use crate::scenes::{self, FirstScenes};
 use crate::stage1::Stage1Batches;
 use crate::stage2::Stage2Batches;
-use crate::trainer::StagePlan;
+use crate::trainer::{MakeBatch, StagePlan};
 
 /// What the command line adds to a config.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -105,7 +106,8 @@ impl Run {
     ) -> Result<Option<Summary>, TrainError> {
         let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
         let reader = self.reader(Split::Train, sink)?;
-        let held_out = HeldOut::new(&self.config, self.held_out_reader(sink)?, self.config.eval.num_validation_scenes)?;
+        let num_scenes = self.config.eval.num_validation_scenes;
+        let held_out = HeldOut::new(&self.config, self.held_out_reader(sink)?, num_scenes, &self.device)?;
 
         let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
             self.train_stage1(&reader, &held_out, stop, sink)?
@@ -138,11 +140,17 @@ impl Run {
             None
         };
         let reader = self.held_out_reader(sink)?;
-        let held_out = HeldOut::new(&self.config, reader, self.config.eval.num_scenes)?;
+        let held_out = HeldOut::new(&self.config, reader, self.config.eval.num_scenes, &self.device)?;
         if !held_out.ledger().skips.is_empty() {
             sink.event(&Event::Message(format!("evaluation: {}", held_out.ledger())));
         }
-        held_out.evaluate(&networks(stage1, stage2), folder, sink)
+        let networks = Networks {
+            encoder: stage1.encoder.valid(),
+            renderer: stage1.renderer.valid(),
+            condensed: stage2.map(|model| (model.condenser.valid(), model.renderer.valid())),
+            device: self.device.clone(),
+        };
+        held_out.evaluate(&networks, folder, sink)
     }
 
     fn train_stage1(
@@ -152,30 +160,13 @@ impl Run {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Clift, TrainError> {
-        let config = &self.config;
         let mut model = self.new_model();
-        if let Some(from) = &config.stage1.init_from {
+        if let Some(from) = &self.config.stage1.init_from {
             init_from(&mut model, from, sink)?;
         }
-        let batches = Stage1Batches::new(config, reader)?;
-        let validate = |model: &Clift, stage, step, sink: &mut dyn Sink| {
-            held_out.validate(model, stage, step, &self.folder("stage1").join("samples"), sink)
-        };
-        let plan = StagePlan {
-            stage: Stage::Stage1,
-            num_steps: config.stage1.steps,
-            accumulate: config.stage1.accumulate,
-            optimizer: &config.stage1.optimizer,
-            renderer_lr_factor: 1.0,
-            validate_every: config.eval.every,
-            validate: &validate,
-            batches: Arc::new(move |step| batches.batch(step)),
-            data: &config.data,
-            checkpoint: &config.checkpoint,
-            folder: self.folder("stage1"),
-            device: &self.device.clone().autodiff(),
-        };
-        let model = plan.train(model, stop, sink)?;
+        let batches = Stage1Batches::new(&self.config, reader)?;
+        let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
+        let model = self.plan(Stage::Stage1, batches).train(model, held_out, stop, sink)?;
         weights::save(&model.stage1(), &self.weights(Stage::Stage1))?;
         Ok(model)
     }
@@ -189,29 +180,31 @@ impl Run {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<(), TrainError> {
-        let config = &self.config;
-        let batches = Stage2Batches::new(config, reader, Arc::new(cache))?;
-        let validate = |model: &Clift, stage, step, sink: &mut dyn Sink| {
-            held_out.validate(model, stage, step, &self.folder("stage2").join("samples"), sink)
-        };
-        let plan = StagePlan {
-            stage: Stage::Stage2,
-            num_steps: config.stage2.steps,
-            accumulate: config.stage2.accumulate,
-            optimizer: &config.stage2.optimizer,
-            renderer_lr_factor: config.stage2.renderer_lr_factor,
-            validate_every: config.eval.every,
-            validate: &validate,
-            batches: Arc::new(move |step| batches.batch(step)),
-            data: &config.data,
-            checkpoint: &config.checkpoint,
-            folder: self.folder("stage2"),
-            device: &self.device.clone().autodiff(),
-        };
+        let batches = Stage2Batches::new(&self.config, reader, Arc::new(cache))?;
+        let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
         let mut model = self.new_model();
         (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
-        let model = plan.train(model, stop, sink)?;
+        let model = self.plan(Stage::Stage2, batches).train(model, held_out, stop, sink)?;
         Ok(weights::save(&model, &self.weights(Stage::Stage2))?)
+    }
+
+    fn plan(&self, stage: Stage, batches: Arc<MakeBatch>) -> StagePlan<'_> {
+        let Config { stage1, stage2, .. } = &self.config;
+        let (num_steps, accumulate, optimizer, renderer_lr_factor) = match stage {
+            Stage::Stage2 => (stage2.steps, stage2.accumulate, &stage2.optimizer, stage2.renderer_lr_factor),
+            _ => (stage1.steps, stage1.accumulate, &stage1.optimizer, 1.0),
+        };
+        StagePlan {
+            stage,
+            num_steps,
+            accumulate,
+            optimizer,
+            renderer_lr_factor,
+            batches,
+            config: &self.config,
+            folder: self.folder(stage.name()),
+            device: self.device.clone().autodiff(),
+        }
     }
 
     fn clusters(
@@ -235,7 +228,6 @@ impl Run {
                 path: folder,
             });
         }
-        use burn::module::Module;
         let encoder = model.encoder.valid();
         ClusterJob { config: &self.config, reader, encoder: &encoder, encoder_hash, device: &self.device }
             .make(&folder, stop, sink)

@@ -13,8 +13,9 @@ use clift_model::Clift;
 
 use crate::TrainError;
 use crate::checkpoint::{Checkpoints, Progress};
-use crate::config::{CheckpointConfig, DataConfig, OptimizerConfig};
+use crate::config::{Config, OptimizerConfig};
 use crate::events::{Event, Sink, Stage, StepEvent};
+use crate::held_out::HeldOut;
 use crate::loss::psnr_of;
 use crate::optim::adamw;
 use crate::schedule::warm_up_cosine;
@@ -23,9 +24,6 @@ use crate::step::{Learner, StageBatch, Update};
 
 /// Makes the batch of a step, in any thread.
 pub type MakeBatch = dyn Fn(u64) -> Result<StageBatch, TrainError> + Send + Sync;
-
-/// Measures a model on held-out views; given the stage and the step.
-pub type Validate<'a> = dyn Fn(&Clift, Stage, u64, &mut dyn Sink) -> Result<(), TrainError> + 'a;
 
 /// What one stage trains, on what, for how long.
 pub struct StagePlan<'a> {
@@ -39,20 +37,14 @@ pub struct StagePlan<'a> {
     pub optimizer: &'a OptimizerConfig,
     /// Learning rate of the renderer over that of the rest.
     pub renderer_lr_factor: f64,
-    /// Steps between validations; 0 for none.
-    pub validate_every: u64,
-    /// Measures held-out views.
-    pub validate: &'a Validate<'a>,
     /// The batches.
     pub batches: Arc<MakeBatch>,
-    /// Threads that make them and how many they make ahead.
-    pub data: &'a DataConfig,
-    /// How often the state is saved.
-    pub checkpoint: &'a CheckpointConfig,
+    /// Loader, checkpoints and validations.
+    pub config: &'a Config,
     /// Folder of the stage inside the run.
     pub folder: PathBuf,
     /// Where tensors live, with autodiff.
-    pub device: &'a Device,
+    pub device: Device,
 }
 
 impl StagePlan<'_> {
@@ -61,9 +53,17 @@ impl StagePlan<'_> {
     /// # Errors
     /// [`TrainError::Interrupted`] after `stop` was set and the state saved, [`TrainError::Diverged`]
     /// after too many bad steps, and whatever data, model or disk give.
-    pub fn train(&self, model: Clift, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<Clift, TrainError> {
+    pub fn train(
+        &self,
+        model: Clift,
+        held_out: &HeldOut,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Clift, TrainError> {
+        let Config { data, checkpoint, eval, .. } = self.config;
         let started = Instant::now();
-        let checkpoints = Checkpoints::new(self.folder.join("checkpoints"), self.checkpoint.keep);
+        let samples = self.folder.join("samples");
+        let checkpoints = Checkpoints::new(self.folder.join("checkpoints"), checkpoint.keep);
         let mut learner = Learner { model, optimizer: adamw(self.optimizer), device: self.device.clone() };
         let mut progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
         learner.model = self.freeze(learner.model);
@@ -72,7 +72,6 @@ impl StagePlan<'_> {
         sink.event(&Event::StageStarted { stage: self.stage, done: progress.step, num_steps: self.num_steps });
 
         let make = self.batches.clone();
-        let data = self.data;
         let batches =
             Prefetcher::new(move |step| make(step), progress.step, self.num_steps, data.num_threads, data.num_prefetch);
         for batch in batches {
@@ -90,19 +89,19 @@ impl StagePlan<'_> {
                 self.note_bad_step(progress, &batch, &checkpoints, &mut sink)?;
             }
             let last = step == self.num_steps;
-            if due(step, self.validate_every) && !last {
-                (self.validate)(&learner.inference_model(), self.stage, step, &mut sink)?;
+            if due(step, eval.every) && !last {
+                held_out.validate(&learner.inference_model(), self.stage, step, &samples, &mut sink)?;
             }
             // A checkpoint is a good state: none is made between bad steps.
             let interrupted = stop.load(Ordering::Relaxed);
-            if progress.bad_steps == 0 && (due(step, self.checkpoint.every) || last || interrupted) {
+            if progress.bad_steps == 0 && (due(step, checkpoint.every) || last || interrupted) {
                 sink.event(&Event::Checkpoint { path: checkpoints.save(&learner, progress)? });
             }
             if interrupted && !last {
                 return Err(TrainError::Interrupted { step });
             }
         }
-        (self.validate)(&learner.inference_model(), self.stage, self.num_steps, &mut sink)?;
+        held_out.validate(&learner.inference_model(), self.stage, self.num_steps, &samples, &mut sink)?;
         sink.event(&Event::StageFinished { stage: self.stage, elapsed_s: started.elapsed().as_secs_f64() });
         drop(sink);
         let path = metrics.path().to_owned();
