@@ -93,11 +93,19 @@ fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
 pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     let io = |error| DataError::io("writing", path)(error);
-    let mut file = NamedTempFile::new_in(folder).map_err(io)?;
+    let mut file = new_file_in(folder).map_err(io)?;
     file.write_all(bytes).map_err(io)?;
     file.as_file().sync_all().map_err(io)?;
     file.persist(path).map_err(|error| io(error.error))?;
     Ok(())
+}
+
+/// A temporary file that, unlike others, everyone may read whom the umask lets: it becomes a part of a data set.
+fn new_file_in(folder: &Path) -> std::io::Result<NamedTempFile> {
+    let mut builder = tempfile::Builder::new();
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    builder.tempfile_in(folder)
 }
 
 /// Packs scenes as `torch.save` would: pickle first, then the storages, stored and aligned to 64 bytes.

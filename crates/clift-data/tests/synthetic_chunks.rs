@@ -64,3 +64,15 @@ fn chunks_are_split_at_the_size_asked_for_and_described_as_their_source_is() {
     assert_eq!(stored.to_string(), made.to_string());
     assert_eq!(stored.image_size, Some([40, 24]));
 }
+
+#[cfg(unix)]
+#[test]
+fn written_files_have_the_permissions_of_other_files_there() {
+    use std::os::unix::fs::PermissionsExt;
+    let root = tempfile::tempdir().unwrap();
+    write(root.path());
+    std::fs::write(root.path().join("other"), "").unwrap();
+    let mode = |name: &str| root.path().join(name).metadata().unwrap().permissions().mode();
+    assert_eq!(mode("train/000000.torch"), mode("other"));
+    assert_eq!(mode("train/index.json"), mode("other"));
+}
