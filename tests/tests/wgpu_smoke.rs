@@ -1,6 +1,4 @@
 //! A training step on a GPU (Mesa's software Vulkan counts) gives what the CPU gives.
-#![cfg(feature = "wgpu")]
-
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Gradients, Tensor};
 use clift_model::device::DeviceName;

@@ -1,5 +1,6 @@
 //! The sweep: every scene encoded once, rendered with every variant at every token count.
 
+use std::collections::BTreeMap;
 use std::time::Instant;
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
@@ -19,6 +20,9 @@ use crate::upload::{upload_cameras, upload_views};
 
 /// Target views rendered at once: bounds memory for clips with a hundred targets.
 const VIEWS_PER_PASS: usize = 8;
+
+/// Most rows of a sheet; more targets are thinned evenly.
+const MAX_ROWS: usize = 6;
 
 /// The networks of an evaluation, on a device without autodiff.
 #[derive(Clone, Debug)]
@@ -46,11 +50,36 @@ pub struct Sweep {
     pub seed: u64,
 }
 
-/// A rendered picture, `height * width * 3` values of RGB, with what was measured of it.
+/// All targets of a scene in one setting.
 struct Rendered {
     setting: Setting,
-    pixels: Vec<Vec<f32>>,
     measured: Vec<Measured>,
+    /// The pictures a sheet shows, by view: `height * width * 3` values of RGB.
+    shown: BTreeMap<usize, Vec<f32>>,
+}
+
+impl Rendered {
+    fn new(setting: Setting) -> Self {
+        Self { setting, measured: Vec::new(), shown: BTreeMap::new() }
+    }
+
+    /// Measures the next view, and keeps its picture if it is to be shown.
+    fn add(&mut self, pixels: Vec<f32>, target: &HostViews, rows: &[usize]) -> Result<(), EvalError> {
+        let view = self.measured.len();
+        self.measured.push(measure(&pixels, target, view)?);
+        if rows.contains(&view) {
+            self.shown.insert(view, pixels);
+        }
+        Ok(())
+    }
+}
+
+/// The views a sheet shows: all, or `MAX_ROWS` of them from the first to the last.
+fn sheet_rows(num_views: usize) -> Vec<usize> {
+    if num_views <= MAX_ROWS {
+        return (0..num_views).collect();
+    }
+    (0..MAX_ROWS).map(|row| row * (num_views - 1) / (MAX_ROWS - 1)).collect()
 }
 
 /// Renders and measures the targets of one scene; returns a sheet of pictures when asked for.
@@ -70,7 +99,8 @@ pub fn evaluate_scene(
     let device = &networks.device;
     let lift = networks.encoder.forward(&upload_views(&[&clip.context], device)?); // [1, N, D]
     let num_tokens = lift.dims()[1];
-    let mut renderings = baselines(clip)?;
+    let rows = if with_sheet { sheet_rows(clip.target.num_views()) } else { Vec::new() };
+    let mut renderings = baselines(clip, &rows)?;
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
         let seed = derive_seed(sweep.seed, &clip.key);
@@ -88,7 +118,7 @@ pub fn evaluate_scene(
                 Variant::Patch | Variant::NearestView | Variant::MeanImage => continue,
             };
             let setting = Setting { variant, num_storage_tokens, num_render_tokens: num_storage_tokens };
-            renderings.push(render(renderer, tokens, &clip.target, setting)?);
+            renderings.push(render(renderer, tokens, &clip.target, setting, &rows)?);
         }
     }
     for rendering in &renderings {
@@ -99,7 +129,7 @@ pub fn evaluate_scene(
             }
         }
     }
-    if with_sheet { Ok(Some(scene_sheet(clip, &renderings)?)) } else { Ok(None) }
+    if with_sheet { Ok(Some(scene_sheet(clip, &renderings, &rows)?)) } else { Ok(None) }
 }
 
 /// K-means of one count, computed when the first variant asks.
@@ -135,11 +165,16 @@ fn random_subset(lift: &Tensor<3>, count: usize, seed: u64) -> Tensor<3> {
     lift.clone().select(1, index)
 }
 
-fn render(renderer: &Renderer, tokens: Tensor<3>, target: &HostViews, setting: Setting) -> Result<Rendered, EvalError> {
-    let device = tokens.device();
-    let mut rendered = Rendered { setting, pixels: Vec::new(), measured: Vec::new() };
+fn render(
+    renderer: &Renderer,
+    tokens: Tensor<3>,
+    target: &HostViews,
+    setting: Setting,
+    rows: &[usize],
+) -> Result<Rendered, EvalError> {
+    let mut rendered = Rendered::new(setting);
     let frame_len = target.height * target.width * 3;
-    let cameras = upload_cameras(&[target], &device)?;
+    let cameras = upload_cameras(&[target], &tokens.device())?;
     for start in (0..target.num_views()).step_by(VIEWS_PER_PASS) {
         let count = VIEWS_PER_PASS.min(target.num_views() - start);
         let cameras = Cameras {
@@ -151,30 +186,25 @@ fn render(renderer: &Renderer, tokens: Tensor<3>, target: &HostViews, setting: S
         let images = renderer.forward(tokens.clone(), &cameras); // [1, T, H, W, 3]
         let values: Vec<f32> = images.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)?;
         let render_s = started.elapsed().as_secs_f64() / count as f64;
-        for (view, pixels) in values.chunks(frame_len).enumerate() {
-            let measured = measure(pixels, target, start + view)?;
-            rendered.measured.push(Measured { render_s: Some(render_s), ..measured });
-            rendered.pixels.push(pixels.to_vec());
+        for pixels in values.chunks(frame_len) {
+            rendered.add(pixels.to_vec(), target, rows)?;
+        }
+        for measured in &mut rendered.measured[start..] {
+            measured.render_s = Some(render_s);
         }
     }
     Ok(rendered)
 }
 
-fn baselines(clip: &Clip) -> Result<Vec<Rendered>, EvalError> {
+fn baselines(clip: &Clip, rows: &[usize]) -> Result<Vec<Rendered>, EvalError> {
     let mean = mean_image(&clip.context)?;
-    let mut nearest = Vec::new();
+    let mut nearest = Rendered::new(Setting::baseline(Variant::NearestView));
+    let mut means = Rendered::new(Setting::baseline(Variant::MeanImage));
     for &pose in &clip.target.c2w {
-        nearest.push(nearest_image(&clip.context, pose)?);
+        nearest.add(nearest_image(&clip.context, pose)?, &clip.target, rows)?;
+        means.add(mean.clone(), &clip.target, rows)?;
     }
-    let means = vec![mean; clip.target.num_views()];
-    [(Variant::NearestView, nearest), (Variant::MeanImage, means)]
-        .into_iter()
-        .map(|(variant, pixels)| {
-            let views = pixels.iter().enumerate();
-            let measured = views.map(|(view, pixels)| measure(pixels, &clip.target, view)).collect::<Result<_, _>>()?;
-            Ok(Rendered { setting: Setting::baseline(variant), pixels, measured })
-        })
-        .collect()
+    Ok(vec![nearest, means])
 }
 
 /// Ground truth of one target in `[0, 1]`.
@@ -193,7 +223,7 @@ fn measure(pixels: &[f32], target: &HostViews, view: usize) -> Result<Measured, 
 
 /// Columns: contexts, target, nearest view, then the fewest and the most tokens of the best variant
 /// there is, and the error of the last.
-fn scene_sheet(clip: &Clip, renderings: &[Rendered]) -> Result<Picture, EvalError> {
+fn scene_sheet(clip: &Clip, renderings: &[Rendered], shown_views: &[usize]) -> Result<Picture, EvalError> {
     let best = [Variant::Clift, Variant::Kmeans, Variant::Random];
     let best = best.into_iter().find(|variant| renderings.iter().any(|r| r.setting.variant == *variant));
     let mut shown: Vec<&Rendered> = renderings.iter().filter(|r| Some(r.setting.variant) == best).collect();
@@ -220,7 +250,7 @@ fn scene_sheet(clip: &Clip, renderings: &[Rendered]) -> Result<Picture, EvalErro
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
 
     let mut rows = Vec::new();
-    for (view, frame) in clip.target.frame_index.iter().enumerate() {
+    for &view in shown_views {
         let truth = truth(&clip.target, view);
         let cell = |picture: Picture, caption: String| Cell { pictures: vec![picture], caption };
         let mut cells = vec![
@@ -229,12 +259,36 @@ fn scene_sheet(clip: &Clip, renderings: &[Rendered]) -> Result<Picture, EvalErro
         ];
         for rendered in nearest.iter().chain(&shown) {
             let caption = format!("{:.2} dB", rendered.measured[view].psnr);
-            cells.push(cell(Picture::from_unit(&rendered.pixels[view], height, width)?, caption));
+            cells.push(cell(Picture::from_unit(&rendered.shown[&view], height, width)?, caption));
         }
         if let Some(last) = shown.last() {
-            cells.push(cell(error_map(&last.pixels[view], &truth, height, width)?, String::new()));
+            cells.push(cell(error_map(&last.shown[&view], &truth, height, width)?, String::new()));
         }
-        rows.push(Row { label: format!("frame {frame}"), cells });
+        rows.push(Row { label: format!("frame {}", clip.target.frame_index[view]), cells });
     }
     Ok(sheet(&clip.key, &columns, &rows))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sheet_of_many_views_goes_from_the_first_to_the_last() {
+        assert_eq!(sheet_rows(3), [0, 1, 2]);
+        assert_eq!(sheet_rows(6), [0, 1, 2, 3, 4, 5]);
+        let rows = sheet_rows(121);
+        assert_eq!((rows.len(), rows[0], rows[MAX_ROWS - 1]), (MAX_ROWS, 0, 120));
+    }
+
+    #[test]
+    fn random_subsets_are_distinct_nested_and_of_the_seed() {
+        let device = Device::flex();
+        let lift = Tensor::<1, Int>::arange(0..50, &device).float().reshape([1, 50, 1]);
+        let subset = |count, seed| random_subset(&lift, count, seed).into_data().try_to_vec::<f32>().expect("f32");
+        let (few, more) = (subset(5, 1), subset(20, 1));
+        assert!(few.iter().all(|token| more.contains(token)));
+        assert!(more.windows(2).all(|pair| pair[0] < pair[1]));
+        assert_ne!(subset(5, 1), subset(5, 2));
+    }
 }

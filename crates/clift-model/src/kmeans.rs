@@ -63,7 +63,7 @@ impl KMeans {
         }
         // Distances are differences of squares: taken about the mean they lose the fewest digits.
         let tokens = tokens.clone() - tokens.mean_dim(1);
-        let samples = Samples::new(tokens);
+        let samples = Samples::new(tokens)?;
         let means = samples.seed(num_clusters, seeds);
         self.lloyd(&samples, means)
     }
@@ -73,7 +73,7 @@ impl KMeans {
         let mut done: Vec<Option<Labels>> = vec![None; batch];
         let mut previous: Vec<Option<Labels>> = vec![None; batch];
         for iteration in 0.. {
-            let labels = samples.assign(&means)?;
+            let labels = samples.assign(&means);
             for ((mut labels, done), previous) in labels.into_iter().zip(&mut done).zip(&mut previous) {
                 if done.is_some() {
                     continue;
@@ -161,9 +161,17 @@ struct Samples {
 }
 
 impl Samples {
-    fn new(tokens: Tensor<3>) -> Self {
+    /// # Errors
+    /// [`ModelError::BadClusters`] when a squared length is not finite.
+    fn new(tokens: Tensor<3>) -> Result<Self, ModelError> {
+        let num_tokens = tokens.dims()[1];
         let squares = tokens.clone().square().sum_dim(2);
-        Self { tokens, squares }
+        let lengths: Vec<f32> = squares.to_data().convert::<f32>().try_to_vec().expect("converted to f32");
+        if let Some(token) = lengths.iter().position(|length| !length.is_finite()) {
+            let what = format!("a token of scene {} is not finite", token / num_tokens);
+            return Err(ModelError::BadClusters { what });
+        }
+        Ok(Self { tokens, squares })
     }
 
     fn device(&self) -> Device {
@@ -216,23 +224,19 @@ impl Samples {
     }
 
     /// The nearest mean of every token, per scene.
-    fn assign(&self, means: &Tensor<3>) -> Result<Vec<Labels>, ModelError> {
+    fn assign(&self, means: &Tensor<3>) -> Vec<Labels> {
         let num_tokens = self.tokens.dims()[1];
         let (distance, assignment) = self.distances(means.clone()).min_dim_with_indices(2);
         let distance: Vec<f32> = distance.into_data().convert::<f32>().try_to_vec::<f32>().expect("converted to f32");
         let assignment: Vec<i64> =
             assignment.into_data().convert::<i64>().try_to_vec::<i64>().expect("converted to i64");
-        if let Some(token) = distance.iter().position(|d| !d.is_finite()) {
-            let what = format!("token {} of scene {} is not finite", token % num_tokens, token / num_tokens);
-            return Err(ModelError::BadClusters { what });
-        }
         let scenes = assignment.chunks(num_tokens).zip(distance.chunks(num_tokens));
-        Ok(scenes
+        scenes
             .map(|(assignment, distance)| Labels {
                 assignment: assignment.iter().map(|&cluster| cluster as u32).collect(),
                 distance: distance.to_vec(),
             })
-            .collect())
+            .collect()
     }
 
     /// Mean of the tokens of every cluster; none is empty.
@@ -358,10 +362,13 @@ mod tests {
     }
 
     #[test]
-    fn a_token_that_is_not_finite_is_named() {
-        let device = Device::flex();
-        let tokens = Tensor::<3>::from_floats([[[0.0], [1.0], [f32::NAN]]], &device);
-        let message = KMeans::default().fit(tokens, 2, &[0]).unwrap_err().to_string();
-        assert!(message.contains("not finite"), "{message}");
+    fn a_token_that_is_not_finite_is_refused_with_its_scene() {
+        for device in devices() {
+            for bad in [f32::NAN, f32::INFINITY, f32::MAX] {
+                let tokens = Tensor::<3>::from_floats([[[0.0], [1.0], [2.0]], [[0.0], [1.0], [bad]]], &device);
+                let message = KMeans::default().fit(tokens, 2, &[0, 0]).unwrap_err().to_string();
+                assert_eq!(message, "bad clusters: a token of scene 1 is not finite");
+            }
+        }
     }
 }

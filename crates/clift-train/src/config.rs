@@ -252,7 +252,12 @@ impl Config {
     /// [`TrainError::BadConfig`] naming the key, the value and the fix.
     pub fn validate(&self) -> Result<(), TrainError> {
         self.model.validate()?;
-        self.model.num_tokens(1, self.data.height, self.data.width)?;
+        let fewest_tokens = self.model.num_tokens(self.data.views.min_context, self.data.height, self.data.width)?;
+        for count in &self.clusters.grid {
+            if count.of(fewest_tokens).is_err() {
+                return Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens")));
+            }
+        }
         self.data.views.validate()?;
         match self.data.source {
             SourceKind::Synthetic => self.data.synthetic.validate()?,
@@ -327,6 +332,10 @@ mod tests {
         config.loss.perceptual_weight = 0.5;
         assert!(config.validate().unwrap_err().to_string().contains("not built yet"));
         config.loss.perceptual_weight = 0.0;
+        config.clusters.grid = vec![TokenCount::Count(5000)];
+        let message = config.validate().unwrap_err().to_string();
+        assert_eq!(message, "`clusters.grid` = 5000: a scene has as few as 4096 tokens");
+        config.clusters.grid = vec![TokenCount::Count(64)];
         config.data.source = SourceKind::Chunks;
         assert!(config.validate().unwrap_err().to_string().starts_with("`data.root` = missing"));
     }

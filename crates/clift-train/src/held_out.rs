@@ -26,9 +26,15 @@ impl<'a> HeldOut<'a> {
     /// Chooses at most `num_scenes` scenes (0: all) of `reader` and their views, to be measured on `device`.
     ///
     /// # Errors
-    /// As [`evaluation_items`].
+    /// As [`evaluation_items`], and [`clift_eval::EvalError::BadTokenCount`] for a count a scene does not have.
     pub fn new(config: &'a Config, reader: ClipReader, num_scenes: usize, device: &Device) -> Result<Self, TrainError> {
         let (items, ledger) = evaluation_items(&config.eval, &reader, num_scenes)?;
+        // A count that a scene does not have is found now, not at the end of training.
+        let tokens_per_view = config.model.num_tokens(1, config.data.height, config.data.width)?;
+        let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
+        for count in config.eval.storage.iter().chain([&config.eval.validation_storage]) {
+            count.of(fewest_views * tokens_per_view)?;
+        }
         Ok(Self { config, reader, items, ledger, device: device.clone() })
     }
 
