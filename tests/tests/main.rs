@@ -1,0 +1,8 @@
+//! Whole runs through the command line: what a user types, and the files and exit codes that follow.
+
+mod bad_input;
+mod hyperparameters;
+mod loss_curve;
+mod pipeline;
+mod resume;
+mod support;

@@ -1,0 +1,233 @@
+//! A run from the first step to the report, and its directory.
+
+use serde_json::Value;
+
+use crate::support::{Place, clift};
+
+/// Keys of a JSON object, in any order.
+fn keys(value: &Value) -> Vec<&str> {
+    let mut keys: Vec<&str> = value.as_object().expect("an object").keys().map(String::as_str).collect();
+    keys.sort_unstable();
+    keys
+}
+
+#[test]
+fn a_run_writes_every_documented_file() {
+    let place = Place::new();
+    let ran = place.train("run", &[], &[]).ok();
+    assert!(ran.stdout.contains("nearest_view") && ran.stdout.contains("clift "), "{}", ran.stdout);
+    assert!(ran.stdout.trim_end().ends_with("run/eval"), "{}", ran.stdout);
+    let changed = format!("--set run_dir: \"runs/tiny\" -> {:?}\n", place.at("run"));
+    assert!(ran.stderr.contains(&changed), "what differs from the file is printed: {}", ran.stderr);
+
+    let config = place.text("run/config.toml");
+    // Resolved: overrides, and defaults that neither the file nor an override names.
+    for line in ["steps = 6", "dim = 16", "max_grad_norm = 1.0", "exact_principal_point = false"] {
+        assert!(config.contains(line), "{line}: {config}");
+    }
+    assert_eq!(place.json("run/run.json"), serde_json::json!({"version": 1, "overfit": null}));
+
+    let lines = place.metrics("run");
+    let steps = lines.iter().map(|line| (line["stage"].as_str().unwrap(), line["step"].as_u64().unwrap()));
+    let expected = (1..=6).map(|step| ("stage1", step)).chain((1..=4).map(|step| ("stage2", step)));
+    assert_eq!(steps.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
+    for line in &lines {
+        assert_eq!(keys(line), ["grad_norm", "loss", "lr", "psnr", "stage", "step", "step_s"]);
+        let number = |key: &str| line[key].as_f64().unwrap_or_else(|| panic!("{key}: {line}"));
+        assert!(number("loss") > 0.0 && number("grad_norm") > 0.0 && number("step_s") > 0.0, "{line}");
+        // Written from the same f64 to the last digit.
+        assert!((number("psnr") + 10.0 * number("loss").log10()).abs() < 1e-9, "{line}");
+    }
+    // Warm-up of two steps to 1e-3, then half a cosine to nothing at step 6.
+    assert_eq!(lines[1]["lr"], 1e-3);
+    assert!(lines[5]["lr"].as_f64().unwrap() < 1e-18, "{}", lines[5]);
+
+    let summary = place.json("run/eval/summary.json");
+    assert_eq!(keys(&summary), ["baselines", "num_scenes", "num_skipped", "num_views", "points"]);
+    assert_eq!(
+        (&summary["num_scenes"], &summary["num_views"], &summary["num_skipped"]),
+        (&3.into(), &6.into(), &0.into())
+    );
+    assert_eq!(keys(&summary["baselines"]), ["mean_image", "nearest_view"]);
+    for baseline in ["mean_image", "nearest_view"] {
+        let baseline = &summary["baselines"][baseline];
+        assert_eq!(keys(baseline), ["psnr", "ssim"]);
+        assert!(baseline["psnr"].as_f64().unwrap() > 5.0 && baseline["ssim"].is_f64(), "{baseline}");
+    }
+    let points = summary["points"].as_array().unwrap();
+    let settings: Vec<_> = points
+        .iter()
+        .map(|point| (point["variant"].as_str().unwrap(), point["num_storage_tokens"].as_u64().unwrap()))
+        .collect();
+    assert_eq!(settings, [("clift", 4), ("clift", 8), ("kmeans", 4), ("kmeans", 8), ("random", 4), ("random", 8)]);
+    for point in points {
+        let documented = [
+            "gflops",
+            "lpips_vgg",
+            "num_identical_views",
+            "num_render_tokens",
+            "num_storage_tokens",
+            "psnr",
+            "psnr_per_view",
+            "psnr_stderr",
+            "render_s",
+            "scene_bytes",
+            "select_s",
+            "ssim",
+            "variant",
+        ];
+        assert_eq!(keys(point), documented);
+        assert_eq!(point["num_render_tokens"], point["num_storage_tokens"]);
+        assert!(point["psnr"].is_f64() && point["psnr_stderr"].is_f64() && point["ssim"].is_f64(), "{point}");
+    }
+
+    let views = place.text("run/eval/views.csv");
+    // A header, then 6 views of 6 points and 2 baselines.
+    assert_eq!(views.lines().count(), 1 + 6 * 8, "{views}");
+
+    let names = |folder: &str| {
+        let items = std::fs::read_dir(place.at(folder)).unwrap_or_else(|error| panic!("{folder}: {error}"));
+        let mut names: Vec<_> = items.map(|item| item.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    };
+    assert_eq!(names("run/eval/sheets"), ["synthetic-0-test-00000.png"], "eval.num_sheets = 1");
+    assert_eq!(names("run/stage1/samples"), ["step-000000003.png", "step-000000006.png"], "eval.every = 3");
+    assert_eq!(names("run/stage2/samples"), ["step-000000003.png", "step-000000004.png"]);
+    for folder in ["run/eval/sheets", "run/stage1/samples", "run/stage2/samples"] {
+        for name in names(folder) {
+            let path = place.at(folder).join(name);
+            let picture = image::open(&path).unwrap_or_else(|error| panic!("{path:?}: {error}")).into_rgb8();
+            // Two targets below each other, at least five columns beside each other.
+            assert!(picture.width() >= 5 * 16 && picture.height() >= 2 * 16, "{path:?}: {:?}", picture.dimensions());
+            let first = picture.get_pixel(0, 0);
+            assert!(picture.pixels().any(|pixel| pixel != first), "{path:?} is blank");
+        }
+    }
+
+    let clusters = place.json("run/clusters/index.json");
+    assert_eq!(clusters["entries"].as_array().unwrap().len(), 6);
+    assert_eq!(names("run/stage1/checkpoints"), ["step-000000004", "step-000000006"], "every 2, the last 2 are kept");
+    assert_eq!(names("run/stage2/checkpoints"), ["step-000000002", "step-000000004"]);
+    let part = |stage: &str, network: &str| place.weights("run", stage).part(network).0.len();
+    assert_eq!(
+        (part("stage1", "encoder."), part("stage1", "renderer.")),
+        (part("stage2", "encoder."), part("stage2", "renderer."))
+    );
+    assert!(part("stage2", "condenser.") > 0);
+    assert!(place.weights("run", "stage1").0.keys().all(|name| !name.starts_with("condenser.")));
+}
+
+/// `summary.json` without what the clock decides.
+pub fn summary_but_time(place: &Place, name: &str) -> Value {
+    let mut summary = place.json(name);
+    for point in summary["points"].as_array_mut().expect("a list") {
+        for key in ["render_s", "select_s"] {
+            point.as_object_mut().expect("an object").remove(key);
+        }
+    }
+    summary
+}
+
+#[test]
+fn a_run_can_be_moved_and_evaluated_with_other_counts() {
+    let place = Place::new();
+    place.train("before", &[], &[]).ok();
+    let summary = summary_but_time(&place, "before/eval/summary.json");
+    std::fs::rename(place.at("before"), place.at("after")).unwrap();
+
+    let ran = place.eval("after", &[]).ok();
+    assert!(ran.stdout.trim_end().ends_with("after/eval"), "{}", ran.stdout);
+    assert_eq!(summary_but_time(&place, "after/eval/summary.json"), summary);
+    assert!(!place.at("before").exists(), "nothing is written to where the run was trained");
+
+    let out = place.at("elsewhere");
+    place.eval("after", &["--storage", "3,1/2", "--set", "eval.num_scenes=2", "--out", out.to_str().unwrap()]).ok();
+    let other = place.json("elsewhere/summary.json");
+    assert_eq!(other["num_scenes"], 2);
+    let stored: Vec<_> = other["points"].as_array().unwrap().iter().map(|point| &point["num_storage_tokens"]).collect();
+    assert_eq!(stored, [3, 4, 3, 4, 3, 4]);
+    assert_eq!(
+        summary_but_time(&place, "after/eval/summary.json"),
+        summary,
+        "--out leaves the run's own results alone"
+    );
+}
+
+#[test]
+fn the_stages_one_by_one_give_the_whole_runs_weights_to_the_bit() {
+    let place = Place::new();
+    place.train("whole", &[], &[]).ok();
+    for stage in ["stage1", "clusters", "stage2"] {
+        let ran = place.train("parts", &[], &["--only", stage]).ok();
+        assert!(ran.stdout.is_empty(), "a part has no evaluation to print: {}", ran.stdout);
+    }
+    assert!(!place.at("parts/eval").exists());
+    place.assert_same_result("parts", "whole");
+    assert_eq!(place.metrics_but_time("parts"), place.metrics_but_time("whole"));
+    place.eval("parts", &[]).ok();
+    let summary = |run: &str| summary_but_time(&place, &format!("{run}/eval/summary.json"));
+    assert_eq!(summary("parts"), summary("whole"));
+}
+
+#[test]
+fn a_stage_before_its_turn_names_what_to_run_first() {
+    let place = Place::new();
+    for stage in ["stage2", "clusters"] {
+        let message = place.train("run", &[], &["--only", stage]).fails(2);
+        let expected =
+            format!("error: {stage} needs the weights of stage 1, which is not there; run --only stage1 first: ");
+        assert!(message.contains(&expected), "{message}");
+        assert!(message.trim_end().ends_with("run/stage1/model.safetensors"), "{message}");
+    }
+    place.train("run", &[], &["--only", "stage1"]).ok();
+    let message = place.train("run", &[], &["--only", "stage2"]).fails(2);
+    assert!(message.contains("error: stage2 needs the cluster cache, which is not there; run --only clusters first: "));
+    // Without stage 2 there is still something to measure, and it says so.
+    let ran = place.eval("run", &[]).ok();
+    assert!(ran.stderr.contains("stage 2 has not run"), "{}", ran.stderr);
+    assert!(!ran.stdout.contains("\nclift "), "{}", ran.stdout);
+
+    let message = clift(["eval", place.at("nowhere").to_str().unwrap()]).fails(2);
+    assert!(message.contains("nowhere/config.toml"), "{message}");
+}
+
+#[test]
+fn overfitting_one_scene_trains_and_measures_that_scene() {
+    let place = Place::new();
+    place.train("run", &["stage1.steps=20", "stage2.steps=2"], &["--overfit", "1"]).ok();
+    assert_eq!(place.json("run/run.json")["overfit"], 1);
+    let summary = place.json("run/eval/summary.json");
+    assert_eq!((&summary["num_scenes"], &summary["num_views"]), (&1.into(), &2.into()));
+    let views = place.text("run/eval/views.csv");
+    assert!(views.lines().skip(1).all(|line| line.contains("synthetic-0-train-0")), "{views}");
+    assert_eq!(place.json("run/clusters/index.json")["entries"].as_array().unwrap().len(), 1);
+    // One scene over and over: the loss of the last five steps is below that of the first five.
+    let losses: Vec<f64> = place.metrics("run").iter().map(|line| line["loss"].as_f64().unwrap()).collect();
+    let mean = |losses: &[f64]| losses.iter().sum::<f64>() / losses.len() as f64;
+    assert!(mean(&losses[15..20]) < mean(&losses[..5]), "{losses:?}");
+}
+
+#[test]
+fn a_run_starts_from_another_runs_weights_and_says_so() {
+    let place = Place::new();
+    place.train("first", &["seed=7"], &["--only", "stage1"]).ok();
+    let first = place.at("first").display().to_string();
+    let file = place.at("first/stage1/model.safetensors").display().to_string();
+    for from in [&first, &file] {
+        // No steps: the weights of the second run are those it starts from.
+        let set = [&format!("stage1.init_from={from:?}"), "stage1.steps=0"];
+        let ran = place.train("second", &set, &["--only", "stage1", "--fresh"]).ok();
+        let count = place.weights("first", "stage1").0.len();
+        let expected =
+            format!("loaded {count} parameters from {file}; left as they were: none; unused in the file: none");
+        assert!(ran.stderr.contains(&expected), "{expected}\nis not in\n{}", ran.stderr);
+        assert_eq!(place.weights("second", "stage1"), place.weights("first", "stage1"));
+    }
+
+    let set = [&format!("stage1.init_from={first:?}"), "model.dim=8"];
+    let message = place.train("third", &set, &["--only", "stage1"]).fails(1);
+    assert!(message.contains(&file), "weights of another width: {message}");
+    let message = place.train("fourth", &["stage1.init_from=no/such/run.safetensors"], &[]).fails(1);
+    assert!(message.contains("no/such/run.safetensors"), "{message}");
+}

@@ -1,0 +1,179 @@
+//! Runs that stop and go on: the result is that of a run that never stopped.
+
+use std::path::Path;
+use std::process::{Child, Command};
+use std::time::{Duration, Instant};
+
+use crate::support::{Place, Ran, files, finish, spawn};
+
+/// Waits until a run has made `count` steps.
+fn wait_for_steps(run: &Path, child: &mut Child, count: usize) {
+    let started = Instant::now();
+    loop {
+        let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
+        if text.lines().count() >= count {
+            return;
+        }
+        assert!(child.try_wait().expect("a child").is_none(), "the run ended before step {count}");
+        assert!(started.elapsed() < Duration::from_secs(60), "no step {count} within a minute");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// Starts a run, sends it a signal after some steps and waits for its end.
+fn stop_after(place: &Place, name: &str, set: &[&str], flags: &[&str], count: usize, signal: &str) -> Ran {
+    let mut child = spawn(place.train_args(name, set, flags));
+    wait_for_steps(&place.at(name), &mut child, count);
+    let sent = Command::new("kill").args([signal, &child.id().to_string()]).status().expect("kill runs");
+    assert!(sent.success(), "the run is still there to be stopped");
+    finish(child)
+}
+
+/// Enough steps that a run is still going when the signal comes: a step takes milliseconds.
+const LONG: [&str; 4] = ["stage1.steps=120", "stage2.steps=120", "eval.every=50", "checkpoint.every=25"];
+
+#[test]
+fn an_interrupted_run_saves_exits_130_and_ends_as_if_it_had_not_been() {
+    let place = Place::new();
+    place.train("whole", &LONG, &[]).ok();
+
+    let message = stop_after(&place, "parts", &LONG, &[], 10, "-INT").fails(130);
+    let step = place.metrics("parts").len();
+    assert!((10..120).contains(&step), "{step}");
+    assert!(message.contains(&format!("error: interrupted at step {step}; the same command resumes")), "{message}");
+    assert!(message.contains(&format!("saved {}", place.at("parts/stage1/checkpoints").display())), "{message}");
+    assert!(place.at(&format!("parts/stage1/checkpoints/step-{step:09}")).is_dir());
+    assert!(!place.at("parts/stage1/model.safetensors").exists());
+
+    // Again, in the middle of stage 2.
+    let ran = stop_after(&place, "parts", &LONG, &[], 130, "-INT");
+    assert!(ran.stderr.contains(&format!("stage1: resumed after {step} of 120 steps")), "{}", ran.stderr);
+    ran.fails(130);
+    let message = place.train("parts", &LONG, &[]).ok().stderr;
+    assert!(message.contains("stage2: resumed after"), "{message}");
+
+    assert_eq!(place.metrics_but_time("parts"), place.metrics_but_time("whole"));
+    place.assert_same_result("parts", "whole");
+}
+
+#[test]
+fn a_killed_run_goes_on_from_its_last_checkpoint_to_the_same_weights() {
+    let place = Place::new();
+    let only = ["--only", "stage1"];
+    place.train("whole", &LONG, &only).ok();
+    // Past the checkpoint of step 25, with steps after it that are lost.
+    assert_eq!(stop_after(&place, "parts", &LONG, &only, 35, "-KILL").code, None);
+    let done = place.metrics("parts").len();
+    let stderr = place.train("parts", &LONG, &only).ok().stderr;
+    let resumed = format!("stage1: resumed after {} of 120 steps", done / 25 * 25);
+    // A save that was not finished when the signal came leaves the checkpoint before it.
+    let or_before = format!("stage1: resumed after {} of 120 steps", (done / 25 - 1) * 25);
+    assert!(stderr.contains(&resumed) || stderr.contains(&or_before), "{resumed}: {stderr}");
+    assert_eq!(place.metrics_but_time("parts"), place.metrics_but_time("whole"), "no step is missing or doubled");
+    assert_eq!(place.weights("parts", "stage1"), place.weights("whole", "stage1"));
+}
+
+#[test]
+fn a_run_stopped_while_clustering_makes_the_cache_anew() {
+    let place = Place::new();
+    place.train("whole", &[], &["--only", "stage1"]).ok();
+    // What a kill leaves: a half-written folder under its temporary name.
+    std::fs::create_dir(place.at("whole/clusters.tmp")).unwrap();
+    std::fs::write(place.at("whole/clusters.tmp/clusters.bin"), b"half").unwrap();
+    std::fs::create_dir_all(place.at("whole/stage2/checkpoints/step-000000002.tmp")).unwrap();
+    place.train("whole", &[], &[]).ok();
+    assert!(!place.at("whole/clusters.tmp").exists());
+    place.train("other", &[], &[]).ok();
+    place.assert_same_result("whole", "other");
+}
+
+#[test]
+fn the_number_of_loader_threads_does_not_change_the_weights() {
+    let place = Place::new();
+    place.train("none", &["data.num_threads=0"], &[]).ok();
+    place.train("two", &["data.num_threads=2", "data.num_prefetch=3"], &[]).ok();
+    assert_eq!(place.metrics_but_time("none"), place.metrics_but_time("two"));
+    place.assert_same_result("none", "two");
+}
+
+#[test]
+fn a_batch_worked_off_in_parts_gives_the_same_update() {
+    let place = Place::new();
+    let batches = ["stage1.batch_size=5", "stage2.batch_size=5"];
+    place.train("at_once", &batches, &[]).ok();
+    // Three scenes and two: parts weigh as many scenes as they have. Stage 2 on its own, because K-means may cluster
+    // other tokens after the smallest change of the encoder.
+    for stage in ["stage1", "stage2"] {
+        let accumulate = format!("{stage}.accumulate=2");
+        place.train(stage, &[&batches[..], &[accumulate.as_str()]].concat(), &[]).ok();
+        let (whole, parts) = (place.weights("at_once", stage), place.weights(stage, stage));
+        let moves: Vec<f64> = parts.moved_from(&whole).collect();
+        // Sums in another order differ in the last bit of f32. Adam divides by the size of a gradient, so one that is
+        // nearly zero may move its weight by another share of the rate of 1e-3; 7e-6 was the most, 4e-9 the mean.
+        let most = moves.iter().copied().fold(0.0, f64::max);
+        let mean = moves.iter().sum::<f64>() / moves.len() as f64;
+        assert!(most < 1e-4 && mean < 1e-7, "{stage}: {most:e}, {mean:e}");
+        for (part, whole) in place.metrics(stage).iter().zip(&place.metrics("at_once")) {
+            let relative = |key: &str| (part[key].as_f64().unwrap() / whole[key].as_f64().unwrap() - 1.0).abs();
+            // Eight times the rounding of one f32.
+            let same = relative("loss") < 1e-6 && relative("grad_norm") < 1e-6;
+            assert!(same || part["stage"] != stage, "{part} is not {whole}");
+        }
+    }
+}
+
+#[test]
+fn a_finished_run_is_left_as_it_is() {
+    let place = Place::new();
+    place.train("run", &[], &[]).ok();
+    let before = files(&place.at("run"));
+    let summary = crate::pipeline::summary_but_time(&place, "run/eval/summary.json");
+    let ran = place.train("run", &[], &[]).ok();
+    assert!(!ran.stderr.contains("stage1: 6 steps") && !ran.stderr.contains("stage2: 4 steps"), "{}", ran.stderr);
+    let after = files(&place.at("run"));
+    assert!(before.keys().eq(after.keys()), "{:?}", after.keys());
+    for (path, bytes) in &before {
+        // The evaluation is made again; its timings differ.
+        let timed = path.ends_with("eval/summary.json") || path.ends_with("eval/views.csv");
+        assert!(timed || *bytes == after[path], "{} changed", path.display());
+    }
+    assert_eq!(crate::pipeline::summary_but_time(&place, "run/eval/summary.json"), summary);
+}
+
+#[test]
+fn keys_that_decide_the_result_are_refused_by_name_and_others_may_change() {
+    let place = Place::new();
+    place.train("run", &[], &["--only", "stage1"]).ok();
+    let before = files(&place.at("run"));
+    for (change, expected) in [
+        ("seed=1", "  seed: 0 -> 1"),
+        ("stage1.steps=7", "  stage1.steps: 6 -> 7"),
+        ("stage1.optimizer.learning_rate=2e-3", "  stage1.optimizer.learning_rate: 0.001 -> 0.002"),
+        ("clusters.grid=[0.5]", "  clusters.grid: [\"1/2\", \"1/1\"] -> [\"1/2\"]"),
+        ("stage1.init_from=other", "  stage1.init_from: not set -> \"other\""),
+    ] {
+        let message = place.train("run", &[change], &[]).fails(2);
+        assert!(message.contains(&format!("settings:\n{expected}\nresume")), "{expected}: {message}");
+        assert!(message.contains("--fresh") && message.trim_end().ends_with("/run"), "{message}");
+    }
+    let message = place.train("run", &["seed=1", "stage1.steps=7"], &["--overfit", "2"]).fails(2);
+    let expected = "settings:\n  --overfit: off -> 2\n  seed: 0 -> 1\n  stage1.steps: 6 -> 7\nresume";
+    assert!(message.contains(expected), "{message}");
+    assert!(files(&place.at("run")) == before, "a refusal changes nothing");
+
+    let free = ["data.num_threads=0", "checkpoint.every=3", "eval.num_scenes=1", "device=ndarray"];
+    place.train("run", &free, &["--only", "clusters"]).ok();
+}
+
+#[test]
+fn fresh_moves_the_former_run_aside() {
+    let place = Place::new();
+    place.train("run", &[], &["--only", "stage1"]).ok();
+    let before: Vec<_> = files(&place.at("run")).into_values().collect();
+    let ran = place.train("run", &["stage1.steps=3"], &["--only", "stage1", "--fresh"]).ok();
+    assert!(ran.stderr.contains("moved the former run to "), "{}", ran.stderr);
+    assert!(files(&place.at("run.1")).into_values().eq(before), "every byte of it");
+    assert_eq!(place.metrics("run").len(), 3);
+    place.train("run", &[], &["--only", "stage1", "--fresh"]).ok();
+    assert_eq!((place.metrics("run.2").len(), place.metrics("run").len()), (3, 6));
+}

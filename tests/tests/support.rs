@@ -1,0 +1,227 @@
+//! Runs the command line in temporary folders and reads what it leaves there.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// The smallest run that has everything: two 16 x 16 views of 4 tokens each, 8 rooms, a fraction of a second.
+///
+/// Replaces every section, so that tuning `configs/tiny.toml` does not reach these tests.
+const MICRO: [&str; 9] = [
+    "seed=0",
+    "device=flex",
+    "data={source='synthetic', width=16, height=16, \
+        synthetic={num_scenes=8, num_frames=8, width=16, height=16, samples_per_pixel=1}, \
+        views={min_context=2, max_context=2, min_gap=[3, 3], max_gap=[6, 6], warm_up_steps=0, num_targets=2}}",
+    "model={dim=16, num_heads=2, feed_forward_dim=24, num_encoder_blocks=1, num_renderer_blocks=1, \
+        condenser={num_blocks=1}}",
+    "stage1={steps=6, batch_size=2, optimizer={learning_rate=1e-3, warm_up_steps=2}}",
+    "clusters={grid=[0.5, 1.0], num_passes=1, num_scenes=6}",
+    "stage2={steps=4, batch_size=2, optimizer={learning_rate=1e-3, warm_up_steps=1}}",
+    "checkpoint={every=2, keep=2}",
+    "eval={storage=[0.5, 1.0], num_scenes=3, num_context=2, num_targets=2, num_sheets=1, every=3, \
+        num_validation_scenes=1}",
+];
+
+/// A file of the repository.
+pub fn repository(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the repository").join(path)
+}
+
+/// What a command left behind.
+#[derive(Debug)]
+pub struct Ran {
+    pub code: Option<i32>,
+    pub stdout: String,
+    pub stderr: String,
+}
+
+impl Ran {
+    /// Expects success.
+    pub fn ok(self) -> Self {
+        assert_eq!(self.code, Some(0), "stdout:\n{}\nstderr:\n{}", self.stdout, self.stderr);
+        self
+    }
+
+    /// Expects this exit code and an error, no panic; gives the error stream.
+    pub fn fails(self, code: i32) -> String {
+        assert_eq!(self.code, Some(code), "stdout:\n{}\nstderr:\n{}", self.stdout, self.stderr);
+        assert!(self.stderr.contains("error: ") && !self.stderr.contains("panicked"), "{}", self.stderr);
+        self.stderr
+    }
+}
+
+/// Runs the command line to its end.
+pub fn clift<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Ran {
+    finish(spawn(args))
+}
+
+/// Starts the command line.
+pub fn spawn<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Child {
+    Command::new(env!("CARGO_BIN_EXE_clift-under-test"))
+        .args(args)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the binary under test starts")
+}
+
+/// Waits for a command.
+pub fn finish(child: Child) -> Ran {
+    let output = child.wait_with_output().expect("the binary under test ends");
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("it prints UTF-8");
+    Ran { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
+}
+
+/// A temporary folder for runs.
+pub struct Place(TempDir);
+
+impl Place {
+    pub fn new() -> Self {
+        Self(tempfile::tempdir().expect("a temporary folder"))
+    }
+
+    /// Path of something in the folder.
+    pub fn at(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    /// Arguments that train the micro run `name` with changed keys and further flags.
+    pub fn train_args(&self, name: &str, set: &[&str], flags: &[&str]) -> Vec<String> {
+        let mut args = vec!["train".into(), repository("configs/tiny.toml").display().to_string()];
+        let run_dir = format!("run_dir={:?}", self.at(name));
+        for text in MICRO.iter().chain(&[run_dir.as_str()]).chain(set) {
+            args.extend(["--set".into(), (*text).into()]);
+        }
+        args.extend(flags.iter().map(|&flag| flag.into()));
+        args
+    }
+
+    /// Trains the micro run `name` to its end.
+    pub fn train(&self, name: &str, set: &[&str], flags: &[&str]) -> Ran {
+        clift(self.train_args(name, set, flags))
+    }
+
+    /// Evaluates the run `name`.
+    pub fn eval(&self, name: &str, flags: &[&str]) -> Ran {
+        let run = self.at(name).display().to_string();
+        clift(["eval", &run].iter().chain(flags))
+    }
+
+    /// What is in a file of the folder.
+    pub fn bytes(&self, name: &str) -> Vec<u8> {
+        std::fs::read(self.at(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+    }
+
+    /// What is in a text file of the folder.
+    pub fn text(&self, name: &str) -> String {
+        String::from_utf8(self.bytes(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+    }
+
+    /// What is in a JSON file of the folder.
+    pub fn json(&self, name: &str) -> Value {
+        serde_json::from_slice(&self.bytes(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+    }
+
+    /// The lines of a run's `metrics.jsonl`.
+    pub fn metrics(&self, run: &str) -> Vec<Value> {
+        let text = self.text(&format!("{run}/metrics.jsonl"));
+        text.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}"))).collect()
+    }
+
+    /// The lines of a run's `metrics.jsonl` without what the clock decides.
+    pub fn metrics_but_time(&self, run: &str) -> Vec<Value> {
+        let mut lines = self.metrics(run);
+        for line in &mut lines {
+            line.as_object_mut().expect("an object").remove("step_s");
+        }
+        lines
+    }
+
+    /// The weights of a stage of a run.
+    pub fn weights(&self, run: &str, stage: &str) -> Weights {
+        Weights::read(&self.at(&format!("{run}/{stage}/model.safetensors")))
+    }
+
+    /// Expects the same clusters and the same weights of both stages, bit for bit.
+    pub fn assert_same_result(&self, run: &str, other: &str) {
+        for stage in ["stage1", "stage2"] {
+            assert!(self.weights(run, stage) == self.weights(other, stage), "{stage} of {run} and {other} differs");
+        }
+        for file in ["clusters/index.json", "clusters/clusters.bin"] {
+            let same = self.bytes(&format!("{run}/{file}")) == self.bytes(&format!("{other}/{file}"));
+            assert!(same, "{file} of {run} and {other} differs");
+        }
+    }
+
+    /// Writes half of a file back.
+    pub fn truncate(&self, name: &str) {
+        let bytes = self.bytes(name);
+        std::fs::write(self.at(name), &bytes[..bytes.len() / 2]).expect("writable");
+    }
+}
+
+/// Copies a folder with everything in it.
+pub fn copy_folder(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).expect("writable");
+    for item in std::fs::read_dir(from).expect("a folder") {
+        let item = item.expect("readable").path();
+        let name = to.join(item.file_name().expect("named"));
+        if item.is_dir() {
+            copy_folder(&item, &name);
+        } else {
+            std::fs::copy(&item, &name).expect("writable");
+        }
+    }
+}
+
+/// Every file below a folder, with its bytes.
+pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for item in std::fs::read_dir(folder).expect("a folder") {
+        let path = item.expect("readable").path();
+        if path.is_dir() {
+            found.extend(files(&path));
+        } else {
+            found.insert(path.clone(), std::fs::read(&path).expect("readable"));
+        }
+    }
+    found
+}
+
+/// Parameters by name.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Weights(pub BTreeMap<String, Vec<f32>>);
+
+impl Weights {
+    /// Reads a weight file. Its bytes may differ where its weights do not: Burn writes the header's metadata in
+    /// any order.
+    fn read(path: &Path) -> Self {
+        let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        let file = safetensors::SafeTensors::deserialize(&bytes).expect("valid safetensors");
+        let values = |data: &[u8]| data.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        let tensors = file.tensors().into_iter().map(|(name, view)| {
+            assert_eq!(view.dtype(), safetensors::Dtype::F32, "{name}");
+            (name, values(view.data()))
+        });
+        Self(tensors.collect())
+    }
+
+    /// The parameters of one network.
+    pub fn part(&self, prefix: &str) -> Self {
+        let part: BTreeMap<_, _> = self.0.clone().into_iter().filter(|(name, _)| name.starts_with(prefix)).collect();
+        assert!(!part.is_empty(), "no parameter starts with {prefix}");
+        Self(part)
+    }
+
+    /// Differences of all values from those of the same model.
+    pub fn moved_from<'a>(&'a self, other: &'a Self) -> impl Iterator<Item = f64> + 'a {
+        assert!(self.0.keys().eq(other.0.keys()), "two models");
+        let pairs = self.0.iter().flat_map(|(name, values)| values.iter().zip(&other.0[name]));
+        pairs.map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs())
+    }
+}
