@@ -7,6 +7,8 @@ use clift_eval::TokenCount;
 use clift_model::device::DeviceName;
 use clift_train::Stage;
 
+pub use crate::data::args::DataCommand;
+
 /// Trains, compresses, renders and measures compressive light-field tokens.
 #[derive(Debug, Parser)]
 #[command(version, propagate_version = true)]
@@ -23,6 +25,17 @@ pub enum Command {
     Train(TrainArgs),
     /// Measure a run on held-out views
     Eval(EvalArgs),
+    /// Make data, or tell what there is
+    Data {
+        /// What to do with data.
+        #[command(subcommand)]
+        command: DataCommand,
+    },
+    /// Check what this machine can train on: every device, the processor, the memory
+    ///
+    /// Runs one forward and backward pass of a small model on every device of this build and compares its
+    /// gradient with that of the default device. Exits with 1 if the default device fails, with 0 otherwise.
+    Doctor,
 }
 
 /// Arguments of `clift train`.
@@ -58,7 +71,7 @@ pub struct EvalArgs {
     /// An evaluation index (JSON) with the context and target frames of every scene
     #[arg(long, value_name = "FILE")]
     pub index: Option<PathBuf>,
-    /// Change a key of the run's config: --set eval.num_scenes=10
+    /// Change a key of the run's config: `--set eval.num_scenes=10`
     #[arg(long, value_name = "KEY=TOML")]
     pub set: Vec<String>,
     /// Where tensors live: flex, ndarray or wgpu

@@ -1,6 +1,8 @@
 //! The command line of clift: arguments and printing, nothing else.
 
 mod args;
+mod data;
+mod doctor;
 mod eval;
 pub mod terminal;
 mod train;
@@ -10,7 +12,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use clift_train::TrainError;
 
-use args::{Args, Command};
+use args::{Args, Command, DataCommand};
 
 /// Done.
 const DONE: u8 = 0;
@@ -27,30 +29,85 @@ pub fn main() -> ExitCode {
     let result = match Args::parse().command {
         Command::Train(args) => train::run(&args),
         Command::Eval(args) => eval::run(&args),
+        Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
+        Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
+        Command::Doctor => doctor::run(),
     };
     match result {
         Ok(()) => ExitCode::from(DONE),
         Err(error) => {
-            eprintln!("error: {error:#}");
+            eprintln!("error: {}", message(&error));
             ExitCode::from(exit_code(&error))
         }
     }
 }
 
-fn exit_code(error: &anyhow::Error) -> u8 {
-    match error.downcast_ref::<TrainError>() {
-        Some(TrainError::Interrupted { .. }) => return INTERRUPTED,
-        Some(TrainError::BadConfig { .. } | TrainError::OtherRun { .. } | TrainError::Missing { .. }) => {
-            return WRONG_USAGE;
-        }
-        Some(TrainError::Model(error)) => return model_exit_code(error),
-        Some(_) => return FAILED,
-        None => {}
+/// The error with its causes, without those that a message quotes already.
+fn message(error: &anyhow::Error) -> String {
+    error
+        .chain()
+        .skip(1)
+        .map(ToString::to_string)
+        .fold(error.to_string(), |text, cause| if text.contains(&cause) { text } else { format!("{text}: {cause}") })
+}
+
+/// The command line asks for something that cannot be done.
+#[derive(Debug)]
+struct WrongUsage(String);
+
+impl std::fmt::Display for WrongUsage {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.0)
     }
-    if error.is::<clift_train::ConfigError>() { WRONG_USAGE } else { FAILED }
+}
+
+impl std::error::Error for WrongUsage {}
+
+fn exit_code(error: &anyhow::Error) -> u8 {
+    if error.is::<WrongUsage>() || error.is::<clift_train::ConfigError>() {
+        return WRONG_USAGE;
+    }
+    if let Some(error) = error.downcast_ref::<clift_data::DataError>() {
+        return data_exit_code(error);
+    }
+    match error.downcast_ref::<TrainError>() {
+        Some(TrainError::Interrupted { .. }) => INTERRUPTED,
+        Some(TrainError::BadConfig { .. } | TrainError::OtherRun { .. } | TrainError::Missing { .. }) => WRONG_USAGE,
+        Some(TrainError::Data(error)) => data_exit_code(error),
+        Some(TrainError::Model(error)) => model_exit_code(error),
+        Some(_) | None => FAILED,
+    }
+}
+
+fn data_exit_code(error: &clift_data::DataError) -> u8 {
+    if matches!(error, clift_data::DataError::BadConfig { .. }) { WRONG_USAGE } else { FAILED }
 }
 
 fn model_exit_code(error: &clift_model::ModelError) -> u8 {
     use clift_model::ModelError::{BadConfig, NoDevice, NotDivisible};
     if matches!(error, BadConfig { .. } | NoDevice { .. } | NotDivisible { .. }) { WRONG_USAGE } else { FAILED }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_is_shown_once() {
+        let missing = clift_train::read_config::<clift_train::Config>("no.toml".as_ref(), &[]).unwrap_err();
+        let text = message(&anyhow::Error::from(missing).context("starting"));
+        assert!(text.starts_with("starting: reading the configuration failed: "), "{text}");
+        assert_eq!(text.matches("os error").count(), 1, "{text}");
+    }
+
+    #[test]
+    fn what_the_user_can_change_is_wrong_usage_and_the_rest_has_failed() {
+        let bad_config = || clift_data::SyntheticConfig { num_frames: 0, ..Default::default() }.validate();
+        assert_eq!(exit_code(&WrongUsage("no".into()).into()), WRONG_USAGE);
+        assert_eq!(exit_code(&bad_config().unwrap_err().into()), WRONG_USAGE);
+        assert_eq!(exit_code(&TrainError::from(bad_config().unwrap_err()).into()), WRONG_USAGE);
+        assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), INTERRUPTED);
+        assert_eq!(exit_code(&clift_data::DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
+        assert_eq!(exit_code(&anyhow::anyhow!("anything else")), FAILED);
+    }
 }

@@ -1,0 +1,182 @@
+//! `clift data info`.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::Context;
+use clift_data::{ChunkSource, ClipReader, Ledger, SceneFilters, SceneSource, SourceInfo, Split};
+use clift_train::config::SourceKind;
+use clift_train::scenes::{self, FirstScenes};
+use clift_train::{Config, read_config};
+
+use super::args::InfoArgs;
+use super::report::{EvaluationReport, Report, SplitReport};
+use crate::WrongUsage;
+
+/// Synthetic scenes that are looked at: there may be millions, and they are all alike.
+const MAX_SYNTHETIC: usize = 1000;
+
+/// Prints what a folder or a config holds.
+pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
+    let report = if args.path.is_dir() {
+        if !args.set.is_empty() {
+            return Err(WrongUsage(format!("--set changes a config, but {} is a folder", args.path.display())).into());
+        }
+        of_folder(&args.path)?
+    } else {
+        let (config, overrides) = read_config::<Config>(&args.path, &args.set)?;
+        for change in overrides {
+            eprintln!("--set {change}");
+        }
+        config.validate()?;
+        of_config(&args.path, &config)?
+    };
+    println!("{report}");
+    if let Some(path) = &args.json {
+        let text = serde_json::to_vec_pretty(&report).context("writing the report as JSON")?;
+        std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
+    }
+    let failed = report.splits.values().filter_map(|split| split.error.as_ref());
+    let failed = failed.chain(report.evaluation.as_ref().and_then(|evaluation| evaluation.error.as_ref()));
+    anyhow::ensure!(failed.count() == 0, "not all of it can be used; the reason stands above");
+    Ok(())
+}
+
+fn of_folder(root: &Path) -> anyhow::Result<Report> {
+    let mut splits = BTreeMap::new();
+    for split in [Split::Train, Split::Test] {
+        if root.join(split.to_string()).join("index.json").exists() {
+            let opened = ChunkSource::open(root, split, &SceneFilters::default());
+            let described = opened.and_then(|source| describe(&source, source.ledger()));
+            splits.insert(split.to_string(), or_error(described));
+        }
+    }
+    if splits.is_empty() {
+        let inside = if root.join("index.json").exists() { "; give the folder above it" } else { "" };
+        let message = format!("{} holds neither train/index.json nor test/index.json{inside}", root.display());
+        return Err(WrongUsage(message).into());
+    }
+    Ok(Report { path: root.to_owned(), splits, evaluation: None, num_tokens: None })
+}
+
+fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
+    let data = &config.data;
+    let mut report = Report { path: path.to_owned(), splits: BTreeMap::new(), evaluation: None, num_tokens: None };
+    for split in [Split::Train, Split::Test] {
+        let described = scenes::open(data, split).and_then(|(source, ledger)| {
+            if split == Split::Test {
+                report.evaluation = Some(evaluation(config, source.clone()));
+            }
+            let source: Arc<dyn SceneSource> = match data.source {
+                SourceKind::Synthetic => Arc::new(FirstScenes::of(source, MAX_SYNTHETIC)),
+                SourceKind::Chunks => source,
+            };
+            let mut described = describe(source.as_ref(), &ledger)?;
+            if split == Split::Train {
+                described.views = Some(long_enough(config, source.as_ref())?);
+            }
+            Ok(described)
+        });
+        report.splits.insert(split.to_string(), or_error(described));
+    }
+    let tokens = |num_views| config.model.num_tokens(num_views, data.height, data.width);
+    report.num_tokens = Some([tokens(data.views.min_context)?, tokens(data.views.max_context)?]);
+    Ok(report)
+}
+
+fn describe(source: &dyn SceneSource, ledger: &Ledger) -> Result<SplitReport, clift_data::DataError> {
+    Ok(SplitReport {
+        error: None,
+        num_scenes: ledger.num_scenes,
+        num_used: ledger.num_used(),
+        skipped: counts(ledger),
+        num_described: source.num_scenes(),
+        info: Some(SourceInfo::read(source)?),
+        views: None,
+    })
+}
+
+fn counts(ledger: &Ledger) -> BTreeMap<String, usize> {
+    ledger.counts().into_iter().map(|(reason, count)| (reason.to_owned(), count)).collect()
+}
+
+fn or_error<E: fmt::Display>(described: Result<SplitReport, E>) -> SplitReport {
+    described.unwrap_or_else(|error| SplitReport { error: Some(error.to_string()), ..Default::default() })
+}
+
+/// Frames that the longest of the shortest stretches has, and how many scenes have as many.
+fn long_enough(config: &Config, source: &dyn SceneSource) -> Result<[usize; 2], clift_data::DataError> {
+    let views = &config.data.views;
+    let gaps = (views.min_context..=views.max_context).map(|num_context| views.gap_bounds(u64::MAX, num_context)[0]);
+    let needed = gaps.max().unwrap_or(0) + 1;
+    let mut num_long = 0;
+    for scene in 0..source.num_scenes() {
+        num_long += usize::from(source.cameras(scene)?.len() >= needed);
+    }
+    Ok([needed, num_long])
+}
+
+fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport {
+    let reader = ClipReader { source, options: config.data.clip_options() };
+    match scenes::evaluation_items(&config.eval, &reader, config.eval.num_scenes) {
+        Ok((items, ledger)) => EvaluationReport {
+            error: None,
+            num_scenes: items.len(),
+            num_views: items.iter().map(|item| item.views.target.len()).sum(),
+            skipped: counts(&ledger),
+        },
+        Err(error) => EvaluationReport { error: Some(error.to_string()), ..Default::default() },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+
+    fn fixtures() -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini")
+    }
+
+    #[test]
+    fn a_folder_is_described_split_by_split() {
+        let text = of_folder(&fixtures()).unwrap().to_string();
+        let expected = "train             2 scenes
+  frames          8 / 8 / 8 (smallest / median / largest)
+  picture         64x36
+  field of view   58.1 / 58.1 / 58.1 deg
+  path extent     0.350 / 0.350 / 0.350
+test              1 scene
+";
+        assert!(text.starts_with(expected), "{text}");
+    }
+
+    #[test]
+    fn a_config_is_described_with_what_its_filters_views_and_evaluation_leave() {
+        let mut config = Config::default();
+        (config.data.source, config.data.root) = (SourceKind::Chunks, Some(fixtures()));
+        (config.data.width, config.data.height) = (48, 32);
+        config.data.filters.min_frames = 8;
+        config.eval.index = Some(fixtures().join("evaluation_index.json"));
+        let text = of_config(Path::new("a.toml"), &config).unwrap().to_string();
+        assert!(text.contains("  long enough     0 of 2: data.views needs 46 frames"), "{text}");
+        assert!(text.contains("evaluation        4 views of 1 scene\n  left out        2 without views"), "{text}");
+        assert!(text.ends_with("tokens per scene  96 to 144"), "{text}");
+
+        config.data.filters.min_frames = 9;
+        let report = of_config(Path::new("a.toml"), &config).unwrap();
+        let error = report.splits["train"].error.as_deref().unwrap();
+        assert!(error.contains("0 of 2 scenes used; 2 shorter than 9 frames"), "{error}");
+        assert!(report.evaluation.is_none());
+    }
+
+    #[test]
+    fn a_folder_without_chunks_or_inside_a_split_says_so() {
+        let message = |path: &Path| of_folder(path).unwrap_err().to_string();
+        assert!(message(Path::new(env!("CARGO_MANIFEST_DIR"))).contains("holds neither train/index.json"));
+        assert!(message(&fixtures().join("train")).ends_with("give the folder above it"));
+    }
+}

@@ -1,0 +1,115 @@
+//! What `clift data info` tells, as a table and as JSON.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::PathBuf;
+
+use clift_data::SourceInfo;
+use serde::Serialize;
+
+use super::text::count;
+
+/// What is told about a folder or a config.
+#[derive(Debug, Serialize)]
+pub struct Report {
+    /// What was looked at.
+    pub path: PathBuf,
+    /// By name.
+    pub splits: BTreeMap<String, SplitReport>,
+    /// Scenes that are evaluated, or why there are none; for a config.
+    pub evaluation: Option<EvaluationReport>,
+    /// Tokens of a scene with the fewest and the most contexts; for a config.
+    pub num_tokens: Option<[usize; 2]>,
+}
+
+/// One half of a data set.
+#[derive(Debug, Default, Serialize)]
+pub struct SplitReport {
+    /// Why the split cannot be used.
+    pub error: Option<String>,
+    /// Scenes there are.
+    pub num_scenes: usize,
+    /// Scenes the filters leave.
+    pub num_used: usize,
+    /// Scenes the filters leave out, by reason.
+    pub skipped: BTreeMap<String, usize>,
+    /// Scenes that `info` describes: the first of many synthetic ones, otherwise all that are used.
+    pub num_described: usize,
+    /// Their description.
+    pub info: Option<SourceInfo>,
+    /// Frames that `data.views` needs, and how many of the described scenes have them; for training scenes.
+    pub views: Option<[usize; 2]>,
+}
+
+/// What an evaluation takes.
+#[derive(Debug, Default, Serialize)]
+pub struct EvaluationReport {
+    /// Why nothing can be evaluated.
+    pub error: Option<String>,
+    /// Scenes.
+    pub num_scenes: usize,
+    /// Target views of all scenes.
+    pub num_views: usize,
+    /// Scenes left out, by reason.
+    pub skipped: BTreeMap<String, usize>,
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut rows: Vec<(&str, String)> = Vec::new();
+        for name in ["train", "test"] {
+            match self.splits.get(name) {
+                None => rows.push((name, "not there".into())),
+                Some(split) => split.rows(name, &mut rows),
+            }
+        }
+        if let Some(evaluation) = &self.evaluation {
+            let counted =
+                format!("{} of {}", count(evaluation.num_views, "view"), count(evaluation.num_scenes, "scene"));
+            rows.push(("evaluation", evaluation.error.clone().unwrap_or(counted)));
+            left_out(&evaluation.skipped, &mut rows);
+        }
+        match self.num_tokens {
+            Some([fewest, most]) if fewest == most => rows.push(("tokens per scene", fewest.to_string())),
+            Some([fewest, most]) => rows.push(("tokens per scene", format!("{fewest} to {most}"))),
+            None => {}
+        }
+        let lines: Vec<String> = rows.iter().map(|(name, value)| format!("{name:<18}{value}")).collect();
+        f.write_str(&lines.join("\n"))
+    }
+}
+
+fn left_out(skipped: &BTreeMap<String, usize>, rows: &mut Vec<(&str, String)>) {
+    rows.extend(skipped.iter().map(|(reason, count)| ("  left out", format!("{count} {reason}"))));
+}
+
+impl SplitReport {
+    fn rows<'a>(&self, name: &'a str, rows: &mut Vec<(&'a str, String)>) {
+        if let Some(error) = &self.error {
+            rows.push((name, error.clone()));
+            return;
+        }
+        let used = if self.skipped.is_empty() { String::new() } else { format!("{} of ", self.num_used) };
+        let first = format!("; described by the first {}", self.num_described);
+        let first = if self.num_described < self.num_used { first.as_str() } else { "" };
+        rows.push((name, format!("{used}{}{first}", count(self.num_scenes, "scene"))));
+        left_out(&self.skipped, rows);
+        let Some(info) = &self.info else { return };
+        if let Some(frames) = info.num_frames {
+            rows.push(("  frames", format!("{frames} (smallest / median / largest)")));
+        }
+        if let Some([width, height]) = info.image_size {
+            rows.push(("  picture", format!("{width}x{height}")));
+        }
+        if let Some(fov) = info.fov_deg {
+            rows.push(("  field of view", format!("{fov:.1} deg")));
+        }
+        if let Some(extent) = info.extent {
+            rows.push(("  path extent", format!("{extent:.3}")));
+        }
+        if let Some([needed, num_long]) = self.views {
+            let of = self.num_described;
+            rows.push(("  long enough", format!("{num_long} of {of}: data.views needs {}", count(needed, "frame"))));
+        }
+    }
+}

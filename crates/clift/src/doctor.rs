@@ -1,0 +1,144 @@
+//! `clift doctor`: what this machine can train on.
+
+mod machine;
+mod probe;
+
+use clift_model::device::DeviceName;
+use probe::{Gradient, Probe};
+
+/// Largest difference of a gradient from the default device's, over its largest entry. Two orders of f32 sums differ
+/// by about 1e-6 here, a wrong kernel by a number near 1.
+const TOLERANCE: f64 = 1e-3;
+
+/// Prints the machine and a row per device; fails if the default device does.
+pub fn run() -> anyhow::Result<()> {
+    println!("{:<12}{}", "clift", version());
+    for (name, value) in machine::rows() {
+        println!("{name:<12}{value}");
+    }
+    println!();
+    let default = DeviceName::default();
+    let reference = probe::probe(default).and_then(|probe| check(probe, None));
+    let mut rows = vec![HEADER.map(String::from)];
+    for name in DeviceName::ALL {
+        let probed = if name == default {
+            reference.clone()
+        } else {
+            probe::probe(name).and_then(|probe| check(probe, reference.as_ref().ok()))
+        };
+        rows.push(row(name, probed.as_ref(), reference.as_ref().ok()));
+    }
+    println!("{}", table(&rows));
+    for name in DeviceName::ALL.into_iter().filter(|name| !name.is_built()) {
+        println!("\n{name} is not in this build: cargo build --release --features {name}");
+    }
+    match reference {
+        Ok(_) => Ok(()),
+        Err(reason) => Err(anyhow::anyhow!("the default device, {default}, fails: {reason}")),
+    }
+}
+
+const HEADER: [&str; 6] = ["device", "state", "adapter", "dtypes", "fwd+bwd", "gradient difference"];
+
+fn version() -> String {
+    let features = if cfg!(feature = "wgpu") { "wgpu" } else { "none" };
+    let (os, arch) = (std::env::consts::OS, std::env::consts::ARCH);
+    format!("{}, cargo features: {features}, {os} {arch}", env!("CARGO_PKG_VERSION"))
+}
+
+/// Refuses a gradient that is zero or not finite, or far from the reference.
+fn check(probe: Probe, reference: Option<&Probe>) -> Result<Probe, String> {
+    let Gradient { values, .. } = &probe.gradient;
+    if let Some(value) = values.iter().find(|value| !value.is_finite()) {
+        return Err(format!("the gradient holds {value}"));
+    }
+    if values.iter().all(|value| *value == 0.0) {
+        return Err("the gradient is zero".into());
+    }
+    match reference.map(|reference| probe.gradient.difference(&reference.gradient)) {
+        Some(difference) if difference.is_nan() || difference > TOLERANCE => {
+            Err(format!("the gradient differs by {difference:.1e}, more than {TOLERANCE:.0e}"))
+        }
+        _ => Ok(probe),
+    }
+}
+
+fn row(name: DeviceName, probed: Result<&Probe, &String>, reference: Option<&Probe>) -> [String; 6] {
+    let is_default = name == DeviceName::default();
+    let dash = || "-".to_owned();
+    let device = if is_default { format!("{name} (default)") } else { name.to_string() };
+    match probed {
+        Err(_) if !name.is_built() => [device, "not built".into(), dash(), dash(), dash(), dash()],
+        Err(reason) => [device, format!("FAILS: {reason}"), dash(), dash(), dash(), dash()],
+        Ok(Probe { adapter, dtypes, gradient, seconds }) => {
+            let difference = match reference {
+                _ if is_default => "reference".into(),
+                Some(reference) => format!("{:.1e}", gradient.difference(&reference.gradient)),
+                None => dash(),
+            };
+            let time = format!("{:.1} ms", seconds * 1e3);
+            [device, "works".into(), adapter.clone(), dtypes.join(" "), time, difference]
+        }
+    }
+}
+
+/// Columns of equal width, two blanks apart; a long state, which ends its row, does not widen them.
+fn table(rows: &[[String; 6]]) -> String {
+    let is_long = |row: &[String; 6]| row[1].starts_with("FAILS");
+    let width = |column: usize| {
+        let cells = rows.iter().filter(|row| column == 0 || !is_long(row)).map(|row| row[column].chars().count());
+        cells.max().unwrap_or(0) + 2
+    };
+    let line = |row: &[String; 6]| {
+        let shown = if is_long(row) { 2 } else { row.len() };
+        let cells = (0..shown).map(|column| format!("{:<width$}", row[column], width = width(column)));
+        cells.collect::<String>().trim_end().to_owned()
+    };
+    rows.iter().map(line).collect::<Vec<_>>().join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn probe(values: Vec<f64>) -> Probe {
+        let gradient = Gradient { loss: 1.0, values };
+        Probe { adapter: "CPU".into(), dtypes: vec!["f32"], gradient, seconds: 0.0125 }
+    }
+
+    #[test]
+    fn a_gradient_that_is_zero_not_finite_or_far_off_fails() {
+        let reference = probe(vec![1.0, -2.0]);
+        let checked = |values: &[f64]| check(probe(values.to_vec()), Some(&reference)).err().unwrap_or_default();
+        assert_eq!(checked(&[1.0, -2.0001]), "");
+        assert_eq!(checked(&[1.0, f64::NAN]), "the gradient holds NaN");
+        assert_eq!(checked(&[0.0, 0.0]), "the gradient is zero");
+        assert_eq!(checked(&[1.0, -2.1]), "the gradient differs by 5.0e-2, more than 1e-3");
+        assert!(checked(&[1.0]).contains("differs"));
+    }
+
+    #[test]
+    fn the_table_keeps_its_columns_beside_a_long_failure() {
+        let reference = probe(vec![1.0]);
+        let failure = "panicked: a very long reason".to_owned();
+        let rows = [
+            HEADER.map(String::from),
+            row(DeviceName::Flex, Ok(&reference), Some(&reference)),
+            row(DeviceName::Ndarray, Err(&failure), Some(&reference)),
+        ];
+        let expected = "\
+device          state  adapter  dtypes  fwd+bwd  gradient difference
+flex (default)  works  CPU      f32     12.5 ms  reference
+ndarray         FAILS: panicked: a very long reason";
+        assert_eq!(table(&rows), expected);
+    }
+
+    #[test]
+    fn every_built_cpu_device_works_here_and_agrees_with_the_default() {
+        let reference = probe::probe(DeviceName::default()).unwrap();
+        for name in [DeviceName::Flex, DeviceName::Ndarray] {
+            let probe = probe::probe(name).and_then(|probe| check(probe, Some(&reference)));
+            assert!(probe.unwrap().dtypes.contains(&"f32"), "{name}");
+        }
+    }
+}

@@ -1,0 +1,73 @@
+//! The processor and the memory, as far as the system tells.
+
+use std::thread::available_parallelism;
+
+/// Rows of name and value.
+pub fn rows() -> Vec<(&'static str, String)> {
+    let read = |path: &str| std::fs::read_to_string(path).unwrap_or_default();
+    let model = field(&read("/proc/cpuinfo"), "model name").unwrap_or_else(|| "unknown processor".into());
+    let cores = available_parallelism().map_or_else(|_| "unknown".into(), |count| count.to_string());
+    let features: Vec<String> = features().iter().map(|(name, has)| format!("{name} {}", yes(*has))).collect();
+    vec![
+        ("processor", format!("{model}, threads: {cores}")),
+        ("features", if features.is_empty() { "none that are looked for".into() } else { features.join(", ") }),
+        ("memory", memory(&read("/proc/meminfo"))),
+    ]
+}
+
+fn yes(has: bool) -> &'static str {
+    if has { "yes" } else { "no" }
+}
+
+/// Instruction sets that make a difference to matrix multiplication.
+#[cfg(target_arch = "x86_64")]
+fn features() -> Vec<(&'static str, bool)> {
+    vec![
+        ("avx2", is_x86_feature_detected!("avx2")),
+        ("fma", is_x86_feature_detected!("fma")),
+        ("avx512f", is_x86_feature_detected!("avx512f")),
+        ("avx512bw", is_x86_feature_detected!("avx512bw")),
+    ]
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn features() -> Vec<(&'static str, bool)> {
+    Vec::new()
+}
+
+/// Memory there is and memory that is free for use, from the text of `/proc/meminfo`.
+fn memory(meminfo: &str) -> String {
+    let gib = |name: &str| {
+        let kib: f64 = field(meminfo, name)?.strip_suffix("kB")?.trim().parse().ok()?;
+        Some(kib / (1024.0 * 1024.0))
+    };
+    match (gib("MemTotal"), gib("MemAvailable")) {
+        (Some(total), Some(available)) => format!("{total:.1} GiB, {available:.1} GiB available"),
+        (Some(total), None) => format!("{total:.1} GiB"),
+        (None, _) => "unknown".into(),
+    }
+}
+
+/// The value of the first line `name : value`.
+fn field(text: &str, name: &str) -> Option<String> {
+    let lines = text.lines().filter_map(|line| line.split_once(':'));
+    lines.into_iter().find(|(key, _)| key.trim() == name).map(|(_, value)| value.trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_is_read_in_gib_and_a_system_that_does_not_tell_is_unknown() {
+        let text = "MemTotal:       25165824 kB\nMemFree: 1 kB\nMemAvailable:   22020096 kB\n";
+        assert_eq!(memory(text), "24.0 GiB, 21.0 GiB available");
+        assert_eq!(memory("MemTotal: 1048576 kB"), "1.0 GiB");
+        assert_eq!(memory(""), "unknown");
+    }
+
+    #[test]
+    fn there_is_a_row_for_processor_features_and_memory() {
+        assert_eq!(rows().iter().map(|(name, _)| *name).collect::<Vec<_>>(), ["processor", "features", "memory"]);
+    }
+}
