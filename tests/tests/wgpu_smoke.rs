@@ -1,4 +1,5 @@
 //! A training step on a GPU (Mesa's software Vulkan counts) gives what the CPU gives.
+
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Gradients, Tensor};
 use clift_model::device::DeviceName;
