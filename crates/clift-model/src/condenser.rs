@@ -98,7 +98,7 @@ impl CondenserBlock {
         }
     }
 
-    /// "Add & LayerNorm" of the text, or the plain assignment the equations print.
+    /// "Add & `LayerNorm`" of the text, or the plain assignment the equations print.
     fn add_or_replace(&self, input: &Tensor<3>, output: Tensor<3>) -> Tensor<3> {
         if self.norm_cross.is_some() { input.clone() + output } else { output }
     }

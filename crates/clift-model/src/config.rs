@@ -41,7 +41,7 @@ pub struct ModelConfig {
 pub struct CondenserConfig {
     /// Condenser blocks; the paper has two.
     pub num_blocks: usize,
-    /// Whether each step inside a block adds to its input ("Add & LayerNorm" of the paper's text),
+    /// Whether each step inside a block adds to its input ("Add & `LayerNorm`" of the paper's text),
     /// or replaces it, as equations 1-3 print it.
     pub residual: bool,
 }

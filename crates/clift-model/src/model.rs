@@ -1,4 +1,4 @@
-//! The three networks of a CLiFT model together.
+//! The three networks of a model together.
 
 use burn::module::Module;
 use burn::tensor::Device;

@@ -1,5 +1,6 @@
 //! Weight files: safetensors in PyTorch's layout, and the hash that names a set of weights.
 
+use std::fmt::Write;
 use std::path::Path;
 
 use burn::module::{Module, ModuleVisitor, Param};
@@ -87,9 +88,14 @@ pub fn hash<M: Module>(module: &M) -> String {
     visit(module, |name, shape, values| {
         sha.update(name.as_bytes());
         sha.update(format!("{shape:?}"));
-        values.iter().for_each(|value| sha.update(value.to_le_bytes()));
+        for value in values {
+            sha.update(value.to_le_bytes());
+        }
     });
-    sha.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    sha.finalize().iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
 }
 
 /// Path of the first parameter with a NaN or an infinity.

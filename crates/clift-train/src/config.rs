@@ -276,7 +276,6 @@ impl Config {
             ("clusters.num_passes", self.clusters.num_passes),
             ("clusters.grid (length)", self.clusters.grid.len()),
             ("eval.storage (length)", self.eval.storage.len()),
-            ("eval.num_context", self.eval.num_context),
             ("eval.num_targets", self.eval.num_targets),
             ("data.num_prefetch", self.data.num_prefetch),
             ("checkpoint.keep", self.checkpoint.keep),
@@ -284,6 +283,9 @@ impl Config {
             if value == 0 {
                 return Err(bad(key, value, "write at least 1"));
             }
+        }
+        if self.eval.num_context < 2 {
+            return Err(bad("eval.num_context", self.eval.num_context, "write at least 2"));
         }
         for (key, accumulate, batch_size) in [
             ("stage1.accumulate", self.stage1.accumulate, self.stage1.batch_size),

@@ -26,14 +26,19 @@ impl<'a> HeldOut<'a> {
     /// Chooses at most `num_scenes` scenes (0: all) of `reader` and their views, to be measured on `device`.
     ///
     /// # Errors
-    /// As [`evaluation_items`], and [`clift_eval::EvalError::BadTokenCount`] for a count a scene does not have.
+    /// As [`evaluation_items`], and [`TrainError::BadConfig`] for a count a scene does not have.
     pub fn new(config: &'a Config, reader: ClipReader, num_scenes: usize, device: &Device) -> Result<Self, TrainError> {
         let (items, ledger) = evaluation_items(&config.eval, &reader, num_scenes)?;
         // A count that a scene does not have is found now, not at the end of training.
         let tokens_per_view = config.model.num_tokens(1, config.data.height, config.data.width)?;
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
-        for count in config.eval.storage.iter().chain([&config.eval.validation_storage]) {
-            count.of(fewest_views * tokens_per_view)?;
+        let fewest_tokens = fewest_views * tokens_per_view;
+        let counts = config.eval.storage.iter().map(|count| ("eval.storage", count));
+        for (key, count) in counts.chain([("eval.validation_storage", &config.eval.validation_storage)]) {
+            if count.of(fewest_tokens).is_err() {
+                let fix = format!("write at most {fewest_tokens}, the fewest tokens of an evaluated scene");
+                return Err(TrainError::BadConfig { key: key.into(), value: count.to_string(), fix });
+            }
         }
         Ok(Self { config, reader, items, ledger, device: device.clone() })
     }

@@ -117,11 +117,11 @@ mod tests {
         let grads_a: Tensor<3> = fixture.tensor("input.grad_a", &device);
         let grads_b: Tensor<2> = fixture.tensor("input.grad_b", &device);
         let rates = fixture.tensor::<1>("output.lr", &device).into_data().try_to_vec::<f32>().expect("f32");
-        for step in 0..5 {
+        for (step, rate) in rates.into_iter().take(5).enumerate() {
             let mut grads = GradientsParams::new();
             grads.register(model.a.id, grads_a.clone().narrow(0, step, 1).squeeze_dim::<2>(0));
             grads.register(model.b.id, grads_b.clone().narrow(0, step, 1).squeeze_dim::<1>(0));
-            model = optimizer.step(f64::from(rates[step]), model, grads);
+            model = optimizer.step(f64::from(rate), model, grads);
             // f32 against f64 for parameters of about one.
             let expected = fixture.tensor::<3>("output.param_a", &device).narrow(0, step, 1);
             assert_close(model.a.val().inner(), expected.squeeze_dim::<2>(0), 1e-6);

@@ -69,7 +69,8 @@ impl Run {
         }
         let config_path = folder.join("config.toml");
         let run_path = folder.join("run.json");
-        if config_path.exists() {
+        // A run that failed before its first step, on a wrong path perhaps, has nothing that settings could contradict.
+        if config_path.exists() && folder.join(Stage::Stage1.name()).exists() {
             refuse_other_run(&config_path, &run_path, &config, options.overfit)?;
         }
         std::fs::create_dir_all(folder).map_err(TrainError::io("making the run directory", folder))?;
@@ -350,5 +351,12 @@ fn flatten(table: toml::Table) -> BTreeMap<String, String> {
 /// `runs/tiny` becomes `runs/tiny.1`, or the first number that is free.
 fn free_name(folder: &Path) -> PathBuf {
     let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    (1..).map(|i| folder.with_file_name(format!("{name}.{i}"))).find(|path| !path.exists()).unwrap_or_default()
+    let mut number = 1;
+    loop {
+        let moved = folder.with_file_name(format!("{name}.{number}"));
+        if !moved.exists() {
+            return moved;
+        }
+        number += 1;
+    }
 }

@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 
+use clift_data::export::spread_views;
 use clift_data::{
     Camera, ChunkSource, ClipReader, DataError, EvaluationIndex, EvaluationItem, Frame, Ledger, SceneSource, Split,
-    SyntheticConfig, SyntheticSource, ViewIndices,
+    SyntheticConfig, SyntheticSource,
 };
 use clift_eval::EvalConfig;
 
@@ -95,7 +96,7 @@ pub fn evaluation_items(
         let mut ledger = Ledger::new(count);
         let mut items = Vec::with_capacity(count);
         for scene in 0..count {
-            match source.cameras(scene).map(|cameras| spread_views(eval, cameras.len())) {
+            match source.cameras(scene).map(|cameras| spread_views(cameras.len(), eval.num_context, eval.num_targets)) {
                 Ok(Some(views)) => items.push(EvaluationItem { scene, views }),
                 Ok(None) => ledger.skip(source.key(scene), "too few frames for its views"),
                 Err(error) => ledger.skip(source.key(scene), error.to_string()),
@@ -108,34 +109,4 @@ pub fn evaluation_items(
         return Err(TrainError::NoScenes { reason: format!("evaluation: {ledger}") });
     }
     Ok((items, ledger))
-}
-
-/// Contexts from the first to the last frame, targets spread over the frames between them.
-fn spread_views(eval: &EvalConfig, num_frames: usize) -> Option<ViewIndices> {
-    let spread = |count: usize, of: usize| -> Vec<usize> {
-        (0..count).map(|i| if count == 1 { of / 2 } else { (i * (of - 1) + (count - 1) / 2) / (count - 1) }).collect()
-    };
-    if num_frames < eval.num_context + eval.num_targets {
-        return None;
-    }
-    let context = spread(eval.num_context, num_frames);
-    let rest: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();
-    let target = spread(eval.num_targets + 2, rest.len())[1..=eval.num_targets].iter().map(|&i| rest[i]).collect();
-    Some(ViewIndices { context, target })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn views_are_spread_over_the_clip_and_targets_are_no_contexts() {
-        let eval = EvalConfig::default();
-        let views = spread_views(&eval, 16).expect("long enough");
-        assert_eq!(views.context, [0, 5, 10, 15]);
-        assert_eq!(views.target.len(), 3);
-        assert!(views.target.iter().all(|frame| !views.context.contains(frame)));
-        assert!(spread_views(&eval, 6).is_none());
-        assert_eq!(spread_views(&eval, 7).expect("just enough").target.len(), 3);
-    }
 }
