@@ -16,7 +16,7 @@ fn losses(lines: &[Value], stage: &str) -> Vec<f64> {
 fn train(place: &Place, reference: &Value, device: &str) -> Vec<Value> {
     let mut args = vec!["train".to_owned(), repository("configs/tiny.toml").display().to_string()];
     let set = reference["set"].as_array().expect("a list").iter().map(|text| text.as_str().expect("text").to_owned());
-    for text in set.chain([format!("run_dir={:?}", place.at("run")), format!("device={device}")]) {
+    for text in set.chain([format!("run_dir=\"{}\"", place.at("run").display()), format!("device={device}")]) {
         args.extend(["--set".into(), text]);
     }
     clift(args).ok();

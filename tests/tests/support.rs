@@ -93,7 +93,7 @@ impl Place {
     /// Arguments that train the micro run `name` with changed keys and further flags.
     pub fn train_args(&self, name: &str, set: &[&str], flags: &[&str]) -> Vec<String> {
         let mut args = vec!["train".into(), repository("configs/tiny.toml").display().to_string()];
-        let run_dir = format!("run_dir={:?}", self.at(name));
+        let run_dir = format!("run_dir=\"{}\"", self.at(name).display());
         for text in MICRO.iter().chain(&[run_dir.as_str()]).chain(set) {
             args.extend(["--set".into(), (*text).into()]);
         }
