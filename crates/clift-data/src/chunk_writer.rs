@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 use std::io::{Cursor, Write};
 use std::path::Path;
 
-use tempfile::NamedTempFile;
 use zip::result::ZipResult;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
 use crate::camera::Camera;
 use crate::error::DataError;
+use crate::files::replace;
 
 /// Size at which a chunk is closed, in bytes of pictures: 100 MB, as in the published RealEstate10K chunks.
 pub const DEFAULT_CHUNK_BYTES: u64 = 100_000_000;
@@ -75,7 +75,7 @@ pub fn write_chunks(
         write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
     }
     let text = serde_json::to_vec_pretty(&index).map_err(|error| bad(error.to_string()))?;
-    write_whole(&index_path, &text)?;
+    replace(&index_path, &text).map_err(DataError::io("writing the index", &index_path))?;
     Ok(index.len())
 }
 
@@ -86,26 +86,7 @@ fn chunk_name(number: usize) -> String {
 fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
     let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
     let bytes = pack(&prefix, scenes).map_err(|error| DataError::io("packing a chunk", path)(error.into()))?;
-    write_whole(path, &bytes)
-}
-
-/// Writes a temporary file beside `path` and renames it, so that no reader ever sees half a file.
-pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
-    let folder = path.parent().unwrap_or(Path::new("."));
-    let io = |error| DataError::io("writing", path)(error);
-    let mut file = new_file_in(folder).map_err(io)?;
-    file.write_all(bytes).map_err(io)?;
-    file.as_file().sync_all().map_err(io)?;
-    file.persist(path).map_err(|error| io(error.error))?;
-    Ok(())
-}
-
-/// A temporary file that, unlike others, everyone may read whom the umask lets: it becomes a part of a data set.
-fn new_file_in(folder: &Path) -> std::io::Result<NamedTempFile> {
-    let mut builder = tempfile::Builder::new();
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    builder.tempfile_in(folder)
+    replace(path, &bytes).map_err(DataError::io("writing a chunk", path))
 }
 
 /// Packs scenes as `torch.save` would: pickle first, then the storages, stored and aligned to 64 bytes.

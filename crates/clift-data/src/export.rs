@@ -6,9 +6,10 @@ use std::path::Path;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::chunk_writer::{SceneRecord, write_chunks, write_whole};
+use crate::chunk_writer::{SceneRecord, write_chunks};
 use crate::clip::{Frame, SceneSource, ViewIndices};
 use crate::error::DataError;
+use crate::files::replace;
 use crate::image::{encode_jpeg, encode_png};
 
 /// How frames are stored.
@@ -111,7 +112,7 @@ pub fn write_evaluation_index(
     }
     let bad = |error: serde_json::Error| DataError::BadIndex { what: error.to_string(), path: path.to_path_buf() };
     let text = serde_json::to_vec(&entries).map_err(bad)?;
-    write_whole(path, &text)?;
+    replace(path, &text).map_err(DataError::io("writing the evaluation index", path))?;
     Ok(entries.values().flatten().count())
 }
 

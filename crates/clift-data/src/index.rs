@@ -94,7 +94,7 @@ impl EvaluationIndex {
     /// entries, and keys that the source does not have.
     ///
     /// # Errors
-    /// As [`EvaluationIndex::views`], and whatever reading a scene's cameras gives.
+    /// As [`EvaluationIndex::views`]; a scene whose cameras cannot be read is left out.
     pub fn select(&self, source: &dyn SceneSource) -> Result<(Vec<EvaluationItem>, Ledger), DataError> {
         let mut ledger = Ledger::new(self.num_keys());
         let mut items = Vec::new();
@@ -102,8 +102,13 @@ impl EvaluationIndex {
             if views.is_none() {
                 ledger.skip(key, "without views in the evaluation index");
             } else if let Some(scene) = source.find(key) {
-                let views = self.views(key, source.cameras(scene)?.len())?;
-                items.extend(views.map(|views| EvaluationItem { scene, views: views.clone() }));
+                match source.cameras(scene) {
+                    Ok(cameras) => {
+                        let views = self.views(key, cameras.len())?;
+                        items.extend(views.map(|views| EvaluationItem { scene, views: views.clone() }));
+                    }
+                    Err(error) => ledger.skip(key, error.to_string()),
+                }
             } else {
                 ledger.skip(key, "not in the data");
             }

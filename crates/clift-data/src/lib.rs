@@ -13,6 +13,7 @@ pub mod clip;
 pub mod clip_reader;
 pub mod error;
 pub mod export;
+pub mod files;
 pub mod image;
 pub mod index;
 pub mod info;

@@ -4,10 +4,10 @@ use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use clift_data::files::replace;
 use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
-use crate::picture::replace_file;
 
 /// How a view was made.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -165,7 +165,7 @@ impl Accumulator {
             }
         }
         let content = csv.into_inner().map_err(|error| failed(error.into_error()))?;
-        replace_file(path, &content).map_err(failed)
+        replace(path, &content).map_err(failed)
     }
 }
 

@@ -1,8 +1,8 @@
 //! 8-bit RGB pictures: what a report shows, and how it reaches the disk.
 
-use std::io::Write;
 use std::path::Path;
 
+use clift_data::files::replace;
 use embedded_graphics::mono_font::{MonoFont, MonoTextStyle, iso_8859_1};
 use embedded_graphics::pixelcolor::{Rgb888, RgbColor};
 use embedded_graphics::prelude::{DrawTarget, Drawable, OriginDimensions, Pixel, Point, Size};
@@ -129,19 +129,9 @@ impl Picture {
         image::codecs::png::PngEncoder::new(&mut png)
             .write_image(&self.rgb, self.rgb.width(), self.rgb.height(), image::ExtendedColorType::Rgb8)
             .map_err(std::io::Error::other)
-            .and_then(|()| replace_file(path, &png))
+            .and_then(|()| replace(path, &png))
             .map_err(|source| EvalError::Io { action: "writing the picture", source, path: path.to_owned() })
     }
-}
-
-/// Writes a file under a temporary name in its own folder and renames it: a reader sees the old
-/// content or the new, never half of it.
-pub(crate) fn replace_file(path: &Path, content: &[u8]) -> std::io::Result<()> {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut file = tempfile::NamedTempFile::new_in(folder)?;
-    file.write_all(content)?;
-    file.persist(path)?;
-    Ok(())
 }
 
 impl OriginDimensions for Picture {

@@ -7,11 +7,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
 
+use clift_data::files::replace;
 use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
 use crate::measured::{Accumulator, Measured, Setting, Variant, ViewsOfSetting};
-use crate::picture::replace_file;
 
 /// What an identical picture counts as in a mean, in dB; larger values are counted as this too.
 ///
@@ -145,7 +145,7 @@ impl Summary {
     pub fn write(&self, path: &Path) -> Result<(), EvalError> {
         serde_json::to_vec_pretty(self)
             .map_err(std::io::Error::from)
-            .and_then(|json| replace_file(path, &[&json[..], b"\n"].concat()))
+            .and_then(|json| replace(path, &[&json[..], b"\n"].concat()))
             .map_err(|source| EvalError::Io { action: "writing the summary", source, path: path.to_owned() })
     }
 }

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use burn::module::Module;
 use burn::store::ModuleRecord;
+use clift_data::files::replace;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
@@ -61,7 +62,8 @@ impl Checkpoints {
         learner.optimizer.save(&optimizer).map_err(TrainError::bad_file("checkpoint", &optimizer))?;
         let state = State { version: VERSION, step: progress.step, bad_steps: progress.bad_steps };
         let text = serde_json::to_vec(&state).map_err(TrainError::bad_file("checkpoint", &temporary))?;
-        crate::files::write(&temporary.join("state.json"), &text)?;
+        let state = temporary.join("state.json");
+        replace(&state, &text).map_err(TrainError::io("writing a checkpoint", &state))?;
         for file in [&model, &optimizer] {
             let synced = std::fs::File::open(file).and_then(|file| file.sync_all());
             synced.map_err(TrainError::io("syncing a checkpoint", file))?;

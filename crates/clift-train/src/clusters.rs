@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
+use clift_data::files::replace;
 use clift_data::order::{below, derive_seed, item_rng};
 use clift_data::{ClipReader, Ledger, ViewIndices};
 use clift_eval::upload_views;
@@ -127,7 +128,7 @@ impl ClusterJob<'_> {
             Index { version: VERSION, encoder: encoder_hash.into(), settings: settings(config), skipped, entries };
         let index_path = temporary.join("index.json");
         let text = serde_json::to_vec(&index).map_err(TrainError::bad_file("cluster cache", &index_path))?;
-        crate::files::write(&index_path, &text)?;
+        replace(&index_path, &text).map_err(TrainError::io(writing, &index_path))?;
         std::fs::rename(&temporary, folder).map_err(TrainError::io("renaming the cluster cache", folder))?;
         ClusterCache::open(folder, config, encoder_hash)
     }

@@ -10,7 +10,6 @@ pub mod diagnostic;
 pub mod document;
 pub mod error;
 pub mod events;
-mod files;
 pub mod held_out;
 mod keys;
 pub mod loss;

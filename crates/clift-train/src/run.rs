@@ -7,6 +7,7 @@ use std::sync::atomic::AtomicBool;
 
 use burn::module::Module;
 use burn::tensor::Device;
+use clift_data::files::replace;
 use clift_data::{ClipReader, SceneSource, Split};
 use clift_eval::{Networks, Summary};
 use clift_model::{Clift, weights};
@@ -77,8 +78,8 @@ impl Run {
         let text = toml::to_string_pretty(&config).map_err(TrainError::bad_file("config", &config_path))?;
         let run = RunFile { version: VERSION, overfit: options.overfit };
         let json = serde_json::to_vec_pretty(&run).map_err(TrainError::bad_file("run file", &run_path))?;
-        crate::files::write(&run_path, &json)?;
-        crate::files::write(&config_path, text.as_bytes())?;
+        replace(&run_path, &json).map_err(TrainError::io("writing the run file", &run_path))?;
+        replace(&config_path, text.as_bytes()).map_err(TrainError::io("writing the config", &config_path))?;
         Ok(Self { config, overfit: options.overfit, device })
     }
 

@@ -94,8 +94,7 @@ impl Sink for MetricsFile {
 }
 
 fn drop_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut kept = tempfile::NamedTempFile::new_in(folder)?;
+    let mut kept = Vec::new();
     let mut broken: Option<usize> = None;
     for (index, line) in BufReader::new(File::open(path)?).split(b'\n').enumerate() {
         let line = line?;
@@ -105,16 +104,14 @@ fn drop_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
         }
         match serde_json::from_slice::<MetricsLine>(&line) {
             Ok(metrics) if (metrics.stage, metrics.step) <= (stage, step) => {
-                kept.write_all(&line)?;
-                kept.write_all(b"\n")?;
+                kept.extend(line);
+                kept.push(b'\n');
             }
             Ok(_) => {}
             Err(_) => broken = Some(index + 1),
         }
     }
-    kept.flush()?;
-    kept.persist(path)?;
-    Ok(())
+    clift_data::files::replace(path, &kept)
 }
 
 /// Gives every event to several sinks, in order.

@@ -38,9 +38,9 @@ pub enum TokenChoice {
 impl StageBatch {
     /// Cuts the batch into `count` parts of nearly equal size.
     fn parts(&self, count: usize) -> impl Iterator<Item = Self> + '_ {
-        let size = self.clips.len().div_ceil(count);
-        (0..self.clips.len()).step_by(size).map(move |start| {
-            let range = start..(start + size).min(self.clips.len());
+        let batch_size = self.clips.len();
+        (0..count).map(move |part| {
+            let range = part * batch_size / count..(part + 1) * batch_size / count;
             let tokens = match &self.tokens {
                 TokenChoice::Subsets(subsets) => TokenChoice::Subsets(subsets[range.clone()].to_vec()),
                 TokenChoice::All => TokenChoice::All,

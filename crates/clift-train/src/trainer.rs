@@ -92,9 +92,8 @@ impl StagePlan<'_> {
             if due(step, eval.every) && !last {
                 held_out.validate(&learner.inference_model(), self.stage, step, &samples, &mut sink)?;
             }
-            // A checkpoint is a good state: none is made between bad steps.
             let interrupted = stop.load(Ordering::Relaxed);
-            if progress.bad_steps == 0 && (due(step, checkpoint.every) || last || interrupted) {
+            if due(step, checkpoint.every) || last || interrupted {
                 sink.event(&Event::Checkpoint { path: checkpoints.save(&learner, progress)? });
             }
             if interrupted && !last {
