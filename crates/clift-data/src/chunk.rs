@@ -25,10 +25,51 @@ pub struct SceneFilters {
     pub max_fov_deg: Option<f64>,
 }
 
+impl SceneFilters {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`DataError::BadConfig`] naming the field that cannot hold.
+    pub fn validate(&self) -> Result<(), DataError> {
+        match self.max_fov_deg {
+            Some(limit) if !(limit.is_finite() && limit > 0.0) => {
+                Err(DataError::bad_config("max_fov_deg", format!("is {limit}; use a positive number such as 100")))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn is_any_set(&self) -> bool {
+        *self != Self::default()
+    }
+}
+
 /// One chunk file; its table is read when a scene of it is first needed.
 struct Chunk {
     path: PathBuf,
     table: OnceLock<ChunkTable>,
+}
+
+impl Chunk {
+    /// Checks that the file is there.
+    fn find(&self) -> Result<(), DataError> {
+        let metadata = std::fs::metadata(&self.path)
+            .map_err(DataError::io("opening a chunk that index.json lists", &self.path))?;
+        if metadata.is_dir() {
+            let what = "index.json lists it as a chunk, but it is a folder".into();
+            return Err(DataError::BadChunk { what, path: self.path.clone() });
+        }
+        Ok(())
+    }
+
+    fn table(&self) -> Result<&ChunkTable, DataError> {
+        if let Some(table) = self.table.get() {
+            return Ok(table);
+        }
+        // Two threads may read the same chunk at once; the first to finish is kept.
+        let read = ChunkTable::read(&self.path)?;
+        Ok(self.table.get_or_init(|| read))
+    }
 }
 
 /// A scene's key and its chunk.
@@ -51,10 +92,14 @@ pub struct ChunkSource {
 impl ChunkSource {
     /// Opens `<root>/<split>`. Without filters this reads `index.json` alone; with filters, every chunk's table.
     ///
+    /// Scenes whose chunk is missing, and with filters those that cannot be read, go into the ledger with the error
+    /// as the reason: a data set with a gap can be used.
+    ///
     /// # Errors
-    /// [`DataError::Io`] for a missing `index.json` or chunk, [`DataError::BadIndex`] for an index that is no map
-    /// from keys to files beside it, and with filters whatever reading a chunk gives.
+    /// [`DataError::Io`] for a missing `index.json`, [`DataError::BadIndex`] for one that is no map from keys to files
+    /// beside it, [`DataError::BadConfig`] for wrong filters, and the first chunk's error when every chunk fails.
     pub fn open(root: &Path, split: Split, filters: &SceneFilters) -> Result<Self, DataError> {
+        filters.validate()?;
         let folder = root.join(split.to_string());
         let index = read_index(&folder.join("index.json"))?;
         let mut chunk_ids = BTreeMap::new();
@@ -67,24 +112,15 @@ impl ChunkSource {
             });
             scenes.push(Entry { key, chunk });
         }
-        for chunk in &chunks {
-            std::fs::metadata(&chunk.path)
-                .map_err(DataError::io("opening a chunk that index.json lists", &chunk.path))?;
-        }
         let mut source = Self { chunks, ledger: Ledger::new(scenes.len()), scenes, positions: HashMap::new() };
-        source.apply(filters)?;
+        source.leave_out(filters)?;
         source.positions = source.scenes.iter().enumerate().map(|(i, entry)| (entry.key.clone(), i)).collect();
         Ok(source)
     }
 
-    /// What the filters left out.
+    /// What the filters left out, and what could not be read.
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
-    }
-
-    /// How many frames a scene has.
-    pub fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
-        Ok(self.table(scene)?.1.images.len())
     }
 
     /// Time stamp of every frame: microseconds in RealEstate10K, frame numbers in DL3DV.
@@ -109,14 +145,22 @@ impl ChunkSource {
         span.read(path)
     }
 
-    fn apply(&mut self, filters: &SceneFilters) -> Result<(), DataError> {
-        if filters.min_frames == 0 && filters.max_fov_deg.is_none() {
-            return Ok(());
+    /// Moves scenes into the ledger: those of chunks that fail, and those that the filters do not let through.
+    fn leave_out(&mut self, filters: &SceneFilters) -> Result<(), DataError> {
+        let open = |chunk: &Chunk| {
+            chunk.find()?;
+            if filters.is_any_set() { chunk.table().map(|_| ()) } else { Ok(()) }
+        };
+        let opened: Vec<Result<(), DataError>> = self.chunks.par_iter().map(open).collect();
+        let failures: Vec<_> = opened.iter().map(|opened| opened.as_ref().err().map(ToString::to_string)).collect();
+        if failures.iter().all(Option::is_some) {
+            opened.into_iter().next().transpose()?;
         }
-        let verdicts = (0..self.scenes.len())
-            .into_par_iter()
-            .map(|scene| self.reason_to_skip(scene, filters))
-            .collect::<Result<Vec<_>, _>>()?;
+        let verdict = |scene: usize| {
+            let failure = failures[self.scenes[scene].chunk].clone();
+            failure.or_else(|| self.reason_to_skip(scene, filters).unwrap_or_else(|error| Some(error.to_string())))
+        };
+        let verdicts: Vec<Option<String>> = (0..self.scenes.len()).into_par_iter().map(verdict).collect();
         let scenes = std::mem::take(&mut self.scenes);
         for (entry, reason) in scenes.into_iter().zip(verdicts) {
             match reason {
@@ -128,7 +172,7 @@ impl ChunkSource {
     }
 
     fn reason_to_skip(&self, scene: usize, filters: &SceneFilters) -> Result<Option<String>, DataError> {
-        if self.num_frames(scene)? < filters.min_frames {
+        if filters.min_frames > 0 && self.num_frames(scene)? < filters.min_frames {
             return Ok(Some(format!("shorter than {} frames", filters.min_frames)));
         }
         let Some(limit) = filters.max_fov_deg else { return Ok(None) };
@@ -143,19 +187,13 @@ impl ChunkSource {
     fn table(&self, scene: usize) -> Result<(&Path, &SceneTable), DataError> {
         let num_scenes = self.scenes.len();
         let Entry { key, chunk } = self.scenes.get(scene).ok_or(DataError::NoSuchScene { scene, num_scenes })?;
-        let Chunk { path, table } = &self.chunks[*chunk];
-        let table = if let Some(table) = table.get() {
-            table
-        } else {
-            // Two threads may read the same chunk at once; the first to finish is kept.
-            let read = ChunkTable::read(path)?;
-            table.get_or_init(|| read)
-        };
-        let scene = table.scenes.iter().find(|scene| scene.key == *key).ok_or_else(|| DataError::BadChunk {
+        let chunk = &self.chunks[*chunk];
+        let table = chunk.table()?;
+        let scene = table.scenes.get(key).ok_or_else(|| DataError::BadChunk {
             what: format!("index.json lists scene {key} in it, but it holds {} other scenes", table.scenes.len()),
-            path: path.clone(),
+            path: chunk.path.clone(),
         })?;
-        Ok((path, scene))
+        Ok((&chunk.path, scene))
     }
 }
 
@@ -170,6 +208,10 @@ impl SceneSource for ChunkSource {
 
     fn find(&self, key: &str) -> Option<usize> {
         self.positions.get(key).copied()
+    }
+
+    fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
+        Ok(self.table(scene)?.1.images.len())
     }
 
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
@@ -189,7 +231,7 @@ fn read_index(path: &Path) -> Result<BTreeMap<String, String>, DataError> {
     let index: BTreeMap<String, String> = serde_json::from_slice(&text)
         .map_err(|error| bad(format!("expected a map from scene keys to chunk files, got {error}")))?;
     for (key, file) in &index {
-        if !Path::new(file).components().all(|part| matches!(part, Component::Normal(_))) {
+        if file.is_empty() || !Path::new(file).components().all(|part| matches!(part, Component::Normal(_))) {
             return Err(bad(format!("scene {key} is in {file:?}, expected a file beside the index")));
         }
     }
@@ -346,8 +388,143 @@ mod tests {
         assert!(open().contains("expected a map from scene keys to chunk files"), "{}", open());
         std::fs::write(&index, r#"{"a": "../../secret.torch"}"#).unwrap();
         assert!(open().contains("expected a file beside the index"), "{}", open());
+        std::fs::write(&index, r#"{"a": ""}"#).unwrap();
+        assert!(open().contains(r#"scene a is in "", expected a file beside the index"#), "{}", open());
         std::fs::write(&index, r#"{"a": "000000.torch"}"#).unwrap();
         assert!(open().starts_with("opening a chunk that index.json lists failed"), "{}", open());
         assert!(open().ends_with("000000.torch"), "{}", open());
+        std::fs::create_dir(folder.path().join("test/000000.torch")).unwrap();
+        let expected = "bad chunk: index.json lists it as a chunk, but it is a folder: ";
+        assert!(open().starts_with(expected) && open().ends_with("000000.torch"), "{}", open());
+    }
+
+    /// A data set of the mini chunk under three names, the last of which is changed, with a scene of each.
+    fn three_chunks(change: impl FnOnce(&Path)) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        let train = folder.path().join("train");
+        std::fs::create_dir(&train).unwrap();
+        for name in ["0.torch", "1.torch", "2.torch"] {
+            std::fs::write(train.join(name), mini_chunk()).unwrap();
+        }
+        let index = r#"{"00000000000000a1": "0.torch", "00000000000000a2": "2.torch"}"#;
+        std::fs::write(train.join("index.json"), index).unwrap();
+        change(&train.join("2.torch"));
+        folder
+    }
+
+    #[test]
+    fn scenes_of_a_chunk_that_fails_are_left_out_with_its_error() {
+        let lists = SceneFilters { min_frames: 8, max_fov_deg: None };
+        let truncate = |path: &Path| std::fs::write(path, &mini_chunk()[..3000]).unwrap();
+        let remove = |path: &Path| std::fs::remove_file(path).unwrap();
+        for (folder, filters, reason) in [
+            (three_chunks(truncate), &lists, "1 bad chunk: "),
+            (three_chunks(remove), &lists, "1 opening a chunk that index.json lists failed: "),
+            (three_chunks(remove), &ALL, "1 opening a chunk that index.json lists failed: "),
+        ] {
+            let source = ChunkSource::open(folder.path(), Split::Train, filters).unwrap();
+            assert_eq!((source.num_scenes(), source.key(0)), (1, "00000000000000a1"));
+            assert!(source.find("00000000000000a2").is_none() && source.frame(0, 0).is_ok());
+            let ledger = source.ledger().to_string();
+            assert!(ledger.starts_with(&format!("1 of 2 scenes used; {reason}")), "{ledger}");
+            assert!(ledger.ends_with("2.torch"), "{ledger}");
+        }
+    }
+
+    #[test]
+    fn scenes_whose_cameras_cannot_be_read_are_left_out_by_the_field_of_view() {
+        let folder = tempfile::tempdir().unwrap();
+        let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &ALL).unwrap();
+        let records = (0..2).map(|scene| {
+            let mut cameras = source.cameras(scene).unwrap();
+            if scene == 0 {
+                cameras[3].c2w.translation[1] = f64::NAN;
+            }
+            let images = (0..8).map(|frame| source.encoded_frame(scene, frame).unwrap()).collect();
+            let (key, timestamps) = (source.key(scene).into(), source.timestamps(scene).unwrap());
+            Ok(crate::SceneRecord { key, url: String::new(), timestamps, cameras, images })
+        });
+        crate::write_chunks(&folder.path().join("train"), records, u64::MAX).unwrap();
+        let filters = SceneFilters { min_frames: 0, max_fov_deg: Some(100.0) };
+        let source = ChunkSource::open(folder.path(), Split::Train, &filters).unwrap();
+        assert_eq!((source.num_scenes(), source.key(0)), (1, "00000000000000a2"));
+        let skip = &source.ledger().skips[0];
+        assert!(skip.key == "00000000000000a1" && skip.reason.contains("frame 3: bad camera: "), "{skip:?}");
+    }
+
+    #[test]
+    fn a_field_of_view_that_is_no_positive_number_is_refused() {
+        for limit in [f64::NAN, f64::INFINITY, 0.0, -1.0] {
+            let filters = SceneFilters { min_frames: 0, max_fov_deg: Some(limit) };
+            let message = filters.validate().unwrap_err().to_string();
+            assert_eq!(message, format!("max_fov_deg is {limit}; use a positive number such as 100"));
+            assert!(ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &filters).is_err());
+        }
+        assert!(ALL.validate().is_ok());
+    }
+
+    /// An archive whose pickle is a list of `scenes`, after a tensor in memo slot 1 and a list of 10,000 references
+    /// to it in slot 2.
+    fn sharing_chunk(scenes: &[u8]) -> Vec<u8> {
+        let mut pickle = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((X\x07\0\0\0storagectorch\nByteStorage\n\
+            X\x01\0\0\x000X\x03\0\0\0cpuK\0tQK\0K\0\x85K\x01\x85\x89ccollections\nOrderedDict\n)RtRq\x01"
+            .to_vec();
+        pickle.extend(b"](");
+        pickle.extend(b"h\x01".repeat(10_000));
+        pickle.extend(b"eq\x02](");
+        pickle.extend(scenes);
+        pickle.extend(b"e.");
+        let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+        let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+        // 10,000 rows of cameras, and as many time stamps.
+        for (name, bytes) in [("data.pkl", pickle), ("data/0", Vec::new()), ("data/1", vec![0; 720_000])] {
+            zip.start_file(format!("bomb/{name}"), options).unwrap();
+            std::io::Write::write_all(&mut zip, &bytes).unwrap();
+        }
+        zip.finish().unwrap().into_inner()
+    }
+
+    /// A scene with the 10,000 shared images and opcodes that give its address; the memo's slot 3 receives it.
+    fn sharing_scene(key: &str, url: &[u8]) -> Vec<u8> {
+        let mut scene = b"}(X\x06\0\0\0imagesh\x02X\x03\0\0\0keyX".to_vec();
+        scene.extend((key.len() as u32).to_le_bytes());
+        scene.extend(key.as_bytes());
+        scene.extend(b"X\x03\0\0\0url");
+        scene.extend(url);
+        for (name, storage, shape) in [
+            ("cameras", "FloatStorage", &b"M\x10\x27K\x12\x86K\x12K\x01\x86"[..]),
+            ("timestamps", "LongStorage", b"M\x10\x27\x85K\x01\x85"),
+        ] {
+            scene.push(b'X');
+            scene.extend((name.len() as u32).to_le_bytes());
+            scene.extend(format!("{name}ctorch._utils\n_rebuild_tensor_v2\n((").as_bytes());
+            scene.extend(
+                format!("X\x07\0\0\0storagectorch\n{storage}\nX\x01\0\0\x001X\x03\0\0\0cpuK\0tQK\0").as_bytes(),
+            );
+            scene.extend(shape);
+            scene.extend(b"\x89ccollections\nOrderedDict\n)RtR");
+        }
+        scene.extend(b"uq\x03");
+        scene
+    }
+
+    #[test]
+    fn scenes_that_share_what_they_refer_to_cannot_fill_the_memory() {
+        let message = |scenes: &[u8]| {
+            let (_folder, source) = with_chunk(&sharing_chunk(scenes), &["a"]);
+            source.num_frames(0).map_err(|error| error.to_string())
+        };
+        let empty = b"X\0\0\0\0";
+        assert_eq!(message(&sharing_scene("a", empty)), Ok(10_000), "the file is one that can be read");
+        // 2,000 million frames of 24 bytes, from 400 kB.
+        let repeated = [sharing_scene("a", empty), b"h\x03".repeat(200_000)].concat();
+        assert!(message(&repeated).unwrap_err().contains("scene 1: key \"a\": it comes twice"));
+        let scenes: Vec<u8> = (0..1000).flat_map(|number| sharing_scene(&format!("{number}"), empty)).collect();
+        assert!(message(&scenes).unwrap_err().contains("more than the limit of 131072 frames"));
+        let long = [b"X\0\0\x40\0", vec![b'u'; 0x40_0000].as_slice(), b"q\x04"].concat();
+        let scenes: Vec<u8> = (0..9)
+            .flat_map(|number| sharing_scene(&format!("{number}"), if number == 0 { &long } else { b"h\x04" }))
+            .collect();
+        assert!(message(&scenes).unwrap_err().contains("more than the limit of 16777216 bytes"));
     }
 }

@@ -1,11 +1,16 @@
 //! What one chunk holds: for each of its scenes, where cameras, time stamps and frames lie in the file.
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use crate::archive::{Archive, Span};
 use crate::camera::Camera;
 use crate::error::DataError;
-use crate::pickle::{ElementType, MAX_BYTES, Pickle, Tensor, Value};
+use crate::pickle::{ElementType, MAX_BYTES, MAX_VALUES, Pickle, Tensor, Value};
+
+/// Most frames of all scenes of a chunk. Scenes may share a list of frames, so that the size of the pickle does not
+/// limit them; those that do not share have 8 values or more per frame, and fewer frames than this.
+const MAX_FRAMES: usize = MAX_VALUES / 8;
 
 /// One scene of a chunk. Pictures and cameras stay in the file.
 pub(crate) struct SceneTable {
@@ -17,9 +22,9 @@ pub(crate) struct SceneTable {
     pub images: Vec<Span>,
 }
 
-/// The scenes of one chunk, in its order.
+/// The scenes of one chunk, by key.
 pub(crate) struct ChunkTable {
-    pub scenes: Vec<SceneTable>,
+    pub scenes: HashMap<String, SceneTable>,
 }
 
 impl ChunkTable {
@@ -41,28 +46,47 @@ impl ChunkTable {
             scene @ Value::Dict(_) => vec![scene],
             _ => return Err(bad("the outermost object is neither a list of scenes nor a scene".into())),
         };
-        let scenes = scenes
-            .into_iter()
-            .enumerate()
-            .map(|(position, scene)| {
-                SceneTable::from_pickle(&pickle, scene, &archive)
-                    .map_err(|what| bad(format!("scene {position}: {what}")))
-            })
-            .collect::<Result<_, _>>()?;
-        Ok(Self { scenes })
+        let mut builder =
+            Builder { pickle: &pickle, archive: &archive, scenes: HashMap::new(), num_frames: 0, url_bytes: 0 };
+        for (position, scene) in scenes.into_iter().enumerate() {
+            builder.add(scene).map_err(|what| bad(format!("scene {position}: {what}")))?;
+        }
+        Ok(Self { scenes: builder.scenes })
     }
 }
 
-impl SceneTable {
-    fn from_pickle(pickle: &Pickle, scene: &Value, archive: &Archive) -> Result<Self, String> {
+/// Collects the scenes of a pickle. What several scenes may share is counted: a file of a few kB must not fill the
+/// memory.
+struct Builder<'a> {
+    pickle: &'a Pickle,
+    archive: &'a Archive,
+    scenes: HashMap<String, SceneTable>,
+    num_frames: usize,
+    url_bytes: usize,
+}
+
+impl Builder<'_> {
+    fn add(&mut self, scene: &Value) -> Result<(), String> {
+        let Self { pickle, archive, .. } = *self;
         let item = |name: &str| pickle.item(scene, name).ok_or_else(|| format!("no entry `{name}`"));
         let Value::Str(key) = item("key")? else { return Err("`key` is no string".into()) };
-        let url = match pickle.item(scene, "url") {
-            Some(Value::Str(url)) => url.clone(),
-            _ => String::new(),
-        };
         let in_scene = |what: String| format!("key {key:?}: {what}");
+        if self.scenes.contains_key(key) {
+            return Err(in_scene("it comes twice".into()));
+        }
+        let url = match pickle.item(scene, "url") {
+            Some(Value::Str(url)) => url.as_str(),
+            _ => "",
+        };
+        self.url_bytes += url.len();
+        if self.url_bytes > MAX_BYTES {
+            return Err(in_scene(format!("the `url`s so far have more than the limit of {MAX_BYTES} bytes")));
+        }
         let Value::List(image_ids) = item("images")? else { return Err(in_scene("`images` is no list".into())) };
+        self.num_frames += image_ids.len();
+        if self.num_frames > MAX_FRAMES {
+            return Err(in_scene(format!("the scenes so far have more than the limit of {MAX_FRAMES} frames")));
+        }
         let num_frames = image_ids.len() as u64;
         let mut images = Vec::with_capacity(image_ids.len());
         for (frame, id) in image_ids.iter().enumerate() {
@@ -75,9 +99,13 @@ impl SceneTable {
                 .map_err(|what| in_scene(format!("`cameras`: {what}")))?;
         let (timestamps, _) = locate(item("timestamps")?, &[Some(num_frames)], &[ElementType::I64], archive)
             .map_err(|what| in_scene(format!("`timestamps`: {what}")))?;
-        Ok(Self { key: key.clone(), url, timestamps, cameras, camera_type, images })
+        let table = SceneTable { key: key.clone(), url: url.to_owned(), timestamps, cameras, camera_type, images };
+        self.scenes.insert(key.clone(), table);
+        Ok(())
     }
+}
 
+impl SceneTable {
     /// Reads every camera of the scene.
     pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera>, DataError> {
         let bytes = self.cameras.read(path)?;

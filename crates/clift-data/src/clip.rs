@@ -68,6 +68,10 @@ pub trait SceneSource: Send + Sync {
     fn find(&self, key: &str) -> Option<usize>;
     /// Cameras of every frame of a scene, in frame order.
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError>;
+    /// How many frames a scene has; unless a source knows better, by reading its cameras.
+    fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
+        Ok(self.cameras(scene)?.len())
+    }
     /// Decodes one frame.
     fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError>;
 }
