@@ -76,7 +76,8 @@ pub fn write_source(
 /// Contexts from the first to the last of `num_frames` frames, and targets spread over the frames between them;
 /// `None` for fewer frames than views, or fewer than 2 contexts.
 pub fn spread_views(num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
-    if num_context < 2 || num_frames < num_context + num_targets {
+    let num_views = num_context.checked_add(num_targets)?;
+    if num_context < 2 || num_frames < num_views {
         return None;
     }
     let spread = |place: usize, count: usize, of: usize| (place * (of - 1) + (count - 1) / 2) / (count - 1);
@@ -107,7 +108,7 @@ pub fn write_evaluation_index(
     }
     let mut entries = BTreeMap::new();
     for scene in 0..source.num_scenes() {
-        let views = spread_views(source.cameras(scene)?.len(), num_context, num_targets);
+        let views = spread_views(source.num_frames(scene)?, num_context, num_targets);
         entries.insert(source.key(scene), views.map(|ViewIndices { context, target }| Entry { context, target }));
     }
     let bad = |error: serde_json::Error| DataError::BadIndex { what: error.to_string(), path: path.to_path_buf() };
@@ -137,6 +138,7 @@ mod tests {
         }
         assert_eq!(spread_views(16, 4, 3).unwrap().context, [0, 5, 10, 15]);
         assert!([spread_views(6, 4, 3), spread_views(9, 1, 3), spread_views(0, 0, 0)].iter().all(Option::is_none));
+        assert!([spread_views(9, 2, usize::MAX), spread_views(9, usize::MAX, 2)].iter().all(Option::is_none));
     }
 
     #[test]
@@ -146,7 +148,7 @@ mod tests {
         for (num_frames, expected) in [(16, 3), (6, 0)] {
             let source = source(num_frames);
             assert_eq!(write_evaluation_index(&path, &source, 4, 3).unwrap(), expected);
-            let (items, ledger) = EvaluationIndex::read(&path).unwrap().select(&source).unwrap();
+            let (items, ledger) = EvaluationIndex::read(&path).unwrap().select(&source, 0);
             assert_eq!((items.len(), ledger.num_scenes), (expected, 3));
             assert!(items.iter().all(|item| Some(&item.views) == spread_views(16, 4, 3).as_ref()));
         }

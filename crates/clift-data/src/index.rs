@@ -81,39 +81,45 @@ impl EvaluationIndex {
         let position =
             position.ok_or_else(|| DataError::MissingIndexKey { key: key.to_owned(), path: self.path.clone() })?;
         let Some(views) = &self.entries[*position].1 else { return Ok(None) };
+        self.check_frames(key, views, num_frames)?;
+        Ok(Some(views))
+    }
+
+    /// The first `limit` scenes of `source` to evaluate (0: all), in the order of the file, and what is left out on
+    /// the way: null entries, empty entries, keys that the source does not have, scenes whose cameras cannot be read
+    /// and those that lack a frame. The ledger counts the entries that were looked at.
+    pub fn select(&self, source: &dyn SceneSource, limit: usize) -> (Vec<EvaluationItem>, Ledger) {
+        let mut ledger = Ledger::default();
+        let mut items = Vec::new();
+        for (key, views) in &self.entries {
+            if limit > 0 && items.len() == limit {
+                break;
+            }
+            ledger.num_scenes += 1;
+            let Some(views) = views else {
+                ledger.skip(key, "without views in the evaluation index");
+                continue;
+            };
+            let Some(scene) = source.find(key) else {
+                ledger.skip(key, "not in the data");
+                continue;
+            };
+            match source.cameras(scene).and_then(|cameras| self.check_frames(key, views, cameras.len())) {
+                Ok(()) => items.push(EvaluationItem { scene, views: views.clone() }),
+                Err(error) => ledger.skip(key, error.to_string()),
+            }
+        }
+        (items, ledger)
+    }
+
+    fn check_frames(&self, key: &str, views: &ViewIndices, num_frames: usize) -> Result<(), DataError> {
         match views.context.iter().chain(&views.target).find(|frame| **frame >= num_frames) {
             Some(frame) => Err(DataError::BadIndex {
                 what: format!("it asks for frame {frame} of scene {key}, which has {num_frames} frames"),
                 path: self.path.clone(),
             }),
-            None => Ok(Some(views)),
+            None => Ok(()),
         }
-    }
-
-    /// The scenes of `source` to evaluate, in the order of the file, and what is left out: null entries, empty
-    /// entries, and keys that the source does not have.
-    ///
-    /// # Errors
-    /// As [`EvaluationIndex::views`]; a scene whose cameras cannot be read is left out.
-    pub fn select(&self, source: &dyn SceneSource) -> Result<(Vec<EvaluationItem>, Ledger), DataError> {
-        let mut ledger = Ledger::new(self.num_keys());
-        let mut items = Vec::new();
-        for (key, views) in &self.entries {
-            if views.is_none() {
-                ledger.skip(key, "without views in the evaluation index");
-            } else if let Some(scene) = source.find(key) {
-                match source.cameras(scene) {
-                    Ok(cameras) => {
-                        let views = self.views(key, cameras.len())?;
-                        items.extend(views.map(|views| EvaluationItem { scene, views: views.clone() }));
-                    }
-                    Err(error) => ledger.skip(key, error.to_string()),
-                }
-            } else {
-                ledger.skip(key, "not in the data");
-            }
-        }
-        Ok((items, ledger))
     }
 }
 
@@ -154,7 +160,7 @@ impl<'de> Deserialize<'de> for IndexFile {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{ChunkSource, SceneFilters, Split};
+    use crate::{Camera, ChunkSource, Frame, SceneFilters, Split, SyntheticConfig, SyntheticSource};
 
     fn index(json: &str) -> Result<EvaluationIndex, DataError> {
         let folder = tempfile::tempdir().unwrap();
@@ -204,16 +210,60 @@ mod tests {
     fn selecting_counts_what_is_left_out() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
         let source = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
-        let (items, ledger) =
-            EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&source).unwrap();
+        let (items, ledger) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&source, 0);
         let views = ViewIndices { context: vec![0, 2, 5, 7], target: vec![1, 3, 4, 6] };
         assert_eq!(items, [EvaluationItem { scene: 0, views }]);
         assert_eq!(ledger.to_string(), "1 of 3 scenes used; 2 without views in the evaluation index");
 
         let train = ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap();
-        let (items, ledger) =
-            EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&train).unwrap();
+        let (items, ledger) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&train, 0);
         assert!(items.is_empty());
         assert_eq!(ledger.counts()["not in the data"], 1);
+    }
+
+    /// Five scenes of eight frames, of which the second cannot be read.
+    struct SecondIsBroken(SyntheticSource);
+
+    impl SceneSource for SecondIsBroken {
+        fn num_scenes(&self) -> usize {
+            self.0.num_scenes()
+        }
+        fn key(&self, scene: usize) -> &str {
+            self.0.key(scene)
+        }
+        fn find(&self, key: &str) -> Option<usize> {
+            self.0.find(key)
+        }
+        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+            if scene == 1 {
+                return Err(DataError::BadCamera { what: "the pose holds NaN".into() });
+            }
+            self.0.cameras(scene)
+        }
+        fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+            self.0.frame(scene, frame)
+        }
+    }
+
+    #[test]
+    fn an_entry_that_cannot_be_used_does_not_stop_the_rest_and_a_limit_ends_the_search() {
+        let config = SyntheticConfig { num_scenes: 5, num_frames: 8, ..Default::default() };
+        let source = SecondIsBroken(SyntheticSource::new(config).unwrap());
+        let last_frames = [8, 7, 7, 7, 7]; // the first scene has no frame 8
+        let entries: Vec<String> = (0..5)
+            .map(|scene| {
+                format!(r#""{}": {{"context": [0, {}], "target": [3]}}"#, source.key(scene), last_frames[scene])
+            })
+            .collect();
+        let index = index(&format!("{{{}}}", entries.join(","))).unwrap();
+        let scenes = |items: &[EvaluationItem]| items.iter().map(|item| item.scene).collect::<Vec<_>>();
+
+        let (items, ledger) = index.select(&source, 0);
+        assert_eq!((scenes(&items), ledger.num_scenes), (vec![2, 3, 4], 5));
+        assert!(ledger.skips[0].reason.contains("asks for frame 8 of scene"), "{ledger}");
+        assert_eq!(ledger.skips[1].reason, "bad camera: the pose holds NaN");
+
+        let (items, ledger) = index.select(&source, 2);
+        assert_eq!((scenes(&items), ledger.num_scenes, ledger.num_used()), (vec![2, 3], 4, 2));
     }
 }

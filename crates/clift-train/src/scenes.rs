@@ -87,11 +87,11 @@ pub fn evaluation_items(
     reader: &ClipReader,
     num_scenes: usize,
 ) -> Result<(Vec<EvaluationItem>, Ledger), TrainError> {
-    let limit = if num_scenes == 0 { usize::MAX } else { num_scenes };
     let source = &reader.source;
-    let (mut items, ledger) = if let Some(index) = &eval.index {
-        EvaluationIndex::read(index)?.select(source.as_ref())?
+    let (items, ledger) = if let Some(index) = &eval.index {
+        EvaluationIndex::read(index)?.select(source.as_ref(), num_scenes)
     } else {
+        let limit = if num_scenes == 0 { usize::MAX } else { num_scenes };
         let count = source.num_scenes().min(limit);
         let mut ledger = Ledger::new(count);
         let mut items = Vec::with_capacity(count);
@@ -104,7 +104,6 @@ pub fn evaluation_items(
         }
         (items, ledger)
     };
-    items.truncate(limit);
     if items.is_empty() {
         return Err(TrainError::NoScenes { reason: format!("evaluation: {ledger}") });
     }
