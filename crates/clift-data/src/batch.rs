@@ -1,5 +1,6 @@
 //! The training batch of a step: which scenes, which views, and what was left out.
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 
@@ -9,8 +10,12 @@ use crate::ledger::Skip;
 use crate::order::{SceneOrder, item_rng};
 use crate::sampler::BoundedSampler;
 
-/// Scenes tried for one slot before the batch fails.
-pub const MAX_ATTEMPTS: u32 = 16;
+/// Tries of one slot, a scene that comes up again included, before the batch may fail.
+const MIN_ATTEMPTS: u32 = 16;
+/// Distinct scenes that one slot tries, or all where there are fewer, before the batch fails.
+const MAX_SCENES_TRIED: usize = 64;
+/// Ends the walk over a permutation that never brings up some scene; 64 come up in 300 steps or so.
+const MAX_STEPS_AHEAD: u32 = 4096;
 
 /// Reads the given frames of a scene as a clip.
 pub type ReadClip = dyn Fn(usize, &ViewIndices) -> Result<Clip, DataError> + Send + Sync;
@@ -59,11 +64,11 @@ impl TrainingClips {
     /// Makes the batch of `step`.
     ///
     /// A scene that is too short or cannot be read is listed in [`ClipBatch::skipped`], and its slot takes the
-    /// scene it would have had one step later, then two, up to [`MAX_ATTEMPTS`] scenes. The replacement is drawn
-    /// with its own randomness, so the other slots do not notice.
+    /// scene it would have had one step later, then two, and so on. The replacement is drawn with its own
+    /// randomness, so the other slots do not notice.
     ///
     /// # Errors
-    /// [`DataError::NoUsableScene`] when a slot's scenes all fail.
+    /// [`DataError::NoUsableScene`] when 16 tries and 64 different scenes (all, where there are fewer) have failed.
     pub fn batch(&self, step: u64) -> Result<ClipBatch, DataError> {
         let num_context = self.sampler.num_context(self.seed, step);
         let mut batch = ClipBatch { step, clips: Vec::new(), skipped: Vec::new() };
@@ -82,9 +87,20 @@ impl TrainingClips {
         skipped: &mut Vec<Skip>,
     ) -> Result<Clip, DataError> {
         let mut last = Skip { key: String::new(), reason: String::new() };
-        for attempt in 0..MAX_ATTEMPTS {
-            let scene = self.order.scene(step.saturating_add(u64::from(attempt)), slot);
-            match self.read_scene(scene, step, slot, attempt, num_context) {
+        let mut tried = BTreeSet::new();
+        let mut attempts = 0;
+        let enough = self.source.num_scenes().min(MAX_SCENES_TRIED);
+        for ahead in 0..MAX_STEPS_AHEAD {
+            if attempts >= MIN_ATTEMPTS && tried.len() >= enough {
+                break;
+            }
+            let scene = self.order.scene(step.saturating_add(u64::from(ahead)), slot);
+            // The first tries may draw other views of a scene that failed; later ones look for other scenes.
+            if !tried.insert(scene) && ahead >= MIN_ATTEMPTS {
+                continue;
+            }
+            attempts += 1;
+            match self.read_scene(scene, step, slot, ahead, num_context) {
                 Ok(clip) => return Ok(clip),
                 Err(error) => {
                     last = Skip { key: self.source.key(scene).into(), reason: error.to_string() };
@@ -93,7 +109,7 @@ impl TrainingClips {
             }
         }
         let Skip { key, reason } = last;
-        Err(DataError::NoUsableScene { step, slot, attempts: MAX_ATTEMPTS, key, reason })
+        Err(DataError::NoUsableScene { step, slot, attempts, key, reason })
     }
 
     fn read_scene(
@@ -104,7 +120,7 @@ impl TrainingClips {
         attempt: u32,
         num_context: usize,
     ) -> Result<Clip, DataError> {
-        let num_frames = self.source.cameras(scene)?.len();
+        let num_frames = self.source.num_frames(scene)?;
         let mut rng = item_rng(self.seed, step, slot as u32, attempt, "views");
         let views = self.sampler.sample(num_frames, step, num_context, &mut rng)?;
         (self.read)(scene, &views)
@@ -127,7 +143,6 @@ mod tests {
     use crate::camera::{Camera, IntrinsicsNorm, Pose};
     use crate::clip::{Frame, Views};
     use crate::loader::Prefetcher;
-    use std::collections::BTreeSet;
 
     /// Scenes without pictures, of these numbers of frames.
     struct Lengths(Vec<usize>, Vec<String>);
@@ -242,9 +257,32 @@ mod tests {
     }
 
     #[test]
+    fn the_one_good_scene_among_many_bad_ones_is_found_from_every_step() {
+        // Batches of as many slots as there are scenes see one place of each epoch: the worst case of a walk.
+        for (num_scenes, batch_size) in [(2, 1), (20, 4), (64, 1), (64, 64)] {
+            let lengths = (0..num_scenes).map(|scene| if scene == 1 { 200 } else { 10 }).collect();
+            let clips = clips(lengths, batch_size, 9);
+            for step in 0..50 {
+                let batch = clips.batch(step).unwrap();
+                assert!(batch.clips.iter().all(|clip| clip.key == "scene-1"), "{num_scenes} scenes, step {step}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_slot_gives_up_after_64_scenes_and_tries_a_single_one_16_times() {
+        let tries = |num_scenes| match clips(vec![10; num_scenes], 1, 9).batch(0) {
+            Err(DataError::NoUsableScene { attempts, .. }) => attempts,
+            other => panic!("{other:?}"),
+        };
+        assert_eq!([tries(1), tries(1000)], [16, 64]);
+        assert!((40..=56).contains(&tries(40)), "{} tries for 40 scenes", tries(40));
+    }
+
+    #[test]
     fn a_source_of_short_scenes_fails_naming_the_last_reason() {
         let error = clips(vec![10; 40], 4, 9).batch(2).unwrap_err().to_string();
-        assert!(error.starts_with("no usable scene for slot 0 of step 2 in 16 tries"), "{error}");
+        assert!(error.starts_with("no usable scene for slot 0 of step 2 in "), "{error}");
         assert!(error.ends_with("failed with: not enough frames: 26 needed, 10 in the scene"), "{error}");
     }
 
