@@ -7,6 +7,9 @@ use crate::clip::ViewIndices;
 use crate::error::DataError;
 use crate::order::{below, between, distinct, draw_from, step_rng};
 
+/// Most context or target views of an item.
+const MAX_VIEWS: usize = 10_000;
+
 /// Value at `step` of a number that grows linearly from `init` to `last` in `warm_up_steps` steps and then stays:
 /// `min(init + trunc((last - init) * step / warm_up_steps), last)`.
 ///
@@ -74,6 +77,11 @@ impl BoundedSampler {
         }
         if *num_targets == 0 {
             return fail("num_targets", "is 0; use 1 or more".into());
+        }
+        for (key, count) in [("max_context", max_context), ("num_targets", num_targets)] {
+            if *count > MAX_VIEWS {
+                return fail(key, format!("is {count}; use {MAX_VIEWS} or fewer"));
+            }
         }
         for (key, gap) in [("min_gap", min_gap), ("max_gap", max_gap)] {
             if gap[0] > gap[1] {
@@ -310,6 +318,12 @@ mod tests {
         );
         assert!(check(BoundedSampler { max_context: 3, ..sampler() }).starts_with("max_context is 3"));
         assert!(check(BoundedSampler { num_targets: 0, ..sampler() }).starts_with("num_targets is 0"));
+        for huge in [10_001, usize::MAX] {
+            let expected = format!("max_context is {huge}; use 10000 or fewer");
+            assert_eq!(check(BoundedSampler { max_context: huge, ..sampler() }), expected);
+            let expected = format!("num_targets is {huge}; use 10000 or fewer");
+            assert_eq!(check(BoundedSampler { num_targets: huge, ..sampler() }), expected);
+        }
         assert!(check(BoundedSampler { min_gap: [30, 25], ..sampler() }).starts_with("min_gap is [30, 25]"));
         assert!(check(BoundedSampler { max_gap: [45, 40], ..sampler() }).starts_with("max_gap is [45, 40]"));
         assert!(check(BoundedSampler { max_gap: [20, 135], ..sampler() }).starts_with("max_gap is [20, 135]"));

@@ -129,6 +129,24 @@ mod tests {
     }
 
     #[test]
+    fn a_number_that_is_not_finite_is_refused_by_its_key() {
+        for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            let valid = SyntheticConfig::default;
+            for (key, config) in [
+                ("fov_deg", SyntheticConfig { fov_deg: value, ..valid() }),
+                ("room_half_size", SyntheticConfig { room_half_size: [value, 2.0], ..valid() }),
+                ("room_half_size", SyntheticConfig { room_half_size: [1.5, value], ..valid() }),
+                ("path_length", SyntheticConfig { path_length: value, ..valid() }),
+                ("texture_frequency", SyntheticConfig { texture_frequency: value, ..valid() }),
+                ("specular", SyntheticConfig { specular: value, ..valid() }),
+            ] {
+                let message = config.validate().unwrap_err().to_string();
+                assert!(message.starts_with(&format!("{key} is ")), "{value}: {message}");
+            }
+        }
+    }
+
+    #[test]
     fn an_unknown_key_is_refused_and_a_missing_one_takes_its_default() {
         let parsed: Result<SyntheticConfig, _> = serde_json::from_str(r#"{"sed": 1}"#);
         assert!(parsed.unwrap_err().to_string().contains("sed"));
