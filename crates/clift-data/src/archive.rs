@@ -44,7 +44,10 @@ impl Span {
         })
     }
 
-    /// Reads the bytes from the archive at `path`; `None` if its header is not where the directory says, it ends
+    /// Reads the bytes from the archive at `path`.
+    ///
+    /// # Errors
+    /// [`DataError::Io`], and [`DataError::BadChunk`] if the header is not where the directory says, the file ends
     /// early, or the checksum differs.
     pub fn read(&self, path: &Path) -> Result<Vec<u8>, DataError> {
         let bad = |what: &str| DataError::BadChunk {

@@ -86,11 +86,6 @@ where
             .collect();
         Self { shared, workers, next_step: start_step }
     }
-
-    /// Step of the item that comes next.
-    pub fn next_step(&self) -> u64 {
-        self.next_step
-    }
 }
 
 impl<T, E: From<WorkerPanic>> Iterator for Prefetcher<T, E> {

@@ -108,11 +108,6 @@ impl SceneOrder {
             as usize
     }
 
-    /// Epoch that batch slot `slot` at `step` lies in, counted from 0.
-    pub fn epoch(&self, step: u64, slot: usize) -> u64 {
-        (self.position(step, slot) / u128::from(self.num_scenes)) as u64
-    }
-
     /// Slots per batch.
     pub fn batch_size(&self) -> usize {
         self.batch_size as usize
