@@ -311,3 +311,51 @@ fn a_damaged_checkpoint_is_an_error_and_never_a_silent_restart() {
         }
     }
 }
+
+#[test]
+fn steps_that_are_not_finite_are_left_out_and_three_in_a_row_stop_the_run() {
+    let place = Place::new();
+    // One update of this size overflows every product after it.
+    let set = ["stage1.optimizer={learning_rate=1e30, warm_up_steps=1}", "checkpoint.every=1", "stage1.steps=9"];
+    let message = place.train("run", &set, &[]).fails(1);
+    assert!(
+        message.contains("step 2 left out: loss or gradient is not finite (scenes synthetic-0-train-"),
+        "{message}"
+    );
+    assert!(message.contains("3 steps in a row had a loss or gradient that is not finite, up to step 4"), "{message}");
+    assert!(message.contains(&place.at("run/stage1/checkpoints").display().to_string()), "{message}");
+    assert!(!place.at("run/stage1/model.safetensors").exists());
+    let lines = place.metrics("run");
+    assert_eq!(lines.len(), 4);
+    assert!(lines[0]["loss"].is_number() && lines[3]["loss"].is_null(), "{lines:?}");
+}
+
+#[test]
+fn weights_of_two_trainings_are_not_evaluated_together() {
+    let place = Place::new();
+    place.train("a", &[], &[]).ok();
+    place.train("b", &["seed=1"], &["--only", "stage1"]).ok();
+    std::fs::copy(place.at("b/stage1/model.safetensors"), place.at("a/stage1/model.safetensors")).expect("copies");
+    let message = place.eval("a", &[]).fails(1);
+    assert!(message.contains("trained on another encoder"), "{message}");
+}
+
+#[test]
+fn an_empty_cluster_cache_is_not_kept() {
+    let place = Place::new();
+    // Scenes of 8 frames train in the first steps and are too short once the gaps have grown.
+    let views =
+        "data.views={min_context=2, max_context=2, min_gap=[3, 8], max_gap=[6, 8], warm_up_steps=6, num_targets=2}";
+    let message = place.train("run", &[views, "stage1.steps=6"], &[]).fails(1);
+    assert!(message.contains("none could be clustered"), "{message}");
+    assert!(!place.at("run/clusters").exists());
+}
+
+#[test]
+fn fresh_is_refused_for_a_later_stage() {
+    let place = Place::new();
+    place.train("run", &[], &["--only", "stage1"]).ok();
+    let message = place.train("run", &[], &["--fresh", "--only", "clusters"]).fails(2);
+    assert!(message.contains("--fresh"), "{message}");
+    assert!(place.at("run/stage1/model.safetensors").exists(), "nothing was moved");
+}

@@ -177,3 +177,47 @@ fn fresh_moves_the_former_run_aside() {
     place.train("run", &[], &["--only", "stage1", "--fresh"]).ok();
     assert_eq!((place.metrics("run.2").len(), place.metrics("run").len()), (3, 6));
 }
+
+#[test]
+fn an_evaluation_can_be_interrupted() {
+    let place = Place::new();
+    place.train("run", &["data.synthetic.num_scenes=400"], &[]).ok();
+    let run = place.at("run").display().to_string();
+    // Hundreds of scenes with rows of targets: far longer than the signal takes.
+    let mut child = spawn(["eval", &run, "--set", "eval.num_scenes=0", "--set", "eval.num_sheets=400"]);
+    let sheets = place.at("run/eval/sheets");
+    let before = std::fs::read_dir(&sheets).expect("the first evaluation's").count();
+    let started = Instant::now();
+    while std::fs::read_dir(&sheets).expect("the folder").count() < before + 3 {
+        assert!(child.try_wait().expect("a child").is_none(), "the evaluation ended before the signal");
+        assert!(started.elapsed() < Duration::from_mins(1), "no sheet within a minute");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill runs");
+    assert!(sent.success());
+    let message = finish(child).fails(130);
+    assert!(message.contains("interrupted at step"), "{message}");
+}
+
+#[test]
+fn a_finished_run_needs_neither_its_clusters_nor_what_it_started_from() {
+    let place = Place::new();
+    place.train("first", &[], &["--only", "stage1"]).ok();
+    let from = format!("stage1.init_from=\"{}\"", place.at("first").display());
+    place.train("second", &[&from], &[]).ok();
+    std::fs::remove_dir_all(place.at("first")).expect("removes");
+    std::fs::remove_dir_all(place.at("second/clusters")).expect("removes");
+    place.train("second", &[&from], &[]).ok();
+    assert!(!place.at("second/clusters").exists(), "nothing was clustered again");
+}
+
+#[test]
+fn a_resumed_stage_does_not_look_for_the_weights_it_started_from() {
+    let place = Place::new();
+    place.train("first", &[], &["--only", "stage1"]).ok();
+    let from = format!("stage1.init_from=\"{}\"", place.at("first").display());
+    let set: Vec<&str> = LONG.iter().copied().chain([from.as_str()]).collect();
+    stop_after(&place, "second", &set, &["--only", "stage1"], 10, "-INT").fails(130);
+    std::fs::remove_dir_all(place.at("first")).expect("removes");
+    place.train("second", &set, &["--only", "stage1"]).ok();
+}

@@ -1,12 +1,26 @@
 //! A training step on a GPU (Mesa's software Vulkan counts) gives what the CPU gives.
 
-use burn::module::{Module, ModuleVisitor, Param};
-use burn::tensor::{Device, Gradients, Tensor};
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::tensor::{Device, Gradients, Int, Tensor};
 use clift_model::device::DeviceName;
 use clift_model::{Cameras, Clift, Clusters, ModelConfig, SceneClusters, Views};
 
-/// Loss and all gradients of a small model with condenser, by parameter path order.
-fn loss_and_gradients(device: &Device) -> (f64, Vec<f64>) {
+/// Moves every parameter by a fixed pattern: the condenser's gates start at zero, and behind a closed
+/// gate every gradient is zero.
+struct Perturb;
+
+impl ModuleMapper for Perturb {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        param.map(|weight| {
+            let shape = weight.dims();
+            let index = Tensor::<1, Int>::arange(0..shape.iter().product::<usize>() as i64, &weight.device());
+            weight + index.float().mul_scalar(0.7).cos().mul_scalar(0.05).reshape(shape)
+        })
+    }
+}
+
+/// Loss and the gradient of every parameter of a small model with condenser.
+fn loss_and_gradients(device: &Device) -> (f64, Vec<Vec<f64>>) {
     let device = device.clone().autodiff();
     let config = ModelConfig {
         dim: 32,
@@ -16,7 +30,7 @@ fn loss_and_gradients(device: &Device) -> (f64, Vec<f64>) {
         num_renderer_blocks: 1,
         ..ModelConfig::default()
     };
-    let model = Clift::new(&config, 0, &device);
+    let model = Clift::new(&config, 0, &device).map(&mut Perturb);
     let cameras = |origin: f32| {
         let pose = |x: f32| [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
         let c2w: Vec<f32> = [origin, -origin, 0.5 * origin, 1.0].into_iter().flat_map(pose).collect();
@@ -33,13 +47,12 @@ fn loss_and_gradients(device: &Device) -> (f64, Vec<f64>) {
     (loss.into_scalar::<f64>(), gradients(&model, &grads))
 }
 
-fn gradients(model: &Clift, grads: &Gradients) -> Vec<f64> {
-    struct Collect<'a>(&'a Gradients, Vec<f64>);
+fn gradients(model: &Clift, grads: &Gradients) -> Vec<Vec<f64>> {
+    struct Collect<'a>(&'a Gradients, Vec<Vec<f64>>);
     impl ModuleVisitor for Collect<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            if let Some(grad) = param.val().grad(self.0) {
-                self.1.extend(grad.into_data().convert::<f64>().try_to_vec::<f64>().expect("f64"));
-            }
+            let grad = param.val().grad(self.0).expect("every parameter takes part");
+            self.1.push(grad.into_data().convert::<f64>().try_to_vec::<f64>().expect("f64"));
         }
     }
     let mut collect = Collect(grads, Vec::new());
@@ -57,9 +70,12 @@ fn forward_and_backward_equal_the_cpus() {
     let (loss, grads) = loss_and_gradients(&wgpu);
     let (expected_loss, expected) = loss_and_gradients(&DeviceName::Flex.open().expect("the CPU device"));
     assert!((loss - expected_loss).abs() < 1e-5 * expected_loss, "{loss} against {expected_loss}");
-    assert_eq!(grads.len(), expected.len(), "the same parameters have gradients");
-    let scale = expected.iter().fold(0.0_f64, |scale, value| scale.max(value.abs()));
-    let error = grads.iter().zip(&expected).fold(0.0_f64, |error, (a, b)| error.max((a - b).abs()));
-    // Sums of a few hundred f32 terms in another order.
-    assert!(error <= 1e-4 * scale, "relative error of the gradients {:.2e}", error / scale);
+    for (parameter, (grad, expected)) in grads.iter().zip(&expected).enumerate() {
+        let scale = expected.iter().fold(0.0_f64, |scale, value| scale.max(value.abs()));
+        assert!(scale > 0.0, "parameter {parameter} is not reached");
+        let error = grad.iter().zip(expected).fold(0.0_f64, |error, (a, b)| error.max((a - b).abs()));
+        // Sums of a few hundred f32 terms in another order, through four blocks; the floor is for keys'
+        // biases, whose gradient is zero but for rounding.
+        assert!(error <= 1e-3 * scale + 1e-9, "parameter {parameter}: error {error:.2e} of {scale:.2e}");
+    }
 }

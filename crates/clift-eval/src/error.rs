@@ -62,6 +62,12 @@ pub enum EvalError {
     /// The condensed variant was asked for without a condenser.
     #[error("the condensed variant needs the weights of stage 2")]
     NoCondenser,
+    /// A sweep was asked for a variant that is not made from tokens here.
+    #[error("the variant `{variant}` is not rendered in a sweep")]
+    NotRendered {
+        /// Its name.
+        variant: &'static str,
+    },
     /// The model refused its input or its weights.
     #[error(transparent)]
     Model(#[from] clift_model::ModelError),

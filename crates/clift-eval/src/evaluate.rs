@@ -115,7 +115,9 @@ pub fn evaluate_scene(
                     let (condenser, renderer) = networks.condensed.as_ref().ok_or(EvalError::NoCondenser)?;
                     (condenser.forward(lift.clone(), &index.clusters()?.upload(device)), renderer)
                 }
-                Variant::Patch | Variant::NearestView | Variant::MeanImage => continue,
+                Variant::Patch | Variant::NearestView | Variant::MeanImage => {
+                    return Err(EvalError::NotRendered { variant: variant.name() });
+                }
             };
             let setting = Setting { variant, num_storage_tokens, num_render_tokens: num_storage_tokens };
             renderings.push(render(renderer, tokens, &clip.target, setting, &rows)?);
@@ -174,7 +176,10 @@ fn render(
 ) -> Result<Rendered, EvalError> {
     let mut rendered = Rendered::new(setting);
     let frame_len = target.height * target.width * 3;
-    let cameras = upload_cameras(&[target], &tokens.device())?;
+    let device = tokens.device();
+    let cameras = upload_cameras(&[target], &device)?;
+    // So that the clock below does not count what is still queued.
+    device.sync().map_err(EvalError::tensor)?;
     for start in (0..target.num_views()).step_by(VIEWS_PER_PASS) {
         let count = VIEWS_PER_PASS.min(target.num_views() - start);
         let cameras = Cameras {

@@ -24,6 +24,10 @@ impl TokenCount {
     /// [`EvalError::BadTokenCount`] when a scene does not have that many.
     pub fn of(self, num_tokens: usize) -> Result<usize, EvalError> {
         match self {
+            _ if num_tokens == 0 => Err(EvalError::BadTokenCount {
+                text: self.to_string(),
+                reason: "a scene without views has no tokens".into(),
+            }),
             Self::Count(count) if (1..=num_tokens).contains(&count) => Ok(count),
             // The small excess keeps 3 of 48 from becoming 2 through 0.0625 * 48 = 2.9999...
             Self::Share(share) => Ok(((num_tokens as f64 * share + 1e-9) as usize).clamp(1, num_tokens)),
@@ -86,13 +90,14 @@ impl<'de> Deserialize<'de> for TokenCount {
             Share(f64),
             Text(String),
         }
-        let text = match Written::deserialize(deserializer)? {
-            Written::Count(count) => count.to_string(),
+        match Written::deserialize(deserializer)? {
             // A float is a share even where it is whole: 1.0 is all tokens, not one.
-            Written::Share(share) => format!("{share}/1"),
-            Written::Text(text) => text,
-        };
-        text.parse().map_err(serde::de::Error::custom)
+            Written::Share(share) if share > 0.0 && share <= 1.0 => return Ok(Self::Share(share)),
+            Written::Share(share) => share.to_string().parse(),
+            Written::Count(count) => count.to_string().parse(),
+            Written::Text(text) => text.parse(),
+        }
+        .map_err(serde::de::Error::custom)
     }
 }
 
@@ -120,6 +125,8 @@ mod tests {
             let message = text.parse::<TokenCount>().unwrap_err().to_string();
             assert!(message.contains(part), "{message}");
         }
+        assert!(parse("1/2").of(0).is_err());
+        assert!(serde_json::from_str::<TokenCount>("-1").unwrap_err().to_string().contains("`-1` tokens"));
         assert!(parse("300").of(256).unwrap_err().to_string().contains("a scene has 256 tokens"));
     }
 

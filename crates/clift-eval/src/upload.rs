@@ -15,22 +15,30 @@ use crate::EvalError;
 /// # Errors
 /// [`EvalError::Model`] when the sets differ in number or size, or a camera is not finite.
 pub fn upload_views(scenes: &[&HostViews], device: &Device) -> Result<Views, EvalError> {
-    let cameras = upload_cameras(scenes, device)?;
-    Ok(Views { images: upload_pictures(scenes, device)?, cameras })
+    let (c2w, intrinsics) = camera_values(scenes);
+    Ok(Views::upload(&pixel_values(scenes), &c2w, &intrinsics, shape(scenes), device)?)
 }
 
 /// The pictures alone, RGB in `[0, 1]`, `[batch, views, height, width, 3]`. See [`upload_views`].
 pub fn upload_pictures(scenes: &[&HostViews], device: &Device) -> Result<Tensor<5>, EvalError> {
-    let images: Vec<u8> = scenes.iter().flat_map(|views| &views.images).copied().collect();
-    Ok(upload_images(&images, shape(scenes), device)?)
+    Ok(upload_images(&pixel_values(scenes), shape(scenes), device)?)
 }
 
 /// The cameras alone. See [`upload_views`].
 pub fn upload_cameras(scenes: &[&HostViews], device: &Device) -> Result<Cameras, EvalError> {
-    let c2w: Vec<f32> = scenes.iter().flat_map(|views| &views.c2w).flat_map(|pose| pose.to_matrix()).collect();
-    let intrinsics = scenes.iter().flat_map(|views| &views.intrinsics);
-    let intrinsics: Vec<f32> = intrinsics.flat_map(|k| [k.fx, k.fy, k.cx, k.cy].map(|value| value as f32)).collect();
+    let (c2w, intrinsics) = camera_values(scenes);
     Ok(Cameras::upload(&c2w, &intrinsics, shape(scenes), device)?)
+}
+
+fn pixel_values(scenes: &[&HostViews]) -> Vec<u8> {
+    scenes.iter().flat_map(|views| &views.images).copied().collect()
+}
+
+fn camera_values(scenes: &[&HostViews]) -> (Vec<f32>, Vec<f32>) {
+    let c2w = scenes.iter().flat_map(|views| &views.c2w).flat_map(|pose| pose.to_matrix()).collect();
+    let intrinsics = scenes.iter().flat_map(|views| &views.intrinsics);
+    let intrinsics = intrinsics.flat_map(|k| [k.fx, k.fy, k.cx, k.cy].map(|value| value as f32)).collect();
+    (c2w, intrinsics)
 }
 
 /// `[batch, views, height, width]` of the first scene; the uploads check the others against it.

@@ -114,6 +114,12 @@ impl ModelConfig {
                 return Err(ModelError::BadConfig { key, value: value.to_string(), fix: "write at least 1".into() });
             }
         }
+        for ((key, value), most) in positive.into_iter().zip([1 << 16, 1 << 10, 1 << 18, 1 << 10, 1 << 10, 256, 64]) {
+            if value > most {
+                let fix = format!("write at most {most}");
+                return Err(ModelError::BadConfig { key, value: value.to_string(), fix });
+            }
+        }
         if !self.dim.is_multiple_of(self.num_heads) {
             return Err(ModelError::BadConfig {
                 key: "model.num_heads",

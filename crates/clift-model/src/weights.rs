@@ -72,7 +72,7 @@ pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError
         SafetensorsStore::from_file(path).with_from_adapter(PyTorchToBurnAdapter).validate(false).allow_partial(true);
     let result = module.load_from(&mut store).map_err(|e| error(e.to_string()))?;
     if let Some(first) = result.errors.first() {
-        return Err(error(format!("{first:?}")));
+        return Err(error(first.to_string()));
     }
     if let Some(name) = first_non_finite(module) {
         return Err(error(format!("{name} is not finite")));

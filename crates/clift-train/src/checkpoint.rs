@@ -124,7 +124,15 @@ impl Checkpoints {
         Ok(found.into_iter().map(|(_, path)| path).collect())
     }
 
+    /// Removes checkpoints beyond the newest, and what a save that was killed has left.
     fn prune(&self) -> Result<(), TrainError> {
+        let listing = "listing checkpoints";
+        for item in std::fs::read_dir(&self.folder).map_err(TrainError::io(listing, &self.folder))? {
+            let path = item.map_err(TrainError::io(listing, &self.folder))?.path();
+            if path.extension().is_some_and(|extension| extension == "tmp") {
+                std::fs::remove_dir_all(&path).map_err(TrainError::io("removing an unfinished save", &path))?;
+            }
+        }
         let all = self.list()?;
         for path in &all[..all.len().saturating_sub(self.keep)] {
             std::fs::remove_dir_all(path).map_err(TrainError::io("removing an old checkpoint", path))?;

@@ -3,6 +3,7 @@
 //! A folder with `index.json` (what was clustered with which encoder) and `clusters.bin` (per entry the
 //! cluster of every token and the token of every cluster, little-endian u16).
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -11,7 +12,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use burn::tensor::Device;
 use clift_data::files::replace;
 use clift_data::order::{below, derive_seed, item_rng};
-use clift_data::{ClipReader, Ledger, ViewIndices};
+use clift_data::{ClipReader, DataError, Ledger, ViewIndices};
 use clift_eval::upload_views;
 use clift_model::{Encoder, SceneClusters};
 use serde::{Deserialize, Serialize};
@@ -21,6 +22,9 @@ use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
 
 const VERSION: u32 = 1;
+
+/// Most tokens of a scene: ids are kept in 16 bits.
+pub const MAX_TOKENS: usize = 1 << 16;
 
 /// One clustered context set of a scene.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -45,8 +49,8 @@ struct Index {
     version: u32,
     /// Hash of the encoder's weights.
     encoder: String,
-    /// The settings that decide the clusters, as JSON.
-    settings: serde_json::Value,
+    /// The settings that decide the clusters, as JSON in a string: read back, numbers could differ in the last digit.
+    settings: String,
     skipped: Ledger,
     entries: Vec<Entry>,
 }
@@ -87,7 +91,7 @@ impl ClusterJob<'_> {
         let total_sets = (config.clusters.num_passes * num_scenes) as u64;
         let started = std::time::Instant::now();
         sink.event(&Event::StageStarted { stage: Stage::Clusters, done: 0, num_steps: total_sets });
-        let mut skipped = Ledger::new(num_scenes);
+        let mut reasons = BTreeMap::new();
         let mut entries = Vec::new();
         let mut offset_bytes = 0;
         for pass in 0..config.clusters.num_passes {
@@ -105,12 +109,11 @@ impl ClusterJob<'_> {
                         });
                         offset_bytes += bytes.len() as u64;
                     }
-                    Err(TrainError::Data(error)) => {
+                    // A scene that does not fit its views is left out; a disk that fails is not a scene.
+                    Err(TrainError::Data(error)) if !matches!(error, DataError::Io { .. }) => {
                         let (key, reason) = (reader.source.key(scene), error.to_string());
-                        if pass == 0 {
-                            skipped.skip(key, reason.clone());
-                        }
-                        sink.event(&Event::Skipped { key: key.into(), reason });
+                        sink.event(&Event::Skipped { key: key.into(), reason: reason.clone() });
+                        reasons.insert(key.to_owned(), reason);
                     }
                     Err(other) => return Err(other),
                 }
@@ -122,6 +125,16 @@ impl ClusterJob<'_> {
             }
         }
         sink.event(&Event::StageFinished { stage: Stage::Clusters, elapsed_s: started.elapsed().as_secs_f64() });
+        if entries.is_empty() {
+            let reason = reasons.into_values().next().unwrap_or_default();
+            return Err(TrainError::NoScenes { reason: format!("none could be clustered; the first: {reason}") });
+        }
+        let mut skipped = Ledger::new(num_scenes);
+        for (key, reason) in reasons {
+            if !entries.iter().any(|entry: &Entry| entry.key == key) {
+                skipped.skip(key, reason);
+            }
+        }
         let data = data.into_inner().map_err(|error| TrainError::io(writing, &data_path)(error.into_error()))?;
         data.sync_all().map_err(TrainError::io(writing, &data_path))?;
         let index =
@@ -140,8 +153,9 @@ impl ClusterJob<'_> {
         let mut rng = item_rng(seed, pass as u64, scene as u32, 0, "context and count");
         let num_context = views.min_context + below(&mut rng, views.max_context - views.min_context + 1);
         let num_frames = reader.source.cameras(scene)?.len();
-        // Past the warm-up: the gaps that stage 1 ends with.
-        let context = views.sample(num_frames, views.warm_up_steps, num_context, &mut rng)?.context;
+        // The gaps that stage 1 ends with.
+        let last_step = config.stage1.steps.min(views.warm_up_steps);
+        let context = views.sample(num_frames, last_step, num_context, &mut rng)?.context;
         let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
         let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
         let count = config.clusters.grid[below(&mut rng, config.clusters.grid.len())].of(lift.dims()[1])?;
@@ -227,7 +241,7 @@ impl Entry {
 }
 
 /// The settings that decide which clusters come out.
-fn settings(config: &Config) -> serde_json::Value {
+fn settings(config: &Config) -> String {
     let data = &config.data;
     serde_json::json!({
         "seed": config.seed,
@@ -241,6 +255,7 @@ fn settings(config: &Config) -> serde_json::Value {
         "views": data.views,
         "clusters": config.clusters,
     })
+    .to_string()
 }
 
 fn encode(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {
@@ -248,5 +263,5 @@ fn encode(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {
     ids.map(|&id| u16::try_from(id).map(u16::to_le_bytes))
         .collect::<Result<Vec<_>, _>>()
         .map(|pairs| pairs.concat())
-        .map_err(|_| TrainError::NoScenes { reason: "a scene has more than 65,536 tokens".into() })
+        .map_err(|_| TrainError::NoScenes { reason: format!("a scene has more than {MAX_TOKENS} tokens") })
 }

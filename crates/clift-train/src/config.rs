@@ -2,13 +2,14 @@
 
 use std::path::PathBuf;
 
-use clift_data::{BoundedSampler, ClipOptions, PoseRotation, PoseScale, SceneFilters, SyntheticConfig};
+use clift_data::{BoundedSampler, ClipOptions, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig};
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
 use clift_model::{KMeans, ModelConfig};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
+use crate::clusters::MAX_TOKENS;
 
 /// A whole experiment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -251,16 +252,43 @@ impl Config {
     /// # Errors
     /// [`TrainError::BadConfig`] naming the key, the value and the fix.
     pub fn validate(&self) -> Result<(), TrainError> {
+        if self.run_dir.as_os_str().is_empty() {
+            return Err(bad("run_dir", "\"\"", "write the folder that is to receive the run"));
+        }
         self.model.validate()?;
-        let fewest_tokens = self.model.num_tokens(self.data.views.min_context, self.data.height, self.data.width)?;
+        self.data.views.validate()?;
+        let tokens_per_view = self.model.num_tokens(1, self.data.height, self.data.width)?;
+        let most_tokens = self.data.views.max_context.saturating_mul(tokens_per_view);
+        if most_tokens > MAX_TOKENS {
+            let fix = format!("{most_tokens} tokens; at most {MAX_TOKENS} are possible: fewer views or smaller ones");
+            return Err(bad("data.views.max_context", self.data.views.max_context, &fix));
+        }
+        let fewest_tokens = self.data.views.min_context * tokens_per_view;
         for count in &self.clusters.grid {
             if count.of(fewest_tokens).is_err() {
                 return Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens")));
             }
         }
-        self.data.views.validate()?;
         match self.data.source {
-            SourceKind::Synthetic => self.data.synthetic.validate()?,
+            SourceKind::Synthetic => {
+                let synthetic = &self.data.synthetic;
+                synthetic.validate()?;
+                if synthetic.width < self.data.width || synthetic.height < self.data.height {
+                    let fix = format!(
+                        "synthetic scenes are {} x {}: write data.synthetic.width and height of at least {} and {}",
+                        synthetic.width, synthetic.height, self.data.width, self.data.height
+                    );
+                    return Err(bad(
+                        "data.width, data.height",
+                        format!("{}, {}", self.data.width, self.data.height),
+                        &fix,
+                    ));
+                }
+                if synthetic.split != Split::default() {
+                    let fix = "leave it out: a run trains on one split and measures on the other";
+                    return Err(bad("data.synthetic.split", synthetic.split, fix));
+                }
+            }
             SourceKind::Chunks if self.data.root.is_none() => {
                 return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
             }
@@ -277,12 +305,31 @@ impl Config {
             ("clusters.grid (length)", self.clusters.grid.len()),
             ("eval.storage (length)", self.eval.storage.len()),
             ("eval.num_targets", self.eval.num_targets),
+            ("eval.num_validation_scenes", self.eval.num_validation_scenes),
+            ("clusters.kmeans.max_iterations", self.clusters.kmeans.max_iterations),
             ("data.num_prefetch", self.data.num_prefetch),
             ("checkpoint.keep", self.checkpoint.keep),
         ] {
             if value == 0 {
                 return Err(bad(key, value, "write at least 1"));
             }
+        }
+        for (key, value, most) in [
+            ("data.num_threads", self.data.num_threads, 1024),
+            ("data.num_prefetch", self.data.num_prefetch, 1024),
+            ("eval.num_context", self.eval.num_context, 10_000),
+            ("eval.num_targets", self.eval.num_targets, 10_000),
+        ] {
+            if value > most {
+                return Err(bad(key, value, &format!("write at most {most}")));
+            }
+        }
+        if !(self.clusters.kmeans.tolerance >= 0.0 && self.clusters.kmeans.tolerance < 1.0) {
+            return Err(bad(
+                "clusters.kmeans.tolerance",
+                self.clusters.kmeans.tolerance,
+                "write 0 or a small fraction",
+            ));
         }
         if self.eval.num_context < 2 {
             return Err(bad("eval.num_context", self.eval.num_context, "write at least 2"));
@@ -307,6 +354,15 @@ impl Config {
                 }
             }
         }
+        for (stage, optimizer) in [("stage1", &self.stage1.optimizer), ("stage2", &self.stage2.optimizer)] {
+            if !(optimizer.weight_decay >= 0.0 && optimizer.weight_decay.is_finite()) {
+                let key = format!("{stage}.optimizer.weight_decay");
+                return Err(bad(&key, optimizer.weight_decay, "write 0 or a positive number"));
+            }
+            if optimizer.max_bad_steps == 0 {
+                return Err(bad(&format!("{stage}.optimizer.max_bad_steps"), 0, "write at least 1"));
+            }
+        }
         let factor = self.stage2.renderer_lr_factor;
         if !(0.0..=1.0).contains(&factor) {
             return Err(bad("stage2.renderer_lr_factor", factor, "write 0 to 1"));
@@ -325,7 +381,10 @@ mod tests {
 
     #[test]
     fn values_out_of_range_are_named_with_the_fix() {
-        let mut config = Config::default();
+        let mut config = Config { run_dir: "run".into(), ..Config::default() };
+        let message = config.validate().unwrap_err().to_string();
+        assert!(message.starts_with("`data.width, data.height` = 256, 256: synthetic scenes are 32 x 32"), "{message}");
+        (config.data.synthetic.width, config.data.synthetic.height) = (256, 256);
         config.validate().expect("the default is valid");
         config.stage1.keep_tokens = [0.5, 0.25];
         let message = config.validate().unwrap_err().to_string();
@@ -338,6 +397,12 @@ mod tests {
         let message = config.validate().unwrap_err().to_string();
         assert_eq!(message, "`clusters.grid` = 5000: a scene has as few as 4096 tokens");
         config.clusters.grid = vec![TokenCount::Count(64)];
+        config.data.views.min_context = 0;
+        assert!(config.validate().is_err(), "and no panic");
+        config.data.views.min_context = 4;
+        config.stage1.optimizer.weight_decay = f64::NAN;
+        assert!(config.validate().unwrap_err().to_string().starts_with("`stage1.optimizer.weight_decay` = NaN"));
+        config.stage1.optimizer.weight_decay = 0.05;
         config.data.source = SourceKind::Chunks;
         assert!(config.validate().unwrap_err().to_string().starts_with("`data.root` = missing"));
     }

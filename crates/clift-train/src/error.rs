@@ -56,6 +56,16 @@ pub enum TrainError {
         /// The cache.
         path: PathBuf,
     },
+    /// The weights of the two stages belong to different trainings.
+    #[error(
+        "the weights of stage 2 were trained on another encoder than stage 1 has now; move stage2/ and clusters/ away \
+         and train stage 2 again: {path}",
+        path = path.display()
+    )]
+    OtherEncoder {
+        /// The weights of stage 2.
+        path: PathBuf,
+    },
     /// A stage needs the result of one that has not run.
     #[error("{stage} needs {what}, which is not there; run {first} first: {path}", path = path.display())]
     Missing {

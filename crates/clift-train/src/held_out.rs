@@ -1,11 +1,14 @@
 //! Measuring a run on views it never trained on: during training and at its end.
 
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
+use clift_data::files::replace;
 use clift_data::order::derive_seed;
 use clift_data::{ClipReader, EvaluationItem, Ledger};
-use clift_eval::{Accumulator, Networks, Summary, Sweep, TokenCount, Variant, evaluate_scene};
+use clift_eval::picture::Picture;
+use clift_eval::{Accumulator, EvalConfig, Networks, Summary, Sweep, TokenCount, Variant, evaluate_scene};
 use clift_model::Clift;
 
 use crate::TrainError;
@@ -23,18 +26,18 @@ pub struct HeldOut<'a> {
 }
 
 impl<'a> HeldOut<'a> {
-    /// Chooses at most `num_scenes` scenes (0: all) of `reader` and their views, to be measured on `device`.
+    /// Chooses the scenes of `reader` and their views that `eval` names, to be measured on `device`.
     ///
     /// # Errors
     /// As [`evaluation_items`], and [`TrainError::BadConfig`] for a count a scene does not have.
-    pub fn new(config: &'a Config, reader: ClipReader, num_scenes: usize, device: &Device) -> Result<Self, TrainError> {
-        let (items, ledger) = evaluation_items(&config.eval, &reader, num_scenes)?;
+    pub fn new(config: &'a Config, eval: &EvalConfig, reader: ClipReader, device: &Device) -> Result<Self, TrainError> {
+        let (items, ledger) = evaluation_items(eval, &reader, eval.num_scenes)?;
         // A count that a scene does not have is found now, not at the end of training.
         let tokens_per_view = config.model.num_tokens(1, config.data.height, config.data.width)?;
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
         let fewest_tokens = fewest_views * tokens_per_view;
-        let counts = config.eval.storage.iter().map(|count| ("eval.storage", count));
-        for (key, count) in counts.chain([("eval.validation_storage", &config.eval.validation_storage)]) {
+        let counts = eval.storage.iter().map(|count| ("eval.storage", count));
+        for (key, count) in counts.chain([("eval.validation_storage", &eval.validation_storage)]) {
             if count.of(fewest_tokens).is_err() {
                 let fix = format!("write at most {fewest_tokens}, the fewest tokens of an evaluated scene");
                 return Err(TrainError::BadConfig { key: key.into(), value: count.to_string(), fix });
@@ -44,7 +47,7 @@ impl<'a> HeldOut<'a> {
     }
 
     /// Measures a model without autodiff during training: all tokens in stage 1, one count of condensed ones in stage 2.
-    /// Writes the first sheet to `folder`.
+    /// Writes the first sheet to `folder`. Left off without a result once `stop` is set.
     ///
     /// # Errors
     /// As [`evaluate_scene`]; a scene that cannot be read is skipped.
@@ -54,6 +57,7 @@ impl<'a> HeldOut<'a> {
         stage: Stage,
         step: u64,
         folder: &Path,
+        stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<(), TrainError> {
         let (storage, variant) = match stage {
@@ -69,8 +73,11 @@ impl<'a> HeldOut<'a> {
         };
         let mut measured = Accumulator::default();
         for (i, item) in self.items.iter().take(self.config.eval.num_validation_scenes).enumerate() {
-            let sheet = self.evaluate_item(&networks, item, &sweep, i == 0, &mut measured, sink)?;
-            if let Some(sheet) = sheet {
+            if stop.load(Ordering::Relaxed) {
+                return Ok(());
+            }
+            let outcome = self.evaluate_item(&networks, item, &sweep, i == 0, &mut measured, sink)?;
+            if let Outcome::Measured(Some(sheet)) = outcome {
                 std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
                 sheet.write_png(&folder.join(format!("step-{step:09}.png")))?;
             }
@@ -83,11 +90,19 @@ impl<'a> HeldOut<'a> {
         Ok(())
     }
 
-    /// Runs the whole sweep and writes `summary.json`, `views.csv` and the picture sheets to `folder`.
+    /// Runs the whole sweep and writes `summary.json`, `views.csv`, `skipped.json` and the picture sheets
+    /// to `folder`.
     ///
     /// # Errors
     /// As [`evaluate_scene`]; scenes that cannot be read are skipped and counted.
-    pub fn evaluate(&self, networks: &Networks, folder: &Path, sink: &mut dyn Sink) -> Result<Summary, TrainError> {
+    /// [`TrainError::Interrupted`] once `stop` is set.
+    pub fn evaluate(
+        &self,
+        networks: &Networks,
+        folder: &Path,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Summary, TrainError> {
         let started = std::time::Instant::now();
         let variants = [Variant::Random, Variant::Kmeans, Variant::Clift];
         let variants = variants.into_iter().filter(|v| *v != Variant::Clift || networks.condensed.is_some());
@@ -95,16 +110,24 @@ impl<'a> HeldOut<'a> {
         let total = self.items.len() as u64;
         sink.event(&Event::StageStarted { stage: Stage::Eval, done: 0, num_steps: total });
         let mut measured = Accumulator::default();
-        for skip in &self.ledger.skips {
+        let mut ledger = self.ledger.clone();
+        for skip in &ledger.skips {
             measured.skip(&skip.key);
         }
         let sheets = folder.join("sheets");
         std::fs::create_dir_all(&sheets).map_err(TrainError::io("making a folder", &sheets))?;
         for (i, item) in self.items.iter().enumerate() {
+            if stop.load(Ordering::Relaxed) {
+                return Err(TrainError::Interrupted { step: i as u64 });
+            }
             let with_sheet = i < self.config.eval.num_sheets;
-            if let Some(sheet) = self.evaluate_item(networks, item, &sweep, with_sheet, &mut measured, sink)? {
-                let key = self.reader.source.key(item.scene);
-                sheet.write_png(&sheets.join(format!("{}.png", file_name(key))))?;
+            let key = self.reader.source.key(item.scene);
+            match self.evaluate_item(networks, item, &sweep, with_sheet, &mut measured, sink)? {
+                Outcome::Measured(None) => {}
+                Outcome::Measured(Some(sheet)) => {
+                    sheet.write_png(&sheets.join(format!("{}.png", file_name(key))))?;
+                }
+                Outcome::Skipped(reason) => ledger.skip(key, reason),
             }
             sink.event(&Event::Progress { stage: Stage::Eval, done: i as u64 + 1, total });
         }
@@ -114,6 +137,7 @@ impl<'a> HeldOut<'a> {
         }
         summary.write(&folder.join("summary.json"))?;
         measured.write_views(&folder.join("views.csv"))?;
+        write_ledger(&ledger, &folder.join("skipped.json"))?;
         sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
     }
@@ -136,17 +160,35 @@ impl<'a> HeldOut<'a> {
         with_sheet: bool,
         measured: &mut Accumulator,
         sink: &mut dyn Sink,
-    ) -> Result<Option<clift_eval::picture::Picture>, TrainError> {
+    ) -> Result<Outcome, TrainError> {
         match self.reader.read(item.scene, &item.views) {
-            Ok(clip) => Ok(evaluate_scene(networks, &clip, sweep, with_sheet, measured)?),
+            Ok(clip) => Ok(Outcome::Measured(evaluate_scene(networks, &clip, sweep, with_sheet, measured)?)),
             Err(error) => {
                 let key = self.reader.source.key(item.scene);
                 measured.skip(key);
-                sink.event(&Event::Skipped { key: key.into(), reason: error.to_string() });
-                Ok(None)
+                let reason = error.to_string();
+                sink.event(&Event::Skipped { key: key.into(), reason: reason.clone() });
+                Ok(Outcome::Skipped(reason))
             }
         }
     }
+}
+
+/// What became of one scene.
+enum Outcome {
+    /// Measured, with its sheet where one was asked for.
+    Measured(Option<Picture>),
+    /// Could not be read; the reason.
+    Skipped(String),
+}
+
+/// Writes which scenes were left out, and why.
+///
+/// # Errors
+/// [`TrainError::Io`].
+pub fn write_ledger(ledger: &Ledger, path: &Path) -> Result<(), TrainError> {
+    let text = serde_json::to_vec_pretty(ledger).map_err(TrainError::bad_file("ledger", path))?;
+    replace(path, &text).map_err(TrainError::io("writing what was left out", path))
 }
 
 /// A key as a file name: anything but letters, digits, `-`, `_` and `.` becomes `_`.

@@ -17,7 +17,7 @@ use crate::TrainError;
 use crate::clusters::{ClusterCache, ClusterJob};
 use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
-use crate::held_out::HeldOut;
+use crate::held_out::{HeldOut, write_ledger};
 use crate::scenes::{self, FirstScenes};
 use crate::stage1::Stage1Batches;
 use crate::stage2::Stage2Batches;
@@ -44,6 +44,8 @@ struct RunFile {
 
 const VERSION: u32 = 1;
 
+const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
+
 /// Keys that may change between the start of a run and its resumption.
 const FREE_KEYS: [&str; 6] = ["run_dir", "device", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
 
@@ -63,6 +65,10 @@ impl Run {
         config.validate()?;
         let device = config.device.open()?;
         let folder = &config.run_dir;
+        if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
+            let fix = "it starts a run over, which begins with stage 1: leave out one of the two";
+            return Err(TrainError::BadConfig { key: "--fresh".into(), value: "with --only".into(), fix: fix.into() });
+        }
         if options.fresh && folder.exists() {
             let moved = free_name(folder);
             std::fs::rename(folder, &moved).map_err(TrainError::io("moving the former run aside", folder))?;
@@ -71,7 +77,8 @@ impl Run {
         let config_path = folder.join("config.toml");
         let run_path = folder.join("run.json");
         // A run that failed before its first step, on a wrong path perhaps, has nothing that settings could contradict.
-        if config_path.exists() && folder.join(Stage::Stage1.name()).exists() {
+        let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
+        if config_path.exists() && has_begun {
             refuse_other_run(&config_path, &run_path, &config, options.overfit)?;
         }
         std::fs::create_dir_all(folder).map_err(TrainError::io("making the run directory", folder))?;
@@ -108,51 +115,69 @@ impl Run {
     ) -> Result<Option<Summary>, TrainError> {
         let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
         let reader = self.reader(Split::Train, sink)?;
-        let num_scenes = self.config.eval.num_validation_scenes;
-        let held_out = HeldOut::new(&self.config, self.held_out_reader(sink)?, num_scenes, &self.device)?;
+        let held_out = self.held_out(sink)?;
 
         let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
             self.train_stage1(&reader, &held_out, stop, sink)?
         } else {
             self.load_stage1(only)?
         };
-        let hash = weights::hash(&stage1.encoder);
-        if wanted(Stage::Clusters) || wanted(Stage::Stage2) {
-            let cache = self.clusters(only, &reader, &stage1, &hash, stop, sink)?;
-            if wanted(Stage::Stage2) && !self.weights(Stage::Stage2).exists() {
+        let train_stage2 = wanted(Stage::Stage2) && !self.weights(Stage::Stage2).exists();
+        if only == Some(Stage::Clusters) || train_stage2 {
+            let cache = self.clusters(only, &reader, &stage1, stop, sink)?;
+            if train_stage2 {
                 self.train_stage2(&reader, cache, &held_out, stage1, stop, sink)?;
             }
         }
-        if only.is_some() { Ok(None) } else { self.evaluate(&self.folder("eval"), sink).map(Some) }
+        if only.is_some() {
+            return Ok(None);
+        }
+        held_out.evaluate(&self.networks(sink)?, &self.folder("eval"), stop, sink).map(Some)
     }
 
     /// Evaluates the run's weights and writes the results to `folder`.
     ///
     /// # Errors
-    /// [`TrainError::Missing`] without the weights of stage 1, and whatever the evaluation gives.
-    pub fn evaluate(&self, folder: &Path, sink: &mut dyn Sink) -> Result<Summary, TrainError> {
+    /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] when those of
+    /// stage 2 do not belong to them, and whatever the evaluation gives.
+    pub fn evaluate(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<Summary, TrainError> {
+        std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
+        let networks = self.networks(sink)?;
+        self.held_out(sink)?.evaluate(&networks, folder, stop, sink)
+    }
+
+    /// The trained networks: of both stages, or of stage 1 alone.
+    fn networks(&self, sink: &mut dyn Sink) -> Result<Networks, TrainError> {
         let stage1 = self.load_stage1(Some(Stage::Eval))?;
         let path = self.weights(Stage::Stage2);
-        let stage2 = if path.exists() {
+        let condensed = if path.exists() {
             let mut model = self.new_model();
             weights::load(&mut model, &path)?.require_all(&path)?;
-            Some(model)
+            if weights::hash(&model.encoder) != weights::hash(&stage1.encoder) {
+                return Err(TrainError::OtherEncoder { path });
+            }
+            Some((model.condenser.valid(), model.renderer.valid()))
         } else {
             sink.event(&Event::Message("stage 2 has not run: evaluating the stage-1 weights alone".into()));
             None
         };
-        let reader = self.held_out_reader(sink)?;
-        let held_out = HeldOut::new(&self.config, reader, self.config.eval.num_scenes, &self.device)?;
+        let (encoder, renderer) = (stage1.encoder.valid(), stage1.renderer.valid());
+        Ok(Networks { encoder, renderer, condensed, device: self.device.clone() })
+    }
+
+    /// The views that are measured, during training and after it.
+    fn held_out(&self, sink: &mut dyn Sink) -> Result<HeldOut<'_>, TrainError> {
+        let mut eval = self.config.eval.clone();
+        if self.overfit.is_some() && eval.index.take().is_some() {
+            sink.event(&Event::Message("--overfit measures the scenes it trains on: eval.index is not used".into()));
+        }
+        // The test split, or the training scenes themselves under --overfit.
+        let reader = self.reader(if self.overfit.is_some() { Split::Train } else { Split::Test }, sink)?;
+        let held_out = HeldOut::new(&self.config, &eval, reader, &self.device)?;
         if !held_out.ledger().skips.is_empty() {
             sink.event(&Event::Message(format!("evaluation: {}", held_out.ledger())));
         }
-        let networks = Networks {
-            encoder: stage1.encoder.valid(),
-            renderer: stage1.renderer.valid(),
-            condensed: stage2.map(|model| (model.condenser.valid(), model.renderer.valid())),
-            device: self.device.clone(),
-        };
-        held_out.evaluate(&networks, folder, sink)
+        Ok(held_out)
     }
 
     fn train_stage1(
@@ -162,13 +187,16 @@ impl Run {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Clift, TrainError> {
-        let mut model = self.new_model();
-        if let Some(from) = &self.config.stage1.init_from {
-            init_from(&mut model, from, sink)?;
-        }
         let batches = Stage1Batches::new(&self.config, reader)?;
         let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
-        let model = self.plan(Stage::Stage1, batches).train(model, held_out, stop, sink)?;
+        let start = |sink: &mut dyn Sink| {
+            let mut model = self.new_model();
+            if let Some(from) = &self.config.stage1.init_from {
+                init_from(&mut model, from, sink)?;
+            }
+            Ok(model)
+        };
+        let model = self.plan(Stage::Stage1, batches).train(start, held_out, stop, sink)?;
         weights::save(&model.stage1(), &self.weights(Stage::Stage1))?;
         Ok(model)
     }
@@ -184,9 +212,12 @@ impl Run {
     ) -> Result<(), TrainError> {
         let batches = Stage2Batches::new(&self.config, reader, Arc::new(cache))?;
         let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
-        let mut model = self.new_model();
-        (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
-        let model = self.plan(Stage::Stage2, batches).train(model, held_out, stop, sink)?;
+        let start = |_: &mut dyn Sink| {
+            let mut model = self.new_model();
+            (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+            Ok(model)
+        };
+        let model = self.plan(Stage::Stage2, batches).train(start, held_out, stop, sink)?;
         Ok(weights::save(&model, &self.weights(Stage::Stage2))?)
     }
 
@@ -214,11 +245,11 @@ impl Run {
         only: Option<Stage>,
         reader: &ClipReader,
         model: &Clift,
-        encoder_hash: &str,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<ClusterCache, TrainError> {
         let folder = self.folder("clusters");
+        let encoder_hash = &weights::hash(&model.encoder);
         if folder.exists() {
             return ClusterCache::open(&folder, &self.config, encoder_hash);
         }
@@ -257,16 +288,14 @@ impl Run {
     fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
         let (source, ledger) = scenes::open(&self.config.data, split)?;
         sink.event(&Event::Message(format!("{split}: {ledger}")));
+        if !ledger.skips.is_empty() && self.config.run_dir.is_dir() {
+            write_ledger(&ledger, &self.folder(&format!("skipped-{split}.json")))?;
+        }
         let source: Arc<dyn SceneSource> = match self.overfit {
             Some(count) => Arc::new(FirstScenes::of(source, count)),
             None => source,
         };
         Ok(ClipReader { source, options: self.config.data.clip_options() })
-    }
-
-    /// The test split, or the training scenes themselves under `--overfit`.
-    fn held_out_reader(&self, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
-        self.reader(if self.overfit.is_some() { Split::Train } else { Split::Test }, sink)
     }
 
     fn folder(&self, name: &str) -> PathBuf {
@@ -301,7 +330,12 @@ fn init_from(model: &mut Clift, from: &Path, sink: &mut dyn Sink) -> Result<(), 
 
 fn read_run_file(path: &Path) -> Result<RunFile, TrainError> {
     let text = std::fs::read(path).map_err(TrainError::io("reading the run file", path))?;
-    serde_json::from_slice(&text).map_err(TrainError::bad_file("run file", path))
+    let run: RunFile = serde_json::from_slice(&text).map_err(TrainError::bad_file("run file", path))?;
+    if run.version != VERSION {
+        let reason = format!("it has version {}, this program reads {VERSION}", run.version);
+        return Err(TrainError::bad_file("run file", path)(reason));
+    }
+    Ok(run)
 }
 
 fn refuse_other_run(

@@ -48,14 +48,15 @@ pub struct StagePlan<'a> {
 }
 
 impl StagePlan<'_> {
-    /// Trains `model` from where the stage stands and returns it when all steps are done.
+    /// Trains from where the stage stands and returns the model when all steps are done. `start` gives
+    /// the model to start from, and is called only where there is no checkpoint.
     ///
     /// # Errors
     /// [`TrainError::Interrupted`] after `stop` was set and the state saved, [`TrainError::Diverged`]
     /// after too many bad steps, and whatever data, model or disk give.
     pub fn train(
         &self,
-        model: Clift,
+        start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
         held_out: &HeldOut,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
@@ -64,6 +65,7 @@ impl StagePlan<'_> {
         let started = Instant::now();
         let samples = self.folder.join("samples");
         let checkpoints = Checkpoints::new(self.folder.join("checkpoints"), checkpoint.keep);
+        let model = if checkpoints.newest()?.is_some() { self.blank_model() } else { start(sink)? };
         let mut learner = Learner { model, optimizer: adamw(self.optimizer), device: self.device.clone() };
         let mut progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
         learner.model = self.freeze(learner.model);
@@ -89,9 +91,6 @@ impl StagePlan<'_> {
                 self.note_bad_step(progress, &batch, &checkpoints, &mut sink)?;
             }
             let last = step == self.num_steps;
-            if due(step, eval.every) && !last {
-                held_out.validate(&learner.inference_model(), self.stage, step, &samples, &mut sink)?;
-            }
             let interrupted = stop.load(Ordering::Relaxed);
             if due(step, checkpoint.every) || last || interrupted {
                 sink.event(&Event::Checkpoint { path: checkpoints.save(&learner, progress)? });
@@ -99,13 +98,22 @@ impl StagePlan<'_> {
             if interrupted && !last {
                 return Err(TrainError::Interrupted { step });
             }
+            // After the save, which a validation that fails must not cost.
+            if due(step, eval.every) && !last && progress.bad_steps == 0 {
+                held_out.validate(&learner.inference_model(), self.stage, step, &samples, stop, &mut sink)?;
+            }
         }
-        held_out.validate(&learner.inference_model(), self.stage, self.num_steps, &samples, &mut sink)?;
+        held_out.validate(&learner.inference_model(), self.stage, self.num_steps, &samples, stop, &mut sink)?;
         sink.event(&Event::StageFinished { stage: self.stage, elapsed_s: started.elapsed().as_secs_f64() });
         drop(sink);
         let path = metrics.path().to_owned();
         metrics.finish().map_err(TrainError::io("writing the metrics", &path))?;
         Ok(learner.model)
+    }
+
+    /// A model whose parameters a checkpoint is about to replace.
+    fn blank_model(&self) -> Clift {
+        Clift::new(&self.config.model, self.config.seed, &self.device)
     }
 
     /// Parameters the stage does not train get no gradient and no decay.

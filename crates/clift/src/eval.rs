@@ -22,7 +22,8 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     }
     let folder = args.out.clone().unwrap_or_else(|| args.run.join("eval"));
     let mut sink = terminal::sink();
-    let summary = Run::reopen(config)?.evaluate(&folder, sink.as_mut())?;
+    let stop = crate::interrupt::flag()?;
+    let summary = Run::reopen(config)?.evaluate(&folder, &stop, sink.as_mut())?;
     drop(sink);
     println!("{summary}");
     println!("results: {}", folder.display());

@@ -4,6 +4,7 @@ mod args;
 mod data;
 mod doctor;
 mod eval;
+mod interrupt;
 pub mod terminal;
 mod train;
 

@@ -1,9 +1,5 @@
 //! `clift train`.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-
-use anyhow::Context;
 use clift_train::{Config, Run, RunOptions, read_config};
 
 use crate::args::TrainArgs;
@@ -17,10 +13,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     }
     config.device = args.device.unwrap_or(config.device);
 
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = stop.clone();
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).context("listening for Ctrl-C")?;
-
+    let stop = crate::interrupt::flag()?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh };
     let mut sink = terminal::sink();
     let folder = config.run_dir.clone();
