@@ -6,17 +6,17 @@ mod probe;
 use clift_model::device::DeviceName;
 use probe::{Gradient, Probe};
 
+use crate::terminal::print_result;
+
 /// Largest difference of a gradient from the default device's, over its largest entry. Two orders of f32 sums differ
 /// by about 1e-6 here, a wrong kernel by a number near 1.
 const TOLERANCE: f64 = 1e-3;
 
 /// Prints the machine and a row per device; fails if the default device does.
 pub fn run() -> anyhow::Result<()> {
-    println!("{:<12}{}", "clift", version());
-    for (name, value) in machine::rows() {
-        println!("{name:<12}{value}");
-    }
-    println!();
+    let machine = [("clift", version())].into_iter().chain(machine::rows());
+    let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
+    print_result(&format!("{}\n", machine.join("\n")))?;
     let default = DeviceName::default();
     let reference = probe::probe(default).and_then(|probe| check(probe, None));
     let mut rows = vec![HEADER.map(String::from)];
@@ -28,9 +28,9 @@ pub fn run() -> anyhow::Result<()> {
         };
         rows.push(row(name, probed.as_ref(), reference.as_ref().ok()));
     }
-    println!("{}", table(&rows));
+    print_result(&table(&rows))?;
     for name in DeviceName::ALL.into_iter().filter(|name| !name.is_built()) {
-        println!("\n{name} is not in this build: cargo build --release --features {name}");
+        print_result(&format!("\n{name} is not in this build: cargo build --release --features {name}"))?;
     }
     match reference {
         Ok(_) => Ok(()),

@@ -6,8 +6,9 @@ mod bar;
 mod counter;
 mod plain;
 
-use std::io::IsTerminal;
+use std::io::{ErrorKind, IsTerminal, Write};
 
+use anyhow::Context;
 use clift_train::events::{Event, Sink, Stage, StepEvent};
 
 pub use bar::Bar;
@@ -21,6 +22,26 @@ pub fn sink() -> Box<dyn Sink> {
     } else {
         Box::new(PlainLines::new(std::io::stderr()))
     }
+}
+
+/// Writes a line or more to the standard output, at once.
+///
+/// # Errors
+/// The operating system's, except that a reader who has left, as `head` does, is none: the rest is not wanted.
+pub fn print_result(text: &str) -> anyhow::Result<()> {
+    write_result(std::io::stdout().lock(), text)
+}
+
+fn write_result(mut out: impl Write, text: &str) -> anyhow::Result<()> {
+    match writeln!(out, "{text}").and_then(|()| out.flush()) {
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
+        written => written.context("writing to the standard output"),
+    }
+}
+
+/// Writes a line to the standard error stream, if that can be: there is nowhere to show a failure to show something.
+pub fn print_note(text: &str) {
+    drop(writeln!(std::io::stderr(), "{text}"));
 }
 
 fn numbers(step: &StepEvent) -> String {
@@ -84,6 +105,29 @@ mod tests {
             grad_norm: 1.0,
             step_s,
         })
+    }
+
+    /// Fails to take what is buffered.
+    struct Fails(ErrorKind);
+
+    impl Write for Fails {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            Ok(bytes.len())
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Err(self.0.into())
+        }
+    }
+
+    #[test]
+    fn a_reader_who_leaves_is_no_error_and_a_full_disk_is() {
+        assert!(write_result(Fails(ErrorKind::BrokenPipe), "row").is_ok());
+        let error = write_result(Fails(ErrorKind::StorageFull), "row").unwrap_err();
+        assert_eq!(crate::message(&error), "writing to the standard output: no storage space");
+        assert_eq!(crate::exit_code(&error), crate::FAILED);
+        let mut out = Vec::new();
+        write_result(&mut out, "row").unwrap();
+        assert_eq!(out, b"row\n");
     }
 
     #[test]

@@ -14,6 +14,7 @@ use clift_train::{Config, read_config};
 use super::args::InfoArgs;
 use super::report::{EvaluationReport, Report, SplitReport};
 use crate::WrongUsage;
+use crate::terminal::{print_note, print_result};
 
 /// Synthetic scenes that are looked at: there may be millions, and they are all alike.
 const MAX_SYNTHETIC: usize = 1000;
@@ -28,12 +29,12 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     } else {
         let (config, overrides) = read_config::<Config>(&args.path, &args.set)?;
         for change in overrides {
-            eprintln!("--set {change}");
+            print_note(&format!("--set {change}"));
         }
         config.validate()?;
         of_config(&args.path, &config)?
     };
-    println!("{report}");
+    print_result(&report.to_string())?;
     if let Some(path) = &args.json {
         let text = serde_json::to_vec_pretty(&report).context("writing the report as JSON")?;
         std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
@@ -113,7 +114,7 @@ fn long_enough(config: &Config, source: &dyn SceneSource) -> Result<[usize; 2], 
     let needed = gaps.max().unwrap_or(0) + 1;
     let mut num_long = 0;
     for scene in 0..source.num_scenes() {
-        num_long += usize::from(source.cameras(scene)?.len() >= needed);
+        num_long += usize::from(source.num_frames(scene)? >= needed);
     }
     Ok([needed, num_long])
 }

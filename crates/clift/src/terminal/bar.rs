@@ -1,12 +1,11 @@
 //! A progress bar on a terminal.
 
-use std::io::Write;
 use std::time::Duration;
 
 use clift_train::events::{Event, Sink};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
-use super::{duration, line, numbers, rate};
+use super::{duration, line, numbers, print_note, rate};
 
 /// A progress bar per stage, with lines above it for what happens once.
 #[derive(Default)]
@@ -24,8 +23,7 @@ impl Sink for Bar {
         if let Some(line) = line(event) {
             match &self.bar {
                 Some(bar) => bar.println(line),
-                // Nowhere to show a failure to show something.
-                None => drop(writeln!(std::io::stderr(), "{line}")),
+                None => print_note(&line),
             }
         }
         match (event, &self.bar) {

@@ -1,12 +1,12 @@
 //! Progress of work that is no training: so many of so many things.
 
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::time::Instant;
 
 use indicatif::ProgressBar;
 
 use super::bar::progress_bar;
-use super::{duration, rate};
+use super::{duration, print_note, rate};
 
 /// Seconds between two plain lines.
 const INTERVAL_S: f64 = 10.0;
@@ -35,7 +35,7 @@ impl Counter {
             None if self.shown.elapsed().as_secs_f64() >= INTERVAL_S => {
                 self.shown = Instant::now();
                 let line = line(&self.name, done, self.total, self.started.elapsed().as_secs_f64());
-                drop(writeln!(std::io::stderr(), "{line}")); // nowhere to show a failure to show something
+                print_note(&line);
             }
             None => {}
         }
