@@ -38,7 +38,7 @@ Examples:
 /// Arguments of `clift data synth`.
 #[derive(Debug, clap::Args)]
 pub struct SynthArgs {
-    /// Folder to write to; what it holds of the splits to be written stops the command
+    /// Folder to write to; it may hold the other split, of the same size, and nothing else
     pub out: PathBuf,
     /// Scenes of each split [default: 100]
     #[arg(long, value_name = "N")]
