@@ -152,7 +152,7 @@ impl ClusterJob<'_> {
         let views = &config.data.views;
         let mut rng = item_rng(seed, pass as u64, scene as u32, 0, "context and count");
         let num_context = views.min_context + below(&mut rng, views.max_context - views.min_context + 1);
-        let num_frames = reader.source.cameras(scene)?.len();
+        let num_frames = reader.source.num_frames(scene)?;
         // The gaps that stage 1 ends with.
         let last_step = config.stage1.steps.min(views.warm_up_steps);
         let context = views.sample(num_frames, last_step, num_context, &mut rng)?.context;

@@ -257,118 +257,113 @@ impl Config {
         }
         self.model.validate()?;
         self.data.views.validate()?;
-        let tokens_per_view = self.model.num_tokens(1, self.data.height, self.data.width)?;
-        let most_tokens = self.data.views.max_context.saturating_mul(tokens_per_view);
-        if most_tokens > MAX_TOKENS {
-            let fix = format!("{most_tokens} tokens; at most {MAX_TOKENS} are possible: fewer views or smaller ones");
-            return Err(bad("data.views.max_context", self.data.views.max_context, &fix));
-        }
-        let fewest_tokens = self.data.views.min_context * tokens_per_view;
-        for count in &self.clusters.grid {
-            if count.of(fewest_tokens).is_err() {
-                return Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens")));
-            }
-        }
-        match self.data.source {
-            SourceKind::Synthetic => {
-                let synthetic = &self.data.synthetic;
-                synthetic.validate()?;
-                if synthetic.width < self.data.width || synthetic.height < self.data.height {
-                    let fix = format!(
-                        "synthetic scenes are {} x {}: write data.synthetic.width and height of at least {} and {}",
-                        synthetic.width, synthetic.height, self.data.width, self.data.height
-                    );
-                    return Err(bad(
-                        "data.width, data.height",
-                        format!("{}, {}", self.data.width, self.data.height),
-                        &fix,
-                    ));
-                }
-                if synthetic.split != Split::default() {
-                    let fix = "leave it out: a run trains on one split and measures on the other";
-                    return Err(bad("data.synthetic.split", synthetic.split, fix));
-                }
-            }
-            SourceKind::Chunks if self.data.root.is_none() => {
-                return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
-            }
-            SourceKind::Chunks => {}
-        }
+        self.validate_token_counts()?;
+        self.data.validate()?;
         if self.loss.perceptual_weight != 0.0 {
             let fix = "the perceptual term is not built yet; write 0 to train on the mean squared error";
             return Err(bad("loss.perceptual_weight", self.loss.perceptual_weight, fix));
         }
-        for (key, value) in [
-            ("stage1.batch_size", self.stage1.batch_size),
-            ("stage2.batch_size", self.stage2.batch_size),
-            ("clusters.num_passes", self.clusters.num_passes),
-            ("clusters.grid (length)", self.clusters.grid.len()),
-            ("eval.storage (length)", self.eval.storage.len()),
-            ("eval.num_targets", self.eval.num_targets),
-            ("eval.num_validation_scenes", self.eval.num_validation_scenes),
-            ("clusters.kmeans.max_iterations", self.clusters.kmeans.max_iterations),
-            ("data.num_prefetch", self.data.num_prefetch),
-            ("checkpoint.keep", self.checkpoint.keep),
+        let Self { stage1, stage2, clusters, eval, checkpoint, .. } = self;
+        for (key, value, least, most) in [
+            ("stage1.batch_size", stage1.batch_size, 1, usize::MAX),
+            ("stage1.accumulate", stage1.accumulate, 1, stage1.batch_size),
+            ("stage2.batch_size", stage2.batch_size, 1, usize::MAX),
+            ("stage2.accumulate", stage2.accumulate, 1, stage2.batch_size),
+            ("clusters.num_passes", clusters.num_passes, 1, usize::MAX),
+            ("clusters.grid (length)", clusters.grid.len(), 1, usize::MAX),
+            ("clusters.kmeans.max_iterations", clusters.kmeans.max_iterations, 1, usize::MAX),
+            ("eval.storage (length)", eval.storage.len(), 1, usize::MAX),
+            ("eval.num_context", eval.num_context, 2, 10_000),
+            ("eval.num_targets", eval.num_targets, 1, 10_000),
+            ("eval.num_validation_scenes", eval.num_validation_scenes, 1, usize::MAX),
+            ("checkpoint.keep", checkpoint.keep, 1, usize::MAX),
         ] {
-            if value == 0 {
-                return Err(bad(key, value, "write at least 1"));
-            }
+            in_range(key, value, least, most)?;
         }
-        for (key, value, most) in [
-            ("data.num_threads", self.data.num_threads, 1024),
-            ("data.num_prefetch", self.data.num_prefetch, 1024),
-            ("eval.num_context", self.eval.num_context, 10_000),
-            ("eval.num_targets", self.eval.num_targets, 10_000),
-        ] {
-            if value > most {
-                return Err(bad(key, value, &format!("write at most {most}")));
-            }
-        }
-        if !(self.clusters.kmeans.tolerance >= 0.0 && self.clusters.kmeans.tolerance < 1.0) {
-            return Err(bad(
-                "clusters.kmeans.tolerance",
-                self.clusters.kmeans.tolerance,
-                "write 0 or a small fraction",
-            ));
-        }
-        if self.eval.num_context < 2 {
-            return Err(bad("eval.num_context", self.eval.num_context, "write at least 2"));
-        }
-        for (key, accumulate, batch_size) in [
-            ("stage1.accumulate", self.stage1.accumulate, self.stage1.batch_size),
-            ("stage2.accumulate", self.stage2.accumulate, self.stage2.batch_size),
-        ] {
-            if !(1..=batch_size).contains(&accumulate) {
-                return Err(bad(key, accumulate, &format!("write 1 to {batch_size}, the batch size")));
-            }
-        }
-        let [low, high] = self.stage1.keep_tokens;
+        let [low, high] = stage1.keep_tokens;
         if !(low > 0.0 && low <= high && high <= 1.0) {
             return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
         }
-        for (stage, optimizer) in [("stage1", &self.stage1.optimizer), ("stage2", &self.stage2.optimizer)] {
-            for (key, value) in [("learning_rate", optimizer.learning_rate), ("max_grad_norm", optimizer.max_grad_norm)]
-            {
-                if !(value > 0.0 && value.is_finite()) {
-                    return Err(bad(&format!("{stage}.optimizer.{key}"), value, "write a positive number"));
-                }
-            }
+        if !(0.0..1.0).contains(&clusters.kmeans.tolerance) {
+            return Err(bad("clusters.kmeans.tolerance", clusters.kmeans.tolerance, "write 0 or a small fraction"));
         }
-        for (stage, optimizer) in [("stage1", &self.stage1.optimizer), ("stage2", &self.stage2.optimizer)] {
-            if !(optimizer.weight_decay >= 0.0 && optimizer.weight_decay.is_finite()) {
-                let key = format!("{stage}.optimizer.weight_decay");
-                return Err(bad(&key, optimizer.weight_decay, "write 0 or a positive number"));
-            }
-            if optimizer.max_bad_steps == 0 {
-                return Err(bad(&format!("{stage}.optimizer.max_bad_steps"), 0, "write at least 1"));
-            }
-        }
-        let factor = self.stage2.renderer_lr_factor;
-        if !(0.0..=1.0).contains(&factor) {
-            return Err(bad("stage2.renderer_lr_factor", factor, "write 0 to 1"));
+        stage1.optimizer.validate("stage1")?;
+        stage2.optimizer.validate("stage2")?;
+        if !(0.0..=1.0).contains(&stage2.renderer_lr_factor) {
+            return Err(bad("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
         }
         Ok(())
     }
+
+    /// No scene has more tokens than can be kept, or fewer than the cluster cache asks for.
+    fn validate_token_counts(&self) -> Result<(), TrainError> {
+        let views = &self.data.views;
+        let tokens_per_view = self.model.num_tokens(1, self.data.height, self.data.width)?;
+        let most_tokens = views.max_context.saturating_mul(tokens_per_view);
+        if most_tokens > MAX_TOKENS {
+            let fix = format!("{most_tokens} tokens; at most {MAX_TOKENS} are possible: fewer views or smaller ones");
+            return Err(bad("data.views.max_context", views.max_context, &fix));
+        }
+        let fewest_tokens = views.min_context * tokens_per_view;
+        match self.clusters.grid.iter().find(|count| count.of(fewest_tokens).is_err()) {
+            None => Ok(()),
+            Some(count) => Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens"))),
+        }
+    }
+}
+
+impl DataConfig {
+    fn validate(&self) -> Result<(), TrainError> {
+        in_range("data.num_threads", self.num_threads, 0, 1024)?;
+        in_range("data.num_prefetch", self.num_prefetch, 1, 1024)?;
+        match self.source {
+            SourceKind::Chunks if self.root.is_none() => {
+                Err(bad("data.root", "missing", "write the folder that holds train/ and test/"))
+            }
+            SourceKind::Chunks => Ok(self.filters.validate()?),
+            SourceKind::Synthetic => self.validate_synthetic(),
+        }
+    }
+
+    fn validate_synthetic(&self) -> Result<(), TrainError> {
+        let synthetic = &self.synthetic;
+        synthetic.validate()?;
+        if synthetic.width < self.width || synthetic.height < self.height {
+            let fix = format!(
+                "synthetic scenes are {} x {}: write data.synthetic.width and height of at least {} and {}",
+                synthetic.width, synthetic.height, self.width, self.height
+            );
+            return Err(bad("data.width, data.height", format!("{}, {}", self.width, self.height), &fix));
+        }
+        if synthetic.split != Split::default() {
+            let fix = "leave it out: a run trains on one split and measures on the other";
+            return Err(bad("data.synthetic.split", synthetic.split, fix));
+        }
+        Ok(())
+    }
+}
+
+impl OptimizerConfig {
+    fn validate(&self, stage: &str) -> Result<(), TrainError> {
+        for (key, value) in [("learning_rate", self.learning_rate), ("max_grad_norm", self.max_grad_norm)] {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(bad(&format!("{stage}.optimizer.{key}"), value, "write a positive number"));
+            }
+        }
+        if !(self.weight_decay >= 0.0 && self.weight_decay.is_finite()) {
+            let key = format!("{stage}.optimizer.weight_decay");
+            return Err(bad(&key, self.weight_decay, "write 0 or a positive number"));
+        }
+        in_range(&format!("{stage}.optimizer.max_bad_steps"), self.max_bad_steps as usize, 1, usize::MAX)
+    }
+}
+
+fn in_range(key: &str, value: usize, least: usize, most: usize) -> Result<(), TrainError> {
+    if (least..=most).contains(&value) {
+        return Ok(());
+    }
+    let fix = if most == usize::MAX { format!("write at least {least}") } else { format!("write {least} to {most}") };
+    Err(bad(key, value, &fix))
 }
 
 fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {

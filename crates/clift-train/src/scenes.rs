@@ -66,6 +66,10 @@ impl SceneSource for FirstScenes {
         self.source.find(key).filter(|scene| *scene < self.num_scenes)
     }
 
+    fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
+        self.source.num_frames(scene)
+    }
+
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         self.source.cameras(scene)
     }
@@ -96,7 +100,7 @@ pub fn evaluation_items(
         let mut ledger = Ledger::new(count);
         let mut items = Vec::with_capacity(count);
         for scene in 0..count {
-            match source.cameras(scene).map(|cameras| spread_views(cameras.len(), eval.num_context, eval.num_targets)) {
+            match source.num_frames(scene).map(|count| spread_views(count, eval.num_context, eval.num_targets)) {
                 Ok(Some(views)) => items.push(EvaluationItem { scene, views }),
                 Ok(None) => ledger.skip(source.key(scene), "too few frames for its views"),
                 Err(error) => ledger.skip(source.key(scene), error.to_string()),

@@ -102,7 +102,7 @@ impl Stage2Batches {
         let scene = source
             .find(&entry.key)
             .ok_or_else(|| TrainError::NoScenes { reason: "the data does not have it any more".into() })?;
-        let num_frames = source.cameras(scene)?.len();
+        let num_frames = source.num_frames(scene)?;
         let target = targets_excluding(&entry.context, num_frames, self.num_targets, rng)?;
         let clip = self.reader.read(scene, &ViewIndices { context: entry.context.clone(), target })?;
         Ok((clip, self.cache.read(entry)?))

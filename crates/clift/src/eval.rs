@@ -9,7 +9,7 @@ use crate::terminal;
 pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let (mut config, overrides) = read_config::<Config>(&args.run.join("config.toml"), &args.set)?;
     for change in overrides {
-        eprintln!("--set {change}");
+        terminal::print_note(&format!("--set {change}"));
     }
     // A run may have been moved since it was trained.
     config.run_dir.clone_from(&args.run);
@@ -25,7 +25,6 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let stop = crate::interrupt::flag()?;
     let summary = Run::reopen(config)?.evaluate(&folder, &stop, sink.as_mut())?;
     drop(sink);
-    println!("{summary}");
-    println!("results: {}", folder.display());
+    terminal::print_result(&format!("{summary}\nresults: {}", folder.display()))?;
     Ok(())
 }

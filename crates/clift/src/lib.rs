@@ -37,7 +37,7 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::from(DONE),
         Err(error) => {
-            eprintln!("error: {}", message(&error));
+            terminal::print_note(&format!("error: {}", message(&error)));
             ExitCode::from(exit_code(&error))
         }
     }

@@ -9,7 +9,7 @@ use crate::terminal;
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let (mut config, overrides) = read_config::<Config>(&args.config, &args.set)?;
     for change in overrides {
-        eprintln!("--set {change}");
+        terminal::print_note(&format!("--set {change}"));
     }
     config.device = args.device.unwrap_or(config.device);
 
@@ -21,8 +21,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let summary = run.train(args.only, &stop, sink.as_mut())?;
     drop(sink);
     if let Some(summary) = summary {
-        println!("{summary}");
-        println!("results: {}", folder.join("eval").display());
+        terminal::print_result(&format!("{summary}\nresults: {}", folder.join("eval").display()))?;
     }
     Ok(())
 }
