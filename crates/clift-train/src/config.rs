@@ -157,7 +157,7 @@ pub struct Stage1Config {
     pub steps: u64,
     /// Scenes per update.
     pub batch_size: usize,
-    /// Parts a batch is worked off in: less memory, the same update.
+    /// Parts a batch is worked off in, at most its size: less memory, the same update.
     pub accumulate: usize,
     /// Smallest and largest share of the tokens the renderer is given; drawn per step.
     pub keep_tokens: [f64; 2],
@@ -210,7 +210,7 @@ pub struct Stage2Config {
     pub steps: u64,
     /// Scenes per update.
     pub batch_size: usize,
-    /// Parts a batch is worked off in: less memory, the same update.
+    /// Parts a batch is worked off in, at most its size: less memory, the same update.
     pub accumulate: usize,
     /// Learning rate of the renderer over that of the condenser.
     pub renderer_lr_factor: f64,
