@@ -14,7 +14,9 @@ impl ModuleMapper for Perturb {
         param.map(|weight| {
             let shape = weight.dims();
             let index = Tensor::<1, Int>::arange(0..shape.iter().product::<usize>() as i64, &weight.device());
-            weight + index.float().mul_scalar(0.7).cos().mul_scalar(0.05).reshape(shape)
+            let pattern = index.float().mul_scalar(0.7).cos().mul_scalar(0.05).reshape(shape);
+            // A leaf again, as parameters are.
+            (weight + pattern).detach().require_grad()
         })
     }
 }
