@@ -74,7 +74,8 @@ impl ClusterJob<'_> {
     /// of the grid, and opens the result. Written to a temporary folder that is then renamed.
     ///
     /// # Errors
-    /// Whatever the disk or the model gives; a scene that cannot be read is skipped and noted.
+    /// Whatever the disk or the model gives, [`TrainError::NoScenes`] when no scene could be clustered, and
+    /// [`TrainError::Interrupted`]. A scene that does not fit its views is skipped and noted.
     pub fn make(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
         let Self { config, reader, encoder_hash, .. } = *self;
         let temporary = folder.with_extension("tmp");
@@ -92,7 +93,7 @@ impl ClusterJob<'_> {
         let started = std::time::Instant::now();
         sink.event(&Event::StageStarted { stage: Stage::Clusters, done: 0, num_steps: total_sets });
         let mut reasons = BTreeMap::new();
-        let mut entries = Vec::new();
+        let mut entries: Vec<Entry> = Vec::new();
         let mut offset_bytes = 0;
         for pass in 0..config.clusters.num_passes {
             for scene in 0..num_scenes {
@@ -129,11 +130,13 @@ impl ClusterJob<'_> {
             let reason = reasons.into_values().next().unwrap_or_default();
             return Err(TrainError::NoScenes { reason: format!("none could be clustered; the first: {reason}") });
         }
+        // A scene that one pass could use is not left out.
+        for entry in &entries {
+            reasons.remove(&entry.key);
+        }
         let mut skipped = Ledger::new(num_scenes);
         for (key, reason) in reasons {
-            if !entries.iter().any(|entry: &Entry| entry.key == key) {
-                skipped.skip(key, reason);
-            }
+            skipped.skip(key, reason);
         }
         let data = data.into_inner().map_err(|error| TrainError::io(writing, &data_path)(error.into_error()))?;
         data.sync_all().map_err(TrainError::io(writing, &data_path))?;
