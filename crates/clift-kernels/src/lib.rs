@@ -6,10 +6,15 @@
 //!
 //! All values are f32: other types take the composed operations of `clift-model`.
 
+pub mod adamw;
 pub mod attention;
+pub mod cluster_attention;
 mod disjoint;
+mod elementwise;
+pub mod gelu;
 mod instruction_set;
-
+pub mod layer_norm;
+pub mod linear;
 mod matmul;
 mod scratch;
 pub mod simd;

@@ -56,6 +56,8 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn max(self, a: Self::V, b: Self::V) -> Self::V;
     /// The smaller value; `b` where one of the two is NaN.
     fn min(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `yes` where `condition` is less than zero, `no` elsewhere.
+    fn select_negative(self, condition: Self::V, yes: Self::V, no: Self::V) -> Self::V;
     /// The square root.
     fn sqrt(self, a: Self::V) -> Self::V;
     /// The nearest integer, ties to even.

@@ -9,7 +9,9 @@ pub fn random(count: usize, seed: u64) -> Vec<f32> {
         state ^= state << 17;
         (state >> 40) as f32 / (1 << 23) as f32 - 1.0
     };
-    (0..16).for_each(|_| drop(next()));
+    for _ in 0..16 {
+        next();
+    }
     (0..count).map(|_| next()).collect()
 }
 

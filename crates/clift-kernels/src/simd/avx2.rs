@@ -67,6 +67,13 @@ impl Simd for Avx2 {
         unsafe { _mm256_min_ps(a, b) }
     }
     #[inline(always)]
+    fn select_negative(self, condition: __m256, yes: __m256, no: __m256) -> __m256 {
+        unsafe {
+            let negative = _mm256_cmp_ps::<_CMP_LT_OQ>(condition, _mm256_setzero_ps());
+            _mm256_blendv_ps(no, yes, negative)
+        }
+    }
+    #[inline(always)]
     fn sqrt(self, a: __m256) -> __m256 {
         unsafe { _mm256_sqrt_ps(a) }
     }

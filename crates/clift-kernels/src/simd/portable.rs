@@ -58,6 +58,10 @@ impl Simd for Portable {
         std::array::from_fn(|i| if a[i] < b[i] { a[i] } else { b[i] })
     }
     #[inline(always)]
+    fn select_negative(self, condition: Self::V, yes: Self::V, no: Self::V) -> Self::V {
+        std::array::from_fn(|i| if condition[i] < 0.0 { yes[i] } else { no[i] })
+    }
+    #[inline(always)]
     fn sqrt(self, a: Self::V) -> Self::V {
         a.map(f32::sqrt)
     }
