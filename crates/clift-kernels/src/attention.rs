@@ -66,34 +66,38 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// Rows to write, as [`Rows`].
+/// Where [`backward`] puts its gradients, in contiguous rows.
 #[derive(Debug)]
-pub struct RowsMut<'a> {
-    /// From the first value on.
-    pub values: &'a mut [f32],
-    /// Distance of two scenes.
-    pub batch_stride: usize,
-    /// Distance of two rows.
-    pub row_stride: usize,
+pub enum Gradients<'a> {
+    /// Those of queries, keys and values side by side: `[batch, num_queries, 3 dim]`.
+    Packed(&'a mut [f32]),
+    /// Those of the queries on their own.
+    Separate {
+        /// `[batch, num_queries, dim]`
+        query: &'a mut [f32],
+        /// Those of keys and values side by side: `[batch, num_keys, 2 dim]`
+        key_value: &'a mut [f32],
+    },
 }
 
-struct SharedRows<'a> {
-    values: Disjoint<'a>,
-    batch_stride: usize,
-    row_stride: usize,
+/// Heads of contiguous rows that several threads write, each its own.
+#[derive(Clone, Copy)]
+struct Heads<'a> {
+    values: &'a Disjoint<'a>,
+    /// Rows of a scene.
+    count: usize,
+    /// Values of a row, and where in it the first head starts.
+    width: usize,
+    first: usize,
 }
 
-impl<'a> SharedRows<'a> {
-    fn new(rows: RowsMut<'a>) -> Self {
-        Self { values: Disjoint::new(rows.values), batch_stride: rows.batch_stride, row_stride: rows.row_stride }
-    }
-
+impl Heads<'_> {
     /// Writes one head of one row.
     ///
     /// # Safety
     /// No other thread may write or read the same head of the same row.
     unsafe fn write(&self, [scene, row, head]: [usize; 3], values: impl ExactSizeIterator<Item = f32>) {
-        let start = scene * self.batch_stride + row * self.row_stride + head * values.len();
+        let start = (scene * self.count + row) * self.width + self.first + head * values.len();
         // SAFETY: the caller's.
         let place = unsafe { self.values.part(start, values.len()) };
         place.iter_mut().zip(values).for_each(|(to, value)| *to = value);
@@ -111,22 +115,24 @@ const ROW_PADDING: usize = 16;
 
 /// Computes `softmax(q k^T / sqrt(head width)) v` per head.
 ///
-/// `output` has rows of `dim` values; `log_sum`, if wanted, is `[batch, num_heads, num_queries]` and
+/// `output` is `[batch, num_queries, dim]`; `log_sum`, if wanted, is `[batch, num_heads, num_queries]` and
 /// receives each row's `log2(sum(2^(score * log2(e))))`, which [`backward`] needs.
 pub fn forward(
     set: InstructionSet,
     sizes: Sizes,
     [query, key, value]: [Rows<'_>; 3],
-    output: RowsMut<'_>,
+    output: &mut [f32],
     log_sum: Option<&mut [f32]>,
 ) {
+    assert_eq!(output.len(), sizes.batch * sizes.num_queries * sizes.dim(), "a row for every query");
     if sizes.num_keys == 0 {
-        output.values.fill(0.0);
+        output.fill(0.0);
         return;
     }
     let blocks = sizes.num_queries.div_ceil(QUERY_BLOCK);
     let parts = sizes.parts(blocks);
-    let output = SharedRows::new(output);
+    let output = Disjoint::new(output);
+    let output = Heads { values: &output, count: sizes.num_queries, width: sizes.dim(), first: 0 };
     let log_sum = log_sum.map(Disjoint::new);
     (0..sizes.batch * sizes.num_heads * parts).into_par_iter().for_each(|task| {
         let (head, part) = (task / parts, task % parts);
@@ -136,7 +142,7 @@ pub fn forward(
             query,
             key,
             value,
-            output: &output,
+            output,
             log_sum: log_sum.as_ref(),
             scene: head / sizes.num_heads,
             head: head % sizes.num_heads,
@@ -150,7 +156,7 @@ struct Forward<'a> {
     query: Rows<'a>,
     key: Rows<'a>,
     value: Rows<'a>,
-    output: &'a SharedRows<'a>,
+    output: Heads<'a>,
     log_sum: Option<&'a Disjoint<'a>>,
     scene: usize,
     head: usize,
@@ -317,17 +323,37 @@ pub struct Saved<'a> {
 ///
 /// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`, `dQ = s dS K`,
 /// `dK = s dS^T Q`; the scores are computed again, a block at a time.
-pub fn backward(
+pub fn backward(set: InstructionSet, sizes: Sizes, saved: Saved<'_>, to: Gradients<'_>) {
+    let Sizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
+    let dim = sizes.dim();
+    assert_eq!(saved.log_sum.len(), batch * num_heads * num_queries, "a sum for every row of scores");
+    match to {
+        Gradients::Packed(packed) => {
+            assert!(packed.len() == batch * num_queries * 3 * dim && num_keys == num_queries);
+            let packed = Disjoint::new(packed);
+            let part = |part| Heads { values: &packed, count: num_queries, width: 3 * dim, first: part * dim };
+            backward_into(set, sizes, saved, [part(0), part(1), part(2)]);
+        }
+        Gradients::Separate { query, key_value } => {
+            assert!(query.len() == batch * num_queries * dim && key_value.len() == batch * num_keys * 2 * dim);
+            let (query, key_value) = (Disjoint::new(query), Disjoint::new(key_value));
+            let part = |part| Heads { values: &key_value, count: num_keys, width: 2 * dim, first: part * dim };
+            let query = Heads { values: &query, count: num_queries, width: dim, first: 0 };
+            backward_into(set, sizes, saved, [query, part(0), part(1)]);
+        }
+    }
+}
+
+/// The three parts must not overlap.
+fn backward_into(
     set: InstructionSet,
     sizes: Sizes,
     saved: Saved<'_>,
-    [grad_query, grad_key, grad_value]: [RowsMut<'_>; 3],
+    [grad_query, grad_key, grad_value]: [Heads<'_>; 3],
 ) {
     let Sizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
-    debug_assert_eq!(saved.log_sum.len(), sizes.batch * num_heads * num_queries);
     let blocks = num_keys.div_ceil(BACKWARD_KEYS);
     let parts = sizes.parts(blocks);
-    let (grad_key, grad_value) = (SharedRows::new(grad_key), SharedRows::new(grad_value));
     let tasks = sizes.batch * num_heads * parts;
     // A part of the keys gives a part of every query's gradient.
     let partial: Vec<Vec<f32>> = (0..tasks)
@@ -338,15 +364,14 @@ pub fn backward(
             set.run(BackwardTask {
                 sizes,
                 saved,
-                grad_key: &grad_key,
-                grad_value: &grad_value,
+                grad_key,
+                grad_value,
                 scene: head / num_heads,
                 head: head % num_heads,
                 keys: bound(part)..bound(part + 1),
             })
         })
         .collect();
-    let grad_query = SharedRows::new(grad_query);
     (0..sizes.batch * num_heads).into_par_iter().for_each(|head| {
         let parts = &partial[head * parts..(head + 1) * parts];
         for row in 0..num_queries {
@@ -362,8 +387,8 @@ pub fn backward(
 struct BackwardTask<'a> {
     sizes: Sizes,
     saved: Saved<'a>,
-    grad_key: &'a SharedRows<'a>,
-    grad_value: &'a SharedRows<'a>,
+    grad_key: Heads<'a>,
+    grad_value: Heads<'a>,
     scene: usize,
     head: usize,
     keys: Range<usize>,
@@ -479,10 +504,6 @@ mod tests {
         Rows { values, batch_stride: count * sizes.dim(), row_stride: sizes.dim() }
     }
 
-    fn rows_mut<'a>(values: &'a mut [f32], sizes: &Sizes, count: usize) -> RowsMut<'a> {
-        RowsMut { values, batch_stride: count * sizes.dim(), row_stride: sizes.dim() }
-    }
-
     /// Output and gradients of queries, keys and values in f64, as the formulas are printed.
     fn reference(sizes: &Sizes, [q, k, v, grad]: [&[f32]; 4]) -> [Vec<f64>; 4] {
         let Sizes { batch, num_queries, num_keys, num_heads, head_width } = *sizes;
@@ -519,6 +540,25 @@ mod tests {
         results
     }
 
+    /// The gradients of queries, keys and values, unpacked.
+    fn gradients(set: InstructionSet, sizes: Sizes, saved: Saved<'_>) -> [Vec<f32>; 3] {
+        let Sizes { batch, num_queries, num_keys, .. } = sizes;
+        let dim = sizes.dim();
+        let part = |packed: &[f32], parts: usize, part: usize| {
+            packed.chunks_exact(parts * dim).flat_map(|row| row[part * dim..(part + 1) * dim].to_vec()).collect()
+        };
+        let mut query = vec![f32::NAN; batch * num_queries * dim];
+        let mut key_value = vec![f32::NAN; batch * num_keys * 2 * dim];
+        backward(set, sizes, saved, Gradients::Separate { query: &mut query, key_value: &mut key_value });
+        let separate = [query, part(&key_value, 2, 0), part(&key_value, 2, 1)];
+        if num_queries == num_keys {
+            let mut packed = vec![f32::NAN; batch * num_queries * 3 * dim];
+            backward(set, sizes, saved, Gradients::Packed(&mut packed));
+            assert_eq!([0, 1, 2].map(|i| part(&packed, 3, i)), separate);
+        }
+        separate
+    }
+
     fn check(sizes: Sizes, spread: f32) {
         let Sizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
         let make = |count: usize, seed: u64| random(batch * count * sizes.dim(), seed);
@@ -531,8 +571,7 @@ mod tests {
             let mut log_sum = vec![f32::NAN; batch * num_heads * num_queries];
             let [query, key, value] =
                 [rows(&q, &sizes, num_queries), rows(&k, &sizes, num_keys), rows(&v, &sizes, num_keys)];
-            let to = rows_mut(&mut output, &sizes, num_queries);
-            forward(set, sizes, [query, key, value], to, Some(&mut log_sum));
+            forward(set, sizes, [query, key, value], &mut output, Some(&mut log_sum));
             assert_close(&output, &expected[0], 1e-5);
             let saved = Saved {
                 query,
@@ -542,14 +581,7 @@ mod tests {
                 log_sum: &log_sum,
                 grad_output: rows(&grad, &sizes, num_queries),
             };
-            let mut grads = [q.len(), k.len(), v.len()].map(|len| vec![f32::NAN; len]);
-            let [grad_q, grad_k, grad_v] = &mut grads;
-            let to = [
-                rows_mut(grad_q, &sizes, num_queries),
-                rows_mut(grad_k, &sizes, num_keys),
-                rows_mut(grad_v, &sizes, num_keys),
-            ];
-            backward(set, sizes, saved, to);
+            let grads = gradients(set, sizes, saved);
             for (grad, expected) in grads.iter().zip(&expected[1..]) {
                 // One key: the exact gradient of queries and keys is zero.
                 if num_keys > 1 || expected.iter().any(|&value| value != 0.0) {
@@ -577,5 +609,6 @@ mod tests {
         check(sizes(1, 13, 1031, 1, 96), 2.0);
         check(sizes(1, 200, 33, 1, 16), 1.0);
         check(sizes(1, 24, 48, 2, 40), 1.0);
+        check(sizes(2, 51, 51, 2, 20), 1.0);
     }
 }

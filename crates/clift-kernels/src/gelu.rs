@@ -35,7 +35,9 @@ impl Combine for GeluSlope {
     fn apply<S: Simd>(self, simd: S, x: S::V, grad: S::V) -> S::V {
         let (distribution, bell) = distribution(simd, x);
         let density = simd.mul(bell, simd.splat(0.398_942_3)); // 1 / sqrt(2 pi)
-        simd.mul(grad, simd.mul_add(x, density, distribution))
+        // The density is not quite zero far out: nothing may multiply it up again.
+        let bounded = simd.max(simd.splat(-40.0), simd.min(simd.splat(40.0), x));
+        simd.mul(grad, simd.mul_add(bounded, density, distribution))
     }
 }
 
@@ -110,6 +112,12 @@ mod tests {
             forward(set, &[f32::NAN, f32::INFINITY, -1e30], &mut output);
             assert!(output[0].is_nan());
             assert_eq!(output[1..], [f32::INFINITY, 0.0]);
+            let mut grad = [1.0; 4];
+            backward(set, &[f32::NAN, f32::INFINITY, -1e30, 3e38], &mut grad);
+            assert!(grad[0].is_nan());
+            for (got, expected) in grad[1..].iter().zip([1.0, 0.0, 1.0]) {
+                assert!((got - expected).abs() < 1e-30, "{got} against {expected}");
+            }
         }
     }
 }
