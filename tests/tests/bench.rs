@@ -1,8 +1,11 @@
 //! `clift bench`: the rows it prints and the file it writes.
 
+use std::io::{BufRead, BufReader};
+use std::process::Command;
+
 use serde_json::Value;
 
-use crate::support::{Place, clift, repository};
+use crate::support::{Place, clift, finish, repository, spawn};
 
 const WORKS: [&str; 9] = [
     "encode",
@@ -74,4 +77,20 @@ fn what_cannot_be_timed_is_wrong_usage() {
     assert!(message.contains("no folder"), "{message}");
     let message = clift(args(&["--set", "data.width=20"])).fails(2);
     assert!(message.contains("20 x 16 does not divide into patches"), "{message}");
+}
+
+#[test]
+fn an_interrupted_benchmark_exits_130_and_writes_nothing() {
+    let place = Place::new();
+    let json = place.at("bench.json").display().to_string();
+    // Thousands of repetitions: the second row goes on for longer than the signal takes.
+    let mut child = spawn(args(&["--work", "encode,render", "--no-error", "--repeats", "3000", "--json", &json]));
+    let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
+    assert!(lines.any(|line| line.starts_with("encode: ")), "the first row is done");
+    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill runs");
+    assert!(sent.success());
+    let rest: Vec<String> = lines.collect();
+    assert_eq!(finish(child).code, Some(130), "{rest:?}");
+    assert!(rest.iter().any(|line| line == "error: interrupted during `render`; nothing was written"), "{rest:?}");
+    assert!(!place.at("bench.json").exists());
 }

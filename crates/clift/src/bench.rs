@@ -39,8 +39,9 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
             counter.get_or_insert_with(|| Counter::new("bench", total as u64)).set(done as u64);
         }
         BenchEvent::Finished(row) => {
-            let line = format!("{}: {}", row.work, seconds(row.median_s));
-            counter.get_or_insert_with(|| Counter::new("bench", 0)).note(&line);
+            if let Some(counter) = &counter {
+                counter.note(&format!("{}: {}", row.work, seconds(row.median_s)));
+            }
         }
     });
     drop(counter);
@@ -68,21 +69,28 @@ const HEADER: [&str; 5] = ["work", "median", "p95", "peak memory", "error agains
 /// The table with what must be known to read it.
 fn shown(report: &Report) -> String {
     let rows: Vec<_> = [HEADER.map(String::from)].into_iter().chain(report.rows.iter().map(cells)).collect();
-    let mut text = format!("{}, {} threads\n\n{}\n", report.device, report.threads, table::columns(&rows));
-    let has = |test: &dyn Fn(&Row) -> bool| report.rows.iter().any(test);
-    if has(&|row| row.work == Work::Render8Views) {
-        text += "\nrender_8_views: seconds are per view";
+    let title = format!("{}, {} threads\n", report.device, report.threads);
+    [title, table::columns(&rows)].into_iter().chain(remarks(&report.rows)).collect::<Vec<_>>().join("\n")
+}
+
+/// What must be known to read the rows, after an empty line.
+fn remarks(rows: &[Row]) -> Vec<String> {
+    let has = |test: &dyn Fn(&Row) -> bool| rows.iter().any(test);
+    let inertia = rows.iter().find_map(|row| row.inertia);
+    let mut remarks: Vec<String> = [
+        has(&|row| row.work == Work::Render8Views).then(|| "render_8_views: seconds are per view".into()),
+        inertia.map(|inertia| format!("kmeans: inertia {inertia:.6e}; its error is the inertia's")),
+        has(&|row| row.max_rel_error.is_some() && row.work.is_checked_reduced())
+            .then(|| format!("* of loss and gradients, with at most {MAX_CHECKED_TOKENS} tokens")),
+        has(&|row| row.max_rel_error.is_none()).then(|| "- not compared with f64".into()),
+    ]
+    .into_iter()
+    .flatten()
+    .collect();
+    if !remarks.is_empty() {
+        remarks.insert(0, String::new());
     }
-    if let Some(inertia) = report.rows.iter().find_map(|row| row.inertia) {
-        text += &format!("\nkmeans: inertia {inertia:.6e}; its error is the inertia's");
-    }
-    if has(&|row| row.max_rel_error.is_some() && row.work.is_checked_reduced()) {
-        text += &format!("\n* of loss and gradients, with at most {MAX_CHECKED_TOKENS} tokens");
-    }
-    if has(&|row| row.max_rel_error.is_none()) {
-        text += "\n- not compared with f64";
-    }
-    text.trim_end().to_owned()
+    remarks
 }
 
 fn cells(row: &Row) -> [String; 5] {
