@@ -199,7 +199,8 @@ impl Samples {
             thresholds.extend((1..num_clusters).flat_map(|_| 0..candidates).map(|_| rng.random_range(0.0..1.0_f32)));
         }
         let steps = num_clusters - 1;
-        let thresholds = Tensor::<3>::from_data(TensorData::new(thresholds, [batch, steps, candidates]), &device);
+        let thresholds = TensorData::new(thresholds, [batch, steps, candidates]);
+        let thresholds = Tensor::<3>::from_data(thresholds, (&device, self.tokens.dtype()));
         let first = Tensor::<1, Int>::from_data(TensorData::new(first, [batch]), &device);
         // Row of scene b's first token, to index all scenes' tokens at once.
         let offset = Tensor::<1, Int>::arange_step(0..(batch * num_tokens) as i64, num_tokens, &device);
