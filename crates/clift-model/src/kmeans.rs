@@ -107,7 +107,7 @@ mod tests {
     use burn::tensor::Device;
 
     use super::*;
-    use crate::testing::{Fixture, devices, random, to_vec};
+    use crate::testing::{Fixture, cpu_devices, devices, random, to_vec};
 
     fn assert_valid(fit: &Fit, num_clusters: usize) {
         for scene in fit.clusters.scenes() {
@@ -116,6 +116,31 @@ mod tests {
             let used: BTreeSet<_> = scene.assignment().iter().collect();
             assert_eq!(used.len(), num_clusters, "no cluster is empty");
         }
+    }
+
+    /// Cluster numbers in the order in which the tokens meet them.
+    fn renumbered(assignment: &[u32]) -> Vec<usize> {
+        let mut met = Vec::new();
+        let number = |cluster: &u32| {
+            met.iter().position(|other| other == cluster).unwrap_or_else(|| {
+                met.push(*cluster);
+                met.len() - 1
+            })
+        };
+        assignment.iter().map(number).collect()
+    }
+
+    /// Squared distance of every token to the mean of every cluster, in f64: `[N][S]`.
+    fn brute_force(tokens: &[Vec<f64>], assignment: &[u32], num_clusters: usize) -> Vec<Vec<f64>> {
+        let mut means = vec![vec![0.0; tokens[0].len()]; num_clusters];
+        for (cluster, mean) in means.iter_mut().enumerate() {
+            let members: Vec<_> = tokens.iter().zip(assignment).filter(|&(_, &own)| own as usize == cluster).collect();
+            for (i, value) in mean.iter_mut().enumerate() {
+                *value = members.iter().map(|(token, _)| token[i]).sum::<f64>() / members.len() as f64;
+            }
+        }
+        let distance = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
+        tokens.iter().map(|token| means.iter().map(|mean| distance(token, mean)).collect()).collect()
     }
 
     /// Mean and standard error.
@@ -172,6 +197,8 @@ mod tests {
             let tokens = random([2, 9, 4], 6, &device).cast(burn::tensor::DType::F32);
             let one = KMeans::default().fit(tokens.clone(), 1, &[0, 1]).expect("fits");
             assert_valid(&one, 1);
+            let spread = to_vec(tokens.clone().var_bias(1).sum_dim(2));
+            assert!((one.inertia[1] - 9.0 * spread[1]).abs() < 1e-4, "{} against {}", one.inertia[1], spread[1]);
             let all = KMeans::default().fit(tokens.clone(), 9, &[0, 1]).expect("fits");
             assert_eq!(all.clusters.scenes()[1], SceneClusters::identity(9));
             let most = KMeans::default().fit(tokens.clone(), 8, &[0, 1]).expect("fits");
@@ -188,7 +215,70 @@ mod tests {
             assert_valid(&KMeans::default().fit(tokens.clone(), 5, &[0]).expect("fits"), 5);
             // Two places only, eight clusters.
             let tokens = Tensor::cat(vec![tokens.clone(), tokens * 3.0], 1);
-            assert_valid(&KMeans::default().fit(tokens, 8, &[0]).expect("fits"), 8);
+            let fit = KMeans::default().fit(tokens, 8, &[0]).expect("fits");
+            assert_valid(&fit, 8);
+            assert!(fit.inertia[0] < 1e-4, "no cluster joins the two places: {}", fit.inertia[0]);
+        }
+    }
+
+    #[test]
+    fn a_fit_run_to_its_end_is_a_local_optimum_of_the_inertia_it_reports() {
+        let kmeans = KMeans { max_iterations: 1000, tolerance: -1.0 };
+        for device in cpu_devices() {
+            let tokens = random([1, 200, 6], 12, &device);
+            let fit = kmeans.fit(tokens.clone(), 23, &[4]).expect("fits");
+            let tokens: Vec<Vec<f64>> = to_vec(tokens).chunks(6).map(<[f64]>::to_vec).collect();
+            let scene = &fit.clusters.scenes()[0];
+            let distances = brute_force(&tokens, scene.assignment(), 23);
+            let own = |token: usize| distances[token][scene.assignment()[token] as usize];
+            let inertia: f64 = (0..200).map(own).sum();
+            assert!((fit.inertia[0] - inertia).abs() < 1e-9 * inertia, "{} against {inertia}", fit.inertia[0]);
+            for (token, all) in distances.iter().enumerate() {
+                let least = all.iter().copied().fold(f64::INFINITY, f64::min);
+                assert!(own(token) <= least + 1e-9, "token {token} is not in its nearest cluster");
+                let centroid = scene.centroid_index()[scene.assignment()[token] as usize] as usize;
+                assert!(own(centroid) <= own(token) + 1e-9, "token {token} is nearer to its mean than the centroid");
+            }
+        }
+    }
+
+    #[test]
+    fn well_separated_tokens_are_told_apart_on_every_device_in_f32_and_f64() {
+        let expected: Vec<usize> = (0..90).map(|token| token % 9).collect();
+        for device in devices() {
+            let corner = Tensor::<3>::from_floats([[[0.0, 0.0], [0.0, 50.0], [90.0, 0.0]]], &device);
+            let corners = Tensor::cat(vec![corner.clone(), corner.clone() - 400.0, corner + 300.0], 1);
+            let noise = random([1, 90, 2], 13, &device);
+            let tokens = corners.repeat_dim(1, 10).cast(noise.dtype()) + noise;
+            for dtype in [tokens.dtype(), burn::tensor::DType::F32] {
+                let fit = KMeans::default().fit(tokens.clone().cast(dtype), 9, &[7]).expect("fits");
+                assert_eq!(renumbered(fit.clusters.scenes()[0].assignment()), expected, "{dtype:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_far_outlier_takes_one_cluster_and_leaves_the_others_alone() {
+        for device in devices() {
+            let near = random([1, 100, 4], 14, &device).cast(burn::tensor::DType::F32);
+            let far = Tensor::<3>::full([1, 1, 4], 1e4, &device);
+            for seed in 0..5 {
+                let fit = KMeans::default().fit(Tensor::cat(vec![near.clone(), far.clone()], 1), 11, &[seed]);
+                let fit = fit.expect("fits");
+                assert_valid(&fit, 11);
+                let assignment = fit.clusters.scenes()[0].assignment();
+                assert_eq!(assignment.iter().filter(|&&cluster| cluster == assignment[100]).count(), 1);
+            }
+        }
+    }
+
+    #[test]
+    fn no_iteration_allowed_still_gives_clusters() {
+        for device in devices() {
+            let tokens = random([1, 30, 4], 15, &device).cast(burn::tensor::DType::F32);
+            let fit = KMeans { max_iterations: 0, ..KMeans::default() }.fit(tokens, 6, &[0]).expect("fits");
+            assert_valid(&fit, 6);
+            assert_eq!(fit.iterations, 0);
         }
     }
 
