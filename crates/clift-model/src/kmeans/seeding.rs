@@ -69,7 +69,9 @@ impl Pool {
             distances.extend(rows);
         }
         let mut weights = vec![0.0; tokens.len()];
-        owner.into_iter().for_each(|place| weights[place] += 1.0);
+        for place in owner {
+            weights[place] += 1.0;
+        }
         Self { tokens, weights, distances, num_tokens }
     }
 
