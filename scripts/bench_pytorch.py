@@ -40,6 +40,8 @@ ROOT = SCRIPTS.parent
 REQUIREMENTS = SCRIPTS / "requirements.txt"
 # CPU builds of torch; the default ones for Linux carry gigabytes of CUDA.
 CPU_WHEELS = "https://download.pytorch.org/whl/cpu"
+# Repetitions of each way PyTorch has, before the fastest is chosen.
+PROBES = 2
 
 
 # ------------------------------------------------------------ environment
@@ -96,10 +98,11 @@ class Bench:
         self.features: Path | None = args.features
         self.env = {name: str(args.threads) for name in ("RAYON_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         self.seconds_lost = 0.0
+        self.probed: dict[tuple[str, str | None, str], float] = {}
         # What a PyTorch process holds that does nothing.
         self.baseline_bytes = 0
 
-    def command(self, side: Side, round_: int, variant: str | None) -> list[str]:
+    def command(self, side: Side, round_: int | None, variant: str | None) -> list[str]:
         if isinstance(side, Torch):
             return self.worker(self.torch_spec(side, round_, variant))
         size = SIZES[side.size or self.args.size]
@@ -116,9 +119,10 @@ class Bench:
     def worker(self, spec: dict[str, Any]) -> list[str]:
         return [str(self.python), str(SCRIPTS / "torch_works.py"), json.dumps({"threads": self.args.threads, **spec})]
 
-    def torch_spec(self, side: Torch, round_: int, variant: str | None) -> dict[str, Any]:
+    def torch_spec(self, side: Torch, round_: int | None, variant: str | None) -> dict[str, Any]:
         spec = dict(work=side.work, variant=variant, size=SIZES[side.size or self.args.size])
-        spec |= dict(repeats=self.args.repeats, warmup=self.args.warmup)
+        repeats = PROBES if round_ is None else self.args.repeats
+        spec |= dict(repeats=repeats, warmup=self.args.warmup)
         if side.work == "kmeans":
             spec |= dict(features=str(self.features_file()), seed=1000 * round_)
         return spec
@@ -134,7 +138,7 @@ class Bench:
             self.features = path
         return self.features
 
-    def measure(self, side: Side, round_: int, variant: str | None = None) -> Measured:
+    def measure(self, side: Side, round_: int | None, variant: str | None = None) -> Measured:
         command = self.command(side, round_, variant)
         finished = quiet_machine.run(command, self.env)
         if isinstance(side, Torch):
@@ -160,9 +164,13 @@ class Bench:
             return (variants[0] if variants else None), {}
         times = {}
         for variant in variants:
-            self.wait()
-            times[variant] = min(self.measure(side, 0, variant).samples)
-            print(f"  PyTorch, {variant}: {seconds(times[variant])}", flush=True)
+            # Rows that differ in the variants they allow do the same thing in those they share.
+            key = (side.work.removesuffix("_unshared"), side.size, variant)
+            if key not in self.probed:
+                self.wait()
+                self.probed[key] = min(self.measure(side, None, variant).samples)
+                print(f"  PyTorch, {variant}: {seconds(self.probed[key])}", flush=True)
+            times[variant] = self.probed[key]
         return min(times, key=times.__getitem__), times
 
     def round(self, sides: list[Side], chosen: dict[Side, str | None], round_: int) -> dict[Side, Measured | str]:
@@ -245,7 +253,8 @@ def summarise(row: Row, rounds: list[dict[Side, Measured]], baseline_bytes: int)
         result["ratio"] = result["ours_s"] / result["pytorch_s"]
         result["ratio_rounds"], result["ratio_spread"] = ratios, [min(ratios), max(ratios)]
         result["memory_ratio"] = result["ours_bytes"] / result["pytorch_bytes"]
-        result["memory_ratio_less_import"] = result["ours_bytes"] / (result["pytorch_bytes"] - baseline_bytes)
+        grown = result["pytorch_bytes"] - baseline_bytes
+        result["memory_ratio_less_import"] = result["ours_bytes"] / grown if grown > 0 else None
     if "ours_inertia" in result and "pytorch_inertia" in result:
         result["inertia_ratio"] = result["ours_inertia"] / result["pytorch_inertia"]
     return result
@@ -341,12 +350,29 @@ def parse_arguments() -> argparse.Namespace:
     return args
 
 
+def note_load(args: argparse.Namespace, report: dict[str, Any]) -> None:
+    """Whether others used the processor during any measurement."""
+    foreign = [row["foreign_cores"] for row in report["rows"] if "foreign_cores" in row]
+    if foreign:
+        report["loaded"] = max(foreign) > args.max_busy
+
+
+def write_report(args: argparse.Namespace, report: dict[str, Any]) -> None:
+    """Writes what there is: also after each group of rows, for a full comparison takes hours."""
+    note_load(args, report)
+    if args.json:
+        args.json.write_text(json.dumps(report, indent=1) + "\n")
+
+
 def measure_all(args: argparse.Namespace, folder: Path, report: dict[str, Any]) -> int:
     # Not resolved: a virtual environment's interpreter is a link, and knows its packages by where the link lies.
     python = Path(os.path.abspath(args.python)) if args.python else make_environment(args.venv.absolute())
     clift = None if args.pytorch_only else (args.clift or build_clift()).absolute()
     bench = Bench(args, python, clift, folder)
-    known = json.loads(quiet_machine.run(bench.worker({"work": "versions"}), bench.env).stdout)
+    try:
+        known = json.loads(quiet_machine.run(bench.worker({"work": "versions"}), bench.env).stdout)
+    except CommandFailed as error:
+        raise CommandFailed(f"{python} cannot do PyTorch's side; does it have {REQUIREMENTS.name}?\n{error}") from None
     quiet_machine.run([str(python), str(SCRIPTS / "check_torch_works.py")], bench.env)
     print("PyTorch's fast ways agree with the twin; its attention is fused", flush=True)
     imports = quiet_machine.run(bench.worker({"work": "import"}), bench.env)
@@ -364,6 +390,7 @@ def measure_all(args: argparse.Namespace, folder: Path, report: dict[str, Any]) 
         for row, result in zip(group, results, strict=True):
             judge(row, result, args.size)
         report["rows"] += results
+        write_report(args, report)
     failed = any("error" in result for result in report["rows"])
     missed = any(not target["met"] for result in report["rows"] for target in result.get("targets", {}).values())
     return 1 if failed or (args.strict and missed) else 0
@@ -388,6 +415,8 @@ def main() -> int:
     try:
         busy, sentence = quiet_machine.load()
         report["loaded"] = busy > args.max_busy
+        if args.json and not args.json.absolute().parent.is_dir():
+            raise CommandFailed(f"there is no folder for {args.json}")
         if args.force and report["loaded"]:
             print(f"the machine is loaded ({sentence}): the figures below say little", flush=True)
         with tempfile.TemporaryDirectory() as folder:
@@ -402,16 +431,14 @@ def main() -> int:
     except KeyboardInterrupt:
         report["stopped"] = "interrupted"
         code = 130
-    foreign = [row["foreign_cores"] for row in report["rows"] if "foreign_cores" in row]
-    report["loaded"] = max(foreign) > args.max_busy if foreign else report["loaded"]
+    note_load(args, report)
     if report["rows"]:
         loaded = "; **others used the processor**" if report["loaded"] else ""
         counts = f"{args.threads} threads, {args.rounds} x {args.repeats} samples"
         print(f"\n{args.size}, {report['cpu']}, {counts}{loaded}\n")
         print(table(report["rows"], args.targets))
         print(f"\nPyTorch's memory holds {gigabytes(report['baseline_bytes'])} that importing it takes.")
-    if args.json:
-        args.json.write_text(json.dumps(report, indent=1) + "\n")
+    write_report(args, report)
     return code
 
 
