@@ -23,6 +23,7 @@ import json
 import os
 import platform
 import shutil
+import signal
 import statistics
 import subprocess
 import sys
@@ -398,6 +399,8 @@ def measure_all(args: argparse.Namespace, folder: Path, report: dict[str, Any]) 
 
 def main() -> int:
     args = parse_arguments()
+    # So that a measurement does not go on alone.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     report: dict[str, Any] = {
         "size": args.size,
         "sizes": SIZES[args.size],
