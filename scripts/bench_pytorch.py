@@ -107,7 +107,8 @@ class Bench:
         if isinstance(side, Torch):
             return self.worker(self.torch_spec(side, round_, variant))
         size = SIZES[side.size or self.args.size]
-        repeats, warmup = (1, 0) if side.contexts else (self.args.repeats, self.args.warmup)
+        # The first step has no optimiser state yet while it goes backward: the second one's memory counts.
+        repeats, warmup = (1, 1) if side.contexts else (self.args.repeats, self.args.warmup)
         command = [str(self.clift), "bench", str(self.args.config), "--work", side.work, "--device", "flex"]
         command += ["--no-error", "--repeats", str(repeats), "--warmup", str(warmup), "--storage", "1/4"]
         for override in [*overrides(size | ({"contexts": side.contexts} if side.contexts else {})), *side.overrides]:
