@@ -360,7 +360,7 @@ def note_load(args: argparse.Namespace, report: dict[str, Any]) -> None:
 
 
 def write_report(args: argparse.Namespace, report: dict[str, Any]) -> None:
-    """Writes what there is: also after each group of rows, for a full comparison takes hours."""
+    """Writes what there is: also after each group of rows, for a full comparison takes long."""
     note_load(args, report)
     if args.json:
         args.json.write_text(json.dumps(report, indent=1) + "\n")
