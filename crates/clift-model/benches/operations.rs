@@ -4,11 +4,13 @@
 
 use std::time::Duration;
 
+use burn::module::Module;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use clift_model::KMeans;
-use clift_model::attention::sdpa;
+use clift_model::attention::self_sdpa;
 use clift_model::cluster_attention::cluster_attention;
-use clift_model::feed_forward::gelu;
+use clift_model::layer_norm::layer_norm;
+use clift_model::linear::{linear, linear_of_gelu};
+use clift_model::{Init, KMeans};
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
 use rand::{RngExt, SeedableRng};
@@ -73,8 +75,8 @@ fn attention(criterion: &mut Criterion) {
     let device = Device::flex();
     let mut group = criterion.benchmark_group("sdpa");
     for Sizes { name, batch, num_tokens, dim, num_heads, .. } in SIZES {
-        let inputs = [1, 2, 3].map(|seed| random([batch, num_tokens, dim], seed, &device));
-        both(&mut group, name, inputs, |[query, key, value]| sdpa(query, key, value, num_heads));
+        let packed = random([batch, num_tokens, 3 * dim], 1, &device);
+        both(&mut group, name, [packed], |[packed]| self_sdpa(packed, num_heads));
     }
 }
 
@@ -83,24 +85,40 @@ fn intra_cluster_attention(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("cluster_attention");
     for Sizes { name, batch, num_tokens, num_storage_tokens, dim, num_heads, .. } in SIZES {
         let num_members = num_tokens - num_storage_tokens;
-        let [query, key, value] = [(num_storage_tokens, 1), (num_members, 2), (num_members, 3)]
-            .map(|(rows, seed)| random([batch, rows, dim], seed, &device));
+        let inputs = [(num_storage_tokens, dim, 1), (num_members, 2 * dim, 2)]
+            .map(|(rows, columns, seed)| random([batch, rows, columns], seed, &device));
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let segment: Vec<i64> = (0..batch * num_members)
             .map(|row| (row / num_members * num_storage_tokens + rng.random_range(0..num_storage_tokens)) as i64)
             .collect();
         let segment = Tensor::<1, Int>::from_data(TensorData::new(segment, [batch * num_members]), &device);
-        both(&mut group, name, [query, key, value], |[query, key, value]| {
-            cluster_attention(query, key, value, segment.clone(), num_heads)
+        both(&mut group, name, inputs, |[query, key_value]| {
+            cluster_attention(query, key_value, segment.clone(), num_heads)
         });
     }
 }
 
-fn activation(criterion: &mut Criterion) {
+fn layers(criterion: &mut Criterion) {
     let device = Device::flex();
-    let mut group = criterion.benchmark_group("gelu");
-    for Sizes { name, batch, num_tokens, feed_forward_dim, .. } in SIZES {
-        both(&mut group, name, [random([batch, num_tokens, feed_forward_dim], 1, &device)], |[x]| gelu(x));
+    let mut group = criterion.benchmark_group("layers");
+    for Sizes { name, batch, num_tokens, dim, feed_forward_dim, .. } in SIZES {
+        let mut init = Init::new(0, &device.clone().autodiff());
+        let (up, down) = (init.linear(dim, feed_forward_dim), init.linear(feed_forward_dim, dim));
+        let norm = init.layer_norm(dim);
+        let x = random([batch, num_tokens, dim], 1, &device);
+        let hidden = random([batch, num_tokens, feed_forward_dim], 1, &device);
+        // On a device without autodiff the layers' own copies are needed.
+        let plain = |x: &Tensor<3>| !x.is_autodiff();
+        let (up_plain, down_plain, norm_plain) = (up.valid(), down.valid(), norm.valid());
+        both(&mut group, &format!("linear/{name}"), [x.clone()], |[x]| {
+            linear(if plain(&x) { &up_plain } else { &up }, x)
+        });
+        both(&mut group, &format!("linear_of_gelu/{name}"), [hidden], |[x]| {
+            linear_of_gelu(if plain(&x) { &down_plain } else { &down }, x)
+        });
+        both(&mut group, &format!("layer_norm/{name}"), [x], |[x]| {
+            layer_norm(if plain(&x) { &norm_plain } else { &norm }, x)
+        });
     }
 }
 
@@ -124,6 +142,6 @@ fn settings() -> Criterion {
 criterion_group! {
     name = operations;
     config = settings();
-    targets = attention, intra_cluster_attention, activation, clustering
+    targets = attention, intra_cluster_attention, layers, clustering
 }
 criterion_main!(operations);

@@ -71,8 +71,7 @@ impl Forward for Condense {
 /// The attention of every centroid to its members, on projections drawn at random.
 pub struct ClusterAttend {
     query: Tensor<3>,
-    key: Tensor<3>,
-    value: Tensor<3>,
+    key_value: Tensor<3>,
     segment: Vec<i64>,
     segment_index: Tensor<1, Int>,
     num_heads: usize,
@@ -86,15 +85,14 @@ impl ClusterAttend {
             return Err(context.bad_storage("all tokens are stored, and none is left to attend to"));
         }
         // Logits with a deviation of about one: sqrt(3) makes uniform values of unit variance.
-        let drawn = |rows: usize, purpose: &str| {
-            uniform([1, rows, dim], context.seed(), purpose, &context.device).mul_scalar(3.0_f64.sqrt())
+        let drawn = |rows: usize, columns: usize, purpose: &str| {
+            uniform([1, rows, columns], context.seed(), purpose, &context.device).mul_scalar(3.0_f64.sqrt())
         };
         let mut rng = step_rng(context.seed(), 0, "bench segments");
         let segment: Vec<i64> = (0..num_members).map(|_| below(&mut rng, count) as i64).collect();
         Ok(Self {
-            query: drawn(count, "bench query"),
-            key: drawn(num_members, "bench key"),
-            value: drawn(num_members, "bench value"),
+            query: drawn(count, dim, "bench query"),
+            key_value: drawn(num_members, 2 * dim, "bench key and value"),
             segment_index: upload(&segment, &context.device),
             segment,
             num_heads: context.config.model.num_heads,
@@ -108,15 +106,14 @@ fn upload(segment: &[i64], device: &Device) -> Tensor<1, Int> {
 
 impl Forward for ClusterAttend {
     fn forward(&self) -> Tensor<1> {
-        let Self { query, key, value, segment_index, num_heads, .. } = self;
-        cluster_attention(query.clone(), key.clone(), value.clone(), segment_index.clone(), *num_heads).flatten(0, 2)
+        let Self { query, key_value, segment_index, num_heads, .. } = self;
+        cluster_attention(query.clone(), key_value.clone(), segment_index.clone(), *num_heads).flatten(0, 2)
     }
 
     fn in_f64(&self, reference: &Device) -> Self {
         Self {
             query: self.query.in_f64(reference),
-            key: self.key.in_f64(reference),
-            value: self.value.in_f64(reference),
+            key_value: self.key_value.in_f64(reference),
             segment: self.segment.clone(),
             segment_index: upload(&self.segment, reference),
             num_heads: self.num_heads,
