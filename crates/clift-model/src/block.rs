@@ -1,5 +1,5 @@
 //! The pre-norm transformer blocks of the encoder and the renderer (paper sections 3.1, 3.3).
-// B scenes, N tokens, Q queries, D width
+// B scenes, N tokens, T target views, G groups of views with the same tokens, Q queries, D width
 
 use burn::module::Module;
 use burn::nn::LayerNorm;
@@ -64,22 +64,30 @@ impl DecoderBlock {
         }
     }
 
-    /// Updates the patches of target views from the tokens of their scenes. Views of one scene are
-    /// consecutive and share its keys and values; they do not see each other.
+    /// What cross-attention needs of a scene's tokens: it does not depend on the views that are drawn.
     ///
     /// # Shapes
-    /// - `x` and the result: `[batch * views, num_queries, dim]`
-    /// - `tokens`: `[batch, num_render_tokens, dim]`
-    pub fn forward(&self, x: Tensor<3>, tokens: Tensor<3>) -> Tensor<3> {
+    /// - `tokens`: `[groups, num_render_tokens, dim]`
+    /// - returns `[groups, num_render_tokens, 2 dim]`, keys and values side by side
+    pub fn memory(&self, tokens: Tensor<3>) -> Tensor<3> {
+        self.cross_attn.project_memory(None, tokens)
+    }
+
+    /// Updates the patches of target views from the [`memory`](Self::memory) of their scenes. Views of
+    /// one group are consecutive and share its keys and values; they do not see each other.
+    ///
+    /// # Shapes
+    /// - `x` and the result: `[views, num_queries, dim]`
+    /// - `memory`: `[groups, num_render_tokens, 2 dim]`
+    pub fn forward(&self, x: Tensor<3>, memory: Tensor<3>) -> Tensor<3> {
         let [views, num_queries, dim] = x.dims();
-        let [batch, _, _] = tokens.dims();
+        let [groups, _, _] = memory.dims();
         let x = x.clone() + self.self_attn.forward(&self.norm_self, x);
 
-        // Cross-attention treats queries one by one, so all views of a scene go in one row of queries.
+        // Cross-attention treats queries one by one, so all views of a group go in one row of queries.
         let query = self.cross_attn.project_query(Some(&self.norm_cross), x.clone());
-        let query = query.reshape([batch, views / batch * num_queries, dim]); // [BT, Q, D] -> [B, TQ, D]
-        let found = cross_sdpa(query, self.cross_attn.project_memory(None, tokens), self.cross_attn.num_heads());
-        let found = found.reshape([views, num_queries, dim]);
+        let query = query.reshape([groups, views / groups * num_queries, dim]); // [T, Q, D] -> [G, TQ / G, D]
+        let found = cross_sdpa(query, memory, self.cross_attn.num_heads()).reshape([views, num_queries, dim]);
         let x = x + self.cross_attn.project_out(found);
 
         x.clone() + self.feed_forward.forward(&self.norm_ff, x)
@@ -125,7 +133,7 @@ mod tests {
             let block = load_weights(DecoderBlock::new(&config(), &mut Init::new(0, &device)), &fixture, "weight.");
             let x = fixture.tensor::<3>("input.x", &device).require_grad();
             let memory = fixture.tensor::<3>("input.memory", &device).require_grad();
-            let output = block.forward(x.clone(), memory.clone());
+            let output = block.forward(x.clone(), block.memory(memory.clone()));
             assert_close(&output.clone().inner(), &fixture.tensor::<3>("output.x", &device).inner(), OUTPUT);
             let grads = (output * fixture.tensor("input.cotangent", &device)).sum().backward();
             for (name, input) in [("x", x), ("memory", memory)] {
@@ -143,9 +151,10 @@ mod tests {
         let to_f32 = |x: Tensor<3>| x.cast(burn::tensor::DType::F32);
         let x = to_f32(random([6, 5, 16], 1, &device)); // two scenes of three views
         let tokens = to_f32(random([2, 7, 16], 2, &device));
-        let together = block.forward(x.clone(), tokens.clone());
+        let together = block.forward(x.clone(), block.memory(tokens.clone()));
         for view in 0..6 {
-            let alone = block.forward(x.clone().narrow(0, view, 1), tokens.clone().narrow(0, view / 3, 1));
+            let alone =
+                block.forward(x.clone().narrow(0, view, 1), block.memory(tokens.clone().narrow(0, view / 3, 1)));
             assert_close(&together.clone().narrow(0, view, 1), &alone, 1e-6);
         }
     }

@@ -36,8 +36,17 @@ impl Encoder {
     /// # Shapes
     /// - returns `[batch, views * (height / patch) * (width / patch), dim]`, ordered by view, row, column
     pub fn forward(&self, context: &Views) -> Tensor<3> {
+        self.blocks.iter().fold(self.embed(context), |tokens, block| block.forward(tokens))
+    }
+
+    /// What the first block starts from: the embedded patches, in the result's shape.
+    pub fn embed(&self, context: &Views) -> Tensor<3> {
         let pixels = Tensor::cat(vec![context.images.clone(), plucker(&context.cameras)], 4); // [B, V, H, W, 9]
-        let tokens = linear(&self.patch_embed, patchify(pixels, self.patch_size));
-        self.blocks.iter().fold(tokens, |tokens, block| block.forward(tokens))
+        linear(&self.patch_embed, patchify(pixels, self.patch_size))
+    }
+
+    /// The blocks after [`embed`](Self::embed).
+    pub fn blocks(&self) -> &[EncoderBlock] {
+        &self.blocks
     }
 }

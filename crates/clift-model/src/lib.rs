@@ -39,5 +39,5 @@ pub use error::ModelError;
 pub use init::Init;
 pub use kmeans::KMeans;
 pub use model::Clift;
-pub use renderer::Renderer;
+pub use renderer::{RenderTokens, Renderer, SceneMemory};
 pub use views::{Cameras, Views};

@@ -6,7 +6,7 @@
 mod clustering;
 mod context;
 mod forward;
-mod inputs;
+pub(crate) mod inputs;
 mod memory;
 mod reference;
 mod statistics;

@@ -23,6 +23,10 @@ pub struct Config {
     /// Where tensors live: `flex`, `ndarray` or `wgpu`.
     #[serde(default)]
     pub device: DeviceName,
+    /// Whether a training step keeps only the input of every transformer block and computes what is inside
+    /// again for the backward: the same gradients in less memory, for one more forward.
+    #[serde(default)]
+    pub recompute: bool,
     /// Scenes and views.
     pub data: DataConfig,
     /// Sizes of the network.

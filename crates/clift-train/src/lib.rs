@@ -17,6 +17,7 @@ pub mod loss;
 mod mistakes;
 pub mod optim;
 mod overrides;
+mod recompute;
 pub mod run;
 pub mod scenes;
 pub mod schedule;

@@ -47,7 +47,8 @@ const VERSION: u32 = 1;
 const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
 
 /// Keys that may change between the start of a run and its resumption.
-const FREE_KEYS: [&str; 6] = ["run_dir", "device", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
+const FREE_KEYS: [&str; 7] =
+    ["run_dir", "device", "recompute", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
 
 /// An open run.
 pub struct Run {

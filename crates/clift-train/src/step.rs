@@ -4,14 +4,15 @@
 use burn::module::Module;
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::{GradientsAccumulator, GradientsParams, ModuleOptimizer};
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use clift_data::{Clip, Skip};
 use clift_eval::{upload_cameras, upload_pictures, upload_views};
-use clift_model::{Cameras, Clift, Clusters, SceneClusters, Views};
+use clift_model::{Cameras, Clift, Clusters, Condenser, RenderTokens, SceneClusters, Views};
 
 use crate::TrainError;
 use crate::loss::mse;
 use crate::optim::{clip_global_norm, global_norm};
+use crate::recompute;
 
 /// What one update sees: clips with equal numbers of views, and which tokens the renderer is given.
 #[derive(Clone, Debug)]
@@ -59,6 +60,8 @@ pub struct Learner {
     pub optimizer: ModuleOptimizer,
     /// Where it is trained.
     pub device: Device,
+    /// Whether the backward computes every block again instead of keeping what is inside it.
+    pub recompute: bool,
 }
 
 /// What an update did.
@@ -75,38 +78,42 @@ pub struct Update {
 impl Learner {
     /// Makes one update from a batch, worked off in `accumulate` parts.
     ///
+    /// Takes the learner and gives it back, so that the update writes the weights in place.
+    ///
     /// # Errors
     /// Whatever the model refuses.
     pub fn step(
-        &mut self,
+        self,
         batch: &StageBatch,
         accumulate: usize,
         rate: ModuleLearningRate,
         max_grad_norm: f64,
-    ) -> Result<Update, TrainError> {
+    ) -> Result<(Self, Update), TrainError> {
+        let Self { model, mut optimizer, device, recompute } = self;
         let mut accumulator = GradientsAccumulator::<Clift>::new();
         let mut total = 0.0;
         for part in batch.parts(accumulate) {
             let share = part.clips.len() as f64 / batch.clips.len() as f64;
-            let loss = self.loss(&part)?.mul_scalar(share);
-            let grads = GradientsParams::from_grads(loss.backward(), &self.model);
-            accumulator.accumulate(&self.model, grads);
-            total += loss.into_scalar::<f64>();
+            let shown = Shown::upload(&part, &device)?;
+            total += if recompute {
+                recompute::backward(&model, &shown, &part.tokens, share, &mut accumulator)?
+            } else {
+                let loss = loss_of(&model, &shown, &part.tokens)?.mul_scalar(share);
+                accumulator.accumulate(&model, GradientsParams::from_grads(loss.backward(), &model));
+                loss.into_scalar::<f64>()
+            };
         }
         let grads = accumulator.grads();
-        let grad_norm = global_norm(&self.model, &grads);
+        let grad_norm = global_norm(&model, &grads);
         // Looked at before the update, so that a bad batch leaves no trace in the weights.
         let applied = total.is_finite() && grad_norm.is_finite();
-        if applied {
-            let grads = clip_global_norm(&self.model, grads, grad_norm, max_grad_norm);
-            self.model = self.optimizer.step(rate, self.model.clone(), grads);
-        }
-        Ok(Update { loss: total, grad_norm, applied })
-    }
-
-    /// Renders the targets of a batch and compares: a scalar on the tape.
-    fn loss(&self, batch: &StageBatch) -> Result<Tensor<1>, TrainError> {
-        loss_of(&self.model, &Shown::upload(batch, &self.device)?, &batch.tokens)
+        let model = if applied {
+            let grads = clip_global_norm(&model, grads, grad_norm, max_grad_norm);
+            optimizer.step(rate, model, grads)
+        } else {
+            model
+        };
+        Ok((Self { model, optimizer, device, recompute }, Update { loss: total, grad_norm, applied }))
     }
 
     /// The model on its device without autodiff.
@@ -138,32 +145,24 @@ impl Shown {
     }
 }
 
-/// Renders the targets and compares.
-pub(crate) fn loss_of(model: &Clift, shown: &Shown, tokens: &TokenChoice) -> Result<Tensor<1>, TrainError> {
+/// Renders the targets and compares: a scalar on the tape.
+pub(crate) fn loss_of(model: &Clift, shown: &Shown, choice: &TokenChoice) -> Result<Tensor<1>, TrainError> {
     let lift = model.encoder.forward(&shown.context); // [B, N, D]
-    let tokens = match tokens {
-        TokenChoice::All => lift,
-        TokenChoice::Subsets(subsets) => keep(lift, subsets), // [BT, K, D]
-        TokenChoice::Clusters(clusters) => {
-            let index = Clusters::new(clusters.clone())?.upload(&lift.device());
-            model.condenser.forward(lift, &index) // [B, S, D]
-        }
-    };
+    let tokens = choice.apply(&model.condenser, lift)?;
     let rendering = model.renderer.forward(tokens, &shown.targets);
     Ok(mse(rendering, shown.pictures.clone()))
 }
 
-/// The kept tokens of every target view: `[B, N, D] -> [B * T, K, D]`.
-fn keep(lift: Tensor<3>, subsets: &[Vec<Vec<u32>>]) -> Tensor<3> {
-    let [batch, num_tokens, dim] = lift.dims();
-    let rows: Vec<i64> = subsets
-        .iter()
-        .enumerate()
-        .flat_map(|(scene, views)| views.iter().flatten().map(move |&token| (scene, token)))
-        .map(|(scene, token)| (scene * num_tokens) as i64 + i64::from(token))
-        .collect();
-    let groups: usize = subsets.iter().map(Vec::len).sum();
-    let count = rows.len();
-    let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [count]), &lift.device());
-    lift.reshape([batch * num_tokens, dim]).select(0, rows).reshape([groups, count / groups, dim])
+impl TokenChoice {
+    /// What the renderer is given of a scene's tokens.
+    pub(crate) fn apply(&self, condenser: &Condenser, lift: Tensor<3>) -> Result<RenderTokens, TrainError> {
+        Ok(match self {
+            Self::All => lift.into(),
+            Self::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
+            Self::Clusters(clusters) => {
+                let index = Clusters::new(clusters.clone())?.upload(&lift.device());
+                condenser.forward(lift, &index).into()
+            }
+        })
+    }
 }

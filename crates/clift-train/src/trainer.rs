@@ -66,7 +66,8 @@ impl StagePlan<'_> {
         let samples = self.folder.join("samples");
         let checkpoints = Checkpoints::new(self.folder.join("checkpoints"), checkpoint.keep);
         let model = if checkpoints.newest()?.is_some() { self.blank_model() } else { start(sink)? };
-        let mut learner = Learner { model, optimizer: adamw(self.optimizer), device: self.device.clone() };
+        let optimizer = adamw(self.optimizer);
+        let mut learner = Learner { model, optimizer, device: self.device.clone(), recompute: self.config.recompute };
         let mut progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
         learner.model = freeze(self.stage, learner.model);
         let mut metrics = self.open_metrics(progress.step)?;
@@ -84,7 +85,8 @@ impl StagePlan<'_> {
             let step = progress.step + 1;
             let lr = warm_up_cosine(step, self.optimizer.learning_rate, self.optimizer.warm_up_steps, self.num_steps);
             let rate = self.learning_rate(lr);
-            let update = learner.step(&batch, self.accumulate, rate, self.optimizer.max_grad_norm)?;
+            let (trained, update) = learner.step(&batch, self.accumulate, rate, self.optimizer.max_grad_norm)?;
+            learner = trained;
             progress = Progress { step, bad_steps: if update.applied { 0 } else { progress.bad_steps + 1 } };
             self.report(update, step, lr, step_started, &mut sink);
             if progress.bad_steps > 0 {

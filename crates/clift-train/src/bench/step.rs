@@ -20,7 +20,8 @@ use crate::trainer::freeze;
 /// Updates of one batch: forward, loss, backward, clipping, `AdamW`.
 pub struct StepTask {
     stage: Stage,
-    learner: Learner,
+    /// Taken while it makes a step, and gone after one that failed.
+    learner: Option<Learner>,
     batch: StageBatch,
     accumulate: usize,
     rate: f64,
@@ -36,10 +37,11 @@ impl StepTask {
             model: freeze(stage, context.model()),
             optimizer: adamw(optimizer),
             device: context.device.clone().autodiff(),
+            recompute: context.config.recompute,
         };
         Ok(Self {
             stage,
-            learner,
+            learner: Some(learner),
             batch: stage_batch(context, stage, batch_size)?,
             accumulate,
             rate: warm_up_cosine(1, optimizer.learning_rate, optimizer.warm_up_steps, steps),
@@ -76,7 +78,9 @@ fn stage_batch(context: &BenchContext, stage: Stage, batch_size: usize) -> Resul
 
 impl Task for StepTask {
     fn run(&mut self) -> Result<(), TrainError> {
-        let update = self.learner.step(&self.batch, self.accumulate, self.rate.into(), self.max_grad_norm)?;
+        let learner = self.learner.take().expect("no step failed before");
+        let (learner, update) = learner.step(&self.batch, self.accumulate, self.rate.into(), self.max_grad_norm)?;
+        self.learner = Some(learner);
         if update.applied {
             return Ok(());
         }
