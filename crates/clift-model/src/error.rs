@@ -52,6 +52,16 @@ pub enum ModelError {
         /// The contradiction, with the indices that show it.
         what: String,
     },
+    /// A token's ray is not finite, or its direction has no length.
+    #[error("the ray of token {token} cannot be used: from {origin:?} along {direction:?}")]
+    BadRay {
+        /// Position of the token.
+        token: usize,
+        /// Where the ray starts.
+        origin: [f64; 3],
+        /// Where it goes.
+        direction: [f64; 3],
+    },
     /// A device name is unknown, or this build does not have it.
     #[error("device `{name}`: {reason}")]
     NoDevice {

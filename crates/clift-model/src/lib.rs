@@ -8,6 +8,7 @@
 
 pub mod attention;
 pub mod block;
+pub mod camera;
 pub mod cluster_attention;
 pub mod clusters;
 pub mod condenser;
@@ -22,11 +23,13 @@ pub mod model;
 pub mod patch;
 pub mod rays;
 pub mod renderer;
+pub mod select;
 #[cfg(test)]
 pub(crate) mod testing;
 pub mod views;
 pub mod weights;
 
+pub use camera::ViewCamera;
 pub use clusters::{ClusterIndex, Clusters, SceneClusters};
 pub use condenser::Condenser;
 pub use config::{CondenserConfig, ModelConfig, Variant};
@@ -36,4 +39,5 @@ pub use init::Init;
 pub use kmeans::KMeans;
 pub use model::Clift;
 pub use renderer::Renderer;
+pub use select::{Preset, Rules, Selector, TokenRay};
 pub use views::{Cameras, Views};
