@@ -70,6 +70,28 @@ pub enum ModelError {
         /// Why it cannot be had, and what would help.
         reason: String,
     },
+    /// A scene file could not be written, or is not one to draw from.
+    #[error("cannot {action} the scene: {reason}; {fix}: {path}", path = path.display())]
+    SceneFile {
+        /// What was being done ("use", "write").
+        action: &'static str,
+        /// Why it cannot.
+        reason: String,
+        /// What to do about it.
+        fix: &'static str,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A scene is to be drawn with weights it was not made for.
+    #[error("the scene was made for the renderer {expected:.12}, these weights are {got:.12}; give the run it was encoded with (--model RUN): {path}", path = path.display())]
+    OtherRenderer {
+        /// Hash in the scene.
+        expected: String,
+        /// Hash of the weights.
+        got: String,
+        /// The weights.
+        path: PathBuf,
+    },
     /// A weight file could not be read or written.
     #[error("{action} the weights failed: {reason}: {path}", path = path.display())]
     Weights {

@@ -23,6 +23,7 @@ pub mod model;
 pub mod patch;
 pub mod rays;
 pub mod renderer;
+pub mod scene;
 pub mod select;
 #[cfg(test)]
 pub(crate) mod testing;
@@ -39,5 +40,6 @@ pub use init::Init;
 pub use kmeans::KMeans;
 pub use model::Clift;
 pub use renderer::Renderer;
+pub use scene::{Scene, TokenKind, TokenStorage, WorldFrame};
 pub use select::{Preset, Rules, Selector, TokenRay};
 pub use views::{Cameras, Views};
