@@ -5,4 +5,5 @@ mod hyperparameters;
 mod loss_curve;
 mod pipeline;
 mod resume;
+mod scene_files;
 mod support;

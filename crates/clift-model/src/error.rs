@@ -70,6 +70,12 @@ pub enum ModelError {
         /// Why it cannot be had, and what would help.
         reason: String,
     },
+    /// A picture could not be read back from its device.
+    #[error("reading a picture from its device failed: {reason}")]
+    Device {
+        /// The device's reason.
+        reason: String,
+    },
     /// A scene file could not be written, or is not one to draw from.
     #[error("cannot {action} the scene: {reason}; {fix}: {path}", path = path.display())]
     SceneFile {

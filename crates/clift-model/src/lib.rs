@@ -27,6 +27,7 @@ pub mod scene;
 pub mod select;
 #[cfg(test)]
 pub(crate) mod testing;
+pub mod viewer;
 pub mod views;
 pub mod weights;
 
@@ -42,4 +43,5 @@ pub use model::Clift;
 pub use renderer::Renderer;
 pub use scene::{Scene, TokenKind, TokenStorage, WorldFrame};
 pub use select::{Preset, Rules, Selector, TokenRay};
+pub use viewer::{Drawn, Viewer};
 pub use views::{Cameras, Views};
