@@ -212,7 +212,7 @@ fn what_cannot_be_drawn_says_what_to_do() {
     assert!(message.contains("no frame takes less than ") && message.contains("--budget-ms "), "{message}");
     let message = with(&["--size", "20x16"]).fails(2);
     assert!(message.contains("an image of 20 x 16 does not divide into patches of 8 x 8"), "{message}");
-    assert!(with(&["--render", "9"]).fails(1).contains("a scene has 2 tokens"));
+    assert!(with(&["--render", "9"]).fails(2).contains("a scene has 2 tokens"));
     let other = place.at("other/stage1/model.safetensors").display().to_string();
     let message = with(&["--model", &other]).fails(2);
     assert!(message.contains("the scene was made for the renderer ") && message.contains("--model RUN"), "{message}");

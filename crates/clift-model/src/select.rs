@@ -202,7 +202,9 @@ impl Selector {
         let nearest = self.measure(&cells, grid(height, width), camera.origin(), per_cell);
         let chosen = nearest.choose(num_render_tokens);
         self.previous = vec![false; num_storage_tokens];
-        chosen.iter().for_each(|&token| self.previous[token as usize] = true);
+        for &token in &chosen {
+            self.previous[token as usize] = true;
+        }
         Ok(chosen)
     }
 
@@ -273,24 +275,24 @@ fn angle(squared_chord: f32) -> f32 {
     let u = if is_acute { squared_chord } else { (4.0 - squared_chord).max(0.0) };
     let x = 1.0 - 0.5 * u;
     let mut sum = -0.001_262_491_1_f32;
-    for coefficient in
-        [0.006_670_09, -0.017_088_126, 0.030_891_88, -0.050_174_303, 0.088_978_99, -0.214_598_8, 1.570_796_3]
-    {
+    for coefficient in [0.006_670_09, -0.017_088_126, 0.030_891_88, -0.050_174_303, 0.088_978_99, -0.214_598_8] {
         sum = sum * x + coefficient;
     }
+    // Half of pi rather than the printed 1.5707963050, 2e-8 less: both branches meet at a right angle.
+    sum = sum * x + std::f32::consts::FRAC_PI_2;
     let angle = (0.5 * u).sqrt() * sum;
     if is_acute { angle } else { std::f32::consts::PI - angle }
 }
 
 /// By distance, then by id.
-fn nearer(a: &(f32, u32), b: &(f32, u32)) -> std::cmp::Ordering {
-    a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
+fn nearer((a, first): (f32, u32), (b, second): (f32, u32)) -> std::cmp::Ordering {
+    a.total_cmp(&b).then(first.cmp(&second))
 }
 
 /// Keeps the `count` nearest, in any order.
 fn keep_nearest(candidates: &mut Vec<(f32, u32)>, count: usize) {
     if count < candidates.len() && count > 0 {
-        candidates.select_nth_unstable_by(count - 1, nearer);
+        candidates.select_nth_unstable_by(count - 1, |a, b| nearer(*a, *b));
     }
     candidates.truncate(count);
 }
@@ -334,7 +336,9 @@ impl Nearest {
             }
         }
         keep_nearest(candidates, count);
-        candidates.iter().for_each(|&(_, token)| self.taken[token as usize] = true);
+        for &(_, token) in candidates.iter() {
+            self.taken[token as usize] = true;
+        }
     }
 
     /// Exactly `count` tokens: of those taken by cells the nearest, or all and then the nearest others.

@@ -89,10 +89,10 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
 fn told(encoded: &Encoded, storage: TokenStorage, path: &Path) -> String {
     let Encoded { scene, num_lift_tokens, tried } = encoded;
     let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-    let errors = tried.iter().map(|(count, error)| format!("\n  {count:>6}  {error:.4}")).collect::<String>();
+    let errors: Vec<String> = tried.iter().map(|(count, error)| format!("{count:>6}  {error:.4}")).collect();
     format!(
         "{}: {} of {num_lift_tokens} tokens ({}, {storage}), {}\nscene {}, {} of {} x {}: frames {frames}\n\
-         tokens  variance left within clusters{errors}",
+         tokens  variance left within clusters\n{}",
         path.display(),
         scene.num_tokens(),
         scene.kind,
@@ -101,6 +101,7 @@ fn told(encoded: &Encoded, storage: TokenStorage, path: &Path) -> String {
         count(scene.context.len(), "view"),
         scene.width,
         scene.height,
+        errors.join("\n"),
     )
 }
 

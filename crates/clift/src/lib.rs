@@ -79,15 +79,18 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     if let Some(error) = error.downcast_ref::<clift_model::ModelError>() {
         return model_exit_code(error);
     }
+    if let Some(EvalError::BadTokenCount { .. }) = error.downcast_ref::<EvalError>() {
+        return WRONG_USAGE;
+    }
     match error.downcast_ref::<TrainError>() {
         Some(TrainError::Interrupted { .. }) => INTERRUPTED,
         Some(
             TrainError::BadConfig { .. }
             | TrainError::OtherRun { .. }
             | TrainError::Missing { .. }
-            | TrainError::NoConfig { .. },
+            | TrainError::NoConfig { .. }
+            | TrainError::Eval(EvalError::BadTokenCount { .. }),
         ) => WRONG_USAGE,
-        Some(TrainError::Eval(EvalError::BadTokenCount { .. })) => WRONG_USAGE,
         Some(TrainError::Data(error)) => data_exit_code(error),
         Some(TrainError::Model(error)) => model_exit_code(error),
         Some(_) | None => FAILED,

@@ -91,7 +91,9 @@ impl Scene {
         let mut bytes = (HEADER_BYTES as u64).to_le_bytes().to_vec();
         bytes.extend(header.bytes());
         bytes.resize(8 + HEADER_BYTES, b' ');
-        tensors.iter().for_each(|(.., data)| bytes.extend(data));
+        for (.., data) in &tensors {
+            bytes.extend(data);
+        }
         Ok(bytes)
     }
 
