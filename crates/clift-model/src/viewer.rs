@@ -232,7 +232,8 @@ mod tests {
             for (view, drawn) in path(11).iter().zip(&drawn) {
                 let cameras = Cameras::of_views(&[*view], 16, 24, &device).unwrap();
                 let alone = renderer.forward(tokens.clone(), &cameras).into_data().convert::<f32>();
-                assert!(largest_difference(&drawn.pixels, alone.as_slice::<f32>().unwrap()) < 1e-6);
+                // Eight views are multiplied in blocks of other sizes than one.
+                assert!(largest_difference(&drawn.pixels, alone.as_slice::<f32>().unwrap()) < 1e-5);
                 assert_eq!((&drawn.tokens, drawn.select_s), (&None, 0.0));
             }
         }

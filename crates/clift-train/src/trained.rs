@@ -22,19 +22,23 @@ impl ModelPath {
     /// Finds the run and the weights of `RUN` or `RUN/stageN/model.safetensors`.
     ///
     /// # Errors
-    /// [`TrainError::Missing`] for a run without weights, [`TrainError::NoConfig`] for a weight file without a config.
+    /// [`TrainError::Missing`] for a run without weights and for no file, [`TrainError::NoConfig`] for a weight file without a config.
     pub fn find(path: &Path) -> Result<Self, TrainError> {
+        let missing = |path: &Path| TrainError::Missing {
+            stage: "encoding",
+            what: "a trained model",
+            first: "clift train",
+            path: path.into(),
+        };
         if path.is_dir() {
             let weights = [Stage::Stage2, Stage::Stage1].map(|stage| weights_of(path, stage));
             let [_, first] = &weights;
             let found = weights.iter().find(|file| file.exists()).cloned();
-            let weights = found.ok_or_else(|| TrainError::Missing {
-                stage: "encoding",
-                what: "a trained model",
-                first: "clift train",
-                path: first.clone(),
-            })?;
+            let weights = found.ok_or_else(|| missing(first))?;
             return Ok(Self { run: path.into(), weights });
+        }
+        if !path.exists() {
+            return Err(missing(path));
         }
         let above = path.ancestors().skip(1).take(2);
         let run = above.map(|folder| if folder.as_os_str().is_empty() { Path::new(".") } else { folder });
@@ -117,6 +121,9 @@ mod tests {
         assert_eq!(renderer_weights(&stage2, TokenKind::Clift), stage2);
 
         let alone = place.path().join("alone.safetensors");
+        let message = ModelPath::find(&alone).unwrap_err().to_string();
+        assert!(message.starts_with("encoding needs a trained model, which is not there"), "{message}");
+        std::fs::write(&alone, "").unwrap();
         let message = ModelPath::find(&alone).unwrap_err().to_string();
         assert!(message.contains("no config.toml beside it or above it"), "{message}");
     }

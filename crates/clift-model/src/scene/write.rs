@@ -32,14 +32,6 @@ impl Scene {
         })
     }
 
-    /// The scene as it would be read back from a file: its tokens rounded.
-    ///
-    /// # Errors
-    /// As [`Scene::write`].
-    pub fn rounded(&self, storage: TokenStorage) -> Result<Self, ModelError> {
-        Ok(Self { tokens: storage.round(&self.tokens, self.model.dim)?, ..self.clone() })
-    }
-
     fn to_bytes(&self, path: &Path, storage: TokenStorage) -> Result<Vec<u8>, ModelError> {
         let refuse = |reason| ModelError::SceneFile {
             action: "write",
