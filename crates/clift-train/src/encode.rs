@@ -136,8 +136,12 @@ fn cluster(
     let (counts, limit) = match budget {
         Budget::Tokens(count) => (vec![count.of(num_tokens)?], f64::INFINITY),
         Budget::MaxError(limit) => {
-            let grid = config.clusters.grid.iter();
-            let mut counts = grid.map(|count| count.of(num_tokens)).collect::<Result<Vec<_>, _>>()?;
+            // Fewer views than in training have fewer tokens than the largest counts may ask for.
+            let mut counts: Vec<_> =
+                config.clusters.grid.iter().filter_map(|count| count.of(num_tokens).ok()).collect();
+            if counts.is_empty() {
+                counts.push(num_tokens);
+            }
             counts.sort_unstable();
             counts.dedup();
             (counts, limit)
@@ -227,6 +231,15 @@ mod tests {
         let message =
             cluster(&config(&grid), &tokens(64, 16), Budget::MaxError(1e-9), 1).map(|_| ()).unwrap_err().to_string();
         assert!(message.starts_with("`--max-error` = 0.000000001: 4 tokens, the most of the run's"), "{message}");
+    }
+
+    #[test]
+    fn counts_that_a_scene_of_few_views_does_not_have_are_left_out() {
+        let kept = |grid: &[TokenCount]| {
+            cluster(&config(grid), &tokens(6, 3), Budget::MaxError(0.5), 1).unwrap().1.last().unwrap().0
+        };
+        assert_eq!(kept(&[TokenCount::Count(100), TokenCount::Count(3)]), 3);
+        assert_eq!(kept(&[TokenCount::Count(100)]), 6, "all there are");
     }
 
     #[test]
