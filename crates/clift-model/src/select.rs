@@ -13,7 +13,10 @@ use rayon::prelude::*;
 use crate::{ModelError, ViewCamera};
 
 /// Side of a cell of the target's grid, in pixels.
-pub const CELL_PX: usize = 16;
+pub const CELL_PX: f64 = 16.0;
+
+/// Cells along the shorter side where they scale with the picture: those of 256 pixels.
+pub const SCALED_CELLS: f64 = 16.0;
 
 /// Cells beyond each edge of the picture.
 pub const MARGIN_CELLS: usize = 4;
@@ -30,17 +33,21 @@ pub enum Preset {
     Paper,
     /// Tokens nearest to any cell, frame by frame: what the released code's table of render budgets uses.
     Global,
+    /// As the paper's, with cells that scale with the picture: the same at 256 pixels. Around a picture of 32 pixels,
+    /// four cells of 16 are four fifths of the grid's width, and most tokens go to what is not seen.
+    Scaled,
 }
 
 impl Preset {
     /// All presets.
-    pub const ALL: [Self; 2] = [Self::Paper, Self::Global];
+    pub const ALL: [Self; 3] = [Self::Paper, Self::Global, Self::Scaled];
 
     /// The name as it is typed.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Paper => "paper",
             Self::Global => "global",
+            Self::Scaled => "scaled",
         }
     }
 
@@ -49,6 +56,7 @@ impl Preset {
         match self {
             Self::Paper => Rules::default(),
             Self::Global => Rules { previous_bonus: 0.0, momentum: 0.0, per_cell: false, ..Rules::default() },
+            Self::Scaled => Rules { scaled_cells: true, ..Rules::default() },
         }
     }
 }
@@ -65,7 +73,7 @@ impl FromStr for Preset {
     }
 }
 
-/// How near a token is to a cell, and how many each cell is given. The default is the paper's.
+/// How near a token is to a cell, how many each cell is given, and how large it is. The default is the paper's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rules {
     /// Weight of the angle between the rays of token and cell, in radians.
@@ -78,11 +86,46 @@ pub struct Rules {
     pub momentum: f32,
     /// Whether every cell is given its `R / Q` nearest tokens before the rest is given to the nearest of all.
     pub per_cell: bool,
+    /// Whether a cell is a sixteenth of the picture's shorter side instead of 16 pixels.
+    pub scaled_cells: bool,
 }
 
 impl Default for Rules {
     fn default() -> Self {
-        Self { angle_weight: 1.0, distance_weight: 0.02, previous_bonus: 0.03, momentum: 0.5, per_cell: true }
+        Self {
+            angle_weight: 1.0,
+            distance_weight: 0.02,
+            previous_bonus: 0.03,
+            momentum: 0.5,
+            per_cell: true,
+            scaled_cells: false,
+        }
+    }
+}
+
+impl Rules {
+    /// Side of a cell of the target's grid, in pixels.
+    fn cell_px(&self, height: usize, width: usize) -> f64 {
+        if self.scaled_cells { height.min(width).max(1) as f64 / SCALED_CELLS } else { CELL_PX }
+    }
+
+    /// Rows and columns of the target's grid: cells that cover the picture, and a margin of four.
+    pub fn grid(&self, height: usize, width: usize) -> [usize; 2] {
+        let cell_px = self.cell_px(height, width);
+        [height, width].map(|side| (side as f64 / cell_px).ceil() as usize + 2 * MARGIN_CELLS)
+    }
+
+    /// Directions through the centres of the cells of the target's grid, row by row; margin cells lie outside the
+    /// picture.
+    ///
+    /// # Shapes
+    /// - returns `[rows * columns]` unit directions with `[rows, columns]` of [`Rules::grid`]
+    pub fn cell_directions(&self, camera: &ViewCamera, height: usize, width: usize) -> Vec<[f64; 3]> {
+        let [rows, columns] = self.grid(height, width);
+        let cell_px = self.cell_px(height, width);
+        let centre = |cell: usize| (cell as f64 - MARGIN_CELLS as f64 + 0.5) * cell_px;
+        let cells = (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column)));
+        cells.map(|(row, column)| camera.direction(centre(column), centre(row))).collect()
     }
 }
 
@@ -93,23 +136,6 @@ pub struct TokenRay {
     pub origin: [f64; 3],
     /// Of any length but zero.
     pub direction: [f64; 3],
-}
-
-/// Rows and columns of the target's grid: cells of 16 pixels and a margin of four.
-pub fn grid(height: usize, width: usize) -> [usize; 2] {
-    [height, width].map(|side| side.div_ceil(CELL_PX) + 2 * MARGIN_CELLS)
-}
-
-/// Directions through the centres of the cells of the target's grid, row by row; margin cells lie outside the
-/// picture.
-///
-/// # Shapes
-/// - returns `[rows * columns]` unit directions with `[rows, columns]` of [`grid`]
-pub fn cell_directions(camera: &ViewCamera, height: usize, width: usize) -> Vec<[f64; 3]> {
-    let [rows, columns] = grid(height, width);
-    let centre = |cell: usize| (cell as f64 - MARGIN_CELLS as f64 + 0.5) * CELL_PX as f64;
-    let cells = (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column)));
-    cells.map(|(row, column)| camera.direction(centre(column), centre(row))).collect()
 }
 
 /// Selects the tokens of one frame after the other, and remembers what the next frame needs of the last.
@@ -191,7 +217,7 @@ impl Selector {
             let fix = "write at least 1".into();
             return Err(ModelError::BadConfig { key: "num_render_tokens", value: "0".into(), fix });
         }
-        let cells = cell_directions(camera, height, width);
+        let cells = self.rules.cell_directions(camera, height, width);
         let mut values = cells.iter().flatten().chain(camera.c2w.iter()).enumerate();
         if let Some((position, &value)) = values.find(|(_, value)| !value.is_finite()) {
             return Err(ModelError::NotFinite { what: "the target's camera", value: value as f32, position });
@@ -199,7 +225,7 @@ impl Selector {
         let num_storage_tokens = self.origins.len();
         let num_render_tokens = num_render_tokens.min(num_storage_tokens);
         let per_cell = if self.rules.per_cell { num_render_tokens / cells.len() } else { 0 };
-        let nearest = self.measure(&cells, grid(height, width), camera.origin(), per_cell);
+        let nearest = self.measure(&cells, self.rules.grid(height, width), camera.origin(), per_cell);
         let chosen = nearest.choose(num_render_tokens);
         self.previous = vec![false; num_storage_tokens];
         for &token in &chosen {

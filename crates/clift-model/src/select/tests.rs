@@ -37,10 +37,11 @@ impl BruteForce {
     fn select(&mut self, camera: &ViewCamera, height: usize, width: usize, count: usize) -> Vec<u32> {
         let rules = self.rules;
         let count = count.min(self.rays.len());
-        let columns = width.div_ceil(16) + 8;
-        let cells: Vec<[f64; 3]> = (0..(height.div_ceil(16) + 8) * columns)
+        let side = if rules.scaled_cells { height.min(width) as f64 / 16.0 } else { 16.0 };
+        let [rows, columns] = [height, width].map(|pixels| (pixels as f64 / side).ceil() as usize + 8);
+        let cells: Vec<[f64; 3]> = (0..rows * columns)
             .map(|cell| {
-                let pixel = |index: usize| (index as f64 - 4.0 + 0.5) * 16.0;
+                let pixel = |index: usize| (index as f64 - 4.0 + 0.5) * side;
                 camera.direction(pixel(cell % columns), pixel(cell / columns))
             })
             .collect();
@@ -99,7 +100,7 @@ fn the_angle_is_that_of_acos_from_equal_to_opposite_directions() {
 fn frames_equal_brute_force_for_no_some_and_many_tokens_per_cell() {
     // A grid of (2 + 8) x (1 + 8) = 90 cells: n is 0, 0, 1, 3, 5, 6 and 7.
     let (height, width) = (32, 16);
-    assert_eq!(grid(height, width), [10, 9]);
+    assert_eq!(Rules::default().grid(height, width), [10, 9]);
     let rays = random_rays(700, 1);
     for preset in Preset::ALL {
         for count in [1, 89, 90, 350, 470, 600, 699, 700] {
@@ -153,8 +154,14 @@ fn two_tokens(angles: [f64; 2]) -> [TokenRay; 2] {
 }
 
 /// Rules under which a picture of one cell sees tokens by their angle alone.
-const PLAIN: Rules =
-    Rules { angle_weight: 1.0, distance_weight: 0.0, previous_bonus: 0.0, momentum: 0.0, per_cell: false };
+const PLAIN: Rules = Rules {
+    angle_weight: 1.0,
+    distance_weight: 0.0,
+    previous_bonus: 0.0,
+    momentum: 0.0,
+    per_cell: false,
+    scaled_cells: false,
+};
 
 #[test]
 fn a_token_of_the_previous_frame_stays_until_another_is_nearer_by_the_bonus() {
@@ -215,15 +222,23 @@ fn the_camera_of_a_token_counts_a_fiftieth_of_its_distance() {
 
 #[test]
 fn the_grid_covers_the_picture_with_four_cells_around_it() {
-    assert_eq!(grid(256, 256), [24, 24]);
-    assert_eq!(grid(256, 448), [24, 36]);
-    assert_eq!(grid(40, 17), [11, 10]);
+    let [paper, scaled] = [Preset::Paper, Preset::Scaled].map(Preset::rules);
+    assert_eq!(paper.grid(256, 256), [24, 24]);
+    assert_eq!(paper.grid(256, 448), [24, 36]);
+    assert_eq!(paper.grid(40, 17), [11, 10]);
+    for (height, width) in [(256, 256), (256, 448)] {
+        assert_eq!(scaled.grid(height, width), paper.grid(height, width));
+    }
+    assert_eq!(scaled.grid(32, 64), [24, 40]);
     let view = camera([0.0; 3], 0.0);
-    let cells = cell_directions(&view, 64, 64);
+    let cells = paper.cell_directions(&view, 64, 64);
     assert_eq!(cells.len(), 144);
     assert_eq!(cells[0], view.direction(-56.0, -56.0));
     assert_eq!(cells[4 * 12 + 4], view.direction(8.0, 8.0), "the first cell inside");
     assert_eq!(cells[143], view.direction(120.0, 120.0));
+    let cells = scaled.cell_directions(&view, 64, 64);
+    assert_eq!(cells[0], view.direction(-14.0, -14.0), "a quarter of the picture to each side");
+    assert_eq!(cells[4 * 24 + 4], view.direction(2.0, 2.0));
 }
 
 #[test]
@@ -240,7 +255,10 @@ fn what_cannot_be_selected_from_is_refused() {
         assert!(message.starts_with("the ray of token 1 cannot be used"), "{message}");
     }
     assert_eq!("global".parse::<Preset>().unwrap(), Preset::Global);
-    assert_eq!("all".parse::<Preset>().unwrap_err().to_string(), "`selection` = all: write one of paper, global");
+    assert_eq!(
+        "all".parse::<Preset>().unwrap_err().to_string(),
+        "`selection` = all: write one of paper, global, scaled"
+    );
 }
 
 proptest! {
@@ -249,10 +267,9 @@ proptest! {
     #[test]
     fn every_frame_has_exactly_the_tokens_asked_for_each_once(
         num_tokens in 1_usize..400, counts in prop::collection::vec(1_usize..500, 1..5), seed in 0_u64..1000,
-        height in 1_usize..40, width in 1_usize..40, paper: bool,
+        height in 1_usize..40, width in 1_usize..40, preset in 0_usize..3,
     ) {
-        let preset = if paper { Preset::Paper } else { Preset::Global };
-        let mut selector = Selector::new(preset.rules(), &random_rays(num_tokens, seed)).unwrap();
+        let mut selector = Selector::new(Preset::ALL[preset].rules(), &random_rays(num_tokens, seed)).unwrap();
         for (frame, count) in counts.into_iter().enumerate() {
             let view = camera([0.1 * frame as f64, 0.0, 0.0], 0.1 * frame as f64);
             let chosen = selector.select(&view, height, width, count).unwrap();

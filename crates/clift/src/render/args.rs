@@ -32,7 +32,7 @@ pub struct RenderArgs {
     /// Draw each frame from as many tokens as this device manages in M milliseconds
     #[arg(long, value_name = "M", value_parser = parse_budget_ms)]
     pub budget_ms: Option<f64>,
-    /// How the tokens of a frame are chosen: paper or global
+    /// How the tokens of a frame are chosen: paper, global or scaled
     #[arg(long, value_name = "PRESET", default_value = "paper")]
     pub selection: Preset,
     /// Columns and rows of a frame, multiples of the model's patch; those of the context views by default
