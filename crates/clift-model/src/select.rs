@@ -24,6 +24,9 @@ pub const MARGIN_CELLS: usize = 4;
 /// Distances are worked out for this many cells by one task at least.
 const CELLS_PER_TASK: usize = 16;
 
+/// Distances of a row that are looked over at once for one small enough.
+const GROUP: usize = 32;
+
 /// A published set of rules.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Preset {
@@ -350,15 +353,21 @@ impl Nearest {
         }
         let candidates = &mut self.candidates;
         candidates.clear();
-        // Tokens farther than `count` others that were seen already need no look.
+        // Tokens farther than `count` others that were seen already need no look, and most groups hold no other.
         let mut limit = f32::INFINITY;
-        for (token, &distance) in row.iter().enumerate() {
-            if distance < limit {
-                candidates.push((distance, token as u32));
-                if candidates.len() == 4 * count {
-                    keep_nearest(candidates, count);
-                    limit = candidates[count - 1].0;
+        for (group, distances) in row.chunks(GROUP).enumerate() {
+            let nearest = distances.iter().fold(f32::INFINITY, |least, &d| if d < least { d } else { least });
+            if nearest >= limit {
+                continue;
+            }
+            for (i, &distance) in distances.iter().enumerate() {
+                if distance < limit {
+                    candidates.push((distance, (group * GROUP + i) as u32));
                 }
+            }
+            if candidates.len() >= 4 * count {
+                keep_nearest(candidates, count);
+                limit = candidates[count - 1].0;
             }
         }
         keep_nearest(candidates, count);

@@ -261,6 +261,28 @@ fn what_cannot_be_selected_from_is_refused() {
     );
 }
 
+#[test]
+#[ignore = "measures time, which a busy machine has not"]
+fn a_frame_of_8192_tokens_and_576_cells_takes_at_most_15_ms_on_two_cores() {
+    let rays = random_rays(8192, 5);
+    for preset in Preset::ALL {
+        for count in [512, 1024, 4096, 8191] {
+            let mut selector = Selector::new(preset.rules(), &rays).unwrap();
+            let mut times_ms: Vec<f64> = (0..60)
+                .map(|frame| {
+                    let view = camera([0.01 * f64::from(frame), 0.0, 0.0], 0.01 * f64::from(frame));
+                    let started = std::time::Instant::now();
+                    selector.select(&view, 256, 256, count).unwrap();
+                    1e3 * started.elapsed().as_secs_f64()
+                })
+                .collect();
+            times_ms.sort_by(f64::total_cmp);
+            println!("{}, {count} tokens: median {:.1} ms, p95 {:.1} ms", preset.name(), times_ms[30], times_ms[57]);
+            assert!(times_ms[30] <= 15.0, "{} of {count}: {:.1} ms", preset.name(), times_ms[30]);
+        }
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 48, failure_persistence: None, ..ProptestConfig::default() })]
 
