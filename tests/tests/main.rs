@@ -1,6 +1,7 @@
 //! Whole runs through the command line: what a user types, and the files and exit codes that follow.
 
 mod bad_input;
+mod bench;
 mod hyperparameters;
 mod loss_curve;
 mod pipeline;

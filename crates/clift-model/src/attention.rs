@@ -1,8 +1,8 @@
 //! Scaled dot-product attention as one operation with its own backward, and the layers made of it.
 //!
 //! Under autodiff Burn's own attention keeps about three score maps per head (13.5 GiB for one
-//! scene of 4,096 tokens). [`sdpa`] keeps its inputs and its output, and computes the scores again
-//! in the backward, a chunk of queries at a time: memory is linear in the number of tokens.
+//! scene of 4,096 tokens). The operations here keep their inputs and their output, and compute the scores
+//! again in the backward, a chunk of queries at a time: memory is linear in the number of tokens.
 #![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
 // B scenes, Q queries, K keys, D width, H heads, E = D/H width of a head
 
@@ -16,64 +16,139 @@ use burn::nn::Linear;
 use burn::tensor::{Shape, Slice, Tensor, assert_shape};
 
 use crate::Init;
+use crate::autodiff::register;
+use crate::linear::linear;
 
-/// Attention of every query to every key, `softmax(q k^T / sqrt(head width)) v`, unmasked.
+mod native;
+
+/// Attention among the tokens of a scene, `softmax(q k^T / sqrt(head width)) v`, unmasked.
 ///
 /// Its gradient is exact and first order. Scores are shifted by their row's maximum, so finite
 /// inputs give finite outputs whatever the size of the logits.
 ///
 /// # Shapes
-/// - `query`: `[batch, num_queries, dim]`, `key` and `value`: `[batch, num_keys, dim]`; head `h` is
-///   columns `h * dim / num_heads ..`
-/// - returns `[batch, num_queries, dim]`
-pub fn sdpa(query: Tensor<3>, key: Tensor<3>, value: Tensor<3>, num_heads: usize) -> Tensor<3> {
-    let [batch, _num_queries, dim] = query.dims();
-    let [_, num_keys, _] = key.dims();
-    assert_shape!(key, [batch, num_keys, dim]);
-    assert_shape!(value, [batch, num_keys, dim]);
-    assert!(dim.is_multiple_of(num_heads), "{num_heads} heads do not divide a width of {dim}");
-    Tensor::from_dispatch(<Dispatch as AttentionOps>::sdpa(
-        query.into_dispatch(),
-        key.into_dispatch(),
-        value.into_dispatch(),
-        num_heads,
-    ))
+/// - `query_key_value`: `[batch, count, 3 dim]`, the three side by side; head `h` is columns
+///   `h * dim / num_heads ..` of each
+/// - returns `[batch, count, dim]`
+pub fn self_sdpa(query_key_value: Tensor<3>, num_heads: usize) -> Tensor<3> {
+    let [_batch, _count, packed] = query_key_value.dims();
+    assert!(packed.is_multiple_of(3 * num_heads), "{num_heads} heads do not divide a third of {packed}");
+    Tensor::from_dispatch(<Dispatch as AttentionOps>::self_sdpa(query_key_value.into_dispatch(), num_heads))
 }
 
-/// The operation behind [`sdpa`] on a device. The body here runs on every one of them.
+/// Attention of every query to every key, like [`self_sdpa`].
+///
+/// # Shapes
+/// - `query`: `[batch, num_queries, dim]`, `key_value`: `[batch, num_keys, 2 dim]`, the two side by side
+/// - returns `[batch, num_queries, dim]`
+pub fn cross_sdpa(query: Tensor<3>, key_value: Tensor<3>, num_heads: usize) -> Tensor<3> {
+    let [batch, _num_queries, dim] = query.dims();
+    let [_, num_keys, _] = key_value.dims();
+    assert_shape!(key_value, [batch, num_keys, 2 * dim]);
+    assert!(dim.is_multiple_of(num_heads), "{num_heads} heads do not divide a width of {dim}");
+    let (query, key_value) = (query.into_dispatch(), key_value.into_dispatch());
+    Tensor::from_dispatch(<Dispatch as AttentionOps>::cross_sdpa(query, key_value, num_heads))
+}
+
+/// The operations behind [`self_sdpa`] and [`cross_sdpa`] on a device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait AttentionOps: Backend {
-    /// See [`sdpa`].
-    fn sdpa(
-        query: FloatTensor<Self>,
-        key: FloatTensor<Self>,
-        value: FloatTensor<Self>,
+    /// See [`self_sdpa`].
+    fn self_sdpa(query_key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self>;
+
+    /// See [`cross_sdpa`].
+    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self>;
+}
+
+/// Both directions of attention on a device. The bodies here run on every one of them.
+pub trait AttentionKernels: Backend {
+    /// The output, and what the backward can use besides it.
+    fn attend(inputs: &Projected<FloatTensor<Self>>, num_heads: usize) -> Attended<FloatTensor<Self>> {
+        Attended { output: forward::<Self>(split::<Self>(inputs), num_heads), log_sum: None }
+    }
+
+    /// The gradients of the inputs from that of the output.
+    fn attend_backward(
+        inputs: Projected<FloatTensor<Self>>,
+        attended: Attended<FloatTensor<Self>>,
         num_heads: usize,
-    ) -> FloatTensor<Self> {
-        forward::<Self>(query, key, value, num_heads)
+        grad_output: FloatTensor<Self>,
+    ) -> Projected<FloatTensor<Self>> {
+        composed_backward::<Self>(inputs, attended.output, num_heads, grad_output)
     }
 }
 
-impl AttentionOps for Flex {}
-impl AttentionOps for NdArray {}
-#[cfg(feature = "wgpu")]
-impl AttentionOps for burn::backend::Cube {}
+/// Queries, keys and values as the projections leave them.
+#[derive(Clone, Debug)]
+pub enum Projected<T> {
+    /// All three side by side: `[B, N, 3D]`.
+    Packed(T),
+    /// Queries on their own.
+    Separate {
+        /// `[B, Q, D]`
+        query: T,
+        /// Keys and values side by side: `[B, K, 2D]`
+        key_value: T,
+    },
+}
 
-impl<B: AttentionOps, C: CheckpointStrategy> AttentionOps for Autodiff<B, C> {
-    fn sdpa(
-        query: FloatTensor<Self>,
-        key: FloatTensor<Self>,
-        value: FloatTensor<Self>,
-        num_heads: usize,
-    ) -> FloatTensor<Self> {
-        let ((query, query_node), (key, key_node), (value, value_node)) =
-            (query.into_parts(), key.into_parts(), value.into_parts());
-        match SdpaBackward.prepare::<C>([query_node, key_node, value_node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let output = B::sdpa(query.clone(), key.clone(), value.clone(), num_heads);
-                prep.finish(SdpaState { query, key, value, output: output.clone(), num_heads }, output)
+/// What attention found.
+#[derive(Clone, Debug)]
+pub struct Attended<T> {
+    /// `[B, Q, D]`
+    pub output: T,
+    /// Logarithm of the sum of every row of scores, `[B, H, Q]`, where the device saved it.
+    pub log_sum: Option<T>,
+}
+
+macro_rules! attention_ops {
+    ($backend:ty) => {
+        impl AttentionOps for $backend {
+            fn self_sdpa(query_key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self> {
+                Self::attend(&Projected::Packed(query_key_value), num_heads).output
             }
-            OpsKind::UnTracked(prep) => prep.finish(B::sdpa(query, key, value, num_heads)),
+
+            fn cross_sdpa(
+                query: FloatTensor<Self>,
+                key_value: FloatTensor<Self>,
+                num_heads: usize,
+            ) -> FloatTensor<Self> {
+                Self::attend(&Projected::Separate { query, key_value }, num_heads).output
+            }
+        }
+    };
+}
+attention_ops!(Flex);
+attention_ops!(NdArray);
+#[cfg(feature = "wgpu")]
+attention_ops!(burn::backend::Cube);
+
+impl AttentionKernels for NdArray {}
+#[cfg(feature = "wgpu")]
+impl AttentionKernels for burn::backend::Cube {}
+
+impl<B: AttentionOps + AttentionKernels, C: CheckpointStrategy> AttentionOps for Autodiff<B, C> {
+    fn self_sdpa(query_key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self> {
+        let (packed, node) = query_key_value.into_parts();
+        match SdpaBackward.prepare::<C>([node]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let state = attend::<B>(Projected::Packed(packed), num_heads);
+                let output = state.attended.output.clone();
+                prep.finish(state, output)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::self_sdpa(packed, num_heads)),
+        }
+    }
+
+    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self> {
+        let ((query, query_node), (key_value, key_value_node)) = (query.into_parts(), key_value.into_parts());
+        match SdpaBackward.prepare::<C>([query_node, key_value_node]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let state = attend::<B>(Projected::Separate { query, key_value }, num_heads);
+                let output = state.attended.output.clone();
+                prep.finish(state, output)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::cross_sdpa(query, key_value, num_heads)),
         }
     }
 }
@@ -83,24 +158,64 @@ struct SdpaBackward;
 
 #[derive(Clone, Debug)]
 struct SdpaState<T> {
-    query: T,
-    key: T,
-    value: T,
-    output: T,
+    inputs: Projected<T>,
+    attended: Attended<T>,
     num_heads: usize,
 }
 
-impl<B: Backend> Backward<B, 3> for SdpaBackward {
+fn attend<B: AttentionKernels>(inputs: Projected<FloatTensor<B>>, num_heads: usize) -> SdpaState<FloatTensor<B>> {
+    SdpaState { attended: B::attend(&inputs, num_heads), inputs, num_heads }
+}
+
+impl<B: AttentionKernels> Backward<B, 1> for SdpaBackward {
     type State = SdpaState<FloatTensor<B>>;
 
-    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        let grad_output = grads.consume::<B>(&ops.node);
-        let gradients = backward::<B>(ops.state, grad_output);
-        for (parent, gradient) in ops.parents.into_iter().zip(gradients) {
-            if let Some(node) = parent {
-                grads.register::<B>(node.id, gradient);
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        register::<B, _, 1>(ops, grads, |SdpaState { inputs, attended, num_heads }, grad_output| {
+            match B::attend_backward(inputs, attended, num_heads, grad_output) {
+                Projected::Packed(grad) => [grad],
+                Projected::Separate { .. } => unreachable!("gradients come as the inputs did"),
             }
-        }
+        });
+    }
+}
+
+impl<B: AttentionKernels> Backward<B, 2> for SdpaBackward {
+    type State = SdpaState<FloatTensor<B>>;
+
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        register::<B, _, 2>(ops, grads, |SdpaState { inputs, attended, num_heads }, grad_output| {
+            match B::attend_backward(inputs, attended, num_heads, grad_output) {
+                Projected::Separate { query, key_value } => [query, key_value],
+                Projected::Packed(_) => unreachable!("gradients come as the inputs did"),
+            }
+        });
+    }
+}
+
+/// Queries, keys and values, each `[B, N, D]`.
+fn split<B: Backend>(inputs: &Projected<FloatTensor<B>>) -> [FloatTensor<B>; 3] {
+    let part = |packed: &FloatTensor<B>, parts: usize, part: usize| {
+        let [batch, count, width] = packed.shape().dims();
+        let dim = width / parts;
+        B::float_slice(packed.clone(), &[0..batch, 0..count, part * dim..(part + 1) * dim].map(Slice::from))
+    };
+    match inputs {
+        Projected::Packed(packed) => [0, 1, 2].map(|i| part(packed, 3, i)),
+        Projected::Separate { query, key_value } => [query.clone(), part(key_value, 2, 0), part(key_value, 2, 1)],
+    }
+}
+
+fn composed_backward<B: Backend>(
+    inputs: Projected<FloatTensor<B>>,
+    output: FloatTensor<B>,
+    num_heads: usize,
+    grad_output: FloatTensor<B>,
+) -> Projected<FloatTensor<B>> {
+    let [query, key, value] = backward::<B>(split::<B>(&inputs), output, num_heads, grad_output);
+    match inputs {
+        Projected::Packed(_) => Projected::Packed(B::float_cat(vec![query, key, value], 2)),
+        Projected::Separate { .. } => Projected::Separate { query, key_value: B::float_cat(vec![key, value], 2) },
     }
 }
 
@@ -114,12 +229,7 @@ fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, num_keys: us
     (0..num_queries).step_by(chunk).map(|start| (start, (start + chunk).min(num_queries))).collect()
 }
 
-fn forward<B: Backend>(
-    query: FloatTensor<B>,
-    key: FloatTensor<B>,
-    value: FloatTensor<B>,
-    num_heads: usize,
-) -> FloatTensor<B> {
+fn forward<B: Backend>([query, key, value]: [FloatTensor<B>; 3], num_heads: usize) -> FloatTensor<B> {
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
     let query = split_heads::<B>(B::float_mul_scalar(query, scale(dim, num_heads).into()), num_heads);
@@ -134,8 +244,12 @@ fn forward<B: Backend>(
 
 /// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`,
 /// `dQ = s dS K`, `dK = s dS^T Q`, a chunk of queries at a time.
-fn backward<B: Backend>(state: SdpaState<FloatTensor<B>>, grad_output: FloatTensor<B>) -> [FloatTensor<B>; 3] {
-    let SdpaState { query, key, value, output, num_heads } = state;
+fn backward<B: Backend>(
+    [query, key, value]: [FloatTensor<B>; 3],
+    output: FloatTensor<B>,
+    num_heads: usize,
+    grad_output: FloatTensor<B>,
+) -> [FloatTensor<B>; 3] {
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
     let head_width = dim / num_heads;
@@ -225,8 +339,7 @@ impl SelfAttention {
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
     pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        let [query, key, value] = split(self.in_proj.forward(x));
-        self.out_proj.forward(sdpa(query, key, value, self.num_heads))
+        linear(&self.out_proj, self_sdpa(linear(&self.in_proj, x), self.num_heads))
     }
 }
 
@@ -251,41 +364,24 @@ impl CrossAttention {
         }
     }
 
-    /// Gives every query what it finds among the memory's tokens.
-    ///
-    /// # Shapes
-    /// - `x`: `[batch, num_queries, dim]`, `memory`: `[batch, num_keys, dim]`
-    /// - returns `[batch, num_queries, dim]`
-    pub fn forward(&self, x: Tensor<3>, memory: Tensor<3>) -> Tensor<3> {
-        let (key, value) = self.project_memory(memory);
-        self.out_proj.forward(sdpa(self.project_query(x), key, value, self.num_heads))
-    }
-
     /// Queries, `[batch, num_queries, dim]`.
     pub(crate) fn project_query(&self, x: Tensor<3>) -> Tensor<3> {
-        self.q_proj.forward(x)
+        linear(&self.q_proj, x)
     }
 
-    /// Keys and values, each `[batch, num_keys, dim]`.
-    pub(crate) fn project_memory(&self, memory: Tensor<3>) -> (Tensor<3>, Tensor<3>) {
-        let [key, value] = split(self.kv_proj.forward(memory));
-        (key, value)
+    /// Keys and values side by side, `[batch, num_keys, 2 dim]`. They depend on the tokens alone.
+    pub(crate) fn project_memory(&self, memory: Tensor<3>) -> Tensor<3> {
+        linear(&self.kv_proj, memory)
     }
 
     /// The projection after the heads.
     pub(crate) fn project_out(&self, x: Tensor<3>) -> Tensor<3> {
-        self.out_proj.forward(x)
+        linear(&self.out_proj, x)
     }
 
     pub(crate) fn num_heads(&self) -> usize {
         self.num_heads
     }
-}
-
-/// Cuts a packed projection into its `COUNT` parts.
-fn split<const COUNT: usize>(packed: Tensor<3>) -> [Tensor<3>; COUNT] {
-    let dim = packed.dims()[2] / COUNT;
-    std::array::from_fn(|part| packed.clone().narrow(2, part * dim, dim))
 }
 
 #[cfg(test)]
@@ -294,6 +390,10 @@ mod tests {
 
     use super::*;
     use crate::testing::{Fixture, assert_close, check_gradients, cpu_devices, devices, random, relative_error};
+
+    fn sdpa(query: Tensor<3>, key: Tensor<3>, value: Tensor<3>, num_heads: usize) -> Tensor<3> {
+        cross_sdpa(query, Tensor::cat(vec![key, value], 2), num_heads)
+    }
 
     /// Attention from Burn's own differentiable operations: the plain reference.
     fn plain(query: Tensor<3>, key: Tensor<3>, value: Tensor<3>, num_heads: usize) -> Tensor<3> {
@@ -353,23 +453,79 @@ mod tests {
     }
 
     #[test]
+    fn packed_inputs_give_what_separate_ones_give() {
+        for device in cpu_devices() {
+            let device = device.autodiff();
+            let packed = random([2, 5, 24], 1, &device).require_grad();
+            let part = |i: usize| packed.clone().narrow(2, 8 * i, 8).detach().require_grad();
+            let separate = [part(0), part(1), part(2)];
+            let cotangent = random([2, 5, 8], 2, &device);
+            let together = self_sdpa(packed.clone(), 2);
+            let [q, k, v] = separate.clone();
+            let apart = sdpa(q, k, v, 2);
+            assert_close(&together.clone().inner(), &apart.clone().inner(), 1e-12);
+            let grad = packed.grad(&(together * cotangent.clone()).sum().backward()).expect("tracked");
+            let grads = (apart * cotangent).sum().backward();
+            let expected = separate.iter().map(|input| input.grad(&grads).expect("tracked")).collect();
+            assert_close(&grad, &Tensor::cat(expected, 2), 1e-12);
+        }
+    }
+
+    /// Output and gradients of the inputs.
+    fn results(
+        inputs: [Tensor<3>; 2],
+        cotangent: Tensor<3>,
+        attend: fn([Tensor<3>; 2]) -> Tensor<3>,
+    ) -> [Tensor<3>; 3] {
+        let inputs = inputs.map(|input| input.autodiff().require_grad());
+        let output = attend(inputs.clone());
+        let grads = (output.clone() * cotangent.autodiff()).sum().backward();
+        let [a, b] = inputs.map(|input| input.grad(&grads).unwrap_or_else(|| input.inner().zeros_like()));
+        [output.inner(), a, b].map(|x| x.cast(DType::F64))
+    }
+
+    #[test]
+    fn native_kernels_equal_the_composed_operation_in_f64_at_odd_shapes() {
+        let device = Device::flex();
+        let cases: [([usize; 4], fn([Tensor<3>; 2]) -> Tensor<3>); 5] = [
+            ([2, 1, 7, 36], |[q, kv]| cross_sdpa(q, kv, 3)),
+            ([1, 9, 1, 24], |[q, kv]| cross_sdpa(q, kv, 2)),
+            ([1, 101, 67, 192], |[q, kv]| cross_sdpa(q, kv, 2)),
+            ([2, 35, 35, 36], |[_, qkv]| self_sdpa(qkv, 3)),
+            ([1, 130, 130, 96], |[_, qkv]| self_sdpa(qkv, 1)),
+        ];
+        for (i, ([batch, queries, keys, dim], attend)) in cases.into_iter().enumerate() {
+            let parts = if i < 3 { 2 } else { 3 };
+            let shapes = [[batch, queries, dim], [batch, keys, parts * dim], [batch, queries, dim]];
+            let [q, kv, cotangent] = [0, 1, 2].map(|i| random(shapes[i], i as u64, &device).cast(DType::F32));
+            let native = results([q.clone(), kv.clone()], cotangent.clone(), attend);
+            let reference = results([q, kv].map(|x| x.cast(DType::F64)), cotangent.cast(DType::F64), attend);
+            for (native, reference) in native.into_iter().zip(reference) {
+                if reference.clone().abs().max().into_scalar::<f64>() > 1e-12 {
+                    assert_close(&native, &reference, 1e-5);
+                }
+            }
+        }
+    }
+
+    #[test]
     fn chunked_queries_give_what_one_chunk_gives() {
         assert_eq!(query_chunks(1, 8, 4096, 4096).len(), 8);
         assert_eq!(query_chunks(1, 1, 3, MAX_SCORES * 2), [(0, 1), (1, 2), (2, 3)]);
         // 2 x 64 heads x 512 x 512 = 2^25 scores: two chunks.
         let device = Device::flex();
-        let inputs = [1, 2, 3].map(|seed| random([2, 512, 64], seed, &device).cast(DType::F32));
-        let [q, k, v] = inputs;
+        // In f64, which takes the composed operation everywhere.
+        let [q, k, v] = [1, 2, 3].map(|seed| random([2, 512, 64], seed, &device));
         assert_eq!(query_chunks(2, 64, 512, 512).len(), 2);
         let tracked = q.clone().autodiff().require_grad();
         let output = sdpa(tracked.clone(), k.clone().autodiff(), v.clone().autodiff(), 64);
-        assert_close(&output.clone().inner(), &plain(q.clone(), k.clone(), v.clone(), 64), 1e-6);
+        assert_close(&output.clone().inner(), &plain(q.clone(), k.clone(), v.clone(), 64), 1e-12);
         let ours = tracked.grad(&output.sum().backward()).expect("tracked");
         let tracked = q.autodiff().require_grad();
         let reference = plain(tracked.clone(), k.autodiff(), v.autodiff(), 64).sum().backward();
         // Rows of dS sum to nearly nothing under a constant cotangent, so compare absolutely.
-        let difference = (ours - tracked.grad(&reference).expect("tracked")).abs().max().into_scalar::<f32>();
-        assert!(difference < 1e-5, "{difference}");
+        let difference = (ours - tracked.grad(&reference).expect("tracked")).abs().max().into_scalar::<f64>();
+        assert!(difference < 1e-12, "{difference}");
     }
 
     #[test]

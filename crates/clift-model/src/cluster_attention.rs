@@ -10,7 +10,11 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::{FloatTensor, IndexingUpdateOp, IntTensor};
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
-use burn::tensor::{FloatDType, Int, Shape, Tensor, assert_shape};
+use burn::tensor::{FloatDType, Int, Shape, Slice, Tensor, assert_shape};
+
+use crate::autodiff::register;
+
+mod native;
 
 /// Attention from every centroid to its members: `o_s = sum_i softmax_i(q_s k_i / sqrt(head width)) v_i`
 /// over the `i` whose segment is `s`. A centroid without members gets zeros.
@@ -18,69 +22,107 @@ use burn::tensor::{FloatDType, Int, Shape, Tensor, assert_shape};
 /// Its gradient is exact and first order. Scores are shifted by their segment's maximum.
 ///
 /// # Shapes
-/// - `query`: `[batch, num_segments, dim]`; `key` and `value`: `[batch, num_members, dim]`
+/// - `query`: `[batch, num_segments, dim]`
+/// - `key_value`: `[batch, num_members, 2 dim]`, the two side by side
 /// - `segment`: `[batch * num_members]`, `scene * num_segments + cluster` of every member
 /// - returns `[batch, num_segments, dim]`
 pub fn cluster_attention(
     query: Tensor<3>,
-    key: Tensor<3>,
-    value: Tensor<3>,
+    key_value: Tensor<3>,
     segment: Tensor<1, Int>,
     num_heads: usize,
 ) -> Tensor<3> {
     let [batch, _num_segments, dim] = query.dims();
-    let [_, num_members, _] = key.dims();
-    assert_shape!(key, [batch, num_members, dim]);
-    assert_shape!(value, [batch, num_members, dim]);
+    let [_, num_members, _] = key_value.dims();
+    assert_shape!(key_value, [batch, num_members, 2 * dim]);
     assert_shape!(segment, [batch * num_members]);
     assert!(dim.is_multiple_of(num_heads), "{num_heads} heads do not divide a width of {dim}");
     Tensor::from_dispatch(<Dispatch as ClusterAttentionOps>::cluster_attention(
         query.into_dispatch(),
-        key.into_dispatch(),
-        value.into_dispatch(),
+        key_value.into_dispatch(),
         segment.into_dispatch(),
         num_heads,
     ))
 }
 
-/// The operation behind [`cluster_attention`] on a device. The body here runs on every one of them.
+/// The operation behind [`cluster_attention`] on a device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait ClusterAttentionOps: Backend {
     /// See [`cluster_attention`].
     fn cluster_attention(
         query: FloatTensor<Self>,
-        key: FloatTensor<Self>,
-        value: FloatTensor<Self>,
+        key_value: FloatTensor<Self>,
         segment: IntTensor<Self>,
         num_heads: usize,
-    ) -> FloatTensor<Self> {
-        forward::<Self>(query, key, value, segment, num_heads).0
+    ) -> FloatTensor<Self>;
+}
+
+/// Both directions of the operation on a device. The bodies here run on every one of them.
+pub trait ClusterAttentionKernels: Backend {
+    /// Output `[B, S, D]` and weights `[BM, H, 1]`.
+    fn attend_clusters(inputs: &ClusterInputs<Self>) -> [FloatTensor<Self>; 2] {
+        forward::<Self>(inputs)
+    }
+
+    /// The gradients of queries and of keys and values from the weights and the output's gradient.
+    fn attend_clusters_backward(
+        inputs: ClusterInputs<Self>,
+        results: [FloatTensor<Self>; 2],
+        grad_output: FloatTensor<Self>,
+    ) -> [FloatTensor<Self>; 2] {
+        backward::<Self>(inputs, results, grad_output)
     }
 }
 
-impl ClusterAttentionOps for Flex {}
-impl ClusterAttentionOps for NdArray {}
-#[cfg(feature = "wgpu")]
-impl ClusterAttentionOps for burn::backend::Cube {}
+/// What [`cluster_attention`] is given.
+#[derive(Clone, Debug)]
+pub struct ClusterInputs<B: Backend> {
+    query: FloatTensor<B>,
+    key_value: FloatTensor<B>,
+    segment: IntTensor<B>,
+    num_heads: usize,
+}
 
-impl<B: ClusterAttentionOps, C: CheckpointStrategy> ClusterAttentionOps for Autodiff<B, C> {
+macro_rules! cluster_attention_ops {
+    ($backend:ty) => {
+        impl ClusterAttentionOps for $backend {
+            fn cluster_attention(
+                query: FloatTensor<Self>,
+                key_value: FloatTensor<Self>,
+                segment: IntTensor<Self>,
+                num_heads: usize,
+            ) -> FloatTensor<Self> {
+                let [output, _] = Self::attend_clusters(&ClusterInputs { query, key_value, segment, num_heads });
+                output
+            }
+        }
+    };
+}
+cluster_attention_ops!(Flex);
+cluster_attention_ops!(NdArray);
+#[cfg(feature = "wgpu")]
+cluster_attention_ops!(burn::backend::Cube);
+
+impl ClusterAttentionKernels for NdArray {}
+#[cfg(feature = "wgpu")]
+impl ClusterAttentionKernels for burn::backend::Cube {}
+
+impl<B: ClusterAttentionOps + ClusterAttentionKernels, C: CheckpointStrategy> ClusterAttentionOps for Autodiff<B, C> {
     fn cluster_attention(
         query: FloatTensor<Self>,
-        key: FloatTensor<Self>,
-        value: FloatTensor<Self>,
+        key_value: FloatTensor<Self>,
         segment: IntTensor<Self>,
         num_heads: usize,
     ) -> FloatTensor<Self> {
-        let ((query, query_node), (key, key_node), (value, value_node)) =
-            (query.into_parts(), key.into_parts(), value.into_parts());
-        match ClusterBackward.prepare::<C>([query_node, key_node, value_node]).compute_bound().stateful() {
+        let ((query, query_node), (key_value, key_value_node)) = (query.into_parts(), key_value.into_parts());
+        match ClusterBackward.prepare::<C>([query_node, key_value_node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let (output, weights) =
-                    forward::<B>(query.clone(), key.clone(), value.clone(), segment.clone(), num_heads);
-                let state = ClusterState { query, key, value, segment, weights, output: output.clone(), num_heads };
-                prep.finish(state, output)
+                let inputs = ClusterInputs::<B> { query, key_value, segment, num_heads };
+                let results = B::attend_clusters(&inputs);
+                let output = results[0].clone();
+                prep.finish((inputs, results), output)
             }
-            OpsKind::UnTracked(prep) => prep.finish(B::cluster_attention(query, key, value, segment, num_heads)),
+            OpsKind::UnTracked(prep) => prep.finish(B::cluster_attention(query, key_value, segment, num_heads)),
         }
     }
 }
@@ -88,46 +130,35 @@ impl<B: ClusterAttentionOps, C: CheckpointStrategy> ClusterAttentionOps for Auto
 #[derive(Debug)]
 struct ClusterBackward;
 
-#[derive(Clone, Debug)]
-struct ClusterState<F, I> {
-    query: F,
-    key: F,
-    value: F,
-    segment: I,
-    weights: F,
-    output: F,
-    num_heads: usize,
-}
+impl<B: ClusterAttentionKernels> Backward<B, 2> for ClusterBackward {
+    type State = (ClusterInputs<B>, [FloatTensor<B>; 2]);
 
-impl<B: Backend> Backward<B, 3> for ClusterBackward {
-    type State = ClusterState<FloatTensor<B>, IntTensor<B>>;
-
-    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        let grad_output = grads.consume::<B>(&ops.node);
-        let gradients = backward::<B>(ops.state, grad_output);
-        for (parent, gradient) in ops.parents.into_iter().zip(gradients) {
-            if let Some(node) = parent {
-                grads.register::<B>(node.id, gradient);
-            }
-        }
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        register::<B, _, 2>(ops, grads, |(inputs, results), grad_output| {
+            B::attend_clusters_backward(inputs, results, grad_output)
+        });
     }
 }
 
-/// Output `[B, S, D]` and weights `[BM, H, 1]`.
-fn forward<B: Backend>(
-    query: FloatTensor<B>,
-    key: FloatTensor<B>,
-    value: FloatTensor<B>,
-    segment: IntTensor<B>,
-    num_heads: usize,
-) -> (FloatTensor<B>, FloatTensor<B>) {
+/// Keys and values, each `[BM, H, E]`.
+fn split<B: Backend>(key_value: FloatTensor<B>, num_heads: usize) -> [FloatTensor<B>; 2] {
+    let [batch, count, width] = key_value.shape().dims();
+    let dim = width / 2;
+    [0..dim, dim..width].map(|columns| {
+        let part = B::float_slice(key_value.clone(), &[0..batch, 0..count, columns].map(Slice::from));
+        flatten::<B>(part, num_heads)
+    })
+}
+
+fn forward<B: Backend>(inputs: &ClusterInputs<B>) -> [FloatTensor<B>; 2] {
+    let ClusterInputs { query, key_value, segment, num_heads } = inputs.clone();
     let [batch, num_segments, dim] = query.shape().dims();
     let segments = batch * num_segments;
     let head_width = dim / num_heads;
     let scale = 1.0 / (head_width as f64).sqrt();
 
     let query = flatten::<B>(B::float_mul_scalar(query, scale.into()), num_heads); // [BS, H, E]
-    let (key, value) = (flatten::<B>(key, num_heads), flatten::<B>(value, num_heads)); // [BM, H, E]
+    let [key, value] = split::<B>(key_value, num_heads); // [BM, H, E]
     let scores = dot::<B>(B::float_select(query, 0, segment.clone()), key); // [BM, H, 1]
 
     // Every segment's maximum. The lowest finite value stands in for segments without members.
@@ -145,17 +176,19 @@ fn forward<B: Backend>(
     let weighted = B::float_mul(value, weights.clone());
     let zeros = B::float_zeros(Shape::new([segments, num_heads, head_width]), &device, dtype);
     let output = B::float_select_assign(zeros, 0, segment, weighted, IndexingUpdateOp::Add);
-    (B::float_reshape(output, Shape::new([batch, num_segments, dim])), weights)
+    [B::float_reshape(output, Shape::new([batch, num_segments, dim])), weights]
 }
 
 /// With `g_i = dO[segment i]`: `dV_i = p_i g_i`, `dS_i = p_i (g_i v_i - rowsum(dO * O)[segment i])`,
 /// `dK_i = s dS_i q[segment i]`, `dQ_s = s sum_i dS_i k_i`.
 fn backward<B: Backend>(
-    state: ClusterState<FloatTensor<B>, IntTensor<B>>,
+    inputs: ClusterInputs<B>,
+    [output, weights]: [FloatTensor<B>; 2],
     grad_output: FloatTensor<B>,
-) -> [FloatTensor<B>; 3] {
-    let ClusterState { query, key, value, segment, weights, output, num_heads } = state;
-    let (query_shape, member_shape) = (query.shape(), key.shape());
+) -> [FloatTensor<B>; 2] {
+    let ClusterInputs { query, key_value, segment, num_heads } = inputs;
+    let query_shape = query.shape();
+    let [_, num_members, _]: [usize; 3] = key_value.shape().dims();
     let [batch, num_segments, dim]: [usize; 3] = query_shape.dims();
     let head_width = dim / num_heads;
     let scale = 1.0 / (head_width as f64).sqrt();
@@ -163,7 +196,7 @@ fn backward<B: Backend>(
     let grad_output = flatten::<B>(grad_output, num_heads); // [BS, H, E]
     let delta = dot::<B>(grad_output.clone(), flatten::<B>(output, num_heads)); // [BS, H, 1]
     let query = flatten::<B>(B::float_mul_scalar(query, scale.into()), num_heads);
-    let (key, value) = (flatten::<B>(key, num_heads), flatten::<B>(value, num_heads));
+    let [key, value] = split::<B>(key_value, num_heads);
 
     let gathered = B::float_select(grad_output, 0, segment.clone()); // [BM, H, E]
     let grad_value = B::float_mul(gathered.clone(), weights.clone());
@@ -174,11 +207,8 @@ fn backward<B: Backend>(
     let zeros = B::float_zeros(Shape::new([batch * num_segments, num_heads, head_width]), &device, dtype);
     let grad_query = B::float_select_assign(zeros, 0, segment, B::float_mul(key, grad_scores), IndexingUpdateOp::Add);
     let grad_query = B::float_mul_scalar(grad_query, scale.into());
-    [
-        B::float_reshape(grad_query, query_shape),
-        B::float_reshape(grad_key, member_shape.clone()),
-        B::float_reshape(grad_value, member_shape),
-    ]
+    let members = [grad_key, grad_value].map(|x| B::float_reshape(x, Shape::new([batch, num_members, dim])));
+    [B::float_reshape(grad_query, query_shape), B::float_cat(members.into(), 2)]
 }
 
 /// `[B, N, D] -> [BN, H, E]`
@@ -198,6 +228,16 @@ mod tests {
 
     use super::*;
     use crate::testing::{assert_close, check_gradients, cpu_devices, devices, random, to_vec};
+
+    fn cluster_attention(
+        query: Tensor<3>,
+        key: Tensor<3>,
+        value: Tensor<3>,
+        segment: Tensor<1, Int>,
+        num_heads: usize,
+    ) -> Tensor<3> {
+        super::cluster_attention(query, Tensor::cat(vec![key, value], 2), segment, num_heads)
+    }
 
     /// Seven members, four segments in each of two scenes: uneven, a singleton, an empty one.
     const SEGMENTS: [i64; 14] = [0, 0, 2, 0, 1, 2, 0, 5, 7, 7, 5, 4, 5, 4];

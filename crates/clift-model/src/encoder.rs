@@ -6,6 +6,7 @@ use burn::nn::Linear;
 use burn::tensor::Tensor;
 
 use crate::block::EncoderBlock;
+use crate::linear::linear;
 use crate::patch::patchify;
 use crate::rays::plucker;
 use crate::{Init, ModelConfig, Views};
@@ -36,7 +37,7 @@ impl Encoder {
     /// - returns `[batch, views * (height / patch) * (width / patch), dim]`, ordered by view, row, column
     pub fn forward(&self, context: &Views) -> Tensor<3> {
         let pixels = Tensor::cat(vec![context.images.clone(), plucker(&context.cameras)], 4); // [B, V, H, W, 9]
-        let tokens = self.patch_embed.forward(patchify(pixels, self.patch_size));
+        let tokens = linear(&self.patch_embed, patchify(pixels, self.patch_size));
         self.blocks.iter().fold(tokens, |tokens, block| block.forward(tokens))
     }
 }

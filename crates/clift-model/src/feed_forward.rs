@@ -1,45 +1,41 @@
 //! The feed-forward network of every block, and GELU with an exact gradient on every device.
 #![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
 
-use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind, unary};
-use burn::backend::ops::ActivationOps;
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, backend_extension};
+use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
 use burn::module::Module;
 use burn::nn::Linear;
 use burn::tensor::Tensor;
+use clift_kernels::{InstructionSet, gelu};
 
 use crate::Init;
+use crate::flex::{contiguous, is_native, tensor, values, values_mut};
+use crate::linear::{linear, linear_of_gelu};
 
-/// `GELU(x) = x * Phi(x)` with the normal distribution function `Phi` (erf, not the tanh
-/// approximation), differentiated exactly. Burn 0.22 differentiates the approximation on GPUs.
-///
-/// # Shapes
-/// - `x` and the result: any
-pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
-    Tensor::from_dispatch(<Dispatch as GeluOps>::exact_gelu(x.into_dispatch()))
-}
-
-/// The operation behind [`gelu`] on a device.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
-pub trait GeluOps: Backend {
-    /// See [`gelu`].
-    fn exact_gelu(x: FloatTensor<Self>) -> FloatTensor<Self> {
-        Self::float_mul(x.clone(), normal_cdf::<Self>(x))
+/// GELU on a device, `x * Phi(x)` with the normal distribution function `Phi` (erf, not the tanh
+/// approximation), and its exact gradient: Burn 0.22 differentiates the approximation on GPUs.
+/// The bodies here run on every device.
+pub trait GeluKernels: Backend {
+    /// `x * Phi(x)`
+    fn gelu_output(x: FloatTensor<Self>) -> FloatTensor<Self> {
+        output::<Self>(x)
     }
-}
 
-/// The gradient of [`gelu`] on a device.
-pub trait GeluGradient: Backend {
     /// `grad * (Phi(x) + x * phi(x))` with the normal density `phi`.
-    fn exact_gelu_backward(x: FloatTensor<Self>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
-        let density = Self::float_exp(Self::float_mul_scalar(Self::float_mul(x.clone(), x.clone()), (-0.5).into()));
-        let density = Self::float_mul_scalar(density, (1.0 / (2.0 * std::f64::consts::PI).sqrt()).into());
-        let slope = Self::float_add(normal_cdf::<Self>(x.clone()), Self::float_mul(x, density));
-        Self::float_mul(grad, slope)
+    fn gelu_grad(x: FloatTensor<Self>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
+        backward::<Self>(x, grad)
     }
+}
+
+fn output<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
+    B::float_mul(x.clone(), normal_cdf::<B>(x))
+}
+
+fn backward<B: Backend>(x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
+    let density = B::float_exp(B::float_mul_scalar(B::float_mul(x.clone(), x.clone()), (-0.5).into()));
+    let density = B::float_mul_scalar(density, (1.0 / (2.0 * std::f64::consts::PI).sqrt()).into());
+    let slope = B::float_add(normal_cdf::<B>(x.clone()), B::float_mul(x, density));
+    B::float_mul(grad, slope)
 }
 
 fn normal_cdf<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
@@ -47,44 +43,29 @@ fn normal_cdf<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     B::float_mul_scalar(B::float_add_scalar(erf, 1.0.into()), 0.5.into())
 }
 
-impl GeluOps for Flex {
-    fn exact_gelu(x: FloatTensor<Self>) -> FloatTensor<Self> {
-        // One pass, and exact on this device.
-        <Self as ActivationOps<Self>>::gelu(x)
-    }
-}
-impl GeluGradient for Flex {
-    fn exact_gelu_backward(x: FloatTensor<Self>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
-        <Self as ActivationOps<Self>>::gelu_backward(x, grad)
-    }
-}
-impl GeluOps for NdArray {}
-impl GeluGradient for NdArray {}
-#[cfg(feature = "wgpu")]
-impl GeluOps for burn::backend::Cube {}
-#[cfg(feature = "wgpu")]
-impl GeluGradient for burn::backend::Cube {}
-
-impl<B: GeluOps + GeluGradient, C: CheckpointStrategy> GeluOps for Autodiff<B, C> {
-    fn exact_gelu(x: FloatTensor<Self>) -> FloatTensor<Self> {
-        let (x, node) = x.into_parts();
-        match GeluBackward.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => prep.finish(x.clone(), B::exact_gelu(x)),
-            OpsKind::UnTracked(prep) => prep.finish(B::exact_gelu(x)),
+impl GeluKernels for Flex {
+    fn gelu_output(x: FloatTensor<Self>) -> FloatTensor<Self> {
+        if !is_native(&x) {
+            return output::<Self>(x);
         }
+        let mut to = vec![0.0; x.shape().num_elements()];
+        let shape = x.shape();
+        gelu::forward(InstructionSet::detected(), values(&contiguous(x)), &mut to);
+        tensor(to, shape)
+    }
+
+    fn gelu_grad(x: FloatTensor<Self>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
+        if !is_native(&x) {
+            return backward::<Self>(x, grad);
+        }
+        let mut grad = contiguous(grad);
+        gelu::backward(InstructionSet::detected(), values(&contiguous(x)), values_mut(&mut grad));
+        grad
     }
 }
-
-#[derive(Debug)]
-struct GeluBackward;
-
-impl<B: GeluGradient> Backward<B, 1> for GeluBackward {
-    type State = FloatTensor<B>;
-
-    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        unary::<B, _>(ops.parents, ops.node, grads, |grad| B::exact_gelu_backward(ops.state, grad));
-    }
-}
+impl GeluKernels for NdArray {}
+#[cfg(feature = "wgpu")]
+impl GeluKernels for burn::backend::Cube {}
 
 /// `down(GELU(up(x)))`.
 #[derive(Module, Debug)]
@@ -104,26 +85,41 @@ impl FeedForward {
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
     pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        self.down.forward(gelu(self.up.forward(x)))
+        linear_of_gelu(&self.down, linear(&self.up, x))
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use burn::module::Param;
+    use burn::tensor::Device;
+
     use super::*;
     use crate::testing::{Fixture, assert_close, check_gradients, cpu_devices, devices, random};
+
+    /// GELU on its own: behind it a layer that changes nothing.
+    fn gelu(x: Tensor<3>) -> Tensor<3> {
+        let device = x.device();
+        let like = x.clone().detach().slice([0..1, 0..1, 0..1]).reshape([1, 1]);
+        let weight = Param::from_tensor(like.ones_like());
+        let bias = Some(Param::from_tensor(like.zeros_like().reshape([1])));
+        assert_eq!(weight.val().device(), device);
+        let dims = x.dims();
+        linear_of_gelu(&Linear { weight, bias }, x.reshape([1, dims.iter().product(), 1])).reshape(dims)
+    }
 
     #[test]
     fn values_and_slopes_equal_pytorchs_from_minus_30_to_30() {
         let fixture = Fixture::open("gelu");
         for device in devices() {
             let device = device.autodiff();
-            let x = fixture.tensor::<1>("input.x", &device).require_grad();
+            let [x, expected, slope] = ["input.x", "output.gelu", "output.derivative"]
+                .map(|name| fixture.tensor::<1>(name, &device).unsqueeze::<3>());
+            let x = x.require_grad();
             let y = gelu(x.clone());
             // Against values up to 30 in f32.
-            assert_close(&y.clone().inner(), &fixture.tensor::<1>("output.gelu", &device).inner(), 1e-6);
-            let slope = x.grad(&y.sum().backward()).expect("tracked");
-            assert_close(&slope, &fixture.tensor::<1>("output.derivative", &device).inner(), 2e-6);
+            assert_close(&y.clone().inner(), &expected.inner(), 1e-6);
+            assert_close(&x.grad(&y.sum().backward()).expect("tracked"), &slope.inner(), 2e-6);
         }
     }
 
@@ -132,5 +128,17 @@ mod tests {
         for device in cpu_devices() {
             check_gradients([random([2, 5, 8], 1, &device) * 3.0], |[x]| gelu(x), 1e-6);
         }
+    }
+
+    #[test]
+    fn native_kernels_equal_f64() {
+        let device = Device::flex();
+        let x = random([3, 7, 5], 1, &device) * 4.0;
+        let narrow = x.clone().cast(burn::tensor::DType::F32);
+        assert_close(
+            &gelu(narrow.clone()).cast(burn::tensor::DType::F64),
+            &gelu(narrow.cast(burn::tensor::DType::F64)),
+            1e-6,
+        );
     }
 }

@@ -1,16 +1,20 @@
 //! Latent K-means: which tokens a scene keeps (paper section 3.2).
 //!
-//! Distances are matrix products on the device; seeding is greedy k-means++ driven by random numbers
-//! drawn on the host, so a seed gives the same clusters on every run. The host sees one assignment
-//! and one distance per token and iteration: it finds empty clusters and decides when to stop.
-// B scenes, N tokens, S clusters, D width, L candidates of one seeding step
+//! Distances are matrix products on the device; random numbers are drawn on the host, so a seed gives the
+//! same clusters on every run. The host sees one assignment and one distance per token and iteration: it
+//! finds empty clusters and decides when to stop.
+// B scenes, N tokens, S clusters, D width
 
-use burn::tensor::{Device, IndexingUpdateOp, Int, Tensor, TensorData};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+mod labels;
+mod samples;
+mod seeding;
+
+use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 
 use crate::{Clusters, ModelError, SceneClusters};
+use labels::Labels;
+use samples::Samples;
 
 /// Settings of latent K-means.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -52,7 +56,7 @@ impl KMeans {
     /// [`ModelError::BadClusters`] when `num_clusters` is not in `1..=num_tokens` or a token is not
     /// finite.
     pub fn fit(&self, tokens: Tensor<3>, num_clusters: usize, seeds: &[u64]) -> Result<Fit, ModelError> {
-        let [batch, num_tokens, _dim] = tokens.dims();
+        let [batch, num_tokens, dim] = tokens.dims();
         assert_eq!(seeds.len(), batch, "one seed per scene");
         if !(1..=num_tokens).contains(&num_clusters) {
             return Err(ModelError::BadClusters { what: format!("{num_clusters} clusters of {num_tokens} tokens") });
@@ -61,203 +65,38 @@ impl KMeans {
             let clusters = Clusters::new(vec![SceneClusters::identity(num_tokens); batch])?;
             return Ok(Fit { clusters, inertia: vec![0.0; batch], iterations: 0 });
         }
-        // Distances are differences of squares: taken about the mean they lose the fewest digits.
-        let tokens = tokens.clone() - tokens.mean_dim(1);
-        let samples = Samples::new(tokens)?;
-        let means = samples.seed(num_clusters, seeds);
-        self.lloyd(&samples, means)
-    }
-
-    fn lloyd(&self, samples: &Samples, mut means: Tensor<3>) -> Result<Fit, ModelError> {
-        let [batch, num_clusters, _dim] = means.dims();
-        let mut done: Vec<Option<Labels>> = vec![None; batch];
-        let mut previous: Vec<Option<Labels>> = vec![None; batch];
-        for iteration in 0.. {
-            let labels = samples.assign(&means);
-            for ((mut labels, done), previous) in labels.into_iter().zip(&mut done).zip(&mut previous) {
-                if done.is_some() {
-                    continue;
-                }
-                labels.fill_empty(num_clusters);
-                let settled = previous.as_ref().is_some_and(|previous| {
-                    previous.assignment == labels.assignment
-                        || previous.inertia() - labels.inertia() <= self.tolerance * previous.inertia()
-                });
-                if settled || iteration == self.max_iterations {
-                    *done = Some(labels.clone());
-                }
-                *previous = Some(labels);
-            }
-            if let Some(finished) = done.iter().cloned().collect::<Option<Vec<Labels>>>() {
-                let scenes = finished.iter().map(|labels| labels.nearest_samples(num_clusters));
-                let clusters = Clusters::new(scenes.collect::<Result<_, _>>()?)?;
-                let inertia = finished.iter().map(Labels::inertia).collect();
-                return Ok(Fit { clusters, inertia, iterations: iteration });
-            }
-            let current: Vec<&Labels> = previous.iter().flatten().collect();
-            means = samples.means(&current, num_clusters);
+        // Refused before any scene is clustered.
+        let scenes = tokens.split(1, 0).into_iter().enumerate().map(|(scene, tokens)| {
+            let what = || format!("a token of scene {scene} is not finite");
+            Samples::new(tokens.reshape([num_tokens, dim])).ok_or_else(|| ModelError::BadClusters { what: what() })
+        });
+        let scenes = scenes.collect::<Result<Vec<_>, _>>()?;
+        let (mut clusters, mut inertia, mut iterations) = (Vec::new(), Vec::new(), 0);
+        for (samples, &seed) in scenes.iter().zip(seeds) {
+            let (labels, taken) = self.lloyd(samples, num_clusters, seed);
+            clusters.push(labels.nearest_samples(num_clusters)?);
+            inertia.push(labels.inertia());
+            iterations = iterations.max(taken);
         }
-        unreachable!("the loop returns at the last iteration")
-    }
-}
-
-/// What the host knows of one scene after an assignment.
-#[derive(Clone, Debug)]
-struct Labels {
-    assignment: Vec<u32>,
-    /// Squared distance of every token to its cluster's mean.
-    distance: Vec<f32>,
-}
-
-impl Labels {
-    fn inertia(&self) -> f64 {
-        self.distance.iter().map(|&d| f64::from(d)).sum()
+        Ok(Fit { clusters: Clusters::new(clusters)?, inertia, iterations })
     }
 
-    /// Gives every empty cluster the token farthest from its own mean, out of clusters that can spare
-    /// one. Lower ids first on ties.
-    fn fill_empty(&mut self, num_clusters: usize) {
-        let mut counts = vec![0_usize; num_clusters];
-        self.assignment.iter().for_each(|&cluster| counts[cluster as usize] += 1);
-        if !counts.contains(&0) {
-            return;
-        }
-        let mut farthest: Vec<usize> = (0..self.assignment.len()).collect();
-        farthest.sort_by(|&a, &b| self.distance[b].total_cmp(&self.distance[a]).then(a.cmp(&b)));
-        let mut candidates = farthest.into_iter();
-        for cluster in 0..num_clusters {
-            if counts[cluster] > 0 {
-                continue;
-            }
-            // There are at least as many tokens as clusters, so one of them can be spared.
-            let Some(token) = candidates.find(|&token| counts[self.assignment[token] as usize] > 1) else { break };
-            counts[self.assignment[token] as usize] -= 1;
-            counts[cluster] = 1;
-            self.assignment[token] = cluster as u32;
-            self.distance[token] = 0.0;
-        }
-    }
-
-    /// Keeps the sample nearest to every mean; the lower id on ties.
-    fn nearest_samples(&self, num_clusters: usize) -> Result<SceneClusters, ModelError> {
-        let mut nearest: Vec<Option<usize>> = vec![None; num_clusters];
-        for (token, &cluster) in self.assignment.iter().enumerate() {
-            let best = &mut nearest[cluster as usize];
-            if best.is_none_or(|best| self.distance[token] < self.distance[best]) {
-                *best = Some(token);
+    /// Clusters of one scene and how many iterations they took.
+    fn lloyd(&self, samples: &Samples, num_clusters: usize, seed: u64) -> (Labels, usize) {
+        let start = seeding::seed(samples, num_clusters, seed, seeding::MAX_TABLE_LEN);
+        let mut labels = samples.assign(samples.select(&start));
+        labels.fill_empty(num_clusters);
+        for iteration in 1..=self.max_iterations {
+            let mut next = samples.assign(samples.means(&labels, num_clusters));
+            next.fill_empty(num_clusters);
+            let settled = next.assignment == labels.assignment
+                || labels.inertia() - next.inertia() <= self.tolerance * labels.inertia();
+            labels = next;
+            if settled {
+                return (labels, iteration);
             }
         }
-        let centroids = nearest.into_iter().flatten().map(|token| token as u32).collect();
-        SceneClusters::new(self.assignment.clone(), centroids)
-    }
-}
-
-/// The tokens with their squared lengths.
-struct Samples {
-    /// `[B, N, D]`
-    tokens: Tensor<3>,
-    /// `[B, N, 1]`
-    squares: Tensor<3>,
-}
-
-impl Samples {
-    /// # Errors
-    /// [`ModelError::BadClusters`] when a squared length is not finite.
-    fn new(tokens: Tensor<3>) -> Result<Self, ModelError> {
-        let num_tokens = tokens.dims()[1];
-        let squares = tokens.clone().square().sum_dim(2);
-        let lengths: Vec<f32> = squares.to_data().convert::<f32>().try_to_vec().expect("converted to f32");
-        if let Some(token) = lengths.iter().position(|length| !length.is_finite()) {
-            let what = format!("a token of scene {} is not finite", token / num_tokens);
-            return Err(ModelError::BadClusters { what });
-        }
-        Ok(Self { tokens, squares })
-    }
-
-    fn device(&self) -> Device {
-        self.tokens.device()
-    }
-
-    /// Squared distances `|x|^2 - 2 x c + |c|^2`, rounded up to zero: `[B, N, D], [B, S, D] -> [B, N, S]`.
-    fn distances(&self, centers: Tensor<3>) -> Tensor<3> {
-        let squares = centers.clone().square().sum_dim(2).swap_dims(1, 2); // [B, 1, S]
-        let products = self.tokens.clone().matmul(centers.swap_dims(1, 2));
-        (self.squares.clone() - products.mul_scalar(2.0) + squares).clamp_min(0.0)
-    }
-
-    /// Greedy k-means++: each step draws `2 + ln(S)` candidates with probability proportional to the
-    /// squared distance to the centers so far and keeps the one that lowers the sum the most.
-    fn seed(&self, num_clusters: usize, seeds: &[u64]) -> Tensor<3> {
-        let [batch, num_tokens, dim] = self.tokens.dims();
-        let candidates = 2 + (num_clusters as f64).ln() as usize;
-        let device = self.device();
-        let mut first = Vec::with_capacity(batch);
-        let mut thresholds = Vec::with_capacity(batch * num_clusters * candidates);
-        for (scene, &seed) in seeds.iter().enumerate() {
-            let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            first.push((scene * num_tokens + rng.random_range(0..num_tokens)) as i64);
-            thresholds.extend((1..num_clusters).flat_map(|_| 0..candidates).map(|_| rng.random_range(0.0..1.0_f32)));
-        }
-        let steps = num_clusters - 1;
-        let thresholds = Tensor::<3>::from_data(TensorData::new(thresholds, [batch, steps, candidates]), &device);
-        let first = Tensor::<1, Int>::from_data(TensorData::new(first, [batch]), &device);
-        // Row of scene b's first token, to index all scenes' tokens at once.
-        let offset = Tensor::<1, Int>::arange_step(0..(batch * num_tokens) as i64, num_tokens, &device);
-        let offset = offset.reshape([batch, 1]);
-        let flat = self.tokens.clone().reshape([batch * num_tokens, dim]);
-
-        let mut centers = vec![flat.clone().select(0, first).reshape([batch, 1, dim])];
-        let mut nearest = self.distances(centers[0].clone()); // [B, N, 1]
-        for step in 0..steps {
-            let cumulative = nearest.clone().squeeze_dim::<2>(2).cumsum(1).reshape([batch, num_tokens, 1]);
-            let total = cumulative.clone().narrow(1, num_tokens - 1, 1);
-            let threshold = thresholds.clone().narrow(1, step, 1) * total; // [B, 1, L]
-            let drawn = cumulative.lower_equal(threshold).int().sum_dim(1).clamp_max((num_tokens - 1) as i64);
-            let rows = drawn.squeeze_dim::<2>(1) + offset.clone(); // [B, L]
-            let drawn = flat.clone().select(0, rows.reshape([batch * candidates])).reshape([batch, candidates, dim]);
-            let after = self.distances(drawn.clone()).min_pair(nearest.expand([batch, num_tokens, candidates]));
-            let best = after.clone().sum_dim(1).argmin(2); // [B, 1, 1]
-            nearest = after.gather(2, best.clone().expand([batch, num_tokens, 1]));
-            centers.push(drawn.gather(1, best.expand([batch, 1, dim])));
-        }
-        Tensor::cat(centers, 1)
-    }
-
-    /// The nearest mean of every token, per scene.
-    fn assign(&self, means: &Tensor<3>) -> Vec<Labels> {
-        let num_tokens = self.tokens.dims()[1];
-        let (distance, assignment) = self.distances(means.clone()).min_dim_with_indices(2);
-        let distance: Vec<f32> = distance.into_data().convert::<f32>().try_to_vec::<f32>().expect("converted to f32");
-        let assignment: Vec<i64> =
-            assignment.into_data().convert::<i64>().try_to_vec::<i64>().expect("converted to i64");
-        let scenes = assignment.chunks(num_tokens).zip(distance.chunks(num_tokens));
-        scenes
-            .map(|(assignment, distance)| Labels {
-                assignment: assignment.iter().map(|&cluster| cluster as u32).collect(),
-                distance: distance.to_vec(),
-            })
-            .collect()
-    }
-
-    /// Mean of the tokens of every cluster; none is empty.
-    fn means(&self, labels: &[&Labels], num_clusters: usize) -> Tensor<3> {
-        let [batch, num_tokens, dim] = self.tokens.dims();
-        let device = self.device();
-        let mut counts = vec![0.0_f32; batch * num_clusters];
-        let mut rows = Vec::with_capacity(batch * num_tokens);
-        for (scene, labels) in labels.iter().enumerate() {
-            for &cluster in &labels.assignment {
-                let row = scene * num_clusters + cluster as usize;
-                counts[row] += 1.0;
-                rows.push(row as i64);
-            }
-        }
-        let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [batch * num_tokens]), &device);
-        let counts = Tensor::<2>::from_data(TensorData::new(counts, [batch * num_clusters, 1]), &device);
-        let flat = self.tokens.clone().reshape([batch * num_tokens, dim]);
-        let sums = Tensor::<2>::zeros([batch * num_clusters, dim], (&device, flat.dtype()));
-        let sums = sums.select_assign(0, rows, flat.clone(), IndexingUpdateOp::Add);
-        (sums / counts.cast(flat.dtype())).reshape([batch, num_clusters, dim])
+        (labels, self.max_iterations)
     }
 }
 
@@ -265,8 +104,10 @@ impl Samples {
 mod tests {
     use std::collections::BTreeSet;
 
+    use burn::tensor::Device;
+
     use super::*;
-    use crate::testing::{Fixture, devices, random, to_vec};
+    use crate::testing::{Fixture, cpu_devices, devices, random, to_vec};
 
     fn assert_valid(fit: &Fit, num_clusters: usize) {
         for scene in fit.clusters.scenes() {
@@ -275,6 +116,31 @@ mod tests {
             let used: BTreeSet<_> = scene.assignment().iter().collect();
             assert_eq!(used.len(), num_clusters, "no cluster is empty");
         }
+    }
+
+    /// Cluster numbers in the order in which the tokens meet them.
+    fn renumbered(assignment: &[u32]) -> Vec<usize> {
+        let mut met = Vec::new();
+        let number = |cluster: &u32| {
+            met.iter().position(|other| other == cluster).unwrap_or_else(|| {
+                met.push(*cluster);
+                met.len() - 1
+            })
+        };
+        assignment.iter().map(number).collect()
+    }
+
+    /// Squared distance of every token to the mean of every cluster, in f64: `[N][S]`.
+    fn brute_force(tokens: &[Vec<f64>], assignment: &[u32], num_clusters: usize) -> Vec<Vec<f64>> {
+        let mut means = vec![vec![0.0; tokens[0].len()]; num_clusters];
+        for (cluster, mean) in means.iter_mut().enumerate() {
+            let members: Vec<_> = tokens.iter().zip(assignment).filter(|&(_, &own)| own as usize == cluster).collect();
+            for (i, value) in mean.iter_mut().enumerate() {
+                *value = members.iter().map(|(token, _)| token[i]).sum::<f64>() / members.len() as f64;
+            }
+        }
+        let distance = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum();
+        tokens.iter().map(|token| means.iter().map(|mean| distance(token, mean)).collect()).collect()
     }
 
     /// Mean and standard error.
@@ -331,6 +197,8 @@ mod tests {
             let tokens = random([2, 9, 4], 6, &device).cast(burn::tensor::DType::F32);
             let one = KMeans::default().fit(tokens.clone(), 1, &[0, 1]).expect("fits");
             assert_valid(&one, 1);
+            let spread = to_vec(tokens.clone().var_bias(1).sum_dim(2));
+            assert!((one.inertia[1] - 9.0 * spread[1]).abs() < 1e-4, "{} against {}", one.inertia[1], spread[1]);
             let all = KMeans::default().fit(tokens.clone(), 9, &[0, 1]).expect("fits");
             assert_eq!(all.clusters.scenes()[1], SceneClusters::identity(9));
             let most = KMeans::default().fit(tokens.clone(), 8, &[0, 1]).expect("fits");
@@ -347,7 +215,70 @@ mod tests {
             assert_valid(&KMeans::default().fit(tokens.clone(), 5, &[0]).expect("fits"), 5);
             // Two places only, eight clusters.
             let tokens = Tensor::cat(vec![tokens.clone(), tokens * 3.0], 1);
-            assert_valid(&KMeans::default().fit(tokens, 8, &[0]).expect("fits"), 8);
+            let fit = KMeans::default().fit(tokens, 8, &[0]).expect("fits");
+            assert_valid(&fit, 8);
+            assert!(fit.inertia[0] < 1e-4, "no cluster joins the two places: {}", fit.inertia[0]);
+        }
+    }
+
+    #[test]
+    fn a_fit_run_to_its_end_is_a_local_optimum_of_the_inertia_it_reports() {
+        let kmeans = KMeans { max_iterations: 1000, tolerance: -1.0 };
+        for device in cpu_devices() {
+            let tokens = random([1, 200, 6], 12, &device);
+            let fit = kmeans.fit(tokens.clone(), 23, &[4]).expect("fits");
+            let tokens: Vec<Vec<f64>> = to_vec(tokens).chunks(6).map(<[f64]>::to_vec).collect();
+            let scene = &fit.clusters.scenes()[0];
+            let distances = brute_force(&tokens, scene.assignment(), 23);
+            let own = |token: usize| distances[token][scene.assignment()[token] as usize];
+            let inertia: f64 = (0..200).map(own).sum();
+            assert!((fit.inertia[0] - inertia).abs() < 1e-9 * inertia, "{} against {inertia}", fit.inertia[0]);
+            for (token, all) in distances.iter().enumerate() {
+                let least = all.iter().copied().fold(f64::INFINITY, f64::min);
+                assert!(own(token) <= least + 1e-9, "token {token} is not in its nearest cluster");
+                let centroid = scene.centroid_index()[scene.assignment()[token] as usize] as usize;
+                assert!(own(centroid) <= own(token) + 1e-9, "token {token} is nearer to its mean than the centroid");
+            }
+        }
+    }
+
+    #[test]
+    fn well_separated_tokens_are_told_apart_on_every_device_in_f32_and_f64() {
+        let expected: Vec<usize> = (0..90).map(|token| token % 9).collect();
+        for device in devices() {
+            let corner = Tensor::<3>::from_floats([[[0.0, 0.0], [0.0, 50.0], [90.0, 0.0]]], &device);
+            let corners = Tensor::cat(vec![corner.clone(), corner.clone() - 400.0, corner + 300.0], 1);
+            let noise = random([1, 90, 2], 13, &device);
+            let tokens = corners.repeat_dim(1, 10).cast(noise.dtype()) + noise;
+            for dtype in [tokens.dtype(), burn::tensor::DType::F32] {
+                let fit = KMeans::default().fit(tokens.clone().cast(dtype), 9, &[7]).expect("fits");
+                assert_eq!(renumbered(fit.clusters.scenes()[0].assignment()), expected, "{dtype:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_far_outlier_takes_one_cluster_and_leaves_the_others_alone() {
+        for device in devices() {
+            let near = random([1, 100, 4], 14, &device).cast(burn::tensor::DType::F32);
+            let far = Tensor::<3>::full([1, 1, 4], 1e4, &device);
+            for seed in 0..5 {
+                let fit = KMeans::default().fit(Tensor::cat(vec![near.clone(), far.clone()], 1), 11, &[seed]);
+                let fit = fit.expect("fits");
+                assert_valid(&fit, 11);
+                let assignment = fit.clusters.scenes()[0].assignment();
+                assert_eq!(assignment.iter().filter(|&&cluster| cluster == assignment[100]).count(), 1);
+            }
+        }
+    }
+
+    #[test]
+    fn no_iteration_allowed_still_gives_clusters() {
+        for device in devices() {
+            let tokens = random([1, 30, 4], 15, &device).cast(burn::tensor::DType::F32);
+            let fit = KMeans { max_iterations: 0, ..KMeans::default() }.fit(tokens, 6, &[0]).expect("fits");
+            assert_valid(&fit, 6);
+            assert_eq!(fit.iterations, 0);
         }
     }
 

@@ -7,6 +7,7 @@
 //! Modules take a [`burn::tensor::Device`]; all devices are named in [`device`].
 
 pub mod attention;
+mod autodiff;
 pub mod block;
 pub mod camera;
 pub mod cluster_attention;
@@ -17,8 +18,11 @@ pub mod device;
 pub mod encoder;
 pub mod error;
 pub mod feed_forward;
+mod flex;
 pub mod init;
 pub mod kmeans;
+pub mod layer_norm;
+pub mod linear;
 pub mod model;
 pub mod patch;
 pub mod rays;

@@ -6,6 +6,8 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Tensor, activation::sigmoid};
 
 use crate::block::DecoderBlock;
+use crate::layer_norm::layer_norm;
+use crate::linear::linear;
 use crate::patch::{patchify, unpatchify};
 use crate::rays::plucker;
 use crate::{Cameras, Init, ModelConfig};
@@ -45,11 +47,11 @@ impl Renderer {
         let [batch, views] = targets.dims();
         let [groups, _, dim] = tokens.dims();
         assert!(groups == batch || groups == batch * views, "{groups} token sets for {batch} scenes of {views} views");
-        let rays = self.ray_embed.forward(patchify(plucker(targets), self.patch_size)); // [B, TQ, D]
+        let rays = linear(&self.ray_embed, patchify(plucker(targets), self.patch_size)); // [B, TQ, D]
         let num_queries = rays.dims()[1] / views;
         let x = rays.reshape([batch * views, num_queries, dim]);
         let x = self.blocks.iter().fold(x, |x, block| block.forward(x, tokens.clone())); // [BT, Q, D]
-        let patches = sigmoid(self.to_pixels.forward(self.output_norm.forward(x)));
+        let patches = sigmoid(linear(&self.to_pixels, layer_norm(&self.output_norm, x)));
         let values = patches.dims()[2];
         let patches = patches.reshape([batch, views * num_queries, values]);
         unpatchify(patches, [views, targets.height, targets.width], self.patch_size)

@@ -120,6 +120,18 @@ pub enum TrainError {
         /// Steps done.
         step: u64,
     },
+    /// A benchmark was asked to stop.
+    #[error("interrupted during `{work}`; nothing was written")]
+    BenchInterrupted {
+        /// The row that was not finished.
+        work: &'static str,
+    },
+    /// A device gave up on work it had accepted.
+    #[error("the device failed: {reason}")]
+    Device {
+        /// Its own words.
+        reason: String,
+    },
     /// Scenes could not be read.
     #[error(transparent)]
     Data(#[from] clift_data::DataError),

@@ -3,6 +3,7 @@
 //! [`Run`] is an experiment in its directory. The training loop is [`trainer::StagePlan::train`], the
 //! same for both stages; they differ in the batches they build.
 
+pub mod bench;
 pub mod checkpoint;
 pub mod clusters;
 pub mod config;

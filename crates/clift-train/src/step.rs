@@ -7,7 +7,7 @@ use burn::optim::{GradientsAccumulator, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use clift_data::{Clip, Skip};
 use clift_eval::{upload_cameras, upload_pictures, upload_views};
-use clift_model::{Clift, Clusters, SceneClusters};
+use clift_model::{Cameras, Clift, Clusters, SceneClusters, Views};
 
 use crate::TrainError;
 use crate::loss::mse;
@@ -106,25 +106,51 @@ impl Learner {
 
     /// Renders the targets of a batch and compares: a scalar on the tape.
     fn loss(&self, batch: &StageBatch) -> Result<Tensor<1>, TrainError> {
-        let contexts: Vec<_> = batch.clips.iter().map(|clip| &clip.context).collect();
-        let targets: Vec<_> = batch.clips.iter().map(|clip| &clip.target).collect();
-        let lift = self.model.encoder.forward(&upload_views(&contexts, &self.device)?); // [B, N, D]
-        let tokens = match &batch.tokens {
-            TokenChoice::All => lift,
-            TokenChoice::Subsets(subsets) => keep(lift, subsets), // [BT, K, D]
-            TokenChoice::Clusters(clusters) => {
-                let index = Clusters::new(clusters.clone())?.upload(&self.device);
-                self.model.condenser.forward(lift, &index) // [B, S, D]
-            }
-        };
-        let rendering = self.model.renderer.forward(tokens, &upload_cameras(&targets, &self.device)?);
-        Ok(mse(rendering, upload_pictures(&targets, &self.device)?))
+        loss_of(&self.model, &Shown::upload(batch, &self.device)?, &batch.tokens)
     }
 
     /// The model on its device without autodiff.
     pub fn inference_model(&self) -> Clift {
         self.model.valid()
     }
+}
+
+/// What a batch shows, on a device.
+pub(crate) struct Shown {
+    /// The given views.
+    pub context: Views,
+    /// Where the targets were taken from.
+    pub targets: Cameras,
+    /// The targets, `[B, T, H, W, 3]`.
+    pub pictures: Tensor<5>,
+}
+
+impl Shown {
+    /// Copies the views of a batch to a device.
+    pub fn upload(batch: &StageBatch, device: &Device) -> Result<Self, TrainError> {
+        let contexts: Vec<_> = batch.clips.iter().map(|clip| &clip.context).collect();
+        let targets: Vec<_> = batch.clips.iter().map(|clip| &clip.target).collect();
+        Ok(Self {
+            context: upload_views(&contexts, device)?,
+            targets: upload_cameras(&targets, device)?,
+            pictures: upload_pictures(&targets, device)?,
+        })
+    }
+}
+
+/// Renders the targets and compares.
+pub(crate) fn loss_of(model: &Clift, shown: &Shown, tokens: &TokenChoice) -> Result<Tensor<1>, TrainError> {
+    let lift = model.encoder.forward(&shown.context); // [B, N, D]
+    let tokens = match tokens {
+        TokenChoice::All => lift,
+        TokenChoice::Subsets(subsets) => keep(lift, subsets), // [BT, K, D]
+        TokenChoice::Clusters(clusters) => {
+            let index = Clusters::new(clusters.clone())?.upload(&lift.device());
+            model.condenser.forward(lift, &index) // [B, S, D]
+        }
+    };
+    let rendering = model.renderer.forward(tokens, &shown.targets);
+    Ok(mse(rendering, shown.pictures.clone()))
 }
 
 /// The kept tokens of every target view: `[B, N, D] -> [B * T, K, D]`.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use burn::module::ParamGroup;
+use burn::module::{Module, ParamGroup};
 use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleLrScheduler};
 use burn::tensor::Device;
 use clift_data::Prefetcher;
@@ -68,7 +68,7 @@ impl StagePlan<'_> {
         let model = if checkpoints.newest()?.is_some() { self.blank_model() } else { start(sink)? };
         let mut learner = Learner { model, optimizer: adamw(self.optimizer), device: self.device.clone() };
         let mut progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
-        learner.model = self.freeze(learner.model);
+        learner.model = freeze(self.stage, learner.model);
         let mut metrics = self.open_metrics(progress.step)?;
         let mut sink = Tee::new(vec![sink, &mut metrics]);
         sink.event(&Event::StageStarted { stage: self.stage, done: progress.step, num_steps: self.num_steps });
@@ -116,16 +116,6 @@ impl StagePlan<'_> {
         Clift::new(&self.config.model, self.config.seed, &self.device)
     }
 
-    /// Parameters the stage does not train get no gradient and no decay.
-    fn freeze(&self, mut model: Clift) -> Clift {
-        use burn::module::Module;
-        match self.stage {
-            Stage::Stage2 => model.encoder = model.encoder.no_grad(),
-            _ => model.condenser = model.condenser.no_grad(),
-        }
-        model
-    }
-
     fn learning_rate(&self, lr: f64) -> ModuleLearningRate {
         let renderer = ParamGroup::from_predicate("renderer");
         ModuleLrScheduler::new(lr).with_group(renderer, constant(lr * self.renderer_lr_factor)).step()
@@ -168,6 +158,15 @@ impl StagePlan<'_> {
         let checkpoint = checkpoints.newest()?.map_or("none".into(), |path| path.display().to_string());
         Err(TrainError::Diverged { count, step, keys, checkpoint })
     }
+}
+
+/// Parameters the stage does not train get no gradient and no decay.
+pub(crate) fn freeze(stage: Stage, mut model: Clift) -> Clift {
+    match stage {
+        Stage::Stage2 => model.encoder = model.encoder.no_grad(),
+        _ => model.condenser = model.condenser.no_grad(),
+    }
+    model
 }
 
 fn due(step: u64, every: u64) -> bool {

@@ -7,6 +7,7 @@ use clift_eval::TokenCount;
 use clift_model::TokenStorage;
 use clift_model::device::DeviceName;
 use clift_train::Stage;
+use clift_train::bench::Work;
 
 pub use crate::data::args::DataCommand;
 pub use crate::encode::EncodeArgs;
@@ -66,6 +67,14 @@ Examples:
     /// Runs one forward and backward pass of a small model on every device of this build and compares its
     /// gradient with that of the default device. Exits with 1 if the default device fails, with 0 otherwise.
     Doctor,
+    /// Time the parts of the method on a device, each with its error against f64
+    ///
+    /// Inputs and weights are drawn from the config's seed: no data is needed. A row is one part of the method at the
+    /// config's sizes, with the fewest context views it allows; `encode` to `render_8_views` are of one scene,
+    /// the steps of the config's batch. The table has the median and the 95th percentile of the repetitions, the peak
+    /// memory of the process during them and the largest relative error of the result against the same
+    /// computation in f64.
+    Bench(BenchArgs),
 }
 
 /// Arguments of `clift train`.
@@ -115,6 +124,40 @@ pub struct EvalArgs {
     pub out: Option<PathBuf>,
 }
 
+/// Arguments of `clift bench`.
+#[derive(Debug, clap::Args)]
+pub struct BenchArgs {
+    /// The experiment whose sizes are used, a TOML file
+    pub config: PathBuf,
+    /// The rows; all of them by default
+    #[arg(long, value_delimiter = ',', value_name = "WORK", help = works_help())]
+    pub work: Vec<Work>,
+    /// Repetitions that count
+    #[arg(long, value_name = "COUNT", default_value = "5", value_parser = parse_repeats)]
+    pub repeats: usize,
+    /// Repetitions before them that do not
+    #[arg(long, value_name = "COUNT", default_value = "1")]
+    pub warmup: usize,
+    /// Leave out the comparison with f64
+    #[arg(long)]
+    pub no_error: bool,
+    /// Where tensors live: flex, ndarray or wgpu
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<DeviceName>,
+    /// Change a key of the config: `--set stage1.batch_size=1`
+    #[arg(long, value_name = "KEY=TOML")]
+    pub set: Vec<String>,
+    /// Tokens that are stored, as a number or a share: clusters of K-means, condenser and stage 2
+    #[arg(long, value_name = "COUNT", default_value = "1/4")]
+    pub storage: TokenCount,
+    /// Let K-means cluster the tensor `features`, [N, D] in f32, of a safetensors file
+    #[arg(long, value_name = "FILE")]
+    pub features: Option<PathBuf>,
+    /// Write the figures, with every repetition, as JSON
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
 fn parse_stage(text: &str) -> Result<Stage, String> {
     let stages = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
     stages.into_iter().find(|stage| stage.name() == text).ok_or_else(|| "write stage1, clusters or stage2".into())
@@ -124,6 +167,17 @@ fn parse_overfit(text: &str) -> Result<usize, String> {
     match text.parse() {
         Ok(count) if count > 0 => Ok(count),
         _ => Err("write how many scenes, at least 1".into()),
+    }
+}
+
+fn works_help() -> String {
+    format!("Time these works alone: {}", Work::ALL.map(Work::name).join(", "))
+}
+
+fn parse_repeats(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(count) if count > 0 => Ok(count),
+        _ => Err("write how often, at least 1".into()),
     }
 }
 
@@ -146,5 +200,18 @@ mod tests {
         assert!(parse(&["train", "a.toml", "--overfit", "0"]).is_err());
         assert!(parse(&["eval", "run", "--storage", "256,1/16"]).is_ok());
         assert!(parse(&["eval", "run", "--storage", "0"]).is_err());
+    }
+
+    #[test]
+    fn works_are_named_and_repeated_at_least_once() {
+        let parse = |words: &[&str]| Args::try_parse_from(["clift", "bench", "a.toml"].iter().chain(words));
+        let Ok(Args { command: Command::Bench(args) }) = parse(&["--work", "encode,stage1_step_tiny"]) else {
+            panic!("valid arguments");
+        };
+        assert_eq!(args.work, [Work::Encode, Work::Stage1StepTiny]);
+        assert_eq!((args.repeats, args.warmup, args.storage), (5, 1, TokenCount::Share(0.25)));
+        let message = parse(&["--work", "incode"]).unwrap_err().to_string();
+        assert!(message.contains("'incode'") && message.contains("the works are encode, kmeans"), "{message}");
+        assert!(parse(&["--repeats", "0"]).is_err());
     }
 }

@@ -1,12 +1,14 @@
 //! The command line of clift: arguments and printing, nothing else.
 
 mod args;
+mod bench;
 mod data;
 mod doctor;
 mod encode;
 mod eval;
 mod interrupt;
 mod render;
+mod table;
 pub mod terminal;
 mod train;
 
@@ -38,6 +40,7 @@ pub fn main() -> ExitCode {
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
         Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
         Command::Doctor => doctor::run(),
+        Command::Bench(args) => bench::run(&args),
     };
     match result {
         Ok(()) => ExitCode::from(DONE),
@@ -83,7 +86,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
         return WRONG_USAGE;
     }
     match error.downcast_ref::<TrainError>() {
-        Some(TrainError::Interrupted { .. }) => INTERRUPTED,
+        Some(TrainError::Interrupted { .. } | TrainError::BenchInterrupted { .. }) => INTERRUPTED,
         Some(
             TrainError::BadConfig { .. }
             | TrainError::OtherRun { .. }
@@ -129,6 +132,7 @@ mod tests {
         assert_eq!(exit_code(&bad_config().unwrap_err().into()), WRONG_USAGE);
         assert_eq!(exit_code(&TrainError::from(bad_config().unwrap_err()).into()), WRONG_USAGE);
         assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), INTERRUPTED);
+        assert_eq!(exit_code(&TrainError::BenchInterrupted { work: "encode" }.into()), INTERRUPTED);
         assert_eq!(exit_code(&clift_data::DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
         assert_eq!(exit_code(&anyhow::anyhow!("anything else")), FAILED);
     }

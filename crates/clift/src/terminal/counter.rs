@@ -40,6 +40,14 @@ impl Counter {
             None => {}
         }
     }
+
+    /// Writes a line, above the bar where there is one.
+    pub fn note(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.println(line),
+            None => print_note(line),
+        }
+    }
 }
 
 impl Drop for Counter {

@@ -1,0 +1,331 @@
+//! Attention of every segment's query to the members of that segment: one score per member and head.
+// S segments, M members, H heads, E width of a head, D = HE
+
+use rayon::prelude::*;
+
+use crate::InstructionSet;
+use crate::disjoint::Disjoint;
+use crate::instruction_set::Kernel;
+use crate::simd::Simd;
+
+/// Sizes, and which member belongs where.
+#[derive(Clone, Debug)]
+pub struct Segments {
+    num_heads: usize,
+    head_width: usize,
+    /// Members of segment `s` are `order[bounds[s]..bounds[s + 1]]`.
+    bounds: Vec<usize>,
+    order: Vec<usize>,
+}
+
+impl Segments {
+    /// Sorts members into `num_segments` segments; `segment` has one number per member.
+    ///
+    /// # Panics
+    /// When a number is not that of a segment.
+    pub fn new(
+        [num_segments, num_heads, head_width]: [usize; 3],
+        segment: impl Iterator<Item = usize> + Clone,
+    ) -> Self {
+        let mut bounds = vec![0; num_segments + 1];
+        let mut num_members = 0;
+        for segment in segment.clone() {
+            bounds[segment + 1] += 1;
+            num_members += 1;
+        }
+        for s in 0..num_segments {
+            bounds[s + 1] += bounds[s];
+        }
+        let mut next = bounds.clone();
+        let mut order = vec![0; num_members];
+        for (member, segment) in segment.enumerate() {
+            order[next[segment]] = member;
+            next[segment] += 1;
+        }
+        Self { num_heads, head_width, bounds, order }
+    }
+
+    fn dim(&self) -> usize {
+        self.num_heads * self.head_width
+    }
+
+    fn len(&self) -> usize {
+        self.bounds.len() - 1
+    }
+
+    fn members(&self, segment: usize) -> &[usize] {
+        &self.order[self.bounds[segment]..self.bounds[segment + 1]]
+    }
+
+    fn scale(&self) -> f32 {
+        (1.0 / (self.head_width as f64).sqrt()) as f32
+    }
+}
+
+/// Segments a task works on.
+const SEGMENTS_OF_A_TASK: usize = 16;
+
+/// Computes `sum_i softmax_i(q_s k_i / sqrt(head width)) v_i` per head over the members of a segment,
+/// zeros for a segment without any.
+///
+/// `query` and `output` are `[segments, dim]`, `key_value` is `[members, 2 dim]`, and `weights`,
+/// `[members, num_heads]`, receives the softmax, which [`backward`] needs.
+pub fn forward(
+    set: InstructionSet,
+    segments: &Segments,
+    [query, key_value]: [&[f32]; 2],
+    output: &mut [f32],
+    weights: &mut [f32],
+) {
+    let (dim, members) = (segments.dim(), segments.order.len());
+    assert!(query.len() == segments.len() * dim && output.len() == query.len(), "rows of all segments");
+    assert!(key_value.len() == members * 2 * dim && weights.len() == members * segments.num_heads, "rows of members");
+    let weights = Disjoint::new(weights);
+    output.par_chunks_mut(SEGMENTS_OF_A_TASK * dim).enumerate().for_each(|(task, output)| {
+        set.run(Forward { segments, query, key_value, first: task * SEGMENTS_OF_A_TASK, output, weights: &weights });
+    });
+}
+
+struct Forward<'a> {
+    segments: &'a Segments,
+    query: &'a [f32],
+    key_value: &'a [f32],
+    first: usize,
+    output: &'a mut [f32],
+    weights: &'a Disjoint<'a>,
+}
+
+impl Kernel for Forward<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { segments, query, key_value, first, output, weights } = self;
+        let (dim, heads, width) = (segments.dim(), segments.num_heads, segments.head_width);
+        let mut scores = Vec::new();
+        for (i, output) in output.chunks_exact_mut(dim).enumerate() {
+            output.fill(0.0);
+            let members = segments.members(first + i);
+            let query = &query[(first + i) * dim..][..dim];
+            scores.clear();
+            for &member in members {
+                let key = &key_value[member * 2 * dim..][..dim];
+                for (query, key) in query.chunks_exact(width).zip(key.chunks_exact(width)) {
+                    scores.push(dot(simd, query, key) * segments.scale());
+                }
+            }
+            for head in 0..heads {
+                softmax(&mut scores, head, heads);
+            }
+            for (&member, scores) in members.iter().zip(scores.chunks_exact(heads)) {
+                let value = &key_value[member * 2 * dim + dim..][..dim];
+                for ((value, output), &weight) in
+                    value.chunks_exact(width).zip(output.chunks_exact_mut(width)).zip(scores)
+                {
+                    add_scaled(simd, value, weight, output);
+                }
+                // SAFETY: a member belongs to one segment, a segment to one task.
+                unsafe { weights.part(member * heads, heads) }.copy_from_slice(scores);
+            }
+        }
+    }
+}
+
+/// Softmax over every `step`th value from `start` on.
+fn softmax(values: &mut [f32], start: usize, step: usize) {
+    let values = values.get_mut(start..).unwrap_or_default();
+    let highest = values.iter().step_by(step).fold(f32::NEG_INFINITY, |a, &b| if a > b { a } else { b });
+    let mut total = 0.0;
+    for value in values.iter_mut().step_by(step) {
+        *value = (*value - highest).exp();
+        total += *value;
+    }
+    values.iter_mut().step_by(step).for_each(|value| *value /= total);
+}
+
+/// Computes the gradients of queries and of keys and values from that of the output.
+///
+/// With `g` the output's gradient of the member's segment: `dV_i = p_i g`,
+/// `dS_i = p_i (g v_i - sum_j p_j g v_j)`, `dK_i = s dS_i q`, `dQ = s sum_i dS_i k_i`.
+pub fn backward(
+    set: InstructionSet,
+    segments: &Segments,
+    [query, key_value, weights, grad]: [&[f32]; 4],
+    [grad_query, grad_key_value]: [&mut [f32]; 2],
+) {
+    let (dim, members) = (segments.dim(), segments.order.len());
+    assert!(query.len() == segments.len() * dim && grad.len() == query.len() && grad_query.len() == query.len());
+    assert!(key_value.len() == members * 2 * dim && weights.len() == members * segments.num_heads);
+    assert_eq!(grad_key_value.len(), key_value.len(), "rows of members");
+    let grad_key_value = Disjoint::new(grad_key_value);
+    grad_query.par_chunks_mut(SEGMENTS_OF_A_TASK * dim).enumerate().for_each(|(task, grad_query)| {
+        set.run(Backward {
+            segments,
+            query,
+            key_value,
+            weights,
+            grad,
+            first: task * SEGMENTS_OF_A_TASK,
+            grad_query,
+            grad_key_value: &grad_key_value,
+        });
+    });
+}
+
+struct Backward<'a> {
+    segments: &'a Segments,
+    query: &'a [f32],
+    key_value: &'a [f32],
+    weights: &'a [f32],
+    grad: &'a [f32],
+    first: usize,
+    grad_query: &'a mut [f32],
+    grad_key_value: &'a Disjoint<'a>,
+}
+
+impl Kernel for Backward<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { segments, query, key_value, weights, grad, first, grad_query, grad_key_value } = self;
+        let (dim, heads, width) = (segments.dim(), segments.num_heads, segments.head_width);
+        let mut slopes: Vec<f32> = Vec::new();
+        for (i, grad_query) in grad_query.chunks_exact_mut(dim).enumerate() {
+            grad_query.fill(0.0);
+            let members = segments.members(first + i);
+            let query = &query[(first + i) * dim..][..dim];
+            let grad = &grad[(first + i) * dim..][..dim];
+            slopes.clear();
+            for &member in members {
+                let value = &key_value[member * 2 * dim + dim..][..dim];
+                for (grad, value) in grad.chunks_exact(width).zip(value.chunks_exact(width)) {
+                    slopes.push(dot(simd, grad, value));
+                }
+            }
+            for head in 0..heads {
+                let weight = |i: usize| weights[members[i] * heads + head];
+                let mean: f32 = (0..members.len()).map(|i| weight(i) * slopes[i * heads + head]).sum();
+                for i in 0..members.len() {
+                    let slope = &mut slopes[i * heads + head];
+                    *slope = weight(i) * (*slope - mean) * segments.scale();
+                }
+            }
+            for (&member, slopes) in members.iter().zip(slopes.chunks_exact(heads)) {
+                let key = &key_value[member * 2 * dim..][..dim];
+                // SAFETY: a member belongs to one segment, a segment to one task.
+                let (grad_key, grad_value) =
+                    unsafe { grad_key_value.part(member * 2 * dim, 2 * dim) }.split_at_mut(dim);
+                for head in 0..heads {
+                    let columns = head * width..(head + 1) * width;
+                    let slope = slopes[head];
+                    add_scaled(simd, &key[columns.clone()], slope, &mut grad_query[columns.clone()]);
+                    set_scaled(simd, &query[columns.clone()], slope, &mut grad_key[columns.clone()]);
+                    let weight = weights[member * heads + head];
+                    set_scaled(simd, &grad[columns.clone()], weight, &mut grad_value[columns]);
+                }
+            }
+        }
+    }
+}
+
+#[inline(always)]
+#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
+fn dot<S: Simd>(simd: S, a: &[f32], b: &[f32]) -> f32 {
+    let mut total = simd.splat(0.0);
+    for (a, b) in a.chunks(S::LANES).zip(b.chunks(S::LANES)) {
+        total = simd.mul_add(simd.read(a), simd.read(b), total);
+    }
+    simd.sum(total)
+}
+
+/// `to += factor * from`
+#[inline(always)]
+#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
+fn add_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
+    let factor = simd.splat(factor);
+    for (from, to) in from.chunks(S::LANES).zip(to.chunks_mut(S::LANES)) {
+        simd.write(to, simd.mul_add(simd.read(from), factor, simd.read(to)));
+    }
+}
+
+/// `to = factor * from`
+#[inline(always)]
+#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
+fn set_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
+    let factor = simd.splat(factor);
+    for (from, to) in from.chunks(S::LANES).zip(to.chunks_mut(S::LANES)) {
+        simd.write(to, simd.mul(simd.read(from), factor));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{assert_close, random};
+
+    /// Output and gradients of queries and of keys and values in f64.
+    fn reference(sizes: [usize; 3], segment: &[usize], [q, kv, grad]: [&[f32]; 3]) -> [Vec<f64>; 3] {
+        let [num_segments, heads, width] = sizes;
+        let dim = heads * width;
+        let wide = |values: &[f32]| values.iter().map(|&value| f64::from(value)).collect::<Vec<_>>();
+        let (q, kv, grad) = (wide(q), wide(kv), wide(grad));
+        let mut results = [vec![0.0; q.len()], vec![0.0; q.len()], vec![0.0; kv.len()]];
+        let [output, grad_q, grad_kv] = &mut results;
+        let scale = 1.0 / (width as f64).sqrt();
+        for (s, head) in (0..num_segments).flat_map(|s| (0..heads).map(move |head| (s, head))) {
+            let members: Vec<usize> = (0..segment.len()).filter(|&i| segment[i] == s).collect();
+            let at = |e: usize| s * dim + head * width + e;
+            let key = |i: usize, e: usize| i * 2 * dim + head * width + e;
+            let value = |i: usize, e: usize| key(i, e) + dim;
+            let sum = |term: &dyn Fn(usize) -> f64| (0..width).map(term).sum::<f64>();
+            let scores: Vec<f64> = members.iter().map(|&i| scale * sum(&|e| q[at(e)] * kv[key(i, e)])).collect();
+            let highest = scores.iter().copied().fold(f64::MIN, f64::max);
+            let total: f64 = scores.iter().map(|score| (score - highest).exp()).sum();
+            let weights: Vec<f64> = scores.iter().map(|score| (score - highest).exp() / total).collect();
+            let slopes: Vec<f64> = members.iter().map(|&i| sum(&|e| grad[at(e)] * kv[value(i, e)])).collect();
+            let mean: f64 = weights.iter().zip(&slopes).map(|(weight, slope)| weight * slope).sum();
+            for ((&i, weight), slope) in members.iter().zip(&weights).zip(&slopes) {
+                let grad_score = weight * (slope - mean) * scale;
+                for e in 0..width {
+                    output[at(e)] += weight * kv[value(i, e)];
+                    grad_q[at(e)] += grad_score * kv[key(i, e)];
+                    grad_kv[key(i, e)] += grad_score * q[at(e)];
+                    grad_kv[value(i, e)] += weight * grad[at(e)];
+                }
+            }
+        }
+        results
+    }
+
+    fn check(sizes: [usize; 3], num_members: usize) {
+        let [num_segments, heads, width] = sizes;
+        let dim = heads * width;
+        // Uneven, some empty, in no order.
+        let segment: Vec<usize> = (0..num_members).map(|i| i * i * 7 % (num_segments + 2) % num_segments).collect();
+        let (q, kv, grad) =
+            (random(num_segments * dim, 1), random(num_members * 2 * dim, 2), random(num_segments * dim, 3));
+        let expected = reference(sizes, &segment, [&q, &kv, &grad]);
+        let segments = Segments::new(sizes, segment.iter().copied());
+        for set in InstructionSet::available() {
+            let mut output = vec![f32::NAN; q.len()];
+            let mut weights = vec![f32::NAN; num_members * heads];
+            forward(set, &segments, [&q, &kv], &mut output, &mut weights);
+            assert_close(&output, &expected[0], 1e-5);
+            let (mut grad_q, mut grad_kv) = (vec![f32::NAN; q.len()], vec![f32::NAN; kv.len()]);
+            backward(set, &segments, [&q, &kv, &weights, &grad], [&mut grad_q, &mut grad_kv]);
+            assert_close(&grad_q, &expected[1], 1e-5);
+            assert_close(&grad_kv, &expected[2], 1e-5);
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_equals_f64_at_odd_shapes() {
+        check([1, 1, 12], 3);
+        check([37, 2, 12], 200);
+        check([19, 3, 96], 77);
+        check([5, 1, 5], 40);
+    }
+}

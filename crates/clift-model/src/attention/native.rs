@@ -1,0 +1,105 @@
+//! Attention on Burn's CPU backend: f32 by the kernels of `clift-kernels`, straight from the packed
+//! projections and into packed gradients.
+
+use burn::backend::flex::FlexTensor;
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{Flex, TensorMetadata};
+use clift_kernels::InstructionSet;
+use clift_kernels::attention::{self as kernel, Gradients, Rows, Saved, Sizes};
+
+use super::{Attended, AttentionKernels, Projected, composed_backward, forward, split};
+use crate::flex::{contiguous, is_native, tensor, values};
+
+impl AttentionKernels for Flex {
+    fn attend(inputs: &Projected<FloatTensor<Self>>, num_heads: usize) -> Attended<FloatTensor<Self>> {
+        if !inputs.is_native() {
+            return Attended { output: forward::<Self>(split::<Self>(inputs), num_heads), log_sum: None };
+        }
+        let inputs = inputs.clone().contiguous();
+        let sizes = inputs.sizes(num_heads);
+        let Sizes { batch, num_queries, head_width, .. } = sizes;
+        let dim = num_heads * head_width;
+        let mut output = vec![0.0; batch * num_queries * dim];
+        let mut log_sum = vec![0.0; batch * num_heads * num_queries];
+        kernel::forward(InstructionSet::detected(), sizes, inputs.rows(dim), &mut output, Some(&mut log_sum));
+        let log_sum = tensor(log_sum, [batch, num_heads, num_queries]);
+        Attended { output: tensor(output, [batch, num_queries, dim]), log_sum: Some(log_sum) }
+    }
+
+    fn attend_backward(
+        inputs: Projected<FloatTensor<Self>>,
+        attended: Attended<FloatTensor<Self>>,
+        num_heads: usize,
+        grad_output: FloatTensor<Self>,
+    ) -> Projected<FloatTensor<Self>> {
+        let Some(log_sum) = attended.log_sum else {
+            return composed_backward::<Self>(inputs, attended.output, num_heads, grad_output);
+        };
+        let inputs = inputs.contiguous();
+        let sizes = inputs.sizes(num_heads);
+        let Sizes { batch, num_queries, num_keys, head_width, .. } = sizes;
+        let dim = num_heads * head_width;
+        let [output, grad_output] = [attended.output, grad_output].map(contiguous);
+        let [query, key, value] = inputs.rows(dim);
+        let [output, grad_output] = [&output, &grad_output].map(|x| columns(x, 0));
+        let saved = Saved { query, key, value, output, log_sum: values(&log_sum), grad_output };
+        let set = InstructionSet::detected();
+        match inputs {
+            Projected::Packed(_) => {
+                let mut grad = vec![0.0; batch * num_queries * 3 * dim];
+                kernel::backward(set, sizes, saved, Gradients::Packed(&mut grad));
+                Projected::Packed(tensor(grad, [batch, num_queries, 3 * dim]))
+            }
+            Projected::Separate { .. } => {
+                let mut query = vec![0.0; batch * num_queries * dim];
+                let mut key_value = vec![0.0; batch * num_keys * 2 * dim];
+                let to = Gradients::Separate { query: &mut query, key_value: &mut key_value };
+                kernel::backward(set, sizes, saved, to);
+                let query = tensor(query, [batch, num_queries, dim]);
+                Projected::Separate { query, key_value: tensor(key_value, [batch, num_keys, 2 * dim]) }
+            }
+        }
+    }
+}
+
+impl Projected<FlexTensor> {
+    fn is_native(&self) -> bool {
+        match self {
+            Self::Packed(packed) => is_native(packed),
+            Self::Separate { query, key_value } => is_native(query) && is_native(key_value),
+        }
+    }
+
+    fn contiguous(self) -> Self {
+        match self {
+            Self::Packed(packed) => Self::Packed(contiguous(packed)),
+            Self::Separate { query, key_value } => {
+                Self::Separate { query: contiguous(query), key_value: contiguous(key_value) }
+            }
+        }
+    }
+
+    fn sizes(&self, num_heads: usize) -> Sizes {
+        let (query, key_value, parts) = match self {
+            Self::Packed(packed) => (packed, packed, 3),
+            Self::Separate { query, key_value } => (query, key_value, 1),
+        };
+        let [batch, num_queries, width] = query.shape().dims();
+        let [_, num_keys, _] = key_value.shape().dims();
+        Sizes { batch, num_queries, num_keys, num_heads, head_width: width / parts / num_heads }
+    }
+
+    /// Rows of queries, keys and values.
+    fn rows(&self, dim: usize) -> [Rows<'_>; 3] {
+        match self {
+            Self::Packed(packed) => [0, 1, 2].map(|part| columns(packed, part * dim)),
+            Self::Separate { query, key_value } => [columns(query, 0), columns(key_value, 0), columns(key_value, dim)],
+        }
+    }
+}
+
+/// Rows of a contiguous tensor from a column on.
+fn columns(x: &FlexTensor, first: usize) -> Rows<'_> {
+    let [_, count, width] = x.shape().dims();
+    Rows { values: values(x).get(first..).unwrap_or_default(), batch_stride: count * width, row_stride: width }
+}

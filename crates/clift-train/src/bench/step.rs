@@ -1,0 +1,139 @@
+//! The rows of whole optimiser updates, by the same [`Learner`] that trains.
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::optim::GradientsParams;
+use burn::tensor::{Device, Tensor};
+use clift_model::Clift;
+
+use super::context::BenchContext;
+use super::inputs::batch;
+use super::reference::{InF64, module_in_f64, relative_error, values};
+use super::task::Task;
+use crate::TrainError;
+use crate::config::{Config, OptimizerConfig};
+use crate::events::Stage;
+use crate::optim::adamw;
+use crate::schedule::warm_up_cosine;
+use crate::step::{Learner, Shown, StageBatch, loss_of};
+use crate::trainer::freeze;
+
+/// Updates of one batch: forward, loss, backward, clipping, `AdamW`.
+pub struct StepTask {
+    stage: Stage,
+    learner: Learner,
+    batch: StageBatch,
+    accumulate: usize,
+    rate: f64,
+    max_grad_norm: f64,
+    /// What the error is taken of.
+    reduced: BenchContext,
+}
+
+impl StepTask {
+    pub fn new(context: &BenchContext, stage: Stage) -> Result<Self, TrainError> {
+        let Part { steps, batch_size, accumulate, optimizer } = Part::of(&context.config, stage);
+        let learner = Learner {
+            model: freeze(stage, context.model()),
+            optimizer: adamw(optimizer),
+            device: context.device.clone().autodiff(),
+        };
+        Ok(Self {
+            stage,
+            learner,
+            batch: stage_batch(context, stage, batch_size)?,
+            accumulate,
+            rate: warm_up_cosine(1, optimizer.learning_rate, optimizer.warm_up_steps, steps),
+            max_grad_norm: optimizer.max_grad_norm,
+            reduced: context.reduced()?,
+        })
+    }
+}
+
+/// What the two stages have in common in a config.
+struct Part<'a> {
+    steps: u64,
+    batch_size: usize,
+    accumulate: usize,
+    optimizer: &'a OptimizerConfig,
+}
+
+impl<'a> Part<'a> {
+    fn of(config: &'a Config, stage: Stage) -> Self {
+        let Config { stage1, stage2, .. } = config;
+        let (steps, batch_size, accumulate, optimizer) = match stage {
+            Stage::Stage2 => (stage2.steps, stage2.batch_size, stage2.accumulate, &stage2.optimizer),
+            _ => (stage1.steps, stage1.batch_size, stage1.accumulate, &stage1.optimizer),
+        };
+        Self { steps, batch_size, accumulate, optimizer }
+    }
+}
+
+/// A batch that keeps every token (stage 1) or the stored ones (stage 2).
+fn stage_batch(context: &BenchContext, stage: Stage, batch_size: usize) -> Result<StageBatch, TrainError> {
+    let stored = if stage == Stage::Stage2 { Some(context.num_storage_tokens()?) } else { None };
+    batch(context.shape(), batch_size, context.num_tokens()?, stored, context.seed())
+}
+
+impl Task for StepTask {
+    fn run(&mut self) -> Result<(), TrainError> {
+        let update = self.learner.step(&self.batch, self.accumulate, self.rate.into(), self.max_grad_norm)?;
+        if update.applied {
+            return Ok(());
+        }
+        let (count, step, keys, checkpoint) = (1, 1, "made up".into(), "none".into());
+        Err(TrainError::Diverged { count, step, keys, checkpoint })
+    }
+
+    fn error(self: Box<Self>, reference: &Device) -> Result<f64, TrainError> {
+        let Self { stage, reduced, .. } = *self;
+        let batch_size = Part::of(&reduced.config, stage).batch_size;
+        let batch = stage_batch(&reduced, stage, batch_size)?;
+        let model = freeze(stage, reduced.model());
+        let ours = gradients(&model, &batch, Shown::upload(&batch, &reduced.device.clone().autodiff())?)?;
+        let copy = module_in_f64(&model, reference).train();
+        let shown = Shown::upload(&batch, &reference.clone().autodiff())?.in_f64(&reference.clone().autodiff());
+        let theirs = gradients(&copy, &batch, shown)?;
+        Ok(largest_error(&model, &ours, &theirs))
+    }
+}
+
+impl InF64 for Shown {
+    fn in_f64(&self, reference: &Device) -> Self {
+        Self {
+            context: self.context.in_f64(reference),
+            targets: self.targets.in_f64(reference),
+            pictures: self.pictures.in_f64(reference),
+        }
+    }
+}
+
+/// Loss of a batch and the gradient of every parameter.
+fn gradients(model: &Clift, batch: &StageBatch, shown: Shown) -> Result<(f64, GradientsParams), TrainError> {
+    let loss = loss_of(model, &shown, &batch.tokens)?;
+    let grads = GradientsParams::from_grads(loss.backward(), model);
+    Ok((values(loss.inner())[0], grads))
+}
+
+/// The largest relative error: of the loss, and of each parameter's gradient against its own largest entry.
+fn largest_error(model: &Clift, result: &(f64, GradientsParams), reference: &(f64, GradientsParams)) -> f64 {
+    struct Compare<'a> {
+        result: &'a GradientsParams,
+        reference: &'a GradientsParams,
+        errors: Vec<f64>,
+    }
+    impl ModuleVisitor for Compare<'_> {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            match (self.result.get::<D>(param.id), self.reference.get::<D>(param.id)) {
+                (Some(result), Some(reference)) => self.errors.push(relative_error(result, reference)),
+                (None, None) => {}
+                // A gradient that only one of them has is wrong altogether.
+                (Some(_), None) | (None, Some(_)) => self.errors.push(f64::INFINITY),
+            }
+        }
+    }
+    let ((loss, result), (expected, reference)) = (result, reference);
+    let mut compare = Compare { result, reference, errors: vec![(loss - expected).abs() / expected.abs()] };
+    model.visit(&mut compare);
+    // `f64::max` would pass over NaN.
+    compare.errors.into_iter().fold(0.0, |most, error| if error > most || error.is_nan() { error } else { most })
+}

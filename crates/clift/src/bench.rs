@@ -1,0 +1,182 @@
+//! `clift bench`.
+
+use std::path::Path;
+
+use anyhow::Context;
+use clift_data::files::replace;
+use clift_train::bench::{self, BenchEvent, BenchOptions, MAX_CHECKED_TOKENS, Report, Row, Work};
+use clift_train::{Config, read_config};
+
+use crate::args::BenchArgs;
+use crate::terminal::{Counter, print_note, print_result};
+use crate::{WrongUsage, interrupt, table};
+
+/// Times what is asked for, prints the table and writes the JSON.
+pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
+    let (mut config, overrides) = read_config::<Config>(&args.config, &args.set)?;
+    for change in overrides {
+        print_note(&format!("--set {change}"));
+    }
+    config.device = args.device.unwrap_or(config.device);
+    // Found out now and not after minutes of work.
+    if let Some(json) = &args.json
+        && !folder_of(json).is_dir()
+    {
+        return Err(WrongUsage(format!("there is no folder for --json {}", json.display())).into());
+    }
+    let options = BenchOptions {
+        work: if args.work.is_empty() { Work::ALL.into() } else { args.work.clone() },
+        repeats: args.repeats,
+        warmup: args.warmup,
+        error: !args.no_error,
+        storage: args.storage,
+        features: args.features.clone(),
+    };
+    let stop = interrupt::flag()?;
+    let mut counter: Option<Counter> = None;
+    let report = bench::run(&config, &options, &stop, &mut |event| match event {
+        BenchEvent::Progress { done, total } => {
+            counter.get_or_insert_with(|| Counter::new("bench", total as u64)).set(done as u64);
+        }
+        BenchEvent::Finished(row) => {
+            if let Some(counter) = &counter {
+                counter.note(&format!("{}: {}", row.work, seconds(row.median_s)));
+            }
+        }
+    });
+    drop(counter);
+    let report = report?;
+    print_result(&shown(&report))?;
+    if let Some(json) = &args.json {
+        write_json(&report, json)?;
+        print_result(&format!("results: {}", json.display()))?;
+    }
+    Ok(())
+}
+
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+fn write_json(report: &Report, path: &Path) -> anyhow::Result<()> {
+    let mut text = serde_json::to_vec_pretty(report).context("writing the results as JSON")?;
+    text.push(b'\n');
+    replace(path, &text).with_context(|| format!("writing {}", path.display()))
+}
+
+const HEADER: [&str; 5] = ["work", "median", "p95", "peak memory", "error against f64"];
+
+/// The table with what must be known to read it.
+fn shown(report: &Report) -> String {
+    let rows: Vec<_> = [HEADER.map(String::from)].into_iter().chain(report.rows.iter().map(cells)).collect();
+    let title = format!("{}, {} threads\n", report.device, report.threads);
+    [title, table::columns(&rows)].into_iter().chain(remarks(&report.rows)).collect::<Vec<_>>().join("\n")
+}
+
+/// What must be known to read the rows, after an empty line.
+fn remarks(rows: &[Row]) -> Vec<String> {
+    let has = |test: &dyn Fn(&Row) -> bool| rows.iter().any(test);
+    let inertia = rows.iter().find_map(|row| row.inertia);
+    let mut remarks: Vec<String> = [
+        has(&|row| row.work == Work::Render8Views).then(|| "render_8_views: seconds are per view".into()),
+        inertia.map(|inertia| format!("kmeans: inertia {inertia:.6e}; its error is the inertia's")),
+        has(&|row| row.max_rel_error.is_some() && row.work.is_checked_reduced())
+            .then(|| format!("* of loss and gradients, with at most {MAX_CHECKED_TOKENS} tokens")),
+        has(&|row| row.max_rel_error.is_none()).then(|| "- not compared with f64".into()),
+    ]
+    .into_iter()
+    .flatten()
+    .collect();
+    if !remarks.is_empty() {
+        remarks.insert(0, String::new());
+    }
+    remarks
+}
+
+fn cells(row: &Row) -> [String; 5] {
+    let mark = if row.work.is_checked_reduced() { " *" } else { "" };
+    let error = match row.max_rel_error {
+        None => "-".into(),
+        Some(error) if error.is_finite() => format!("{error:.1e}{mark}"),
+        Some(_) => format!("not finite{mark}"),
+    };
+    let peak = row.peak_bytes.map_or_else(|| "unknown".into(), bytes);
+    [row.work.to_string(), seconds(row.median_s), seconds(row.p95_s), peak, error]
+}
+
+/// Three digits of a duration.
+fn seconds(seconds: f64) -> String {
+    match seconds {
+        s if s >= 100.0 => format!("{s:.0} s"),
+        s if s >= 10.0 => format!("{s:.1} s"),
+        s if s >= 1.0 => format!("{s:.2} s"),
+        s if s >= 0.1 => format!("{:.0} ms", s * 1e3),
+        s if s >= 0.01 => format!("{:.1} ms", s * 1e3),
+        s => format!("{:.2} ms", s * 1e3),
+    }
+}
+
+fn bytes(bytes: u64) -> String {
+    let mib = bytes as f64 / (1024.0 * 1024.0);
+    if mib < 1024.0 { format!("{mib:.0} MiB") } else { format!("{:.2} GiB", mib / 1024.0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use clift_model::device::DeviceName;
+
+    use super::*;
+
+    fn row(work: Work, median_s: f64, peak_bytes: Option<u64>, max_rel_error: Option<f64>) -> Row {
+        let inertia = (work == Work::Kmeans).then_some(1234.5);
+        Row { work, median_s, p95_s: median_s * 2.0, peak_bytes, max_rel_error, samples_s: vec![median_s], inertia }
+    }
+
+    #[test]
+    fn the_table_says_what_each_figure_is_of() {
+        let rows = vec![
+            row(Work::Encode, 12.345, Some(3 << 30), Some(3.14e-7)),
+            row(Work::Kmeans, 0.5, Some(700 << 20), Some(f64::NAN)),
+            row(Work::Render8Views, 0.0123, None, None),
+            row(Work::Stage1Step, 123.4, None, Some(2e-5)),
+        ];
+        let expected = "\
+flex, 2 threads
+
+work            median   p95      peak memory  error against f64
+encode          12.3 s   24.7 s   3.00 GiB     3.1e-7
+kmeans          500 ms   1.00 s   700 MiB      not finite
+render_8_views  12.3 ms  24.6 ms  unknown      -
+stage1_step     123 s    247 s    unknown      2.0e-5 *
+
+render_8_views: seconds are per view
+kmeans: inertia 1.234500e3; its error is the inertia's
+* of loss and gradients, with at most 1024 tokens
+- not compared with f64";
+        assert_eq!(shown(&Report { device: DeviceName::Flex, threads: 2, rows }), expected);
+    }
+
+    #[test]
+    fn a_table_without_remarks_ends_with_its_last_row() {
+        let rows = vec![row(Work::Encode, 0.002, Some(1 << 20), Some(1e-7))];
+        let text = shown(&Report { device: DeviceName::Flex, threads: 1, rows });
+        assert!(text.ends_with("\nencode  2.00 ms  4.00 ms  1 MiB        1.0e-7"), "{text}");
+    }
+
+    #[test]
+    fn the_json_has_the_named_keys_and_null_where_nothing_was_measured() {
+        let rows = vec![row(Work::Kmeans, 0.5, Some(7), Some(0.25)), row(Work::Render8Views, 0.5, None, None)];
+        let json = serde_json::to_value(Report { device: DeviceName::Flex, threads: 2, rows }).unwrap();
+        let expected = serde_json::json!({
+            "device": "flex",
+            "threads": 2,
+            "rows": [
+                {"work": "kmeans", "median_s": 0.5, "p95_s": 1.0, "peak_bytes": 7, "max_rel_error": 0.25,
+                    "samples_s": [0.5], "inertia": 1234.5},
+                {"work": "render_8_views", "median_s": 0.5, "p95_s": 1.0, "peak_bytes": null,
+                    "max_rel_error": null, "samples_s": [0.5]},
+            ],
+        });
+        assert_eq!(json, expected);
+    }
+}

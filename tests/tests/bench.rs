@@ -1,0 +1,96 @@
+//! `clift bench`: the rows it prints and the file it writes.
+
+use std::io::{BufRead, BufReader};
+use std::process::Command;
+
+use serde_json::Value;
+
+use crate::support::{Place, clift, finish, repository, spawn};
+
+const WORKS: [&str; 9] = [
+    "encode",
+    "kmeans",
+    "condense",
+    "cluster_attention",
+    "render",
+    "render_8_views",
+    "stage1_step",
+    "stage1_step_tiny",
+    "stage2_step",
+];
+
+/// Arguments for a network that takes milliseconds.
+fn args(flags: &[&str]) -> Vec<String> {
+    let config = repository("configs/tiny.toml").display().to_string();
+    let model = "model={dim=16, num_heads=2, feed_forward_dim=24, num_encoder_blocks=1, num_renderer_blocks=1}";
+    let set = [model, "data.width=16", "data.height=16", "stage1.batch_size=2", "stage2.batch_size=2"];
+    let set = set.iter().flat_map(|text| ["--set".to_owned(), (*text).to_owned()]);
+    ["bench".into(), config].into_iter().chain(set).chain(flags.iter().map(|&flag| flag.into())).collect()
+}
+
+#[test]
+fn every_row_is_printed_and_written_with_its_time_and_its_error() {
+    let place = Place::new();
+    let json = place.at("bench.json").display().to_string();
+    let ran = clift(args(&["--repeats", "2", "--warmup", "0", "--json", &json])).ok();
+    for work in WORKS {
+        assert!(ran.stdout.lines().any(|line| line.starts_with(&format!("{work}  "))), "{work}: {}", ran.stdout);
+        assert!(ran.stderr.lines().any(|line| line.starts_with(&format!("{work}: "))), "{work}: {}", ran.stderr);
+    }
+    let report = place.json("bench.json");
+    assert_eq!(report["device"], "flex");
+    assert!(report["threads"].as_u64().is_some_and(|threads| threads > 0));
+    let rows = report["rows"].as_array().expect("rows");
+    assert_eq!(rows.iter().map(|row| &row["work"]).collect::<Vec<_>>(), WORKS);
+    for row in rows {
+        let number = |key: &str| row[key].as_f64().unwrap_or_else(|| panic!("{key} of {row}"));
+        assert!(number("median_s") > 0.0 && number("p95_s") >= number("median_s"), "{row}");
+        assert_eq!(row["samples_s"].as_array().map(Vec::len), Some(2), "{row}");
+        // f32 through a block or two; an f32 that was compared with itself would give exactly 0 everywhere.
+        assert!(number("max_rel_error") < 1e-4, "{row}");
+        let peak = &row["peak_bytes"];
+        assert!(peak.is_null() || peak.as_u64().is_some_and(|bytes| bytes > 1 << 20), "{row}");
+        assert_eq!(row.get("inertia").is_some(), row["work"] == "kmeans", "{row}");
+    }
+    let exact = rows.iter().filter(|row| row["max_rel_error"] == 0.0 && row["work"] != "kmeans").count();
+    assert_eq!(exact, 0, "{rows:?}");
+}
+
+#[test]
+fn works_are_chosen_and_errors_left_out_on_request() {
+    let place = Place::new();
+    let json = place.at("bench.json").display().to_string();
+    let chosen = ["--work", "render,encode", "--no-error", "--repeats", "1", "--json", &json];
+    clift(args(&chosen)).ok();
+    let rows = &place.json("bench.json")["rows"];
+    assert_eq!((&rows[0]["work"], &rows[1]["work"]), (&"encode".into(), &"render".into()));
+    assert!(rows.as_array().is_some_and(|rows| rows.iter().all(|row| row["max_rel_error"] == Value::Null)));
+}
+
+#[test]
+fn what_cannot_be_timed_is_wrong_usage() {
+    let message = clift(args(&["--work", "encode,incode"])).fails(2);
+    assert!(message.contains("'incode'") && message.contains("the works are encode, kmeans, condense"), "{message}");
+    let message = clift(args(&["--storage", "17"])).fails(2);
+    assert!(message.contains("`--storage` = 17"), "{message}");
+    let message = clift(args(&["--json", "no/such/folder/bench.json"])).fails(2);
+    assert!(message.contains("no folder"), "{message}");
+    let message = clift(args(&["--set", "data.width=20"])).fails(2);
+    assert!(message.contains("20 x 16 does not divide into patches"), "{message}");
+}
+
+#[test]
+fn an_interrupted_benchmark_exits_130_and_writes_nothing() {
+    let place = Place::new();
+    let json = place.at("bench.json").display().to_string();
+    // Thousands of repetitions: the second row goes on for longer than the signal takes.
+    let mut child = spawn(args(&["--work", "encode,render", "--no-error", "--repeats", "3000", "--json", &json]));
+    let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
+    assert!(lines.any(|line| line.starts_with("encode: ")), "the first row is done");
+    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill runs");
+    assert!(sent.success());
+    let rest: Vec<String> = lines.collect();
+    assert_eq!(finish(child).code, Some(130), "{rest:?}");
+    assert!(rest.iter().any(|line| line == "error: interrupted during `render`; nothing was written"), "{rest:?}");
+    assert!(!place.at("bench.json").exists());
+}
