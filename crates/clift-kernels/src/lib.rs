@@ -6,7 +6,6 @@
 //!
 //! All values are f32: other types take the composed operations of `clift-model`.
 
-pub mod adamw;
 pub mod attention;
 pub mod cluster_attention;
 mod disjoint;

@@ -8,8 +8,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use clift_model::attention::self_sdpa;
 use clift_model::cluster_attention::cluster_attention;
-use clift_model::layer_norm::layer_norm;
-use clift_model::linear::{linear, linear_of_gelu};
+use clift_model::linear::{linear, linear_of_gelu, linear_of_norm};
 use clift_model::{Init, KMeans};
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
@@ -116,8 +115,8 @@ fn layers(criterion: &mut Criterion) {
         both(&mut group, &format!("linear_of_gelu/{name}"), [hidden], |[x]| {
             linear_of_gelu(if plain(&x) { &down_plain } else { &down }, x)
         });
-        both(&mut group, &format!("layer_norm/{name}"), [x], |[x]| {
-            layer_norm(if plain(&x) { &norm_plain } else { &norm }, x)
+        both(&mut group, &format!("linear_of_norm/{name}"), [x], |[x]| {
+            if plain(&x) { linear_of_norm(&norm_plain, &up_plain, x) } else { linear_of_norm(&norm, &up, x) }
         });
     }
 }

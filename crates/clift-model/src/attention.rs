@@ -12,12 +12,12 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
 use burn::module::Module;
-use burn::nn::Linear;
+use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Shape, Slice, Tensor, assert_shape};
 
 use crate::Init;
 use crate::autodiff::register;
-use crate::linear::linear;
+use crate::linear::{linear, linear_of_norm};
 
 mod native;
 
@@ -171,9 +171,9 @@ impl<B: AttentionKernels> Backward<B, 1> for SdpaBackward {
     type State = SdpaState<FloatTensor<B>>;
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 1>(ops, grads, |SdpaState { inputs, attended, num_heads }, grad_output| {
+        register::<B, _, 1>(ops, grads, |SdpaState { inputs, attended, num_heads }, grad_output, _| {
             match B::attend_backward(inputs, attended, num_heads, grad_output) {
-                Projected::Packed(grad) => [grad],
+                Projected::Packed(grad) => [Some(grad)],
                 Projected::Separate { .. } => unreachable!("gradients come as the inputs did"),
             }
         });
@@ -184,9 +184,9 @@ impl<B: AttentionKernels> Backward<B, 2> for SdpaBackward {
     type State = SdpaState<FloatTensor<B>>;
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 2>(ops, grads, |SdpaState { inputs, attended, num_heads }, grad_output| {
+        register::<B, _, 2>(ops, grads, |SdpaState { inputs, attended, num_heads }, grad_output, _| {
             match B::attend_backward(inputs, attended, num_heads, grad_output) {
-                Projected::Separate { query, key_value } => [query, key_value],
+                Projected::Separate { query, key_value } => [Some(query), Some(key_value)],
                 Projected::Packed(_) => unreachable!("gradients come as the inputs did"),
             }
         });
@@ -334,12 +334,12 @@ impl SelfAttention {
         Self { in_proj: init.attention_in(dim, 3), out_proj: init.attention_out(dim), num_heads }
     }
 
-    /// Mixes tokens of the same scene.
+    /// Mixes the normalised tokens of the same scene.
     ///
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
-    pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        linear(&self.out_proj, self_sdpa(linear(&self.in_proj, x), self.num_heads))
+    pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
+        linear(&self.out_proj, self_sdpa(linear_of_norm(norm, &self.in_proj, x), self.num_heads))
     }
 }
 
@@ -365,13 +365,13 @@ impl CrossAttention {
     }
 
     /// Queries, `[batch, num_queries, dim]`.
-    pub(crate) fn project_query(&self, x: Tensor<3>) -> Tensor<3> {
-        linear(&self.q_proj, x)
+    pub(crate) fn project_query(&self, norm: Option<&LayerNorm>, x: Tensor<3>) -> Tensor<3> {
+        project(norm, &self.q_proj, x)
     }
 
     /// Keys and values side by side, `[batch, num_keys, 2 dim]`. They depend on the tokens alone.
-    pub(crate) fn project_memory(&self, memory: Tensor<3>) -> Tensor<3> {
-        linear(&self.kv_proj, memory)
+    pub(crate) fn project_memory(&self, norm: Option<&LayerNorm>, memory: Tensor<3>) -> Tensor<3> {
+        project(norm, &self.kv_proj, memory)
     }
 
     /// The projection after the heads.
@@ -381,6 +381,13 @@ impl CrossAttention {
 
     pub(crate) fn num_heads(&self) -> usize {
         self.num_heads
+    }
+}
+
+fn project(norm: Option<&LayerNorm>, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    match norm {
+        Some(norm) => linear_of_norm(norm, layer, x),
+        None => linear(layer, x),
     }
 }
 

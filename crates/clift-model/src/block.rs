@@ -7,7 +7,6 @@ use burn::tensor::Tensor;
 
 use crate::attention::{CrossAttention, SelfAttention, cross_sdpa};
 use crate::feed_forward::FeedForward;
-use crate::layer_norm::layer_norm;
 use crate::{Init, ModelConfig};
 
 /// Self-attention and feed-forward, each normalised before and added after.
@@ -35,8 +34,8 @@ impl EncoderBlock {
     /// # Shapes
     /// - `x` and the result: `[batch, num_tokens, dim]`
     pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        let x = x.clone() + self.attn.forward(layer_norm(&self.norm_attn, x));
-        x.clone() + self.feed_forward.forward(layer_norm(&self.norm_ff, x))
+        let x = x.clone() + self.attn.forward(&self.norm_attn, x);
+        x.clone() + self.feed_forward.forward(&self.norm_ff, x)
     }
 }
 
@@ -74,16 +73,16 @@ impl DecoderBlock {
     pub fn forward(&self, x: Tensor<3>, tokens: Tensor<3>) -> Tensor<3> {
         let [views, num_queries, dim] = x.dims();
         let [batch, _, _] = tokens.dims();
-        let x = x.clone() + self.self_attn.forward(layer_norm(&self.norm_self, x));
+        let x = x.clone() + self.self_attn.forward(&self.norm_self, x);
 
         // Cross-attention treats queries one by one, so all views of a scene go in one row of queries.
-        let query = self.cross_attn.project_query(layer_norm(&self.norm_cross, x.clone()));
+        let query = self.cross_attn.project_query(Some(&self.norm_cross), x.clone());
         let query = query.reshape([batch, views / batch * num_queries, dim]); // [BT, Q, D] -> [B, TQ, D]
-        let found = cross_sdpa(query, self.cross_attn.project_memory(tokens), self.cross_attn.num_heads());
+        let found = cross_sdpa(query, self.cross_attn.project_memory(None, tokens), self.cross_attn.num_heads());
         let found = found.reshape([views, num_queries, dim]);
         let x = x + self.cross_attn.project_out(found);
 
-        x.clone() + self.feed_forward.forward(layer_norm(&self.norm_ff, x))
+        x.clone() + self.feed_forward.forward(&self.norm_ff, x)
     }
 }
 

@@ -134,8 +134,8 @@ impl<B: ClusterAttentionKernels> Backward<B, 2> for ClusterBackward {
     type State = (ClusterInputs<B>, [FloatTensor<B>; 2]);
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 2>(ops, grads, |(inputs, results), grad_output| {
-            B::attend_clusters_backward(inputs, results, grad_output)
+        register::<B, _, 2>(ops, grads, |(inputs, results), grad_output, _| {
+            B::attend_clusters_backward(inputs, results, grad_output).map(Some)
         });
     }
 }

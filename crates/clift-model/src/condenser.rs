@@ -8,7 +8,6 @@ use burn::tensor::{Tensor, assert_shape};
 use crate::attention::{CrossAttention, SelfAttention};
 use crate::cluster_attention::cluster_attention;
 use crate::feed_forward::FeedForward;
-use crate::layer_norm::layer_norm;
 use crate::{ClusterIndex, Init, ModelConfig};
 
 /// Blocks of inter-cluster self-attention, intra-cluster cross-attention and feed-forward behind a
@@ -72,26 +71,21 @@ impl CondenserBlock {
     }
 
     fn forward(&self, centroids: Tensor<3>, members: Option<&Tensor<3>>, clusters: &ClusterIndex) -> Tensor<3> {
-        let mixed =
-            self.add_or_replace(&centroids, self.self_attn.forward(layer_norm(&self.norm_self, centroids.clone()))); // eq. 1
+        let mixed = self.add_or_replace(&centroids, self.self_attn.forward(&self.norm_self, centroids.clone())); // eq. 1
         let gathered = match members {
             Some(members) => self.gather_members(mixed, members.clone(), clusters), // eq. 2
             None => mixed,
         };
-        let update = self.feed_forward.forward(layer_norm(&self.norm_ff, gathered.clone())); // eq. 3
+        let update = self.feed_forward.forward(&self.norm_ff, gathered.clone()); // eq. 3
         let update = self.add_or_replace(&gathered, update);
         centroids + self.gate.forward(update) // eq. 4
     }
 
     /// Equation 2. A cluster of one token has no keys and keeps equation 1's value.
     fn gather_members(&self, mixed: Tensor<3>, members: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
-        let query = match &self.norm_cross {
-            Some(norm) => layer_norm(norm, mixed.clone()),
-            None => mixed.clone(),
-        };
         let segment = clusters.members.as_ref().expect("there are members").segment.clone();
-        let key_value = self.cluster_attn.project_memory(layer_norm(&self.norm_memory, members));
-        let query = self.cluster_attn.project_query(query);
+        let key_value = self.cluster_attn.project_memory(Some(&self.norm_memory), members);
+        let query = self.cluster_attn.project_query(self.norm_cross.as_ref(), mixed.clone());
         let found = cluster_attention(query, key_value, segment, self.cluster_attn.num_heads());
         let gathered = self.add_or_replace(&mixed, self.cluster_attn.project_out(found));
         match &clusters.singleton {

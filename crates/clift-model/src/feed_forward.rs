@@ -4,13 +4,13 @@
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
 use burn::module::Module;
-use burn::nn::Linear;
+use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 use clift_kernels::{InstructionSet, gelu};
 
 use crate::Init;
 use crate::flex::{contiguous, is_native, tensor, values, values_mut};
-use crate::linear::{linear, linear_of_gelu};
+use crate::linear::{linear_of_gelu, linear_of_norm};
 
 /// GELU on a device, `x * Phi(x)` with the normal distribution function `Phi` (erf, not the tanh
 /// approximation), and its exact gradient: Burn 0.22 differentiates the approximation on GPUs.
@@ -67,7 +67,7 @@ impl GeluKernels for NdArray {}
 #[cfg(feature = "wgpu")]
 impl GeluKernels for burn::backend::Cube {}
 
-/// `down(GELU(up(x)))`.
+/// `down(GELU(up(norm(x))))`; the norm is the block's.
 #[derive(Module, Debug)]
 pub struct FeedForward {
     up: Linear,
@@ -80,12 +80,12 @@ impl FeedForward {
         Self { up: init.linear(dim, hidden), down: init.linear(hidden, dim) }
     }
 
-    /// Maps every token on its own.
+    /// Maps every normalised token on its own.
     ///
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
-    pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        linear_of_gelu(&self.down, linear(&self.up, x))
+    pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
+        linear_of_gelu(&self.down, linear_of_norm(norm, &self.up, x))
     }
 }
 

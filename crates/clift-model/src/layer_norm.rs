@@ -1,46 +1,20 @@
-//! Layer normalisation as one operation with its own backward.
+//! Layer normalisation on a device, in both directions. Every norm of the model stands before a linear
+//! layer: [`linear_of_norm`](crate::linear::linear_of_norm) is the operation.
 #![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
 // B scenes, N tokens, D width
 
-use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
-use burn::nn::LayerNorm;
-use burn::tensor::{Shape, Tensor, assert_shape};
+use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
+use burn::tensor::Shape;
 use clift_kernels::{InstructionSet, layer_norm as kernel};
 
-use crate::autodiff::register;
 use crate::flex::{contiguous, is_native, tensor, values};
 
 /// Added to the variance, as in PyTorch.
 pub const EPSILON: f64 = 1e-5;
 
-/// `(x - mean) / sqrt(variance + 1e-5) * gamma + beta` over the last dimension.
-///
-/// # Shapes
-/// - `x` and the result: `[batch, count, dim]`
-///
-/// # Panics
-/// When the layer has no bias.
-pub fn layer_norm(layer: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
-    let gamma = layer.gamma.val();
-    let beta = layer.beta.as_ref().expect("the layer has a bias").val();
-    let [dim] = gamma.dims();
-    assert_shape!(x, [.., dim]);
-    let [x, gamma, beta] = [x.into_dispatch(), gamma.into_dispatch(), beta.into_dispatch()];
-    Tensor::from_dispatch(<Dispatch as LayerNormOps>::norm_rows(x, gamma, beta))
-}
-
-/// The operation behind [`layer_norm`] on a device.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
-pub trait LayerNormOps: Backend {
-    /// See [`layer_norm`].
-    fn norm_rows(x: FloatTensor<Self>, gamma: FloatTensor<Self>, beta: FloatTensor<Self>) -> FloatTensor<Self>;
-}
-
-/// The parts of the operation on a device. The bodies here run on every one of them.
+/// `(x - mean) / sqrt(variance + 1e-5) * gamma + beta` over the last dimension, and its gradient. The
+/// bodies here run on every device.
 pub trait LayerNormKernels: Backend {
     /// The result, and what [`LayerNormKernels::norm_backward`] can use besides the inputs.
     fn norm_output(
@@ -60,10 +34,12 @@ pub trait LayerNormKernels: Backend {
 /// What the backward needs.
 #[derive(Clone, Debug)]
 pub struct NormState<T> {
-    x: T,
-    gamma: T,
+    /// `[B, N, D]`
+    pub x: T,
+    /// `[D]`
+    pub gamma: T,
     /// Mean and inverse deviation of every row, `[BN, 2]`, where the device saved them.
-    statistics: Option<T>,
+    pub statistics: Option<T>,
 }
 
 /// `(x - mean) / deviation` and `1 / deviation`.
@@ -145,78 +121,35 @@ impl LayerNormKernels for NdArray {}
 #[cfg(feature = "wgpu")]
 impl LayerNormKernels for burn::backend::Cube {}
 
-impl LayerNormOps for Flex {
-    fn norm_rows(x: FloatTensor<Self>, gamma: FloatTensor<Self>, beta: FloatTensor<Self>) -> FloatTensor<Self> {
-        Self::norm_output(x, gamma, beta).0
-    }
-}
-impl LayerNormOps for NdArray {
-    fn norm_rows(x: FloatTensor<Self>, gamma: FloatTensor<Self>, beta: FloatTensor<Self>) -> FloatTensor<Self> {
-        Self::norm_output(x, gamma, beta).0
-    }
-}
-#[cfg(feature = "wgpu")]
-impl LayerNormOps for burn::backend::Cube {
-    fn norm_rows(x: FloatTensor<Self>, gamma: FloatTensor<Self>, beta: FloatTensor<Self>) -> FloatTensor<Self> {
-        Self::norm_output(x, gamma, beta).0
-    }
-}
-
-impl<B: LayerNormOps + LayerNormKernels, C: CheckpointStrategy> LayerNormOps for Autodiff<B, C> {
-    fn norm_rows(x: FloatTensor<Self>, gamma: FloatTensor<Self>, beta: FloatTensor<Self>) -> FloatTensor<Self> {
-        let ((x, x_node), (gamma, gamma_node), (beta, beta_node)) =
-            (x.into_parts(), gamma.into_parts(), beta.into_parts());
-        match LayerNormBackward.prepare::<C>([x_node, gamma_node, beta_node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let (output, statistics) = B::norm_output(x.clone(), gamma.clone(), beta);
-                prep.finish(NormState { x, gamma, statistics }, output)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::norm_rows(x, gamma, beta)),
-        }
-    }
-}
-
-#[derive(Debug)]
-struct LayerNormBackward;
-
-impl<B: LayerNormKernels> Backward<B, 3> for LayerNormBackward {
-    type State = NormState<FloatTensor<B>>;
-
-    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 3>(ops, grads, B::norm_backward);
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use burn::module::Param;
-    use burn::nn::LayerNormConfig;
-    use burn::tensor::{DType, Device};
+    use burn::nn::{LayerNormConfig, Linear};
+    use burn::tensor::{DType, Device, Tensor};
 
-    use super::*;
+    use crate::linear::norm_then_linear;
     use crate::testing::{assert_close, check_gradients, cpu_devices, devices, random};
 
-    fn layer(gamma: Tensor<1>, beta: Tensor<1>) -> LayerNorm {
-        let mut layer = LayerNormConfig::new(gamma.dims()[0]).init(&gamma.device());
-        layer.gamma = Param::from_tensor(gamma);
-        layer.beta = Some(Param::from_tensor(beta));
-        layer
-    }
-
-    /// The norm with gamma and beta as inputs, for which the tests want gradients too.
+    /// The norm on its own, before a layer that changes nothing; gamma and beta as `[1, 1, D]`.
     fn norm(x: Tensor<3>, gamma: Tensor<3>, beta: Tensor<3>) -> Tensor<3> {
         let [_, _, dim] = x.dims();
-        let [gamma, beta] = [gamma, beta].map(|x| x.reshape([dim]).into_dispatch());
-        Tensor::from_dispatch(<Dispatch as LayerNormOps>::norm_rows(x.into_dispatch(), gamma, beta))
+        let (device, dtype) = (x.device(), x.dtype());
+        let identity = Linear {
+            weight: Param::from_tensor(Tensor::<2>::eye(dim, &device).cast(dtype)),
+            bias: Some(Param::from_tensor(Tensor::<1>::zeros([dim], &device).cast(dtype))),
+        };
+        norm_then_linear(x, gamma.reshape([dim]), beta.reshape([dim]), &identity)
     }
 
     #[test]
     fn equals_burns_own_layer() {
         for device in devices() {
-            let [gamma, beta] = [1, 2].map(|seed| random([12], seed, &device).cast(DType::F32));
-            let layer = layer(gamma, beta);
+            let [gamma, beta] = [1, 2].map(|seed| random([1, 1, 12], seed, &device).cast(DType::F32));
+            let mut layer = LayerNormConfig::new(12).init(&device);
+            layer.gamma = Param::from_tensor(gamma.clone().reshape([12]));
+            layer.beta = Some(Param::from_tensor(beta.clone().reshape([12])));
             let x = random([2, 5, 12], 3, &device).cast(DType::F32);
-            assert_close(&layer_norm(&layer, x.clone()), &layer.forward(x), 2e-6);
+            assert_close(&norm(x.clone(), gamma, beta), &layer.forward(x), 2e-6);
         }
     }
 
@@ -249,10 +182,10 @@ mod tests {
     fn a_constant_row_gives_beta_and_finite_gradients() {
         for device in devices() {
             let device = device.autodiff();
-            let [gamma, beta] = [1, 2].map(|seed| random([12], seed, &device).cast(DType::F32));
+            let [gamma, beta] = [1, 2].map(|seed| random([1, 1, 12], seed, &device).cast(DType::F32));
             let x = (Tensor::<3>::ones([1, 2, 12], &device) * 3.0).require_grad();
-            let output = layer_norm(&layer(gamma, beta.clone()), x.clone());
-            assert_close(&output.clone().inner(), &beta.inner().unsqueeze::<3>().expand([1, 2, 12]), 1e-4);
+            let output = norm(x.clone(), gamma, beta.clone());
+            assert_close(&output.clone().inner(), &beta.inner().expand([1, 2, 12]), 1e-4);
             let gradient = x.grad(&output.square().sum().backward()).expect("tracked");
             assert!(gradient.is_finite().all().into_scalar::<bool>());
         }

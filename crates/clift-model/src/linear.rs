@@ -1,7 +1,8 @@
-//! Linear layers as one operation, on their own or behind a GELU.
+//! Linear layers as one operation: on their own, behind a GELU, or behind a layer norm.
 //!
-//! `linear(gelu(x))` keeps `x` and computes `gelu(x)` again in the backward, which costs one pass
-//! and saves the widest activation of a transformer block.
+//! What stands before the layer is not kept for the backward but computed again from its input, one
+//! pass: a GELU's result is the widest activation of a transformer block, and every block has two or
+//! three norms.
 #![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
 // B scenes, N rows of a scene, I inputs, O outputs
 
@@ -10,13 +11,15 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
-use burn::nn::Linear;
+use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Shape, Tensor, assert_shape};
 use clift_kernels::linear::{self as kernel, Matrix};
 use clift_kernels::{InstructionSet, layer_norm};
 
+use crate::autodiff::register;
 use crate::feed_forward::GeluKernels;
 use crate::flex::{contiguous, is_native, tensor, values};
+use crate::layer_norm::{LayerNormKernels, NormState};
 
 /// `x W + b` of a layer with a bias.
 ///
@@ -30,7 +33,7 @@ pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, false)
 }
 
-/// `gelu(x) W + b` with the exact GELU, see [`gelu`](crate::feed_forward::gelu).
+/// `gelu(x) W + b` with `gelu(x) = x Phi(x)` and the normal distribution function `Phi`.
 ///
 /// # Shapes
 /// - `x`: `[batch, count, inputs]`
@@ -42,29 +45,71 @@ pub fn linear_of_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, true)
 }
 
+/// `norm(x) W + b` with `norm(x) = (x - mean) / sqrt(variance + 1e-5) * gamma + beta` over a row.
+///
+/// # Shapes
+/// - `x`: `[batch, count, inputs]`
+/// - returns `[batch, count, outputs]`
+///
+/// # Panics
+/// When the norm or the layer has no bias.
+pub fn linear_of_norm(norm: &LayerNorm, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    norm_then_linear(x, norm.gamma.val(), norm.beta.as_ref().expect("the norm has a bias").val(), layer)
+}
+
 fn apply(layer: &Linear, x: Tensor<3>, of_gelu: bool) -> Tensor<3> {
-    let weight = layer.weight.val();
-    let bias = layer.bias.as_ref().expect("the layer has a bias").val();
-    let [inputs, _outputs] = weight.dims();
-    assert_shape!(x, [.., inputs]);
+    let (weight, bias) = parameters(layer, &x);
     let [x, weight, bias] = [x.into_dispatch(), weight.into_dispatch(), bias.into_dispatch()];
     Tensor::from_dispatch(<Dispatch as LinearOps>::linear_layer(x, weight, bias, of_gelu))
 }
 
-/// The operation behind [`linear`] and [`linear_of_gelu`] on a device.
+/// [`linear_of_norm`] with the norm's parameters as tensors.
+pub(crate) fn norm_then_linear(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>, layer: &Linear) -> Tensor<3> {
+    let (weight, bias) = parameters(layer, &x);
+    let [inputs, _outputs] = weight.dims();
+    assert_shape!(gamma, [inputs]);
+    assert_shape!(beta, [inputs]);
+    Tensor::from_dispatch(<Dispatch as LinearOps>::norm_then_linear(
+        x.into_dispatch(),
+        gamma.into_dispatch(),
+        beta.into_dispatch(),
+        weight.into_dispatch(),
+        bias.into_dispatch(),
+    ))
+}
+
+/// Weight and bias of a layer that takes `x`.
+fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
+    let weight = layer.weight.val();
+    let bias = layer.bias.as_ref().expect("the layer has a bias").val();
+    let [inputs, _outputs] = weight.dims();
+    assert_shape!(x, [.., inputs]);
+    (weight, bias)
+}
+
+/// The operations behind [`linear`], [`linear_of_gelu`] and [`linear_of_norm`] on a device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait LinearOps: Backend {
-    /// See [`linear`].
+    /// See [`linear`] and [`linear_of_gelu`].
     fn linear_layer(
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
         of_gelu: bool,
     ) -> FloatTensor<Self>;
+
+    /// See [`linear_of_norm`].
+    fn norm_then_linear(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+    ) -> FloatTensor<Self>;
 }
 
 /// The parts of the operation on a device. The bodies here run on every one of them.
-pub trait LinearKernels: GeluKernels {
+pub trait LinearKernels: GeluKernels + LayerNormKernels {
     /// `x W + b`: `[B, N, I] -> [B, N, O]`
     fn linear_output(x: FloatTensor<Self>, weight: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self> {
         output::<Self>(x, weight, bias)
@@ -139,6 +184,36 @@ fn forward<B: LinearKernels>(
     B::linear_output(if of_gelu { B::gelu_output(x) } else { x }, weight, bias)
 }
 
+macro_rules! linear_ops {
+    ($backend:ty) => {
+        impl LinearOps for $backend {
+            fn linear_layer(
+                x: FloatTensor<Self>,
+                weight: FloatTensor<Self>,
+                bias: FloatTensor<Self>,
+                of_gelu: bool,
+            ) -> FloatTensor<Self> {
+                forward::<Self>(x, weight, bias, of_gelu)
+            }
+
+            fn norm_then_linear(
+                x: FloatTensor<Self>,
+                gamma: FloatTensor<Self>,
+                beta: FloatTensor<Self>,
+                weight: FloatTensor<Self>,
+                bias: FloatTensor<Self>,
+            ) -> FloatTensor<Self> {
+                let (normal, _statistics) = Self::norm_output(x, gamma, beta);
+                Self::linear_output(normal, weight, bias)
+            }
+        }
+    };
+}
+linear_ops!(Flex);
+linear_ops!(NdArray);
+#[cfg(feature = "wgpu")]
+linear_ops!(burn::backend::Cube);
+
 impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff<B, C> {
     fn linear_layer(
         x: FloatTensor<Self>,
@@ -154,6 +229,27 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
                 prep.finish(LinearState { x, weight, of_gelu }, output)
             }
             OpsKind::UnTracked(prep) => prep.finish(forward::<B>(x, weight, bias, of_gelu)),
+        }
+    }
+
+    fn norm_then_linear(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+    ) -> FloatTensor<Self> {
+        let ((x, x_node), (gamma, gamma_node), (beta, beta_node)) =
+            (x.into_parts(), gamma.into_parts(), beta.into_parts());
+        let ((weight, weight_node), (bias, bias_node)) = (weight.into_parts(), bias.into_parts());
+        let nodes = [x_node, gamma_node, beta_node, weight_node, bias_node];
+        match NormLinearBackward.prepare::<C>(nodes).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let (normal, statistics) = B::norm_output(x.clone(), gamma.clone(), beta.clone());
+                let output = B::linear_output(normal, weight.clone(), bias);
+                prep.finish(NormLinearState { norm: NormState { x, gamma, statistics }, beta, weight }, output)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::norm_then_linear(x, gamma, beta, weight, bias)),
         }
     }
 }
@@ -173,41 +269,63 @@ impl<B: LinearKernels> Backward<B, 3> for LinearBackward {
 
     /// With `a = x` or `gelu(x)`: `dW = a^T dO`, `db = sum dO`, `da = dO W^T`.
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        let grad = grads.consume::<B>(&ops.node);
-        let LinearState { x, weight, of_gelu } = ops.state;
-        let [of_x, of_weight, of_bias] = ops.parents;
-        if let Some(node) = of_bias {
-            grads.register::<B>(node.id, B::sum_rows(grad.clone()));
-        }
-        if let Some(node) = of_weight {
-            let activation = if of_gelu { B::gelu_output(x.clone()) } else { x.clone() };
-            let transposed = B::float_swap_dims(rows::<B>(activation), 0, 1);
-            grads.register::<B>(node.id, B::float_matmul(transposed, rows::<B>(grad.clone())));
-        }
-        if let Some(node) = of_x {
-            let product = B::float_matmul(rows::<B>(grad), B::float_swap_dims(weight, 0, 1));
-            let grad = B::float_reshape(product, x.shape());
-            grads.register::<B>(node.id, if of_gelu { B::gelu_grad(x, grad) } else { grad });
-        }
+        register::<B, _, 3>(ops, grads, |LinearState { x, weight, of_gelu }, grad, wanted| {
+            let [of_x, of_weight, of_bias] = wanted;
+            let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
+            let grad_weight = of_weight.then(|| {
+                let activation = if of_gelu { B::gelu_output(x.clone()) } else { x.clone() };
+                grad_of_weight::<B>(activation, grad.clone())
+            });
+            let grad_x = of_x.then(|| {
+                let grad = grad_of_input::<B>(grad, weight);
+                if of_gelu { B::gelu_grad(x, grad) } else { grad }
+            });
+            [grad_x, grad_weight, grad_bias]
+        });
     }
 }
 
-macro_rules! composed {
-    ($backend:ty) => {
-        impl LinearOps for $backend {
-            fn linear_layer(
-                x: FloatTensor<Self>,
-                weight: FloatTensor<Self>,
-                bias: FloatTensor<Self>,
-                of_gelu: bool,
-            ) -> FloatTensor<Self> {
-                forward::<Self>(x, weight, bias, of_gelu)
-            }
-        }
-    };
+#[derive(Debug)]
+struct NormLinearBackward;
+
+#[derive(Clone, Debug)]
+struct NormLinearState<T> {
+    norm: NormState<T>,
+    beta: T,
+    weight: T,
 }
 
-composed!(Flex);
-composed!(NdArray);
-#[cfg(feature = "wgpu")]
-composed!(burn::backend::Cube);
+impl<B: LinearKernels> Backward<B, 5> for NormLinearBackward {
+    type State = NormLinearState<FloatTensor<B>>;
+
+    /// As for [`LinearBackward`] with `a = norm(x)`, and `da` handed on through the norm.
+    fn backward(self, ops: Ops<Self::State, 5>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        register::<B, _, 5>(ops, grads, |NormLinearState { norm, beta, weight }, grad, wanted| {
+            let [of_x, of_gamma, of_beta, of_weight, of_bias] = wanted;
+            let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
+            let grad_weight = of_weight.then(|| {
+                let (normal, _statistics) = B::norm_output(norm.x.clone(), norm.gamma.clone(), beta);
+                grad_of_weight::<B>(normal, grad.clone())
+            });
+            let [grad_x, grad_gamma, grad_beta] = if of_x || of_gamma || of_beta {
+                B::norm_backward(norm, grad_of_input::<B>(grad, weight)).map(Some)
+            } else {
+                [None, None, None]
+            };
+            [grad_x, grad_gamma, grad_beta, grad_weight, grad_bias]
+        });
+    }
+}
+
+/// `x^T grad`: `[I, O]`
+fn grad_of_weight<B: Backend>(x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
+    B::float_matmul(B::float_swap_dims(rows::<B>(x), 0, 1), rows::<B>(grad))
+}
+
+/// `grad W^T`: `[B, N, O] -> [B, N, I]`
+fn grad_of_input<B: Backend>(grad: FloatTensor<B>, weight: FloatTensor<B>) -> FloatTensor<B> {
+    let [batch, count, _] = grad.shape().dims();
+    let [inputs, _] = weight.shape().dims();
+    let product = B::float_matmul(rows::<B>(grad), B::float_swap_dims(weight, 0, 1));
+    B::float_reshape(product, Shape::new([batch, count, inputs]))
+}

@@ -6,8 +6,7 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Tensor, activation::sigmoid};
 
 use crate::block::DecoderBlock;
-use crate::layer_norm::layer_norm;
-use crate::linear::linear;
+use crate::linear::{linear, linear_of_norm};
 use crate::patch::{patchify, unpatchify};
 use crate::rays::plucker;
 use crate::{Cameras, Init, ModelConfig};
@@ -51,7 +50,7 @@ impl Renderer {
         let num_queries = rays.dims()[1] / views;
         let x = rays.reshape([batch * views, num_queries, dim]);
         let x = self.blocks.iter().fold(x, |x, block| block.forward(x, tokens.clone())); // [BT, Q, D]
-        let patches = sigmoid(linear(&self.to_pixels, layer_norm(&self.output_norm, x)));
+        let patches = sigmoid(linear_of_norm(&self.output_norm, &self.to_pixels, x));
         let values = patches.dims()[2];
         let patches = patches.reshape([batch, views * num_queries, values]);
         unpatchify(patches, [views, targets.height, targets.width], self.patch_size)
