@@ -47,8 +47,9 @@ Examples:
 Paths:
   interpolate   through the context views
   orbit         once around, looking at what the context views look at
-  FILE.json     {\"poses\": [{\"c2w\": [[4 numbers] x 3], \"intrinsics_norm\": [fx, fy, cx, cy]}, ..]}: camera to world
-                in the world of the capture, OpenCV axes; intrinsics over width and height, may be left out
+  FILE.json     {\"poses\": [{\"c2w\": [[4 numbers] x 3]}, ..]}: camera to world,
+                OpenCV axes, in the world of the capture; a pose may have
+                \"intrinsics_norm\": [fx, fy, cx, cy], over width and height
 
 Examples:
   clift render room.clift --path interpolate -o out
