@@ -6,4 +6,5 @@ mod hyperparameters;
 mod loss_curve;
 mod pipeline;
 mod resume;
+mod scene_files;
 mod support;

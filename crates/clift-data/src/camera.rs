@@ -97,16 +97,27 @@ impl Pose {
 
     /// Row-major 4 x 4 matrix in f32, as tensors hold it.
     pub fn to_matrix(self) -> [f32; 16] {
+        self.to_matrix_f64().map(|value| value as f32)
+    }
+
+    /// Row-major 4 x 4 matrix.
+    pub fn to_matrix_f64(self) -> [f64; 16] {
         let (r, t) = (self.rotation, self.translation);
         let mut matrix = [0.0; 16];
         for row in 0..3 {
-            for column in 0..3 {
-                matrix[row * 4 + column] = r[row][column] as f32;
-            }
-            matrix[row * 4 + 3] = t[row] as f32;
+            matrix[row * 4..row * 4 + 3].copy_from_slice(&r[row]);
+            matrix[row * 4 + 3] = t[row];
         }
         matrix[15] = 1.0;
         matrix
+    }
+
+    /// Reads the upper three rows of [`Pose::to_matrix_f64`].
+    ///
+    /// # Errors
+    /// As [`Pose::from_rows`].
+    pub fn from_matrix(matrix: &[f64; 16]) -> Result<Self, DataError> {
+        Self::from_rows(&[0, 1, 2].map(|row| [0, 1, 2, 3].map(|column| matrix[row * 4 + column])))
     }
 
     /// The opposite motion, exact for a rotation that is orthonormal: `[R^T | -R^T t]`.

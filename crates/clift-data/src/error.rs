@@ -54,6 +54,14 @@ pub enum DataError {
         /// The file.
         path: PathBuf,
     },
+    /// A file of camera poses does not have the expected form.
+    #[error("bad poses: {what}: {path}", path = path.display())]
+    BadPoses {
+        /// What is wrong with it, with the position of the pose.
+        what: String,
+        /// The file.
+        path: PathBuf,
+    },
     /// A scene is not in the evaluation index, not even as an unused entry.
     #[error("scene {key} is not in the evaluation index: {path}", path = path.display())]
     MissingIndexKey {

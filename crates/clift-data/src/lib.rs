@@ -6,6 +6,7 @@
 mod archive;
 pub mod batch;
 pub mod camera;
+pub mod camera_path;
 pub mod chunk;
 mod chunk_table;
 pub mod chunk_writer;
@@ -25,6 +26,7 @@ pub mod order;
 pub mod pickle;
 pub mod sampler;
 pub mod split;
+pub mod spread;
 pub mod synthetic;
 mod unpickle;
 
@@ -44,4 +46,5 @@ pub use normalize::{PoseRotation, PoseScale, SceneFrame};
 pub use order::SceneOrder;
 pub use sampler::BoundedSampler;
 pub use split::Split;
+pub use spread::spread_along_path;
 pub use synthetic::{SyntheticConfig, SyntheticSource};

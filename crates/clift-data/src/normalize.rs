@@ -122,7 +122,11 @@ fn mean_quaternion(poses: &[Pose]) -> [[f64; 3]; 3] {
         }
     }
     let norm = sum.iter().map(|value| value * value).sum::<f64>().sqrt();
-    let [w, x, y, z] = sum.map(|value| value / norm);
+    from_quaternion(sum.map(|value| value / norm))
+}
+
+/// Rotation of a unit quaternion (w, x, y, z).
+pub(crate) fn from_quaternion([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
     [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
         [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
@@ -131,7 +135,7 @@ fn mean_quaternion(poses: &[Pose]) -> [[f64; 3]; 3] {
 }
 
 /// Unit quaternion (w, x, y, z) of a rotation, from the largest of its four squared components.
-fn quaternion(r: &[[f64; 3]; 3]) -> [f64; 4] {
+pub(crate) fn quaternion(r: &[[f64; 3]; 3]) -> [f64; 4] {
     let [xx, yy, zz] = [r[0][0], r[1][1], r[2][2]];
     let squares = [1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz];
     let [wx, wy, wz] = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]];

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
 use crate::token_count::TokenCount;
@@ -12,6 +13,8 @@ use crate::token_count::TokenCount;
 pub struct EvalConfig {
     /// Token counts a scene is stored with.
     pub storage: Vec<TokenCount>,
+    /// Number format that stored tokens are rounded to before they are rendered, as in a scene file.
+    pub tokens: TokenStorage,
     /// Evaluation index with the context and target frames of every scene. Without one, contexts are
     /// spread evenly over each clip and targets lie between them.
     pub index: Option<PathBuf>,
@@ -37,6 +40,7 @@ impl Default for EvalConfig {
         let shares = [1.0 / 16.0, 0.125, 0.25, 0.5, 0.75, 1.0];
         Self {
             storage: shares.map(TokenCount::Share).into(),
+            tokens: TokenStorage::F32,
             index: None,
             num_scenes: 0,
             num_context: 4,

@@ -6,7 +6,8 @@ use std::time::Instant;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use clift_data::order::{derive_seed, item_rng};
 use clift_data::{Clip, Views as HostViews};
-use clift_model::{Cameras, Clusters, Condenser, Encoder, KMeans, Renderer};
+use clift_model::scene::file_bytes;
+use clift_model::{Cameras, Clusters, Condenser, Encoder, KMeans, Renderer, TokenStorage};
 use rand::seq::SliceRandom;
 
 use crate::EvalError;
@@ -42,6 +43,8 @@ pub struct Networks {
 pub struct Sweep {
     /// Token counts a scene is stored with.
     pub storage: Vec<TokenCount>,
+    /// Number format that the tokens of [`Variant::Clift`] and [`Variant::Kmeans`] are rounded to, as in a scene file.
+    pub tokens: TokenStorage,
     /// Which variants are rendered; [`Variant::Clift`] needs [`Networks::condensed`].
     pub variants: Vec<Variant>,
     /// Latent K-means.
@@ -120,6 +123,16 @@ pub fn evaluate_scene(
                 }
             };
             let setting = Setting { variant, num_storage_tokens, num_render_tokens: num_storage_tokens };
+            let tokens = if variant == Variant::Random {
+                tokens
+            } else {
+                let num_views = clip.context.num_views();
+                into.add_scene_bytes(
+                    setting,
+                    file_bytes(num_storage_tokens, tokens.dims()[2], num_views, sweep.tokens),
+                );
+                rounded(tokens, sweep.tokens)?
+            };
             renderings.push(render(renderer, tokens, &clip.target, setting, &rows)?);
         }
     }
@@ -165,6 +178,17 @@ fn random_subset(lift: &Tensor<3>, count: usize, seed: u64) -> Tensor<3> {
     index.sort_unstable();
     let index = Tensor::<1, Int>::from_data(TensorData::new(index, [count]), &lift.device());
     lift.clone().select(1, index)
+}
+
+/// Tokens `[1, S, D]` as they would come back from a scene file.
+fn rounded(tokens: Tensor<3>, storage: TokenStorage) -> Result<Tensor<3>, EvalError> {
+    if storage == TokenStorage::F32 {
+        return Ok(tokens);
+    }
+    let (shape, device) = (tokens.dims(), tokens.device());
+    let values: Vec<f32> = tokens.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)?;
+    let values = storage.round(&values, shape[2])?;
+    Ok(Tensor::from_data(TensorData::new(values, shape), &device))
 }
 
 fn render(

@@ -1,6 +1,8 @@
 //! Metrics, baselines, evaluation sweeps and their pictures
 
+pub mod animation;
 pub mod baseline;
+pub mod budget;
 pub mod config;
 pub mod error;
 pub mod evaluate;
@@ -12,6 +14,8 @@ pub mod summary;
 pub mod token_count;
 pub mod upload;
 
+pub use animation::Animation;
+pub use budget::Calibration;
 pub use config::EvalConfig;
 pub use error::EvalError;
 pub use evaluate::{Networks, Sweep, evaluate_scene};

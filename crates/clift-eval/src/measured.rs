@@ -131,6 +131,12 @@ impl Accumulator {
         self.costs.insert(setting, cost);
     }
 
+    /// Notes the size of a scene's file; of scenes with different numbers of context views the largest counts.
+    pub fn add_scene_bytes(&mut self, setting: Setting, bytes: u64) {
+        let cost = self.costs.entry(setting).or_default();
+        cost.scene_bytes = cost.scene_bytes.max(Some(bytes));
+    }
+
     /// Notes a scene that was left out.
     pub fn skip(&mut self, scene: &str) {
         self.skipped.insert(scene.to_owned());

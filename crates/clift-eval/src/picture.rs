@@ -71,6 +71,11 @@ impl Picture {
         Self::from_rgb8(&rgb, height, width)
     }
 
+    /// The pixels, `[height, width, 3]`.
+    pub fn as_rgb8(&self) -> &[u8] {
+        self.rgb.as_raw()
+    }
+
     /// Columns.
     pub fn width(&self) -> usize {
         self.rgb.width() as usize

@@ -52,6 +52,16 @@ pub enum ModelError {
         /// The contradiction, with the indices that show it.
         what: String,
     },
+    /// A token's ray is not finite, or its direction has no length.
+    #[error("the ray of token {token} cannot be used: from {origin:?} along {direction:?}")]
+    BadRay {
+        /// Position of the token.
+        token: usize,
+        /// Where the ray starts.
+        origin: [f64; 3],
+        /// Where it goes.
+        direction: [f64; 3],
+    },
     /// A device name is unknown, or this build does not have it.
     #[error("device `{name}`: {reason}")]
     NoDevice {
@@ -59,6 +69,34 @@ pub enum ModelError {
         name: String,
         /// Why it cannot be had, and what would help.
         reason: String,
+    },
+    /// A picture could not be read back from its device.
+    #[error("reading a picture from its device failed: {reason}")]
+    Device {
+        /// The device's reason.
+        reason: String,
+    },
+    /// A scene file could not be written, or is not one to draw from.
+    #[error("cannot {action} the scene: {reason}; {fix}: {path}", path = path.display())]
+    SceneFile {
+        /// What was being done ("use", "write").
+        action: &'static str,
+        /// Why it cannot.
+        reason: String,
+        /// What to do about it.
+        fix: &'static str,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A scene is to be drawn with weights it was not made for.
+    #[error("the scene was made for the renderer {expected:.12}, these weights are {got:.12}; give the run it was encoded with (--model RUN): {path}", path = path.display())]
+    OtherRenderer {
+        /// Hash in the scene.
+        expected: String,
+        /// Hash of the weights.
+        got: String,
+        /// The weights.
+        path: PathBuf,
     },
     /// A weight file could not be read or written.
     #[error("{action} the weights failed: {reason}: {path}", path = path.display())]

@@ -9,6 +9,7 @@
 pub mod attention;
 mod autodiff;
 pub mod block;
+pub mod camera;
 pub mod cluster_attention;
 pub mod clusters;
 pub mod condenser;
@@ -26,11 +27,15 @@ pub mod model;
 pub mod patch;
 pub mod rays;
 pub mod renderer;
+pub mod scene;
+pub mod select;
 #[cfg(test)]
 pub(crate) mod testing;
+pub mod viewer;
 pub mod views;
 pub mod weights;
 
+pub use camera::ViewCamera;
 pub use clusters::{ClusterIndex, Clusters, SceneClusters};
 pub use condenser::Condenser;
 pub use config::{CondenserConfig, ModelConfig, Variant};
@@ -40,4 +45,7 @@ pub use init::Init;
 pub use kmeans::KMeans;
 pub use model::Clift;
 pub use renderer::{RenderTokens, Renderer, SceneMemory};
+pub use scene::{Scene, TokenKind, TokenStorage, WorldFrame};
+pub use select::{Preset, Rules, Selector, TokenRay};
+pub use viewer::{Drawn, Viewer};
 pub use views::{Cameras, Views};

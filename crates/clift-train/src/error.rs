@@ -78,6 +78,21 @@ pub enum TrainError {
         /// Where it was looked for.
         path: PathBuf,
     },
+    /// A weight file lies away from the run that made it.
+    #[error(
+        "there is no config.toml beside it or above it, which says what model it holds; give the run directory, or          RUN/stage2/model.safetensors: {path}",
+        path = path.display()
+    )]
+    NoConfig {
+        /// The weight file.
+        path: PathBuf,
+    },
+    /// A tensor could not be read back from its device.
+    #[error("reading tokens from their device failed: {reason}")]
+    Tensor {
+        /// The device's reason.
+        reason: String,
+    },
     /// The loss or the gradient was not finite several steps in a row.
     #[error(
         "{count} steps in a row had a loss or gradient that is not finite, up to step {step} (scenes {keys}); \

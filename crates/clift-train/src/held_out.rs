@@ -149,7 +149,8 @@ impl<'a> HeldOut<'a> {
 
     fn sweep(&self, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
         let seed = derive_seed(self.config.seed, "eval");
-        Sweep { storage, variants, kmeans: self.config.clusters.kmeans.clone(), seed }
+        let tokens = self.config.eval.tokens;
+        Sweep { storage, tokens, variants, kmeans: self.config.clusters.kmeans.clone(), seed }
     }
 
     fn evaluate_item(

@@ -9,6 +9,7 @@ pub mod clusters;
 pub mod config;
 pub mod diagnostic;
 pub mod document;
+pub mod encode;
 pub mod error;
 pub mod events;
 pub mod held_out;
@@ -25,6 +26,7 @@ pub mod sinks;
 pub mod stage1;
 pub mod stage2;
 pub mod step;
+pub mod trained;
 pub mod trainer;
 
 pub use config::Config;

@@ -4,11 +4,14 @@ use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
 use clift_eval::TokenCount;
+use clift_model::TokenStorage;
 use clift_model::device::DeviceName;
 use clift_train::Stage;
 use clift_train::bench::Work;
 
 pub use crate::data::args::DataCommand;
+pub use crate::encode::EncodeArgs;
+pub use crate::render::RenderArgs;
 
 /// Trains, compresses, renders and measures compressive light-field tokens.
 #[derive(Debug, Parser)]
@@ -26,6 +29,34 @@ pub enum Command {
     Train(TrainArgs),
     /// Measure a run on held-out views
     Eval(EvalArgs),
+    /// Compress a posed capture into a scene file
+    ///
+    /// Chooses context views along the camera's path, encodes them, and keeps as many tokens as asked for. The file
+    /// holds everything but the weights.
+    #[command(after_help = "\
+Examples:
+  clift encode runs/tiny --scene synthetic-0-test-00000 -o room.clift
+  clift encode runs/re10k /data/re10k --scene 5aca87f95a9412c6 --storage 1/8 -o room.clift
+  clift encode runs/re10k /data/re10k/test --max-error 0.02 --tokens int8 -o room.clift")]
+    Encode(EncodeArgs),
+    /// Draw a scene file along a camera path
+    ///
+    /// Writes frame-00000.png and so on, animation.png (an animated PNG, which browsers play) and render.json (what was
+    /// drawn from how many tokens, and how long it took) to a new folder.
+    #[command(after_help = "\
+Paths:
+  interpolate   through the context views
+  orbit         once around, looking at what the context views look at
+  FILE.json     {\"poses\": [{\"c2w\": [[4 numbers] x 3]}, ..]}: camera to world,
+                OpenCV axes, in the world of the capture; a pose may have
+                \"intrinsics_norm\": [fx, fy, cx, cy], over width and height
+
+Examples:
+  clift render room.clift --path interpolate -o out
+  clift render room.clift --path orbit --size 512x512 --frames 120 -o out
+  clift render room.clift --path poses.json --render 256 --selection global -o out
+  clift render room.clift --path orbit --budget-ms 30 -o out")]
+    Render(RenderArgs),
     /// Make data, or tell what there is
     Data {
         /// What to do with data.
@@ -77,6 +108,9 @@ pub struct EvalArgs {
     /// Token counts to store, as numbers or shares: --storage 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub storage: Vec<TokenCount>,
+    /// Round stored tokens as a scene file would: f32, f16 or int8
+    #[arg(long, value_name = "FORMAT")]
+    pub tokens: Option<TokenStorage>,
     /// An evaluation index (JSON) with the context and target frames of every scene
     #[arg(long, value_name = "FILE")]
     pub index: Option<PathBuf>,

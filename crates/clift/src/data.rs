@@ -4,4 +4,4 @@ pub mod args;
 pub mod info;
 mod report;
 pub mod synth;
-mod text;
+pub mod text;

@@ -17,6 +17,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     if !args.storage.is_empty() {
         config.eval.storage.clone_from(&args.storage);
     }
+    config.eval.tokens = args.tokens.unwrap_or(config.eval.tokens);
     if args.index.is_some() {
         config.eval.index.clone_from(&args.index);
     }

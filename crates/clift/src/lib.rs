@@ -4,8 +4,10 @@ mod args;
 mod bench;
 mod data;
 mod doctor;
+mod encode;
 mod eval;
 mod interrupt;
+mod render;
 mod table;
 pub mod terminal;
 mod train;
@@ -13,6 +15,7 @@ mod train;
 use std::process::ExitCode;
 
 use clap::Parser;
+use clift_eval::EvalError;
 use clift_train::TrainError;
 
 use args::{Args, Command, DataCommand};
@@ -32,6 +35,8 @@ pub fn main() -> ExitCode {
     let result = match Args::parse().command {
         Command::Train(args) => train::run(&args),
         Command::Eval(args) => eval::run(&args),
+        Command::Encode(args) => encode::run(&args),
+        Command::Render(args) => render::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
         Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
         Command::Doctor => doctor::run(),
@@ -74,9 +79,21 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     if let Some(error) = error.downcast_ref::<clift_data::DataError>() {
         return data_exit_code(error);
     }
+    if let Some(error) = error.downcast_ref::<clift_model::ModelError>() {
+        return model_exit_code(error);
+    }
+    if let Some(EvalError::BadTokenCount { .. }) = error.downcast_ref::<EvalError>() {
+        return WRONG_USAGE;
+    }
     match error.downcast_ref::<TrainError>() {
         Some(TrainError::Interrupted { .. } | TrainError::BenchInterrupted { .. }) => INTERRUPTED,
-        Some(TrainError::BadConfig { .. } | TrainError::OtherRun { .. } | TrainError::Missing { .. }) => WRONG_USAGE,
+        Some(
+            TrainError::BadConfig { .. }
+            | TrainError::OtherRun { .. }
+            | TrainError::Missing { .. }
+            | TrainError::NoConfig { .. }
+            | TrainError::Eval(EvalError::BadTokenCount { .. }),
+        ) => WRONG_USAGE,
         Some(TrainError::Data(error)) => data_exit_code(error),
         Some(TrainError::Model(error)) => model_exit_code(error),
         Some(_) | None => FAILED,
@@ -88,8 +105,12 @@ fn data_exit_code(error: &clift_data::DataError) -> u8 {
 }
 
 fn model_exit_code(error: &clift_model::ModelError) -> u8 {
-    use clift_model::ModelError::{BadConfig, NoDevice, NotDivisible};
-    if matches!(error, BadConfig { .. } | NoDevice { .. } | NotDivisible { .. }) { WRONG_USAGE } else { FAILED }
+    use clift_model::ModelError::{BadConfig, NoDevice, NotDivisible, OtherRenderer};
+    if matches!(error, BadConfig { .. } | NoDevice { .. } | NotDivisible { .. } | OtherRenderer { .. }) {
+        WRONG_USAGE
+    } else {
+        FAILED
+    }
 }
 
 #[cfg(test)]

@@ -102,7 +102,7 @@ impl Splits {
     }
 }
 
-fn parse_size(text: &str) -> Result<[usize; 2], String> {
+pub fn parse_size(text: &str) -> Result<[usize; 2], String> {
     let size =
         text.split_once(['x', 'X']).and_then(|(width, height)| Some([width.parse().ok()?, height.parse().ok()?]));
     size.filter(|size| !size.contains(&0)).ok_or_else(|| "write columns and rows, as 64x48".into())

@@ -1,0 +1,316 @@
+//! Camera paths to render: through the context views, around what they look at, or from a file.
+
+use std::path::Path;
+
+use serde::Deserialize;
+
+use crate::camera::{Intrinsics, IntrinsicsNorm, Pose, cross, dot};
+use crate::error::DataError;
+use crate::normalize::{SceneFrame, from_quaternion, quaternion};
+
+/// Share of the contexts' extent that an orbit goes around: outside it nothing was seen.
+const ORBIT_SHARE: f64 = 0.7;
+
+/// Smallest radius of an orbit, where contexts lie on a line; the normalised contexts reach to 1.
+const MIN_ORBIT_RADIUS: f64 = 0.1;
+
+/// Distance of what an orbit looks at, where contexts look parallel, and its bounds otherwise.
+const FOCUS: f64 = 2.0;
+const FOCUS_RANGE: [f64; 2] = [0.5, 8.0];
+
+/// Most poses that are read from a file.
+const MAX_POSES: usize = 100_000;
+
+/// One view to render, in the scene's normalised frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PathView {
+    /// Camera to world.
+    pub c2w: Pose,
+    /// In pixels of the picture to render.
+    pub intrinsics: Intrinsics,
+}
+
+/// Through all context views in their order, smoothly: the first frame is the first view, the last frame the last.
+///
+/// Centres follow a Catmull-Rom spline, orientations the shortest turn, intrinsics a straight line.
+pub fn interpolate(context: &[PathView], num_frames: usize) -> Vec<PathView> {
+    let Some(last) = context.len().checked_sub(1) else { return Vec::new() };
+    let place = |frame: usize| last as f64 * frame as f64 / num_frames.saturating_sub(1).max(1) as f64;
+    (0..num_frames).map(|frame| between(context, place(frame))).collect()
+}
+
+/// The view at `place` in `0..=context.len() - 1`.
+fn between(context: &[PathView], place: f64) -> PathView {
+    let last = context.len() - 1;
+    let first = (place as usize).min(last.saturating_sub(1));
+    let t = place - first as f64;
+    let [before, from, to, after] =
+        [first.saturating_sub(1), first, (first + 1).min(last), (first + 2).min(last)].map(|view| &context[view]);
+    let translation = [0, 1, 2].map(|i| {
+        let [a, b, c, d] = [before, from, to, after].map(|view| view.c2w.translation[i]);
+        b + 0.5 * t * (c - a + t * (2.0 * a - 5.0 * b + 4.0 * c - d + t * (3.0 * (b - c) + d - a)))
+    });
+    let rotation = turn(&from.c2w, &to.c2w, t);
+    let mix = |a: f64, b: f64| a + t * (b - a);
+    let (a, b) = (from.intrinsics, to.intrinsics);
+    let intrinsics = Intrinsics { fx: mix(a.fx, b.fx), fy: mix(a.fy, b.fy), cx: mix(a.cx, b.cx), cy: mix(a.cy, b.cy) };
+    PathView { c2w: Pose { rotation, translation }, intrinsics }
+}
+
+/// Spherical interpolation of two orientations.
+fn turn(from: &Pose, to: &Pose, t: f64) -> [[f64; 3]; 3] {
+    let (a, mut b) = (quaternion(&from.rotation), quaternion(&to.rotation));
+    let mut cosine: f64 = a.iter().zip(b).map(|(a, b)| a * b).sum();
+    if cosine < 0.0 {
+        (b, cosine) = (b.map(|value| -value), -cosine);
+    }
+    let angle = cosine.min(1.0).acos();
+    // Below a thousandth of a degree the sines cancel, and a straight line is as good.
+    let [u, v] =
+        if angle < 1e-5 { [1.0 - t, t] } else { [(1.0 - t) * angle, t * angle].map(|x| x.sin() / angle.sin()) };
+    let sum = [0, 1, 2, 3].map(|i| u * a[i] + v * b[i]);
+    let norm = sum.iter().map(|value| value * value).sum::<f64>().sqrt();
+    from_quaternion(sum.map(|value| value / norm))
+}
+
+/// Once around the mean view, looking at what the context views look at: an ellipse as wide and as high as most of
+/// their centres are apart. The frame after the last would be the first.
+pub fn orbit(context: &[PathView], num_frames: usize) -> Vec<PathView> {
+    let Some(intrinsics) = mean_intrinsics(context) else { return Vec::new() };
+    let focus = [0.0, 0.0, focus_distance(context)];
+    let radius = |axis: usize| {
+        let extent = context.iter().map(|view| view.c2w.translation[axis].abs()).fold(0.0, f64::max);
+        (ORBIT_SHARE * extent).max(MIN_ORBIT_RADIUS)
+    };
+    let [x, y] = [0, 1].map(radius);
+    let view = |frame: usize| {
+        let (sin, cos) = (std::f64::consts::TAU * frame as f64 / num_frames as f64).sin_cos();
+        PathView { c2w: look_at([x * cos, y * sin, 0.0], focus), intrinsics }
+    };
+    (0..num_frames).map(view).collect()
+}
+
+/// Mean intrinsics of the context views; `None` without any.
+pub fn mean_intrinsics(context: &[PathView]) -> Option<Intrinsics> {
+    let count = context.len() as f64;
+    let mean = |value: fn(&Intrinsics) -> f64| context.iter().map(|view| value(&view.intrinsics) / count).sum();
+    (!context.is_empty()).then(|| Intrinsics {
+        fx: mean(|k| k.fx),
+        fy: mean(|k| k.fy),
+        cx: mean(|k| k.cx),
+        cy: mean(|k| k.cy),
+    })
+}
+
+/// The point of the mean view's axis that is nearest to the axes of all views (least squares), as a distance.
+fn focus_distance(context: &[PathView]) -> f64 {
+    let (mut above, mut below) = (0.0, 0.0);
+    for view in context {
+        let axis = view.c2w.rotate([0.0, 0.0, 1.0]);
+        // With A = I - d d^T: z = sum(e^T A o) / sum(e^T A e).
+        above += view.c2w.translation[2] - axis[2] * dot(axis, view.c2w.translation);
+        below += 1.0 - axis[2] * axis[2];
+    }
+    let distance = above / below;
+    // Parallel axes meet nowhere, diverging ones behind the cameras.
+    if below > 1e-6 && distance > 0.0 { distance.clamp(FOCUS_RANGE[0], FOCUS_RANGE[1]) } else { FOCUS }
+}
+
+/// A camera at `centre` that looks at `point`, upright in the frame of the mean view.
+fn look_at(centre: [f64; 3], point: [f64; 3]) -> Pose {
+    let unit = |v: [f64; 3]| v.map(|value| value / dot(v, v).sqrt());
+    let forward = unit([0, 1, 2].map(|i| point[i] - centre[i]));
+    let right = unit(cross([0.0, 1.0, 0.0], forward));
+    let down = cross(forward, right);
+    Pose { rotation: [0, 1, 2].map(|row| [right[row], down[row], forward[row]]), translation: centre }
+}
+
+/// What a file of poses holds.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct PoseFile {
+    poses: Vec<FilePose>,
+}
+
+/// One pose of a file.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FilePose {
+    /// Camera to world in the capture's world, OpenCV axes; three or four rows.
+    c2w: Vec<[f64; 4]>,
+    /// `fx, fy, cx, cy` over width and height; those of the context views if it is missing.
+    #[serde(default)]
+    intrinsics_norm: Option<[f64; 4]>,
+}
+
+/// Reads `{"poses": [{"c2w": [[..4], [..4], [..4]], "intrinsics_norm": [fx, fy, cx, cy]}, ..]}`: poses in the world of
+/// the capture, as its own files give them (camera to world, OpenCV axes), for pictures of `width` by `height`.
+///
+/// # Errors
+/// [`DataError::Io`], and [`DataError::BadPoses`] for another form or a pose that is none, with its position.
+pub fn read_poses(
+    path: &Path,
+    frame: &SceneFrame,
+    default: Intrinsics,
+    width: usize,
+    height: usize,
+) -> Result<Vec<PathView>, DataError> {
+    let text = std::fs::read(path).map_err(DataError::io("reading the poses", path))?;
+    let bad = |what: String| DataError::BadPoses { what, path: path.to_path_buf() };
+    let file: PoseFile = serde_json::from_slice(&text)
+        .map_err(|error| bad(format!("expected {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}")))?;
+    if !(1..=MAX_POSES).contains(&file.poses.len()) {
+        return Err(bad(format!("{} poses, expected 1 to {MAX_POSES}", file.poses.len())));
+    }
+    let view = |(position, pose): (usize, FilePose)| {
+        let bad = |what: String| bad(format!("pose {position}: {what}"));
+        let (rows, last) = match pose.c2w[..] {
+            [a, b, c] => ([a, b, c], [0.0, 0.0, 0.0, 1.0]),
+            [a, b, c, last] => ([a, b, c], last),
+            _ => return Err(bad(format!("{} rows, expected 3 or 4", pose.c2w.len()))),
+        };
+        if last != [0.0, 0.0, 0.0, 1.0] {
+            return Err(bad(format!("its last row is {last:?}, expected [0, 0, 0, 1]")));
+        }
+        let c2w = frame.normalize(Pose::from_rows(&rows).map_err(|error| bad(error.to_string()))?);
+        let intrinsics = match pose.intrinsics_norm {
+            None => default,
+            Some([fx, fy, cx, cy]) if fx > 0.0 && fy > 0.0 && [fx, fy, cx, cy].iter().all(|v| v.is_finite()) => {
+                IntrinsicsNorm { fx, fy, cx, cy }.to_pixels(width, height)
+            }
+            Some(other) => return Err(bad(format!("its intrinsics are {other:?}"))),
+        };
+        Ok(PathView { c2w, intrinsics })
+    };
+    file.poses.into_iter().enumerate().map(view).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const K: Intrinsics = Intrinsics { fx: 40.0, fy: 41.0, cx: 16.0, cy: 12.0 };
+
+    /// A camera at `centre`, turned by `angle` about the y axis.
+    fn view(centre: [f64; 3], angle: f64) -> PathView {
+        let (sin, cos) = angle.sin_cos();
+        let rotation = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
+        PathView { c2w: Pose { rotation, translation: centre }, intrinsics: K }
+    }
+
+    fn assert_close(a: &PathView, b: &PathView, tolerance: f64) {
+        let (a, b) = (a.c2w.to_matrix_f64(), b.c2w.to_matrix_f64());
+        assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < tolerance), "{a:?} {b:?}");
+    }
+
+    fn walk() -> Vec<PathView> {
+        vec![
+            view([-1.0, 0.0, 0.0], 0.4),
+            view([-0.2, 0.1, 0.3], 0.1),
+            view([0.3, -0.1, 0.0], 0.0),
+            view([1.0, 0.0, 0.1], -0.5),
+        ]
+    }
+
+    #[test]
+    fn an_interpolated_path_goes_through_every_context_view() {
+        let context = walk();
+        let path = interpolate(&context, 31);
+        assert_eq!(path.len(), 31);
+        for (i, view) in context.iter().enumerate() {
+            assert_close(&path[10 * i], view, 1e-12);
+        }
+        for view in &path {
+            assert!(view.c2w.orthonormality_defect() < 1e-12);
+        }
+        // No frame goes farther than a few times the mean step.
+        let step = |pair: &[PathView]| {
+            let [a, b] = [pair[0], pair[1]].map(|view| view.c2w.translation);
+            a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+        };
+        assert!(path.windows(2).all(|pair| step(pair) < 0.2), "2 units in 30 steps");
+    }
+
+    #[test]
+    fn half_way_between_two_views_is_half_the_turn_and_the_mean_of_the_rest() {
+        let mut context = vec![view([0.0; 3], 0.2), view([1.0, 2.0, 0.0], 0.8)];
+        context[1].intrinsics.fx = 60.0;
+        let middle = interpolate(&context, 3)[1];
+        assert_close(&middle, &view([0.5, 1.0, 0.0], 0.5), 1e-12);
+        assert!((middle.intrinsics.fx - 50.0).abs() < 1e-12);
+        assert_eq!(interpolate(&context, 1).len(), 1);
+        assert_close(&interpolate(&context, 1)[0], &context[0], 1e-12);
+        assert_close(&interpolate(&context[..1], 5)[3], &context[0], 1e-12);
+        assert!(interpolate(&[], 5).is_empty());
+    }
+
+    #[test]
+    fn opposite_signs_of_a_quaternion_do_not_take_the_long_way() {
+        // Three quarters of a half turn to either side of 170 degrees.
+        let context = [view([0.0; 3], 2.9), view([1.0, 0.0, 0.0], -2.9)];
+        let middle = interpolate(&context, 3)[1];
+        assert_close(&middle, &view([0.5, 0.0, 0.0], std::f64::consts::PI), 1e-9);
+    }
+
+    #[test]
+    fn an_orbit_looks_at_what_the_views_look_at_and_ends_where_it_starts() {
+        // Two cameras that look at (0, 0, 3) from either side.
+        let turn = 1.0_f64.atan2(3.0);
+        let context = [view([-1.0, 0.0, 0.0], turn), view([1.0, 0.0, 0.0], -turn)];
+        assert!((focus_distance(&context) - 3.0).abs() < 1e-9);
+        let path = orbit(&context, 12);
+        assert_eq!(path.len(), 12);
+        for view in &path {
+            let to_focus = [0, 1, 2].map(|i| [0.0, 0.0, 3.0][i] - view.c2w.translation[i]);
+            let forward = view.c2w.rotate([0.0, 0.0, 1.0]);
+            assert!((dot(to_focus, forward) / dot(to_focus, to_focus).sqrt() - 1.0).abs() < 1e-12);
+            assert!(view.c2w.orthonormality_defect() < 1e-12);
+            assert!(view.c2w.rotation[1][1] > 0.9, "upright");
+        }
+        assert!((path[0].c2w.translation[0] - 0.7).abs() < 1e-12);
+        assert!((path[3].c2w.translation[1] - 0.1).abs() < 1e-12, "contexts on a line: a small way up and down");
+        let parallel = [view([-1.0, 0.0, 0.0], 0.0), view([1.0, 0.0, 0.0], 0.0)];
+        assert_eq!(focus_distance(&parallel), FOCUS);
+        assert!(orbit(&[], 3).is_empty());
+    }
+
+    fn read(json: &str) -> Result<Vec<PathView>, DataError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("poses.json");
+        std::fs::write(&path, json).unwrap();
+        let frame = SceneFrame { mean_c2w: view([1.0, 0.0, 0.0], 0.0).c2w, scale: 2.0 };
+        read_poses(&path, &frame, K, 64, 32)
+    }
+
+    #[test]
+    fn poses_of_a_file_are_moved_into_the_frame_of_the_scene() {
+        let views = read(
+            r#"{"poses": [{"c2w": [[1,0,0,3],[0,1,0,0],[0,0,1,0.5]]},
+                {"c2w": [[1,0,0,1],[0,1,0,0],[0,0,1,0],[0,0,0,1]], "intrinsics_norm": [0.5, 1.0, 0.5, 0.25]}]}"#,
+        )
+        .unwrap();
+        assert_close(&views[0], &view([4.0, 0.0, 1.0], 0.0), 1e-12);
+        assert_eq!(views[0].intrinsics, K);
+        assert_close(&views[1], &view([0.0; 3], 0.0), 1e-12);
+        assert_eq!(views[1].intrinsics, Intrinsics { fx: 32.0, fy: 32.0, cx: 32.0, cy: 8.0 });
+    }
+
+    #[test]
+    fn a_file_that_holds_no_poses_says_what_is_expected_and_where_it_goes_wrong() {
+        for (json, part) in [
+            ("[]", "expected {\"poses\": "),
+            (r#"{"poses": []}"#, "0 poses, expected 1 to 100000"),
+            (r#"{"poses": [{"c2w": [[1,0,0,0]]}]}"#, "pose 0: 1 rows, expected 3 or 4"),
+            (r#"{"poses": [{"c2w": [[2,0,0,0],[0,1,0,0],[0,0,1,0]]}]}"#, "pose 0: bad camera: the rotation is off"),
+            (r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,2]]}]}"#, "its last row is"),
+            (
+                r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "intrinsics_norm": [0,1,0,0]}]}"#,
+                "pose 0: its intrinsics are [0.0, 1.0",
+            ),
+            (r#"{"poses": [], "frames": []}"#, "unknown field `frames`"),
+        ] {
+            let message = read(json).unwrap_err().to_string();
+            assert!(message.contains(part) && message.ends_with("poses.json"), "{message}");
+        }
+    }
+}

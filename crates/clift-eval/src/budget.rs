@@ -1,0 +1,143 @@
+//! Time per frame against the number of rendered tokens, measured on a device: what a budget in milliseconds buys.
+
+use std::time::Instant;
+
+use clift_model::viewer::FRAMES_PER_CALL;
+use clift_model::{ModelError, ViewCamera, Viewer};
+
+/// Parts of the stored tokens that are timed, in sixteenths; all of them are timed beside.
+const SIXTEENTHS: [usize; 5] = [1, 2, 4, 8, 12];
+
+/// Draws of one count, after one that is not timed: at least two, at most so many, and no more after so many seconds.
+const MAX_DRAWS: usize = 7;
+const ENOUGH_S: f64 = 1.0;
+
+/// Time per frame, from the choice of tokens to pixels on the host.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Calibration {
+    /// Tokens and seconds, by tokens: what was measured of frames drawn from a part of the tokens.
+    pub some: Vec<(usize, f64)>,
+    /// All tokens and seconds, where frames are drawn several at a time and tokens need no choosing.
+    pub all: (usize, f64),
+}
+
+impl Calibration {
+    /// Times frames of a few counts.
+    ///
+    /// # Errors
+    /// As [`Viewer::draw`].
+    pub fn measure(viewer: &mut Viewer, view: &ViewCamera, height: usize, width: usize) -> Result<Self, ModelError> {
+        let num_storage_tokens = viewer.num_storage_tokens();
+        let mut counts: Vec<usize> = SIXTEENTHS
+            .iter()
+            .map(|part| (num_storage_tokens * part / 16).max(1))
+            .chain([num_storage_tokens - 1])
+            .collect();
+        counts.retain(|&count| count > 0 && count < num_storage_tokens);
+        counts.dedup();
+        let mut some = Vec::new();
+        for count in counts {
+            some.push((count, median_s(viewer, &[*view], height, width, count)?));
+        }
+        let views = [*view; FRAMES_PER_CALL];
+        let all = (num_storage_tokens, median_s(viewer, &views, height, width, num_storage_tokens)?);
+        viewer.reset();
+        Ok(Self { some, all })
+    }
+
+    /// The most tokens whose frames take at most `budget_s` seconds; `None` if not even the fewest that were timed do.
+    ///
+    /// Between measured counts time is a straight line, and more tokens never take less time than fewer: what a later
+    /// count seems to save is noise of the clock.
+    pub fn most_tokens(&self, budget_s: f64) -> Option<usize> {
+        if self.all.1 <= budget_s {
+            return Some(self.all.0);
+        }
+        let mut best = None;
+        let mut before: Option<(usize, f64)> = None;
+        for &(count, seconds) in &self.some {
+            let seconds = before.map_or(seconds, |(_, earlier)| seconds.max(earlier));
+            if seconds <= budget_s {
+                best = Some(count);
+            } else {
+                let (fewer, earlier) = before?;
+                let share = (budget_s - earlier) / (seconds - earlier);
+                // The small excess keeps a whole number from being rounded down to the one before.
+                return Some(fewer + ((count - fewer) as f64 * share + 1e-9) as usize);
+            }
+            before = Some((count, seconds));
+        }
+        best
+    }
+
+    /// The shortest time that was measured.
+    pub fn least_s(&self) -> f64 {
+        self.some.iter().chain([&self.all]).map(|(_, seconds)| *seconds).fold(f64::INFINITY, f64::min)
+    }
+}
+
+/// Median seconds per frame.
+fn median_s(
+    viewer: &mut Viewer,
+    views: &[ViewCamera],
+    height: usize,
+    width: usize,
+    count: usize,
+) -> Result<f64, ModelError> {
+    viewer.draw(views, height, width, count)?;
+    let mut seconds = Vec::new();
+    let started = Instant::now();
+    while seconds.len() < 2 || (seconds.len() < MAX_DRAWS && started.elapsed().as_secs_f64() < ENOUGH_S) {
+        let now = Instant::now();
+        viewer.draw(views, height, width, count)?;
+        seconds.push(now.elapsed().as_secs_f64() / views.len() as f64);
+    }
+    seconds.sort_by(f64::total_cmp);
+    Ok(seconds[seconds.len() / 2])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_budget_between_two_measured_counts_buys_its_share_of_the_tokens_between() {
+        let times = Calibration { some: vec![(16, 0.010), (64, 0.022), (128, 0.030)], all: (256, 0.050) };
+        for (budget_s, expected) in [
+            (0.009, None),
+            (0.010, Some(16)),
+            (0.016, Some(40)),
+            (0.0219, Some(63)),
+            (0.030, Some(128)),
+            (0.049, Some(128)),
+            (0.050, Some(256)),
+        ] {
+            assert_eq!(times.most_tokens(budget_s), expected, "{budget_s}");
+        }
+        assert_eq!(times.least_s(), 0.010);
+    }
+
+    #[test]
+    fn noise_of_the_clock_never_makes_more_tokens_cheaper() {
+        // 64 tokens seem cheaper than 16: a budget that 16 do not meet is met by no more of them.
+        let times = Calibration { some: vec![(8, 0.010), (16, 0.020), (64, 0.012), (128, 0.030)], all: (256, 0.050) };
+        assert_eq!(times.most_tokens(0.015), Some(12));
+        assert_eq!(times.most_tokens(0.020), Some(64), "as dear as 16");
+        assert_eq!(times.most_tokens(0.025), Some(96));
+        let mut last = 0;
+        for step in 0..100 {
+            let count = times.most_tokens(0.0006 * f64::from(step)).unwrap_or(0);
+            assert!(count >= last, "a larger budget never buys fewer");
+            last = count;
+        }
+    }
+
+    #[test]
+    fn all_tokens_are_taken_where_drawing_several_frames_at_once_makes_them_cheaper_than_some() {
+        let times = Calibration { some: vec![(16, 0.010), (64, 0.012)], all: (256, 0.008) };
+        assert_eq!(times.most_tokens(0.009), Some(256));
+        assert_eq!(times.least_s(), 0.008);
+        let one = Calibration { some: Vec::new(), all: (1, 0.01) };
+        assert_eq!((one.most_tokens(0.02), one.most_tokens(0.001)), (Some(1), None));
+    }
+}

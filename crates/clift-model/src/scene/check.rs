@@ -1,0 +1,96 @@
+//! What a scene must be before it is written or drawn. Files come from anywhere: nothing is taken on trust.
+
+use super::{HEADER_BYTES, Scene};
+use crate::ViewCamera;
+
+/// Most context views of a scene.
+const MAX_VIEWS: usize = 1024;
+
+/// Longest side of a context view in pixels.
+const MAX_SIDE_PX: usize = 1 << 14;
+
+/// Most patches of all context views; the encoder has a token for each.
+const MAX_PATCHES: usize = 1 << 20;
+
+/// Largest error of `R^T R` in a pose, as the readers of captures allow.
+const MAX_ROTATION_ERROR: f64 = 1e-2;
+
+impl Scene {
+    /// Says what is wrong with the scene, if anything.
+    pub(super) fn check(&self) -> Result<(), String> {
+        self.model.validate().map_err(|error| error.to_string())?;
+        let views = self.context.len();
+        if !(1..=MAX_VIEWS).contains(&views) || self.context_frames.len() != views {
+            let frames = self.context_frames.len();
+            return Err(format!(
+                "it has {views} context cameras and {frames} frame numbers, expected 1 to {MAX_VIEWS}"
+            ));
+        }
+        if self.height.max(self.width) > MAX_SIDE_PX {
+            return Err(format!("its views are {} x {}, larger than {MAX_SIDE_PX}", self.width, self.height));
+        }
+        let num_patches = self.model.num_tokens(views, self.height, self.width).map_err(|error| error.to_string())?;
+        if num_patches > MAX_PATCHES {
+            return Err(format!("its views have {num_patches} patches, more than {MAX_PATCHES}"));
+        }
+        self.check_tokens(num_patches)?;
+        for (view, camera) in self.context.iter().enumerate() {
+            check_camera(camera).map_err(|what| format!("context camera {view} {what}"))?;
+        }
+        check_pose(&self.world.mean_c2w).map_err(|what| format!("the mean pose {what}"))?;
+        if !(self.world.scale > 0.0 && self.world.scale.is_finite()) {
+            return Err(format!("the scale of its poses is {}", self.world.scale));
+        }
+        let is_hash = self.renderer_hash.len() == 64 && self.renderer_hash.bytes().all(|c| c.is_ascii_hexdigit());
+        if !is_hash {
+            return Err(format!("the hash of its renderer is not 64 hexadecimal digits: {:?}", self.renderer_hash));
+        }
+        if self.key.len() + self.model_path.len() > HEADER_BYTES {
+            return Err(format!("its key and path are longer than a header: {} bytes", self.key.len()));
+        }
+        Ok(())
+    }
+
+    fn check_tokens(&self, num_patches: usize) -> Result<(), String> {
+        let (count, dim) = (self.num_tokens(), self.model.dim);
+        if !(1..=num_patches).contains(&count) {
+            return Err(format!("it has {count} tokens of {num_patches} patches"));
+        }
+        if self.tokens.len() != count * dim {
+            return Err(format!("{count} tokens of width {dim} have {} values", self.tokens.len()));
+        }
+        if let Some(position) = self.tokens.iter().position(|value| !value.is_finite()) {
+            return Err(format!("token {} holds {}", position / dim, self.tokens[position]));
+        }
+        let mut seen = vec![false; num_patches];
+        for (token, &id) in self.token_ids.iter().enumerate() {
+            match seen.get_mut(id as usize) {
+                Some(seen) if !*seen => *seen = true,
+                Some(_) => return Err(format!("token {token} is of patch {id}, as another is")),
+                None => return Err(format!("token {token} is of patch {id} of {num_patches}")),
+            }
+        }
+        Ok(())
+    }
+}
+
+fn check_camera(camera: &ViewCamera) -> Result<(), String> {
+    let [fx, fy, cx, cy] = camera.intrinsics;
+    if !(fx > 0.0 && fy > 0.0 && [fx, fy, cx, cy].iter().all(|value| value.is_finite())) {
+        return Err(format!("has the intrinsics {:?}", camera.intrinsics));
+    }
+    check_pose(&camera.c2w)
+}
+
+fn check_pose(c2w: &[f64; 16]) -> Result<(), String> {
+    if let Some(value) = c2w.iter().find(|value| !value.is_finite()) {
+        return Err(format!("holds {value}"));
+    }
+    let product = |i: usize, j: usize| (0..3).map(|k| c2w[4 * k + i] * c2w[4 * k + j]).sum::<f64>();
+    let error = |i: usize, j: usize| (product(i, j) - f64::from(u8::from(i == j))).abs();
+    let worst = (0..9).map(|entry| error(entry / 3, entry % 3)).fold(0.0, f64::max);
+    if worst > MAX_ROTATION_ERROR || c2w[12..] != [0.0, 0.0, 0.0, 1.0] {
+        return Err(format!("is no pose: its rotation is off an orthonormal one by {worst:.1e}"));
+    }
+    Ok(())
+}

@@ -1,0 +1,116 @@
+//! Scenes to files.
+
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::path::Path;
+
+use super::{FORMAT, HEADER_BYTES, Scene, TokenStorage, VERSION, dtype_name};
+use crate::ModelError;
+
+impl Scene {
+    /// Writes the scene to a temporary name beside `path` that is then renamed: no reader sees half a file.
+    ///
+    /// # Errors
+    /// [`ModelError::SceneFile`], and [`ModelError::BadConfig`] for tokens that `storage` cannot hold.
+    pub fn write(&self, path: &Path, storage: TokenStorage) -> Result<(), ModelError> {
+        let bytes = self.to_bytes(path, storage)?;
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let mut builder = tempfile::Builder::new();
+        // The umask decides who may read it, as for any file that is kept.
+        #[cfg(unix)]
+        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+        let written = builder.tempfile_in(folder).and_then(|mut file| {
+            file.write_all(&bytes)?;
+            file.as_file().sync_all()?;
+            Ok(file.persist(path)?)
+        });
+        written.map(|_| ()).map_err(|error| ModelError::SceneFile {
+            action: "write",
+            reason: error.to_string(),
+            fix: "choose a folder that exists and can be written to",
+            path: path.into(),
+        })
+    }
+
+    fn to_bytes(&self, path: &Path, storage: TokenStorage) -> Result<Vec<u8>, ModelError> {
+        let refuse = |reason| ModelError::SceneFile {
+            action: "write",
+            reason,
+            fix: "encode other views or fewer tokens",
+            path: path.into(),
+        };
+        self.check().map_err(refuse)?;
+        let (tokens, scales) = storage.encode(&self.tokens, self.model.dim)?;
+        let (count, views) = (self.num_tokens(), self.context.len());
+        let f64_bytes = |values: &mut dyn Iterator<Item = f64>| values.flat_map(f64::to_le_bytes).collect::<Vec<u8>>();
+        let f32_bytes = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+        let u32_bytes = |values: &[u32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+        let rays: Vec<f32> = self.plucker_rays().into_iter().flatten().map(|value| value as f32).collect();
+        let mut tensors = vec![
+            ("context_c2w", "F64", vec![views, 4, 4], f64_bytes(&mut self.context.iter().flat_map(|view| view.c2w))),
+            (
+                "context_intrinsics",
+                "F64",
+                vec![views, 4],
+                f64_bytes(&mut self.context.iter().flat_map(|view| view.intrinsics)),
+            ),
+            ("world_mean_c2w", "F64", vec![4, 4], f64_bytes(&mut self.world.mean_c2w.into_iter())),
+            ("world_scale", "F64", vec![1], f64_bytes(&mut [self.world.scale].into_iter())),
+            ("token_rays", "F32", vec![count, 6], f32_bytes(&rays)),
+        ];
+        if let Some(scales) = scales {
+            tensors.push(("token_scales", "F32", vec![count], f32_bytes(&scales)));
+        }
+        tensors.push(("context_frames", "U32", vec![views], u32_bytes(&self.context_frames)));
+        tensors.push(("token_ids", "U32", vec![count], u32_bytes(&self.token_ids)));
+        tensors.push(("tokens", dtype_name(storage), vec![count, self.model.dim], tokens));
+
+        let mut header = self.metadata().map_err(refuse)?;
+        let mut start = 0;
+        for (name, dtype, shape, data) in &tensors {
+            let end = start + data.len();
+            let _ = write!(
+                header,
+                ",\"{name}\":{{\"dtype\":\"{dtype}\",\"shape\":{shape:?},\"data_offsets\":[{start},{end}]}}"
+            );
+            start = end;
+        }
+        header.push('}');
+        if header.len() > HEADER_BYTES {
+            let most = HEADER_BYTES - (header.len() - self.key.len() - self.model_path.len()).min(HEADER_BYTES);
+            return Err(refuse(format!("its key and the path of its model are longer than {most} bytes")));
+        }
+        let mut bytes = (HEADER_BYTES as u64).to_le_bytes().to_vec();
+        bytes.extend(header.bytes());
+        bytes.resize(8 + HEADER_BYTES, b' ');
+        for (.., data) in &tensors {
+            bytes.extend(data);
+        }
+        Ok(bytes)
+    }
+
+    /// The header up to the first tensor. Written by hand: safetensors orders metadata at random, and equal scenes
+    /// are equal files.
+    fn metadata(&self) -> Result<String, String> {
+        let json = |text: &str| serde_json::to_string(text).map_err(|error| error.to_string());
+        let model = serde_json::to_string(&self.model).map_err(|error| error.to_string())?;
+        let fields = [
+            ("format", FORMAT),
+            ("version", VERSION),
+            ("key", &self.key),
+            ("kind", self.kind.name()),
+            ("model", &model),
+            ("renderer", &self.renderer_hash),
+            ("model_path", &self.model_path),
+            ("height", &self.height.to_string()),
+            ("width", &self.width.to_string()),
+        ];
+        let mut header = String::from("{\"__metadata__\":{");
+        for (i, (name, value)) in fields.into_iter().enumerate() {
+            let comma = if i == 0 { "" } else { "," };
+            let _ = write!(header, "{comma}\"{name}\":{}", json(value)?);
+        }
+        header.push('}');
+        Ok(header)
+    }
+}

@@ -1,0 +1,130 @@
+//! Networks that are done training, to encode scenes with.
+
+use std::path::{Path, PathBuf};
+
+use burn::tensor::Device;
+use clift_model::{Clift, Condenser, Encoder, Renderer, TokenKind, weights};
+
+use crate::TrainError;
+use crate::config::Config;
+use crate::events::Stage;
+
+/// A run directory, and one of its weight files.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ModelPath {
+    /// Directory with the `config.toml` of the run.
+    pub run: PathBuf,
+    /// The weights: those of the last stage that is done, unless a file was given.
+    pub weights: PathBuf,
+}
+
+impl ModelPath {
+    /// Finds the run and the weights of `RUN` or `RUN/stageN/model.safetensors`.
+    ///
+    /// # Errors
+    /// [`TrainError::Missing`] for a run without weights and for no file, [`TrainError::NoConfig`] for a weight file without a config.
+    pub fn find(path: &Path) -> Result<Self, TrainError> {
+        let missing = |path: &Path| TrainError::Missing {
+            stage: "encoding",
+            what: "a trained model",
+            first: "clift train",
+            path: path.into(),
+        };
+        if path.is_dir() {
+            let weights = [Stage::Stage2, Stage::Stage1].map(|stage| weights_of(path, stage));
+            let [_, first] = &weights;
+            let found = weights.iter().find(|file| file.exists()).cloned();
+            let weights = found.ok_or_else(|| missing(first))?;
+            return Ok(Self { run: path.into(), weights });
+        }
+        if !path.exists() {
+            return Err(missing(path));
+        }
+        let above = path.ancestors().skip(1).take(2);
+        let run = above.map(|folder| if folder.as_os_str().is_empty() { Path::new(".") } else { folder });
+        let run = run.into_iter().find(|folder| folder.join("config.toml").is_file());
+        let run = run.ok_or_else(|| TrainError::NoConfig { path: path.into() })?;
+        Ok(Self { run: run.into(), weights: path.into() })
+    }
+}
+
+/// The weight file of a run that draws tokens of this kind.
+pub fn renderer_weights(run_or_file: &Path, kind: TokenKind) -> PathBuf {
+    let stage = match kind {
+        TokenKind::Clift => Stage::Stage2,
+        TokenKind::Kmeans => Stage::Stage1,
+    };
+    if run_or_file.is_dir() { weights_of(run_or_file, stage) } else { run_or_file.into() }
+}
+
+fn weights_of(run: &Path, stage: Stage) -> PathBuf {
+    run.join(stage.name()).join("model.safetensors")
+}
+
+/// The networks of a weight file, on a device without autodiff.
+#[derive(Clone, Debug)]
+pub struct Trained {
+    /// Posed pictures to tokens.
+    pub encoder: Encoder,
+    /// Where the file has one: stage 2.
+    pub condenser: Option<Condenser>,
+    /// The renderer trained with it.
+    pub renderer: Renderer,
+    /// Where they live.
+    pub device: Device,
+}
+
+impl Trained {
+    /// Reads a weight file of the model of `config`, of either stage.
+    ///
+    /// # Errors
+    /// [`clift_model::ModelError::Weights`] for a file that cannot be read or holds another model, and what opening the
+    /// device gives.
+    pub fn load(config: &Config, path: &Path) -> Result<Self, TrainError> {
+        let device = config.device.open()?;
+        let mut model = Clift::new(&config.model, config.seed, &device);
+        let loaded = weights::load(&mut model, path)?;
+        let has_condenser = !loaded.missing.iter().any(|name| name.starts_with("condenser."));
+        if has_condenser || loaded.missing.iter().any(|name| !name.starts_with("condenser.")) {
+            loaded.require_all(path)?;
+        }
+        let Clift { encoder, condenser, renderer } = model;
+        Ok(Self { encoder, condenser: has_condenser.then_some(condenser), renderer, device })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_gives_its_last_stage_and_a_file_its_run() {
+        let place = tempfile::tempdir().unwrap();
+        let run = place.path().join("run");
+        let touch = |name: &str| {
+            std::fs::create_dir_all(run.join(name).parent().unwrap()).unwrap();
+            std::fs::write(run.join(name), "").unwrap();
+            run.join(name)
+        };
+        touch("config.toml");
+        let message = ModelPath::find(&run).unwrap_err().to_string();
+        assert!(
+            message.starts_with("encoding needs a trained model, which is not there; run clift train"),
+            "{message}"
+        );
+        let stage1 = touch("stage1/model.safetensors");
+        assert_eq!(ModelPath::find(&run).unwrap(), ModelPath { run: run.clone(), weights: stage1.clone() });
+        let stage2 = touch("stage2/model.safetensors");
+        assert_eq!(ModelPath::find(&run).unwrap().weights, stage2);
+        assert_eq!(ModelPath::find(&stage1).unwrap(), ModelPath { run: run.clone(), weights: stage1.clone() });
+        assert_eq!(renderer_weights(&run, TokenKind::Kmeans), stage1);
+        assert_eq!(renderer_weights(&stage2, TokenKind::Clift), stage2);
+
+        let alone = place.path().join("alone.safetensors");
+        let message = ModelPath::find(&alone).unwrap_err().to_string();
+        assert!(message.starts_with("encoding needs a trained model, which is not there"), "{message}");
+        std::fs::write(&alone, "").unwrap();
+        let message = ModelPath::find(&alone).unwrap_err().to_string();
+        assert!(message.contains("no config.toml beside it or above it"), "{message}");
+    }
+}

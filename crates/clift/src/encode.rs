@@ -1,0 +1,153 @@
+//! `clift encode`.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use clift_data::{ChunkSource, ClipReader, SceneFilters, SceneSource, Split};
+use clift_eval::TokenCount;
+use clift_model::TokenStorage;
+use clift_model::device::DeviceName;
+use clift_train::encode::{Budget, EncodeOptions, Encoded};
+use clift_train::trained::{ModelPath, Trained};
+use clift_train::{Config, read_config, scenes};
+
+use crate::WrongUsage;
+use crate::data::text::{bytes, count};
+use crate::terminal;
+
+/// Keys that are shown when one has to be chosen.
+const MAX_KEYS_SHOWN: usize = 8;
+
+/// Arguments of `clift encode`.
+#[derive(Debug, clap::Args)]
+pub struct EncodeArgs {
+    /// A run directory, or a model.safetensors in one
+    #[arg(value_name = "RUN|MODEL")]
+    pub model: PathBuf,
+    /// Folder of chunks: with train/ or test/ in it, or one of these; the run's own data by default
+    #[arg(value_name = "DIR")]
+    pub data: Option<PathBuf>,
+    /// The scene file to write
+    #[arg(long, short, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Key of the scene, where there are several
+    #[arg(long, value_name = "KEY")]
+    pub scene: Option<String>,
+    /// Half of the data: train or test
+    #[arg(long, value_name = "SPLIT", default_value = "test", value_parser = parse_split)]
+    pub split: Split,
+    /// Frames the encoder sees, as 0,5,9; by default as many as in training, spread along the path
+    #[arg(long, value_name = "FRAMES", value_delimiter = ',')]
+    pub context: Vec<usize>,
+    /// Tokens to keep, a number or a share [default: 1/4]
+    #[arg(long, value_name = "COUNT", conflicts_with = "max_error")]
+    pub storage: Option<TokenCount>,
+    /// Keep the fewest tokens of the run's clusters.grid that leave at most this share of the tokens' variance unexplained
+    #[arg(long, value_name = "E", value_parser = parse_error_share)]
+    pub max_error: Option<f64>,
+    /// Number format of the tokens in the file: f32, f16 or int8
+    #[arg(long, value_name = "FORMAT", default_value_t)]
+    pub tokens: TokenStorage,
+    /// Change a key of the run's config: `--set 'data.root="PATH"'`
+    #[arg(long, value_name = "KEY=TOML")]
+    pub set: Vec<String>,
+    /// Where tensors live: flex, ndarray or wgpu
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<DeviceName>,
+}
+
+/// Encodes one scene and writes its file.
+pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
+    let model = ModelPath::find(&args.model)?;
+    let (mut config, overrides) = read_config::<Config>(&model.run.join("config.toml"), &args.set)?;
+    for change in overrides {
+        terminal::print_note(&format!("--set {change}"));
+    }
+    config.device = args.device.unwrap_or(config.device);
+    config.validate()?;
+    let source = match &args.data {
+        Some(folder) => open_chunks(folder, args.split)?,
+        None => scenes::open(&config.data, args.split)?.0,
+    };
+    let scene = choose(source.as_ref(), args.scene.as_deref())?;
+    let reader = ClipReader { source, options: config.data.clip_options() };
+    let budget = match args.max_error {
+        Some(error) => Budget::MaxError(error),
+        None => Budget::Tokens(args.storage.unwrap_or(TokenCount::Share(0.25))),
+    };
+    let options = EncodeOptions {
+        context: (!args.context.is_empty()).then(|| args.context.clone()),
+        budget,
+        model_path: args.model.to_string_lossy().into_owned(),
+    };
+    let encoded = Trained::load(&config, &model.weights)?.encode(&config, &reader, scene, &options)?;
+    encoded.scene.write(&args.out, args.tokens)?;
+    terminal::print_result(&told(&encoded, args.tokens, &args.out))
+}
+
+/// What was written, for people.
+fn told(encoded: &Encoded, storage: TokenStorage, path: &Path) -> String {
+    let Encoded { scene, num_lift_tokens, tried } = encoded;
+    let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+    let errors: Vec<String> = tried.iter().map(|(count, error)| format!("{count:>6}  {error:.4}")).collect();
+    format!(
+        "{}: {} of {num_lift_tokens} tokens ({}, {storage}), {}\nscene {}, {} of {} x {}: frames {frames}\n\
+         tokens  variance left within clusters\n{}",
+        path.display(),
+        scene.num_tokens(),
+        scene.kind,
+        bytes(scene.file_bytes(storage)),
+        scene.key,
+        count(scene.context.len(), "view"),
+        scene.width,
+        scene.height,
+        errors.join("\n"),
+    )
+}
+
+/// Opens a folder of chunks, all of its scenes.
+fn open_chunks(folder: &Path, split: Split) -> anyhow::Result<Arc<dyn SceneSource>> {
+    let (root, split) = if folder.join("index.json").exists() {
+        let absolute = folder.canonicalize().unwrap_or_else(|_| folder.to_path_buf());
+        let name = absolute.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let split = parse_split(&name).map_err(|_| {
+            WrongUsage(format!("{} holds an index.json but is named neither train nor test", folder.display()))
+        })?;
+        (absolute.parent().unwrap_or(Path::new("/")).to_path_buf(), split)
+    } else if folder.join(split.to_string()).join("index.json").exists() {
+        (folder.to_path_buf(), split)
+    } else {
+        let message = format!("{} holds neither index.json nor {split}/index.json", folder.display());
+        return Err(WrongUsage(format!("{message}; give a folder of chunks (see `clift data info`)")).into());
+    };
+    // Filters choose what to train on; this scene was chosen by hand.
+    Ok(Arc::new(ChunkSource::open(&root, split, &SceneFilters::default())?))
+}
+
+/// The scene asked for, or the only one.
+fn choose(source: &dyn SceneSource, key: Option<&str>) -> anyhow::Result<usize> {
+    let num_scenes = source.num_scenes();
+    let mut keys: Vec<&str> = (0..num_scenes.min(MAX_KEYS_SHOWN)).map(|scene| source.key(scene)).collect();
+    if num_scenes > MAX_KEYS_SHOWN {
+        keys.push("..");
+    }
+    let keys = keys.join(", ");
+    match key {
+        Some(key) => match source.find(key) {
+            Some(scene) => Ok(scene),
+            None => Err(WrongUsage(format!("there is no scene {key}; the {num_scenes} there are: {keys}")).into()),
+        },
+        None if num_scenes == 1 => Ok(0),
+        None => Err(WrongUsage(format!("{num_scenes} scenes; choose one with --scene: {keys}")).into()),
+    }
+}
+
+fn parse_split(text: &str) -> Result<Split, String> {
+    let splits = [Split::Train, Split::Test];
+    splits.into_iter().find(|split| split.to_string() == text).ok_or_else(|| "write train or test".into())
+}
+
+fn parse_error_share(text: &str) -> Result<f64, String> {
+    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
+    share.ok_or_else(|| "write a share of the variance, 0 to 1".into())
+}

@@ -1,0 +1,141 @@
+//! `clift render`.
+
+mod args;
+mod film;
+
+use anyhow::Context;
+use clift_data::camera_path::{PathView, interpolate, mean_intrinsics, orbit, read_poses};
+use clift_data::files::replace;
+use clift_data::{Intrinsics, Pose, SceneFrame};
+use clift_eval::Calibration;
+use clift_model::viewer::load_renderer;
+use clift_model::{ModelError, Scene, ViewCamera, Viewer};
+use clift_train::trained::renderer_weights;
+use serde::Serialize;
+
+use args::CameraPath;
+pub use args::RenderArgs;
+
+use crate::WrongUsage;
+use crate::terminal::{print_note, print_result};
+
+/// What `render.json` holds.
+#[derive(Debug, Serialize)]
+struct Report {
+    scene: String,
+    device: &'static str,
+    height: usize,
+    width: usize,
+    num_frames: usize,
+    num_storage_tokens: usize,
+    num_render_tokens: usize,
+    /// Median seconds per frame.
+    select_s: f64,
+    /// Median seconds per frame.
+    render_s: f64,
+    /// Tokens and seconds per frame, measured before; with `--budget-ms`.
+    calibration: Option<Vec<(usize, f64)>>,
+}
+
+/// Draws a scene file along a path.
+pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
+    let (scene, _) = Scene::read(&args.scene)?;
+    let [width, height] = args.size.unwrap_or([scene.width, scene.height]);
+    // Refuses what is not whole patches.
+    scene.model.num_tokens(1, height, width)?;
+    film::refuse_existing(&args.out)?;
+    let views = path(&scene, args, height, width)?;
+    let model = args.model.clone().unwrap_or_else(|| scene.model_path.clone().into());
+    let weights = renderer_weights(&model, scene.kind);
+    if args.model.is_none() && !weights.exists() {
+        let message = format!("the scene was encoded with {}, which is not there", weights.display());
+        return Err(WrongUsage(format!("{message}; give the run with --model RUN")).into());
+    }
+    let device = args.device.unwrap_or_default();
+    let opened = device.open()?;
+    let renderer = load_renderer(&scene, &weights, &opened)?;
+    let mut viewer = Viewer::new(&scene, renderer, args.selection.rules(), &opened)?;
+    let (num_render_tokens, calibration) = tokens(&scene, args, &mut viewer, &views[0], height, width)?;
+    let timing = film::film(&mut viewer, &views, [height, width], num_render_tokens, args)?;
+    let report = Report {
+        scene: scene.key.clone(),
+        device: device.as_str(),
+        height,
+        width,
+        num_frames: views.len(),
+        num_storage_tokens: scene.num_tokens(),
+        num_render_tokens,
+        select_s: timing.select_s,
+        render_s: timing.render_s,
+        calibration: calibration.map(|times| times.some.into_iter().chain([times.all]).collect()),
+    };
+    let json = serde_json::to_vec_pretty(&report).context("writing the report as JSON")?;
+    let path = args.out.join("render.json");
+    replace(&path, &json).with_context(|| format!("writing {}", path.display()))?;
+    print_result(&format!(
+        "{}: {} frames of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
+         {:.1} ms per frame on {device} (median): {:.1} ms to choose tokens, {:.1} ms to draw",
+        args.out.display(),
+        views.len(),
+        scene.num_tokens(),
+        1e3 * (timing.select_s + timing.render_s),
+        1e3 * timing.select_s,
+        1e3 * timing.render_s,
+    ))
+}
+
+/// How many tokens each frame is drawn from, and what was measured to find out.
+fn tokens(
+    scene: &Scene,
+    args: &RenderArgs,
+    viewer: &mut Viewer,
+    view: &ViewCamera,
+    height: usize,
+    width: usize,
+) -> anyhow::Result<(usize, Option<Calibration>)> {
+    let num_storage_tokens = scene.num_tokens();
+    let Some(budget_ms) = args.budget_ms else {
+        return Ok((args.render.map_or(Ok(num_storage_tokens), |count| count.of(num_storage_tokens))?, None));
+    };
+    let times = Calibration::measure(viewer, view, height, width)?;
+    for (count, seconds) in times.some.iter().chain([&times.all]) {
+        print_note(&format!("measured: {count} tokens, {:.1} ms per frame", 1e3 * seconds));
+    }
+    let Some(count) = times.most_tokens(budget_ms / 1e3) else {
+        let least_ms = (1e4 * times.least_s()).ceil() / 10.0;
+        let message = format!("no frame takes less than {least_ms} ms here; write at least --budget-ms {least_ms}");
+        return Err(WrongUsage(format!("{message}, or a smaller --size")).into());
+    };
+    print_note(&format!("{budget_ms} ms per frame: {count} of {num_storage_tokens} tokens"));
+    Ok((count, Some(times)))
+}
+
+/// The views of the path, in pixels of the pictures to draw.
+fn path(scene: &Scene, args: &RenderArgs, height: usize, width: usize) -> anyhow::Result<Vec<ViewCamera>> {
+    let context = scene.context.iter().map(|view| {
+        let ViewCamera { c2w, intrinsics: [fx, fy, cx, cy] } =
+            view.resized([scene.height, scene.width], [height, width]);
+        Ok(PathView { c2w: Pose::from_matrix(&c2w)?, intrinsics: Intrinsics { fx, fy, cx, cy } })
+    });
+    let context = context.collect::<anyhow::Result<Vec<_>>>()?;
+    let views = match &args.path {
+        CameraPath::Interpolate => interpolate(&context, args.frames),
+        CameraPath::Orbit => orbit(&context, args.frames),
+        CameraPath::File(file) => {
+            let mean_c2w = Pose::from_matrix(&scene.world.mean_c2w)?;
+            let frame = SceneFrame { mean_c2w, scale: scene.world.scale };
+            let default = mean_intrinsics(&context).context("a scene without context views")?;
+            read_poses(file, &frame, default, width, height)?
+        }
+    };
+    let camera = |view: &PathView| {
+        let Intrinsics { fx, fy, cx, cy } = view.intrinsics;
+        ViewCamera { c2w: view.c2w.to_matrix_f64(), intrinsics: [fx, fy, cx, cy] }
+    };
+    let views: Vec<ViewCamera> = views.iter().map(camera).collect();
+    if views.is_empty() {
+        let fix = "write at least 1".into();
+        return Err(ModelError::BadConfig { key: "frames", value: "0".into(), fix }.into());
+    }
+    Ok(views)
+}

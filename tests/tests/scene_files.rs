@@ -1,0 +1,279 @@
+//! Scenes that are kept: encoded, drawn again, measured.
+
+use std::path::Path;
+
+use clift_data::export::spread_views;
+use clift_data::{Clip, ClipReader, Split};
+use clift_eval::metrics::{psnr, ssim};
+use clift_eval::picture::Picture;
+use clift_model::viewer::load_renderer;
+use clift_model::{Preset, Scene, TokenKind, TokenStorage, Viewer};
+use clift_train::encode::view_cameras;
+use clift_train::{Config, read_config, scenes};
+use serde_json::{Value, json};
+
+use crate::support::{Place, clift, repository};
+
+const KEY: &str = "synthetic-0-test-00000";
+
+/// Encodes a scene of the run `run` into `name`.
+fn encode_args(place: &Place, run: &str, name: &str, flags: &[&str]) -> Vec<String> {
+    let mut args = vec!["encode".into(), place.at(run).display().to_string()];
+    args.extend(["--out".into(), place.at(name).display().to_string()]);
+    args.extend(flags.iter().map(|&flag| flag.to_owned()));
+    args
+}
+
+fn render_args(place: &Place, name: &str, out: &str, flags: &[&str]) -> Vec<String> {
+    let [name, out] = [name, out].map(|name| place.at(name).display().to_string());
+    let args = ["render", &name, "--out", &out].map(String::from);
+    args.into_iter().chain(flags.iter().map(|&flag| flag.to_owned())).collect()
+}
+
+fn config(place: &Place, run: &str) -> Config {
+    read_config(&place.at(run).join("config.toml"), &[]).expect("a run's config").0
+}
+
+/// The first test scene with the views that `clift eval` gives it.
+fn first_clip(place: &Place, run: &str) -> (Clip, ClipReader) {
+    let config = config(place, run);
+    let (source, _) = scenes::open(&config.data, Split::Test).expect("the run's rooms");
+    let reader = ClipReader { source, options: config.data.clip_options() };
+    let views = spread_views(8, config.eval.num_context, config.eval.num_targets).expect("enough frames");
+    assert_eq!(views.context, [0, 7]);
+    (reader.read(0, &views).expect("readable"), reader)
+}
+
+/// PSNR and SSIM of every target view of a clip.
+fn measure(clip: &Clip, pictures: &[Vec<f32>]) -> Vec<(f64, f64)> {
+    let (height, width) = (clip.target.height, clip.target.width);
+    let truths = clip.target.images.chunks(height * width * 3);
+    assert_eq!(pictures.len(), clip.target.num_views());
+    let measure = |(pixels, truth): (&Vec<f32>, &[u8])| {
+        let truth: Vec<f32> = truth.iter().map(|&value| f32::from(value) / 255.0).collect();
+        let (psnr, ssim) = (psnr(pixels, &truth), ssim(pixels, &truth, height, width));
+        (psnr.expect("finite"), ssim.expect("large enough"))
+    };
+    pictures.iter().zip(truths).map(measure).collect()
+}
+
+/// PSNR and SSIM that an evaluation wrote for the first scene's condensed tokens.
+fn evaluated(place: &Place, eval: &str, num_tokens: usize) -> Vec<(f64, f64)> {
+    let text = place.text(&format!("{eval}/views.csv"));
+    let rows = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
+    let rows = rows.filter(|row| row[0] == KEY && row[2] == "clift" && row[3] == num_tokens.to_string());
+    rows.map(|row| (row[5].parse().expect("a number"), row[6].parse().expect("a number"))).collect()
+}
+
+/// Draws a clip's targets from a scene file.
+fn drawn(scene: &Path, weights: &Path, clip: &Clip) -> Vec<Vec<f32>> {
+    let (scene, _) = Scene::read(scene).expect("a scene");
+    let device = burn::tensor::Device::flex();
+    let renderer = load_renderer(&scene, weights, &device).expect("its renderer");
+    let mut viewer = Viewer::new(&scene, renderer, Preset::Paper.rules(), &device).expect("its tokens");
+    let views = view_cameras(&clip.target);
+    let frames = viewer.draw(&views, clip.target.height, clip.target.width, scene.num_tokens()).expect("draws");
+    frames.into_iter().map(|frame| frame.pixels).collect()
+}
+
+#[test]
+fn a_scene_file_gives_the_numbers_of_the_evaluation_without_it() {
+    let place = Place::new();
+    place.train("run", &["stage1.steps=60", "stage2.steps=20"], &[]).ok();
+    let (clip, reader) = first_clip(&place, "run");
+    let weights = place.at("run/stage2/model.safetensors");
+    let poses: Vec<Value> = clip
+        .target
+        .frame_index
+        .iter()
+        .map(|&frame| {
+            let camera = &reader.source.cameras(0).expect("cameras")[frame];
+            let rows: Vec<Vec<f64>> = camera.c2w.to_matrix_f64().chunks(4).map(<[f64]>::to_vec).collect();
+            json!({"c2w": rows})
+        })
+        .collect();
+    std::fs::write(place.at("poses.json"), json!({"poses": poses}).to_string()).unwrap();
+
+    for (count, storage) in [(4, "f32"), (8, "f32"), (4, "f16"), (8, "f16"), (4, "int8"), (8, "int8")] {
+        let name = format!("{count}-{storage}.clift");
+        let flags = ["--scene", KEY, "--context", "0,7", "--storage", &count.to_string(), "--tokens", storage]
+            .map(String::from);
+        let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
+        let ran = clift(encode_args(&place, "run", &name, &flags)).ok();
+        assert!(ran.stdout.contains(&format!("{count} of 8 tokens (clift, {storage})")), "{}", ran.stdout);
+
+        // The file's size is that of the formula, and of the evaluation's summary.
+        let format: TokenStorage = storage.parse().unwrap();
+        let (scene, found) = Scene::read(&place.at(&name)).unwrap();
+        assert_eq!((scene.num_tokens(), scene.kind, found), (count, TokenKind::Clift, format));
+        assert_eq!(scene.context_frames, [0, 7]);
+        let bytes = place.bytes(&name).len() as u64;
+        assert_eq!(bytes, 8 + 2048 + 136 + 164 * 2 + (count * (28 + format.bytes_per_token(16))) as u64);
+        assert_eq!(bytes, scene.file_bytes(format));
+        let eval = place.at(storage);
+        place.eval("run", &["--tokens", storage, "--out", eval.to_str().unwrap()]).ok();
+        let points = place.json(&format!("{storage}/summary.json"))["points"].clone();
+        let point = points.as_array().unwrap().iter().find(|point| {
+            (point["variant"].as_str(), point["num_storage_tokens"].as_u64()) == (Some("clift"), Some(count as u64))
+        });
+        assert_eq!(point.unwrap()["scene_bytes"], bytes);
+
+        // Rounded or not, the file gives what the evaluation has in memory, to the last digit.
+        let from_file = measure(&clip, &drawn(&place.at(&name), &weights, &clip));
+        assert_eq!(from_file, evaluated(&place, storage, count), "{name}");
+        let exact = evaluated(&place, "run/eval", count);
+        let loss_db = match format {
+            TokenStorage::F32 => 0.0,
+            TokenStorage::F16 => 0.005,
+            TokenStorage::Int8 => 0.05,
+        };
+        for ((psnr, _), (exact, _)) in from_file.iter().zip(&exact) {
+            assert!((psnr - exact).abs() <= loss_db, "{name}: {psnr} dB against {exact}");
+        }
+
+        // The command draws the same pictures, rounded to 8 bits: half a level is at most 0.02 dB here.
+        let out = format!("{count}-{storage}");
+        let poses = place.at("poses.json").display().to_string();
+        clift(render_args(&place, &name, &out, &["--path", &poses])).ok();
+        let pictures: Vec<Vec<f32>> = (0..clip.target.num_views())
+            .map(|view| {
+                let picture = image::open(place.at(&format!("{out}/frame-{view:05}.png"))).unwrap().into_rgb8();
+                picture.into_raw().iter().map(|&value| f32::from(value) / 255.0).collect()
+            })
+            .collect();
+        for ((psnr, _), (exact, _)) in measure(&clip, &pictures).iter().zip(&from_file) {
+            assert!((psnr - exact).abs() < 0.02, "{name}: {psnr} dB in the file, {exact} drawn");
+        }
+    }
+}
+
+#[test]
+fn a_path_is_drawn_as_frames_and_an_animation_from_any_number_of_tokens() {
+    let place = Place::new();
+    place.train("run", &[], &[]).ok();
+    clift(encode_args(&place, "run", "room.clift", &["--scene", KEY, "--storage", "1.0"])).ok();
+    let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
+    assert_eq!((scene.num_tokens(), storage), (8, TokenStorage::F16));
+    assert_eq!(scene.context_frames.len(), 2, "as many contexts as in training");
+
+    let names = |out: &str| {
+        let items = std::fs::read_dir(place.at(out)).unwrap();
+        let mut names: Vec<_> = items.map(|item| item.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    };
+    for (out, size, flags, num_render_tokens) in [
+        ("all", (16, 16), vec!["--path", "interpolate"], 8),
+        ("some", (16, 16), vec!["--path", "interpolate", "--render", "3"], 3),
+        ("global", (16, 16), vec!["--path", "orbit", "--render", "1/2", "--selection", "global"], 4),
+        ("large", (48, 32), vec!["--path", "orbit", "--size", "48x32"], 8),
+        ("in-time", (16, 16), vec!["--path", "orbit", "--budget-ms", "60000"], 8),
+    ] {
+        let flags = [&flags[..], &["--frames", "10", "--fps", "12"]].concat();
+        let ran = clift(render_args(&place, "room.clift", out, &flags)).ok();
+        let expected = format!("10 frames of {} x {}, each from {num_render_tokens} of 8 tokens", size.0, size.1);
+        assert!(ran.stdout.contains(&expected), "{}", ran.stdout);
+        let mut expected: Vec<String> = (0..10).map(|frame| format!("frame-{frame:05}.png")).collect();
+        expected.insert(0, "animation.png".into());
+        expected.push("render.json".into());
+        assert_eq!(names(out), expected);
+        for name in &expected[..11] {
+            assert_eq!(image::image_dimensions(place.at(out).join(name)).unwrap(), size, "{out}/{name}");
+        }
+        let report = place.json(&format!("{out}/render.json"));
+        assert_eq!((&report["num_frames"], &report["num_render_tokens"]), (&10.into(), &num_render_tokens.into()));
+        assert_eq!(report["calibration"].is_array(), out == "in-time", "{report}");
+        assert_eq!(report["select_s"].as_f64().unwrap() > 0.0, num_render_tokens < 8, "{report}");
+    }
+    // The first frame through the contexts is the first context's.
+    let device = burn::tensor::Device::flex();
+    let renderer = load_renderer(&scene, &place.at("run/stage2/model.safetensors"), &device).unwrap();
+    let mut viewer = Viewer::new(&scene, renderer, Preset::Paper.rules(), &device).unwrap();
+    let first = viewer.draw(&scene.context[..1], 16, 16, 8).unwrap().remove(0);
+    let first = Picture::from_unit(&first.pixels, 16, 16).unwrap();
+    let written = image::open(place.at("all/frame-00000.png")).unwrap().into_rgb8();
+    let difference = first.as_rgb8().iter().zip(written.as_raw()).map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(difference <= Some(1), "rounding alone differs: {difference:?}");
+    assert_ne!(place.bytes("all/frame-00000.png"), place.bytes("some/frame-00000.png"));
+    assert_ne!(place.bytes("all/frame-00000.png"), place.bytes("all/frame-00009.png"));
+}
+
+#[test]
+fn what_cannot_be_drawn_says_what_to_do() {
+    let place = Place::new();
+    place.train("run", &[], &[]).ok();
+    place.train("other", &["seed=1"], &["--only", "stage1"]).ok();
+    clift(encode_args(&place, "run", "room.clift", &["--scene", KEY])).ok();
+    let render = |flags: &[&str]| clift(render_args(&place, "room.clift", "out", flags));
+    let orbit = ["--path", "orbit", "--frames", "2"];
+    let with = |flags: &[&str]| render(&[&orbit[..], flags].concat());
+
+    let message = with(&["--budget-ms", "0.0001"]).fails(2);
+    assert!(message.contains("no frame takes less than ") && message.contains("--budget-ms "), "{message}");
+    let message = with(&["--size", "20x16"]).fails(2);
+    assert!(message.contains("an image of 20 x 16 does not divide into patches of 8 x 8"), "{message}");
+    assert!(with(&["--render", "9"]).fails(2).contains("a scene has 2 tokens"));
+    let other = place.at("other/stage1/model.safetensors").display().to_string();
+    let message = with(&["--model", &other]).fails(2);
+    assert!(message.contains("the scene was made for the renderer ") && message.contains("--model RUN"), "{message}");
+    let message = render(&["--path", "no/poses.json"]).fails(1);
+    assert!(message.trim_end().ends_with("no/poses.json"), "{message}");
+    assert!(!place.at("out").exists(), "nothing is left of what was refused");
+
+    std::fs::create_dir(place.at("out")).unwrap();
+    std::fs::write(place.at("out/notes.txt"), "").unwrap();
+    assert!(with(&[]).fails(2).contains("is not empty, and nothing is written over"));
+    std::fs::remove_file(place.at("out/notes.txt")).unwrap();
+
+    std::fs::rename(place.at("run"), place.at("moved")).unwrap();
+    let message = with(&[]).fails(2);
+    assert!(message.contains("which is not there; give the run with --model RUN"), "{message}");
+    let moved = place.at("moved").display().to_string();
+    with(&["--model", &moved]).ok();
+
+    place.truncate("room.clift");
+    let message = clift(render_args(&place, "room.clift", "again", &orbit)).fails(1);
+    assert!(message.contains("cannot use the scene: it is cut off") && message.contains("copy it again"), "{message}");
+    let weights = place.at("moved/stage2/model.safetensors").display().to_string();
+    let message = clift(["render", weights.as_str(), "--path", "orbit", "--out", "again"]).fails(1);
+    assert!(message.contains("its header does not say that it is a scene"), "{message}");
+}
+
+#[test]
+fn a_scene_is_chosen_by_key_and_encoded_with_what_the_run_has() {
+    let place = Place::new();
+    place.train("run", &[], &["--only", "stage1"]).ok();
+    let encode = |flags: &[&str]| clift(encode_args(&place, "run", "room.clift", flags));
+    let message = encode(&[]).fails(2);
+    assert!(message.contains("scenes; choose one with --scene: synthetic-0-test-00000, "), "{message}");
+    assert!(encode(&["--scene", "attic"]).fails(2).contains("there is no scene attic; the "));
+    let message = encode(&["--scene", KEY, "--context", "0,8"]).fails(2);
+    assert!(message.contains("`--context` = 0,8: there is no frame 8; the scene has frames 0 to 7"), "{message}");
+    assert!(encode(&["--scene", KEY, "--storage", "9"]).fails(2).contains("a scene has 8 tokens"));
+    assert!(encode(&["--scene", KEY, "--storage", "4", "--max-error", "0.5"]).code == Some(2));
+
+    // Without stage 2, tokens are those nearest to the cluster centres. No variance may be left: all of them.
+    let ran = encode(&["--scene", KEY, "--max-error", "0"]).ok();
+    assert!(ran.stdout.contains("8 of 8 tokens (kmeans, f16)"), "{}", ran.stdout);
+    assert!(encode(&["--scene", KEY, "--max-error", "1"]).ok().stdout.contains("4 of 8 tokens"));
+    let frames = clift(render_args(&place, "room.clift", "out", &["--path", "orbit", "--frames", "2"])).ok();
+    assert!(frames.stdout.contains("2 frames of 16 x 16"), "{}", frames.stdout);
+
+    // Chunks of the same kind as the run's or not: any folder of them, either half, whole or by its index.
+    let mini = repository("data-fixtures/re10k-mini");
+    let on = |folder: &Path, flags: &[&str]| encode(&[&[folder.to_str().unwrap()], flags].concat());
+    assert!(on(&mini, &[]).ok().stdout.contains("scene 00000000000000b1, 2 views of 16 x 16"));
+    assert!(on(&mini.join("test"), &[]).ok().stdout.contains("scene 00000000000000b1"));
+    let train = ["--split", "train", "--scene", "00000000000000a2"];
+    assert!(on(&mini, &train).ok().stdout.contains("scene 00000000000000a2"));
+    assert!(on(&place.at("run"), &[]).fails(2).contains("holds neither index.json nor test/index.json"));
+
+    let file = place.at("run/stage1/model.safetensors").display().to_string();
+    let out = place.at("from-file.clift").display().to_string();
+    clift(["encode", &file, mini.to_str().unwrap(), "-o", &out]).ok();
+    assert_eq!(Scene::read(Path::new(&out)).unwrap().0.model_path, file);
+    std::fs::copy(&file, place.at("alone.safetensors")).unwrap();
+    let alone = place.at("alone.safetensors").display().to_string();
+    let message = clift(["encode", &alone, mini.to_str().unwrap(), "-o", &out]).fails(2);
+    assert!(message.contains("no config.toml beside it or above it"), "{message}");
+}
