@@ -167,7 +167,6 @@ impl Kernel for Forward<'_> {
     type Output = ();
 
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     fn run<S: Simd>(self, simd: S) {
         let Self { sizes, query, key, value, output, log_sum, scene, head, queries } = self;
         let Sizes { num_keys, head_width, .. } = sizes;
@@ -233,7 +232,6 @@ impl Kernel for Forward<'_> {
 /// Turns a row of scores into `2^(score * scale - highest)` with the highest scaled score so far, adds
 /// them to `total`, and returns the factor that brings what was summed before to the new height.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn exponentials<S: Simd>(simd: S, scores: &mut [f32], scale: f32, highest: &mut f32, total: &mut f32) -> f32 {
     let full = scores.len() / S::LANES * S::LANES;
     let mut largest = simd.splat(f32::NEG_INFINITY);
@@ -261,7 +259,6 @@ fn exponentials<S: Simd>(simd: S, scores: &mut [f32], scale: f32, highest: &mut 
 }
 
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn scale<S: Simd>(simd: S, values: &mut [f32], factor: f32) {
     let factor = simd.splat(factor);
     for chunk in values.chunks_exact_mut(S::LANES) {
@@ -271,7 +268,6 @@ fn scale<S: Simd>(simd: S, values: &mut [f32], factor: f32) {
 
 /// Copies rows one after the other, each followed by zeros up to `width`.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn copy_padded<'a>(to: &mut [f32], width: usize, rows: impl Iterator<Item = &'a [f32]>) {
     for (to, row) in to.chunks_exact_mut(width).zip(rows) {
         to[..row.len()].copy_from_slice(row);
@@ -281,7 +277,6 @@ fn copy_padded<'a>(to: &mut [f32], width: usize, rows: impl Iterator<Item = &'a 
 
 /// Copies rows as columns of panels: a panel is `[head_width, panel]`, the last one padded with zeros.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn copy_transposed<'a>(
     to: &mut [f32],
     panel: usize,
@@ -399,7 +394,6 @@ impl<'a> Kernel for BackwardTask<'a> {
     type Output = Vec<f32>;
 
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     fn run<S: Simd>(self, simd: S) -> Vec<f32> {
         let Self { sizes, saved, grad_key, grad_value, scene, head, keys } = self;
         let Sizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
@@ -483,7 +477,6 @@ impl<'a> Kernel for BackwardTask<'a> {
 
 /// Turns a row of scores into weights `P`, and the weights' gradients beside it into the scores'.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn score_gradients<S: Simd>(simd: S, (scores, slopes): (&mut [f32], &mut [f32]), scale: f32, log_sum: f32, delta: f32) {
     let (factor, shift, delta) = (simd.splat(scale), simd.splat(-log_sum), simd.splat(delta));
     for (score, slope) in scores.chunks_exact_mut(S::LANES).zip(slopes.chunks_exact_mut(S::LANES)) {
@@ -563,7 +556,9 @@ mod tests {
         let Sizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
         let make = |count: usize, seed: u64| random(batch * count * sizes.dim(), seed);
         let mut q = make(num_queries, 1);
-        q.iter_mut().for_each(|value| *value *= spread);
+        for value in &mut q {
+            *value *= spread;
+        }
         let (k, v, grad) = (make(num_keys, 2), make(num_keys, 3), make(num_queries, 4));
         let expected = reference(&sizes, [&q, &k, &v, &grad]);
         for set in InstructionSet::available() {

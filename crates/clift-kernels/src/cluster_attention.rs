@@ -99,7 +99,6 @@ impl Kernel for Forward<'_> {
     type Output = ();
 
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     fn run<S: Simd>(self, simd: S) {
         let Self { segments, query, key_value, first, output, weights } = self;
         let (dim, heads, width) = (segments.dim(), segments.num_heads, segments.head_width);
@@ -188,7 +187,6 @@ impl Kernel for Backward<'_> {
     type Output = ();
 
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     fn run<S: Simd>(self, simd: S) {
         let Self { segments, query, key_value, weights, grad, first, grad_query, grad_key_value } = self;
         let (dim, heads, width) = (segments.dim(), segments.num_heads, segments.head_width);
@@ -232,7 +230,6 @@ impl Kernel for Backward<'_> {
 }
 
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn dot<S: Simd>(simd: S, a: &[f32], b: &[f32]) -> f32 {
     let mut total = simd.splat(0.0);
     for (a, b) in a.chunks(S::LANES).zip(b.chunks(S::LANES)) {
@@ -243,7 +240,6 @@ fn dot<S: Simd>(simd: S, a: &[f32], b: &[f32]) -> f32 {
 
 /// `to += factor * from`
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn add_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
     let factor = simd.splat(factor);
     for (from, to) in from.chunks(S::LANES).zip(to.chunks_mut(S::LANES)) {
@@ -253,7 +249,6 @@ fn add_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
 
 /// `to = factor * from`
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn set_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
     let factor = simd.splat(factor);
     for (from, to) in from.chunks(S::LANES).zip(to.chunks_mut(S::LANES)) {

@@ -39,7 +39,6 @@ impl<F: Map> Kernel for MapPiece<'_, F> {
     type Output = ();
 
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     fn run<S: Simd>(self, simd: S) {
         for (from, to) in self.from.chunks(S::LANES).zip(self.to.chunks_mut(S::LANES)) {
             simd.write(to, self.function.apply(simd, simd.read(from)));
@@ -57,7 +56,6 @@ impl<F: Combine> Kernel for CombinePiece<'_, F> {
     type Output = ();
 
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     fn run<S: Simd>(self, simd: S) {
         for (from, to) in self.from.chunks(S::LANES).zip(self.to.chunks_mut(S::LANES)) {
             simd.write(to, self.function.apply(simd, simd.read(from), simd.read(to)));

@@ -82,7 +82,6 @@ impl Kernel for Forward<'_> {
     type Output = ();
 
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     fn run<S: Simd>(self, simd: S) {
         let Self { epsilon, x, gamma, beta, output, statistics } = self;
         let dim = gamma.len();
@@ -116,7 +115,6 @@ impl Kernel for Backward<'_> {
     type Output = ();
 
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     fn run<S: Simd>(self, simd: S) {
         let Self { x, gamma, grad, grad_x, statistics, sums } = self;
         let dim = gamma.len();
@@ -153,7 +151,6 @@ impl Kernel for Backward<'_> {
 }
 
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn sum<S: Simd>(simd: S, values: &[f32]) -> f32 {
     let mut total = simd.splat(0.0);
     for chunk in values.chunks(S::LANES) {
@@ -164,7 +161,6 @@ fn sum<S: Simd>(simd: S, values: &[f32]) -> f32 {
 
 /// Sum of `(value - mean)^2`.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 fn sum_of_squares<S: Simd>(simd: S, values: &[f32], mean: f32) -> f32 {
     let full = values.len() / S::LANES * S::LANES;
     let shift = simd.splat(mean);
@@ -204,7 +200,6 @@ impl Kernel for SumRows<'_> {
     type Output = ();
 
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     fn run<S: Simd>(self, simd: S) {
         for x in self.x.chunks_exact(self.to.len()) {
             for (x, to) in x.chunks(S::LANES).zip(self.to.chunks_mut(S::LANES)) {

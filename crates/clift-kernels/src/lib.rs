@@ -1,10 +1,12 @@
 //! CPU kernels of clift: slices in, slices out, without Burn.
 //!
-//! Each kernel is written once over [`simd::Simd`] and compiled for every [`InstructionSet`]; the one
+//! Each kernel is written once over `simd::Simd` and compiled for every [`InstructionSet`]; the one
 //! to use is chosen at run time. Work is split by shape and never by the number of threads, so a
 //! result does not depend on how many there are.
 //!
 //! All values are f32: other types take the composed operations of `clift-model`.
+
+#![expect(clippy::inline_always, reason = "only what is inlined into a kernel is compiled with its instructions")]
 
 pub mod attention;
 pub mod cluster_attention;
@@ -16,7 +18,7 @@ pub mod layer_norm;
 pub mod linear;
 mod matmul;
 mod scratch;
-pub mod simd;
+mod simd;
 #[cfg(test)]
 mod testing;
 

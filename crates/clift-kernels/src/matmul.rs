@@ -32,7 +32,6 @@ impl Tile {
     /// # Safety
     /// All values of A, B and C that the sizes name must be readable, C's writable.
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     #[expect(clippy::needless_range_loop, reason = "both loops unroll over constants")]
     pub unsafe fn run<S: Simd, const ROWS: usize, const VECTORS: usize>(self, simd: S) {
         let Self { inner, a, a_row, a_step, b, b_step, c, c_row, accumulate } = self;
@@ -83,14 +82,12 @@ pub(crate) struct Right<'a> {
 
 /// Columns of a full panel.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "a constant")]
 pub(crate) fn panel_width<S: Simd>() -> usize {
     S::LANES * S::TILE_VECTORS
 }
 
 /// `columns` rounded up to whole vectors.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "a division by a constant")]
 pub(crate) fn padded<S: Simd>(columns: usize) -> usize {
     columns.next_multiple_of(S::LANES)
 }
@@ -98,7 +95,6 @@ pub(crate) fn padded<S: Simd>(columns: usize) -> usize {
 /// `C[rows, columns] = A[rows, inner] B[inner, columns]`, or added to C. Whole vectors of columns are
 /// computed: B must have and C must have room for [`padded`] columns.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 pub(crate) fn multiply<S: Simd>(
     simd: S,
     [rows, inner, columns]: [usize; 3],
@@ -145,7 +141,6 @@ pub(crate) fn multiply<S: Simd>(
 /// # Safety
 /// As [`Tile::run`].
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
 unsafe fn run_tile<S: Simd>(simd: S, tile: Tile, rows: usize, vectors: usize) -> usize {
     // SAFETY: the caller's.
     unsafe {
@@ -180,7 +175,6 @@ impl Tile {
     /// # Safety
     /// As [`Tile::run`].
     #[inline(always)]
-    #[expect(clippy::inline_always, reason = "must be compiled with the instructions of its caller")]
     unsafe fn run_vectors<S: Simd, const ROWS: usize>(self, simd: S) {
         // SAFETY: the caller's.
         unsafe {

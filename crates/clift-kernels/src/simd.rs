@@ -2,8 +2,7 @@
 //!
 //! A value of a type that implements [`Simd`] is the proof that the processor has its instructions,
 //! which makes the arithmetic safe to call. Everything that is generic over [`Simd`] must be
-//! `#[inline(always)]`: only code inlined into [`InstructionSet::run`](crate::InstructionSet::run)
-//! is compiled with the instructions.
+//! `#[inline(always)]`: only code inlined into `InstructionSet::run` is compiled with the instructions.
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
@@ -58,8 +57,6 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn min(self, a: Self::V, b: Self::V) -> Self::V;
     /// `yes` where `condition` is less than zero, `no` elsewhere.
     fn select_negative(self, condition: Self::V, yes: Self::V, no: Self::V) -> Self::V;
-    /// The square root.
-    fn sqrt(self, a: Self::V) -> Self::V;
     /// The nearest integer, ties to even.
     fn round(self, a: Self::V) -> Self::V;
     /// `a * 2^n` for integers `n` in `-126..=127`.

@@ -478,12 +478,10 @@ mod tests {
         }
     }
 
+    type Attend = fn([Tensor<3>; 2]) -> Tensor<3>;
+
     /// Output and gradients of the inputs.
-    fn results(
-        inputs: [Tensor<3>; 2],
-        cotangent: Tensor<3>,
-        attend: fn([Tensor<3>; 2]) -> Tensor<3>,
-    ) -> [Tensor<3>; 3] {
+    fn results(inputs: [Tensor<3>; 2], cotangent: Tensor<3>, attend: Attend) -> [Tensor<3>; 3] {
         let inputs = inputs.map(|input| input.autodiff().require_grad());
         let output = attend(inputs.clone());
         let grads = (output.clone() * cotangent.autodiff()).sum().backward();
@@ -494,7 +492,7 @@ mod tests {
     #[test]
     fn native_kernels_equal_the_composed_operation_in_f64_at_odd_shapes() {
         let device = Device::flex();
-        let cases: [([usize; 4], fn([Tensor<3>; 2]) -> Tensor<3>); 5] = [
+        let cases: [([usize; 4], Attend); 5] = [
             ([2, 1, 7, 36], |[q, kv]| cross_sdpa(q, kv, 3)),
             ([1, 9, 1, 24], |[q, kv]| cross_sdpa(q, kv, 2)),
             ([1, 101, 67, 192], |[q, kv]| cross_sdpa(q, kv, 2)),

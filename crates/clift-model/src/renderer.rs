@@ -51,7 +51,8 @@ impl Renderer {
     /// # Shapes
     /// - `tokens`: `[batch, num_render_tokens, dim]`
     pub fn memory(&self, tokens: &Tensor<3>) -> SceneMemory {
-        SceneMemory { blocks: self.blocks.iter().map(|block| block.memory(tokens.clone())).collect() }
+        let blocks = self.blocks.iter().map(|block| block.memory(tokens.clone())).collect();
+        SceneMemory { blocks, num_render_tokens: tokens.dims()[1] }
     }
 
     /// Draws target views as [`forward`](Self::forward) does, from what [`memory`](Self::memory) prepared.
@@ -96,6 +97,26 @@ impl Renderer {
 pub struct SceneMemory {
     /// Each `[batch, num_render_tokens, 2 dim]`.
     blocks: Vec<Tensor<3>>,
+    num_render_tokens: usize,
+}
+
+impl SceneMemory {
+    /// How many tokens it is of.
+    pub fn num_render_tokens(&self) -> usize {
+        self.num_render_tokens
+    }
+
+    /// The memory of some of the tokens, by their places.
+    #[must_use]
+    pub fn select(&self, tokens: &[u32]) -> Self {
+        let Some(first) = self.blocks.first() else {
+            return self.clone();
+        };
+        let places: Vec<i64> = tokens.iter().map(|&token| i64::from(token)).collect();
+        let places = Tensor::<1, Int>::from_data(TensorData::new(places, [tokens.len()]), &first.device());
+        let blocks = self.blocks.iter().map(|memory| memory.clone().select(1, places.clone())).collect();
+        Self { blocks, num_render_tokens: tokens.len() }
+    }
 }
 
 /// The tokens that target views are drawn from.

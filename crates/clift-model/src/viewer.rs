@@ -6,9 +6,11 @@ use std::path::Path;
 use std::time::Instant;
 
 use burn::module::Module;
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use burn::tensor::{Device, Tensor, TensorData};
 
-use crate::{Cameras, Init, ModelConfig, ModelError, Renderer, Rules, Scene, Selector, ViewCamera, weights};
+use crate::{
+    Cameras, Init, ModelConfig, ModelError, Renderer, Rules, Scene, SceneMemory, Selector, ViewCamera, weights,
+};
 
 /// Frames that are drawn by one call where all tokens are used: they share keys and values.
 pub const FRAMES_PER_CALL: usize = 8;
@@ -73,7 +75,8 @@ pub struct Drawn {
 #[derive(Debug)]
 pub struct Viewer {
     renderer: Renderer,
-    tokens: Tensor<3>,
+    /// Of all stored tokens: what every frame draws from, or from a part of.
+    memory: SceneMemory,
     selector: Selector,
     device: Device,
 }
@@ -87,12 +90,12 @@ impl Viewer {
         let shape = [1, scene.num_tokens(), scene.model.dim];
         let tokens = Tensor::from_data(TensorData::new(scene.tokens.clone(), shape), device);
         let selector = Selector::new(rules, &scene.token_rays())?;
-        Ok(Self { renderer, tokens, selector, device: device.clone() })
+        Ok(Self { memory: renderer.memory(&tokens), renderer, selector, device: device.clone() })
     }
 
     /// How many tokens the scene has.
     pub fn num_storage_tokens(&self) -> usize {
-        self.tokens.dims()[1]
+        self.memory.num_render_tokens()
     }
 
     /// Forgets the previous frame.
@@ -144,15 +147,11 @@ impl Viewer {
     ) -> Result<Vec<Drawn>, ModelError> {
         let started = Instant::now();
         let cameras = Cameras::of_views(views, height, width, &self.device)?;
-        let tokens = match &chosen {
-            None => self.tokens.clone(),
-            Some(chosen) => {
-                let index: Vec<i64> = chosen.iter().map(|&token| i64::from(token)).collect();
-                let index = TensorData::new(index, [chosen.len()]);
-                self.tokens.clone().select(1, Tensor::<1, Int>::from_data(index, &self.device)) // [1, S, D] -> [1, R, D]
-            }
+        let pictures = match &chosen {
+            None => self.renderer.draw(&self.memory, &cameras),
+            Some(chosen) => self.renderer.draw(&self.memory.select(chosen), &cameras),
         };
-        let pictures = self.renderer.forward(tokens, &cameras).into_data().convert::<f32>();
+        let pictures = pictures.into_data().convert::<f32>();
         let pixels =
             pictures.try_to_vec::<f32>().map_err(|error| ModelError::Device { reason: format!("{error:?}") })?;
         let render_s = started.elapsed().as_secs_f64() / views.len() as f64;

@@ -9,6 +9,7 @@ mod forward;
 pub(crate) mod inputs;
 mod memory;
 mod reference;
+mod selection;
 mod statistics;
 mod step;
 mod task;
@@ -156,7 +157,7 @@ fn measure(
     let max_rel_error = if options.error {
         let error = task.error(&context.reference()?)?;
         advance(1)?;
-        Some(error)
+        error
     } else {
         None
     };

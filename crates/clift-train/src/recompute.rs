@@ -7,6 +7,7 @@
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Gradients, Tensor};
+use clift_model::block::EncoderBlock;
 use clift_model::{Cameras, Clift, Views};
 
 use crate::TrainError;
@@ -27,8 +28,7 @@ pub(crate) fn backward(
     // Forward without a tape: what every block starts from.
     let context = Views { images: shown.context.images.clone().inner(), cameras: untracked(&shown.context.cameras) };
     let targets = untracked(&shown.targets);
-    let (encoder_inputs, lift) =
-        inputs(plain.encoder.embed(&context), plain.encoder.blocks(), |block, x| block.forward(x));
+    let (encoder_inputs, lift) = inputs(plain.encoder.embed(&context), plain.encoder.blocks(), EncoderBlock::forward);
     let tokens = choice.apply(&plain.condenser, lift.clone())?;
     let (renderer_inputs, x) = inputs(plain.renderer.embed(&targets), plain.renderer.blocks(), |block, x| {
         block.forward(x, tokens.memory(block))

@@ -7,7 +7,6 @@ pub struct Portable;
 
 const LANES: usize = 8;
 
-#[expect(clippy::inline_always, reason = "the arrays must stay in registers")]
 impl Simd for Portable {
     const LANES: usize = LANES;
     const TILE_ROWS: usize = 4;
@@ -60,10 +59,6 @@ impl Simd for Portable {
     #[inline(always)]
     fn select_negative(self, condition: Self::V, yes: Self::V, no: Self::V) -> Self::V {
         std::array::from_fn(|i| if condition[i] < 0.0 { yes[i] } else { no[i] })
-    }
-    #[inline(always)]
-    fn sqrt(self, a: Self::V) -> Self::V {
-        a.map(f32::sqrt)
     }
     #[inline(always)]
     fn round(self, a: Self::V) -> Self::V {

@@ -47,7 +47,7 @@ impl Task for Clustering {
         Ok(())
     }
 
-    fn error(self: Box<Self>, reference: &Device) -> Result<f64, TrainError> {
+    fn error(self: Box<Self>, reference: &Device) -> Result<Option<f64>, TrainError> {
         let fit = match &self.fit {
             Some(fit) => fit.clone(),
             None => self.fit(self.tokens.clone())?,
@@ -55,7 +55,7 @@ impl Task for Clustering {
         let reached = inertia(&self.tokens, &fit);
         let tokens = self.tokens.in_f64(reference);
         let expected = inertia(&self.tokens, &self.fit(tokens)?);
-        Ok(if reached == expected { 0.0 } else { (reached - expected).abs() / expected })
+        Ok(Some(if reached == expected { 0.0 } else { (reached - expected).abs() / expected }))
     }
 
     fn inertia(&self) -> Option<f64> {

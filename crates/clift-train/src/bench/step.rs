@@ -88,7 +88,7 @@ impl Task for StepTask {
         Err(TrainError::Diverged { count, step, keys, checkpoint })
     }
 
-    fn error(self: Box<Self>, reference: &Device) -> Result<f64, TrainError> {
+    fn error(self: Box<Self>, reference: &Device) -> Result<Option<f64>, TrainError> {
         let Self { stage, reduced, .. } = *self;
         let batch_size = Part::of(&reduced.config, stage).batch_size;
         let batch = stage_batch(&reduced, stage, batch_size)?;
@@ -97,7 +97,7 @@ impl Task for StepTask {
         let copy = module_in_f64(&model, reference).train();
         let shown = Shown::upload(&batch, &reference.clone().autodiff())?.in_f64(&reference.clone().autodiff());
         let theirs = gradients(&copy, &batch, shown)?;
-        Ok(largest_error(&model, &ours, &theirs))
+        Ok(Some(largest_error(&model, &ours, &theirs)))
     }
 }
 

@@ -10,9 +10,10 @@ pub trait Task {
     /// Does the work once; what is queued on the device may go on.
     fn run(&mut self) -> Result<(), TrainError>;
 
-    /// Largest relative error against the same computation in f64 on the reference device. Takes the task, so
+    /// Largest relative error against the same computation in f64 on the reference device, where the result is
+    /// numbers. Takes the task, so
     /// that what only the timing needs is gone by then.
-    fn error(self: Box<Self>, reference: &Device) -> Result<f64, TrainError>;
+    fn error(self: Box<Self>, reference: &Device) -> Result<Option<f64>, TrainError>;
 
     /// By what the seconds of a repetition are divided.
     fn num_views(&self) -> usize {
@@ -46,11 +47,11 @@ impl<T: Forward> Task for T {
         Ok(())
     }
 
-    fn error(self: Box<Self>, reference: &Device) -> Result<f64, TrainError> {
+    fn error(self: Box<Self>, reference: &Device) -> Result<Option<f64>, TrainError> {
         let result = self.forward();
         let copy = self.in_f64(reference);
         drop(self);
-        Ok(relative_error(result, copy.forward()))
+        Ok(Some(relative_error(result, copy.forward())))
     }
 
     fn num_views(&self) -> usize {

@@ -5,6 +5,7 @@ use serde::{Serialize, Serializer};
 use super::clustering::Clustering;
 use super::context::BenchContext;
 use super::forward::{ClusterAttend, Condense, Encode, Render};
+use super::selection::Selection;
 use super::step::StepTask;
 use super::task::Task;
 use crate::TrainError;
@@ -21,6 +22,8 @@ pub enum Work {
     Condense,
     /// The attention of equation 2 alone, without projections.
     ClusterAttention,
+    /// Algorithm 1: half of one scene's stored tokens for one view.
+    Select,
     /// One view of one scene from all its tokens.
     Render,
     /// Eight views of one scene in one call, sharing its tokens; seconds are per view.
@@ -35,11 +38,12 @@ pub enum Work {
 
 impl Work {
     /// All works, in the order they run.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Encode,
         Self::Kmeans,
         Self::Condense,
         Self::ClusterAttention,
+        Self::Select,
         Self::Render,
         Self::Render8Views,
         Self::Stage1Step,
@@ -54,6 +58,7 @@ impl Work {
             Self::Kmeans => "kmeans",
             Self::Condense => "condense",
             Self::ClusterAttention => "cluster_attention",
+            Self::Select => "select",
             Self::Render => "render",
             Self::Render8Views => "render_8_views",
             Self::Stage1Step => "stage1_step",
@@ -74,6 +79,7 @@ impl Work {
             Self::Kmeans => Box::new(Clustering::new(context)?),
             Self::Condense => Box::new(Condense::new(context)?),
             Self::ClusterAttention => Box::new(ClusterAttend::new(context)?),
+            Self::Select => Box::new(Selection::new(context)?),
             Self::Render => Box::new(Render::new(context, 1)?),
             Self::Render8Views => Box::new(Render::new(context, 8)?),
             Self::Stage1Step => Box::new(StepTask::new(context, Stage::Stage1)?),
@@ -114,6 +120,8 @@ mod tests {
             assert_eq!(work.name().parse(), Ok(work));
         }
         let message = "incode".parse::<Work>().unwrap_err();
-        assert!(message.starts_with("unknown; the works are encode, kmeans, condense, cluster_attention, render, "));
+        assert!(
+            message.starts_with("unknown; the works are encode, kmeans, condense, cluster_attention, select, render, ")
+        );
     }
 }
