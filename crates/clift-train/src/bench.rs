@@ -207,7 +207,8 @@ mod tests {
             assert_eq!(report.rows.iter().map(|row| row.work).collect::<Vec<_>>(), Work::ALL);
             for row in &report.rows {
                 // Blocks of f32 as in the tests of the model: outputs to 1e-5, gradients to 5e-5.
-                assert!(row.max_rel_error.is_some_and(|error| error < 1e-4), "{device}: {row:?}");
+                let close = row.max_rel_error.map(|error| error < 1e-4);
+                assert_eq!(close, (row.work != Work::Select).then_some(true), "{device}: {row:?}");
                 assert_eq!(row.samples_s.len(), 2);
                 assert!(row.samples_s.iter().all(|sample| (0.0..=row.p95_s).contains(sample)));
                 assert_eq!(row.inertia.is_some(), row.work == Work::Kmeans);
