@@ -18,7 +18,7 @@ use crate::EvalError;
 use crate::exhibit::{Exhibit, best_variant};
 use crate::machine;
 use crate::summary::{Point, Summary};
-use axis::grouped;
+use axis::{grouped, milliseconds};
 use figures::{Figure, fastest, figures, is_whole, seconds, setting};
 use markup::Escaped;
 
@@ -114,7 +114,7 @@ impl Report {
         }
         if let Some((point, seconds)) = whole.last().and_then(|point| Some((point, seconds(point)?))) {
             let tokens = format!("{} tokens", grouped(point.num_storage_tokens as f64, 0));
-            tile("a frame", grouped(seconds * 1e3, 1), "ms", tokens)?;
+            tile("a frame", milliseconds(seconds), "ms", tokens)?;
         }
         let scenes = format!("of {}", grouped(self.ledger.num_scenes.max(*num_scenes) as f64, 0));
         let views = format!("{} views", grouped(*num_views as f64, 0));
@@ -162,8 +162,8 @@ impl Report {
                 number(point.psnr, 2),
                 number(point.psnr_stderr, 2),
                 number(point.ssim, 3),
-                number(point.select_s.map(|seconds| seconds * 1e3), 1),
-                number(point.render_s.map(|seconds| seconds * 1e3), 1),
+                point.select_s.map_or_else(|| DASH.into(), milliseconds),
+                point.render_s.map_or_else(|| DASH.into(), milliseconds),
                 number(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
                 if front.contains(&i) { "\u{25cf}".to_owned() } else { String::new() },
             ];
@@ -181,9 +181,8 @@ impl Report {
             return writeln!(out, "<p class=\"none\">None is shown: <code>eval.num_sheets</code> is 0.</p>");
         }
         writeln!(out, "<p class=\"note\">{SCENES_NOTE}</p>")?;
-        if self.exhibits.iter().all(|exhibit| exhibit.choices.is_empty()) {
-            writeln!(out, "<p class=\"note\">{NO_CHOICE}</p>")?;
-        }
+        let has_choices = self.exhibits.iter().any(|exhibit| !exhibit.choices.is_empty());
+        writeln!(out, "<p class=\"note\">{}</p>", if has_choices { CHOICE } else { NO_CHOICE })?;
         for (number, exhibit) in self.exhibits.iter().take(MAX_EXHIBITS).enumerate() {
             scene::write(exhibit, number, out)?;
         }
@@ -237,12 +236,18 @@ const SCENES_NOTE: &str = "The target view in the middle of each scene, as every
                            of the context views has the colour of its cluster, and rings are the centroids: the tokens \
                            that are stored.";
 
+const CHOICE: &str = "Where views are drawn from fewer tokens than are stored, dots are those chosen for the target and \
+                      rings the other stored ones.";
+
 const NO_CHOICE: &str = "All views are drawn from all stored tokens. <code>clift eval RUN --render 1/4,1/2</code> draws \
                          them from fewer, chosen for each view, and shows which.";
 
 const FOOTNOTE: &str = "PSNR is of pictures clamped to [0, 1]; SSIM has a Gaussian window of 11 taps. Means are over \
                         the views of a scene, then over scenes; \u{b1} is the standard error over scenes. A dash is what \
                         was not measured. Times are of this machine, under whatever else it did.";
+
+/// What was not measured.
+const DASH: &str = "\u{2013}";
 
 /// The first sentence: what the method reaches with the fewest and with the most tokens.
 fn sentence(fewest: &Point, most: &Point) -> String {
@@ -259,7 +264,7 @@ fn sentence(fewest: &Point, most: &Point) -> String {
 
 /// A value, or a dash where it was not measured.
 fn number(value: Option<f64>, decimals: usize) -> String {
-    value.filter(|value| value.is_finite()).map_or_else(|| "\u{2013}".into(), |value| grouped(value, decimals))
+    value.filter(|value| value.is_finite()).map_or_else(|| DASH.into(), |value| grouped(value, decimals))
 }
 
 #[cfg(test)]

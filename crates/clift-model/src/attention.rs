@@ -11,15 +11,14 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
-use burn::module::Module;
-use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Shape, Slice, Tensor, assert_shape};
 
-use crate::Init;
 use crate::autodiff::register;
-use crate::linear::{linear, linear_of_norm};
 
+mod layers;
 mod native;
+
+pub use layers::{CrossAttention, SelfAttention};
 
 /// Attention among the tokens of a scene, `softmax(q k^T / sqrt(head width)) v`, unmasked.
 ///
@@ -317,78 +316,6 @@ fn rows<B: Backend>(x: &FloatTensor<B>, (start, end): (usize, usize)) -> FloatTe
 
 fn concat<B: Backend>(mut chunks: Vec<FloatTensor<B>>) -> FloatTensor<B> {
     if chunks.len() == 1 { chunks.remove(0) } else { B::float_cat(chunks, 2) }
-}
-
-/// Self-attention with a packed projection (paper section 3.1: eight heads).
-#[derive(Module, Debug)]
-pub struct SelfAttention {
-    in_proj: Linear,
-    out_proj: Linear,
-    #[module(skip)]
-    num_heads: usize,
-}
-
-impl SelfAttention {
-    /// Makes the layer with PyTorch's initialisation of multi-head attention.
-    pub fn new(dim: usize, num_heads: usize, init: &mut Init) -> Self {
-        Self { in_proj: init.attention_in(dim, 3), out_proj: init.attention_out(dim), num_heads }
-    }
-
-    /// Mixes the normalised tokens of the same scene.
-    ///
-    /// # Shapes
-    /// - `x` and the result: `[batch, count, dim]`
-    pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
-        linear(&self.out_proj, self_sdpa(linear_of_norm(norm, &self.in_proj, x), self.num_heads))
-    }
-}
-
-/// Attention from one set of tokens to another.
-#[derive(Module, Debug)]
-pub struct CrossAttention {
-    q_proj: Linear,
-    kv_proj: Linear,
-    out_proj: Linear,
-    #[module(skip)]
-    num_heads: usize,
-}
-
-impl CrossAttention {
-    /// Makes the layer with PyTorch's initialisation of multi-head attention.
-    pub fn new(dim: usize, num_heads: usize, init: &mut Init) -> Self {
-        Self {
-            q_proj: init.attention_in(dim, 1),
-            kv_proj: init.attention_in(dim, 2),
-            out_proj: init.attention_out(dim),
-            num_heads,
-        }
-    }
-
-    /// Queries, `[batch, num_queries, dim]`.
-    pub(crate) fn project_query(&self, norm: Option<&LayerNorm>, x: Tensor<3>) -> Tensor<3> {
-        project(norm, &self.q_proj, x)
-    }
-
-    /// Keys and values side by side, `[batch, num_keys, 2 dim]`. They depend on the tokens alone.
-    pub(crate) fn project_memory(&self, norm: Option<&LayerNorm>, memory: Tensor<3>) -> Tensor<3> {
-        project(norm, &self.kv_proj, memory)
-    }
-
-    /// The projection after the heads.
-    pub(crate) fn project_out(&self, x: Tensor<3>) -> Tensor<3> {
-        linear(&self.out_proj, x)
-    }
-
-    pub(crate) fn num_heads(&self) -> usize {
-        self.num_heads
-    }
-}
-
-fn project(norm: Option<&LayerNorm>, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
-    match norm {
-        Some(norm) => linear_of_norm(norm, layer, x),
-        None => linear(layer, x),
-    }
 }
 
 #[cfg(test)]

@@ -91,17 +91,23 @@ fn linear_ticks(min: f64, max: f64) -> Vec<f64> {
 }
 
 /// Powers of ten within a range, with 2 and 5 times them or 3 times them where there is room, at most [`MAX_TICKS`];
-/// a range that holds fewer than two of them is divided evenly.
+/// a range that holds fewer than three of them is divided evenly.
 fn log_ticks(min: f64, max: f64) -> Vec<f64> {
     let powers = min.log10().floor() as i32..=max.log10().ceil() as i32;
     for factors in [&[1.0, 2.0, 5.0][..], &[1.0, 3.0], &[1.0]] {
         let ticks = powers.clone().flat_map(|power| factors.iter().map(move |factor| factor * 10_f64.powi(power)));
         let ticks: Vec<f64> = ticks.filter(|tick| (min..=max).contains(tick)).collect();
-        if (2..=MAX_TICKS).contains(&ticks.len()) {
+        if (3..=MAX_TICKS).contains(&ticks.len()) {
             return ticks;
         }
     }
     linear_ticks(min, max)
+}
+
+/// Milliseconds of so many seconds, in three digits where they are below a thousand.
+pub fn milliseconds(seconds: f64) -> String {
+    let ms = seconds * 1e3;
+    grouped(ms, if ms < 9.995 { 2 } else { usize::from(ms < 99.95) })
 }
 
 /// A number with a comma between thousands.
@@ -146,7 +152,7 @@ mod tests {
         assert_eq!(labels(Scale::Log, &[7.0, 90.0]), ["10", "20", "50", "100"]);
         assert_eq!(labels(Scale::Log, &[0.5, 2000.0]), ["1", "10", "100", "1,000"]);
         assert_eq!(labels(Scale::Log, &[0.011, 0.12]), ["0.01", "0.02", "0.05", "0.10"]);
-        // No two of them lie between: divided evenly.
+        // None of them lies between: divided evenly.
         let expected = ["11.0", "11.5", "12.0", "12.5", "13.0", "13.5", "14.0"];
         assert_eq!(labels(Scale::Log, &[11.0, 14.0]), expected);
     }
@@ -181,6 +187,7 @@ mod tests {
     #[test]
     fn thousands_are_grouped() {
         assert_eq!([0.0, 999.0, 1000.0, 1_234_567.0].map(|v| grouped(v, 0)), ["0", "999", "1,000", "1,234,567"]);
+        assert_eq!([0.000_512, 0.0123, 0.4567, 3.2].map(milliseconds), ["0.51", "12.3", "457", "3,200"]);
         assert_eq!(grouped(-1234.56, 1), "\u{2212}1,234.6");
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::axis::{Scale, grouped};
+use super::axis::{Scale, milliseconds};
 use super::pareto::front;
 use super::plot::{Level, Look, Mark, Plot, Series};
 use crate::exhibit::best_variant;
@@ -104,7 +104,7 @@ fn mark(point: &Point, x: f64) -> Option<Mark> {
     let Point { num_storage_tokens: stored, num_render_tokens: rendered, .. } = *point;
     let tokens = if is_whole(point) { format!("{stored} tokens") } else { format!("{rendered} of {stored} tokens") };
     let error = point.psnr_stderr.map(|error| format!(" \u{b1} {error:.2}")).unwrap_or_default();
-    let time = seconds(point).map(|s| format!(", {} ms per frame", grouped(s * 1e3, 1))).unwrap_or_default();
+    let time = seconds(point).map(|s| format!(", {} ms per frame", milliseconds(s))).unwrap_or_default();
     let title = format!("{}, {tokens}: {y:.2}{error} dB{time}", point.variant.name());
     Some(Mark { x, y, error: point.psnr_stderr, title })
 }

@@ -155,7 +155,8 @@ impl Plot {
             }
             writeln!(out, "\"/>")?;
         }
-        for series in &self.series {
+        // The first, which is the method, on top.
+        for series in self.series.iter().rev() {
             series.write(out, &x, &y)?;
         }
         writeln!(out, "</svg>")?;

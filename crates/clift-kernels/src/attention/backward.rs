@@ -1,0 +1,205 @@
+//! The backward pass.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::{Gradients, Heads, QUERY_BLOCK, ROW_PADDING, Rows, Sizes, copy_padded, copy_transposed};
+use crate::InstructionSet;
+use crate::disjoint::Disjoint;
+use crate::instruction_set::Kernel;
+use crate::matmul::{Left, Right, multiply, padded, panel_width};
+use crate::scratch::{Scratch, cut};
+use crate::simd::Simd;
+
+/// Keys in a block: there are two blocks of scores and two of gradients.
+const BACKWARD_KEYS: usize = 256;
+
+/// What [`backward`] reads: the inputs and the results of [`forward`](super::forward), and the output's gradient.
+#[derive(Clone, Copy, Debug)]
+pub struct Saved<'a> {
+    /// Queries.
+    pub query: Rows<'a>,
+    /// Keys.
+    pub key: Rows<'a>,
+    /// Values.
+    pub value: Rows<'a>,
+    /// Output of the forward pass.
+    pub output: Rows<'a>,
+    /// Row sums of the forward pass, `[batch, num_heads, num_queries]`.
+    pub log_sum: &'a [f32],
+    /// Gradient of the output.
+    pub grad_output: Rows<'a>,
+}
+
+/// Computes the gradients of queries, keys and values.
+///
+/// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`, `dQ = s dS K`,
+/// `dK = s dS^T Q`; the scores are computed again, a block at a time.
+pub fn backward(set: InstructionSet, sizes: Sizes, saved: Saved<'_>, to: Gradients<'_>) {
+    let Sizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
+    let dim = sizes.dim();
+    assert_eq!(saved.log_sum.len(), batch * num_heads * num_queries, "a sum for every row of scores");
+    match to {
+        Gradients::Packed(packed) => {
+            assert!(packed.len() == batch * num_queries * 3 * dim && num_keys == num_queries);
+            let packed = Disjoint::new(packed);
+            let part = |part| Heads { values: &packed, count: num_queries, width: 3 * dim, first: part * dim };
+            backward_into(set, sizes, saved, [part(0), part(1), part(2)]);
+        }
+        Gradients::Separate { query, key_value } => {
+            assert!(query.len() == batch * num_queries * dim && key_value.len() == batch * num_keys * 2 * dim);
+            let (query, key_value) = (Disjoint::new(query), Disjoint::new(key_value));
+            let part = |part| Heads { values: &key_value, count: num_keys, width: 2 * dim, first: part * dim };
+            let query = Heads { values: &query, count: num_queries, width: dim, first: 0 };
+            backward_into(set, sizes, saved, [query, part(0), part(1)]);
+        }
+    }
+}
+
+/// The three parts must not overlap.
+fn backward_into(
+    set: InstructionSet,
+    sizes: Sizes,
+    saved: Saved<'_>,
+    [grad_query, grad_key, grad_value]: [Heads<'_>; 3],
+) {
+    let Sizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
+    let blocks = num_keys.div_ceil(BACKWARD_KEYS);
+    let parts = sizes.parts(blocks);
+    let tasks = sizes.batch * num_heads * parts;
+    // A part of the keys gives a part of every query's gradient.
+    let partial: Vec<Vec<f32>> = (0..tasks)
+        .into_par_iter()
+        .map(|task| {
+            let (head, part) = (task / parts, task % parts);
+            let bound = |part: usize| (part * blocks / parts * BACKWARD_KEYS).min(num_keys);
+            set.run(BackwardTask {
+                sizes,
+                saved,
+                grad_key,
+                grad_value,
+                scene: head / num_heads,
+                head: head % num_heads,
+                keys: bound(part)..bound(part + 1),
+            })
+        })
+        .collect();
+    (0..sizes.batch * num_heads).into_par_iter().for_each(|head| {
+        let parts = &partial[head * parts..(head + 1) * parts];
+        for row in 0..num_queries {
+            let width = parts[0].len() / num_queries;
+            let values = (row * width..row * width + head_width)
+                .map(|i| parts.iter().map(|part| part[i]).sum::<f32>() * sizes.scale());
+            // SAFETY: no other task has this head.
+            unsafe { grad_query.write([head / num_heads, row, head % num_heads], values) };
+        }
+    });
+}
+
+struct BackwardTask<'a> {
+    sizes: Sizes,
+    saved: Saved<'a>,
+    grad_key: Heads<'a>,
+    grad_value: Heads<'a>,
+    scene: usize,
+    head: usize,
+    keys: Range<usize>,
+}
+
+impl<'a> Kernel for BackwardTask<'a> {
+    /// Gradients of all queries from these keys before scaling, in rows of the padded head width.
+    type Output = Vec<f32>;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> Vec<f32> {
+        let Self { sizes, saved, grad_key, grad_value, scene, head, keys } = self;
+        let Sizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
+        let (width, panel) = (padded::<S>(head_width), panel_width::<S>());
+        let block = num_keys.min(BACKWARD_KEYS);
+        let score_row = block.next_multiple_of(panel) + ROW_PADDING;
+        let lens = [
+            num_queries * width,
+            num_queries * width,
+            num_queries,
+            block.next_multiple_of(panel) * head_width,
+            block.next_multiple_of(panel) * head_width,
+            block * width,
+            block * width,
+            block * width,
+            QUERY_BLOCK * score_row,
+            QUERY_BLOCK * score_row,
+        ];
+        let mut grad_query = vec![0.0; num_queries * width];
+        let head_of = |rows: &Rows<'a>, row: usize| rows.head(&sizes, scene, row, head);
+        let mut scratch = Scratch::take(lens.iter().sum());
+        let [queries, grads, delta, keys_t, values_t, key_rows, key_sums, value_sums, weights, slopes] =
+            cut(&mut scratch, lens);
+        copy_padded(queries, width, (0..num_queries).map(|row| head_of(&saved.query, row)));
+        copy_padded(grads, width, (0..num_queries).map(|row| head_of(&saved.grad_output, row)));
+        for (row, to) in delta.iter_mut().enumerate() {
+            let pairs = head_of(&saved.output, row).iter().zip(head_of(&saved.grad_output, row));
+            *to = pairs.map(|(a, b)| a * b).sum();
+        }
+        let log_sum = &saved.log_sum[(scene * num_heads + head) * num_queries..][..num_queries];
+
+        for first_key in keys.clone().step_by(BACKWARD_KEYS) {
+            let count = BACKWARD_KEYS.min(keys.end - first_key);
+            let rows = first_key..first_key + count;
+            copy_transposed(keys_t, panel, head_width, rows.clone().map(|row| head_of(&saved.key, row)));
+            copy_transposed(values_t, panel, head_width, rows.clone().map(|row| head_of(&saved.value, row)));
+            copy_padded(key_rows, width, rows.clone().map(|row| head_of(&saved.key, row)));
+            key_sums.fill(0.0);
+            value_sums.fill(0.0);
+            for start in (0..num_queries).step_by(QUERY_BLOCK) {
+                let rows = QUERY_BLOCK.min(num_queries - start);
+                let (query, grad) = (&queries[start * width..], &grads[start * width..]);
+                let transposed = |values| Right { values, step: panel, panel: panel * head_width };
+                let by_row = |values| Left { values, row: width, step: 1 };
+                let size = [rows, head_width, count];
+                multiply(simd, size, by_row(query), transposed(keys_t), (weights, score_row), false);
+                multiply(simd, size, by_row(grad), transposed(values_t), (slopes, score_row), false);
+                for row in 0..rows {
+                    let range = row * score_row..row * score_row + padded::<S>(count);
+                    score_gradients(
+                        simd,
+                        (&mut weights[range.clone()], &mut slopes[range]),
+                        sizes.scale() * std::f32::consts::LOG2_E,
+                        log_sum[start + row],
+                        delta[start + row],
+                    );
+                }
+                let by_key = |values| Left { values, row: 1, step: score_row };
+                let plain = |values| Right { values, step: width, panel };
+                let size = [count, rows, head_width];
+                multiply(simd, size, by_key(weights), plain(grad), (value_sums, width), true);
+                multiply(simd, size, by_key(slopes), plain(query), (key_sums, width), true);
+                let by_query = Left { values: slopes, row: score_row, step: 1 };
+                let to = (&mut grad_query[start * width..], width);
+                multiply(simd, [rows, count, head_width], by_query, plain(key_rows), to, true);
+            }
+            for row in 0..count {
+                let place = [scene, first_key + row, head];
+                let key_row = key_sums[row * width..][..head_width].iter().map(|sum| sum * sizes.scale());
+                let value_row = value_sums[row * width..][..head_width].iter().copied();
+                // SAFETY: no other task has this key of this head.
+                unsafe {
+                    grad_key.write(place, key_row);
+                    grad_value.write(place, value_row);
+                }
+            }
+        }
+        grad_query
+    }
+}
+
+/// Turns a row of scores into weights `P`, and the weights' gradients beside it into the scores'.
+#[inline(always)]
+fn score_gradients<S: Simd>(simd: S, (scores, slopes): (&mut [f32], &mut [f32]), scale: f32, log_sum: f32, delta: f32) {
+    let (factor, shift, delta) = (simd.splat(scale), simd.splat(-log_sum), simd.splat(delta));
+    for (score, slope) in scores.chunks_exact_mut(S::LANES).zip(slopes.chunks_exact_mut(S::LANES)) {
+        let weight = simd.exp2(simd.mul_add(simd.read(score), factor, shift));
+        simd.write(score, weight);
+        simd.write(slope, simd.mul(weight, simd.sub(simd.read(slope), delta)));
+    }
+}

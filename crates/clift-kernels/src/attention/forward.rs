@@ -1,0 +1,169 @@
+//! The forward pass.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::{Heads, QUERY_BLOCK, ROW_PADDING, Rows, Sizes, copy_padded, copy_transposed};
+use crate::InstructionSet;
+use crate::disjoint::Disjoint;
+use crate::instruction_set::Kernel;
+use crate::matmul::{Left, Right, multiply, padded, panel_width};
+use crate::scratch::{Scratch, cut};
+use crate::simd::Simd;
+
+/// Keys in a block: scores of a block take 200 KB.
+const FORWARD_KEYS: usize = 512;
+
+/// Computes `softmax(q k^T / sqrt(head width)) v` per head.
+///
+/// `output` is `[batch, num_queries, dim]`; `log_sum`, if wanted, is `[batch, num_heads, num_queries]` and
+/// receives each row's `log2(sum(2^(score * log2(e))))`, which [`backward`](super::backward) needs.
+pub fn forward(
+    set: InstructionSet,
+    sizes: Sizes,
+    [query, key, value]: [Rows<'_>; 3],
+    output: &mut [f32],
+    log_sum: Option<&mut [f32]>,
+) {
+    assert_eq!(output.len(), sizes.batch * sizes.num_queries * sizes.dim(), "a row for every query");
+    if sizes.num_keys == 0 {
+        output.fill(0.0);
+        return;
+    }
+    let blocks = sizes.num_queries.div_ceil(QUERY_BLOCK);
+    let parts = sizes.parts(blocks);
+    let output = Disjoint::new(output);
+    let output = Heads { values: &output, count: sizes.num_queries, width: sizes.dim(), first: 0 };
+    let log_sum = log_sum.map(Disjoint::new);
+    (0..sizes.batch * sizes.num_heads * parts).into_par_iter().for_each(|task| {
+        let (head, part) = (task / parts, task % parts);
+        let bound = |part: usize| (part * blocks / parts * QUERY_BLOCK).min(sizes.num_queries);
+        set.run(Forward {
+            sizes,
+            query,
+            key,
+            value,
+            output,
+            log_sum: log_sum.as_ref(),
+            scene: head / sizes.num_heads,
+            head: head % sizes.num_heads,
+            queries: bound(part)..bound(part + 1),
+        });
+    });
+}
+
+struct Forward<'a> {
+    sizes: Sizes,
+    query: Rows<'a>,
+    key: Rows<'a>,
+    value: Rows<'a>,
+    output: Heads<'a>,
+    log_sum: Option<&'a Disjoint<'a>>,
+    scene: usize,
+    head: usize,
+    queries: Range<usize>,
+}
+
+impl Kernel for Forward<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { sizes, query, key, value, output, log_sum, scene, head, queries } = self;
+        let Sizes { num_keys, head_width, .. } = sizes;
+        let (width, panel) = (padded::<S>(head_width), panel_width::<S>());
+        let score_row = num_keys.min(FORWARD_KEYS).next_multiple_of(panel) + ROW_PADDING;
+        let lens = [
+            num_keys.next_multiple_of(panel) * head_width,
+            num_keys * width,
+            QUERY_BLOCK * head_width,
+            QUERY_BLOCK * score_row,
+            QUERY_BLOCK * width,
+            QUERY_BLOCK,
+            QUERY_BLOCK,
+        ];
+        let mut scratch = Scratch::take(lens.iter().sum());
+        let [keys, values, block, scores, sums, highest, total] = cut(&mut scratch, lens);
+        copy_transposed(keys, panel, head_width, (0..num_keys).map(|row| key.head(&sizes, scene, row, head)));
+        copy_padded(values, width, (0..num_keys).map(|row| value.head(&sizes, scene, row, head)));
+        for start in queries.clone().step_by(QUERY_BLOCK) {
+            let rows = QUERY_BLOCK.min(queries.end - start);
+            copy_padded(block, head_width, (start..start + rows).map(|row| query.head(&sizes, scene, row, head)));
+            sums.fill(0.0);
+            highest.fill(f32::NEG_INFINITY);
+            total.fill(0.0);
+            for first_key in (0..num_keys).step_by(FORWARD_KEYS) {
+                let count = FORWARD_KEYS.min(num_keys - first_key);
+                let left = Left { values: block, row: head_width, step: 1 };
+                let right = Right { values: &keys[first_key * head_width..], step: panel, panel: panel * head_width };
+                multiply(simd, [rows, head_width, count], left, right, (scores, score_row), false);
+                for row in 0..rows {
+                    let shrink = exponentials(
+                        simd,
+                        &mut scores[row * score_row..][..count],
+                        sizes.scale() * std::f32::consts::LOG2_E,
+                        &mut highest[row],
+                        &mut total[row],
+                    );
+                    if shrink != 1.0 {
+                        scale(simd, &mut sums[row * width..][..width], shrink);
+                    }
+                }
+                let left = Left { values: scores, row: score_row, step: 1 };
+                let right = Right { values: &values[first_key * width..], step: width, panel };
+                multiply(simd, [rows, count, head_width], left, right, (sums, width), true);
+            }
+            for row in 0..rows {
+                let result = sums[row * width..][..head_width].iter().map(|sum| sum / total[row]);
+                // SAFETY: no other task has this query of this head.
+                unsafe { output.write([scene, start + row, head], result) };
+            }
+            if let Some(log_sum) = log_sum {
+                let place = (scene * sizes.num_heads + head) * sizes.num_queries + start;
+                // SAFETY: no other task has this query of this head.
+                let to = unsafe { log_sum.part(place, rows) };
+                for (row, to) in to.iter_mut().enumerate() {
+                    *to = highest[row] + total[row].log2();
+                }
+            }
+        }
+    }
+}
+
+/// Turns a row of scores into `2^(score * scale - highest)` with the highest scaled score so far, adds
+/// them to `total`, and returns the factor that brings what was summed before to the new height.
+#[inline(always)]
+fn exponentials<S: Simd>(simd: S, scores: &mut [f32], scale: f32, highest: &mut f32, total: &mut f32) -> f32 {
+    let full = scores.len() / S::LANES * S::LANES;
+    let mut largest = simd.splat(f32::NEG_INFINITY);
+    for chunk in scores[..full].chunks_exact(S::LANES) {
+        largest = simd.max(largest, simd.read(chunk));
+    }
+    let largest = scores[full..].iter().fold(simd.largest(largest), |a, &b| if a > b { a } else { b });
+    let before = *highest;
+    let height = if before > largest * scale { before } else { largest * scale };
+    let shrink = if before == height { 1.0 } else { (before - height).exp2() };
+
+    let (factor, shift) = (simd.splat(scale), simd.splat(-height));
+    let mut sum = simd.splat(0.0);
+    for chunk in scores[..full].chunks_exact_mut(S::LANES) {
+        let weight = simd.exp2(simd.mul_add(simd.read(chunk), factor, shift));
+        simd.write(chunk, weight);
+        sum = simd.add(sum, weight);
+    }
+    let rest = &mut scores[full..];
+    let weight = simd.exp2(simd.mul_add(simd.read(rest), factor, shift));
+    simd.write(rest, weight);
+    *highest = height;
+    *total = *total * shrink + simd.sum(sum) + rest.iter().sum::<f32>();
+    shrink
+}
+
+#[inline(always)]
+fn scale<S: Simd>(simd: S, values: &mut [f32], factor: f32) {
+    let factor = simd.splat(factor);
+    for chunk in values.chunks_exact_mut(S::LANES) {
+        simd.write(chunk, simd.mul(simd.read(chunk), factor));
+    }
+}
