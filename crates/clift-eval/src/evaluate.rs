@@ -105,7 +105,9 @@ pub fn evaluate_scene(
                 settings.push(some);
             }
             if variant != Variant::Random {
-                settings.into_iter().for_each(|setting| into.add_scene_bytes(setting, bytes));
+                for setting in settings {
+                    into.add_scene_bytes(setting, bytes);
+                }
             }
         }
         if is_shown {

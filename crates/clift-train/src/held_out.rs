@@ -89,9 +89,9 @@ impl<'a> HeldOut<'a> {
                 return Ok(());
             }
             let outcome = self.evaluate_item(&networks, item, &sweep, i == 0, &mut measured, sink)?;
-            if let Outcome::Measured(Some(Shown { sheet, .. })) = outcome {
+            if let Outcome::Measured(Some(shown)) = outcome {
                 std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
-                sheet.write_png(&folder.join(format!("step-{step:09}.png")))?;
+                shown.sheet.write_png(&folder.join(format!("step-{step:09}.png")))?;
             }
         }
         let summary = measured.summary();
@@ -137,7 +137,8 @@ impl<'a> HeldOut<'a> {
             let key = self.reader.source.key(item.scene);
             match self.evaluate_item(networks, item, &sweep, is_shown, &mut measured, sink)? {
                 Outcome::Measured(None) => {}
-                Outcome::Measured(Some(Shown { sheet, exhibit })) => {
+                Outcome::Measured(Some(shown)) => {
+                    let Shown { sheet, exhibit } = *shown;
                     sheet.write_png(&sheets.join(format!("{}.png", file_name(key))))?;
                     if exhibits.len() < MAX_EXHIBITS {
                         exhibits.push(exhibit);
@@ -196,7 +197,10 @@ impl<'a> HeldOut<'a> {
         sink: &mut dyn Sink,
     ) -> Result<Outcome, TrainError> {
         match self.reader.read(item.scene, &item.views) {
-            Ok(clip) => Ok(Outcome::Measured(evaluate_scene(networks, &clip, sweep, is_shown, measured)?)),
+            Ok(clip) => {
+                let shown = evaluate_scene(networks, &clip, sweep, is_shown, measured)?;
+                Ok(Outcome::Measured(shown.map(Box::new)))
+            }
             Err(error) => {
                 let key = self.reader.source.key(item.scene);
                 measured.skip(key);
@@ -211,7 +215,7 @@ impl<'a> HeldOut<'a> {
 /// What became of one scene.
 enum Outcome {
     /// Measured, with its pictures where they are shown.
-    Measured(Option<Shown>),
+    Measured(Option<Box<Shown>>),
     /// Could not be read; the reason.
     Skipped(String),
 }

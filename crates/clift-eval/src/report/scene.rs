@@ -179,17 +179,12 @@ fn area(exhibit: &Exhibit) -> String {
 /// A path of circles around the centres of the patches of one view.
 fn rings(ids: &[u32], view: usize, [rows, columns]: [usize; 2], radius: f64) -> String {
     let across = 2.0 * radius;
-    let mut path = String::new();
-    for &id in ids {
-        let id = id as usize;
-        if id / (rows * columns) == view {
-            let (x, y) = ((id % columns) as f64 + 0.5 - radius, (id / columns % rows) as f64 + 0.5);
-            path.push_str(&format!(
-                "M{x:.2} {y}a{radius} {radius} 0 1 0 {across} 0a{radius} {radius} 0 1 0 -{across} 0z"
-            ));
-        }
-    }
-    path
+    let ring = |id: usize| {
+        let (x, y) = ((id % columns) as f64 + 0.5 - radius, (id / columns % rows) as f64 + 0.5);
+        format!("M{x:.2} {y}a{radius} {radius} 0 1 0 {across} 0a{radius} {radius} 0 1 0 -{across} 0z")
+    };
+    let ids = ids.iter().map(|&id| id as usize).filter(|id| id / (rows * columns) == view);
+    ids.map(ring).collect::<Vec<_>>().concat()
 }
 
 /// Colours that differ as much as may be for clusters of near numbers: hues a golden section apart.
