@@ -154,6 +154,9 @@ impl Plot {
                 write!(out, "H{:.1}V{:.1}", x(*next_x), y(*next_y))?;
             }
             writeln!(out, "\"/>")?;
+            for (front_x, front_y) in &self.front {
+                writeln!(out, "<circle class=\"front\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"8\"/>", x(*front_x), y(*front_y))?;
+            }
         }
         // The first, which is the method, on top.
         for series in self.series.iter().rev() {
@@ -246,6 +249,7 @@ mod tests {
         let svg = text(&plot(vec![mark(8.0, 14.0), mark(16.0, 18.0)]));
         assert_eq!(svg.matches("class=\"mark\" transform").count(), 2);
         assert_eq!(svg.matches("class=\"error\"").count(), 2);
+        assert_eq!(svg.matches("<circle class=\"front\"").count(), 2);
         for part in
             ["quality &amp; tokens", "a &lt; b", ">tokens</text>", ">PSNR, dB</text>", ">8</text>", ">16</text>"]
         {
