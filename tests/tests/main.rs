@@ -5,6 +5,7 @@ mod bench;
 mod hyperparameters;
 mod loss_curve;
 mod pipeline;
+mod report;
 mod resume;
 mod scene_files;
 mod support;

@@ -17,6 +17,7 @@ fn a_run_writes_every_documented_file() {
     let ran = place.train("run", &[], &[]).ok();
     assert!(ran.stdout.contains("nearest_view") && ran.stdout.contains("clift "), "{}", ran.stdout);
     assert!(ran.stdout.trim_end().ends_with("run/eval"), "{}", ran.stdout);
+    assert!(ran.stdout.contains("run/eval/report.html\n"), "{}", ran.stdout);
     let changed = format!("--set run_dir: \"runs/tiny\" -> {:?}\n", place.at("run"));
     assert!(ran.stderr.contains(&changed), "what differs from the file is printed: {}", ran.stderr);
 

@@ -6,9 +6,9 @@ use clift_data::export::spread_views;
 use clift_data::{Clip, ClipReader, Split};
 use clift_eval::metrics::{psnr, ssim};
 use clift_eval::picture::Picture;
+use clift_eval::view_cameras;
 use clift_model::viewer::load_renderer;
 use clift_model::{Preset, Scene, TokenKind, TokenStorage, Viewer};
-use clift_train::encode::view_cameras;
 use clift_train::{Config, read_config, scenes};
 use serde_json::{Value, json};
 
@@ -57,22 +57,23 @@ fn measure(clip: &Clip, pictures: &[Vec<f32>]) -> Vec<(f64, f64)> {
     pictures.iter().zip(truths).map(measure).collect()
 }
 
-/// PSNR and SSIM that an evaluation wrote for the first scene's condensed tokens.
-fn evaluated(place: &Place, eval: &str, num_tokens: usize) -> Vec<(f64, f64)> {
+/// PSNR and SSIM that an evaluation wrote for the first scene's condensed tokens, all of them or some.
+fn evaluated(place: &Place, eval: &str, num_tokens: usize, num_render_tokens: usize) -> Vec<(f64, f64)> {
+    let [stored, rendered] = [num_tokens, num_render_tokens].map(|count| count.to_string());
     let text = place.text(&format!("{eval}/views.csv"));
     let rows = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
-    let rows = rows.filter(|row| row[0] == KEY && row[2] == "clift" && row[3] == num_tokens.to_string());
+    let rows = rows.filter(|row| row[0] == KEY && row[2..5] == ["clift", &stored, &rendered]);
     rows.map(|row| (row[5].parse().expect("a number"), row[6].parse().expect("a number"))).collect()
 }
 
-/// Draws a clip's targets from a scene file.
-fn drawn(scene: &Path, weights: &Path, clip: &Clip) -> Vec<Vec<f32>> {
+/// Draws a clip's targets from a scene file, each from so many of its tokens.
+fn drawn(scene: &Path, weights: &Path, clip: &Clip, preset: Preset, num_render_tokens: usize) -> Vec<Vec<f32>> {
     let (scene, _) = Scene::read(scene).expect("a scene");
     let device = burn::tensor::Device::flex();
     let renderer = load_renderer(&scene, weights, &device).expect("its renderer");
-    let mut viewer = Viewer::new(&scene, renderer, Preset::Paper.rules(), &device).expect("its tokens");
+    let mut viewer = Viewer::new(&scene, renderer, preset.rules(), &device).expect("its tokens");
     let views = view_cameras(&clip.target);
-    let frames = viewer.draw(&views, clip.target.height, clip.target.width, scene.num_tokens()).expect("draws");
+    let frames = viewer.draw(&views, clip.target.height, clip.target.width, num_render_tokens).expect("draws");
     frames.into_iter().map(|frame| frame.pixels).collect()
 }
 
@@ -119,9 +120,9 @@ fn a_scene_file_gives_the_numbers_of_the_evaluation_without_it() {
         assert_eq!(point.unwrap()["scene_bytes"], bytes);
 
         // Rounded or not, the file gives what the evaluation has in memory, to the last digit.
-        let from_file = measure(&clip, &drawn(&place.at(&name), &weights, &clip));
-        assert_eq!(from_file, evaluated(&place, storage, count), "{name}");
-        let exact = evaluated(&place, "run/eval", count);
+        let from_file = measure(&clip, &drawn(&place.at(&name), &weights, &clip, Preset::Paper, count));
+        assert_eq!(from_file, evaluated(&place, storage, count, count), "{name}");
+        let exact = evaluated(&place, "run/eval", count, count);
         let loss_db = match format {
             TokenStorage::F32 => 0.0,
             TokenStorage::F16 => 0.005,
@@ -143,6 +144,26 @@ fn a_scene_file_gives_the_numbers_of_the_evaluation_without_it() {
             .collect();
         for ((psnr, _), (exact, _)) in measure(&clip, &pictures).iter().zip(&from_file) {
             assert!((psnr - exact).abs() < 0.02, "{name}: {psnr} dB in the file, {exact} drawn");
+        }
+    }
+}
+
+#[test]
+fn an_evaluation_from_chosen_tokens_has_the_numbers_of_rendering_a_file_from_them() {
+    let place = Place::new();
+    place.train("run", &["stage1.steps=60", "stage2.steps=20"], &[]).ok();
+    let (clip, _) = first_clip(&place, "run");
+    let weights = place.at("run/stage2/model.safetensors");
+    let flags = ["--scene", KEY, "--context", "0,7", "--storage", "8", "--tokens", "f32"];
+    clift(encode_args(&place, "run", "room.clift", &flags)).ok();
+    for preset in Preset::ALL {
+        let out = place.at(preset.name());
+        let ran =
+            place.eval("run", &["--render", "3,1/4", "--selection", preset.name(), "--out", out.to_str().unwrap()]);
+        ran.ok();
+        for count in [2, 3] {
+            let from_file = measure(&clip, &drawn(&place.at("room.clift"), &weights, &clip, preset, count));
+            assert_eq!(from_file, evaluated(&place, preset.name(), 8, count), "{}, {count}", preset.name());
         }
     }
 }

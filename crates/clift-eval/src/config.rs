@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
+use crate::selection::Selection;
 use crate::token_count::TokenCount;
 
 /// Which scenes and views are rendered, with how many tokens.
@@ -13,6 +14,11 @@ use crate::token_count::TokenCount;
 pub struct EvalConfig {
     /// Token counts a scene is stored with.
     pub storage: Vec<TokenCount>,
+    /// Token counts a view is drawn from, numbers or shares of the stored ones, beside all of them: where they are
+    /// fewer than are stored, every view is given tokens chosen for it.
+    pub render: Vec<TokenCount>,
+    /// How those are chosen: `paper`, `global`, `scaled` or `random`.
+    pub selection: Selection,
     /// Number format that stored tokens are rounded to before they are rendered, as in a scene file.
     pub tokens: TokenStorage,
     /// Evaluation index with the context and target frames of every scene. Without one, contexts are
@@ -24,7 +30,7 @@ pub struct EvalConfig {
     pub num_context: usize,
     /// Target views of a scene without an index.
     pub num_targets: usize,
-    /// Scenes of which a picture sheet is written.
+    /// Scenes of which a picture sheet is written; the report shows them too, at most six.
     pub num_sheets: usize,
     /// Steps between validations during training; 0 for none.
     pub every: u64,
@@ -40,6 +46,8 @@ impl Default for EvalConfig {
         let shares = [1.0 / 16.0, 0.125, 0.25, 0.5, 0.75, 1.0];
         Self {
             storage: shares.map(TokenCount::Share).into(),
+            render: Vec::new(),
+            selection: Selection::default(),
             tokens: TokenStorage::F32,
             index: None,
             num_scenes: 0,

@@ -125,17 +125,28 @@ impl Picture {
         let Ok(_) = Text::with_baseline(text, Point::new(x as i32, y as i32), style, Baseline::Top).draw(self);
     }
 
+    /// The bytes of a PNG file.
+    ///
+    /// # Errors
+    /// For a picture without pixels.
+    pub fn png(&self) -> std::io::Result<Vec<u8>> {
+        let mut png = Vec::new();
+        image::codecs::png::PngEncoder::new(&mut png)
+            .write_image(&self.rgb, self.rgb.width(), self.rgb.height(), image::ExtendedColorType::Rgb8)
+            .map_err(std::io::Error::other)?;
+        Ok(png)
+    }
+
     /// Writes the picture as PNG, under a temporary name first, so that no reader sees half a file.
     ///
     /// # Errors
     /// [`EvalError::Io`] when the folder cannot be written.
     pub fn write_png(&self, path: &Path) -> Result<(), EvalError> {
-        let mut png = Vec::new();
-        image::codecs::png::PngEncoder::new(&mut png)
-            .write_image(&self.rgb, self.rgb.width(), self.rgb.height(), image::ExtendedColorType::Rgb8)
-            .map_err(std::io::Error::other)
-            .and_then(|()| replace(path, &png))
-            .map_err(|source| EvalError::Io { action: "writing the picture", source, path: path.to_owned() })
+        self.png().and_then(|png| replace(path, &png)).map_err(|source| EvalError::Io {
+            action: "writing the picture",
+            source,
+            path: path.to_owned(),
+        })
     }
 }
 

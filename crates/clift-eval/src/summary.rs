@@ -155,7 +155,8 @@ impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { num_scenes, num_views, num_skipped, baselines, points } = self;
         writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes left out\n")?;
-        let headers = ["stored", "rendered", "PSNR dB", "+- dB", "SSIM", "LPIPS", "render ms", "GMAC", "scene kB"];
+        let headers =
+            ["stored", "rendered", "PSNR dB", "+- dB", "SSIM", "LPIPS", "select ms", "render ms", "GMAC", "scene kB"];
         write_row(f, "variant", headers.map(str::to_owned))?;
         for (variant, Quality { psnr, ssim }) in
             [(Variant::NearestView, baselines.nearest_view), (Variant::MeanImage, baselines.mean_image)]
@@ -172,6 +173,7 @@ impl fmt::Display for Summary {
                 cell(point.psnr_stderr, 2),
                 cell(point.ssim, 3),
                 cell(point.lpips_vgg, 3),
+                cell(point.select_s.map(|seconds| seconds * 1e3), 1),
                 cell(point.render_s.map(|seconds| seconds * 1e3), 1),
                 cell(point.gflops, 1),
                 cell(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
@@ -186,8 +188,8 @@ fn cell(value: Option<f64>, decimals: usize) -> String {
     value.map_or_else(|| "-".to_owned(), |value| format!("{value:.decimals$}"))
 }
 
-fn write_row(f: &mut fmt::Formatter<'_>, name: &str, cells: [String; 9]) -> fmt::Result {
-    const WIDTHS: [usize; 9] = [7, 9, 8, 6, 6, 6, 10, 8, 9];
+fn write_row(f: &mut fmt::Formatter<'_>, name: &str, cells: [String; 10]) -> fmt::Result {
+    const WIDTHS: [usize; 10] = [7, 9, 8, 6, 6, 6, 10, 10, 8, 9];
     write!(f, "{name:<12}")?;
     for (cell, width) in cells.iter().zip(WIDTHS) {
         write!(f, " {cell:>width$}")?;
@@ -295,10 +297,10 @@ mod tests {
         views.set_cost(SETTING, Cost { gflops: Some(45.23), scene_bytes: Some(99_000) });
         let expected = "2 views of 2 scenes, 0 scenes left out
 
-variant       stored  rendered  PSNR dB  +- dB   SSIM  LPIPS  render ms     GMAC  scene kB
-nearest_view       -         -    18.00      -  0.500      -          -        -         -
-mean_image         -         -        -      -      -      -          -        -         -
-clift             64        32    20.50   0.50  0.205      -          -     45.2      99.0
+variant       stored  rendered  PSNR dB  +- dB   SSIM  LPIPS  select ms  render ms     GMAC  scene kB
+nearest_view       -         -    18.00      -  0.500      -          -          -        -         -
+mean_image         -         -        -      -      -      -          -          -        -         -
+clift             64        32    20.50   0.50  0.205      -          -          -     45.2      99.0
 ";
         assert_eq!(views.summary().to_string(), expected);
     }

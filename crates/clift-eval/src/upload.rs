@@ -2,6 +2,7 @@
 
 use burn::tensor::{Device, Tensor};
 use clift_data::Views as HostViews;
+use clift_model::ViewCamera;
 use clift_model::views::{Cameras, Views, upload_images};
 
 use crate::EvalError;
@@ -28,6 +29,12 @@ pub fn upload_pictures(scenes: &[&HostViews], device: &Device) -> Result<Tensor<
 pub fn upload_cameras(scenes: &[&HostViews], device: &Device) -> Result<Cameras, EvalError> {
     let (c2w, intrinsics) = camera_values(scenes);
     Ok(Cameras::upload(&c2w, &intrinsics, shape(scenes), device)?)
+}
+
+/// The cameras of one scene on the host, as token selection takes them.
+pub fn view_cameras(views: &HostViews) -> Vec<ViewCamera> {
+    let cameras = views.c2w.iter().zip(&views.intrinsics);
+    cameras.map(|(pose, k)| ViewCamera { c2w: pose.to_matrix_f64(), intrinsics: [k.fx, k.fy, k.cx, k.cy] }).collect()
 }
 
 fn pixel_values(scenes: &[&HostViews]) -> Vec<u8> {

@@ -112,16 +112,7 @@ impl Scene {
     /// # Shapes
     /// - returns `[num_tokens]`
     pub fn token_rays(&self) -> Vec<TokenRay> {
-        let patch_size = self.model.patch_size;
-        let [rows, columns] = [self.height, self.width].map(|side| side / patch_size);
-        let centre = |patch: usize| (patch as f64 + 0.5) * patch_size as f64;
-        let ray = |&id: &u32| {
-            let id = id as usize;
-            let camera = &self.context[id / (rows * columns)];
-            let direction = camera.direction(centre(id % columns), centre(id / columns % rows));
-            TokenRay { origin: camera.origin(), direction }
-        };
-        self.token_ids.iter().map(ray).collect()
+        TokenRay::of_patches(&self.token_ids, &self.context, self.height, self.width, self.model.patch_size)
     }
 
     /// `[moment, direction]` of every token.

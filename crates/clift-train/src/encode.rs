@@ -3,9 +3,9 @@
 
 use burn::tensor::Tensor;
 use clift_data::order::derive_seed;
-use clift_data::{ClipReader, Pose, SceneFrame, ViewIndices, Views, spread_along_path};
-use clift_eval::{TokenCount, upload_views};
-use clift_model::{Clusters, Scene, TokenKind, ViewCamera, WorldFrame, weights};
+use clift_data::{ClipReader, Pose, SceneFrame, ViewIndices, spread_along_path};
+use clift_eval::{TokenCount, upload_views, view_cameras};
+use clift_model::{Clusters, Scene, TokenKind, WorldFrame, weights};
 
 use crate::TrainError;
 use crate::config::Config;
@@ -94,12 +94,6 @@ impl Trained {
         };
         Ok(Encoded { scene, num_lift_tokens, tried })
     }
-}
-
-/// Cameras of views that the readers give, for the model.
-pub fn view_cameras(views: &Views) -> Vec<ViewCamera> {
-    let cameras = views.c2w.iter().zip(&views.intrinsics);
-    cameras.map(|(pose, k)| ViewCamera { c2w: pose.to_matrix_f64(), intrinsics: [k.fx, k.fy, k.cx, k.cy] }).collect()
 }
 
 /// The frames asked for, or as many as in training, spread along the path.

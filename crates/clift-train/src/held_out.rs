@@ -7,8 +7,10 @@ use burn::tensor::Device;
 use clift_data::files::replace;
 use clift_data::order::derive_seed;
 use clift_data::{ClipReader, EvaluationItem, Ledger};
-use clift_eval::picture::Picture;
-use clift_eval::{Accumulator, EvalConfig, Networks, Summary, Sweep, TokenCount, Variant, evaluate_scene};
+use clift_eval::report::MAX_EXHIBITS;
+use clift_eval::{
+    Accumulator, EvalConfig, Exhibit, Networks, Report, Shown, Summary, Sweep, TokenCount, Variant, evaluate_scene,
+};
 use clift_model::Clift;
 
 use crate::TrainError;
@@ -43,6 +45,16 @@ impl<'a> HeldOut<'a> {
                 return Err(TrainError::BadConfig { key: key.into(), value: count.to_string(), fix });
             }
         }
+        let most_stored =
+            eval.storage.iter().filter_map(|count| count.of(fewest_tokens).ok()).max().unwrap_or_default();
+        // Where no scene stores more tokens than are to be drawn, a count would be left out in silence.
+        for count in &eval.render {
+            if count.of(most_stored).is_ok_and(|rendered| rendered < most_stored) {
+                continue;
+            }
+            let fix = format!("write less than {most_stored}, the most tokens that every scene stores");
+            return Err(TrainError::BadConfig { key: "eval.render".into(), value: count.to_string(), fix });
+        }
         Ok(Self { config, reader, items, ledger, device: device.clone() })
     }
 
@@ -64,7 +76,7 @@ impl<'a> HeldOut<'a> {
             Stage::Stage2 => (self.config.eval.validation_storage, Variant::Clift),
             _ => (TokenCount::Share(1.0), Variant::Kmeans),
         };
-        let sweep = self.sweep(vec![storage], vec![variant]);
+        let sweep = Sweep { render: Vec::new(), ..self.sweep(vec![storage], vec![variant]) };
         let networks = Networks {
             encoder: model.encoder.clone(),
             renderer: model.renderer.clone(),
@@ -77,9 +89,9 @@ impl<'a> HeldOut<'a> {
                 return Ok(());
             }
             let outcome = self.evaluate_item(&networks, item, &sweep, i == 0, &mut measured, sink)?;
-            if let Outcome::Measured(Some(sheet)) = outcome {
+            if let Outcome::Measured(Some(shown)) = outcome {
                 std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
-                sheet.write_png(&folder.join(format!("step-{step:09}.png")))?;
+                shown.sheet.write_png(&folder.join(format!("step-{step:09}.png")))?;
             }
         }
         let summary = measured.summary();
@@ -90,7 +102,7 @@ impl<'a> HeldOut<'a> {
         Ok(())
     }
 
-    /// Runs the whole sweep and writes `summary.json`, `views.csv`, `skipped.json` and the picture sheets
+    /// Runs the whole sweep and writes `report.html`, `summary.json`, `views.csv`, `skipped.json` and the picture sheets
     /// to `folder`.
     ///
     /// # Errors
@@ -116,16 +128,21 @@ impl<'a> HeldOut<'a> {
         }
         let sheets = folder.join("sheets");
         std::fs::create_dir_all(&sheets).map_err(TrainError::io("making a folder", &sheets))?;
+        let mut exhibits = Vec::new();
         for (i, item) in self.items.iter().enumerate() {
             if stop.load(Ordering::Relaxed) {
                 return Err(TrainError::Interrupted { step: i as u64 });
             }
-            let with_sheet = i < self.config.eval.num_sheets;
+            let is_shown = i < self.config.eval.num_sheets;
             let key = self.reader.source.key(item.scene);
-            match self.evaluate_item(networks, item, &sweep, with_sheet, &mut measured, sink)? {
+            match self.evaluate_item(networks, item, &sweep, is_shown, &mut measured, sink)? {
                 Outcome::Measured(None) => {}
-                Outcome::Measured(Some(sheet)) => {
+                Outcome::Measured(Some(shown)) => {
+                    let Shown { sheet, exhibit } = *shown;
                     sheet.write_png(&sheets.join(format!("{}.png", file_name(key))))?;
+                    if exhibits.len() < MAX_EXHIBITS {
+                        exhibits.push(exhibit);
+                    }
                 }
                 Outcome::Skipped(reason) => ledger.skip(key, reason),
             }
@@ -138,8 +155,17 @@ impl<'a> HeldOut<'a> {
         summary.write(&folder.join("summary.json"))?;
         measured.write_views(&folder.join("views.csv"))?;
         write_ledger(&ledger, &folder.join("skipped.json"))?;
+        self.report(&summary, ledger, exhibits)?.write(&folder.join("report.html"))?;
         sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
+    }
+
+    fn report(&self, summary: &Summary, ledger: Ledger, exhibits: Vec<Exhibit>) -> Result<Report, TrainError> {
+        let run_dir = &self.config.run_dir;
+        let name = run_dir.file_name().unwrap_or(run_dir.as_os_str()).to_string_lossy().into_owned();
+        let config = toml::to_string_pretty(self.config).map_err(TrainError::bad_file("config", run_dir))?;
+        let device = self.config.device.to_string();
+        Ok(Report { name, summary: summary.clone(), ledger, exhibits, config, device })
     }
 
     /// What could not be chosen.
@@ -148,9 +174,17 @@ impl<'a> HeldOut<'a> {
     }
 
     fn sweep(&self, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
-        let seed = derive_seed(self.config.seed, "eval");
-        let tokens = self.config.eval.tokens;
-        Sweep { storage, tokens, variants, kmeans: self.config.clusters.kmeans.clone(), seed }
+        let Config { seed, eval, clusters, model, .. } = self.config;
+        Sweep {
+            storage,
+            render: eval.render.clone(),
+            selection: eval.selection,
+            tokens: eval.tokens,
+            variants,
+            kmeans: clusters.kmeans.clone(),
+            patch_size: model.patch_size,
+            seed: derive_seed(*seed, "eval"),
+        }
     }
 
     fn evaluate_item(
@@ -158,12 +192,15 @@ impl<'a> HeldOut<'a> {
         networks: &Networks,
         item: &EvaluationItem,
         sweep: &Sweep,
-        with_sheet: bool,
+        is_shown: bool,
         measured: &mut Accumulator,
         sink: &mut dyn Sink,
     ) -> Result<Outcome, TrainError> {
         match self.reader.read(item.scene, &item.views) {
-            Ok(clip) => Ok(Outcome::Measured(evaluate_scene(networks, &clip, sweep, with_sheet, measured)?)),
+            Ok(clip) => {
+                let shown = evaluate_scene(networks, &clip, sweep, is_shown, measured)?;
+                Ok(Outcome::Measured(shown.map(Box::new)))
+            }
             Err(error) => {
                 let key = self.reader.source.key(item.scene);
                 measured.skip(key);
@@ -177,8 +214,8 @@ impl<'a> HeldOut<'a> {
 
 /// What became of one scene.
 enum Outcome {
-    /// Measured, with its sheet where one was asked for.
-    Measured(Option<Picture>),
+    /// Measured, with its pictures where they are shown.
+    Measured(Option<Box<Shown>>),
     /// Could not be read; the reason.
     Skipped(String),
 }

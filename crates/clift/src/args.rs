@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
-use clift_eval::TokenCount;
+use clift_eval::{Selection, TokenCount};
 use clift_model::TokenStorage;
 use clift_model::device::DeviceName;
 use clift_train::Stage;
@@ -108,6 +108,12 @@ pub struct EvalArgs {
     /// Token counts to store, as numbers or shares: --storage 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub storage: Vec<TokenCount>,
+    /// Draw views from fewer tokens than are stored too, numbers or shares of those: --render 128,1/2
+    #[arg(long, value_delimiter = ',', value_name = "COUNT")]
+    pub render: Vec<TokenCount>,
+    /// How those are chosen: paper, global, scaled or random
+    #[arg(long, alias = "select", value_name = "PRESET")]
+    pub selection: Option<Selection>,
     /// Round stored tokens as a scene file would: f32, f16 or int8
     #[arg(long, value_name = "FORMAT")]
     pub tokens: Option<TokenStorage>,
@@ -201,6 +207,8 @@ mod tests {
         assert!(parse(&["train", "a.toml", "--overfit", "0"]).is_err());
         assert!(parse(&["eval", "run", "--storage", "256,1/16"]).is_ok());
         assert!(parse(&["eval", "run", "--storage", "0"]).is_err());
+        assert!(parse(&["eval", "run", "--render", "16,1/2", "--selection", "random"]).is_ok());
+        assert!(parse(&["eval", "run", "--selection", "nearest"]).is_err());
     }
 
     #[test]

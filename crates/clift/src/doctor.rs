@@ -1,8 +1,8 @@
 //! `clift doctor`: what this machine can train on.
 
-mod machine;
 mod probe;
 
+use clift_eval::machine;
 use clift_model::device::DeviceName;
 use probe::{Gradient, Probe};
 

@@ -17,6 +17,10 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     if !args.storage.is_empty() {
         config.eval.storage.clone_from(&args.storage);
     }
+    if !args.render.is_empty() {
+        config.eval.render.clone_from(&args.render);
+    }
+    config.eval.selection = args.selection.unwrap_or(config.eval.selection);
     config.eval.tokens = args.tokens.unwrap_or(config.eval.tokens);
     if args.index.is_some() {
         config.eval.index.clone_from(&args.index);
@@ -26,6 +30,5 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let stop = crate::interrupt::flag()?;
     let summary = Run::reopen(config)?.evaluate(&folder, &stop, sink.as_mut())?;
     drop(sink);
-    terminal::print_result(&format!("{summary}\nresults: {}", folder.display()))?;
-    Ok(())
+    terminal::print_evaluation(&summary, &folder)
 }

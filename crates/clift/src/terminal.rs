@@ -7,8 +7,10 @@ mod counter;
 mod plain;
 
 use std::io::{ErrorKind, IsTerminal, Write};
+use std::path::Path;
 
 use anyhow::Context;
+use clift_eval::Summary;
 use clift_train::events::{Event, Sink, Stage, StepEvent};
 
 pub use bar::Bar;
@@ -30,6 +32,15 @@ pub fn sink() -> Box<dyn Sink> {
 /// The operating system's, except that a reader who has left, as `head` does, is none: the rest is not wanted.
 pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
+}
+
+/// Writes what an evaluation found and where it lies.
+///
+/// # Errors
+/// As [`print_result`].
+pub fn print_evaluation(summary: &Summary, folder: &Path) -> anyhow::Result<()> {
+    let report = folder.join("report.html");
+    print_result(&format!("{summary}\nreport: {}\nresults: {}", report.display(), folder.display()))
 }
 
 fn write_result(mut out: impl Write, text: &str) -> anyhow::Result<()> {

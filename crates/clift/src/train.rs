@@ -21,7 +21,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let summary = run.train(args.only, &stop, sink.as_mut())?;
     drop(sink);
     if let Some(summary) = summary {
-        terminal::print_result(&format!("{summary}\nresults: {}", folder.join("eval").display()))?;
+        terminal::print_evaluation(&summary, &folder.join("eval"))?;
     }
     Ok(())
 }

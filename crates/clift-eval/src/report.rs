@@ -1,0 +1,271 @@
+//! An evaluation as one HTML file that needs nothing beside it: no network, no scripts, no other files.
+
+mod axis;
+mod date;
+mod figures;
+mod markup;
+mod pareto;
+mod plot;
+mod scene;
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use clift_data::Ledger;
+use clift_data::files::replace;
+
+use crate::EvalError;
+use crate::exhibit::{Exhibit, best_variant};
+use crate::machine;
+use crate::summary::{Point, Summary};
+use axis::{grouped, milliseconds};
+use figures::{Figure, fastest, figures, is_whole, seconds, setting};
+use markup::Escaped;
+
+const STYLE: &str = include_str!("report/style.css");
+
+/// Most scenes that are shown, which bounds the size of the file.
+pub const MAX_EXHIBITS: usize = 6;
+
+/// What a report is made of.
+#[derive(Clone, Debug)]
+pub struct Report {
+    /// What was evaluated, such as the name of a run.
+    pub name: String,
+    /// The measured means.
+    pub summary: Summary,
+    /// What was left out.
+    pub ledger: Ledger,
+    /// Scenes to show; the first [`MAX_EXHIBITS`] are.
+    pub exhibits: Vec<Exhibit>,
+    /// The resolved config, TOML.
+    pub config: String,
+    /// Where tensors lived.
+    pub device: String,
+}
+
+impl Report {
+    /// Writes the file, under a temporary name first.
+    ///
+    /// # Errors
+    /// [`EvalError::Io`] when the folder is missing or cannot be written.
+    pub fn write(&self, path: &Path) -> Result<(), EvalError> {
+        self.to_html().and_then(|html| replace(path, &html)).map_err(|source| EvalError::Io {
+            action: "writing the report",
+            source,
+            path: path.to_owned(),
+        })
+    }
+
+    /// The page, as UTF-8.
+    ///
+    /// # Errors
+    /// As [`crate::picture::Picture::png`].
+    pub fn to_html(&self) -> io::Result<Vec<u8>> {
+        let mut out = Vec::new();
+        let name = Escaped(&self.name);
+        writeln!(out, "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">")?;
+        writeln!(out, "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">")?;
+        writeln!(out, "<title>{name} \u{b7} clift evaluation</title>\n<style>\n{STYLE}</style></head>\n<body><main>")?;
+        writeln!(out, "<h1>{name}</h1><p class=\"soft\">clift evaluation, {}</p>", date::now())?;
+        self.write_headline(&mut out)?;
+        self.write_figures(&mut out)?;
+        self.write_table(&mut out)?;
+        self.write_scenes(&mut out)?;
+        self.write_left_out(&mut out)?;
+        self.write_machine(&mut out)?;
+        self.write_config(&mut out)?;
+        writeln!(out, "<footer><p>{FOOTNOTE}</p></footer>\n</main></body></html>")?;
+        Ok(out)
+    }
+
+    /// What one wants to know first.
+    fn write_headline(&self, out: &mut impl Write) -> io::Result<()> {
+        let Summary { num_scenes, num_views, baselines, points, .. } = &self.summary;
+        let best = best_variant(points.iter().map(setting));
+        let whole: Vec<&Point> = points.iter().filter(|p| Some(p.variant) == best && is_whole(p)).collect();
+        if let (Some(fewest), Some(most)) = (whole.first(), whole.last()) {
+            write!(out, "<p class=\"lead\">{}", sentence(fewest, most))?;
+            if let (Some(psnr), Some(nearest)) = (most.psnr, baselines.nearest_view.psnr) {
+                let gain = psnr - nearest;
+                let side = if gain < 0.0 { "below" } else { "above" };
+                write!(
+                    out,
+                    " With the latter it is {} dB {side} a copy of the nearest context view.",
+                    grouped(gain.abs(), 2)
+                )?;
+            }
+            writeln!(out, "</p>")?;
+        }
+        writeln!(out, "<dl class=\"tiles\">")?;
+        let mut tile = |name: &str, value: String, unit: &str, more: String| {
+            writeln!(out, "<div><dt>{name}</dt><dd>{value} <small>{unit}</small></dd><dd>{more}</dd></div>")
+        };
+        let (first, last) = (whole.first(), whole.last().filter(|_| whole.len() > 1));
+        for point in first.into_iter().chain(last) {
+            let name = format!("{}, {} tokens", point.variant.name(), grouped(point.num_storage_tokens as f64, 0));
+            let error = point.psnr_stderr.map(|error| format!("\u{b1} {error:.2}")).unwrap_or_default();
+            tile(&name, number(point.psnr, 2), "dB", error)?;
+        }
+        tile("nearest view", number(baselines.nearest_view.psnr, 2), "dB", "a copy, no model".into())?;
+        if let Some(bytes) = whole.first().and_then(|point| point.scene_bytes) {
+            let tokens = format!("{} tokens", grouped(whole[0].num_storage_tokens as f64, 0));
+            tile("a scene file", grouped(bytes as f64 / 1e3, 1), "kB", tokens)?;
+        }
+        if let Some((point, seconds)) = whole.last().and_then(|point| Some((point, seconds(point)?))) {
+            let tokens = format!("{} tokens", grouped(point.num_storage_tokens as f64, 0));
+            tile("a frame", milliseconds(seconds), "ms", tokens)?;
+        }
+        let scenes = format!("of {}", grouped(self.ledger.num_scenes.max(*num_scenes) as f64, 0));
+        let views = format!("{} views", grouped(*num_views as f64, 0));
+        tile("scenes evaluated", grouped(*num_scenes as f64, 0), &scenes, views)?;
+        writeln!(out, "</dl>")
+    }
+
+    fn write_figures(&self, out: &mut impl Write) -> io::Result<()> {
+        writeln!(out, "<h2>Quality and cost</h2>\n<div class=\"figures\">")?;
+        for Figure { heading, plot, note } in figures(&self.summary) {
+            writeln!(out, "<section><h3>{heading}</h3>")?;
+            plot.write(out)?;
+            if !note.is_empty() {
+                writeln!(out, "<p class=\"note\">{note}</p>")?;
+            }
+            writeln!(out, "</section>")?;
+        }
+        writeln!(out, "</div>")?;
+        let has_error = self.summary.points.iter().any(|point| point.psnr_stderr.is_some());
+        let error = if has_error { "Error bars are one standard error over scenes." } else { "" };
+        writeln!(out, "<p class=\"note\">{error} Rest on a mark to read its values.</p>")
+    }
+
+    fn write_table(&self, out: &mut impl Write) -> io::Result<()> {
+        let Summary { baselines, points, .. } = &self.summary;
+        writeln!(out, "<h2>All points</h2>\n<div class=\"scroll\"><table><thead><tr>")?;
+        for head in TABLE_HEAD {
+            write!(out, "<th scope=\"col\">{head}</th>")?;
+        }
+        writeln!(out, "</tr></thead><tbody>")?;
+        for (name, quality) in [("nearest view", baselines.nearest_view), ("mean image", baselines.mean_image)] {
+            let (psnr, ssim) = (number(quality.psnr, 2), number(quality.ssim, 3));
+            write!(out, "<tr><td>{name}</td><td></td><td></td><td>{psnr}</td><td></td><td>{ssim}</td>")?;
+            writeln!(out, "<td></td><td></td><td></td><td></td></tr>")?;
+        }
+        let front = fastest(points);
+        for (i, point) in points.iter().enumerate() {
+            let is_first = i == 0 || points[i - 1].variant != point.variant;
+            let class = [is_first.then_some("first"), front.contains(&i).then_some("front-row")];
+            let class: Vec<&str> = class.into_iter().flatten().collect();
+            write!(out, "<tr class=\"{}\"><td>{}</td>", class.join(" "), point.variant.name())?;
+            let cells = [
+                grouped(point.num_storage_tokens as f64, 0),
+                grouped(point.num_render_tokens as f64, 0),
+                number(point.psnr, 2),
+                number(point.psnr_stderr, 2),
+                number(point.ssim, 3),
+                point.select_s.map_or_else(|| DASH.into(), milliseconds),
+                point.render_s.map_or_else(|| DASH.into(), milliseconds),
+                number(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
+                if front.contains(&i) { "\u{25cf}".to_owned() } else { String::new() },
+            ];
+            for cell in cells {
+                write!(out, "<td>{cell}</td>")?;
+            }
+            writeln!(out, "</tr>")?;
+        }
+        writeln!(out, "</tbody></table></div>")
+    }
+
+    fn write_scenes(&self, out: &mut impl Write) -> io::Result<()> {
+        writeln!(out, "<h2>Scenes</h2>")?;
+        if self.exhibits.is_empty() {
+            return writeln!(out, "<p class=\"none\">None is shown: <code>eval.num_sheets</code> is 0.</p>");
+        }
+        writeln!(out, "<p class=\"note\">{SCENES_NOTE}</p>")?;
+        let has_choices = self.exhibits.iter().any(|exhibit| !exhibit.choices.is_empty());
+        writeln!(out, "<p class=\"note\">{}</p>", if has_choices { CHOICE } else { NO_CHOICE })?;
+        for (number, exhibit) in self.exhibits.iter().take(MAX_EXHIBITS).enumerate() {
+            scene::write(exhibit, number, out)?;
+        }
+        Ok(())
+    }
+
+    fn write_left_out(&self, out: &mut impl Write) -> io::Result<()> {
+        let Ledger { num_scenes, skips } = &self.ledger;
+        writeln!(out, "<h2>What was left out</h2>")?;
+        let evaluated = grouped(self.summary.num_scenes as f64, 0);
+        writeln!(out, "<p>{evaluated} of {} scenes were evaluated.</p>", grouped(*num_scenes as f64, 0))?;
+        if skips.is_empty() {
+            return writeln!(out, "<p>None was left out.</p>");
+        }
+        writeln!(out, "<table class=\"plain\"><thead><tr><th>scenes</th><th>reason</th></tr></thead><tbody>")?;
+        for (reason, count) in self.ledger.counts() {
+            writeln!(out, "<tr><td>{count}</td><td>{}</td></tr>", Escaped(reason))?;
+        }
+        writeln!(out, "</tbody></table><p class=\"note\">Each by its name: <code>skipped.json</code>.</p>")
+    }
+
+    fn write_machine(&self, out: &mut impl Write) -> io::Result<()> {
+        writeln!(out, "<h2>Machine</h2><table class=\"plain\"><tbody>")?;
+        let ours = [("clift", env!("CARGO_PKG_VERSION").to_owned()), ("device", self.device.clone())];
+        for (name, value) in ours.into_iter().chain(machine::rows()) {
+            writeln!(out, "<tr><td>{name}</td><td>{}</td></tr>", Escaped(value))?;
+        }
+        writeln!(out, "</tbody></table>")
+    }
+
+    fn write_config(&self, out: &mut impl Write) -> io::Result<()> {
+        writeln!(out, "<h2>Config</h2><details><summary>Every key, resolved</summary>")?;
+        writeln!(out, "<pre>{}</pre></details>", Escaped(&self.config))
+    }
+}
+
+const TABLE_HEAD: [&str; 10] = [
+    "variant",
+    "stored<br>tokens",
+    "rendered<br>tokens",
+    "PSNR<br>dB",
+    "\u{b1}<br>dB",
+    "SSIM<br>&nbsp;",
+    "choice<br>ms",
+    "drawing<br>ms",
+    "scene<br>kB",
+    "Pareto<br>front",
+];
+
+const SCENES_NOTE: &str = "The target view in the middle of each scene, as every variant draws it. In the maps a patch \
+                           of the context views has the colour of its cluster, and rings are the centroids: the tokens \
+                           that are stored.";
+
+const CHOICE: &str = "Where views are drawn from fewer tokens than are stored, dots are those chosen for the target and \
+                      rings the other stored ones.";
+
+const NO_CHOICE: &str = "All views are drawn from all stored tokens. <code>clift eval RUN --render 1/4,1/2</code> draws \
+                         them from fewer, chosen for each view, and shows which.";
+
+const FOOTNOTE: &str = "PSNR is of pictures clamped to [0, 1]; SSIM has a Gaussian window of 11 taps. Means are over \
+                        the views of a scene, then over scenes; \u{b1} is the standard error over scenes. A dash is what \
+                        was not measured. Times are of this machine, under whatever else it did.";
+
+/// What was not measured.
+const DASH: &str = "\u{2013}";
+
+/// The first sentence: what the method reaches with the fewest and with the most tokens.
+fn sentence(fewest: &Point, most: &Point) -> String {
+    let variant = fewest.variant.name();
+    let reached = |point: &Point| {
+        let tokens = grouped(point.num_storage_tokens as f64, 0);
+        format!("<strong>{} dB</strong> with {tokens} stored tokens", number(point.psnr, 2))
+    };
+    if fewest == most {
+        return format!("{variant} reaches {}.", reached(fewest));
+    }
+    format!("{variant} reaches {} and {}.", reached(fewest), reached(most))
+}
+
+/// A value, or a dash where it was not measured.
+fn number(value: Option<f64>, decimals: usize) -> String {
+    value.filter(|value| value.is_finite()).map_or_else(|| DASH.into(), |value| grouped(value, decimals))
+}
+
+#[cfg(test)]
+mod tests;
