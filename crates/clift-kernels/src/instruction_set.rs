@@ -31,7 +31,7 @@ impl InstructionSet {
     pub const VARIABLE: &str = "CLIFT_INSTRUCTION_SET";
 
     /// The one to use: the widest that the processor has, or what [`InstructionSet::VARIABLE`] names,
-    /// if the processor has that. Read once per process.
+    /// if the processor has that; any other text is as none. Read once per process.
     pub fn detected() -> Self {
         static DETECTED: OnceLock<InstructionSet> = OnceLock::new();
         *DETECTED.get_or_init(|| {

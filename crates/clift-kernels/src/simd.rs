@@ -59,7 +59,7 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn select_negative(self, condition: Self::V, yes: Self::V, no: Self::V) -> Self::V;
     /// The nearest integer, ties to even.
     fn round(self, a: Self::V) -> Self::V;
-    /// `a * 2^n` for integers `n` in `-126..=127`.
+    /// `a * 2^n` for integers `n` in `-126..=127`; zero or as it should be for -127.
     fn scale_by_power(self, a: Self::V, n: Self::V) -> Self::V;
     /// The sum of all lanes.
     fn sum(self, a: Self::V) -> f32;
@@ -99,7 +99,7 @@ pub trait Simd: Copy + Send + Sync + 'static {
         to.copy_from_slice(&padded[..count]);
     }
 
-    /// `2^a`, to 2e-7. Zero below `2^-126`, at most `2^127`; NaN stays NaN.
+    /// `2^a`, to 2e-7. Below `2^-126` it is no more than that, and not always zero; at most `2^127`. NaN stays NaN.
     #[inline(always)]
     fn exp2(self, a: Self::V) -> Self::V {
         // Coefficients of Cephes' exp2f.

@@ -13,8 +13,7 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Shape, Tensor, assert_shape};
-use clift_kernels::linear::{self as kernel, Matrix};
-use clift_kernels::{InstructionSet, layer_norm};
+use clift_kernels::{InstructionSet, layer_norm, linear as kernel};
 
 use crate::autodiff::register;
 use crate::feed_forward::GeluKernels;
@@ -150,13 +149,8 @@ impl LinearKernels for Flex {
         let [_, outputs] = weight.shape().dims();
         let [x, weight, bias] = [x, weight, bias].map(contiguous);
         let mut output = vec![0.0; batch * count * outputs];
-        kernel::forward(
-            [batch * count, inputs, outputs],
-            Matrix::contiguous(values(&x), inputs),
-            Matrix::contiguous(values(&weight), outputs),
-            Some(values(&bias)),
-            &mut output,
-        );
+        let sizes = [batch * count, inputs, outputs];
+        kernel::forward(sizes, [values(&x), values(&weight), values(&bias)], &mut output);
         tensor(output, [batch, count, outputs])
     }
 
