@@ -4,6 +4,7 @@ mod bad_input;
 mod bench;
 mod hyperparameters;
 mod loss_curve;
+mod patchwise;
 mod pipeline;
 mod report;
 mod resume;

@@ -17,6 +17,7 @@ use clift_data::files::replace;
 use crate::EvalError;
 use crate::exhibit::{Exhibit, best_variant};
 use crate::machine;
+use crate::paired::Difference;
 use crate::summary::{Point, Summary};
 use axis::{grouped, milliseconds};
 use figures::{Figure, fastest, figures, is_whole, seconds, setting};
@@ -71,6 +72,7 @@ impl Report {
         self.write_headline(&mut out)?;
         self.write_figures(&mut out)?;
         self.write_table(&mut out)?;
+        self.write_differences(&mut out)?;
         self.write_scenes(&mut out)?;
         self.write_left_out(&mut out)?;
         self.write_machine(&mut out)?;
@@ -175,6 +177,27 @@ impl Report {
         writeln!(out, "</tbody></table></div>")
     }
 
+    /// Which variant is better on the same scenes; nothing where there is no pair.
+    fn write_differences(&self, out: &mut impl Write) -> io::Result<()> {
+        let differences = &self.summary.differences;
+        if differences.is_empty() {
+            return Ok(());
+        }
+        writeln!(out, "<h2>Scene by scene</h2>\n<p class=\"note\">{DIFFERENCES_NOTE}</p>")?;
+        writeln!(out, "<div class=\"scroll\"><table><thead><tr>")?;
+        for head in ["better", "worse", "stored<br>tokens", "scenes<br>&nbsp;", "difference<br>dB", "\u{b1}<br>dB"] {
+            write!(out, "<th scope=\"col\">{head}</th>")?;
+        }
+        writeln!(out, "</tr></thead><tbody>")?;
+        for Difference { variant, against, num_storage_tokens, num_scenes, psnr, psnr_stderr } in differences {
+            let count = grouped(*num_storage_tokens as f64, 0);
+            let (psnr, error) = (number(Some(*psnr), 2), number(*psnr_stderr, 2));
+            write!(out, "<tr><td>{}</td><td>{}</td><td>{count}</td>", variant.name(), against.name())?;
+            writeln!(out, "<td>{}</td><td>{psnr}</td><td>{error}</td></tr>", grouped(*num_scenes as f64, 0))?;
+        }
+        writeln!(out, "</tbody></table></div>")
+    }
+
     fn write_scenes(&self, out: &mut impl Write) -> io::Result<()> {
         writeln!(out, "<h2>Scenes</h2>")?;
         if self.exhibits.is_empty() {
@@ -231,6 +254,9 @@ const TABLE_HEAD: [&str; 10] = [
     "scene<br>kB",
     "Pareto<br>front",
 ];
+
+const DIFFERENCES_NOTE: &str = "PSNR of the variant that the paper finds better less that of the other, on the same \
+                                scenes: below zero where these scenes disagree.";
 
 const SCENES_NOTE: &str = "The target view in the middle of each scene, as every variant draws it. In the maps a patch \
                            of the context views has the colour of its cluster, and rings are the centroids: the tokens \

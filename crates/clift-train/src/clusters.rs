@@ -1,4 +1,4 @@
-//! The offline cluster cache: latent K-means of every training scene, made once from the frozen encoder.
+//! The offline cluster cache: latent K-means of every training scene, made once from the frozen encoder, or tiles.
 //!
 //! A folder with `index.json` (what was clustered with which encoder) and `clusters.bin` (per entry the
 //! cluster of every token and the token of every cluster, little-endian u16).
@@ -14,11 +14,11 @@ use clift_data::files::replace;
 use clift_data::order::{below, derive_seed, item_rng};
 use clift_data::{ClipReader, DataError, Ledger, ViewIndices};
 use clift_eval::upload_views;
-use clift_model::{Encoder, SceneClusters};
+use clift_model::{Encoder, Grouping, SceneClusters, tile_clusters};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
-use crate::config::Config;
+use crate::config::{ClustersConfig, Config};
 use crate::events::{Event, Sink, Stage};
 
 const VERSION: u32 = 1;
@@ -160,10 +160,21 @@ impl ClusterJob<'_> {
         let last_step = config.stage1.steps.min(views.warm_up_steps);
         let context = views.sample(num_frames, last_step, num_context, &mut rng)?.context;
         let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
-        let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
-        let count = config.clusters.grid[below(&mut rng, config.clusters.grid.len())].of(lift.dims()[1])?;
-        let fit = config.clusters.kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
-        Ok((context, fit.clusters.scenes()[0].clone()))
+        let ClustersConfig { grouping, grid, kmeans, .. } = &config.clusters;
+        let num_tokens = config.model.num_tokens(num_context, clip.context.height, clip.context.width)?;
+        let count = grid[below(&mut rng, grid.len())].of(num_tokens)?;
+        let clusters = match grouping {
+            Grouping::Kmeans => {
+                let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
+                let fit = kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
+                fit.clusters.scenes()[0].clone()
+            }
+            Grouping::Patch => {
+                let grid = [clip.context.height, clip.context.width].map(|side| side / config.model.patch_size);
+                tile_clusters(num_context, grid, count)?
+            }
+        };
+        Ok((context, clusters))
     }
 }
 

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clift_data::{BoundedSampler, ClipOptions, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig};
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
-use clift_model::{KMeans, ModelConfig};
+use clift_model::{Grouping, KMeans, ModelConfig};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
@@ -188,6 +188,9 @@ impl Default for Stage1Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ClustersConfig {
+    /// What stage 2 learns to condense: clusters of latent K-means (`kmeans`), or tiles of the views (`patch`), which
+    /// the paper compares them with.
+    pub grouping: Grouping,
     /// Token counts that stage 2 trains on. Departs from the reference, which draws any ratio per
     /// scene and pads: a shared grid makes dense batches.
     pub grid: Vec<TokenCount>,
@@ -202,7 +205,13 @@ pub struct ClustersConfig {
 impl Default for ClustersConfig {
     fn default() -> Self {
         let shares = [1.0 / 32.0, 1.0 / 16.0, 0.125, 0.1875, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0];
-        Self { grid: shares.map(TokenCount::Share).into(), num_passes: 3, num_scenes: 0, kmeans: KMeans::default() }
+        Self {
+            grouping: Grouping::Kmeans,
+            grid: shares.map(TokenCount::Share).into(),
+            num_passes: 3,
+            num_scenes: 0,
+            kmeans: KMeans::default(),
+        }
     }
 }
 
@@ -309,10 +318,20 @@ impl Config {
             return Err(bad("data.views.max_context", views.max_context, &fix));
         }
         let fewest_tokens = views.min_context * tokens_per_view;
-        match self.clusters.grid.iter().find(|count| count.of(fewest_tokens).is_err()) {
-            None => Ok(()),
-            Some(count) => Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens"))),
+        if let Some(count) = self.clusters.grid.iter().find(|count| count.of(fewest_tokens).is_err()) {
+            return Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens")));
         }
+        if self.clusters.grouping == Grouping::Patch {
+            let grid = self.clusters.grid.iter().map(|count| ("clusters.grid", count));
+            let counts = grid.chain([("eval.validation_storage", &self.eval.validation_storage)]);
+            for (key, count) in counts {
+                let too_few = |views: usize| count.of(views * tokens_per_view).is_ok_and(|count| count < views);
+                if too_few(views.min_context) || too_few(views.max_context) {
+                    return Err(bad(key, count, "write at least a tile for every context view"));
+                }
+            }
+        }
+        Ok(())
     }
 }
 

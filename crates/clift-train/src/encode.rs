@@ -5,7 +5,7 @@ use burn::tensor::Tensor;
 use clift_data::order::derive_seed;
 use clift_data::{ClipReader, Pose, SceneFrame, ViewIndices, spread_along_path};
 use clift_eval::{TokenCount, upload_views, view_cameras};
-use clift_model::{Clusters, Scene, TokenKind, WorldFrame, weights};
+use clift_model::{Clusters, Grouping, Scene, TokenKind, WorldFrame, weights};
 
 use crate::TrainError;
 use crate::config::Config;
@@ -56,6 +56,10 @@ impl Trained {
         scene: usize,
         options: &EncodeOptions,
     ) -> Result<Encoded, TrainError> {
+        if config.clusters.grouping != Grouping::Kmeans {
+            let fix = "scenes are of K-means tokens: encode with a run whose clusters.grouping is \"kmeans\"".into();
+            return Err(TrainError::BadConfig { key: "clusters.grouping".into(), value: "\"patch\"".into(), fix });
+        }
         let key = reader.source.key(scene);
         let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
         let frames = context_frames(&poses, options.context.as_deref(), config.data.views.max_context)?;

@@ -10,7 +10,7 @@ use burn::tensor::Device;
 use clift_data::files::replace;
 use clift_data::{ClipReader, SceneSource, Split};
 use clift_eval::{Networks, Summary};
-use clift_model::{Clift, weights};
+use clift_model::{Clift, Condenser, Encoder, Renderer, weights};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
@@ -136,34 +136,62 @@ impl Run {
         held_out.evaluate(&self.networks(sink)?, &self.folder("eval"), stop, sink).map(Some)
     }
 
-    /// Evaluates the run's weights and writes the results to `folder`.
+    /// Evaluates the run's weights and writes the results to `folder`; `beside` is another run of the same stage 1
+    /// whose stage 2 was trained on other groups of tokens, to be measured on the same views.
     ///
     /// # Errors
     /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] when those of
     /// stage 2 do not belong to them, and whatever the evaluation gives.
-    pub fn evaluate(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<Summary, TrainError> {
+    pub fn evaluate(
+        &self,
+        folder: &Path,
+        beside: Option<&Config>,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Summary, TrainError> {
         std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
-        let networks = self.networks(sink)?;
+        let mut networks = self.networks(sink)?;
+        if let Some(other) = beside {
+            if other.clusters.grouping == self.config.clusters.grouping {
+                let value = other.run_dir.display().to_string();
+                let fix = "its stage 2 was trained on the same groups of tokens: name a run with another \
+                           clusters.grouping";
+                return Err(TrainError::BadConfig { key: "--with".into(), value, fix: fix.into() });
+            }
+            let (condenser, renderer) = self.load_stage2(other, &networks.encoder)?;
+            networks.set_condensed(other.clusters.grouping, condenser, renderer);
+        }
         self.held_out(sink)?.evaluate(&networks, folder, stop, sink)
     }
 
     /// The trained networks: of both stages, or of stage 1 alone.
     fn networks(&self, sink: &mut dyn Sink) -> Result<Networks, TrainError> {
         let stage1 = self.load_stage1(Some(Stage::Eval))?;
-        let path = self.weights(Stage::Stage2);
-        let condensed = if path.exists() {
-            let mut model = self.new_model();
-            weights::load(&mut model, &path)?.require_all(&path)?;
-            if weights::hash(&model.encoder) != weights::hash(&stage1.encoder) {
-                return Err(TrainError::OtherEncoder { path });
-            }
-            Some((model.condenser.valid(), model.renderer.valid()))
+        let (encoder, renderer) = (stage1.encoder.valid(), stage1.renderer.valid());
+        let device = self.device.clone();
+        let mut networks = Networks { encoder, renderer, condensed: None, patch_condensed: None, device };
+        if self.weights(Stage::Stage2).exists() {
+            let (condenser, renderer) = self.load_stage2(&self.config, &networks.encoder)?;
+            networks.set_condensed(self.config.clusters.grouping, condenser, renderer);
         } else {
             sink.event(&Event::Message("stage 2 has not run: evaluating the stage-1 weights alone".into()));
-            None
-        };
-        let (encoder, renderer) = (stage1.encoder.valid(), stage1.renderer.valid());
-        Ok(Networks { encoder, renderer, condensed, device: self.device.clone() })
+        }
+        Ok(networks)
+    }
+
+    /// Condenser and renderer of the stage 2 of `config`'s run, which must have been trained on this encoder.
+    fn load_stage2(&self, config: &Config, encoder: &Encoder) -> Result<(Condenser, Renderer), TrainError> {
+        let path = config.run_dir.join(Stage::Stage2.name()).join("model.safetensors");
+        if !path.exists() {
+            let what = "the weights of stage 2";
+            return Err(TrainError::Missing { stage: "evaluation", what, first: "clift train", path });
+        }
+        let mut model = Clift::new(&config.model, config.seed, &self.device);
+        weights::load(&mut model, &path)?.require_all(&path)?;
+        if weights::hash(&model.encoder) != weights::hash(encoder) {
+            return Err(TrainError::OtherEncoder { path });
+        }
+        Ok((model.condenser, model.renderer))
     }
 
     /// The views that are measured, during training and after it.

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
-use clift_eval::{Selection, TokenCount};
+use clift_eval::{Experiment, Selection, TokenCount};
 use clift_model::TokenStorage;
 use clift_model::device::DeviceName;
 use clift_train::Stage;
@@ -105,6 +105,16 @@ pub struct TrainArgs {
 pub struct EvalArgs {
     /// A run directory
     pub run: PathBuf,
+    /// An experiment of the paper: main, ablation, patchwise or budget
+    ///
+    /// Sets variants, --storage, --render and --selection; those given beside it win. main: quality against data size.
+    /// ablation: random tokens, K-means, K-means and condenser. patchwise: tiles of the views against K-means, each
+    /// with and without condenser; needs --with. budget: half of the tokens stored, fewer and fewer of them rendered.
+    #[arg(long, value_name = "NAME")]
+    pub preset: Option<Experiment>,
+    /// Another run of the same stage 1 with another clusters.grouping, measured on the same views
+    #[arg(long, value_name = "RUN")]
+    pub with: Option<PathBuf>,
     /// Token counts to store, as numbers or shares: --storage 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub storage: Vec<TokenCount>,
