@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor};
 use clift_data::order::derive_seed;
 use clift_data::{Clip, Views as HostViews};
 use clift_model::scene::file_bytes;
-use clift_model::{Cameras, Condenser, Encoder, Grouping, KMeans, Renderer, TokenStorage};
+use clift_model::{Cameras, Condenser, Encoder, Grouping, KMeans, Renderer, TokenStorage, total_variance};
 
 use crate::EvalError;
 use crate::exhibit::{Material, Shown, sheet_rows};
@@ -113,6 +113,7 @@ pub fn evaluate_scene(
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.patch_size);
     let views = (clip.context.num_views(), grid);
+    let variance = total_variance(&lift)?[0];
     let rows = if is_shown { sheet_rows(clip.target.num_views()) } else { Vec::new() };
     let is_shown = !rows.is_empty();
     let mut material = Material { renderings: baselines(clip, &rows)?, ..Material::default() };
@@ -140,6 +141,9 @@ pub fn evaluate_scene(
                     into.add_scene_bytes(setting, bytes);
                 }
             }
+        }
+        if let Some(error) = index.cluster_error(variance) {
+            into.add_cluster_error(&clip.key, num_storage_tokens, error);
         }
         if is_shown {
             material.clusters.push(index.scene_clusters()?.clone());

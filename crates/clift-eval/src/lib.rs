@@ -1,5 +1,6 @@
 //! Metrics, baselines, evaluation sweeps and their pictures
 
+pub mod adaptive;
 pub mod animation;
 pub mod baseline;
 pub mod budget;
@@ -22,6 +23,7 @@ pub mod summary;
 pub mod token_count;
 pub mod upload;
 
+pub use adaptive::Adaptive;
 pub use animation::Animation;
 pub use budget::Calibration;
 pub use config::EvalConfig;

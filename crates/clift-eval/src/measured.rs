@@ -102,6 +102,8 @@ pub struct Accumulator {
     pub(crate) views: BTreeMap<Setting, ViewsOfSetting>,
     pub(crate) costs: BTreeMap<Setting, Cost>,
     pub(crate) skipped: BTreeSet<String>,
+    /// Share of the token variance within clusters, by scene and count.
+    pub(crate) cluster_errors: BTreeMap<(String, usize), f64>,
 }
 
 impl Accumulator {

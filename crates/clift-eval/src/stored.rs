@@ -5,6 +5,7 @@ use std::cell::OnceCell;
 
 use burn::tensor::{Int, Tensor, TensorData};
 use clift_data::order::item_rng;
+use clift_model::kmeans::Fit;
 use clift_model::{Clusters, Condenser, KMeans, Renderer, SceneClusters, TokenStorage, tile_clusters};
 use rand::seq::SliceRandom;
 
@@ -64,7 +65,7 @@ pub(crate) struct GroupsOnce<'a> {
     pub seed: u64,
     /// Context views, and rows and columns of tokens of each.
     pub views: (usize, [usize; 2]),
-    clusters: OnceCell<Clusters>,
+    fit: OnceCell<Fit>,
     tiles: OnceCell<Clusters>,
 }
 
@@ -76,7 +77,7 @@ impl<'a> GroupsOnce<'a> {
         num_clusters: usize,
         seed: u64,
     ) -> Self {
-        Self { kmeans, lift, num_clusters, seed, views, clusters: OnceCell::new(), tiles: OnceCell::new() }
+        Self { kmeans, lift, num_clusters, seed, views, fit: OnceCell::new(), tiles: OnceCell::new() }
     }
 
     /// Tiles of the context views, [`tile_clusters`].
@@ -90,11 +91,20 @@ impl<'a> GroupsOnce<'a> {
     }
 
     pub fn clusters(&self) -> Result<&Clusters, EvalError> {
-        if let Some(clusters) = self.clusters.get() {
-            return Ok(clusters);
+        Ok(&self.fit()?.clusters)
+    }
+
+    /// Share of `total_variance` that is left within clusters, where K-means was asked for.
+    pub fn cluster_error(&self, total_variance: f64) -> Option<f64> {
+        self.fit.get().map(|fit| fit.error(0, total_variance))
+    }
+
+    fn fit(&self) -> Result<&Fit, EvalError> {
+        if let Some(fit) = self.fit.get() {
+            return Ok(fit);
         }
         let fit = self.kmeans.fit(self.lift.clone(), self.num_clusters, &[self.seed])?;
-        Ok(self.clusters.get_or_init(|| fit.clusters))
+        Ok(self.fit.get_or_init(|| fit))
     }
 
     /// Those of the one scene there is.

@@ -10,6 +10,7 @@ use std::path::Path;
 use clift_data::files::replace;
 use serde::{Deserialize, Serialize};
 
+use crate::adaptive::Adaptive;
 use crate::error::EvalError;
 use crate::measured::{Accumulator, Measured, Setting, Variant, ViewsOfSetting};
 use crate::paired::Difference;
@@ -85,6 +86,8 @@ pub struct Summary {
     pub points: Vec<Point>,
     /// What the paper finds better less what it finds worse, scene by scene.
     pub differences: Vec<Difference>,
+    /// A count for every scene against one for all.
+    pub adaptive: Vec<Adaptive>,
 }
 
 impl Accumulator {
@@ -114,6 +117,7 @@ impl Accumulator {
                 .map(|(setting, views)| self.point(*setting, views))
                 .collect(),
             differences: self.differences(),
+            adaptive: self.adaptive(),
         }
     }
 
@@ -157,7 +161,7 @@ impl Summary {
 /// A table for people: quality, tokens and cost of each setting; `-` is what was not measured.
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { num_scenes, num_views, num_skipped, baselines, points, differences } = self;
+        let Self { num_scenes, num_views, num_skipped, baselines, points, differences, adaptive } = self;
         writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes left out\n")?;
         let headers =
             ["stored", "rendered", "PSNR dB", "+- dB", "SSIM", "LPIPS", "select ms", "render ms", "GMAC", "scene kB"];
@@ -192,6 +196,12 @@ impl fmt::Display for Summary {
             let names = format!("{} - {}", variant.name(), against.name());
             writeln!(f, "{names:<24} {num_storage_tokens:>6} tokens {psnr:>+7.2} +- {error} dB")?;
         }
+        if !adaptive.is_empty() {
+            writeln!(f, "\n--max-error against one count for all scenes, at no more tokens on average")?;
+        }
+        for Adaptive { max_error, mean_storage_tokens: own, num_storage_tokens: fixed, difference, .. } in adaptive {
+            writeln!(f, "{max_error:<8.4} {own:>8.1} tokens against {fixed:>6} {difference:>+7.2} dB")?;
+        }
         Ok(())
     }
 }
@@ -220,6 +230,15 @@ fn scene_means(views: &ViewsOfSetting, value: impl Fn(&Measured) -> Option<f64>)
         .chunk_by(|((a, _), _), ((b, _), _)| a == b)
         .filter_map(|scene| mean(&scene.iter().filter_map(|(_, view)| value(view)).collect::<Vec<_>>()))
         .collect()
+}
+
+/// Mean PSNR of every scene.
+pub(crate) fn scene_values(views: &ViewsOfSetting) -> BTreeMap<&str, f64> {
+    let mut scenes: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+    for ((scene, _), view) in views {
+        scenes.entry(scene).or_default().push(capped(view.psnr));
+    }
+    scenes.into_iter().filter_map(|(scene, psnr)| Some((scene, mean(&psnr)?))).collect()
 }
 
 pub(crate) fn mean(values: &[f64]) -> Option<f64> {
@@ -297,7 +316,7 @@ mod tests {
                 "ssim": 0.2, "lpips_vgg": null, "render_s": null, "select_s": null,
                 "gflops": 2.5, "scene_bytes": 99_000
             }],
-            "differences": []
+            "differences": [], "adaptive": []
         });
         assert_eq!(serde_json::from_str::<serde_json::Value>(&text).unwrap(), expected);
         assert_eq!(serde_json::from_str::<Summary>(&text).unwrap(), views.summary());

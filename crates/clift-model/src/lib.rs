@@ -43,7 +43,7 @@ pub use config::{CondenserConfig, ModelConfig, Variant};
 pub use encoder::Encoder;
 pub use error::ModelError;
 pub use init::Init;
-pub use kmeans::KMeans;
+pub use kmeans::{KMeans, total_variance};
 pub use model::Clift;
 pub use patchwise::{Grouping, tile_clusters};
 pub use renderer::{RenderTokens, Renderer, SceneMemory};

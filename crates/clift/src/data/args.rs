@@ -69,8 +69,8 @@ pub struct SynthArgs {
 /// Arguments of `clift data info`.
 #[derive(Debug, clap::Args)]
 pub struct InfoArgs {
-    /// A folder with train/ or test/ in it, or a config (TOML)
-    #[arg(value_name = "DIR|CONFIG")]
+    /// A folder with train/ or test/ in it, a config (TOML) or an evaluation index (JSON)
+    #[arg(value_name = "DIR|CONFIG|INDEX")]
     pub path: PathBuf,
     /// Change a key of the config: `--set data.filters.min_frames=60`
     #[arg(long, value_name = "KEY=TOML")]

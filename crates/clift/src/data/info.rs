@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context;
-use clift_data::{ChunkSource, ClipReader, Ledger, SceneFilters, SceneSource, SourceInfo, Split};
+use clift_data::{ChunkSource, ClipReader, EvaluationIndex, Ledger, SceneFilters, SceneSource, SourceInfo, Split};
 use clift_train::config::SourceKind;
 use clift_train::scenes::{self, FirstScenes};
 use clift_train::{Config, read_config};
@@ -21,6 +21,9 @@ const MAX_SYNTHETIC: usize = 1000;
 
 /// Prints what a folder or a config holds.
 pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
+    if args.path.extension().is_some_and(|extension| extension == "json") {
+        return of_index(args);
+    }
     let report = if args.path.is_dir() {
         if !args.set.is_empty() {
             return Err(WrongUsage(format!("--set changes a config, but {} is a folder", args.path.display())).into());
@@ -42,6 +45,17 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     let failed = report.splits.values().filter_map(|split| split.error.as_ref());
     let failed = failed.chain(report.evaluation.as_ref().and_then(|evaluation| evaluation.error.as_ref()));
     anyhow::ensure!(failed.count() == 0, "not all of it can be used; the reason stands above");
+    Ok(())
+}
+
+/// Prints what an evaluation index asks for.
+fn of_index(args: &InfoArgs) -> anyhow::Result<()> {
+    let census = EvaluationIndex::read(&args.path)?.census();
+    print_result(&format!("{census}\n"))?;
+    if let Some(path) = &args.json {
+        let text = serde_json::to_vec_pretty(&census).context("writing the counts as JSON")?;
+        std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
+    }
     Ok(())
 }
 
