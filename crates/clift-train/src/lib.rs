@@ -30,7 +30,7 @@ pub mod trained;
 pub mod trainer;
 
 pub use config::Config;
-pub use document::{ConfigError, Override, read_config};
+pub use document::{ConfigError, Override, read_checked_config, read_config};
 pub use error::TrainError;
 pub use events::{Event, Sink, Stage};
 pub use run::{Run, RunOptions};

@@ -1,13 +1,13 @@
 //! `clift train`.
 
-use clift_train::{Config, Run, RunOptions, read_config};
+use clift_train::{Config, Run, RunOptions, read_checked_config};
 
 use crate::args::TrainArgs;
 use crate::terminal;
 
 /// Trains what the config says and prints the evaluation.
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
-    let (mut config, overrides) = read_config::<Config>(&args.config, &args.set)?;
+    let (mut config, overrides) = read_checked_config(&args.config, &args.set, Config::validate)?;
     for change in overrides {
         terminal::print_note(&format!("--set {change}"));
     }
