@@ -124,7 +124,11 @@ impl ModelConfig {
             return Err(ModelError::BadConfig {
                 key: "model.num_heads",
                 value: self.num_heads.to_string(),
-                fix: format!("write a divisor of model.dim = {}, such as {}", self.dim, near_divisors(self.dim, self.num_heads)),
+                fix: format!(
+                    "write a divisor of model.dim = {}, such as {}",
+                    self.dim,
+                    near_divisors(self.dim, self.num_heads)
+                ),
             });
         }
         Ok(())

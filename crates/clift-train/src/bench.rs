@@ -4,7 +4,7 @@
 //! fast because it is wrong shows.
 
 mod clustering;
-mod context;
+pub(crate) mod context;
 mod forward;
 pub(crate) mod inputs;
 mod memory;

@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use clift_data::{BoundedSampler, ClipOptions, DataError, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig};
+use clift_data::{
+    BoundedSampler, ClipOptions, DataError, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig,
+};
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
 use clift_model::{KMeans, ModelConfig};
@@ -306,7 +308,8 @@ impl Config {
         for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
             if value == 0 || !value.is_multiple_of(patch_size) {
                 let below = value / patch_size * patch_size;
-                let near = if below == 0 { patch_size.to_string() } else { format!("{below} or {}", below + patch_size) };
+                let near =
+                    if below == 0 { patch_size.to_string() } else { format!("{below} or {}", below + patch_size) };
                 let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
                 return Err(bad(key, value, &fix));
             }

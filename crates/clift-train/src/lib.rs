@@ -18,6 +18,7 @@ pub mod loss;
 mod mistakes;
 pub mod optim;
 mod overrides;
+pub mod plan;
 mod recompute;
 pub mod run;
 pub mod scenes;

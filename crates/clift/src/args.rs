@@ -63,6 +63,12 @@ Examples:
         #[command(subcommand)]
         command: DataCommand,
     },
+    /// Tell what a run takes before it starts: parameters, memory, time per step
+    ///
+    /// Of both stages, the cluster cache and the evaluation. Parameters are counted exactly and memory from what the
+    /// operations keep; times come from one block of each kind, timed on the device at the config's sizes. No data is
+    /// read, and reading it is not counted.
+    Plan(PlanArgs),
     /// Check what this machine can train on: every device, the processor, the memory
     ///
     /// Runs one forward and backward pass of a small model on every device of this build and compares its
@@ -129,6 +135,25 @@ pub struct EvalArgs {
     /// Where to write; `eval` inside the run by default
     #[arg(long, short, value_name = "DIR")]
     pub out: Option<PathBuf>,
+}
+
+/// Arguments of `clift plan`.
+#[derive(Debug, clap::Args)]
+pub struct PlanArgs {
+    /// The experiment, a TOML file
+    pub config: PathBuf,
+    /// Change a key of the config: `--set stage1.accumulate=4`
+    #[arg(long, value_name = "KEY=TOML")]
+    pub set: Vec<String>,
+    /// Where tensors live: flex, ndarray or wgpu
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<DeviceName>,
+    /// Leave out the times, which take some seconds to find
+    #[arg(long)]
+    pub no_time: bool,
+    /// Write the plan as JSON
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
 }
 
 /// Arguments of `clift bench`.

@@ -1,6 +1,6 @@
 //! `clift train`.
 
-use clift_train::{Config, Run, RunOptions, read_checked_config};
+use clift_train::{Config, Run, RunOptions, plan, read_checked_config};
 
 use crate::args::TrainArgs;
 use crate::terminal;
@@ -12,6 +12,12 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
         terminal::print_note(&format!("--set {change}"));
     }
     config.device = args.device.unwrap_or(config.device);
+    // Now, and not when the system ends the run after hours of other work.
+    if let Ok(planned) = plan::plan(&config, false)
+        && let Some(warning) = plan::memory_warning(&config, &planned)
+    {
+        terminal::print_note(&format!("warning: {warning}"));
+    }
 
     let stop = crate::interrupt::flag()?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh };

@@ -24,8 +24,8 @@ impl Parameters {
         let dim = config.dim as u64;
         let linear = |inputs: usize, outputs: usize| (inputs * outputs + outputs) as u64;
         let blocks = |count: usize, one: u64| count as u64 * one;
-        let encoder = linear(config.context_patch_len(), config.dim)
-            + blocks(config.num_encoder_blocks, encoder_block(config));
+        let encoder =
+            linear(config.context_patch_len(), config.dim) + blocks(config.num_encoder_blocks, encoder_block(config));
         let condenser = blocks(config.condenser.num_blocks, condenser_block(config));
         let renderer = linear(config.ray_patch_len(), config.dim)
             + blocks(config.num_renderer_blocks, decoder_block(config))
@@ -109,8 +109,8 @@ impl Macs {
         let SceneSizes { num_tokens, num_render_tokens, num_targets, num_patches, .. } = *sizes;
         // Four projections, two matrices of the feed-forward network, scores and sums of values.
         let among = |count: f64| count * (4.0 * dim * dim + 2.0 * dim * hidden) + 2.0 * count * count * dim;
-        let encoder = num_tokens * config.context_patch_len() as f64 * dim
-            + config.num_encoder_blocks as f64 * among(num_tokens);
+        let encoder =
+            num_tokens * config.context_patch_len() as f64 * dim + config.num_encoder_blocks as f64 * among(num_tokens);
         let condenser = sizes.num_storage_tokens.map_or(0.0, |stored| {
             let members = num_tokens - stored;
             let cross = 2.0 * stored * dim * dim + 2.0 * members * dim * dim + 2.0 * members * dim;

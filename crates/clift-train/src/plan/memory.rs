@@ -106,7 +106,12 @@ fn parts(config: &ModelConfig, sizes: &UpdateSizes) -> Vec<Part> {
     // The norm's input, the sigmoid's result, the difference; pictures and their gradients in two orders.
     let rgb = pixels(config.rgb_patch_len(), scene.num_targets * scene.num_patches);
     let parameters = 2 * config.dim as u64 + linear(config.dim, config.rgb_patch_len());
-    parts.push(Part { kept: y + 2.0 * rgb, working: 2.0 * y + 3.0 * rgb, forward: 4.0 * rgb, parameters: parameters as f64 });
+    parts.push(Part {
+        kept: y + 2.0 * rgb,
+        working: 2.0 * y + 3.0 * rgb,
+        forward: 4.0 * rgb,
+        parameters: parameters as f64,
+    });
     parts
 }
 
