@@ -24,6 +24,7 @@ pub mod run;
 pub mod scenes;
 pub mod schedule;
 pub mod sinks;
+pub mod stability;
 pub mod stage1;
 pub mod stage2;
 pub mod step;

@@ -16,7 +16,7 @@ use serde::Serialize;
 use crate::TrainError;
 use crate::config::{Config, SourceKind};
 use crate::events::Stage;
-use calibration::{InferenceRates, inference_rates, trained, update_rates};
+use calibration::{InferenceRates, InferenceTimed, inference_rates, loading_s, trained, update_rates};
 use counts::{Macs, Parameters, SceneSizes};
 use memory::{InferenceSizes, UpdateSizes, inference_bytes, update_bytes};
 use sizes::{batch_sizes, drawn, largest, middle, num_tokens, picture_values, update_macs};
@@ -56,7 +56,11 @@ pub struct PartPlan {
     pub gmacs: f64,
     /// Most memory of the process.
     pub peak_bytes: u64,
-    /// Seconds of one, on average; `None` where it was not asked for.
+    /// Seconds of one on the device, on average; `None` where it was not asked for.
+    pub compute_s: Option<f64>,
+    /// Seconds of one on one thread that reads and decodes; `None` where it was not asked for or the data is not there.
+    pub loading_s: Option<f64>,
+    /// Seconds from one to the next: both, as far as they do not overlap.
     pub seconds: Option<f64>,
 }
 
@@ -90,7 +94,39 @@ pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
         });
     }
     plan.parts.push(evaluation(config, &parameters, is_timed)?);
+    let per_view_s = if is_timed { loading_s(config) } else { None };
+    for part in &mut plan.parts {
+        let (num_views, num_threads) = read_for(config, part.part);
+        part.loading_s = per_view_s.map(|seconds| seconds * num_views);
+        part.seconds = part.compute_s.map(|compute| {
+            let is_cpu = matches!(config.device, DeviceName::Flex | DeviceName::Ndarray);
+            from_one_to_the_next(compute, part.loading_s.unwrap_or(0.0), num_threads, is_cpu.then_some(plan.threads))
+        });
+    }
     Ok(plan)
+}
+
+/// Views that one step or scene of a part reads, on average, and the threads that read them beside the work.
+fn read_for(config: &Config, part: &str) -> (f64, usize) {
+    let views = &config.data.views;
+    let contexts = f64::midpoint(views.min_context as f64, views.max_context as f64);
+    let batch = |batch_size: usize| batch_size as f64 * (contexts + views.num_targets as f64);
+    match part {
+        "stage1" => (batch(config.stage1.batch_size), config.data.num_threads),
+        "stage2" => (batch(config.stage2.batch_size), config.data.num_threads),
+        "clusters" => (contexts, 0),
+        _ => ((config.eval.num_context + config.eval.num_targets) as f64, 0),
+    }
+}
+
+/// Seconds between two steps of which each takes `compute_s` on the device and `loading_s` on one of `num_threads`
+/// threads that load ahead; `cores` are those that a CPU device shares with them.
+fn from_one_to_the_next(compute_s: f64, loading_s: f64, num_threads: usize, cores: Option<usize>) -> f64 {
+    if num_threads == 0 {
+        return compute_s + loading_s;
+    }
+    let shared = cores.map_or(0.0, |cores| loading_s / cores as f64);
+    (compute_s + shared).max(loading_s / num_threads as f64)
 }
 
 /// What [`Config::validate`] asks, but for where the data is: a plan needs none.
@@ -152,7 +188,7 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
     let macs_of_scene = all.iter().map(|scene| update_macs(config, stage, scene)).sum::<f64>() / all.len() as f64;
     let macs = batch_size as f64 * macs_of_scene;
     let trained_parameters = trained(parameters, stage);
-    let seconds = if is_timed {
+    let compute_s = if is_timed {
         let rates = update_rates(config, stage, &middle(config, stage)?)?;
         Some(macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter)
     } else {
@@ -176,7 +212,9 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
         trained_parameters,
         gmacs: macs / 1e9,
         peak_bytes: machine::own_bytes() + bytes as u64,
-        seconds,
+        compute_s,
+        loading_s: None,
+        seconds: None,
     })
 }
 
@@ -198,9 +236,10 @@ fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<
         macs += Macs::of(&config.model, &scene(num_context)?).encoder;
     }
     macs /= (views.max_context - views.min_context + 1) as f64;
-    let seconds = if is_timed {
+    let compute_s = if is_timed {
         let counts = counts(num_tokens(config, num_context)?)?;
-        let rates = inference_rates(config, num_context, 1, &probed(&counts))?;
+        let timed = InferenceTimed { num_context, num_targets: 1, counts: &probed(&counts), is_measured: false };
+        let rates = inference_rates(config, &timed)?;
         let kmeans = counts.iter().map(|&count| kmeans_s(&rates, count)).sum::<f64>() / counts.len() as f64;
         Some(macs * rates.encode_per_mac + kmeans)
     } else {
@@ -226,7 +265,9 @@ fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<
         trained_parameters: 0,
         gmacs: macs / 1e9,
         peak_bytes: machine::own_bytes() + inference_bytes(&config.model, parameters.total as f64, &sizes) as u64,
-        seconds,
+        compute_s,
+        loading_s: None,
+        seconds: None,
     })
 }
 
@@ -246,13 +287,19 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
     let encoder = of_count.first().map_or(0.0, |macs| macs.encoder);
     let condenser: f64 = of_count.iter().map(|macs| macs.condenser).sum();
     let renderer: f64 = of_count.iter().map(|macs| 3.0 * macs.renderer).sum();
-    let seconds = if is_timed {
-        let mut counts = stored.clone();
-        counts.sort_unstable();
-        let rates = inference_rates(config, eval.num_context, num_targets.min(VIEWS_PER_PASS), &probed(&counts))?;
-        let kmeans: f64 = stored.iter().map(|&count| kmeans_s(&rates, count)).sum();
-        let networks = encoder * rates.encode_per_mac + (condenser + renderer) * rates.render_per_mac;
-        Some(networks + kmeans)
+    let compute_s = if is_timed {
+        let timed = InferenceTimed { num_context: eval.num_context, num_targets, counts: &[], is_measured: true };
+        let rates = inference_rates(config, &timed)?;
+        // What the timed network lacks of the whole one.
+        let of_timed: Vec<Macs> = stored.iter().map(|&count| Macs::of(&rates.timed, &scene(count))).collect();
+        let missing = |all: f64, timed: f64, per_mac: f64| (all - timed).max(0.0) * per_mac;
+        let of_encoder = of_timed.first().map_or(0.0, |macs| macs.encoder);
+        let of_rest = of_timed.iter().map(|macs| macs.condenser + 3.0 * macs.renderer).sum();
+        Some(
+            rates.measuring_s
+                + missing(encoder, of_encoder, rates.encode_per_mac)
+                + missing(condenser + renderer, of_rest, rates.render_per_mac),
+        )
     } else {
         None
     };
@@ -273,7 +320,9 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
         trained_parameters: 0,
         gmacs: (encoder + condenser + renderer) / 1e9,
         peak_bytes: machine::own_bytes() + inference_bytes(&config.model, weights, &sizes) as u64,
-        seconds,
+        compute_s,
+        loading_s: None,
+        seconds: None,
     })
 }
 
@@ -318,6 +367,7 @@ fn kmeans_s(rates: &InferenceRates, count: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use clift_eval::TokenCount;
+    use clift_model::ModelConfig;
 
     use super::*;
 
@@ -361,11 +411,25 @@ mod tests {
 
     #[test]
     fn the_seconds_of_clustering_lie_on_a_line() {
-        let rates = InferenceRates { encode_per_mac: 0.0, render_per_mac: 0.0, kmeans: vec![(10, 1.0), (20, 2.0)] };
+        let rates = InferenceRates {
+            encode_per_mac: 0.0,
+            render_per_mac: 0.0,
+            kmeans: vec![(10, 1.0), (20, 2.0)],
+            measuring_s: 0.0,
+            timed: ModelConfig::default(),
+        };
         let seconds = [5, 10, 15, 20, 30].map(|count| kmeans_s(&rates, count));
         assert_eq!(seconds, [1.0, 1.0, 1.5, 2.0, 2.0]);
         assert_eq!(probed(&[1, 2, 3, 4, 5]), [1, 3, 5]);
         assert_eq!(probed(&[7]), [7]);
+    }
+
+    #[test]
+    fn loading_is_hidden_behind_the_work_as_far_as_threads_and_cores_allow() {
+        assert_eq!(from_one_to_the_next(1.0, 0.5, 0, Some(2)), 1.5);
+        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, Some(2)), 1.25);
+        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, None), 1.0);
+        assert_eq!(from_one_to_the_next(1.0, 9.0, 3, None), 3.0);
     }
 
     #[test]

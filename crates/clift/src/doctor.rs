@@ -1,20 +1,25 @@
 //! `clift doctor`: what this machine can train on.
 
 mod probe;
+mod stability;
 
 use clift_eval::machine;
 use clift_model::InstructionSet;
 use clift_model::device::DeviceName;
 use probe::{Gradient, Probe};
 
+use crate::args::DoctorArgs;
 use crate::terminal::print_result;
 
 /// Largest difference of a gradient from the default device's, over its largest entry. Two orders of f32 sums differ
 /// by about 1e-6 here, a wrong kernel by a number near 1.
 const TOLERANCE: f64 = 1e-3;
 
-/// Prints the machine and a row per device; fails if the default device does.
-pub fn run() -> anyhow::Result<()> {
+/// Prints the machine and a row per device, or the hard cases; fails if the default device does, or a case.
+pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
+    if args.stability {
+        return stability::run(args);
+    }
     let machine = [("clift", version())].into_iter().chain(machine::rows()).chain([("kernels", kernels())]);
     let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
     print_result(&format!("{}\n", machine.join("\n")))?;

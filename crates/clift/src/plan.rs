@@ -36,7 +36,8 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-const HEADER: [&str; 7] = ["part", "trains", "how many", "peak memory", "GMACs each", "time each", "time"];
+const HEADER: [&str; 8] =
+    ["part", "trains", "how many", "peak memory", "GMACs each", "reading each", "time each", "time"];
 
 fn shown(plan: &Plan) -> String {
     let Plan { device, threads, parameters, num_tokens: [fewest, most], available_bytes, parts } = plan;
@@ -55,7 +56,7 @@ tokens of a scene: {tokens}
     [head, table::columns(&rows)].into_iter().chain(total).collect::<Vec<_>>().join("\n")
 }
 
-fn cells(part: &PartPlan) -> [String; 7] {
+fn cells(part: &PartPlan) -> [String; 8] {
     let dash = || "-".to_owned();
     let count = part.count.map_or_else(|| format!("every {}", part.unit), |count| format!("{count} {}s", part.unit));
     [
@@ -64,6 +65,7 @@ fn cells(part: &PartPlan) -> [String; 7] {
         count,
         bytes(part.peak_bytes),
         format!("{:.3}", part.gmacs),
+        part.loading_s.map_or_else(dash, seconds),
         part.seconds.map_or_else(dash, seconds),
         part.total_s().map_or_else(dash, duration),
     ]
@@ -85,6 +87,8 @@ mod tests {
             trained_parameters: if unit == "step" { 30 } else { 0 },
             gmacs: 1.5,
             peak_bytes: 3 << 29,
+            compute_s: seconds,
+            loading_s: None,
             seconds,
         };
         let plan = Plan {
@@ -100,9 +104,9 @@ flex, 2 threads, memory available: unknown
 parameters: 60 (encoder 10, condenser 20, renderer 30)
 tokens of a scene: 64 to 96
 
-part    trains  how many     peak memory  GMACs each  time each  time
-stage1  30      7200 steps   1.50 GiB     1.500       500 ms     1 h 0 min
-eval    -       every scene  1.50 GiB     1.500       2.00 s     -";
+part    trains  how many     peak memory  GMACs each  reading each  time each  time
+stage1  30      7200 steps   1.50 GiB     1.500       -             500 ms     1 h 0 min
+eval    -       every scene  1.50 GiB     1.500       -             2.00 s     -";
         assert_eq!(shown(&plan), expected);
     }
 }

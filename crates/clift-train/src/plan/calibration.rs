@@ -6,7 +6,9 @@ use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::order::{item_rng, step_rng};
-use clift_eval::{TokenCount, upload_cameras, upload_views};
+use clift_data::{ClipReader, Split};
+use clift_eval::{Accumulator, Networks, Sweep, TokenCount, Variant, evaluate_scene, upload_cameras, upload_views};
+use clift_model::ModelConfig;
 use rand::RngExt;
 use rand::seq::index::sample;
 
@@ -19,6 +21,7 @@ use crate::bench::inputs::{Shape, batch, clip};
 use crate::config::Config;
 use crate::events::Stage;
 use crate::optim::{adamw, clip_global_norm, global_norm};
+use crate::scenes;
 use crate::step::{Learner, Shown, StageBatch, TokenChoice, loss_of};
 use crate::trainer::freeze;
 
@@ -47,6 +50,10 @@ pub struct InferenceRates {
     pub render_per_mac: f64,
     /// Seconds of latent K-means by number of clusters.
     pub kmeans: Vec<(usize, f64)>,
+    /// Seconds of the evaluation of one scene with the networks of `timed`: clusters, pictures and their measures.
+    pub measuring_s: f64,
+    /// The network that was timed.
+    pub timed: ModelConfig,
 }
 
 /// The config with one block of each kind, which take as long as any other.
@@ -85,7 +92,7 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
     let macs_of_scene = update_macs(&shallow, stage, &middle.scene);
     let num_scenes = ((ENOUGH_MACS / macs_of_scene) as usize).clamp(1, middle.num_scenes);
     let batch = drawn(&context, stage, middle, num_scenes)?;
-    let OptimizerOf { optimizer, .. } = optimizer_of(config, stage);
+    let optimizer = if stage == Stage::Stage2 { &config.stage2.optimizer } else { &config.stage1.optimizer };
     let mut learner = Learner {
         model: freeze(stage, context.model()),
         optimizer: adamw(optimizer),
@@ -128,15 +135,6 @@ pub fn trained(parameters: &Parameters, stage: Stage) -> u64 {
     }
 }
 
-struct OptimizerOf<'a> {
-    optimizer: &'a crate::config::OptimizerConfig,
-}
-
-fn optimizer_of(config: &Config, stage: Stage) -> OptimizerOf<'_> {
-    let optimizer = if stage == Stage::Stage2 { &config.stage2.optimizer } else { &config.stage1.optimizer };
-    OptimizerOf { optimizer }
-}
-
 /// A batch of made-up scenes with the middle's numbers of tokens.
 fn drawn(context: &BenchContext, stage: Stage, middle: &Middle, num_scenes: usize) -> Result<StageBatch, TrainError> {
     let (num_tokens, kept) = (context.num_tokens()?, middle.scene.num_render_tokens as usize);
@@ -153,13 +151,9 @@ fn drawn(context: &BenchContext, stage: Stage, middle: &Middle, num_scenes: usiz
     Ok(batch)
 }
 
-/// Times encoding, drawing and clustering one scene.
-pub fn inference_rates(
-    config: &Config,
-    num_context: usize,
-    num_targets: usize,
-    counts: &[usize],
-) -> Result<InferenceRates, TrainError> {
+/// Times encoding, drawing, clustering and measuring one scene.
+pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<InferenceRates, TrainError> {
+    let InferenceTimed { num_context, num_targets, counts, is_measured } = *sizes;
     let shallow = shallow(config);
     let context = context(&shallow, num_context)?;
     let model = context.model().valid();
@@ -167,43 +161,103 @@ pub fn inference_rates(
     let clip = clip(shape, context.seed(), 0);
     let views = upload_views(&[&clip.context], &context.device)?;
     let cameras = upload_cameras(&[&clip.target], &context.device)?;
-    let num_tokens = context.num_tokens()?;
     let patches = (shape.size[0] / config.model.patch_size) * (shape.size[1] / config.model.patch_size);
-    let sizes = SceneSizes {
-        num_tokens: num_tokens as f64,
+    let num_tokens = context.num_tokens()? as f64;
+    let scene = SceneSizes {
+        num_tokens,
         num_storage_tokens: None,
-        num_render_tokens: num_tokens as f64,
+        num_render_tokens: num_tokens,
         is_per_view: false,
         num_targets: num_targets as f64,
         num_patches: patches as f64,
     };
-    let macs = Macs::of(&shallow.model, &sizes);
-    let least = |work: &mut dyn FnMut() -> Result<(), TrainError>, repeats: usize| -> Result<f64, TrainError> {
+    let macs = Macs::of(&shallow.model, &scene);
+    let least = |work: &mut dyn FnMut() -> Result<(), TrainError>| -> Result<f64, TrainError> {
         let mut seconds = f64::INFINITY;
-        for repeat in 0..=repeats {
+        for repeat in 0..=REPEATS {
             let started = Instant::now();
             work()?;
             context.sync()?;
-            if repeat > 0 || repeats == 0 {
+            if repeat > 0 {
                 seconds = seconds.min(started.elapsed().as_secs_f64());
             }
         }
         Ok(seconds)
     };
-    let encode_s = least(&mut || read(model.encoder.forward(&views)), REPEATS)?;
+    let encode_s = least(&mut || read(model.encoder.forward(&views)))?;
     let lift = model.encoder.forward(&views);
-    let render_s = least(&mut || read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)), REPEATS)?;
+    let render_s = least(&mut || read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?;
     let mut kmeans = Vec::new();
-    for &count in counts {
-        // One seed takes a few iterations more, another fewer.
-        let seeds: Vec<u64> = (0..3).map(|seed| step_rng(context.seed(), seed, "plan clusters").random()).collect();
-        let mut total = 0.0;
-        for &seed in &seeds {
-            total += least(&mut || Ok(config.clusters.kmeans.fit(lift.clone(), count, &[seed]).map(drop)?), 0)?;
+    let mut measuring_s = 0.0;
+    if is_measured {
+        let networks = Networks {
+            encoder: model.encoder.clone(),
+            renderer: model.renderer.clone(),
+            condensed: Some((model.condenser.clone(), model.renderer.clone())),
+            device: context.device.clone(),
+        };
+        let eval = &config.eval;
+        let sweep = Sweep {
+            storage: eval.storage.clone(),
+            render: eval.render.clone(),
+            selection: eval.selection,
+            tokens: eval.tokens,
+            variants: vec![Variant::Random, Variant::Kmeans, Variant::Clift],
+            kmeans: config.clusters.kmeans.clone(),
+            patch_size: config.model.patch_size,
+            seed: config.seed,
+        };
+        measuring_s = f64::INFINITY;
+        for _ in 0..2 {
+            let started = Instant::now();
+            evaluate_scene(&networks, &clip, &sweep, false, &mut Accumulator::default())?;
+            measuring_s = measuring_s.min(started.elapsed().as_secs_f64());
         }
-        kmeans.push((count, total / seeds.len() as f64));
+    } else {
+        for &count in counts {
+            // One seed takes a few iterations more, another fewer.
+            let seeds: Vec<u64> = (0..3).map(|seed| step_rng(context.seed(), seed, "plan clusters").random()).collect();
+            let started = Instant::now();
+            for &seed in &seeds {
+                config.clusters.kmeans.fit(lift.clone(), count, &[seed])?;
+            }
+            kmeans.push((count, started.elapsed().as_secs_f64() / seeds.len() as f64));
+        }
     }
-    Ok(InferenceRates { encode_per_mac: encode_s / macs.encoder, render_per_mac: render_s / macs.renderer, kmeans })
+    let [encode_per_mac, render_per_mac] = [encode_s / macs.encoder, render_s / macs.renderer];
+    Ok(InferenceRates { encode_per_mac, render_per_mac, kmeans, measuring_s, timed: shallow.model })
+}
+
+/// What is timed without gradients.
+#[derive(Clone, Copy, Debug)]
+pub struct InferenceTimed<'a> {
+    /// Context views.
+    pub num_context: usize,
+    /// Target views that are drawn at once.
+    pub num_targets: usize,
+    /// Counts of clusters.
+    pub counts: &'a [usize],
+    /// Whether a whole evaluation of the scene is timed, and not its clusters alone.
+    pub is_measured: bool,
+}
+
+/// Seconds that one thread takes to read a view of a training scene; `None` where the data is not there.
+pub fn loading_s(config: &Config) -> Option<f64> {
+    let (source, _) = scenes::open(&config.data, Split::Train).ok()?;
+    let reader = ClipReader { source, options: config.data.clip_options() };
+    let views = &config.data.views;
+    let mut times = Vec::new();
+    for scene in 0..reader.source.num_scenes().min(6) {
+        let mut rng = item_rng(config.seed, 0, scene as u32, 0, "plan views");
+        let num_frames = reader.source.num_frames(scene).ok()?;
+        let started = Instant::now();
+        let drawn = views.sample(num_frames, views.warm_up_steps, views.max_context, &mut rng).ok()?;
+        let clip = reader.read(scene, &drawn).ok()?;
+        times.push(started.elapsed().as_secs_f64() / (clip.context.num_views() + clip.target.num_views()) as f64);
+    }
+    // The first opens files that the others find open.
+    let rest = times.get(1..).filter(|rest| !rest.is_empty())?;
+    Some(rest.iter().sum::<f64>() / rest.len() as f64)
 }
 
 /// Waits for a value of a result.

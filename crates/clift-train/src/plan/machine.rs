@@ -16,9 +16,9 @@ pub fn available_bytes(device: DeviceName) -> Option<u64> {
     Some(group.unwrap_or(u64::MAX).min(kib * 1024))
 }
 
-/// Memory that a process of this program holds besides its tensors: its code, threads and buffers.
+/// Memory that a process of this program holds besides its tensors: its code, threads and buffers (docs/plan.md).
 pub fn own_bytes() -> u64 {
-    40 << 20
+    25 << 20
 }
 
 fn field<'a>(text: &'a str, name: &str) -> Option<&'a str> {
