@@ -26,8 +26,19 @@ pub(super) const CASES: &[Case] = &[
         run: |place| attended(place, 1e4),
     },
     Case {
-        name: "logits up to +-1e4 inside clusters",
-        breaks: "the same in segments",
+        name: "logits near 1e4 and near -1e4, whole rows of them",
+        breaks: "the maximum that is taken off, differences of large scores",
+        bound: Bound::Most(2e-2),
+        reason: "as above",
+        run: |place| {
+            let count = place.size.pick(64, 1024);
+            let inputs = level_scores(place, 1e4, [count, count]);
+            compared(place, inputs, |[query, key_value]| cross_sdpa(query, key_value, 2))
+        },
+    },
+    Case {
+        name: "the same inside clusters",
+        breaks: "the maximum of a segment",
         bound: Bound::Most(2e-2),
         reason: "as above",
         run: clustered,
@@ -107,11 +118,29 @@ fn scores_up_to(place: &Place, largest: f64, [queries, keys]: [usize; 2], dim: u
     (query.mul_scalar(largest / most), Tensor::cat(vec![key, value], 2))
 }
 
+/// Queries whose scores are all near `level`, or all near `-level`, and differ by about one; keys and values.
+fn level_scores(place: &Place, level: f64, [queries, keys]: [usize; 2]) -> [Tensor<3>; 2] {
+    const DIM: usize = 32;
+    let head_width = DIM / 2;
+    let drawn = |count: usize, width: usize, purpose: &str| uniform([1, count, width], 0, purpose, &place.device);
+    // The first column of a head carries the level, the others what differs.
+    let columns = (0..DIM).map(|column| if column % head_width == 0 { 0.0 } else { 1.0 }).collect::<Vec<f64>>();
+    let is_other = Tensor::<1>::from_data(TensorData::new(columns, [DIM]), &place.device).reshape([1, 1, DIM]);
+    let is_level = is_other.clone().mul_scalar(-1.0).add_scalar(1.0);
+    let signs = (0..queries).map(|query| if query % 2 == 0 { level } else { -level }).collect::<Vec<f64>>();
+    let signs = Tensor::<1>::from_data(TensorData::new(signs, [queries]), &place.device).reshape([1, queries, 1]);
+    let scale = (head_width as f64).sqrt();
+    let query: Tensor<3> = drawn(queries, DIM, "stability query").mul_scalar(scale);
+    let query = query * is_other.clone() + signs.mul_scalar(scale) * is_level.clone();
+    let key: Tensor<3> = drawn(keys, DIM, "stability key") * is_other + is_level;
+    [query, Tensor::cat(vec![key, drawn(keys, DIM, "stability value")], 2)]
+}
+
 fn clustered(place: &Place) -> Result<Outcome, TrainError> {
-    let (dim, stored, members) = (32, place.size.pick(8, 64), place.size.pick(64, 1024));
-    let (query, key_value) = scores_up_to(place, 1e4, [stored, members], dim);
+    let (stored, members) = (place.size.pick(8, 64), place.size.pick(64, 1024));
+    let inputs = level_scores(place, 1e4, [stored, members]);
     let segment: Vec<i64> = (0..members).map(|member| (member * 7 % stored) as i64).collect();
-    compared(place, [query, key_value], move |[query, key_value]| {
+    compared(place, inputs, move |[query, key_value]| {
         let segment = TensorData::new(segment.clone(), [segment.len()]);
         let segment = Tensor::<1, Int>::from_data(segment, &query.device().without_autodiff()).autodiff();
         cluster_attention(query, key_value, segment, 2)

@@ -1,5 +1,6 @@
 //! Whole updates, loss and gradients, on views that are hard.
 
+use clift_data::normalize::MAX_COORDINATE;
 use clift_data::{Clip, Views};
 use clift_model::ModelConfig;
 
@@ -43,11 +44,17 @@ pub(super) const CASES: &[Case] = &[
         run: |place| changed(place, 4, |clip| move_cameras(clip, |x| 1e-6 * x)),
     },
     Case {
-        name: "cameras 1e6 from the origin, not normalised",
-        breaks: "moments of 1e6 beside colours of 1",
+        name: "cameras 1e3 from the contexts, the most a clip may have",
+        breaks: "moments of 1e3 beside colours of 1",
         bound: Bound::Most(1e-3),
-        reason: "colours are 1e-6 of the moments they are added to: f32 keeps a digit less of each",
-        run: |place| changed(place, 4, |clip| move_cameras(clip, |x| x + 1e6)),
+        reason: "the first layer adds colours to a thousand times as much, so that f32 has three digits less of them",
+        run: |place| {
+            changed(place, 4, |clip| {
+                for pose in clip.context.c2w.iter_mut().chain(&mut clip.target.c2w) {
+                    pose.translation = pose.translation.map(|x| x + MAX_COORDINATE);
+                }
+            })
+        },
     },
     Case {
         name: "field of view of 5 degrees",
