@@ -37,6 +37,7 @@ pub mod views;
 pub mod weights;
 
 pub use camera::ViewCamera;
+pub use clift_kernels::InstructionSet;
 pub use clusters::{ClusterIndex, Clusters, SceneClusters};
 pub use condenser::Condenser;
 pub use config::{CondenserConfig, ModelConfig, Variant};

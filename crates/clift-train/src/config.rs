@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use clift_data::{BoundedSampler, ClipOptions, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig};
+use clift_data::{
+    BoundedSampler, ClipOptions, DataError, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig,
+};
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
 use clift_model::{Grouping, KMeans, ModelConfig};
@@ -269,7 +271,8 @@ impl Config {
             return Err(bad("run_dir", "\"\"", "write the folder that is to receive the run"));
         }
         self.model.validate()?;
-        self.data.views.validate()?;
+        self.data.views.validate().map_err(in_section("data.views"))?;
+        self.validate_size()?;
         self.validate_token_counts()?;
         self.data.validate()?;
         if self.loss.perceptual_weight != 0.0 {
@@ -304,6 +307,21 @@ impl Config {
         stage2.optimizer.validate("stage2")?;
         if !(0.0..=1.0).contains(&stage2.renderer_lr_factor) {
             return Err(bad("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
+        }
+        Ok(())
+    }
+
+    /// Pictures are whole patches.
+    fn validate_size(&self) -> Result<(), TrainError> {
+        let patch_size = self.model.patch_size;
+        for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
+            if value == 0 || !value.is_multiple_of(patch_size) {
+                let below = value / patch_size * patch_size;
+                let near =
+                    if below == 0 { patch_size.to_string() } else { format!("{below} or {}", below + patch_size) };
+                let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
+                return Err(bad(key, value, &fix));
+            }
         }
         Ok(())
     }
@@ -343,17 +361,17 @@ impl DataConfig {
             SourceKind::Chunks if self.root.is_none() => {
                 Err(bad("data.root", "missing", "write the folder that holds train/ and test/"))
             }
-            SourceKind::Chunks => Ok(self.filters.validate()?),
+            SourceKind::Chunks => self.filters.validate().map_err(in_section("data.filters")),
             SourceKind::Synthetic => self.validate_synthetic(),
         }
     }
 
     fn validate_synthetic(&self) -> Result<(), TrainError> {
         let synthetic = &self.synthetic;
-        synthetic.validate()?;
+        synthetic.validate().map_err(in_section("data.synthetic"))?;
         if synthetic.width < self.width || synthetic.height < self.height {
             let fix = format!(
-                "synthetic scenes are {} x {}: write data.synthetic.width and height of at least {} and {}",
+                "synthetic scenes are {} x {}: write data.synthetic.width and data.synthetic.height of at least {} and {}",
                 synthetic.width, synthetic.height, self.width, self.height
             );
             return Err(bad("data.width, data.height", format!("{}, {}", self.width, self.height), &fix));
@@ -387,6 +405,18 @@ fn in_range(key: &str, value: usize, least: usize, most: usize) -> Result<(), Tr
     }
     let fix = if most == usize::MAX { format!("write at least {least}") } else { format!("write {least} to {most}") };
     Err(bad(key, value, &fix))
+}
+
+/// Names the key of a section's own refusal in full; for `map_err`.
+fn in_section(section: &'static str) -> impl FnOnce(DataError) -> TrainError {
+    move |error| match error {
+        // Such a problem says "is VALUE; FIX".
+        DataError::BadConfig { key, problem } => match problem.strip_prefix("is ").and_then(|is| is.split_once("; ")) {
+            Some((value, fix)) => bad(&format!("{section}.{key}"), value, fix),
+            None => DataError::BadConfig { key: format!("{section}.{key}"), problem }.into(),
+        },
+        other => other.into(),
+    }
 }
 
 fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {

@@ -63,11 +63,20 @@ Examples:
         #[command(subcommand)]
         command: DataCommand,
     },
+    /// Tell what a run takes before it starts: parameters, memory, time per step
+    ///
+    /// Of both stages, the cluster cache and the evaluation. Parameters are counted exactly and memory from what the
+    /// operations keep; times come from one block of each kind, timed on the device at the config's sizes. Where the
+    /// data is there, a few scenes of it are read for the time that takes.
+    Plan(PlanArgs),
     /// Check what this machine can train on: every device, the processor, the memory
     ///
     /// Runs one forward and backward pass of a small model on every device of this build and compares its
     /// gradient with that of the default device. Exits with 1 if the default device fails, with 0 otherwise.
-    Doctor,
+    ///
+    /// With --stability it instead runs the hard cases (zero baselines, extreme logits, one cluster for all, ..) on every
+    /// device of the build, each against the same computation in f64, and exits with 1 if one is beyond its bound.
+    Doctor(DoctorArgs),
     /// Time the parts of the method on a device, each with its error against f64
     ///
     /// Inputs and weights are drawn from the config's seed: no data is needed. A row is one part of the method at the
@@ -139,6 +148,39 @@ pub struct EvalArgs {
     /// Where to write; `eval` inside the run by default
     #[arg(long, short, value_name = "DIR")]
     pub out: Option<PathBuf>,
+}
+
+/// Arguments of `clift doctor`.
+#[derive(Debug, clap::Args)]
+pub struct DoctorArgs {
+    /// Run the hard cases instead
+    #[arg(long)]
+    pub stability: bool,
+    /// At the sizes of the tests: seconds instead of minutes
+    #[arg(long, requires = "stability")]
+    pub small: bool,
+    /// Write their table as Markdown
+    #[arg(long, requires = "stability", value_name = "FILE")]
+    pub markdown: Option<PathBuf>,
+}
+
+/// Arguments of `clift plan`.
+#[derive(Debug, clap::Args)]
+pub struct PlanArgs {
+    /// The experiment, a TOML file
+    pub config: PathBuf,
+    /// Change a key of the config: `--set stage1.accumulate=4`
+    #[arg(long, value_name = "KEY=TOML")]
+    pub set: Vec<String>,
+    /// Where tensors live: flex, ndarray or wgpu
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<DeviceName>,
+    /// Leave out the times, which take some seconds to find
+    #[arg(long)]
+    pub no_time: bool,
+    /// Write the plan as JSON
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
 }
 
 /// Arguments of `clift bench`.

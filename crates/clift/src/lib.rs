@@ -7,10 +7,12 @@ mod doctor;
 mod encode;
 mod eval;
 mod interrupt;
+mod plan;
 mod render;
 mod table;
 pub mod terminal;
 mod train;
+mod units;
 
 use std::process::ExitCode;
 
@@ -39,7 +41,8 @@ pub fn main() -> ExitCode {
         Command::Render(args) => render::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
         Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
-        Command::Doctor => doctor::run(),
+        Command::Plan(args) => plan::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Bench(args) => bench::run(&args),
     };
     match result {

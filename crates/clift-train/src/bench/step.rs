@@ -112,7 +112,7 @@ impl InF64 for Shown {
 }
 
 /// Loss of a batch and the gradient of every parameter.
-fn gradients(model: &Clift, batch: &StageBatch, shown: Shown) -> Result<(f64, GradientsParams), TrainError> {
+pub(crate) fn gradients(model: &Clift, batch: &StageBatch, shown: Shown) -> Result<(f64, GradientsParams), TrainError> {
     let loss = loss_of(model, &shown, &batch.tokens)?;
     let grads = GradientsParams::from_grads(loss.backward(), model);
     Ok((values(loss.inner())[0], grads))
