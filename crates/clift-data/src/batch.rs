@@ -7,7 +7,7 @@ use std::sync::Arc;
 use crate::clip::{Clip, SceneSource, ViewIndices};
 use crate::error::DataError;
 use crate::ledger::Skip;
-use crate::order::{SceneOrder, item_rng};
+use crate::order::{SceneOrder, item_rng, unit};
 use crate::sampler::BoundedSampler;
 
 /// Tries of one slot, a scene that comes up again included, before the batch may fail.
@@ -39,6 +39,7 @@ pub struct TrainingClips {
     sampler: BoundedSampler,
     order: SceneOrder,
     seed: u64,
+    flip: bool,
 }
 
 impl TrainingClips {
@@ -58,7 +59,13 @@ impl TrainingClips {
     ) -> Result<Self, DataError> {
         sampler.validate()?;
         let order = SceneOrder::new(seed, source.num_scenes(), batch_size)?;
-        Ok(Self { source, read, sampler, order, seed })
+        Ok(Self { source, read, sampler, order, seed, flip: false })
+    }
+
+    /// Flips half of the clips left to right, drawn by chance, as a whole ([`Clip::flipped`]); `false` flips none.
+    #[must_use]
+    pub fn with_flip(self, flip: bool) -> Self {
+        Self { flip, ..self }
     }
 
     /// Makes the batch of `step`.
@@ -120,10 +127,12 @@ impl TrainingClips {
         attempt: u32,
         num_context: usize,
     ) -> Result<Clip, DataError> {
-        let num_frames = self.source.num_frames(scene)?;
         let mut rng = item_rng(self.seed, step, slot as u32, attempt, "views");
-        let views = self.sampler.sample(num_frames, step, num_context, &mut rng)?;
-        (self.read)(scene, &views)
+        let views = self.sampler.draw(self.source.as_ref(), scene, step, num_context, &mut rng)?;
+        let clip = (self.read)(scene, &views)?;
+        // A stream of its own, so that the views drawn are the same with and without it.
+        let is_flipped = self.flip && unit(&mut item_rng(self.seed, step, slot as u32, attempt, "flip")) < 0.5;
+        Ok(if is_flipped { clip.flipped() } else { clip })
     }
 }
 
@@ -183,7 +192,7 @@ mod tests {
                 width: 0,
                 height: 0,
                 images: Vec::new(),
-                c2w: vec![Pose::IDENTITY; frame_index.len()],
+                c2w: vec![Pose { translation: [1.0, 0.0, 0.0], ..Pose::IDENTITY }; frame_index.len()],
                 intrinsics: Vec::new(),
                 frame_index: frame_index.to_vec(),
             };
@@ -294,5 +303,19 @@ mod tests {
         let read = |_: usize, _: &ViewIndices| unreachable!("nothing is read");
         let made = TrainingClips::new(Lengths::new(vec![9]), Arc::new(read), sampler, 1, 0);
         assert!(made.unwrap_err().to_string().starts_with("num_targets is 0"));
+    }
+
+    #[test]
+    fn about_half_of_the_clips_are_flipped_and_the_views_drawn_stay_the_same() {
+        let plain: Vec<ClipBatch> = (0..100).map(|step| mixed().batch(step).unwrap()).collect();
+        assert_eq!(plain, (0..100).map(|step| mixed().with_flip(false).batch(step).unwrap()).collect::<Vec<_>>());
+        let flipped: Vec<ClipBatch> = (0..100).map(|step| mixed().with_flip(true).batch(step).unwrap()).collect();
+        assert_eq!(flipped, (0..100).map(|step| mixed().with_flip(true).batch(step).unwrap()).collect::<Vec<_>>());
+        let mut num_flipped = 0;
+        for (plain, flipped) in plain.iter().zip(&flipped).flat_map(|(a, b)| a.clips.iter().zip(&b.clips)) {
+            assert!(*flipped == *plain || *flipped == plain.flipped());
+            num_flipped += usize::from(*flipped != *plain);
+        }
+        assert!((160..240).contains(&num_flipped), "{num_flipped} of 400"); // the deviation is 10
     }
 }

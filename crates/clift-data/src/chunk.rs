@@ -123,19 +123,8 @@ impl ChunkSource {
         &self.ledger
     }
 
-    /// Time stamp of every frame: microseconds in RealEstate10K, frame numbers in DL3DV.
-    pub fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
-        let (path, table) = self.table(scene)?;
-        table.read_timestamps(path)
-    }
-
-    /// Where a scene comes from; empty if its file does not say.
-    pub fn url(&self, scene: usize) -> Result<&str, DataError> {
-        Ok(&self.table(scene)?.1.url)
-    }
-
     /// Reads the file of one frame, JPEG or PNG, as it is in the chunk.
-    pub fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Vec<u8>, DataError> {
+    fn read_encoded(&self, scene: usize, frame: usize) -> Result<Vec<u8>, DataError> {
         let (path, table) = self.table(scene)?;
         let span = table.images.get(frame).ok_or_else(|| DataError::NoSuchFrame {
             key: table.key.clone(),
@@ -214,13 +203,26 @@ impl SceneSource for ChunkSource {
         Ok(self.table(scene)?.1.images.len())
     }
 
+    fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
+        let (path, table) = self.table(scene)?;
+        table.read_timestamps(path)
+    }
+
+    fn url(&self, scene: usize) -> Result<String, DataError> {
+        Ok(self.table(scene)?.1.url.clone())
+    }
+
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         let (path, table) = self.table(scene)?;
         table.read_cameras(path)
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-        decode(&self.encoded_frame(scene, frame)?, self.key(scene), frame)
+        decode(&self.read_encoded(scene, frame)?, self.key(scene), frame)
+    }
+
+    fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
+        self.read_encoded(scene, frame).map(Some)
     }
 }
 
@@ -440,7 +442,7 @@ mod tests {
             if scene == 0 {
                 cameras[3].c2w.translation[1] = f64::NAN;
             }
-            let images = (0..8).map(|frame| source.encoded_frame(scene, frame).unwrap()).collect();
+            let images = (0..8).map(|frame| source.encoded_frame(scene, frame).unwrap().unwrap()).collect();
             let (key, timestamps) = (source.key(scene).into(), source.timestamps(scene).unwrap());
             Ok(crate::SceneRecord { key, url: String::new(), timestamps, cameras, images })
         });

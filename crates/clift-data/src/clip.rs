@@ -72,6 +72,19 @@ pub trait SceneSource: Send + Sync {
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.cameras(scene)?.len())
     }
+    /// Time stamp of every frame: microseconds in RealEstate10K, otherwise frame numbers; by default positions.
+    fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
+        Ok((0..self.num_frames(scene)? as i64).collect())
+    }
+    /// Where a scene comes from; empty if nothing says.
+    fn url(&self, _scene: usize) -> Result<String, DataError> {
+        Ok(String::new())
+    }
     /// Decodes one frame.
     fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError>;
+    /// The JPEG or PNG file that [`SceneSource::frame`] decodes, byte by byte; `None` where there is none: the picture
+    /// is computed, or resampled on load.
+    fn encoded_frame(&self, _scene: usize, _frame: usize) -> Result<Option<Vec<u8>>, DataError> {
+        Ok(None)
+    }
 }

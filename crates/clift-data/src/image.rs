@@ -5,16 +5,37 @@ use std::io::Cursor;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
+use serde::{Deserialize, Serialize};
 
 use crate::camera::{Intrinsics, IntrinsicsNorm};
 use crate::clip::Frame;
 use crate::error::DataError;
-use crate::lanczos::resize_lanczos;
+use crate::lanczos::{Window, resize_lanczos_window};
 
 /// Most columns or rows of a picture that is decoded.
 pub const MAX_SIDE: u32 = 16_384;
 /// Most memory that decoding one picture may take: 8,192 x 8,192 RGB and the decoder's own copy.
 const MAX_DECODE_BYTES: u64 = 512 << 20;
+
+/// Where the principal point goes when a picture is cropped.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Crop {
+    /// It keeps its place relative to the width and height, as published numbers have it: half a pixel off where the
+    /// rescaled picture has an odd margin, and more where it is not in the middle.
+    #[default]
+    Protocol,
+    /// It moves with the pixels.
+    Exact,
+}
+
+impl Crop {
+    /// By default the key is not written: what runs from before it existed have on disk stays as it is.
+    #[allow(clippy::trivially_copy_pass_by_ref)] // serde's signature
+    pub fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+}
 
 /// Decodes a JPEG or PNG file to 8-bit RGB; grey becomes RGB, an alpha channel is dropped.
 ///
@@ -93,14 +114,14 @@ pub fn fit(
     }
     let (scaled_width, scaled_height) = covering_size((frame.width, frame.height), (width, height));
     let (column, row) = ((scaled_width - width) / 2, (scaled_height - height) / 2);
-    let scaled = resize_lanczos(frame, scaled_width, scaled_height);
+    let window = Window { column, row, width, height };
+    let cropped = resize_lanczos_window(frame, scaled_width, scaled_height, window);
     let in_scaled = intrinsics_norm.to_pixels(scaled_width, scaled_height);
     let (cx, cy) = if exact_principal_point {
         (in_scaled.cx - column as f64, in_scaled.cy - row as f64)
     } else {
         (intrinsics_norm.cx * width as f64, intrinsics_norm.cy * height as f64)
     };
-    let cropped = crop(&scaled, column, row, width, height);
     Ok((cropped, Intrinsics { fx: in_scaled.fx, fy: in_scaled.fy, cx, cy }))
 }
 
@@ -109,12 +130,6 @@ fn covering_size(from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
     let scale = (to.1 as f64 / from.1 as f64).max(to.0 as f64 / from.0 as f64);
     let side = |from: usize| (from as f64 * scale).round_ties_even() as usize;
     (side(from.0), side(from.1))
-}
-
-fn crop(frame: &Frame, column: usize, row: usize, width: usize, height: usize) -> Frame {
-    let rows = frame.rgb.chunks_exact(frame.width * 3).skip(row).take(height);
-    let rgb = rows.flat_map(|pixels| &pixels[column * 3..(column + width) * 3]).copied().collect();
-    Frame { width, height, rgb }
 }
 
 #[cfg(test)]

@@ -3,9 +3,10 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::clip::ViewIndices;
+use crate::clip::{SceneSource, ViewIndices};
 use crate::error::DataError;
-use crate::order::{below, between, distinct, draw_from, step_rng};
+use crate::inner_views::InnerViews;
+use crate::order::{below, between, draw_from, step_rng};
 
 /// Most context or target views of an item.
 const MAX_VIEWS: usize = 10_000;
@@ -22,7 +23,7 @@ pub fn schedule(init: usize, last: usize, warm_up_steps: u64, step: u64) -> usiz
     init + growth as usize
 }
 
-/// Draws a stretch of a scene, whose two ends and random inner frames are the context, and targets from inside it.
+/// Draws a stretch of a scene, whose two ends and some inner frames are the context, and targets from inside it.
 ///
 /// The stretch grows during training: its gap (last minus first frame) is uniform in `[min_gap, max_gap]`, both on
 /// the [`schedule`] of `warm_up_steps`. This is the `bounded_v2` sampler of DepthSplat, which the paper trains with;
@@ -45,6 +46,9 @@ pub struct BoundedSampler {
     pub num_targets: usize,
     /// Whether a frame may be a target more than once. A target may be a context frame either way.
     pub with_replacement: bool,
+    /// How the contexts between the two ends are chosen: `random`, `farthest_point` or `even`.
+    #[serde(skip_serializing_if = "InnerViews::is_default")]
+    pub inner: InnerViews,
 }
 
 impl Default for BoundedSampler {
@@ -57,6 +61,7 @@ impl Default for BoundedSampler {
             warm_up_steps: 30_000,
             num_targets: 6,
             with_replacement: true,
+            inner: InnerViews::Random,
         }
     }
 }
@@ -128,9 +133,30 @@ impl BoundedSampler {
             .map(|[init, last]| schedule(init, last, self.warm_up_steps, step) / self.gap_divisor(num_context))
     }
 
-    /// Draws the views of one item from a scene of `num_frames` frames.
+    /// Draws the views of one item from a scene of `source`. Its cameras are read only where the choice of inner views
+    /// looks at them.
     ///
-    /// The contexts are distinct and sorted: both ends of the stretch, and inner frames drawn uniformly. The
+    /// # Errors
+    /// As [`BoundedSampler::sample`], and whatever reading the scene gives.
+    pub fn draw(
+        &self,
+        source: &dyn SceneSource,
+        scene: usize,
+        step: u64,
+        num_context: usize,
+        rng: &mut impl Rng,
+    ) -> Result<ViewIndices, DataError> {
+        if !self.inner.needs_centres() {
+            return self.sample(source.num_frames(scene)?, &[], step, num_context, rng);
+        }
+        let centres: Vec<_> = source.cameras(scene)?.iter().map(|camera| camera.c2w.translation).collect();
+        self.sample(centres.len(), &centres, step, num_context, rng)
+    }
+
+    /// Draws the views of one item from a scene of `num_frames` frames with their camera centres, which may be left out
+    /// where `inner` does not need them.
+    ///
+    /// The contexts are distinct and sorted: both ends of the stretch, and inner frames as `inner` says. The
     /// targets lie between the ends, inclusive, in the order drawn. Expects a sampler that [`validate`]s.
     ///
     /// # Errors
@@ -141,10 +167,15 @@ impl BoundedSampler {
     pub fn sample(
         &self,
         num_frames: usize,
+        centres: &[[f64; 3]],
         step: u64,
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
+        if self.inner.needs_centres() && centres.len() != num_frames {
+            let problem = format!("are {}; farthest points need one for each of {num_frames} frames", centres.len());
+            return Err(DataError::bad_config("centres", problem));
+        }
         let Self { min_context, max_context, .. } = self;
         if !(min_context..=max_context).contains(&&num_context) {
             let problem = format!("is {num_context}; the sampler is set to {min_context} to {max_context}");
@@ -164,7 +195,7 @@ impl BoundedSampler {
             draw_from(rng, (left..=right).collect(), self.num_targets)
         };
 
-        let inner = distinct(rng, gap - 1, num_context - 2).into_iter().map(|offset| left + 1 + offset);
+        let inner = self.inner.choose(rng, left, right, num_context - 2, centres);
         let context = std::iter::once(left).chain(inner).chain([right]).collect();
         Ok(ViewIndices { context, target })
     }
@@ -205,194 +236,4 @@ pub fn targets_excluding(
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::order::item_rng;
-    use proptest::prelude::*;
-    use std::collections::BTreeSet;
-
-    fn sampler() -> BoundedSampler {
-        BoundedSampler::default()
-    }
-
-    /// Smallest and largest of many drawn gaps.
-    fn gaps(sampler: &BoundedSampler, num_frames: usize, step: u64, num_context: usize) -> [usize; 2] {
-        let gaps: BTreeSet<usize> = (0..4_000)
-            .map(|slot| {
-                let mut rng = item_rng(1, step, slot, 0, "test");
-                let views = sampler.sample(num_frames, step, num_context, &mut rng).unwrap();
-                views.context[num_context - 1] - views.context[0]
-            })
-            .collect();
-        [*gaps.first().unwrap(), *gaps.last().unwrap()]
-    }
-
-    #[test]
-    fn gaps_grow_with_the_step_and_fill_their_bounds() {
-        for (step, bounds) in
-            [(0, [25, 45]), (1_500, [26, 49]), (15_000, [35, 90]), (30_000, [45, 135]), (900_000, [45, 135])]
-        {
-            assert_eq!(sampler().gap_bounds(step, 4), bounds, "step {step}");
-            assert_eq!(gaps(&sampler(), 1_000, step, 4), bounds, "step {step}");
-        }
-    }
-
-    #[test]
-    fn the_schedule_truncates_and_stays_at_its_last_value() {
-        assert_eq!(schedule(25, 45, 30_000, 1_499), 25);
-        assert_eq!(schedule(25, 45, 30_000, 1_500), 26);
-        assert_eq!(schedule(25, 45, 30_000, 29_999), 44);
-        assert_eq!(schedule(25, 45, 30_000, u64::MAX), 45);
-        assert_eq!(schedule(25, 45, 0, 0), 45);
-    }
-
-    #[test]
-    fn a_short_scene_lowers_the_largest_gap() {
-        assert_eq!(gaps(&sampler(), 31, 0, 4), [25, 30]);
-    }
-
-    #[test]
-    fn a_scene_of_smallest_gap_plus_one_frame_is_just_enough() {
-        let mut rng = item_rng(1, 0, 0, 0, "test");
-        let views = sampler().sample(26, 0, 4, &mut rng).unwrap();
-        assert_eq!((views.context[0], views.context[3]), (0, 25));
-        let error = sampler().sample(25, 0, 4, &mut rng).unwrap_err();
-        assert_eq!(error.to_string(), "not enough frames: 26 needed, 25 in the scene");
-        assert!(sampler().sample(0, 0, 4, &mut rng).is_err());
-    }
-
-    #[test]
-    fn a_number_of_contexts_outside_the_bounds_is_refused() {
-        for num_context in [0, 1, 3, 7] {
-            let error = sampler().sample(200, 0, num_context, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err();
-            assert_eq!(error.to_string(), format!("num_context is {num_context}; the sampler is set to 4 to 6"));
-        }
-    }
-
-    #[test]
-    fn half_as_many_contexts_take_half_the_gap() {
-        let sampler = BoundedSampler { min_context: 2, ..sampler() };
-        assert_eq!(sampler.gap_bounds(0, 6), [25, 45]);
-        assert_eq!(sampler.gap_bounds(0, 4), [25, 45]);
-        assert_eq!(sampler.gap_bounds(0, 3), [12, 22]);
-        assert_eq!(sampler.gap_bounds(0, 2), [8, 15]);
-    }
-
-    #[test]
-    fn the_number_of_contexts_is_a_function_of_seed_and_step_and_takes_every_value() {
-        let drawn: Vec<usize> = (0..200).map(|step| sampler().num_context(5, step)).collect();
-        assert_eq!(drawn, (0..200).map(|step| sampler().num_context(5, step)).collect::<Vec<_>>());
-        assert_ne!(drawn, (0..200).map(|step| sampler().num_context(6, step)).collect::<Vec<_>>());
-        assert_eq!(drawn.into_iter().collect::<BTreeSet<_>>(), [4, 5, 6].into());
-    }
-
-    // The expected values come from an implementation of this sampler in Python.
-    #[test]
-    fn samples_are_the_same_on_every_platform_and_in_every_release() {
-        let views = sampler().sample(279, 1_500, 6, &mut item_rng(7, 1_500, 3, 0, "views")).unwrap();
-        assert_eq!(views.context, [168, 189, 195, 202, 204, 208]);
-        assert_eq!(views.target, [170, 196, 205, 194, 172, 203]);
-    }
-
-    #[test]
-    fn every_inner_frame_is_equally_likely_to_be_a_context() {
-        // Gap 25 with 4 contexts: each of 24 inner frames is drawn with chance 1/12, 1,000 of 12,000 times;
-        // the deviation is 30.
-        let sampler = BoundedSampler { max_gap: [25, 45], ..sampler() };
-        let mut counts = [0_i32; 26];
-        for slot in 0..12_000 {
-            let views = sampler.sample(26, 0, 4, &mut item_rng(1, 0, slot, 0, "test")).unwrap();
-            views.context.iter().for_each(|&frame| counts[frame] += 1);
-        }
-        assert_eq!((counts[0], counts[25]), (12_000, 12_000));
-        assert!(counts[1..25].iter().all(|count| (count - 1_000).abs() < 150), "{counts:?}");
-    }
-
-    #[test]
-    fn a_config_names_the_key_the_value_and_the_fix() {
-        let check = |sampler: BoundedSampler| sampler.validate().unwrap_err().to_string();
-        assert!(sampler().validate().is_ok());
-        assert_eq!(
-            check(BoundedSampler { min_context: 1, ..sampler() }),
-            "min_context is 1; a stretch has two ends, so use 2 or more"
-        );
-        assert!(check(BoundedSampler { max_context: 3, ..sampler() }).starts_with("max_context is 3"));
-        assert!(check(BoundedSampler { num_targets: 0, ..sampler() }).starts_with("num_targets is 0"));
-        for huge in [10_001, usize::MAX] {
-            let expected = format!("max_context is {huge}; use 10000 or fewer");
-            assert_eq!(check(BoundedSampler { max_context: huge, ..sampler() }), expected);
-            let expected = format!("num_targets is {huge}; use 10000 or fewer");
-            assert_eq!(check(BoundedSampler { num_targets: huge, ..sampler() }), expected);
-        }
-        assert!(check(BoundedSampler { min_gap: [30, 25], ..sampler() }).starts_with("min_gap is [30, 25]"));
-        assert!(check(BoundedSampler { max_gap: [45, 40], ..sampler() }).starts_with("max_gap is [45, 40]"));
-        assert!(check(BoundedSampler { max_gap: [20, 135], ..sampler() }).starts_with("max_gap is [20, 135]"));
-        assert!(
-            check(BoundedSampler { min_gap: [4, 45], ..sampler() }).contains("6 distinct contexts need a gap of 5")
-        );
-        assert!(
-            check(BoundedSampler { num_targets: 27, with_replacement: false, ..sampler() })
-                .starts_with("num_targets is 27")
-        );
-    }
-
-    #[test]
-    fn an_unknown_key_is_refused() {
-        let parsed: Result<BoundedSampler, _> = serde_json::from_str(r#"{"min_gaps": [1, 2]}"#);
-        assert!(parsed.unwrap_err().to_string().contains("min_gaps"));
-    }
-
-    #[test]
-    fn stage_two_targets_are_distinct_inner_frames_while_there_are_enough() {
-        let mut rng = item_rng(1, 0, 0, 0, "test");
-        let mut targets = targets_excluding(&[9, 3, 5], 20, 4, &mut rng).unwrap();
-        targets.sort_unstable();
-        assert_eq!(targets, [4, 6, 7, 8]);
-    }
-
-    #[test]
-    fn stage_two_targets_repeat_when_candidates_are_few_and_fall_back_to_the_contexts() {
-        let mut rng = item_rng(1, 0, 0, 0, "test");
-        assert_eq!(targets_excluding(&[3, 5], 20, 3, &mut rng).unwrap(), [4, 4, 4]);
-        let targets = targets_excluding(&[3, 4, 5], 20, 6, &mut rng).unwrap();
-        assert_eq!(targets.len(), 6);
-        assert!(targets.iter().all(|target| (3..=5).contains(target)));
-    }
-
-    #[test]
-    fn stage_two_contexts_beyond_the_scene_are_refused() {
-        let mut rng = item_rng(1, 0, 0, 0, "test");
-        let message = targets_excluding(&[3, 20], 20, 3, &mut rng).unwrap_err().to_string();
-        assert_eq!(message, "not enough frames: 21 needed, 20 in the scene");
-        assert!(targets_excluding(&[], 20, 3, &mut rng).is_err());
-    }
-
-    proptest! {
-        #[test]
-        fn contexts_are_distinct_sorted_frames_and_targets_lie_between_them(
-            seed: u64,
-            num_frames in 0_usize..300,
-            step in 0_u64..60_000,
-            num_context in 4_usize..=6,
-            with_replacement: bool,
-        ) {
-            let sampler = BoundedSampler { with_replacement, ..sampler() };
-            let [min_gap, max_gap] = sampler.gap_bounds(step, num_context);
-            let draw = || sampler.sample(num_frames, step, num_context, &mut item_rng(seed, step, 0, 0, "test"));
-            let Ok(views) = draw() else {
-                prop_assert!(num_frames <= min_gap);
-                return Ok(());
-            };
-            prop_assert_eq!(&views, &draw().unwrap());
-            prop_assert_eq!(views.context.len(), num_context);
-            prop_assert!(views.context.windows(2).all(|pair| pair[0] < pair[1]));
-            let (first, last) = (views.context[0], views.context[num_context - 1]);
-            prop_assert!(last < num_frames && (min_gap..=max_gap).contains(&(last - first)));
-            prop_assert_eq!(views.target.len(), 6);
-            prop_assert!(views.target.iter().all(|target| (first..=last).contains(target)));
-            if !with_replacement {
-                prop_assert_eq!(views.target.iter().collect::<BTreeSet<_>>().len(), 6);
-            }
-        }
-    }
-}
+mod tests;

@@ -137,7 +137,7 @@ mod tests {
         for scene in 0..num_scenes {
             let mut rng = item_rng(1, 0, scene as u32, 0, "test");
             let num_frames = source.config().num_frames;
-            let views = sampler.sample(num_frames, 0, 4, &mut rng).unwrap();
+            let views = sampler.sample(num_frames, &[], 0, 4, &mut rng).unwrap();
             let target = targets_excluding(&views.context, num_frames, 1, &mut rng).unwrap()[0];
             let center = source.cameras(scene).unwrap().into_iter().map(|c| c.c2w.translation).collect::<Vec<_>>();
             let pixels = |frame: usize| -> Vec<f64> {

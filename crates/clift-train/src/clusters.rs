@@ -155,10 +155,9 @@ impl ClusterJob<'_> {
         let views = &config.data.views;
         let mut rng = item_rng(seed, pass as u64, scene as u32, 0, "context and count");
         let num_context = views.min_context + below(&mut rng, views.max_context - views.min_context + 1);
-        let num_frames = reader.source.num_frames(scene)?;
         // The gaps that stage 1 ends with.
         let last_step = config.stage1.steps.min(views.warm_up_steps);
-        let context = views.sample(num_frames, last_step, num_context, &mut rng)?.context;
+        let context = views.draw(reader.source.as_ref(), scene, last_step, num_context, &mut rng)?.context;
         let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
         let ClustersConfig { grouping, grid, kmeans, .. } = &config.clusters;
         let num_tokens = config.model.num_tokens(num_context, clip.context.height, clip.context.width)?;
@@ -264,7 +263,7 @@ fn settings(config: &Config) -> String {
         "synthetic": data.synthetic,
         "size": [data.width, data.height],
         "poses": [serde_json::json!(data.pose_rotation), serde_json::json!(data.pose_scale)],
-        "exact_principal_point": data.exact_principal_point,
+        "exact_principal_point": data.clip_options().exact_principal_point,
         "filters": data.filters,
         "views": data.views,
         "clusters": config.clusters,

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clift_data::{
-    BoundedSampler, ClipOptions, DataError, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig,
+    BoundedSampler, ClipOptions, Crop, DataError, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig,
 };
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
@@ -79,8 +79,14 @@ pub struct DataConfig {
     pub pose_rotation: PoseRotation,
     /// Which cameras set the scale of a scene: contexts only, or targets as well (the reference's numbers).
     pub pose_scale: PoseScale,
-    /// Whether the principal point follows the crop exactly; published numbers are made without.
+    /// Whether the principal point follows the crop exactly: an older way to write `crop = "exact"`.
     pub exact_principal_point: bool,
+    /// Where the principal point goes when pictures are cropped: `protocol`, as in published numbers, or `exact`.
+    #[serde(skip_serializing_if = "Crop::is_default")]
+    pub crop: Crop,
+    /// Whether stage 1 flips half of its clips left to right. Stage 2 trains on clusters of clips as they are.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub flip: bool,
     /// Which scenes of the files are used.
     pub filters: SceneFilters,
     /// The synthetic scenes.
@@ -103,6 +109,8 @@ impl Default for DataConfig {
             pose_rotation: PoseRotation::default(),
             pose_scale: PoseScale::default(),
             exact_principal_point: false,
+            crop: Crop::Protocol,
+            flip: false,
             filters: SceneFilters::default(),
             synthetic: SyntheticConfig::default(),
             views: BoundedSampler::default(),
@@ -120,7 +128,7 @@ impl DataConfig {
             height: self.height,
             pose_rotation: self.pose_rotation,
             pose_scale: self.pose_scale,
-            exact_principal_point: self.exact_principal_point,
+            exact_principal_point: self.exact_principal_point || self.crop == Crop::Exact,
         }
     }
 }
@@ -453,5 +461,21 @@ mod tests {
         config.stage1.optimizer.weight_decay = 0.05;
         config.data.source = SourceKind::Chunks;
         assert!(config.validate().unwrap_err().to_string().starts_with("`data.root` = missing"));
+    }
+
+    #[test]
+    fn younger_keys_are_not_written_by_default_so_that_older_runs_resume() {
+        let written = |config: &Config| toml::Table::try_from(config).unwrap()["data"].clone();
+        let mut config = Config::default();
+        let data = written(&config);
+        assert!(["crop", "flip"].iter().all(|key| data.get(key).is_none()) && data["views"].get("inner").is_none());
+        assert!(!config.data.clip_options().exact_principal_point);
+        (config.data.crop, config.data.flip) = (Crop::Exact, true);
+        let data = written(&config);
+        assert_eq!((data["crop"].as_str(), data["flip"].as_bool()), (Some("exact"), Some(true)));
+        assert!(config.data.clip_options().exact_principal_point);
+        config.data.crop = Crop::Protocol;
+        config.data.exact_principal_point = true;
+        assert!(config.data.clip_options().exact_principal_point);
     }
 }

@@ -1,0 +1,93 @@
+//! Whether the pictures can be read, have one size and differ from each other.
+
+use std::collections::{BTreeMap, HashMap};
+use std::hash::{DefaultHasher, Hash, Hasher};
+
+use rayon::prelude::*;
+
+use super::SceneCheck;
+use crate::camera::Camera;
+use crate::clip::SceneSource;
+
+/// Most frames named in a sentence.
+const MAX_NAMED: usize = 5;
+/// Equal pictures contradict cameras that differ by more than this share of the path's extent, ..
+const MOST_MOVE: f64 = 0.02;
+/// .. or by more than this, in degrees.
+const MOST_TURN_DEG: f64 = 1.0;
+
+/// Columns and rows of every frame; `None` for one that cannot be read.
+pub(super) type Sizes = Vec<Option<[usize; 2]>>;
+
+/// Decodes every frame.
+pub(super) fn look(source: &dyn SceneSource, scene: usize, cameras: &[Camera], check: &mut SceneCheck) -> Sizes {
+    let read = (0..cameras.len()).into_par_iter().map(|frame| {
+        let picture = source.frame(scene, frame)?;
+        let mut hasher = DefaultHasher::new();
+        picture.rgb.hash(&mut hasher);
+        Ok(([picture.width, picture.height], hasher.finish()))
+    });
+    let read: Vec<Result<([usize; 2], u64), crate::DataError>> = read.collect();
+    let failures: Vec<(usize, String)> =
+        read.iter().enumerate().filter_map(|(frame, read)| Some((frame, read.as_ref().err()?.to_string()))).collect();
+    if let Some((_, first)) = failures.first() {
+        let frames: Vec<usize> = failures.iter().map(|(frame, _)| *frame).collect();
+        check.reasons.push(format!("{} cannot be read; the first: {first}", named(&frames)));
+    }
+    let sizes: Sizes = read.iter().map(|read| Some(read.as_ref().ok()?.0)).collect();
+    let mut counts: BTreeMap<[usize; 2], usize> = BTreeMap::new();
+    sizes.iter().flatten().for_each(|size| *counts.entry(*size).or_default() += 1);
+    check.image_size = counts.iter().max_by_key(|(_, count)| **count).map(|(size, _)| *size);
+    if counts.len() > 1 {
+        let list: Vec<String> =
+            counts.iter().map(|([width, height], count)| format!("{width}x{height} ({count})")).collect();
+        check.notes.push(format!("frames have {} sizes: {}", counts.len(), list.join(", ")));
+    }
+    let hashes: Vec<Option<u64>> = read.iter().map(|read| Some(read.as_ref().ok()?.1)).collect();
+    compare(&hashes, cameras, check);
+    sizes
+}
+
+/// Looks for equal pictures, and whether their cameras are.
+fn compare(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
+    let extent = extent(cameras);
+    let mut seen: HashMap<u64, usize> = HashMap::new();
+    let (mut equal, mut contradictions) = (Vec::new(), Vec::new());
+    for (frame, hash) in hashes.iter().enumerate() {
+        let Some(hash) = hash else { continue };
+        let Some(&first) = seen.get(hash) else {
+            seen.insert(*hash, frame);
+            continue;
+        };
+        let (distance, turn_deg) = apart(&cameras[first], &cameras[frame]);
+        let is_moved = distance > MOST_MOVE * extent || turn_deg > MOST_TURN_DEG;
+        (if is_moved { &mut contradictions } else { &mut equal }).push(frame);
+    }
+    if !contradictions.is_empty() {
+        let frames = named(&contradictions);
+        check.reasons.push(format!("{frames} repeat the picture of an earlier frame that has another camera"));
+    }
+    if !equal.is_empty() {
+        check.notes.push(format!("{} repeat the picture and the camera of an earlier frame", named(&equal)));
+    }
+}
+
+/// Distance of the centres, and the angle between the orientations in degrees.
+fn apart(a: &Camera, b: &Camera) -> (f64, f64) {
+    let move_ = (0..3).map(|i| (a.c2w.translation[i] - b.c2w.translation[i]).powi(2)).sum::<f64>().sqrt();
+    let trace: f64 = (0..3).map(|i| (0..3).map(|j| a.c2w.rotation[i][j] * b.c2w.rotation[i][j]).sum::<f64>()).sum();
+    (move_, ((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees())
+}
+
+/// Largest distance of a camera centre from the first.
+fn extent(cameras: &[Camera]) -> f64 {
+    cameras.iter().map(|camera| apart(&cameras[0], camera).0).fold(0.0, f64::max)
+}
+
+/// `3 frames (1, 4, 7)`, with dots beyond a handful.
+pub(super) fn named(frames: &[usize]) -> String {
+    let list: Vec<String> = frames.iter().take(MAX_NAMED).map(ToString::to_string).collect();
+    let more = if frames.len() > MAX_NAMED { ", .." } else { "" };
+    let noun = if frames.len() == 1 { "frame" } else { "frames" };
+    format!("{} {noun} ({}{more})", frames.len(), list.join(", "))
+}

@@ -1,0 +1,140 @@
+//! Corners of pictures and which of them show the same point: what poses are checked against.
+//!
+//! Nothing here looks at cameras. Corners are found in two sizes of a picture, described by the gradients around them,
+//! matched both ways, and kept where one fundamental matrix, whichever it is, explains them.
+
+mod corners;
+mod descriptor;
+mod fundamental;
+mod grey;
+mod matching;
+
+use crate::clip::Frame;
+use crate::lanczos::resize_lanczos;
+use descriptor::Descriptor;
+pub use fundamental::{Matrix3, epipolar_distance, line, line_back, of_cameras};
+use grey::Grey;
+
+/// Columns to which wider pictures are reduced; distances are in pixels of this width.
+pub const WIDTH: usize = 640;
+/// Most corners of the two sizes of a picture.
+const MAX_CORNERS: [usize; 2] = [900, 500];
+/// Size of the smaller picture: corners of a surface seen from nearer match those of the larger.
+const SMALLER: f64 = 0.6;
+
+/// Corners of a picture, in pixels of the picture `WIDTH` wide, with what is around them.
+#[derive(Clone, Debug, Default)]
+pub struct Features {
+    points: Vec<[f64; 2]>,
+    descriptors: Vec<Descriptor>,
+}
+
+/// Two corners that show the same point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Match {
+    /// Column and row in the first picture.
+    pub first: [f64; 2],
+    /// Column and row in the second picture.
+    pub second: [f64; 2],
+}
+
+impl Features {
+    /// Finds the corners of a picture.
+    pub fn find(frame: &Frame) -> Self {
+        let shown = reduced(frame);
+        let unit = WIDTH as f64 / shown.width as f64;
+        let smaller = |side: usize| ((side as f64 * SMALLER).round() as usize).max(1);
+        let second = resize_lanczos(&shown, smaller(shown.width), smaller(shown.height));
+        let mut features = Self::default();
+        for (picture, count) in [&shown, &second].into_iter().zip(MAX_CORNERS) {
+            let grey = Grey::of(picture).blurred();
+            let (scale_x, scale_y) =
+                (shown.width as f64 / picture.width as f64 * unit, shown.height as f64 / picture.height as f64 * unit);
+            for [x, y] in corners::find(&grey, count) {
+                if let Some(descriptor) = Descriptor::at(&grey, x, y) {
+                    features.points.push([x * scale_x, y * scale_y]);
+                    features.descriptors.push(descriptor);
+                }
+            }
+        }
+        features
+    }
+
+    /// How many corners there are.
+    pub fn len(&self) -> usize {
+        self.points.len()
+    }
+
+    /// Whether there is no corner.
+    pub fn is_empty(&self) -> bool {
+        self.points.is_empty()
+    }
+
+    /// Pairs of corners that are each other's most similar, clearly so, and that some epipolar geometry explains.
+    /// The same for the same pictures; fewer than a handful mean that the pictures do not show the same.
+    pub fn matches(&self, other: &Self) -> Vec<Match> {
+        let pairs = matching::mutual(&self.descriptors, &other.descriptors);
+        let matches: Vec<Match> =
+            pairs.into_iter().map(|(a, b)| Match { first: self.points[a], second: other.points[b] }).collect();
+        fundamental::consistent(&matches)
+    }
+}
+
+/// The picture at most `WIDTH` wide.
+pub fn reduced(frame: &Frame) -> Frame {
+    if frame.width <= WIDTH {
+        return frame.clone();
+    }
+    let height = (frame.height as f64 * WIDTH as f64 / frame.width as f64).round().max(1.0) as usize;
+    resize_lanczos(frame, WIDTH, height)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{SceneSource, SyntheticConfig, SyntheticSource};
+
+    fn room() -> SyntheticSource {
+        let config = SyntheticConfig {
+            num_scenes: 1,
+            num_frames: 24,
+            width: 320,
+            height: 240,
+            path_length: 1.2,
+            texture_frequency: 3.0,
+            specular: 0.1,
+            ..Default::default()
+        };
+        SyntheticSource::new(config).unwrap()
+    }
+
+    #[test]
+    fn a_picture_matches_itself_in_place() {
+        let features = Features::find(&room().frame(0, 0).unwrap());
+        assert!(features.len() > 80, "{}", features.len());
+        let matches = features.matches(&features);
+        // A pattern that repeats has no clear match.
+        assert!(matches.len() > features.len() / 2, "{} of {}", matches.len(), features.len());
+        assert!(matches.iter().all(|pair| pair.first == pair.second));
+    }
+
+    #[test]
+    fn matches_of_two_views_lie_on_each_others_epipolar_lines() {
+        let source = room();
+        let cameras = source.cameras(0).unwrap();
+        let matches =
+            Features::find(&source.frame(0, 4).unwrap()).matches(&Features::find(&source.frame(0, 6).unwrap()));
+        let geometry = of_cameras([&cameras[4], &cameras[6]], [[320, 240]; 2]);
+        let mut distances: Vec<f64> = matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect();
+        distances.sort_by(f64::total_cmp);
+        assert!(matches.len() > 40, "{}", matches.len());
+        assert!(distances[matches.len() / 2] < 0.6, "{distances:?}"); // pixels of a picture twice as wide
+    }
+
+    #[test]
+    fn pictures_of_one_colour_have_no_corners() {
+        let features = Features::find(&Frame { width: 64, height: 48, rgb: vec![90; 64 * 48 * 3] });
+        assert!(features.is_empty() && features.matches(&features).is_empty());
+        assert!(Features::find(&Frame { width: 3, height: 2, rgb: vec![9; 18] }).is_empty());
+    }
+}
