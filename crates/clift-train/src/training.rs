@@ -171,12 +171,14 @@ impl<'a> Training<'a> {
             }
             return Err(TrainError::Interrupted { step });
         }
+        // Where nothing could be measured, a resumed run tries again.
+        let Some(psnr) = psnr else { return Ok(()) };
         self.progress.validated = step;
         if !self.is_checkpoint_due() {
             return Ok(());
         }
-        // A step with a checkpoint, whether or not it was saved before a kill: the best is the same.
-        if let Some(psnr) = psnr.filter(|psnr| self.progress.best.is_none_or(|best| *psnr > best.psnr)) {
+        // Of the regular checkpoints only, not of those that a signal caused: the best is the same after any kill.
+        if self.progress.best.is_none_or(|best| psnr > best.psnr) {
             self.progress.best = Some(Best { step, psnr });
         }
         self.checkpoints.update(&self.progress)
