@@ -108,7 +108,7 @@ pub(crate) fn compare(
     if differences.is_empty() {
         return Ok(extensions);
     }
-    let is_all = differences.len() == extensions.len();
+    let is_all = !extend && differences.len() == extensions.len();
     let or = if is_all { "train on with --extend (which changes the learning rates to come), " } else { "" };
     Err(TrainError::OtherRun { differences: differences.join("\n"), or, path: config.run_dir.clone() })
 }
