@@ -52,7 +52,9 @@ impl Loaded {
 /// [`ModelError::Weights`].
 pub fn save<M: Module>(module: &M, path: &Path) -> Result<(), ModelError> {
     let error = |reason: String| ModelError::Weights { action: "writing", reason, path: path.into() };
-    let temporary = path.with_extension("safetensors.tmp");
+    // The store writes to a name of its own beside this one, which a kill leaves there: it starts like ours.
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let temporary = path.with_file_name(format!(".clift-{name}.tmp"));
     let mut store = SafetensorsStore::from_file(&temporary)
         .with_to_adapter(BurnToPyTorchAdapter)
         .overwrite(true)

@@ -199,7 +199,8 @@ impl<'a> Training<'a> {
 
     /// Adds to an error where the stage stands and what there is to go on from.
     pub fn name_checkpoint(&self, error: TrainError) -> TrainError {
-        if matches!(error, TrainError::Interrupted { .. } | TrainError::Diverged { .. }) {
+        let says_so = matches!(error, TrainError::Interrupted { .. } | TrainError::Diverged { .. });
+        if says_so || self.progress.step == 0 {
             return error;
         }
         TrainError::Stopped {
