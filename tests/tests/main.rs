@@ -2,6 +2,12 @@
 
 mod bad_input;
 mod bench;
+#[cfg(unix)]
+mod crash;
+mod exact_resume;
+mod extend;
+#[cfg(unix)]
+mod failing_disk;
 mod hyperparameters;
 mod loss_curve;
 mod patchwise;
@@ -9,4 +15,6 @@ mod pipeline;
 mod report;
 mod resume;
 mod scene_files;
+#[cfg(unix)]
+mod signals;
 mod support;

@@ -59,7 +59,8 @@ impl<'a> HeldOut<'a> {
     }
 
     /// Measures a model without autodiff during training: all tokens in stage 1, one count of condensed ones in stage 2.
-    /// Writes the first sheet to `folder`. Left off without a result once `stop` is set.
+    /// Writes the first sheet to `folder`. Returns the mean PSNR; none where nothing could be measured, and once `stop` is
+    /// set.
     ///
     /// # Errors
     /// As [`evaluate_scene`]; a scene that cannot be read is skipped.
@@ -71,7 +72,7 @@ impl<'a> HeldOut<'a> {
         folder: &Path,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
-    ) -> Result<(), TrainError> {
+    ) -> Result<Option<f64>, TrainError> {
         let grouping = self.config.clusters.grouping;
         let (storage, variant) = match stage {
             Stage::Stage2 => (self.config.eval.validation_storage, condensed_variant(grouping)),
@@ -89,7 +90,7 @@ impl<'a> HeldOut<'a> {
         let mut measured = Accumulator::default();
         for (i, item) in self.items.iter().take(self.config.eval.num_validation_scenes).enumerate() {
             if stop.load(Ordering::Relaxed) {
-                return Ok(());
+                return Ok(None);
             }
             let outcome = self.evaluate_item(&networks, item, &sweep, i == 0, &mut measured, sink)?;
             if let Outcome::Measured(Some(shown)) = outcome {
@@ -98,11 +99,10 @@ impl<'a> HeldOut<'a> {
             }
         }
         let summary = measured.summary();
-        if let Some(point) = summary.points.first() {
-            let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
-            sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
-        }
-        Ok(())
+        let Some(point) = summary.points.first() else { return Ok(None) };
+        let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
+        sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
+        Ok(point.psnr.filter(|psnr| psnr.is_finite()))
     }
 
     /// Runs the whole sweep and writes `report.html`, `summary.json`, `views.csv`, `skipped.json` and the picture sheets

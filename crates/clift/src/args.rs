@@ -107,6 +107,9 @@ pub struct TrainArgs {
     /// Start over: move an existing run aside first
     #[arg(long)]
     pub fresh: bool,
+    /// Train on for more steps than the run was started with, on the learning rates of the new count
+    #[arg(long, conflicts_with = "fresh")]
+    pub extend: bool,
 }
 
 /// Arguments of `clift eval`.

@@ -20,7 +20,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     }
 
     let stop = crate::interrupt::flag()?;
-    let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh };
+    let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
     let mut sink = terminal::sink();
     let folder = config.run_dir.clone();
     let run = Run::open(config, &options, sink.as_mut())?;
