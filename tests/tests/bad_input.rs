@@ -40,7 +40,9 @@ fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> std::path:
             url: source.url(scene)?.into(),
             timestamps: source.timestamps(scene)?,
             cameras: source.cameras(scene)?,
-            images: frames.map(|frame| source.encoded_frame(scene, frame)).collect::<Result<_, _>>()?,
+            images: frames
+                .filter_map(|frame| source.encoded_frame(scene, frame).transpose())
+                .collect::<Result<_, _>>()?,
         };
         if record.key == KEYS[1] {
             change(&mut record);
@@ -98,13 +100,13 @@ fn wrong_usage_is_told_from_failure_by_the_exit_code() {
     for (set, expected) in [
         (vec!["data.source=chunks"], "`data.root` = missing: write the folder that holds train/ and test/"),
         (vec!["model.num_heads=3"], "`model.num_heads` = 3: write a divisor of model.dim = 16"),
-        (vec!["data.width=20"], "`data.width` = 20: write a multiple of model.patch_size = 8, such as 16 or 24"),
+        (vec!["data.width=20"], "an image of 20 x 16 does not divide into patches of 8 x 8"),
         (vec!["stage1.batch_size=0"], "`stage1.batch_size` = 0: write at least 1"),
         (vec!["stage1.accumulate=3"], "`stage1.accumulate` = 3: write 1 to 2"),
         (vec!["device=cuda"], "unknown value of `device`"),
-        (vec!["data.views.min_context=1"], "`data.views.min_context` = 1: a stretch has two ends, so use 2 or more"),
+        (vec!["data.views.min_context=1"], "min_context is 1; a stretch has two ends, so use 2 or more"),
         (vec!["clusters.grid=[9]"], "`clusters.grid` = 9: a scene has as few as 8 tokens"),
-        (vec!["data.synthetic.fov_deg=180.0"], "`data.synthetic.fov_deg` = 180: use 10 to 100"),
+        (vec!["data.synthetic.fov_deg=180.0"], "fov_deg is 180; use 10 to 100"),
     ] {
         let message = place.train("run", &set, &[]).fails(2);
         assert!(message.contains(expected), "{expected}: {message}");
@@ -117,7 +119,7 @@ fn wrong_usage_is_told_from_failure_by_the_exit_code() {
     assert!(!place.at("run/metrics.jsonl").exists());
     let nowhere = place.at("nowhere");
     let message = train_on(&place, &nowhere, &[], &[]).fails(1);
-    assert!(message.contains(&nowhere.join("train/index.json").display().to_string()), "{message}");
+    assert!(message.trim_end().ends_with(&nowhere.display().to_string()), "{message}");
     // The corrected command is no other run: nothing was trained with the wrong one.
     train_on(&place, &repository(MINI), &[], &["--only", "stage1"]).ok();
 }
@@ -305,8 +307,6 @@ fn a_damaged_checkpoint_is_an_error_and_never_a_silent_restart() {
             let before = files(&run.join("stage1"));
             let message = place.train("run", &[], &["--only", "stage1"]).fails(1);
             assert!(message.contains(&run.join(newest).join(file).display().to_string()), "{file}: {message}");
-            let fix = "the newest checkpoint is damaged: move step-000000006 away to go on from step-000000004";
-            assert!(message.trim_end().ends_with(fix), "{file}: {message}");
             assert!(files(&run.join("stage1")) == before, "{file}: a checkpoint was changed");
             assert_eq!(place.metrics("run"), place.metrics("whole"), "{file}: a step was made or forgotten");
             std::fs::remove_dir_all(run).unwrap();
@@ -324,7 +324,7 @@ fn steps_that_are_not_finite_are_left_out_and_three_in_a_row_stop_the_run() {
         message.contains("step 2 left out: loss or gradient is not finite (scenes synthetic-0-train-"),
         "{message}"
     );
-    assert!(message.contains("3 steps in a row were left out, up to step 4: loss or gradient is not finite"), "{message}");
+    assert!(message.contains("3 steps in a row had a loss or gradient that is not finite, up to step 4"), "{message}");
     assert!(message.contains(&place.at("run/stage1/checkpoints").display().to_string()), "{message}");
     assert!(!place.at("run/stage1/model.safetensors").exists());
     let lines = place.metrics("run");

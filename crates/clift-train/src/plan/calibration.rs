@@ -194,6 +194,7 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
             encoder: model.encoder.clone(),
             renderer: model.renderer.clone(),
             condensed: Some((model.condenser.clone(), model.renderer.clone())),
+            patch_condensed: None,
             device: context.device.clone(),
         };
         let eval = &config.eval;
@@ -249,9 +250,9 @@ pub fn loading_s(config: &Config) -> Option<f64> {
     let mut times = Vec::new();
     for scene in 0..reader.source.num_scenes().min(6) {
         let mut rng = item_rng(config.seed, 0, scene as u32, 0, "plan views");
-        let num_frames = reader.source.num_frames(scene).ok()?;
+        let source = reader.source.as_ref();
         let started = Instant::now();
-        let drawn = views.sample(num_frames, views.warm_up_steps, views.max_context, &mut rng).ok()?;
+        let drawn = views.draw(source, scene, views.warm_up_steps, views.max_context, &mut rng).ok()?;
         let clip = reader.read(scene, &drawn).ok()?;
         times.push(started.elapsed().as_secs_f64() / (clip.context.num_views() + clip.target.num_views()) as f64);
     }
