@@ -35,7 +35,8 @@ fn a_killed_save_and_a_killed_rename_are_cleared_away() {
     let place = Place::new();
     place.train("whole", &THIRTY, &[]).ok();
     killed_at("saved/stage1/17", &place.train_args("parts", &THIRTY, &[]));
-    let leftovers = ["parts/.clift-x", "parts/stage1/.clift-y", "parts/stage1/checkpoints/step-000000034.tmp/model.bpk"];
+    let leftovers =
+        ["parts/.clift-x", "parts/stage1/.clift-y", "parts/stage1/checkpoints/step-000000034.tmp/model.bpk"];
     for name in leftovers {
         std::fs::create_dir_all(place.at(name).parent().expect("a folder")).expect("writable");
         std::fs::write(place.at(name), b"half").expect("writable");
@@ -108,7 +109,10 @@ fn spikes_in_a_row_stop_the_run_and_name_the_last_checkpoint() {
     assert!(message.contains(" is a spike (scenes synthetic-0-train-"), "{message}");
     let step = *place.checkpoints("run", "stage1").last().expect("a checkpoint");
     let checkpoint = place.at(&format!("run/stage1/checkpoints/step-{step:09}"));
-    assert!(message.trim_end().ends_with(&format!("the last good checkpoint is {}", checkpoint.display())), "{message}");
+    assert!(
+        message.trim_end().ends_with(&format!("the last good checkpoint is {}", checkpoint.display())),
+        "{message}"
+    );
     // The same steps are bad again: nothing but the same message comes of trying.
     let again = place.train("run", &set, &["--only", "stage1"]).fails(1);
     let told = |message: &str| message.lines().find(|line| line.starts_with("error: ")).map(str::to_owned);
@@ -124,5 +128,8 @@ fn the_last_the_best_and_every_mth_checkpoint_are_kept() {
     let expected: std::collections::BTreeSet<u64> = [8, 16, 20, 22, best].into();
     assert!(place.checkpoints("run", "stage1").into_iter().eq(expected), "the best is {best}");
     let message = place.train("other", &["checkpoint={every=2, keep_every=3}"], &[]).fails(2);
-    assert!(message.contains("checkpoint.keep_every") && message.contains("a multiple of checkpoint.every"), "{message}");
+    assert!(
+        message.contains("checkpoint.keep_every") && message.contains("a multiple of checkpoint.every"),
+        "{message}"
+    );
 }

@@ -29,7 +29,10 @@ fn a_save_that_does_not_fit_leaves_the_last_checkpoint_and_the_run_goes_on_later
     let mut command = Command::new("sh");
     command.args(["-c", "trap '' XFSZ; ulimit -f $0; exec \"$@\"", &blocks.to_string(), BINARY]);
     let message = finish(start(command.args(place.train_args("run", &HALF, &[])))).fails(1);
-    assert!(message.contains("error: writing a checkpoint failed: ") && message.contains("File too large"), "{message}");
+    assert!(
+        message.contains("error: writing a checkpoint failed: ") && message.contains("File too large"),
+        "{message}"
+    );
     assert!(message.contains("step-000000024.tmp/model.bpk\nstage1 stopped after step 24; "), "{message}");
     assert_names_the_last_good_checkpoint(&place, "run", 12, &message);
     place.train("run", &HALF, &[]).ok();
@@ -66,7 +69,8 @@ fn a_full_disk_leaves_the_last_checkpoint_and_the_run_goes_on_when_there_is_room
     let run = "disk/run";
     killed_at("saved/stage1/12", &place.train_args(run, &HALF, &[]));
     // Fills the disk up to less than a checkpoint takes.
-    let model = std::fs::metadata(place.at("disk/run/stage1/checkpoints/step-000000012/model.bpk")).expect("there").len();
+    let model =
+        std::fs::metadata(place.at("disk/run/stage1/checkpoints/step-000000012/model.bpk")).expect("there").len();
     let free = || {
         let output = Command::new("stat").args(["-f", "-c", "%a %S"]).arg(&folder).output().expect("stat runs");
         let text = String::from_utf8(output.stdout).expect("text");
@@ -97,7 +101,10 @@ fn a_run_directory_that_cannot_be_is_an_error_before_anything_else() {
     let place = Place::new();
     std::fs::write(place.at("file"), b"not a folder").expect("writable");
     let message = place.train("file/run", &[], &[]).fails(1);
-    assert!(message.contains("making the run directory failed: ") && message.trim_end().ends_with("file/run"), "{message}");
+    assert!(
+        message.contains("making the run directory failed: ") && message.trim_end().ends_with("file/run"),
+        "{message}"
+    );
     // A folder that turned into something else.
     place.train("run", &[], &["--only", "stage1"]).ok();
     std::fs::write(place.at("run/clusters.tmp"), b"not a folder").expect("writable");
@@ -111,8 +118,20 @@ fn data_that_vanishes_stops_the_run_after_a_save_and_it_goes_on_when_the_data_is
     let place = Place::new();
     let data = place.at("rooms");
     let folder = data.display().to_string();
-    clift(["data", "synth", &folder, "--scenes", "8", "--frames", "8", "--size", "16x16", "--set", "samples_per_pixel=1"])
-        .ok();
+    clift([
+        "data",
+        "synth",
+        &folder,
+        "--scenes",
+        "8",
+        "--frames",
+        "8",
+        "--size",
+        "16x16",
+        "--set",
+        "samples_per_pixel=1",
+    ])
+    .ok();
     let source = format!(
         "data={{source='chunks', root='{folder}', width=16, height=16, num_threads=0, \
          views={{min_context=2, max_context=2, min_gap=[3, 3], max_gap=[6, 6], warm_up_steps=0, num_targets=2}}}}"

@@ -19,7 +19,10 @@ fn every_signal_saves_and_exits_with_its_own_code() {
         signal(&child, name);
         let message = finish(child).fails(code);
         let steps = place.metrics(&run).len() as u64;
-        assert!(message.contains(&format!("error: interrupted at step {steps}; the same command resumes")), "{message}");
+        assert!(
+            message.contains(&format!("error: interrupted at step {steps}; the same command resumes")),
+            "{message}"
+        );
         assert_eq!(place.checkpoints(&run, "stage1"), [steps]);
     }
 }
