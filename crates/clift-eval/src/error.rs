@@ -42,6 +42,26 @@ pub enum EvalError {
         /// Rows.
         height: usize,
     },
+    /// LPIPS has no value left of a picture after its last stage.
+    #[error("LPIPS needs at least {min} x {min} pixels, got {width} x {height}", min = crate::lpips::LPIPS_MIN_SIZE_PX)]
+    TooSmallForLpips {
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+    },
+    /// A file with the weights of a network that measures pictures cannot be used.
+    #[error("bad weights for {what}: {reason}; `{command}` makes them: {path}", path = path.display())]
+    BadWeights {
+        /// What they are for.
+        what: &'static str,
+        /// What is wrong with them.
+        reason: String,
+        /// What to run.
+        command: &'static str,
+        /// The file.
+        path: PathBuf,
+    },
     /// A baseline was asked for a scene that has no context view.
     #[error("a baseline needs at least one context view, got none")]
     NoContext,

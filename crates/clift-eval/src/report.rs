@@ -4,7 +4,6 @@ mod axis;
 mod date;
 mod figures;
 mod markup;
-mod pareto;
 mod plot;
 mod scene;
 

@@ -58,6 +58,8 @@ impl Run {
     pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         config.validate()?;
         let device = config.device.open()?;
+        // Missing weights are found now, not after the data.
+        config.loss.weights()?;
         let folder = &config.run_dir;
         if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
             let fix = "it starts a run over, which begins with stage 1: leave out one of the two";

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use super::axis::{Scale, milliseconds};
-use super::pareto::front;
 use super::plot::{Level, Look, Mark, Plot, Series};
 use crate::exhibit::best_variant;
 use crate::measured::{Setting, Variant};
+use crate::pareto::front;
 use crate::summary::{Point, Summary};
 
 const QUALITY: &str = "PSNR, dB";
