@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod bench;
+mod evaluation;
 #[cfg(unix)]
 mod crash;
 mod exact_resume;

@@ -138,6 +138,7 @@ pub(crate) mod tests {
     }
 
     fn check_fixture(lpips: &Lpips, fixture: &Reference, tolerance: f64) {
+        let mut most = 0.0_f64;
         let pairs = fixture.names("output.psnr.");
         assert!(!pairs.is_empty(), "an empty fixture checks nothing");
         for pair in pairs {
@@ -148,10 +149,12 @@ pub(crate) mod tests {
             let expected = |metric: &str| fixture.f64s(&format!("output.{metric}.{pair}"))[0];
             let apart = lpips.measure(&pred, &target, height, width).unwrap();
             assert!((apart - expected("lpips")).abs() <= tolerance, "{pair}: {apart} is not {}", expected("lpips"));
+            most = most.max((apart - expected("lpips")).abs());
             let (psnr, ssim) = (psnr(&pred, &target).unwrap(), ssim(&pred, &target, height, width).unwrap());
             assert!(psnr == expected("psnr") || (psnr - expected("psnr")).abs() <= 1e-4, "{pair}: {psnr} dB");
             assert!((ssim - expected("ssim")).abs() <= 1e-5, "{pair}: SSIM {ssim}");
         }
+        println!("largest error of LPIPS {most:.1e}");
     }
 
     #[test]
@@ -169,7 +172,7 @@ pub(crate) mod tests {
     fn the_full_network_gives_the_lpips_packages_distances() {
         let folder = std::path::PathBuf::from(std::env::var("CLIFT_CHECK_VGG").expect("the folder of check_vgg.py"));
         let lpips = Lpips::load(&folder.join("lpips-vgg.safetensors"), &Device::flex()).unwrap();
-        check_fixture(&lpips, &Reference::read(&folder.join("lpips.safetensors")), 1e-4);
+        check_fixture(&lpips, &Reference::read(&folder.join("lpips.safetensors")), 1e-5);
     }
 
     #[test]

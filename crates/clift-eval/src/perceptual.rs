@@ -117,8 +117,10 @@ mod tests {
     #[test]
     fn loss_and_gradient_equal_pytorchs_at_an_odd_size() {
         let fixture = Reference::open("perceptual");
-        for device in [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().unwrap()) {
-            for (dtype, tolerance) in [(DType::F64, 1e-10), (DType::F32, 1e-4)] {
+        // The backward of ndarray rounds to f32 somewhere, even where everything is f64.
+        for (name, in_f64) in [(DeviceName::Flex, 1e-10), (DeviceName::Ndarray, 1e-6)] {
+            let device = name.open().unwrap();
+            for (dtype, tolerance) in [(DType::F64, in_f64), (DType::F32, 1e-4)] {
                 let tensor = |name: &str| fixture.tensor::<5>(name, &device, dtype);
                 let (loss, grad) = both(&narrow((&device, dtype)), tensor("input.rendering"), tensor("input.target"));
                 let expected = fixture.f64s("output.loss")[0];
@@ -126,7 +128,7 @@ mod tests {
                 // f32 the tolerance is of the largest entry, of which one sign moves at most a little.
                 assert!((loss - expected).abs() <= tolerance * 0.1 * expected, "{loss} is not {expected}");
                 let error = largest_difference(&grad, &fixture.f64s("grad.input.rendering"));
-                assert!(error <= tolerance, "{dtype:?}: {error:.2e}");
+                assert!(error <= tolerance, "{name}, {dtype:?}: {error:.2e}");
             }
         }
     }
@@ -202,7 +204,7 @@ mod tests {
         assert!((value - expected).abs() <= 1e-4 * expected, "{value} is not {expected}");
         let error = largest_difference(&grad, &fixture.f64s("grad.input.rendering"));
         // Signs of differences that rounding turns around: see above.
-        assert!(error <= 2e-2, "{error:.2e}");
+        assert!(error <= 1e-3, "{error:.2e}");
         println!("loss {value} for {expected}, largest error of the gradient {error:.2e} of its largest entry");
     }
 }
