@@ -2,9 +2,9 @@
 
 mod bad_input;
 mod bench;
-mod evaluation;
 #[cfg(unix)]
 mod crash;
+mod evaluation;
 mod exact_resume;
 mod extend;
 #[cfg(unix)]
