@@ -117,7 +117,7 @@ fn another_systems_pictures_stand_beside_ours_and_missing_ones_are_named() {
     let flags = ["--predictions", &grey, "--name", "Grey & co", "--data-size", "1.5kB"];
     let ran = place.eval("run", &flags).ok();
     let missing = format!("{}/{:0>6}.png", views[0].0, views[0].1);
-    assert!(ran.stdout.contains(&format!("Grey & co: 1 of 6 pictures are missing")), "{}", ran.stdout);
+    assert!(ran.stdout.contains("Grey & co: 1 of 6 pictures are missing"), "{}", ran.stdout);
     assert!(ran.stdout.contains(&missing), "{}", ran.stdout);
     let summary = place.json("run/eval/summary.json");
     assert_eq!(summary["missing"][0]["pictures"], serde_json::json!([missing]));

@@ -176,14 +176,14 @@ mod tests {
 
     #[test]
     fn the_weights_get_no_gradient() {
-        let device = Device::flex();
-        let loss = narrow((&device, DType::F32));
         struct Tracked(usize);
         impl burn::module::ModuleVisitor for Tracked {
             fn visit_float<const D: usize>(&mut self, param: &burn::module::Param<Tensor<D>>) {
                 self.0 += usize::from(param.is_require_grad() || param.val().is_require_grad());
             }
         }
+        let device = Device::flex();
+        let loss = narrow((&device, DType::F32));
         let mut tracked = Tracked(0);
         loss.vgg.visit(&mut tracked);
         assert_eq!(tracked.0, 0);

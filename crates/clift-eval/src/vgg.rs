@@ -41,10 +41,11 @@ pub struct VggShape {
 }
 
 impl VggShape {
-    /// VGG-16 with the features relu1_2, 2_2, 3_3, 4_3, 5_3.
+    /// VGG-16 with the features `relu1_2`, `relu2_2`, `relu3_3`, `relu4_3` and `relu5_3`.
     pub const VGG16: Self =
         Self { widths: [64, 128, 256, 512, 512], convs: [2, 2, 3, 3, 3], taps: [2, 2, 3, 3, 3], pooling: Pooling::Max };
-    /// VGG-19 with average pooling and the features relu1_2, 2_2, 3_2, 4_2, 5_2.
+    /// VGG-19 with average pooling and the features `relu1_2`, `relu2_2`, `relu3_2`, `relu4_2` and
+    /// `relu5_2`.
     pub const VGG19: Self = Self {
         widths: [64, 128, 256, 512, 512],
         convs: [2, 2, 4, 4, 2],

@@ -8,7 +8,8 @@ use clift_data::{ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split,
 use clift_model::{Scene, weights};
 use clift_train::checkpoint::Checkpoints;
 use clift_train::clusters::ClusterCache;
-use clift_train::config::OptimizerConfig;
+use clift_train::config::{CheckpointConfig, OptimizerConfig};
+use clift_train::loss::Loss;
 use clift_train::optim::adamw;
 use clift_train::step::Learner;
 use clift_train::{Config, Run, read_checked_config};
@@ -413,9 +414,10 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             model: model.clone(),
             optimizer: adamw(&OptimizerConfig::default()),
             device: Device::flex().autodiff(),
+            loss: Loss::default(),
             recompute: false,
         };
-        Checkpoints::new(folder.clone(), 1).resume(&mut learner).map(drop).map_err(words_of)
+        Checkpoints::new(folder.clone(), CheckpointConfig::default()).resume(&mut learner).map(drop).map_err(words_of)
     })
 }
 
