@@ -4,6 +4,7 @@ mod bad_input;
 mod bench;
 #[cfg(unix)]
 mod crash;
+mod evaluation;
 mod exact_resume;
 mod extend;
 #[cfg(unix)]

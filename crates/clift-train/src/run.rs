@@ -8,7 +8,8 @@ use burn::module::Module;
 use burn::tensor::Device;
 use clift_data::files::remove_leftovers;
 use clift_data::{ClipReader, SceneSource, Split};
-use clift_eval::{Networks, Summary};
+use clift_eval::lpips::LPIPS_COMMAND;
+use clift_eval::{Networks, Summary, System};
 use clift_model::{Clift, Condenser, Encoder, Renderer, weights};
 
 use crate::TrainError;
@@ -58,6 +59,13 @@ impl Run {
     pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         config.validate()?;
         let device = config.device.open()?;
+        // Missing weights are found now, not after days of training.
+        config.loss.weights()?;
+        if let Some(path) = config.eval.lpips_path().filter(|path| !path.is_file()) {
+            let fix = format!("there is no such file; `{LPIPS_COMMAND}` makes it, \"\" leaves LPIPS out");
+            let value = path.display().to_string();
+            return Err(TrainError::BadConfig { key: "eval.lpips_weights".into(), value, fix });
+        }
         let folder = &config.run_dir;
         if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
             let fix = "it starts a run over, which begins with stage 1: leave out one of the two";
@@ -131,11 +139,12 @@ impl Run {
         if only.is_some() {
             return Ok(None);
         }
-        held_out.evaluate(&self.networks(sink)?, &self.folder("eval"), stop, sink).map(Some)
+        held_out.evaluate(&self.networks(sink)?, &[], &self.folder("eval"), stop, sink).map(Some)
     }
 
-    /// Evaluates the run's weights and writes the results to `folder`; `beside` is another run of the same stage 1
-    /// whose stage 2 was trained on other groups of tokens, to be measured on the same views.
+    /// Evaluates the run's weights, and other systems' pictures beside them, and writes the results to `folder`;
+    /// `beside` is another run of the same stage 1 whose stage 2 was trained on other groups of tokens, to be measured
+    /// on the same views.
     ///
     /// # Errors
     /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] when those of
@@ -143,6 +152,7 @@ impl Run {
     /// whatever the evaluation gives.
     pub fn evaluate(
         &self,
+        systems: &[System],
         folder: &Path,
         beside: Option<&Config>,
         stop: &AtomicBool,
@@ -162,7 +172,7 @@ impl Run {
             let (condenser, renderer) = self.load_stage2(other, &networks.encoder)?;
             networks.set_condensed(other.clusters.grouping, condenser, renderer);
         }
-        self.held_out(sink)?.evaluate(&networks, folder, stop, sink)
+        self.held_out(sink)?.evaluate(&networks, systems, folder, stop, sink)
     }
 
     /// The trained networks: of both stages, or of stage 1 alone.

@@ -16,6 +16,7 @@ use crate::checkpoint::Checkpoints;
 use crate::config::{Config, OptimizerConfig};
 use crate::events::{Event, Sink, Stage};
 use crate::held_out::HeldOut;
+use crate::loss::Loss;
 use crate::optim::adamw;
 use crate::sinks::RunLog;
 use crate::step::{Learner, StageBatch};
@@ -64,7 +65,12 @@ impl StagePlan<'_> {
         let checkpoints = self.checkpoints();
         let model = if checkpoints.newest()?.is_some() { self.blank_model() } else { start(sink)? };
         let optimizer = adamw(self.optimizer);
-        let mut learner = Learner { model, optimizer, device: self.device.clone(), recompute: self.config.recompute };
+        let loss = Loss::load(&self.config.loss, &self.device)?;
+        if let Some(sha256) = loss.sha256() {
+            sink.event(&Event::Message(format!("perceptual loss: weights with SHA-256 {sha256}")));
+        }
+        let (device, recompute) = (self.device.clone(), self.config.recompute);
+        let mut learner = Learner { model, optimizer, device, loss, recompute };
         let progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
         learner.model = freeze(self.stage, learner.model);
         std::fs::create_dir_all(&self.folder).map_err(TrainError::io("making a folder", &self.folder))?;

@@ -1,12 +1,16 @@
 //! `clift eval`.
 
+use std::path::Path;
+
+use clift_eval::{System, SystemName};
 use clift_train::{Config, Run, read_config};
 
 use crate::args::EvalArgs;
-use crate::terminal;
+use crate::{WrongUsage, terminal};
 
 /// Evaluates a run and prints the table.
 pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
+    let systems = systems(args)?;
     let (mut config, overrides) = read_config::<Config>(&args.run.join("config.toml"), &args.set)?;
     for change in overrides {
         terminal::print_note(&format!("--set {change}"));
@@ -24,7 +28,9 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
         config.eval.render.clone_from(&args.render);
     }
     config.eval.selection = args.selection.unwrap_or(config.eval.selection);
-    config.eval.tokens = args.tokens.unwrap_or(config.eval.tokens);
+    if !args.tokens.is_empty() {
+        config.eval.tokens.clone_from(&args.tokens);
+    }
     if args.index.is_some() {
         config.eval.index.clone_from(&args.index);
     }
@@ -37,7 +43,33 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let beside = beside.transpose()?;
     let mut sink = terminal::sink();
     let stop = crate::interrupt::flag()?;
-    let summary = Run::reopen(config)?.evaluate(&folder, beside.as_ref(), &stop, sink.as_mut())?;
+    let run = Run::reopen(config)?;
+    let summary = run.evaluate(&systems, &folder, beside.as_ref(), &stop, sink.as_mut())?;
     drop(sink);
     terminal::print_evaluation(&summary, &folder)
+}
+
+/// Other systems, with as many names and sizes as there are, or none.
+fn systems(args: &EvalArgs) -> anyhow::Result<Vec<System>> {
+    let EvalArgs { predictions, name, data_size, .. } = args;
+    for (flag, count) in [("--name", name.len()), ("--data-size", data_size.len())] {
+        if count != 0 && count != predictions.len() {
+            let text =
+                format!("{} --predictions but {count} {flag}: write one for each, in their order", predictions.len());
+            return Err(WrongUsage(text).into());
+        }
+    }
+    let mut systems: Vec<System> = Vec::new();
+    for (i, folder) in predictions.iter().enumerate() {
+        if !folder.is_dir() {
+            return Err(WrongUsage(format!("there is no folder for --predictions {}", folder.display())).into());
+        }
+        let of_folder = || folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned();
+        let name = SystemName::new(&name.get(i).cloned().unwrap_or_else(of_folder))?;
+        if systems.iter().any(|system| system.name == name) {
+            return Err(WrongUsage(format!("two --predictions are called {}: write --name", name.as_str())).into());
+        }
+        systems.push(System { name, folder: Path::to_owned(folder), data_bytes: data_size.get(i).copied() });
+    }
+    Ok(systems)
 }

@@ -9,6 +9,7 @@ use clift_model::{Scene, weights};
 use clift_train::checkpoint::Checkpoints;
 use clift_train::clusters::ClusterCache;
 use clift_train::config::{CheckpointConfig, OptimizerConfig};
+use clift_train::loss::Loss;
 use clift_train::optim::adamw;
 use clift_train::step::Learner;
 use clift_train::{Config, Run, read_checked_config};
@@ -413,6 +414,7 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             model: model.clone(),
             optimizer: adamw(&OptimizerConfig::default()),
             device: Device::flex().autodiff(),
+            loss: Loss::default(),
             recompute: false,
         };
         Checkpoints::new(folder.clone(), CheckpointConfig { keep: 1, ..CheckpointConfig::default() })
