@@ -307,6 +307,8 @@ fn a_damaged_checkpoint_is_an_error_and_never_a_silent_restart() {
             let before = files(&run.join("stage1"));
             let message = place.train("run", &[], &["--only", "stage1"]).fails(1);
             assert!(message.contains(&run.join(newest).join(file).display().to_string()), "{file}: {message}");
+            let fix = "the newest checkpoint is damaged: move step-000000006 away to go on from step-000000004";
+            assert!(message.trim_end().ends_with(fix), "{file}: {message}");
             assert!(files(&run.join("stage1")) == before, "{file}: a checkpoint was changed");
             assert_eq!(place.metrics("run"), place.metrics("whole"), "{file}: a step was made or forgotten");
             std::fs::remove_dir_all(run).unwrap();
