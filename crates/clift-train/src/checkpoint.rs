@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use burn::module::Module;
 use burn::store::ModuleRecord;
-use clift_data::files::{publish, remove_folder, replace};
+use clift_data::files::{make_folder, publish, remove_folder, replace};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
@@ -102,7 +102,7 @@ impl Checkpoints {
     }
 
     fn write(learner: &Learner, progress: &Progress, temporary: &Path, path: &Path) -> Result<(), TrainError> {
-        std::fs::create_dir_all(temporary).map_err(TrainError::io("making a checkpoint", temporary))?;
+        make_folder(temporary).map_err(TrainError::io("making a checkpoint", temporary))?;
         let failed =
             |name: &str, reason: String| TrainError::io(SAVING, &temporary.join(name))(std::io::Error::other(reason));
         let record = learner.model.clone().into_record();

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::files::remove_leftovers;
+use clift_data::files::{make_folder, remove_leftovers};
 use clift_data::{ClipReader, SceneSource, Split};
 use clift_eval::lpips::LPIPS_COMMAND;
 use clift_eval::{Networks, Summary, System};
@@ -78,7 +78,7 @@ impl Run {
             std::fs::rename(folder, &moved).map_err(TrainError::io("moving the former run aside", folder))?;
             sink.event(&Event::Message(format!("moved the former run to {}", moved.display())));
         }
-        std::fs::create_dir_all(folder).map_err(TrainError::io("making the run directory", folder))?;
+        make_folder(folder).map_err(TrainError::io("making the run directory", folder))?;
         let lock = RunLock::take(folder, sink)?;
         remove_leftovers(folder).map_err(TrainError::io("removing what a killed process left", folder))?;
         // A run that failed before its first step, on a wrong path perhaps, has nothing that settings could contradict.

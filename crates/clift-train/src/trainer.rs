@@ -9,6 +9,7 @@ use burn::module::{Module, ParamGroup};
 use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleLrScheduler};
 use burn::tensor::Device;
 use clift_data::Prefetcher;
+use clift_data::files::make_folder;
 use clift_model::Clift;
 
 use crate::TrainError;
@@ -73,7 +74,7 @@ impl StagePlan<'_> {
         let mut learner = Learner { model, optimizer, device, loss, recompute };
         let progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
         learner.model = freeze(self.stage, learner.model);
-        std::fs::create_dir_all(&self.folder).map_err(TrainError::io("making a folder", &self.folder))?;
+        make_folder(&self.folder).map_err(TrainError::io("making a folder", &self.folder))?;
         let run_dir = self.folder.parent().unwrap_or(&self.folder);
         let mut log = RunLog::open(run_dir, self.stage, progress.step, sink)?;
         log.event(&Event::StageStarted { stage: self.stage, done: progress.step, num_steps: self.num_steps });

@@ -407,6 +407,14 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
         let path = item.expect("it can be listed").path();
         std::fs::copy(&path, step.join(path.file_name().expect("it has a name"))).expect("it can be copied");
     }
+    if name != "state.json" {
+        // The checksums would keep every change from the readers that are attacked.
+        let state = step.join("state.json");
+        let text = std::fs::read(&state).expect("the checkpoint has a state");
+        let mut value: serde_json::Value = serde_json::from_slice(&text).expect("it is JSON");
+        value["files"] = serde_json::json!({});
+        std::fs::write(state, value.to_string()).expect("a temporary folder is writable");
+    }
     let model = setup.model();
     Box::new(move |bytes| {
         std::fs::write(step.join(name), bytes).expect("a temporary folder is writable");
@@ -417,10 +425,7 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             loss: Loss::default(),
             recompute: false,
         };
-        Checkpoints::new(folder.clone(), CheckpointConfig { keep: 1, ..CheckpointConfig::default() })
-            .resume(&mut learner)
-            .map(drop)
-            .map_err(words_of)
+        Checkpoints::new(folder.clone(), CheckpointConfig::default()).resume(&mut learner).map(drop).map_err(words_of)
     })
 }
 
