@@ -100,7 +100,7 @@ fn wrong_usage_is_told_from_failure_by_the_exit_code() {
     for (set, expected) in [
         (vec!["data.source=chunks"], "`data.root` = missing: write the folder that holds train/ and test/"),
         (vec!["model.num_heads=3"], "`model.num_heads` = 3: write a divisor of model.dim = 16"),
-        (vec!["data.width=20"], "an image of 20 x 16 does not divide into patches of 8 x 8"),
+        (vec!["data.width=20"], "`data.width` = 20: write a multiple of model.patch_size = 8"),
         (vec!["stage1.batch_size=0"], "`stage1.batch_size` = 0: write at least 1"),
         (vec!["stage1.accumulate=3"], "`stage1.accumulate` = 3: write 1 to 2"),
         (vec!["device=cuda"], "unknown value of `device`"),
