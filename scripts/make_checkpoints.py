@@ -2,6 +2,7 @@
 
     .venv/bin/python scripts/make_checkpoints.py           # writes every file
     .venv/bin/python scripts/make_checkpoints.py --check   # remakes them and compares every tensor
+    .venv/bin/python scripts/make_checkpoints.py --full F  # writes one of the published size elsewhere
 
 `NAME.ckpt` is a checkpoint as Lightning's trainer saves one: the network below `transformer.`, a perceptual
 network beside it, optimiser states and objects of a project that nobody else has. `NAME.safetensors` holds
@@ -160,11 +161,17 @@ def same(a: Path, b: Path) -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Makes the checkpoints in data-fixtures/checkpoints.")
     parser.add_argument("--check", action="store_true", help="compare with what is checked in; write nothing there")
+    parser.add_argument("--full", metavar="FILE", help="write a released-re10k checkpoint of the published size")
     args = parser.parse_args()
     torch.set_num_threads(1)
     pickle_stand_ins.install()
     test_layers_equal_torchs()
     test_norms_are_the_only_difference()
+    if args.full:
+        rng = np.random.default_rng(0)
+        torch.save(checkpoint(network(ReleasedConfig(), rng), rng), args.full)
+        print(f"{args.full}: {Path(args.full).stat().st_size} bytes")
+        return 0
     if not args.check:
         write(FOLDER)
         for path in sorted(FOLDER.iterdir()):

@@ -17,6 +17,12 @@ use crate::model_dir::{self, Parameter};
 
 /// Keys of one kind that a message lists.
 const MAX_LISTED: usize = 12;
+/// Letters of a key that a message shows.
+const MAX_SHOWN: usize = 160;
+/// Keys that are looked through for the nearest.
+const MAX_COMPARED: usize = 1000;
+/// Kinds of keys outside the network that are told apart.
+const MAX_IGNORED: usize = 64;
 
 /// What the user says about a checkpoint.
 #[derive(Clone, Debug)]
@@ -148,6 +154,57 @@ enum Problem {
     NoTensor(String),
 }
 
+impl Problem {
+    fn kind(&self) -> &'static str {
+        match self {
+            Self::Missing(_) => "missing",
+            Self::Unknown(_) => "unknown",
+            Self::Shape { .. } => "misshapen",
+            Self::Format { .. } => "not in f32",
+            Self::NoTensor(_) => "no tensor",
+        }
+    }
+
+    fn told(&self, state: &StateDict, missing: &[&str], unknown: &[&str]) -> String {
+        match self {
+            Self::Missing(tensor) => format!("{} {:?}{}", tensor.key, tensor.shape, near(&tensor.key, unknown)),
+            Self::Unknown(key) => {
+                let shape = state.tensor(key).map_or_else(String::new, |(_, shape)| format!(" {shape:?}"));
+                format!("{}{shape}{}", shown(key), near(plain(key), missing))
+            }
+            Self::Shape { key, got, expected } => format!("{} is {got:?}, expected {expected:?}", shown(key)),
+            Self::Format { key, got, shape, is_convertible } => {
+                let fix = if *is_convertible { "; --convert converts it to f32" } else { "" };
+                format!("{} {shape:?} is {got:?}{fix}", shown(key))
+            }
+            Self::NoTensor(key) => shown(key),
+        }
+    }
+}
+
+/// The candidate that a word may be a slip of. Only so many words and letters are compared: a file decides how many
+/// there are.
+fn near(word: &str, candidates: &[&str]) -> String {
+    let short = |word: &&str| word.len() <= MAX_SHOWN;
+    let found = Some(word).filter(short).and_then(|word| {
+        let candidates = candidates.iter().copied().filter(short).take(MAX_COMPARED);
+        nearest(word, candidates)
+    });
+    found.map_or_else(String::new, |name| format!("; nearest name: {}", shown(name)))
+}
+
+/// A key without the network's prefix.
+fn plain(key: &str) -> &str {
+    key.strip_prefix(PREFIX).unwrap_or(key)
+}
+
+/// A key of a file that may be hostile, for a terminal.
+fn shown(key: &str) -> String {
+    let short: String = key.chars().take(MAX_SHOWN).collect();
+    let rest = if short.len() < key.len() { ".." } else { "" };
+    format!("{}{rest}", short.escape_debug())
+}
+
 impl Keys {
     fn of(state: &StateDict, options: &ImportOptions) -> Result<Self, TrainError> {
         // A state dict saved on its own has no prefix.
@@ -156,18 +213,15 @@ impl Keys {
         for key in state.keys() {
             let Some(name) = key.strip_prefix(prefix).filter(|_| !key.starts_with(interchange::PERCEPTUAL_PREFIX))
             else {
-                let first = key.split('.').next().unwrap_or_default().escape_debug().to_string();
-                *ignored.entry(first).or_insert(0) += 1;
+                let first = shown(key.split('.').next().unwrap_or_default());
+                let is_known = ignored.contains_key(&first) || ignored.len() < MAX_IGNORED;
+                *ignored.entry(if is_known { first } else { "others".into() }).or_insert(0) += 1;
                 continue;
             };
             let renamed = options.renames.iter().fold(name.to_owned(), |name, (from, to)| name.replace(from, to));
             if let Some(other) = network.insert(plain_key(&renamed), key.to_owned()) {
-                let reason = format!(
-                    "{} and {} are both {}",
-                    other.escape_debug(),
-                    key.escape_debug(),
-                    plain_key(&renamed).escape_debug()
-                );
+                let (other, key, name) = (shown(&other), shown(key), shown(&plain_key(&renamed)));
+                let reason = format!("{other} and {key} are both {name}");
                 return Err(TrainError::bad_file("checkpoint", state.path())(reason));
             }
         }
@@ -222,38 +276,17 @@ impl Keys {
         let unknown: Vec<&str> = problems
             .iter()
             .filter_map(|problem| match problem {
-                Problem::Unknown(key) => Some(key.as_str()),
+                Problem::Unknown(key) => Some(plain(key)),
                 _ => None,
             })
             .collect();
-        let near = |word: &str, candidates: &[&str]| {
-            let found = nearest(word, candidates.iter().copied());
-            found.map_or_else(String::new, |name| format!("; nearest name: {}", name.escape_debug()))
-        };
         let mut listed = BTreeMap::new();
         for problem in &problems {
-            let (kind, line) = match problem {
-                Problem::Missing(tensor) => {
-                    ("missing", format!("{} {:?}{}", tensor.key, tensor.shape, near(&tensor.key, &unknown)))
-                }
-                Problem::Unknown(key) => {
-                    let shape = state.tensor(key).map_or_else(String::new, |(_, shape)| format!(" {shape:?}"));
-                    let name = key.strip_prefix(PREFIX).unwrap_or(key);
-                    ("unknown", format!("{}{shape}{}", key.escape_debug(), near(name, &missing)))
-                }
-                Problem::Shape { key, got, expected } => {
-                    ("misshapen", format!("{} is {got:?}, expected {expected:?}", key.escape_debug()))
-                }
-                Problem::Format { key, got, shape, is_convertible } => {
-                    let fix = if *is_convertible { "; --convert converts it to f32" } else { "" };
-                    ("not in f32", format!("{} {shape:?} is {got:?}{fix}", key.escape_debug()))
-                }
-                Problem::NoTensor(key) => ("no tensor", key.escape_debug().to_string()),
-            };
+            let kind = problem.kind();
             let count = listed.entry(kind).or_insert(0_usize);
             *count += 1;
             if *count <= MAX_LISTED {
-                let _ = write!(text, "\n  {kind}: {line}");
+                let _ = write!(text, "\n  {kind}: {}", problem.told(state, &missing, &unknown));
             }
         }
         for (kind, count) in listed.into_iter().filter(|(_, count)| *count > MAX_LISTED) {

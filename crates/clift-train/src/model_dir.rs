@@ -35,7 +35,9 @@ pub struct Parameter {
 
 /// The settings under which the reference evaluates a published network.
 pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
-    let mut config = Config { run_dir: folder.into(), ..Config::default() };
+    // Where `clift train` would write, given this config; evaluating sets its own.
+    let run_dir = Path::new("runs").join(folder.file_name().unwrap_or("imported".as_ref()));
+    let mut config = Config { run_dir, ..Config::default() };
     let data = &mut config.data;
     data.source = SourceKind::Auto;
     (data.views.min_context, data.views.max_context) = (4, 4);

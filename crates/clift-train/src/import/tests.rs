@@ -218,7 +218,7 @@ fn missing_and_unknown_keys_are_listed_with_the_nearest_name() {
         &message,
         &[
             "it does not hold a released-re10k network (width 15, 3 heads, 1 + 2 layers); nothing was written",
-            "missing: encoder.layers.0.norm1.weight [15]; nearest name: transformer.encoder.layers.0.norm_1.weight",
+            "missing: encoder.layers.0.norm1.weight [15]; nearest name: encoder.layers.0.norm_1.weight",
             "unknown: transformer.encoder.layers.0.norm_1.weight [15]; nearest name: encoder.layers.0.norm1.weight",
             "unknown: transformer.extra.deep.bias [2]",
             "--rename FROM=TO",
