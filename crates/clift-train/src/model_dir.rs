@@ -2,6 +2,7 @@
 //! That of an imported model has `import.json` too.
 
 use std::collections::HashMap;
+use std::fmt::Write;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -74,7 +75,10 @@ pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
             count => sha.update(&buffer[..count]),
         }
     }
-    Ok(sha.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
+    Ok(sha.finalize().iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    }))
 }
 
 /// A folder that is removed unless it is renamed.

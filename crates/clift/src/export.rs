@@ -26,7 +26,7 @@ pub struct ExportArgs {
 /// Kinds of files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Format {
-    /// {"state_dict": {..}} for torch.load
+    /// For torch.load
     Pytorch,
     /// The same keys in a safetensors file
     Safetensors,

@@ -20,14 +20,13 @@ impl Reader<'_> {
     }
 
     pub(super) fn push_global(&mut self, module: &str, name: &str) -> Result<(), Stop> {
-        let value = match global(module, name, self.others)? {
-            Some(global) => Value::Global(global),
-            None => {
-                if self.passed_over.len() < MAX_PASSED_OVER {
-                    self.passed_over.insert(shown(module, name));
-                }
-                Value::Opaque
+        let value = if let Some(global) = global(module, name, self.others)? {
+            Value::Global(global)
+        } else {
+            if self.passed_over.len() < MAX_PASSED_OVER {
+                self.passed_over.insert(shown(module, name));
             }
+            Value::Opaque
         };
         self.push(value)
     }
