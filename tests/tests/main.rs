@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod bench;
+mod checkpoints;
 #[cfg(unix)]
 mod crash;
 mod evaluation;

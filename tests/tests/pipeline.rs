@@ -247,7 +247,7 @@ fn a_run_starts_from_another_runs_weights_and_says_so() {
         let ran = place.train("second", &set, &["--only", "stage1", "--fresh"]).ok();
         let count = place.weights("first", "stage1").0.len();
         let expected =
-            format!("loaded {count} parameters from {file}; left as they were: none; unused in the file: none");
+            format!("loaded {count} parameters from {file}; new, not in the file: none; unused in the file: none");
         assert!(ran.stderr.contains(&expected), "{expected}\nis not in\n{}", ran.stderr);
         assert_eq!(place.weights("second", "stage1"), place.weights("first", "stage1"));
     }

@@ -7,7 +7,8 @@ use clift_data::Clip;
 use clift_data::order::derive_seed;
 use clift_model::scene::file_bytes;
 use clift_model::{
-    Cameras, Condenser, Convention, Encoder, Grouping, KMeans, ModelConfig, Renderer, TokenStorage, total_variance,
+    Cameras, Clift, Condenser, Convention, Encoder, Grouping, KMeans, LiftNorm, ModelConfig, Renderer, TokenStorage,
+    total_variance,
 };
 
 use crate::EvalError;
@@ -27,14 +28,35 @@ use crate::upload::{upload_cameras, upload_views};
 pub struct Networks {
     /// Encoder, the same for both stages.
     pub encoder: Encoder,
+    /// A norm of its tokens, in the variant that has one: that of stage 1.
+    pub lift_norm: LiftNorm,
     /// Stage-1 renderer: draws random subsets and uncondensed centroids.
     pub renderer: Renderer,
-    /// Condenser and stage-2 renderer, once there are.
-    pub condensed: Option<(Condenser, Renderer)>,
-    /// Those trained on tiles of the views instead of K-means.
-    pub patch_condensed: Option<(Condenser, Renderer)>,
+    /// What stage 2 trained, once it has.
+    pub condensed: Option<Condensed>,
+    /// The same, trained on tiles of the views instead of K-means.
+    pub patch_condensed: Option<Condensed>,
     /// Where they live.
     pub device: Device,
+}
+
+/// The networks that stage 2 trains.
+#[derive(Clone, Debug)]
+pub struct Condensed {
+    /// A norm of the encoder's tokens, in the variant that has one.
+    pub lift_norm: LiftNorm,
+    /// Writes the tokens of a cluster into its centroid.
+    pub condenser: Condenser,
+    /// Draws condensed tokens.
+    pub renderer: Renderer,
+}
+
+impl Condensed {
+    /// Those of a model.
+    pub fn of(model: &Clift) -> Self {
+        let Clift { lift_norm, condenser, renderer, .. } = model.clone();
+        Self { lift_norm, condenser, renderer }
+    }
 }
 
 /// Settings of a sweep.
@@ -67,10 +89,19 @@ pub struct Sweep {
 
 impl Networks {
     /// Takes the networks of a stage 2 that was trained on such groups.
-    pub fn set_condensed(&mut self, grouping: Grouping, condenser: Condenser, renderer: Renderer) {
+    pub fn set_condensed(&mut self, grouping: Grouping, condensed: Condensed) {
         match grouping {
-            Grouping::Kmeans => self.condensed = Some((condenser, renderer)),
-            Grouping::Patch => self.patch_condensed = Some((condenser, renderer)),
+            Grouping::Kmeans => self.condensed = Some(condensed),
+            Grouping::Patch => self.patch_condensed = Some(condensed),
+        }
+    }
+
+    /// What stage 2 trained for a variant.
+    pub(crate) fn condensed_of(&self, variant: Variant) -> Option<&Condensed> {
+        match variant {
+            Variant::Clift => self.condensed.as_ref(),
+            Variant::PatchClift => self.patch_condensed.as_ref(),
+            _ => None,
         }
     }
 
@@ -121,7 +152,15 @@ pub fn evaluate_scene(
     is_shown: bool,
     into: &mut Accumulator,
 ) -> Result<Option<Shown>, EvalError> {
-    let lift = networks.encoder.forward(&upload_views(&[&clip.context], &networks.device)?); // [1, N, D]
+    let features = networks.encoder.forward(&upload_views(&[&clip.context], &networks.device)?);
+    // Where stage 2 has trained a norm of the tokens, condensed ones are of that norm, and of its clusters.
+    let normed: Vec<(Variant, Tensor<3>)> = [Variant::Clift, Variant::PatchClift]
+        .into_iter()
+        .filter_map(|variant| Some((variant, networks.condensed_of(variant)?)))
+        .filter(|(_, condensed)| condensed.lift_norm.is_norm())
+        .map(|(variant, condensed)| (variant, condensed.lift_norm.forward(features.clone())))
+        .collect();
+    let lift = networks.lift_norm.forward(features); // [1, N, D]
     let [_, num_tokens, dim] = lift.dims();
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
@@ -138,10 +177,16 @@ pub fn evaluate_scene(
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
         let index = GroupsOnce::new(&sweep.kmeans, &lift, views, num_storage_tokens, seed);
+        let own: Vec<_> = normed
+            .iter()
+            .map(|(of, lift)| (*of, lift, GroupsOnce::new(&sweep.kmeans, lift, views, num_storage_tokens, seed)))
+            .collect();
         for &variant in &sweep.variants {
+            let own = own.iter().find(|(of, ..)| *of == variant);
+            let (lift, index) = own.map_or((&lift, &index), |(_, lift, index)| (*lift, index));
             for (i, &tokens) in sweep.formats(variant).iter().enumerate() {
                 let rows = if i == 0 { &rows[..] } else { &[] };
-                let stored = Stored::new(variant, networks, &lift, &index, tokens)?;
+                let stored = Stored::new(variant, networks, lift, index, tokens)?;
                 let whole = Setting {
                     variant,
                     num_storage_tokens,
@@ -174,6 +219,8 @@ pub fn evaluate_scene(
             into.add_cluster_error(&clip.key, num_storage_tokens, error);
         }
         if is_shown {
+            let own = own.iter().find(|(of, ..)| *of == Variant::Clift);
+            let index = own.map_or(&index, |(.., index)| index);
             material.clusters.push(index.scene_clusters()?.clone());
         }
     }

@@ -41,7 +41,7 @@ pub use budget::Calibration;
 pub use compare::{Comparison, Evaluation};
 pub use config::EvalConfig;
 pub use error::EvalError;
-pub use evaluate::{Networks, Sweep, evaluate_scene};
+pub use evaluate::{Condensed, Networks, Sweep, evaluate_scene};
 pub use exhibit::{Exhibit, Shown};
 pub use lpips::Lpips;
 pub use measured::{Accumulator, Variant};

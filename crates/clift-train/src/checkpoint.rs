@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use burn::module::Module;
 use burn::store::ModuleRecord;
 use clift_data::files::{make_folder, publish, remove_folder, replace};
+use clift_model::ModelConfig;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
@@ -30,6 +31,9 @@ struct State {
     progress: Progress,
     /// The other files, by name.
     files: BTreeMap<String, Fingerprint>,
+    /// Which network it is; earlier versions did not say.
+    #[serde(default)]
+    model: Option<ModelConfig>,
 }
 
 /// What tells a damaged file from a whole one.
@@ -75,12 +79,19 @@ pub struct Best {
 pub struct Checkpoints {
     folder: PathBuf,
     retention: CheckpointConfig,
+    model: Option<ModelConfig>,
 }
 
 impl Checkpoints {
     /// Keeps checkpoints in `folder`, and as many as `retention` says.
     pub fn new(folder: PathBuf, retention: CheckpointConfig) -> Self {
-        Self { folder, retention }
+        Self { folder, retention, model: None }
+    }
+
+    /// Notes in every checkpoint which network it is, and refuses those of another.
+    #[must_use]
+    pub fn of(self, model: ModelConfig) -> Self {
+        Self { model: Some(model), ..self }
     }
 
     /// Saves model, optimiser and progress, and removes the checkpoints that are kept no longer.
@@ -91,7 +102,7 @@ impl Checkpoints {
         let path = self.path_of(progress.step);
         let temporary = path.with_extension("tmp");
         remove_if_there(&temporary)?;
-        let written = Self::write(learner, progress, &temporary, &path);
+        let written = self.write(learner, progress, &temporary, &path);
         if written.is_err() {
             // A full disk needs the space; what even that leaves is removed by the next save.
             drop(std::fs::remove_dir_all(&temporary));
@@ -101,7 +112,7 @@ impl Checkpoints {
         Ok(path)
     }
 
-    fn write(learner: &Learner, progress: &Progress, temporary: &Path, path: &Path) -> Result<(), TrainError> {
+    fn write(&self, learner: &Learner, progress: &Progress, temporary: &Path, path: &Path) -> Result<(), TrainError> {
         make_folder(temporary).map_err(TrainError::io("making a checkpoint", temporary))?;
         let failed =
             |name: &str, reason: String| TrainError::io(SAVING, &temporary.join(name))(std::io::Error::other(reason));
@@ -114,7 +125,8 @@ impl Checkpoints {
             let file = temporary.join(name);
             files.insert(name.to_owned(), fingerprint(&file).map_err(TrainError::io(SAVING, &file))?);
         }
-        write_state(temporary, &State { version: VERSION, progress: progress.clone(), files })?;
+        let state = State { version: VERSION, progress: progress.clone(), files, model: self.model.clone() };
+        write_state(temporary, &state)?;
         if path.exists() {
             // Only where somebody moved newer checkpoints away and trains those steps again.
             std::fs::remove_dir_all(path).map_err(TrainError::io("replacing a checkpoint", path))?;
@@ -141,7 +153,7 @@ impl Checkpoints {
     pub fn resume(&self, learner: &mut Learner) -> Result<Option<Progress>, TrainError> {
         let mut all = self.list()?;
         let Some(path) = all.pop() else { return Ok(None) };
-        let loaded = load(&path, learner).map_err(|source| {
+        let loaded = load(&path, self.model.as_ref(), learner).map_err(|source| {
             let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let fix = match all.last() {
                 Some(older) => format!("move {} away to go on from {}", name(&path), name(older)),
@@ -242,8 +254,14 @@ fn read_state(folder: &Path) -> Result<State, TrainError> {
     serde_json::from_value(value).map_err(|error| bad(error.to_string()))
 }
 
-fn load(folder: &Path, learner: &mut Learner) -> Result<Progress, TrainError> {
-    let State { progress, files, .. } = read_state(folder)?;
+fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) -> Result<Progress, TrainError> {
+    let State { progress, files, model, .. } = read_state(folder)?;
+    if let (Some(model), Some(expected)) = (&model, expected)
+        && model != expected
+    {
+        let reason = format!("it holds another network ({model:?}) than the config's [model]");
+        return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
+    }
     for (name, expected) in &files {
         let file = folder.join(name);
         let found = fingerprint(&file).map_err(TrainError::io("reading a checkpoint", &file))?;

@@ -126,6 +126,7 @@ impl ClusterJob<'_> {
         let count = grid[below(&mut rng, grid.len())].of(num_tokens)?;
         let clusters = match grouping {
             Grouping::Kmeans => {
+                // Before any norm of the tokens, as in the reference: stage 2 trains that norm, and the clusters stay.
                 let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
                 let fit = kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
                 fit.clusters.scenes()[0].clone()

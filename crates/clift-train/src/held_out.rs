@@ -11,8 +11,8 @@ use clift_eval::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX};
 use clift_eval::predictions::{file_name, picture_name};
 use clift_eval::report::MAX_EXHIBITS;
 use clift_eval::{
-    Accumulator, EvalConfig, EvalError, Exhibit, Lpips, Networks, Report, Shown, Summary, Sweep, System, TokenCount,
-    Variant, evaluate_scene,
+    Accumulator, Condensed, EvalConfig, EvalError, Exhibit, Lpips, Networks, Report, Shown, Summary, Sweep, System,
+    TokenCount, Variant, evaluate_scene,
 };
 use clift_model::device::DeviceName;
 use clift_model::{Clift, Grouping};
@@ -87,12 +87,13 @@ impl<'a> HeldOut<'a> {
         let sweep = Sweep { render: Vec::new(), tokens: first_format, ..sweep };
         let mut networks = Networks {
             encoder: model.encoder.clone(),
+            lift_norm: model.lift_norm.clone(),
             renderer: model.renderer.clone(),
             condensed: None,
             patch_condensed: None,
             device: self.device.clone(),
         };
-        networks.set_condensed(grouping, model.condenser.clone(), model.renderer.clone());
+        networks.set_condensed(grouping, Condensed::of(model));
         let mut measured = Accumulator::default();
         for (i, item) in self.items.iter().take(self.config.eval.num_validation_scenes).enumerate() {
             if stop.load(Ordering::Relaxed) {

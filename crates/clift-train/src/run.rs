@@ -9,8 +9,8 @@ use burn::tensor::Device;
 use clift_data::files::{make_folder, remove_leftovers};
 use clift_data::{ClipReader, SceneSource, Split};
 use clift_eval::lpips::LPIPS_COMMAND;
-use clift_eval::{Networks, Summary, System};
-use clift_model::{Clift, Condenser, Encoder, Renderer, weights};
+use clift_eval::{Condensed, Networks, Summary, System};
+use clift_model::{Clift, Encoder, weights};
 
 use crate::TrainError;
 use crate::cluster_journal::remove_journal;
@@ -169,8 +169,8 @@ impl Run {
                            clusters.grouping";
                 return Err(TrainError::BadConfig { key: "--with".into(), value, fix: fix.into() });
             }
-            let (condenser, renderer) = self.load_stage2(other, &networks.encoder)?;
-            networks.set_condensed(other.clusters.grouping, condenser, renderer);
+            let condensed = self.load_stage2(other, &networks.encoder)?;
+            networks.set_condensed(other.clusters.grouping, condensed);
         }
         self.held_out(sink)?.evaluate(&networks, systems, folder, stop, sink)
     }
@@ -178,20 +178,20 @@ impl Run {
     /// The trained networks: of both stages, or of stage 1 alone.
     fn networks(&self, sink: &mut dyn Sink) -> Result<Networks, TrainError> {
         let stage1 = self.load_stage1(Some(Stage::Eval))?;
-        let (encoder, renderer) = (stage1.encoder.valid(), stage1.renderer.valid());
+        let Clift { encoder, lift_norm, renderer, .. } = stage1.valid();
         let device = self.device.clone();
-        let mut networks = Networks { encoder, renderer, condensed: None, patch_condensed: None, device };
+        let mut networks = Networks { encoder, lift_norm, renderer, condensed: None, patch_condensed: None, device };
         if self.weights(Stage::Stage2).exists() {
-            let (condenser, renderer) = self.load_stage2(&self.config, &networks.encoder)?;
-            networks.set_condensed(self.config.clusters.grouping, condenser, renderer);
+            let condensed = self.load_stage2(&self.config, &networks.encoder)?;
+            networks.set_condensed(self.config.clusters.grouping, condensed);
         } else {
             sink.event(&Event::Message("stage 2 has not run: evaluating the stage-1 weights alone".into()));
         }
         Ok(networks)
     }
 
-    /// Condenser and renderer of the stage 2 of `config`'s run, which must have been trained on this encoder.
-    fn load_stage2(&self, config: &Config, encoder: &Encoder) -> Result<(Condenser, Renderer), TrainError> {
+    /// What the stage 2 of `config`'s run trained, which must have been on this encoder.
+    fn load_stage2(&self, config: &Config, encoder: &Encoder) -> Result<Condensed, TrainError> {
         let path = config.run_dir.join(Stage::Stage2.name()).join("model.safetensors");
         if !path.exists() {
             let what = "the weights of stage 2";
@@ -202,7 +202,7 @@ impl Run {
         if weights::hash(&model.encoder) != weights::hash(encoder) {
             return Err(TrainError::OtherEncoder { path });
         }
-        Ok((model.condenser, model.renderer))
+        Ok(Condensed::of(&model))
     }
 
     /// The views that are measured, during training and after it.
@@ -254,7 +254,7 @@ impl Run {
         let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
         let start = |_: &mut dyn Sink| {
             let mut model = self.new_model();
-            (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+            model.set_stage1(stage1.stage1());
             Ok(model)
         };
         let model = self.plan(Stage::Stage2, batches).train(start, held_out, stop, sink)?;
@@ -322,7 +322,7 @@ impl Run {
         let mut model = self.new_model();
         let mut stage1 = model.stage1();
         weights::load(&mut stage1, &path)?.require_all(&path)?;
-        (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+        model.set_stage1(stage1);
         Ok(model)
     }
 
@@ -350,17 +350,20 @@ impl Run {
 
 /// Starts from another run or a weight file, and says what was and was not loaded.
 fn init_from(model: &mut Clift, from: &Path, sink: &mut dyn Sink) -> Result<(), TrainError> {
-    let path = if from.is_dir() { from.join("stage1").join("model.safetensors") } else { from.into() };
+    // A run, a model directory or a weight file.
+    let in_folder = ["stage1/model.safetensors", "model.safetensors"].map(|file| from.join(file));
+    let [run, _] = &in_folder;
+    let path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
     let mut stage1 = model.stage1();
-    let loaded = weights::load(&mut stage1, &path)?;
+    let loaded = weights::load(&mut stage1, path)?;
     if loaded.applied.is_empty() {
         let reason = "none of its tensors has a place in this model".to_owned();
-        return Err(TrainError::bad_file("weight file for stage1.init_from", &path)(reason));
+        return Err(TrainError::bad_file("weight file for stage1.init_from", path)(reason));
     }
-    (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+    model.set_stage1(stage1);
     let list = |names: &[String]| if names.is_empty() { "none".into() } else { names.join(", ") };
     sink.event(&Event::Message(format!(
-        "loaded {} parameters from {}; left as they were: {}; unused in the file: {}",
+        "loaded {} parameters from {}; new, not in the file: {}; unused in the file: {}",
         loaded.applied.len(),
         path.display(),
         list(&loaded.missing),

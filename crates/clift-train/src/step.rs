@@ -174,7 +174,7 @@ pub(crate) fn loss_of(
     choice: &TokenChoice,
     loss: &Loss,
 ) -> Result<LossParts, TrainError> {
-    let lift = model.encoder.forward(&shown.context); // [B, N, D]
+    let lift = model.lift(&shown.context); // [B, N, D]
     let tokens = choice.apply(&model.condenser, lift)?;
     let rendering = model.renderer.forward(tokens, &shown.targets);
     Ok(loss.of(rendering, shown.pictures.clone()))

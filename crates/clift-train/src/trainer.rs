@@ -93,7 +93,8 @@ impl StagePlan<'_> {
 
     /// The checkpoints of the stage.
     pub(crate) fn checkpoints(&self) -> Checkpoints {
-        Checkpoints::new(self.folder.join("checkpoints"), self.config.checkpoint.clone())
+        let checkpoints = Checkpoints::new(self.folder.join("checkpoints"), self.config.checkpoint.clone());
+        checkpoints.of(self.config.model.clone())
     }
 
     /// A model whose parameters a checkpoint is about to replace.

@@ -12,6 +12,8 @@ use clift_train::bench::Work;
 
 pub use crate::data::args::DataCommand;
 pub use crate::encode::EncodeArgs;
+pub use crate::export::ExportArgs;
+pub use crate::import::ImportArgs;
 pub use crate::render::RenderArgs;
 
 /// Trains, compresses, renders and measures compressive light-field tokens.
@@ -113,6 +115,22 @@ Examples:
     /// memory of the process during them and the largest relative error of the result against the same
     /// computation in f64.
     Bench(BenchArgs),
+    /// Read a published PyTorch checkpoint into a model directory
+    ///
+    /// The file is read, never run: what stands beside the weights is passed over. Every parameter must be there, every
+    /// key of the network must be used, or nothing is written. The directory holds model.safetensors, config.toml (the
+    /// network's sizes, and the protocol it is evaluated under) and import.json (what came from where).
+    #[command(after_help = "\
+Examples:
+  clift import last.ckpt --variant released-re10k -o models/re10k
+  clift eval --checkpoint models/re10k --data /data/re10k --index evaluation_index_re10k_context4.json")]
+    Import(ImportArgs),
+    /// Write a model's weights for PyTorch, under the keys of published checkpoints
+    #[command(after_help = "\
+Examples:
+  clift export models/re10k --format pytorch -o re10k.ckpt
+  clift export runs/tiny/stage1/model.safetensors --format safetensors -o tiny.safetensors")]
+    Export(ExportArgs),
 }
 
 /// Arguments of `clift train`.
@@ -144,7 +162,17 @@ pub struct TrainArgs {
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
     /// A run directory
-    pub run: PathBuf,
+    #[arg(required_unless_present = "checkpoint", conflicts_with = "checkpoint")]
+    pub run: Option<PathBuf>,
+    /// Measure the model of a directory, as `clift import` writes, instead of a run
+    #[arg(long, value_name = "MODEL", requires = "data")]
+    pub checkpoint: Option<PathBuf>,
+    /// Folder of the data: with --checkpoint, or where a run's data has moved
+    #[arg(long, value_name = "DIR")]
+    pub data: Option<PathBuf>,
+    /// The first-stage model of --checkpoint: adds random and K-means tokens, drawn by it
+    #[arg(long, value_name = "MODEL", requires = "checkpoint")]
+    pub stage1: Option<PathBuf>,
     /// An experiment of the paper: main, ablation, patchwise or budget
     ///
     /// Sets variants, --storage, --render and --selection; those given beside it win. main: quality against data size.
@@ -153,7 +181,7 @@ pub struct EvalArgs {
     #[arg(long, value_name = "NAME")]
     pub preset: Option<Experiment>,
     /// Another run of the same stage 1 with another clusters.grouping, measured on the same views
-    #[arg(long, value_name = "RUN")]
+    #[arg(long, value_name = "RUN", conflicts_with = "checkpoint")]
     pub with: Option<PathBuf>,
     /// Token counts to store, as numbers or shares: --storage 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
@@ -355,6 +383,14 @@ mod tests {
         assert!(parse(&["train", "a.toml", "--only", "stage3"]).is_err());
         assert!(parse(&["train", "a.toml", "--overfit", "0"]).is_err());
         assert!(parse(&["eval", "run", "--storage", "256,1/16"]).is_ok());
+        assert!(parse(&["eval"]).is_err());
+        assert!(parse(&["eval", "--checkpoint", "model"]).is_err());
+        assert!(parse(&["eval", "--checkpoint", "model", "--data", "re10k"]).is_ok());
+        assert!(parse(&["eval", "run", "--checkpoint", "model", "--data", "re10k"]).is_err());
+        assert!(parse(&["import", "a.ckpt", "--variant", "released-re10k", "-o", "m", "--rename", "a=b"]).is_ok());
+        assert!(parse(&["import", "a.ckpt", "--variant", "re10k", "-o", "m"]).is_err());
+        assert!(parse(&["import", "a.ckpt", "--variant", "paper", "-o", "m", "--rename", "a"]).is_err());
+        assert!(parse(&["export", "m", "--format", "pytorch", "-o", "a.ckpt"]).is_ok());
         assert!(parse(&["eval", "run", "--storage", "0"]).is_err());
         assert!(parse(&["eval", "run", "--render", "16,1/2", "--selection", "random"]).is_ok());
         assert!(parse(&["eval", "run", "--selection", "nearest"]).is_err());

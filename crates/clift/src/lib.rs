@@ -7,7 +7,9 @@ mod data;
 mod doctor;
 mod encode;
 mod eval;
+mod export;
 mod flops;
+mod import;
 mod interrupt;
 mod json;
 mod plan;
@@ -47,6 +49,8 @@ pub fn main() -> ExitCode {
         Command::Plan(args) => plan::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Import(args) => import::run(&args),
+        Command::Export(args) => export::run(&args),
     };
     match result {
         Ok(()) => ExitCode::from(DONE),

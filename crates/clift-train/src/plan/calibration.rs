@@ -7,7 +7,9 @@ use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::order::{item_rng, step_rng};
 use clift_data::{ClipReader, Split};
-use clift_eval::{Accumulator, Networks, Sweep, TokenCount, Variant, evaluate_scene, upload_cameras, upload_views};
+use clift_eval::{
+    Accumulator, Condensed, Networks, Sweep, TokenCount, Variant, evaluate_scene, upload_cameras, upload_views,
+};
 use clift_model::ModelConfig;
 use rand::RngExt;
 use rand::seq::index::sample;
@@ -187,16 +189,17 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
         }
         Ok(seconds)
     };
-    let encode_s = least(&mut || read(model.encoder.forward(&views)))?;
-    let lift = model.encoder.forward(&views);
+    let encode_s = least(&mut || read(model.lift(&views)))?;
+    let lift = model.lift(&views);
     let render_s = least(&mut || read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?;
     let mut kmeans = Vec::new();
     let mut measuring_s = 0.0;
     if is_measured {
         let networks = Networks {
             encoder: model.encoder.clone(),
+            lift_norm: model.lift_norm.clone(),
             renderer: model.renderer.clone(),
-            condensed: Some((model.condenser.clone(), model.renderer.clone())),
+            condensed: Some(Condensed::of(&model)),
             patch_condensed: None,
             device: context.device.clone(),
         };
