@@ -169,6 +169,11 @@ impl ClusterCache {
         if index.settings != settings(config) {
             return Err(stale("its data, sampler or K-means settings are not this run's".into()));
         }
+        if let Some(entry) = index.entries.iter().find(|entry| !entry.is_possible()) {
+            let Entry { key, num_tokens, num_storage_tokens, .. } = entry;
+            let reason = format!("scene {key} has {num_storage_tokens} clusters of {num_tokens} tokens");
+            return Err(TrainError::BadFile { what: "cluster cache", reason, path });
+        }
         let data = folder.join("clusters.bin");
         let found = std::fs::metadata(&data).map_err(TrainError::io("opening the cluster cache", &data))?.len();
         let expected: u64 = index.entries.iter().map(Entry::num_bytes).sum();
@@ -210,6 +215,11 @@ impl ClusterCache {
 }
 
 impl Entry {
+    /// Whether a scene can have so many tokens and clusters. No number is allocated or added up before.
+    fn is_possible(&self) -> bool {
+        (1..=MAX_TOKENS).contains(&self.num_tokens) && (1..=self.num_tokens).contains(&self.num_storage_tokens)
+    }
+
     pub(crate) fn num_bytes(&self) -> u64 {
         2 * (self.num_tokens + self.num_storage_tokens) as u64
     }

@@ -398,7 +398,7 @@ fn model_weights(setup: &Setup) -> Read {
     })
 }
 
-/// Resumes from a checkpoint of which one file is damaged.
+/// Resumes from a checkpoint of which one file is damaged; its checksum is put right, or nothing behind it is reached.
 fn checkpoint(setup: &Setup, name: &'static str) -> Read {
     let folder = setup.fresh(&format!("checkpoint-{name}"));
     let step = folder.join("step-000000002");
@@ -407,9 +407,15 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
         let path = item.expect("it can be listed").path();
         std::fs::copy(&path, step.join(path.file_name().expect("it has a name"))).expect("it can be copied");
     }
+    let mut state: serde_json::Value =
+        serde_json::from_slice(&read(&step.join("state.json"))).expect("a valid state is JSON");
     let model = setup.model();
     Box::new(move |bytes| {
         std::fs::write(step.join(name), bytes).expect("a temporary folder is writable");
+        if name != "state.json" {
+            state["files"][name] = serde_json::json!({"num_bytes": bytes.len(), "crc32": crc32fast::hash(bytes)});
+            std::fs::write(step.join("state.json"), state.to_string()).expect("a temporary folder is writable");
+        }
         let mut learner = Learner {
             model: model.clone(),
             optimizer: adamw(&OptimizerConfig::default()),
@@ -417,10 +423,8 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             loss: Loss::default(),
             recompute: false,
         };
-        Checkpoints::new(folder.clone(), CheckpointConfig { keep: 1, ..CheckpointConfig::default() })
-            .resume(&mut learner)
-            .map(drop)
-            .map_err(words_of)
+        let checkpoints = Checkpoints::new(folder.clone(), CheckpointConfig::default());
+        checkpoints.resume(&mut learner).map(drop).map_err(words_of)
     })
 }
 
