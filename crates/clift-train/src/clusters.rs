@@ -221,7 +221,7 @@ impl Entry {
     }
 
     pub(crate) fn num_bytes(&self) -> u64 {
-        2 * (self.num_tokens + self.num_storage_tokens) as u64
+        (self.num_tokens as u64).saturating_add(self.num_storage_tokens as u64).saturating_mul(2)
     }
 }
 

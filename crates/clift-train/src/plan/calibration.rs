@@ -7,13 +7,13 @@ use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::order::{item_rng, step_rng};
 use clift_data::{ClipReader, Split};
-use clift_eval::{Accumulator, Networks, Sweep, TokenCount, Variant, evaluate_scene, upload_cameras, upload_views};
+use clift_eval::{Accumulator, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
 use clift_model::ModelConfig;
 use rand::RngExt;
 use rand::seq::index::sample;
 
 use super::counts::{Macs, Parameters, SceneSizes};
-use super::sizes::{Middle, update_macs};
+use super::sizes::{Middle, update_macs, variants};
 use crate::TrainError;
 use crate::bench::BenchOptions;
 use crate::bench::context::BenchContext;
@@ -206,7 +206,7 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
             render: eval.render.clone(),
             selection: eval.selection,
             tokens: eval.tokens.clone(),
-            variants: vec![Variant::Random, Variant::Kmeans, Variant::Clift],
+            variants: variants(config).into_iter().filter(|variant| networks.can_draw(*variant)).collect(),
             kmeans: config.clusters.kmeans.clone(),
             model: config.model.clone(),
             lpips: None,
@@ -258,8 +258,8 @@ pub fn loading_s(config: &Config) -> Option<f64> {
     let mut times = Vec::new();
     for scene in 0..reader.source.num_scenes().min(6) {
         let mut rng = item_rng(config.seed, 0, scene as u32, 0, "plan views");
-        let source = reader.source.as_ref();
         let started = Instant::now();
+        let source = reader.source.as_ref();
         let drawn = views.draw(source, scene, views.warm_up_steps, views.max_context, &mut rng).ok()?;
         let clip = reader.read(scene, &drawn).ok()?;
         times.push(started.elapsed().as_secs_f64() / (clip.context.num_views() + clip.target.num_views()) as f64);

@@ -1,5 +1,7 @@
 //! The sizes that steps of a run have: those in the middle, the average, and the largest.
 
+use clift_eval::Variant;
+
 use super::counts::{Macs, SceneSizes};
 use crate::TrainError;
 use crate::config::Config;
@@ -90,6 +92,14 @@ pub fn largest(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> 
         }
         _ => kept(config, num_context, config.stage1.keep_tokens[1]),
     }
+}
+
+/// What an evaluation draws at every count of tokens: what is asked for, or all that a run has weights for.
+pub fn variants(config: &Config) -> Vec<Variant> {
+    if config.eval.variants.is_empty() {
+        return vec![Variant::Random, Variant::Kmeans, Variant::Clift];
+    }
+    config.eval.variants.clone()
 }
 
 /// Encoder tokens of a scene.
