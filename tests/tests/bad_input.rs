@@ -324,7 +324,10 @@ fn steps_that_are_not_finite_are_left_out_and_three_in_a_row_stop_the_run() {
         message.contains("step 2 left out: loss or gradient is not finite (scenes synthetic-0-train-"),
         "{message}"
     );
-    assert!(message.contains("3 steps in a row were left out, up to step 4: loss or gradient is not finite"), "{message}");
+    assert!(
+        message.contains("3 steps in a row were left out, up to step 4: loss or gradient is not finite"),
+        "{message}"
+    );
     assert!(message.contains(&place.at("run/stage1/checkpoints").display().to_string()), "{message}");
     assert!(!place.at("run/stage1/model.safetensors").exists());
     let lines = place.metrics("run");
