@@ -243,3 +243,37 @@ fn settings(config: &Config) -> String {
     })
     .to_string()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What a cache says whose only entry has such counts.
+    fn opened(num_tokens: usize, num_storage_tokens: usize) -> String {
+        let config = Config::default();
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let entry = Entry { key: "a".into(), context: vec![0], num_tokens, num_storage_tokens, offset_bytes: 0 };
+        let index = Index {
+            version: VERSION,
+            encoder: "e".into(),
+            settings: settings(&config),
+            skipped: Ledger::new(1),
+            entries: vec![entry],
+        };
+        std::fs::write(folder.path().join("index.json"), serde_json::to_vec(&index).expect("JSON")).expect("writable");
+        std::fs::write(folder.path().join("clusters.bin"), [0, 0, 0, 0]).expect("writable");
+        ClusterCache::open(folder.path(), &config, "e")
+            .map(|_| "opened".into())
+            .unwrap_or_else(|error| error.to_string())
+    }
+
+    #[test]
+    fn counts_that_no_scene_has_are_refused_before_they_are_added_or_allocated() {
+        assert_eq!(opened(1, 1), "opened");
+        for (num_tokens, num_storage_tokens) in [(usize::MAX, 3), (1 << 62, 1 << 62), (0, 0), (1, 2), (2, 0)] {
+            let message = opened(num_tokens, num_storage_tokens);
+            let expected = format!("scene a has {num_storage_tokens} clusters of {num_tokens} tokens");
+            assert!(message.contains(&expected), "{message}");
+        }
+    }
+}
