@@ -38,7 +38,7 @@ pub struct Target {
 /// All of them. A new reader is a line here and, where it needs more than its bytes, a function below.
 pub const TARGETS: &[Target] = &[
     Target { name: "pickle", seeds: pickles, open: pickle, words: PICKLE_WORDS, ..PLAIN },
-    Target { name: "chunk", seeds: |_| vec![chunk_file()], open: |s| chunk(s, |bytes| bytes.to_vec()), ..PLAIN },
+    Target { name: "chunk", seeds: |_| vec![chunk_file()], open: |s| chunk(s, <[u8]>::to_vec), ..PLAIN },
     Target {
         name: "chunk-pickle",
         seeds: |_| vec![member(&chunk_file(), "data.pkl")],
