@@ -262,9 +262,7 @@ mod tests {
         };
         std::fs::write(folder.path().join("index.json"), serde_json::to_vec(&index).expect("JSON")).expect("writable");
         std::fs::write(folder.path().join("clusters.bin"), [0, 0, 0, 0]).expect("writable");
-        ClusterCache::open(folder.path(), &config, "e")
-            .map(|_| "opened".into())
-            .unwrap_or_else(|error| error.to_string())
+        ClusterCache::open(folder.path(), &config, "e").map_or_else(|error| error.to_string(), |_| "opened".into())
     }
 
     #[test]

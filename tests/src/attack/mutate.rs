@@ -55,7 +55,7 @@ pub struct Mutator<'a> {
     /// Words of the format.
     pub words: &'a [&'a [u8]],
     /// Puts right what would hide the damage: checksums.
-    pub repair: fn(&mut Vec<u8>),
+    pub repair: fn(&mut [u8]),
 }
 
 impl Mutator<'_> {

@@ -30,7 +30,7 @@ pub struct Target {
     /// Words of its format.
     pub words: &'static [&'static [u8]],
     /// Puts checksums right.
-    pub repair: fn(&mut Vec<u8>),
+    pub repair: fn(&mut [u8]),
     /// Most bytes it may take for an input of so many.
     pub most_bytes: fn(usize) -> usize,
 }
@@ -361,7 +361,7 @@ fn picture(_: &Setup) -> Read {
 }
 
 /// Gives every block of a PNG the checksum it should have, as far as its blocks can be followed.
-fn png_checksums(bytes: &mut Vec<u8>) {
+fn png_checksums(bytes: &mut [u8]) {
     let mut at = 8;
     while at + 12 <= bytes.len() {
         let len = u32::from_be_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]) as usize;
