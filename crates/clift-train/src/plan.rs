@@ -251,6 +251,7 @@ fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<
         num_targets: 0.0,
         num_patches: num_tokens(config, 1)? as f64,
         num_picture_values: picture_values(config),
+        num_loaded: (parameters.encoder + parameters.renderer) as f64,
     };
     let num_scenes = match (config.clusters.num_scenes, config.data.source) {
         (0, SourceKind::Synthetic) => Some(config.data.synthetic.num_scenes),
@@ -315,6 +316,7 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
             * config.data.width
             * config.data.height
             * 3) as f64,
+        num_loaded: parameters.total as f64,
     };
     // Both stages have a renderer of their own.
     let weights = (parameters.total + parameters.renderer) as f64;
