@@ -293,11 +293,18 @@ mod tests {
         use burn::tensor::Device;
         use clift_model::{Clift, ModelConfig};
 
+        use crate::loss::Loss;
+
         let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
         let device = Device::flex().autodiff();
         let optimizer = crate::optim::adamw(&crate::config::OptimizerConfig::default());
-        let mut learner =
-            Learner { model: Clift::new(&config, 0, &device), optimizer, device: device.clone(), recompute: false };
+        let mut learner = Learner {
+            model: Clift::new(&config, 0, &device),
+            optimizer,
+            device,
+            loss: Loss::default(),
+            recompute: false,
+        };
         let place = tempfile::tempdir().expect("a temporary folder");
         let checkpoints = Checkpoints::new(place.path().into(), CheckpointConfig::default());
         let step = checkpoints.save(&learner, &Progress { step: 1, ..Progress::default() }).expect("it can be saved");
