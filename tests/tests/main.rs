@@ -1,5 +1,6 @@
 //! Whole runs through the command line: what a user types, and the files and exit codes that follow.
 
+mod attack;
 mod bad_input;
 mod bench;
 mod checkpoints;
@@ -12,6 +13,7 @@ mod extend;
 mod failing_disk;
 mod hyperparameters;
 mod layouts;
+mod licences;
 mod loss_curve;
 mod patchwise;
 mod pipeline;
@@ -21,3 +23,4 @@ mod scene_files;
 #[cfg(unix)]
 mod signals;
 mod support;
+mod wrong_inputs;

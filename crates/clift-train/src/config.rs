@@ -361,9 +361,7 @@ impl Config {
             ("stage2.batch_size", stage2.batch_size, 1, usize::MAX),
             ("stage2.accumulate", stage2.accumulate, 1, stage2.batch_size),
             ("clusters.num_passes", clusters.num_passes, 1, usize::MAX),
-            ("clusters.grid (length)", clusters.grid.len(), 1, usize::MAX),
             ("clusters.kmeans.max_iterations", clusters.kmeans.max_iterations, 1, usize::MAX),
-            ("eval.storage (length)", eval.storage.len(), 1, usize::MAX),
             ("eval.num_context", eval.num_context, 2, 10_000),
             ("eval.num_targets", eval.num_targets, 1, 10_000),
             ("eval.num_validation_scenes", eval.num_validation_scenes, 1, usize::MAX),
@@ -376,6 +374,11 @@ impl Config {
         {
             let fix = format!("write 0 or a multiple of checkpoint.every, which is {}", checkpoint.every);
             return Err(bad("checkpoint.keep_every", checkpoint.keep_every, &fix));
+        }
+        for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.storage", &eval.storage)] {
+            if counts.is_empty() {
+                return Err(bad(key, "[]", "write at least one count"));
+            }
         }
         let [low, high] = stage1.keep_tokens;
         if !(low > 0.0 && low <= high && high <= 1.0) {

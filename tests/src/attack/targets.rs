@@ -30,7 +30,7 @@ pub struct Target {
     /// Words of its format.
     pub words: &'static [&'static [u8]],
     /// Puts checksums right.
-    pub repair: fn(&mut Vec<u8>),
+    pub repair: fn(&mut [u8]),
     /// Most bytes it may take for an input of so many.
     pub most_bytes: fn(usize) -> usize,
 }
@@ -38,7 +38,7 @@ pub struct Target {
 /// All of them. A new reader is a line here and, where it needs more than its bytes, a function below.
 pub const TARGETS: &[Target] = &[
     Target { name: "pickle", seeds: pickles, open: pickle, words: PICKLE_WORDS, ..PLAIN },
-    Target { name: "chunk", seeds: |_| vec![chunk_file()], open: |s| chunk(s, |bytes| bytes.to_vec()), ..PLAIN },
+    Target { name: "chunk", seeds: |_| vec![chunk_file()], open: |s| chunk(s, <[u8]>::to_vec), ..PLAIN },
     Target {
         name: "chunk-pickle",
         seeds: |_| vec![member(&chunk_file(), "data.pkl")],
@@ -361,7 +361,7 @@ fn picture(_: &Setup) -> Read {
 }
 
 /// Gives every block of a PNG the checksum it should have, as far as its blocks can be followed.
-fn png_checksums(bytes: &mut Vec<u8>) {
+fn png_checksums(bytes: &mut [u8]) {
     let mut at = 8;
     while at + 12 <= bytes.len() {
         let len = u32::from_be_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]) as usize;
@@ -398,7 +398,7 @@ fn model_weights(setup: &Setup) -> Read {
     })
 }
 
-/// Resumes from a checkpoint of which one file is damaged.
+/// Resumes from a checkpoint of which one file is damaged; its checksum is put right, or nothing behind it is reached.
 fn checkpoint(setup: &Setup, name: &'static str) -> Read {
     let folder = setup.fresh(&format!("checkpoint-{name}"));
     let step = folder.join("step-000000002");
@@ -407,17 +407,15 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
         let path = item.expect("it can be listed").path();
         std::fs::copy(&path, step.join(path.file_name().expect("it has a name"))).expect("it can be copied");
     }
-    if name != "state.json" {
-        // The checksums would keep every change from the readers that are attacked.
-        let state = step.join("state.json");
-        let text = std::fs::read(&state).expect("the checkpoint has a state");
-        let mut value: serde_json::Value = serde_json::from_slice(&text).expect("it is JSON");
-        value["files"] = serde_json::json!({});
-        std::fs::write(state, value.to_string()).expect("a temporary folder is writable");
-    }
+    let mut state: serde_json::Value =
+        serde_json::from_slice(&read(&step.join("state.json"))).expect("a valid state is JSON");
     let model = setup.model();
     Box::new(move |bytes| {
         std::fs::write(step.join(name), bytes).expect("a temporary folder is writable");
+        if name != "state.json" {
+            state["files"][name] = serde_json::json!({"num_bytes": bytes.len(), "crc32": crc32fast::hash(bytes)});
+            std::fs::write(step.join("state.json"), state.to_string()).expect("a temporary folder is writable");
+        }
         let mut learner = Learner {
             model: model.clone(),
             optimizer: adamw(&OptimizerConfig::default()),
@@ -425,7 +423,8 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             loss: Loss::default(),
             recompute: false,
         };
-        Checkpoints::new(folder.clone(), CheckpointConfig::default()).resume(&mut learner).map(drop).map_err(words_of)
+        let checkpoints = Checkpoints::new(folder.clone(), CheckpointConfig::default());
+        checkpoints.resume(&mut learner).map(drop).map_err(words_of)
     })
 }
 
