@@ -122,21 +122,19 @@ impl ModelConfig {
     /// Work of condensing `num_tokens` tokens into `num_storage_tokens`: every other token is a key of its own
     /// centroid.
     pub fn condense_macs(&self, num_tokens: usize, num_storage_tokens: usize) -> Macs {
-        let [stored, members, dim, hidden, blocks] = [
-            num_storage_tokens,
-            num_tokens.saturating_sub(num_storage_tokens),
-            self.dim,
-            self.feed_forward_dim,
-            self.condenser.num_blocks,
-        ]
-        .map(|size| size as u64);
+        // In the released networks a centroid is a key of itself.
+        let is_released = self.variant.is_released();
+        let num_keys = if is_released { num_tokens } else { num_tokens.saturating_sub(num_storage_tokens) };
+        let [stored, keys, dim, hidden, blocks] =
+            [num_storage_tokens, num_keys, self.dim, self.feed_forward_dim, self.condenser.num_blocks]
+                .map(|size| size as u64);
         let square = dim * dim;
-        // Without members equation 2 is skipped, its projections too.
-        let cross = if members > 0 { 2 * stored * square + 2 * members * square } else { 0 };
+        // Without keys equation 2 is skipped, its projections too.
+        let cross = if keys > 0 { 2 * stored * square + 2 * keys * square } else { 0 };
         Macs {
             linear: blocks * (4 * stored * square + cross + 2 * stored * dim * hidden + stored * square),
-            attention: blocks * (2 * stored * stored * dim + 2 * members * dim),
-            normalised: blocks * (3 * stored + members) * dim,
+            attention: blocks * (2 * stored * stored * dim + 2 * keys * dim),
+            normalised: blocks * (3 * stored + if is_released { 0 } else { keys }) * dim,
         }
     }
 }
