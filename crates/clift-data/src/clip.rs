@@ -58,7 +58,7 @@ pub struct Clip {
     pub target: Views,
 }
 
-/// Scenes with random access to single frames: chunks on disk, or synthetic ones made on the fly.
+/// Scenes with random access to single frames: chunks or photos on disk, or synthetic ones made on the fly.
 pub trait SceneSource: Send + Sync {
     /// How many scenes there are.
     fn num_scenes(&self) -> usize;
@@ -74,4 +74,9 @@ pub trait SceneSource: Send + Sync {
     }
     /// Decodes one frame.
     fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError>;
+    /// The JPEG or PNG file that [`SceneSource::frame`] decodes, byte by byte; `None` where there is none: the picture
+    /// is computed, or resampled on load.
+    fn encoded_frame(&self, _scene: usize, _frame: usize) -> Result<Option<Vec<u8>>, DataError> {
+        Ok(None)
+    }
 }
