@@ -33,6 +33,31 @@ pub struct IntrinsicsNorm {
 }
 
 impl IntrinsicsNorm {
+    /// Checks that a picture can have been taken with them.
+    ///
+    /// # Errors
+    /// [`DataError::BadCamera`] when a focal length is not positive or a number is not finite.
+    pub fn validate(self) -> Result<(), DataError> {
+        let Self { fx, fy, cx, cy } = self;
+        for (name, focal) in [("fx", fx), ("fy", fy)] {
+            if !(focal.is_finite() && focal > 0.0) {
+                return Err(DataError::BadCamera { what: format!("{name} is {focal}, expected a positive number") });
+            }
+        }
+        for (name, centre) in [("cx", cx), ("cy", cy)] {
+            if !centre.is_finite() {
+                return Err(DataError::BadCamera { what: format!("{name} is {centre}, expected a finite number") });
+            }
+        }
+        Ok(())
+    }
+
+    /// Divides `intrinsics` in pixels by the size of their image.
+    pub fn of_pixels(intrinsics: Intrinsics, width: f64, height: f64) -> Self {
+        let Intrinsics { fx, fy, cx, cy } = intrinsics;
+        Self { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height }
+    }
+
     /// Scales to pixels of an image of `width` by `height`.
     pub fn to_pixels(self, width: usize, height: usize) -> Intrinsics {
         let (width, height) = (width as f64, height as f64);
@@ -193,18 +218,10 @@ impl Camera {
     /// rigid motion (see [`Pose::from_rows`]).
     pub fn from_re10k(row: [f64; 18]) -> Result<Self, DataError> {
         let [fx, fy, cx, cy, ..] = row;
-        for (name, focal) in [("fx", fx), ("fy", fy)] {
-            if !(focal.is_finite() && focal > 0.0) {
-                return Err(DataError::BadCamera { what: format!("{name} is {focal}, expected a positive number") });
-            }
-        }
-        for (name, centre) in [("cx", cx), ("cy", cy)] {
-            if !centre.is_finite() {
-                return Err(DataError::BadCamera { what: format!("{name} is {centre}, expected a finite number") });
-            }
-        }
+        let intrinsics_norm = IntrinsicsNorm { fx, fy, cx, cy };
+        intrinsics_norm.validate()?;
         let w2c = Pose::from_rows(&[0, 1, 2].map(|r| [0, 1, 2, 3].map(|c| row[6 + 4 * r + c])))?;
-        Ok(Self { intrinsics_norm: IntrinsicsNorm { fx, fy, cx, cy }, c2w: w2c.matrix_inverse() })
+        Ok(Self { intrinsics_norm, c2w: w2c.matrix_inverse() })
     }
 
     /// Writes the 18 numbers that [`Camera::from_re10k`] reads, with zeros for the placeholders.

@@ -5,44 +5,15 @@ use std::path::{Component, Path, PathBuf};
 use std::sync::OnceLock;
 
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
 use crate::chunk_table::{ChunkTable, SceneTable};
 use crate::clip::{Frame, SceneSource};
 use crate::error::DataError;
+use crate::filters::SceneFilters;
 use crate::image::decode;
 use crate::ledger::Ledger;
 use crate::split::Split;
-
-/// Which scenes of a data set are used. What they leave out is in the source's [`Ledger`].
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct SceneFilters {
-    /// Fewest frames of a usable scene; 0 keeps all. The paper's training set keeps scenes of 46 and more.
-    pub min_frames: usize,
-    /// Largest field of view of any frame, in degrees; pixelSplat leaves out scenes above 100.
-    pub max_fov_deg: Option<f64>,
-}
-
-impl SceneFilters {
-    /// Checks every field.
-    ///
-    /// # Errors
-    /// [`DataError::BadConfig`] naming the field that cannot hold.
-    pub fn validate(&self) -> Result<(), DataError> {
-        match self.max_fov_deg {
-            Some(limit) if !(limit.is_finite() && limit > 0.0) => {
-                Err(DataError::bad_config("max_fov_deg", format!("is {limit}; use a positive number such as 100")))
-            }
-            _ => Ok(()),
-        }
-    }
-
-    fn is_any_set(&self) -> bool {
-        *self != Self::default()
-    }
-}
 
 /// One chunk file; its table is read when a scene of it is first needed.
 struct Chunk {
@@ -99,9 +70,18 @@ impl ChunkSource {
     /// [`DataError::Io`] for a missing `index.json`, [`DataError::BadIndex`] for one that is no map from keys to files
     /// beside it, [`DataError::BadConfig`] for wrong filters, and the first chunk's error when every chunk fails.
     pub fn open(root: &Path, split: Split, filters: &SceneFilters) -> Result<Self, DataError> {
-        filters.validate()?;
         let folder = root.join(split.to_string());
         let index = read_index(&folder.join("index.json"))?;
+        Self::of_index(&folder, index, filters)
+    }
+
+    /// Opens the scenes of `index`, from keys to files in `folder`.
+    pub(crate) fn of_index(
+        folder: &Path,
+        index: BTreeMap<String, String>,
+        filters: &SceneFilters,
+    ) -> Result<Self, DataError> {
+        filters.validate()?;
         let mut chunk_ids = BTreeMap::new();
         let mut chunks = Vec::new();
         let mut scenes = Vec::with_capacity(index.len());
@@ -161,15 +141,8 @@ impl ChunkSource {
     }
 
     fn reason_to_skip(&self, scene: usize, filters: &SceneFilters) -> Result<Option<String>, DataError> {
-        if filters.min_frames > 0 && self.num_frames(scene)? < filters.min_frames {
-            return Ok(Some(format!("shorter than {} frames", filters.min_frames)));
-        }
-        let Some(limit) = filters.max_fov_deg else { return Ok(None) };
-        let is_wide = self.cameras(scene)?.iter().any(|camera| {
-            let (x, y) = camera.fov_deg();
-            x.max(y) > limit
-        });
-        Ok(is_wide.then(|| format!("with a field of view above {limit} degrees")))
+        let num_frames = if filters.min_frames > 0 { self.num_frames(scene)? } else { 0 };
+        filters.reason_to_skip(num_frames, || self.cameras(scene))
     }
 
     /// The table of a scene, with the path of its chunk.
@@ -196,7 +169,9 @@ impl SceneSource for ChunkSource {
     }
 
     fn find(&self, key: &str) -> Option<usize> {
-        self.positions.get(key).copied()
+        // DepthSplat's training chunks prefix the keys that its indices give without.
+        let prefixed = || self.positions.get(&format!("{DL3DV_PREFIX}{key}"));
+        self.positions.get(key).or_else(prefixed).copied()
     }
 
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
@@ -226,8 +201,11 @@ impl SceneSource for ChunkSource {
     }
 }
 
+/// What DepthSplat puts before the keys of DL3DV's training scenes.
+pub(crate) const DL3DV_PREFIX: &str = "dl3dv_";
+
 /// Reads `index.json`: scene key to file name, sorted by key.
-fn read_index(path: &Path) -> Result<BTreeMap<String, String>, DataError> {
+pub(crate) fn read_index(path: &Path) -> Result<BTreeMap<String, String>, DataError> {
     let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
     let text = std::fs::read(path).map_err(DataError::io("reading the scene index", path))?;
     let index: BTreeMap<String, String> = serde_json::from_slice(&text)

@@ -30,6 +30,18 @@ pub struct SceneRecord {
     pub images: Vec<Vec<u8>>,
 }
 
+impl SceneRecord {
+    /// Says which lists differ in length.
+    pub(crate) fn check(&self) -> Result<(), String> {
+        let Self { key, timestamps, cameras, images, .. } = self;
+        let (timestamps, cameras, images) = (timestamps.len(), cameras.len(), images.len());
+        if timestamps == images && cameras == images {
+            return Ok(());
+        }
+        Err(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps"))
+    }
+}
+
 /// Writes `000000.torch, 000001.torch, ..` and, when all are written, `index.json` into `folder`; returns how many
 /// scenes there are. A chunk is closed once its pictures have `target_bytes` or more. Every file appears under its
 /// name only when it is complete, and an existing `index.json` is not overwritten.
@@ -54,11 +66,7 @@ pub fn write_chunks(
     let mut pending_bytes = 0;
     for scene in scenes {
         let scene = scene?;
-        let (timestamps, cameras, images) = (scene.timestamps.len(), scene.cameras.len(), scene.images.len());
-        if timestamps != images || cameras != images {
-            let key = &scene.key;
-            return Err(bad(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps")));
-        }
+        scene.check().map_err(&bad)?;
         if index.insert(scene.key.clone(), chunk_name(num_chunks)).is_some() {
             return Err(bad(format!("scene {} comes twice", scene.key)));
         }
@@ -79,24 +87,37 @@ pub fn write_chunks(
     Ok(index.len())
 }
 
-fn chunk_name(number: usize) -> String {
+pub(crate) fn chunk_name(number: usize) -> String {
     format!("{number:06}.torch")
 }
 
-fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
-    let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
-    let bytes = pack(&prefix, scenes).map_err(|error| DataError::io("packing a chunk", path)(error.into()))?;
-    replace(path, &bytes).map_err(DataError::io("writing a chunk", path))
-}
-
-/// Packs scenes as `torch.save` would: pickle first, then the storages, stored and aligned to 64 bytes.
-fn pack(prefix: &str, scenes: &[SceneRecord]) -> ZipResult<Vec<u8>> {
-    let mut pickle = PickleWriter { bytes: b"\x80\x02".to_vec(), storages: Vec::new() };
+/// Writes a list of scenes.
+pub(crate) fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
+    let mut pickle = PickleWriter::new();
     pickle.raw(b"](");
     for scene in scenes {
         pickle.scene(scene);
     }
     pickle.raw(b"e.");
+    write_archive(path, &pickle)
+}
+
+/// Writes a scene by itself, as CLiFT's tool does.
+pub(crate) fn write_scene_file(path: &Path, scene: &SceneRecord) -> Result<(), DataError> {
+    let mut pickle = PickleWriter::new();
+    pickle.scene(scene);
+    pickle.raw(b".");
+    write_archive(path, &pickle)
+}
+
+fn write_archive(path: &Path, pickle: &PickleWriter) -> Result<(), DataError> {
+    let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
+    let bytes = pack(&prefix, pickle).map_err(|error| DataError::io("packing a chunk", path)(error.into()))?;
+    replace(path, &bytes).map_err(DataError::io("writing a chunk", path))
+}
+
+/// Packs what `torch.save` would: pickle first, then the storages, stored and aligned to 64 bytes.
+fn pack(prefix: &str, pickle: &PickleWriter) -> ZipResult<Vec<u8>> {
     let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
     let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
     let mut member = |name: &str, alignment: u16, bytes: &[u8]| {
@@ -120,6 +141,11 @@ struct PickleWriter {
 }
 
 impl PickleWriter {
+    /// Protocol 2, nothing yet.
+    fn new() -> Self {
+        Self { bytes: b"\x80\x02".to_vec(), storages: Vec::new() }
+    }
+
     fn scene(&mut self, scene: &SceneRecord) {
         let timestamps = scene.timestamps.iter().flat_map(|time| time.to_le_bytes()).collect();
         let rows = scene.cameras.iter().flat_map(Camera::to_re10k);

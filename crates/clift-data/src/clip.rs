@@ -58,7 +58,7 @@ pub struct Clip {
     pub target: Views,
 }
 
-/// Scenes with random access to single frames: chunks on disk, or synthetic ones made on the fly.
+/// Scenes with random access to single frames: chunks or photos on disk, or synthetic ones made on the fly.
 pub trait SceneSource: Send + Sync {
     /// How many scenes there are.
     fn num_scenes(&self) -> usize;

@@ -54,6 +54,22 @@ pub enum DataError {
         /// The file.
         path: PathBuf,
     },
+    /// A folder or file holds scenes in no layout that is known, or not in the one asked for.
+    #[error("no scenes found: {what}: {path}", path = path.display())]
+    UnknownLayout {
+        /// What was looked for, and what there is.
+        what: String,
+        /// The folder or file.
+        path: PathBuf,
+    },
+    /// A scene of photos cannot be used: its cameras are malformed, of an unknown model or without pictures.
+    #[error("bad scene: {what}: {path}", path = path.display())]
+    BadScene {
+        /// What is wrong with it, with the line, camera or picture.
+        what: String,
+        /// The file that holds the cameras, or the picture.
+        path: PathBuf,
+    },
     /// A file of camera poses does not have the expected form.
     #[error("bad poses: {what}: {path}", path = path.display())]
     BadPoses {

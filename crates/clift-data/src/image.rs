@@ -1,6 +1,7 @@
 //! Pictures: decoding and encoding files, and fitting a frame with its intrinsics to the model's size.
 
 use std::io::Cursor;
+use std::path::Path;
 
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
@@ -62,6 +63,29 @@ pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<Frame, DataError>
         return Err(bad(format!("it is {width}x{height}")));
     }
     Ok(Frame { width: width as usize, height: height as usize, rgb: picture.into_raw() })
+}
+
+/// Reads the columns and rows of a JPEG or PNG file from its head.
+///
+/// # Errors
+/// [`DataError::Io`], and [`DataError::BadScene`] for what is no picture.
+pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
+    let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
+    let metadata = std::fs::metadata(path).map_err(DataError::io("opening a picture", path))?;
+    if !metadata.is_file() {
+        return Err(bad("expected a picture, and it is no file".into()));
+    }
+    let reader = ImageReader::open(path).map_err(DataError::io("opening a picture", path))?;
+    let reader = reader.with_guessed_format().map_err(DataError::io("reading a picture", path))?;
+    if !matches!(reader.format(), Some(ImageFormat::Jpeg | ImageFormat::Png)) {
+        return Err(bad("the picture is neither JPEG nor PNG".into()));
+    }
+    let (width, height) =
+        reader.into_dimensions().map_err(|error| bad(format!("the picture cannot be read: {error}")))?;
+    if width == 0 || height == 0 {
+        return Err(bad(format!("the picture is {width}x{height}")));
+    }
+    Ok([width as usize, height as usize])
 }
 
 /// Whether an end marker follows the last scan; the decoder fills what is missing of a truncated JPEG with grey.

@@ -1,9 +1,15 @@
-//! The ledger of what was left out: every skipped scene with its reason, counted and printable.
+//! The ledger of what was left out: every skipped scene and frame with its reason, counted and printable.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
+
+/// Names of frames that a printed ledger shows per reason; its file has all of them.
+const MAX_NAMES_SHOWN: usize = 3;
+
+/// Reasons that a printed ledger shows.
+const MAX_REASONS_SHOWN: usize = 8;
 
 /// One scene that was left out.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -14,24 +20,51 @@ pub struct Skip {
     pub reason: String,
 }
 
-/// How many scenes there were and which were left out. Prints as `2 of 3 scenes used; 1 shorter than 46 frames`.
+/// One frame that was left out.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameSkip {
+    /// Key of its scene.
+    pub key: String,
+    /// What its file calls it: the name of a picture, or a time stamp.
+    pub frame: String,
+    /// Why, in words that equal cases share.
+    pub reason: String,
+}
+
+/// How many scenes there were and what was left out. Prints as `2 of 3 scenes used; 1 shorter than 46 frames`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ledger {
     /// Scenes looked at, used or not.
     pub num_scenes: usize,
     /// Scenes left out, in the order they were met.
     pub skips: Vec<Skip>,
+    /// Frames left out of scenes: those that are used without them, and those that are left out because of them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub frames: Vec<FrameSkip>,
+    /// What else is to be known about the scenes, in whole sentences without a stop.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub notes: Vec<String>,
 }
 
 impl Ledger {
     /// A ledger of `num_scenes` scenes of which none is left out yet.
     pub fn new(num_scenes: usize) -> Self {
-        Self { num_scenes, skips: Vec::new() }
+        Self { num_scenes, ..Self::default() }
     }
 
     /// Notes that a scene is left out.
     pub fn skip(&mut self, key: impl Into<String>, reason: impl Into<String>) {
         self.skips.push(Skip { key: key.into(), reason: reason.into() });
+    }
+
+    /// Notes that a frame is left out.
+    pub fn skip_frame(&mut self, key: impl Into<String>, frame: impl Into<String>, reason: impl Into<String>) {
+        self.frames.push(FrameSkip { key: key.into(), frame: frame.into(), reason: reason.into() });
+    }
+
+    /// Whether anything was left out.
+    pub fn has_gaps(&self) -> bool {
+        !(self.skips.is_empty() && self.frames.is_empty())
     }
 
     /// Scenes that are used.
@@ -47,15 +80,34 @@ impl Ledger {
         }
         counts
     }
+
+    /// Names of the frames that each reason left out, by reason.
+    pub fn frame_names(&self) -> BTreeMap<&str, Vec<&str>> {
+        let mut names: BTreeMap<_, Vec<_>> = BTreeMap::new();
+        for skip in &self.frames {
+            names.entry(skip.reason.as_str()).or_default().push(skip.frame.as_str());
+        }
+        names
+    }
 }
 
 impl fmt::Display for Ledger {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} of {} scenes used", self.num_used(), self.num_scenes)?;
-        for (reason, count) in self.counts() {
+        let counts = self.counts();
+        for (reason, count) in counts.iter().take(MAX_REASONS_SHOWN) {
             write!(f, "; {count} {reason}")?;
         }
-        Ok(())
+        if counts.len() > MAX_REASONS_SHOWN {
+            write!(f, "; {} for other reasons", counts.values().skip(MAX_REASONS_SHOWN).sum::<usize>())?;
+        }
+        for (reason, names) in self.frame_names() {
+            let more = if names.len() > MAX_NAMES_SHOWN { ", .." } else { "" };
+            let noun = if names.len() == 1 { "frame" } else { "frames" };
+            let shown = names[..names.len().min(MAX_NAMES_SHOWN)].join(", ");
+            write!(f, "; {} {noun} {reason} ({shown}{more})", names.len())?;
+        }
+        self.notes.iter().try_for_each(|note| write!(f, "; {note}"))
     }
 }
 
@@ -71,5 +123,29 @@ mod tests {
         ledger.skip("b", "null in the evaluation index");
         ledger.skip("c", "shorter than 46 frames");
         assert_eq!(ledger.to_string(), "2 of 5 scenes used; 1 null in the evaluation index; 2 shorter than 46 frames");
+        (0..8).for_each(|number| ledger.skip("d", format!("broken {number}")));
+        assert!(ledger.to_string().ends_with("; 1 broken 7; 3 for other reasons"), "{ledger}");
+    }
+
+    #[test]
+    fn frames_left_out_are_named_and_counted_and_notes_follow() {
+        let mut ledger = Ledger::new(1);
+        assert!(!ledger.has_gaps());
+        for frame in ["1.jpg", "5.jpg", "6.jpg", "7.jpg"] {
+            ledger.skip_frame("fox", frame, "without a picture");
+        }
+        ledger.skip_frame("fox", "9.jpg", "named twice");
+        ledger.notes.push("both splits hold all scenes".into());
+        let expected = "1 of 1 scenes used; 1 frame named twice (9.jpg); \
+            4 frames without a picture (1.jpg, 5.jpg, 6.jpg, ..); both splits hold all scenes";
+        assert_eq!(ledger.to_string(), expected);
+        assert!(ledger.has_gaps());
+    }
+
+    #[test]
+    fn a_ledger_without_frames_is_written_as_before_and_older_files_are_read() {
+        let text = serde_json::to_string(&Ledger::new(2)).unwrap();
+        assert_eq!(text, r#"{"num_scenes":2,"skips":[]}"#);
+        assert_eq!(serde_json::from_str::<Ledger>(&text).unwrap(), Ledger::new(2));
     }
 }

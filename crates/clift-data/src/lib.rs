@@ -1,4 +1,5 @@
-//! Posed photos in, clips out: cameras, RealEstate10K chunks, synthetic scenes, samplers and the loader.
+//! Posed photos in, clips out: cameras, data sets and captures in every layout, synthetic scenes, samplers and the
+//! loader.
 //!
 //! This crate does not depend on Burn: its clips and batches are plain host arrays, and
 //! `clift_model::Views::upload` is the one place where they meet a device.
@@ -13,45 +14,71 @@ mod chunk_table;
 pub mod chunk_writer;
 pub mod clip;
 pub mod clip_reader;
+mod colmap;
+pub mod convert;
 pub mod error;
 pub mod export;
 mod features;
 pub mod files;
+pub mod filters;
 mod flip;
 pub mod image;
 pub mod index;
 pub mod info;
 pub mod inner_views;
+mod journal;
 pub mod lanczos;
+pub mod layout;
 pub mod ledger;
+pub mod lens;
 pub mod loader;
 pub mod normalize;
 pub mod order;
+pub mod overlap;
+pub mod overlap_index;
+mod photo;
+mod photo_source;
 pub mod pickle;
+mod picture_folder;
+mod re10k_text;
 pub mod sampler;
+mod scene_folder;
 pub mod split;
 pub mod spread;
 pub mod synthetic;
+pub mod test_scenes;
+pub mod throughput;
+mod transforms;
+pub mod undistort;
 mod unpickle;
 
 pub use batch::{ClipBatch, TrainingClips};
 pub use camera::{Camera, Intrinsics, IntrinsicsNorm, Pose};
 pub use check::{Checked, SceneCheck, check_scene};
-pub use chunk::{ChunkSource, SceneFilters};
+pub use chunk::ChunkSource;
 pub use chunk_writer::{SceneRecord, write_chunks};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
 pub use clip_reader::{ClipOptions, ClipReader};
+pub use convert::{ConvertOptions, ConvertTo, Converted, convert};
 pub use error::DataError;
 pub use export::{Encoding, write_evaluation_index, write_source};
+pub use filters::SceneFilters;
 pub use image::Crop;
 pub use index::{EvaluationIndex, EvaluationItem};
 pub use info::{SourceInfo, Spread};
 pub use inner_views::InnerViews;
-pub use ledger::{Ledger, Skip};
+pub use layout::{FileOptions, Layout, LayoutOptions, Opened, open_layout};
+pub use ledger::{FrameSkip, Ledger, Skip};
+pub use lens::Lens;
 pub use loader::Prefetcher;
 pub use normalize::{PoseRotation, PoseScale, SceneFrame};
 pub use order::SceneOrder;
+pub use overlap::overlap;
+pub use overlap_index::{OverlapOptions, write_overlap_index};
 pub use sampler::BoundedSampler;
 pub use split::Split;
 pub use spread::spread_along_path;
 pub use synthetic::{SyntheticConfig, SyntheticSource};
+pub use test_scenes::TestScenes;
+pub use throughput::{Throughput, ThroughputOptions, measure};
+pub use undistort::Undistortion;

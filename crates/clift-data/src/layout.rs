@@ -1,0 +1,343 @@
+//! Every layout that posed photos come in, recognised by what is in a folder.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::chunk::{ChunkSource, read_index};
+use crate::chunk_table::ChunkTable;
+use crate::clip::SceneSource;
+use crate::error::DataError;
+use crate::filters::SceneFilters;
+use crate::ledger::Ledger;
+use crate::photo_source::{PhotoSource, PhotoSourceOptions};
+use crate::picture_folder::file_names;
+use crate::re10k_text::looks_like_re10k;
+use crate::scene_folder::{SceneFiles, SceneFolder, find_scenes, scene_in};
+use crate::split::Split;
+use crate::test_scenes::TestScenes;
+use crate::transforms::PhotoOptions;
+
+/// Folders that DL3DV's pictures are in, in the order they are preferred: 480 x 270, then larger.
+const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
+/// What CLiFT's tool writes beside scenes in files of their own: keys of those whose pictures have another size.
+const INVALID_KEYS: &str = "invalid_keys.txt";
+
+/// How scenes lie on disk.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Layout {
+    /// Whichever of the others is recognised.
+    #[default]
+    Auto,
+    /// pixelSplat's and DepthSplat's: `NNNNNN.torch` files of many scenes with an `index.json`.
+    Chunks,
+    /// CLiFT's: a `.torch` file per scene.
+    Scenes,
+    /// RealEstate10K's text files of cameras, and folders of frames.
+    Re10kTxt,
+    /// DL3DV's folders: `transforms.json` and `images_8` or `images_4`, by hash. Lens distortion is ignored, as the
+    /// published numbers do.
+    Dl3dv,
+    /// Own captures: `transforms.json` or a COLMAP model, a scene per folder. Lens distortion is undone.
+    Captures,
+}
+
+impl fmt::Display for Layout {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Auto => "auto",
+            Self::Chunks => "chunks",
+            Self::Scenes => "scenes",
+            Self::Re10kTxt => "re10k_txt",
+            Self::Dl3dv => "dl3dv",
+            Self::Captures => "captures",
+        })
+    }
+}
+
+/// Where the parts of a layout are, if not where they are expected.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FileOptions {
+    /// Keys of the scenes kept for testing and out of training: an evaluation index, a JSON list or a key per line.
+    pub test_scenes: Option<PathBuf>,
+    /// Folder of the frames of `re10k_txt`, with a folder per key in it or in `train/` and `test/` below it.
+    pub frames: Option<PathBuf>,
+    /// Folder of the pictures within a scene of `dl3dv` or `captures`, such as `images_4`.
+    pub image_folder: Option<String>,
+    /// Whether lens distortion is undone; by default in `captures` alone.
+    pub undistort: Option<bool>,
+    /// Whether scenes of `re10k_txt` and `dl3dv` with missing pictures are used without these frames. Positions of
+    /// frames then differ from those that published indices count.
+    pub keep_incomplete: bool,
+}
+
+/// What is opened, and which part of it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct LayoutOptions {
+    /// The layout, or `Auto`.
+    pub layout: Layout,
+    /// Which scenes are used.
+    pub filters: SceneFilters,
+    /// Where parts are.
+    pub files: FileOptions,
+    /// Fewest columns and rows of a usable picture; for layouts of one file per frame.
+    pub min_size: [usize; 2],
+}
+
+/// Scenes that were opened.
+pub struct Opened {
+    /// The scenes.
+    pub source: Arc<dyn SceneSource>,
+    /// What was left out, and why.
+    pub ledger: Ledger,
+    /// The layout that was found.
+    pub layout: Layout,
+    /// Whether training and test scenes lie in folders of their own, `train/` and `test/`.
+    pub has_splits: bool,
+}
+
+/// Opens one half of a data set: what is in `root/train` or `root/test`, or in `root` where it has neither. `root` may
+/// be a data set, a single scene, or a `transforms.json` of any name.
+///
+/// Without folders of their own both halves are the same scenes (the ledger notes it), unless
+/// [`FileOptions::test_scenes`] divides them.
+///
+/// # Errors
+/// [`DataError::UnknownLayout`] for a folder without scenes; what opening the layout gives.
+pub fn open_layout(
+    root: &Path,
+    split: Split,
+    options: &LayoutOptions,
+) -> Result<(Arc<dyn SceneSource>, Ledger), DataError> {
+    Opened::open(root, split, options).map(|opened| (opened.source, opened.ledger))
+}
+
+/// A folder of scenes.
+struct Place<'a> {
+    root: &'a Path,
+    base: PathBuf,
+    split: Split,
+    has_splits: bool,
+}
+
+impl Opened {
+    /// Does [`open_layout`], and says what it found.
+    pub fn open(root: &Path, split: Split, options: &LayoutOptions) -> Result<Self, DataError> {
+        let list = options.files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
+        let place = Place::find(root, split)?;
+        let mut opened = match place.scenes(options.layout)? {
+            Found::Torch(layout) => place.open_torch(layout, options, list.as_ref())?,
+            Found::Photos(layout, scenes) => place.open_photos(layout, scenes, options, list.as_ref())?,
+        };
+        if !opened.has_splits && list.is_none() {
+            let note = "no train/ and test/ folders and no list of test scenes: both halves are the same scenes";
+            opened.ledger.notes.push(note.into());
+        }
+        Ok(opened)
+    }
+}
+
+/// What is in a folder.
+enum Found {
+    Torch(Layout),
+    Photos(Layout, Vec<SceneFolder>),
+}
+
+impl<'a> Place<'a> {
+    fn find(root: &'a Path, split: Split) -> Result<Self, DataError> {
+        std::fs::metadata(root).map_err(DataError::io("opening the data", root))?;
+        let has_splits = [Split::Train, Split::Test].iter().any(|split| root.join(split.to_string()).is_dir())
+            && scene_in(root).is_none();
+        let base = if has_splits { root.join(split.to_string()) } else { root.to_owned() };
+        if !base.exists() {
+            let what = format!("there is no folder {split}/ beside the other split");
+            return Err(DataError::UnknownLayout { what, path: root.to_owned() });
+        }
+        Ok(Self { root, base, split, has_splits })
+    }
+
+    /// Finds the scenes of the layout asked for, or of the first that is recognised.
+    fn scenes(&self, asked: Layout) -> Result<Found, DataError> {
+        let base = &self.base;
+        if base.is_file() {
+            let layout = if asked == Layout::Auto { Layout::Captures } else { asked };
+            return Ok(Found::Photos(layout, vec![SceneFolder::of_file(base)]));
+        }
+        let names = file_names(base)?;
+        let has = |ending: &str| names.iter().any(|name| name.ends_with(ending));
+        let none = |what: &str| Err(DataError::UnknownLayout { what: what.into(), path: base.clone() });
+        match asked {
+            Layout::Chunks => return Ok(Found::Torch(Layout::Chunks)),
+            Layout::Scenes if has(".torch") => return Ok(Found::Torch(Layout::Scenes)),
+            Layout::Scenes => return none("expected .torch files"),
+            Layout::Auto if names.iter().any(|name| name == "index.json") => return Ok(Found::Torch(Layout::Chunks)),
+            Layout::Auto if has(".torch") => return Ok(Found::Torch(Layout::Scenes)),
+            _ => {}
+        }
+        if matches!(asked, Layout::Auto | Layout::Re10kTxt) {
+            let texts: Vec<&String> = names.iter().filter(|name| name.ends_with(".txt")).collect();
+            let is_scene = scene_in(base).is_some();
+            if !is_scene && texts.iter().take(8).any(|name| looks_like_re10k(&base.join(name))) {
+                return Ok(Found::Photos(Layout::Re10kTxt, Vec::new()));
+            }
+        }
+        let scenes = find_scenes(base)?;
+        let is_text = |scene: &SceneFolder| matches!(scene.files, SceneFiles::Re10kText { .. });
+        let found = match asked {
+            Layout::Re10kTxt => Found::Photos(asked, scenes.into_iter().filter(is_text).collect()),
+            Layout::Dl3dv => {
+                let is_transforms = |scene: &SceneFolder| matches!(scene.files, SceneFiles::Transforms(_));
+                Found::Photos(asked, scenes.into_iter().filter(is_transforms).collect())
+            }
+            Layout::Captures => Found::Photos(asked, scenes),
+            _ if scenes.iter().all(is_text) => Found::Photos(Layout::Re10kTxt, scenes),
+            _ if scenes.iter().all(SceneFolder::is_dl3dv) => Found::Photos(Layout::Dl3dv, scenes),
+            _ => Found::Photos(Layout::Captures, scenes),
+        };
+        if let Found::Photos(layout, scenes) = &found
+            && scenes.is_empty()
+        {
+            return none(match layout {
+                _ if asked == Layout::Auto => {
+                    "looked for index.json with chunks, .torch files, RealEstate10K's .txt files, and for folders with \
+                     a transforms.json or a COLMAP model, three levels down"
+                }
+                Layout::Re10kTxt => "expected RealEstate10K's .txt files",
+                Layout::Dl3dv => "expected folders with a transforms.json",
+                _ => "expected folders with a transforms.json or a COLMAP model",
+            });
+        }
+        Ok(found)
+    }
+
+    fn open_torch(
+        &self,
+        layout: Layout,
+        options: &LayoutOptions,
+        list: Option<&TestScenes>,
+    ) -> Result<Opened, DataError> {
+        let mut ledger = Ledger::default();
+        let mut index = if layout == Layout::Chunks {
+            read_index(&self.base.join("index.json"))?
+        } else {
+            self.index_of_files(&mut ledger)?
+        };
+        let keys: Vec<String> = index.keys().cloned().collect();
+        let kept = divide(list, &keys, self, &mut ledger);
+        let mut kept = kept.into_iter();
+        index.retain(|_, _| kept.next().unwrap_or_default());
+        let source = ChunkSource::of_index(&self.base, index, &options.filters)?;
+        append(&mut ledger, source.ledger());
+        Ok(Opened { source: Arc::new(source), ledger, layout, has_splits: self.has_splits })
+    }
+
+    /// Scenes in files of their own, by the names of these. Chunks whose index is missing are looked into.
+    fn index_of_files(&self, ledger: &mut Ledger) -> Result<BTreeMap<String, String>, DataError> {
+        let mut files: Vec<String> = file_names(&self.base)?;
+        files.retain(|name| name.ends_with(".torch"));
+        files.sort_unstable();
+        let stem = |file: &str| file.trim_end_matches(".torch").to_owned();
+        let first = files.iter().take(8).find_map(|file| Some((file, ChunkTable::read(&self.base.join(file)).ok()?)));
+        if first.is_some_and(|(file, table)| table.scenes.len() != 1 || !table.scenes.contains_key(&stem(file))) {
+            let tables: Vec<_> = files.par_iter().map(|file| (file, ChunkTable::read(&self.base.join(file)))).collect();
+            let mut index = BTreeMap::new();
+            for (file, table) in tables {
+                match table {
+                    Ok(table) => index.extend(table.scenes.into_keys().map(|key| (key, file.clone()))),
+                    Err(error) => {
+                        ledger.num_scenes += 1;
+                        ledger.skip(file, error.to_string());
+                    }
+                }
+            }
+            ledger.notes.push(format!("there is no index.json: the scenes of {} files were looked up", files.len()));
+            return Ok(index);
+        }
+        let mut index: BTreeMap<String, String> = files.iter().map(|file| (stem(file), file.clone())).collect();
+        let invalid = self.base.join(INVALID_KEYS);
+        if invalid.is_file() {
+            let invalid = TestScenes::read(&invalid)?;
+            for key in index.keys().filter(|key| invalid.contains(key)) {
+                ledger.num_scenes += 1;
+                ledger.skip(key, format!("in {INVALID_KEYS}"));
+            }
+            index.retain(|key, _| !invalid.contains(key));
+        }
+        Ok(index)
+    }
+
+    fn open_photos(
+        &self,
+        layout: Layout,
+        scenes: Vec<SceneFolder>,
+        options: &LayoutOptions,
+        list: Option<&TestScenes>,
+    ) -> Result<Opened, DataError> {
+        let is_text = layout == Layout::Re10kTxt;
+        let mut scenes = if scenes.is_empty() { self.re10k_clips(options)? } else { scenes };
+        let mut ledger = Ledger::default();
+        let keys: Vec<String> = scenes.iter().map(|scene| scene.key.clone()).collect();
+        let mut kept = divide(list, &keys, self, &mut ledger).into_iter();
+        scenes.retain(|_| kept.next().unwrap_or_default());
+        let is_dl3dv = layout == Layout::Dl3dv;
+        let files = &options.files;
+        let source_options = PhotoSourceOptions {
+            photos: PhotoOptions {
+                image_folder: files.image_folder.clone(),
+                first_folders: if is_dl3dv { DL3DV_FOLDERS } else { &[] },
+                undistort: files.undistort.unwrap_or(layout == Layout::Captures),
+            },
+            filters: options.filters.clone(),
+            whole_scenes: (is_dl3dv || is_text) && !files.keep_incomplete,
+            min_size: options.min_size,
+        };
+        let source = PhotoSource::open(scenes, &source_options)?;
+        append(&mut ledger, source.ledger());
+        Ok(Opened { source: Arc::new(source), ledger, layout, has_splits: self.has_splits })
+    }
+
+    /// Clips of RealEstate10K as text files, and where their frames are.
+    fn re10k_clips(&self, options: &LayoutOptions) -> Result<Vec<SceneFolder>, DataError> {
+        let mut names = file_names(&self.base)?;
+        names.sort_unstable();
+        let split = self.split.to_string();
+        let folders: Vec<PathBuf> = match &options.files.frames {
+            Some(frames) => vec![frames.clone(), frames.join(&split)],
+            None => {
+                let above = self.base.parent().unwrap_or(&self.base);
+                let frames = [self.root.join("frames"), above.join("frames")];
+                let frames = frames.iter().flat_map(|frames| [frames.clone(), frames.join(&split)]);
+                std::iter::once(self.base.clone()).chain(frames).collect()
+            }
+        };
+        let clip = |name: &String| {
+            let key = name.strip_suffix(".txt")?;
+            let mut places = folders.iter().map(|folder| folder.join(key));
+            let frames = places.find(|frames| frames.is_dir()).unwrap_or_else(|| self.root.join("frames").join(key));
+            let files = SceneFiles::Re10kText { cameras: self.base.join(name), frames };
+            Some(SceneFolder { key: key.into(), files })
+        };
+        Ok(names.iter().filter_map(clip).collect())
+    }
+}
+
+/// Which of the keys belong to the split; the rest goes into the ledger.
+fn divide(list: Option<&TestScenes>, keys: &[String], place: &Place<'_>, ledger: &mut Ledger) -> Vec<bool> {
+    let Some(list) = list else { return vec![true; keys.len()] };
+    let (kept, divided) = list.divide(keys, place.split, !place.has_splits);
+    append(ledger, &divided);
+    kept
+}
+
+fn append(ledger: &mut Ledger, more: &Ledger) {
+    ledger.num_scenes += more.num_scenes;
+    ledger.skips.extend_from_slice(&more.skips);
+    ledger.frames.extend_from_slice(&more.frames);
+    ledger.notes.extend_from_slice(&more.notes);
+}

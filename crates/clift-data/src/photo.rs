@@ -1,0 +1,110 @@
+//! A picture file with its camera, and a scene of them: what every layout of one file per frame is read to.
+
+use std::path::{Path, PathBuf};
+
+use crate::camera::{Camera, IntrinsicsNorm, Pose};
+use crate::clip::Frame;
+use crate::error::DataError;
+use crate::files::read_bounded;
+use crate::image::{decode, read_size};
+use crate::lens::Lens;
+use crate::undistort::Undistortion;
+
+/// Most bytes of one picture file.
+const MAX_PICTURE_BYTES: u64 = 256 << 20;
+/// By how much the shape (width over height) of a picture may differ from that of its camera: rounding of a picture
+/// scaled down to a few dozen pixels.
+const MAX_SHAPE_ERROR: f64 = 0.02;
+
+/// One picture on disk.
+#[derive(Clone, Debug)]
+pub(crate) struct Photo {
+    pub path: PathBuf,
+    /// The camera of the picture as it is given out: a pinhole.
+    pub camera: Camera,
+    /// How the file's picture becomes that.
+    pub undistortion: Option<Box<Undistortion>>,
+    /// Width over height of the pictures that the intrinsics were given for.
+    pub shape: Option<f64>,
+}
+
+/// A frame that has no photo, by the name its file gives it.
+pub(crate) struct MissingPhoto {
+    pub name: String,
+    /// Why, in words that equal cases share.
+    pub reason: String,
+}
+
+/// The photos of a scene, in the order of their frames.
+#[derive(Default)]
+pub(crate) struct PhotoScene {
+    pub photos: Vec<Photo>,
+    pub missing: Vec<MissingPhoto>,
+    /// What else is to be known.
+    pub notes: Vec<String>,
+}
+
+impl Photo {
+    /// A photo through `lens`, which is undone on load if `undistort` says so and ignored otherwise.
+    ///
+    /// # Errors
+    /// [`DataError::BadCamera`] for intrinsics that cannot be, and what [`Undistortion::new`] gives.
+    pub fn new(
+        path: PathBuf,
+        c2w: Pose,
+        intrinsics_norm: IntrinsicsNorm,
+        lens: Lens,
+        undistort: bool,
+    ) -> Result<Self, DataError> {
+        intrinsics_norm.validate()?;
+        if !undistort || lens.is_pinhole() {
+            return Ok(Self { path, camera: Camera { intrinsics_norm, c2w }, undistortion: None, shape: None });
+        }
+        let undistortion = Undistortion::new(intrinsics_norm, lens)?;
+        let camera = Camera { intrinsics_norm: undistortion.intrinsics_norm(), c2w };
+        Ok(Self { path, camera, undistortion: Some(Box::new(undistortion)), shape: None })
+    }
+
+    /// Reads the file as it is.
+    pub fn read(&self) -> Result<Vec<u8>, DataError> {
+        read_bounded(&self.path, MAX_PICTURE_BYTES, "reading a picture")
+    }
+
+    /// Columns and rows, from the head of the file.
+    pub fn size(&self) -> Result<[usize; 2], DataError> {
+        let size = read_size(&self.path)?;
+        self.check_shape(size)?;
+        Ok(size)
+    }
+
+    /// Decodes the picture and undoes the lens.
+    pub fn decode(&self, key: &str, frame: usize) -> Result<Frame, DataError> {
+        let picture = decode(&self.read()?, key, frame)?;
+        self.check_shape([picture.width, picture.height])?;
+        Ok(match &self.undistortion {
+            Some(undistortion) => undistortion.apply(&picture),
+            None => picture,
+        })
+    }
+
+    /// A picture that was turned after its camera was found has the wrong camera.
+    fn check_shape(&self, [width, height]: [usize; 2]) -> Result<(), DataError> {
+        let Some(expected) = self.shape else { return Ok(()) };
+        let shape = width as f64 / height as f64;
+        if (shape / expected - 1.0).abs() <= MAX_SHAPE_ERROR {
+            return Ok(());
+        }
+        let what = format!(
+            "the picture is {width}x{height}, {shape:.3} times as wide as high, and its camera's {expected:.3} times; \
+             it may have been turned or cropped after the cameras were found"
+        );
+        Err(DataError::BadScene { what, path: self.path.clone() })
+    }
+}
+
+impl PhotoScene {
+    /// An error about a frame of the scene at `path`.
+    pub fn in_frame(path: &Path, name: &str) -> impl FnOnce(DataError) -> DataError {
+        move |error| DataError::BadScene { what: format!("frame {name}: {error}"), path: path.to_owned() }
+    }
+}

@@ -1,0 +1,296 @@
+//! Own captures and DL3DV as `transforms.json`, in the form that nerfstudio and instant-ngp write.
+//!
+//! Poses are camera to world with OpenGL's axes (+x right, +y up, -z forward) and become OpenCV's.
+
+use std::collections::HashSet;
+use std::fmt;
+use std::marker::PhantomData;
+use std::path::{Component, Path, PathBuf};
+
+use serde::de::{Error, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
+
+use crate::camera::{Intrinsics, IntrinsicsNorm, Pose};
+use crate::error::DataError;
+use crate::files::read_bounded;
+use crate::image::read_size;
+use crate::lens::Lens;
+use crate::photo::{MissingPhoto, Photo, PhotoScene};
+use crate::picture_folder::{PictureFolders, natural_order};
+
+/// Most bytes of one `transforms.json`.
+const MAX_BYTES: u64 = 128 << 20;
+/// Most frames of one scene.
+pub(crate) const MAX_FRAMES: usize = 100_000;
+
+/// How photos are found and what is done to them.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct PhotoOptions {
+    /// Folder of the pictures, beside the cameras' file, instead of the one that it names.
+    pub image_folder: Option<String>,
+    /// Folders to look for when none is asked for, before the one that the cameras' file names.
+    pub first_folders: &'static [&'static str],
+    /// Whether lens distortion is undone; otherwise it is ignored.
+    pub undistort: bool,
+}
+
+/// Defines a struct with the keys of a camera, which may stand at the top or in a frame.
+macro_rules! with_optics {
+    ($name:ident { $($field:ident: $type:ty,)* }) => {
+        #[derive(Deserialize)]
+        struct $name {
+            $($field: $type,)*
+            camera_model: Option<String>,
+            is_fisheye: Option<bool>,
+            w: Option<f64>,
+            h: Option<f64>,
+            fl_x: Option<f64>,
+            fl_y: Option<f64>,
+            cx: Option<f64>,
+            cy: Option<f64>,
+            camera_angle_x: Option<f64>,
+            camera_angle_y: Option<f64>,
+            k1: Option<f64>,
+            k2: Option<f64>,
+            k3: Option<f64>,
+            k4: Option<f64>,
+            p1: Option<f64>,
+            p2: Option<f64>,
+        }
+
+        impl $name {
+            fn optics(&self) -> Optics<'_> {
+                Optics {
+                    camera_model: self.camera_model.as_deref(),
+                    is_fisheye: self.is_fisheye,
+                    size: [self.w, self.h],
+                    focal: [self.fl_x, self.fl_y],
+                    centre: [self.cx, self.cy],
+                    angle: [self.camera_angle_x, self.camera_angle_y],
+                    radial: [self.k1, self.k2, self.k3, self.k4],
+                    tangential: [self.p1, self.p2],
+                }
+            }
+        }
+    };
+}
+
+with_optics!(Document { frames: Bounded<Entry, MAX_FRAMES>, });
+with_optics!(Entry { file_path: String, transform_matrix: Bounded<[f64; 4], 4>, });
+
+impl Entry {
+    /// The upper three rows of the matrix; the fourth may be left out.
+    fn c2w_rows(&self) -> Result<[[f64; 4]; 3], String> {
+        let rows = &self.transform_matrix.0;
+        if let Some(last) = rows.get(3) {
+            let error = last.iter().zip([0.0, 0.0, 0.0, 1.0]).map(|(got, expected)| (got - expected).abs());
+            if !(error.fold(0.0, f64::max) < 1e-6) {
+                return Err(format!("transform_matrix ends in {last:?}, expected 0 0 0 1"));
+            }
+        }
+        match rows.as_slice() {
+            [a, b, c, ..] => Ok([*a, *b, *c]),
+            rows => Err(format!("transform_matrix has {} rows, expected 4", rows.len())),
+        }
+    }
+}
+
+/// What is said of a camera. Lengths are in pixels, angles in radians.
+struct Optics<'a> {
+    camera_model: Option<&'a str>,
+    is_fisheye: Option<bool>,
+    size: [Option<f64>; 2],
+    focal: [Option<f64>; 2],
+    centre: [Option<f64>; 2],
+    angle: [Option<f64>; 2],
+    radial: [Option<f64>; 4],
+    tangential: [Option<f64>; 2],
+}
+
+impl<'a> Optics<'a> {
+    /// What a frame says, and where it says nothing, what stands at the top. A focal length of its own overrules an
+    /// angle at the top.
+    fn or(self, top: &Optics<'a>) -> Self {
+        let either = |own: [Option<f64>; 2], top: [Option<f64>; 2]| [own[0].or(top[0]), own[1].or(top[1])];
+        let has_focal = self.focal.iter().chain(&self.angle).any(Option::is_some);
+        Self {
+            camera_model: self.camera_model.or(top.camera_model),
+            is_fisheye: self.is_fisheye.or(top.is_fisheye),
+            size: either(self.size, top.size),
+            focal: if has_focal { self.focal } else { top.focal },
+            angle: if has_focal { self.angle } else { top.angle },
+            centre: either(self.centre, top.centre),
+            radial: [0, 1, 2, 3].map(|i| self.radial[i].or(top.radial[i])),
+            tangential: either(self.tangential, top.tangential),
+        }
+    }
+
+    /// The lens, if it is one that can be undone.
+    fn lens(&self) -> Result<Lens, String> {
+        let model = self.camera_model.unwrap_or("OPENCV");
+        let known = ["PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "perspective"];
+        if !known.contains(&model) || self.is_fisheye == Some(true) {
+            let model = if self.is_fisheye == Some(true) { "OPENCV_FISHEYE" } else { model };
+            return Err(format!("camera_model is {model}, expected one of {}", known.join(", ")));
+        }
+        let [k1, k2, k3, k4] = self.radial.map(Option::unwrap_or_default);
+        if k4 != 0.0 {
+            return Err(format!("k4 is {k4}: only lenses of k1, k2, k3, p1 and p2 can be undone"));
+        }
+        let lens = Lens { radial: [k1, k2, k3], tangential: self.tangential.map(Option::unwrap_or_default) };
+        lens.validate().map(|()| lens).map_err(|error| error.to_string())
+    }
+
+    /// Columns and rows of the pictures that the intrinsics were given for.
+    fn size(&self) -> Result<Option<[f64; 2]>, String> {
+        let [Some(width), Some(height)] = self.size else { return Ok(None) };
+        for (name, side) in [("w", width), ("h", height)] {
+            if !(side.is_finite() && side >= 1.0) {
+                return Err(format!("{name} is {side}, expected a number of pixels"));
+            }
+        }
+        Ok(Some([width, height]))
+    }
+
+    fn intrinsics_norm(&self, [width, height]: [f64; 2]) -> Result<IntrinsicsNorm, String> {
+        let of_angle = |axis: usize, side: f64| self.angle[axis].map(|angle| 0.5 * side / (0.5 * angle).tan());
+        let [x, y] = [self.focal[0].or_else(|| of_angle(0, width)), self.focal[1].or_else(|| of_angle(1, height))];
+        let (Some(fx), Some(fy)) = (x.or(y), y.or(x)) else {
+            return Err("neither fl_x nor camera_angle_x is given".into());
+        };
+        let [cx, cy] = self.centre;
+        let intrinsics = Intrinsics { fx, fy, cx: cx.unwrap_or(width / 2.0), cy: cy.unwrap_or(height / 2.0) };
+        let intrinsics_norm = IntrinsicsNorm::of_pixels(intrinsics, width, height);
+        intrinsics_norm.validate().map(|()| intrinsics_norm).map_err(|error| error.to_string())
+    }
+}
+
+/// Reads a `transforms.json` and finds its pictures. Frames are in the natural order of their names.
+///
+/// # Errors
+/// [`DataError::Io`], and [`DataError::BadScene`] for a file of another form, a camera that cannot be used and two
+/// frames of one name.
+pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
+    let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
+    let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
+    let document: Document = serde_json::from_slice(&text).map_err(|error| bad(explain(&error, &text)))?;
+    drop(text);
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
+    entries.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
+    let mut pictures = Pictures { folder, options, folders: PictureFolders::default() };
+    let (top, mut scene) = (document.optics(), PhotoScene::default());
+    let mut taken = HashSet::new();
+    for entry in entries {
+        let name = &entry.file_path;
+        let in_frame = |what: String| bad(format!("frame {name}: {what}"));
+        let picture = match pictures.find(name) {
+            Ok(picture) if taken.insert(picture.clone()) => picture,
+            found => {
+                let reason = found.map_or_else(|reason| reason, |_| "whose picture another frame has".into());
+                scene.missing.push(MissingPhoto { name: name.clone(), reason });
+                continue;
+            }
+        };
+        let optics = entry.optics().or(&top);
+        let lens = optics.lens().map_err(in_frame)?;
+        let given = optics.size().map_err(in_frame)?;
+        let size = match given {
+            Some(size) => size,
+            None => read_size(&picture)?.map(|side| side as f64),
+        };
+        let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;
+        let rows = entry.c2w_rows().map_err(in_frame)?;
+        let photo = Pose::from_opengl(&rows)
+            .and_then(|c2w| Photo::new(picture, c2w, intrinsics_norm, lens, options.undistort))
+            .map_err(PhotoScene::in_frame(path, name))?;
+        scene.photos.push(Photo { shape: given.map(|[width, height]| width / height), ..photo });
+    }
+    Ok(scene)
+}
+
+/// The reason of the parser, and what it does not say of numbers that Python writes and JSON does not have.
+fn explain(error: &serde_json::Error, text: &[u8]) -> String {
+    let line = text.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
+    let column = error.column().min(line.len());
+    let near = String::from_utf8_lossy(&line[column.saturating_sub(9)..line.len().min(column + 9)]);
+    let hint = if near.contains("NaN") || near.contains("Infinity") { " (a number is NaN or infinite)" } else { "" };
+    format!("expected the form that nerfstudio writes, got {error}{hint}")
+}
+
+/// Where the pictures of one scene are looked for.
+struct Pictures<'a> {
+    folder: &'a Path,
+    options: &'a PhotoOptions,
+    folders: PictureFolders,
+}
+
+impl Pictures<'_> {
+    fn find(&mut self, file_path: &str) -> Result<PathBuf, String> {
+        let slashes = if file_path.contains('/') { file_path.to_owned() } else { file_path.replace('\\', "/") };
+        let named = Path::new(&slashes);
+        if let Some(folder) = &self.options.image_folder {
+            return self.folders.find(&self.folder.join(folder).join(below_first(named)));
+        }
+        for first in self.options.first_folders {
+            let folder = self.folder.join(first);
+            if self.folders.has(&folder) {
+                return self.folders.find(&folder.join(below_first(named)));
+            }
+        }
+        let given = self.folder.join(named);
+        let (Some(parent), Some(name)) = (given.parent(), given.file_name()) else {
+            return Err("without a picture".into());
+        };
+        if self.folders.has(parent) {
+            return self.folders.find(&given);
+        }
+        // Pictures scaled down alone, or an absolute path of another computer.
+        let last = parent.file_name().unwrap_or_default().to_string_lossy();
+        let beside = ["_2", "_4", "_8"].map(|suffix| parent.with_file_name(format!("{last}{suffix}")));
+        let here = self.folder.join(&*last);
+        match beside.into_iter().chain([here]).find(|folder| self.folders.has(folder)) {
+            Some(folder) => self.folders.find(&folder.join(name)),
+            None => Err("without a picture".into()),
+        }
+    }
+}
+
+/// A path without its first folder: `images/left/1.png` is `left/1.png` in `images_8`. Of an absolute one, the name.
+fn below_first(path: &Path) -> PathBuf {
+    if path.is_absolute() {
+        return path.file_name().unwrap_or_default().into();
+    }
+    let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
+    parts[parts.len().min(2).saturating_sub(1)..].iter().collect()
+}
+
+/// A list of at most `MAX` items: what a few bytes of JSON become takes a hundred times their memory.
+struct Bounded<T, const MAX: usize>(Vec<T>);
+
+impl<'de, T: Deserialize<'de>, const MAX: usize> Deserialize<'de> for Bounded<T, MAX> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_seq(BoundedVisitor(PhantomData))
+    }
+}
+
+struct BoundedVisitor<T, const MAX: usize>(PhantomData<T>);
+
+impl<'de, T: Deserialize<'de>, const MAX: usize> Visitor<'de> for BoundedVisitor<T, MAX> {
+    type Value = Bounded<T, MAX>;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "a list of at most {MAX}")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Self::Value, A::Error> {
+        let mut list = Vec::new();
+        while let Some(item) = items.next_element()? {
+            if list.len() == MAX {
+                return Err(A::Error::custom(format!("a list of more than {MAX} items")));
+            }
+            list.push(item);
+        }
+        Ok(Bounded(list))
+    }
+}
