@@ -104,7 +104,7 @@ fn encode(encoder: impl ImageEncoder, frame: &Frame) -> Result<(), DataError> {
 /// picture has an odd margin; `exact_principal_point` moves it with the crop instead.
 ///
 // Departs from the protocol, which keeps the normalised position: the same for a principal point in the centre, as
-// RealEstate10K has it, and a pixel wrong for a phone picture cropped to a square.
+// RealEstate10K has it, and half a pixel wrong for a phone picture cropped to a square.
 ///
 /// # Errors
 /// [`DataError::Upscale`] when the target is larger than the frame.
