@@ -40,7 +40,9 @@ fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> std::path:
             url: source.url(scene)?.into(),
             timestamps: source.timestamps(scene)?,
             cameras: source.cameras(scene)?,
-            images: frames.map(|frame| source.encoded_frame(scene, frame)).collect::<Result<_, _>>()?,
+            images: frames
+                .filter_map(|frame| source.encoded_frame(scene, frame).transpose())
+                .collect::<Result<_, _>>()?,
         };
         if record.key == KEYS[1] {
             change(&mut record);
@@ -117,7 +119,7 @@ fn wrong_usage_is_told_from_failure_by_the_exit_code() {
     assert!(!place.at("run/metrics.jsonl").exists());
     let nowhere = place.at("nowhere");
     let message = train_on(&place, &nowhere, &[], &[]).fails(1);
-    assert!(message.contains(&nowhere.join("train/index.json").display().to_string()), "{message}");
+    assert!(message.trim_end().ends_with(&nowhere.display().to_string()), "{message}");
     // The corrected command is no other run: nothing was trained with the wrong one.
     train_on(&place, &repository(MINI), &[], &["--only", "stage1"]).ok();
 }

@@ -287,7 +287,7 @@ fn a_scene_is_chosen_by_key_and_encoded_with_what_the_run_has() {
     assert!(on(&mini.join("test"), &[]).ok().stdout.contains("scene 00000000000000b1"));
     let train = ["--split", "train", "--scene", "00000000000000a2"];
     assert!(on(&mini, &train).ok().stdout.contains("scene 00000000000000a2"));
-    assert!(on(&place.at("run"), &[]).fails(2).contains("holds neither index.json nor test/index.json"));
+    assert!(on(&place.at("run"), &[]).fails(2).contains("no scenes found: looked for index.json with chunks, "));
 
     let file = place.at("run/stage1/model.safetensors").display().to_string();
     let out = place.at("from-file.clift").display().to_string();

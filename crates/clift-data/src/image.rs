@@ -120,9 +120,12 @@ fn encode(encoder: impl ImageEncoder, frame: &Frame) -> Result<(), DataError> {
 }
 
 /// Rescales a frame until it just covers `width` by `height`, crops the centre, and moves its intrinsics along
-/// (pixelSplat's protocol). Focal lengths follow the rescaled picture. The principal point keeps its normalised
-/// position, which is what the published numbers use and is half a pixel off where the rescaled picture has an odd
-/// margin; `exact_principal_point` moves it with the crop instead.
+/// (pixelSplat's protocol). Focal lengths and the way from the centre to the principal point follow the rescaled picture.
+/// The centre stays the centre, which is what the published numbers use and is half a pixel off where the rescaled
+/// picture has an odd margin; `exact_principal_point` moves it with the crop instead.
+///
+// Departs from the protocol, which keeps the normalised position: the same for a principal point in the centre, as
+// RealEstate10K has it, and half a pixel wrong for a phone picture cropped to a square.
 ///
 /// # Errors
 /// [`DataError::Upscale`] when the target is larger than the frame.
@@ -144,7 +147,9 @@ pub fn fit(
     let (cx, cy) = if exact_principal_point {
         (in_scaled.cx - column as f64, in_scaled.cy - row as f64)
     } else {
-        (intrinsics_norm.cx * width as f64, intrinsics_norm.cy * height as f64)
+        let from_centre = |at: f64, scaled: usize| (at - 0.5) * scaled as f64;
+        let x = width as f64 / 2.0 + from_centre(intrinsics_norm.cx, scaled_width);
+        (x, height as f64 / 2.0 + from_centre(intrinsics_norm.cy, scaled_height))
     };
     Ok((cropped, Intrinsics { fx: in_scaled.fx, fy: in_scaled.fy, cx, cy }))
 }
@@ -200,6 +205,19 @@ mod tests {
             }
         }
         assert!((intrinsics.cx - 3.4).abs() < 1e-12, "{intrinsics:?}"); // 0.6 * 9 - 2
+    }
+
+    #[test]
+    fn a_principal_point_off_the_centre_is_half_a_pixel_from_the_exact_one_at_most() {
+        let frame = ramp(108, 192);
+        let norm = IntrinsicsNorm { fx: 1.27, fy: 0.72, cx: 0.6, cy: 0.55 };
+        let [protocol, exact] = [false, true].map(|exact| fit(&frame, norm, 64, 64, exact).unwrap().1);
+        // 64 x 114, 25 rows cut off above and below: 0.55 * 114 - 25 = 37.7.
+        assert!((exact.cx - 38.4).abs() < 1e-12 && (exact.cy - 37.7).abs() < 1e-12, "{exact:?}");
+        assert!((protocol.cx - exact.cx).abs() < 1e-12 && (protocol.cy - exact.cy).abs() < 1e-12, "{protocol:?}");
+        let odd = fit(&ramp(108, 193), norm, 64, 63, false).unwrap().1;
+        let exact = fit(&ramp(108, 193), norm, 64, 63, true).unwrap().1;
+        assert!((odd.cy - exact.cy).abs() <= 0.5 + 1e-12, "{odd:?} {exact:?}");
     }
 
     #[test]

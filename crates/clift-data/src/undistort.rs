@@ -63,34 +63,55 @@ impl Undistortion {
     /// Resamples a picture, bilinearly, into one of the same size. What rounding puts beyond the edge is the edge.
     pub fn apply(&self, frame: &Frame) -> Frame {
         let &Frame { width, height, ref rgb } = frame;
-        let (from, to) = (self.from.to_pixels(width, height), self.to.to_pixels(width, height));
         let mut undistorted = vec![0; rgb.len()];
-        undistorted.par_chunks_exact_mut(width * 3).enumerate().for_each(|(row, pixels)| {
-            let y = (row as f64 + 0.5 - to.cy) / to.fy;
-            for (column, pixel) in pixels.as_chunks_mut().0.iter_mut().enumerate() {
-                let x = (column as f64 + 0.5 - to.cx) / to.fx;
-                let [x, y] = self.lens.distort([x, y]);
-                *pixel = bilinear(frame, x * from.fx + from.cx, y * from.fy + from.cy);
-            }
-        });
+        let rows = undistorted.par_chunks_exact_mut(width * 3).enumerate();
+        // Places first, colours second: a loop of arithmetic alone is one the compiler makes vectors of.
+        rows.for_each_init(
+            || vec![[0; 2]; width],
+            |places, (row, pixels)| {
+                self.find_places(row, [width, height], places);
+                for (pixel, place) in pixels.as_chunks_mut().0.iter_mut().zip(&*places) {
+                    *pixel = bilinear(frame, *place);
+                }
+            },
+        );
         Frame { width, height, rgb: undistorted }
+    }
+
+    /// Where each pixel of a row lies in the distorted picture: columns and rows from the centre of the first pixel, in
+    /// [`STEPS`] per pixel, within the picture.
+    fn find_places(&self, row: usize, [width, height]: [usize; 2], places: &mut [[u32; 2]]) {
+        let (from, to) = (self.from.to_pixels(width, height), self.to.to_pixels(width, height));
+        let (step_x, y) = (1.0 / to.fx, (row as f64 + 0.5 - to.cy) / to.fy);
+        let most = [width, height].map(|side| ((side - 1) * STEPS) as f64);
+        let steps = STEPS as f64;
+        for (column, place) in places.iter_mut().enumerate() {
+            let x = (f64::from(column as u32) + 0.5 - to.cx) * step_x;
+            let [x, y] = self.lens.distort([x, y]);
+            let at = [(x * from.fx + from.cx - 0.5) * steps + 0.5, (y * from.fy + from.cy - 0.5) * steps + 0.5];
+            *place = [at[0].clamp(0.0, most[0]) as u32, at[1].clamp(0.0, most[1]) as u32];
+        }
     }
 }
 
-/// Colour at `(x, y)`, with pixel centres at halves.
-fn bilinear(frame: &Frame, x: f64, y: f64) -> [u8; 3] {
-    let place = |at: f64, size: usize| {
-        let at = (at - 0.5).clamp(0.0, (size - 1) as f64);
-        let low = (at as usize).min(size - 1);
-        (low, (low + 1).min(size - 1), (at - low as f64) as f32)
+/// Parts of a pixel that places are rounded to: the product of two and a colour fits into 32 bits.
+const STEPS: usize = 2048;
+
+/// Colour at a place given in [`STEPS`].
+fn bilinear(frame: &Frame, place: [u32; 2]) -> [u8; 3] {
+    let steps = STEPS as u32;
+    let [column, row] = place.map(|at| (at / steps) as usize);
+    let [x, y] = place.map(|at| at % steps);
+    let right = (column + 1).min(frame.width - 1);
+    let below = (row + 1).min(frame.height - 1);
+    let pixel = |column: usize, row: usize| {
+        let start = (row * frame.width + column) * 3;
+        &frame.rgb[start..start + 3]
     };
-    let (left, right, x) = place(x, frame.width);
-    let (top, bottom, y) = place(y, frame.height);
-    let pixel = |column: usize, row: usize| &frame.rgb[(row * frame.width + column) * 3..][..3];
-    let corners = [pixel(left, top), pixel(right, top), pixel(left, bottom), pixel(right, bottom)];
+    let (a, b, c, d) = (pixel(column, row), pixel(right, row), pixel(column, below), pixel(right, below));
     [0, 1, 2].map(|channel| {
-        let [a, b, c, d] = corners.map(|corner| f32::from(corner[channel]));
-        let (upper, lower) = (a + (b - a) * x, c + (d - c) * x);
-        (upper + (lower - upper) * y + 0.5) as u8
+        let [a, b, c, d] = [a, b, c, d].map(|pixel| u32::from(pixel[channel]));
+        let (upper, lower) = (a * (steps - x) + b * x, c * (steps - x) + d * x);
+        ((upper * (steps - y) + lower * y + steps * steps / 2) / (steps * steps)) as u8
     })
 }

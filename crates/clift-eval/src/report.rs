@@ -190,7 +190,7 @@ impl Report {
     }
 
     fn write_left_out(&self, out: &mut impl Write) -> io::Result<()> {
-        let Ledger { num_scenes, skips } = &self.ledger;
+        let Ledger { num_scenes, skips, .. } = &self.ledger;
         writeln!(out, "<h2>What was left out</h2>")?;
         let evaluated = grouped(self.summary.num_scenes as f64, 0);
         writeln!(out, "<p>{evaluated} of {} scenes were evaluated.</p>", grouped(*num_scenes as f64, 0))?;

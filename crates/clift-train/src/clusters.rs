@@ -249,6 +249,7 @@ fn settings(config: &Config) -> String {
         "seed": config.seed,
         "source": data.source,
         "root": data.root,
+        "files": data.files,
         "synthetic": data.synthetic,
         "size": [data.width, data.height],
         "poses": [serde_json::json!(data.pose_rotation), serde_json::json!(data.pose_scale)],

@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use clift_data::{BoundedSampler, ClipOptions, Crop, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig};
+use clift_data::{
+    BoundedSampler, ClipOptions, Crop, FileOptions, Layout, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig,
+};
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
 use clift_model::{KMeans, ModelConfig};
@@ -52,13 +54,38 @@ pub struct Config {
 
 /// Where scenes come from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "snake_case")]
 pub enum SourceKind {
     /// Ray-traced rooms made on the fly.
     #[default]
     Synthetic,
+    /// Whichever of those below is found under `root`.
+    Auto,
     /// `{train,test}/NNNNNN.torch` with `index.json` under `root`, as pixelSplat has them.
     Chunks,
+    /// `{train,test}/KEY.torch`, a file per scene.
+    Scenes,
+    /// RealEstate10K's `{train,test}/KEY.txt`, and folders of frames.
+    Re10kTxt,
+    /// DL3DV's folders, by hash.
+    Dl3dv,
+    /// Own captures: folders with `transforms.json` or a COLMAP model.
+    Captures,
+}
+
+impl SourceKind {
+    /// The layout on disk; `None` for scenes that are made.
+    pub fn layout(self) -> Option<Layout> {
+        match self {
+            Self::Synthetic => None,
+            Self::Auto => Some(Layout::Auto),
+            Self::Chunks => Some(Layout::Chunks),
+            Self::Scenes => Some(Layout::Scenes),
+            Self::Re10kTxt => Some(Layout::Re10kTxt),
+            Self::Dl3dv => Some(Layout::Dl3dv),
+            Self::Captures => Some(Layout::Captures),
+        }
+    }
 }
 
 /// Scenes and how views are drawn from them.
@@ -67,8 +94,10 @@ pub enum SourceKind {
 pub struct DataConfig {
     /// Where scenes come from.
     pub source: SourceKind,
-    /// Folder with `train/` and `test/`; for chunks.
+    /// Folder with `train/` and `test/`, or of scenes, or of one scene; for scenes on disk.
     pub root: Option<PathBuf>,
+    /// Where the parts of a layout are, if not where they are expected; for scenes on disk.
+    pub files: FileOptions,
     /// Columns of every view, a multiple of the patch.
     pub width: usize,
     /// Rows of every view, a multiple of the patch.
@@ -102,6 +131,7 @@ impl Default for DataConfig {
         Self {
             source: SourceKind::Synthetic,
             root: None,
+            files: FileOptions::default(),
             width: 256,
             height: 256,
             pose_rotation: PoseRotation::default(),
@@ -328,13 +358,13 @@ impl DataConfig {
     fn validate(&self) -> Result<(), TrainError> {
         in_range("data.num_threads", self.num_threads, 0, 1024)?;
         in_range("data.num_prefetch", self.num_prefetch, 1, 1024)?;
-        match self.source {
-            SourceKind::Chunks if self.root.is_none() => {
-                Err(bad("data.root", "missing", "write the folder that holds train/ and test/"))
-            }
-            SourceKind::Chunks => Ok(self.filters.validate()?),
-            SourceKind::Synthetic => self.validate_synthetic(),
+        if self.source == SourceKind::Synthetic {
+            return self.validate_synthetic();
         }
+        if self.root.is_none() {
+            return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
+        }
+        Ok(self.filters.validate()?)
     }
 
     fn validate_synthetic(&self) -> Result<(), TrainError> {

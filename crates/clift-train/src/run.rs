@@ -289,7 +289,7 @@ impl Run {
     fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
         let (source, ledger) = scenes::open(&self.config.data, split)?;
         sink.event(&Event::Message(format!("{split}: {ledger}")));
-        if !ledger.skips.is_empty() && self.config.run_dir.is_dir() {
+        if ledger.has_gaps() && self.config.run_dir.is_dir() {
             write_ledger(&ledger, &self.folder(&format!("skipped-{split}.json")))?;
         }
         let source: Arc<dyn SceneSource> = match self.overfit {

@@ -4,38 +4,45 @@ use std::sync::Arc;
 
 use clift_data::export::spread_views;
 use clift_data::{
-    Camera, ChunkSource, ClipReader, DataError, EvaluationIndex, EvaluationItem, Frame, Ledger, SceneSource, Split,
-    SyntheticConfig, SyntheticSource,
+    Camera, ClipReader, DataError, EvaluationIndex, EvaluationItem, Frame, Layout, LayoutOptions, Ledger, Opened,
+    SceneSource, Split, SyntheticConfig, SyntheticSource,
 };
 use clift_eval::EvalConfig;
 
 use crate::TrainError;
-use crate::config::{DataConfig, SourceKind};
+use crate::config::DataConfig;
 
 /// Opens one half of the data, with the ledger of what its filters left out.
 ///
 /// # Errors
 /// Whatever opening the source gives, and [`TrainError::NoScenes`] when the filters leave none.
 pub fn open(data: &DataConfig, split: Split) -> Result<(Arc<dyn SceneSource>, Ledger), TrainError> {
-    let (source, ledger): (Arc<dyn SceneSource>, Ledger) = match data.source {
-        SourceKind::Synthetic => {
+    let (source, ledger) = match data.source.layout() {
+        None => {
             let source = SyntheticSource::new(SyntheticConfig { split, ..data.synthetic.clone() })?;
             let ledger = Ledger::new(source.num_scenes());
-            (Arc::new(source), ledger)
+            (Arc::new(source) as Arc<dyn SceneSource>, ledger)
         }
-        SourceKind::Chunks => {
-            let root = data.root.as_deref().ok_or_else(|| TrainError::BadConfig {
-                key: "data.root".into(),
-                value: "missing".into(),
-                fix: "write the folder that holds train/ and test/".into(),
-            })?;
-            let source = ChunkSource::open(root, split, &data.filters)?;
-            let ledger = source.ledger().clone();
-            (Arc::new(source), ledger)
-        }
+        Some(layout) => open_files(data, layout, split)?,
     };
     if source.num_scenes() == 0 {
         return Err(TrainError::NoScenes { reason: format!("{split}: {ledger}") });
+    }
+    Ok((source, ledger))
+}
+
+fn open_files(data: &DataConfig, layout: Layout, split: Split) -> Result<(Arc<dyn SceneSource>, Ledger), TrainError> {
+    let missing =
+        |key: &str, fix: &str| TrainError::BadConfig { key: key.into(), value: "missing".into(), fix: fix.into() };
+    let root = data.root.as_deref();
+    let root = root.ok_or_else(|| missing("data.root", "write the folder that holds train/ and test/"))?;
+    let (filters, files) = (data.filters.clone(), data.files.clone());
+    let options = LayoutOptions { layout, filters, files, min_size: [data.width, data.height] };
+    let Opened { source, ledger, layout, has_splits } = Opened::open(root, split, &options)?;
+    if split == Split::Train && layout == Layout::Dl3dv && !has_splits && data.files.test_scenes.is_none() {
+        let fix = "the folders hold DL3DV's benchmark scenes too, which are not to be trained on: write the path of an \
+                   evaluation index, or of a file with a key per line (an empty file for none)";
+        return Err(missing("data.files.test_scenes", fix));
     }
     Ok((source, ledger))
 }
@@ -76,6 +83,10 @@ impl SceneSource for FirstScenes {
 
     fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
         self.source.frame(scene, frame)
+    }
+
+    fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
+        self.source.encoded_frame(scene, frame)
     }
 }
 

@@ -3,13 +3,13 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use clift_data::{ChunkSource, ClipReader, SceneFilters, SceneSource, Split};
+use clift_data::{ClipReader, FileOptions, LayoutOptions, SceneSource, Split, open_layout};
 use clift_eval::TokenCount;
 use clift_model::TokenStorage;
 use clift_model::device::DeviceName;
 use clift_train::encode::{Budget, EncodeOptions, Encoded};
 use clift_train::trained::{ModelPath, Trained};
-use clift_train::{Config, read_config, scenes};
+use clift_train::{Config, Override, read_config, scenes};
 
 use crate::WrongUsage;
 use crate::data::text::{bytes, count};
@@ -24,7 +24,8 @@ pub struct EncodeArgs {
     /// A run directory, or a model.safetensors in one
     #[arg(value_name = "RUN|MODEL")]
     pub model: PathBuf,
-    /// Folder of chunks: with train/ or test/ in it, or one of these; the run's own data by default
+    /// A capture (a folder with transforms.json or a COLMAP model), or a data set in any layout; the run's own data by
+    /// default
     #[arg(value_name = "DIR")]
     pub data: Option<PathBuf>,
     /// The scene file to write
@@ -60,13 +61,13 @@ pub struct EncodeArgs {
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let model = ModelPath::find(&args.model)?;
     let (mut config, overrides) = read_config::<Config>(&model.run.join("config.toml"), &args.set)?;
-    for change in overrides {
+    for change in &overrides {
         terminal::print_note(&format!("--set {change}"));
     }
     config.device = args.device.unwrap_or(config.device);
     config.validate()?;
     let source = match &args.data {
-        Some(folder) => open_chunks(folder, args.split)?,
+        Some(folder) => open_folder(folder, args.split, &config, &overrides)?,
         None => scenes::open(&config.data, args.split)?.0,
     };
     let scene = choose(source.as_ref(), args.scene.as_deref())?;
@@ -105,23 +106,22 @@ fn told(encoded: &Encoded, storage: TokenStorage, path: &Path) -> String {
     )
 }
 
-/// Opens a folder of chunks, all of its scenes.
-fn open_chunks(folder: &Path, split: Split) -> anyhow::Result<Arc<dyn SceneSource>> {
-    let (root, split) = if folder.join("index.json").exists() {
-        let absolute = folder.canonicalize().unwrap_or_else(|_| folder.to_path_buf());
-        let name = absolute.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let split = parse_split(&name).map_err(|_| {
-            WrongUsage(format!("{} holds an index.json but is named neither train nor test", folder.display()))
-        })?;
-        (absolute.parent().unwrap_or(Path::new("/")).to_path_buf(), split)
-    } else if folder.join(split.to_string()).join("index.json").exists() {
-        (folder.to_path_buf(), split)
-    } else {
-        let message = format!("{} holds neither index.json nor {split}/index.json", folder.display());
-        return Err(WrongUsage(format!("{message}; give a folder of chunks (see `clift data info`)")).into());
-    };
+/// Opens a folder of scenes in any layout, or a single scene, with the options of the run's files only where `--set` gave
+/// them for this one.
+fn open_folder(
+    folder: &Path,
+    split: Split,
+    config: &Config,
+    overrides: &[Override],
+) -> anyhow::Result<Arc<dyn SceneSource>> {
+    let is_meant = overrides.iter().any(|change| change.key.starts_with("data.files"));
+    let files = if is_meant { config.data.files.clone() } else { FileOptions::default() };
     // Filters choose what to train on; this scene was chosen by hand.
-    Ok(Arc::new(ChunkSource::open(&root, split, &SceneFilters::default())?))
+    let (source, ledger) = open_layout(folder, split, &LayoutOptions { files, ..LayoutOptions::default() })?;
+    if ledger.has_gaps() {
+        terminal::print_note(&format!("{}: {ledger}", folder.display()));
+    }
+    Ok(source)
 }
 
 /// The scene asked for, or the only one.

@@ -101,7 +101,8 @@ fn exit_code(error: &anyhow::Error) -> u8 {
 }
 
 fn data_exit_code(error: &clift_data::DataError) -> u8 {
-    if matches!(error, clift_data::DataError::BadConfig { .. }) { WRONG_USAGE } else { FAILED }
+    use clift_data::DataError::{BadConfig, UnknownLayout};
+    if matches!(error, BadConfig { .. } | UnknownLayout { .. }) { WRONG_USAGE } else { FAILED }
 }
 
 fn model_exit_code(error: &clift_model::ModelError) -> u8 {

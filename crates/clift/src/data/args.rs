@@ -25,11 +25,13 @@ num_objects, path_length, texture_frequency, specular, samples_per_pixel.")]
     Synth(SynthArgs),
     /// Tell what a data folder holds, or what a config uses of it
     ///
-    /// Per split: scenes, frames (smallest / median / largest), picture size, field of view, extent of the camera
-    /// path. For a config also what its filters, its views and its evaluation leave, and the tokens of a scene.
+    /// Any layout is recognised: chunks, files per scene, RealEstate10K's text, DL3DV's folders, captures with
+    /// transforms.json or a COLMAP model. Per split: scenes, frames (smallest / median / largest), picture size, field
+    /// of view, extent of the camera path, frames without a picture. For a config also what its filters, its views and its evaluation leave, and the tokens of a scene.
     #[command(after_help = "\
 Examples:
   clift data info /data/re10k
+  clift data info captures/attic
   clift data info configs/tiny.toml
   clift data info configs/re10k.toml --set data.filters.min_frames=60 --json info.json")]
     Info(InfoArgs),
@@ -69,7 +71,7 @@ pub struct SynthArgs {
 /// Arguments of `clift data info`.
 #[derive(Debug, clap::Args)]
 pub struct InfoArgs {
-    /// A folder with train/ or test/ in it, or a config (TOML)
+    /// A folder of scenes, one scene, or a config (TOML)
     #[arg(value_name = "DIR|CONFIG")]
     pub path: PathBuf,
     /// Change a key of the config: `--set data.filters.min_frames=60`

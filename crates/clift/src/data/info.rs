@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context;
-use clift_data::{ChunkSource, ClipReader, Ledger, SceneFilters, SceneSource, SourceInfo, Split};
+use clift_data::{ClipReader, DataError, LayoutOptions, Ledger, Opened, SceneSource, SourceInfo, Split};
 use clift_train::config::SourceKind;
 use clift_train::scenes::{self, FirstScenes};
 use clift_train::{Config, read_config};
@@ -21,9 +21,9 @@ const MAX_SYNTHETIC: usize = 1000;
 
 /// Prints what a folder or a config holds.
 pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
-    let report = if args.path.is_dir() {
+    let report = if args.path.is_dir() || args.path.extension().is_some_and(|ending| ending == "json") {
         if !args.set.is_empty() {
-            return Err(WrongUsage(format!("--set changes a config, but {} is a folder", args.path.display())).into());
+            return Err(WrongUsage(format!("--set changes a config, but {} is none", args.path.display())).into());
         }
         of_folder(&args.path)?
     } else {
@@ -46,25 +46,31 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
 }
 
 fn of_folder(root: &Path) -> anyhow::Result<Report> {
-    let mut splits = BTreeMap::new();
-    for split in [Split::Train, Split::Test] {
-        if root.join(split.to_string()).join("index.json").exists() {
-            let opened = ChunkSource::open(root, split, &SceneFilters::default());
-            let described = opened.and_then(|source| describe(&source, source.ledger()));
-            splits.insert(split.to_string(), or_error(described));
+    let mut report = Report { path: root.to_owned(), ..Report::default() };
+    let splits = [Split::Train, Split::Test];
+    let there: Vec<Split> = splits.into_iter().filter(|split| root.join(split.to_string()).is_dir()).collect();
+    for split in if there.is_empty() { vec![Split::Test] } else { there } {
+        let opened = match Opened::open(root, split, &LayoutOptions::default()) {
+            Ok(opened) => opened,
+            Err(error @ DataError::UnknownLayout { .. }) => return Err(error.into()),
+            Err(error) => {
+                report.splits.insert(split.to_string(), or_error(Err(error)));
+                continue;
+            }
+        };
+        let name = if opened.has_splits { split.to_string() } else { "all".into() };
+        report.layout = Some(opened.layout);
+        report.splits.insert(name, or_error(describe(opened.source.as_ref(), &opened.ledger)));
+        if !opened.has_splits {
+            break;
         }
     }
-    if splits.is_empty() {
-        let inside = if root.join("index.json").exists() { "; give the folder above it" } else { "" };
-        let message = format!("{} holds neither train/index.json nor test/index.json{inside}", root.display());
-        return Err(WrongUsage(message).into());
-    }
-    Ok(Report { path: root.to_owned(), splits, evaluation: None, num_tokens: None })
+    Ok(report)
 }
 
 fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
     let data = &config.data;
-    let mut report = Report { path: path.to_owned(), splits: BTreeMap::new(), evaluation: None, num_tokens: None };
+    let mut report = Report { path: path.to_owned(), ..Report::default() };
     for split in [Split::Train, Split::Test] {
         let described = scenes::open(data, split).and_then(|(source, ledger)| {
             if split == Split::Test {
@@ -72,7 +78,7 @@ fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
             }
             let source: Arc<dyn SceneSource> = match data.source {
                 SourceKind::Synthetic => Arc::new(FirstScenes::of(source, MAX_SYNTHETIC)),
-                SourceKind::Chunks => source,
+                _ => source,
             };
             let mut described = describe(source.as_ref(), &ledger)?;
             if split == Split::Train {
@@ -93,6 +99,8 @@ fn describe(source: &dyn SceneSource, ledger: &Ledger) -> Result<SplitReport, cl
         num_scenes: ledger.num_scenes,
         num_used: ledger.num_used(),
         skipped: counts(ledger),
+        frames: ledger.frames.clone(),
+        notes: ledger.notes.clone(),
         num_described: source.num_scenes(),
         info: Some(SourceInfo::read(source)?),
         views: None,
@@ -145,7 +153,8 @@ mod tests {
     #[test]
     fn a_folder_is_described_split_by_split() {
         let text = of_folder(&fixtures()).unwrap().to_string();
-        let expected = "train             2 scenes
+        let expected = "layout            chunks
+train             2 scenes
   frames          8 / 8 / 8 (smallest / median / largest)
   picture         64x36
   field of view   58.1 / 58.1 / 58.1 deg
@@ -175,9 +184,26 @@ test              1 scene
     }
 
     #[test]
-    fn a_folder_without_chunks_or_inside_a_split_says_so() {
-        let message = |path: &Path| of_folder(path).unwrap_err().to_string();
-        assert!(message(Path::new(env!("CARGO_MANIFEST_DIR"))).contains("holds neither train/index.json"));
-        assert!(message(&fixtures().join("train")).ends_with("give the folder above it"));
+    fn a_folder_without_scenes_says_what_was_looked_for_and_one_inside_a_split_is_described() {
+        let error = of_folder(Path::new(env!("CARGO_MANIFEST_DIR"))).unwrap_err();
+        assert!(error.to_string().starts_with("no scenes found: looked for index.json with chunks, "), "{error}");
+        assert_eq!(crate::exit_code(&error), crate::WRONG_USAGE);
+        let text = of_folder(&fixtures().join("train")).unwrap().to_string();
+        assert!(text.starts_with("layout            chunks\nall               2 scenes\n"), "{text}");
+    }
+
+    #[test]
+    fn frames_without_a_picture_are_listed_scene_by_scene() {
+        let mut split = SplitReport { num_scenes: 1, num_used: 1, num_described: 1, ..SplitReport::default() };
+        let mut ledger = Ledger::new(1);
+        ["0005.jpg", "0016.jpg"].into_iter().for_each(|name| ledger.skip_frame("fox", name, "without a picture"));
+        (split.frames, split.notes) = (ledger.frames, vec!["both halves are the same scenes".into()]);
+        let splits = BTreeMap::from([("all".into(), split)]);
+        let text = Report { layout: Some(clift_data::Layout::Captures), splits, ..Report::default() }.to_string();
+        let expected = "layout            captures
+all               1 scene
+  left out        of fox 2 frames without a picture: 0005.jpg, 0016.jpg
+  note            both halves are the same scenes";
+        assert_eq!(text, expected);
     }
 }

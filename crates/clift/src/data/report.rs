@@ -4,17 +4,24 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
-use clift_data::SourceInfo;
+use clift_data::{FrameSkip, Layout, SourceInfo};
 use serde::Serialize;
 
 use super::text::count;
 
+/// Scenes whose frames are named; JSON has all.
+const MAX_SCENES_NAMED: usize = 20;
+/// Frames that are named of one scene.
+const MAX_FRAMES_NAMED: usize = 50;
+
 /// What is told about a folder or a config.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Default, Serialize)]
 pub struct Report {
     /// What was looked at.
     pub path: PathBuf,
-    /// By name.
+    /// How the scenes lie on disk; for a folder.
+    pub layout: Option<Layout>,
+    /// By name; `all` for a folder without `train/` and `test/`.
     pub splits: BTreeMap<String, SplitReport>,
     /// Scenes that are evaluated, or why there are none; for a config.
     pub evaluation: Option<EvaluationReport>,
@@ -33,6 +40,10 @@ pub struct SplitReport {
     pub num_used: usize,
     /// Scenes the filters leave out, by reason.
     pub skipped: BTreeMap<String, usize>,
+    /// Frames left out of scenes.
+    pub frames: Vec<FrameSkip>,
+    /// What else is to be known.
+    pub notes: Vec<String>,
     /// Scenes that `info` describes: the first of many synthetic ones, otherwise all that are used.
     pub num_described: usize,
     /// Their description.
@@ -57,8 +68,12 @@ pub struct EvaluationReport {
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut rows: Vec<(&str, String)> = Vec::new();
-        for name in ["train", "test"] {
-            match self.splits.get(name) {
+        if let Some(layout) = self.layout {
+            rows.push(("layout", layout.to_string()));
+        }
+        let names = if self.splits.contains_key("all") { &["all"][..] } else { &["train", "test"] };
+        for name in names {
+            match self.splits.get(*name) {
                 None => rows.push((name, "not there".into())),
                 Some(split) => split.rows(name, &mut rows),
             }
@@ -83,6 +98,23 @@ fn left_out(skipped: &BTreeMap<String, usize>, rows: &mut Vec<(&str, String)>) {
     rows.extend(skipped.iter().map(|(reason, count)| ("  left out", format!("{count} {reason}"))));
 }
 
+/// Names the frames that are left out, scene by scene and reason by reason.
+fn frames_left_out(frames: &[FrameSkip], rows: &mut Vec<(&str, String)>) {
+    let mut names: BTreeMap<(&str, &str), Vec<&str>> = BTreeMap::new();
+    for FrameSkip { key, frame, reason } in frames {
+        names.entry((key, reason)).or_default().push(frame);
+    }
+    let num_groups = names.len();
+    for ((key, reason), names) in names.into_iter().take(MAX_SCENES_NAMED) {
+        let more = if names.len() > MAX_FRAMES_NAMED { ", .." } else { "" };
+        let shown = names[..names.len().min(MAX_FRAMES_NAMED)].join(", ");
+        rows.push(("  left out", format!("of {key} {} {reason}: {shown}{more}", count(names.len(), "frame"))));
+    }
+    if num_groups > MAX_SCENES_NAMED {
+        rows.push(("  left out", format!("frames of {} more scenes", num_groups - MAX_SCENES_NAMED)));
+    }
+}
+
 impl SplitReport {
     fn rows<'a>(&self, name: &'a str, rows: &mut Vec<(&'a str, String)>) {
         if let Some(error) = &self.error {
@@ -94,6 +126,8 @@ impl SplitReport {
         let first = if self.num_described < self.num_used { first.as_str() } else { "" };
         rows.push((name, format!("{used}{}{first}", count(self.num_scenes, "scene"))));
         left_out(&self.skipped, rows);
+        frames_left_out(&self.frames, rows);
+        rows.extend(self.notes.iter().map(|note| ("  note", note.clone())));
         let Some(info) = &self.info else { return };
         if let Some(frames) = info.num_frames {
             rows.push(("  frames", format!("{frames} (smallest / median / largest)")));

@@ -1,0 +1,184 @@
+//! What own captures say, leave out and do in their own way.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use clift_data::image::{decode, encode_png};
+use clift_data::{
+    FileOptions, Frame, IntrinsicsNorm, LayoutOptions, Ledger, Lens, SceneSource, Split, Undistortion, open_layout,
+};
+use serde_json::{Value, json};
+
+use crate::files::{copy_folder, fixtures};
+
+const SIZE: [usize; 2] = [24, 16];
+
+/// A picture of one colour per number.
+fn png(number: u8) -> Vec<u8> {
+    let [width, height] = SIZE;
+    let rgb = (0..width * height * 3).map(|i| number.wrapping_mul(31).wrapping_add((i / 5) as u8)).collect();
+    encode_png(&Frame { width, height, rgb }).unwrap()
+}
+
+/// A camera-to-world matrix at `(x, 0, 0)`, as rows.
+fn at(x: f64) -> Value {
+    json!([[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+}
+
+/// A capture with these files and this `transforms.json`.
+struct Capture(tempfile::TempDir);
+
+impl Capture {
+    fn new(pictures: &[&str], transforms: &Value) -> Self {
+        let root = tempfile::tempdir().unwrap();
+        for (number, name) in pictures.iter().enumerate() {
+            let path = root.path().join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, png(number as u8)).unwrap();
+        }
+        fs::write(root.path().join("transforms.json"), transforms.to_string()).unwrap();
+        Self(root)
+    }
+
+    fn open(&self) -> Result<(Arc<dyn SceneSource>, Ledger), String> {
+        open_layout(self.0.path(), Split::Test, &LayoutOptions::default()).map_err(|error| error.to_string())
+    }
+
+    /// Which of the pictures each frame is, and where its camera stands.
+    fn frames(&self) -> Vec<(u8, f64)> {
+        let (source, _) = self.open().unwrap();
+        let cameras = source.cameras(0).unwrap();
+        let number = |frame| (0..9).find(|number| source.encoded_frame(0, frame).unwrap().unwrap() == png(*number));
+        (0..cameras.len()).map(|frame| (number(frame).unwrap(), cameras[frame].c2w.translation[0])).collect()
+    }
+}
+
+fn frame(name: &str, x: f64) -> Value {
+    json!({"file_path": name, "transform_matrix": at(x)})
+}
+
+#[test]
+fn frames_are_in_the_order_people_count_in_and_joined_to_cameras_by_name() {
+    let frames = [frame("images/10.png", 10.0), frame("images/9.png", 9.0), frame("images/1.png", 1.0)];
+    let capture =
+        Capture::new(&["images/1.png", "images/10.png", "images/9.png"], &json!({"fl_x": 20, "frames": frames}));
+    assert_eq!(capture.frames(), [(0, 1.0), (2, 9.0), (1, 10.0)]);
+}
+
+#[test]
+fn angles_and_the_pictures_own_size_stand_in_for_what_is_missing() {
+    let angle = 2.0 * (0.5_f64 / 0.8).atan();
+    let capture = Capture::new(&["r_0.png"], &json!({"camera_angle_x": angle, "frames": [frame("./r_0", 0.0)]}));
+    let k = capture.open().unwrap().0.cameras(0).unwrap()[0].intrinsics_norm;
+    // Square pixels: fy in pixels is fx.
+    for (got, expected) in [(k.fx, 0.8), (k.fy, 0.8 * 24.0 / 16.0), (k.cx, 0.5), (k.cy, 0.5)] {
+        assert!((got - expected).abs() < 1e-12, "{k:?}");
+    }
+}
+
+#[test]
+fn a_frame_overrules_what_stands_at_the_top_and_sizes_scale_with_the_pictures() {
+    let mut own = frame("images/b.png", 1.0);
+    for (key, value) in [("fl_x", 30.0), ("w", 48.0), ("h", 32.0), ("cx", 12.0)] {
+        own[key] = value.into();
+    }
+    let top = json!({"fl_x": 120, "fl_y": 90, "cx": 60, "cy": 36, "w": 120, "h": 80,
+                     "frames": [frame("images/a.png", 0.0), own]});
+    let capture = Capture::new(&["images/a.png", "images/b.png"], &top);
+    let cameras = capture.open().unwrap().0.cameras(0).unwrap();
+    let [a, b] = [0, 1].map(|frame: usize| cameras[frame].intrinsics_norm);
+    assert_eq!([a.fx, a.fy, a.cx, a.cy], [1.0, 1.125, 0.5, 0.45]);
+    // A focal length of its own is for both axes, and not mixed with another's fl_y.
+    assert_eq!([b.fx, b.fy, b.cx, b.cy], [0.625, 0.9375, 0.25, 1.125]);
+}
+
+#[test]
+fn pictures_are_found_in_smaller_copies_and_by_paths_of_another_computer() {
+    let transforms = |name: &str| json!({"fl_x": 20, "frames": [frame(name, 2.0)]});
+    for (file, named) in [
+        ("images_4/a.png", "images/a.png"),
+        ("images/a.png", "/home/somebody/attic/images/a.png"),
+        ("images/a.png", "images\\a.png"),
+        ("images/a.PNG", "./images/a.jpg"),
+        ("a.png", "a.png"),
+    ] {
+        assert_eq!(Capture::new(&[file], &transforms(named)).frames(), [(0, 2.0)], "{file} for {named}");
+    }
+    let message = Capture::new(&["images/b.png"], &transforms("images/a.png")).open().err().unwrap();
+    assert!(message.contains("none of its 1 frames has a picture, the first being images/a.png"), "{message}");
+}
+
+#[test]
+fn a_picture_that_two_frames_name_is_used_once() {
+    let frames = [frame("images/a.png", 0.0), frame("images/a", 1.0), frame("images/b.png", 2.0)];
+    let capture = Capture::new(&["images/a.png", "images/b.png"], &json!({"fl_x": 20, "frames": frames}));
+    assert_eq!(capture.open().unwrap().0.num_frames(0).unwrap(), 2);
+    let ledger = capture.open().unwrap().1;
+    assert_eq!(ledger.frames[0].reason, "whose picture another frame has");
+    assert_eq!(ledger.frames.len(), 1);
+}
+
+/// A copy of COLMAP's fixture whose camera has another model, and its first picture as it is on disk.
+fn colmap(model: &str) -> (tempfile::TempDir, Frame) {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&fixtures().join("layouts/colmap_txt"), root.path());
+    let path = root.path().join("attic/sparse/0/cameras.txt");
+    let text = fs::read_to_string(&path).unwrap();
+    let line = text.lines().find(|line| line.starts_with('7')).unwrap();
+    fs::write(&path, text.replace(line, &format!("7 {model}"))).unwrap();
+    let file = fs::read(root.path().join("attic/images/left/frame 8.png")).unwrap();
+    (root, decode(&file, "", 0).unwrap())
+}
+
+fn open(root: &Path, undistort: Option<bool>) -> Arc<dyn SceneSource> {
+    let files = FileOptions { undistort, ..FileOptions::default() };
+    open_layout(root, Split::Test, &LayoutOptions { files, ..LayoutOptions::default() }).unwrap().0
+}
+
+#[test]
+fn every_model_of_colmap_is_read_and_its_lens_undone_unless_it_is_to_be_ignored() {
+    // In pixels of twice the picture: cameras scale.
+    let norm = |fx: f64, fy: f64| IntrinsicsNorm { fx: fx / 64.0, fy: fy / 36.0, cx: 31.0 / 64.0, cy: 19.0 / 36.0 };
+    for (line, fx, fy, radial, tangential) in [
+        ("SIMPLE_PINHOLE 64 36 56 31 19", 56.0, 56.0, [0.0; 2], [0.0; 2]),
+        ("PINHOLE 64 36 56 57 31 19", 56.0, 57.0, [0.0; 2], [0.0; 2]),
+        ("SIMPLE_RADIAL 64 36 56 31 19 0.1", 56.0, 56.0, [0.1, 0.0], [0.0; 2]),
+        ("RADIAL 64 36 56 31 19 0.1 -0.03", 56.0, 56.0, [0.1, -0.03], [0.0; 2]),
+        ("OPENCV 64 36 56 57 31 19 0.1 -0.03 0.002 -0.001", 56.0, 57.0, [0.1, -0.03], [0.002, -0.001]),
+    ] {
+        let (root, picture) = colmap(line);
+        let (norm, lens) = (norm(fx, fy), Lens { radial: [radial[0], radial[1], 0.0], tangential });
+        let ignored = open(root.path(), Some(false));
+        assert_eq!(ignored.cameras(0).unwrap()[0].intrinsics_norm, norm, "{line}");
+        assert_eq!(ignored.frame(0, 0).unwrap(), picture, "{line}");
+        let source = open(root.path(), None);
+        if lens.is_pinhole() {
+            assert_eq!(source.frame(0, 0).unwrap(), picture, "{line}");
+            continue;
+        }
+        let undistortion = Undistortion::new(norm, lens).unwrap();
+        assert_eq!(source.cameras(0).unwrap()[0].intrinsics_norm, undistortion.intrinsics_norm(), "{line}");
+        assert_eq!(source.frame(0, 0).unwrap(), undistortion.apply(&picture), "{line}");
+        assert_ne!(source.frame(0, 0).unwrap(), picture, "{line}");
+        assert_eq!(source.encoded_frame(0, 0).unwrap(), None, "no file holds the resampled picture");
+    }
+}
+
+#[test]
+fn other_models_are_noted_and_pictures_are_found_from_any_place_of_the_model() {
+    let (root, picture) = colmap("PINHOLE 64 36 56 57 31 19");
+    let scene = root.path().join("attic");
+    copy_folder(&scene.join("sparse/0"), &scene.join("sparse/1"));
+    let (_, ledger) = open_layout(root.path(), Split::Test, &LayoutOptions::default()).unwrap();
+    assert!(ledger.notes[0].ends_with("sparse/0 has 1 more models, which are not used: only model 0 is"), "{ledger}");
+    let models: [(&str, PathBuf); 3] =
+        [("colmap/sparse/0", "images".into()), ("dense/sparse", "dense/images".into()), ("sparse", "images_4".into())];
+    for (model, images) in models {
+        let other = tempfile::tempdir().unwrap();
+        copy_folder(&scene.join("sparse/0"), &other.path().join("attic").join(model));
+        copy_folder(&scene.join("images"), &other.path().join("attic").join(images));
+        let source = open(other.path(), None);
+        assert_eq!((source.key(0), source.frame(0, 0).unwrap()), ("attic", picture.clone()), "{model}");
+    }
+}

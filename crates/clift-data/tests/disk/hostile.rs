@@ -1,0 +1,297 @@
+//! Broken and hostile scenes: an error that says what is wrong where, no panic, bounded time and memory.
+
+use std::fs;
+use std::path::Path;
+
+use crate::files::{copy_folder, fixtures};
+use clift_data::{LayoutOptions, Split, open_layout};
+use proptest::prelude::*;
+
+/// Opens a scene and reads all of it; the first error as text.
+fn read(root: &Path) -> Result<usize, String> {
+    let text = |error: clift_data::DataError| error.to_string();
+    let (source, _) = open_layout(root, Split::Test, &LayoutOptions::default()).map_err(text)?;
+    for scene in 0..source.num_scenes() {
+        for frame in 0..source.cameras(scene).map_err(text)?.len() {
+            source.frame(scene, frame).map_err(text)?;
+        }
+    }
+    Ok(source.num_scenes())
+}
+
+/// A copy of a fixture in which `file` is `change`d.
+fn changed(layout: &str, file: &str, change: impl FnOnce(Vec<u8>) -> Vec<u8>) -> Result<usize, String> {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&fixtures().join("layouts").join(layout), root.path());
+    let path = root.path().join(file);
+    fs::write(&path, change(fs::read(&path).unwrap())).unwrap();
+    read(root.path())
+}
+
+fn replaced(layout: &str, file: &str, from: &str, to: &str) -> String {
+    let change = |bytes: Vec<u8>| {
+        let text = String::from_utf8(bytes).unwrap();
+        assert!(text.contains(from), "{from}");
+        text.replacen(from, to, 1).into_bytes()
+    };
+    changed(layout, file, change).expect_err(to)
+}
+
+const JSON: &str = "attic/transforms.json";
+
+#[test]
+fn what_is_wrong_with_a_transforms_json_is_said() {
+    for (from, to, expected) in [
+        ("\"frames\"", "\"pictures\"", "missing field `frames`"),
+        ("\"transform_matrix\"", "\"matrix\"", "missing field `transform_matrix`"),
+        ("\"file_path\": \"./images/8\"", "\"file_path\": 8", "invalid type: integer `8`, expected a string"),
+        ("\"fl_x\": 28.0, ", "", "frame ./images/12: neither"),
+        ("\"fl_x\": 28.0", "\"fl_x\": -28.0", "fx is -0.875, expected a positive number"),
+        ("\"fl_x\": 28.0", "\"fl_x\": NaN", "(a number is NaN or infinite)"),
+        ("\"fl_x\": 28.0", "\"fl_x\": 1e999", "number out of range"),
+        ("\"fl_x\": 28.0", "\"fl_x\": \"28\"", "invalid type: string \"28\", expected f64"),
+        ("\"w\": 32", "\"w\": 0", "w is 0, expected a number of pixels"),
+        ("\"OPENCV\"", "\"OPENCV_FISHEYE\"", "camera_model is OPENCV_FISHEYE, expected one of PINHOLE, "),
+        ("\"fl_x\"", "\"is_fisheye\": true, \"fl_x\"", "camera_model is OPENCV_FISHEYE"),
+        ("\"fl_x\"", "\"k4\": 0.1, \"fl_x\"", "k4 is 0.1: only lenses of"),
+        ("\"fl_x\"", "\"k1\": -9.5, \"fl_x\"", "cannot be undone at the edge of the picture"),
+        ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 1.0, 1.0]", "transform_matrix ends in [0.0, 0.0, 1.0, 1.0]"),
+        ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]", "a list of more than 4 items"),
+        ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0]", "invalid length 3"),
+    ] {
+        // The last of frame 12's intrinsics replaced alone would leave fl_y to stand for both.
+        let message = if to.is_empty() {
+            let change = |bytes: Vec<u8>| {
+                let text = String::from_utf8(bytes).unwrap();
+                text.replace("\"fl_x\": 28.0, ", "").replace("\"fl_y\": 28.125, ", "").into_bytes()
+            };
+            changed("capture", JSON, change).unwrap_err()
+        } else {
+            replaced("capture", JSON, from, to)
+        };
+        let expected = if to.is_empty() { "neither fl_x nor camera_angle_x is given" } else { expected };
+        assert!(message.contains(expected), "{to}: {message}");
+        assert!(message.starts_with("bad scene: ") && message.ends_with("transforms.json"), "{message}");
+    }
+    let cut = changed("capture", JSON, |bytes| bytes[..bytes.len() / 2].to_vec()).unwrap_err();
+    assert!(cut.contains("EOF while parsing"), "{cut}");
+}
+
+#[test]
+fn a_rotation_that_is_none_is_refused_by_name() {
+    let change = |bytes: Vec<u8>| {
+        let mut json: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
+        json["frames"][0]["transform_matrix"][0][0] = 3.0.into();
+        serde_json::to_vec(&json).unwrap()
+    };
+    let message = changed("capture", JSON, change).unwrap_err();
+    assert!(message.contains("frame ./images/12: bad camera: the rotation is off an orthonormal one by"), "{message}");
+}
+
+#[test]
+fn a_turned_picture_is_left_out_for_its_shape() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&fixtures().join("layouts/capture"), root.path());
+    let picture = clift_data::Frame { width: 18, height: 32, rgb: vec![9; 18 * 32 * 3] };
+    let png = clift_data::image::encode_png(&picture).unwrap();
+    fs::write(root.path().join("attic/images/10.png"), &png).unwrap();
+    fs::write(root.path().join("attic/images/11.png"), "no picture").unwrap();
+    let (source, ledger) = open_layout(root.path(), Split::Test, &LayoutOptions::default()).unwrap();
+    assert_eq!(source.num_frames(0).unwrap(), 4);
+    let left_out: Vec<_> = ledger.frames.iter().map(|skip| (skip.frame.as_str(), skip.reason.as_str())).collect();
+    let expected = [
+        ("./images/99", "without a picture"),
+        ("10.png", "whose picture has another shape than its camera"),
+        ("11.png", "whose picture cannot be read"),
+    ];
+    assert_eq!(left_out, expected);
+    // Cameras and pictures stay together: frame 2 is now 12.png.
+    assert_eq!(source.frame(0, 2).unwrap().width, 32);
+    assert!((source.cameras(0).unwrap()[2].c2w.translation[0] - 1.8).abs() < 1e-9);
+    for frame in 8..14 {
+        fs::write(root.path().join(format!("attic/images/{frame}.png")), &png).unwrap();
+    }
+    let message = read(root.path()).unwrap_err();
+    assert!(message.contains("it may have been turned or cropped after the cameras were found"), "{message}");
+}
+
+const BINARY: [&str; 2] = ["attic/sparse/0/cameras.bin", "attic/sparse/0/images.bin"];
+const TEXT: [&str; 2] = ["attic/sparse/0/cameras.txt", "attic/sparse/0/images.txt"];
+
+#[test]
+fn a_truncated_model_or_one_with_huge_counts_is_refused_without_taking_memory() {
+    for file in BINARY {
+        let count = |count: u64| {
+            let change = |mut bytes: Vec<u8>| {
+                bytes[..8].copy_from_slice(&count.to_le_bytes());
+                bytes
+            };
+            changed("colmap_bin", file, change)
+        };
+        for number in [7, u64::from(u32::MAX), u64::MAX] {
+            let message = count(number).unwrap_err();
+            assert!(message.contains("lies behind the end of the file") && message.ends_with(".bin"), "{message}");
+        }
+        for length in [0, 7, 9, 40, 100] {
+            let message = changed("colmap_bin", file, |bytes| bytes[..length.min(bytes.len() - 1)].to_vec());
+            assert!(message.unwrap_err().contains("it is truncated"), "{file} of {length} bytes");
+        }
+    }
+    // The count of points of the first image, after its name.
+    let points = |count: u64| {
+        let change = |mut bytes: Vec<u8>| {
+            let at = 8 + 4 + 56 + 4 + "left/frame 8.png".len() + 1;
+            bytes[at..at + 8].copy_from_slice(&count.to_le_bytes());
+            bytes
+        };
+        changed("colmap_bin", BINARY[1], change).unwrap_err()
+    };
+    for count in [1 << 20, 1 << 60, u64::MAX / 24, u64::MAX] {
+        assert!(points(count).contains("lies behind the end of the file"), "{count}");
+    }
+    let unending = |bytes: Vec<u8>| [&bytes[..8 + 64], &[b'x'; 10_000]].concat();
+    assert!(changed("colmap_bin", BINARY[1], unending).unwrap_err().contains("is longer than 4096 bytes"));
+}
+
+#[test]
+fn what_is_wrong_with_a_model_is_said() {
+    let model = |id: i32| {
+        let change = |mut bytes: Vec<u8>| {
+            bytes[12..16].copy_from_slice(&id.to_le_bytes());
+            bytes
+        };
+        changed("colmap_bin", BINARY[0], change).unwrap_err()
+    };
+    assert!(model(99).contains("camera 0 of 1 has the unknown model 99"), "{}", model(99));
+    assert!(model(-1).contains("unknown model -1"), "{}", model(-1));
+    assert!(model(5).contains("truncated"), "more parameters than there are: {}", model(5));
+    for (file, from, to, expected) in [
+        (0, "7 PINHOLE", "7 FULL_OPENCV", "camera 7: FULL_OPENCV has 4 parameters, expected 12"),
+        (0, "7 PINHOLE", "7 FISH", "camera 7: the model is FISH, expected SIMPLE_PINHOLE"),
+        (0, "PINHOLE 32", "PINHOLE -32", "line 4: WIDTH is \"-32\", expected a number"),
+        (0, "PINHOLE 32 18", "PINHOLE 32 0", "camera 7: it is 32x0 pixels"),
+        (0, "32 18 28", "32 18 nan", "camera 7: bad camera: fx is NaN"),
+        (0, "7 PINHOLE", "8 PINHOLE", "there is no camera 7"),
+        (1, "40 0.9833474432563557", "40 nan", "the pose holds NaN"),
+        (1, "40 0.98", "40 7.98", "the quaternion has length 7.98"),
+        (1, "7 left/frame 8.png", "7", "the NAME has 0 bytes"),
+        (1, "7 left/frame 8.png\n\n", "7 left/frame 8.png\n", "expected the points of the image above"),
+        (1, "\n3.5 0 -1", "\n3.5 zero -1", "expected the points of the image above"),
+    ] {
+        let message = replaced("colmap_txt", TEXT[file], from, to);
+        assert!(message.contains(expected) && message.ends_with(".txt"), "{to}: {message}");
+    }
+    let long = |bytes: Vec<u8>| [b"x".repeat(1 << 20).as_slice(), b"\n", &bytes].concat();
+    assert!(changed("colmap_txt", TEXT[0], long).unwrap_err().contains("line 1: the line is too long"));
+}
+
+#[test]
+fn a_long_line_of_points_is_passed_over() {
+    let change = |bytes: Vec<u8>| {
+        let text = String::from_utf8(bytes).unwrap();
+        text.replacen("\n3.5 0 -1", &format!("\n{}", "3.5 0.25 -1 ".repeat(200_000)), 1).into_bytes()
+    };
+    assert_eq!(changed("colmap_txt", TEXT[1], change), Ok(1));
+}
+
+#[test]
+fn what_is_wrong_with_real_estate_10k_text_is_said_with_the_line() {
+    let key = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
+    let file = format!("test/{key}.txt");
+    for (from, to, expected) in [
+        ("\n1033367 0.875000000", "\n1033367", "line 3: expected 19 columns, got 18"),
+        ("\n1033367 0.875000000", "\n1033367 0.875000000 7", "line 3: expected 19 columns, got more"),
+        ("\n1033367 0.875000000", "\n1033367 NaN", "line 3: bad camera: fx is NaN"),
+        ("\n1033367 0.875000000", "\n1033367 wide", "line 3: \"wide\" is no number"),
+        ("\n1033367 ", "\n1033367.5 ", "line 3: the time stamp is \"1033367.5\""),
+        ("\n1033367 ", "\n1000000 ", "line 3: the time stamp 1000000 does not come after the one above"),
+    ] {
+        let message = replaced("re10k_txt", &file, from, to);
+        assert!(message.contains(expected) && message.ends_with(".txt"), "{to}: {message}");
+    }
+}
+
+#[test]
+fn a_list_of_millions_of_frames_is_refused_at_its_limit() {
+    let frame = r#"{"file_path":"a","transform_matrix":[]},"#;
+    let change = |_| format!("{{\"frames\":[{}]}}", frame.repeat(200_000).trim_end_matches(',')).into_bytes();
+    let message = changed("capture", JSON, change).unwrap_err();
+    assert!(message.contains("a list of more than 100000 items"), "{message}");
+    let deep = |_| format!("{{\"frames\":{}", "[".repeat(1 << 20)).into_bytes();
+    assert!(changed("capture", JSON, deep).unwrap_err().starts_with("bad scene: "));
+    let ignored = |_| format!("{{\"x\":{}", "[".repeat(1 << 20)).into_bytes();
+    assert!(changed("capture", JSON, ignored).unwrap_err().contains("EOF while parsing"));
+}
+
+#[test]
+fn a_file_that_is_too_large_is_refused_before_it_is_read() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&fixtures().join("layouts/capture"), root.path());
+    let file = fs::OpenOptions::new().write(true).open(root.path().join(JSON)).unwrap();
+    file.set_len(1 << 40).unwrap(); // sparse: takes no room
+    let message = read(root.path()).unwrap_err();
+    assert!(message.contains("bytes, more than the limit of 134217728"), "{message}");
+}
+
+#[cfg(unix)]
+#[test]
+fn links_in_a_circle_and_pipes_end() {
+    use std::os::unix::fs::symlink;
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&fixtures().join("layouts/capture"), root.path());
+    symlink(root.path(), root.path().join("up")).unwrap();
+    symlink(root.path().join("attic"), root.path().join("again")).unwrap();
+    symlink(root.path().join("loop"), root.path().join("loop")).unwrap();
+    symlink("..", root.path().join("attic/images/up")).unwrap();
+    assert_eq!(read(root.path()), Ok(1));
+    // A scene that is a device, and a picture that is one.
+    symlink("/dev/zero", root.path().join("attic/images/99.png")).unwrap();
+    let (source, ledger) = open_layout(root.path(), Split::Test, &LayoutOptions::default()).unwrap();
+    assert_eq!(source.num_frames(0).unwrap(), 6);
+    assert!(ledger.frames.iter().any(|skip| skip.reason == "whose picture cannot be read"), "{ledger}");
+}
+
+/// Every file with cameras, by its fixture.
+const FILES: [(&str, &str); 5] = [
+    ("capture", JSON),
+    ("colmap_bin", BINARY[0]),
+    ("colmap_bin", BINARY[1]),
+    ("colmap_txt", TEXT[0]),
+    ("colmap_txt", TEXT[1]),
+];
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(96))]
+
+    #[test]
+    fn cameras_with_bytes_changed_never_panic(
+        file in 0..FILES.len(),
+        changes in proptest::collection::vec((0.0..1.0, any::<u8>()), 1..6),
+        length in 0.0..2.0,
+    ) {
+        let (layout, file) = FILES[file];
+        let _ = changed(layout, file, |mut bytes| {
+            for (at, byte) in changes {
+                let at = (at * bytes.len() as f64) as usize;
+                bytes[at] = byte;
+            }
+            let length = (length * bytes.len() as f64) as usize; // cut in half of the cases
+            bytes.truncate(length);
+            bytes
+        });
+    }
+
+    #[test]
+    fn text_of_real_estate_10k_with_bytes_changed_never_panics(
+        changes in proptest::collection::vec((0.0..1.0, any::<u8>()), 1..6),
+    ) {
+        let key = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
+        let _ = changed("re10k_txt", &format!("test/{key}.txt"), |mut bytes| {
+            for (at, byte) in changes {
+                let at = (at * bytes.len() as f64) as usize;
+                bytes[at] = byte;
+            }
+            bytes
+        });
+    }
+}

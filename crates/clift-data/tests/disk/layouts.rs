@@ -1,0 +1,274 @@
+//! One scene in every layout, written by `scripts/make_layout_fixtures.py`.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::files::{copy_folder, fixtures};
+use clift_data::normalize::{PoseRotation, PoseScale};
+use clift_data::{
+    Clip, ClipOptions, ClipReader, FileOptions, Layout, LayoutOptions, Ledger, Opened, SceneFilters, SceneSource,
+    SourceInfo, Split, ViewIndices, open_layout,
+};
+
+const KEY: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
+
+/// Folder, split, layout and key of each.
+const LAYOUTS: [(&str, Split, Layout, &str); 10] = [
+    ("chunks", Split::Test, Layout::Chunks, KEY),
+    ("depthsplat", Split::Train, Layout::Chunks, "dl3dv_"),
+    ("scenes", Split::Test, Layout::Scenes, KEY),
+    ("re10k_txt", Split::Test, Layout::Re10kTxt, KEY),
+    ("re10k_folders", Split::Test, Layout::Re10kTxt, KEY),
+    ("dl3dv_flat", Split::Test, Layout::Dl3dv, KEY),
+    ("dl3dv", Split::Test, Layout::Dl3dv, KEY),
+    ("dl3dv_benchmark", Split::Test, Layout::Dl3dv, KEY),
+    ("capture", Split::Test, Layout::Captures, "attic"),
+    ("colmap_bin", Split::Test, Layout::Captures, "attic"),
+];
+
+fn layouts() -> PathBuf {
+    fixtures().join("layouts")
+}
+
+fn open(root: &Path, split: Split, layout: Layout) -> Opened {
+    let options = LayoutOptions { layout, ..LayoutOptions::default() };
+    Opened::open(root, split, &options).unwrap_or_else(|error| panic!("{}: {error}", root.display()))
+}
+
+fn clip(source: Arc<dyn SceneSource>) -> Clip {
+    let options = ClipOptions {
+        width: 16,
+        height: 16,
+        pose_rotation: PoseRotation::Quaternion,
+        pose_scale: PoseScale::Context,
+        exact_principal_point: true,
+    };
+    let views = ViewIndices { context: vec![0, 2, 5], target: vec![1, 3, 4] };
+    ClipReader { source, options }.read(0, &views).unwrap()
+}
+
+fn numbers(clip: &Clip) -> Vec<f64> {
+    let views = [&clip.context, &clip.target];
+    let poses = views.iter().flat_map(|views| views.c2w.iter().flat_map(|c2w| c2w.to_matrix_f64()));
+    let optics = views.iter().flat_map(|views| views.intrinsics.iter().flat_map(|k| [k.fx, k.fy, k.cx, k.cy]));
+    poses.chain(optics).collect()
+}
+
+#[test]
+fn all_layouts_of_a_scene_give_the_same_clip() {
+    let expected = clip(open(&layouts().join("chunks"), Split::Test, Layout::Auto).source);
+    let text_model = ("colmap_txt", Split::Test, Layout::Captures, "attic");
+    for (name, split, layout, key) in LAYOUTS.into_iter().chain([text_model]) {
+        for asked in [Layout::Auto, layout] {
+            let opened = open(&layouts().join(name), split, asked);
+            assert_eq!((opened.layout, opened.source.num_scenes()), (layout, 1), "{name}");
+            let source = opened.source;
+            assert!(source.key(0).starts_with(key), "{name}: {}", source.key(0));
+            let found = if key == "attic" { key } else { KEY };
+            assert_eq!((source.find(found), source.num_frames(0).unwrap()), (Some(0), 6), "{name}");
+            let clip = clip(source.clone());
+            assert_eq!(clip.context.images, expected.context.images, "{name}");
+            assert_eq!(clip.target.images, expected.target.images, "{name}");
+            for (got, expected) in numbers(&clip).into_iter().zip(numbers(&expected)) {
+                // Chunks hold f32 and RealEstate10K nine decimals; the path is two units long.
+                assert!((got - expected).abs() < 1e-5, "{name}: {got} against {expected}");
+            }
+            let file = source.encoded_frame(0, 3).unwrap().expect("the file of a frame");
+            assert_eq!(clift_data::image::decode(&file, "", 3).unwrap(), source.frame(0, 3).unwrap(), "{name}");
+        }
+    }
+}
+
+#[test]
+fn cameras_are_those_of_the_script_that_wrote_them() {
+    // What the script says of frame 3: 1.0 + 0.2 * 3, -0.5 + 0.03 * 9, 2.0 - 0.1 * 3.
+    for (name, split, ..) in LAYOUTS {
+        let source = open(&layouts().join(name), split, Layout::Auto).source;
+        let camera = source.cameras(0).unwrap()[3];
+        let k = camera.intrinsics_norm;
+        let expected = [1.6, -0.23, 1.7, 0.875, 1.5625, 0.515_625, 0.468_75];
+        let got = camera.c2w.translation.into_iter().chain([k.fx, k.fy, k.cx, k.cy]);
+        for (got, expected) in got.zip(expected) {
+            assert!((got - expected).abs() < 1e-6, "{name}: {got} against {expected}"); // f32
+        }
+        assert!(source.frame(0, 6).is_err() && source.frame(1, 0).is_err() && source.cameras(1).is_err(), "{name}");
+    }
+}
+
+#[test]
+fn a_frame_without_a_picture_is_named_and_left_out_of_a_capture() {
+    let Opened { ledger, source, .. } = open(&layouts().join("capture"), Split::Test, Layout::Auto);
+    assert_eq!(source.num_frames(0).unwrap(), 6);
+    let expected = "1 of 1 scenes used; 1 frame without a picture (./images/99); no train/ and test/ folders and no \
+                    list of test scenes: both halves are the same scenes";
+    assert_eq!(ledger.to_string(), expected);
+}
+
+#[test]
+fn a_capture_may_be_given_as_a_folder_of_folders_a_folder_or_a_file() {
+    let capture = layouts().join("capture");
+    let expected = clip(open(&capture, Split::Test, Layout::Auto).source);
+    for part in ["attic", "attic/transforms.json"] {
+        let opened = open(&capture.join(part), Split::Train, Layout::Auto);
+        assert_eq!((opened.source.key(0), opened.layout), ("attic", Layout::Captures));
+        assert_eq!(clip(opened.source), expected, "{part}");
+    }
+    let model = open(&layouts().join("colmap_txt/attic"), Split::Test, Layout::Auto).source;
+    assert_eq!((model.key(0), model.num_scenes()), ("attic", 1));
+}
+
+/// DL3DV's fixture with frame 3 of one scene renamed, and that scene twice.
+fn two_scenes(root: &Path) -> [String; 2] {
+    let keys = [KEY.to_owned(), KEY.replace('d', "e")];
+    for key in &keys {
+        copy_folder(&layouts().join("dl3dv/1K").join(KEY), &root.join("2K").join(key));
+    }
+    let pictures = root.join("2K").join(&keys[1]).join("images_8");
+    std::fs::rename(pictures.join("frame_00004.png"), pictures.join("4.png")).unwrap();
+    keys
+}
+
+fn open_with(root: &Path, split: Split, files: FileOptions) -> (Arc<dyn SceneSource>, Ledger) {
+    open_layout(root, split, &LayoutOptions { files, ..LayoutOptions::default() }).unwrap()
+}
+
+#[test]
+fn a_scene_of_a_data_set_with_a_missing_picture_is_left_out_unless_it_is_asked_for() {
+    let root = tempfile::tempdir().unwrap();
+    let [whole, torn] = two_scenes(root.path());
+    let (source, ledger) = open_with(root.path(), Split::Test, FileOptions::default());
+    assert_eq!((source.num_scenes(), source.key(0)), (1, whole.as_str()));
+    assert_eq!(ledger.skips[0].reason, "with frames that have no picture");
+    assert_eq!((&ledger.frames[0].key, ledger.frames[0].frame.as_str()), (&torn, "images/frame_00004.png"));
+
+    let files = FileOptions { keep_incomplete: true, ..FileOptions::default() };
+    let (source, ledger) = open_with(root.path(), Split::Test, files);
+    let scene = source.find(&torn).unwrap();
+    assert_eq!((source.num_scenes(), source.num_frames(scene).unwrap()), (2, 5));
+    assert!(ledger.skips.is_empty() && ledger.frames.len() == 1);
+    // Joined by name: the frame after the gap has its own picture and camera.
+    let other = source.find(&whole).unwrap();
+    assert_eq!(source.frame(scene, 3).unwrap(), source.frame(other, 4).unwrap());
+    assert_eq!(source.cameras(scene).unwrap()[3], source.cameras(other).unwrap()[4]);
+}
+
+#[test]
+fn scenes_of_the_list_are_kept_out_of_training_and_missing_ones_are_counted() {
+    let root = tempfile::tempdir().unwrap();
+    let [train, test] = two_scenes(root.path());
+    let list = root.path().join("benchmark.json");
+    std::fs::write(&list, format!(r#"{{"{test}": null, "00": {{"context": [0], "target": [1]}}}}"#)).unwrap();
+    let files = || FileOptions { test_scenes: Some(list.clone()), keep_incomplete: true, ..FileOptions::default() };
+    let (source, ledger) = open_with(root.path(), Split::Train, files());
+    assert_eq!((source.num_scenes(), source.key(0)), (1, train.as_str()));
+    assert!(ledger.to_string().starts_with("1 of 2 scenes used; 1 kept for testing"), "{ledger}");
+    let (source, ledger) = open_with(root.path(), Split::Test, files());
+    assert_eq!((source.num_scenes(), source.key(0)), (1, test.as_str()));
+    assert!(ledger.to_string().starts_with("1 of 2 scenes used; 1 in the list of test scenes, but not"), "{ledger}");
+
+    // DepthSplat's training chunks prefix the keys.
+    std::fs::write(&list, format!("{KEY}\n")).unwrap();
+    let (source, ledger) = open_with(&layouts().join("depthsplat"), Split::Train, files());
+    assert_eq!((source.num_scenes(), ledger.to_string()), (0, "0 of 1 scenes used; 1 kept for testing".into()));
+}
+
+#[test]
+fn filters_and_sizes_leave_scenes_out_with_a_reason() {
+    let ledger = |filters: SceneFilters, min_size: [usize; 2]| {
+        let options = LayoutOptions { filters, min_size, ..LayoutOptions::default() };
+        let (source, ledger) = open_layout(&layouts().join("dl3dv"), Split::Test, &options).unwrap();
+        assert_eq!(source.num_scenes(), ledger.num_used());
+        ledger.skips.into_iter().map(|skip| skip.reason).collect::<Vec<_>>()
+    };
+    let none = SceneFilters::default;
+    assert_eq!(ledger(none(), [32, 18]), [] as [&str; 0]);
+    assert_eq!(ledger(none(), [32, 19]), ["with pictures smaller than 32x19"]);
+    assert_eq!(ledger(SceneFilters { min_frames: 7, ..none() }, [0, 0]), ["shorter than 7 frames"]);
+    let narrow = SceneFilters { max_fov_deg: Some(40.0), ..none() };
+    assert_eq!(ledger(narrow, [0, 0]), ["with a field of view above 40 degrees"]);
+}
+
+#[test]
+fn the_folder_of_pictures_may_be_chosen() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&layouts().join("dl3dv"), root.path());
+    let scene = root.path().join("1K").join(KEY);
+    copy_folder(&scene.join("images_8"), &scene.join("small"));
+    let chosen = |folder: &str| {
+        let files = FileOptions { image_folder: Some(folder.into()), ..FileOptions::default() };
+        open_layout(root.path(), Split::Test, &LayoutOptions { files, ..LayoutOptions::default() })
+    };
+    assert_eq!(chosen("small").unwrap().0.num_frames(0).unwrap(), 6);
+    let message = chosen("large").err().unwrap().to_string();
+    assert!(
+        message.contains("none of its 6 frames has a picture, the first being images/frame_00001.png"),
+        "{message}"
+    );
+    assert!(message.ends_with("transforms.json"), "{message}");
+}
+
+#[test]
+fn frames_of_real_estate_10k_are_found_where_the_user_says() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&layouts().join("re10k_txt/test"), &root.path().join("data/test"));
+    let elsewhere = root.path().join("extracted");
+    copy_folder(&layouts().join("re10k_txt/frames"), &elsewhere.join("test"));
+    let data = root.path().join("data");
+    let message = open_layout(&data, Split::Test, &LayoutOptions::default()).err().unwrap().to_string();
+    assert!(message.contains("none of its 6 frames has a picture, the first being 1000000"), "{message}");
+    let files = FileOptions { frames: Some(elsewhere), ..FileOptions::default() };
+    assert_eq!(open_with(&data, Split::Test, files).0.num_frames(0).unwrap(), 6);
+}
+
+#[test]
+fn files_of_scenes_are_opened_without_an_index_and_chunks_that_lost_theirs_too() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&layouts().join("scenes"), root.path());
+    let (source, ledger) = open_with(root.path(), Split::Test, FileOptions::default());
+    assert_eq!((source.key(0), ledger.to_string()), (KEY, "1 of 1 scenes used".into()));
+    std::fs::write(root.path().join("test/invalid_keys.txt"), KEY).unwrap();
+    let (source, ledger) = open_with(root.path(), Split::Test, FileOptions::default());
+    assert_eq!((source.num_scenes(), ledger.to_string()), (0, "0 of 1 scenes used; 1 in invalid_keys.txt".into()));
+
+    let chunks = tempfile::tempdir().unwrap();
+    copy_folder(&layouts().join("chunks"), chunks.path());
+    std::fs::remove_file(chunks.path().join("test/index.json")).unwrap();
+    std::fs::write(chunks.path().join("test/000001.torch"), "cut").unwrap();
+    let opened = open(chunks.path(), Split::Test, Layout::Auto);
+    assert_eq!((opened.source.key(0), opened.source.num_frames(0).unwrap()), (KEY, 6));
+    let ledger = opened.ledger.to_string();
+    assert!(ledger.starts_with("1 of 2 scenes used; 1 bad chunk: "), "{ledger}");
+    assert!(ledger.ends_with("there is no index.json: the scenes of 2 files were looked up"), "{ledger}");
+}
+
+#[test]
+fn scenes_of_one_name_are_told_apart_by_the_way_to_them() {
+    let root = tempfile::tempdir().unwrap();
+    for place in ["a/attic", "b/c/attic", "b/cellar"] {
+        copy_folder(&layouts().join("capture/attic"), &root.path().join(place));
+    }
+    let source = open(root.path(), Split::Test, Layout::Auto).source;
+    let keys: Vec<&str> = (0..source.num_scenes()).map(|scene| source.key(scene)).collect();
+    assert_eq!(keys, ["a/attic", "b/c/attic", "cellar"]);
+}
+
+#[test]
+fn halves_in_folders_of_their_own_are_told_from_a_shared_folder() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&layouts().join("capture"), &root.path().join("train"));
+    let opened = open(root.path(), Split::Train, Layout::Auto);
+    assert!(opened.has_splits && opened.ledger.notes.is_empty());
+    let error = open_layout(root.path(), Split::Test, &LayoutOptions::default()).err().unwrap();
+    assert!(error.to_string().starts_with("no scenes found: there is no folder test/ beside the other split: "));
+    assert!(!open(&root.path().join("train"), Split::Test, Layout::Auto).has_splits);
+}
+
+#[test]
+fn any_layout_is_described() {
+    for (name, split, ..) in LAYOUTS {
+        let info = SourceInfo::read(open(&layouts().join(name), split, Layout::Auto).source.as_ref()).unwrap();
+        assert_eq!((info.num_scenes, info.image_size), (1, Some([32, 18])), "{name}");
+        // atan(0.515625 / 0.875) + atan(0.484375 / 0.875), by hand
+        assert_eq!(format!("{:.1}", info.fov_deg.unwrap().max), "59.5", "{name}");
+    }
+}
