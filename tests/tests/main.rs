@@ -2,10 +2,19 @@
 
 mod bad_input;
 mod bench;
+#[cfg(unix)]
+mod crash;
+mod exact_resume;
+mod extend;
+#[cfg(unix)]
+mod failing_disk;
 mod hyperparameters;
 mod loss_curve;
+mod patchwise;
 mod pipeline;
 mod report;
 mod resume;
 mod scene_files;
+#[cfg(unix)]
+mod signals;
 mod support;

@@ -44,7 +44,10 @@ fn a_run_writes_every_documented_file() {
     assert!(lines[5]["lr"].as_f64().unwrap() < 1e-18, "{}", lines[5]);
 
     let summary = place.json("run/eval/summary.json");
-    assert_eq!(keys(&summary), ["baselines", "num_scenes", "num_skipped", "num_views", "points"]);
+    assert_eq!(
+        keys(&summary),
+        ["adaptive", "baselines", "differences", "num_scenes", "num_skipped", "num_views", "points"]
+    );
     assert_eq!(
         (&summary["num_scenes"], &summary["num_views"], &summary["num_skipped"]),
         (&3.into(), &6.into(), &0.into())

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use tempfile::TempDir;
@@ -61,13 +62,43 @@ pub fn clift<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Ra
 
 /// Starts the command line.
 pub fn spawn<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Child {
-    Command::new(env!("CARGO_BIN_EXE_clift-under-test"))
-        .args(args)
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .expect("the binary under test starts")
+    start(Command::new(BINARY).args(args))
+}
+
+/// The command line as a program.
+pub const BINARY: &str = env!("CARGO_BIN_EXE_clift-under-test");
+
+/// Starts a command that [`finish`] waits for.
+pub fn start(command: &mut Command) -> Child {
+    let piped = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    piped.spawn().expect("the binary under test starts")
+}
+
+/// Runs a training that kills itself at `moment` (see `clift-killed`), and expects that it did.
+pub fn killed_at(moment: &str, args: &[String]) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_clift-killed"));
+    let ran = finish(start(command.arg(moment).args(args)));
+    assert_eq!(ran.code, None, "{moment}: stdout:\n{}\nstderr:\n{}", ran.stdout, ran.stderr);
+}
+
+/// Sends a signal to a command.
+pub fn signal(child: &Child, name: &str) {
+    let sent = Command::new("kill").args([name, &child.id().to_string()]).status().expect("kill runs");
+    assert!(sent.success(), "the run is still there to be stopped");
+}
+
+/// Waits until a run has made `count` steps.
+pub fn wait_for_steps(run: &Path, child: &mut Child, count: usize) {
+    let started = Instant::now();
+    loop {
+        let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
+        if text.lines().count() >= count {
+            return;
+        }
+        assert!(child.try_wait().expect("a child").is_none(), "the run ended before step {count}");
+        assert!(started.elapsed() < Duration::from_mins(1), "no step {count} within a minute");
+        std::thread::sleep(Duration::from_millis(2));
+    }
 }
 
 /// Waits for a command.
@@ -156,6 +187,51 @@ impl Place {
             let same = self.bytes(&format!("{run}/{file}")) == self.bytes(&format!("{other}/{file}"));
             assert!(same, "{file} of {run} and {other} differs");
         }
+    }
+
+    /// Expects the same files, but for what the clock decides: weights, clusters, metrics, steps left out, samples, the
+    /// progress in the last checkpoints, and the evaluation.
+    pub fn assert_same_run(&self, run: &str, other: &str) {
+        assert_eq!(self.metrics_but_time(run), self.metrics_but_time(other), "no step is missing or doubled");
+        let compared = |run: &str| {
+            let mut files = files(&self.at(run));
+            // The time of day is in the report, times in `views.csv`; `config.toml` holds the run's own path.
+            let is_result = |path: &Path| {
+                let name = path.strip_prefix(self.at(run)).expect("below").display().to_string();
+                let (others, progress) = (["metrics.jsonl", "config.toml", "lock"], name.contains("/checkpoints/"));
+                !(others.contains(&name.as_str()) || name.starts_with("eval/") || progress)
+            };
+            files.retain(|path, _| is_result(path));
+            let name = |path: PathBuf| path.strip_prefix(self.at(run)).expect("below").to_owned();
+            files.into_iter().map(|(path, bytes)| (name(path), bytes)).collect::<BTreeMap<_, _>>()
+        };
+        let (files, expected) = (compared(run), compared(other));
+        assert!(files.keys().eq(expected.keys()), "{:?} is not {:?}", files.keys(), expected.keys());
+        for (name, bytes) in &files {
+            assert!(*bytes == expected[name], "{} of {run} and {other} differs", name.display());
+        }
+        for stage in ["stage1", "stage2"] {
+            assert_eq!(self.progress(run, stage), self.progress(other, stage), "{stage}");
+        }
+        let summary = |run: &str| crate::pipeline::summary_but_time(self, &format!("{run}/eval/summary.json"));
+        assert_eq!(summary(run), summary(other));
+    }
+
+    /// The steps of a stage's checkpoints.
+    pub fn checkpoints(&self, run: &str, stage: &str) -> Vec<u64> {
+        let folder = std::fs::read_dir(self.at(&format!("{run}/{stage}/checkpoints"))).expect("a folder");
+        let name = |item: std::io::Result<std::fs::DirEntry>| item.expect("readable").file_name().into_string();
+        let step = |name: String| name.strip_prefix("step-").and_then(|step| step.parse().ok());
+        let mut steps: Vec<u64> =
+            folder.map(|item| name(item).expect("text")).map(|name| step(name.clone()).expect(&name)).collect();
+        steps.sort_unstable();
+        steps
+    }
+
+    /// What the last checkpoint of a stage says about the training.
+    pub fn progress(&self, run: &str, stage: &str) -> Value {
+        let step = *self.checkpoints(run, stage).last().expect("a checkpoint");
+        self.json(&format!("{run}/{stage}/checkpoints/step-{step:09}/state.json"))["progress"].take()
     }
 
     /// Writes half of a file back.

@@ -7,7 +7,7 @@ use crate::camera::{Camera, Intrinsics};
 use crate::clip::{Clip, Frame, SceneSource, ViewIndices, Views};
 use crate::error::DataError;
 use crate::image::fit;
-use crate::normalize::{PoseRotation, PoseScale, SceneFrame};
+use crate::normalize::{PoseRotation, PoseScale, SceneFrame, check_near};
 
 /// How frames and poses are prepared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,7 +39,8 @@ impl ClipReader {
     ///
     /// # Errors
     /// [`DataError::NoSuchFrame`] for a position the scene does not have; whatever reading cameras or frames, fitting
-    /// ([`DataError::Upscale`]) or normalising ([`DataError::ZeroBaseline`]) gives.
+    /// ([`DataError::Upscale`]) or normalising ([`DataError::ZeroBaseline`]) gives; [`DataError::InFrame`] around
+    /// [`DataError::BadCamera`] for a camera that is too far from the contexts.
     pub fn read(&self, scene: usize, views: &ViewIndices) -> Result<Clip, DataError> {
         let key = self.source.key(scene);
         let cameras = self.source.cameras(scene)?;
@@ -60,6 +61,13 @@ impl ClipReader {
                 other => other,
             }
         })?;
+        for &frame in wanted.clone() {
+            check_near(&scene_frame.normalize(cameras[frame].c2w)).map_err(|source| DataError::InFrame {
+                key: key.to_owned(),
+                frame,
+                source: Box::new(source),
+            })?;
+        }
         let mut fitted = HashMap::new();
         for &frame in wanted {
             if let std::collections::hash_map::Entry::Vacant(entry) = fitted.entry(frame) {

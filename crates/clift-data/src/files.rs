@@ -1,9 +1,16 @@
-//! Files that are whole or absent, and files that are read up to a limit.
+//! Files and folders that are whole or absent: written under a temporary name, synced, renamed. Files that are read up
+//! to a limit.
+//!
+//! A rename is on the disk once the folder it happened in is synced; until then a power cut may undo it.
 
-use std::io::{Read, Write};
+use std::fs::File;
+use std::io::{ErrorKind, Read, Write};
 use std::path::Path;
 
 use crate::error::DataError;
+
+/// Start of every temporary file's name: what a kill leaves behind can be told from everything else.
+const TEMPORARY: &str = ".clift-";
 
 /// Replaces `path` with `bytes`. No reader ever sees half a file, and after an error the former one is untouched.
 ///
@@ -12,14 +19,65 @@ use crate::error::DataError;
 /// # Errors
 /// The operating system's.
 pub fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = folder_of(path);
     let mut builder = tempfile::Builder::new();
+    builder.prefix(TEMPORARY);
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     let mut file = builder.tempfile_in(folder)?;
     file.write_all(bytes)?;
     file.as_file().sync_all()?;
     file.persist(path)?;
+    sync_folder(folder)
+}
+
+/// Gives the finished folder `temporary` the name `path`, which must be free: syncs its files, then the folder, renames,
+/// and syncs the rename. Folders inside it are not looked into.
+///
+/// # Errors
+/// The operating system's.
+pub fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
+    for item in std::fs::read_dir(temporary)? {
+        // Opened for writing, because Windows syncs no other file.
+        File::options().write(true).open(item?.path())?.sync_all()?;
+    }
+    sync_folder(temporary)?;
+    std::fs::rename(temporary, path)?;
+    sync_folder(folder_of(path))
+}
+
+/// Removes a folder so that a kill in the middle leaves no half of it under its name: it is renamed first.
+///
+/// # Errors
+/// The operating system's.
+pub fn remove_folder(path: &Path) -> std::io::Result<()> {
+    let doomed = path.with_extension("tmp");
+    if doomed.exists() {
+        std::fs::remove_dir_all(&doomed)?;
+    }
+    std::fs::rename(path, &doomed)?;
+    std::fs::remove_dir_all(&doomed)
+}
+
+/// Removes what kills in the middle of [`replace`] have left in a folder and in those below it. Nobody may be writing
+/// there.
+///
+/// # Errors
+/// The operating system's; a folder that is not there holds nothing.
+pub fn remove_leftovers(folder: &Path) -> std::io::Result<()> {
+    let items = match std::fs::read_dir(folder) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+        items => items?,
+    };
+    for item in items {
+        let item = item?;
+        let kind = item.file_type()?;
+        if kind.is_dir() {
+            remove_leftovers(&item.path())?;
+        } else if kind.is_file() && item.file_name().to_string_lossy().starts_with(TEMPORARY) {
+            std::fs::remove_file(item.path())?;
+        }
+    }
     Ok(())
 }
 
@@ -41,9 +99,35 @@ pub(crate) fn read_bounded(path: &Path, limit: u64, action: &'static str) -> Res
     Ok(bytes)
 }
 
+/// Makes renames and new names in a folder survive a power cut.
+///
+/// # Errors
+/// The operating system's. A file system that syncs no folders is taken at its word, and so is Windows, which cannot
+/// open one.
+pub fn sync_folder(folder: &Path) -> std::io::Result<()> {
+    if cfg!(windows) {
+        return Ok(());
+    }
+    match File::open(folder)?.sync_all() {
+        Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
+        synced => synced,
+    }
+}
+
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn names(folder: &Path) -> Vec<String> {
+        let items = std::fs::read_dir(folder).unwrap();
+        let mut names: Vec<_> = items.map(|item| item.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
 
     #[test]
     fn a_file_is_replaced_and_nothing_else_is_left_behind() {
@@ -52,7 +136,7 @@ mod tests {
         replace(&path, b"old").unwrap();
         replace(&path, b"new").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"new");
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+        assert_eq!(names(folder.path()), ["a.json"]);
         assert!(replace(&folder.path().join("missing/a.json"), b"x").is_err());
     }
 
@@ -79,5 +163,54 @@ mod tests {
         replace(&folder.path().join("ours"), b"x").unwrap();
         std::fs::write(folder.path().join("plain"), b"x").unwrap();
         assert_eq!(mode("ours"), mode("plain"));
+    }
+
+    #[test]
+    fn a_folder_is_published_whole_and_only_under_a_free_name() {
+        let place = tempfile::tempdir().unwrap();
+        let (temporary, path) = (place.path().join("step-1.tmp"), place.path().join("step-1"));
+        std::fs::create_dir(&temporary).unwrap();
+        std::fs::write(temporary.join("model"), b"weights").unwrap();
+        publish(&temporary, &path).unwrap();
+        assert_eq!(std::fs::read(path.join("model")).unwrap(), b"weights");
+        assert_eq!(names(place.path()), ["step-1"]);
+        std::fs::create_dir(&temporary).unwrap();
+        assert!(publish(&temporary, &path).is_err(), "the folder that is there is not empty");
+        assert_eq!(names(&path), ["model"]);
+    }
+
+    #[test]
+    fn a_folder_is_removed_with_what_an_earlier_removal_left() {
+        let place = tempfile::tempdir().unwrap();
+        for name in ["step-1", "step-1.tmp"] {
+            std::fs::create_dir(place.path().join(name)).unwrap();
+            std::fs::write(place.path().join(name).join("model"), b"weights").unwrap();
+        }
+        remove_folder(&place.path().join("step-1")).unwrap();
+        assert!(names(place.path()).is_empty());
+        assert!(remove_folder(&place.path().join("step-1")).is_err());
+    }
+
+    #[test]
+    fn leftovers_are_removed_from_every_folder_and_nothing_else() {
+        let place = tempfile::tempdir().unwrap();
+        std::fs::create_dir(place.path().join("eval")).unwrap();
+        for name in [".clift-x1", "eval/.clift-y2", "eval/report.html", ".hidden", "clift-notes"] {
+            std::fs::write(place.path().join(name), b"x").unwrap();
+        }
+        remove_leftovers(place.path()).unwrap();
+        assert_eq!(names(place.path()), [".hidden", "clift-notes", "eval"]);
+        assert_eq!(names(&place.path().join("eval")), ["report.html"]);
+        remove_leftovers(&place.path().join("missing")).unwrap();
+    }
+
+    /// What `replace` leaves when the process is killed before the rename is found by its name.
+    #[test]
+    fn temporary_files_have_the_name_that_leftovers_are_known_by() {
+        let place = tempfile::tempdir().unwrap();
+        let file = tempfile::Builder::new().prefix(TEMPORARY).tempfile_in(place.path()).unwrap();
+        let (_, path) = file.keep().unwrap();
+        remove_leftovers(place.path()).unwrap();
+        assert!(!path.exists());
     }
 }

@@ -40,6 +40,12 @@ pub struct SceneFrame {
     pub scale: f64,
 }
 
+/// Largest coordinate that a camera of a clip may have in the normalised frame, whose contexts reach to 1.
+///
+/// Farther away colours drown in the rays' moments: f32 keeps seven digits of their sum (docs/stability.md). The
+/// reference draws other views beyond the same number.
+pub const MAX_COORDINATE: f64 = 1e3;
+
 impl SceneFrame {
     /// Finds the frame of `context`, camera-to-world poses; `target` counts for [`PoseScale::All`] alone.
     ///
@@ -95,6 +101,19 @@ impl SceneFrame {
         let moved = to_mean.after(Pose { translation: offset, ..c2w });
         Pose { translation: moved.translation.map(|value| value * self.scale), ..moved }
     }
+}
+
+/// Refuses a normalised pose beyond [`MAX_COORDINATE`].
+pub(crate) fn check_near(pose: &Pose) -> Result<(), DataError> {
+    let coordinate = largest([pose.translation].into_iter());
+    if coordinate <= MAX_COORDINATE {
+        return Ok(());
+    }
+    let what = format!(
+        "it stands {coordinate:.0} times the contexts' extent away; expected at most {MAX_COORDINATE}, beyond which f32 \
+         loses the colours beside the rays"
+    );
+    Err(DataError::BadCamera { what })
 }
 
 fn check_finite(pose: &Pose) -> Result<(), DataError> {
@@ -170,6 +189,15 @@ fn unit(sum: [f64; 3], count: usize) -> Option<[f64; 3]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_camera_is_near_up_to_the_edge() {
+        let at =
+            |x: f64| Pose { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, x, 0.0] };
+        assert!(check_near(&at(-MAX_COORDINATE)).is_ok());
+        let message = check_near(&at(-1.01 * MAX_COORDINATE)).unwrap_err().to_string();
+        assert!(message.contains("it stands 1010 times the contexts' extent away; expected at most 1000"), "{message}");
+    }
     use proptest::prelude::*;
     use safetensors::SafeTensors;
 

@@ -168,9 +168,25 @@ mod tests {
         let (written, ledger) = index(&rooms(40, 3.0), &OverlapOptions::default());
         assert_eq!((written.num_keys(), written.usable().count()), (20, 0));
         assert_eq!(ledger.to_string(), "0 of 20 scenes used; 20 shorter than 46 frames");
-        let wide = OverlapOptions { distance: [30, 35], min_overlap: 1.0, ..OverlapOptions::default() };
-        let (_, ledger) = index(&rooms(40, 5.0), &wide);
-        assert!(ledger.to_string().contains("without two frames 30 to 35 apart that overlap by 1"), "{ledger}");
+    }
+
+    #[test]
+    fn a_camera_that_turns_away_has_pairs_only_as_far_apart_as_it_still_sees_the_same() {
+        // 75 degrees wide, three degrees per frame: half of the view is left after some 12 frames, nothing after 25.
+        let intrinsics_norm = crate::IntrinsicsNorm { fx: 0.65, fy: 0.65, cx: 0.5, cy: 0.5 };
+        let camera = |frame: usize| {
+            let (sin, cos) = (3.0 * frame as f64).to_radians().sin_cos();
+            let rotation = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
+            Camera { intrinsics_norm, c2w: crate::Pose { rotation, translation: [0.0; 3] } }
+        };
+        let cameras: Vec<Camera> = (0..60).map(camera).collect();
+        let options = |near, far| OverlapOptions { distance: [near, far], ..OverlapOptions::default() };
+        for key in ["a", "b", "c", "d", "e", "f"] {
+            let ViewIndices { context, .. } = options(4, 50).draw(key, &cameras).unwrap();
+            assert!((4..=12).contains(&(context[3] - context[0])), "{context:?}");
+        }
+        let reason = options(20, 50).draw("a", &cameras).unwrap_err();
+        assert_eq!(reason, "without two frames 20 to 50 apart that overlap by 0.6");
     }
 
     #[test]

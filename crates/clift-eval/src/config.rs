@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
+use crate::measured::Variant;
 use crate::selection::Selection;
 use crate::token_count::TokenCount;
 
@@ -19,6 +20,8 @@ pub struct EvalConfig {
     pub render: Vec<TokenCount>,
     /// How those are chosen: `paper`, `global`, `scaled` or `random`.
     pub selection: Selection,
+    /// What is rendered, of `random`, `patch`, `patch_clift`, `kmeans` and `clift`; empty for all there are weights for.
+    pub variants: Vec<Variant>,
     /// Number format that stored tokens are rounded to before they are rendered, as in a scene file.
     pub tokens: TokenStorage,
     /// Evaluation index with the context and target frames of every scene. Without one, contexts are
@@ -48,6 +51,7 @@ impl Default for EvalConfig {
             storage: shares.map(TokenCount::Share).into(),
             render: Vec::new(),
             selection: Selection::default(),
+            variants: Vec::new(),
             tokens: TokenStorage::F32,
             index: None,
             num_scenes: 0,

@@ -59,9 +59,12 @@ pub enum EvalError {
         /// Why it cannot be had, and what can.
         reason: String,
     },
-    /// The condensed variant was asked for without a condenser.
-    #[error("the condensed variant needs the weights of stage 2")]
-    NoCondenser,
+    /// A condensed variant was asked for without a condenser that was trained on its groups.
+    #[error("the variant `{variant}` needs the weights of a stage 2 that was trained on its groups of tokens")]
+    NoCondenser {
+        /// Its name.
+        variant: &'static str,
+    },
     /// A sweep was asked for a variant that is not made from tokens here.
     #[error("the variant `{variant}` is not rendered in a sweep")]
     NotRendered {

@@ -6,14 +6,14 @@ use burn::tensor::{Device, Tensor};
 use clift_data::order::derive_seed;
 use clift_data::{Clip, Views as HostViews};
 use clift_model::scene::file_bytes;
-use clift_model::{Cameras, Condenser, Encoder, KMeans, Renderer, TokenStorage};
+use clift_model::{Cameras, Condenser, Encoder, Grouping, KMeans, Renderer, TokenStorage, total_variance};
 
 use crate::EvalError;
 use crate::exhibit::{Material, Shown, sheet_rows};
 use crate::measured::{Accumulator, Setting, Variant};
 use crate::rendered::{Rendered, baselines};
 use crate::selection::{Chosen, Selection};
-use crate::stored::{KMeansOnce, Stored, rows_of};
+use crate::stored::{GroupsOnce, Stored, rows_of};
 use crate::token_count::TokenCount;
 use crate::upload::{upload_cameras, upload_views};
 
@@ -29,6 +29,8 @@ pub struct Networks {
     pub renderer: Renderer,
     /// Condenser and stage-2 renderer, once there are.
     pub condensed: Option<(Condenser, Renderer)>,
+    /// Those trained on tiles of the views instead of K-means.
+    pub patch_condensed: Option<(Condenser, Renderer)>,
     /// Where they live.
     pub device: Device,
 }
@@ -42,9 +44,9 @@ pub struct Sweep {
     pub render: Vec<TokenCount>,
     /// How fewer tokens are chosen.
     pub selection: Selection,
-    /// Number format that the tokens of [`Variant::Clift`] and [`Variant::Kmeans`] are rounded to, as in a scene file.
+    /// Number format that stored tokens are rounded to, as in a scene file; not those of [`Variant::Random`].
     pub tokens: TokenStorage,
-    /// Which variants are rendered; [`Variant::Clift`] needs [`Networks::condensed`].
+    /// Which variants are rendered: those of [`Networks::variants`], or fewer.
     pub variants: Vec<Variant>,
     /// Latent K-means.
     pub kmeans: KMeans,
@@ -52,6 +54,33 @@ pub struct Sweep {
     pub patch_size: usize,
     /// Seed of K-means and of what is random; each scene derives its own from it and its key.
     pub seed: u64,
+}
+
+impl Networks {
+    /// Takes the networks of a stage 2 that was trained on such groups.
+    pub fn set_condensed(&mut self, grouping: Grouping, condenser: Condenser, renderer: Renderer) {
+        match grouping {
+            Grouping::Kmeans => self.condensed = Some((condenser, renderer)),
+            Grouping::Patch => self.patch_condensed = Some((condenser, renderer)),
+        }
+    }
+
+    /// Whether there are weights for a variant.
+    pub fn can_draw(&self, variant: Variant) -> bool {
+        match variant {
+            Variant::Random | Variant::Patch | Variant::Kmeans => true,
+            Variant::Clift => self.condensed.is_some(),
+            Variant::PatchClift => self.patch_condensed.is_some(),
+            Variant::NearestView | Variant::MeanImage => false,
+        }
+    }
+
+    /// What is drawn where nothing else is asked for, tiles only beside their condenser.
+    pub fn variants(&self) -> Vec<Variant> {
+        let all = [Variant::Random, Variant::Patch, Variant::PatchClift, Variant::Kmeans, Variant::Clift];
+        let is_wanted = |variant: &Variant| *variant != Variant::Patch || self.patch_condensed.is_some();
+        all.into_iter().filter(|variant| self.can_draw(*variant)).filter(is_wanted).collect()
+    }
 }
 
 impl Sweep {
@@ -82,13 +111,16 @@ pub fn evaluate_scene(
     let lift = networks.encoder.forward(&upload_views(&[&clip.context], &networks.device)?); // [1, N, D]
     let [_, num_tokens, dim] = lift.dims();
     let seed = derive_seed(sweep.seed, &clip.key);
+    let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.patch_size);
+    let views = (clip.context.num_views(), grid);
+    let variance = total_variance(&lift)?[0];
     let rows = if is_shown { sheet_rows(clip.target.num_views()) } else { Vec::new() };
     let is_shown = !rows.is_empty();
     let mut material = Material { renderings: baselines(clip, &rows)?, ..Material::default() };
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
         let bytes = file_bytes(num_storage_tokens, dim, clip.context.num_views(), sweep.tokens);
-        let index = KMeansOnce::new(&sweep.kmeans, &lift, num_storage_tokens, seed);
+        let index = GroupsOnce::new(&sweep.kmeans, &lift, views, num_storage_tokens, seed);
         for &variant in &sweep.variants {
             let stored = Stored::new(variant, networks, &lift, &index, sweep.tokens)?;
             let setting = |num_render_tokens| Setting { variant, num_storage_tokens, num_render_tokens };
@@ -109,6 +141,9 @@ pub fn evaluate_scene(
                     into.add_scene_bytes(setting, bytes);
                 }
             }
+        }
+        if let Some(error) = index.cluster_error(variance) {
+            into.add_cluster_error(&clip.key, num_storage_tokens, error);
         }
         if is_shown {
             material.clusters.push(index.scene_clusters()?.clone());

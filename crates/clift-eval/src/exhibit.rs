@@ -135,7 +135,9 @@ fn small(picture: Picture) -> Picture {
 /// The variant that stands for the method: the condensed one where there is a condenser.
 pub(crate) fn best_variant(settings: impl IntoIterator<Item = Setting>) -> Option<Variant> {
     let there: BTreeSet<Variant> = settings.into_iter().map(|setting| setting.variant).collect();
-    [Variant::Clift, Variant::Kmeans, Variant::Random].into_iter().find(|variant| there.contains(variant))
+    [Variant::Clift, Variant::PatchClift, Variant::Kmeans, Variant::Random]
+        .into_iter()
+        .find(|variant| there.contains(variant))
 }
 
 /// The views a sheet shows: all, or `MAX_ROWS` of them from the first to the last.

@@ -1,5 +1,6 @@
 //! Metrics, baselines, evaluation sweeps and their pictures
 
+pub mod adaptive;
 pub mod animation;
 pub mod baseline;
 pub mod budget;
@@ -10,7 +11,9 @@ pub mod exhibit;
 pub mod machine;
 pub mod measured;
 pub mod metrics;
+pub mod paired;
 pub mod picture;
+pub mod preset;
 mod rendered;
 pub mod report;
 pub mod selection;
@@ -20,6 +23,7 @@ pub mod summary;
 pub mod token_count;
 pub mod upload;
 
+pub use adaptive::Adaptive;
 pub use animation::Animation;
 pub use budget::Calibration;
 pub use config::EvalConfig;
@@ -27,6 +31,8 @@ pub use error::EvalError;
 pub use evaluate::{Networks, Sweep, evaluate_scene};
 pub use exhibit::{Exhibit, Shown};
 pub use measured::{Accumulator, Variant};
+pub use paired::Difference;
+pub use preset::Experiment;
 pub use report::Report;
 pub use selection::Selection;
 pub use summary::Summary;

@@ -17,8 +17,10 @@ pub enum Variant {
     Clift,
     /// The tokens nearest to the cluster centres, without the condenser.
     Kmeans,
-    /// Whole patches of the context views.
+    /// The tokens in the middle of rectangular tiles of the context views, without a condenser.
     Patch,
+    /// The same behind a condenser that was trained on tiles.
+    PatchClift,
     /// A random subset of all tokens.
     Random,
     /// Baseline: the nearest context view.
@@ -34,6 +36,7 @@ impl Variant {
             Self::Clift => "clift",
             Self::Kmeans => "kmeans",
             Self::Patch => "patch",
+            Self::PatchClift => "patch_clift",
             Self::Random => "random",
             Self::NearestView => "nearest_view",
             Self::MeanImage => "mean_image",
@@ -99,6 +102,8 @@ pub struct Accumulator {
     pub(crate) views: BTreeMap<Setting, ViewsOfSetting>,
     pub(crate) costs: BTreeMap<Setting, Cost>,
     pub(crate) skipped: BTreeSet<String>,
+    /// Share of the token variance within clusters, by scene and count.
+    pub(crate) cluster_errors: BTreeMap<(String, usize), f64>,
 }
 
 impl Accumulator {
@@ -232,9 +237,15 @@ attic,9,nearest_view,0,0,inf,,,,
 
     #[test]
     fn a_variant_is_named_alike_in_json_and_csv() {
-        for variant in
-            [Variant::Clift, Variant::Kmeans, Variant::Patch, Variant::Random, Variant::NearestView, Variant::MeanImage]
-        {
+        for variant in [
+            Variant::Clift,
+            Variant::Kmeans,
+            Variant::Patch,
+            Variant::PatchClift,
+            Variant::Random,
+            Variant::NearestView,
+            Variant::MeanImage,
+        ] {
             assert_eq!(serde_json::to_value(variant).unwrap(), variant.name());
         }
     }

@@ -17,6 +17,7 @@ use clift_data::files::replace;
 use crate::EvalError;
 use crate::exhibit::{Exhibit, best_variant};
 use crate::machine;
+use crate::paired::Difference;
 use crate::summary::{Point, Summary};
 use axis::{grouped, milliseconds};
 use figures::{Figure, fastest, figures, is_whole, seconds, setting};
@@ -71,6 +72,8 @@ impl Report {
         self.write_headline(&mut out)?;
         self.write_figures(&mut out)?;
         self.write_table(&mut out)?;
+        self.write_differences(&mut out)?;
+        self.write_adaptive(&mut out)?;
         self.write_scenes(&mut out)?;
         self.write_left_out(&mut out)?;
         self.write_machine(&mut out)?;
@@ -175,6 +178,59 @@ impl Report {
         writeln!(out, "</tbody></table></div>")
     }
 
+    /// Which variant is better on the same scenes; nothing where there is no pair.
+    fn write_differences(&self, out: &mut impl Write) -> io::Result<()> {
+        let differences = &self.summary.differences;
+        if differences.is_empty() {
+            return Ok(());
+        }
+        writeln!(out, "<h2>Scene by scene</h2>\n<p class=\"note\">{DIFFERENCES_NOTE}</p>")?;
+        writeln!(out, "<div class=\"scroll\"><table><thead><tr>")?;
+        for head in ["better", "worse", "stored<br>tokens", "scenes<br>&nbsp;", "difference<br>dB", "\u{b1}<br>dB"] {
+            write!(out, "<th scope=\"col\">{head}</th>")?;
+        }
+        writeln!(out, "</tr></thead><tbody>")?;
+        for Difference { variant, against, num_storage_tokens, num_scenes, psnr, psnr_stderr } in differences {
+            let count = grouped(*num_storage_tokens as f64, 0);
+            let (psnr, error) = (number(Some(*psnr), 2), number(*psnr_stderr, 2));
+            write!(out, "<tr><td>{}</td><td>{}</td><td>{count}</td>", variant.name(), against.name())?;
+            writeln!(out, "<td>{}</td><td>{psnr}</td><td>{error}</td></tr>", grouped(*num_scenes as f64, 0))?;
+        }
+        writeln!(out, "</tbody></table></div>")
+    }
+
+    /// What a count for every scene gains over one for all; nothing where there are not three counts.
+    fn write_adaptive(&self, out: &mut impl Write) -> io::Result<()> {
+        let adaptive = &self.summary.adaptive;
+        if adaptive.is_empty() {
+            return Ok(());
+        }
+        writeln!(out, "<h2>A count for every scene</h2>\n<p class=\"note\">{ADAPTIVE_NOTE}</p>")?;
+        writeln!(out, "<div class=\"scroll\"><table><thead><tr>")?;
+        let heads =
+            ["most<br>error", "tokens,<br>mean", "PSNR<br>dB", "fixed<br>tokens", "difference<br>dB", "\u{b1}<br>dB"];
+        for head in ["variant"].into_iter().chain(heads) {
+            write!(out, "<th scope=\"col\">{head}</th>")?;
+        }
+        writeln!(out, "</tr></thead><tbody>")?;
+        for row in adaptive {
+            let cells = [
+                number(Some(row.max_error), 4),
+                number(Some(row.mean_storage_tokens), 1),
+                number(Some(row.psnr), 2),
+                grouped(row.num_storage_tokens as f64, 0),
+                number(Some(row.difference), 2),
+                number(row.difference_stderr, 2),
+            ];
+            write!(out, "<tr><td>{}</td>", row.variant.name())?;
+            for cell in cells {
+                write!(out, "<td>{cell}</td>")?;
+            }
+            writeln!(out, "</tr>")?;
+        }
+        writeln!(out, "</tbody></table></div>")
+    }
+
     fn write_scenes(&self, out: &mut impl Write) -> io::Result<()> {
         writeln!(out, "<h2>Scenes</h2>")?;
         if self.exhibits.is_empty() {
@@ -231,6 +287,14 @@ const TABLE_HEAD: [&str; 10] = [
     "scene<br>kB",
     "Pareto<br>front",
 ];
+
+const DIFFERENCES_NOTE: &str = "PSNR of the variant that the paper finds better less that of the other, on the same \
+                                scenes: below zero where these scenes disagree.";
+
+const ADAPTIVE_NOTE: &str = "Every scene keeps the fewest of the stored counts that leave at most this share of its \
+                             tokens' variance within clusters, as <code>clift encode --max-error</code> does; the share \
+                             is the smallest with which scenes keep no more tokens on average than the fixed count \
+                             beside it. Below zero, one count for all is better.";
 
 const SCENES_NOTE: &str = "The target view in the middle of each scene, as every variant draws it. In the maps a patch \
                            of the context views has the colour of its cluster, and rings are the centroids: the tokens \

@@ -5,7 +5,8 @@ use std::cell::OnceCell;
 
 use burn::tensor::{Int, Tensor, TensorData};
 use clift_data::order::item_rng;
-use clift_model::{Clusters, KMeans, Renderer, SceneClusters, TokenStorage};
+use clift_model::kmeans::Fit;
+use clift_model::{Clusters, Condenser, KMeans, Renderer, SceneClusters, TokenStorage, tile_clusters};
 use rand::seq::SliceRandom;
 
 use crate::EvalError;
@@ -28,7 +29,7 @@ impl<'a> Stored<'a> {
         variant: Variant,
         networks: &'a Networks,
         lift: &Tensor<3>,
-        index: &KMeansOnce,
+        index: &GroupsOnce,
         storage: TokenStorage,
     ) -> Result<Self, EvalError> {
         let device = &networks.device;
@@ -36,39 +37,74 @@ impl<'a> Stored<'a> {
             let ids = random_subset(lift.dims()[1], index.num_clusters, index.seed);
             return Ok(Self { tokens: rows_of(lift, &ids), ids, renderer: &networks.renderer });
         }
-        let (tokens, renderer) = match variant {
-            Variant::Kmeans => (index.clusters()?.upload(device).gather_centroids(lift.clone()), &networks.renderer),
-            Variant::Clift => {
-                let (condenser, renderer) = networks.condensed.as_ref().ok_or(EvalError::NoCondenser)?;
-                (condenser.forward(lift.clone(), &index.clusters()?.upload(device)), renderer)
-            }
+        let clusters = match variant {
+            Variant::Kmeans | Variant::Clift => index.clusters()?,
+            Variant::Patch | Variant::PatchClift => index.tiles()?,
             _ => return Err(EvalError::NotRendered { variant: variant.name() }),
         };
-        let ids = index.scene_clusters()?.centroid_index().to_vec();
+        let uploaded = clusters.upload(device);
+        let condensed = |networks: Option<&'a (Condenser, Renderer)>| {
+            let (condenser, renderer) = networks.ok_or(EvalError::NoCondenser { variant: variant.name() })?;
+            Ok::<_, EvalError>((condenser.forward(lift.clone(), &uploaded), renderer))
+        };
+        let (tokens, renderer) = match variant {
+            Variant::Clift => condensed(networks.condensed.as_ref())?,
+            Variant::PatchClift => condensed(networks.patch_condensed.as_ref())?,
+            _ => (uploaded.gather_centroids(lift.clone()), &networks.renderer),
+        };
+        let ids = clusters.scenes()[0].centroid_index().to_vec();
         Ok(Self { tokens: rounded(tokens, storage)?, ids, renderer })
     }
 }
 
-/// K-means of one count, computed when the first variant asks.
-pub(crate) struct KMeansOnce<'a> {
-    kmeans: &'a KMeans,
-    lift: &'a Tensor<3>,
-    num_clusters: usize,
-    seed: u64,
-    clusters: OnceCell<Clusters>,
+/// Groups of one count, made when the first variant asks.
+pub(crate) struct GroupsOnce<'a> {
+    pub kmeans: &'a KMeans,
+    pub lift: &'a Tensor<3>,
+    pub num_clusters: usize,
+    pub seed: u64,
+    /// Context views, and rows and columns of tokens of each.
+    pub views: (usize, [usize; 2]),
+    fit: OnceCell<Fit>,
+    tiles: OnceCell<Clusters>,
 }
 
-impl<'a> KMeansOnce<'a> {
-    pub fn new(kmeans: &'a KMeans, lift: &'a Tensor<3>, num_clusters: usize, seed: u64) -> Self {
-        Self { kmeans, lift, num_clusters, seed, clusters: OnceCell::new() }
+impl<'a> GroupsOnce<'a> {
+    pub fn new(
+        kmeans: &'a KMeans,
+        lift: &'a Tensor<3>,
+        views: (usize, [usize; 2]),
+        num_clusters: usize,
+        seed: u64,
+    ) -> Self {
+        Self { kmeans, lift, num_clusters, seed, views, fit: OnceCell::new(), tiles: OnceCell::new() }
+    }
+
+    /// Tiles of the context views, [`tile_clusters`].
+    pub fn tiles(&self) -> Result<&Clusters, EvalError> {
+        if let Some(tiles) = self.tiles.get() {
+            return Ok(tiles);
+        }
+        let (num_views, grid) = self.views;
+        let tiles = Clusters::new(vec![tile_clusters(num_views, grid, self.num_clusters)?])?;
+        Ok(self.tiles.get_or_init(|| tiles))
     }
 
     pub fn clusters(&self) -> Result<&Clusters, EvalError> {
-        if let Some(clusters) = self.clusters.get() {
-            return Ok(clusters);
+        Ok(&self.fit()?.clusters)
+    }
+
+    /// Share of `total_variance` that is left within clusters, where K-means was asked for.
+    pub fn cluster_error(&self, total_variance: f64) -> Option<f64> {
+        self.fit.get().map(|fit| fit.error(0, total_variance))
+    }
+
+    fn fit(&self) -> Result<&Fit, EvalError> {
+        if let Some(fit) = self.fit.get() {
+            return Ok(fit);
         }
         let fit = self.kmeans.fit(self.lift.clone(), self.num_clusters, &[self.seed])?;
-        Ok(self.clusters.get_or_init(|| fit.clusters))
+        Ok(self.fit.get_or_init(|| fit))
     }
 
     /// Those of the one scene there is.

@@ -10,8 +10,10 @@ use std::path::Path;
 use clift_data::files::replace;
 use serde::{Deserialize, Serialize};
 
+use crate::adaptive::Adaptive;
 use crate::error::EvalError;
 use crate::measured::{Accumulator, Measured, Setting, Variant, ViewsOfSetting};
+use crate::paired::Difference;
 
 /// What an identical picture counts as in a mean, in dB; larger values are counted as this too.
 ///
@@ -82,6 +84,10 @@ pub struct Summary {
     pub baselines: Baselines,
     /// One per setting, ordered by variant and then by rising token counts.
     pub points: Vec<Point>,
+    /// What the paper finds better less what it finds worse, scene by scene.
+    pub differences: Vec<Difference>,
+    /// A count for every scene against one for all.
+    pub adaptive: Vec<Adaptive>,
 }
 
 impl Accumulator {
@@ -110,6 +116,8 @@ impl Accumulator {
                 .filter(|(setting, _)| !matches!(setting.variant, Variant::NearestView | Variant::MeanImage))
                 .map(|(setting, views)| self.point(*setting, views))
                 .collect(),
+            differences: self.differences(),
+            adaptive: self.adaptive(),
         }
     }
 
@@ -153,7 +161,7 @@ impl Summary {
 /// A table for people: quality, tokens and cost of each setting; `-` is what was not measured.
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { num_scenes, num_views, num_skipped, baselines, points } = self;
+        let Self { num_scenes, num_views, num_skipped, baselines, points, differences, adaptive } = self;
         writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes left out\n")?;
         let headers =
             ["stored", "rendered", "PSNR dB", "+- dB", "SSIM", "LPIPS", "select ms", "render ms", "GMAC", "scene kB"];
@@ -180,6 +188,20 @@ impl fmt::Display for Summary {
             ];
             write_row(f, point.variant.name(), cells)?;
         }
+        if !differences.is_empty() {
+            writeln!(f, "\nPSNR of the same scenes, difference and standard error")?;
+        }
+        for Difference { variant, against, num_storage_tokens, psnr, psnr_stderr, .. } in differences {
+            let error = cell(*psnr_stderr, 2);
+            let names = format!("{} - {}", variant.name(), against.name());
+            writeln!(f, "{names:<24} {num_storage_tokens:>6} tokens {psnr:>+7.2} +- {error} dB")?;
+        }
+        if !adaptive.is_empty() {
+            writeln!(f, "\n--max-error against one count for all scenes, at no more tokens on average")?;
+        }
+        for Adaptive { max_error, mean_storage_tokens: own, num_storage_tokens: fixed, difference, .. } in adaptive {
+            writeln!(f, "{max_error:<8.4} {own:>8.1} tokens against {fixed:>6} {difference:>+7.2} dB")?;
+        }
         Ok(())
     }
 }
@@ -197,7 +219,7 @@ fn write_row(f: &mut fmt::Formatter<'_>, name: &str, cells: [String; 10]) -> fmt
     writeln!(f)
 }
 
-fn capped(psnr: f64) -> f64 {
+pub(crate) fn capped(psnr: f64) -> f64 {
     psnr.min(PSNR_CAP_DB)
 }
 
@@ -210,12 +232,21 @@ fn scene_means(views: &ViewsOfSetting, value: impl Fn(&Measured) -> Option<f64>)
         .collect()
 }
 
-fn mean(values: &[f64]) -> Option<f64> {
+/// Mean PSNR of every scene.
+pub(crate) fn scene_values(views: &ViewsOfSetting) -> BTreeMap<&str, f64> {
+    let mut scenes: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+    for ((scene, _), view) in views {
+        scenes.entry(scene).or_default().push(capped(view.psnr));
+    }
+    scenes.into_iter().filter_map(|(scene, psnr)| Some((scene, mean(&psnr)?))).collect()
+}
+
+pub(crate) fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 /// Sample standard deviation over the square root of the count.
-fn standard_error(values: &[f64]) -> Option<f64> {
+pub(crate) fn standard_error(values: &[f64]) -> Option<f64> {
     let count = values.len() as f64;
     let mean = mean(values)?;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
@@ -284,7 +315,8 @@ mod tests {
                 "psnr": 20.0, "psnr_stderr": null, "psnr_per_view": 20.0, "num_identical_views": 0,
                 "ssim": 0.2, "lpips_vgg": null, "render_s": null, "select_s": null,
                 "gflops": 2.5, "scene_bytes": 99_000
-            }]
+            }],
+            "differences": [], "adaptive": []
         });
         assert_eq!(serde_json::from_str::<serde_json::Value>(&text).unwrap(), expected);
         assert_eq!(serde_json::from_str::<Summary>(&text).unwrap(), views.summary());

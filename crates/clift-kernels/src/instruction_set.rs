@@ -1,3 +1,4 @@
+use std::fmt;
 use std::sync::OnceLock;
 
 #[cfg(target_arch = "x86_64")]
@@ -16,6 +17,25 @@ pub enum InstructionSet {
     Avx512,
 }
 
+/// A value of [`InstructionSet::VARIABLE`] that cannot be followed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BadInstructionSet {
+    /// What it holds.
+    pub text: String,
+    /// Whether it is an instruction set, which this processor lacks.
+    pub is_known: bool,
+}
+
+impl fmt::Display for BadInstructionSet {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let names = InstructionSet::available().map(InstructionSet::name).collect::<Vec<_>>().join(", ");
+        let why = if self.is_known { "this processor does not have it" } else { "it is no instruction set" };
+        write!(f, "{why}; it can be one of {names}, or left out for the first of them")
+    }
+}
+
+impl std::error::Error for BadInstructionSet {}
+
 /// Work that is generic over the instruction set. `run` must be `#[inline(always)]`.
 pub(crate) trait Kernel {
     type Output;
@@ -30,17 +50,39 @@ impl InstructionSet {
     /// The environment variable that forces an instruction set: `avx512`, `avx2` or `portable`.
     pub const VARIABLE: &str = "CLIFT_INSTRUCTION_SET";
 
-    /// The one to use: the widest that the processor has, or what [`InstructionSet::VARIABLE`] names,
-    /// if the processor has that; any other text is as none. Read once per process.
+    /// The one to use: what [`InstructionSet::VARIABLE`] names, or else the widest that the processor has. Read once
+    /// per process.
+    ///
+    /// A kernel cannot refuse what is not there, so that it takes the widest then, too: a program asks
+    /// [`InstructionSet::forced`] at its start.
     pub fn detected() -> Self {
         static DETECTED: OnceLock<InstructionSet> = OnceLock::new();
-        *DETECTED.get_or_init(|| {
-            let asked = std::env::var(Self::VARIABLE).ok();
-            let mut available = Self::available();
-            let widest = available.next().unwrap_or(Self::Portable);
-            let forced = Self::available().find(|set| asked.as_deref() == Some(set.name()));
-            forced.unwrap_or(widest)
-        })
+        *DETECTED.get_or_init(|| Self::forced().ok().flatten().unwrap_or_else(Self::widest))
+    }
+
+    /// The widest that this processor can run.
+    pub fn widest() -> Self {
+        Self::available().next().unwrap_or(Self::Portable)
+    }
+
+    /// What [`InstructionSet::VARIABLE`] names; `None` where it is not set or empty.
+    ///
+    /// # Errors
+    /// The text and what it may be, where it names no instruction set that this processor has.
+    pub fn forced() -> Result<Option<Self>, BadInstructionSet> {
+        match std::env::var_os(Self::VARIABLE) {
+            None => Ok(None),
+            Some(text) => Self::parse(&text.to_string_lossy()),
+        }
+    }
+
+    fn parse(text: &str) -> Result<Option<Self>, BadInstructionSet> {
+        if text.is_empty() {
+            return Ok(None);
+        }
+        let bad = |is_known| BadInstructionSet { text: text.to_owned(), is_known };
+        let known = Self::ALL.into_iter().find(|set| set.name() == text).ok_or_else(|| bad(false))?;
+        if known.is_available() { Ok(Some(known)) } else { Err(bad(true)) }
     }
 
     /// Those that this processor can run, the widest first.
@@ -113,4 +155,22 @@ fn run_avx2<K: Kernel>(kernel: K) -> K::Output {
 fn run_avx512<K: Kernel>(kernel: K) -> K::Output {
     // SAFETY: this function is compiled for, and so only called on, such a processor.
     kernel.run(unsafe { Avx512::new() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_asked_for_is_taken_or_refused_by_name() {
+        assert_eq!(InstructionSet::parse(""), Ok(None));
+        assert_eq!(InstructionSet::parse("portable"), Ok(Some(InstructionSet::Portable)));
+        for set in InstructionSet::ALL {
+            let parsed = InstructionSet::parse(set.name());
+            assert_eq!(parsed.is_ok(), set.is_available(), "{}", set.name());
+        }
+        let message = InstructionSet::parse("AVX2").unwrap_err().to_string();
+        assert!(message.starts_with("it is no instruction set; it can be one of "), "{message}");
+        assert!(message.contains("portable"), "{message}");
+    }
 }

@@ -22,4 +22,4 @@ mod simd;
 #[cfg(test)]
 mod testing;
 
-pub use instruction_set::InstructionSet;
+pub use instruction_set::{BadInstructionSet, InstructionSet};

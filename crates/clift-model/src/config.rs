@@ -124,11 +124,24 @@ impl ModelConfig {
             return Err(ModelError::BadConfig {
                 key: "model.num_heads",
                 value: self.num_heads.to_string(),
-                fix: format!("write a divisor of model.dim = {}", self.dim),
+                fix: format!(
+                    "write a divisor of model.dim = {}, such as {}",
+                    self.dim,
+                    near_divisors(self.dim, self.num_heads)
+                ),
             });
         }
         Ok(())
     }
+}
+
+/// The divisors of `number` next to `wrong`, in words.
+fn near_divisors(number: usize, wrong: usize) -> String {
+    let divides = |candidate: &usize| number.is_multiple_of(*candidate);
+    let below = (1..wrong.min(number + 1)).rev().find(divides);
+    let above = (wrong + 1..=number).find(divides);
+    let near: Vec<String> = below.into_iter().chain(above).map(|divisor| divisor.to_string()).collect();
+    near.join(" or ")
 }
 
 #[cfg(test)]
@@ -147,7 +160,9 @@ mod tests {
     #[test]
     fn heads_that_do_not_divide_the_width_are_refused_by_name() {
         let message = ModelConfig { num_heads: 7, ..ModelConfig::default() }.validate().unwrap_err().to_string();
-        assert_eq!(message, "`model.num_heads` = 7: write a divisor of model.dim = 768");
+        assert_eq!(message, "`model.num_heads` = 7: write a divisor of model.dim = 768, such as 6 or 8");
+        let message = ModelConfig { num_heads: 800, ..ModelConfig::default() }.validate().unwrap_err().to_string();
+        assert!(message.ends_with("such as 768"), "{message}");
     }
 
     #[test]

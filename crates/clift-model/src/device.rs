@@ -1,6 +1,7 @@
 //! Every device this project runs on, by the name a config or a command line gives it.
 
 use burn::tensor::Device;
+use clift_kernels::{BadInstructionSet, InstructionSet};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
@@ -43,10 +44,19 @@ impl DeviceName {
     ///
     /// # Errors
     /// [`ModelError::NoDevice`] when this build does not contain it (the message says how to build
-    /// one that does) or no adapter is found.
+    /// one that does) or no adapter is found; [`ModelError::BadConfig`] when the environment asks `flex` for an
+    /// instruction set that the processor does not have.
     pub fn open(self) -> Result<Device, ModelError> {
         match self {
-            Self::Flex => Ok(Device::flex()),
+            Self::Flex => {
+                let bad = |bad: BadInstructionSet| ModelError::BadConfig {
+                    key: InstructionSet::VARIABLE,
+                    fix: bad.to_string(),
+                    value: bad.text,
+                };
+                InstructionSet::forced().map_err(bad)?;
+                Ok(Device::flex())
+            }
             // Upstream retires this backend in favour of flex; it stays as an independent check.
             #[allow(deprecated)]
             Self::Ndarray => Ok(Device::ndarray()),

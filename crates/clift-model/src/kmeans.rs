@@ -43,6 +43,33 @@ pub struct Fit {
     pub iterations: usize,
 }
 
+impl Fit {
+    /// Share of a scene's [`total_variance`] that its clusters leave within them, 0 for a scene of equal tokens.
+    pub fn error(&self, scene: usize, total_variance: f64) -> f64 {
+        if total_variance > 0.0 { self.inertia[scene] / total_variance } else { 0.0 }
+    }
+}
+
+/// Sum of squared distances of the tokens to their mean, per scene: the inertia of a single cluster.
+///
+/// # Shapes
+/// - `tokens`: `[batch, num_tokens, dim]`
+///
+/// # Errors
+/// [`ModelError::Tensor`] when the device does not give its values back.
+pub fn total_variance(tokens: &Tensor<3>) -> Result<Vec<f64>, ModelError> {
+    let [batch, num_tokens, _] = tokens.dims();
+    let centred = tokens.clone() - tokens.clone().mean_dim(1);
+    // Summed in f64 on the host: thousands of squares of unlike size.
+    let squares = centred.square().sum_dim(2).reshape([batch * num_tokens]); // [B, N, D] -> [B * N]
+    let squares = squares
+        .into_data()
+        .convert::<f32>()
+        .try_to_vec::<f32>()
+        .map_err(|error| ModelError::Device { reason: format!("{error:?}") })?;
+    Ok(squares.chunks(num_tokens).map(|scene| scene.iter().copied().map(f64::from).sum()).collect())
+}
+
 impl KMeans {
     /// Clusters the tokens of every scene into `num_clusters` groups, none of them empty.
     ///

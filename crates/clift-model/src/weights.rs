@@ -1,6 +1,9 @@
 //! Weight files: safetensors in PyTorch's layout, and the hash that names a set of weights.
 
-use std::fmt::Write;
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs::File;
+use std::io::{ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use burn::module::{Module, ModuleVisitor, Param};
@@ -43,20 +46,65 @@ impl Loaded {
 }
 
 /// Writes the parameters of a module under the names and in the layout PyTorch gives them
-/// (linear weights `[outputs, inputs]`), to a temporary name that is then renamed.
+/// (linear weights `[outputs, inputs]`), to a temporary name that is then renamed. Equal weights are equal files.
 ///
 /// # Errors
 /// [`ModelError::Weights`].
 pub fn save<M: Module>(module: &M, path: &Path) -> Result<(), ModelError> {
     let error = |reason: String| ModelError::Weights { action: "writing", reason, path: path.into() };
-    let temporary = path.with_extension("safetensors.tmp");
+    // The store writes to a name of its own beside this one, which a kill leaves there: it starts like ours.
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let temporary = path.with_file_name(format!(".clift-{name}.tmp"));
     let mut store = SafetensorsStore::from_file(&temporary)
         .with_to_adapter(BurnToPyTorchAdapter)
         .overwrite(true)
         .metadata("format", "clift-1");
-    module.save_into(&mut store).map_err(|e| error(e.to_string()))?;
-    let synced = std::fs::File::open(&temporary).and_then(|file| file.sync_all());
-    synced.and_then(|()| std::fs::rename(&temporary, path)).map_err(|e| error(e.to_string()))
+    let saved = module.save_into(&mut store).map_err(|e| e.to_string());
+    let written = saved.and_then(|()| publish(&temporary, path).map_err(|e| e.to_string()));
+    written.map_err(|reason| {
+        // On a full disk the space is needed; if even that fails, the next save writes over it.
+        drop(std::fs::remove_file(&temporary));
+        error(reason)
+    })
+}
+
+/// Gives a finished file its name, with its header in order.
+fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
+    let mut file = File::options().read(true).write(true).open(temporary)?;
+    sort_header(&mut file)?;
+    file.sync_all()?;
+    std::fs::rename(temporary, path)?;
+    sync_folder(path)
+}
+
+/// Writes a safetensors header anew with its keys sorted: Burn's store orders them at random, file by file. The
+/// tensors' bytes stay where they are.
+fn sort_header(file: &mut File) -> std::io::Result<()> {
+    let mut length = [0; 8];
+    file.read_exact(&mut length)?;
+    let length = u64::from_le_bytes(length);
+    let mut header = vec![0; usize::try_from(length).map_err(std::io::Error::other)?];
+    file.read_exact(&mut header)?;
+    let entries: BTreeMap<String, BTreeMap<String, serde_json::Value>> = serde_json::from_slice(&header)?;
+    let mut sorted = serde_json::to_vec(&entries)?;
+    if sorted.len() > header.len() {
+        return Err(std::io::Error::other("the header has no room for itself with its keys sorted"));
+    }
+    sorted.resize(header.len(), b' ');
+    file.seek(SeekFrom::Start(8))?;
+    file.write_all(&sorted)
+}
+
+/// Makes the name of a file survive a power cut, where the system lets a folder be synced.
+pub(crate) fn sync_folder(path: &Path) -> std::io::Result<()> {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if cfg!(windows) {
+        return Ok(()); // it opens no folders
+    }
+    match File::open(folder)?.sync_all() {
+        Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
+        synced => synced,
+    }
 }
 
 /// Reads parameters written by [`save`] into a module and says which.
@@ -169,6 +217,24 @@ mod tests {
         let loaded = load(&mut model(2), &path).expect("nothing fits, nothing breaks");
         let message = loaded.require_all(&path).unwrap_err().to_string();
         assert!(message.contains("86 parameters missing (condenser.blocks.0"), "{message}");
+    }
+
+    #[test]
+    fn equal_weights_are_equal_files_in_a_header_that_others_read() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let files: Vec<Vec<u8>> = (0..4)
+            .map(|i| {
+                let path = directory.path().join(format!("{i}.safetensors"));
+                save(&model(1), &path).expect("writes");
+                std::fs::read(path).expect("reads")
+            })
+            .collect();
+        // Of three keys in any order, four files would agree once in 216 times.
+        assert!(files.iter().all(|bytes| *bytes == files[0]));
+        let (_, header) = safetensors::SafeTensors::read_metadata(&files[0]).expect("valid");
+        let metadata = header.metadata().as_ref().expect("there");
+        assert!(metadata.len() >= 2 && metadata["format"] == "clift-1", "{metadata:?}");
+        assert_eq!(std::fs::read_dir(directory.path()).expect("a folder").count(), 4, "nothing else is left");
     }
 
     #[test]

@@ -4,14 +4,14 @@
 //! fast because it is wrong shows.
 
 mod clustering;
-mod context;
+pub(crate) mod context;
 mod forward;
 pub(crate) mod inputs;
-mod memory;
-mod reference;
+pub mod memory;
+pub(crate) mod reference;
 mod selection;
 mod statistics;
-mod step;
+pub(crate) mod step;
 mod task;
 mod work;
 

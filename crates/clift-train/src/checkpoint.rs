@@ -1,102 +1,155 @@
-//! The state of a stage on disk: a folder per step, written under a temporary name and renamed.
+//! The state of a stage on disk: a folder per step, written under a temporary name, synced and renamed.
 
-use std::path::PathBuf;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 
 use burn::module::Module;
 use burn::store::ModuleRecord;
-use clift_data::files::replace;
+use clift_data::files::{publish, remove_folder, replace};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
+use crate::bad_steps::Recent;
+use crate::config::CheckpointConfig;
+use crate::exact;
 use crate::step::Learner;
 
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
+const MODEL: &str = "model.bpk";
+const OPTIMIZER: &str = "optimizer.bpk";
+const SAVING: &str = "writing a checkpoint";
+const LISTING: &str = "listing checkpoints";
 
 /// What `state.json` of a checkpoint holds.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct State {
     version: u32,
-    /// Updates made.
-    step: u64,
+    progress: Progress,
+    /// The other files, by name.
+    files: BTreeMap<String, Fingerprint>,
+}
+
+/// What tells a damaged file from a whole one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Fingerprint {
+    num_bytes: u64,
+    crc32: u32,
+}
+
+/// Where training goes on. With the weights and the optimiser this is all: batches, schedules and everything random are
+/// functions of the seed and the step.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Progress {
+    /// Updates made, with those left out.
+    pub step: u64,
     /// Updates in a row that were left out just before.
-    bad_steps: u32,
+    pub bad_steps: u32,
+    /// Updates left out in all.
+    pub num_bad_steps: u64,
+    /// The last step whose validation is done; 0 for none.
+    pub validated: u64,
+    /// The best validation so far of a step with a checkpoint.
+    pub best: Option<Best>,
+    /// What the next step is compared with.
+    pub recent: Recent,
+}
+
+/// The best validation of a stage.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Best {
+    /// Its step.
+    pub step: u64,
+    /// Mean PSNR of the held-out views, in dB.
+    #[serde(with = "exact")]
+    pub psnr: f64,
 }
 
 /// The checkpoints of one stage.
 #[derive(Clone, Debug)]
 pub struct Checkpoints {
     folder: PathBuf,
-    keep: usize,
-}
-
-/// Where training goes on.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Progress {
-    /// Updates made.
-    pub step: u64,
-    /// Updates in a row that were left out just before.
-    pub bad_steps: u32,
+    retention: CheckpointConfig,
 }
 
 impl Checkpoints {
-    /// Keeps the newest `keep` checkpoints in `folder`.
-    pub fn new(folder: PathBuf, keep: usize) -> Self {
-        Self { folder, keep }
+    /// Keeps checkpoints in `folder`, and as many as `retention` says.
+    pub fn new(folder: PathBuf, retention: CheckpointConfig) -> Self {
+        Self { folder, retention }
     }
 
-    /// Saves model, optimiser and progress, and removes checkpoints beyond the newest.
+    /// Saves model, optimiser and progress, and removes the checkpoints that are kept no longer.
     ///
     /// # Errors
-    /// [`TrainError::Io`] and [`TrainError::BadFile`]; older checkpoints are then untouched.
-    pub fn save(&self, learner: &Learner, progress: Progress) -> Result<PathBuf, TrainError> {
-        let path = self.folder.join(format!("step-{:09}", progress.step));
+    /// [`TrainError::Io`]; older checkpoints are then untouched, and what was written of this one is removed.
+    pub fn save(&self, learner: &Learner, progress: &Progress) -> Result<PathBuf, TrainError> {
+        let path = self.path_of(progress.step);
         let temporary = path.with_extension("tmp");
-        if temporary.exists() {
-            std::fs::remove_dir_all(&temporary).map_err(TrainError::io("removing an unfinished save", &temporary))?;
+        remove_if_there(&temporary)?;
+        let written = Self::write(learner, progress, &temporary, &path);
+        if written.is_err() {
+            // A full disk needs the space; what even that leaves is removed by the next save.
+            drop(std::fs::remove_dir_all(&temporary));
         }
-        std::fs::create_dir_all(&temporary).map_err(TrainError::io("making a checkpoint", &temporary))?;
-        let model = temporary.join("model.bpk");
-        learner.model.clone().into_record().save(&model).map_err(TrainError::bad_file("checkpoint", &model))?;
-        let optimizer = temporary.join("optimizer.bpk");
-        learner.optimizer.save(&optimizer).map_err(TrainError::bad_file("checkpoint", &optimizer))?;
-        let state = State { version: VERSION, step: progress.step, bad_steps: progress.bad_steps };
-        let text = serde_json::to_vec(&state).map_err(TrainError::bad_file("checkpoint", &temporary))?;
-        let state = temporary.join("state.json");
-        replace(&state, &text).map_err(TrainError::io("writing a checkpoint", &state))?;
-        for file in [&model, &optimizer] {
-            let synced = std::fs::File::open(file).and_then(|file| file.sync_all());
-            synced.map_err(TrainError::io("syncing a checkpoint", file))?;
-        }
-        if path.exists() {
-            std::fs::remove_dir_all(&path).map_err(TrainError::io("replacing a checkpoint", &path))?;
-        }
-        std::fs::rename(&temporary, &path).map_err(TrainError::io("renaming a checkpoint", &path))?;
-        self.prune()?;
+        written?;
+        self.prune(progress)?;
         Ok(path)
+    }
+
+    fn write(learner: &Learner, progress: &Progress, temporary: &Path, path: &Path) -> Result<(), TrainError> {
+        std::fs::create_dir_all(temporary).map_err(TrainError::io("making a checkpoint", temporary))?;
+        let failed =
+            |name: &str, reason: String| TrainError::io(SAVING, &temporary.join(name))(std::io::Error::other(reason));
+        let record = learner.model.clone().into_record();
+        record.save(temporary.join(MODEL)).map_err(|error| failed(MODEL, error.to_string()))?;
+        let saved = learner.optimizer.save(temporary.join(OPTIMIZER));
+        saved.map_err(|error| failed(OPTIMIZER, error.to_string()))?;
+        let mut files = BTreeMap::new();
+        for name in [MODEL, OPTIMIZER] {
+            let file = temporary.join(name);
+            files.insert(name.to_owned(), fingerprint(&file).map_err(TrainError::io(SAVING, &file))?);
+        }
+        write_state(temporary, &State { version: VERSION, progress: progress.clone(), files })?;
+        if path.exists() {
+            // Only where somebody moved newer checkpoints away and trains those steps again.
+            std::fs::remove_dir_all(path).map_err(TrainError::io("replacing a checkpoint", path))?;
+        }
+        publish(temporary, path).map_err(TrainError::io(SAVING, path))
+    }
+
+    /// Writes what a validation has added to the progress into the checkpoint of its step, and removes the checkpoints
+    /// that are kept no longer.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`] and [`TrainError::BadFile`]; the checkpoint is then as it was.
+    pub fn update(&self, progress: &Progress) -> Result<(), TrainError> {
+        let path = self.path_of(progress.step);
+        let state = State { progress: progress.clone(), ..read_state(&path)? };
+        write_state(&path, &state)?;
+        self.prune(progress)
     }
 
     /// Loads the newest checkpoint into a learner; `None` when there is none.
     ///
     /// # Errors
-    /// [`TrainError::BadFile`] for a damaged checkpoint: nothing is started over in silence.
+    /// [`TrainError::Damaged`] for a damaged checkpoint: nothing is started over in silence.
     pub fn resume(&self, learner: &mut Learner) -> Result<Option<Progress>, TrainError> {
-        let Some(path) = self.list()?.pop() else { return Ok(None) };
-        let state_path = path.join("state.json");
-        let text = std::fs::read(&state_path).map_err(TrainError::io("reading a checkpoint", &state_path))?;
-        let state: State = serde_json::from_slice(&text).map_err(TrainError::bad_file("checkpoint", &state_path))?;
-        if state.version != VERSION {
-            let reason = format!("it has version {}, this program reads {VERSION}", state.version);
-            return Err(TrainError::bad_file("checkpoint", &state_path)(reason));
-        }
-        let model = path.join("model.bpk");
-        let record = ModuleRecord::load(&model).map_err(TrainError::bad_file("checkpoint", &model))?;
-        let loaded = learner.model.clone().try_load_record(record);
-        learner.model = loaded.map_err(|error| TrainError::bad_file("checkpoint", &model)(format!("{error:?}")))?;
-        let optimizer = path.join("optimizer.bpk");
-        let loaded = learner.optimizer.clone().load(&optimizer);
-        learner.optimizer = loaded.map_err(TrainError::bad_file("checkpoint", &optimizer))?;
-        Ok(Some(Progress { step: state.step, bad_steps: state.bad_steps }))
+        let mut all = self.list()?;
+        let Some(path) = all.pop() else { return Ok(None) };
+        let loaded = load(&path, learner).map_err(|source| {
+            let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let fix = match all.last() {
+                Some(older) => format!("move {} away to go on from {}", name(&path), name(older)),
+                None => "it is the only checkpoint of its stage; --fresh starts the run over".into(),
+            };
+            TrainError::Damaged { source: Box::new(source), fix }
+        });
+        loaded.map(Some)
     }
 
     /// The newest checkpoint.
@@ -107,36 +160,160 @@ impl Checkpoints {
         Ok(self.list()?.pop())
     }
 
+    /// The step of the newest checkpoint.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`].
+    pub fn newest_step(&self) -> Result<Option<u64>, TrainError> {
+        Ok(self.newest()?.as_deref().and_then(step_of))
+    }
+
+    fn path_of(&self, step: u64) -> PathBuf {
+        self.folder.join(format!("step-{step:09}"))
+    }
+
     /// Complete checkpoints, oldest first.
     fn list(&self) -> Result<Vec<PathBuf>, TrainError> {
         if !self.folder.exists() {
             return Ok(Vec::new());
         }
         let mut found = Vec::new();
-        for item in std::fs::read_dir(&self.folder).map_err(TrainError::io("listing checkpoints", &self.folder))? {
-            let path = item.map_err(TrainError::io("listing checkpoints", &self.folder))?.path();
-            let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-            if let Some(step) = name.strip_prefix("step-").and_then(|step| step.parse::<u64>().ok()) {
-                found.push((step, path));
-            }
+        for item in std::fs::read_dir(&self.folder).map_err(TrainError::io(LISTING, &self.folder))? {
+            let path = item.map_err(TrainError::io(LISTING, &self.folder))?.path();
+            found.extend(step_of(&path).map(|step| (step, path)));
         }
         found.sort();
         Ok(found.into_iter().map(|(_, path)| path).collect())
     }
 
-    /// Removes checkpoints beyond the newest, and what a save that was killed has left.
-    fn prune(&self) -> Result<(), TrainError> {
-        let listing = "listing checkpoints";
-        for item in std::fs::read_dir(&self.folder).map_err(TrainError::io(listing, &self.folder))? {
-            let path = item.map_err(TrainError::io(listing, &self.folder))?.path();
+    /// Removes the checkpoints that are kept no longer, and what a save that was killed has left.
+    fn prune(&self, progress: &Progress) -> Result<(), TrainError> {
+        for item in std::fs::read_dir(&self.folder).map_err(TrainError::io(LISTING, &self.folder))? {
+            let path = item.map_err(TrainError::io(LISTING, &self.folder))?.path();
             if path.extension().is_some_and(|extension| extension == "tmp") {
-                std::fs::remove_dir_all(&path).map_err(TrainError::io("removing an unfinished save", &path))?;
+                remove_if_there(&path)?;
             }
         }
-        let all = self.list()?;
-        for path in &all[..all.len().saturating_sub(self.keep)] {
-            std::fs::remove_dir_all(path).map_err(TrainError::io("removing an old checkpoint", path))?;
+        let steps: Vec<u64> = self.list()?.iter().filter_map(|path| step_of(path)).collect();
+        for step in surplus(&steps, &self.retention, progress.best) {
+            let path = self.path_of(step);
+            remove_folder(&path).map_err(TrainError::io("removing an old checkpoint", &path))?;
         }
         Ok(())
+    }
+}
+
+/// The steps, oldest first, that are neither among the last nor the best nor one of the regular ones.
+fn surplus(steps: &[u64], retention: &CheckpointConfig, best: Option<Best>) -> Vec<u64> {
+    let CheckpointConfig { keep, keep_every, keep_best, .. } = *retention;
+    let is_kept = |step: u64| {
+        let is_best = keep_best && best.is_some_and(|best| best.step == step);
+        is_best || (keep_every > 0 && step.is_multiple_of(keep_every))
+    };
+    steps[..steps.len().saturating_sub(keep)].iter().copied().filter(|step| !is_kept(*step)).collect()
+}
+
+fn step_of(path: &Path) -> Option<u64> {
+    path.file_name()?.to_str()?.strip_prefix("step-")?.parse().ok()
+}
+
+fn remove_if_there(folder: &Path) -> Result<(), TrainError> {
+    if folder.exists() {
+        std::fs::remove_dir_all(folder).map_err(TrainError::io("removing an unfinished save", folder))?;
+    }
+    Ok(())
+}
+
+fn write_state(folder: &Path, state: &State) -> Result<(), TrainError> {
+    let path = folder.join("state.json");
+    let text = serde_json::to_vec(state).map_err(TrainError::bad_file("checkpoint", &path))?;
+    replace(&path, &text).map_err(TrainError::io(SAVING, &path))
+}
+
+fn read_state(folder: &Path) -> Result<State, TrainError> {
+    let path = folder.join("state.json");
+    let bad = |reason: String| TrainError::bad_file("checkpoint", &path)(reason);
+    let text = std::fs::read(&path).map_err(TrainError::io("reading a checkpoint", &path))?;
+    let value: serde_json::Value = serde_json::from_slice(&text).map_err(|error| bad(error.to_string()))?;
+    let version = &value["version"];
+    if *version != VERSION {
+        return Err(bad(format!("it has version {version}, this program reads {VERSION}")));
+    }
+    serde_json::from_value(value).map_err(|error| bad(error.to_string()))
+}
+
+fn load(folder: &Path, learner: &mut Learner) -> Result<Progress, TrainError> {
+    let State { progress, files, .. } = read_state(folder)?;
+    for (name, expected) in &files {
+        let file = folder.join(name);
+        let found = fingerprint(&file).map_err(TrainError::io("reading a checkpoint", &file))?;
+        if found != *expected {
+            let reason = format!("{} bytes with other contents, {} expected", found.num_bytes, expected.num_bytes);
+            return Err(TrainError::bad_file("checkpoint", &file)(reason));
+        }
+    }
+    let model = folder.join(MODEL);
+    let record = ModuleRecord::load(&model).map_err(TrainError::bad_file("checkpoint", &model))?;
+    let loaded = learner.model.clone().try_load_record(record);
+    learner.model = loaded.map_err(|error| TrainError::bad_file("checkpoint", &model)(format!("{error:?}")))?;
+    let optimizer = folder.join(OPTIMIZER);
+    let loaded = learner.optimizer.clone().load(&optimizer);
+    learner.optimizer = loaded.map_err(TrainError::bad_file("checkpoint", &optimizer))?;
+    Ok(progress)
+}
+
+fn fingerprint(path: &Path) -> std::io::Result<Fingerprint> {
+    let mut file = File::open(path)?;
+    let mut hasher = crc32fast::Hasher::new();
+    let (mut num_bytes, mut buffer) = (0, vec![0; 1 << 20]);
+    loop {
+        match file.read(&mut buffer)? {
+            0 => return Ok(Fingerprint { num_bytes, crc32: hasher.finalize() }),
+            count => {
+                hasher.update(&buffer[..count]);
+                num_bytes += count as u64;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_last_the_best_and_every_mth_are_kept() {
+        let steps = [10, 20, 30, 40, 50, 60];
+        let gone = |keep, keep_every, keep_best, best: u64| {
+            let retention = CheckpointConfig { every: 10, keep, keep_every, keep_best };
+            surplus(&steps, &retention, Some(Best { step: best, psnr: 20.0 }))
+        };
+        assert_eq!(gone(2, 0, false, 20), [10, 20, 30, 40]);
+        assert_eq!(gone(2, 0, true, 20), [10, 30, 40]);
+        assert_eq!(gone(1, 30, true, 20), [10, 40, 50]);
+        assert_eq!(gone(1, 30, true, 60), [10, 20, 40, 50], "the best is the last");
+        assert_eq!(gone(9, 0, false, 20), [0; 0]);
+        let none = CheckpointConfig { keep: 1, ..CheckpointConfig::default() };
+        assert_eq!(surplus(&steps, &none, None).len(), 5);
+    }
+
+    #[test]
+    fn only_whole_checkpoints_have_a_step() {
+        let step = |name: &str| step_of(Path::new(name));
+        assert_eq!((step("a/step-000000017"), step("a/step-1000000000")), (Some(17), Some(1_000_000_000)));
+        assert_eq!((step("a/step-000000017.tmp"), step("a/best")), (None, None));
+    }
+
+    #[test]
+    fn a_fingerprint_sees_every_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.bpk");
+        let mut bytes = vec![7; 3_000_000];
+        std::fs::write(&path, &bytes).unwrap();
+        let whole = fingerprint(&path).unwrap();
+        assert_eq!(whole.num_bytes, 3_000_000);
+        bytes[2_000_001] ^= 1;
+        std::fs::write(&path, &bytes).unwrap();
+        assert_ne!(fingerprint(&path).unwrap(), whole);
     }
 }

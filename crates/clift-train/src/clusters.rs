@@ -1,24 +1,24 @@
-//! The offline cluster cache: latent K-means of every training scene, made once from the frozen encoder.
+//! The offline cluster cache: latent K-means of every training scene, made once from the frozen encoder, or tiles.
 //!
 //! A folder with `index.json` (what was clustered with which encoder) and `clusters.bin` (per entry the
-//! cluster of every token and the token of every cluster, little-endian u16).
+//! cluster of every token and the token of every cluster, little-endian u16). While it is made, a journal keeps what is
+//! done.
 
-use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
+use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
-use clift_data::files::replace;
 use clift_data::order::{below, derive_seed, item_rng};
 use clift_data::{ClipReader, DataError, Ledger, ViewIndices};
 use clift_eval::upload_views;
-use clift_model::{Encoder, SceneClusters};
+use clift_model::{Encoder, Grouping, SceneClusters, tile_clusters};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
-use crate::config::Config;
+use crate::cluster_journal::{Journal, Origin};
+use crate::config::{ClustersConfig, Config};
 use crate::events::{Event, Sink, Stage};
 
 const VERSION: u32 = 1;
@@ -45,14 +45,14 @@ pub struct Entry {
 /// What `index.json` holds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Index {
-    version: u32,
+pub(crate) struct Index {
+    pub version: u32,
     /// Hash of the encoder's weights.
-    encoder: String,
+    pub encoder: String,
     /// The settings that decide the clusters, as JSON in a string: read back, numbers could differ in the last digit.
-    settings: String,
-    skipped: Ledger,
-    entries: Vec<Entry>,
+    pub settings: String,
+    pub skipped: Ledger,
+    pub entries: Vec<Entry>,
 }
 
 /// What the cache of a run is made from.
@@ -71,98 +71,71 @@ pub struct ClusterJob<'a> {
 
 impl ClusterJob<'_> {
     /// Clusters every training scene `num_passes` times, each time with one context set and one count
-    /// of the grid, and opens the result. Written to a temporary folder that is then renamed.
+    /// of the grid, and opens the result. What an interrupted call with the same encoder and settings has done is taken
+    /// over; the result is the same, byte for byte. Written to a temporary folder that is then renamed.
     ///
     /// # Errors
     /// Whatever the disk or the model gives, [`TrainError::NoScenes`] when no scene could be clustered, and
     /// [`TrainError::Interrupted`]. A scene that does not fit its views is skipped and noted.
     pub fn make(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
         let Self { config, reader, encoder_hash, .. } = *self;
-        let temporary = folder.with_extension("tmp");
-        if temporary.exists() {
-            std::fs::remove_dir_all(&temporary).map_err(TrainError::io("removing an unfinished cache", &temporary))?;
-        }
-        std::fs::create_dir_all(&temporary).map_err(TrainError::io("making the cluster cache", &temporary))?;
-        let data_path = temporary.join("clusters.bin");
-        let writing = "writing the cluster cache";
-        let mut data = BufWriter::new(File::create(&data_path).map_err(TrainError::io(writing, &data_path))?);
+        let origin = Origin { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };
+        let mut journal = Journal::open(&folder.with_extension("tmp"), origin)?;
 
         let total = reader.source.num_scenes();
         let num_scenes = if config.clusters.num_scenes == 0 { total } else { config.clusters.num_scenes.min(total) };
         let total_sets = (config.clusters.num_passes * num_scenes) as u64;
         let started = std::time::Instant::now();
-        sink.event(&Event::StageStarted { stage: Stage::Clusters, done: 0, num_steps: total_sets });
-        let mut reasons = BTreeMap::new();
-        let mut entries: Vec<Entry> = Vec::new();
-        let mut offset_bytes = 0;
-        for pass in 0..config.clusters.num_passes {
-            for scene in 0..num_scenes {
-                match self.cluster_scene(pass, scene) {
-                    Ok((context, clusters)) => {
-                        let bytes = encode(&clusters)?;
-                        data.write_all(&bytes).map_err(TrainError::io(writing, &data_path))?;
-                        entries.push(Entry {
-                            key: reader.source.key(scene).into(),
-                            context,
-                            num_tokens: clusters.assignment().len(),
-                            num_storage_tokens: clusters.centroid_index().len(),
-                            offset_bytes,
-                        });
-                        offset_bytes += bytes.len() as u64;
-                    }
-                    // A scene that does not fit its views is left out; a disk that fails is not a scene.
-                    Err(TrainError::Data(error)) if !matches!(error, DataError::Io { .. }) => {
-                        let (key, reason) = (reader.source.key(scene), error.to_string());
-                        sink.event(&Event::Skipped { key: key.into(), reason: reason.clone() });
-                        reasons.insert(key.to_owned(), reason);
-                    }
-                    Err(other) => return Err(other),
+        let done = journal.num_sets();
+        sink.event(&Event::StageStarted { stage: Stage::Clusters, done, num_steps: total_sets });
+        for set in done..total_sets {
+            let (pass, scene) = (set / num_scenes as u64, set as usize % num_scenes);
+            let key = reader.source.key(scene);
+            match self.cluster_scene(pass, scene) {
+                Ok((context, clusters)) => journal.add(key, context, &clusters)?,
+                // A scene that does not fit its views is left out; a disk that fails is not a scene.
+                Err(TrainError::Data(error)) if !matches!(error, DataError::Io { .. }) => {
+                    let reason = error.to_string();
+                    sink.event(&Event::Skipped { key: key.into(), reason: reason.clone() });
+                    journal.skip(key, &reason)?;
                 }
-                let done = (pass * num_scenes + scene + 1) as u64;
-                sink.event(&Event::Progress { stage: Stage::Clusters, done, total: total_sets });
-                if stop.load(Ordering::Relaxed) {
-                    return Err(TrainError::Interrupted { step: done });
-                }
+                Err(other) => return Err(other),
+            }
+            sink.event(&Event::Progress { stage: Stage::Clusters, done: set + 1, total: total_sets });
+            if stop.load(Ordering::Relaxed) {
+                return Err(TrainError::Interrupted { step: set + 1 });
             }
         }
         sink.event(&Event::StageFinished { stage: Stage::Clusters, elapsed_s: started.elapsed().as_secs_f64() });
-        if entries.is_empty() {
-            let reason = reasons.into_values().next().unwrap_or_default();
-            return Err(TrainError::NoScenes { reason: format!("none could be clustered; the first: {reason}") });
-        }
-        // A scene that one pass could use is not left out.
-        for entry in &entries {
-            reasons.remove(&entry.key);
-        }
-        let mut skipped = Ledger::new(num_scenes);
-        for (key, reason) in reasons {
-            skipped.skip(key, reason);
-        }
-        let data = data.into_inner().map_err(|error| TrainError::io(writing, &data_path)(error.into_error()))?;
-        data.sync_all().map_err(TrainError::io(writing, &data_path))?;
-        let index =
-            Index { version: VERSION, encoder: encoder_hash.into(), settings: settings(config), skipped, entries };
-        let index_path = temporary.join("index.json");
-        let text = serde_json::to_vec(&index).map_err(TrainError::bad_file("cluster cache", &index_path))?;
-        replace(&index_path, &text).map_err(TrainError::io(writing, &index_path))?;
-        std::fs::rename(&temporary, folder).map_err(TrainError::io("renaming the cluster cache", folder))?;
+        journal.publish(folder, num_scenes)?;
         ClusterCache::open(folder, config, encoder_hash)
     }
 
-    fn cluster_scene(&self, pass: usize, scene: usize) -> Result<(Vec<usize>, SceneClusters), TrainError> {
+    fn cluster_scene(&self, pass: u64, scene: usize) -> Result<(Vec<usize>, SceneClusters), TrainError> {
         let Self { config, reader, encoder, device, .. } = *self;
         let seed = derive_seed(config.seed, "clusters");
         let views = &config.data.views;
-        let mut rng = item_rng(seed, pass as u64, scene as u32, 0, "context and count");
+        let mut rng = item_rng(seed, pass, scene as u32, 0, "context and count");
         let num_context = views.min_context + below(&mut rng, views.max_context - views.min_context + 1);
         // The gaps that stage 1 ends with.
         let last_step = config.stage1.steps.min(views.warm_up_steps);
         let context = views.draw(reader.source.as_ref(), scene, last_step, num_context, &mut rng)?.context;
         let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
-        let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
-        let count = config.clusters.grid[below(&mut rng, config.clusters.grid.len())].of(lift.dims()[1])?;
-        let fit = config.clusters.kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
-        Ok((context, fit.clusters.scenes()[0].clone()))
+        let ClustersConfig { grouping, grid, kmeans, .. } = &config.clusters;
+        let num_tokens = config.model.num_tokens(num_context, clip.context.height, clip.context.width)?;
+        let count = grid[below(&mut rng, grid.len())].of(num_tokens)?;
+        let clusters = match grouping {
+            Grouping::Kmeans => {
+                let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
+                let fit = kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
+                fit.clusters.scenes()[0].clone()
+            }
+            Grouping::Patch => {
+                let grid = [clip.context.height, clip.context.width].map(|side| side / config.model.patch_size);
+                tile_clusters(num_context, grid, count)?
+            }
+        };
+        Ok((context, clusters))
     }
 }
 
@@ -237,7 +210,7 @@ impl ClusterCache {
 }
 
 impl Entry {
-    fn num_bytes(&self) -> u64 {
+    pub(crate) fn num_bytes(&self) -> u64 {
         2 * (self.num_tokens + self.num_storage_tokens) as u64
     }
 }
@@ -259,12 +232,4 @@ fn settings(config: &Config) -> String {
         "clusters": config.clusters,
     })
     .to_string()
-}
-
-fn encode(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {
-    let ids = clusters.assignment().iter().chain(clusters.centroid_index());
-    ids.map(|&id| u16::try_from(id).map(u16::to_le_bytes))
-        .collect::<Result<Vec<_>, _>>()
-        .map(|pairs| pairs.concat())
-        .map_err(|_| TrainError::NoScenes { reason: format!("a scene has more than {MAX_TOKENS} tokens") })
 }

@@ -3,11 +3,12 @@
 use std::path::PathBuf;
 
 use clift_data::{
-    BoundedSampler, ClipOptions, Crop, FileOptions, Layout, PoseRotation, PoseScale, SceneFilters, Split, SyntheticConfig,
+    BoundedSampler, ClipOptions, Crop, DataError, FileOptions, Layout, PoseRotation, PoseScale, SceneFilters, Split,
+    SyntheticConfig,
 };
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
-use clift_model::{KMeans, ModelConfig};
+use clift_model::{Grouping, KMeans, ModelConfig};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
@@ -181,13 +182,25 @@ pub struct OptimizerConfig {
     pub weight_decay: f64,
     /// Gradients are scaled down to this global norm.
     pub max_grad_norm: f64,
-    /// Steps in a row with a loss or gradient that is not finite before the run stops.
+    /// A step whose loss or gradient norm is more than this many times its median over the last 101 good steps is left
+    /// out; 0 leaves out only those that are not finite.
+    pub spike_factor: f64,
+    /// Steps in a row that are left out before the run stops.
     pub max_bad_steps: u32,
 }
 
 impl Default for OptimizerConfig {
     fn default() -> Self {
-        Self { learning_rate: 4e-4, warm_up_steps: 2500, weight_decay: 0.05, max_grad_norm: 1.0, max_bad_steps: 3 }
+        Self {
+            learning_rate: 4e-4,
+            warm_up_steps: 2500,
+            weight_decay: 0.05,
+            max_grad_norm: 1.0,
+            // Far from what happens in good training: in `tiny.toml` no loss is above 2 times, no gradient norm above
+            // 4.3 times its median.
+            spike_factor: 100.0,
+            max_bad_steps: 3,
+        }
     }
 }
 
@@ -226,6 +239,9 @@ impl Default for Stage1Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ClustersConfig {
+    /// What stage 2 learns to condense: clusters of latent K-means (`kmeans`), or tiles of the views (`patch`), which
+    /// the paper compares them with.
+    pub grouping: Grouping,
     /// Token counts that stage 2 trains on. Departs from the reference, which draws any ratio per
     /// scene and pads: a shared grid makes dense batches.
     pub grid: Vec<TokenCount>,
@@ -240,7 +256,13 @@ pub struct ClustersConfig {
 impl Default for ClustersConfig {
     fn default() -> Self {
         let shares = [1.0 / 32.0, 1.0 / 16.0, 0.125, 0.1875, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0];
-        Self { grid: shares.map(TokenCount::Share).into(), num_passes: 3, num_scenes: 0, kmeans: KMeans::default() }
+        Self {
+            grouping: Grouping::Kmeans,
+            grid: shares.map(TokenCount::Share).into(),
+            num_passes: 3,
+            num_scenes: 0,
+            kmeans: KMeans::default(),
+        }
     }
 }
 
@@ -280,11 +302,15 @@ pub struct CheckpointConfig {
     pub every: u64,
     /// How many of the latest are kept.
     pub keep: usize,
+    /// Whether the one with the best validation is kept too, of those whose step is validated (`eval.every`).
+    pub keep_best: bool,
+    /// Keeps every checkpoint whose step is a multiple of this, which is one of `every`; 0 keeps none for that.
+    pub keep_every: u64,
 }
 
 impl Default for CheckpointConfig {
     fn default() -> Self {
-        Self { every: 1000, keep: 2 }
+        Self { every: 1000, keep: 2, keep_best: true, keep_every: 0 }
     }
 }
 
@@ -298,7 +324,8 @@ impl Config {
             return Err(bad("run_dir", "\"\"", "write the folder that is to receive the run"));
         }
         self.model.validate()?;
-        self.data.views.validate()?;
+        self.data.views.validate().map_err(in_section("data.views"))?;
+        self.validate_size()?;
         self.validate_token_counts()?;
         self.data.validate()?;
         if self.loss.perceptual_weight != 0.0 {
@@ -322,6 +349,12 @@ impl Config {
         ] {
             in_range(key, value, least, most)?;
         }
+        if checkpoint.keep_every > 0
+            && (checkpoint.every == 0 || !checkpoint.keep_every.is_multiple_of(checkpoint.every))
+        {
+            let fix = format!("write 0 or a multiple of checkpoint.every, which is {}", checkpoint.every);
+            return Err(bad("checkpoint.keep_every", checkpoint.keep_every, &fix));
+        }
         let [low, high] = stage1.keep_tokens;
         if !(low > 0.0 && low <= high && high <= 1.0) {
             return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
@@ -337,6 +370,21 @@ impl Config {
         Ok(())
     }
 
+    /// Pictures are whole patches.
+    fn validate_size(&self) -> Result<(), TrainError> {
+        let patch_size = self.model.patch_size;
+        for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
+            if value == 0 || !value.is_multiple_of(patch_size) {
+                let below = value / patch_size * patch_size;
+                let near =
+                    if below == 0 { patch_size.to_string() } else { format!("{below} or {}", below + patch_size) };
+                let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
+                return Err(bad(key, value, &fix));
+            }
+        }
+        Ok(())
+    }
+
     /// No scene has more tokens than can be kept, or fewer than the cluster cache asks for.
     fn validate_token_counts(&self) -> Result<(), TrainError> {
         let views = &self.data.views;
@@ -347,10 +395,20 @@ impl Config {
             return Err(bad("data.views.max_context", views.max_context, &fix));
         }
         let fewest_tokens = views.min_context * tokens_per_view;
-        match self.clusters.grid.iter().find(|count| count.of(fewest_tokens).is_err()) {
-            None => Ok(()),
-            Some(count) => Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens"))),
+        if let Some(count) = self.clusters.grid.iter().find(|count| count.of(fewest_tokens).is_err()) {
+            return Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens")));
         }
+        if self.clusters.grouping == Grouping::Patch {
+            let grid = self.clusters.grid.iter().map(|count| ("clusters.grid", count));
+            let counts = grid.chain([("eval.validation_storage", &self.eval.validation_storage)]);
+            for (key, count) in counts {
+                let too_few = |views: usize| count.of(views * tokens_per_view).is_ok_and(|count| count < views);
+                if too_few(views.min_context) || too_few(views.max_context) {
+                    return Err(bad(key, count, "write at least a tile for every context view"));
+                }
+            }
+        }
+        Ok(())
     }
 }
 
@@ -364,15 +422,15 @@ impl DataConfig {
         if self.root.is_none() {
             return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
         }
-        Ok(self.filters.validate()?)
+        self.filters.validate().map_err(in_section("data.filters"))
     }
 
     fn validate_synthetic(&self) -> Result<(), TrainError> {
         let synthetic = &self.synthetic;
-        synthetic.validate()?;
+        synthetic.validate().map_err(in_section("data.synthetic"))?;
         if synthetic.width < self.width || synthetic.height < self.height {
             let fix = format!(
-                "synthetic scenes are {} x {}: write data.synthetic.width and height of at least {} and {}",
+                "synthetic scenes are {} x {}: write data.synthetic.width and data.synthetic.height of at least {} and {}",
                 synthetic.width, synthetic.height, self.width, self.height
             );
             return Err(bad("data.width, data.height", format!("{}, {}", self.width, self.height), &fix));
@@ -396,6 +454,10 @@ impl OptimizerConfig {
             let key = format!("{stage}.optimizer.weight_decay");
             return Err(bad(&key, self.weight_decay, "write 0 or a positive number"));
         }
+        if !(self.spike_factor == 0.0 || (self.spike_factor > 1.0 && self.spike_factor.is_finite())) {
+            let key = format!("{stage}.optimizer.spike_factor");
+            return Err(bad(&key, self.spike_factor, "write 0 to look for no spikes, or a number above 1"));
+        }
         in_range(&format!("{stage}.optimizer.max_bad_steps"), self.max_bad_steps as usize, 1, usize::MAX)
     }
 }
@@ -406,6 +468,18 @@ fn in_range(key: &str, value: usize, least: usize, most: usize) -> Result<(), Tr
     }
     let fix = if most == usize::MAX { format!("write at least {least}") } else { format!("write {least} to {most}") };
     Err(bad(key, value, &fix))
+}
+
+/// Names the key of a section's own refusal in full; for `map_err`.
+fn in_section(section: &'static str) -> impl FnOnce(DataError) -> TrainError {
+    move |error| match error {
+        // Such a problem says "is VALUE; FIX".
+        DataError::BadConfig { key, problem } => match problem.strip_prefix("is ").and_then(|is| is.split_once("; ")) {
+            Some((value, fix)) => bad(&format!("{section}.{key}"), value, fix),
+            None => DataError::BadConfig { key: format!("{section}.{key}"), problem }.into(),
+        },
+        other => other.into(),
+    }
 }
 
 fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {

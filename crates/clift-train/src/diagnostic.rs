@@ -61,6 +61,21 @@ impl<'a> Sources<'a> {
         self.file.len() + 1 + before
     }
 
+    /// The overrides with blanks in front, which move their spans behind the file's, so that one span names one place.
+    pub(crate) fn padded_overrides(&self) -> Vec<String> {
+        let padded = |index| format!("{}{}", " ".repeat(self.override_start(index)), self.overrides[index]);
+        (0..self.overrides.len()).map(padded).collect()
+    }
+
+    /// Where a span of the texts is, in words.
+    pub(crate) fn place(&self, span: &Range<usize>) -> String {
+        if span.start > self.file.len() {
+            return "by --set".to_owned();
+        }
+        let start = floor_char_boundary(self.file, span.start);
+        format!("in line {}", self.file[..start].matches('\n').count() + 1)
+    }
+
     /// Describes a mistake at a span of the texts; a span beyond one line is marked on its first line.
     pub(crate) fn at(&self, span: Range<usize>, title: String, label: String) -> Diagnostic {
         let index = (0..self.overrides.len()).rev().find(|&index| span.start >= self.override_start(index));

@@ -3,8 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
+use toml::Spanned;
 use toml::de::DeTable;
 
+use crate::TrainError;
+use crate::config::Config;
 use crate::diagnostic::{Diagnostic, Sources};
 use crate::keys::Keys;
 use crate::mistakes;
@@ -35,6 +38,12 @@ pub enum ConfigError {
     /// A key is missing, or its value has the wrong type or is not one of those allowed.
     #[error("{0}")]
     Value(Box<Diagnostic>),
+    /// A value is out of its range, or does not fit another one.
+    #[error("{0}")]
+    Range(Box<Diagnostic>),
+    /// Something else is wrong with the values.
+    #[error(transparent)]
+    Other(Box<TrainError>),
 }
 
 /// Reads the TOML file at `path`, applies the overrides in order, and lists what they changed.
@@ -60,19 +69,49 @@ pub fn parse_config<T: DeserializeOwned>(
     overrides: &[String],
 ) -> Result<(T, Vec<Override>), ConfigError> {
     let sources = Sources::new(path, file, overrides);
+    let padded = sources.padded_overrides();
+    let (root, changed) = merged(&sources, file, &padded)?;
+    let config = read_table(root, &sources)?;
+    Ok((config, changed))
+}
+
+/// Does [`read_config`] for a whole experiment, and then asks `check` whether its values fit.
+///
+/// # Errors
+/// As [`read_config`], and [`ConfigError::Range`] with the place of a value that `check` refuses by its key.
+pub fn read_checked_config(
+    path: &Path,
+    overrides: &[String],
+    check: impl FnOnce(&Config) -> Result<(), TrainError>,
+) -> Result<(Config, Vec<Override>), ConfigError> {
+    let file = std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })?;
+    let sources = Sources::new(path, &file, overrides);
+    let padded = sources.padded_overrides();
+    let (root, changed) = merged(&sources, &file, &padded)?;
+    let config: Config = read_table(root.clone(), &sources)?;
+    match check(&config) {
+        Ok(()) => Ok((config, changed)),
+        Err(error) => Err(match mistakes::out_of_range(&error, root.get_ref(), &sources) {
+            Some(diagnostic) => ConfigError::Range(Box::new(diagnostic)),
+            None => ConfigError::Other(Box::new(error)),
+        }),
+    }
+}
+
+/// The file's table with the overrides in it, and what those changed.
+fn merged<'t>(
+    sources: &Sources,
+    file: &'t str,
+    padded: &'t [String],
+) -> Result<(Spanned<DeTable<'t>>, Vec<Override>), ConfigError> {
     let mut root = DeTable::parse(file).map_err(|error| {
         let span = error.span().unwrap_or(0..0);
         ConfigError::Syntax(Box::new(sources.at(span, "the file is not TOML".into(), error.message().into())))
     })?;
-
-    // Blanks in front of an override move its spans behind the file's, so that one span names one place.
-    let padded: Vec<String> = (0..overrides.len())
-        .map(|index| format!("{}{}", " ".repeat(sources.override_start(index)), overrides[index]))
-        .collect();
     let mut changed: Vec<Override> = Vec::new();
     for (index, text) in padded.iter().enumerate() {
         let start = sources.override_start(index);
-        let (key, value) = parse_override(&sources, text, start).map_err(ConfigError::Override)?;
+        let (key, value) = parse_override(sources, text, start).map_err(ConfigError::Override)?;
         let to = show(value.get_ref());
         let from = merge(root.get_mut(), &key, value).map_err(|blocked| {
             let title = format!("`{}` is a value, not a section", blocked.get_ref());
@@ -85,14 +124,16 @@ pub fn parse_config<T: DeserializeOwned>(
         }
     }
     changed.retain(|change| change.from.as_ref() != Some(&change.to));
+    Ok((root, changed))
+}
 
-    let unknown = mistakes::unknown_keys(&Keys::of::<T>(), root.get_ref(), &sources);
+fn read_table<T: DeserializeOwned>(root: Spanned<DeTable>, sources: &Sources) -> Result<T, ConfigError> {
+    let unknown = mistakes::unknown_keys(&Keys::of::<T>(), root.get_ref(), sources);
     if !unknown.is_empty() {
         return Err(ConfigError::UnknownKeys(unknown));
     }
-    let config = T::deserialize(toml::Deserializer::from(root.clone()))
-        .map_err(|error| ConfigError::Value(Box::new(mistakes::wrong_value(&error, root.get_ref(), &sources))))?;
-    Ok((config, changed))
+    T::deserialize(toml::Deserializer::from(root.clone()))
+        .map_err(|error| ConfigError::Value(Box::new(mistakes::wrong_value(&error, root.get_ref(), sources))))
 }
 
 #[cfg(test)]

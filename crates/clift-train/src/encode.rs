@@ -5,7 +5,7 @@ use burn::tensor::Tensor;
 use clift_data::order::derive_seed;
 use clift_data::{ClipReader, Pose, SceneFrame, ViewIndices, spread_along_path};
 use clift_eval::{TokenCount, upload_views, view_cameras};
-use clift_model::{Clusters, Scene, TokenKind, WorldFrame, weights};
+use clift_model::{Clusters, Grouping, Scene, TokenKind, WorldFrame, total_variance, weights};
 
 use crate::TrainError;
 use crate::config::Config;
@@ -56,6 +56,10 @@ impl Trained {
         scene: usize,
         options: &EncodeOptions,
     ) -> Result<Encoded, TrainError> {
+        if config.clusters.grouping != Grouping::Kmeans {
+            let fix = "scenes are of K-means tokens: encode with a run whose clusters.grouping is \"kmeans\"".into();
+            return Err(TrainError::BadConfig { key: "clusters.grouping".into(), value: "\"patch\"".into(), fix });
+        }
         let key = reader.source.key(scene);
         let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
         let frames = context_frames(&poses, options.context.as_deref(), config.data.views.max_context)?;
@@ -141,11 +145,11 @@ fn cluster(
             (counts, limit)
         }
     };
-    let variance = total_variance(lift)?;
+    let variance = total_variance(lift)?[0];
     let mut tried = Vec::new();
     for count in counts {
         let fit = config.clusters.kmeans.fit(lift.clone(), count, &[seed])?;
-        let error = if variance > 0.0 { fit.inertia[0] / variance } else { 0.0 };
+        let error = fit.error(0, variance);
         tried.push((count, error));
         if error <= limit {
             return Ok((fit.clusters, tried));
@@ -156,16 +160,6 @@ fn cluster(
         "{count} tokens, the most of the run's clusters.grid, leave {error:.4}; write at least that, or --storage 1.0"
     );
     Err(TrainError::BadConfig { key: "--max-error".into(), value: limit.to_string(), fix })
-}
-
-/// Sum of squared distances of the tokens of one scene to their mean.
-fn total_variance(lift: &Tensor<3>) -> Result<f64, TrainError> {
-    let [_, num_tokens, _] = lift.dims();
-    let centred = lift.clone() - lift.clone().mean_dim(1);
-    let squares = centred.square().sum_dim(2).reshape([num_tokens]); // [1, N, D] -> [N]
-    let squares = squares.into_data().convert::<f32>();
-    let squares = squares.try_to_vec::<f32>().map_err(|error| TrainError::Tensor { reason: format!("{error:?}") })?;
-    Ok(squares.into_iter().map(f64::from).sum())
 }
 
 #[cfg(test)]

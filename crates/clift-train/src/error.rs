@@ -28,13 +28,15 @@ pub enum TrainError {
     },
     /// The run directory holds a run with other settings.
     #[error(
-        "this run was started with other settings:\n{differences}\nresume with the old values, choose another \
+        "this run was started with other settings:\n{differences}\nresume with the old values, {or}choose another \
          `run_dir`, or start over with --fresh: {path}",
         path = path.display()
     )]
     OtherRun {
         /// One line per differing key: `key: old -> new`.
         differences: String,
+        /// Another way on, where there is one.
+        or: &'static str,
         /// The run directory.
         path: PathBuf,
     },
@@ -93,20 +95,50 @@ pub enum TrainError {
         /// The device's reason.
         reason: String,
     },
-    /// The loss or the gradient was not finite several steps in a row.
+    /// Several steps in a row had to be left out.
     #[error(
-        "{count} steps in a row had a loss or gradient that is not finite, up to step {step} (scenes {keys}); \
-         the last good checkpoint is {checkpoint}"
+        "{count} steps in a row were left out, up to step {step}: {reason} (scenes {keys}); bad_steps.jsonl has them \
+         all; the last good checkpoint is {checkpoint}"
     )]
     Diverged {
         /// How many.
         count: u32,
         /// The last of them.
         step: u64,
+        /// What was wrong with that.
+        reason: String,
         /// Scenes of its batch.
         keys: String,
         /// The newest checkpoint, or "none".
         checkpoint: String,
+    },
+    /// A stage could not go on. What it had done is on the disk.
+    #[error("{source}\n{stage} stopped after step {step}; the last good checkpoint is {checkpoint}")]
+    Stopped {
+        /// What went wrong.
+        source: Box<TrainError>,
+        /// The stage.
+        stage: &'static str,
+        /// Its last step.
+        step: u64,
+        /// The newest checkpoint, or "none".
+        checkpoint: String,
+    },
+    /// A checkpoint cannot be read.
+    #[error("{source}\nthe newest checkpoint is damaged: {fix}")]
+    Damaged {
+        /// What is wrong with it.
+        source: Box<TrainError>,
+        /// What to do about it.
+        fix: String,
+    },
+    /// Another process works in the run directory.
+    #[error("{holder} is working in this run directory; wait for its end or choose another `run_dir`: {path}", path = path.display())]
+    Locked {
+        /// Which process, where that is known.
+        holder: String,
+        /// The run directory.
+        path: PathBuf,
     },
     /// No scene is left to train or evaluate on.
     #[error("no usable scene: {reason}")]

@@ -11,7 +11,7 @@ use clift_eval::report::MAX_EXHIBITS;
 use clift_eval::{
     Accumulator, EvalConfig, Exhibit, Networks, Report, Shown, Summary, Sweep, TokenCount, Variant, evaluate_scene,
 };
-use clift_model::Clift;
+use clift_model::{Clift, Grouping};
 
 use crate::TrainError;
 use crate::config::Config;
@@ -59,7 +59,8 @@ impl<'a> HeldOut<'a> {
     }
 
     /// Measures a model without autodiff during training: all tokens in stage 1, one count of condensed ones in stage 2.
-    /// Writes the first sheet to `folder`. Left off without a result once `stop` is set.
+    /// Writes the first sheet to `folder`. Returns the mean PSNR; none where nothing could be measured, and once `stop` is
+    /// set.
     ///
     /// # Errors
     /// As [`evaluate_scene`]; a scene that cannot be read is skipped.
@@ -71,22 +72,25 @@ impl<'a> HeldOut<'a> {
         folder: &Path,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
-    ) -> Result<(), TrainError> {
+    ) -> Result<Option<f64>, TrainError> {
+        let grouping = self.config.clusters.grouping;
         let (storage, variant) = match stage {
-            Stage::Stage2 => (self.config.eval.validation_storage, Variant::Clift),
+            Stage::Stage2 => (self.config.eval.validation_storage, condensed_variant(grouping)),
             _ => (TokenCount::Share(1.0), Variant::Kmeans),
         };
         let sweep = Sweep { render: Vec::new(), ..self.sweep(vec![storage], vec![variant]) };
-        let networks = Networks {
+        let mut networks = Networks {
             encoder: model.encoder.clone(),
             renderer: model.renderer.clone(),
-            condensed: Some((model.condenser.clone(), model.renderer.clone())),
+            condensed: None,
+            patch_condensed: None,
             device: self.device.clone(),
         };
+        networks.set_condensed(grouping, model.condenser.clone(), model.renderer.clone());
         let mut measured = Accumulator::default();
         for (i, item) in self.items.iter().take(self.config.eval.num_validation_scenes).enumerate() {
             if stop.load(Ordering::Relaxed) {
-                return Ok(());
+                return Ok(None);
             }
             let outcome = self.evaluate_item(&networks, item, &sweep, i == 0, &mut measured, sink)?;
             if let Outcome::Measured(Some(shown)) = outcome {
@@ -95,11 +99,10 @@ impl<'a> HeldOut<'a> {
             }
         }
         let summary = measured.summary();
-        if let Some(point) = summary.points.first() {
-            let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
-            sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
-        }
-        Ok(())
+        let Some(point) = summary.points.first() else { return Ok(None) };
+        let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
+        sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
+        Ok(point.psnr.filter(|psnr| psnr.is_finite()))
     }
 
     /// Runs the whole sweep and writes `report.html`, `summary.json`, `views.csv`, `skipped.json` and the picture sheets
@@ -116,9 +119,7 @@ impl<'a> HeldOut<'a> {
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
         let started = std::time::Instant::now();
-        let variants = [Variant::Random, Variant::Kmeans, Variant::Clift];
-        let variants = variants.into_iter().filter(|v| *v != Variant::Clift || networks.condensed.is_some());
-        let sweep = self.sweep(self.config.eval.storage.clone(), variants.collect());
+        let sweep = self.sweep(self.config.eval.storage.clone(), self.variants(networks)?);
         let total = self.items.len() as u64;
         sink.event(&Event::StageStarted { stage: Stage::Eval, done: 0, num_steps: total });
         let mut measured = Accumulator::default();
@@ -173,6 +174,29 @@ impl<'a> HeldOut<'a> {
         &self.ledger
     }
 
+    /// The variants that are asked for, or all there are weights for.
+    fn variants(&self, networks: &Networks) -> Result<Vec<Variant>, TrainError> {
+        let asked = &self.config.eval.variants;
+        if asked.is_empty() {
+            return Ok(networks.variants());
+        }
+        match asked.iter().find(|variant| !networks.can_draw(**variant)) {
+            None => Ok(asked.clone()),
+            Some(variant) => {
+                let fix = match variant {
+                    Variant::Clift => "stage 2 was not trained on clusters of K-means: leave it out".into(),
+                    Variant::PatchClift => {
+                        "stage 2 was not trained on tiles: train a run with clusters.grouping = \"patch\" and \
+                         stage1.init_from this one, and evaluate it with --with"
+                            .into()
+                    }
+                    _ => "baselines are always measured: leave it out".to_owned(),
+                };
+                Err(TrainError::BadConfig { key: "eval.variants".into(), value: variant.name().into(), fix })
+            }
+        }
+    }
+
     fn sweep(&self, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
         let Config { seed, eval, clusters, model, .. } = self.config;
         Sweep {
@@ -209,6 +233,14 @@ impl<'a> HeldOut<'a> {
                 Ok(Outcome::Skipped(reason))
             }
         }
+    }
+}
+
+/// The variant that a condenser trained on such groups draws.
+const fn condensed_variant(grouping: Grouping) -> Variant {
+    match grouping {
+        Grouping::Kmeans => Variant::Clift,
+        Grouping::Patch => Variant::PatchClift,
     }
 }
 

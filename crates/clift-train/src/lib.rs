@@ -3,8 +3,10 @@
 //! [`Run`] is an experiment in its directory. The training loop is [`trainer::StagePlan::train`], the
 //! same for both stages; they differ in the batches they build.
 
+pub mod bad_steps;
 pub mod bench;
 pub mod checkpoint;
+mod cluster_journal;
 pub mod clusters;
 pub mod config;
 pub mod diagnostic;
@@ -12,25 +14,32 @@ pub mod document;
 pub mod encode;
 pub mod error;
 pub mod events;
+mod exact;
+mod extend;
 pub mod held_out;
 mod keys;
+pub mod lock;
 pub mod loss;
 mod mistakes;
 pub mod optim;
 mod overrides;
+pub mod plan;
 mod recompute;
 pub mod run;
+mod run_settings;
 pub mod scenes;
 pub mod schedule;
 pub mod sinks;
+pub mod stability;
 pub mod stage1;
 pub mod stage2;
 pub mod step;
 pub mod trained;
 pub mod trainer;
+mod training;
 
 pub use config::Config;
-pub use document::{ConfigError, Override, read_config};
+pub use document::{ConfigError, Override, read_checked_config, read_config};
 pub use error::TrainError;
 pub use events::{Event, Sink, Stage};
 pub use run::{Run, RunOptions};

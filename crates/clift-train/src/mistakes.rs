@@ -2,8 +2,10 @@
 
 use std::ops::Range;
 
+use clift_model::ModelError;
 use toml::de::{DeTable, DeValue};
 
+use crate::TrainError;
 use crate::diagnostic::{Diagnostic, Sources};
 use crate::keys::{Keys, nearest};
 
@@ -93,6 +95,59 @@ pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sou
             sources.at(span, format!("wrong value{of_path}"), label)
         }
         None => sources.at(span, format!("wrong value{of_path}"), message.to_owned()),
+    }
+}
+
+/// Puts a value that was refused by its key where it stands, with the places of the other keys the refusal names.
+/// `None` for a refusal that names no key.
+pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &Sources) -> Option<Diagnostic> {
+    let (keys, fix) = match error {
+        TrainError::BadConfig { key, fix, .. } => (key.as_str(), fix.as_str()),
+        TrainError::Model(ModelError::BadConfig { key, fix, .. }) => (*key, fix.as_str()),
+        _ => return None,
+    };
+    // "data.width, data.height" are two keys, "clusters.grid (length)" is one.
+    let keys: Vec<&str> = keys.split(", ").filter_map(|key| key.split(' ').next()).collect();
+    let set: Vec<(&str, Range<usize>)> =
+        keys.iter().filter_map(|key| span_of(root, key).map(|span| (*key, span))).collect();
+    let title = error.to_string();
+    let mut diagnostic = match set.first() {
+        Some((_, span)) => sources.at(span.clone(), title, String::new()),
+        None => {
+            let keys = quoted(keys.iter().copied());
+            sources.whole(title).with_help(format!("the file does not set {keys}"))
+        }
+    };
+    for (key, span) in set.iter().skip(1) {
+        diagnostic = diagnostic.with_help(format!("`{key}` is set {}", sources.place(span)));
+    }
+    for key in dotted_keys(fix).into_iter().filter(|key| !keys.contains(key)) {
+        if let Some(span) = span_of(root, key) {
+            diagnostic = diagnostic.with_help(format!("`{key}` is set {}", sources.place(&span)));
+        }
+    }
+    Some(diagnostic)
+}
+
+/// Words of a text that are made like dotted keys, each once.
+fn dotted_keys(text: &str) -> Vec<&str> {
+    let is_part = |c: char| c.is_ascii_alphanumeric() || "_.".contains(c);
+    let mut found: Vec<&str> = Vec::new();
+    for word in text.split(|c| !is_part(c)).map(|word| word.trim_end_matches('.')) {
+        if word.contains('.') && !found.contains(&word) {
+            found.push(word);
+        }
+    }
+    found
+}
+
+/// The span of the value of a dotted key.
+fn span_of(table: &DeTable, key: &str) -> Option<Range<usize>> {
+    let (first, rest) = key.split_once('.').map_or((key, None), |(first, rest)| (first, Some(rest)));
+    let value = table.get(first)?;
+    match rest {
+        None => Some(value.span()),
+        Some(rest) => span_of(value.get_ref().as_table()?, rest),
     }
 }
 

@@ -1,23 +1,24 @@
 //! A run: its directory, what it resumes, and the order of its stages.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::files::replace;
+use clift_data::files::remove_leftovers;
 use clift_data::{ClipReader, SceneSource, Split};
 use clift_eval::{Networks, Summary};
-use clift_model::{Clift, weights};
-use serde::{Deserialize, Serialize};
+use clift_model::{Clift, Condenser, Encoder, Renderer, weights};
 
 use crate::TrainError;
+use crate::cluster_journal::remove_journal;
 use crate::clusters::{ClusterCache, ClusterJob};
 use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
 use crate::held_out::{HeldOut, write_ledger};
+use crate::lock::RunLock;
+use crate::run_settings::{RunFile, compare, write_config};
 use crate::scenes::{self, FirstScenes};
 use crate::stage1::Stage1Batches;
 use crate::stage2::Stage2Batches;
@@ -32,36 +33,28 @@ pub struct RunOptions {
     pub overfit: Option<usize>,
     /// Start over: an existing run directory is moved aside.
     pub fresh: bool,
+    /// Take larger step counts than the run was started with.
+    pub extend: bool,
 }
-
-/// What `run.json` holds.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct RunFile {
-    version: u32,
-    overfit: Option<usize>,
-}
-
-const VERSION: u32 = 1;
 
 const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
-
-/// Keys that may change between the start of a run and its resumption.
-const FREE_KEYS: [&str; 7] =
-    ["run_dir", "device", "recompute", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
 
 /// An open run.
 pub struct Run {
     config: Config,
     overfit: Option<usize>,
     device: Device,
+    /// Of a run that is written to.
+    lock: Option<RunLock>,
 }
 
 impl Run {
-    /// Opens the run directory of a config, new or to be resumed, and writes the resolved config to it.
+    /// Opens the run directory of a config, new or to be resumed, and writes the resolved config to it. No other process
+    /// can open it until the run is dropped.
     ///
     /// # Errors
-    /// [`TrainError::OtherRun`] when the directory holds a run with other settings.
+    /// [`TrainError::OtherRun`] when the directory holds a run with other settings, [`TrainError::Locked`] when another
+    /// process works in it.
     pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         config.validate()?;
         let device = config.device.open()?;
@@ -71,24 +64,29 @@ impl Run {
             return Err(TrainError::BadConfig { key: "--fresh".into(), value: "with --only".into(), fix: fix.into() });
         }
         if options.fresh && folder.exists() {
+            // Not from under a process that trains in it. Let go of before the move, which Windows refuses otherwise.
+            drop(RunLock::take(folder, sink)?);
             let moved = free_name(folder);
             std::fs::rename(folder, &moved).map_err(TrainError::io("moving the former run aside", folder))?;
             sink.event(&Event::Message(format!("moved the former run to {}", moved.display())));
         }
-        let config_path = folder.join("config.toml");
-        let run_path = folder.join("run.json");
+        std::fs::create_dir_all(folder).map_err(TrainError::io("making the run directory", folder))?;
+        let lock = RunLock::take(folder, sink)?;
+        remove_leftovers(folder).map_err(TrainError::io("removing what a killed process left", folder))?;
         // A run that failed before its first step, on a wrong path perhaps, has nothing that settings could contradict.
         let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
-        if config_path.exists() && has_begun {
-            refuse_other_run(&config_path, &run_path, &config, options.overfit)?;
+        let mut file = RunFile::new(options.overfit);
+        if folder.join("config.toml").exists() && has_begun {
+            let found = RunFile::read(folder)?;
+            let extensions = compare(folder, &found, &config, options.overfit, options.extend)?;
+            file.extended = found.extended;
+            for extension in extensions {
+                file.extended.push(extension.apply(folder, sink)?);
+            }
         }
-        std::fs::create_dir_all(folder).map_err(TrainError::io("making the run directory", folder))?;
-        let text = toml::to_string_pretty(&config).map_err(TrainError::bad_file("config", &config_path))?;
-        let run = RunFile { version: VERSION, overfit: options.overfit };
-        let json = serde_json::to_vec_pretty(&run).map_err(TrainError::bad_file("run file", &run_path))?;
-        replace(&run_path, &json).map_err(TrainError::io("writing the run file", &run_path))?;
-        replace(&config_path, text.as_bytes()).map_err(TrainError::io("writing the config", &config_path))?;
-        Ok(Self { config, overfit: options.overfit, device })
+        file.write(folder)?;
+        write_config(&config)?;
+        Ok(Self { config, overfit: options.overfit, device, lock: Some(lock) })
     }
 
     /// Opens a run that exists, to evaluate it.
@@ -97,9 +95,9 @@ impl Run {
     /// [`TrainError::BadFile`] for a damaged `run.json`, and what the device gives.
     pub fn reopen(config: Config) -> Result<Self, TrainError> {
         config.validate()?;
-        let run = read_run_file(&config.run_dir.join("run.json"))?;
+        let run = RunFile::read(&config.run_dir)?;
         let device = config.device.open()?;
-        Ok(Self { config, overfit: run.overfit, device })
+        Ok(Self { config, overfit: run.overfit, device, lock: None })
     }
 
     /// Does what is left of the run, or of one stage, and evaluates it. Returns the evaluation of a
@@ -136,34 +134,65 @@ impl Run {
         held_out.evaluate(&self.networks(sink)?, &self.folder("eval"), stop, sink).map(Some)
     }
 
-    /// Evaluates the run's weights and writes the results to `folder`.
+    /// Evaluates the run's weights and writes the results to `folder`; `beside` is another run of the same stage 1
+    /// whose stage 2 was trained on other groups of tokens, to be measured on the same views.
     ///
     /// # Errors
     /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] when those of
-    /// stage 2 do not belong to them, and whatever the evaluation gives.
-    pub fn evaluate(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<Summary, TrainError> {
+    /// stage 2 do not belong to them, [`TrainError::Locked`] when `folder` lies in a run that another process works in, and
+    /// whatever the evaluation gives.
+    pub fn evaluate(
+        &self,
+        folder: &Path,
+        beside: Option<&Config>,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Summary, TrainError> {
+        let is_inside = self.lock.is_none() && folder.starts_with(&self.config.run_dir);
+        let _lock = is_inside.then(|| RunLock::take(&self.config.run_dir, sink)).transpose()?;
         std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
-        let networks = self.networks(sink)?;
+        let mut networks = self.networks(sink)?;
+        if let Some(other) = beside {
+            if other.clusters.grouping == self.config.clusters.grouping {
+                let value = other.run_dir.display().to_string();
+                let fix = "its stage 2 was trained on the same groups of tokens: name a run with another \
+                           clusters.grouping";
+                return Err(TrainError::BadConfig { key: "--with".into(), value, fix: fix.into() });
+            }
+            let (condenser, renderer) = self.load_stage2(other, &networks.encoder)?;
+            networks.set_condensed(other.clusters.grouping, condenser, renderer);
+        }
         self.held_out(sink)?.evaluate(&networks, folder, stop, sink)
     }
 
     /// The trained networks: of both stages, or of stage 1 alone.
     fn networks(&self, sink: &mut dyn Sink) -> Result<Networks, TrainError> {
         let stage1 = self.load_stage1(Some(Stage::Eval))?;
-        let path = self.weights(Stage::Stage2);
-        let condensed = if path.exists() {
-            let mut model = self.new_model();
-            weights::load(&mut model, &path)?.require_all(&path)?;
-            if weights::hash(&model.encoder) != weights::hash(&stage1.encoder) {
-                return Err(TrainError::OtherEncoder { path });
-            }
-            Some((model.condenser.valid(), model.renderer.valid()))
+        let (encoder, renderer) = (stage1.encoder.valid(), stage1.renderer.valid());
+        let device = self.device.clone();
+        let mut networks = Networks { encoder, renderer, condensed: None, patch_condensed: None, device };
+        if self.weights(Stage::Stage2).exists() {
+            let (condenser, renderer) = self.load_stage2(&self.config, &networks.encoder)?;
+            networks.set_condensed(self.config.clusters.grouping, condenser, renderer);
         } else {
             sink.event(&Event::Message("stage 2 has not run: evaluating the stage-1 weights alone".into()));
-            None
-        };
-        let (encoder, renderer) = (stage1.encoder.valid(), stage1.renderer.valid());
-        Ok(Networks { encoder, renderer, condensed, device: self.device.clone() })
+        }
+        Ok(networks)
+    }
+
+    /// Condenser and renderer of the stage 2 of `config`'s run, which must have been trained on this encoder.
+    fn load_stage2(&self, config: &Config, encoder: &Encoder) -> Result<(Condenser, Renderer), TrainError> {
+        let path = config.run_dir.join(Stage::Stage2.name()).join("model.safetensors");
+        if !path.exists() {
+            let what = "the weights of stage 2";
+            return Err(TrainError::Missing { stage: "evaluation", what, first: "clift train", path });
+        }
+        let mut model = Clift::new(&config.model, config.seed, &self.device);
+        weights::load(&mut model, &path)?.require_all(&path)?;
+        if weights::hash(&model.encoder) != weights::hash(encoder) {
+            return Err(TrainError::OtherEncoder { path });
+        }
+        Ok((model.condenser, model.renderer))
     }
 
     /// The views that are measured, during training and after it.
@@ -252,6 +281,7 @@ impl Run {
         let folder = self.folder("clusters");
         let encoder_hash = &weights::hash(&model.encoder);
         if folder.exists() {
+            remove_journal(&folder)?;
             return ClusterCache::open(&folder, &self.config, encoder_hash);
         }
         if only == Some(Stage::Stage2) {
@@ -327,61 +357,6 @@ fn init_from(model: &mut Clift, from: &Path, sink: &mut dyn Sink) -> Result<(), 
         list(&loaded.unused)
     )));
     Ok(())
-}
-
-fn read_run_file(path: &Path) -> Result<RunFile, TrainError> {
-    let text = std::fs::read(path).map_err(TrainError::io("reading the run file", path))?;
-    let run: RunFile = serde_json::from_slice(&text).map_err(TrainError::bad_file("run file", path))?;
-    if run.version != VERSION {
-        let reason = format!("it has version {}, this program reads {VERSION}", run.version);
-        return Err(TrainError::bad_file("run file", path)(reason));
-    }
-    Ok(run)
-}
-
-fn refuse_other_run(
-    config_path: &Path,
-    run_path: &Path,
-    config: &Config,
-    overfit: Option<usize>,
-) -> Result<(), TrainError> {
-    let text = std::fs::read_to_string(config_path).map_err(TrainError::io("reading the run's config", config_path))?;
-    let bad = || TrainError::bad_file("config", config_path);
-    let old: toml::Table = text.parse().map_err(|error: toml::de::Error| bad()(error.message().to_owned()))?;
-    let new = toml::Table::try_from(config).map_err(|error| bad()(error.to_string()))?;
-    let (mut old, mut new) = (flatten(old), flatten(new));
-    let flag = |overfit: Option<usize>| overfit.map_or("off".into(), |count| count.to_string());
-    old.insert("--overfit".into(), flag(read_run_file(run_path)?.overfit));
-    new.insert("--overfit".into(), flag(overfit));
-
-    let keys: std::collections::BTreeSet<_> = old.keys().chain(new.keys()).collect();
-    let free = |key: &str| FREE_KEYS.iter().any(|free| key == *free || (free.ends_with('.') && key.starts_with(free)));
-    let show = |value: Option<&String>| value.cloned().unwrap_or_else(|| "not set".into());
-    let differences: Vec<String> = keys
-        .into_iter()
-        .filter(|key| !free(key) && old.get(*key) != new.get(*key))
-        .map(|key| format!("  {key}: {} -> {}", show(old.get(key)), show(new.get(key))))
-        .collect();
-    if differences.is_empty() {
-        return Ok(());
-    }
-    let path = config.run_dir.clone();
-    Err(TrainError::OtherRun { differences: differences.join("\n"), path })
-}
-
-/// Dotted keys and their values as text.
-fn flatten(table: toml::Table) -> BTreeMap<String, String> {
-    let mut flat = BTreeMap::new();
-    let mut pending: Vec<(String, toml::Value)> = table.into_iter().collect();
-    while let Some((key, value)) = pending.pop() {
-        match value {
-            toml::Value::Table(inner) => pending.extend(inner.into_iter().map(|(k, v)| (format!("{key}.{k}"), v))),
-            other => {
-                flat.insert(key, other.to_string());
-            }
-        }
-    }
-    flat
 }
 
 /// `runs/tiny` becomes `runs/tiny.1`, or the first number that is free.

@@ -1,4 +1,4 @@
-//! Sinks without a terminal: `metrics.jsonl`, and one that feeds several others.
+//! What a run writes step by step: `metrics.jsonl` and `bad_steps.jsonl`.
 
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Write};
@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::TrainError;
+use crate::bad_steps::BadStep;
 use crate::events::{Event, Sink, Stage, StepEvent};
 
 /// One line of `metrics.jsonl`. JSON holds no NaN and no infinity: such a number is `null`.
@@ -42,37 +44,56 @@ impl From<&StepEvent> for MetricsLine {
     }
 }
 
-/// Writes a line per step to `metrics.jsonl`, flushed, so that a killed run keeps all but its last line.
+/// A file of JSON lines, one or none per step, each flushed: a killed run keeps all but the last.
 #[derive(Debug)]
-pub struct MetricsFile {
+pub struct StepLines {
     path: PathBuf,
-    file: File,
+    /// Opened by the first line.
+    file: Option<File>,
     failure: Option<std::io::Error>,
 }
 
-impl MetricsFile {
-    /// Opens the file of a run that goes on after `step` updates of `stage`; `0` for a stage that starts anew.
+impl StepLines {
+    /// Takes up the file of a run that goes on after `step` updates of `stage`; `0` for a stage that starts anew.
     ///
     /// Lines of later steps and stages are dropped, because they will be written again. So is a last line that was
     /// torn by a kill. The shortened file replaces the old one by a rename, never half of it.
     ///
     /// # Errors
-    /// The operating system's, and `InvalidData` with the line's number for a line before the last that is no
-    /// metrics line: the file is then someone else's, and is left alone.
+    /// The operating system's, and `InvalidData` with the line's number for a line before the last that names no
+    /// step: the file is then someone else's, and is left alone.
     pub fn open(path: &Path, stage: Stage, step: u64) -> std::io::Result<Self> {
         if path.exists() {
             drop_after(path, stage, step)?;
         }
-        let file = OpenOptions::new().create(true).append(true).open(path)?;
-        Ok(Self { path: path.to_owned(), file, failure: None })
+        Ok(Self { path: path.to_owned(), file: None, failure: None })
     }
 
-    /// Says whether every line reached the disk.
+    /// Appends a line. A failure is kept for [`StepLines::check`]; nothing is written after it.
+    pub fn write(&mut self, line: &impl Serialize) {
+        if self.failure.is_none() {
+            self.failure = self.try_write(line).err();
+        }
+    }
+
+    fn try_write(&mut self, line: &impl Serialize) -> std::io::Result<()> {
+        let file = match &mut self.file {
+            Some(file) => file,
+            none => none.insert(OpenOptions::new().create(true).append(true).open(&self.path)?),
+        };
+        // One write a line: a kill tears at most the last one.
+        file.write_all(format!("{}\n", serde_json::to_string(line)?).as_bytes())
+    }
+
+    /// Says whether every line was written, and makes them survive a power cut.
     ///
     /// # Errors
     /// The first failure to write; lines after it were not tried.
-    pub fn finish(self) -> std::io::Result<()> {
-        self.failure.map_or(Ok(()), Err)
+    pub fn check(&mut self) -> std::io::Result<()> {
+        if let Some(failure) = self.failure.take() {
+            return Err(failure);
+        }
+        self.file.as_ref().map_or(Ok(()), File::sync_data)
     }
 
     /// Where the lines go.
@@ -81,56 +102,80 @@ impl MetricsFile {
     }
 }
 
-impl Sink for MetricsFile {
-    fn event(&mut self, event: &Event) {
-        let (Event::Step(step), None) = (event, &self.failure) else { return };
-        let written = serde_json::to_string(&MetricsLine::from(step))
-            .map_err(std::io::Error::from)
-            // One write a line: a kill tears at most the last one.
-            .and_then(|line| self.file.write_all(format!("{line}\n").as_bytes()))
-            .and_then(|()| self.file.flush());
-        self.failure = written.err();
-    }
+/// What every line says about where it belongs.
+#[derive(Deserialize)]
+struct Place {
+    step: u64,
+    stage: Stage,
 }
 
 fn drop_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
     let mut kept = Vec::new();
     let mut broken: Option<usize> = None;
-    for (index, line) in BufReader::new(File::open(path)?).split(b'\n').enumerate() {
-        let line = line?;
+    let mut is_whole = true;
+    let mut reader = BufReader::new(File::open(path)?);
+    for number in 1.. {
+        let mut line = Vec::new();
+        if reader.read_until(b'\n', &mut line)? == 0 {
+            break;
+        }
         if let Some(number) = broken {
-            let reason = format!("line {number} is no line of metrics");
+            let reason = format!("line {number} is not of a step");
             return Err(std::io::Error::new(std::io::ErrorKind::InvalidData, reason));
         }
-        match serde_json::from_slice::<MetricsLine>(&line) {
-            Ok(metrics) if (metrics.stage, metrics.step) <= (stage, step) => {
-                kept.extend(line);
-                kept.push(b'\n');
-            }
-            Ok(_) => {}
-            Err(_) => broken = Some(index + 1),
+        match serde_json::from_slice::<Place>(&line) {
+            // Without its end a line may be torn, even if what is there can be read.
+            Ok(place) if line.ends_with(b"\n") && (place.stage, place.step) <= (stage, step) => kept.extend(line),
+            Ok(_) => is_whole = false,
+            Err(_) => (is_whole, broken) = (false, Some(number)),
         }
     }
-    clift_data::files::replace(path, &kept)
+    if is_whole { Ok(()) } else { clift_data::files::replace(path, &kept) }
 }
 
-/// Gives every event to several sinks, in order.
-#[derive(Default)]
-pub struct Tee<'a> {
-    sinks: Vec<&'a mut dyn Sink>,
+/// The files that a stage writes step by step, in front of another sink: a line per step in `metrics.jsonl`, one per
+/// step left out in `bad_steps.jsonl`.
+pub struct RunLog<'a> {
+    sink: &'a mut dyn Sink,
+    metrics: StepLines,
+    bad_steps: StepLines,
 }
 
-impl<'a> Tee<'a> {
-    /// Feeds these sinks.
-    pub fn new(sinks: Vec<&'a mut dyn Sink>) -> Self {
-        Self { sinks }
+impl<'a> RunLog<'a> {
+    /// Takes up the files in `run_dir` after `step` updates of `stage`, as [`StepLines::open`].
+    ///
+    /// # Errors
+    /// [`TrainError::Io`].
+    pub fn open(run_dir: &Path, stage: Stage, step: u64, sink: &'a mut dyn Sink) -> Result<Self, TrainError> {
+        let open = |name: &str| {
+            let path = run_dir.join(name);
+            StepLines::open(&path, stage, step).map_err(TrainError::io("opening the log of steps", &path))
+        };
+        Ok(Self { sink, metrics: open("metrics.jsonl")?, bad_steps: open("bad_steps.jsonl")? })
+    }
+
+    /// Notes a step that was left out.
+    pub fn bad_step(&mut self, line: &BadStep) {
+        self.bad_steps.write(line);
+    }
+
+    /// Says whether every line is on the disk. A checkpoint is only saved if so, or a resumed run would lack lines.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`] with the first failure.
+    pub fn check(&mut self) -> Result<(), TrainError> {
+        for lines in [&mut self.metrics, &mut self.bad_steps] {
+            lines.check().map_err(TrainError::io("writing the log of steps", lines.path()))?;
+        }
+        Ok(())
     }
 }
 
-impl Sink for Tee<'_> {
+impl Sink for RunLog<'_> {
     fn event(&mut self, event: &Event) {
-        for sink in &mut self.sinks {
-            sink.event(event);
+        self.sink.event(event);
+        if let Event::Step(step) = event {
+            self.metrics.write(&MetricsLine::from(step));
         }
     }
 }
@@ -145,12 +190,25 @@ mod tests {
         Event::Step(event)
     }
 
-    fn write(path: &Path, from: (Stage, u64), steps: &[(Stage, u64)]) {
-        let mut sink = MetricsFile::open(path, from.0, from.1).unwrap();
-        for &(stage, number) in steps {
-            sink.event(&step(stage, number));
+    /// Counts what it is told.
+    #[derive(Default)]
+    struct Count(usize);
+
+    impl Sink for Count {
+        fn event(&mut self, _event: &Event) {
+            self.0 += 1;
         }
-        sink.finish().unwrap();
+    }
+
+    /// Writes to `metrics.jsonl` of a run.
+    fn write(path: &Path, from: (Stage, u64), steps: &[(Stage, u64)]) {
+        let mut count = Count::default();
+        let mut log = RunLog::open(path.parent().unwrap(), from.0, from.1, &mut count).unwrap();
+        for &(stage, number) in steps {
+            log.event(&step(stage, number));
+        }
+        log.check().unwrap();
+        assert_eq!(count.0, steps.len(), "the other sink is told too");
     }
 
     fn steps(path: &Path) -> Vec<(Stage, u64)> {
@@ -163,12 +221,13 @@ mod tests {
     fn a_line_holds_the_documented_names_and_null_for_what_is_not_finite() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
-        let mut sink = MetricsFile::open(&path, Stage::Stage1, 0).unwrap();
+        let mut count = Count::default();
+        let mut sink = RunLog::open(folder.path(), Stage::Stage1, 0, &mut count).unwrap();
         sink.event(&Event::Message("not a step".into()));
         let Event::Step(event) = step(Stage::Stage1, 1) else { panic!() };
         sink.event(&Event::Step(StepEvent { psnr: f64::INFINITY, loss: f64::NAN, ..event }));
         assert_eq!(
-            std::fs::read_to_string(&path).unwrap(), // before `finish`: the line is flushed
+            std::fs::read_to_string(&path).unwrap(), // before `check`: the line is flushed
             "{\"step\":1,\"stage\":\"stage1\",\"loss\":null,\"psnr\":null,\"lr\":0.001,\"grad_norm\":2.0,\"step_s\":0.25}\n"
         );
     }
@@ -191,7 +250,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
         write(&path, (Stage::Stage1, 0), &[(Stage::Stage1, 1)]);
-        for torn in ["{\"step\":2,\"sta", "{\"step\":2,\"sta\n", "\u{0}\u{0}"] {
+        let whole_but_its_end = "{\"step\":2,\"stage\":\"stage1\"}";
+        for torn in ["{\"step\":2,\"sta", "{\"step\":2,\"sta\n", "\u{0}\u{0}", whole_but_its_end] {
             let whole = std::fs::read_to_string(&path).unwrap();
             std::fs::write(&path, whole + torn).unwrap();
             write(&path, (Stage::Stage1, 5), &[]);
@@ -204,22 +264,49 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
         std::fs::write(&path, "a diary\nof days\n").unwrap();
-        let error = MetricsFile::open(&path, Stage::Stage1, 0).unwrap_err();
-        assert_eq!(error.to_string(), "line 1 is no line of metrics");
+        let error = StepLines::open(&path, Stage::Stage1, 0).unwrap_err();
+        assert_eq!(error.to_string(), "line 1 is not of a step");
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "a diary\nof days\n");
     }
 
     #[test]
-    fn a_tee_feeds_every_sink() {
-        #[derive(Default)]
-        struct Count(usize);
-        impl Sink for Count {
-            fn event(&mut self, _event: &Event) {
-                self.0 += 1;
-            }
-        }
-        let (mut a, mut b) = (Count::default(), Count::default());
-        Tee::new(vec![&mut a, &mut b]).event(&Event::Warning("hot".into()));
-        assert_eq!((a.0, b.0), (1, 1));
+    fn a_failure_to_write_is_told_once_and_ends_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("missing/metrics.jsonl");
+        let mut lines = StepLines::open(&path, Stage::Stage1, 0).unwrap();
+        lines.write(&1);
+        std::fs::create_dir(folder.path().join("missing")).unwrap();
+        lines.write(&2);
+        assert!(!path.exists(), "a file with a gap would look whole");
+        assert_eq!(lines.check().unwrap_err().kind(), std::io::ErrorKind::NotFound);
+    }
+
+    #[test]
+    fn bad_steps_have_a_file_of_their_own_that_is_resumed_like_the_metrics() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("bad_steps.jsonl");
+        let bad = |step| BadStep {
+            step,
+            stage: Stage::Stage1,
+            reason: crate::bad_steps::Fault::LossSpike,
+            loss: Some(2.0),
+            grad_norm: None,
+            median_loss: Some(0.5),
+            median_grad_norm: Some(1.0),
+            in_a_row: 1,
+            scenes: Vec::new(),
+        };
+        let mut count = Count::default();
+        let mut log = RunLog::open(folder.path(), Stage::Stage1, 0, &mut count).unwrap();
+        assert!(!path.exists(), "a run without bad steps has no such file");
+        log.bad_step(&bad(3));
+        log.bad_step(&bad(5));
+        log.check().unwrap();
+        RunLog::open(folder.path(), Stage::Stage1, 4, &mut count).unwrap();
+        assert_eq!(
+            std::fs::read_to_string(&path).unwrap(),
+            "{\"step\":3,\"stage\":\"stage1\",\"reason\":\"loss_spike\",\"loss\":2.0,\"grad_norm\":null,\
+             \"median_loss\":0.5,\"median_grad_norm\":1.0,\"in_a_row\":1,\"scenes\":[]}\n"
+        );
     }
 }

@@ -71,23 +71,38 @@ pub struct Update {
     pub loss: f64,
     /// Global norm of the gradient before clipping.
     pub grad_norm: f64,
-    /// Whether the weights changed: not if loss or gradient were not finite.
+    /// Whether the weights changed.
     pub applied: bool,
 }
 
 impl Learner {
-    /// Makes one update from a batch, worked off in `accumulate` parts.
-    ///
-    /// Takes the learner and gives it back, so that the update writes the weights in place.
+    /// Makes one update from a batch, worked off in `accumulate` parts, unless its loss or gradient is not finite.
     ///
     /// # Errors
-    /// Whatever the model refuses.
+    /// As [`Learner::step_if`].
     pub fn step(
         self,
         batch: &StageBatch,
         accumulate: usize,
         rate: ModuleLearningRate,
         max_grad_norm: f64,
+    ) -> Result<(Self, Update), TrainError> {
+        self.step_if(batch, accumulate, rate, max_grad_norm, |loss, norm| loss.is_finite() && norm.is_finite())
+    }
+
+    /// Makes one update from a batch if `accept` of its loss and gradient norm says so.
+    ///
+    /// Takes the learner and gives it back, so that the update writes the weights in place.
+    ///
+    /// # Errors
+    /// Whatever the model refuses.
+    pub fn step_if(
+        self,
+        batch: &StageBatch,
+        accumulate: usize,
+        rate: ModuleLearningRate,
+        max_grad_norm: f64,
+        accept: impl FnOnce(f64, f64) -> bool,
     ) -> Result<(Self, Update), TrainError> {
         let Self { model, mut optimizer, device, recompute } = self;
         let mut accumulator = GradientsAccumulator::<Clift>::new();
@@ -106,7 +121,7 @@ impl Learner {
         let grads = accumulator.grads();
         let grad_norm = global_norm(&model, &grads);
         // Looked at before the update, so that a bad batch leaves no trace in the weights.
-        let applied = total.is_finite() && grad_norm.is_finite();
+        let applied = accept(total, grad_norm);
         let model = if applied {
             let grads = clip_global_norm(&model, grads, grad_norm, max_grad_norm);
             optimizer.step(rate, model, grads)

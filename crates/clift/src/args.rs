@@ -3,13 +3,14 @@
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
-use clift_eval::{Selection, TokenCount};
+use clift_eval::{Experiment, Selection, TokenCount};
 use clift_model::TokenStorage;
 use clift_model::device::DeviceName;
 use clift_train::Stage;
 use clift_train::bench::Work;
 
 pub use crate::data::args::DataCommand;
+pub use crate::data::bench::BenchDataArgs;
 pub use crate::encode::EncodeArgs;
 pub use crate::render::RenderArgs;
 
@@ -64,11 +65,20 @@ Examples:
         #[command(subcommand)]
         command: DataCommand,
     },
+    /// Tell what a run takes before it starts: parameters, memory, time per step
+    ///
+    /// Of both stages, the cluster cache and the evaluation. Parameters are counted exactly and memory from what the
+    /// operations keep; times come from one block of each kind, timed on the device at the config's sizes. Where the
+    /// data is there, a few scenes of it are read for the time that takes.
+    Plan(PlanArgs),
     /// Check what this machine can train on: every device, the processor, the memory
     ///
     /// Runs one forward and backward pass of a small model on every device of this build and compares its
     /// gradient with that of the default device. Exits with 1 if the default device fails, with 0 otherwise.
-    Doctor,
+    ///
+    /// With --stability it instead runs the hard cases (zero baselines, extreme logits, one cluster for all, ..) on every
+    /// device of the build, each against the same computation in f64, and exits with 1 if one is beyond its bound.
+    Doctor(DoctorArgs),
     /// Time the parts of the method on a device, each with its error against f64
     ///
     /// Inputs and weights are drawn from the config's seed: no data is needed. A row is one part of the method at the
@@ -99,6 +109,9 @@ pub struct TrainArgs {
     /// Start over: move an existing run aside first
     #[arg(long)]
     pub fresh: bool,
+    /// Train on for more steps than the run was started with, on the learning rates of the new count
+    #[arg(long, conflicts_with = "fresh")]
+    pub extend: bool,
 }
 
 /// Arguments of `clift eval`.
@@ -106,6 +119,16 @@ pub struct TrainArgs {
 pub struct EvalArgs {
     /// A run directory
     pub run: PathBuf,
+    /// An experiment of the paper: main, ablation, patchwise or budget
+    ///
+    /// Sets variants, --storage, --render and --selection; those given beside it win. main: quality against data size.
+    /// ablation: random tokens, K-means, K-means and condenser. patchwise: tiles of the views against K-means, each
+    /// with and without condenser; needs --with. budget: half of the tokens stored, fewer and fewer of them rendered.
+    #[arg(long, value_name = "NAME")]
+    pub preset: Option<Experiment>,
+    /// Another run of the same stage 1 with another clusters.grouping, measured on the same views
+    #[arg(long, value_name = "RUN")]
+    pub with: Option<PathBuf>,
     /// Token counts to store, as numbers or shares: --storage 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub storage: Vec<TokenCount>,
@@ -132,11 +155,56 @@ pub struct EvalArgs {
     pub out: Option<PathBuf>,
 }
 
+/// Arguments of `clift doctor`.
+#[derive(Debug, clap::Args)]
+pub struct DoctorArgs {
+    /// Run the hard cases instead
+    #[arg(long)]
+    pub stability: bool,
+    /// At the sizes of the tests: seconds instead of minutes
+    #[arg(long, requires = "stability")]
+    pub small: bool,
+    /// Write their table as Markdown
+    #[arg(long, requires = "stability", value_name = "FILE")]
+    pub markdown: Option<PathBuf>,
+}
+
+/// Arguments of `clift plan`.
+#[derive(Debug, clap::Args)]
+pub struct PlanArgs {
+    /// The experiment, a TOML file
+    pub config: PathBuf,
+    /// Change a key of the config: `--set stage1.accumulate=4`
+    #[arg(long, value_name = "KEY=TOML")]
+    pub set: Vec<String>,
+    /// Where tensors live: flex, ndarray or wgpu
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<DeviceName>,
+    /// Leave out the times, which take some seconds to find
+    #[arg(long)]
+    pub no_time: bool,
+    /// Write the plan as JSON
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
+/// What is timed instead of the parts of the method.
+#[derive(Debug, Subcommand)]
+pub enum BenchCommand {
+    /// Time how fast clips are read from a folder, in order and at random
+    Data(BenchDataArgs),
+}
+
 /// Arguments of `clift bench`.
 #[derive(Debug, clap::Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub struct BenchArgs {
+    /// Something else to time.
+    #[command(subcommand)]
+    pub command: Option<BenchCommand>,
     /// The experiment whose sizes are used, a TOML file
-    pub config: PathBuf,
+    #[arg(required = true)]
+    pub config: Option<PathBuf>,
     /// The rows; all of them by default
     #[arg(long, value_delimiter = ',', value_name = "WORK", help = works_help())]
     pub work: Vec<Work>,

@@ -9,11 +9,12 @@ use clift_train::{Config, read_config};
 
 use crate::args::BenchArgs;
 use crate::terminal::{Counter, print_note, print_result};
+use crate::units::{bytes, folder_of, seconds};
 use crate::{WrongUsage, interrupt, table};
 
 /// Times what is asked for, prints the table and writes the JSON.
 pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
-    let (mut config, overrides) = read_config::<Config>(&args.config, &args.set)?;
+    let (mut config, overrides) = read_config::<Config>(args.config.as_deref().unwrap_or(Path::new("")), &args.set)?;
     for change in overrides {
         print_note(&format!("--set {change}"));
     }
@@ -52,10 +53,6 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
         print_result(&format!("results: {}", json.display()))?;
     }
     Ok(())
-}
-
-fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 fn write_json(report: &Report, path: &Path) -> anyhow::Result<()> {
@@ -102,23 +99,6 @@ fn cells(row: &Row) -> [String; 5] {
     };
     let peak = row.peak_bytes.map_or_else(|| "unknown".into(), bytes);
     [row.work.to_string(), seconds(row.median_s), seconds(row.p95_s), peak, error]
-}
-
-/// Three digits of a duration.
-fn seconds(seconds: f64) -> String {
-    match seconds {
-        s if s >= 100.0 => format!("{s:.0} s"),
-        s if s >= 10.0 => format!("{s:.1} s"),
-        s if s >= 1.0 => format!("{s:.2} s"),
-        s if s >= 0.1 => format!("{:.0} ms", s * 1e3),
-        s if s >= 0.01 => format!("{:.1} ms", s * 1e3),
-        s => format!("{:.2} ms", s * 1e3),
-    }
-}
-
-fn bytes(bytes: u64) -> String {
-    let mib = bytes as f64 / (1024.0 * 1024.0);
-    if mib < 1024.0 { format!("{mib:.0} MiB") } else { format!("{:.2} GiB", mib / 1024.0) }
 }
 
 #[cfg(test)]

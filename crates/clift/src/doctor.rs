@@ -1,20 +1,26 @@
 //! `clift doctor`: what this machine can train on.
 
 mod probe;
+mod stability;
 
 use clift_eval::machine;
+use clift_model::InstructionSet;
 use clift_model::device::DeviceName;
 use probe::{Gradient, Probe};
 
+use crate::args::DoctorArgs;
 use crate::terminal::print_result;
 
 /// Largest difference of a gradient from the default device's, over its largest entry. Two orders of f32 sums differ
 /// by about 1e-6 here, a wrong kernel by a number near 1.
 const TOLERANCE: f64 = 1e-3;
 
-/// Prints the machine and a row per device; fails if the default device does.
-pub fn run() -> anyhow::Result<()> {
-    let machine = [("clift", version())].into_iter().chain(machine::rows());
+/// Prints the machine and a row per device, or the hard cases; fails if the default device does, or a case.
+pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
+    if args.stability {
+        return stability::run(args);
+    }
+    let machine = [("clift", version())].into_iter().chain(machine::rows()).chain([("kernels", kernels())]);
     let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
     print_result(&format!("{}\n", machine.join("\n")))?;
     let default = DeviceName::default();
@@ -44,6 +50,24 @@ fn version() -> String {
     let features = if cfg!(feature = "wgpu") { "wgpu" } else { "none" };
     let (os, arch) = (std::env::consts::OS, std::env::consts::ARCH);
     format!("{}, cargo features: {features}, {os} {arch}", env!("CARGO_PKG_VERSION"))
+}
+
+/// The instruction set of flex's kernels, the others there are, and who chose.
+fn kernels() -> String {
+    let names = |sets: &mut dyn Iterator<Item = InstructionSet>| {
+        let names: Vec<_> = sets.map(InstructionSet::name).collect();
+        if names.is_empty() { "none".to_owned() } else { names.join(", ") }
+    };
+    let variable = InstructionSet::VARIABLE;
+    match InstructionSet::forced() {
+        Err(bad) => format!("{variable} = {}: {bad}", bad.text),
+        Ok(forced) => {
+            let used = InstructionSet::detected();
+            let why = if forced.is_some() { format!("chosen by {variable}") } else { "the widest here".into() };
+            let others = names(&mut InstructionSet::available().filter(|set| *set != used));
+            format!("{} ({why}; also possible: {others})", used.name())
+        }
+    }
 }
 
 /// Refuses a gradient that is zero or not finite, or far from the reference.

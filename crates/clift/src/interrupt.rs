@@ -1,21 +1,72 @@
-//! Ctrl-C and SIGTERM: the first asks the work to stop in good order, the second ends the process.
+//! Ctrl-C, SIGTERM and a closed terminal: the first signal asks the work to stop in good order, the second ends the
+//! process.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize};
+use std::sync::{Arc, OnceLock};
 
 use anyhow::Context;
+use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::flag;
 
-use crate::INTERRUPTED;
+/// What a shell adds to the number of the signal that ended a process.
+const SIGNALLED: u8 = 128;
+
+/// The number of the last signal; 0 for none.
+static LAST_SIGNAL: OnceLock<Arc<AtomicUsize>> = OnceLock::new();
 
 /// A flag that is set when the process is asked to stop.
 pub fn flag() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
-    let flag = stop.clone();
-    let handler = move || {
-        if flag.swap(true, Ordering::Relaxed) {
-            std::process::exit(i32::from(INTERRUPTED));
-        }
+    let last = LAST_SIGNAL.get_or_init(Arc::default);
+    let listen = |signal: i32| {
+        // In this order: the flag is what the second signal finds set.
+        flag::register_conditional_shutdown(signal, i32::from(SIGNALLED) + signal, stop.clone())?;
+        flag::register_usize(signal, last.clone(), signal as usize)?;
+        flag::register(signal, stop.clone())
     };
-    ctrlc::set_handler(handler).context("listening for Ctrl-C")?;
+    for signal in [SIGINT, SIGTERM] {
+        listen(signal).context("listening for signals")?;
+    }
+    #[cfg(unix)]
+    if !is_ignored(signal_hook::consts::SIGHUP) {
+        listen(signal_hook::consts::SIGHUP).context("listening for signals")?;
+    }
     Ok(stop)
+}
+
+/// The exit code of a process that stopped because it was asked to: 128 and the number of the signal.
+pub fn exit_code() -> u8 {
+    let last = LAST_SIGNAL.get().map_or(0, |last| last.load(std::sync::atomic::Ordering::SeqCst));
+    SIGNALLED + u8::try_from(last).ok().filter(|last| *last != 0).unwrap_or(SIGINT as u8)
+}
+
+/// Whether the process was started to ignore a signal, as `nohup` does with SIGHUP. Linux tells; elsewhere it is taken
+/// for not ignored.
+#[cfg(unix)]
+fn is_ignored(signal: i32) -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    ignores(&status, signal)
+}
+
+#[cfg(unix)]
+fn ignores(status: &str, signal: i32) -> bool {
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ignored_signals_are_read_from_the_mask() {
+        let status = "Name:\tclift\nSigBlk:\tffffffffffffffff\nSigIgn:\t0000000000001001\nSigCgt:\t0\n";
+        assert!(ignores(status, 1) && ignores(status, 13));
+        assert!(!ignores(status, 2) && !ignores("", 1));
+    }
+
+    #[test]
+    fn without_a_signal_the_code_is_that_of_ctrl_c() {
+        assert_eq!(exit_code(), 130);
+    }
 }

@@ -7,10 +7,12 @@ mod doctor;
 mod encode;
 mod eval;
 mod interrupt;
+mod plan;
 mod render;
 mod table;
 pub mod terminal;
 mod train;
+mod units;
 
 use std::process::ExitCode;
 
@@ -18,7 +20,7 @@ use clap::Parser;
 use clift_eval::EvalError;
 use clift_train::TrainError;
 
-use args::{Args, Command, DataCommand};
+use args::{Args, BenchArgs, BenchCommand, Command, DataCommand};
 
 /// Done.
 const DONE: u8 = 0;
@@ -26,11 +28,9 @@ const DONE: u8 = 0;
 const FAILED: u8 = 1;
 /// The command line or the config is wrong.
 const WRONG_USAGE: u8 = 2;
-/// Interrupted after saving: 128 + SIGINT.
-const INTERRUPTED: u8 = 130;
 
 /// Runs the command line of this process and returns its exit code: 0 done, 1 failed, 2 wrong usage
-/// or config, 130 interrupted after saving.
+/// or config, 130 (Ctrl-C), 143 (SIGTERM) or 129 (a closed terminal) interrupted after saving.
 pub fn main() -> ExitCode {
     let result = match Args::parse().command {
         Command::Train(args) => train::run(&args),
@@ -39,7 +39,12 @@ pub fn main() -> ExitCode {
         Command::Render(args) => render::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
         Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
-        Command::Doctor => doctor::run(),
+        Command::Data { command: DataCommand::Check(args) } => data::check::run(&args),
+        Command::Data { command: DataCommand::Index(args) } => data::index::run(&args),
+        Command::Data { command: DataCommand::Convert(args) } => data::convert::run(&args),
+        Command::Plan(args) => plan::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
+        Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => data::bench::run(&args),
         Command::Bench(args) => bench::run(&args),
     };
     match result {
@@ -85,18 +90,21 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     if let Some(EvalError::BadTokenCount { .. }) = error.downcast_ref::<EvalError>() {
         return WRONG_USAGE;
     }
-    match error.downcast_ref::<TrainError>() {
-        Some(TrainError::Interrupted { .. } | TrainError::BenchInterrupted { .. }) => INTERRUPTED,
-        Some(
-            TrainError::BadConfig { .. }
-            | TrainError::OtherRun { .. }
-            | TrainError::Missing { .. }
-            | TrainError::NoConfig { .. }
-            | TrainError::Eval(EvalError::BadTokenCount { .. }),
-        ) => WRONG_USAGE,
-        Some(TrainError::Data(error)) => data_exit_code(error),
-        Some(TrainError::Model(error)) => model_exit_code(error),
-        Some(_) | None => FAILED,
+    error.downcast_ref::<TrainError>().map_or(FAILED, train_exit_code)
+}
+
+fn train_exit_code(error: &TrainError) -> u8 {
+    match error {
+        TrainError::Interrupted { .. } | TrainError::BenchInterrupted { .. } => interrupt::exit_code(),
+        TrainError::BadConfig { .. }
+        | TrainError::OtherRun { .. }
+        | TrainError::Missing { .. }
+        | TrainError::NoConfig { .. }
+        | TrainError::Eval(EvalError::BadTokenCount { .. }) => WRONG_USAGE,
+        TrainError::Data(error) => data_exit_code(error),
+        TrainError::Model(error) => model_exit_code(error),
+        TrainError::Stopped { source, .. } | TrainError::Damaged { source, .. } => train_exit_code(source),
+        _ => FAILED,
     }
 }
 
@@ -132,8 +140,10 @@ mod tests {
         assert_eq!(exit_code(&WrongUsage("no".into()).into()), WRONG_USAGE);
         assert_eq!(exit_code(&bad_config().unwrap_err().into()), WRONG_USAGE);
         assert_eq!(exit_code(&TrainError::from(bad_config().unwrap_err()).into()), WRONG_USAGE);
-        assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), INTERRUPTED);
-        assert_eq!(exit_code(&TrainError::BenchInterrupted { work: "encode" }.into()), INTERRUPTED);
+        let stopped = |source| TrainError::Stopped { source, stage: "stage1", step: 3, checkpoint: "none".into() };
+        assert_eq!(exit_code(&stopped(Box::new(bad_config().unwrap_err().into())).into()), WRONG_USAGE);
+        assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), 130);
+        assert_eq!(exit_code(&TrainError::BenchInterrupted { work: "encode" }.into()), 130);
         assert_eq!(exit_code(&clift_data::DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
         assert_eq!(exit_code(&anyhow::anyhow!("anything else")), FAILED);
     }

@@ -1,20 +1,26 @@
 //! `clift train`.
 
-use clift_train::{Config, Run, RunOptions, read_config};
+use clift_train::{Config, Run, RunOptions, plan, read_checked_config};
 
 use crate::args::TrainArgs;
 use crate::terminal;
 
 /// Trains what the config says and prints the evaluation.
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
-    let (mut config, overrides) = read_config::<Config>(&args.config, &args.set)?;
+    let (mut config, overrides) = read_checked_config(&args.config, &args.set, Config::validate)?;
     for change in overrides {
         terminal::print_note(&format!("--set {change}"));
     }
     config.device = args.device.unwrap_or(config.device);
+    // Now, and not when the system ends the run after hours of other work.
+    if let Ok(planned) = plan::plan(&config, false)
+        && let Some(warning) = plan::memory_warning(&config, &planned)
+    {
+        terminal::print_note(&format!("warning: {warning}"));
+    }
 
     let stop = crate::interrupt::flag()?;
-    let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh };
+    let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
     let mut sink = terminal::sink();
     let folder = config.run_dir.clone();
     let run = Run::open(config, &options, sink.as_mut())?;

@@ -75,9 +75,10 @@ fn check(cameras: impl Fn(usize, &mut Camera) + Send + Sync) -> SceneCheck {
     check_scene(&Changed { room: &rooms()[0], cameras, frame: |frame| frame }, 0).check
 }
 
+/// Up or down: the camera goes sideways, and a turn to the side would move points along their epipolar lines.
 fn turned(c2w: Pose, angle_deg: f64) -> Pose {
     let (sin, cos) = angle_deg.to_radians().sin_cos();
-    let turn = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
+    let turn = [[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]];
     c2w.after(Pose { rotation: turn, translation: [0.0; 3] })
 }
 

@@ -72,7 +72,7 @@ fn pictures_without_a_file_are_encoded() {
     same(&rooms(3), back.as_ref());
 }
 
-/// Rooms that stop being readable after some frames, as when a process is killed.
+/// Rooms whose cameras can be read so many times, twice per scene: as when a process is killed.
 struct Interrupted {
     rooms: SyntheticSource,
     left: AtomicUsize,
@@ -103,7 +103,7 @@ fn an_interrupted_conversion_goes_on_and_ends_with_the_same_files() {
         let whole = tempfile::tempdir().unwrap();
         convert(&rooms(6), whole.path(), options, |_| ()).unwrap();
         let folder = tempfile::tempdir().unwrap();
-        let killed = Interrupted { rooms: rooms(6), left: AtomicUsize::new(3) };
+        let killed = Interrupted { rooms: rooms(6), left: AtomicUsize::new(6) };
         let run = std::panic::AssertUnwindSafe(|| convert(&killed, folder.path(), options, |_| ()));
         assert!(std::panic::catch_unwind(run).is_err());
         assert!(!folder.path().join("index.json").exists());

@@ -34,6 +34,8 @@ pub struct SyntheticConfig {
     pub path_length: f64,
     /// Cycles of the wall patterns per unit of length; patterns on objects are twice as fine. Finer is harder.
     pub texture_frequency: f64,
+    /// Share of the rooms that are empty and of one colour a wall, so that scenes differ in how much they hold.
+    pub plain_share: f64,
     /// Strength of highlights and reflections, which change with the view: 0 is matt, 1 is polished.
     pub specular: f64,
     /// Rays per pixel, a square number.
@@ -54,6 +56,7 @@ impl Default for SyntheticConfig {
             num_objects: [3, 5],
             path_length: 4.0,
             texture_frequency: 0.4,
+            plain_share: 0.0,
             specular: 0.4,
             samples_per_pixel: 4,
         }
@@ -89,6 +92,7 @@ impl SyntheticConfig {
             ("fov_deg", self.fov_deg, 10.0, 100.0),
             ("path_length", self.path_length, 0.01, 1_000.0),
             ("texture_frequency", self.texture_frequency, 0.0, 100.0),
+            ("plain_share", self.plain_share, 0.0, 1.0),
             ("specular", self.specular, 0.0, 1.0),
         ] {
             if !(low..=high).contains(&value) {
@@ -124,6 +128,7 @@ mod tests {
         assert!(check(|c| c.num_objects = [4, 2]).starts_with("num_objects is [4, 2]"));
         assert!(check(|c| c.path_length = 0.0).starts_with("path_length is 0"));
         assert!(check(|c| c.texture_frequency = -1.0).starts_with("texture_frequency is -1"));
+        assert!(check(|c| c.plain_share = 1.5).starts_with("plain_share is 1.5"));
         assert!(check(|c| c.specular = 1.5).starts_with("specular is 1.5"));
         assert!(check(|c| c.samples_per_pixel = 6).starts_with("samples_per_pixel is 6"));
     }

@@ -67,8 +67,10 @@ impl Scene {
         let path = CameraPath::draw(rng, half_size, config.path_length);
         let lamp = [wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35)];
 
+        // No draw where no room is plain: those rooms stay what they are.
+        let is_plain = config.plain_share > 0.0 && unit(rng) < config.plain_share;
         let hue = unit(rng);
-        let frequency = config.texture_frequency;
+        let frequency = if is_plain { 0.0 } else { config.texture_frequency };
         let walls = [0, 1, 2, 3, 4, 5].map(|side| {
             let (hue, saturation, value, frequency) = match side {
                 2 => (hue, 0.1, 0.9, 0.5 * frequency),
@@ -90,7 +92,8 @@ impl Scene {
             lamp: Vector::from_f64(lamp),
             path,
         };
-        for _ in 0..between(rng, config.num_objects[0], config.num_objects[1]) {
+        let [fewest, most] = if is_plain { [0, 0] } else { config.num_objects };
+        for _ in 0..between(rng, fewest, most) {
             let object = (0..MAX_PLACEMENTS).find_map(|attempt| scene.try_object(rng, config, attempt));
             scene.objects.extend(object);
         }
@@ -204,6 +207,17 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_share_of_the_rooms_is_plain_and_none_unless_asked_for() {
+        let plain = |plain_share| {
+            let config = SyntheticConfig { plain_share, ..Default::default() };
+            scenes(&config).iter().filter(|scene| scene.objects.is_empty()).count()
+        };
+        assert_eq!((plain(0.0), plain(1.0)), (0, 200));
+        // Four standard deviations of 200 throws: 28.
+        assert!((72..=128).contains(&plain(0.5)), "{}", plain(0.5));
     }
 
     #[test]

@@ -85,7 +85,8 @@ const fn look(variant: Variant) -> Look {
         Variant::Kmeans => 1,
         Variant::Random => 2,
         Variant::Patch => 3,
-        Variant::NearestView | Variant::MeanImage => 4,
+        // Baselines are levels, not series.
+        Variant::PatchClift | Variant::NearestView | Variant::MeanImage => 4,
     }]
 }
 

@@ -76,7 +76,7 @@ fn write_drawings(exhibit: &Exhibit, out: &mut impl Write) -> io::Result<()> {
     }
     end_row(out)?;
     let whole = |setting: Setting| setting.num_render_tokens == setting.num_storage_tokens;
-    for variant in [Variant::Clift, Variant::Kmeans, Variant::Patch, Variant::Random] {
+    for variant in [Variant::Clift, Variant::Kmeans, Variant::PatchClift, Variant::Patch, Variant::Random] {
         let drawings = exhibit.drawings.iter().filter(|d| d.setting.variant == variant && whole(d.setting));
         write_strip(variant.name(), &drawings.collect::<Vec<_>>(), out)?;
     }

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use super::{FORMAT, HEADER_BYTES, Scene, TokenStorage, VERSION, dtype_name};
 use crate::ModelError;
+use crate::weights::sync_folder;
 
 impl Scene {
     /// Writes the scene to a temporary name beside `path` that is then renamed: no reader sees half a file.
@@ -22,9 +23,10 @@ impl Scene {
         let written = builder.tempfile_in(folder).and_then(|mut file| {
             file.write_all(&bytes)?;
             file.as_file().sync_all()?;
-            Ok(file.persist(path)?)
+            file.persist(path)?;
+            sync_folder(path)
         });
-        written.map(|_| ()).map_err(|error| ModelError::SceneFile {
+        written.map_err(|error| ModelError::SceneFile {
             action: "write",
             reason: error.to_string(),
             fix: "choose a folder that exists and can be written to",

@@ -10,6 +10,7 @@ use super::inputs::batch;
 use super::reference::{InF64, module_in_f64, relative_error, values};
 use super::task::Task;
 use crate::TrainError;
+use crate::bad_steps::Fault;
 use crate::config::{Config, OptimizerConfig};
 use crate::events::Stage;
 use crate::optim::adamw;
@@ -84,8 +85,8 @@ impl Task for StepTask {
         if update.applied {
             return Ok(());
         }
-        let (count, step, keys, checkpoint) = (1, 1, "made up".into(), "none".into());
-        Err(TrainError::Diverged { count, step, keys, checkpoint })
+        let (reason, keys, checkpoint) = (Fault::NotFinite.to_string(), "made up".into(), "none".into());
+        Err(TrainError::Diverged { count: 1, step: 1, reason, keys, checkpoint })
     }
 
     fn error(self: Box<Self>, reference: &Device) -> Result<Option<f64>, TrainError> {
@@ -112,7 +113,7 @@ impl InF64 for Shown {
 }
 
 /// Loss of a batch and the gradient of every parameter.
-fn gradients(model: &Clift, batch: &StageBatch, shown: Shown) -> Result<(f64, GradientsParams), TrainError> {
+pub(crate) fn gradients(model: &Clift, batch: &StageBatch, shown: Shown) -> Result<(f64, GradientsParams), TrainError> {
     let loss = loss_of(model, &shown, &batch.tokens)?;
     let grads = GradientsParams::from_grads(loss.backward(), model);
     Ok((values(loss.inner())[0], grads))

@@ -4,10 +4,10 @@ use std::fs;
 use std::path::Path;
 
 use anyhow::Context;
+use clift_data::Split;
 use clift_data::check::{Checked, SceneCheck, check_scene, left_out, note_frames};
 use clift_data::files::replace;
 use clift_data::image::encode_png;
-use clift_data::Split;
 use serde::Serialize;
 
 use super::args::CheckArgs;
@@ -46,7 +46,11 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
         replace(path, &text).with_context(|| format!("writing {}", path.display()))?;
     }
     let flagged = report.scenes.iter().filter(|row| !row.check.ok).count();
-    anyhow::ensure!(flagged == 0, "{flagged} of {} flagged; the reasons stand above", count(report.scenes.len(), "scene"));
+    anyhow::ensure!(
+        flagged == 0,
+        "{flagged} of {} flagged; the reasons stand above",
+        count(report.scenes.len(), "scene")
+    );
     Ok(())
 }
 
@@ -127,9 +131,8 @@ mod tests {
         };
         let reasons = vec!["it has no frames".to_owned()];
         let bad = SceneCheck { key: "b".into(), reasons, notes: vec!["so much".into()], ..SceneCheck::default() };
-        let report = Report {
-            scenes: vec![Row { split: Some(Split::Train), check: good }, Row { split: None, check: bad }],
-        };
+        let report =
+            Report { scenes: vec![Row { split: Some(Split::Train), check: good }, Row { split: None, check: bad }] };
         let expected = "\
 scene    frames  size     field of view  epipolar
 train/a  36      576x320  93.0 deg       0.31 px   ok

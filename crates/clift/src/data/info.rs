@@ -6,7 +6,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context;
-use clift_data::{ClipReader, DataError, LayoutOptions, Ledger, Opened, SceneSource, SourceInfo, Split};
+use clift_data::{
+    ClipReader, DataError, EvaluationIndex, LayoutOptions, Ledger, Opened, SceneSource, SourceInfo, Split,
+};
 use clift_train::config::SourceKind;
 use clift_train::scenes::{self, FirstScenes};
 use clift_train::{Config, read_config};
@@ -21,7 +23,12 @@ const MAX_SYNTHETIC: usize = 1000;
 
 /// Prints what a folder or a config holds.
 pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
-    let report = if args.path.is_dir() || args.path.extension().is_some_and(|ending| ending == "json") {
+    let is_json = args.path.extension().is_some_and(|ending| ending == "json");
+    let is_scene = is_json && args.path.file_name().is_some_and(|name| name.to_string_lossy().contains("transforms"));
+    if is_json && !is_scene {
+        return of_index(args);
+    }
+    let report = if args.path.is_dir() || is_scene {
         if !args.set.is_empty() {
             return Err(WrongUsage(format!("--set changes a config, but {} is none", args.path.display())).into());
         }
@@ -42,6 +49,17 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     let failed = report.splits.values().filter_map(|split| split.error.as_ref());
     let failed = failed.chain(report.evaluation.as_ref().and_then(|evaluation| evaluation.error.as_ref()));
     anyhow::ensure!(failed.count() == 0, "not all of it can be used; the reason stands above");
+    Ok(())
+}
+
+/// Prints what an evaluation index asks for.
+fn of_index(args: &InfoArgs) -> anyhow::Result<()> {
+    let census = EvaluationIndex::read(&args.path)?.census();
+    print_result(&format!("{census}\n"))?;
+    if let Some(path) = &args.json {
+        let text = serde_json::to_vec_pretty(&census).context("writing the counts as JSON")?;
+        std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
+    }
     Ok(())
 }
 

@@ -1,0 +1,268 @@
+//! Seconds of a shallow copy of the network on this device, from which those of the whole one are counted.
+
+use std::time::Instant;
+
+use burn::module::Module;
+use burn::optim::GradientsParams;
+use burn::tensor::Tensor;
+use clift_data::order::{item_rng, step_rng};
+use clift_data::{ClipReader, Split};
+use clift_eval::{Accumulator, Networks, Sweep, TokenCount, Variant, evaluate_scene, upload_cameras, upload_views};
+use clift_model::ModelConfig;
+use rand::RngExt;
+use rand::seq::index::sample;
+
+use super::counts::{Macs, Parameters, SceneSizes};
+use super::sizes::{Middle, update_macs};
+use crate::TrainError;
+use crate::bench::BenchOptions;
+use crate::bench::context::BenchContext;
+use crate::bench::inputs::{Shape, batch, clip};
+use crate::config::Config;
+use crate::events::Stage;
+use crate::optim::{adamw, clip_global_norm, global_norm};
+use crate::scenes;
+use crate::step::{Learner, Shown, StageBatch, TokenChoice, loss_of};
+use crate::trainer::freeze;
+
+/// Multiplications of a calibrated update: a second of a laptop.
+const ENOUGH_MACS: f64 = 30e9;
+
+/// Repetitions that are timed, after one that is not; the least is taken, since whatever else the machine does only
+/// adds to it.
+const REPEATS: usize = 3;
+
+/// What a device takes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rates {
+    /// Seconds of one multiplication of the network, with everything around it.
+    pub per_mac: f64,
+    /// Seconds of the update of one parameter: norm, clipping, `AdamW`.
+    pub per_parameter: f64,
+}
+
+/// What a device takes without gradients.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InferenceRates {
+    /// Seconds of one multiplication of the encoder.
+    pub encode_per_mac: f64,
+    /// Seconds of one multiplication of the renderer.
+    pub render_per_mac: f64,
+    /// Seconds of latent K-means by number of clusters.
+    pub kmeans: Vec<(usize, f64)>,
+    /// Seconds of the evaluation of one scene with the networks of `timed`: clusters, pictures and their measures.
+    pub measuring_s: f64,
+    /// The network that was timed.
+    pub timed: ModelConfig,
+}
+
+/// The config with one block of each kind, which take as long as any other.
+fn shallow(config: &Config) -> Config {
+    let mut config = config.clone();
+    let model = &mut config.model;
+    // Encoder and renderer keep their proportion as far as whole blocks can.
+    let [encoder, renderer] = [model.num_encoder_blocks, model.num_renderer_blocks];
+    let fewest = encoder.min(renderer);
+    model.num_encoder_blocks = (encoder + fewest / 2) / fewest;
+    model.num_renderer_blocks = (renderer + fewest / 2) / fewest;
+    model.condenser.num_blocks = 1;
+    config
+}
+
+fn context(config: &Config, num_context: usize) -> Result<BenchContext, TrainError> {
+    let mut config = config.clone();
+    (config.data.views.min_context, config.data.views.max_context) = (num_context, num_context);
+    // Clusters and counts are this module's own.
+    config.clusters.grid = vec![TokenCount::Share(1.0)];
+    let options = BenchOptions {
+        work: Vec::new(),
+        repeats: 1,
+        warmup: 0,
+        error: false,
+        storage: TokenCount::Share(1.0),
+        features: None,
+    };
+    BenchContext::new(&config, &options)
+}
+
+/// Times an update of a shallow network at the middle of a stage's sizes.
+pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Rates, TrainError> {
+    let shallow = shallow(config);
+    let context = context(&shallow, middle.num_context)?;
+    let macs_of_scene = update_macs(&shallow, stage, &middle.scene);
+    let num_scenes = ((ENOUGH_MACS / macs_of_scene) as usize).clamp(1, middle.num_scenes);
+    let batch = drawn(&context, stage, middle, num_scenes)?;
+    let optimizer = if stage == Stage::Stage2 { &config.stage2.optimizer } else { &config.stage1.optimizer };
+    let mut learner = Learner {
+        model: freeze(stage, context.model()),
+        optimizer: adamw(optimizer),
+        device: context.device.clone().autodiff(),
+        recompute: config.recompute,
+    };
+    let rate = optimizer.learning_rate;
+    let mut step_s = f64::INFINITY;
+    for repeat in 0..=REPEATS {
+        let started = Instant::now();
+        (learner, _) = learner.step(&batch, 1, rate.into(), optimizer.max_grad_norm)?;
+        context.sync()?;
+        if repeat > 0 {
+            step_s = step_s.min(started.elapsed().as_secs_f64());
+        }
+    }
+    let shown = Shown::upload(&batch, &learner.device)?;
+    let mut optimizer_s = f64::INFINITY;
+    for _ in 0..REPEATS {
+        let loss = loss_of(&learner.model, &shown, &batch.tokens)?;
+        let grads = GradientsParams::from_grads(loss.backward(), &learner.model);
+        context.sync()?;
+        let started = Instant::now();
+        let norm = global_norm(&learner.model, &grads);
+        let grads = clip_global_norm(&learner.model, grads, norm, optimizer.max_grad_norm);
+        learner.model = learner.optimizer.step(rate, learner.model, grads);
+        context.sync()?;
+        optimizer_s = optimizer_s.min(started.elapsed().as_secs_f64());
+    }
+    let macs = num_scenes as f64 * macs_of_scene;
+    let parameters = trained(&Parameters::of(&shallow.model), stage) as f64;
+    Ok(Rates { per_mac: (step_s - optimizer_s).max(0.0) / macs, per_parameter: optimizer_s / parameters })
+}
+
+/// Parameters that a stage trains.
+pub fn trained(parameters: &Parameters, stage: Stage) -> u64 {
+    match stage {
+        Stage::Stage2 => parameters.condenser + parameters.renderer,
+        _ => parameters.encoder + parameters.renderer,
+    }
+}
+
+/// A batch of made-up scenes with the middle's numbers of tokens.
+fn drawn(context: &BenchContext, stage: Stage, middle: &Middle, num_scenes: usize) -> Result<StageBatch, TrainError> {
+    let (num_tokens, kept) = (context.num_tokens()?, middle.scene.num_render_tokens as usize);
+    let stored = (stage == Stage::Stage2).then_some(kept);
+    let mut batch = batch(context.shape(), num_scenes, num_tokens, stored, context.seed())?;
+    if stage != Stage::Stage2 && kept < num_tokens {
+        let subsets = batch.clips.iter().enumerate().map(|(slot, clip)| {
+            let mut rng = item_rng(context.seed(), 0, slot as u32, 0, "plan tokens");
+            let subset = |_| sample(&mut rng, num_tokens, kept).into_iter().map(|token| token as u32).collect();
+            (0..clip.target.num_views()).map(subset).collect()
+        });
+        batch.tokens = TokenChoice::Subsets(subsets.collect());
+    }
+    Ok(batch)
+}
+
+/// Times encoding, drawing, clustering and measuring one scene.
+pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<InferenceRates, TrainError> {
+    let InferenceTimed { num_context, num_targets, counts, is_measured } = *sizes;
+    let shallow = shallow(config);
+    let context = context(&shallow, num_context)?;
+    let model = context.model().valid();
+    let shape = Shape { num_context, num_targets, ..context.shape() };
+    let clip = clip(shape, context.seed(), 0);
+    let views = upload_views(&[&clip.context], &context.device)?;
+    let cameras = upload_cameras(&[&clip.target], &context.device)?;
+    let patches = (shape.size[0] / config.model.patch_size) * (shape.size[1] / config.model.patch_size);
+    let num_tokens = context.num_tokens()? as f64;
+    let scene = SceneSizes {
+        num_tokens,
+        num_storage_tokens: None,
+        num_render_tokens: num_tokens,
+        is_per_view: false,
+        num_targets: num_targets as f64,
+        num_patches: patches as f64,
+    };
+    let macs = Macs::of(&shallow.model, &scene);
+    let least = |work: &mut dyn FnMut() -> Result<(), TrainError>| -> Result<f64, TrainError> {
+        let mut seconds = f64::INFINITY;
+        for repeat in 0..=REPEATS {
+            let started = Instant::now();
+            work()?;
+            context.sync()?;
+            if repeat > 0 {
+                seconds = seconds.min(started.elapsed().as_secs_f64());
+            }
+        }
+        Ok(seconds)
+    };
+    let encode_s = least(&mut || read(model.encoder.forward(&views)))?;
+    let lift = model.encoder.forward(&views);
+    let render_s = least(&mut || read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?;
+    let mut kmeans = Vec::new();
+    let mut measuring_s = 0.0;
+    if is_measured {
+        let networks = Networks {
+            encoder: model.encoder.clone(),
+            renderer: model.renderer.clone(),
+            condensed: Some((model.condenser.clone(), model.renderer.clone())),
+            patch_condensed: None,
+            device: context.device.clone(),
+        };
+        let eval = &config.eval;
+        let sweep = Sweep {
+            storage: eval.storage.clone(),
+            render: eval.render.clone(),
+            selection: eval.selection,
+            tokens: eval.tokens,
+            variants: vec![Variant::Random, Variant::Kmeans, Variant::Clift],
+            kmeans: config.clusters.kmeans.clone(),
+            patch_size: config.model.patch_size,
+            seed: config.seed,
+        };
+        measuring_s = f64::INFINITY;
+        for _ in 0..2 {
+            let started = Instant::now();
+            evaluate_scene(&networks, &clip, &sweep, false, &mut Accumulator::default())?;
+            measuring_s = measuring_s.min(started.elapsed().as_secs_f64());
+        }
+    } else {
+        for &count in counts {
+            // One seed takes a few iterations more, another fewer.
+            let seeds: Vec<u64> = (0..3).map(|seed| step_rng(context.seed(), seed, "plan clusters").random()).collect();
+            let started = Instant::now();
+            for &seed in &seeds {
+                config.clusters.kmeans.fit(lift.clone(), count, &[seed])?;
+            }
+            kmeans.push((count, started.elapsed().as_secs_f64() / seeds.len() as f64));
+        }
+    }
+    let [encode_per_mac, render_per_mac] = [encode_s / macs.encoder, render_s / macs.renderer];
+    Ok(InferenceRates { encode_per_mac, render_per_mac, kmeans, measuring_s, timed: shallow.model })
+}
+
+/// What is timed without gradients.
+#[derive(Clone, Copy, Debug)]
+pub struct InferenceTimed<'a> {
+    /// Context views.
+    pub num_context: usize,
+    /// Target views that are drawn at once.
+    pub num_targets: usize,
+    /// Counts of clusters.
+    pub counts: &'a [usize],
+    /// Whether a whole evaluation of the scene is timed, and not its clusters alone.
+    pub is_measured: bool,
+}
+
+/// Seconds that one thread takes to read a view of a training scene; `None` where the data is not there.
+pub fn loading_s(config: &Config) -> Option<f64> {
+    let (source, _) = scenes::open(&config.data, Split::Train).ok()?;
+    let reader = ClipReader { source, options: config.data.clip_options() };
+    let views = &config.data.views;
+    let mut times = Vec::new();
+    for scene in 0..reader.source.num_scenes().min(6) {
+        let mut rng = item_rng(config.seed, 0, scene as u32, 0, "plan views");
+        let source = reader.source.as_ref();
+        let started = Instant::now();
+        let drawn = views.draw(source, scene, views.warm_up_steps, views.max_context, &mut rng).ok()?;
+        let clip = reader.read(scene, &drawn).ok()?;
+        times.push(started.elapsed().as_secs_f64() / (clip.context.num_views() + clip.target.num_views()) as f64);
+    }
+    // The first opens files that the others find open.
+    let rest = times.get(1..).filter(|rest| !rest.is_empty())?;
+    Some(rest.iter().sum::<f64>() / rest.len() as f64)
+}
+
+/// Waits for a value of a result.
+fn read(tensor: Tensor<3>) -> Result<(), TrainError> {
+    let value = tensor.slice([0..1, 0..1, 0..1]).into_data();
+    if value.num_elements() == 1 { Ok(()) } else { Err(TrainError::Tensor { reason: "it is empty".into() }) }
+}

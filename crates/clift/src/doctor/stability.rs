@@ -1,0 +1,54 @@
+//! `clift doctor --stability`: the hard cases.
+
+use anyhow::Context;
+use clift_data::files::replace;
+use clift_model::device::DeviceName;
+use clift_train::stability::{self, Row, Size};
+
+use crate::args::DoctorArgs;
+use crate::terminal::{print_note, print_result};
+
+/// Runs every case on every device of the build, and fails if one is beyond its bound.
+pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
+    let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
+    let size = if args.small { Size::Small } else { Size::Full };
+    let rows = stability::run(&devices, size, &mut |row| print_note(&line(&devices, row)))?;
+    if let Some(path) = &args.markdown {
+        let text = format!("{}\n{}\n", head(args.small), stability::markdown(&devices, &rows));
+        replace(path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
+        print_result(&format!("table: {}", path.display()))?;
+    }
+    let broken = rows.iter().filter(|row| !row.holds()).count();
+    print_result(&format!("{} of {} cases hold on {}", rows.len() - broken, rows.len(), names(&devices)))?;
+    if broken > 0 {
+        return Err(anyhow::anyhow!("{broken} cases do not hold"));
+    }
+    Ok(())
+}
+
+fn names(devices: &[DeviceName]) -> String {
+    devices.iter().map(ToString::to_string).collect::<Vec<_>>().join(" and ")
+}
+
+fn line(devices: &[DeviceName], row: &Row) -> String {
+    let outcomes = devices.iter().zip(&row.outcomes);
+    let outcomes = outcomes.map(|(device, outcome)| format!("{device} {}", stability::shown(row, outcome)));
+    format!("{}: {}", row.case.name, outcomes.collect::<Vec<_>>().join(", "))
+}
+
+/// What stands above the table.
+fn head(small: bool) -> String {
+    let command = if small { "clift doctor --stability --small" } else { "clift doctor --stability" };
+    format!(
+        "# Numbers on hard scenes
+
+Made by `{command} --markdown docs/stability.md`; a small version of every case runs in `cargo test`.
+
+Each case is a real computation in f32 and the same code on the same values in f64, which takes the composed
+operations instead of the kernels. The error is the largest difference over the largest value, of an update over its
+loss and the gradient of every parameter (of parameters whose gradient is below a thousandth of the largest one, over
+that thousandth: a gradient that is zero in exact arithmetic is noise in any other). What is **bold** is beyond its bound.
+What `refused` stands for has a message and a test of its own.
+"
+    )
+}

@@ -1,0 +1,156 @@
+//! Damage: bits, bytes, cuts, splices, lengths, numbers and words, as a function of (reader, seed, number).
+
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// Lengths and counts that readers trip over.
+const NUMBERS: [u64; 20] = [
+    0,
+    1,
+    2,
+    3,
+    7,
+    8,
+    127,
+    128,
+    255,
+    256,
+    0x7fff,
+    0x8000,
+    0xffff,
+    0x1_0000,
+    0x7fff_ffff,
+    0x8000_0000,
+    0xffff_ffff,
+    0x1_0000_0000,
+    0x7fff_ffff_ffff_ffff,
+    u64::MAX,
+];
+
+/// What stands in a text where a number was.
+const TEXTS: [&str; 14] = [
+    "0",
+    "-1",
+    "1",
+    "2",
+    "65536",
+    "4294967296",
+    "9223372036854775807",
+    "9223372036854775808",
+    "18446744073709551615",
+    "4611686018427387904",
+    "1e308",
+    "1e999",
+    "-0.0",
+    "null",
+];
+
+/// Largest input that is made of a smaller one.
+const MOST_BYTES: usize = 1 << 20;
+
+/// Damages one reader's valid files.
+pub struct Mutator<'a> {
+    /// The valid files.
+    pub seeds: &'a [Vec<u8>],
+    /// Words of the format.
+    pub words: &'a [&'a [u8]],
+    /// Puts right what would hide the damage: checksums.
+    pub repair: fn(&mut Vec<u8>),
+}
+
+impl Mutator<'_> {
+    /// The input of an execution.
+    pub fn input(&self, target: &str, seed: u64, number: u64) -> Vec<u8> {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed ^ name_hash(target));
+        rng.set_stream(number);
+        let mut bytes = self.seeds[below(&mut rng, self.seeds.len())].clone();
+        for _ in 0..1 + below(&mut rng, 6) {
+            self.damage(&mut bytes, &mut rng);
+        }
+        // Half of the time the damage is one that checksums do not see.
+        if rng.random_bool(0.5) {
+            (self.repair)(&mut bytes);
+        }
+        bytes
+    }
+
+    fn damage(&self, bytes: &mut Vec<u8>, rng: &mut ChaCha8Rng) {
+        let at = below(rng, bytes.len() + 1).min(bytes.len().saturating_sub(1));
+        if bytes.is_empty() {
+            bytes.push(rng.random());
+            return;
+        }
+        match below(rng, 12) {
+            0 | 1 => bytes[at] ^= 1 << below(rng, 8),
+            2 => bytes[at] = rng.random(),
+            3 => bytes.truncate(at),
+            4 => drop(bytes.drain(at..at + below(rng, (bytes.len() - at).min(64)) + usize::from(bytes.len() > at + 1))),
+            5 => {
+                let len = 1 + below(rng, (bytes.len() - at).min(4096));
+                let part = bytes[at..(at + len).min(bytes.len())].to_vec();
+                insert(bytes, at, &part.repeat(1 + below(rng, 4)));
+            }
+            6 => {
+                let other = &self.seeds[below(rng, self.seeds.len())];
+                let from = below(rng, other.len());
+                let len = 1 + below(rng, other.len() - from);
+                bytes.truncate(at);
+                bytes.extend_from_slice(&other[from..from + len]);
+            }
+            7 | 8 => overwrite_number(bytes, at, rng),
+            9 => replace_digits(bytes, at, rng),
+            _ if self.words.is_empty() => bytes[at] ^= 0x80,
+            10 => insert(bytes, at, self.words[below(rng, self.words.len())]),
+            _ => {
+                let word = self.words[below(rng, self.words.len())];
+                let end = (at + word.len()).min(bytes.len());
+                bytes[at..end].copy_from_slice(&word[..end - at]);
+            }
+        }
+    }
+}
+
+fn below(rng: &mut impl Rng, count: usize) -> usize {
+    if count == 0 { 0 } else { rng.random_range(0..count) }
+}
+
+fn insert(bytes: &mut Vec<u8>, at: usize, part: &[u8]) {
+    if bytes.len() + part.len() <= MOST_BYTES.max(bytes.len()) {
+        bytes.splice(at..at, part.iter().copied());
+    }
+}
+
+/// A number of 1, 2, 4 or 8 bytes in either order, perhaps near the file's own length.
+fn overwrite_number(bytes: &mut [u8], at: usize, rng: &mut ChaCha8Rng) {
+    let width = 1 << below(rng, 4);
+    let number = match below(rng, 4) {
+        0 => (bytes.len() as u64).wrapping_add(rng.random_range(0..5)).wrapping_sub(2),
+        1 => {
+            let mut there = [0; 8];
+            let end = (at + width).min(bytes.len());
+            there[..end - at].copy_from_slice(&bytes[at..end]);
+            u64::from_le_bytes(there).wrapping_add(rng.random_range(0..17)).wrapping_sub(8)
+        }
+        _ => NUMBERS[below(rng, NUMBERS.len())],
+    };
+    let little = number.to_le_bytes();
+    let mut part = little[..width].to_vec();
+    if rng.random_bool(0.5) {
+        part.reverse();
+    }
+    let end = (at + width).min(bytes.len());
+    bytes[at..end].copy_from_slice(&part[..end - at]);
+}
+
+/// Puts another number where the next one of a text stands.
+fn replace_digits(bytes: &mut Vec<u8>, at: usize, rng: &mut ChaCha8Rng) {
+    let Some(start) = (at..bytes.len()).find(|&i| bytes[i].is_ascii_digit()) else { return };
+    let end = (start..bytes.len()).find(|&i| !bytes[i].is_ascii_digit()).unwrap_or(bytes.len());
+    let text = TEXTS[below(rng, TEXTS.len())];
+    bytes.splice(start..end, text.bytes());
+}
+
+/// A number of a name, the same everywhere (FNV-1a).
+fn name_hash(name: &str) -> u64 {
+    name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
+}

@@ -1,0 +1,74 @@
+//! What an attack came to.
+
+use std::fmt::Write as _;
+use std::time::Duration;
+
+/// A reader that has so many findings is not attacked further.
+pub const MOST_FINDINGS: usize = 20;
+
+/// Longest message: a refusal is read by people.
+pub const MOST_MESSAGE: usize = 20_000;
+
+/// What happened to one reader.
+#[derive(Debug)]
+pub struct Attacked {
+    name: &'static str,
+    /// Inputs read.
+    pub executions: u64,
+    /// Inputs that were taken.
+    pub accepted: u64,
+    /// Longest of them.
+    pub slowest: Duration,
+    /// Most bytes that one took.
+    pub peak_bytes: usize,
+    /// Seconds of all.
+    pub seconds: f64,
+    /// What was wrong, each once.
+    pub findings: Vec<String>,
+}
+
+impl Attacked {
+    pub fn new(name: &'static str) -> Self {
+        let (slowest, findings) = (Duration::ZERO, Vec::new());
+        Self { name, executions: 0, accepted: 0, slowest, peak_bytes: 0, seconds: 0.0, findings }
+    }
+
+    /// Notes a finding and the file that shows it.
+    pub fn find(&mut self, what: String, saved: Option<String>) {
+        if self.findings.iter().all(|known| !known.starts_with(&what)) {
+            self.findings.push(saved.map_or(what.clone(), |saved| format!("{what} ({saved})")));
+        }
+    }
+
+    /// One line for people.
+    pub fn line(&self) -> String {
+        let Self { name, executions, accepted, slowest, peak_bytes, seconds, findings } = self;
+        let mut line = format!(
+            "{name}: {executions} executions in {seconds:.0} s, {accepted} accepted, slowest {:.1} ms, peak {:.1} MiB",
+            slowest.as_secs_f64() * 1e3,
+            *peak_bytes as f64 / f64::from(1 << 20)
+        );
+        for finding in findings {
+            let _ = write!(line, "\n  FOUND: {finding}");
+        }
+        line
+    }
+}
+
+/// The table.
+pub fn markdown(rows: &[Attacked], seconds: f64, seed: u64) -> String {
+    let mut text = format!(
+        "`clift-attack --seconds {seconds} --seed {seed}`:\n\n\
+         | reader | executions | accepted | slowest | peak memory | found |\n|---|---|---|---|---|---|\n"
+    );
+    for Attacked { name, executions, accepted, slowest, peak_bytes, findings, .. } in rows {
+        let found = if findings.is_empty() { "nothing".into() } else { findings.join("; ").replace('|', "/") };
+        let _ = writeln!(
+            text,
+            "| {name} | {executions} | {accepted} | {:.1} ms | {:.1} MiB | {found} |",
+            slowest.as_secs_f64() * 1e3,
+            *peak_bytes as f64 / f64::from(1 << 20)
+        );
+    }
+    text
+}

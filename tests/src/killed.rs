@@ -1,0 +1,55 @@
+//! A training that kills itself with SIGKILL at a chosen moment: `clift-killed MOMENT train CONFIG [--set K=V] [--only S]`.
+//!
+//! A moment is `step/STAGE/N` (step N was made, not saved), `saved/STAGE/N` (its checkpoint is there) or `set/N` (N sets
+//! are clustered). Signals from outside cannot be timed like that: a step takes milliseconds.
+
+use std::process::Command;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+use clift_train::{Config, Event, Run, RunOptions, Sink, Stage, read_config};
+
+struct Killer {
+    moment: String,
+}
+
+impl Sink for Killer {
+    fn event(&mut self, event: &Event) {
+        let moment = match event {
+            Event::Step(step) => format!("step/{}/{}", step.stage.name(), step.step),
+            Event::Checkpoint { path } => {
+                let name = |path: &std::path::Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+                let stage = path.ancestors().nth(2).map(name).unwrap_or_default();
+                format!("saved/{stage}/{}", name(path).trim_start_matches("step-").trim_start_matches('0'))
+            }
+            Event::Progress { done, .. } => format!("set/{done}"),
+            _ => return,
+        };
+        if moment == self.moment {
+            let id = std::process::id().to_string();
+            Command::new("kill").args(["-KILL", &id]).status().expect("kill runs");
+            std::thread::sleep(Duration::from_mins(1));
+        }
+    }
+}
+
+fn main() {
+    let mut args = std::env::args().skip(1);
+    let moment = args.next().expect("a moment");
+    assert_eq!(args.next().as_deref(), Some("train"));
+    let config = args.next().expect("a config");
+    let (mut set, mut options) = (Vec::new(), RunOptions::default());
+    while let (Some(flag), Some(value)) = (args.next(), args.next()) {
+        let stage = |stage: &Stage| stage.name() == value;
+        match flag.as_str() {
+            "--set" => set.push(value),
+            "--only" => options.only = [Stage::Stage1, Stage::Clusters, Stage::Stage2].into_iter().find(stage),
+            _ => panic!("{flag} is not known"),
+        }
+    }
+    let (config, _) = read_config::<Config>(config.as_ref(), &set).expect("a valid config");
+    let mut sink = Killer { moment };
+    let run = Run::open(config, &options, &mut sink).expect("a free run directory");
+    run.train(options.only, &AtomicBool::new(false), &mut sink).expect("nothing else comes in between");
+    panic!("the run ended before {}", sink.moment);
+}

@@ -1,0 +1,77 @@
+//! `--extend`: more steps than a run was started with.
+
+use crate::support::{Place, files, killed_at};
+
+#[test]
+fn a_finished_stage_goes_on_with_the_rates_of_the_new_count() {
+    let place = Place::new();
+    place.train("run", &[], &[]).ok();
+    let former = place.bytes("run/stage2/model.safetensors");
+    let before = files(&place.at("run"));
+    let more = ["stage2.steps=8"];
+    let message = place.train("run", &more, &[]).fails(2);
+    assert!(message.contains("  stage2.steps: 4 -> 8\n") && message.contains("train on with --extend"), "{message}");
+    assert!(files(&place.at("run")) == before, "a refusal changes nothing");
+
+    let ran = place.train("run", &more, &["--extend"]).ok();
+    assert!(ran.stderr.contains("stage2: resumed after 4 of 8 steps"), "{}", ran.stderr);
+    assert_eq!(place.bytes("run/stage2/model-4-steps.safetensors"), former);
+    assert_ne!(place.bytes("run/stage2/model.safetensors"), former);
+    let expected = serde_json::json!([{"stage": "stage2", "from": 4, "to": 8, "at_step": 4}]);
+    assert_eq!(place.json("run/run.json")["extended"], expected);
+
+    // From step 5 on the rates are those of a run of eight steps; up to it they were those of one of four.
+    place.train("eight", &more, &[]).ok();
+    let rate = |run: &str, step: usize| place.metrics(run)[6 + step - 1]["lr"].as_f64().expect("a rate");
+    assert_eq!(place.metrics("run").len(), 14);
+    assert!((5..=8).all(|step| rate("run", step) == rate("eight", step)));
+    assert!(rate("run", 3) < rate("eight", 3) && rate("run", 5) > rate("run", 4));
+
+    // The run now has that count: no flag is needed, and it has not forgotten.
+    place.train("run", &more, &[]).ok();
+    assert_eq!(place.json("run/run.json")["extended"], expected);
+    assert!(place.train("run", &[], &["--extend"]).fails(2).contains("stage2.steps: 8 -> 4"), "counts do not shrink");
+}
+
+#[test]
+fn an_extended_stage_resumes_exactly() {
+    let place = Place::new();
+    let (six, twelve) = (["checkpoint.every=3"], ["checkpoint.every=3", "stage1.steps=12"]);
+    for name in ["whole", "parts"] {
+        place.train(name, &six, &["--only", "stage1"]).ok();
+    }
+    place.train("whole", &twelve, &["--only", "stage1", "--extend"]).ok();
+    let mut args = place.train_args("parts", &six, &["--only", "stage1"]);
+    // Killed after the weights were renamed and before the new count was written: as if it had not been asked for.
+    let weights = place.at("parts/stage1/model.safetensors");
+    std::fs::rename(&weights, place.at("parts/stage1/model-6-steps.safetensors")).expect("renames");
+    crate::support::clift(&args).ok();
+    assert!(weights.exists(), "made again from the last checkpoint");
+    std::fs::remove_file(place.at("parts/stage1/model-6-steps.safetensors")).expect("removes");
+
+    args = place.train_args("parts", &twelve, &["--only", "stage1", "--extend"]);
+    crate::support::clift(&args).ok();
+    assert_eq!(place.bytes("parts/stage1/model.safetensors"), place.bytes("whole/stage1/model.safetensors"));
+
+    // Before its end a stage is extended too, from the checkpoint it has.
+    killed_at("saved/stage1/3", &place.train_args("early", &six, &[]));
+    place.train("early", &twelve, &["--only", "stage1", "--extend"]).ok();
+    assert_eq!(place.json("early/run.json")["extended"][0]["at_step"], 3);
+    assert_ne!(place.bytes("early/stage1/model.safetensors"), place.bytes("whole/stage1/model.safetensors"));
+}
+
+#[test]
+fn what_cannot_go_on_is_refused() {
+    let place = Place::new();
+    place.train("run", &[], &[]).ok();
+    let before = files(&place.at("run"));
+    let message = place.train("run", &["stage1.steps=9"], &["--extend"]).fails(2);
+    assert!(message.contains("clusters/ was made with the encoder that stage 1 has now"), "{message}");
+    let message = place.train("run", &["stage2.steps=9", "seed=1"], &["--extend"]).fails(2);
+    assert!(message.contains("settings:\n  seed: 0 -> 1\nresume"), "{message}");
+    assert!(files(&place.at("run")) == before, "a refusal changes nothing");
+    std::fs::remove_dir_all(place.at("run/stage2/checkpoints")).expect("removes");
+    let message = place.train("run", &["stage2.steps=9"], &["--extend"]).fails(2);
+    assert!(message.contains("stage2/checkpoints, from which the stage would go on, is gone"), "{message}");
+    assert!(place.at("run/stage2/model.safetensors").exists());
+}

@@ -1,0 +1,156 @@
+//! Disks that are full, folders that cannot be written, data that vanishes: the run ends with a message and goes on later.
+
+use std::path::Path;
+use std::process::Command;
+
+use crate::support::{BINARY, Place, clift, finish, killed_at, spawn, start, wait_for_steps};
+
+/// Twelve saved steps and as many to come.
+const HALF: [&str; 4] = ["stage1.steps=24", "stage2.steps=12", "eval.every=12", "checkpoint={every=12, keep=2}"];
+
+/// Expects a message with what failed, where the stage stands and what there is to go on from.
+fn assert_names_the_last_good_checkpoint(place: &Place, run: &str, step: u64, message: &str) {
+    let checkpoint = place.at(&format!("{run}/stage1/checkpoints/step-{step:09}")).display().to_string();
+    assert!(message.trim_end().ends_with(&format!("the last good checkpoint is {checkpoint}")), "{message}");
+    assert_eq!(place.checkpoints(run, "stage1"), [step], "nothing half-written lies beside it");
+}
+
+/// No file may grow beyond the limit: what a full disk is to a checkpoint, without the right to mount one.
+#[test]
+fn a_save_that_does_not_fit_leaves_the_last_checkpoint_and_the_run_goes_on_later() {
+    let place = Place::new();
+    place.train("whole", &HALF, &[]).ok();
+    killed_at("saved/stage1/12", &place.train_args("run", &HALF, &[]));
+    let largest = |path: &Path| std::fs::metadata(path).expect("there").len();
+    let model = largest(&place.at("run/stage1/checkpoints/step-000000012/model.bpk"));
+    // Blocks have 512 bytes or 1,024, by the shell; the config fits and the weights do not.
+    let blocks = model / 1024 - 1;
+    assert!(largest(&place.at("run/config.toml")) < blocks * 512, "{model}");
+    let mut command = Command::new("sh");
+    command.args(["-c", "trap '' XFSZ; ulimit -f $0; exec \"$@\"", &blocks.to_string(), BINARY]);
+    let message = finish(start(command.args(place.train_args("run", &HALF, &[])))).fails(1);
+    assert!(
+        message.contains("error: writing a checkpoint failed: ") && message.contains("File too large"),
+        "{message}"
+    );
+    assert!(message.contains("step-000000024.tmp/model.bpk\nstage1 stopped after step 24; "), "{message}");
+    assert_names_the_last_good_checkpoint(&place, "run", 12, &message);
+    place.train("run", &HALF, &[]).ok();
+    place.assert_same_run("run", "whole");
+}
+
+/// A small file system in memory, unmounted when dropped. Only root may have one.
+struct SmallDisk<'a>(&'a Path);
+
+impl<'a> SmallDisk<'a> {
+    fn mount(folder: &'a Path, kib: u64) -> Option<Self> {
+        std::fs::create_dir(folder).expect("writable");
+        let options = format!("size={kib}k");
+        let mount = Command::new("mount").args(["-t", "tmpfs", "-o", &options, "clift-test"]).arg(folder).output();
+        mount.ok().filter(|output| output.status.success()).map(|_| Self(folder))
+    }
+}
+
+impl Drop for SmallDisk<'_> {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg(self.0).status();
+    }
+}
+
+#[test]
+fn a_full_disk_leaves_the_last_checkpoint_and_the_run_goes_on_when_there_is_room() {
+    let place = Place::new();
+    let folder = place.at("disk");
+    let Some(disk) = SmallDisk::mount(&folder, 4096) else {
+        println!("passed by: no right to mount a tmpfs");
+        return;
+    };
+    place.train("whole", &HALF, &[]).ok();
+    let run = "disk/run";
+    killed_at("saved/stage1/12", &place.train_args(run, &HALF, &[]));
+    // Fills the disk up to less than a checkpoint takes.
+    let model =
+        std::fs::metadata(place.at("disk/run/stage1/checkpoints/step-000000012/model.bpk")).expect("there").len();
+    let free = || {
+        let output = Command::new("stat").args(["-f", "-c", "%a %S"]).arg(&folder).output().expect("stat runs");
+        let text = String::from_utf8(output.stdout).expect("text");
+        text.split_whitespace().map(|number| number.parse::<u64>().expect("a number")).product::<u64>()
+    };
+    std::fs::write(folder.join("ballast"), vec![1; (free() - model / 2) as usize]).expect("fits");
+    let message = finish(spawn(place.train_args(run, &HALF, &[]))).fails(1);
+    assert!(message.contains("No space left on device"), "{message}");
+    assert!(message.contains("stage1 stopped after step 24; "), "{message}");
+    assert_names_the_last_good_checkpoint(&place, run, 12, &message);
+
+    // Not even a line of metrics fits: the run stops before the next save, and with no gap in its metrics.
+    let rest = vec![1; free() as usize];
+    let _ = std::fs::write(folder.join("more-ballast"), rest);
+    let message = finish(spawn(place.train_args(run, &HALF, &[]))).fails(1);
+    assert!(message.contains("No space left on device"), "{message}");
+
+    for name in ["ballast", "more-ballast"] {
+        std::fs::remove_file(folder.join(name)).expect("removes");
+    }
+    place.train(run, &HALF, &[]).ok();
+    place.assert_same_run(run, "whole");
+    drop(disk);
+}
+
+#[test]
+fn a_run_directory_that_cannot_be_is_an_error_before_anything_else() {
+    let place = Place::new();
+    std::fs::write(place.at("file"), b"not a folder").expect("writable");
+    let message = place.train("file/run", &[], &[]).fails(1);
+    assert!(
+        message.contains("making the run directory failed: ") && message.trim_end().ends_with("file/run"),
+        "{message}"
+    );
+    // A folder that turned into something else.
+    place.train("run", &[], &["--only", "stage1"]).ok();
+    std::fs::write(place.at("run/clusters.tmp"), b"not a folder").expect("writable");
+    let message = place.train("run", &[], &[]).fails(1);
+    assert!(message.trim_end().ends_with("run/clusters.tmp"), "{message}");
+    assert!(place.at("run/stage1/model.safetensors").exists());
+}
+
+#[test]
+fn data_that_vanishes_stops_the_run_after_a_save_and_it_goes_on_when_the_data_is_back() {
+    let place = Place::new();
+    let data = place.at("rooms");
+    let folder = data.display().to_string();
+    clift([
+        "data",
+        "synth",
+        &folder,
+        "--scenes",
+        "8",
+        "--frames",
+        "8",
+        "--size",
+        "16x16",
+        "--set",
+        "samples_per_pixel=1",
+    ])
+    .ok();
+    let source = format!(
+        "data={{source='chunks', root='{folder}', width=16, height=16, num_threads=0, \
+         views={{min_context=2, max_context=2, min_gap=[3, 3], max_gap=[6, 6], warm_up_steps=0, num_targets=2}}}}"
+    );
+    let set = ["stage1.steps=400", "eval.every=0", "checkpoint={every=1000, keep=2}", source.as_str()];
+    place.train("whole", &set, &[]).ok();
+
+    let mut child = spawn(place.train_args("run", &set, &[]));
+    wait_for_steps(&place.at("run"), &mut child, 5);
+    std::fs::rename(&data, place.at("gone")).expect("renames");
+    let message = finish(child).fails(1);
+    let steps = place.metrics("run").len() as u64;
+    assert!((5..400).contains(&steps), "{steps}");
+    assert!(message.contains("no usable scene for slot 0 of step ") && message.contains("000000.torch"), "{message}");
+    assert!(message.contains(&format!("\nstage1 stopped after step {steps}; ")), "{message}");
+    assert_names_the_last_good_checkpoint(&place, "run", steps, &message);
+
+    assert!(place.train("run", &set, &[]).fails(1).contains("index.json"));
+    std::fs::rename(place.at("gone"), &data).expect("renames");
+    place.train("run", &set, &[]).ok();
+    place.assert_same_run("run", "whole");
+}

@@ -1,0 +1,85 @@
+//! Signals and second processes.
+
+use std::os::unix::process::ExitStatusExt;
+use std::process::Command;
+
+use crate::support::{Place, finish, signal, spawn, start, wait_for_steps};
+
+/// Steps enough that a run is still going when the signal comes.
+const LONG: [&str; 5] =
+    ["stage1.steps=20000", "stage2.steps=120", "eval.every=0", "checkpoint.every=10000", "data.num_threads=0"];
+
+#[test]
+fn every_signal_saves_and_exits_with_its_own_code() {
+    let place = Place::new();
+    for (name, code) in [("-INT", 130), ("-TERM", 143), ("-HUP", 129)] {
+        let run = format!("run{name}");
+        let mut child = spawn(place.train_args(&run, &LONG, &[]));
+        wait_for_steps(&place.at(&run), &mut child, 5);
+        signal(&child, name);
+        let message = finish(child).fails(code);
+        let steps = place.metrics(&run).len() as u64;
+        assert!(
+            message.contains(&format!("error: interrupted at step {steps}; the same command resumes")),
+            "{message}"
+        );
+        assert_eq!(place.checkpoints(&run, "stage1"), [steps]);
+    }
+}
+
+#[test]
+fn a_signal_ends_other_commands_with_its_own_code_too() {
+    let place = Place::new();
+    let config = crate::support::repository("configs/tiny.toml").display().to_string();
+    let json = place.at("bench.json").display().to_string();
+    let mut child = spawn(["bench", &config, "--repeats", "100000", "--work", "select", "--json", &json]);
+    std::thread::sleep(std::time::Duration::from_secs(1));
+    assert!(child.try_wait().expect("a child").is_none(), "it ended before the signal");
+    signal(&child, "-TERM");
+    finish(child).fails(143);
+    assert!(!place.at("bench.json").exists());
+}
+
+#[test]
+fn a_run_started_by_nohup_outlives_its_terminal() {
+    let place = Place::new();
+    let args = place.train_args("run", &LONG, &[]);
+    let mut command = Command::new("sh");
+    command.args(["-c", "trap '' HUP; exec \"$@\"", "sh", crate::support::BINARY]).args(args);
+    let mut child = start(&mut command);
+    wait_for_steps(&place.at("run"), &mut child, 5);
+    signal(&child, "-HUP");
+    let steps = place.metrics("run").len();
+    wait_for_steps(&place.at("run"), &mut child, steps + 20);
+    signal(&child, "-TERM");
+    finish(child).fails(143);
+}
+
+#[test]
+fn a_second_process_is_refused_while_the_first_lives_and_not_after() {
+    let place = Place::new();
+    let mut first = spawn(place.train_args("run", &LONG, &[]));
+    wait_for_steps(&place.at("run"), &mut first, 5);
+    let holder = format!("process {} is working in this run directory", first.id());
+    for flags in [&[][..], &["--fresh"], &["--only", "clusters"]] {
+        let message = place.train("run", &LONG, flags).fails(1);
+        assert!(message.contains(&holder) && message.trim_end().ends_with("/run"), "{message}");
+    }
+    assert!(!place.at("run.1").exists(), "nothing was moved from under it");
+    let message = place.eval("run", &[]).fails(1);
+    assert!(message.contains(&holder), "{message}");
+    // Elsewhere an evaluation may write; there are no weights yet.
+    let elsewhere = place.at("elsewhere").display().to_string();
+    assert!(place.eval("run", &["--out", &elsewhere]).fails(2).contains("the weights of stage 1"));
+
+    assert!(first.try_wait().expect("a child").is_none(), "the first goes on");
+    signal(&first, "-KILL");
+    let status = first.wait().expect("a child");
+    assert_eq!(status.signal(), Some(9));
+    // What the dead process left locks nothing. Its lines would be taken for those of the next.
+    std::fs::remove_file(place.at("run/metrics.jsonl")).expect("removes");
+    let mut next = spawn(place.train_args("run", &LONG, &[]));
+    wait_for_steps(&place.at("run"), &mut next, 5);
+    signal(&next, "-INT");
+    finish(next).fails(130);
+}
