@@ -76,7 +76,7 @@ def main() -> None:
         f"{len(means)} pictures at {args.size}: mean absolute difference {np.mean(means):.4f} grey levels "
         f"(worst picture {max(means):.4f}), largest difference of a value {largest}"
     )
-    sys.exit(max(means) >= LIMIT)
+    sys.exit(int(max(means) >= LIMIT))
 
 
 if __name__ == "__main__":

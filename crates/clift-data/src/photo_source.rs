@@ -224,6 +224,15 @@ impl SceneSource for PhotoSource {
         Ok(self.scene(scene)?.photos.iter().map(|photo| photo.camera).collect())
     }
 
+    /// The numbers in the names of the pictures, where they count up: `83333.jpg`, `frame_00012.png`.
+    fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
+        let photos = &self.scene(scene)?.photos;
+        let number = |photo: &Photo| photo.path.file_stem()?.to_str()?.rsplit('_').next()?.parse().ok();
+        let numbers: Option<Vec<i64>> = photos.iter().map(number).collect();
+        let numbers = numbers.filter(|numbers| numbers.is_sorted_by(|a, b| a < b));
+        Ok(numbers.unwrap_or_else(|| (0..photos.len() as i64).collect()))
+    }
+
     fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
         self.photo(scene, frame)?.decode(self.key(scene), frame)
     }

@@ -64,6 +64,25 @@ fn chunks_and_scenes_hold_the_same_and_keep_the_files_of_the_pictures() {
 }
 
 #[test]
+fn every_layout_is_converted_to_the_same_scene() {
+    let layouts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/layouts");
+    let open = |root: &Path| open_layout(root, Split::Test, &LayoutOptions::default()).unwrap().0;
+    let times = open(&layouts.join("chunks")).timestamps(0).unwrap();
+    for name in ["re10k_txt", "re10k_folders", "dl3dv_flat", "capture", "colmap_bin", "scenes"] {
+        let source = open(&layouts.join(name));
+        for options in [CHUNKS, SCENES] {
+            let folder = tempfile::tempdir().unwrap();
+            let converted = convert(source.as_ref(), &folder.path().join("test"), options, |_| ()).unwrap();
+            assert_eq!((converted.num_scenes, &converted.skipped[..]), (source.num_scenes(), &[][..]), "{name}");
+            same(source.as_ref(), open(folder.path()).as_ref());
+        }
+        if name.starts_with("re10k") {
+            assert_eq!(source.timestamps(0).unwrap(), times, "{name}");
+        }
+    }
+}
+
+#[test]
 fn pictures_without_a_file_are_encoded() {
     let folder = tempfile::tempdir().unwrap();
     let converted = convert(&rooms(3), &folder.path().join("test"), CHUNKS, |_| ()).unwrap();
