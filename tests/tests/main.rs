@@ -4,6 +4,7 @@ mod bad_input;
 mod bench;
 #[cfg(unix)]
 mod crash;
+mod data_tools;
 mod exact_resume;
 mod extend;
 #[cfg(unix)]
