@@ -254,9 +254,9 @@ fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<
     };
     let num_scenes = match (config.clusters.num_scenes, config.data.source) {
         (0, SourceKind::Synthetic) => Some(config.data.synthetic.num_scenes),
-        (0, SourceKind::Chunks) => None,
+        (0, _) => None,
         (count, SourceKind::Synthetic) => Some(count.min(config.data.synthetic.num_scenes)),
-        (count, SourceKind::Chunks) => Some(count),
+        (count, _) => Some(count),
     };
     Ok(PartPlan {
         part: "clusters",

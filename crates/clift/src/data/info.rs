@@ -23,8 +23,10 @@ const MAX_SYNTHETIC: usize = 1000;
 
 /// Prints what a folder or a config holds.
 pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
-    let is_json = args.path.extension().is_some_and(|ending| ending == "json");
-    let is_scene = is_json && args.path.file_name().is_some_and(|name| name.to_string_lossy().contains("transforms"));
+    let is_json = args.path.extension().is_some_and(|extension| extension == "json");
+    // A scene may be given by its cameras, of which there may be several files: transforms_train.json.
+    let name = args.path.file_name().unwrap_or_default().to_string_lossy();
+    let is_scene = is_json && name.starts_with("transforms");
     if is_json && !is_scene {
         return of_index(args);
     }

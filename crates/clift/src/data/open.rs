@@ -33,10 +33,14 @@ pub fn halves(root: &Path, splits: Splits) -> anyhow::Result<Vec<Half>> {
     for &split in wanted {
         let mut opened = Opened::open(root, split, &LayoutOptions::default())?;
         if !opened.has_splits {
-            // The note says that both halves are the same scenes, and here they are no halves.
-            opened.ledger.notes.clear();
+            // Here they are no halves.
+            opened.ledger.notes.retain(|note| !note.contains("both halves are the same scenes"));
         }
+        let is_whole = !opened.has_splits;
         halves.push(Half { split: opened.has_splits.then_some(split), opened });
+        if is_whole {
+            break;
+        }
     }
     Ok(halves)
 }
