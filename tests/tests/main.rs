@@ -10,6 +10,7 @@ mod extend;
 #[cfg(unix)]
 mod failing_disk;
 mod hyperparameters;
+mod layouts;
 mod loss_curve;
 mod patchwise;
 mod pipeline;

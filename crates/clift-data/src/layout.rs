@@ -15,7 +15,7 @@ use crate::error::DataError;
 use crate::filters::SceneFilters;
 use crate::ledger::Ledger;
 use crate::photo_source::{PhotoSource, PhotoSourceOptions};
-use crate::picture_folder::file_names;
+use crate::picture_folder::{file_names, has_ending};
 use crate::re10k_text::looks_like_re10k;
 use crate::scene_folder::{SceneFiles, SceneFolder, find_scenes, scene_in};
 use crate::split::Split;
@@ -24,7 +24,7 @@ use crate::transforms::PhotoOptions;
 
 /// Folders that DL3DV's pictures are in, in the order they are preferred: 480 x 270, then larger.
 const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
-/// What CLiFT's tool writes beside scenes in files of their own: keys of those whose pictures have another size.
+/// What the reference's tool writes beside scenes in files of their own: keys of those whose pictures have another size.
 const INVALID_KEYS: &str = "invalid_keys.txt";
 
 /// How scenes lie on disk.
@@ -36,7 +36,7 @@ pub enum Layout {
     Auto,
     /// pixelSplat's and DepthSplat's: `NNNNNN.torch` files of many scenes with an `index.json`.
     Chunks,
-    /// CLiFT's: a `.torch` file per scene.
+    /// The reference's: a `.torch` file per scene.
     Scenes,
     /// RealEstate10K's text files of cameras, and folders of frames.
     Re10kTxt,
@@ -130,13 +130,15 @@ impl Opened {
     /// Does [`open_layout`], and says what it found.
     pub fn open(root: &Path, split: Split, options: &LayoutOptions) -> Result<Self, DataError> {
         let list = options.files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
+        // An empty list says that no scene is kept for testing: both halves are then the same.
+        let list = list.filter(|list| list.num_scenes() > 0);
         let place = Place::find(root, split)?;
         let mut opened = match place.scenes(options.layout)? {
             Found::Torch(layout) => place.open_torch(layout, options, list.as_ref())?,
             Found::Photos(layout, scenes) => place.open_photos(layout, scenes, options, list.as_ref())?,
         };
         if !opened.has_splits && list.is_none() {
-            let note = "no train/ and test/ folders and no list of test scenes: both halves are the same scenes";
+            let note = "no train/ and test/ folders and no test scenes in a list: both halves are the same scenes";
             opened.ledger.notes.push(note.into());
         }
         Ok(opened)
@@ -170,18 +172,18 @@ impl<'a> Place<'a> {
             return Ok(Found::Photos(layout, vec![SceneFolder::of_file(base)]));
         }
         let names = file_names(base)?;
-        let has = |ending: &str| names.iter().any(|name| name.ends_with(ending));
+        let has_torch = names.iter().any(|name| has_ending(name, "torch"));
         let none = |what: &str| Err(DataError::UnknownLayout { what: what.into(), path: base.clone() });
         match asked {
             Layout::Chunks => return Ok(Found::Torch(Layout::Chunks)),
-            Layout::Scenes if has(".torch") => return Ok(Found::Torch(Layout::Scenes)),
+            Layout::Scenes if has_torch => return Ok(Found::Torch(Layout::Scenes)),
             Layout::Scenes => return none("expected .torch files"),
             Layout::Auto if names.iter().any(|name| name == "index.json") => return Ok(Found::Torch(Layout::Chunks)),
-            Layout::Auto if has(".torch") => return Ok(Found::Torch(Layout::Scenes)),
+            Layout::Auto if has_torch => return Ok(Found::Torch(Layout::Scenes)),
             _ => {}
         }
         if matches!(asked, Layout::Auto | Layout::Re10kTxt) {
-            let texts: Vec<&String> = names.iter().filter(|name| name.ends_with(".txt")).collect();
+            let texts: Vec<&String> = names.iter().filter(|name| has_ending(name, "txt")).collect();
             let is_scene = scene_in(base).is_some();
             if !is_scene && texts.iter().take(8).any(|name| looks_like_re10k(&base.join(name))) {
                 return Ok(Found::Photos(Layout::Re10kTxt, Vec::new()));
@@ -240,7 +242,7 @@ impl<'a> Place<'a> {
     /// Scenes in files of their own, by the names of these. Chunks whose index is missing are looked into.
     fn index_of_files(&self, ledger: &mut Ledger) -> Result<BTreeMap<String, String>, DataError> {
         let mut files: Vec<String> = file_names(&self.base)?;
-        files.retain(|name| name.ends_with(".torch"));
+        files.retain(|name| has_ending(name, "torch"));
         files.sort_unstable();
         let stem = |file: &str| file.trim_end_matches(".torch").to_owned();
         let first = files.iter().take(8).find_map(|file| Some((file, ChunkTable::read(&self.base.join(file)).ok()?)));
@@ -307,14 +309,13 @@ impl<'a> Place<'a> {
         let mut names = file_names(&self.base)?;
         names.sort_unstable();
         let split = self.split.to_string();
-        let folders: Vec<PathBuf> = match &options.files.frames {
-            Some(frames) => vec![frames.clone(), frames.join(&split)],
-            None => {
-                let above = self.base.parent().unwrap_or(&self.base);
-                let frames = [self.root.join("frames"), above.join("frames")];
-                let frames = frames.iter().flat_map(|frames| [frames.clone(), frames.join(&split)]);
-                std::iter::once(self.base.clone()).chain(frames).collect()
-            }
+        let folders: Vec<PathBuf> = if let Some(frames) = &options.files.frames {
+            vec![frames.clone(), frames.join(&split)]
+        } else {
+            let above = self.base.parent().unwrap_or(&self.base);
+            let frames = [self.root.join("frames"), above.join("frames")];
+            let frames = frames.iter().flat_map(|frames| [frames.clone(), frames.join(&split)]);
+            std::iter::once(self.base.clone()).chain(frames).collect()
         };
         let clip = |name: &String| {
             let key = name.strip_suffix(".txt")?;

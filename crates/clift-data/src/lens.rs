@@ -67,8 +67,8 @@ impl Lens {
 
     fn is_folded(&self, point: [f64; 2]) -> bool {
         let [[a, b], [c, d]] = self.jacobian(point);
-        // Not `<=`: a NaN is no usable lens either.
-        !(a * d - b * c > 0.0)
+        let determinant = a * d - b * c;
+        determinant.is_nan() || determinant <= 0.0
     }
 
     /// The ray that the lens puts at `point`; `None` where the model has none: beyond the radius at which it folds

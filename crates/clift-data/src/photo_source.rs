@@ -79,15 +79,12 @@ impl PhotoSource {
                 reason: Some((error.to_string(), Some(error))),
             });
             let has_photos = num_frames > 0;
-            match reason {
-                Some((reason, error)) => {
-                    ledger.skip(&folder.key, reason);
-                    first_error = first_error.or(error);
-                }
-                None => {
-                    ledger.notes.extend(notes);
-                    scenes.push(Entry { folder: folder.clone(), num_frames, unusable });
-                }
+            if let Some((reason, error)) = reason {
+                ledger.skip(&folder.key, reason);
+                first_error = first_error.or(error);
+            } else {
+                ledger.notes.extend(notes);
+                scenes.push(Entry { folder: folder.clone(), num_frames, unusable });
             }
             // Of a scene without any picture the frames say nothing more.
             for MissingPhoto { name, reason } in missing.into_iter().filter(|_| has_photos) {

@@ -108,6 +108,11 @@ pub(crate) fn file_names(folder: &Path) -> Result<Vec<String>, DataError> {
     Ok(names)
 }
 
+/// Whether a name ends in a dot and `ending`, as it is written.
+pub(crate) fn has_ending(name: &str, ending: &str) -> bool {
+    name.strip_suffix(ending).is_some_and(|stem| stem.ends_with('.'))
+}
+
 /// Stem and ending of a name; the ending is `None` unless it is one of pictures.
 fn split_name(name: &str) -> (&str, Option<&str>) {
     match name.rsplit_once('.') {

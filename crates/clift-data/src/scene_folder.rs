@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::colmap::{find_model, read_colmap};
 use crate::error::DataError;
 use crate::photo::PhotoScene;
-use crate::picture_folder::{file_names, numbered_pictures};
+use crate::picture_folder::{file_names, has_ending, numbered_pictures};
 use crate::re10k_text::{looks_like_re10k, read_re10k_text};
 use crate::transforms::{PhotoOptions, read_transforms};
 
@@ -83,7 +83,7 @@ pub(crate) fn scene_in(folder: &Path) -> Option<SceneFiles> {
 /// A clip of RealEstate10K in a folder of its own: its cameras as the only text file, frames beside it or one below.
 fn re10k_in(folder: &Path) -> Option<SceneFiles> {
     let names = file_names(folder).ok()?;
-    let mut texts = names.iter().filter(|name| name.ends_with(".txt"));
+    let mut texts = names.iter().filter(|name| has_ending(name, "txt"));
     let (Some(text), None) = (texts.next(), texts.next()) else { return None };
     let cameras = folder.join(text);
     if !looks_like_re10k(&cameras) {

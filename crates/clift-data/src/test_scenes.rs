@@ -1,6 +1,6 @@
 //! The scenes that are kept for testing: of DL3DV the 140 of its benchmark, which its folders hold beside all others.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
 
 use serde::de::IgnoredAny;
@@ -32,8 +32,8 @@ impl TestScenes {
         let json = |error: serde_json::Error| bad(format!("expected an index, a list or a key per line, got {error}"));
         let keys: Vec<String> = match text.trim_start().chars().next() {
             Some('{') => {
-                let index: std::collections::BTreeMap<String, IgnoredAny> =
-                    serde_json::from_str(&text).map_err(json)?;
+                // What the keys stand for is passed over, whatever it is.
+                let index: HashMap<String, Option<IgnoredAny>> = serde_json::from_str(&text).map_err(json)?;
                 index.into_keys().collect()
             }
             Some('[') => serde_json::from_str(&text).map_err(json)?,

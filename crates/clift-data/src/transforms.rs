@@ -84,7 +84,7 @@ impl Entry {
         let rows = &self.transform_matrix.0;
         if let Some(last) = rows.get(3) {
             let error = last.iter().zip([0.0, 0.0, 0.0, 1.0]).map(|(got, expected)| (got - expected).abs());
-            if !(error.fold(0.0, f64::max) < 1e-6) {
+            if error.fold(0.0, f64::max) > 1e-6 {
                 return Err(format!("transform_matrix ends in {last:?}, expected 0 0 0 1"));
             }
         }

@@ -45,7 +45,7 @@ impl Undistortion {
             top = top.min(-ray(share, 0.0)?[1]);
             bottom = bottom.min(ray(share, 1.0)?[1]);
         }
-        if !(left.min(right).min(top).min(bottom) > 0.0) {
+        if left.min(right).min(top).min(bottom) <= 0.0 {
             return Err(bad(format!(
                 "the principal point ({cx}, {cy}) of a distorted camera lies outside of the picture"
             )));

@@ -8,6 +8,17 @@ use crate::split::Split;
 /// Most scenes of one source: the table of key blocks is then below 1 MiB.
 pub(super) const MAX_SCENES: usize = 32_000_000;
 
+/// Which way the camera looks on its path.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Looks {
+    /// From near the walls to the middle: all views show the same things.
+    #[default]
+    In,
+    /// From near the middle to the walls, turning: views far apart on the path show nothing in common.
+    Out,
+}
+
 /// What synthetic scenes look like. Lengths are in the scene's own unit; a room is 3 to 4 units wide.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -30,7 +41,10 @@ pub struct SyntheticConfig {
     pub room_half_size: [f64; 2],
     /// Fewest and most boxes and balls in a room; a crowded room may hold fewer.
     pub num_objects: [usize; 2],
-    /// Length of the camera path from the first to the last frame, before small swings. Longer is harder.
+    /// Which way the camera looks, `"in"` or `"out"`.
+    pub looks: Looks,
+    /// Length of the camera path from the first to the last frame, before small swings. Longer is harder. A camera that
+    /// looks out turns by the angle that it would go around by if it looked in.
     pub path_length: f64,
     /// Cycles of the wall patterns per unit of length; patterns on objects are twice as fine. Finer is harder.
     pub texture_frequency: f64,
@@ -54,6 +68,7 @@ impl Default for SyntheticConfig {
             fov_deg: 75.0,
             room_half_size: [1.5, 2.0],
             num_objects: [3, 5],
+            looks: Looks::In,
             path_length: 4.0,
             texture_frequency: 0.4,
             plain_share: 0.0,

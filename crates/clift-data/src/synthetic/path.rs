@@ -7,6 +7,8 @@ use rand::Rng;
 use crate::camera::{Camera, IntrinsicsNorm, Pose};
 use crate::order::unit;
 
+use super::config::Looks;
+
 /// Least distance, in the scene's units of length, between the camera and any surface.
 pub(super) const CLEARANCE: f64 = 0.25;
 
@@ -21,14 +23,18 @@ pub(super) struct CameraPath {
     /// The looked-at point and how far it swings.
     target: [[f64; 3]; 2],
     phase: f64,
+    looks: Looks,
 }
+
+/// Radius of the path of a camera that looks out, as a share of one that looks in.
+const INNER_RADIUS: f64 = 0.25;
 
 /// How far the radius swings to either side, as a share of it.
 const RADIUS_SWING: f64 = 0.06;
 
 impl CameraPath {
     /// Draws a path about `length` long in a room with these `half_size`s (y is down).
-    pub fn draw(rng: &mut impl Rng, half_size: [f64; 3], length: f64) -> Self {
+    pub fn draw(rng: &mut impl Rng, half_size: [f64; 3], length: f64, looks: Looks) -> Self {
         let widest = half_size[0].min(half_size[2]) - CLEARANCE;
         let radius = widest * (0.86 + 0.08 * unit(rng));
         let side = if unit(rng) < 0.5 { -1.0 } else { 1.0 };
@@ -41,7 +47,8 @@ impl CameraPath {
         let pan = radius * (0.35 + around(0.1));
         let drift = [pan * cos, around(0.3 * tall), pan * sin];
         Self {
-            radius,
+            radius: if looks == Looks::Out { INNER_RADIUS * radius } else { radius },
+            looks,
             start: unit(rng) * TAU,
             sweep: side * length / radius,
             height,
@@ -68,7 +75,15 @@ impl CameraPath {
         let position = self.position(time);
         let swing = (TAU * time + self.phase).cos();
         let [target, drift] = self.target;
-        let forward = unit_vector([0, 1, 2].map(|i| target[i] + swing * drift[i] - position[i]));
+        let forward = [0, 1, 2].map(|i| target[i] + swing * drift[i] - position[i]);
+        // Out is away from the axis of the room, as far up or down as in would be.
+        let forward = unit_vector(match self.looks {
+            Looks::In => forward,
+            Looks::Out => {
+                let away = self.radius / INNER_RADIUS / position[0].hypot(position[2]);
+                [away * position[0], forward[1], away * position[2]]
+            }
+        });
         let right = unit_vector(cross([0.0, 1.0, 0.0], forward));
         let down = cross(forward, right);
         let fx = 0.5 / (0.5 * fov_deg.to_radians()).tan();

@@ -64,7 +64,7 @@ impl Scene {
         let (wide, deep) = (half(), half());
         let tall = small * (0.6 + 0.15 * unit(rng));
         let half_size = [wide, tall, deep];
-        let path = CameraPath::draw(rng, half_size, config.path_length);
+        let path = CameraPath::draw(rng, half_size, config.path_length, config.looks);
         let lamp = [wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35)];
 
         // No draw where no room is plain: those rooms stay what they are.
@@ -145,6 +145,7 @@ fn swing(rng: &mut impl Rng, size: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::order::step_rng;
+    use crate::synthetic::config::Looks;
 
     /// Distance from a point to an object's surface, 0 inside.
     fn distance(object: &Object, point: Vector) -> f32 {
@@ -172,7 +173,8 @@ mod tests {
             path_length: 20.0,
             ..Default::default()
         };
-        for config in [SyntheticConfig::default(), crowded] {
+        let turning = SyntheticConfig { looks: Looks::Out, ..crowded.clone() };
+        for config in [SyntheticConfig::default(), crowded, turning] {
             for scene in scenes(&config) {
                 for time in 0..=500 {
                     let position = Vector::from_f64(scene.path.position(f64::from(time) / 500.0));
@@ -204,6 +206,20 @@ mod tests {
                 for other in &scene.objects[i + 1..] {
                     let [x, _, z] = (object.center - other.center).0;
                     assert!(x.hypot(z) > object.reach() + other.reach());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_camera_that_looks_out_turns_its_back_on_the_middle() {
+        for looks in [Looks::In, Looks::Out] {
+            for scene in scenes(&SyntheticConfig { looks, ..Default::default() }) {
+                for time in [0.0, 0.3, 1.0] {
+                    let camera = scene.path.camera(time, 75.0, 1.0).c2w;
+                    let forward = camera.rotation.map(|row| row[2]);
+                    let away = forward[0] * camera.translation[0] + forward[2] * camera.translation[2];
+                    assert_eq!(away > 0.0, looks == Looks::Out, "{forward:?} at {:?}", camera.translation);
                 }
             }
         }

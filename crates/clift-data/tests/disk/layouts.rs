@@ -100,7 +100,7 @@ fn a_frame_without_a_picture_is_named_and_left_out_of_a_capture() {
     let Opened { ledger, source, .. } = open(&layouts().join("capture"), Split::Test, Layout::Auto);
     assert_eq!(source.num_frames(0).unwrap(), 6);
     let expected = "1 of 1 scenes used; 1 frame without a picture (./images/99); no train/ and test/ folders and no \
-                    list of test scenes: both halves are the same scenes";
+                    test scenes in a list: both halves are the same scenes";
     assert_eq!(ledger.to_string(), expected);
 }
 

@@ -1,0 +1,66 @@
+//! Scenes in other layouts than chunks, through the command line.
+
+use crate::support::{Place, clift, repository};
+
+/// Keys that put the micro run on six frames of 32 x 18.
+fn data(source: &str, layout: &str, more: &str) -> String {
+    let root = repository("data-fixtures/layouts").join(layout);
+    format!(
+        "data={{source='{source}', root='{}', width=16, height=16, {more} views={{min_context=2, max_context=2, \
+         min_gap=[3, 3], max_gap=[5, 5], warm_up_steps=0, num_targets=2}}}}",
+        root.display()
+    )
+}
+
+#[test]
+fn a_capture_is_trained_on_encoded_and_drawn_and_its_missing_frame_is_named() {
+    let place = Place::new();
+    let ran = place.train("run", &[&data("auto", "capture", ""), "clusters.num_scenes=0"], &[]).ok();
+    let text = format!("{}{}", ran.stdout, ran.stderr);
+    let expected = "train: 1 of 1 scenes used; 1 frame without a picture (./images/99); no train/ and test/ folders";
+    assert!(text.contains(expected), "{text}");
+    let skipped = place.json("run/skipped-train.json");
+    assert_eq!(skipped["frames"][0]["frame"], "./images/99");
+    assert_eq!(skipped["frames"][0]["key"], "attic");
+
+    let capture = repository("data-fixtures/layouts/colmap_txt/attic");
+    let [run, out, frames] = ["run", "attic.clift", "frames"].map(|name| place.at(name).display().to_string());
+    let ran = clift(["encode", &run, capture.to_str().unwrap(), "-o", &out]).ok();
+    assert!(ran.stdout.contains("scene attic, 2 views of 16 x 16"), "{}", ran.stdout);
+    let ran = clift(["render", &out, "--path", "interpolate", "--frames", "2", "-o", &frames]).ok();
+    assert!(ran.stdout.contains("2 frames of 16 x 16"), "{}", ran.stdout);
+}
+
+#[test]
+fn folders_of_dl3dv_are_trained_on_only_with_a_list_of_test_scenes() {
+    let place = Place::new();
+    let message = place.train("run", &[&data("dl3dv", "dl3dv", "")], &[]).fails(2);
+    assert!(message.contains("`data.files.test_scenes` = missing: the folders hold DL3DV's benchmark"), "{message}");
+    std::fs::write(place.at("none.txt"), "").unwrap();
+    let files = format!("files={{test_scenes='{}'}},", place.at("none.txt").display());
+    let ran = place.train("run", &[&data("dl3dv", "dl3dv", &files)], &["--only", "stage1"]).ok();
+    assert!(format!("{}{}", ran.stdout, ran.stderr).contains("both halves are the same scenes"));
+    let files = format!("{files} filters={{min_frames=9}},");
+    let message = place.train("other", &[&data("auto", "dl3dv", &files)], &[]).fails(1);
+    assert!(message.contains("0 of 1 scenes used; 1 shorter than 9 frames"), "{message}");
+}
+
+#[test]
+fn a_folder_of_any_layout_is_described() {
+    let layouts = repository("data-fixtures/layouts");
+    for (name, layout) in [
+        ("chunks", "chunks"),
+        ("scenes", "scenes"),
+        ("re10k_txt", "re10k_txt"),
+        ("re10k_folders", "re10k_txt"),
+        ("dl3dv_benchmark", "dl3dv"),
+        ("capture/attic/transforms.json", "captures"),
+        ("colmap_bin", "captures"),
+    ] {
+        let ran = clift(["data", "info", layouts.join(name).to_str().unwrap()]).ok();
+        assert!(ran.stdout.starts_with(&format!("layout            {layout}\n")), "{name}: {}", ran.stdout);
+        assert!(ran.stdout.contains("  picture         32x18"), "{name}: {}", ran.stdout);
+    }
+    let message = clift(["data", "info", repository("configs").to_str().unwrap()]).fails(2);
+    assert!(message.contains("no scenes found: looked for index.json with chunks, "), "{message}");
+}
