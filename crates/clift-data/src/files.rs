@@ -81,24 +81,6 @@ pub fn remove_leftovers(folder: &Path) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Reads a file of at most `limit` bytes. Anything but a file (a folder, a pipe that never ends) is refused before it
-/// is opened.
-pub(crate) fn read_bounded(path: &Path, limit: u64, action: &'static str) -> Result<Vec<u8>, DataError> {
-    let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
-    let metadata = std::fs::metadata(path).map_err(DataError::io(action, path))?;
-    if !metadata.is_file() {
-        return Err(bad("expected a file, and it is none".into()));
-    }
-    if metadata.len() > limit {
-        return Err(bad(format!("the file has {} bytes, more than the limit of {limit}", metadata.len())));
-    }
-    let mut bytes = Vec::with_capacity(metadata.len() as usize);
-    let file = std::fs::File::open(path).map_err(DataError::io(action, path))?;
-    // A file that grows meanwhile is cut off at its former size.
-    file.take(metadata.len()).read_to_end(&mut bytes).map_err(DataError::io(action, path))?;
-    Ok(bytes)
-}
-
 /// Makes renames and new names in a folder survive a power cut.
 ///
 /// # Errors
