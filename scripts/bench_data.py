@@ -134,7 +134,9 @@ def ours(clift: Path, folder: Path, args: argparse.Namespace, out: Path) -> dict
     return json.loads(out.read_text())
 
 
-def theirs(what: str, folder: Path, clips: Path, which: str, size: list[int], limit: int | None = None) -> dict[str, Any]:
+def theirs(
+    what: str, folder: Path, clips: Path, which: str, size: list[int], limit: int | None = None
+) -> dict[str, Any]:
     if limit is not None:
         lists = json.loads(clips.read_text())
         clips = clips.with_name("few.json")
@@ -147,7 +149,8 @@ def theirs(what: str, folder: Path, clips: Path, which: str, size: list[int], li
 def compare(clift: Path, root: Path, args: argparse.Namespace) -> dict[str, Any]:
     size = [int(side) for side in args.size.split("x")]
     folder = root / "train"
-    rows: dict[str, list[float]] = {name: [] for name in ("ours_in_order", "theirs_in_order", "ours_random_s", "theirs_random_s")}
+    names = ("ours_in_order", "theirs_in_order", "ours_random_s", "theirs_random_s")
+    rows: dict[str, list[float]] = {name: [] for name in names}
     peaks: dict[str, int] = {"ours": 0, "theirs": 0}
     with tempfile.TemporaryDirectory() as scratch:
         clips = Path(scratch) / "clips.json"

@@ -95,7 +95,7 @@ impl OverlapOptions {
 }
 
 /// Writes an index of every scene of `source` that [`EvaluationIndex`](crate::EvaluationIndex) reads, `null` for
-/// scenes without such views. The ledger says which and why. A scene's views depend on its cameras, its key and the
+/// scenes without such views; nothing if no scene has any. The ledger says which and why. A scene's views depend on its cameras, its key and the
 /// seed alone: other scenes may come and go.
 ///
 /// # Errors
@@ -119,7 +119,10 @@ pub fn write_overlap_index(
         let views = views.map_err(|reason| ledger.skip(key, reason)).ok();
         entries.push((key, views));
     }
-    write_index(path, entries)?;
+    // Nothing to evaluate is no index.
+    if ledger.num_used() > 0 {
+        write_index(path, entries)?;
+    }
     Ok(ledger)
 }
 
@@ -133,7 +136,7 @@ mod tests {
         SyntheticSource::new(config).unwrap()
     }
 
-    fn index(source: &SyntheticSource, options: &OverlapOptions) -> (EvaluationIndex, Ledger) {
+    fn index(source: &dyn SceneSource, options: &OverlapOptions) -> (EvaluationIndex, Ledger) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         let ledger = write_overlap_index(&path, source, options).unwrap();
@@ -165,9 +168,37 @@ mod tests {
 
     #[test]
     fn scenes_without_views_are_null_and_in_the_ledger() {
-        let (written, ledger) = index(&rooms(40, 3.0), &OverlapOptions::default());
-        assert_eq!((written.num_keys(), written.usable().count()), (20, 0));
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("index.json");
+        let ledger = write_overlap_index(&path, &rooms(40, 3.0), &OverlapOptions::default()).unwrap();
         assert_eq!(ledger.to_string(), "0 of 20 scenes used; 20 shorter than 46 frames");
+        assert!(!path.exists(), "an index without views");
+        let (written, ledger) = index(&FirstIsShort(rooms(60, 3.0)), &OverlapOptions::default());
+        assert_eq!((written.num_keys(), written.usable().count()), (20, 19));
+        assert_eq!(ledger.to_string(), "19 of 20 scenes used; 1 shorter than 46 frames");
+    }
+
+    /// Rooms of which the first has ten frames.
+    struct FirstIsShort(SyntheticSource);
+
+    impl SceneSource for FirstIsShort {
+        fn num_scenes(&self) -> usize {
+            self.0.num_scenes()
+        }
+        fn key(&self, scene: usize) -> &str {
+            self.0.key(scene)
+        }
+        fn find(&self, key: &str) -> Option<usize> {
+            self.0.find(key)
+        }
+        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+            let mut cameras = self.0.cameras(scene)?;
+            cameras.truncate(if scene == 0 { 10 } else { usize::MAX });
+            Ok(cameras)
+        }
+        fn frame(&self, scene: usize, frame: usize) -> Result<crate::Frame, DataError> {
+            self.0.frame(scene, frame)
+        }
     }
 
     #[test]

@@ -67,7 +67,6 @@ fn chunks_and_scenes_hold_the_same_and_keep_the_files_of_the_pictures() {
 fn every_layout_is_converted_to_the_same_scene() {
     let layouts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/layouts");
     let open = |root: &Path| open_layout(root, Split::Test, &LayoutOptions::default()).unwrap().0;
-    let times = open(&layouts.join("chunks")).timestamps(0).unwrap();
     for name in ["re10k_txt", "re10k_folders", "dl3dv_flat", "capture", "colmap_bin", "scenes"] {
         let source = open(&layouts.join(name));
         for options in [CHUNKS, SCENES] {
@@ -77,6 +76,7 @@ fn every_layout_is_converted_to_the_same_scene() {
             same(source.as_ref(), open(folder.path()).as_ref());
         }
         if name.starts_with("re10k") {
+            let times: Vec<i64> = (0..6).map(|frame| 1_000_000 + 33_367 * frame).collect();
             assert_eq!(source.timestamps(0).unwrap(), times, "{name}");
         }
     }
