@@ -54,8 +54,7 @@ pub struct Checked {
 
 /// Checks one scene of `source`. What fails is a reason in the result and never an error.
 ///
-/// All frames are decoded, on all cores, and about nine pairs of them compared. Time grows with the frames; a clip of
-/// 100 frames of 640 x 360 takes about a second.
+/// All frames are decoded, on all cores, and about nine pairs of them compared.
 pub fn check_scene(source: &dyn SceneSource, scene: usize) -> Checked {
     let mut check = SceneCheck { key: source.key(scene).to_owned(), ..SceneCheck::default() };
     let cameras = match source.cameras(scene) {
