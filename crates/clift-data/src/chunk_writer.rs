@@ -102,7 +102,7 @@ pub(crate) fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), Dat
     write_archive(path, &pickle)
 }
 
-/// Writes a scene by itself, as CLiFT's tool does.
+/// Writes a scene by itself, as the reference's tool does.
 pub(crate) fn write_scene_file(path: &Path, scene: &SceneRecord) -> Result<(), DataError> {
     let mut pickle = PickleWriter::new();
     pickle.scene(scene);

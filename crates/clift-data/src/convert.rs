@@ -118,7 +118,7 @@ impl<'a> Writer<'a> {
     /// Takes up the scenes of the files that the journal knows.
     fn resume(source: &dyn SceneSource, folder: &'a Path, journal: &'a mut Journal) -> Result<Self, DataError> {
         let mut index = BTreeMap::new();
-        for name in journal.names().filter(|name| name.ends_with(".torch")) {
+        for name in journal.names().filter(|name| Path::new(name).extension().is_some_and(|ending| ending == "torch")) {
             let path = folder.join(name);
             for key in ChunkTable::read(&path)?.scenes.into_keys() {
                 if source.find(&key).is_none() {
@@ -184,7 +184,8 @@ impl<'a> Writer<'a> {
     /// The first chunk name that is not in use.
     fn free_name(&self) -> String {
         let used: HashSet<&String> = self.index.values().collect();
-        (0..).map(chunk_name).find(|name| !used.contains(name)).unwrap_or_default()
+        // Of one name more than there are files, one is free.
+        (0..=used.len()).map(chunk_name).find(|name| !used.contains(name)).unwrap_or_default()
     }
 
     fn finish(mut self, to: ConvertTo) -> Result<Converted, DataError> {

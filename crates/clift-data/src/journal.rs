@@ -71,9 +71,9 @@ impl Journal {
     }
 
     fn rewrite(&self) -> Result<(), DataError> {
-        let text: String = self.sums.iter().map(|(name, sum)| format!("{sum}  {name}\n")).collect();
+        let lines: Vec<String> = self.sums.iter().map(|(name, sum)| format!("{sum}  {name}\n")).collect();
         let path = self.folder.join(FILE_NAME);
-        replace(&path, text.as_bytes()).map_err(DataError::io("writing the checksums", &path))
+        replace(&path, lines.concat().as_bytes()).map_err(DataError::io("writing the checksums", &path))
     }
 }
 
@@ -89,7 +89,8 @@ fn hash(path: &Path) -> Result<String, DataError> {
             count => digest.update(&buffer[..count]),
         }
     }
-    Ok(digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
+    let pairs: Vec<String> = digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
+    Ok(pairs.concat())
 }
 
 #[cfg(test)]

@@ -51,7 +51,7 @@ pub(super) fn look(
     check: &mut SceneCheck,
 ) -> Option<Frame> {
     let features: Vec<OnceLock<Option<Features>>> = (0..cameras.len()).map(|_| OnceLock::new()).collect();
-    let view = Scene { source, scene, cameras, sizes, features };
+    let view = SceneViews { source, scene, cameras, sizes, features };
     let mut pairs: Vec<Pair> = view.anchors().into_par_iter().filter_map(|anchor| view.pair_from(anchor)).collect();
     // At the end of a scene two frames may have chosen each other.
     pairs.sort_by_key(|pair| pair.check.frames);
@@ -87,7 +87,7 @@ pub(super) fn look(
     view.draw(shown)
 }
 
-struct Scene<'a> {
+struct SceneViews<'a> {
     source: &'a dyn SceneSource,
     scene: usize,
     cameras: &'a [Camera],
@@ -95,7 +95,7 @@ struct Scene<'a> {
     features: Vec<OnceLock<Option<Features>>>,
 }
 
-impl Scene<'_> {
+impl SceneViews<'_> {
     /// Frames that a partner is looked for, spread over the scene.
     fn anchors(&self) -> Vec<usize> {
         let count = self.cameras.len().saturating_sub(1);

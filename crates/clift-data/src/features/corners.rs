@@ -95,7 +95,7 @@ fn measure(grey: &Grey) -> Vec<f32> {
                 (0..3).for_each(|i| sum[i] += product[i] * weight);
             }
             let [xx, xy, yy] = sum;
-            measure[y * width + x] = (xx + yy) / 2.0 - ((xx - yy) * (xx - yy) / 4.0 + xy * xy).sqrt();
+            measure[y * width + x] = f32::midpoint(xx, yy) - ((xx - yy) * (xx - yy) / 4.0 + xy * xy).sqrt();
         }
     }
     measure
