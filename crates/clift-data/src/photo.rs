@@ -26,6 +26,8 @@ pub(crate) struct Photo {
     pub undistortion: Option<Box<Undistortion>>,
     /// Width over height of the pictures that the intrinsics were given for.
     pub shape: Option<f64>,
+    /// Microseconds, or the number at the end of the file's name.
+    pub time: Option<i64>,
 }
 
 /// A frame that has no photo, by the name its file gives it.
@@ -42,6 +44,8 @@ pub(crate) struct PhotoScene {
     pub missing: Vec<MissingPhoto>,
     /// What else is to be known.
     pub notes: Vec<String>,
+    /// Where it comes from; empty if nothing says.
+    pub url: String,
 }
 
 impl Photo {
@@ -57,12 +61,14 @@ impl Photo {
         undistort: bool,
     ) -> Result<Self, DataError> {
         intrinsics_norm.validate()?;
+        let time = number_at_end(&path);
         if !undistort || lens.is_pinhole() {
-            return Ok(Self { path, camera: Camera { intrinsics_norm, c2w }, undistortion: None, shape: None });
+            let camera = Camera { intrinsics_norm, c2w };
+            return Ok(Self { path, camera, undistortion: None, shape: None, time });
         }
         let undistortion = Undistortion::new(intrinsics_norm, lens)?;
         let camera = Camera { intrinsics_norm: undistortion.intrinsics_norm(), c2w };
-        Ok(Self { path, camera, undistortion: Some(Box::new(undistortion)), shape: None })
+        Ok(Self { path, camera, undistortion: Some(Box::new(undistortion)), shape: None, time })
     }
 
     /// Reads the file as it is.
@@ -102,7 +108,21 @@ impl Photo {
     }
 }
 
+/// The digits that a file's name ends in: 12 of `frame_00012.png`.
+fn number_at_end(path: &Path) -> Option<i64> {
+    let stem = path.file_stem()?.to_str()?;
+    let start = stem.rfind(|c: char| !c.is_ascii_digit()).map_or(0, |last| last + 1);
+    stem.get(start..)?.parse().ok()
+}
+
 impl PhotoScene {
+    /// Time stamps that rise from frame to frame; positions where names give none.
+    pub fn timestamps(&self) -> Vec<i64> {
+        let times: Option<Vec<i64>> = self.photos.iter().map(|photo| photo.time).collect();
+        let times = times.filter(|times| times.is_sorted_by(|a, b| a < b));
+        times.unwrap_or_else(|| (0..self.photos.len() as i64).collect())
+    }
+
     /// An error about a frame of the scene at `path`.
     pub fn in_frame(path: &Path, name: &str) -> impl FnOnce(DataError) -> DataError {
         move |error| DataError::BadScene { what: format!("frame {name}: {error}"), path: path.to_owned() }

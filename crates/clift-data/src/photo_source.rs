@@ -159,7 +159,7 @@ impl PhotoSource {
 
 /// Reads a scene and says whether it can be used.
 fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Findings, DataError> {
-    let PhotoScene { photos, mut missing, notes } = folder.read(&options.photos)?;
+    let PhotoScene { photos, mut missing, notes, .. } = folder.read(&options.photos)?;
     let num_listed = photos.len() + missing.len();
     let (mut unusable, mut first_error, mut is_small) = (Vec::new(), None, false);
     let num_checked = if options.whole_scenes { 1 } else { photos.len() };
@@ -180,6 +180,8 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
             }
         }
     }
+    // A data set whose frames have not been extracted has millions of them to name.
+    missing.truncate(if photos.is_empty() { 1 } else { MAX_FRAMES_NAMED });
     let num_frames = photos.len() - unusable.len();
     let reason = if num_frames == 0 {
         let error = first_error.unwrap_or_else(|| {
@@ -221,13 +223,12 @@ impl SceneSource for PhotoSource {
         Ok(self.scene(scene)?.photos.iter().map(|photo| photo.camera).collect())
     }
 
-    /// The numbers in the names of the pictures, where they count up: `83333.jpg`, `frame_00012.png`.
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
-        let photos = &self.scene(scene)?.photos;
-        let number = |photo: &Photo| photo.path.file_stem()?.to_str()?.rsplit('_').next()?.parse().ok();
-        let numbers: Option<Vec<i64>> = photos.iter().map(number).collect();
-        let numbers = numbers.filter(|numbers| numbers.is_sorted_by(|a, b| a < b));
-        Ok(numbers.unwrap_or_else(|| (0..photos.len() as i64).collect()))
+        Ok(self.scene(scene)?.timestamps())
+    }
+
+    fn url(&self, scene: usize) -> Result<String, DataError> {
+        Ok(self.scene(scene)?.url.clone())
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {

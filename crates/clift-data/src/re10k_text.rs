@@ -12,6 +12,8 @@ use crate::transforms::MAX_FRAMES;
 
 /// Most bytes of one file: a hundred times those of the longest clip.
 const MAX_BYTES: u64 = 16 << 20;
+/// Most characters of a video's address that are kept.
+const MAX_URL_CHARS: usize = 1000;
 /// Columns of a line: a time stamp, four intrinsics, two zeros and a pose of 3 x 4.
 const NUM_COLUMNS: usize = 19;
 
@@ -34,6 +36,9 @@ fn parse(text: &str, pictures: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Str
     for (number, line) in text.lines().enumerate() {
         // The first line is the address of the video; some tools leave it out.
         let is_address = number == 0 && line.split_ascii_whitespace().count() < NUM_COLUMNS;
+        if is_address {
+            scene.url = line.trim().chars().take(MAX_URL_CHARS).collect();
+        }
         if line.trim().is_empty() || is_address {
             continue;
         }
@@ -48,7 +53,13 @@ fn parse(text: &str, pictures: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Str
         }
         match pictures.get(&time) {
             Some(path) => {
-                scene.photos.push(Photo { path: path.clone(), camera, undistortion: None, shape: None });
+                scene.photos.push(Photo {
+                    path: path.clone(),
+                    camera,
+                    undistortion: None,
+                    shape: None,
+                    time: Some(time),
+                });
             }
             None => scene.missing.push(MissingPhoto { name: time.to_string(), reason: "without a picture".into() }),
         }

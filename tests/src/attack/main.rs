@@ -5,6 +5,7 @@
 //! what was found is found again: `clift-attack --target NAME --seed S --first NUMBER --count 1`.
 
 mod counting;
+mod layouts;
 mod mutate;
 mod report;
 mod setup;
@@ -19,6 +20,7 @@ use std::time::{Duration, Instant};
 
 use clap::Parser;
 
+use layouts::LAYOUT_TARGETS;
 use mutate::Mutator;
 use report::Attacked;
 use setup::Setup;
@@ -56,13 +58,18 @@ struct Args {
     list: bool,
 }
 
+/// Every reader.
+fn all_targets() -> impl Iterator<Item = &'static Target> {
+    TARGETS.iter().chain(LAYOUT_TARGETS)
+}
+
 fn main() -> ExitCode {
     let args = Args::parse();
     if args.list {
-        TARGETS.iter().for_each(|target| println!("{}", target.name));
+        all_targets().for_each(|target| println!("{}", target.name));
         return ExitCode::SUCCESS;
     }
-    if let Some(unknown) = args.target.iter().find(|name| TARGETS.iter().all(|target| target.name != **name)) {
+    if let Some(unknown) = args.target.iter().find(|name| all_targets().all(|target| target.name != **name)) {
         eprintln!("there is no reader {unknown}; --list names them");
         return ExitCode::from(2);
     }
@@ -75,7 +82,7 @@ fn main() -> ExitCode {
     };
     let messages = hush_panics();
     watch::start(Duration::from_secs(MOST_SECONDS));
-    let chosen = TARGETS.iter().filter(|target| args.target.is_empty() || args.target.iter().any(|n| n == target.name));
+    let chosen = all_targets().filter(|target| args.target.is_empty() || args.target.iter().any(|n| n == target.name));
     let mut rows = Vec::new();
     for target in chosen {
         let row = attack(target, &setup, &args, &messages);

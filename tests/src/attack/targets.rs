@@ -8,7 +8,7 @@ use clift_data::{ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split,
 use clift_model::{Scene, weights};
 use clift_train::checkpoint::Checkpoints;
 use clift_train::clusters::ClusterCache;
-use clift_train::config::OptimizerConfig;
+use clift_train::config::{CheckpointConfig, OptimizerConfig};
 use clift_train::optim::adamw;
 use clift_train::step::Learner;
 use clift_train::{Config, Run, read_checked_config};
@@ -127,7 +127,7 @@ pub const TARGETS: &[Target] = &[
 ];
 
 /// A reader without words and checksums, which takes a fixed amount and a multiple of its input.
-const PLAIN: Target = Target {
+pub const PLAIN: Target = Target {
     name: "",
     seeds: |_| Vec::new(),
     open: |_| Box::new(|_| Ok(())),
@@ -187,7 +187,7 @@ const PICKLE_WORDS: &[&[u8]] = &[
     b"((((((((",
     b"))))))))",
 ];
-const JSON_WORDS: &[&[u8]] = &[
+pub const JSON_WORDS: &[&[u8]] = &[
     b"{",
     b"}",
     b"[",
@@ -285,7 +285,7 @@ fn read(path: &Path) -> Vec<u8> {
     std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-fn words_of(error: impl std::fmt::Display) -> String {
+pub fn words_of(error: impl std::fmt::Display) -> String {
     error.to_string()
 }
 
@@ -415,7 +415,10 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             device: Device::flex().autodiff(),
             recompute: false,
         };
-        Checkpoints::new(folder.clone(), 1).resume(&mut learner).map(drop).map_err(words_of)
+        Checkpoints::new(folder.clone(), CheckpointConfig { keep: 1, ..CheckpointConfig::default() })
+            .resume(&mut learner)
+            .map(drop)
+            .map_err(words_of)
     })
 }
 

@@ -96,6 +96,16 @@ fn cameras_are_those_of_the_script_that_wrote_them() {
 }
 
 #[test]
+fn time_stamps_and_addresses_are_those_of_the_files() {
+    let times = |name: &str| open(&layouts().join(name), Split::Test, Layout::Auto).source.timestamps(0).unwrap();
+    assert_eq!(times("re10k_txt")[..2], [1_000_000, 1_033_367]);
+    assert_eq!(times("dl3dv"), [1, 2, 3, 4, 5, 6]);
+    assert_eq!(times("capture"), [8, 9, 10, 11, 12, 13]);
+    let url = |name: &str| open(&layouts().join(name), Split::Test, Layout::Auto).source.url(0).unwrap();
+    assert_eq!((url("re10k_txt").as_str(), url("dl3dv").as_str()), ("https://example.org/watch", ""));
+}
+
+#[test]
 fn a_frame_without_a_picture_is_named_and_left_out_of_a_capture() {
     let Opened { ledger, source, .. } = open(&layouts().join("capture"), Split::Test, Layout::Auto);
     assert_eq!(source.num_frames(0).unwrap(), 6);
