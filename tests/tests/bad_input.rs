@@ -100,7 +100,7 @@ fn wrong_usage_is_told_from_failure_by_the_exit_code() {
     for (set, expected) in [
         (vec!["data.source=chunks"], "`data.root` = missing: write the folder that holds train/ and test/"),
         (vec!["model.num_heads=3"], "`model.num_heads` = 3: write a divisor of model.dim = 16"),
-        (vec!["data.width=20"], "an image of 20 x 16 does not divide into patches of 8 x 8"),
+        (vec!["data.width=20"], "`data.width` = 20: write a multiple of model.patch_size = 8"),
         (vec!["stage1.batch_size=0"], "`stage1.batch_size` = 0: write at least 1"),
         (vec!["stage1.accumulate=3"], "`stage1.accumulate` = 3: write 1 to 2"),
         (vec!["device=cuda"], "unknown value of `device`"),
@@ -307,6 +307,8 @@ fn a_damaged_checkpoint_is_an_error_and_never_a_silent_restart() {
             let before = files(&run.join("stage1"));
             let message = place.train("run", &[], &["--only", "stage1"]).fails(1);
             assert!(message.contains(&run.join(newest).join(file).display().to_string()), "{file}: {message}");
+            let fix = "the newest checkpoint is damaged: move step-000000006 away to go on from step-000000004";
+            assert!(message.trim_end().ends_with(fix), "{file}: {message}");
             assert!(files(&run.join("stage1")) == before, "{file}: a checkpoint was changed");
             assert_eq!(place.metrics("run"), place.metrics("whole"), "{file}: a step was made or forgotten");
             std::fs::remove_dir_all(run).unwrap();
@@ -324,7 +326,10 @@ fn steps_that_are_not_finite_are_left_out_and_three_in_a_row_stop_the_run() {
         message.contains("step 2 left out: loss or gradient is not finite (scenes synthetic-0-train-"),
         "{message}"
     );
-    assert!(message.contains("3 steps in a row had a loss or gradient that is not finite, up to step 4"), "{message}");
+    assert!(
+        message.contains("3 steps in a row were left out, up to step 4: loss or gradient is not finite"),
+        "{message}"
+    );
     assert!(message.contains(&place.at("run/stage1/checkpoints").display().to_string()), "{message}");
     assert!(!place.at("run/stage1/model.safetensors").exists());
     let lines = place.metrics("run");

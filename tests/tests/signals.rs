@@ -2,6 +2,7 @@
 
 use std::os::unix::process::ExitStatusExt;
 use std::process::Command;
+use std::time::{Duration, Instant};
 
 use crate::support::{Place, finish, signal, spawn, start, wait_for_steps};
 
@@ -28,12 +29,34 @@ fn every_signal_saves_and_exits_with_its_own_code() {
 }
 
 #[test]
+fn a_second_signal_ends_the_run_at_once_without_saving() {
+    let place = Place::new();
+    // The first batch takes far longer than two signals.
+    let set = [&LONG[..], &["stage1.batch_size=50000"]].concat();
+    let mut child = spawn(place.train_args("run", &set, &[]));
+    // It listens before it takes the run.
+    let id = child.id().to_string();
+    while std::fs::read_to_string(place.at("run/lock")).unwrap_or_default() != id {
+        assert!(child.try_wait().expect("a child").is_none(), "the run ended before it began");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    signal(&child, "-TERM");
+    std::thread::sleep(Duration::from_millis(200));
+    assert!(child.try_wait().expect("a child").is_none(), "the first signal waits for the step");
+    signal(&child, "-TERM");
+    let started = Instant::now();
+    let ran = finish(child);
+    assert!(started.elapsed() < Duration::from_secs(5) && ran.code == Some(143), "{:?}: {}", ran.code, ran.stderr);
+    assert!(!ran.stderr.contains("saved") && !place.at("run/stage1/checkpoints").exists(), "{}", ran.stderr);
+}
+
+#[test]
 fn a_signal_ends_other_commands_with_its_own_code_too() {
     let place = Place::new();
     let config = crate::support::repository("configs/tiny.toml").display().to_string();
     let json = place.at("bench.json").display().to_string();
     let mut child = spawn(["bench", &config, "--repeats", "100000", "--work", "select", "--json", &json]);
-    std::thread::sleep(std::time::Duration::from_secs(1));
+    std::thread::sleep(Duration::from_secs(1));
     assert!(child.try_wait().expect("a child").is_none(), "it ended before the signal");
     signal(&child, "-TERM");
     finish(child).fails(143);

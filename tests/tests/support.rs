@@ -178,6 +178,11 @@ impl Place {
         Weights::read(&self.at(&format!("{run}/{stage}/model.safetensors")))
     }
 
+    /// The weights of a model directory.
+    pub fn model(&self, name: &str) -> Weights {
+        Weights::read(&self.at(&format!("{name}/model.safetensors")))
+    }
+
     /// Expects the same clusters and the same weights of both stages, bit for bit.
     pub fn assert_same_result(&self, run: &str, other: &str) {
         for stage in ["stage1", "stage2"] {

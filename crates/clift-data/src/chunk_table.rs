@@ -131,7 +131,7 @@ impl SceneTable {
 }
 
 /// Where a tensor's bytes lie, after checking type, shape (`None` is any size), layout and bounds.
-fn locate(
+pub(crate) fn locate(
     value: &Value,
     shape: &[Option<u64>],
     element_types: &[ElementType],

@@ -1,16 +1,12 @@
 //! Writes scenes in the chunk layout: files that `torch.load` and [`crate::ChunkSource`] read.
 
 use std::collections::BTreeMap;
-use std::io::{Cursor, Write};
 use std::path::Path;
-
-use zip::result::ZipResult;
-use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipWriter};
 
 use crate::camera::Camera;
 use crate::error::DataError;
 use crate::files::replace;
+use crate::pickle_writer::PickleWriter;
 
 /// Size at which a chunk is closed, in bytes of pictures: 100 MB, as in the published RealEstate10K chunks.
 pub const DEFAULT_CHUNK_BYTES: u64 = 100_000_000;
@@ -96,116 +92,47 @@ pub(crate) fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), Dat
     let mut pickle = PickleWriter::new();
     pickle.raw(b"](");
     for scene in scenes {
-        pickle.scene(scene);
+        write_scene(scene, &mut pickle);
     }
     pickle.raw(b"e.");
-    write_archive(path, &pickle)
+    write_archive(path, pickle)
 }
 
 /// Writes a scene by itself, as the reference's tool does.
 pub(crate) fn write_scene_file(path: &Path, scene: &SceneRecord) -> Result<(), DataError> {
     let mut pickle = PickleWriter::new();
-    pickle.scene(scene);
+    write_scene(scene, &mut pickle);
     pickle.raw(b".");
-    write_archive(path, &pickle)
+    write_archive(path, pickle)
 }
 
-fn write_archive(path: &Path, pickle: &PickleWriter) -> Result<(), DataError> {
+fn write_archive(path: &Path, pickle: PickleWriter) -> Result<(), DataError> {
     let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
-    let bytes = pack(&prefix, pickle).map_err(|error| DataError::io("packing a chunk", path)(error.into()))?;
+    let bytes = pickle.pack(&prefix).map_err(|error| DataError::io("packing a chunk", path)(error.into()))?;
     replace(path, &bytes).map_err(DataError::io("writing a chunk", path))
 }
 
-/// Packs what `torch.save` would: pickle first, then the storages, stored and aligned to 64 bytes.
-fn pack(prefix: &str, pickle: &PickleWriter) -> ZipResult<Vec<u8>> {
-    let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    let mut member = |name: &str, alignment: u16, bytes: &[u8]| {
-        zip.start_file(format!("{prefix}/{name}"), options.with_alignment(alignment))?;
-        zip.write_all(bytes)?;
-        ZipResult::Ok(())
-    };
-    member("data.pkl", 1, &pickle.bytes)?;
-    member("byteorder", 1, b"little")?;
-    for (number, storage) in pickle.storages.iter().enumerate() {
-        member(&format!("data/{number}"), 64, storage)?;
+fn write_scene(scene: &SceneRecord, pickle: &mut PickleWriter) {
+    let timestamps = scene.timestamps.iter().flat_map(|time| time.to_le_bytes()).collect();
+    let rows = scene.cameras.iter().flat_map(Camera::to_re10k);
+    let cameras = rows.flat_map(|number| (number as f32).to_le_bytes()).collect();
+    let num_frames = scene.images.len();
+    pickle.raw(b"}(");
+    pickle.string("url");
+    pickle.string(&scene.url);
+    pickle.string("timestamps");
+    pickle.tensor("LongStorage", timestamps, &[num_frames]);
+    pickle.string("cameras");
+    pickle.tensor("FloatStorage", cameras, &[num_frames, 18]);
+    pickle.string("images");
+    pickle.raw(b"](");
+    for image in &scene.images {
+        pickle.tensor("ByteStorage", image.clone(), &[image.len()]);
     }
-    member("version", 1, b"3\n")?;
-    Ok(zip.finish()?.into_inner())
-}
-
-/// A pickle of protocol 2 and the storages it refers to.
-struct PickleWriter {
-    bytes: Vec<u8>,
-    storages: Vec<Vec<u8>>,
-}
-
-impl PickleWriter {
-    /// Protocol 2, nothing yet.
-    fn new() -> Self {
-        Self { bytes: b"\x80\x02".to_vec(), storages: Vec::new() }
-    }
-
-    fn scene(&mut self, scene: &SceneRecord) {
-        let timestamps = scene.timestamps.iter().flat_map(|time| time.to_le_bytes()).collect();
-        let rows = scene.cameras.iter().flat_map(Camera::to_re10k);
-        let cameras = rows.flat_map(|number| (number as f32).to_le_bytes()).collect();
-        let num_frames = scene.images.len();
-        self.raw(b"}(");
-        self.string("url");
-        self.string(&scene.url);
-        self.string("timestamps");
-        self.tensor("LongStorage", timestamps, &[num_frames]);
-        self.string("cameras");
-        self.tensor("FloatStorage", cameras, &[num_frames, 18]);
-        self.string("images");
-        self.raw(b"](");
-        for image in &scene.images {
-            self.tensor("ByteStorage", image.clone(), &[image.len()]);
-        }
-        self.raw(b"e");
-        self.string("key");
-        self.string(&scene.key);
-        self.raw(b"u");
-    }
-
-    /// A contiguous tensor that is the whole of a new storage.
-    fn tensor(&mut self, storage_type: &str, storage: Vec<u8>, shape: &[usize]) {
-        self.raw(b"ctorch._utils\n_rebuild_tensor_v2\n((");
-        self.string("storage");
-        self.raw(format!("ctorch\n{storage_type}\n").as_bytes());
-        self.string(&self.storages.len().to_string());
-        self.string("cpu");
-        self.integer(shape.iter().product());
-        self.raw(b"tQ");
-        self.integer(0); // offset
-        self.raw(b"(");
-        for size in shape {
-            self.integer(*size);
-        }
-        self.raw(b"t(");
-        for dimension in 0..shape.len() {
-            self.integer(shape[dimension + 1..].iter().product());
-        }
-        self.raw(b"t\x89ccollections\nOrderedDict\n)RtR"); // requires no gradient, has no hooks
-        self.storages.push(storage);
-    }
-
-    fn string(&mut self, text: &str) {
-        self.raw(b"X");
-        self.raw(&(text.len() as u32).to_le_bytes());
-        self.raw(text.as_bytes());
-    }
-
-    /// LONG1 with eight bytes: one opcode for every size.
-    fn integer(&mut self, value: usize) {
-        self.raw(&[0x8a, 8]);
-        self.raw(&(value as u64).to_le_bytes());
-    }
-
-    fn raw(&mut self, bytes: &[u8]) {
-        self.bytes.extend_from_slice(bytes);
-    }
+    pickle.raw(b"e");
+    pickle.string("key");
+    pickle.string(&scene.key);
+    pickle.raw(b"u");
 }
 
 #[cfg(test)]

@@ -46,6 +46,14 @@ pub enum DataError {
         /// The chunk.
         path: PathBuf,
     },
+    /// A PyTorch checkpoint is truncated, not an archive, or does not hold the tensors that are asked for.
+    #[error("bad checkpoint: {what}: {path}", path = path.display())]
+    BadCheckpoint {
+        /// What is wrong with it, with the key where there is one.
+        what: String,
+        /// The checkpoint.
+        path: PathBuf,
+    },
     /// An `index.json` or evaluation index does not have the expected form.
     #[error("bad index: {what}: {path}", path = path.display())]
     BadIndex {

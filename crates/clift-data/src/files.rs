@@ -46,6 +46,17 @@ pub fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
     sync_folder(folder_of(path))
 }
 
+/// Makes a folder, with those above it, that survives a power cut.
+///
+/// # Errors
+/// The operating system's.
+pub fn make_folder(path: &Path) -> std::io::Result<()> {
+    let is_new = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
+    let new: Vec<&Path> = path.ancestors().take_while(is_new).collect();
+    std::fs::create_dir_all(path)?;
+    new.into_iter().rev().try_for_each(|folder| sync_folder(folder_of(folder)))
+}
+
 /// Removes a folder so that a kill in the middle leaves no half of it under its name: it is renamed first.
 ///
 /// # Errors
@@ -177,6 +188,17 @@ mod tests {
         std::fs::create_dir(&temporary).unwrap();
         assert!(publish(&temporary, &path).is_err(), "the folder that is there is not empty");
         assert_eq!(names(&path), ["model"]);
+    }
+
+    #[test]
+    fn folders_are_made_with_those_above_them_and_may_be_there_already() {
+        let place = tempfile::tempdir().unwrap();
+        for path in ["a/b/c", "a/b/c", "a/b/d"] {
+            make_folder(&place.path().join(path)).unwrap();
+        }
+        assert_eq!(names(&place.path().join("a/b")), ["c", "d"]);
+        std::fs::write(place.path().join("file"), b"x").unwrap();
+        assert!(make_folder(&place.path().join("file/a")).is_err());
     }
 
     #[test]

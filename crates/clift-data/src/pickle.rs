@@ -5,10 +5,11 @@
 //! cycle that leaks nor a nesting that overflows the stack, and what it can allocate is bounded by [`MAX_BYTES`]
 //! and [`MAX_VALUES`].
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use crate::error::DataError;
-use crate::unpickle::{Stop, unpickle};
+use crate::unpickle::{Others, Stop, Unpickled, unpickle};
 
 /// Largest pickle that is read; a chunk of 2,000 frames has about 150 kB.
 pub const MAX_BYTES: usize = 16 << 20;
@@ -32,6 +33,10 @@ pub enum ElementType {
     F32,
     /// `torch.DoubleStorage`
     F64,
+    /// `torch.HalfStorage`, in checkpoints alone.
+    F16,
+    /// `torch.BFloat16Storage`, in checkpoints alone.
+    BF16,
 }
 
 impl ElementType {
@@ -39,6 +44,7 @@ impl ElementType {
     pub fn num_bytes(self) -> u64 {
         match self {
             Self::U8 => 1,
+            Self::F16 | Self::BF16 => 2,
             Self::I32 | Self::F32 => 4,
             Self::I64 | Self::F64 => 8,
         }
@@ -50,6 +56,8 @@ impl ElementType {
 pub enum Global {
     /// `torch._utils._rebuild_tensor_v2`
     RebuildTensor,
+    /// `torch._utils._rebuild_parameter`, in checkpoints alone.
+    RebuildParameter,
     /// `collections.OrderedDict`
     OrderedDict,
     /// `torch.ByteStorage` and its like.
@@ -117,6 +125,8 @@ pub enum Value {
     Storage(Box<Storage>),
     /// A tensor.
     Tensor(Box<Tensor>),
+    /// Something of a checkpoint that was passed over: an object of a class that is not known, what was made from it.
+    Opaque,
 }
 
 /// An unpickled object and everything it refers to.
@@ -124,6 +134,7 @@ pub enum Value {
 pub struct Pickle {
     values: Vec<Value>,
     root: ValueId,
+    passed_over: BTreeSet<String>,
 }
 
 impl Pickle {
@@ -134,11 +145,29 @@ impl Pickle {
     /// else: unknown opcodes, calls of anything but a tensor or an empty `OrderedDict`, truncation, exceeded limits.
     /// `path` is only named in the message.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, DataError> {
-        let (values, root) = unpickle(bytes).map_err(|stop| match stop {
+        Self::read(bytes, path, Others::Refuse)
+    }
+
+    /// Reads a pickle with objects of any class, such as a training program's checkpoint: those are passed over as
+    /// [`Value::Opaque`]. Nothing of them is run either.
+    ///
+    /// # Errors
+    /// As [`Pickle::parse`]; [`DataError::RefusedGlobal`] only for names whose sole use in a pickle is an attack.
+    pub fn parse_checkpoint(bytes: &[u8], path: &Path) -> Result<Self, DataError> {
+        Self::read(bytes, path, Others::PassOver)
+    }
+
+    fn read(bytes: &[u8], path: &Path, others: Others) -> Result<Self, DataError> {
+        let Unpickled { values, root, passed_over } = unpickle(bytes, others).map_err(|stop| match stop {
             Stop::Refused(name) => DataError::RefusedGlobal { name, path: path.to_path_buf() },
             Stop::Bad(what) => DataError::BadPickle { what, path: path.to_path_buf() },
         })?;
-        Ok(Self { values, root })
+        Ok(Self { values, root, passed_over })
+    }
+
+    /// Python names that were passed over, at most a few hundred of them.
+    pub fn passed_over(&self) -> &BTreeSet<String> {
+        &self.passed_over
     }
 
     /// The outermost object.

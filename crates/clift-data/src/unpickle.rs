@@ -1,22 +1,57 @@
 //! The machine behind [`crate::pickle`]: a stack, a memo, and the opcodes that `torch.save` writes.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 
-use crate::pickle::{ElementType, Global, MAX_BYTES, MAX_VALUES, Storage, Tensor, Value, ValueId};
+use crate::pickle::{Global, MAX_BYTES, MAX_VALUES, Storage, Tensor, Value, ValueId};
+
+mod names;
+mod objects;
+
+use names::{global, shown};
 
 /// Deepest nesting of unfinished lists, dicts and tuples; chunks need five.
 const MAX_DEPTH: usize = 32;
+/// The same in checkpoints, whose configuration objects nest.
+const MAX_CHECKPOINT_DEPTH: usize = 256;
+/// Most names that are remembered to be told.
+const MAX_PASSED_OVER: usize = 256;
 /// Most dimensions of a tensor.
 const MAX_DIMENSIONS: usize = 4;
 /// Longest name of a storage; `torch.save` numbers them.
 const MAX_STORAGE_KEY_BYTES: usize = 32;
 
-/// Reads a pickle into its values and the place of the outermost one.
-pub(crate) fn unpickle(bytes: &[u8]) -> Result<(Vec<Value>, ValueId), Stop> {
-    let mut reader =
-        Reader { bytes, at: 0, values: Vec::new(), stack: Vec::new(), marks: Vec::new(), memo: HashMap::new() };
+/// What is done with objects of classes that are not known.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Others {
+    /// The file is refused.
+    Refuse,
+    /// They are read past, as [`Value::Opaque`].
+    PassOver,
+}
+
+/// What a pickle holds.
+pub(crate) struct Unpickled {
+    pub values: Vec<Value>,
+    /// The outermost value.
+    pub root: ValueId,
+    /// Names of the classes and functions that were passed over.
+    pub passed_over: BTreeSet<String>,
+}
+
+/// Reads a pickle.
+pub(crate) fn unpickle(bytes: &[u8], others: Others) -> Result<Unpickled, Stop> {
+    let mut reader = Reader {
+        bytes,
+        at: 0,
+        others,
+        values: Vec::new(),
+        stack: Vec::new(),
+        marks: Vec::new(),
+        memo: HashMap::new(),
+        passed_over: BTreeSet::new(),
+    };
     match reader.run() {
-        Ok(root) => Ok((reader.values, root)),
+        Ok(root) => Ok(Unpickled { values: reader.values, root, passed_over: reader.passed_over }),
         Err(Stop::Bad(what)) => Err(Stop::Bad(format!("{what} (at byte {})", reader.at))),
         Err(refused) => Err(refused),
     }
@@ -40,10 +75,12 @@ impl From<&str> for Stop {
 struct Reader<'a> {
     bytes: &'a [u8],
     at: usize,
+    others: Others,
     values: Vec<Value>,
     stack: Vec<ValueId>,
     marks: Vec<usize>,
     memo: HashMap<u32, ValueId>,
+    passed_over: BTreeSet<String>,
 }
 
 impl Reader<'_> {
@@ -51,6 +88,7 @@ impl Reader<'_> {
         if self.bytes.len() > MAX_BYTES {
             return Err(Stop::Bad(format!("it has {} bytes, more than the limit of {MAX_BYTES}", self.bytes.len())));
         }
+        let max_depth = if self.passes_over() { MAX_CHECKPOINT_DEPTH } else { MAX_DEPTH };
         loop {
             match self.u8()? {
                 b'.' => return self.pop(),
@@ -59,12 +97,16 @@ impl Reader<'_> {
                     version => return Err(Stop::Bad(format!("protocol {version}, expected 2 to 5"))),
                 },
                 0x95 => drop(self.take(8)?), // FRAME: a length that only matters to streams
-                b'(' if self.marks.len() == MAX_DEPTH => {
-                    return Err(Stop::Bad(format!("nested deeper than {MAX_DEPTH} levels")));
+                b'(' if self.marks.len() == max_depth => {
+                    return Err(Stop::Bad(format!("nested deeper than {max_depth} levels")));
                 }
                 b'(' => self.marks.push(self.stack.len()),
                 opcode => {
-                    if !(self.read_scalar(opcode)? || self.read_container(opcode)? || self.read_reference(opcode)?) {
+                    let known = self.read_scalar(opcode)?
+                        || self.read_container(opcode)?
+                        || self.read_reference(opcode)?
+                        || self.passes_over() && self.read_object(opcode)?;
+                    if !known {
                         return Err(Stop::Bad(format!("opcode {opcode:#04x}, which torch.save does not write")));
                     }
                 }
@@ -85,11 +127,16 @@ impl Reader<'_> {
                 let length = self.u8()? as usize;
                 let digits = self.take(length)?;
                 if length > 8 {
-                    return Err("an integer of more than 64 bits".into());
+                    if !self.passes_over() {
+                        return Err("an integer of more than 64 bits".into());
+                    }
+                    self.push(Value::Opaque)?;
+                    return Ok(true);
                 }
+                let digits = digits.to_vec();
                 let negative = digits.last().is_some_and(|high| high & 0x80 != 0);
                 let mut extended = [if negative { 0xff } else { 0 }; 8];
-                extended[..length].copy_from_slice(digits);
+                extended[..length].copy_from_slice(&digits);
                 Value::Int(i64::from_le_bytes(extended))
             }
             b'G' => Value::Float(f64::from_be_bytes(self.array()?)),
@@ -169,24 +216,26 @@ impl Reader<'_> {
             }
             b'c' => {
                 let (module, name) = (self.line()?, self.line()?);
-                self.push(Value::Global(global(&module, &name)?))?;
+                self.push_global(&module, &name)?;
             }
             0x93 => {
                 let (name, module) = (self.pop()?, self.pop()?);
                 let (Value::Str(name), Value::Str(module)) = (self.get(name), self.get(module)) else {
                     return Err("a Python name that is not a string".into());
                 };
-                let global = global(module, name)?;
-                self.push(Value::Global(global))?;
+                let (module, name) = (module.clone(), name.clone());
+                self.push_global(&module, &name)?;
             }
             b'Q' => {
                 let id = self.pop()?;
-                let storage = self.storage(id)?;
-                self.push(Value::Storage(Box::new(storage)))?;
+                let storage = self.storage(id).map(|storage| Value::Storage(Box::new(storage)));
+                let value = self.or_opaque(storage)?;
+                self.push(value)?;
             }
             b'R' => {
                 let (arguments, callee) = (self.pop()?, self.pop()?);
-                let value = self.call(callee, arguments)?;
+                let value = self.call(callee, arguments);
+                let value = self.or_opaque(value)?;
                 self.push(value)?;
             }
             _ => return Ok(false),
@@ -210,7 +259,7 @@ impl Reader<'_> {
         }
     }
 
-    /// The only two calls that are understood; both only describe data.
+    /// The only calls that are understood; all of them only describe data.
     fn call(&self, callee: ValueId, arguments: ValueId) -> Result<Value, Stop> {
         let Value::Tuple(arguments) = self.get(arguments) else {
             return Err("a call whose arguments are no tuple".into());
@@ -228,6 +277,10 @@ impl Reader<'_> {
                 }
                 Ok(Value::Tensor(Box::new(Tensor { storage: (**storage).clone(), offset, shape, stride })))
             }
+            (Value::Global(Global::RebuildParameter), [data, ..]) => match self.get(*data) {
+                Value::Tensor(tensor) => Ok(Value::Tensor(tensor.clone())),
+                _ => Err("a parameter without a tensor".into()),
+            },
             _ => Err("a call of something other than a tensor or an empty OrderedDict".into()),
         }
     }
@@ -278,6 +331,9 @@ impl Reader<'_> {
 
     fn extend_list(&mut self, items: &[ValueId]) -> Result<(), Stop> {
         let list = self.top()?;
+        if self.is_passed_over(list) {
+            return Ok(());
+        }
         let Value::List(list) = &mut self.values[list.0 as usize] else {
             return Err("an append to something other than a list".into());
         };
@@ -287,6 +343,9 @@ impl Reader<'_> {
 
     fn extend_dict(&mut self, items: &[ValueId]) -> Result<(), Stop> {
         let dict = self.top()?;
+        if self.is_passed_over(dict) {
+            return Ok(());
+        }
         let Value::Dict(dict) = &mut self.values[dict.0 as usize] else {
             return Err("an item set on something other than a dict".into());
         };
@@ -341,22 +400,4 @@ impl Reader<'_> {
         self.at += 1;
         Ok(line)
     }
-}
-
-/// Looks a Python name up in the allow-list.
-fn global(module: &str, name: &str) -> Result<Global, Stop> {
-    Ok(match (module, name) {
-        ("torch._utils", "_rebuild_tensor_v2") => Global::RebuildTensor,
-        ("collections", "OrderedDict") => Global::OrderedDict,
-        ("torch", "ByteStorage") => Global::Storage(ElementType::U8),
-        ("torch", "IntStorage") => Global::Storage(ElementType::I32),
-        ("torch", "LongStorage") => Global::Storage(ElementType::I64),
-        ("torch", "FloatStorage") => Global::Storage(ElementType::F32),
-        ("torch", "DoubleStorage") => Global::Storage(ElementType::F64),
-        _ => {
-            // A name from a hostile file: short enough for a terminal, and without control characters.
-            let name: String = format!("{module}.{name}").chars().take(120).collect();
-            return Err(Stop::Refused(name.escape_debug().to_string()));
-        }
-    })
 }

@@ -58,6 +58,9 @@ impl Accumulator {
         let mut curves: BTreeMap<&str, Curve> = BTreeMap::new();
         let whole = |setting: &Setting| setting.num_render_tokens == setting.num_storage_tokens;
         let settings = self.views.iter().filter(|(setting, _)| setting.variant == variant && whole(setting));
+        // Of the finest format, where there are several.
+        let format = settings.clone().map(|(setting, _)| setting.tokens).min().flatten();
+        let settings = settings.filter(|(setting, _)| setting.tokens == format);
         let mut num_counts = 0;
         for (setting, views) in settings {
             num_counts += 1;
@@ -109,13 +112,15 @@ mod tests {
     use super::*;
     use crate::measured::Measured;
 
+    const SETTING: Setting = Setting::baseline(Variant::Clift);
+
     /// Scenes with (count, error, PSNR) each.
     fn accumulator(scenes: &[(&str, &[(usize, f64, f64)])]) -> Accumulator {
         let mut views = Accumulator::default();
         for (scene, points) in scenes {
             for &(count, error, psnr) in *points {
-                let setting = Setting { variant: Variant::Clift, num_storage_tokens: count, num_render_tokens: count };
-                views.add(scene, 1, setting, Measured::quality(psnr, None)).unwrap();
+                let whole = Setting { num_storage_tokens: count, num_render_tokens: count, ..SETTING };
+                views.add(scene, 1, whole, Measured::quality(psnr, None)).unwrap();
                 views.add_cluster_error(scene, count, error);
             }
         }

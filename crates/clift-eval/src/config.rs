@@ -1,9 +1,9 @@
 //! What is evaluated, as the `[eval]` section of a config holds it.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clift_model::TokenStorage;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::measured::Variant;
 use crate::selection::Selection;
@@ -22,8 +22,12 @@ pub struct EvalConfig {
     pub selection: Selection,
     /// What is rendered, of `random`, `patch`, `patch_clift`, `kmeans` and `clift`; empty for all there are weights for.
     pub variants: Vec<Variant>,
-    /// Number format that stored tokens are rounded to before they are rendered, as in a scene file.
-    pub tokens: TokenStorage,
+    /// Number formats that stored tokens are rounded to before they are rendered, as in a scene file: one, or a list of
+    /// those to compare.
+    #[serde(deserialize_with = "one_or_more")]
+    pub tokens: Vec<TokenStorage>,
+    /// Weights of LPIPS, converted by `scripts/convert_vgg.py`; without them it is not measured.
+    pub lpips_weights: Option<PathBuf>,
     /// Evaluation index with the context and target frames of every scene. Without one, contexts are
     /// spread evenly over each clip and targets lie between them.
     pub index: Option<PathBuf>,
@@ -43,6 +47,38 @@ pub struct EvalConfig {
     pub validation_storage: TokenCount,
 }
 
+impl EvalConfig {
+    /// The weights of LPIPS; none where the key is missing or empty.
+    pub fn lpips_path(&self) -> Option<&Path> {
+        self.lpips_weights.as_deref().filter(|path| !path.as_os_str().is_empty())
+    }
+}
+
+/// A format or a list of them.
+fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TokenStorage>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "a format (\"f32\", \"f16\", \"int8\") or a list of them")]
+    enum Written {
+        One(TokenStorage),
+        More(Vec<TokenStorage>),
+    }
+    let mut formats = match Written::deserialize(deserializer)? {
+        Written::One(format) => vec![format],
+        Written::More(formats) => formats,
+    };
+    let mut seen = Vec::new();
+    formats.retain(|format| {
+        !seen.contains(format) && {
+            seen.push(*format);
+            true
+        }
+    });
+    if formats.is_empty() {
+        return Err(serde::de::Error::custom("at least one format is needed"));
+    }
+    Ok(formats)
+}
+
 impl Default for EvalConfig {
     fn default() -> Self {
         // The ratios of the paper's main experiment.
@@ -52,7 +88,8 @@ impl Default for EvalConfig {
             render: Vec::new(),
             selection: Selection::default(),
             variants: Vec::new(),
-            tokens: TokenStorage::F32,
+            tokens: vec![TokenStorage::F32],
+            lpips_weights: None,
             index: None,
             num_scenes: 0,
             num_context: 4,
@@ -62,5 +99,26 @@ impl Default for EvalConfig {
             num_validation_scenes: 4,
             validation_storage: TokenCount::Share(0.125),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn formats_are_one_or_a_list_each_once() {
+        let tokens = |text: &str| serde_json::from_str::<EvalConfig>(text).map(|config| config.tokens);
+        assert_eq!(tokens(r#"{"tokens": "f16"}"#).unwrap(), [TokenStorage::F16]);
+        assert_eq!(tokens(r#"{"tokens": ["int8", "f32", "int8"]}"#).unwrap(), [TokenStorage::Int8, TokenStorage::F32]);
+        assert!(tokens(r#"{"tokens": []}"#).unwrap_err().to_string().contains("at least one"));
+        assert!(tokens(r#"{"tokens": "f64"}"#).unwrap_err().to_string().contains("int8"));
+    }
+
+    #[test]
+    fn an_empty_path_takes_the_weights_away() {
+        let config = |path: &str| EvalConfig { lpips_weights: Some(path.into()), ..EvalConfig::default() };
+        assert_eq!(config("").lpips_path(), None);
+        assert_eq!(config("a").lpips_path(), Some(Path::new("a")));
     }
 }

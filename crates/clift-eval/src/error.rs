@@ -42,6 +42,66 @@ pub enum EvalError {
         /// Rows.
         height: usize,
     },
+    /// LPIPS has no value left of a picture after its last stage.
+    #[error("LPIPS needs at least {min} x {min} pixels, got {width} x {height}", min = crate::lpips::LPIPS_MIN_SIZE_PX)]
+    TooSmallForLpips {
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+    },
+    /// A file with the weights of a network that measures pictures cannot be used.
+    #[error("bad weights for {what}: {reason}; `{command}` makes them: {path}", path = path.display())]
+    BadWeights {
+        /// What they are for.
+        what: &'static str,
+        /// What is wrong with them.
+        reason: String,
+        /// What to run.
+        command: &'static str,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A name that another system cannot have.
+    #[error("`{name}` cannot be the name of a system: {reason}")]
+    BadSystemName {
+        /// What was written.
+        name: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A picture of another system cannot be compared with its target.
+    #[error("bad picture: {reason}: {path}", path = path.display())]
+    BadPrediction {
+        /// What is wrong with it.
+        reason: String,
+        /// The picture.
+        path: PathBuf,
+    },
+    /// Another system's folder holds none of the pictures that are evaluated.
+    #[error(
+        "{name} has none of the {expected} target pictures; the first would be {first}, or the same in a folder \
+         `color` of its scene: {path}",
+        path = path.display()
+    )]
+    NoPredictions {
+        /// The system.
+        name: &'static str,
+        /// How many there could be.
+        expected: usize,
+        /// The first that was looked for.
+        first: String,
+        /// The folder.
+        path: PathBuf,
+    },
+    /// Two evaluations cannot be compared.
+    #[error("{reason}: {path}", path = path.display())]
+    NotComparable {
+        /// Why not.
+        reason: String,
+        /// The evaluation.
+        path: PathBuf,
+    },
     /// A baseline was asked for a scene that has no context view.
     #[error("a baseline needs at least one context view, got none")]
     NoContext,

@@ -3,36 +3,60 @@
 use std::time::Instant;
 
 use burn::tensor::{Device, Tensor};
+use clift_data::Clip;
 use clift_data::order::derive_seed;
-use clift_data::{Clip, Views as HostViews};
 use clift_model::scene::file_bytes;
-use clift_model::{Cameras, Condenser, Encoder, Grouping, KMeans, Renderer, TokenStorage, total_variance};
+use clift_model::{
+    Cameras, Clift, Condenser, Convention, Encoder, Grouping, KMeans, LiftNorm, ModelConfig, Renderer, TokenStorage,
+    total_variance,
+};
 
 use crate::EvalError;
 use crate::exhibit::{Material, Shown, sheet_rows};
+use crate::lpips::Lpips;
 use crate::measured::{Accumulator, Setting, Variant};
-use crate::rendered::{Rendered, baselines};
+use crate::memory;
+use crate::predictions::System;
+use crate::rendered::{Judge, Rendered, baselines};
 use crate::selection::{Chosen, Selection};
 use crate::stored::{GroupsOnce, Stored, rows_of};
 use crate::token_count::TokenCount;
 use crate::upload::{upload_cameras, upload_views};
-
-/// Target views rendered at once: bounds memory for clips with a hundred targets.
-const VIEWS_PER_PASS: usize = 8;
 
 /// The networks of an evaluation, on a device without autodiff.
 #[derive(Clone, Debug)]
 pub struct Networks {
     /// Encoder, the same for both stages.
     pub encoder: Encoder,
+    /// A norm of its tokens, in the variant that has one: that of stage 1.
+    pub lift_norm: LiftNorm,
     /// Stage-1 renderer: draws random subsets and uncondensed centroids.
     pub renderer: Renderer,
-    /// Condenser and stage-2 renderer, once there are.
-    pub condensed: Option<(Condenser, Renderer)>,
-    /// Those trained on tiles of the views instead of K-means.
-    pub patch_condensed: Option<(Condenser, Renderer)>,
+    /// What stage 2 trained, once it has.
+    pub condensed: Option<Condensed>,
+    /// The same, trained on tiles of the views instead of K-means.
+    pub patch_condensed: Option<Condensed>,
     /// Where they live.
     pub device: Device,
+}
+
+/// The networks that stage 2 trains.
+#[derive(Clone, Debug)]
+pub struct Condensed {
+    /// A norm of the encoder's tokens, in the variant that has one.
+    pub lift_norm: LiftNorm,
+    /// Writes the tokens of a cluster into its centroid.
+    pub condenser: Condenser,
+    /// Draws condensed tokens.
+    pub renderer: Renderer,
+}
+
+impl Condensed {
+    /// Those of a model.
+    pub fn of(model: &Clift) -> Self {
+        let Clift { lift_norm, condenser, renderer, .. } = model.clone();
+        Self { lift_norm, condenser, renderer }
+    }
 }
 
 /// Settings of a sweep.
@@ -44,24 +68,40 @@ pub struct Sweep {
     pub render: Vec<TokenCount>,
     /// How fewer tokens are chosen.
     pub selection: Selection,
-    /// Number format that stored tokens are rounded to, as in a scene file; not those of [`Variant::Random`].
-    pub tokens: TokenStorage,
+    /// Number formats that stored tokens are rounded to, as in a scene file, one after the other. Random subsets have
+    /// no file and are not rounded. Pictures are shown of the first.
+    pub tokens: Vec<TokenStorage>,
     /// Which variants are rendered: those of [`Networks::variants`], or fewer.
     pub variants: Vec<Variant>,
     /// Latent K-means.
     pub kmeans: KMeans,
-    /// Pixels along a side of the patch a token stands on.
-    pub patch_size: usize,
+    /// Sizes of the networks.
+    pub model: ModelConfig,
+    /// LPIPS, where its weights are there.
+    pub lpips: Option<Lpips>,
+    /// Other systems' pictures.
+    pub systems: Vec<System>,
+    /// Whether tensors live in this process's memory, so that its peak says something.
+    pub is_cpu: bool,
     /// Seed of K-means and of what is random; each scene derives its own from it and its key.
     pub seed: u64,
 }
 
 impl Networks {
     /// Takes the networks of a stage 2 that was trained on such groups.
-    pub fn set_condensed(&mut self, grouping: Grouping, condenser: Condenser, renderer: Renderer) {
+    pub fn set_condensed(&mut self, grouping: Grouping, condensed: Condensed) {
         match grouping {
-            Grouping::Kmeans => self.condensed = Some((condenser, renderer)),
-            Grouping::Patch => self.patch_condensed = Some((condenser, renderer)),
+            Grouping::Kmeans => self.condensed = Some(condensed),
+            Grouping::Patch => self.patch_condensed = Some(condensed),
+        }
+    }
+
+    /// What stage 2 trained for a variant.
+    pub(crate) fn condensed_of(&self, variant: Variant) -> Option<&Condensed> {
+        match variant {
+            Variant::Clift => self.condensed.as_ref(),
+            Variant::PatchClift => self.patch_condensed.as_ref(),
+            _ => None,
         }
     }
 
@@ -71,7 +111,7 @@ impl Networks {
             Variant::Random | Variant::Patch | Variant::Kmeans => true,
             Variant::Clift => self.condensed.is_some(),
             Variant::PatchClift => self.patch_condensed.is_some(),
-            Variant::NearestView | Variant::MeanImage => false,
+            Variant::NearestView | Variant::MeanImage | Variant::System(_) => false,
         }
     }
 
@@ -92,6 +132,10 @@ impl Sweep {
         counts.dedup();
         counts
     }
+
+    fn formats(&self, variant: Variant) -> &[TokenStorage] {
+        if variant == Variant::Random { &[TokenStorage::F32] } else { &self.tokens }
+    }
 }
 
 /// Renders and measures the targets of one scene; returns its pictures when they are to be shown.
@@ -108,37 +152,66 @@ pub fn evaluate_scene(
     is_shown: bool,
     into: &mut Accumulator,
 ) -> Result<Option<Shown>, EvalError> {
-    let lift = networks.encoder.forward(&upload_views(&[&clip.context], &networks.device)?); // [1, N, D]
+    let features = networks.encoder.forward(&upload_views(&[&clip.context], &networks.device)?);
+    // Where stage 2 has trained a norm of the tokens, condensed ones are of that norm, and of its clusters.
+    let normed: Vec<(Variant, Tensor<3>)> = [Variant::Clift, Variant::PatchClift]
+        .into_iter()
+        .filter_map(|variant| Some((variant, networks.condensed_of(variant)?)))
+        .filter(|(_, condensed)| condensed.lift_norm.is_norm())
+        .map(|(variant, condensed)| (variant, condensed.lift_norm.forward(features.clone())))
+        .collect();
+    let lift = networks.lift_norm.forward(features); // [1, N, D]
     let [_, num_tokens, dim] = lift.dims();
     let seed = derive_seed(sweep.seed, &clip.key);
-    let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.patch_size);
+    let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
     let views = (clip.context.num_views(), grid);
     let variance = total_variance(&lift)?[0];
     let rows = if is_shown { sheet_rows(clip.target.num_views()) } else { Vec::new() };
     let is_shown = !rows.is_empty();
-    let mut material = Material { renderings: baselines(clip, &rows)?, ..Material::default() };
+    let judge = Judge::new(&clip.target, sweep.lpips.as_ref());
+    let drawing = Drawing { clip, judge: &judge, cameras: upload_cameras(&[&clip.target], &networks.device)?, sweep };
+    let mut material = Material { renderings: baselines(clip, &judge, &rows)?, ..Material::default() };
+    for rendering in &material.renderings {
+        record(clip, rendering, into)?;
+    }
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
-        let bytes = file_bytes(num_storage_tokens, dim, clip.context.num_views(), sweep.tokens);
         let index = GroupsOnce::new(&sweep.kmeans, &lift, views, num_storage_tokens, seed);
+        let own: Vec<_> = normed
+            .iter()
+            .map(|(of, lift)| (*of, lift, GroupsOnce::new(&sweep.kmeans, lift, views, num_storage_tokens, seed)))
+            .collect();
         for &variant in &sweep.variants {
-            let stored = Stored::new(variant, networks, &lift, &index, sweep.tokens)?;
-            let setting = |num_render_tokens| Setting { variant, num_storage_tokens, num_render_tokens };
-            let whole = setting(num_storage_tokens);
-            let mut settings = vec![whole];
-            material.renderings.push(render(&stored, &clip.target, whole, &rows)?);
-            for num_render_tokens in sweep.render_counts(num_storage_tokens) {
-                let some = setting(num_render_tokens);
-                let chosen = sweep.selection.choose(clip, &stored.ids, sweep.patch_size, num_render_tokens, seed)?;
-                material.renderings.push(render_chosen(&stored, &chosen, &clip.target, some, &rows)?);
-                if is_shown {
-                    material.choices.push((some, stored.ids.clone(), chosen));
+            let own = own.iter().find(|(of, ..)| *of == variant);
+            let (lift, index) = own.map_or((&lift, &index), |(_, lift, index)| (*lift, index));
+            for (i, &tokens) in sweep.formats(variant).iter().enumerate() {
+                let rows = if i == 0 { &rows[..] } else { &[] };
+                let stored = Stored::new(variant, networks, lift, index, tokens)?;
+                let whole = Setting {
+                    variant,
+                    num_storage_tokens,
+                    num_render_tokens: num_storage_tokens,
+                    tokens: Some(tokens),
+                };
+                let mut renderings = vec![drawing.render(&stored, None, whole, rows, into)?];
+                for num_render_tokens in sweep.render_counts(num_storage_tokens) {
+                    let some = Setting { num_render_tokens, ..whole };
+                    let patch_size = sweep.model.patch_size;
+                    let chosen = sweep.selection.choose(clip, &stored.ids, patch_size, num_render_tokens, seed)?;
+                    renderings.push(drawing.render(&stored, Some(&chosen), some, rows, into)?);
+                    if !rows.is_empty() {
+                        material.choices.push((some, stored.ids.clone(), chosen));
+                    }
                 }
-                settings.push(some);
-            }
-            if variant != Variant::Random {
-                for setting in settings {
-                    into.add_scene_bytes(setting, bytes);
+                let bytes = file_bytes(num_storage_tokens, dim, clip.context.num_views(), tokens);
+                for rendering in renderings {
+                    record(clip, &rendering, into)?;
+                    if variant != Variant::Random {
+                        into.add_scene_bytes(rendering.setting, bytes);
+                    }
+                    if !rows.is_empty() {
+                        material.renderings.push(rendering);
+                    }
                 }
             }
         }
@@ -146,74 +219,89 @@ pub fn evaluate_scene(
             into.add_cluster_error(&clip.key, num_storage_tokens, error);
         }
         if is_shown {
+            let own = own.iter().find(|(of, ..)| *of == Variant::Clift);
+            let index = own.map_or(&index, |(.., index)| index);
             material.clusters.push(index.scene_clusters()?.clone());
         }
     }
-    for rendering in &material.renderings {
-        for (&frame, &measured) in clip.target.frame_index.iter().zip(&rendering.measured) {
-            // A target drawn twice is one view.
-            if !into.contains(&clip.key, frame, rendering.setting) {
-                into.add(&clip.key, frame, rendering.setting, measured)?;
+    for system in &sweep.systems {
+        let scored = system.score(clip, &judge, &rows, into)?;
+        for (&view, &measured) in &scored.measured {
+            let frame = clip.target.frame_index[view];
+            if !into.contains(&clip.key, frame, scored.setting) {
+                into.add(&clip.key, frame, scored.setting, measured)?;
             }
         }
+        material.others.push(scored);
     }
-    if is_shown { Shown::new(clip, &material, &rows, sweep.patch_size).map(Some) } else { Ok(None) }
+    if is_shown { Shown::new(clip, &material, &rows, sweep.model.patch_size).map(Some) } else { Ok(None) }
 }
 
-/// Draws every target from all tokens.
-fn render(stored: &Stored, target: &HostViews, setting: Setting, rows: &[usize]) -> Result<Rendered, EvalError> {
-    let Stored { tokens, renderer, .. } = stored;
-    let mut rendered = Rendered::new(setting);
-    let frame_len = target.height * target.width * 3;
-    let device = tokens.device();
-    let cameras = upload_cameras(&[target], &device)?;
-    // So that the clock below does not count what is still queued.
-    device.sync().map_err(EvalError::tensor)?;
-    let started = Instant::now();
-    let memory = renderer.memory(tokens);
-    device.sync().map_err(EvalError::tensor)?;
-    // Once for the scene: every view bears its share.
-    let shared_s = started.elapsed().as_secs_f64() / target.num_views() as f64;
-    for start in (0..target.num_views()).step_by(VIEWS_PER_PASS) {
-        let count = VIEWS_PER_PASS.min(target.num_views() - start);
-        let cameras = narrowed(&cameras, start, count);
-        let started = Instant::now();
-        let images = renderer.draw(&memory, &cameras); // [1, T, H, W, 3]
-        let values: Vec<f32> = images.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)?;
-        let render_s = shared_s + started.elapsed().as_secs_f64() / count as f64;
-        for pixels in values.chunks(frame_len) {
-            rendered.add(pixels.to_vec(), target, rows)?;
+/// Adds what was measured of a scene in one setting.
+fn record(clip: &Clip, rendering: &Rendered, into: &mut Accumulator) -> Result<(), EvalError> {
+    for (&frame, &measured) in clip.target.frame_index.iter().zip(&rendering.measured) {
+        // A target drawn twice is one view.
+        if !into.contains(&clip.key, frame, rendering.setting) {
+            into.add(&clip.key, frame, rendering.setting, measured)?;
         }
-        for measured in &mut rendered.measured[start..] {
+    }
+    Ok(())
+}
+
+/// The targets of a scene, to be drawn in many settings.
+struct Drawing<'a> {
+    clip: &'a Clip,
+    judge: &'a Judge<'a>,
+    cameras: Cameras,
+    sweep: &'a Sweep,
+}
+
+impl Drawing<'_> {
+    /// Draws every target alone, from all stored tokens or from those chosen for it.
+    ///
+    /// The clock runs from tokens on the device to pixels on the host. Nothing is shared between views, so that times of
+    /// any two settings can be compared; a viewer that draws a scene from all its tokens again and again keeps their keys
+    /// and values and is faster.
+    fn render(
+        &self,
+        stored: &Stored,
+        chosen: Option<&[Chosen]>,
+        setting: Setting,
+        rows: &[usize],
+        into: &mut Accumulator,
+    ) -> Result<Rendered, EvalError> {
+        let target = &self.clip.target;
+        let device = stored.tokens.device();
+        let draw = |view: usize| -> Result<Vec<f32>, EvalError> {
+            let tokens: Tensor<3> = match chosen {
+                Some(chosen) => rows_of(&stored.tokens, &chosen[view].tokens), // [1, S, D] -> [1, R, D]
+                None => stored.tokens.clone(),
+            };
+            let image = stored.renderer.forward(tokens, &narrowed(&self.cameras, view, 1)); // [1, 1, H, W, 3]
+            image.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
+        };
+        // So that the clock does not count what is still queued.
+        device.sync().map_err(EvalError::tensor)?;
+        if !into.is_warm(setting) {
+            // Once before all views of the setting that are timed: for what a device does only once, and for the memory.
+            let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
+            draw(0)?;
+            into.set_warm(setting, if has_peak { memory::peak_bytes() } else { None });
+            let macs = self.sweep.model.render_macs(target.height, target.width, setting.num_render_tokens)?;
+            into.add_gflops(setting, macs.count(Convention::Macs) as f64 / 1e9);
+        }
+        let mut rendered = Rendered::new(setting);
+        for view in 0..target.num_views() {
+            let started = Instant::now();
+            let pixels = draw(view)?;
+            let render_s = started.elapsed().as_secs_f64();
+            rendered.add(pixels, self.judge, rows)?;
+            let measured = &mut rendered.measured[view];
             measured.render_s = Some(render_s);
+            measured.select_s = chosen.map(|chosen| chosen[view].select_s);
         }
+        Ok(rendered)
     }
-    Ok(rendered)
-}
-
-/// Draws every target alone, from the tokens chosen for it.
-fn render_chosen(
-    stored: &Stored,
-    chosen: &[Chosen],
-    target: &HostViews,
-    setting: Setting,
-    rows: &[usize],
-) -> Result<Rendered, EvalError> {
-    let mut rendered = Rendered::new(setting);
-    let device = stored.tokens.device();
-    let cameras = upload_cameras(&[target], &device)?;
-    device.sync().map_err(EvalError::tensor)?;
-    for (view, Chosen { tokens, select_s }) in chosen.iter().enumerate() {
-        let started = Instant::now();
-        let tokens: Tensor<3> = rows_of(&stored.tokens, tokens); // [1, S, D] -> [1, R, D]
-        let image = stored.renderer.forward(tokens, &narrowed(&cameras, view, 1));
-        let pixels: Vec<f32> = image.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)?;
-        let render_s = started.elapsed().as_secs_f64();
-        rendered.add(pixels, target, rows)?;
-        let measured = &mut rendered.measured[view];
-        (measured.render_s, measured.select_s) = (Some(render_s), Some(*select_s));
-    }
-    Ok(rendered)
 }
 
 /// `count` views of a scene from the view `start` on.
@@ -243,10 +331,13 @@ mod tests {
                 TokenCount::Count(4),
             ],
             selection: Selection::Preset(Preset::Paper),
-            tokens: TokenStorage::F32,
+            tokens: vec![TokenStorage::F32],
             variants: Vec::new(),
             kmeans: KMeans::default(),
-            patch_size: 8,
+            model: ModelConfig::default(),
+            lpips: None,
+            systems: Vec::new(),
+            is_cpu: true,
             seed: 0,
         };
         assert_eq!(sweep.render_counts(128), [4, 16, 64]);

@@ -8,6 +8,7 @@ use clift_model::SceneClusters;
 use crate::EvalError;
 use crate::measured::{Setting, Variant};
 use crate::picture::{Picture, error_map};
+use crate::predictions::Scored;
 use crate::rendered::{Rendered, truth};
 use crate::selection::Chosen;
 use crate::sheet::{Cell, Row, sheet};
@@ -81,6 +82,8 @@ pub(crate) struct Material {
     pub clusters: Vec<SceneClusters>,
     /// The patches that stored tokens stand on, and what was chosen of them for every target.
     pub choices: Vec<(Setting, Vec<u32>, Vec<Chosen>)>,
+    /// Other systems' pictures.
+    pub others: Vec<Scored>,
 }
 
 impl Shown {
@@ -100,6 +103,12 @@ impl Exhibit {
         for rendered in &material.renderings {
             let picture = small(Picture::from_unit(&rendered.shown[&view], height, width)?);
             drawings.push(Drawing { setting: rendered.setting, psnr: rendered.measured[view].psnr, picture });
+        }
+        for scored in &material.others {
+            if let (Some(pixels), Some(measured)) = (scored.shown.get(&view), scored.measured.get(&view)) {
+                let picture = small(Picture::from_unit(pixels, height, width)?);
+                drawings.push(Drawing { setting: scored.setting, psnr: measured.psnr, picture });
+            }
         }
         drawings.sort_by_key(|drawing| drawing.setting);
         drawings.dedup_by_key(|drawing| drawing.setting);

@@ -5,9 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use clift_data::files::replace;
+use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
+use crate::predictions::SystemName;
 
 /// How a view was made.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -27,12 +29,16 @@ pub enum Variant {
     NearestView,
     /// Baseline: the mean of the context views.
     MeanImage,
+    /// Pictures of another system.
+    #[serde(untagged)]
+    System(SystemName),
 }
 
 impl Variant {
     /// The name in files and tables.
     pub const fn name(self) -> &'static str {
         match self {
+            Self::System(name) => name.as_str(),
             Self::Clift => "clift",
             Self::Kmeans => "kmeans",
             Self::Patch => "patch",
@@ -53,12 +59,19 @@ pub struct Setting {
     pub num_storage_tokens: usize,
     /// Tokens the renderer was given; 0 for a baseline.
     pub num_render_tokens: usize,
+    /// Number format of the stored tokens; none where there are none.
+    pub tokens: Option<TokenStorage>,
 }
 
 impl Setting {
-    /// The setting of a baseline, which has no tokens.
+    /// The setting of a baseline or of another system, which has no tokens.
     pub const fn baseline(variant: Variant) -> Self {
-        Self { variant, num_storage_tokens: 0, num_render_tokens: 0 }
+        Self { variant, num_storage_tokens: 0, num_render_tokens: 0, tokens: None }
+    }
+
+    /// Name of the number format, empty where there is none.
+    pub fn format_name(self) -> &'static str {
+        self.tokens.map_or("", TokenStorage::name)
     }
 }
 
@@ -69,16 +82,21 @@ pub struct Measured {
     pub psnr: f64,
     /// Structural similarity; `None` below 11 x 11 pixels.
     pub ssim: Option<f64>,
-    /// LPIPS with VGG-16; `None` without its weights.
+    /// LPIPS with VGG-16; `None` without its weights and below 16 x 16 pixels.
     pub lpips_vgg: Option<f64>,
-    /// Seconds the renderer took.
+    /// Seconds the renderer took for this view alone, from tokens to pixels.
     pub render_s: Option<f64>,
     /// Seconds token selection took.
     pub select_s: Option<f64>,
 }
 
 impl Measured {
-    /// Only PSNR and SSIM, as a baseline has them.
+    /// Time per frame: choosing tokens, where that was done, and drawing.
+    pub fn frame_s(&self) -> Option<f64> {
+        self.render_s.map(|render_s| render_s + self.select_s.unwrap_or_default())
+    }
+
+    /// Only PSNR and SSIM.
     pub const fn quality(psnr: f64, ssim: Option<f64>) -> Self {
         Self { psnr, ssim, lpips_vgg: None, render_s: None, select_s: None }
     }
@@ -89,8 +107,19 @@ impl Measured {
 pub struct Cost {
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
-    /// Bytes of a scene file.
+    /// Bytes of a scene file, or the data size that was given for another system.
     pub scene_bytes: Option<u64>,
+    /// Most memory of the process while a view was drawn, everything in it included.
+    pub peak_bytes: Option<u64>,
+}
+
+/// Something that a summary has no number of.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct NotMeasured {
+    /// Name of the number.
+    pub metric: String,
+    /// Why, and what to do about it.
+    pub reason: String,
 }
 
 /// Views of one setting, by scene key and target frame.
@@ -104,6 +133,10 @@ pub struct Accumulator {
     pub(crate) skipped: BTreeSet<String>,
     /// Share of the token variance within clusters, by scene and count.
     pub(crate) cluster_errors: BTreeMap<(String, usize), f64>,
+    pub(crate) not_measured: Vec<NotMeasured>,
+    pub(crate) missing: BTreeMap<SystemName, BTreeSet<String>>,
+    pub(crate) lpips_sha256: Option<String>,
+    warm: BTreeSet<Setting>,
 }
 
 impl Accumulator {
@@ -118,7 +151,7 @@ impl Accumulator {
                 Ok(())
             }
             Entry::Occupied(_) => {
-                let Setting { variant, num_storage_tokens: stored, num_render_tokens: rendered } = setting;
+                let Setting { variant, num_storage_tokens: stored, num_render_tokens: rendered, .. } = setting;
                 let variant = variant.name();
                 let view = format!("{variant} of {scene}, frame {frame}, {stored} stored, {rendered} rendered");
                 Err(EvalError::DuplicateView { view })
@@ -142,6 +175,37 @@ impl Accumulator {
         cost.scene_bytes = cost.scene_bytes.max(Some(bytes));
     }
 
+    /// Notes what drawing a view costs.
+    pub fn add_gflops(&mut self, setting: Setting, gflops: f64) {
+        self.costs.entry(setting).or_default().gflops = Some(gflops);
+    }
+
+    /// Whether a view of a setting has been drawn before those that are timed.
+    pub(crate) fn is_warm(&self, setting: Setting) -> bool {
+        self.warm.contains(&setting)
+    }
+
+    /// Notes that one has, with the memory it took.
+    pub(crate) fn set_warm(&mut self, setting: Setting, peak_bytes: Option<u64>) {
+        self.warm.insert(setting);
+        self.costs.entry(setting).or_default().peak_bytes = peak_bytes;
+    }
+
+    /// Notes why there is no number.
+    pub fn note_not_measured(&mut self, metric: &str, reason: String) {
+        self.not_measured.push(NotMeasured { metric: metric.into(), reason });
+    }
+
+    /// Notes which weights LPIPS has.
+    pub fn set_lpips_weights(&mut self, sha256: &str) {
+        self.lpips_sha256 = Some(sha256.into());
+    }
+
+    /// Notes a picture that another system does not have.
+    pub fn miss(&mut self, system: SystemName, picture: String) {
+        self.missing.entry(system).or_default().insert(picture);
+    }
+
     /// Notes a scene that was left out.
     pub fn skip(&mut self, scene: &str) {
         self.skipped.insert(scene.to_owned());
@@ -156,7 +220,7 @@ impl Accumulator {
         let failed = |source| EvalError::Io { action: "writing the measured views", source, path: path.to_owned() };
         let text = |value: Option<f64>| value.map(|value| value.to_string()).unwrap_or_default();
         let mut csv = csv::Writer::from_writer(Vec::new());
-        let mut write = |row: [&str; 10]| csv.write_record(row).map_err(|error| failed(error.into()));
+        let mut write = |row: [&str; 11]| csv.write_record(row).map_err(|error| failed(error.into()));
         write(VIEW_COLUMNS)?;
         for (setting, views) in &self.views {
             let (stored, rendered) = (setting.num_storage_tokens.to_string(), setting.num_render_tokens.to_string());
@@ -172,6 +236,7 @@ impl Accumulator {
                     &text(view.lpips_vgg),
                     &text(view.render_s),
                     &text(view.select_s),
+                    setting.format_name(),
                 ])?;
             }
         }
@@ -181,7 +246,7 @@ impl Accumulator {
 }
 
 /// Columns of `views.csv`.
-const VIEW_COLUMNS: [&str; 10] = [
+const VIEW_COLUMNS: [&str; 11] = [
     "scene",
     "target_frame",
     "variant",
@@ -192,13 +257,19 @@ const VIEW_COLUMNS: [&str; 10] = [
     "lpips_vgg",
     "render_s",
     "select_s",
+    "tokens",
 ];
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const CLIFT: Setting = Setting { variant: Variant::Clift, num_storage_tokens: 64, num_render_tokens: 32 };
+    const CLIFT: Setting = Setting {
+        variant: Variant::Clift,
+        num_storage_tokens: 64,
+        num_render_tokens: 32,
+        tokens: Some(TokenStorage::F16),
+    };
 
     #[test]
     fn views_csv_has_a_row_per_view_in_a_fixed_order_whatever_came_first() {
@@ -211,10 +282,10 @@ mod tests {
             ("attic", 9, Setting::baseline(Variant::NearestView), Measured::quality(f64::INFINITY, None)),
         ];
         let expected =
-            "scene,target_frame,variant,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s
-attic,9,clift,64,32,20.25,0.5,,0.5,
-\"room, \"\"big\"\"\",3,clift,64,32,20.25,0.5,,0.5,
-attic,9,nearest_view,0,0,inf,,,,
+            "scene,target_frame,variant,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s,tokens
+attic,9,clift,64,32,20.25,0.5,,0.5,,f16
+\"room, \"\"big\"\"\",3,clift,64,32,20.25,0.5,,0.5,,f16
+attic,9,nearest_view,0,0,inf,,,,,
 ";
         for order in [[0, 1, 2], [2, 1, 0]] {
             let mut views = Accumulator::default();
@@ -247,6 +318,11 @@ attic,9,nearest_view,0,0,inf,,,,
             Variant::MeanImage,
         ] {
             assert_eq!(serde_json::to_value(variant).unwrap(), variant.name());
+            assert_eq!(serde_json::from_value::<Variant>(variant.name().into()).unwrap(), variant);
         }
+        let other = Variant::System(SystemName::new("MVSplat").unwrap());
+        assert_eq!(serde_json::to_value(other).unwrap(), "MVSplat");
+        assert_eq!(serde_json::from_value::<Variant>("MVSplat".into()).unwrap(), other);
+        assert!(serde_json::from_value::<Variant>("".into()).is_err());
     }
 }

@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 
+use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
 use crate::measured::{Accumulator, Setting, Variant, ViewsOfSetting};
@@ -28,6 +29,8 @@ pub struct Difference {
     pub against: Variant,
     /// Tokens in the scene file, of both.
     pub num_storage_tokens: usize,
+    /// Number format of the stored tokens, of both; random subsets are never rounded.
+    pub tokens: Option<TokenStorage>,
     /// Scenes that were measured in both.
     pub num_scenes: usize,
     /// Mean over those scenes of `variant` less `against`, in dB: positive where the paper's order holds.
@@ -46,12 +49,14 @@ impl Accumulator {
                 if setting.variant != variant || setting.num_render_tokens != count {
                     continue;
                 }
-                if let Some(other) = self.views.get(&Setting { variant: against, ..*setting }) {
+                let tokens = if against == Variant::Random { Some(TokenStorage::F32) } else { setting.tokens };
+                if let Some(other) = self.views.get(&Setting { variant: against, tokens, ..*setting }) {
                     let per_scene = paired(better, other);
                     differences.extend(mean(&per_scene).map(|psnr| Difference {
                         variant,
                         against,
                         num_storage_tokens: count,
+                        tokens: setting.tokens,
                         num_scenes: per_scene.len(),
                         psnr,
                         psnr_stderr: standard_error(&per_scene),
@@ -80,7 +85,7 @@ mod tests {
     use crate::measured::Measured;
 
     fn setting(variant: Variant, num_storage_tokens: usize, num_render_tokens: usize) -> Setting {
-        Setting { variant, num_storage_tokens, num_render_tokens }
+        Setting { variant, num_storage_tokens, num_render_tokens, tokens: Some(TokenStorage::F32) }
     }
 
     fn accumulator(rows: &[(&str, usize, Setting, f64)]) -> Accumulator {

@@ -4,7 +4,6 @@ mod axis;
 mod date;
 mod figures;
 mod markup;
-mod pareto;
 mod plot;
 mod scene;
 
@@ -20,7 +19,8 @@ use crate::machine;
 use crate::paired::Difference;
 use crate::summary::{Point, Summary};
 use axis::{grouped, milliseconds};
-use figures::{Figure, fastest, figures, is_whole, seconds, setting};
+use clift_model::TokenStorage;
+use figures::{Figure, figures, is_whole, seconds, setting};
 use markup::Escaped;
 
 const STYLE: &str = include_str!("report/style.css");
@@ -86,7 +86,10 @@ impl Report {
     fn write_headline(&self, out: &mut impl Write) -> io::Result<()> {
         let Summary { num_scenes, num_views, baselines, points, .. } = &self.summary;
         let best = best_variant(points.iter().map(setting));
-        let whole: Vec<&Point> = points.iter().filter(|p| Some(p.variant) == best && is_whole(p)).collect();
+        let mut whole: Vec<&Point> = points.iter().filter(|p| Some(p.variant) == best && is_whole(p)).collect();
+        // Of the finest format, where there are several.
+        let format = whole.iter().map(|point| point.tokens).min().flatten();
+        whole.retain(|point| point.tokens == format);
         if let (Some(fewest), Some(most)) = (whole.first(), whole.last()) {
             write!(out, "<p class=\"lead\">{}", sentence(fewest, most))?;
             if let (Some(psnr), Some(nearest)) = (most.psnr, baselines.nearest_view.psnr) {
@@ -149,33 +152,35 @@ impl Report {
         }
         writeln!(out, "</tr></thead><tbody>")?;
         for (name, quality) in [("nearest view", baselines.nearest_view), ("mean image", baselines.mean_image)] {
-            let (psnr, ssim) = (number(quality.psnr, 2), number(quality.ssim, 3));
-            write!(out, "<tr><td>{name}</td><td></td><td></td><td>{psnr}</td><td></td><td>{ssim}</td>")?;
-            writeln!(out, "<td></td><td></td><td></td><td></td></tr>")?;
+            let (psnr, ssim, lpips) = (number(quality.psnr, 2), number(quality.ssim, 3), number(quality.lpips_vgg, 3));
+            write!(out, "<tr><td>{name}</td><td></td><td></td><td></td><td>{psnr}</td><td></td><td>{ssim}</td>")?;
+            writeln!(out, "<td>{lpips}</td>{}</tr>", "<td></td>".repeat(TABLE_HEAD.len() - 8))?;
         }
-        let front = fastest(points);
         for (i, point) in points.iter().enumerate() {
             let is_first = i == 0 || points[i - 1].variant != point.variant;
-            let class = [is_first.then_some("first"), front.contains(&i).then_some("front-row")];
+            let is_front = point.pareto_time || point.pareto_bytes;
+            let class = [is_first.then_some("first"), is_front.then_some("front-row")];
             let class: Vec<&str> = class.into_iter().flatten().collect();
-            write!(out, "<tr class=\"{}\"><td>{}</td>", class.join(" "), point.variant.name())?;
-            let cells = [
-                grouped(point.num_storage_tokens as f64, 0),
-                grouped(point.num_render_tokens as f64, 0),
-                number(point.psnr, 2),
-                number(point.psnr_stderr, 2),
-                number(point.ssim, 3),
-                point.select_s.map_or_else(|| DASH.into(), milliseconds),
-                point.render_s.map_or_else(|| DASH.into(), milliseconds),
-                number(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
-                if front.contains(&i) { "\u{25cf}".to_owned() } else { String::new() },
-            ];
-            for cell in cells {
+            write!(out, "<tr class=\"{}\"><td>{}</td>", class.join(" "), Escaped(point.variant.name()))?;
+            for cell in cells(point) {
                 write!(out, "<td>{cell}</td>")?;
             }
             writeln!(out, "</tr>")?;
         }
-        writeln!(out, "</tbody></table></div>")
+        writeln!(out, "</tbody></table></div>\n<p class=\"note\">{TABLE_NOTE}</p>")?;
+        for missing in &self.summary.missing {
+            let (name, count) = (Escaped(missing.variant.name()), missing.num_missing);
+            let of = self.summary.num_views;
+            writeln!(
+                out,
+                "<p class=\"note\">{name}: {count} of {of} pictures are missing; its means are over the rest.</p>"
+            )?;
+        }
+        for missing in &self.summary.not_measured {
+            let (metric, reason) = (Escaped(&missing.metric), Escaped(&missing.reason));
+            writeln!(out, "<p class=\"note\"><code>{metric}</code> is not measured: {reason}</p>")?;
+        }
+        Ok(())
     }
 
     /// Which variant is better on the same scenes; nothing where there is no pair.
@@ -186,14 +191,24 @@ impl Report {
         }
         writeln!(out, "<h2>Scene by scene</h2>\n<p class=\"note\">{DIFFERENCES_NOTE}</p>")?;
         writeln!(out, "<div class=\"scroll\"><table><thead><tr>")?;
-        for head in ["better", "worse", "stored<br>tokens", "scenes<br>&nbsp;", "difference<br>dB", "\u{b1}<br>dB"] {
+        for head in [
+            "better",
+            "worse",
+            "stored<br>tokens",
+            "format<br>&nbsp;",
+            "scenes<br>&nbsp;",
+            "difference<br>dB",
+            "\u{b1}<br>dB",
+        ] {
             write!(out, "<th scope=\"col\">{head}</th>")?;
         }
         writeln!(out, "</tr></thead><tbody>")?;
-        for Difference { variant, against, num_storage_tokens, num_scenes, psnr, psnr_stderr } in differences {
+        for Difference { variant, against, num_storage_tokens, num_scenes, tokens, psnr, psnr_stderr } in differences {
             let count = grouped(*num_storage_tokens as f64, 0);
             let (psnr, error) = (number(Some(*psnr), 2), number(*psnr_stderr, 2));
-            write!(out, "<tr><td>{}</td><td>{}</td><td>{count}</td>", variant.name(), against.name())?;
+            let format = tokens.map_or(DASH, TokenStorage::name);
+            write!(out, "<tr><td>{}</td><td>{}</td>", variant.name(), against.name())?;
+            write!(out, "<td>{count}</td><td>{format}</td>")?;
             writeln!(out, "<td>{}</td><td>{psnr}</td><td>{error}</td></tr>", grouped(*num_scenes as f64, 0))?;
         }
         writeln!(out, "</tbody></table></div>")
@@ -275,17 +290,24 @@ impl Report {
     }
 }
 
-const TABLE_HEAD: [&str; 10] = [
+const TABLE_HEAD: [&str; 17] = [
     "variant",
     "stored<br>tokens",
     "rendered<br>tokens",
+    "format<br>&nbsp;",
     "PSNR<br>dB",
     "\u{b1}<br>dB",
     "SSIM<br>&nbsp;",
-    "choice<br>ms",
+    "LPIPS<br>&nbsp;",
     "drawing<br>ms",
+    "p95<br>ms",
+    "frame<br>ms",
+    "p95<br>ms",
+    "GMAC<br>&nbsp;",
     "scene<br>kB",
-    "Pareto<br>front",
+    "memory<br>MB",
+    "front:<br>time",
+    "front:<br>bytes",
 ];
 
 const DIFFERENCES_NOTE: &str = "PSNR of the variant that the paper finds better less that of the other, on the same \
@@ -295,6 +317,36 @@ const ADAPTIVE_NOTE: &str = "Every scene keeps the fewest of the stored counts t
                              tokens' variance within clusters, as <code>clift encode --max-error</code> does; the share \
                              is the smallest with which scenes keep no more tokens on average than the fixed count \
                              beside it. Below zero, one count for all is better.";
+
+/// What stands behind the name of a point.
+fn cells(point: &Point) -> [String; 16] {
+    let count = |count: usize| if count == 0 { DASH.to_owned() } else { grouped(count as f64, 0) };
+    let ms = |seconds: Option<f64>| seconds.map_or_else(|| DASH.into(), milliseconds);
+    let dot = |is_front: bool| if is_front { "\u{25cf}".to_owned() } else { String::new() };
+    [
+        count(point.num_storage_tokens),
+        count(point.num_render_tokens),
+        point.tokens.map_or(DASH, TokenStorage::name).to_owned(),
+        number(point.psnr, 2),
+        number(point.psnr_stderr, 2),
+        number(point.ssim, 3),
+        number(point.lpips_vgg, 3),
+        ms(point.render_median_s),
+        ms(point.render_p95_s),
+        ms(point.frame_median_s),
+        ms(point.frame_p95_s),
+        number(point.gflops, if point.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }),
+        number(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
+        number(point.peak_bytes.map(|bytes| bytes as f64 / 1e6), 0),
+        dot(point.pareto_time),
+        dot(point.pareto_bytes),
+    ]
+}
+
+const TABLE_NOTE: &str = "Each view is drawn alone, keys and values of its tokens included; a frame is the choice of tokens and \
+                          the drawing; times are medians and 95th percentiles over views. A point is on a front if no \
+                          other has its PSNR in as little time per frame, or in as few bytes. Memory is the peak of \
+                          the whole process. GMAC are multiply-accumulates per view, attention included.";
 
 const SCENES_NOTE: &str = "The target view in the middle of each scene, as every variant draws it. In the maps a patch \
                            of the context views has the colour of its cluster, and rings are the centroids: the tokens \
@@ -306,8 +358,8 @@ const CHOICE: &str = "Where views are drawn from fewer tokens than are stored, d
 const NO_CHOICE: &str = "All views are drawn from all stored tokens. <code>clift eval RUN --render 1/4,1/2</code> draws \
                          them from fewer, chosen for each view, and shows which.";
 
-const FOOTNOTE: &str = "PSNR is of pictures clamped to [0, 1]; SSIM has a Gaussian window of 11 taps. Means are over \
-                        the views of a scene, then over scenes; \u{b1} is the standard error over scenes. A dash is what \
+const FOOTNOTE: &str = "PSNR is of pictures clamped to [0, 1]; SSIM has a Gaussian window of 11 taps; LPIPS is \
+                        version 0.1 with VGG-16. Means are over the views of a scene, then over scenes; \u{b1} is the standard error over scenes. A dash is what \
                         was not measured. Times are of this machine, under whatever else it did.";
 
 /// What was not measured.

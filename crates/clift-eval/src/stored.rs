@@ -6,7 +6,7 @@ use std::cell::OnceCell;
 use burn::tensor::{Int, Tensor, TensorData};
 use clift_data::order::item_rng;
 use clift_model::kmeans::Fit;
-use clift_model::{Clusters, Condenser, KMeans, Renderer, SceneClusters, TokenStorage, tile_clusters};
+use clift_model::{Clusters, KMeans, Renderer, SceneClusters, TokenStorage, tile_clusters};
 use rand::seq::SliceRandom;
 
 use crate::EvalError;
@@ -43,13 +43,12 @@ impl<'a> Stored<'a> {
             _ => return Err(EvalError::NotRendered { variant: variant.name() }),
         };
         let uploaded = clusters.upload(device);
-        let condensed = |networks: Option<&'a (Condenser, Renderer)>| {
-            let (condenser, renderer) = networks.ok_or(EvalError::NoCondenser { variant: variant.name() })?;
-            Ok::<_, EvalError>((condenser.forward(lift.clone(), &uploaded), renderer))
-        };
         let (tokens, renderer) = match variant {
-            Variant::Clift => condensed(networks.condensed.as_ref())?,
-            Variant::PatchClift => condensed(networks.patch_condensed.as_ref())?,
+            Variant::Clift | Variant::PatchClift => {
+                let condensed = networks.condensed_of(variant);
+                let condensed = condensed.ok_or(EvalError::NoCondenser { variant: variant.name() })?;
+                (condensed.condenser.forward(lift.clone(), &uploaded), &condensed.renderer)
+            }
             _ => (uploaded.gather_centroids(lift.clone()), &networks.renderer),
         };
         let ids = clusters.scenes()[0].centroid_index().to_vec();

@@ -3,17 +3,22 @@
 //! A mean is over the views of a scene first and over the scenes then, so that a scene with many
 //! targets weighs no more than one with few. The mean over all views stands beside it.
 
+mod scenes;
+mod table;
+
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt;
 use std::path::Path;
 
 use clift_data::files::replace;
+use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
 use crate::adaptive::Adaptive;
 use crate::error::EvalError;
-use crate::measured::{Accumulator, Measured, Setting, Variant, ViewsOfSetting};
+use crate::measured::{Accumulator, Measured, NotMeasured, Setting, Variant, ViewsOfSetting};
 use crate::paired::Difference;
+use crate::pareto::front;
+use crate::statistics::{median, p95};
 
 /// What an identical picture counts as in a mean, in dB; larger values are counted as this too.
 ///
@@ -29,6 +34,8 @@ pub struct Quality {
     pub psnr: Option<f64>,
     /// Mean over scenes of the scene's mean SSIM.
     pub ssim: Option<f64>,
+    /// Mean over scenes of the scene's mean LPIPS.
+    pub lpips_vgg: Option<f64>,
 }
 
 /// The pictures every method must beat.
@@ -49,6 +56,10 @@ pub struct Point {
     pub num_storage_tokens: usize,
     /// Tokens the renderer was given.
     pub num_render_tokens: usize,
+    /// Number format of the stored tokens.
+    pub tokens: Option<TokenStorage>,
+    /// Views measured in this setting; fewer than of the evaluation only where another system's pictures are missing.
+    pub num_views: usize,
     /// Mean over scenes of the scene's mean PSNR, in dB.
     pub psnr: Option<f64>,
     /// Standard error of `psnr` over the scenes; `null` for a single scene.
@@ -59,16 +70,45 @@ pub struct Point {
     pub num_identical_views: usize,
     /// Mean over scenes of the scene's mean SSIM.
     pub ssim: Option<f64>,
+    /// Mean SSIM over all views.
+    pub ssim_per_view: Option<f64>,
     /// Mean over scenes of the scene's mean LPIPS.
     pub lpips_vgg: Option<f64>,
-    /// Mean seconds per rendered view.
+    /// Mean LPIPS over all views.
+    pub lpips_vgg_per_view: Option<f64>,
+    /// Mean seconds of the renderer per view.
     pub render_s: Option<f64>,
+    /// Their median.
+    pub render_median_s: Option<f64>,
+    /// What 95 % of them do not exceed (nearest rank).
+    pub render_p95_s: Option<f64>,
     /// Mean seconds per token selection.
     pub select_s: Option<f64>,
+    /// Median seconds per view, selection and renderer together.
+    pub frame_median_s: Option<f64>,
+    /// What 95 % of them do not exceed.
+    pub frame_p95_s: Option<f64>,
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
-    /// Bytes of a scene file.
+    /// Bytes of a scene file, or the data size given for another system.
     pub scene_bytes: Option<u64>,
+    /// Most resident memory of the whole process while a view was drawn, weights and all; on a CPU alone.
+    pub peak_bytes: Option<u64>,
+    /// Whether no other point is as good in PSNR for as little time per frame (`frame_median_s`).
+    pub pareto_time: bool,
+    /// Whether no other point is as good in PSNR for as few bytes (`scene_bytes`).
+    pub pareto_bytes: bool,
+}
+
+/// Pictures that another system does not have.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Missing {
+    /// The system.
+    pub variant: Variant,
+    /// How many target views it has no picture of.
+    pub num_missing: usize,
+    /// Each of them, inside its folder.
+    pub pictures: Vec<String>,
 }
 
 /// The content of `summary.json`.
@@ -80,6 +120,12 @@ pub struct Summary {
     pub num_views: usize,
     /// Scenes left out, each with its reason in the log.
     pub num_skipped: usize,
+    /// SHA-256 of the weights that LPIPS was measured with.
+    pub lpips_weights_sha256: Option<String>,
+    /// Numbers that are `null` everywhere, and why.
+    pub not_measured: Vec<NotMeasured>,
+    /// Where another system's pictures were incomplete.
+    pub missing: Vec<Missing>,
     /// What the points must beat.
     pub baselines: Baselines,
     /// One per setting, ordered by variant and then by rising token counts.
@@ -100,8 +146,21 @@ impl Accumulator {
             Quality {
                 psnr: views.and_then(|views| mean(&scene_means(views, |view| Some(capped(view.psnr))))),
                 ssim: views.and_then(|views| mean(&scene_means(views, |view| view.ssim))),
+                lpips_vgg: views.and_then(|views| mean(&scene_means(views, |view| view.lpips_vgg))),
             }
         };
+        let missing = self.missing.iter().map(|(&system, pictures)| Missing {
+            variant: Variant::System(system),
+            num_missing: pictures.len(),
+            pictures: pictures.iter().cloned().collect(),
+        });
+        let mut points: Vec<Point> = self
+            .views
+            .iter()
+            .filter(|(setting, _)| !matches!(setting.variant, Variant::NearestView | Variant::MeanImage))
+            .map(|(setting, views)| self.point(*setting, views))
+            .collect();
+        mark_fronts(&mut points);
         Summary {
             num_scenes: scenes.len(),
             num_views: targets.len(),
@@ -110,12 +169,10 @@ impl Accumulator {
                 nearest_view: quality(Variant::NearestView),
                 mean_image: quality(Variant::MeanImage),
             },
-            points: self
-                .views
-                .iter()
-                .filter(|(setting, _)| !matches!(setting.variant, Variant::NearestView | Variant::MeanImage))
-                .map(|(setting, views)| self.point(*setting, views))
-                .collect(),
+            lpips_weights_sha256: self.lpips_sha256.clone(),
+            not_measured: self.not_measured.clone(),
+            missing: missing.collect(),
+            points,
             differences: self.differences(),
             adaptive: self.adaptive(),
         }
@@ -126,22 +183,51 @@ impl Accumulator {
         let over_scenes = |value: fn(&Measured) -> Option<f64>| mean(&scene_means(views, value));
         let over_views =
             |value: fn(&Measured) -> Option<f64>| mean(&views.values().filter_map(value).collect::<Vec<_>>());
+        let of_times = |value: fn(&Measured) -> Option<f64>, statistic: fn(&[f64]) -> f64| {
+            let times: Vec<f64> = views.values().filter_map(value).collect();
+            (!times.is_empty()).then(|| statistic(&times))
+        };
+        let (render_s, frame_s) = (|view: &Measured| view.render_s, Measured::frame_s);
         let cost = self.costs.get(&setting).copied().unwrap_or_default();
         Point {
             variant: setting.variant,
             num_storage_tokens: setting.num_storage_tokens,
             num_render_tokens: setting.num_render_tokens,
+            tokens: setting.tokens,
+            num_views: views.len(),
             psnr: mean(&per_scene),
             psnr_stderr: standard_error(&per_scene),
             psnr_per_view: over_views(|view| Some(capped(view.psnr))),
             num_identical_views: views.values().filter(|view| view.psnr == f64::INFINITY).count(),
             ssim: over_scenes(|view| view.ssim),
+            ssim_per_view: over_views(|view| view.ssim),
             lpips_vgg: over_scenes(|view| view.lpips_vgg),
-            render_s: over_views(|view| view.render_s),
+            lpips_vgg_per_view: over_views(|view| view.lpips_vgg),
+            render_s: over_views(render_s),
+            render_median_s: of_times(render_s, median),
+            render_p95_s: of_times(render_s, p95),
             select_s: over_views(|view| view.select_s),
+            frame_median_s: of_times(frame_s, median),
+            frame_p95_s: of_times(frame_s, p95),
             gflops: cost.gflops,
             scene_bytes: cost.scene_bytes,
+            peak_bytes: cost.peak_bytes,
+            pareto_time: false,
+            pareto_bytes: false,
         }
+    }
+}
+
+fn mark_fronts(points: &mut [Point]) {
+    let of = |points: &[Point], cost: fn(&Point) -> Option<f64>| {
+        let place = |point: &Point| (cost(point).unwrap_or(f64::NAN), point.psnr.unwrap_or(f64::NAN));
+        front(&points.iter().map(place).collect::<Vec<_>>())
+    };
+    for i in of(points, |point| point.frame_median_s) {
+        points[i].pareto_time = true;
+    }
+    for i in of(points, |point| point.scene_bytes.map(|bytes| bytes as f64)) {
+        points[i].pareto_bytes = true;
     }
 }
 
@@ -156,67 +242,6 @@ impl Summary {
             .and_then(|json| replace(path, &[&json[..], b"\n"].concat()))
             .map_err(|source| EvalError::Io { action: "writing the summary", source, path: path.to_owned() })
     }
-}
-
-/// A table for people: quality, tokens and cost of each setting; `-` is what was not measured.
-impl fmt::Display for Summary {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { num_scenes, num_views, num_skipped, baselines, points, differences, adaptive } = self;
-        writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes left out\n")?;
-        let headers =
-            ["stored", "rendered", "PSNR dB", "+- dB", "SSIM", "LPIPS", "select ms", "render ms", "GMAC", "scene kB"];
-        write_row(f, "variant", headers.map(str::to_owned))?;
-        for (variant, Quality { psnr, ssim }) in
-            [(Variant::NearestView, baselines.nearest_view), (Variant::MeanImage, baselines.mean_image)]
-        {
-            let mut cells = std::array::from_fn(|_| cell(None, 0));
-            (cells[2], cells[4]) = (cell(psnr, 2), cell(ssim, 3));
-            write_row(f, variant.name(), cells)?;
-        }
-        for point in points {
-            let cells = [
-                point.num_storage_tokens.to_string(),
-                point.num_render_tokens.to_string(),
-                cell(point.psnr, 2),
-                cell(point.psnr_stderr, 2),
-                cell(point.ssim, 3),
-                cell(point.lpips_vgg, 3),
-                cell(point.select_s.map(|seconds| seconds * 1e3), 1),
-                cell(point.render_s.map(|seconds| seconds * 1e3), 1),
-                cell(point.gflops, 1),
-                cell(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
-            ];
-            write_row(f, point.variant.name(), cells)?;
-        }
-        if !differences.is_empty() {
-            writeln!(f, "\nPSNR of the same scenes, difference and standard error")?;
-        }
-        for Difference { variant, against, num_storage_tokens, psnr, psnr_stderr, .. } in differences {
-            let error = cell(*psnr_stderr, 2);
-            let names = format!("{} - {}", variant.name(), against.name());
-            writeln!(f, "{names:<24} {num_storage_tokens:>6} tokens {psnr:>+7.2} +- {error} dB")?;
-        }
-        if !adaptive.is_empty() {
-            writeln!(f, "\n--max-error against one count for all scenes, at no more tokens on average")?;
-        }
-        for Adaptive { max_error, mean_storage_tokens: own, num_storage_tokens: fixed, difference, .. } in adaptive {
-            writeln!(f, "{max_error:<8.4} {own:>8.1} tokens against {fixed:>6} {difference:>+7.2} dB")?;
-        }
-        Ok(())
-    }
-}
-
-fn cell(value: Option<f64>, decimals: usize) -> String {
-    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.decimals$}"))
-}
-
-fn write_row(f: &mut fmt::Formatter<'_>, name: &str, cells: [String; 10]) -> fmt::Result {
-    const WIDTHS: [usize; 10] = [7, 9, 8, 6, 6, 6, 10, 10, 8, 9];
-    write!(f, "{name:<12}")?;
-    for (cell, width) in cells.iter().zip(WIDTHS) {
-        write!(f, " {cell:>width$}")?;
-    }
-    writeln!(f)
 }
 
 pub(crate) fn capped(psnr: f64) -> f64 {
@@ -258,7 +283,12 @@ mod tests {
     use super::*;
     use crate::measured::{Cost, Measured};
 
-    const SETTING: Setting = Setting { variant: Variant::Clift, num_storage_tokens: 64, num_render_tokens: 32 };
+    const SETTING: Setting = Setting {
+        variant: Variant::Clift,
+        num_storage_tokens: 64,
+        num_render_tokens: 32,
+        tokens: Some(TokenStorage::F16),
+    };
 
     fn measured(views: &[(&str, usize, f64)]) -> Accumulator {
         let mut accumulator = Accumulator::default();
@@ -302,19 +332,29 @@ mod tests {
     fn what_was_not_measured_is_null_and_the_file_has_the_documented_names() {
         let mut views = measured(&[("a", 0, 20.0)]);
         views.add("a", 0, Setting::baseline(Variant::NearestView), Measured::quality(18.0, Some(0.5))).unwrap();
-        views.set_cost(SETTING, Cost { gflops: Some(2.5), scene_bytes: Some(99_000) });
+        views.costs.insert(SETTING, Cost { gflops: Some(2.5), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) });
         views.skip("c");
+        views.note_not_measured("lpips_vgg", "no weights".into());
         let folder = tempfile::tempdir().unwrap();
         views.summary().write(&folder.path().join("summary.json")).unwrap();
         let text = std::fs::read_to_string(folder.path().join("summary.json")).unwrap();
         let expected = serde_json::json!({
             "num_scenes": 1, "num_views": 1, "num_skipped": 1,
-            "baselines": {"nearest_view": {"psnr": 18.0, "ssim": 0.5}, "mean_image": {"psnr": null, "ssim": null}},
+            "lpips_weights_sha256": null,
+            "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
+            "missing": [],
+            "baselines": {
+                "nearest_view": {"psnr": 18.0, "ssim": 0.5, "lpips_vgg": null},
+                "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null}
+            },
             "points": [{
-                "variant": "clift", "num_storage_tokens": 64, "num_render_tokens": 32,
-                "psnr": 20.0, "psnr_stderr": null, "psnr_per_view": 20.0, "num_identical_views": 0,
-                "ssim": 0.2, "lpips_vgg": null, "render_s": null, "select_s": null,
-                "gflops": 2.5, "scene_bytes": 99_000
+                "variant": "clift", "num_storage_tokens": 64, "num_render_tokens": 32, "tokens": "f16",
+                "num_views": 1, "psnr": 20.0, "psnr_stderr": null, "psnr_per_view": 20.0, "num_identical_views": 0,
+                "ssim": 0.2, "ssim_per_view": 0.2, "lpips_vgg": null, "lpips_vgg_per_view": null,
+                "render_s": null, "render_median_s": null, "render_p95_s": null,
+                "select_s": null, "frame_median_s": null, "frame_p95_s": null,
+                "gflops": 2.5, "scene_bytes": 99_000, "peak_bytes": 1_048_576,
+                "pareto_time": false, "pareto_bytes": true
             }],
             "differences": [], "adaptive": []
         });
@@ -323,17 +363,33 @@ mod tests {
     }
 
     #[test]
-    fn the_table_lines_up() {
-        let mut views = measured(&[("a", 0, 20.0), ("b", 0, 21.0)]);
-        views.add("a", 0, Setting::baseline(Variant::NearestView), Measured::quality(18.0, Some(0.5))).unwrap();
-        views.set_cost(SETTING, Cost { gflops: Some(45.23), scene_bytes: Some(99_000) });
-        let expected = "2 views of 2 scenes, 0 scenes left out
+    fn times_have_a_median_and_a_95th_percentile_alone_and_with_selection() {
+        let mut views = Accumulator::default();
+        for frame in 0..20 {
+            let ms = if frame == 7 { 100.0 } else { 1.0 + frame as f64 };
+            let measured = Measured { render_s: Some(ms * 1e-3), select_s: Some(0.5), ..Measured::quality(20.0, None) };
+            views.add("a", frame, SETTING, measured).unwrap();
+        }
+        let point = views.summary().points.remove(0);
+        let near = |got: Option<f64>, expected: f64| (got.unwrap() - expected).abs() < 1e-12;
+        // 1 to 20 without 8, and 100: the middle two are 11 and 12, the 19th of 20 is 20.
+        assert!(near(point.render_median_s, 0.0115) && near(point.render_p95_s, 0.020), "{point:?}");
+        assert!(near(point.frame_median_s, 0.5115) && near(point.frame_p95_s, 0.520), "{point:?}");
+        assert!(near(point.select_s, 0.5), "{point:?}");
+    }
 
-variant       stored  rendered  PSNR dB  +- dB   SSIM  LPIPS  select ms  render ms     GMAC  scene kB
-nearest_view       -         -    18.00      -  0.500      -          -          -        -         -
-mean_image         -         -        -      -      -      -          -          -        -         -
-clift             64        32    20.50   0.50  0.205      -          -          -     45.2      99.0
-";
-        assert_eq!(views.summary().to_string(), expected);
+    #[test]
+    fn the_fronts_of_time_and_of_bytes_are_each_marked() {
+        let mut views = Accumulator::default();
+        // (stored, dB, ms, bytes): the second is slower and worse than the first but smaller than the third.
+        for (stored, psnr, ms, bytes) in [(8, 20.0, 1.0, 900), (4, 19.0, 2.0, 400), (16, 22.0, 3.0, 1600)] {
+            let setting = Setting { num_storage_tokens: stored, ..SETTING };
+            let measured = Measured { render_s: Some(ms * 1e-3), ..Measured::quality(psnr, None) };
+            views.add("a", 0, setting, measured).unwrap();
+            views.add_scene_bytes(setting, bytes);
+        }
+        let points = views.summary().points;
+        let marks: Vec<_> = points.iter().map(|p| (p.num_storage_tokens, p.pareto_time, p.pareto_bytes)).collect();
+        assert_eq!(marks, [(4, false, true), (8, true, true), (16, true, true)]);
     }
 }

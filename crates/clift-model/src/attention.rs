@@ -14,6 +14,7 @@ use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, 
 use burn::tensor::{Shape, Slice, Tensor, assert_shape};
 
 use crate::autodiff::register;
+use crate::flops::counted;
 
 mod layers;
 mod native;
@@ -30,8 +31,9 @@ pub use layers::{CrossAttention, SelfAttention};
 ///   `h * dim / num_heads ..` of each
 /// - returns `[batch, count, dim]`
 pub fn self_sdpa(query_key_value: Tensor<3>, num_heads: usize) -> Tensor<3> {
-    let [_batch, _count, packed] = query_key_value.dims();
+    let [batch, count, packed] = query_key_value.dims();
     assert!(packed.is_multiple_of(3 * num_heads), "{num_heads} heads do not divide a third of {packed}");
+    counted::add_attention(batch * count * count, packed / 3);
     Tensor::from_dispatch(<Dispatch as AttentionOps>::self_sdpa(query_key_value.into_dispatch(), num_heads))
 }
 
@@ -41,10 +43,11 @@ pub fn self_sdpa(query_key_value: Tensor<3>, num_heads: usize) -> Tensor<3> {
 /// - `query`: `[batch, num_queries, dim]`, `key_value`: `[batch, num_keys, 2 dim]`, the two side by side
 /// - returns `[batch, num_queries, dim]`
 pub fn cross_sdpa(query: Tensor<3>, key_value: Tensor<3>, num_heads: usize) -> Tensor<3> {
-    let [batch, _num_queries, dim] = query.dims();
+    let [batch, num_queries, dim] = query.dims();
     let [_, num_keys, _] = key_value.dims();
     assert_shape!(key_value, [batch, num_keys, 2 * dim]);
     assert!(dim.is_multiple_of(num_heads), "{num_heads} heads do not divide a width of {dim}");
+    counted::add_attention(batch * num_queries * num_keys, dim);
     let (query, key_value) = (query.into_dispatch(), key_value.into_dispatch());
     Tensor::from_dispatch(<Dispatch as AttentionOps>::cross_sdpa(query, key_value, num_heads))
 }

@@ -23,7 +23,7 @@ impl EncoderBlock {
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         Self {
             norm_attn: init.layer_norm(config.dim),
-            attn: SelfAttention::new(config.dim, config.num_heads, init),
+            attn: SelfAttention::new(config, init),
             norm_ff: init.layer_norm(config.dim),
             feed_forward: FeedForward::new(config.dim, config.feed_forward_dim, init),
         }
@@ -56,9 +56,9 @@ impl DecoderBlock {
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         Self {
             norm_self: init.layer_norm(config.dim),
-            self_attn: SelfAttention::new(config.dim, config.num_heads, init),
+            self_attn: SelfAttention::new(config, init),
             norm_cross: init.layer_norm(config.dim),
-            cross_attn: CrossAttention::new(config.dim, config.num_heads, init),
+            cross_attn: CrossAttention::new(config, init),
             norm_ff: init.layer_norm(config.dim),
             feed_forward: FeedForward::new(config.dim, config.feed_forward_dim, init),
         }

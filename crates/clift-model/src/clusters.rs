@@ -97,11 +97,13 @@ impl Clusters {
         let mut centroid = Vec::with_capacity(batch * num_storage_tokens);
         let mut member = Vec::with_capacity(batch * num_members);
         let mut segment = Vec::with_capacity(batch * num_members);
+        let mut everyone = Vec::with_capacity(batch * num_tokens);
         let mut singleton = vec![true; batch * num_storage_tokens];
         for (scene, clusters) in self.scenes.iter().enumerate() {
             centroid
                 .extend(clusters.centroid_index.iter().map(|&token| (scene * num_tokens) as i64 + i64::from(token)));
             for (token, &cluster) in clusters.assignment.iter().enumerate() {
+                everyone.push((scene * num_storage_tokens) as i64 + i64::from(cluster));
                 if clusters.centroid_index[cluster as usize] as usize != token {
                     let row = scene * num_storage_tokens + cluster as usize;
                     member.push((scene * num_tokens + token) as i64);
@@ -120,6 +122,7 @@ impl Clusters {
             num_tokens,
             num_storage_tokens,
             centroid: index(centroid),
+            segment: index(everyone),
             members: (num_members > 0).then(|| Members { token: index(member), segment: index(segment) }),
             singleton: has_singletons.then(|| {
                 Tensor::<3, Bool>::from_data(TensorData::new(singleton, [batch, num_storage_tokens, 1]), device)
@@ -137,6 +140,8 @@ pub struct ClusterIndex {
     pub(crate) num_storage_tokens: usize,
     /// Token row of every centroid, `[B * S]`.
     pub(crate) centroid: Tensor<1, Int>,
+    /// Centroid row of every token, centroids included, `[B * N]`.
+    pub(crate) segment: Tensor<1, Int>,
     /// The tokens that are not centroids, if there are any.
     pub(crate) members: Option<Members>,
     /// Clusters of one token, `[B, S, 1]`, if there are any.

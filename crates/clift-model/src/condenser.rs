@@ -8,13 +8,21 @@ use burn::tensor::{Tensor, assert_shape};
 use crate::attention::{CrossAttention, SelfAttention};
 use crate::cluster_attention::cluster_attention;
 use crate::feed_forward::FeedForward;
+use crate::flops::counted;
 use crate::{ClusterIndex, Init, ModelConfig};
+
+mod released;
+
+use released::ReleasedCondenser;
 
 /// Blocks of inter-cluster self-attention, intra-cluster cross-attention and feed-forward behind a
 /// gate that starts at zero: an untrained condenser returns the centroids unchanged.
 #[derive(Module, Debug)]
 pub struct Condenser {
+    /// The paper's blocks; none in the released networks.
     blocks: Vec<CondenserBlock>,
+    /// What the released networks have in their place.
+    released: Option<ReleasedCondenser>,
 }
 
 /// One round of equations 1-4.
@@ -35,13 +43,17 @@ struct CondenserBlock {
 impl Condenser {
     /// Makes a condenser of the sizes of `config`.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
-        Self { blocks: (0..config.condenser.num_blocks).map(|_| CondenserBlock::new(config, init)).collect() }
+        if config.variant.is_released() {
+            return Self { blocks: Vec::new(), released: Some(ReleasedCondenser::new(config, init)) };
+        }
+        let blocks = (0..config.condenser.num_blocks).map(|_| CondenserBlock::new(config, init)).collect();
+        Self { blocks, released: None }
     }
 
     /// Writes what each cluster knows into its centroid (paper section 3.2, equations 1-4).
     ///
     /// # Shapes
-    /// - `lift`: `[batch, num_tokens, dim]`, encoder output
+    /// - `lift`: `[batch, num_tokens, dim]`, encoder output behind [`LiftNorm`](crate::LiftNorm)
     /// - returns `[batch, num_storage_tokens, dim]`
     ///
     /// Cost is linear in `num_tokens`: a token is a key for its own centroid only.
@@ -49,6 +61,9 @@ impl Condenser {
         let [_batch, _num_tokens, dim] = lift.dims();
         let centroids = clusters.gather_centroids(lift.clone()); // [B, N, D] -> [B, S, D]
         assert_shape!(centroids, [clusters.batch, clusters.num_storage_tokens, dim]);
+        if let Some(released) = &self.released {
+            return released.forward(centroids, lift, clusters);
+        }
         // "The remaining LiFTs": the centroid itself is not among its keys.
         let members = clusters.members.as_ref().map(|members| clusters.gather(lift, &members.token)); // [B, M, D]
         self.blocks.iter().fold(centroids, |centroids, block| block.forward(centroids, members.as_ref(), clusters))
@@ -60,10 +75,10 @@ impl CondenserBlock {
         let dim = config.dim;
         Self {
             norm_self: init.layer_norm(dim),
-            self_attn: SelfAttention::new(dim, config.num_heads, init),
+            self_attn: SelfAttention::new(config, init),
             norm_cross: config.condenser.residual.then(|| init.layer_norm(dim)),
             norm_memory: init.layer_norm(dim),
-            cluster_attn: CrossAttention::new(dim, config.num_heads, init),
+            cluster_attn: CrossAttention::new(config, init),
             norm_ff: init.layer_norm(dim),
             feed_forward: FeedForward::new(dim, config.feed_forward_dim, init),
             gate: init.zero_linear(dim, dim),
@@ -78,6 +93,8 @@ impl CondenserBlock {
         };
         let update = self.feed_forward.forward(&self.norm_ff, gathered.clone()); // eq. 3
         let update = self.add_or_replace(&gathered, update);
+        let [batch, stored, dim] = update.dims();
+        counted::add_linear(batch * stored, dim, dim); // the one layer without a bias, which is Burn's own
         centroids + self.gate.forward(update) // eq. 4
     }
 
@@ -105,8 +122,10 @@ mod tests {
     use burn::tensor::{DType, Device};
 
     use super::*;
-    use crate::testing::{Fixture, assert_close, devices, load_weights, random, to_vec, weight_gradients};
-    use crate::{Clusters, CondenserConfig, SceneClusters};
+    use crate::testing::{
+        Fixture, assert_close, check_gradients, cpu_devices, devices, load_weights, random, to_vec, weight_gradients,
+    };
+    use crate::{Clusters, CondenserConfig, SceneClusters, Variant};
 
     fn config(residual: bool) -> ModelConfig {
         ModelConfig {
@@ -158,10 +177,53 @@ mod tests {
         condenser
     }
 
+    /// Parameters in f64.
+    struct Widen;
+
+    impl burn::module::ModuleMapper for Widen {
+        fn map_float<const D: usize>(
+            &mut self,
+            param: burn::module::Param<Tensor<D>>,
+        ) -> burn::module::Param<Tensor<D>> {
+            burn::module::Param::from_tensor(param.val().cast(DType::F64))
+        }
+    }
+
+    #[test]
+    fn gradients_of_the_released_networks_equal_central_differences_in_f64() {
+        for variant in [Variant::ReleasedRe10k, Variant::ReleasedDl3dv] {
+            for device in cpu_devices() {
+                let config = ModelConfig { variant, condenser: CondenserConfig::of(variant), ..config(true) };
+                let mut init = Init::new(5, &device);
+                let mut condenser = Condenser::new(&config, &mut init);
+                let released = condenser.released.as_mut().expect("a released network");
+                released.open(&mut init);
+                let condenser = burn::module::Module::map(condenser, &mut Widen);
+                // A cluster of one attends to itself.
+                let scene = SceneClusters::new(vec![0, 1, 1, 2, 1], vec![0, 4, 3]).expect("valid");
+                let clusters = Clusters::new(vec![scene]).expect("one");
+                let forward = |lift: Tensor<3>| {
+                    let device = lift.device();
+                    if lift.is_autodiff() {
+                        condenser.clone().train().forward(lift, &clusters.upload(&device.autodiff()))
+                    } else {
+                        condenser.clone().forward(lift, &clusters.upload(&device))
+                    }
+                };
+                check_gradients([random([1, 5, 16], 6, &device)], |[lift]| forward(lift), 1e-6);
+            }
+        }
+    }
+
     #[test]
     fn an_untrained_condenser_returns_the_centroids() {
-        for device in devices() {
-            let condenser = Condenser::new(&config(true), &mut Init::new(0, &device));
+        let variants = Variant::ALL.map(|variant| ModelConfig {
+            variant,
+            condenser: CondenserConfig::of(variant),
+            ..config(true)
+        });
+        for (device, config) in devices().into_iter().flat_map(|device| variants.clone().map(|v| (device.clone(), v))) {
+            let condenser = Condenser::new(&config, &mut Init::new(0, &device));
             let lift = random([2, 6, 16], 1, &device).cast(DType::F32);
             let scene = SceneClusters::new(vec![0, 1, 1, 0, 0, 1], vec![3, 2]).expect("valid");
             let index = Clusters::new(vec![scene.clone(), scene]).expect("equal").upload(&device);

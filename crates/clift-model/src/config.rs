@@ -11,11 +11,56 @@ pub enum Variant {
     /// The paper's equations: pre-norm blocks, two condenser blocks (paper section 3).
     #[default]
     Paper,
+    /// The released code's network for `RealEstate10K`: one condenser block, a pre-norm decoder layer with `ReLU` whose
+    /// keys and values are the raw tokens of the cluster with its centroid, and one gate with a bias behind it.
+    ReleasedRe10k,
+    /// The released code's network for DL3DV: as [`Variant::ReleasedRe10k`], with an RMS norm of every head's queries
+    /// and keys in all attention, and a layer norm behind the encoder.
+    ReleasedDl3dv,
+}
+
+impl Variant {
+    /// All variants, in the order they are listed to a user.
+    pub const ALL: [Self; 3] = [Self::Paper, Self::ReleasedRe10k, Self::ReleasedDl3dv];
+
+    /// The name as it is typed.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Paper => "paper",
+            Self::ReleasedRe10k => "released-re10k",
+            Self::ReleasedDl3dv => "released-dl3dv",
+        }
+    }
+
+    /// Whether the condenser is the released code's.
+    pub fn is_released(self) -> bool {
+        self != Self::Paper
+    }
+
+    /// Whether queries and keys are normalised head by head, and tokens behind the encoder.
+    pub fn has_norms(self) -> bool {
+        self == Self::ReleasedDl3dv
+    }
+}
+
+impl std::fmt::Display for Variant {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+impl std::str::FromStr for Variant {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|variant| variant.as_str() == text);
+        found.ok_or_else(|| format!("write {}", Self::ALL.map(Self::as_str).join(", ")))
+    }
 }
 
 /// Sizes of the encoder, the condenser and the renderer. The defaults are the paper's.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "ModelSection")]
 pub struct ModelConfig {
     /// Which published network the blocks follow.
     pub variant: Variant,
@@ -36,10 +81,9 @@ pub struct ModelConfig {
 }
 
 /// The neural condenser (paper section 3.2, equations 1-4).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct CondenserConfig {
-    /// Condenser blocks; the paper has two.
+    /// Condenser blocks; the paper has two, the released networks one.
     pub num_blocks: usize,
     /// Whether each step inside a block adds to its input ("Add & `LayerNorm`" of the paper's text),
     /// or replaces it, as equations 1-3 print it.
@@ -63,7 +107,80 @@ impl Default for ModelConfig {
 
 impl Default for CondenserConfig {
     fn default() -> Self {
-        Self { num_blocks: 2, residual: true }
+        Self::of(Variant::Paper)
+    }
+}
+
+impl CondenserConfig {
+    /// That of a variant.
+    pub fn of(variant: Variant) -> Self {
+        Self { num_blocks: if variant.is_released() { 1 } else { 2 }, residual: true }
+    }
+}
+
+/// [`ModelConfig`] as a file holds it: what the file leaves out of the condenser depends on the variant.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct ModelSection {
+    variant: Variant,
+    dim: usize,
+    num_heads: usize,
+    feed_forward_dim: usize,
+    num_encoder_blocks: usize,
+    num_renderer_blocks: usize,
+    patch_size: usize,
+    condenser: CondenserSection,
+}
+
+/// [`CondenserConfig`] as a file holds it.
+#[derive(Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct CondenserSection {
+    num_blocks: Option<usize>,
+    residual: Option<bool>,
+}
+
+impl Default for ModelSection {
+    fn default() -> Self {
+        let ModelConfig {
+            variant,
+            dim,
+            num_heads,
+            feed_forward_dim,
+            num_encoder_blocks,
+            num_renderer_blocks,
+            patch_size,
+            condenser: _,
+        } = ModelConfig::default();
+        Self {
+            variant,
+            dim,
+            num_heads,
+            feed_forward_dim,
+            num_encoder_blocks,
+            num_renderer_blocks,
+            patch_size,
+            condenser: CondenserSection::default(),
+        }
+    }
+}
+
+impl From<ModelSection> for ModelConfig {
+    fn from(section: ModelSection) -> Self {
+        let usual = CondenserConfig::of(section.variant);
+        Self {
+            variant: section.variant,
+            dim: section.dim,
+            num_heads: section.num_heads,
+            feed_forward_dim: section.feed_forward_dim,
+            num_encoder_blocks: section.num_encoder_blocks,
+            num_renderer_blocks: section.num_renderer_blocks,
+            patch_size: section.patch_size,
+            condenser: CondenserConfig {
+                num_blocks: section.condenser.num_blocks.unwrap_or(usual.num_blocks),
+                residual: section.condenser.residual.unwrap_or(usual.residual),
+            },
+        }
     }
 }
 
@@ -131,6 +248,19 @@ impl ModelConfig {
                 ),
             });
         }
+        let CondenserConfig { num_blocks, residual } = self.condenser;
+        if self.variant.is_released() && num_blocks != 1 {
+            let fix = format!("model.variant = \"{}\" has one: leave the key out", self.variant);
+            return Err(ModelError::BadConfig {
+                key: "model.condenser.num_blocks",
+                value: num_blocks.to_string(),
+                fix,
+            });
+        }
+        if self.variant.is_released() && !residual {
+            let fix = format!("the block of model.variant = \"{}\" has residuals: leave the key out", self.variant);
+            return Err(ModelError::BadConfig { key: "model.condenser.residual", value: residual.to_string(), fix });
+        }
         Ok(())
     }
 }
@@ -155,6 +285,32 @@ mod tests {
         assert_eq!([config.context_patch_len(), config.ray_patch_len(), config.rgb_patch_len()], [576, 384, 192]);
         assert_eq!(config.num_tokens(4, 256, 256).expect("divides"), 4096);
         assert_eq!(config.num_tokens(4, 256, 448).expect("divides"), 7168);
+    }
+
+    #[test]
+    fn one_key_chooses_a_released_network_and_contradictions_are_refused() {
+        let parse = |text: &str| serde_json::from_str::<ModelConfig>(text).expect("a model section");
+        for variant in Variant::ALL {
+            let config = parse(&format!("{{\"variant\": \"{variant}\"}}"));
+            assert_eq!(
+                (config.variant, config.condenser.num_blocks),
+                (variant, if variant.is_released() { 1 } else { 2 })
+            );
+            config.validate().expect("one key is enough");
+            assert_eq!(variant.as_str().parse(), Ok(variant));
+            assert_eq!(parse(&serde_json::to_string(&config).expect("JSON")), config);
+        }
+        assert_eq!(parse("{}"), ModelConfig::default());
+        let message = |text: &str| parse(text).validate().unwrap_err().to_string();
+        let two = message(r#"{"variant": "released-re10k", "condenser": {"num_blocks": 2}}"#);
+        assert!(
+            two.starts_with("`model.condenser.num_blocks` = 2: model.variant = \"released-re10k\" has one"),
+            "{two}"
+        );
+        let plain = message(r#"{"variant": "released-dl3dv", "condenser": {"residual": false}}"#);
+        assert!(plain.starts_with("`model.condenser.residual` = false"), "{plain}");
+        assert!(serde_json::from_str::<ModelConfig>(r#"{"depth": 1}"#).is_err());
+        assert!(serde_json::from_str::<ModelConfig>(r#"{"condenser": {"depth": 1}}"#).is_err());
     }
 
     #[test]

@@ -11,8 +11,8 @@ use crate::patch::patchify;
 use crate::rays::plucker;
 use crate::{Init, ModelConfig, Views};
 
-/// Patch embedding and self-attention over all tokens of all views. The result is not normalised:
-/// K-means, condenser and renderer all work on the raw residual stream.
+/// Patch embedding and self-attention over all tokens of all views. The result is not normalised: K-means, condenser
+/// and renderer all work on the raw residual stream, but for the variant with a [`LiftNorm`](crate::LiftNorm).
 #[derive(Module, Debug)]
 pub struct Encoder {
     patch_embed: Linear,

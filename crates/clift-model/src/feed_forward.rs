@@ -5,12 +5,12 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
 use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
-use burn::tensor::Tensor;
+use burn::tensor::{Tensor, activation};
 use clift_kernels::{InstructionSet, gelu};
 
 use crate::Init;
 use crate::flex::{contiguous, is_native, tensor, values, values_mut};
-use crate::linear::{linear_of_gelu, linear_of_norm};
+use crate::linear::{linear, linear_of_gelu, linear_of_norm};
 
 /// GELU on a device, `x * Phi(x)` with the normal distribution function `Phi` (erf, not the tanh
 /// approximation), and its exact gradient: Burn 0.22 differentiates the approximation on GPUs.
@@ -67,17 +67,33 @@ impl GeluKernels for NdArray {}
 #[cfg(feature = "wgpu")]
 impl GeluKernels for burn::backend::Cube {}
 
+/// What stands between the two layers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Activation {
+    /// `x * Phi(x)`
+    Gelu,
+    /// `max(x, 0)`: in the condenser of the released networks.
+    Relu,
+}
+
 /// `down(GELU(up(norm(x))))`; the norm is the block's.
 #[derive(Module, Debug)]
 pub struct FeedForward {
     up: Linear,
     down: Linear,
+    #[module(skip)]
+    activation: Activation,
 }
 
 impl FeedForward {
     /// Makes the network with PyTorch's initialisation.
     pub fn new(dim: usize, hidden: usize, init: &mut Init) -> Self {
-        Self { up: init.linear(dim, hidden), down: init.linear(hidden, dim) }
+        Self::with(Activation::Gelu, dim, hidden, init)
+    }
+
+    /// The same with another activation.
+    pub fn with(activation: Activation, dim: usize, hidden: usize, init: &mut Init) -> Self {
+        Self { up: init.linear(dim, hidden), down: init.linear(hidden, dim), activation }
     }
 
     /// Maps every normalised token on its own.
@@ -85,7 +101,11 @@ impl FeedForward {
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
     pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
-        linear_of_gelu(&self.down, linear_of_norm(norm, &self.up, x))
+        let hidden = linear_of_norm(norm, &self.up, x);
+        match self.activation {
+            Activation::Gelu => linear_of_gelu(&self.down, hidden),
+            Activation::Relu => linear(&self.down, activation::relu(hidden)),
+        }
     }
 }
 

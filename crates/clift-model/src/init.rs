@@ -5,7 +5,7 @@
 //! copies of each other: here each is drawn on its own.
 
 use burn::module::Param;
-use burn::nn::{LayerNorm, LayerNormConfig, Linear};
+use burn::nn::{LayerNorm, LayerNormConfig, Linear, RmsNorm, RmsNormConfig};
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -45,6 +45,16 @@ impl Init {
     /// A linear layer without bias that starts as zero (`W_z` of paper equation 4).
     pub fn zero_linear(&mut self, inputs: usize, outputs: usize) -> Linear {
         Linear { weight: self.zeros([inputs, outputs]), bias: None }
+    }
+
+    /// A linear layer with bias, both zero at the start: the gate of the released condensers.
+    pub fn zero_linear_with_bias(&mut self, inputs: usize, outputs: usize) -> Linear {
+        Linear { bias: Some(self.zeros([outputs])), ..self.zero_linear(inputs, outputs) }
+    }
+
+    /// An RMS norm with epsilon 1e-5.
+    pub fn rms_norm(&mut self, dim: usize) -> RmsNorm {
+        RmsNormConfig::new(dim).init(&self.device)
     }
 
     /// A layer norm with epsilon 1e-5.

@@ -18,6 +18,7 @@ use clift_kernels::{InstructionSet, layer_norm, linear as kernel};
 use crate::autodiff::register;
 use crate::feed_forward::GeluKernels;
 use crate::flex::{contiguous, is_native, tensor, values};
+use crate::flops::counted;
 use crate::layer_norm::{LayerNormKernels, NormState};
 
 /// `x W + b` of a layer with a bias.
@@ -81,8 +82,9 @@ pub(crate) fn norm_then_linear(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>, 
 fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
     let weight = layer.weight.val();
     let bias = layer.bias.as_ref().expect("the layer has a bias").val();
-    let [inputs, _outputs] = weight.dims();
+    let ([inputs, outputs], [batch, count, _]) = (weight.dims(), x.dims());
     assert_shape!(x, [.., inputs]);
+    counted::add_linear(batch * count, inputs, outputs);
     (weight, bias)
 }
 

@@ -1,15 +1,17 @@
 //! The three networks of a model together.
 
 use burn::module::Module;
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 
-use crate::{Condenser, Encoder, Init, ModelConfig, Renderer};
+use crate::{Condenser, Encoder, Init, LiftNorm, ModelConfig, Renderer, Views};
 
 /// Encoder, condenser and renderer. Stage 1 trains the first and the last, stage 2 the last two.
 #[derive(Module, Debug)]
 pub struct Clift {
     /// Posed pictures to light-field tokens.
     pub encoder: Encoder,
+    /// A norm of those, in the variant that has one. Both stages train it.
+    pub lift_norm: LiftNorm,
     /// Light-field tokens to compressed ones.
     pub condenser: Condenser,
     /// Tokens and a camera to a picture.
@@ -21,6 +23,8 @@ pub struct Clift {
 pub struct Stage1 {
     /// Posed pictures to light-field tokens.
     pub encoder: Encoder,
+    /// A norm of those, in the variant that has one.
+    pub lift_norm: LiftNorm,
     /// Tokens and a camera to a picture.
     pub renderer: Renderer,
 }
@@ -33,22 +37,35 @@ impl Clift {
         let renderer = Renderer::new(config, &mut init);
         // Last, so that stage 1 does not depend on the condenser's settings.
         let condenser = Condenser::new(config, &mut init);
-        Self { encoder, condenser, renderer }
+        let lift_norm = LiftNorm::new(config, &mut init);
+        Self { encoder, lift_norm, condenser, renderer }
+    }
+
+    /// The tokens of context views that condenser and renderer read.
+    ///
+    /// # Shapes
+    /// - returns `[batch, num_tokens, dim]`
+    pub fn lift(&self, context: &Views) -> Tensor<3> {
+        self.lift_norm.forward(self.encoder.forward(context))
     }
 
     /// The networks of stage 1, sharing this model's parameters.
     pub fn stage1(&self) -> Stage1 {
-        Stage1 { encoder: self.encoder.clone(), renderer: self.renderer.clone() }
+        Stage1 { encoder: self.encoder.clone(), lift_norm: self.lift_norm.clone(), renderer: self.renderer.clone() }
+    }
+
+    /// Takes the networks of stage 1 from elsewhere.
+    pub fn set_stage1(&mut self, stage1: Stage1) {
+        let Stage1 { encoder, lift_norm, renderer } = stage1;
+        (self.encoder, self.lift_norm, self.renderer) = (encoder, lift_norm, renderer);
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::Tensor;
-
     use super::*;
+    use crate::Cameras;
     use crate::testing::{Fixture, assert_close, devices, load_weights, weight_gradients};
-    use crate::{Cameras, Views};
 
     #[test]
     fn encoder_and_renderer_equal_pytorchs_with_the_gradients_of_the_loss() {

@@ -32,12 +32,12 @@ const GROUP: usize = 32;
 pub enum Preset {
     /// Algorithm 1 as printed: the nearest tokens of every cell, momentum, and a bonus for tokens of the previous
     /// frame.
-    #[default]
     Paper,
     /// Tokens nearest to any cell, frame by frame: what the released code's table of render budgets uses.
     Global,
     /// As the paper's, with cells that scale with the picture: the same at 256 pixels. Around a picture of 32 pixels,
     /// four cells of 16 are four fifths of the grid's width, and most tokens go to what is not seen.
+    #[default]
     Scaled,
 }
 

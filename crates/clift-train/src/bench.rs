@@ -7,10 +7,8 @@ mod clustering;
 pub(crate) mod context;
 mod forward;
 pub(crate) mod inputs;
-pub mod memory;
 pub(crate) mod reference;
 mod selection;
-mod statistics;
 pub(crate) mod step;
 mod task;
 mod work;
@@ -19,7 +17,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use clift_eval::TokenCount;
+use clift_eval::{TokenCount, memory, statistics};
 use clift_model::device::DeviceName;
 use serde::Serialize;
 

@@ -3,11 +3,13 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
 use burn::module::Module;
 use burn::store::ModuleRecord;
-use clift_data::files::{publish, remove_folder, replace};
+use clift_data::files::{make_folder, publish, remove_folder, replace};
+use clift_model::ModelConfig;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
@@ -30,6 +32,9 @@ struct State {
     progress: Progress,
     /// The other files, by name.
     files: BTreeMap<String, Fingerprint>,
+    /// Which network it is; earlier versions did not say.
+    #[serde(default)]
+    model: Option<ModelConfig>,
 }
 
 /// What tells a damaged file from a whole one.
@@ -75,12 +80,19 @@ pub struct Best {
 pub struct Checkpoints {
     folder: PathBuf,
     retention: CheckpointConfig,
+    model: Option<ModelConfig>,
 }
 
 impl Checkpoints {
     /// Keeps checkpoints in `folder`, and as many as `retention` says.
     pub fn new(folder: PathBuf, retention: CheckpointConfig) -> Self {
-        Self { folder, retention }
+        Self { folder, retention, model: None }
+    }
+
+    /// Notes in every checkpoint which network it is, and refuses those of another.
+    #[must_use]
+    pub fn of(self, model: ModelConfig) -> Self {
+        Self { model: Some(model), ..self }
     }
 
     /// Saves model, optimiser and progress, and removes the checkpoints that are kept no longer.
@@ -91,7 +103,7 @@ impl Checkpoints {
         let path = self.path_of(progress.step);
         let temporary = path.with_extension("tmp");
         remove_if_there(&temporary)?;
-        let written = Self::write(learner, progress, &temporary, &path);
+        let written = self.write(learner, progress, &temporary, &path);
         if written.is_err() {
             // A full disk needs the space; what even that leaves is removed by the next save.
             drop(std::fs::remove_dir_all(&temporary));
@@ -101,8 +113,8 @@ impl Checkpoints {
         Ok(path)
     }
 
-    fn write(learner: &Learner, progress: &Progress, temporary: &Path, path: &Path) -> Result<(), TrainError> {
-        std::fs::create_dir_all(temporary).map_err(TrainError::io("making a checkpoint", temporary))?;
+    fn write(&self, learner: &Learner, progress: &Progress, temporary: &Path, path: &Path) -> Result<(), TrainError> {
+        make_folder(temporary).map_err(TrainError::io("making a checkpoint", temporary))?;
         let failed =
             |name: &str, reason: String| TrainError::io(SAVING, &temporary.join(name))(std::io::Error::other(reason));
         let record = learner.model.clone().into_record();
@@ -114,7 +126,8 @@ impl Checkpoints {
             let file = temporary.join(name);
             files.insert(name.to_owned(), fingerprint(&file).map_err(TrainError::io(SAVING, &file))?);
         }
-        write_state(temporary, &State { version: VERSION, progress: progress.clone(), files })?;
+        let state = State { version: VERSION, progress: progress.clone(), files, model: self.model.clone() };
+        write_state(temporary, &state)?;
         if path.exists() {
             // Only where somebody moved newer checkpoints away and trains those steps again.
             std::fs::remove_dir_all(path).map_err(TrainError::io("replacing a checkpoint", path))?;
@@ -141,7 +154,7 @@ impl Checkpoints {
     pub fn resume(&self, learner: &mut Learner) -> Result<Option<Progress>, TrainError> {
         let mut all = self.list()?;
         let Some(path) = all.pop() else { return Ok(None) };
-        let loaded = load(&path, learner).map_err(|source| {
+        let loaded = load(&path, self.model.as_ref(), learner).map_err(|source| {
             let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let fix = match all.last() {
                 Some(older) => format!("move {} away to go on from {}", name(&path), name(older)),
@@ -242,8 +255,18 @@ fn read_state(folder: &Path) -> Result<State, TrainError> {
     serde_json::from_value(value).map_err(|error| bad(error.to_string()))
 }
 
-fn load(folder: &Path, learner: &mut Learner) -> Result<Progress, TrainError> {
-    let State { progress, files, .. } = read_state(folder)?;
+fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) -> Result<Progress, TrainError> {
+    let State { progress, files, model, .. } = read_state(folder)?;
+    if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !files.contains_key(*name)) {
+        let reason = format!("it has no checksum of {name}");
+        return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
+    }
+    if let (Some(model), Some(expected)) = (&model, expected)
+        && model != expected
+    {
+        let reason = format!("it holds another network ({model:?}) than the config's [model]");
+        return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
+    }
     for (name, expected) in &files {
         let file = folder.join(name);
         let found = fingerprint(&file).map_err(TrainError::io("reading a checkpoint", &file))?;
@@ -257,7 +280,9 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<Progress, TrainError> {
     let loaded = learner.model.clone().try_load_record(record);
     learner.model = loaded.map_err(|error| TrainError::bad_file("checkpoint", &model)(format!("{error:?}")))?;
     let optimizer = folder.join(OPTIMIZER);
-    let loaded = learner.optimizer.clone().load(&optimizer);
+    // Burn 0.22 panics where a record's tensors have no parameter ids; the clone that is half loaded is dropped.
+    let loaded = catch_unwind(AssertUnwindSafe(|| learner.optimizer.clone().load(&optimizer)));
+    let loaded = loaded.map_err(|_| TrainError::bad_file("checkpoint", &optimizer)("it is no optimiser's record"))?;
     learner.optimizer = loaded.map_err(TrainError::bad_file("checkpoint", &optimizer))?;
     Ok(progress)
 }
@@ -280,6 +305,41 @@ fn fingerprint(path: &Path) -> std::io::Result<Fingerprint> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_optimizer_that_is_none_is_refused_and_so_is_a_file_without_checksum() {
+        use burn::tensor::Device;
+        use clift_model::{Clift, ModelConfig};
+
+        use crate::loss::Loss;
+
+        let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
+        let device = Device::flex().autodiff();
+        let optimizer = crate::optim::adamw(&crate::config::OptimizerConfig::default());
+        let mut learner = Learner {
+            model: Clift::new(&config, 0, &device),
+            optimizer,
+            device,
+            loss: Loss::default(),
+            recompute: false,
+        };
+        let place = tempfile::tempdir().expect("a temporary folder");
+        let checkpoints = Checkpoints::new(place.path().into(), CheckpointConfig::default());
+        let step = checkpoints.save(&learner, &Progress { step: 1, ..Progress::default() }).expect("it can be saved");
+
+        // The weights of a model under the optimiser's name, with a checksum that fits: found by damaging files.
+        std::fs::copy(step.join(MODEL), step.join(OPTIMIZER)).expect("it can be copied");
+        let mut state = read_state(&step).expect("it is well");
+        state.files.insert(OPTIMIZER.into(), fingerprint(&step.join(OPTIMIZER)).expect("it can be read"));
+        write_state(&step, &state).expect("it can be written");
+        let refused = checkpoints.resume(&mut learner);
+        assert!(refused.is_err(), "{refused:?}");
+
+        state.files.remove(MODEL);
+        write_state(&step, &state).expect("it can be written");
+        let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
+        assert!(message.contains("it has no checksum of model.bpk"), "{message}");
+    }
 
     #[test]
     fn the_last_the_best_and_every_mth_are_kept() {

@@ -9,7 +9,7 @@ use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use clift_data::Ledger;
-use clift_data::files::{publish, replace};
+use clift_data::files::{make_folder, publish, replace};
 use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 
@@ -63,7 +63,7 @@ impl Journal {
         if folder.exists() {
             std::fs::remove_dir_all(folder).map_err(TrainError::io("removing an unfinished cache", folder))?;
         }
-        std::fs::create_dir_all(folder).map_err(TrainError::io("making the cluster cache", folder))?;
+        make_folder(folder).map_err(TrainError::io("making the cluster cache", folder))?;
         let create = |name: &str| File::create(folder.join(name)).map_err(TrainError::io(WRITING, &folder.join(name)));
         let (data, lines) = (create(DATA)?, create(JOURNAL)?);
         let mut journal = Self { folder: folder.into(), origin, data, lines, entries: Vec::new(), skipped: Vec::new() };

@@ -126,6 +126,7 @@ impl ClusterJob<'_> {
         let count = grid[below(&mut rng, grid.len())].of(num_tokens)?;
         let clusters = match grouping {
             Grouping::Kmeans => {
+                // Before any norm of the tokens, as in the reference: stage 2 trains that norm, and the clusters stay.
                 let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
                 let fit = kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
                 fit.clusters.scenes()[0].clone()
@@ -169,6 +170,11 @@ impl ClusterCache {
         if index.settings != settings(config) {
             return Err(stale("its data, sampler or K-means settings are not this run's".into()));
         }
+        if let Some(entry) = index.entries.iter().find(|entry| !entry.is_possible()) {
+            let Entry { key, num_tokens, num_storage_tokens, .. } = entry;
+            let reason = format!("scene {key} has {num_storage_tokens} clusters of {num_tokens} tokens");
+            return Err(TrainError::BadFile { what: "cluster cache", reason, path });
+        }
         let data = folder.join("clusters.bin");
         let found = std::fs::metadata(&data).map_err(TrainError::io("opening the cluster cache", &data))?.len();
         let expected: u64 = index.entries.iter().map(Entry::num_bytes).sum();
@@ -210,8 +216,13 @@ impl ClusterCache {
 }
 
 impl Entry {
+    /// Whether a scene can have so many tokens and clusters. No number is allocated or added up before.
+    fn is_possible(&self) -> bool {
+        (1..=MAX_TOKENS).contains(&self.num_tokens) && (1..=self.num_tokens).contains(&self.num_storage_tokens)
+    }
+
     pub(crate) fn num_bytes(&self) -> u64 {
-        2 * (self.num_tokens + self.num_storage_tokens) as u64
+        (self.num_tokens as u64).saturating_add(self.num_storage_tokens as u64).saturating_mul(2)
     }
 }
 
@@ -232,4 +243,36 @@ fn settings(config: &Config) -> String {
         "clusters": config.clusters,
     })
     .to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What a cache says whose only entry has such counts.
+    fn opened(num_tokens: usize, num_storage_tokens: usize) -> String {
+        let config = Config::default();
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let entry = Entry { key: "a".into(), context: vec![0], num_tokens, num_storage_tokens, offset_bytes: 0 };
+        let index = Index {
+            version: VERSION,
+            encoder: "e".into(),
+            settings: settings(&config),
+            skipped: Ledger::new(1),
+            entries: vec![entry],
+        };
+        std::fs::write(folder.path().join("index.json"), serde_json::to_vec(&index).expect("JSON")).expect("writable");
+        std::fs::write(folder.path().join("clusters.bin"), [0, 0, 0, 0]).expect("writable");
+        ClusterCache::open(folder.path(), &config, "e").map_or_else(|error| error.to_string(), |_| "opened".into())
+    }
+
+    #[test]
+    fn counts_that_no_scene_has_are_refused_before_they_are_added_or_allocated() {
+        assert_eq!(opened(1, 1), "opened");
+        for (num_tokens, num_storage_tokens) in [(usize::MAX, 3), (1 << 62, 1 << 62), (0, 0), (1, 2), (2, 0)] {
+            let message = opened(num_tokens, num_storage_tokens);
+            let expected = format!("scene a has {num_storage_tokens} clusters of {num_tokens} tokens");
+            assert!(message.contains(&expected), "{message}");
+        }
+    }
 }

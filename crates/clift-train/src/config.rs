@@ -1,11 +1,12 @@
 //! One config file per experiment: `[data] [model] [loss] [stage1] [clusters] [stage2] [checkpoint] [eval]`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clift_data::{
     BoundedSampler, ClipOptions, Crop, DataError, FileOptions, Layout, PoseRotation, PoseScale, SceneFilters, Split,
     SyntheticConfig,
 };
+use clift_eval::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX};
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
 use clift_model::{Grouping, KMeans, ModelConfig};
@@ -166,8 +167,32 @@ impl DataConfig {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LossConfig {
-    /// Weight of the perceptual term; the paper has 0.5. This version has none: leave it at 0.
+    /// Weight of the perceptual term; the paper has 0.5. 0 trains on the mean squared error alone.
     pub perceptual_weight: f64,
+    /// Weights of its network, VGG-19 as MatConvNet publishes it, converted by `scripts/convert_vgg.py`.
+    pub vgg_weights: Option<PathBuf>,
+}
+
+impl LossConfig {
+    /// The weights to read for training, where there is a perceptual term.
+    ///
+    /// # Errors
+    /// [`TrainError::BadConfig`] with the command that makes them, where there are none.
+    pub fn weights(&self) -> Result<Option<&Path>, TrainError> {
+        if self.perceptual_weight == 0.0 {
+            return Ok(None);
+        }
+        let fix = |what: &str| {
+            format!("{what}; `{PERCEPTUAL_COMMAND}` makes them, loss.perceptual_weight = 0 trains without the term")
+        };
+        match self.vgg_weights.as_deref() {
+            None => Err(bad("loss.vgg_weights", "missing", &fix("the perceptual term needs the weights of VGG-19"))),
+            Some(path) if !path.is_file() => {
+                Err(bad("loss.vgg_weights", path.display(), &fix("there is no such file")))
+            }
+            Some(path) => Ok(Some(path)),
+        }
+    }
 }
 
 /// AdamW with warm-up and cosine decay.
@@ -328,10 +353,7 @@ impl Config {
         self.validate_size()?;
         self.validate_token_counts()?;
         self.data.validate()?;
-        if self.loss.perceptual_weight != 0.0 {
-            let fix = "the perceptual term is not built yet; write 0 to train on the mean squared error";
-            return Err(bad("loss.perceptual_weight", self.loss.perceptual_weight, fix));
-        }
+        self.validate_loss()?;
         let Self { stage1, stage2, clusters, eval, checkpoint, .. } = self;
         for (key, value, least, most) in [
             ("stage1.batch_size", stage1.batch_size, 1, usize::MAX),
@@ -339,9 +361,7 @@ impl Config {
             ("stage2.batch_size", stage2.batch_size, 1, usize::MAX),
             ("stage2.accumulate", stage2.accumulate, 1, stage2.batch_size),
             ("clusters.num_passes", clusters.num_passes, 1, usize::MAX),
-            ("clusters.grid (length)", clusters.grid.len(), 1, usize::MAX),
             ("clusters.kmeans.max_iterations", clusters.kmeans.max_iterations, 1, usize::MAX),
-            ("eval.storage (length)", eval.storage.len(), 1, usize::MAX),
             ("eval.num_context", eval.num_context, 2, 10_000),
             ("eval.num_targets", eval.num_targets, 1, 10_000),
             ("eval.num_validation_scenes", eval.num_validation_scenes, 1, usize::MAX),
@@ -354,6 +374,11 @@ impl Config {
         {
             let fix = format!("write 0 or a multiple of checkpoint.every, which is {}", checkpoint.every);
             return Err(bad("checkpoint.keep_every", checkpoint.keep_every, &fix));
+        }
+        for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.storage", &eval.storage)] {
+            if counts.is_empty() {
+                return Err(bad(key, "[]", "write at least one count"));
+            }
         }
         let [low, high] = stage1.keep_tokens;
         if !(low > 0.0 && low <= high && high <= 1.0) {
@@ -381,6 +406,22 @@ impl Config {
                 let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
                 return Err(bad(key, value, &fix));
             }
+        }
+        Ok(())
+    }
+
+    /// The weights themselves are only asked for where a run is trained: measuring one does not need them.
+    fn validate_loss(&self) -> Result<(), TrainError> {
+        let weight = self.loss.perceptual_weight;
+        if !(weight >= 0.0 && weight.is_finite()) {
+            return Err(bad("loss.perceptual_weight", weight, "write 0 or a positive number"));
+        }
+        let DataConfig { width, height, .. } = self.data;
+        if weight > 0.0 && width.min(height) < PERCEPTUAL_MIN_SIZE_PX {
+            let fix = format!(
+                "its network needs pictures of {PERCEPTUAL_MIN_SIZE_PX} x {PERCEPTUAL_MIN_SIZE_PX}, these have {width} x {height}: write 0"
+            );
+            return Err(bad("loss.perceptual_weight", weight, &fix));
         }
         Ok(())
     }
@@ -501,9 +542,24 @@ mod tests {
         let message = config.validate().unwrap_err().to_string();
         assert_eq!(message, "`stage1.keep_tokens` = [0.5, 0.25]: write 0 < smallest <= largest <= 1");
         config.stage1.keep_tokens = [0.25, 1.0];
+        config.loss.perceptual_weight = -0.5;
+        let message = config.validate().unwrap_err().to_string();
+        assert_eq!(message, "`loss.perceptual_weight` = -0.5: write 0 or a positive number");
         config.loss.perceptual_weight = 0.5;
-        assert!(config.validate().unwrap_err().to_string().contains("not built yet"));
+        config.validate().expect("to be measured a run needs no weights of its loss");
+        let message = config.loss.weights().unwrap_err().to_string();
+        assert!(
+            message.starts_with("`loss.vgg_weights` = missing") && message.contains(PERCEPTUAL_COMMAND),
+            "{message}"
+        );
+        config.loss.vgg_weights = Some("no/such/file".into());
+        let message = config.loss.weights().unwrap_err().to_string();
+        assert!(message.contains("no such file") && message.contains(PERCEPTUAL_COMMAND), "{message}");
+        (config.data.width, config.data.height) = (8, 256);
+        assert!(config.validate().unwrap_err().to_string().contains("16 x 16"), "too small for the network");
+        (config.data.width, config.data.height) = (256, 256);
         config.loss.perceptual_weight = 0.0;
+        assert_eq!(config.loss.weights().expect("no term"), None);
         config.clusters.grid = vec![TokenCount::Count(5000)];
         let message = config.validate().unwrap_err().to_string();
         assert_eq!(message, "`clusters.grid` = 5000: a scene has as few as 4096 tokens");

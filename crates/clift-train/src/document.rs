@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
 use serde::de::DeserializeOwned;
 use toml::Spanned;
 use toml::de::DeTable;
@@ -54,7 +55,10 @@ pub enum ConfigError {
 ///
 /// # Errors
 /// [`ConfigError`]; its message shows the line, a caret and the fix.
-pub fn read_config<T: DeserializeOwned>(path: &Path, overrides: &[String]) -> Result<(T, Vec<Override>), ConfigError> {
+pub fn read_config<T: DeserializeOwned + Serialize>(
+    path: &Path,
+    overrides: &[String],
+) -> Result<(T, Vec<Override>), ConfigError> {
     let file = std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })?;
     parse_config(path, &file, overrides)
 }
@@ -63,7 +67,7 @@ pub fn read_config<T: DeserializeOwned>(path: &Path, overrides: &[String]) -> Re
 ///
 /// # Errors
 /// As [`read_config`].
-pub fn parse_config<T: DeserializeOwned>(
+pub fn parse_config<T: DeserializeOwned + Serialize>(
     path: &Path,
     file: &str,
     overrides: &[String],
@@ -127,22 +131,26 @@ fn merged<'t>(
     Ok((root, changed))
 }
 
-fn read_table<T: DeserializeOwned>(root: Spanned<DeTable>, sources: &Sources) -> Result<T, ConfigError> {
+fn read_table<T: DeserializeOwned + Serialize>(root: Spanned<DeTable>, sources: &Sources) -> Result<T, ConfigError> {
     let unknown = mistakes::unknown_keys(&Keys::of::<T>(), root.get_ref(), sources);
     if !unknown.is_empty() {
         return Err(ConfigError::UnknownKeys(unknown));
     }
-    T::deserialize(toml::Deserializer::from(root.clone()))
-        .map_err(|error| ConfigError::Value(Box::new(mistakes::wrong_value(&error, root.get_ref(), sources))))
+    let config = T::deserialize(toml::Deserializer::from(root.clone()))
+        .map_err(|error| ConfigError::Value(Box::new(mistakes::wrong_value(&error, root.get_ref(), sources))))?;
+    match mistakes::too_long(&config, root.get_ref(), sources) {
+        Some(diagnostic) => Err(ConfigError::Value(Box::new(diagnostic))),
+        None => Ok(config),
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use serde::Deserialize;
+    use serde::{Deserialize, Serialize};
 
     use super::*;
 
-    #[derive(Debug, PartialEq, Deserialize)]
+    #[derive(Debug, PartialEq, Deserialize, Serialize)]
     #[serde(deny_unknown_fields)]
     struct Config {
         #[serde(default)]
@@ -154,7 +162,7 @@ mod tests {
         clusters: Clusters,
     }
 
-    #[derive(Debug, PartialEq, Deserialize)]
+    #[derive(Debug, PartialEq, Deserialize, Serialize)]
     #[serde(deny_unknown_fields)]
     struct Model {
         num_heads: usize,
@@ -162,7 +170,7 @@ mod tests {
         norm: Norm,
     }
 
-    #[derive(Debug, Default, PartialEq, Deserialize)]
+    #[derive(Debug, Default, PartialEq, Deserialize, Serialize)]
     #[serde(rename_all = "lowercase")]
     enum Norm {
         #[default]
@@ -170,7 +178,7 @@ mod tests {
         Rms,
     }
 
-    #[derive(Debug, Default, PartialEq, Deserialize)]
+    #[derive(Debug, Default, PartialEq, Deserialize, Serialize)]
     #[serde(default, deny_unknown_fields)]
     struct Stage {
         steps: usize,
@@ -178,10 +186,11 @@ mod tests {
         batch_size: usize,
     }
 
-    #[derive(Debug, Default, PartialEq, Deserialize)]
+    #[derive(Debug, Default, PartialEq, Deserialize, Serialize)]
     #[serde(default, deny_unknown_fields)]
     struct Clusters {
         grid: Vec<f64>,
+        range: [f64; 2],
     }
 
     const FILE: &str = "# tiny\n[model]\nnum_heads = 4\n\n[stage1]\nsteps = 90000\n";
@@ -293,6 +302,17 @@ unknown section [stage2]
  | clusters.grid=[0.5, true]
  |                     ^^^^ expected a number, got true";
         assert_eq!(message(FILE, &["clusters.grid=[0.5, true]"]), expected);
+    }
+
+    #[test]
+    fn a_list_that_is_too_long_is_not_cut() {
+        let expected = "wrong value of `clusters.range`
+--> --set
+ |
+ | clusters.range=[0, 1, 2]
+ |                ^^^^^^^^^ expected a list of 2, got one of 3";
+        assert_eq!(message(FILE, &["clusters.range=[0, 1, 2]"]), expected);
+        assert!(message(FILE, &["clusters.range=[0]"]).starts_with("wrong value of `clusters.range`"));
     }
 
     #[test]

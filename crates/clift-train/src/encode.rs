@@ -70,6 +70,7 @@ impl Trained {
         let frame = SceneFrame::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)?;
 
         let lift = self.encoder.forward(&upload_views(&[&clip.context], &self.device)?); // [1, N, D]
+        let lift = self.lift_norm.forward(lift);
         let [_, num_lift_tokens, dim] = lift.dims();
         let seed = derive_seed(derive_seed(config.seed, "eval"), key);
         let (clusters, tried) = cluster(config, &lift, options.budget, seed)?;

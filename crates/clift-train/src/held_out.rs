@@ -7,10 +7,14 @@ use burn::tensor::Device;
 use clift_data::files::replace;
 use clift_data::order::derive_seed;
 use clift_data::{ClipReader, EvaluationItem, Ledger};
+use clift_eval::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX};
+use clift_eval::predictions::{file_name, picture_name};
 use clift_eval::report::MAX_EXHIBITS;
 use clift_eval::{
-    Accumulator, EvalConfig, Exhibit, Networks, Report, Shown, Summary, Sweep, TokenCount, Variant, evaluate_scene,
+    Accumulator, Condensed, EvalConfig, EvalError, Exhibit, Lpips, Networks, Report, Shown, Summary, Sweep, System,
+    TokenCount, Variant, evaluate_scene,
 };
+use clift_model::device::DeviceName;
 use clift_model::{Clift, Grouping};
 
 use crate::TrainError;
@@ -78,15 +82,18 @@ impl<'a> HeldOut<'a> {
             Stage::Stage2 => (self.config.eval.validation_storage, condensed_variant(grouping)),
             _ => (TokenCount::Share(1.0), Variant::Kmeans),
         };
-        let sweep = Sweep { render: Vec::new(), ..self.sweep(vec![storage], vec![variant]) };
+        let sweep = self.sweep(vec![storage], vec![variant]);
+        let first_format = sweep.tokens[..1].to_vec();
+        let sweep = Sweep { render: Vec::new(), tokens: first_format, ..sweep };
         let mut networks = Networks {
             encoder: model.encoder.clone(),
+            lift_norm: model.lift_norm.clone(),
             renderer: model.renderer.clone(),
             condensed: None,
             patch_condensed: None,
             device: self.device.clone(),
         };
-        networks.set_condensed(grouping, model.condenser.clone(), model.renderer.clone());
+        networks.set_condensed(grouping, Condensed::of(model));
         let mut measured = Accumulator::default();
         for (i, item) in self.items.iter().take(self.config.eval.num_validation_scenes).enumerate() {
             if stop.load(Ordering::Relaxed) {
@@ -105,24 +112,27 @@ impl<'a> HeldOut<'a> {
         Ok(point.psnr.filter(|psnr| psnr.is_finite()))
     }
 
-    /// Runs the whole sweep and writes `report.html`, `summary.json`, `views.csv`, `skipped.json` and the picture sheets
-    /// to `folder`.
+    /// Runs the whole sweep and writes `report.html`, `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the
+    /// picture sheets to `folder`. The pictures of `systems` are scored beside it.
     ///
     /// # Errors
     /// As [`evaluate_scene`]; scenes that cannot be read are skipped and counted.
-    /// [`TrainError::Interrupted`] once `stop` is set.
+    /// [`TrainError::Interrupted`] once `stop` is set, [`EvalError::NoPredictions`] for a system without any picture.
     pub fn evaluate(
         &self,
         networks: &Networks,
+        systems: &[System],
         folder: &Path,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
         let started = std::time::Instant::now();
+        let mut measured = Accumulator::default();
+        let lpips = self.lpips(&mut measured, sink)?;
         let sweep = self.sweep(self.config.eval.storage.clone(), self.variants(networks)?);
+        let sweep = Sweep { lpips, systems: systems.to_vec(), ..sweep };
         let total = self.items.len() as u64;
         sink.event(&Event::StageStarted { stage: Stage::Eval, done: 0, num_steps: total });
-        let mut measured = Accumulator::default();
         let mut ledger = self.ledger.clone();
         for skip in &ledger.skips {
             measured.skip(&skip.key);
@@ -153,12 +163,48 @@ impl<'a> HeldOut<'a> {
         if summary.num_views == 0 {
             return Err(TrainError::NoScenes { reason: "every scene of the evaluation failed".into() });
         }
+        for system in systems {
+            self.require_pictures(system, &summary)?;
+        }
         summary.write(&folder.join("summary.json"))?;
+        measured.write_scenes(&folder.join("scenes.csv"))?;
         measured.write_views(&folder.join("views.csv"))?;
         write_ledger(&ledger, &folder.join("skipped.json"))?;
         self.report(&summary, ledger, exhibits)?.write(&folder.join("report.html"))?;
         sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
+    }
+
+    /// LPIPS, or a note why it is not measured.
+    fn lpips(&self, measured: &mut Accumulator, sink: &mut dyn Sink) -> Result<Option<Lpips>, TrainError> {
+        let data = &self.config.data;
+        let reason = match self.config.eval.lpips_path() {
+            _ if data.width.min(data.height) < LPIPS_MIN_SIZE_PX => {
+                format!("pictures are below {LPIPS_MIN_SIZE_PX} x {LPIPS_MIN_SIZE_PX} pixels")
+            }
+            Some(path) => {
+                let lpips = Lpips::load(path, &self.device)?;
+                sink.event(&Event::Message(format!("LPIPS: weights with SHA-256 {}", lpips.sha256())));
+                measured.set_lpips_weights(lpips.sha256());
+                return Ok(Some(lpips));
+            }
+            None => format!("eval.lpips_weights is not set; `{LPIPS_COMMAND}` makes the file"),
+        };
+        measured.note_not_measured("lpips_vgg", reason);
+        Ok(None)
+    }
+
+    /// A folder without a single picture is a mistake of the path, not a system that misses all.
+    fn require_pictures(&self, system: &System, summary: &Summary) -> Result<(), TrainError> {
+        if summary.points.iter().any(|point| point.variant == system.setting().variant) {
+            return Ok(());
+        }
+        let first = self.items.first().and_then(|item| {
+            let frame = item.views.target.first()?;
+            Some(picture_name(self.reader.source.key(item.scene), *frame))
+        });
+        let (name, first, path) = (system.name.as_str(), first.unwrap_or_default(), system.folder.clone());
+        Err(EvalError::NoPredictions { name, expected: summary.num_views, first, path }.into())
     }
 
     fn report(&self, summary: &Summary, ledger: Ledger, exhibits: Vec<Exhibit>) -> Result<Report, TrainError> {
@@ -198,15 +244,18 @@ impl<'a> HeldOut<'a> {
     }
 
     fn sweep(&self, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
-        let Config { seed, eval, clusters, model, .. } = self.config;
+        let Config { seed, eval, clusters, model, device, .. } = self.config;
         Sweep {
             storage,
             render: eval.render.clone(),
             selection: eval.selection,
-            tokens: eval.tokens,
+            tokens: eval.tokens.clone(),
             variants,
             kmeans: clusters.kmeans.clone(),
-            patch_size: model.patch_size,
+            model: model.clone(),
+            lpips: None,
+            systems: Vec::new(),
+            is_cpu: matches!(device, DeviceName::Flex | DeviceName::Ndarray),
             seed: derive_seed(*seed, "eval"),
         }
     }
@@ -259,9 +308,4 @@ enum Outcome {
 pub fn write_ledger(ledger: &Ledger, path: &Path) -> Result<(), TrainError> {
     let text = serde_json::to_vec_pretty(ledger).map_err(TrainError::bad_file("ledger", path))?;
     replace(path, &text).map_err(TrainError::io("writing what was left out", path))
-}
-
-/// A key as a file name: anything but letters, digits, `-`, `_` and `.` becomes `_`.
-fn file_name(key: &str) -> String {
-    key.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect()
 }

@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use clift_model::ModelError;
+use serde::Serialize;
 use toml::de::{DeTable, DeValue};
 
 use crate::TrainError;
@@ -59,6 +60,7 @@ fn unknown_key(
     let elsewhere: Vec<String> = all.sections_with(name).iter().map(|section| format!("[{section}]")).collect();
     let label = match keys.nearest(name) {
         Some(near) if is_section && section.is_empty() => format!("did you mean [{near}]?"),
+        _ if !is_section && !elsewhere.is_empty() => format!("`{name}` belongs to {}", elsewhere.join(" or ")),
         Some(near) => format!("did you mean `{near}`?"),
         None if !elsewhere.is_empty() => format!("`{name}` belongs to {}", elsewhere.join(" or ")),
         None => String::new(),
@@ -98,6 +100,27 @@ pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sou
     }
 }
 
+/// Finds a list that is longer than what was made of it: the deserialiser takes what it needs and forgets the rest.
+pub(crate) fn too_long<T: Serialize>(config: &T, root: &DeTable, sources: &Sources) -> Option<Diagnostic> {
+    let made = toml::Value::try_from(config).ok()?;
+    find_too_long(made.as_table()?, root, "", sources)
+}
+
+fn find_too_long(made: &toml::Table, table: &DeTable, section: &str, sources: &Sources) -> Option<Diagnostic> {
+    table.iter().find_map(|(key, value)| {
+        let name = key.get_ref().as_ref();
+        let path = join(section, name);
+        match (made.get(name)?, value.get_ref()) {
+            (toml::Value::Table(made), DeValue::Table(below)) => find_too_long(made, below, &path, sources),
+            (toml::Value::Array(made), DeValue::Array(items)) if made.len() < items.len() => {
+                let label = format!("expected a list of {}, got one of {}", made.len(), items.len());
+                Some(sources.at(value.span(), format!("wrong value of `{path}`"), label))
+            }
+            _ => None,
+        }
+    })
+}
+
 /// Puts a value that was refused by its key where it stands, with the places of the other keys the refusal names.
 /// `None` for a refusal that names no key.
 pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &Sources) -> Option<Diagnostic> {
@@ -106,13 +129,14 @@ pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &Sources
         TrainError::Model(ModelError::BadConfig { key, fix, .. }) => (*key, fix.as_str()),
         _ => return None,
     };
-    // "data.width, data.height" are two keys, "clusters.grid (length)" is one.
-    let keys: Vec<&str> = keys.split(", ").filter_map(|key| key.split(' ').next()).collect();
+    // "data.width, data.height" are two keys.
+    let keys: Vec<&str> = keys.split(", ").collect();
     let set: Vec<(&str, Range<usize>)> =
         keys.iter().filter_map(|key| span_of(root, key).map(|span| (*key, span))).collect();
     let title = error.to_string();
     let mut diagnostic = match set.first() {
         Some((_, span)) => sources.at(span.clone(), title, String::new()),
+        None if matches!(error, TrainError::BadConfig { value, .. } if value == "missing") => sources.whole(title),
         None => {
             let keys = quoted(keys.iter().copied());
             sources.whole(title).with_help(format!("the file does not set {keys}"))

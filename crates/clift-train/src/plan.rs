@@ -19,7 +19,7 @@ use crate::events::Stage;
 use calibration::{InferenceRates, InferenceTimed, inference_rates, loading_s, trained, update_rates};
 use counts::{Macs, Parameters, SceneSizes};
 use memory::{InferenceSizes, UpdateSizes, inference_bytes, update_bytes};
-use sizes::{batch_sizes, drawn, largest, middle, num_tokens, picture_values, update_macs};
+use sizes::{batch_sizes, drawn, largest, middle, num_tokens, picture_values, update_macs, variants};
 
 /// Target views that an evaluation draws at once.
 const VIEWS_PER_PASS: usize = 8;
@@ -251,6 +251,7 @@ fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<
         num_targets: 0.0,
         num_patches: num_tokens(config, 1)? as f64,
         num_picture_values: picture_values(config),
+        num_loaded: (parameters.encoder + parameters.renderer) as f64,
     };
     let num_scenes = match (config.clusters.num_scenes, config.data.source) {
         (0, SourceKind::Synthetic) => Some(config.data.synthetic.num_scenes),
@@ -276,7 +277,7 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
     let all = num_tokens(config, eval.num_context)?;
     let stored = eval.storage.iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
     let num_targets = eval.num_targets;
-    // Condensed, clustered and random tokens are drawn at every count.
+    // Every variant is drawn at every count.
     let scene = |count: usize| SceneSizes {
         num_storage_tokens: Some(count as f64),
         num_render_tokens: count as f64,
@@ -286,7 +287,8 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
     let of_count: Vec<Macs> = stored.iter().map(|&count| Macs::of(&config.model, &scene(count))).collect();
     let encoder = of_count.first().map_or(0.0, |macs| macs.encoder);
     let condenser: f64 = of_count.iter().map(|macs| macs.condenser).sum();
-    let renderer: f64 = of_count.iter().map(|macs| 3.0 * macs.renderer).sum();
+    let num_variants = variants(config).len();
+    let renderer: f64 = of_count.iter().map(|macs| num_variants as f64 * macs.renderer).sum();
     let compute_s = if is_timed {
         let timed = InferenceTimed { num_context: eval.num_context, num_targets, counts: &[], is_measured: true };
         let rates = inference_rates(config, &timed)?;
@@ -294,7 +296,7 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
         let of_timed: Vec<Macs> = stored.iter().map(|&count| Macs::of(&rates.timed, &scene(count))).collect();
         let missing = |all: f64, timed: f64, per_mac: f64| (all - timed).max(0.0) * per_mac;
         let of_encoder = of_timed.first().map_or(0.0, |macs| macs.encoder);
-        let of_rest = of_timed.iter().map(|macs| macs.condenser + 3.0 * macs.renderer).sum();
+        let of_rest = of_timed.iter().map(|macs| macs.condenser + num_variants as f64 * macs.renderer).sum();
         Some(
             rates.measuring_s
                 + missing(encoder, of_encoder, rates.encode_per_mac)
@@ -309,7 +311,12 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
         num_targets: num_targets.min(VIEWS_PER_PASS) as f64,
         num_patches: num_tokens(config, 1)? as f64,
         // Pictures of every count and variant are held until the scene is measured.
-        num_picture_values: (num_targets * (3 * stored.len() + 3) * config.data.width * config.data.height * 3) as f64,
+        num_picture_values: (num_targets
+            * (num_variants * stored.len() + 3)
+            * config.data.width
+            * config.data.height
+            * 3) as f64,
+        num_loaded: parameters.total as f64,
     };
     // Both stages have a renderer of their own.
     let weights = (parameters.total + parameters.renderer) as f64;

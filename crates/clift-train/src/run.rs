@@ -6,10 +6,11 @@ use std::sync::atomic::AtomicBool;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::files::remove_leftovers;
+use clift_data::files::{make_folder, remove_leftovers};
 use clift_data::{ClipReader, SceneSource, Split};
-use clift_eval::{Networks, Summary};
-use clift_model::{Clift, Condenser, Encoder, Renderer, weights};
+use clift_eval::lpips::LPIPS_COMMAND;
+use clift_eval::{Condensed, Networks, Summary, System};
+use clift_model::{Clift, Encoder, weights};
 
 use crate::TrainError;
 use crate::cluster_journal::remove_journal;
@@ -58,6 +59,13 @@ impl Run {
     pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         config.validate()?;
         let device = config.device.open()?;
+        // Missing weights are found now, not after days of training.
+        config.loss.weights()?;
+        if let Some(path) = config.eval.lpips_path().filter(|path| !path.is_file()) {
+            let fix = format!("there is no such file; `{LPIPS_COMMAND}` makes it, \"\" leaves LPIPS out");
+            let value = path.display().to_string();
+            return Err(TrainError::BadConfig { key: "eval.lpips_weights".into(), value, fix });
+        }
         let folder = &config.run_dir;
         if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
             let fix = "it starts a run over, which begins with stage 1: leave out one of the two";
@@ -70,7 +78,7 @@ impl Run {
             std::fs::rename(folder, &moved).map_err(TrainError::io("moving the former run aside", folder))?;
             sink.event(&Event::Message(format!("moved the former run to {}", moved.display())));
         }
-        std::fs::create_dir_all(folder).map_err(TrainError::io("making the run directory", folder))?;
+        make_folder(folder).map_err(TrainError::io("making the run directory", folder))?;
         let lock = RunLock::take(folder, sink)?;
         remove_leftovers(folder).map_err(TrainError::io("removing what a killed process left", folder))?;
         // A run that failed before its first step, on a wrong path perhaps, has nothing that settings could contradict.
@@ -131,11 +139,12 @@ impl Run {
         if only.is_some() {
             return Ok(None);
         }
-        held_out.evaluate(&self.networks(sink)?, &self.folder("eval"), stop, sink).map(Some)
+        held_out.evaluate(&self.networks(sink)?, &[], &self.folder("eval"), stop, sink).map(Some)
     }
 
-    /// Evaluates the run's weights and writes the results to `folder`; `beside` is another run of the same stage 1
-    /// whose stage 2 was trained on other groups of tokens, to be measured on the same views.
+    /// Evaluates the run's weights, and other systems' pictures beside them, and writes the results to `folder`;
+    /// `beside` is another run of the same stage 1 whose stage 2 was trained on other groups of tokens, to be measured
+    /// on the same views.
     ///
     /// # Errors
     /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] when those of
@@ -143,6 +152,7 @@ impl Run {
     /// whatever the evaluation gives.
     pub fn evaluate(
         &self,
+        systems: &[System],
         folder: &Path,
         beside: Option<&Config>,
         stop: &AtomicBool,
@@ -159,29 +169,29 @@ impl Run {
                            clusters.grouping";
                 return Err(TrainError::BadConfig { key: "--with".into(), value, fix: fix.into() });
             }
-            let (condenser, renderer) = self.load_stage2(other, &networks.encoder)?;
-            networks.set_condensed(other.clusters.grouping, condenser, renderer);
+            let condensed = self.load_stage2(other, &networks.encoder)?;
+            networks.set_condensed(other.clusters.grouping, condensed);
         }
-        self.held_out(sink)?.evaluate(&networks, folder, stop, sink)
+        self.held_out(sink)?.evaluate(&networks, systems, folder, stop, sink)
     }
 
     /// The trained networks: of both stages, or of stage 1 alone.
     fn networks(&self, sink: &mut dyn Sink) -> Result<Networks, TrainError> {
         let stage1 = self.load_stage1(Some(Stage::Eval))?;
-        let (encoder, renderer) = (stage1.encoder.valid(), stage1.renderer.valid());
+        let Clift { encoder, lift_norm, renderer, .. } = stage1.valid();
         let device = self.device.clone();
-        let mut networks = Networks { encoder, renderer, condensed: None, patch_condensed: None, device };
+        let mut networks = Networks { encoder, lift_norm, renderer, condensed: None, patch_condensed: None, device };
         if self.weights(Stage::Stage2).exists() {
-            let (condenser, renderer) = self.load_stage2(&self.config, &networks.encoder)?;
-            networks.set_condensed(self.config.clusters.grouping, condenser, renderer);
+            let condensed = self.load_stage2(&self.config, &networks.encoder)?;
+            networks.set_condensed(self.config.clusters.grouping, condensed);
         } else {
             sink.event(&Event::Message("stage 2 has not run: evaluating the stage-1 weights alone".into()));
         }
         Ok(networks)
     }
 
-    /// Condenser and renderer of the stage 2 of `config`'s run, which must have been trained on this encoder.
-    fn load_stage2(&self, config: &Config, encoder: &Encoder) -> Result<(Condenser, Renderer), TrainError> {
+    /// What the stage 2 of `config`'s run trained, which must have been on this encoder.
+    fn load_stage2(&self, config: &Config, encoder: &Encoder) -> Result<Condensed, TrainError> {
         let path = config.run_dir.join(Stage::Stage2.name()).join("model.safetensors");
         if !path.exists() {
             let what = "the weights of stage 2";
@@ -192,7 +202,7 @@ impl Run {
         if weights::hash(&model.encoder) != weights::hash(encoder) {
             return Err(TrainError::OtherEncoder { path });
         }
-        Ok((model.condenser, model.renderer))
+        Ok(Condensed::of(&model))
     }
 
     /// The views that are measured, during training and after it.
@@ -244,7 +254,7 @@ impl Run {
         let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
         let start = |_: &mut dyn Sink| {
             let mut model = self.new_model();
-            (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+            model.set_stage1(stage1.stage1());
             Ok(model)
         };
         let model = self.plan(Stage::Stage2, batches).train(start, held_out, stop, sink)?;
@@ -312,7 +322,7 @@ impl Run {
         let mut model = self.new_model();
         let mut stage1 = model.stage1();
         weights::load(&mut stage1, &path)?.require_all(&path)?;
-        (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+        model.set_stage1(stage1);
         Ok(model)
     }
 
@@ -340,17 +350,20 @@ impl Run {
 
 /// Starts from another run or a weight file, and says what was and was not loaded.
 fn init_from(model: &mut Clift, from: &Path, sink: &mut dyn Sink) -> Result<(), TrainError> {
-    let path = if from.is_dir() { from.join("stage1").join("model.safetensors") } else { from.into() };
+    // A run, a model directory or a weight file.
+    let in_folder = ["stage1/model.safetensors", "model.safetensors"].map(|file| from.join(file));
+    let [run, _] = &in_folder;
+    let path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
     let mut stage1 = model.stage1();
-    let loaded = weights::load(&mut stage1, &path)?;
+    let loaded = weights::load(&mut stage1, path)?;
     if loaded.applied.is_empty() {
         let reason = "none of its tensors has a place in this model".to_owned();
-        return Err(TrainError::bad_file("weight file for stage1.init_from", &path)(reason));
+        return Err(TrainError::bad_file("weight file for stage1.init_from", path)(reason));
     }
-    (model.encoder, model.renderer) = (stage1.encoder, stage1.renderer);
+    model.set_stage1(stage1);
     let list = |names: &[String]| if names.is_empty() { "none".into() } else { names.join(", ") };
     sink.event(&Event::Message(format!(
-        "loaded {} parameters from {}; left as they were: {}; unused in the file: {}",
+        "loaded {} parameters from {}; new, not in the file: {}; unused in the file: {}",
         loaded.applied.len(),
         path.display(),
         list(&loaded.missing),

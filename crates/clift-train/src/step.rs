@@ -10,7 +10,7 @@ use clift_eval::{upload_cameras, upload_pictures, upload_views};
 use clift_model::{Cameras, Clift, Clusters, Condenser, RenderTokens, SceneClusters, Views};
 
 use crate::TrainError;
-use crate::loss::mse;
+use crate::loss::{Loss, LossParts};
 use crate::optim::{clip_global_norm, global_norm};
 use crate::recompute;
 
@@ -60,6 +60,8 @@ pub struct Learner {
     pub optimizer: ModuleOptimizer,
     /// Where it is trained.
     pub device: Device,
+    /// What is minimised.
+    pub loss: Loss,
     /// Whether the backward computes every block again instead of keeping what is inside it.
     pub recompute: bool,
 }
@@ -67,8 +69,10 @@ pub struct Learner {
 /// What an update did.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Update {
-    /// Mean squared error of the batch.
+    /// What is minimised, of the batch.
     pub loss: f64,
+    /// Mean squared error of the batch.
+    pub mse: f64,
     /// Global norm of the gradient before clipping.
     pub grad_norm: f64,
     /// Whether the weights changed.
@@ -104,19 +108,22 @@ impl Learner {
         max_grad_norm: f64,
         accept: impl FnOnce(f64, f64) -> bool,
     ) -> Result<(Self, Update), TrainError> {
-        let Self { model, mut optimizer, device, recompute } = self;
+        let Self { model, mut optimizer, device, loss, recompute } = self;
         let mut accumulator = GradientsAccumulator::<Clift>::new();
-        let mut total = 0.0;
+        let (mut total, mut mse) = (0.0, 0.0);
         for part in batch.parts(accumulate) {
             let share = part.clips.len() as f64 / batch.clips.len() as f64;
             let shown = Shown::upload(&part, &device)?;
-            total += if recompute {
-                recompute::backward(&model, &shown, &part.tokens, share, &mut accumulator)?
+            let parts = if recompute {
+                recompute::backward(&model, &shown, &part.tokens, &loss, share, &mut accumulator)?
             } else {
-                let loss = loss_of(&model, &shown, &part.tokens)?.mul_scalar(share);
-                accumulator.accumulate(&model, GradientsParams::from_grads(loss.backward(), &model));
-                loss.into_scalar::<f64>()
+                let parts = loss_of(&model, &shown, &part.tokens, &loss)?;
+                let grads = parts.total.clone().mul_scalar(share).backward();
+                accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
+                parts
             };
+            total += share * parts.total.into_scalar::<f64>();
+            mse += share * parts.mse.into_scalar::<f64>();
         }
         let grads = accumulator.grads();
         let grad_norm = global_norm(&model, &grads);
@@ -128,7 +135,7 @@ impl Learner {
         } else {
             model
         };
-        Ok((Self { model, optimizer, device, recompute }, Update { loss: total, grad_norm, applied }))
+        Ok((Self { model, optimizer, device, loss, recompute }, Update { loss: total, mse, grad_norm, applied }))
     }
 
     /// The model on its device without autodiff.
@@ -160,12 +167,17 @@ impl Shown {
     }
 }
 
-/// Renders the targets and compares: a scalar on the tape.
-pub(crate) fn loss_of(model: &Clift, shown: &Shown, choice: &TokenChoice) -> Result<Tensor<1>, TrainError> {
-    let lift = model.encoder.forward(&shown.context); // [B, N, D]
+/// Renders the targets and compares, on the tape.
+pub(crate) fn loss_of(
+    model: &Clift,
+    shown: &Shown,
+    choice: &TokenChoice,
+    loss: &Loss,
+) -> Result<LossParts, TrainError> {
+    let lift = model.lift(&shown.context); // [B, N, D]
     let tokens = choice.apply(&model.condenser, lift)?;
     let rendering = model.renderer.forward(tokens, &shown.targets);
-    Ok(mse(rendering, shown.pictures.clone()))
+    Ok(loss.of(rendering, shown.pictures.clone()))
 }
 
 impl TokenChoice {

@@ -3,13 +3,13 @@
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use clift_model::{Clift, Condenser, Encoder, Renderer, TokenKind, weights};
+use clift_model::{Clift, Condenser, Encoder, LiftNorm, Renderer, TokenKind, weights};
 
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::Stage;
 
-/// A run directory, and one of its weight files.
+/// A run or model directory, and one of its weight files.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ModelPath {
     /// Directory with the `config.toml` of the run.
@@ -19,7 +19,7 @@ pub struct ModelPath {
 }
 
 impl ModelPath {
-    /// Finds the run and the weights of `RUN` or `RUN/stageN/model.safetensors`.
+    /// Finds the run and the weights of `RUN`, `RUN/stageN/model.safetensors`, or a model directory.
     ///
     /// # Errors
     /// [`TrainError::Missing`] for a run without weights and for no file, [`TrainError::NoConfig`] for a weight file without a config.
@@ -30,6 +30,9 @@ impl ModelPath {
             first: "clift train",
             path: path.into(),
         };
+        if path.is_dir() && path.join("model.safetensors").is_file() {
+            return Ok(Self { run: path.into(), weights: path.join("model.safetensors") });
+        }
         if path.is_dir() {
             let weights = [Stage::Stage2, Stage::Stage1].map(|stage| weights_of(path, stage));
             let [_, first] = &weights;
@@ -54,7 +57,12 @@ pub fn renderer_weights(run_or_file: &Path, kind: TokenKind) -> PathBuf {
         TokenKind::Clift => Stage::Stage2,
         TokenKind::Kmeans => Stage::Stage1,
     };
-    if run_or_file.is_dir() { weights_of(run_or_file, stage) } else { run_or_file.into() }
+    let model = run_or_file.join("model.safetensors");
+    match (run_or_file.is_dir(), model.is_file()) {
+        (true, true) => model,
+        (true, false) => weights_of(run_or_file, stage),
+        (false, _) => run_or_file.into(),
+    }
 }
 
 fn weights_of(run: &Path, stage: Stage) -> PathBuf {
@@ -66,6 +74,8 @@ fn weights_of(run: &Path, stage: Stage) -> PathBuf {
 pub struct Trained {
     /// Posed pictures to tokens.
     pub encoder: Encoder,
+    /// A norm of those, in the variant that has one.
+    pub lift_norm: LiftNorm,
     /// Where the file has one: stage 2.
     pub condenser: Option<Condenser>,
     /// The renderer trained with it.
@@ -88,8 +98,8 @@ impl Trained {
         if has_condenser || loaded.missing.iter().any(|name| !name.starts_with("condenser.")) {
             loaded.require_all(path)?;
         }
-        let Clift { encoder, condenser, renderer } = model;
-        Ok(Self { encoder, condenser: has_condenser.then_some(condenser), renderer, device })
+        let Clift { encoder, lift_norm, condenser, renderer } = model;
+        Ok(Self { encoder, lift_norm, condenser: has_condenser.then_some(condenser), renderer, device })
     }
 }
 

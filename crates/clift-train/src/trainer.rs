@@ -9,6 +9,7 @@ use burn::module::{Module, ParamGroup};
 use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleLrScheduler};
 use burn::tensor::Device;
 use clift_data::Prefetcher;
+use clift_data::files::make_folder;
 use clift_model::Clift;
 
 use crate::TrainError;
@@ -16,6 +17,7 @@ use crate::checkpoint::Checkpoints;
 use crate::config::{Config, OptimizerConfig};
 use crate::events::{Event, Sink, Stage};
 use crate::held_out::HeldOut;
+use crate::loss::Loss;
 use crate::optim::adamw;
 use crate::sinks::RunLog;
 use crate::step::{Learner, StageBatch};
@@ -64,10 +66,15 @@ impl StagePlan<'_> {
         let checkpoints = self.checkpoints();
         let model = if checkpoints.newest()?.is_some() { self.blank_model() } else { start(sink)? };
         let optimizer = adamw(self.optimizer);
-        let mut learner = Learner { model, optimizer, device: self.device.clone(), recompute: self.config.recompute };
+        let loss = Loss::load(&self.config.loss, &self.device)?;
+        if let Some(sha256) = loss.sha256() {
+            sink.event(&Event::Message(format!("perceptual loss: weights with SHA-256 {sha256}")));
+        }
+        let (device, recompute) = (self.device.clone(), self.config.recompute);
+        let mut learner = Learner { model, optimizer, device, loss, recompute };
         let progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
         learner.model = freeze(self.stage, learner.model);
-        std::fs::create_dir_all(&self.folder).map_err(TrainError::io("making a folder", &self.folder))?;
+        make_folder(&self.folder).map_err(TrainError::io("making a folder", &self.folder))?;
         let run_dir = self.folder.parent().unwrap_or(&self.folder);
         let mut log = RunLog::open(run_dir, self.stage, progress.step, sink)?;
         log.event(&Event::StageStarted { stage: self.stage, done: progress.step, num_steps: self.num_steps });
@@ -86,7 +93,8 @@ impl StagePlan<'_> {
 
     /// The checkpoints of the stage.
     pub(crate) fn checkpoints(&self) -> Checkpoints {
-        Checkpoints::new(self.folder.join("checkpoints"), self.config.checkpoint.clone())
+        let checkpoints = Checkpoints::new(self.folder.join("checkpoints"), self.config.checkpoint.clone());
+        checkpoints.of(self.config.model.clone())
     }
 
     /// A model whose parameters a checkpoint is about to replace.

@@ -101,7 +101,7 @@ impl<'a> Training<'a> {
             step: self.progress.step,
             num_steps: self.plan.num_steps,
             loss: update.loss,
-            psnr: psnr_of(update.loss),
+            psnr: psnr_of(update.mse),
             lr,
             grad_norm: update.grad_norm,
             step_s: started.elapsed().as_secs_f64(),

@@ -3,15 +3,18 @@
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
+use clift_eval::compare::Side;
 use clift_eval::{Experiment, Selection, TokenCount};
-use clift_model::TokenStorage;
 use clift_model::device::DeviceName;
+use clift_model::{Convention, TokenStorage};
 use clift_train::Stage;
 use clift_train::bench::Work;
 
 pub use crate::data::args::DataCommand;
 pub use crate::data::bench::BenchDataArgs;
 pub use crate::encode::EncodeArgs;
+pub use crate::export::ExportArgs;
+pub use crate::import::ImportArgs;
 pub use crate::render::RenderArgs;
 
 /// Trains, compresses, renders and measures compressive light-field tokens.
@@ -28,8 +31,34 @@ pub struct Args {
 pub enum Command {
     /// Train both stages of a config, or go on where its run stands, and evaluate the result
     Train(TrainArgs),
-    /// Measure a run on held-out views
+    /// Measure a run on held-out views, and other systems' pictures of the same views
+    #[command(after_help = "\
+Other systems:
+  DIR holds <scene key>/<target frame, six digits>.png, or <scene key>/color/..,
+  as pixelSplat writes them; what is no letter, digit, - _ or . in a key is _.
+
+Examples:
+  clift eval runs/tiny --storage 8,1/4,1.0 --tokens f32,f16,int8
+  clift eval runs/re10k --index INDEX.json --set 'eval.lpips_weights=\"lpips-vgg.safetensors\"'
+  clift eval runs/re10k --index INDEX.json --predictions out/mvsplat --name MVSplat --data-size 12MB")]
     Eval(EvalArgs),
+    /// Compare two evaluations view by view: mean differences of scenes with a confidence interval
+    ///
+    /// Takes run directories, folders of `clift eval --out`, or `views.csv` files. Every setting that both have is
+    /// compared over the target views that both have; views of one alone are left out and counted. Differences are
+    /// second minus first, averaged over the views of a scene and then over scenes; the interval is 95 % of Student's t.
+    #[command(after_help = "\
+Examples:
+  clift compare runs/a runs/b
+  clift compare runs/a runs/a --variants kmeans,clift
+  clift compare runs/a runs/a --variants clift:f32,clift:int8")]
+    Compare(CompareArgs),
+    /// Count the work of drawing a view, of encoding and of condensing a scene
+    ///
+    /// By the sizes of a config, or of the paper's network with four context views of 256 x 256. `paper` counts as the
+    /// paper's table comes out: a multiply-accumulate of a linear layer is one, attention is left out, five for each
+    /// value a norm normalises. `macs` counts every multiply-accumulate, `flops` twice as many.
+    Flops(FlopsArgs),
     /// Compress a posed capture into a scene file
     ///
     /// Chooses context views along the camera's path, encodes them, and keeps as many tokens as asked for. The file
@@ -87,6 +116,22 @@ Examples:
     /// memory of the process during them and the largest relative error of the result against the same
     /// computation in f64.
     Bench(BenchArgs),
+    /// Read a published PyTorch checkpoint into a model directory
+    ///
+    /// The file is read, never run: what stands beside the weights is passed over. Every parameter must be there, every
+    /// key of the network must be used, or nothing is written. The directory holds model.safetensors, config.toml (the
+    /// network's sizes, and the protocol it is evaluated under) and import.json (what came from where).
+    #[command(after_help = "\
+Examples:
+  clift import last.ckpt --variant released-re10k -o models/re10k
+  clift eval --checkpoint models/re10k --data /data/re10k --index evaluation_index_re10k_context4.json")]
+    Import(ImportArgs),
+    /// Write a model's weights for PyTorch, under the keys of published checkpoints
+    #[command(after_help = "\
+Examples:
+  clift export models/re10k --format pytorch -o re10k.ckpt
+  clift export runs/tiny/stage1/model.safetensors --format safetensors -o tiny.safetensors")]
+    Export(ExportArgs),
 }
 
 /// Arguments of `clift train`.
@@ -118,7 +163,17 @@ pub struct TrainArgs {
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
     /// A run directory
-    pub run: PathBuf,
+    #[arg(required_unless_present = "checkpoint", conflicts_with = "checkpoint")]
+    pub run: Option<PathBuf>,
+    /// Measure the model of a directory, as `clift import` writes, instead of a run
+    #[arg(long, value_name = "MODEL", requires = "data")]
+    pub checkpoint: Option<PathBuf>,
+    /// Folder of the data: with --checkpoint, or where a run's data has moved
+    #[arg(long, value_name = "DIR")]
+    pub data: Option<PathBuf>,
+    /// The first-stage model of --checkpoint: adds random and K-means tokens, drawn by it
+    #[arg(long, value_name = "MODEL", requires = "checkpoint")]
+    pub stage1: Option<PathBuf>,
     /// An experiment of the paper: main, ablation, patchwise or budget
     ///
     /// Sets variants, --storage, --render and --selection; those given beside it win. main: quality against data size.
@@ -127,7 +182,7 @@ pub struct EvalArgs {
     #[arg(long, value_name = "NAME")]
     pub preset: Option<Experiment>,
     /// Another run of the same stage 1 with another clusters.grouping, measured on the same views
-    #[arg(long, value_name = "RUN")]
+    #[arg(long, value_name = "RUN", conflicts_with = "checkpoint")]
     pub with: Option<PathBuf>,
     /// Token counts to store, as numbers or shares: --storage 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
@@ -138,9 +193,18 @@ pub struct EvalArgs {
     /// How those are chosen: paper, global, scaled or random
     #[arg(long, alias = "select", value_name = "PRESET")]
     pub selection: Option<Selection>,
-    /// Round stored tokens as a scene file would: f32, f16 or int8
-    #[arg(long, value_name = "FORMAT")]
-    pub tokens: Option<TokenStorage>,
+    /// Round stored tokens as a scene file would, in each of these formats in turn: f32, f16, int8
+    #[arg(long, value_delimiter = ',', value_name = "FORMAT")]
+    pub tokens: Vec<TokenStorage>,
+    /// Score another system's pictures of the targets too; repeatable
+    #[arg(long, value_name = "DIR")]
+    pub predictions: Vec<PathBuf>,
+    /// What it is called, once per --predictions in their order; the folder's name by default
+    #[arg(long, value_name = "NAME", requires = "predictions")]
+    pub name: Vec<String>,
+    /// What it keeps of a scene, such as 12.5MB, once per --predictions in their order
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, requires = "predictions")]
+    pub data_size: Vec<u64>,
     /// An evaluation index (JSON) with the context and target frames of every scene
     #[arg(long, value_name = "FILE")]
     pub index: Option<PathBuf>,
@@ -195,6 +259,40 @@ pub enum BenchCommand {
     Data(BenchDataArgs),
 }
 
+/// Arguments of `clift compare`.
+#[derive(Debug, clap::Args)]
+pub struct CompareArgs {
+    /// The first evaluation
+    pub a: PathBuf,
+    /// The second
+    pub b: PathBuf,
+    /// Compare a variant of the first with another of the second, at equal counts: kmeans,clift or clift:f32,clift:int8
+    #[arg(long, value_name = "A,B", value_parser = parse_sides)]
+    pub variants: Option<[Side; 2]>,
+    /// Write the differences as JSON
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
+/// Arguments of `clift flops`.
+#[derive(Debug, clap::Args)]
+pub struct FlopsArgs {
+    /// The experiment whose sizes are used, a TOML file; the paper's sizes by default
+    pub config: Option<PathBuf>,
+    /// How to count: paper, macs or flops
+    #[arg(long, default_value = "macs")]
+    pub convention: Convention,
+    /// Numbers of rendered tokens, or shares of a scene's; those of the paper's table, or of the config, by default
+    #[arg(long, value_delimiter = ',', value_name = "COUNT")]
+    pub render: Vec<TokenCount>,
+    /// Change a key of the config: `--set model.dim=512`
+    #[arg(long, value_name = "KEY=TOML", requires = "config")]
+    pub set: Vec<String>,
+    /// Write the counts as JSON
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
 /// Arguments of `clift bench`.
 #[derive(Debug, clap::Args)]
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
@@ -232,6 +330,29 @@ pub struct BenchArgs {
     /// Write the figures, with every repetition, as JSON
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
+}
+
+fn parse_sides(text: &str) -> Result<[Side; 2], String> {
+    let parts: Vec<&str> = text.split(',').map(str::trim).filter(|part| !part.is_empty()).collect();
+    let [a, b] = parts[..] else { return Err("write two variants, such as kmeans,clift".into()) };
+    Ok([Side::parse(a), Side::parse(b)])
+}
+
+/// Bytes, or so many kB, MB, GB of a thousand each.
+fn parse_bytes(text: &str) -> Result<u64, String> {
+    let text = text.trim();
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic()).trim();
+    let factor = match text[text.trim_end_matches(|c: char| c.is_ascii_alphabetic()).len()..].to_lowercase().as_str() {
+        "" | "b" => 1.0,
+        "k" | "kb" => 1e3,
+        "m" | "mb" => 1e6,
+        "g" | "gb" => 1e9,
+        _ => return Err("write a number of bytes, or of kB, MB or GB".into()),
+    };
+    match digits.parse::<f64>() {
+        Ok(number) if number > 0.0 && number * factor < 1e15 => Ok((number * factor).round() as u64),
+        _ => Err("write a positive number of bytes, or of kB, MB or GB".into()),
+    }
 }
 
 fn parse_stage(text: &str) -> Result<Stage, String> {
@@ -275,9 +396,33 @@ mod tests {
         assert!(parse(&["train", "a.toml", "--only", "stage3"]).is_err());
         assert!(parse(&["train", "a.toml", "--overfit", "0"]).is_err());
         assert!(parse(&["eval", "run", "--storage", "256,1/16"]).is_ok());
+        assert!(parse(&["eval"]).is_err());
+        assert!(parse(&["eval", "--checkpoint", "model"]).is_err());
+        assert!(parse(&["eval", "--checkpoint", "model", "--data", "re10k"]).is_ok());
+        assert!(parse(&["eval", "run", "--checkpoint", "model", "--data", "re10k"]).is_err());
+        assert!(parse(&["import", "a.ckpt", "--variant", "released-re10k", "-o", "m", "--rename", "a=b"]).is_ok());
+        assert!(parse(&["import", "a.ckpt", "--variant", "re10k", "-o", "m"]).is_err());
+        assert!(parse(&["import", "a.ckpt", "--variant", "paper", "-o", "m", "--rename", "a"]).is_err());
+        assert!(parse(&["export", "m", "--format", "pytorch", "-o", "a.ckpt"]).is_ok());
         assert!(parse(&["eval", "run", "--storage", "0"]).is_err());
         assert!(parse(&["eval", "run", "--render", "16,1/2", "--selection", "random"]).is_ok());
         assert!(parse(&["eval", "run", "--selection", "nearest"]).is_err());
+        assert!(parse(&["eval", "run", "--tokens", "f32,int8", "--predictions", "a", "--predictions", "b"]).is_ok());
+        assert!(parse(&["eval", "run", "--name", "MVSplat"]).is_err(), "a name of nothing");
+        assert!(parse(&["compare", "a", "b", "--variants", "kmeans,clift:int8"]).is_ok());
+        assert!(parse(&["compare", "a", "b", "--variants", "kmeans"]).is_err());
+        assert!(parse(&["flops", "--convention", "paper"]).is_ok());
+        assert!(parse(&["flops", "--convention", "flop"]).is_err());
+        assert!(parse(&["flops", "--set", "model.dim=8"]).is_err(), "of which config");
+    }
+
+    #[test]
+    fn sizes_are_bytes_or_thousands_of_them() {
+        let sizes = ["12", "1.5kB", "3 MB", "2g"].map(|text| parse_bytes(text).unwrap());
+        assert_eq!(sizes, [12, 1500, 3_000_000, 2_000_000_000]);
+        for text in ["", "MB", "-1", "0", "1TB", "1e99GB", "nan"] {
+            assert!(parse_bytes(text).is_err(), "{text}");
+        }
     }
 
     #[test]

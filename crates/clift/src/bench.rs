@@ -1,9 +1,5 @@
 //! `clift bench`.
 
-use std::path::Path;
-
-use anyhow::Context;
-use clift_data::files::replace;
 use clift_train::bench::{self, BenchEvent, BenchOptions, MAX_CHECKED_TOKENS, Report, Row, Work};
 use clift_train::{Config, read_config};
 
@@ -49,16 +45,10 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let report = report?;
     print_result(&shown(&report))?;
     if let Some(json) = &args.json {
-        write_json(&report, json)?;
+        crate::json::write(&report, json)?;
         print_result(&format!("results: {}", json.display()))?;
     }
     Ok(())
-}
-
-fn write_json(report: &Report, path: &Path) -> anyhow::Result<()> {
-    let mut text = serde_json::to_vec_pretty(report).context("writing the results as JSON")?;
-    text.push(b'\n');
-    replace(path, &text).with_context(|| format!("writing {}", path.display()))
 }
 
 const HEADER: [&str; 5] = ["work", "median", "p95", "peak memory", "error against f64"];

@@ -21,7 +21,7 @@ const MAX_KEYS_SHOWN: usize = 8;
 /// Arguments of `clift encode`.
 #[derive(Debug, clap::Args)]
 pub struct EncodeArgs {
-    /// A run directory, or a model.safetensors in one
+    /// A run or model directory, or a model.safetensors in one
     #[arg(value_name = "RUN|MODEL")]
     pub model: PathBuf,
     /// A capture (a folder with transforms.json or a COLMAP model), or a data set in any layout; the run's own data by
@@ -65,6 +65,8 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         terminal::print_note(&format!("--set {change}"));
     }
     config.device = args.device.unwrap_or(config.device);
+    // A model that was imported names no data.
+    config.data.root = config.data.root.or_else(|| args.data.clone());
     config.validate()?;
     let source = match &args.data {
         Some(folder) => open_folder(folder, args.split, &config, &overrides)?,

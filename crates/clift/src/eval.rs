@@ -1,19 +1,60 @@
 //! `clift eval`.
 
-use clift_train::{Config, Run, read_config};
+use std::path::{Path, PathBuf};
+
+use clift_eval::{System, SystemName};
+use clift_train::config::SourceKind;
+use clift_train::trained::ModelPath;
+use clift_train::{Config, Run, model_dir, read_config};
 
 use crate::args::EvalArgs;
-use crate::terminal;
+use crate::{WrongUsage, terminal};
 
-/// Evaluates a run and prints the table.
+/// Evaluates a run or a model and prints the table.
 pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
-    let (mut config, overrides) = read_config::<Config>(&args.run.join("config.toml"), &args.set)?;
+    let systems = systems(args)?;
+    let model = args.checkpoint.as_deref().map(ModelPath::find).transpose()?;
+    let folder = match (&model, &args.run) {
+        (Some(model), _) => &model.run,
+        (None, Some(run)) => run,
+        (None, None) => unreachable!("the command line asks for one of the two"),
+    };
+    let config = read(args, folder)?;
+    let out: PathBuf = args.out.clone().unwrap_or_else(|| folder.join("eval"));
+    let beside = args.with.as_ref().map(|run| -> anyhow::Result<Config> {
+        let (mut other, _) = read_config::<Config>(&run.join("config.toml"), &[])?;
+        other.run_dir.clone_from(run);
+        Ok(other)
+    });
+    let beside = beside.transpose()?;
+    let mut sink = terminal::sink();
+    let stop = crate::interrupt::flag()?;
+    let summary = match &model {
+        None => Run::reopen(config)?.evaluate(&systems, &out, beside.as_ref(), &stop, sink.as_mut())?,
+        Some(model) => {
+            let stage1 = args.stage1.as_deref().map(ModelPath::find).transpose()?;
+            model_dir::evaluate(config, model, stage1.as_ref(), &systems, &out, &stop, sink.as_mut())?
+        }
+    };
+    drop(sink);
+    terminal::print_evaluation(&summary, &out)
+}
+
+/// The config of a run or model directory with what the command line changes.
+fn read(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
+    let (mut config, overrides) = read_config::<Config>(&folder.join("config.toml"), &args.set)?;
     for change in overrides {
         terminal::print_note(&format!("--set {change}"));
     }
     // A run may have been moved since it was trained.
-    config.run_dir.clone_from(&args.run);
+    config.run_dir = folder.to_path_buf();
     config.device = args.device.unwrap_or(config.device);
+    if let Some(data) = &args.data {
+        config.data.root = Some(data.clone());
+        if config.data.source == SourceKind::Synthetic {
+            config.data.source = SourceKind::Auto;
+        }
+    }
     if let Some(experiment) = args.preset {
         experiment.apply(&mut config.eval);
     }
@@ -24,20 +65,36 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
         config.eval.render.clone_from(&args.render);
     }
     config.eval.selection = args.selection.unwrap_or(config.eval.selection);
-    config.eval.tokens = args.tokens.unwrap_or(config.eval.tokens);
+    if !args.tokens.is_empty() {
+        config.eval.tokens.clone_from(&args.tokens);
+    }
     if args.index.is_some() {
         config.eval.index.clone_from(&args.index);
     }
-    let folder = args.out.clone().unwrap_or_else(|| args.run.join("eval"));
-    let beside = args.with.as_ref().map(|run| -> anyhow::Result<Config> {
-        let (mut other, _) = read_config::<Config>(&run.join("config.toml"), &[])?;
-        other.run_dir.clone_from(run);
-        Ok(other)
-    });
-    let beside = beside.transpose()?;
-    let mut sink = terminal::sink();
-    let stop = crate::interrupt::flag()?;
-    let summary = Run::reopen(config)?.evaluate(&folder, beside.as_ref(), &stop, sink.as_mut())?;
-    drop(sink);
-    terminal::print_evaluation(&summary, &folder)
+    Ok(config)
+}
+
+/// Other systems, with as many names and sizes as there are, or none.
+fn systems(args: &EvalArgs) -> anyhow::Result<Vec<System>> {
+    let EvalArgs { predictions, name, data_size, .. } = args;
+    for (flag, count) in [("--name", name.len()), ("--data-size", data_size.len())] {
+        if count != 0 && count != predictions.len() {
+            let text =
+                format!("{} --predictions but {count} {flag}: write one for each, in their order", predictions.len());
+            return Err(WrongUsage(text).into());
+        }
+    }
+    let mut systems: Vec<System> = Vec::new();
+    for (i, folder) in predictions.iter().enumerate() {
+        if !folder.is_dir() {
+            return Err(WrongUsage(format!("there is no folder for --predictions {}", folder.display())).into());
+        }
+        let of_folder = || folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned();
+        let name = SystemName::new(&name.get(i).cloned().unwrap_or_else(of_folder))?;
+        if systems.iter().any(|system| system.name == name) {
+            return Err(WrongUsage(format!("two --predictions are called {}: write --name", name.as_str())).into());
+        }
+        systems.push(System { name, folder: Path::to_owned(folder), data_bytes: data_size.get(i).copied() });
+    }
+    Ok(systems)
 }

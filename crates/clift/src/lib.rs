@@ -2,11 +2,16 @@
 
 mod args;
 mod bench;
+mod compare;
 mod data;
 mod doctor;
 mod encode;
 mod eval;
+mod export;
+mod flops;
+mod import;
 mod interrupt;
+mod json;
 mod plan;
 mod render;
 mod table;
@@ -35,6 +40,8 @@ pub fn main() -> ExitCode {
     let result = match Args::parse().command {
         Command::Train(args) => train::run(&args),
         Command::Eval(args) => eval::run(&args),
+        Command::Compare(args) => compare::run(&args),
+        Command::Flops(args) => flops::run(&args),
         Command::Encode(args) => encode::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
@@ -46,6 +53,8 @@ pub fn main() -> ExitCode {
         Command::Doctor(args) => doctor::run(&args),
         Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => data::bench::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Import(args) => import::run(&args),
+        Command::Export(args) => export::run(&args),
     };
     match result {
         Ok(()) => ExitCode::from(DONE),
@@ -87,8 +96,8 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     if let Some(error) = error.downcast_ref::<clift_model::ModelError>() {
         return model_exit_code(error);
     }
-    if let Some(EvalError::BadTokenCount { .. }) = error.downcast_ref::<EvalError>() {
-        return WRONG_USAGE;
+    if let Some(error) = error.downcast_ref::<EvalError>() {
+        return eval_exit_code(error);
     }
     error.downcast_ref::<TrainError>().map_or(FAILED, train_exit_code)
 }
@@ -99,8 +108,8 @@ fn train_exit_code(error: &TrainError) -> u8 {
         TrainError::BadConfig { .. }
         | TrainError::OtherRun { .. }
         | TrainError::Missing { .. }
-        | TrainError::NoConfig { .. }
-        | TrainError::Eval(EvalError::BadTokenCount { .. }) => WRONG_USAGE,
+        | TrainError::NoConfig { .. } => WRONG_USAGE,
+        TrainError::Eval(error) => eval_exit_code(error),
         TrainError::Data(error) => data_exit_code(error),
         TrainError::Model(error) => model_exit_code(error),
         TrainError::Stopped { source, .. } | TrainError::Damaged { source, .. } => train_exit_code(source),
@@ -111,6 +120,19 @@ fn train_exit_code(error: &TrainError) -> u8 {
 fn data_exit_code(error: &clift_data::DataError) -> u8 {
     use clift_data::DataError::{BadConfig, UnknownLayout};
     if matches!(error, BadConfig { .. } | UnknownLayout { .. }) { WRONG_USAGE } else { FAILED }
+}
+
+fn eval_exit_code(error: &EvalError) -> u8 {
+    use EvalError::{BadSystemName, BadTokenCount, BadWeights, NoPredictions, NotComparable};
+    match error {
+        BadTokenCount { .. }
+        | BadSystemName { .. }
+        | BadWeights { .. }
+        | NoPredictions { .. }
+        | NotComparable { .. } => WRONG_USAGE,
+        EvalError::Model(error) => model_exit_code(error),
+        _ => FAILED,
+    }
 }
 
 fn model_exit_code(error: &clift_model::ModelError) -> u8 {

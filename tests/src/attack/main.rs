@@ -66,7 +66,9 @@ fn all_targets() -> impl Iterator<Item = &'static Target> {
 fn main() -> ExitCode {
     let args = Args::parse();
     if args.list {
-        all_targets().for_each(|target| println!("{}", target.name));
+        for target in all_targets() {
+            println!("{}", target.name);
+        }
         return ExitCode::SUCCESS;
     }
     if let Some(unknown) = args.target.iter().find(|name| all_targets().all(|target| target.name != **name)) {

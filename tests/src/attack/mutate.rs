@@ -55,7 +55,7 @@ pub struct Mutator<'a> {
     /// Words of the format.
     pub words: &'a [&'a [u8]],
     /// Puts right what would hide the damage: checksums.
-    pub repair: fn(&mut Vec<u8>),
+    pub repair: fn(&mut [u8]),
 }
 
 impl Mutator<'_> {
@@ -64,7 +64,7 @@ impl Mutator<'_> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed ^ name_hash(target));
         rng.set_stream(number);
         let mut bytes = self.seeds[below(&mut rng, self.seeds.len())].clone();
-        for _ in 0..1 + below(&mut rng, 6) {
+        for _ in 0..=below(&mut rng, 6) {
             self.damage(&mut bytes, &mut rng);
         }
         // Half of the time the damage is one that checksums do not see.

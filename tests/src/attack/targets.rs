@@ -9,6 +9,7 @@ use clift_model::{Scene, weights};
 use clift_train::checkpoint::Checkpoints;
 use clift_train::clusters::ClusterCache;
 use clift_train::config::{CheckpointConfig, OptimizerConfig};
+use clift_train::loss::Loss;
 use clift_train::optim::adamw;
 use clift_train::step::Learner;
 use clift_train::{Config, Run, read_checked_config};
@@ -29,7 +30,7 @@ pub struct Target {
     /// Words of its format.
     pub words: &'static [&'static [u8]],
     /// Puts checksums right.
-    pub repair: fn(&mut Vec<u8>),
+    pub repair: fn(&mut [u8]),
     /// Most bytes it may take for an input of so many.
     pub most_bytes: fn(usize) -> usize,
 }
@@ -37,7 +38,7 @@ pub struct Target {
 /// All of them. A new reader is a line here and, where it needs more than its bytes, a function below.
 pub const TARGETS: &[Target] = &[
     Target { name: "pickle", seeds: pickles, open: pickle, words: PICKLE_WORDS, ..PLAIN },
-    Target { name: "chunk", seeds: |_| vec![chunk_file()], open: |s| chunk(s, |bytes| bytes.to_vec()), ..PLAIN },
+    Target { name: "chunk", seeds: |_| vec![chunk_file()], open: |s| chunk(s, <[u8]>::to_vec), ..PLAIN },
     Target {
         name: "chunk-pickle",
         seeds: |_| vec![member(&chunk_file(), "data.pkl")],
@@ -360,7 +361,7 @@ fn picture(_: &Setup) -> Read {
 }
 
 /// Gives every block of a PNG the checksum it should have, as far as its blocks can be followed.
-fn png_checksums(bytes: &mut Vec<u8>) {
+fn png_checksums(bytes: &mut [u8]) {
     let mut at = 8;
     while at + 12 <= bytes.len() {
         let len = u32::from_be_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]) as usize;
@@ -397,7 +398,7 @@ fn model_weights(setup: &Setup) -> Read {
     })
 }
 
-/// Resumes from a checkpoint of which one file is damaged.
+/// Resumes from a checkpoint of which one file is damaged; its checksum is put right, or nothing behind it is reached.
 fn checkpoint(setup: &Setup, name: &'static str) -> Read {
     let folder = setup.fresh(&format!("checkpoint-{name}"));
     let step = folder.join("step-000000002");
@@ -406,19 +407,24 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
         let path = item.expect("it can be listed").path();
         std::fs::copy(&path, step.join(path.file_name().expect("it has a name"))).expect("it can be copied");
     }
+    let mut state: serde_json::Value =
+        serde_json::from_slice(&read(&step.join("state.json"))).expect("a valid state is JSON");
     let model = setup.model();
     Box::new(move |bytes| {
         std::fs::write(step.join(name), bytes).expect("a temporary folder is writable");
+        if name != "state.json" {
+            state["files"][name] = serde_json::json!({"num_bytes": bytes.len(), "crc32": crc32fast::hash(bytes)});
+            std::fs::write(step.join("state.json"), state.to_string()).expect("a temporary folder is writable");
+        }
         let mut learner = Learner {
             model: model.clone(),
             optimizer: adamw(&OptimizerConfig::default()),
             device: Device::flex().autodiff(),
+            loss: Loss::default(),
             recompute: false,
         };
-        Checkpoints::new(folder.clone(), CheckpointConfig { keep: 1, ..CheckpointConfig::default() })
-            .resume(&mut learner)
-            .map(drop)
-            .map_err(words_of)
+        let checkpoints = Checkpoints::new(folder.clone(), CheckpointConfig::default());
+        checkpoints.resume(&mut learner).map(drop).map_err(words_of)
     })
 }
 

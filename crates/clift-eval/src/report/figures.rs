@@ -1,9 +1,10 @@
 //! The plots of a report: quality against tokens, bytes and time.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+
+use clift_model::TokenStorage;
 
 use super::axis::{Scale, milliseconds};
-use super::pareto::front;
 use super::plot::{Level, Look, Mark, Plot, Series};
 use crate::exhibit::best_variant;
 use crate::measured::{Setting, Variant};
@@ -25,17 +26,18 @@ pub struct Figure {
 pub fn figures(summary: &Summary) -> Vec<Figure> {
     let mut figures = vec![Figure {
         heading: "Quality against stored tokens",
-        plot: by_variant(summary, "stored tokens", Scale::LogValues, |point| Some(point.num_storage_tokens as f64)),
+        plot: by_variant(summary, "stored tokens", Scale::LogValues, |point| {
+            (point.num_storage_tokens > 0).then_some(point.num_storage_tokens as f64)
+        }),
         note: "",
     }];
     if summary.points.iter().any(|point| is_whole(point) && point.scene_bytes.is_some()) {
-        figures.push(Figure {
-            heading: "Quality against the size of a scene",
-            plot: by_variant(summary, "scene file, kB", Scale::Log, |point| {
-                point.scene_bytes.map(|bytes| bytes as f64 / 1e3)
-            }),
-            note: "",
-        });
+        let kb = |point: &Point| point.scene_bytes.map(|bytes| bytes as f64 / 1e3);
+        let mut plot = by_variant(summary, "scene, kB", Scale::Log, kb);
+        let on_front = summary.points.iter().filter(|point| point.pareto_bytes);
+        plot.front = on_front.filter_map(|point| Some((kb(point)?, point.psnr?))).collect();
+        plot.front.sort_by(|a, b| a.0.total_cmp(&b.0));
+        figures.push(Figure { heading: "Quality against the size of a scene", plot, note: "" });
     }
     if summary.points.iter().any(|point| !is_whole(point)) {
         figures.push(Figure {
@@ -45,12 +47,8 @@ pub fn figures(summary: &Summary) -> Vec<Figure> {
         });
     }
     if summary.points.iter().any(|point| seconds(point).is_some()) {
-        let note = if summary.points.iter().all(is_whole) {
-            ""
-        } else {
-            "Views from all stored tokens are drawn up to eight at a time and share keys and values; views from chosen \
-             tokens are drawn one by one, the choice included."
-        };
+        let note =
+            "Each view is drawn alone, the choice of its tokens included where they are chosen: medians over views.";
         figures.push(Figure { heading: "Quality against time per frame", plot: by_time(summary), note });
     }
     figures
@@ -58,8 +56,8 @@ pub fn figures(summary: &Summary) -> Vec<Figure> {
 
 /// The setting of a point.
 pub fn setting(point: &Point) -> Setting {
-    let Point { variant, num_storage_tokens, num_render_tokens, .. } = *point;
-    Setting { variant, num_storage_tokens, num_render_tokens }
+    let Point { variant, num_storage_tokens, num_render_tokens, tokens, .. } = *point;
+    Setting { variant, num_storage_tokens, num_render_tokens, tokens }
 }
 
 /// Whether a point's views are drawn from all tokens that are stored.
@@ -67,27 +65,57 @@ pub fn is_whole(point: &Point) -> bool {
     point.num_render_tokens == point.num_storage_tokens
 }
 
-/// Time per frame: choosing tokens and drawing.
+/// Median time per frame: choosing tokens and drawing.
 pub fn seconds(point: &Point) -> Option<f64> {
-    point.render_s.map(|render_s| render_s + point.select_s.unwrap_or_default())
-}
-
-/// Points that no other beats in both time per frame and PSNR.
-pub fn fastest(points: &[Point]) -> Vec<usize> {
-    let value = |value: Option<f64>| value.unwrap_or(f64::NAN);
-    front(&points.iter().map(|point| (value(seconds(point)), value(point.psnr))).collect::<Vec<_>>())
+    point.frame_median_s
 }
 
 /// The look of a variant, the same in every plot.
-const fn look(variant: Variant) -> Look {
-    Look::ALL[match variant {
-        Variant::Clift => 0,
-        Variant::Kmeans => 1,
-        Variant::Random => 2,
-        Variant::Patch => 3,
+fn look(summary: &Summary, variant: Variant) -> Look {
+    let ours = |i: usize| Look::ALL[i];
+    match variant {
+        Variant::Clift => ours(0),
+        Variant::Kmeans => ours(1),
+        Variant::Random => ours(2),
+        Variant::Patch => ours(3),
         // Baselines are levels, not series.
-        Variant::PatchClift | Variant::NearestView | Variant::MeanImage => 4,
-    }]
+        Variant::PatchClift | Variant::NearestView | Variant::MeanImage => ours(4),
+        Variant::System(_) => {
+            let is_system = |variant: &Variant| matches!(variant, Variant::System(_));
+            let systems: BTreeSet<_> = summary.points.iter().map(|point| point.variant).filter(is_system).collect();
+            let place = systems.into_iter().position(|system| system == variant).unwrap_or_default();
+            Look::OTHERS[place % Look::OTHERS.len()]
+        }
+    }
+}
+
+/// Whether stored tokens have several number formats, so that lines are told apart by them too.
+fn has_formats(summary: &Summary) -> bool {
+    let stored = summary.points.iter().filter(|point| point.scene_bytes.is_some());
+    stored.filter_map(|point| point.tokens).collect::<BTreeSet<_>>().len() > 1
+}
+
+/// A line for every variant and number format, in its look.
+fn series(summary: &Summary, is_joined: bool, mark: impl Fn(&Point) -> Option<Mark>) -> Vec<Series> {
+    let has_formats = has_formats(summary);
+    let mut lines: BTreeMap<(Variant, Option<TokenStorage>), Vec<Mark>> = BTreeMap::new();
+    for point in &summary.points {
+        if let Some(mark) = mark(point) {
+            lines.entry((point.variant, point.tokens.filter(|_| has_formats))).or_default().push(mark);
+        }
+    }
+    let line = |((variant, tokens), marks): ((Variant, Option<TokenStorage>), Vec<Mark>)| {
+        let mut look = look(summary, variant);
+        let mut name = variant.name().to_owned();
+        if let Some(tokens) = tokens.filter(|_| variant != Variant::Random) {
+            // The colour is the variant's, the marker the format's.
+            let format = TokenStorage::ALL.iter().position(|format| *format == tokens).unwrap_or_default();
+            look.marker = Look::ALL[format].marker;
+            name = format!("{name}, {}", tokens.name());
+        }
+        Series { name, look, is_joined, marks }
+    };
+    lines.into_iter().map(line).collect()
 }
 
 fn levels(summary: &Summary) -> Vec<Level> {
@@ -103,34 +131,28 @@ fn levels(summary: &Summary) -> Vec<Level> {
 fn mark(point: &Point, x: f64) -> Option<Mark> {
     let y = point.psnr?;
     let Point { num_storage_tokens: stored, num_render_tokens: rendered, .. } = *point;
-    let tokens = if is_whole(point) { format!("{stored} tokens") } else { format!("{rendered} of {stored} tokens") };
+    let tokens = match (stored, is_whole(point)) {
+        (0, _) => String::new(),
+        (_, true) => format!(", {stored} tokens"),
+        (_, false) => format!(", {rendered} of {stored} tokens"),
+    };
+    let format = point.tokens.map(|tokens| format!(" in {}", tokens.name())).unwrap_or_default();
     let error = point.psnr_stderr.map(|error| format!(" \u{b1} {error:.2}")).unwrap_or_default();
     let time = seconds(point).map(|s| format!(", {} ms per frame", milliseconds(s))).unwrap_or_default();
-    let title = format!("{}, {tokens}: {y:.2}{error} dB{time}", point.variant.name());
+    let title = format!("{}{tokens}{format}: {y:.2}{error} dB{time}", point.variant.name());
     Some(Mark { x, y, error: point.psnr_stderr, title })
 }
 
 /// A line per variant, of the points that are drawn from all they store.
 fn by_variant(summary: &Summary, x_label: &'static str, x_scale: Scale, x: impl Fn(&Point) -> Option<f64>) -> Plot {
-    let mut series: BTreeMap<Variant, Vec<Mark>> = BTreeMap::new();
-    for point in summary.points.iter().filter(|point| is_whole(point)) {
-        if let Some(mark) = x(point).and_then(|x| mark(point, x)) {
-            series.entry(point.variant).or_default().push(mark);
-        }
-    }
-    let series = series.into_iter().map(|(variant, marks)| Series {
-        name: variant.name().into(),
-        look: look(variant),
-        is_joined: true,
-        marks,
-    });
+    let whole = |point: &Point| if is_whole(point) { x(point).and_then(|x| mark(point, x)) } else { None };
     let title = format!("PSNR against {x_label}, a line per variant, with the standard error over scenes");
     Plot {
         title,
         x_label,
         x_scale,
         y_label: QUALITY,
-        series: series.collect(),
+        series: series(summary, true, whole),
         levels: levels(summary),
         front: Vec::new(),
     }
@@ -140,7 +162,10 @@ fn by_variant(summary: &Summary, x_label: &'static str, x_scale: Scale, x: impl 
 fn by_rendered(summary: &Summary) -> Plot {
     let best = best_variant(summary.points.iter().map(setting));
     let mut lines: BTreeMap<usize, Vec<Mark>> = BTreeMap::new();
-    for point in summary.points.iter().filter(|point| Some(point.variant) == best) {
+    // Of the finest format, where there are several.
+    let is_best = |point: &&Point| Some(point.variant) == best;
+    let format = summary.points.iter().filter(is_best).map(|point| point.tokens).min().flatten();
+    for point in summary.points.iter().filter(is_best).filter(|point| point.tokens == format) {
         lines.entry(point.num_storage_tokens).or_default().extend(mark(point, point.num_render_tokens as f64));
     }
     lines.retain(|_, marks| marks.len() > 1);
@@ -169,30 +194,20 @@ fn by_rendered(summary: &Summary) -> Plot {
 
 /// Every point over its time per frame, and the front.
 fn by_time(summary: &Summary) -> Plot {
-    let mut series: BTreeMap<Variant, Vec<Mark>> = BTreeMap::new();
-    for point in &summary.points {
-        if let Some(mark) = seconds(point).and_then(|seconds| mark(point, seconds * 1e3)) {
-            series.entry(point.variant).or_default().push(Mark { error: None, ..mark });
-        }
-    }
-    let on_front = fastest(&summary.points);
-    let place = |i: usize| {
-        let point = &summary.points[i];
-        Some((seconds(point)? * 1e3, point.psnr?))
+    let place = |point: &Point| Some((seconds(point)? * 1e3, point.psnr?));
+    let at_time = |point: &Point| {
+        let mark = seconds(point).and_then(|seconds| mark(point, seconds * 1e3))?;
+        Some(Mark { error: None, ..mark })
     };
-    let series = series.into_iter().map(|(variant, marks)| Series {
-        name: variant.name().into(),
-        look: look(variant),
-        is_joined: false,
-        marks,
-    });
+    let mut front: Vec<_> = summary.points.iter().filter(|point| point.pareto_time).filter_map(place).collect();
+    front.sort_by(|a, b| a.0.total_cmp(&b.0));
     Plot {
         title: "PSNR against time per frame, every point, with the Pareto front".into(),
         x_label: "time per frame, ms",
         x_scale: Scale::Linear,
         y_label: QUALITY,
-        series: series.collect(),
+        series: series(summary, false, at_time),
         levels: Vec::new(),
-        front: on_front.into_iter().filter_map(place).collect(),
+        front,
     }
 }

@@ -31,6 +31,13 @@ impl Look {
         Self { class: "c3", marker: "M0 -5.6L5.6 0L0 5.6L-5.6 0z" },
         Self { class: "c4", marker: "M-5 -3.8H5L0 5.2z" },
     ];
+
+    /// Looks of other systems.
+    pub const OTHERS: [Self; 3] = [
+        Self { class: "c5", marker: "M-5 -1.6H-1.6V-5H1.6V-1.6H5V1.6H1.6V5H-1.6V1.6H-5z" },
+        Self { class: "c6", marker: "M-2.8 -4.9H2.8L5.6 0L2.8 4.9H-2.8L-5.6 0z" },
+        Self { class: "c7", marker: "M-5 -2.4H5V2.4H-5z" },
+    ];
 }
 
 /// One measured value.

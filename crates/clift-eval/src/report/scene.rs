@@ -80,6 +80,13 @@ fn write_drawings(exhibit: &Exhibit, out: &mut impl Write) -> io::Result<()> {
         let drawings = exhibit.drawings.iter().filter(|d| d.setting.variant == variant && whole(d.setting));
         write_strip(variant.name(), &drawings.collect::<Vec<_>>(), out)?;
     }
+    for drawing in &exhibit.drawings {
+        if let Variant::System(name) = drawing.setting.variant {
+            start_row(&Escaped(name.as_str()).to_string(), out)?;
+            write_drawing(drawing, "its picture", out)?;
+            end_row(out)?;
+        }
+    }
     let best = best_variant(exhibit.drawings.iter().map(|drawing| drawing.setting));
     let some = exhibit.drawings.iter().filter(|d| Some(d.setting.variant) == best && !whole(d.setting));
     let most = some.clone().map(|drawing| drawing.setting.num_storage_tokens).max();

@@ -1,14 +1,15 @@
-use clift_model::SceneClusters;
+use clift_model::{SceneClusters, TokenStorage};
 
 use super::*;
 use crate::exhibit::{Choice, Drawing};
 use crate::measured::{Accumulator, Measured, Setting, Variant};
 use crate::picture::Picture;
+use crate::predictions::SystemName;
 
 const HOSTILE: &str = "<script>alert('room')</script>";
 
 fn setting(variant: Variant, num_storage_tokens: usize, num_render_tokens: usize) -> Setting {
-    Setting { variant, num_storage_tokens, num_render_tokens }
+    Setting { variant, num_storage_tokens, num_render_tokens, tokens: Some(TokenStorage::F32) }
 }
 
 /// Two variants at two counts and one choice, over two scenes.
@@ -137,8 +138,9 @@ fn no_text_from_data_is_read_as_markup() {
 #[test]
 fn the_points_on_the_pareto_front_are_marked() {
     let html = page(&report());
-    // 1 ms and 15 dB, 2 ms and 16.5 dB, 3 ms and 18.5 dB; the random subset is slower and worse than the second.
-    assert_eq!(html.matches("\u{25cf}").count(), 3);
+    // Time: 1 ms and 15 dB, 2 ms and 16.5 dB, 3 ms and 18.5 dB; the random subset is slower and worse than the second.
+    // Bytes: 4,000 and 16.5 dB, 8,000 and 18.5 dB; those with 15 dB take 8,000 as well.
+    assert_eq!(html.matches("<td>\u{25cf}</td>").count(), 3 + 2);
     let random = html.split("<tr").find(|row| row.contains("<td>random</td>")).unwrap();
     assert!(!random.contains('\u{25cf}'), "{random}");
 }
@@ -193,4 +195,45 @@ fn a_report_that_cannot_be_written_says_where() {
     let path = folder.path().join("report.html");
     report().write(&path).unwrap();
     assert!(std::fs::read_to_string(&path).unwrap().ends_with("</html>\n"));
+}
+
+#[test]
+fn other_systems_stand_in_tables_plots_and_scenes_with_what_they_miss() {
+    let name = SystemName::new("<b>MVSplat</b>").unwrap();
+    let mut other = report();
+    let mut views = Accumulator::default();
+    let setting = Setting::baseline(Variant::System(name));
+    views.add("a", 3, setting, Measured::quality(17.0, Some(0.5))).unwrap();
+    views.add_scene_bytes(setting, 5_000);
+    views.miss(name, "b/000003.png".into());
+    views.note_not_measured("lpips_vgg", "no <weights>".into());
+    let theirs = views.summary();
+    other.summary.points.extend(theirs.points);
+    (other.summary.missing, other.summary.not_measured) = (theirs.missing, theirs.not_measured);
+    other.exhibits[0].drawings.push(Drawing { setting, psnr: 17.0, picture: Picture::new(16, 16, [9; 3]) });
+    let html = page(&other);
+    let escaped = "&lt;b&gt;MVSplat&lt;/b&gt;";
+    assert!(!html.contains("<b>MVSplat"), "a name is no markup");
+    assert!(html.contains(&format!("<td>{escaped}</td>")), "table");
+    assert!(html.contains(&format!("<h4>{escaped}</h4>")), "scene");
+    assert!(html.contains(&format!("</svg>{escaped}</li>")), "legend");
+    assert!(html.contains(&format!("{escaped}: 1 of 2 pictures are missing")), "{html}");
+    assert!(html.contains("<code>lpips_vgg</code> is not measured: no &lt;weights&gt;"));
+    assert!(!html.contains("NaN") && !html.contains("inf\""), "no place for zero tokens on an axis of logarithms");
+}
+
+#[test]
+fn several_formats_have_lines_of_their_own() {
+    let mut several = report();
+    let mut coarse: Vec<Point> =
+        several.summary.points.iter().filter(|point| point.variant == Variant::Clift).cloned().collect();
+    for point in &mut coarse {
+        (point.tokens, point.scene_bytes) = (Some(TokenStorage::Int8), point.scene_bytes.map(|bytes| bytes / 4));
+    }
+    several.summary.points.extend(coarse);
+    let html = page(&several);
+    for part in ["</svg>clift, f32</li>", "</svg>clift, int8</li>", "</svg>random</li>", "<td>int8</td>"] {
+        assert!(html.contains(part), "{part}");
+    }
+    assert!(!page(&report()).contains("clift, f32"), "one format needs no telling apart");
 }

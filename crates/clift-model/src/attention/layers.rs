@@ -5,22 +5,30 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 
 use super::self_sdpa;
-use crate::Init;
 use crate::linear::{linear, linear_of_norm};
+use crate::qk_norm::QkNorm;
+use crate::{Init, ModelConfig};
 
 /// Self-attention with a packed projection (paper section 3.1: eight heads).
 #[derive(Module, Debug)]
 pub struct SelfAttention {
     in_proj: Linear,
     out_proj: Linear,
+    qk_norm: Option<QkNorm>,
     #[module(skip)]
     num_heads: usize,
 }
 
 impl SelfAttention {
     /// Makes the layer with PyTorch's initialisation of multi-head attention.
-    pub fn new(dim: usize, num_heads: usize, init: &mut Init) -> Self {
-        Self { in_proj: init.attention_in(dim, 3), out_proj: init.attention_out(dim), num_heads }
+    pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        let ModelConfig { dim, num_heads, .. } = *config;
+        Self {
+            in_proj: init.attention_in(dim, 3),
+            out_proj: init.attention_out(dim),
+            qk_norm: QkNorm::of(config, init),
+            num_heads,
+        }
     }
 
     /// Mixes the normalised tokens of the same scene.
@@ -28,7 +36,12 @@ impl SelfAttention {
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
     pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
-        linear(&self.out_proj, self_sdpa(linear_of_norm(norm, &self.in_proj, x), self.num_heads))
+        let packed = linear_of_norm(norm, &self.in_proj, x);
+        let packed = match &self.qk_norm {
+            Some(qk_norm) => qk_norm.packed(packed),
+            None => packed,
+        };
+        linear(&self.out_proj, self_sdpa(packed, self.num_heads))
     }
 }
 
@@ -38,29 +51,40 @@ pub struct CrossAttention {
     q_proj: Linear,
     kv_proj: Linear,
     out_proj: Linear,
+    qk_norm: Option<QkNorm>,
     #[module(skip)]
     num_heads: usize,
 }
 
 impl CrossAttention {
     /// Makes the layer with PyTorch's initialisation of multi-head attention.
-    pub fn new(dim: usize, num_heads: usize, init: &mut Init) -> Self {
+    pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        let ModelConfig { dim, num_heads, .. } = *config;
         Self {
             q_proj: init.attention_in(dim, 1),
             kv_proj: init.attention_in(dim, 2),
             out_proj: init.attention_out(dim),
+            qk_norm: QkNorm::of(config, init),
             num_heads,
         }
     }
 
     /// Queries, `[batch, num_queries, dim]`.
     pub(crate) fn project_query(&self, norm: Option<&LayerNorm>, x: Tensor<3>) -> Tensor<3> {
-        project(norm, &self.q_proj, x)
+        let query = project(norm, &self.q_proj, x);
+        match &self.qk_norm {
+            Some(qk_norm) => qk_norm.queries(query),
+            None => query,
+        }
     }
 
     /// Keys and values side by side, `[batch, num_keys, 2 dim]`. They depend on the tokens alone.
     pub(crate) fn project_memory(&self, norm: Option<&LayerNorm>, memory: Tensor<3>) -> Tensor<3> {
-        project(norm, &self.kv_proj, memory)
+        let key_value = project(norm, &self.kv_proj, memory);
+        match &self.qk_norm {
+            Some(qk_norm) => qk_norm.keys_beside_values(key_value),
+            None => key_value,
+        }
     }
 
     /// The projection after the heads.

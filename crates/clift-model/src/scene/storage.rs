@@ -14,7 +14,7 @@ use crate::ModelError;
 const INT8_MAX: f32 = 127.0;
 
 /// Number format of the tokens in a scene file.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TokenStorage {
     /// 32-bit floats: the renderer gets the tokens it would get without a file.

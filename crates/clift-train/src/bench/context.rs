@@ -138,7 +138,7 @@ impl BenchContext {
             return Ok(lift.clone());
         }
         let views = upload_views(&[&self.clip(1).context], &self.device)?;
-        let lift = self.model().encoder.valid().forward(&views);
+        let lift = self.model().valid().lift(&views);
         Ok(self.lift.get_or_init(|| lift).clone())
     }
 

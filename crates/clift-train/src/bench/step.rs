@@ -13,6 +13,7 @@ use crate::TrainError;
 use crate::bad_steps::Fault;
 use crate::config::{Config, OptimizerConfig};
 use crate::events::Stage;
+use crate::loss::Loss;
 use crate::optim::adamw;
 use crate::schedule::warm_up_cosine;
 use crate::step::{Learner, Shown, StageBatch, loss_of};
@@ -38,6 +39,8 @@ impl StepTask {
             model: freeze(stage, context.model()),
             optimizer: adamw(optimizer),
             device: context.device.clone().autodiff(),
+            // The network of a perceptual term is not this project's: the rows are of the model alone.
+            loss: Loss::default(),
             recompute: context.config.recompute,
         };
         Ok(Self {
@@ -114,7 +117,7 @@ impl InF64 for Shown {
 
 /// Loss of a batch and the gradient of every parameter.
 pub(crate) fn gradients(model: &Clift, batch: &StageBatch, shown: Shown) -> Result<(f64, GradientsParams), TrainError> {
-    let loss = loss_of(model, &shown, &batch.tokens)?;
+    let loss = loss_of(model, &shown, &batch.tokens, &Loss::default())?.total;
     let grads = GradientsParams::from_grads(loss.backward(), model);
     Ok((values(loss.inner())[0], grads))
 }

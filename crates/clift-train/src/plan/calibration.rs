@@ -7,19 +7,20 @@ use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::order::{item_rng, step_rng};
 use clift_data::{ClipReader, Split};
-use clift_eval::{Accumulator, Networks, Sweep, TokenCount, Variant, evaluate_scene, upload_cameras, upload_views};
+use clift_eval::{Accumulator, Condensed, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
 use clift_model::ModelConfig;
 use rand::RngExt;
 use rand::seq::index::sample;
 
 use super::counts::{Macs, Parameters, SceneSizes};
-use super::sizes::{Middle, update_macs};
+use super::sizes::{Middle, update_macs, variants};
 use crate::TrainError;
 use crate::bench::BenchOptions;
 use crate::bench::context::BenchContext;
 use crate::bench::inputs::{Shape, batch, clip};
 use crate::config::Config;
 use crate::events::Stage;
+use crate::loss::Loss;
 use crate::optim::{adamw, clip_global_norm, global_norm};
 use crate::scenes;
 use crate::step::{Learner, Shown, StageBatch, TokenChoice, loss_of};
@@ -97,6 +98,8 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
         model: freeze(stage, context.model()),
         optimizer: adamw(optimizer),
         device: context.device.clone().autodiff(),
+        // The network of a perceptual term is not counted.
+        loss: Loss::default(),
         recompute: config.recompute,
     };
     let rate = optimizer.learning_rate;
@@ -112,7 +115,7 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
     let shown = Shown::upload(&batch, &learner.device)?;
     let mut optimizer_s = f64::INFINITY;
     for _ in 0..REPEATS {
-        let loss = loss_of(&learner.model, &shown, &batch.tokens)?;
+        let loss = loss_of(&learner.model, &shown, &batch.tokens, &learner.loss)?.total;
         let grads = GradientsParams::from_grads(loss.backward(), &learner.model);
         context.sync()?;
         let started = Instant::now();
@@ -184,16 +187,17 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
         }
         Ok(seconds)
     };
-    let encode_s = least(&mut || read(model.encoder.forward(&views)))?;
-    let lift = model.encoder.forward(&views);
+    let encode_s = least(&mut || read(model.lift(&views)))?;
+    let lift = model.lift(&views);
     let render_s = least(&mut || read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?;
     let mut kmeans = Vec::new();
     let mut measuring_s = 0.0;
     if is_measured {
         let networks = Networks {
             encoder: model.encoder.clone(),
+            lift_norm: model.lift_norm.clone(),
             renderer: model.renderer.clone(),
-            condensed: Some((model.condenser.clone(), model.renderer.clone())),
+            condensed: Some(Condensed::of(&model)),
             patch_condensed: None,
             device: context.device.clone(),
         };
@@ -202,16 +206,21 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
             storage: eval.storage.clone(),
             render: eval.render.clone(),
             selection: eval.selection,
-            tokens: eval.tokens,
-            variants: vec![Variant::Random, Variant::Kmeans, Variant::Clift],
+            tokens: eval.tokens.clone(),
+            variants: variants(config).into_iter().filter(|variant| networks.can_draw(*variant)).collect(),
             kmeans: config.clusters.kmeans.clone(),
-            patch_size: config.model.patch_size,
+            model: config.model.clone(),
+            lpips: None,
+            systems: Vec::new(),
+            is_cpu: context.is_cpu,
             seed: config.seed,
         };
         measuring_s = f64::INFINITY;
+        // One for both: the second time no setting draws the view that warms it up.
+        let mut measured = Accumulator::default();
         for _ in 0..2 {
             let started = Instant::now();
-            evaluate_scene(&networks, &clip, &sweep, false, &mut Accumulator::default())?;
+            evaluate_scene(&networks, &clip, &sweep, false, &mut measured)?;
             measuring_s = measuring_s.min(started.elapsed().as_secs_f64());
         }
     } else {
@@ -247,18 +256,22 @@ pub fn loading_s(config: &Config) -> Option<f64> {
     let (source, _) = scenes::open(&config.data, Split::Train).ok()?;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let views = &config.data.views;
-    let mut times = Vec::new();
-    for scene in 0..reader.source.num_scenes().min(6) {
+    let num_scenes = reader.source.num_scenes().min(6);
+    let mut total_s = 0.0;
+    for scene in 0..num_scenes {
         let mut rng = item_rng(config.seed, 0, scene as u32, 0, "plan views");
         let source = reader.source.as_ref();
-        let started = Instant::now();
         let drawn = views.draw(source, scene, views.warm_up_steps, views.max_context, &mut rng).ok()?;
-        let clip = reader.read(scene, &drawn).ok()?;
-        times.push(started.elapsed().as_secs_f64() / (clip.context.num_views() + clip.target.num_views()) as f64);
+        let num_views = drawn.context.len() + drawn.target.len();
+        let mut least_s = f64::INFINITY;
+        for _ in 0..2 {
+            let started = Instant::now();
+            reader.read(scene, &drawn).ok()?;
+            least_s = least_s.min(started.elapsed().as_secs_f64());
+        }
+        total_s += least_s / num_views as f64;
     }
-    // The first opens files that the others find open.
-    let rest = times.get(1..).filter(|rest| !rest.is_empty())?;
-    Some(rest.iter().sum::<f64>() / rest.len() as f64)
+    (num_scenes > 0).then(|| total_s / num_scenes as f64)
 }
 
 /// Waits for a value of a result.

@@ -84,10 +84,7 @@ impl SceneSizes {
     /// Tokens that keys and values are projected for: those of a scene, or its views' subsets where that is fewer.
     pub fn num_projected(&self) -> f64 {
         let all = self.num_storage_tokens.unwrap_or(self.num_tokens);
-        match self.is_per_view {
-            true => all.min(self.num_targets * self.num_render_tokens),
-            false => self.num_render_tokens,
-        }
+        if self.is_per_view { all.min(self.num_targets * self.num_render_tokens) } else { self.num_render_tokens }
     }
 }
 

@@ -10,6 +10,10 @@ use crate::events::Stage;
 /// Bytes of an f32.
 const F32: f64 = 4.0;
 
+/// What the C library's heap holds for a byte of what a backward pass keeps: freed pieces below 32 MiB stay in it.
+/// Measured at 1.05 to 1.2 (docs/plan.md).
+const HEAP: f64 = 1.15;
+
 /// Above this many values K-means asks the device for every distance instead of keeping a table.
 const MAX_KMEANS_TABLE: f64 = (1_u64 << 26) as f64;
 
@@ -40,7 +44,7 @@ pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
     let parts = parts(config, sizes);
     let pictures = sizes.num_scenes * sizes.num_picture_values;
     let earlier = if sizes.is_accumulated { trained } else { 0.0 };
-    let backward = peak(&parts) + pictures + earlier;
+    let backward = HEAP * peak(&parts) + pictures + earlier;
     // Gradients, and a few copies of the largest matrix on the way to its update.
     let optimizer = trained + 5.0 * largest_matrix(config);
     // Weights, and two moments of those that train.
@@ -170,6 +174,7 @@ fn condenser_part(config: &ModelConfig, w: f64, members: f64) -> Part {
 
 /// What is needed to encode, cluster and draw one scene without gradients.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(clippy::struct_field_names, reason = "they are all numbers of something")]
 pub struct InferenceSizes {
     /// Encoder tokens.
     pub num_tokens: f64,
@@ -181,6 +186,8 @@ pub struct InferenceSizes {
     pub num_patches: f64,
     /// Values of all the scene's pictures.
     pub num_picture_values: f64,
+    /// Weights that are read from a file into a network that is there already.
+    pub num_loaded: f64,
 }
 
 /// Most bytes of tensors alive while `parameters` weights encode, cluster and draw a scene.
@@ -198,7 +205,8 @@ pub fn inference_bytes(config: &ModelConfig, parameters: f64, sizes: &InferenceS
     });
     // Keys and values of one block, and the views' hidden values.
     let render = if sizes.num_targets > 0.0 { 3.0 * x + y + forward_values(config, y) } else { 0.0 };
-    F32 * (parameters + sizes.num_picture_values + encode.max(kmeans).max(render))
+    let working = sizes.num_picture_values + encode.max(kmeans).max(render);
+    F32 * (parameters + working.max(sizes.num_loaded))
 }
 
 #[cfg(test)]

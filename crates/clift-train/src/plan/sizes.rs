@@ -1,5 +1,7 @@
 //! The sizes that steps of a run have: those in the middle, the average, and the largest.
 
+use clift_eval::Variant;
+
 use super::counts::{Macs, SceneSizes};
 use crate::TrainError;
 use crate::config::Config;
@@ -39,20 +41,17 @@ pub fn drawn(config: &Config, stage: Stage) -> Result<Vec<SceneSizes>, TrainErro
     let views = &config.data.views;
     let mut all = Vec::new();
     for num_context in views.min_context..=views.max_context {
-        match stage {
-            Stage::Stage2 => {
-                for count in &config.clusters.grid {
-                    let num_tokens = num_tokens(config, num_context)?;
-                    all.push(stored(config, num_context, count.of(num_tokens)? as f64)?);
-                }
+        if stage == Stage::Stage2 {
+            let num_tokens = num_tokens(config, num_context)?;
+            for count in &config.clusters.grid {
+                all.push(stored(config, num_context, count.of(num_tokens)? as f64)?);
             }
-            _ => {
-                let [low, high] = config.stage1.keep_tokens;
-                for point in 0..NUM_SHARES {
-                    let share = low + (high - low) * (point as f64 + 0.5) / NUM_SHARES as f64;
-                    all.push(kept(config, num_context, share)?);
-                }
-            }
+            continue;
+        }
+        let [low, high] = config.stage1.keep_tokens;
+        for point in 0..NUM_SHARES {
+            let share = low + (high - low) * (point as f64 + 0.5) / NUM_SHARES as f64;
+            all.push(kept(config, num_context, share)?);
         }
     }
     Ok(all)
@@ -62,18 +61,15 @@ pub fn drawn(config: &Config, stage: Stage) -> Result<Vec<SceneSizes>, TrainErro
 pub fn middle(config: &Config, stage: Stage) -> Result<Middle, TrainError> {
     let views = &config.data.views;
     let num_context = usize::midpoint(views.min_context, views.max_context);
-    let scene = match stage {
-        Stage::Stage2 => {
-            let num_tokens = num_tokens(config, num_context)?;
-            let counts = config.clusters.grid.iter().map(|count| count.of(num_tokens));
-            let mut counts = counts.collect::<Result<Vec<_>, _>>()?;
-            counts.sort_unstable();
-            stored(config, num_context, counts[counts.len() / 2] as f64)?
-        }
-        _ => {
-            let [low, high] = config.stage1.keep_tokens;
-            kept(config, num_context, f64::midpoint(low, high))?
-        }
+    let scene = if stage == Stage::Stage2 {
+        let num_tokens = num_tokens(config, num_context)?;
+        let counts = config.clusters.grid.iter().map(|count| count.of(num_tokens));
+        let mut counts = counts.collect::<Result<Vec<_>, _>>()?;
+        counts.sort_unstable();
+        stored(config, num_context, counts[counts.len() / 2] as f64)?
+    } else {
+        let [low, high] = config.stage1.keep_tokens;
+        kept(config, num_context, f64::midpoint(low, high))?
     };
     Ok(Middle { num_context, num_scenes: batch_sizes(config, stage).1, scene })
 }
@@ -81,15 +77,21 @@ pub fn middle(config: &Config, stage: Stage) -> Result<Middle, TrainError> {
 /// The largest scene of a stage.
 pub fn largest(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> {
     let num_context = config.data.views.max_context;
-    match stage {
-        Stage::Stage2 => {
-            let num_tokens = num_tokens(config, num_context)?;
-            let counts = config.clusters.grid.iter().map(|count| count.of(num_tokens));
-            let most = counts.collect::<Result<Vec<_>, _>>()?.into_iter().max().unwrap_or(num_tokens);
-            stored(config, num_context, most as f64)
-        }
-        _ => kept(config, num_context, config.stage1.keep_tokens[1]),
+    if stage != Stage::Stage2 {
+        return kept(config, num_context, config.stage1.keep_tokens[1]);
     }
+    let num_tokens = num_tokens(config, num_context)?;
+    let counts = config.clusters.grid.iter().map(|count| count.of(num_tokens));
+    let most = counts.collect::<Result<Vec<_>, _>>()?.into_iter().max().unwrap_or(num_tokens);
+    stored(config, num_context, most as f64)
+}
+
+/// What an evaluation draws at every count of tokens: what is asked for, or all that a run has weights for.
+pub fn variants(config: &Config) -> Vec<Variant> {
+    if config.eval.variants.is_empty() {
+        return vec![Variant::Random, Variant::Kmeans, Variant::Clift];
+    }
+    config.eval.variants.clone()
 }
 
 /// Encoder tokens of a scene.

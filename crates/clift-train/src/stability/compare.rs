@@ -31,7 +31,7 @@ fn largest(model: &Clift, ours: &(f64, GradientsParams), theirs: &(f64, Gradient
         ours: &'a GradientsParams,
         theirs: &'a GradientsParams,
         /// Largest difference and largest entry of every parameter.
-        pairs: Vec<(f64, f64)>,
+        found: Vec<(f64, f64)>,
     }
     impl ModuleVisitor for Pairs<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
@@ -39,19 +39,19 @@ fn largest(model: &Clift, ours: &(f64, GradientsParams), theirs: &(f64, Gradient
                 (Some(ours), Some(theirs)) => {
                     let (ours, theirs) = (values(ours), values(theirs));
                     let difference = most(ours.iter().zip(&theirs).map(|(a, b)| a - b));
-                    self.pairs.push((difference, most(theirs.into_iter())));
+                    self.found.push((difference, most(theirs.into_iter())));
                 }
                 (None, None) => {}
                 // A gradient that only one of them has is wrong altogether.
-                _ => self.pairs.push((f64::INFINITY, 1.0)),
+                _ => self.found.push((f64::INFINITY, 1.0)),
             }
         }
     }
-    let mut pairs = Pairs { ours: &ours.1, theirs: &theirs.1, pairs: Vec::new() };
+    let mut pairs = Pairs { ours: &ours.1, theirs: &theirs.1, found: Vec::new() };
     model.visit(&mut pairs);
-    let least = LEAST_SHARE * most(pairs.pairs.iter().map(|(_, entry)| *entry));
+    let least = LEAST_SHARE * most(pairs.found.iter().map(|(_, entry)| *entry));
     let loss = (ours.0 - theirs.0).abs() / theirs.0.abs().max(f64::MIN_POSITIVE);
-    let errors = pairs.pairs.iter().map(|(difference, entry)| match difference {
+    let errors = pairs.found.iter().map(|(difference, entry)| match difference {
         0.0 => 0.0,
         difference => difference / entry.max(least),
     });

@@ -10,6 +10,7 @@ use super::{Bound, Case, Outcome};
 use crate::bench::inputs::{batch, model};
 use crate::bench::reference::{InF64, module_in_f64, values};
 use crate::config::OptimizerConfig;
+use crate::loss::Loss;
 use crate::optim::{adamw, clip_global_norm, global_norm};
 use crate::step::{Shown, StageBatch, loss_of};
 use crate::trainer::freeze;
@@ -47,7 +48,7 @@ fn losses(mut model: Clift, batch: &StageBatch, device: &Device, in_f64: bool) -
     for _ in 0..STEPS {
         let shown = Shown::upload(batch, &device)?;
         let shown = if in_f64 { shown.in_f64(&device) } else { shown };
-        let loss = loss_of(&model, &shown, &batch.tokens)?;
+        let loss = loss_of(&model, &shown, &batch.tokens, &Loss::default())?.total;
         losses.push(values(loss.clone().inner())[0]);
         let grads = GradientsParams::from_grads(loss.backward(), &model);
         let norm = global_norm(&model, &grads);

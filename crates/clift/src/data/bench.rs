@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clift_data::files::replace;
 use clift_data::{ClipOptions, PoseRotation, PoseScale, Throughput, ThroughputOptions, measure};
-use clift_train::bench::memory::{peak_bytes, start_peak};
+use clift_eval::memory::{peak_bytes, start_peak};
 use serde::Serialize;
 
 use super::args::{Splits, parse_size};

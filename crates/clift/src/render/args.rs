@@ -33,7 +33,7 @@ pub struct RenderArgs {
     #[arg(long, value_name = "M", value_parser = parse_budget_ms)]
     pub budget_ms: Option<f64>,
     /// How the tokens of a frame are chosen: paper, global or scaled
-    #[arg(long, value_name = "PRESET", default_value = "paper")]
+    #[arg(long, value_name = "PRESET", default_value = "scaled")]
     pub selection: Preset,
     /// Columns and rows of a frame, multiples of the model's patch; those of the context views by default
     #[arg(long, value_name = "WxH", value_parser = parse_size)]

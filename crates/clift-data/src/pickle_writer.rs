@@ -1,0 +1,78 @@
+//! Writes what `torch.load` reads: a pickle of protocol 2 beside its storages, in a ZIP archive.
+
+use std::io::{Cursor, Write};
+
+use zip::result::ZipResult;
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipWriter};
+
+/// A pickle of protocol 2 and the storages it refers to.
+pub(crate) struct PickleWriter {
+    bytes: Vec<u8>,
+    storages: Vec<Vec<u8>>,
+}
+
+impl PickleWriter {
+    /// Starts a pickle.
+    pub fn new() -> Self {
+        Self { bytes: b"\x80\x02".to_vec(), storages: Vec::new() }
+    }
+
+    /// A contiguous tensor that is the whole of a new storage.
+    pub fn tensor(&mut self, storage_type: &str, storage: Vec<u8>, shape: &[usize]) {
+        self.raw(b"ctorch._utils\n_rebuild_tensor_v2\n((");
+        self.string("storage");
+        self.raw(format!("ctorch\n{storage_type}\n").as_bytes());
+        self.string(&self.storages.len().to_string());
+        self.string("cpu");
+        self.integer(shape.iter().product());
+        self.raw(b"tQ");
+        self.integer(0); // offset
+        self.raw(b"(");
+        for size in shape {
+            self.integer(*size);
+        }
+        self.raw(b"t(");
+        for dimension in 0..shape.len() {
+            self.integer(shape[dimension + 1..].iter().product());
+        }
+        self.raw(b"t\x89ccollections\nOrderedDict\n)RtR"); // requires no gradient, has no hooks
+        self.storages.push(storage);
+    }
+
+    /// A string.
+    pub fn string(&mut self, text: &str) {
+        self.raw(b"X");
+        self.raw(&(text.len() as u32).to_le_bytes());
+        self.raw(text.as_bytes());
+    }
+
+    /// LONG1 with eight bytes: one opcode for every size.
+    pub fn integer(&mut self, value: usize) {
+        self.raw(&[0x8a, 8]);
+        self.raw(&(value as u64).to_le_bytes());
+    }
+
+    /// Opcodes as they are.
+    pub fn raw(&mut self, bytes: &[u8]) {
+        self.bytes.extend_from_slice(bytes);
+    }
+
+    /// Packs a finished pickle and its storages, stored and aligned to 64 bytes, below the folder `prefix`.
+    pub fn pack(self, prefix: &str) -> ZipResult<Vec<u8>> {
+        let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+        let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
+        let mut member = |name: &str, alignment: u16, bytes: &[u8]| {
+            zip.start_file(format!("{prefix}/{name}"), options.with_alignment(alignment))?;
+            zip.write_all(bytes)?;
+            ZipResult::Ok(())
+        };
+        member("data.pkl", 1, &self.bytes)?;
+        member("byteorder", 1, b"little")?;
+        for (number, storage) in self.storages.iter().enumerate() {
+            member(&format!("data/{number}"), 64, storage)?;
+        }
+        member("version", 1, b"3\n")?;
+        Ok(zip.finish()?.into_inner())
+    }
+}

@@ -1,0 +1,97 @@
+//! What the pickles of checkpoints have beyond those of chunks: objects of any class, sets and bytes. All of it is
+//! passed over.
+
+use super::{MAX_PASSED_OVER, Others, Reader, Stop, global, shown};
+use crate::pickle::{Value, ValueId};
+
+impl Reader<'_> {
+    pub(super) fn passes_over(&self) -> bool {
+        self.others == Others::PassOver
+    }
+
+    /// Whether a value was passed over, and what is put into it is too.
+    pub(super) fn is_passed_over(&self, id: ValueId) -> bool {
+        matches!(self.get(id), Value::Opaque)
+    }
+
+    /// What cannot be understood is an error in a chunk, and passed over in a checkpoint.
+    pub(super) fn or_opaque(&self, value: Result<Value, Stop>) -> Result<Value, Stop> {
+        if self.passes_over() { Ok(value.unwrap_or(Value::Opaque)) } else { value }
+    }
+
+    pub(super) fn push_global(&mut self, module: &str, name: &str) -> Result<(), Stop> {
+        let value = if let Some(global) = global(module, name, self.others)? {
+            Value::Global(global)
+        } else {
+            if self.passed_over.len() < MAX_PASSED_OVER {
+                self.passed_over.insert(shown(module, name));
+            }
+            Value::Opaque
+        };
+        self.push(value)
+    }
+
+    /// Objects, sets, bytes and what else only checkpoints have.
+    pub(super) fn read_object(&mut self, opcode: u8) -> Result<bool, Stop> {
+        match opcode {
+            // BUILD: the state of an object, which stays on the stack.
+            b'b' => {
+                self.pop()?;
+                self.top()?;
+            }
+            // NEWOBJ, NEWOBJ_EX: a class and its arguments.
+            0x81 => self.replace(2)?,
+            0x92 => self.replace(3)?,
+            // EMPTY_SET, ADDITEMS, FROZENSET
+            0x8f => self.push(Value::Opaque)?,
+            0x90 => {
+                self.pop_to_mark()?;
+                self.top()?;
+            }
+            0x91 => {
+                self.pop_to_mark()?;
+                self.push(Value::Opaque)?;
+            }
+            // SHORT_BINSTRING, SHORT_BINBYTES: a length of one byte; BINSTRING, BINBYTES: of four; BINBYTES8,
+            // BYTEARRAY8, BINUNICODE8: of eight. LONG4 is a number of so many bytes.
+            b'U' | b'C' => {
+                let length = usize::from(self.u8()?);
+                self.pass_over(length)?;
+            }
+            b'T' | b'B' | 0x8b => {
+                let length = u32::from_le_bytes(self.array()?) as usize;
+                self.pass_over(length)?;
+            }
+            0x8e | 0x96 | 0x8d => {
+                let length = u64::from_le_bytes(self.array()?);
+                self.pass_over(usize::try_from(length).unwrap_or(usize::MAX))?;
+            }
+            // POP, POP_MARK, DUP
+            b'0' => {
+                self.pop()?;
+            }
+            b'1' => {
+                self.pop_to_mark()?;
+            }
+            b'2' => {
+                let top = self.top()?;
+                self.stack.push(top);
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// An object in the place of what it is made from.
+    fn replace(&mut self, count: usize) -> Result<(), Stop> {
+        for _ in 0..count {
+            self.pop()?;
+        }
+        self.push(Value::Opaque)
+    }
+
+    fn pass_over(&mut self, num_bytes: usize) -> Result<(), Stop> {
+        self.take(num_bytes)?;
+        self.push(Value::Opaque)
+    }
+}

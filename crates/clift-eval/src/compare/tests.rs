@@ -1,0 +1,104 @@
+use super::*;
+
+const HEAD: &str =
+    "scene,target_frame,variant,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s";
+
+fn evaluation(folder: &Path, name: &str, rows: &[&str]) -> Evaluation {
+    let path = folder.join(name);
+    std::fs::create_dir_all(path.join("eval")).unwrap();
+    let text = format!("{HEAD},tokens\n{}\n", rows.join("\n"));
+    std::fs::write(path.join("eval/views.csv"), text).unwrap();
+    Evaluation::read(&path).unwrap()
+}
+
+#[test]
+fn differences_are_paired_by_scene_and_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let a = evaluation(
+        folder.path(),
+        "a",
+        &[
+            "x,1,clift,8,8,20,0.5,,0.1,,f32",
+            "x,2,clift,8,8,22,0.5,,0.1,,f32",
+            "y,1,clift,8,8,30,0.5,,0.1,,f32",
+            "z,1,clift,8,8,10,0.5,,0.1,,f32",
+        ],
+    );
+    // Another order, one view more and one less.
+    let b = evaluation(
+        folder.path(),
+        "b",
+        &[
+            "y,1,clift,8,8,33,0.6,0.1,0.1,,f32",
+            "x,2,clift,8,8,23,0.5,,0.1,,f32",
+            "x,1,clift,8,8,21,0.5,,0.1,,f32",
+            "w,1,clift,8,8,10,0.5,,0.1,,f32",
+        ],
+    );
+    let comparison = Comparison::new(&a, &b, None).unwrap();
+    let [pair] = &comparison.pairs[..] else { panic!("{comparison:?}") };
+    assert_eq!((pair.num_scenes, pair.num_views, pair.num_only_a, pair.num_only_b), (2, 3, 1, 1));
+    let psnr = pair.psnr.unwrap();
+    // Scene means 21 -> 22 and 30 -> 33: differences 1 and 3, standard error 1, t of one degree of freedom.
+    assert_eq!((psnr.a, psnr.b, psnr.mean, psnr.stderr), (25.5, 27.5, 2.0, Some(1.0)));
+    let [low, high] = psnr.interval.unwrap();
+    assert!((low - (2.0 - 12.706_204_736)).abs() < 1e-6 && (high - (2.0 + 12.706_204_736)).abs() < 1e-6);
+    assert!(!psnr.is_clear());
+    assert_eq!(pair.lpips_vgg, None, "only one side has it");
+    let text = comparison.to_string();
+    assert!(text.contains("clift 8 f32") && text.contains("+2.000 [-10.706, +14.706]"), "{text}");
+    assert!(text.contains("up to 1 of A alone and 1 of B alone are left out"), "{text}");
+}
+
+#[test]
+fn a_difference_that_is_the_same_in_every_scene_is_clear() {
+    let of = |shift: f64| {
+        let pairs: Vec<(f64, f64)> =
+            (0..30).map(|i| (f64::from(i), f64::from(i) + shift + 0.01 * f64::from(i % 2))).collect();
+        Difference::of(&pairs).unwrap()
+    };
+    assert!(of(0.5).is_clear() && of(-0.5).is_clear() && !of(-0.005).is_clear());
+    let single = Difference::of(&[(1.0, 2.0)]).unwrap();
+    assert_eq!((single.mean, single.interval, single.is_clear()), (1.0, None, false));
+}
+
+#[test]
+fn variants_of_one_evaluation_are_compared_at_equal_counts() {
+    let folder = tempfile::tempdir().unwrap();
+    let rows = [
+        "x,1,kmeans,8,8,20,,,,,f32",
+        "x,1,kmeans,8,8,19,,,,,int8",
+        "x,1,kmeans,16,16,25,,,,,f32",
+        "x,1,clift,8,8,21,,,,,f32",
+        "x,1,clift,16,8,90,,,,,f32",
+        "x,1,clift,16,16,inf,,,,,f32",
+    ];
+    let all = evaluation(folder.path(), "all", &rows);
+    let sides = [Side::parse("kmeans:f32"), Side::parse("clift")];
+    let comparison = Comparison::new(&all, &all, Some(&sides)).unwrap();
+    let means: Vec<f64> = comparison.pairs.iter().map(|pair| pair.psnr.unwrap().mean).collect();
+    // An identical picture counts as 100 dB.
+    assert_eq!(means, [1.0, 75.0]);
+    assert!(comparison.to_string().contains("kmeans 8 f32 -> clift 8 f32"), "{comparison}");
+    let sides = [Side::parse("kmeans:f32"), Side::parse("kmeans:int8")];
+    assert_eq!(Comparison::new(&all, &all, Some(&sides)).unwrap().pairs.len(), 1);
+}
+
+#[test]
+fn what_cannot_be_compared_says_why() {
+    let folder = tempfile::tempdir().unwrap();
+    let a = evaluation(folder.path(), "a", &["x,1,clift,8,8,20,,,,,f32"]);
+    let counts = evaluation(folder.path(), "counts", &["x,1,clift,16,16,20,,,,,f32"]);
+    let scenes = evaluation(folder.path(), "scenes", &["y,1,clift,8,8,20,,,,,f32"]);
+    let message = |b: &Evaluation| Comparison::new(&a, b, None).unwrap_err().to_string();
+    assert!(message(&counts).contains("no setting is in both") && message(&counts).contains("clift 16 f32"));
+    assert!(message(&scenes).contains("no target view is in both") && message(&scenes).contains("y, frame 1"));
+    let missing = Evaluation::read(&folder.path().join("nowhere")).unwrap_err().to_string();
+    assert!(missing.contains("`clift eval` writes it") && missing.ends_with("nowhere"), "{missing}");
+    let bad = folder.path().join("views.csv");
+    std::fs::write(&bad, format!("{HEAD}\nx,1,clift,eight,8,20,,,,\n")).unwrap();
+    assert!(Evaluation::read(&bad).is_err());
+    // Without the column of formats, as before there was one.
+    std::fs::write(&bad, format!("{HEAD}\nx,1,clift,8,8,20,,,,\n")).unwrap();
+    assert!(Evaluation::read(&bad).is_ok());
+}

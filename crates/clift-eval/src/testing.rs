@@ -1,0 +1,58 @@
+//! The fixtures that inline tests share.
+
+use std::path::{Path, PathBuf};
+
+use burn::tensor::{DType, Device, Tensor, TensorData};
+use safetensors::{Dtype, SafeTensors};
+
+/// Channels of the narrow networks in the fixtures.
+pub const NARROW: [usize; 5] = [4, 6, 8, 8, 10];
+
+/// Where a file of `data-fixtures/reference` lies.
+pub fn reference_path(name: &str) -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join(format!("../../data-fixtures/reference/{name}.safetensors"))
+}
+
+/// A file of inputs and expected outputs.
+pub struct Reference(Vec<u8>);
+
+impl Reference {
+    /// Reads a file of `data-fixtures/reference`.
+    pub fn open(name: &str) -> Self {
+        Self::read(&reference_path(name))
+    }
+
+    pub fn read(path: &Path) -> Self {
+        Self(std::fs::read(path).unwrap_or_else(|error| panic!("{error}: {}", path.display())))
+    }
+
+    /// Names of the tensors that start with `prefix`, without it.
+    pub fn names(&self, prefix: &str) -> Vec<String> {
+        let file = SafeTensors::deserialize(&self.0).unwrap();
+        file.names().into_iter().filter_map(|name| name.strip_prefix(prefix)).map(String::from).collect()
+    }
+
+    pub fn shape(&self, name: &str) -> Vec<usize> {
+        SafeTensors::deserialize(&self.0).unwrap().tensor(name).unwrap().shape().to_vec()
+    }
+
+    pub fn f64s(&self, name: &str) -> Vec<f64> {
+        let file = SafeTensors::deserialize(&self.0).unwrap();
+        let view = file.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}"));
+        match view.dtype() {
+            Dtype::F32 => {
+                view.data().as_chunks::<4>().0.iter().map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect()
+            }
+            Dtype::F64 => view.data().as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect(),
+            other => panic!("{name} is {other:?}"),
+        }
+    }
+
+    pub fn f32s(&self, name: &str) -> Vec<f32> {
+        self.f64s(name).into_iter().map(|value| value as f32).collect()
+    }
+
+    pub fn tensor<const D: usize>(&self, name: &str, device: &Device, dtype: DType) -> Tensor<D> {
+        Tensor::from_data(TensorData::new(self.f64s(name), self.shape(name)), (device, dtype))
+    }
+}

@@ -1,0 +1,173 @@
+//! Weights of networks that cannot come with this program: safetensors files that `scripts/convert_vgg.py` writes.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use burn::tensor::{DType, Device, Tensor, TensorData};
+use safetensors::{Dtype, SafeTensors};
+use sha2::{Digest, Sha256};
+
+use crate::EvalError;
+
+/// Larger files are refused before they are read; VGG-16 with its heads takes 59 MB.
+const MAX_BYTES: u64 = 256 << 20;
+
+/// Which file is expected, and how to get it.
+#[derive(Clone, Copy, Debug)]
+pub struct Wanted {
+    /// What it is for, as messages name it.
+    pub what: &'static str,
+    /// Value of `format` in the file's metadata.
+    pub format: &'static str,
+    /// The command that makes it.
+    pub command: &'static str,
+}
+
+/// The tensors of a file, taken out one by one: every one must be asked for, and be of the right shape.
+pub struct WeightFile {
+    wanted: Wanted,
+    tensors: BTreeMap<String, (Vec<usize>, Vec<f32>)>,
+    sha256: String,
+    path: PathBuf,
+}
+
+impl WeightFile {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// [`EvalError::BadWeights`] for a file that cannot be read, is of another format, or holds anything but finite
+    /// f32 values.
+    pub fn read(path: &Path, wanted: Wanted) -> Result<Self, EvalError> {
+        let bad = |reason: String| bad_weights(wanted, reason, path);
+        let size = std::fs::metadata(path).map_err(|error| bad(error.to_string()))?.len();
+        if size > MAX_BYTES {
+            return Err(bad(format!("it has {size} bytes, at most {MAX_BYTES} are read")));
+        }
+        let bytes = std::fs::read(path).map_err(|error| bad(error.to_string()))?;
+        let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(|error| bad(error.to_string()))?;
+        let format = metadata.metadata().as_ref().and_then(|entries| entries.get("format")).cloned();
+        if format.as_deref() != Some(wanted.format) {
+            let found = format.unwrap_or_else(|| "none".into());
+            return Err(bad(format!("its format is {found}, expected {}", wanted.format)));
+        }
+        let file = SafeTensors::deserialize(&bytes).map_err(|error| bad(error.to_string()))?;
+        let mut tensors = BTreeMap::new();
+        for (name, view) in file.tensors() {
+            if view.dtype() != Dtype::F32 {
+                return Err(bad(format!("{name} is {:?}, expected F32", view.dtype())));
+            }
+            let values: Vec<f32> =
+                view.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+            if values.iter().any(|value| !value.is_finite()) {
+                return Err(bad(format!("{name} is not finite")));
+            }
+            tensors.insert(name, (view.shape().to_vec(), values));
+        }
+        let sha256 = Sha256::digest(&bytes).iter().fold(String::new(), |mut text, byte| {
+            let _ = write!(text, "{byte:02x}");
+            text
+        });
+        Ok(Self { wanted, tensors, sha256, path: path.into() })
+    }
+
+    /// Takes a tensor out.
+    ///
+    /// # Errors
+    /// [`EvalError::BadWeights`] where it is missing or of another shape.
+    pub fn take<const D: usize>(
+        &mut self,
+        name: &str,
+        shape: [usize; D],
+        (device, dtype): (&Device, DType),
+    ) -> Result<Tensor<D>, EvalError> {
+        let Some((found, values)) = self.tensors.remove(name) else {
+            return Err(self.bad(format!("{name} is missing")));
+        };
+        if found != shape {
+            return Err(self.bad(format!("{name} has shape {found:?}, expected {shape:?}")));
+        }
+        Ok(Tensor::from_data(TensorData::new(values, shape), (device, dtype)))
+    }
+
+    /// Demands that nothing is left, and gives the SHA-256 of the file in 64 hexadecimal digits.
+    ///
+    /// # Errors
+    /// [`EvalError::BadWeights`] naming what has no place.
+    pub fn finish(self) -> Result<String, EvalError> {
+        match self.tensors.keys().next() {
+            None => Ok(self.sha256),
+            Some(name) => Err(self.bad(format!("{name} has no place in the network"))),
+        }
+    }
+
+    fn bad(&self, reason: String) -> EvalError {
+        bad_weights(self.wanted, reason, &self.path)
+    }
+}
+
+fn bad_weights(wanted: Wanted, reason: String, path: &Path) -> EvalError {
+    let Wanted { what, command, .. } = wanted;
+    EvalError::BadWeights { what, reason, command, path: path.into() }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashMap;
+
+    use safetensors::tensor::TensorView;
+
+    use super::*;
+
+    const WANTED: Wanted = Wanted { what: "LPIPS", format: "test-1", command: "convert it" };
+
+    fn written(folder: &Path, format: &str, values: &[f32]) -> PathBuf {
+        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let view = TensorView::new(Dtype::F32, vec![values.len()], &bytes).unwrap();
+        let metadata = HashMap::from([("format".to_owned(), format.to_owned())]);
+        let path = folder.join(format!("{format}-{}.safetensors", values.len()));
+        std::fs::write(&path, safetensors::serialize([("head1.weight", view)], Some(metadata)).unwrap()).unwrap();
+        path
+    }
+
+    #[test]
+    fn every_tensor_is_asked_for_and_of_the_right_shape() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = written(folder.path(), "test-1", &[1.0, 2.0]);
+        let device = Device::flex();
+        let open = || WeightFile::read(&path, WANTED).unwrap();
+        let mut file = open();
+        let tensor = file.take("head1.weight", [2], (&device, DType::F32)).unwrap();
+        assert_eq!(tensor.into_data().try_to_vec::<f32>().unwrap(), [1.0, 2.0]);
+        assert_eq!(file.finish().unwrap().len(), 64);
+        let messages = [
+            open().take("head2.weight", [2], (&device, DType::F32)).unwrap_err(),
+            open().take("head1.weight", [3], (&device, DType::F32)).unwrap_err(),
+            open().finish().unwrap_err(),
+        ]
+        .map(|error| error.to_string());
+        for (message, part) in messages.iter().zip(["head2.weight is missing", "expected [3]", "has no place"]) {
+            assert!(message.starts_with("bad weights for LPIPS: ") && message.contains(part), "{message}");
+            assert!(message.contains("`convert it`") && message.ends_with("test-1-2.safetensors"), "{message}");
+        }
+    }
+
+    #[test]
+    fn other_formats_and_hostile_files_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let other = written(folder.path(), "test-2", &[1.0]);
+        let nan = written(folder.path(), "test-1", &[f32::NAN; 3]);
+        let cut = folder.path().join("cut.safetensors");
+        let bytes = std::fs::read(&other).unwrap();
+        std::fs::write(&cut, &bytes[..bytes.len() - 2]).unwrap();
+        let empty = folder.path().join("empty.safetensors");
+        std::fs::write(&empty, "").unwrap();
+        let missing = folder.path().join("missing.safetensors");
+        for (path, part) in
+            [(&other, "test-2"), (&nan, "not finite"), (&cut, ""), (&empty, ""), (&missing, "No such file")]
+        {
+            let Err(error) = WeightFile::read(path, WANTED) else { panic!("{} is accepted", path.display()) };
+            assert!(error.to_string().contains(part), "{error}");
+        }
+    }
+}

@@ -1,0 +1,192 @@
+//! A model directory: `model.safetensors` with `config.toml`, which says what network it is and how it is evaluated.
+//! That of an imported model has `import.json` too.
+
+use std::collections::HashMap;
+use std::fmt::Write;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use clift_data::files::{publish, replace};
+use clift_data::{ClipReader, PoseRotation, PoseScale, Split};
+use clift_eval::{Condensed, Networks, Summary, System, Variant as Tokens};
+use clift_model::{ModelConfig, Variant, weights};
+use safetensors::tensor::{Dtype, TensorView};
+use sha2::{Digest, Sha256};
+
+use crate::TrainError;
+use crate::config::{Config, SourceKind};
+use crate::events::{Event, Sink};
+use crate::held_out::HeldOut;
+use crate::import::Imported;
+use crate::scenes;
+use crate::trained::{ModelPath, Trained};
+
+/// A parameter on the host, in PyTorch's layout.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Parameter {
+    /// Its path in weight files.
+    pub path: String,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Its values, row-major.
+    pub values: Vec<f32>,
+}
+
+/// The settings under which the reference evaluates a published network.
+pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
+    // Where `clift train` would write, given this config; evaluating sets its own.
+    let run_dir = Path::new("runs").join(folder.file_name().unwrap_or("imported".as_ref()));
+    let mut config = Config { run_dir, ..Config::default() };
+    let data = &mut config.data;
+    data.source = SourceKind::Auto;
+    (data.views.min_context, data.views.max_context) = (4, 4);
+    match model.variant {
+        Variant::Paper => {}
+        Variant::ReleasedRe10k => (data.pose_rotation, data.pose_scale) = (PoseRotation::Quaternion, PoseScale::All),
+        Variant::ReleasedDl3dv => {
+            (data.width, data.height) = (448, 256);
+            (data.pose_rotation, data.pose_scale) = (PoseRotation::Axes, PoseScale::Context);
+            data.views.max_context = 6;
+        }
+    }
+    config.model = model;
+    config
+}
+
+/// Nothing that exists is written over.
+pub(crate) fn refuse_existing(folder: &Path) -> Result<(), TrainError> {
+    if !folder.exists() {
+        return Ok(());
+    }
+    let fix = "it exists already; write the name of a directory that does not".to_owned();
+    Err(TrainError::BadConfig { key: "-o".into(), value: folder.display().to_string(), fix })
+}
+
+/// SHA-256 of a file, as 64 hexadecimal digits.
+pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
+    let reading = "reading the checkpoint";
+    let mut file = File::open(path).map_err(TrainError::io(reading, path))?;
+    let (mut sha, mut buffer) = (Sha256::new(), vec![0; 1 << 20]);
+    loop {
+        match file.read(&mut buffer).map_err(TrainError::io(reading, path))? {
+            0 => break,
+            count => sha.update(&buffer[..count]),
+        }
+    }
+    Ok(sha.finalize().iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    }))
+}
+
+/// A folder that is removed unless it is renamed.
+struct Unfinished(PathBuf);
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        // It may have been renamed; what else fails here has failed before.
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Writes a model directory under a temporary name, reads the model back as every command does, and renames it.
+pub(crate) fn write(
+    folder: &Path,
+    config: &Config,
+    parameters: &[Parameter],
+    imported: &Imported,
+) -> Result<(), TrainError> {
+    let name = folder.file_name().ok_or_else(|| {
+        let fix = "write the name of a directory".to_owned();
+        TrainError::BadConfig { key: "-o".into(), value: folder.display().to_string(), fix }
+    })?;
+    let temporary = folder.with_file_name(format!(".{}.{}.tmp", name.to_string_lossy(), std::process::id()));
+    let writing = "writing the model directory";
+    std::fs::create_dir_all(&temporary).map_err(TrainError::io(writing, &temporary))?;
+    let temporary = Unfinished(temporary);
+    let weights_path = temporary.0.join("model.safetensors");
+    replace(&weights_path, &to_safetensors(parameters, &weights_path)?)
+        .map_err(TrainError::io(writing, &weights_path))?;
+    let config_path = temporary.0.join("config.toml");
+    let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &config_path))?;
+    replace(&config_path, text.as_bytes()).map_err(TrainError::io(writing, &config_path))?;
+    let import_path = temporary.0.join("import.json");
+    let text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", &import_path))?;
+    replace(&import_path, &text).map_err(TrainError::io(writing, &import_path))?;
+
+    Trained::load(config, &weights_path)?;
+    refuse_existing(folder)?;
+    publish(&temporary.0, folder).map_err(TrainError::io(writing, folder))
+}
+
+/// The bytes of a safetensors file.
+pub(crate) fn to_safetensors(parameters: &[Parameter], path: &Path) -> Result<Vec<u8>, TrainError> {
+    let bad = |error: safetensors::SafeTensorError| TrainError::bad_file("weight file", path)(error);
+    let bytes: Vec<Vec<u8>> =
+        parameters.iter().map(|p| p.values.iter().flat_map(|value| value.to_le_bytes()).collect()).collect();
+    let views: Result<Vec<(&str, TensorView)>, _> = parameters
+        .iter()
+        .zip(&bytes)
+        .map(|(p, bytes)| Ok((p.path.as_str(), TensorView::new(Dtype::F32, p.shape.clone(), bytes)?)))
+        .collect();
+    let metadata = HashMap::from([("format".to_owned(), "clift-1".to_owned())]);
+    safetensors::serialize(views.map_err(bad)?, Some(metadata)).map_err(bad)
+}
+
+/// Evaluates the model of a directory, with the data and settings of `config`, and writes the results to `folder`.
+///
+/// A model with a condenser is measured on condensed tokens alone unless `stage1` is given, the model it was trained
+/// from: that draws the other variants. `systems` are measured beside it.
+///
+/// # Errors
+/// [`TrainError::BadFile`] when `stage1` has another encoder, [`TrainError::BadConfig`] for variants that there are no
+/// weights for, and whatever data, models or evaluation give.
+pub fn evaluate(
+    mut config: Config,
+    model: &ModelPath,
+    stage1: Option<&ModelPath>,
+    systems: &[System],
+    folder: &Path,
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<Summary, TrainError> {
+    config.validate()?;
+    let last = Trained::load(&config, &model.weights)?;
+    let first = stage1.map(|path| Trained::load(&config, &path.weights)).transpose()?;
+    if let (Some(first), Some(path)) = (&first, stage1)
+        && weights::hash(&first.encoder) != weights::hash(&last.encoder)
+    {
+        let reason = format!("its encoder is not that of {}", model.weights.display());
+        return Err(TrainError::bad_file("stage-1 model", &path.weights)(reason));
+    }
+    if last.condenser.is_some() && first.is_none() {
+        // Its renderer was trained on condensed tokens: what it makes of others is no baseline.
+        let asked = &mut config.eval.variants;
+        if asked.is_empty() {
+            asked.push(Tokens::Clift);
+        }
+        if let Some(variant) = asked.iter().find(|variant| **variant != Tokens::Clift) {
+            let fix = "give the first-stage model that draws it with --stage1".to_owned();
+            return Err(TrainError::BadConfig { key: "eval.variants".into(), value: variant.name().into(), fix });
+        }
+    }
+    let (source, ledger) = scenes::open(&config.data, Split::Test)?;
+    sink.event(&Event::Message(format!("{}: {ledger}", Split::Test)));
+    let reader = ClipReader { source, options: config.data.clip_options() };
+    let held_out = HeldOut::new(&config, &config.eval, reader, &last.device)?;
+    if !held_out.ledger().skips.is_empty() {
+        sink.event(&Event::Message(format!("evaluation: {}", held_out.ledger())));
+    }
+    std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
+    let Trained { encoder, lift_norm, condenser, renderer, device } = last;
+    let condensed =
+        condenser.map(|condenser| Condensed { lift_norm: lift_norm.clone(), condenser, renderer: renderer.clone() });
+    let (lift_norm, renderer) = first.map_or((lift_norm, renderer), |first| (first.lift_norm, first.renderer));
+    let mut networks = Networks { encoder, lift_norm, renderer, condensed: None, patch_condensed: None, device };
+    if let Some(condensed) = condensed {
+        networks.set_condensed(config.clusters.grouping, condensed);
+    }
+    held_out.evaluate(&networks, systems, folder, stop, sink)
+}

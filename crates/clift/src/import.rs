@@ -1,0 +1,81 @@
+//! `clift import`.
+
+use std::path::PathBuf;
+
+use clift_model::Variant;
+use clift_train::import::{ImportOptions, Imported, import};
+
+use crate::terminal;
+
+/// Arguments of `clift import`.
+#[derive(Debug, clap::Args)]
+pub struct ImportArgs {
+    /// A checkpoint that PyTorch wrote
+    #[arg(value_name = "CKPT")]
+    pub file: PathBuf,
+    /// The network it holds: paper, released-re10k or released-dl3dv
+    #[arg(long, value_name = "VARIANT")]
+    pub variant: Variant,
+    /// The model directory to write
+    #[arg(long, short, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Attention heads, which no shape shows but in released-dl3dv [default: 8]
+    #[arg(long, value_name = "COUNT")]
+    pub num_heads: Option<usize>,
+    /// Take parameters in f16, bf16 or f64 as well, converted to f32
+    #[arg(long)]
+    pub convert: bool,
+    /// Replace a part of every key, repeatedly: `--rename attn.qn=attn.q_norm`
+    #[arg(long, value_name = "FROM=TO", value_parser = parse_rename)]
+    pub rename: Vec<(String, String)>,
+}
+
+/// Imports a checkpoint and prints what became what.
+pub fn run(args: &ImportArgs) -> anyhow::Result<()> {
+    let options = ImportOptions {
+        variant: args.variant,
+        num_heads: args.num_heads,
+        convert: args.convert,
+        renames: args.rename.clone(),
+    };
+    let (config, imported) = import(&args.file, &args.out, &options)?;
+    let model = &config.model;
+    let mut lines: Vec<String> =
+        imported.parameters.iter().map(|(key, paths)| format!("{key} -> {}", paths.join(", "))).collect();
+    lines.extend(told(&imported));
+    lines.push(format!(
+        "{}: {} of width {}, {} heads, {} + {} layers, {}; {} tensors, all of the network's",
+        args.out.display(),
+        imported.variant,
+        model.dim,
+        model.num_heads,
+        model.num_encoder_blocks,
+        model.num_renderer_blocks,
+        if imported.has_condenser { "with its condenser" } else { "without condenser (a first-stage checkpoint)" },
+        imported.parameters.len(),
+    ));
+    terminal::print_result(&lines.join("\n"))
+}
+
+/// What was not taken over.
+fn told(imported: &Imported) -> Vec<String> {
+    let mut lines = Vec::new();
+    for (first, count) in &imported.ignored {
+        lines.push(format!("not of the network: {count} keys {first}.*"));
+    }
+    if !imported.passed_over.is_empty() {
+        let names: Vec<&str> = imported.passed_over.iter().map(String::as_str).collect();
+        lines.push(format!("passed over, not run: {}", names.join(", ")));
+    }
+    if imported.num_converted > 0 {
+        lines.push(format!("converted to f32: {} tensors", imported.num_converted));
+    }
+    lines
+}
+
+fn parse_rename(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((from, to)) if !from.is_empty() => Ok((from.into(), to.into())),
+        _ => Err("write FROM=TO".into()),
+    }
+}

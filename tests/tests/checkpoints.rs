@@ -1,0 +1,198 @@
+//! Published checkpoints in and out, through the command line.
+
+use std::path::Path;
+
+use clift_data::{StateDict, write_state_dict};
+
+use crate::support::{Place, clift, files, repository};
+
+/// Pictures of 2 x 3 patches, as the sizes of the fixtures' networks do not matter.
+const SMALL: [&str; 6] = ["--set", "data.width=24", "--set", "data.height=16", "--set", "eval.num_sheets=1"];
+
+fn checkpoint(name: &str) -> String {
+    repository(&format!("data-fixtures/checkpoints/{name}.ckpt")).display().to_string()
+}
+
+fn mini() -> String {
+    repository("data-fixtures/re10k-mini").display().to_string()
+}
+
+/// Imports a fixture into the folder `name` and returns that.
+fn import(place: &Place, file: &str, variant: &str, num_heads: &str, name: &str) -> String {
+    let folder = place.at(name).display().to_string();
+    let ran = clift(["import", file, "--variant", variant, "--num-heads", num_heads, "-o", &folder]).ok();
+    assert!(ran.stdout.contains("transformer.output_norm.weight -> renderer.output_norm.weight"), "{}", ran.stdout);
+    folder
+}
+
+/// Evaluates a model on the test scene of the small data set.
+fn evaluate(model: &str, out: &Path, flags: &[&str]) -> serde_json::Value {
+    let index = repository("data-fixtures/re10k-mini/evaluation_index.json").display().to_string();
+    let (data, out_text) = (mini(), out.display().to_string());
+    let fixed = ["eval", "--checkpoint", model, "--data", &data, "--index", &index, "--out", &out_text];
+    clift(fixed.iter().chain(&SMALL).chain(flags)).ok();
+    serde_json::from_slice(&std::fs::read(out.join("summary.json")).unwrap()).unwrap()
+}
+
+fn variants(summary: &serde_json::Value) -> Vec<&str> {
+    let mut names: Vec<&str> =
+        summary["points"].as_array().unwrap().iter().map(|point| point["variant"].as_str().unwrap()).collect();
+    names.dedup();
+    names.sort_unstable();
+    names.dedup();
+    names
+}
+
+#[test]
+fn a_published_checkpoint_is_imported_measured_encoded_and_drawn() {
+    let place = Place::new();
+    for (name, variant, heads) in [("re10k", "released-re10k", "3"), ("dl3dv", "released-dl3dv", "7")] {
+        let model = import(&place, &checkpoint(name), variant, heads, name);
+        let config = place.text(&format!("{name}/config.toml"));
+        let poses = if name == "re10k" { ["\"quaternion\"", "\"all\""] } else { ["\"axes\"", "\"context\""] };
+        for line in [
+            format!("variant = \"{variant}\""),
+            format!("pose_rotation = {}", poses[0]),
+            format!("pose_scale = {}", poses[1]),
+        ] {
+            assert!(config.contains(&line), "{line}\nis not in\n{config}");
+        }
+        let summary = evaluate(&model, &place.at(&format!("{name}-eval")), &[]);
+        assert_eq!((&summary["num_scenes"], &summary["num_views"]), (&1.into(), &4.into()));
+        assert_eq!(variants(&summary), ["clift"]);
+        // The reference's shares of 24 tokens.
+        let stored: Vec<u64> = summary["points"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|point| point["num_storage_tokens"].as_u64().unwrap())
+            .collect();
+        assert_eq!(stored, [1, 3, 6, 12, 18, 24]);
+
+        let scene = place.at(&format!("{name}.clift")).display().to_string();
+        let data = mini();
+        let encode = ["encode", &model, &data, "--scene", "00000000000000b1", "-o", &scene, "--storage", "1/2"];
+        clift(encode.iter().chain(&SMALL)).ok();
+        let out = place.at(&format!("{name}-drawn")).display().to_string();
+        clift(["render", &scene, "--path", "interpolate", "--frames", "3", "-o", &out]).ok();
+        assert!(place.at(&format!("{name}-drawn/frame-00002.png")).exists());
+    }
+}
+
+#[test]
+fn a_first_stage_model_adds_the_uncondensed_variants() {
+    let place = Place::new();
+    let model = import(&place, &checkpoint("re10k"), "released-re10k", "3", "second");
+    // The same network before its second stage: another renderer, no condenser.
+    let state = StateDict::open(checkpoint("re10k").as_ref()).unwrap();
+    let first: Vec<_> = state
+        .keys()
+        .filter(|key| key.starts_with("transformer.") && !key.contains("squeezer"))
+        .map(|key| {
+            let mut values = state.read(key).unwrap();
+            if key.contains("patch_to_image") {
+                for value in &mut values {
+                    *value *= 0.9;
+                }
+            }
+            let shape = state.tensor(key).unwrap().1.iter().map(|&size| size as usize).collect();
+            (key.to_owned(), shape, values)
+        })
+        .collect();
+    let file = place.at("first.ckpt");
+    write_state_dict(&file, &first).unwrap();
+    let first = import(&place, &file.display().to_string(), "released-re10k", "3", "first");
+
+    assert_eq!(variants(&evaluate(&first, &place.at("a"), &[])), ["kmeans", "random"]);
+    let alone = evaluate(&first, &place.at("a"), &["--storage", "6"]);
+    let both = evaluate(&model, &place.at("b"), &["--stage1", &first, "--storage", "6"]);
+    assert_eq!(variants(&both), ["clift", "kmeans", "random"]);
+    let psnr = |summary: &serde_json::Value, variant: &str| {
+        let points = summary["points"].as_array().unwrap();
+        points.iter().find(|point| point["variant"] == variant).unwrap()["psnr"].as_f64().unwrap()
+    };
+    assert_eq!(psnr(&alone, "kmeans"), psnr(&both, "kmeans"), "the first stage's own renderer draws them");
+
+    let other = import(&place, &checkpoint("re10k_first"), "released-re10k", "5", "other");
+    let (data, out) = (mini(), place.at("c").display().to_string());
+    let args = ["eval", "--checkpoint", &model, "--stage1", &other, "--data", &data, "--out", &out];
+    let message = clift(args.iter().chain(&SMALL)).fails(1);
+    assert!(message.contains("model.safetensors"), "{message}");
+}
+
+#[test]
+fn a_checkpoint_that_does_not_fit_leaves_nothing_behind() {
+    let place = Place::new();
+    let folder = place.at("model").display().to_string();
+    let import = |file: &str, variant: &str, heads: &str| {
+        clift(["import", file, "--variant", variant, "--num-heads", heads, "-o", &folder])
+    };
+    let message = import(&checkpoint("dl3dv"), "released-re10k", "7").fails(1);
+    for part in ["unknown: transformer.input_norm.weight [14]", "nothing was written", "--variant released-dl3dv"] {
+        assert!(message.contains(part), "{part}\nis not in\n{message}");
+    }
+    let message = import(&checkpoint("half"), "released-re10k", "5").fails(1);
+    assert!(message.contains("not in f32: transformer."), "{message}");
+    import(&checkpoint("re10k"), "released-re10k", "4").fails(2);
+    let cut = place.at("cut.ckpt");
+    std::fs::write(&cut, &std::fs::read(checkpoint("re10k")).unwrap()[..5000]).unwrap();
+    import(&cut.display().to_string(), "released-re10k", "3").fails(1);
+    std::fs::remove_file(&cut).unwrap();
+    assert!(files(&place.at("")).is_empty());
+}
+
+#[test]
+fn released_variants_train_in_both_stages_and_leave_as_checkpoints() {
+    let place = Place::new();
+    for variant in ["released-re10k", "released-dl3dv"] {
+        let set = [&format!("model.variant={variant}")[..], "checkpoint.every=2", "recompute=true"];
+        place.train(variant, &set, &[]).ok();
+        let [first, second] = ["stage1", "stage2"].map(|stage| place.weights(variant, stage));
+        let moved = |part: &str| {
+            let (second, first) = (second.part(part), first.part(part));
+            second.moved_from(&first).fold(0.0, f64::max)
+        };
+        assert_eq!(moved("encoder."), 0.0, "the encoder is frozen in stage 2");
+        assert!(moved("renderer.") > 0.0);
+        assert!(second.part("condenser.released.gate.").0.values().flatten().any(|&value| value != 0.0));
+        if variant == "released-dl3dv" {
+            // Four steps of AdamW at up to 1e-3 move every value by about the sum of the rates, the renderer's by a tenth.
+            assert!(moved("lift_norm.") > 3.0 * moved("renderer.output_norm."), "it trains at the full rate");
+        }
+        let state = place.json(&format!("{variant}/stage2/checkpoints/step-000000004/state.json"));
+        assert_eq!(state["model"]["variant"], *variant, "saved with every checkpoint");
+        let points = place.json(&format!("{variant}/eval/summary.json"));
+        assert_eq!(variants(&points), ["clift", "kmeans", "random"]);
+
+        let file = place.at(&format!("{variant}.ckpt")).display().to_string();
+        let run = place.at(variant).display().to_string();
+        clift(["export", &run, "--format", "pytorch", "-o", &file]).ok();
+        let name = format!("{variant}-model");
+        import(&place, &file, variant, "2", &name);
+        assert!(place.model(&name) == second, "the weights come back bit for bit");
+    }
+}
+
+#[test]
+fn a_dl3dv_model_starts_from_an_imported_re10k_model_and_lists_what_is_new() {
+    let place = Place::new();
+    let from = import(&place, &checkpoint("re10k"), "released-re10k", "3", "re10k");
+    let model = "model={variant='released-dl3dv', dim=15, num_heads=3, feed_forward_dim=22, num_encoder_blocks=1, \
+                 num_renderer_blocks=2}";
+    let set = [model, &format!("stage1.init_from={from:?}"), "stage1.steps=0"];
+    let ran = place.train("dl3dv", &set, &["--only", "stage1"]).ok();
+    for part in [
+        "encoder.blocks.0.attn.qk_norm.query.",
+        "renderer.blocks.1.cross_attn.qk_norm.key.",
+        "lift_norm.norm.",
+        "unused in the file: condenser.released.",
+    ] {
+        assert!(ran.stderr.contains(part), "{part}\nis not in\n{}", ran.stderr);
+    }
+    let (old, new) = (place.model("re10k"), place.weights("dl3dv", "stage1"));
+    for (name, values) in old.0.iter().filter(|(name, _)| !name.starts_with("condenser.")) {
+        assert_eq!(&new.0[name], values, "{name}");
+    }
+    let gamma: Vec<f32> = new.part("lift_norm.norm.weight").0.into_values().flatten().collect();
+    assert_eq!(gamma, [1.0; 15]);
+}
