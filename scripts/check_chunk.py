@@ -1,4 +1,4 @@
-"""Checks that PyTorch reads chunk files: `python scripts/check_chunk.py CHUNK.torch [..]`.
+"""Checks that PyTorch reads chunk files and files of single scenes: `python scripts/check_chunk.py FILE.torch [..]`.
 
 Loads each with `torch.load(weights_only=True)`, checks types and shapes, and decodes every picture if Pillow is there.
 Prints a line per chunk; exits with an error at the first thing that does not fit the format.
@@ -51,6 +51,10 @@ def main():
         sys.exit(__doc__)
     for path in map(Path, sys.argv[1:]):
         scenes = torch.load(path, weights_only=True)
+        # A scene by itself, named after its key, is the other layout.
+        if isinstance(scenes, dict):
+            assert path.stem == scenes["key"], (path.stem, scenes["key"])
+            scenes = [scenes]
         assert isinstance(scenes, list), type(scenes)
         num_frames = sum(check_scene(scene) for scene in scenes)
         index = path.parent / "index.json"

@@ -58,6 +58,25 @@ def write_lanczos(folder):
     save_file(tensors, folder / "lanczos.safetensors")
 
 
+def write_fitted(folder):
+    """JPEG files (`N.jpeg`, u8) and what Pillow makes of them (`N.output`, u8 [height, width, 3]): decoded, rescaled until
+    they cover the size, cropped at the centre."""
+    tensors = {}
+    for number, ((height, width), (to_height, to_width), quality) in enumerate(
+        [((180, 320), (128, 128), 90), ((160, 284), (96, 168), 80), ((240, 135), (64, 64), 95)]
+    ):
+        file = io.BytesIO()
+        Image.fromarray(picture(height, width, number)).save(file, "JPEG", quality=quality)
+        decoded = Image.open(io.BytesIO(file.getvalue()))
+        scale = max(to_height / height, to_width / width)
+        scaled = (round(width * scale), round(height * scale))
+        row, column = (scaled[1] - to_height) // 2, (scaled[0] - to_width) // 2
+        rescaled = np.asarray(decoded.resize(scaled, Image.LANCZOS))
+        tensors[f"{number}.jpeg"] = np.frombuffer(file.getvalue(), np.uint8).copy()
+        tensors[f"{number}.output"] = rescaled[row : row + to_height, column : column + to_width].copy()
+    save_file(tensors, folder / "fitted.safetensors")
+
+
 def normalized(context, target, rotation, scale):
     """Pose normalisation as the protocol writes it, with quaternions aligned to the first one."""
     if rotation == "quaternion":
@@ -165,6 +184,7 @@ def main():
     for name in ["reference", "re10k-mini", "hostile"]:
         (root / name).mkdir(parents=True, exist_ok=True)
     write_lanczos(root / "reference")
+    write_fitted(root / "reference")
     write_poses(root / "reference")
     write_chunks(root / "re10k-mini")
     write_decoded(root / "reference", root / "re10k-mini")

@@ -6,6 +6,7 @@ mod bench;
 mod checkpoints;
 #[cfg(unix)]
 mod crash;
+mod data_tools;
 mod evaluation;
 mod exact_resume;
 mod extend;

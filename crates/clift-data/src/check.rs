@@ -5,6 +5,8 @@ mod epipolar;
 mod frames;
 mod picture;
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 use crate::clip::{Frame, SceneSource};
@@ -52,8 +54,7 @@ pub struct Checked {
 
 /// Checks one scene of `source`. What fails is a reason in the result and never an error.
 ///
-/// All frames are decoded, on all cores, and about nine pairs of them compared. Time grows with the frames; a clip of
-/// 100 frames of 640 x 360 takes about a second.
+/// All frames are decoded, on all cores, and about nine pairs of them compared.
 pub fn check_scene(source: &dyn SceneSource, scene: usize) -> Checked {
     let mut check = SceneCheck { key: source.key(scene).to_owned(), ..SceneCheck::default() };
     let cameras = match source.cameras(scene) {
@@ -73,12 +74,25 @@ pub fn check_scene(source: &dyn SceneSource, scene: usize) -> Checked {
 
 /// The scenes that opening a source left out, as flagged ones.
 pub fn left_out(ledger: &Ledger) -> Vec<SceneCheck> {
-    let flagged = ledger.skips.iter().map(|skip| SceneCheck {
-        key: skip.key.clone(),
-        reasons: vec![skip.reason.clone()],
-        ..SceneCheck::default()
+    let flagged = ledger.skips.iter().map(|skip| {
+        let mut check = SceneCheck { key: skip.key.clone(), ..SceneCheck::default() };
+        check.reasons.push(skip.reason.clone());
+        note_frames(ledger, &mut check);
+        check
     });
     flagged.collect()
+}
+
+/// Names every frame that opening the source left out of a scene.
+pub fn note_frames(ledger: &Ledger, check: &mut SceneCheck) {
+    let mut by_reason: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for skip in ledger.frames.iter().filter(|skip| skip.key == check.key) {
+        by_reason.entry(&skip.reason).or_default().push(&skip.frame);
+    }
+    for (reason, names) in by_reason {
+        let frames = if names.len() == 1 { "frame" } else { "frames" };
+        check.notes.push(format!("{} {frames} left out, {reason}: {}", names.len(), names.join(", ")));
+    }
 }
 
 #[cfg(test)]

@@ -3,8 +3,6 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use zip::result::ZipResult;
-
 use crate::camera::Camera;
 use crate::error::DataError;
 use crate::files::replace;
@@ -26,6 +24,18 @@ pub struct SceneRecord {
     pub cameras: Vec<Camera>,
     /// One JPEG or PNG file per frame.
     pub images: Vec<Vec<u8>>,
+}
+
+impl SceneRecord {
+    /// Says which lists differ in length.
+    pub(crate) fn check(&self) -> Result<(), String> {
+        let Self { key, timestamps, cameras, images, .. } = self;
+        let (timestamps, cameras, images) = (timestamps.len(), cameras.len(), images.len());
+        if timestamps == images && cameras == images {
+            return Ok(());
+        }
+        Err(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps"))
+    }
 }
 
 /// Writes `000000.torch, 000001.torch, ..` and, when all are written, `index.json` into `folder`; returns how many
@@ -52,11 +62,7 @@ pub fn write_chunks(
     let mut pending_bytes = 0;
     for scene in scenes {
         let scene = scene?;
-        let (timestamps, cameras, images) = (scene.timestamps.len(), scene.cameras.len(), scene.images.len());
-        if timestamps != images || cameras != images {
-            let key = &scene.key;
-            return Err(bad(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps")));
-        }
+        scene.check().map_err(&bad)?;
         if index.insert(scene.key.clone(), chunk_name(num_chunks)).is_some() {
             return Err(bad(format!("scene {} comes twice", scene.key)));
         }
@@ -77,25 +83,33 @@ pub fn write_chunks(
     Ok(index.len())
 }
 
-fn chunk_name(number: usize) -> String {
+pub(crate) fn chunk_name(number: usize) -> String {
     format!("{number:06}.torch")
 }
 
-fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
-    let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
-    let bytes = pack(&prefix, scenes).map_err(|error| DataError::io("packing a chunk", path)(error.into()))?;
-    replace(path, &bytes).map_err(DataError::io("writing a chunk", path))
-}
-
-/// Packs scenes as `torch.save` would: pickle first, then the storages, stored and aligned to 64 bytes.
-fn pack(prefix: &str, scenes: &[SceneRecord]) -> ZipResult<Vec<u8>> {
+/// Writes a list of scenes.
+pub(crate) fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
     let mut pickle = PickleWriter::new();
     pickle.raw(b"](");
     for scene in scenes {
         write_scene(scene, &mut pickle);
     }
     pickle.raw(b"e.");
-    pickle.pack(prefix)
+    write_archive(path, pickle)
+}
+
+/// Writes a scene by itself, as the reference's tool does.
+pub(crate) fn write_scene_file(path: &Path, scene: &SceneRecord) -> Result<(), DataError> {
+    let mut pickle = PickleWriter::new();
+    write_scene(scene, &mut pickle);
+    pickle.raw(b".");
+    write_archive(path, pickle)
+}
+
+fn write_archive(path: &Path, pickle: PickleWriter) -> Result<(), DataError> {
+    let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
+    let bytes = pickle.pack(&prefix).map_err(|error| DataError::io("packing a chunk", path)(error.into()))?;
+    replace(path, &bytes).map_err(DataError::io("writing a chunk", path))
 }
 
 fn write_scene(scene: &SceneRecord, pickle: &mut PickleWriter) {

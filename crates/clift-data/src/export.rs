@@ -23,7 +23,7 @@ pub enum Encoding {
 }
 
 impl Encoding {
-    fn encode(self, frame: &Frame) -> Result<Vec<u8>, DataError> {
+    pub(crate) fn encode(self, frame: &Frame) -> Result<Vec<u8>, DataError> {
         match self {
             Self::Png => encode_png(frame),
             Self::Jpeg(quality) => encode_jpeg(frame, quality),
@@ -101,20 +101,32 @@ pub fn write_evaluation_index(
     num_context: usize,
     num_targets: usize,
 ) -> Result<usize, DataError> {
+    let mut entries = Vec::with_capacity(source.num_scenes());
+    for scene in 0..source.num_scenes() {
+        let views = spread_views(source.num_frames(scene)?, num_context, num_targets);
+        entries.push((source.key(scene), views));
+    }
+    let num_usable = entries.iter().filter(|(_, views)| views.is_some()).count();
+    write_index(path, entries)?;
+    Ok(num_usable)
+}
+
+/// Writes an index that [`EvaluationIndex`](crate::EvaluationIndex) reads, sorted by key.
+pub(crate) fn write_index<'a>(
+    path: &Path,
+    entries: impl IntoIterator<Item = (&'a str, Option<ViewIndices>)>,
+) -> Result<(), DataError> {
     #[derive(Serialize)]
     struct Entry {
         context: Vec<usize>,
         target: Vec<usize>,
     }
-    let mut entries = BTreeMap::new();
-    for scene in 0..source.num_scenes() {
-        let views = spread_views(source.num_frames(scene)?, num_context, num_targets);
-        entries.insert(source.key(scene), views.map(|ViewIndices { context, target }| Entry { context, target }));
-    }
+    let entry = |ViewIndices { context, target }| Entry { context, target };
+    let entries: BTreeMap<&str, Option<Entry>> =
+        entries.into_iter().map(|(key, views)| (key, views.map(entry))).collect();
     let bad = |error: serde_json::Error| DataError::BadIndex { what: error.to_string(), path: path.to_path_buf() };
     let text = serde_json::to_vec(&entries).map_err(bad)?;
-    replace(path, &text).map_err(DataError::io("writing the evaluation index", path))?;
-    Ok(entries.values().flatten().count())
+    replace(path, &text).map_err(DataError::io("writing the evaluation index", path))
 }
 
 #[cfg(test)]

@@ -60,16 +60,6 @@ impl Features {
         features
     }
 
-    /// How many corners there are.
-    pub fn len(&self) -> usize {
-        self.points.len()
-    }
-
-    /// Whether there is no corner.
-    pub fn is_empty(&self) -> bool {
-        self.points.is_empty()
-    }
-
     /// Pairs of corners that are each other's most similar, clearly so, and that some epipolar geometry explains.
     /// The same for the same pictures; fewer than a handful mean that the pictures do not show the same.
     pub fn matches(&self, other: &Self) -> Vec<Match> {
@@ -111,10 +101,10 @@ mod tests {
     #[test]
     fn a_picture_matches_itself_in_place() {
         let features = Features::find(&room().frame(0, 0).unwrap());
-        assert!(features.len() > 80, "{}", features.len());
+        assert!(features.points.len() > 80, "{}", features.points.len());
         let matches = features.matches(&features);
         // A pattern that repeats has no clear match.
-        assert!(matches.len() > features.len() / 2, "{} of {}", matches.len(), features.len());
+        assert!(matches.len() > features.points.len() / 2, "{} of {}", matches.len(), features.points.len());
         assert!(matches.iter().all(|pair| pair.first == pair.second));
     }
 
@@ -128,13 +118,13 @@ mod tests {
         let mut distances: Vec<f64> = matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect();
         distances.sort_by(f64::total_cmp);
         assert!(matches.len() > 40, "{}", matches.len());
-        assert!(distances[matches.len() / 2] < 0.6, "{distances:?}"); // pixels of a picture twice as wide
+        assert!(distances[matches.len() / 2] < 1.0, "{distances:?}"); // half a pixel of the picture, which is 320 wide
     }
 
     #[test]
     fn pictures_of_one_colour_have_no_corners() {
         let features = Features::find(&Frame { width: 64, height: 48, rgb: vec![90; 64 * 48 * 3] });
-        assert!(features.is_empty() && features.matches(&features).is_empty());
-        assert!(Features::find(&Frame { width: 3, height: 2, rgb: vec![9; 18] }).is_empty());
+        assert!(features.points.is_empty() && features.matches(&features).is_empty());
+        assert!(Features::find(&Frame { width: 3, height: 2, rgb: vec![9; 18] }).points.is_empty());
     }
 }

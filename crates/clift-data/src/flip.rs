@@ -119,7 +119,9 @@ mod tests {
     fn the_rays_of_a_flipped_clip_mirror_and_so_do_its_pixels() {
         let mut clip = read(Arc::new(room()), [40, 16], PoseRotation::Quaternion);
         for views in [&mut clip.context, &mut clip.target] {
-            views.intrinsics.iter_mut().for_each(|k| k.cx += 1.7);
+            for k in &mut views.intrinsics {
+                k.cx += 1.7;
+            }
         }
         let flipped = clip.flipped();
         for (views, mirrored) in [(&clip.context, &flipped.context), (&clip.target, &flipped.target)] {

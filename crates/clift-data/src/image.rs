@@ -261,4 +261,21 @@ mod tests {
         let message = decode(&png, "k", 0).unwrap_err().to_string();
         assert!(message.contains("limit") || message.contains("exceeds"), "{message}");
     }
+
+    #[test]
+    fn a_jpeg_is_decoded_rescaled_and_cropped_as_pillow_does_it_to_a_fraction_of_a_level() {
+        let bytes = include_bytes!("../../../data-fixtures/reference/fitted.safetensors");
+        let tensors = safetensors::SafeTensors::deserialize(bytes).unwrap();
+        let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
+        for number in 0..3 {
+            let expected = tensors.tensor(&format!("{number}.output")).unwrap();
+            let &[height, width, 3] = expected.shape() else { panic!("{:?}", expected.shape()) };
+            let frame = decode(tensors.tensor(&format!("{number}.jpeg")).unwrap().data(), "k", 0).unwrap();
+            let (fitted, _) = fit(&frame, norm, width, height, false).unwrap();
+            let differences = fitted.rgb.iter().zip(expected.data()).map(|(a, b)| a.abs_diff(*b));
+            let mean = differences.clone().map(f64::from).sum::<f64>() / fitted.rgb.len() as f64;
+            // Decoders round differently; of real photos the mean is below 0.1 (docs/data-tools.md).
+            assert!(mean < 0.5 && differences.max() <= Some(8), "{number}: {mean}");
+        }
+    }
 }

@@ -54,12 +54,11 @@ pub fn resize_lanczos_window(frame: &Frame, width: usize, height: usize, window:
         _ => [window.row, row_end],
     };
     let input = &frame.rgb[top * frame.width * 3..bottom * frame.width * 3];
-    let narrowed = match &column_taps {
-        Some(taps) => resize_columns(input, frame.width, taps),
-        None => {
-            let rows = input.chunks_exact(frame.width * 3);
-            rows.flat_map(|row| &row[window.column * 3..column_end * 3]).copied().collect()
-        }
+    let narrowed = if let Some(taps) = &column_taps {
+        resize_columns(input, frame.width, taps)
+    } else {
+        let rows = input.chunks_exact(frame.width * 3);
+        rows.flat_map(|row| &row[window.column * 3..column_end * 3]).copied().collect()
     };
     let rgb = match &row_taps {
         Some(taps) => resize_rows(&narrowed, window.width * 3, top, taps),

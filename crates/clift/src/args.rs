@@ -11,6 +11,7 @@ use clift_train::Stage;
 use clift_train::bench::Work;
 
 pub use crate::data::args::DataCommand;
+pub use crate::data::bench::BenchDataArgs;
 pub use crate::encode::EncodeArgs;
 pub use crate::export::ExportArgs;
 pub use crate::import::ImportArgs;
@@ -251,6 +252,13 @@ pub struct PlanArgs {
     pub json: Option<PathBuf>,
 }
 
+/// What is timed instead of the parts of the method.
+#[derive(Debug, Subcommand)]
+pub enum BenchCommand {
+    /// Time how fast clips are read from a folder, in order and at random
+    Data(BenchDataArgs),
+}
+
 /// Arguments of `clift compare`.
 #[derive(Debug, clap::Args)]
 pub struct CompareArgs {
@@ -287,9 +295,14 @@ pub struct FlopsArgs {
 
 /// Arguments of `clift bench`.
 #[derive(Debug, clap::Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub struct BenchArgs {
+    /// Something else to time.
+    #[command(subcommand)]
+    pub command: Option<BenchCommand>,
     /// The experiment whose sizes are used, a TOML file
-    pub config: PathBuf,
+    #[arg(required = true)]
+    pub config: Option<PathBuf>,
     /// The rows; all of them by default
     #[arg(long, value_delimiter = ',', value_name = "WORK", help = works_help())]
     pub work: Vec<Work>,

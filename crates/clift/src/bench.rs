@@ -10,7 +10,7 @@ use crate::{WrongUsage, interrupt, table};
 
 /// Times what is asked for, prints the table and writes the JSON.
 pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
-    let (mut config, overrides) = read_config::<Config>(&args.config, &args.set)?;
+    let (mut config, overrides) = read_config::<Config>(args.config.as_deref().unwrap_or(Path::new("")), &args.set)?;
     for change in overrides {
         print_note(&format!("--set {change}"));
     }

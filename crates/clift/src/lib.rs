@@ -25,7 +25,7 @@ use clap::Parser;
 use clift_eval::EvalError;
 use clift_train::TrainError;
 
-use args::{Args, Command, DataCommand};
+use args::{Args, BenchArgs, BenchCommand, Command, DataCommand};
 
 /// Done.
 const DONE: u8 = 0;
@@ -46,8 +46,12 @@ pub fn main() -> ExitCode {
         Command::Render(args) => render::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
         Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
+        Command::Data { command: DataCommand::Check(args) } => data::check::run(&args),
+        Command::Data { command: DataCommand::Index(args) } => data::index::run(&args),
+        Command::Data { command: DataCommand::Convert(args) } => data::convert::run(&args),
         Command::Plan(args) => plan::run(&args),
         Command::Doctor(args) => doctor::run(&args),
+        Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => data::bench::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Import(args) => import::run(&args),
         Command::Export(args) => export::run(&args),

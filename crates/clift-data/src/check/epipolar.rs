@@ -51,8 +51,11 @@ pub(super) fn look(
     check: &mut SceneCheck,
 ) -> Option<Frame> {
     let features: Vec<OnceLock<Option<Features>>> = (0..cameras.len()).map(|_| OnceLock::new()).collect();
-    let view = Scene { source, scene, cameras, sizes, features };
-    let pairs: Vec<Pair> = view.anchors().into_par_iter().filter_map(|anchor| view.pair_from(anchor)).collect();
+    let view = SceneViews { source, scene, cameras, sizes, features };
+    let mut pairs: Vec<Pair> = view.anchors().into_par_iter().filter_map(|anchor| view.pair_from(anchor)).collect();
+    // At the end of a scene two frames may have chosen each other.
+    pairs.sort_by_key(|pair| pair.check.frames);
+    pairs.dedup_by_key(|pair| pair.check.frames);
     check.pairs = pairs.iter().map(|pair| pair.check.clone()).collect();
     let pooled: Vec<f64> = pairs.iter().flat_map(|pair| evenly(&pair.distances, MAX_MATCHES)).collect();
     if pooled.len() < MIN_MATCHES {
@@ -73,7 +76,9 @@ pub(super) fn look(
     } else {
         for PairCheck { frames: [a, b], epipolar_px, .. } in &check.pairs {
             if *epipolar_px > NOTED_PX {
-                check.notes.push(format!("frames {a} and {b} alone: {epipolar_px:.1} px from the epipolar lines"));
+                check.notes.push(format!(
+                    "frames {a} and {b} alone: {epipolar_px:.1} px; their poses, or a pattern that repeats"
+                ));
             }
         }
     }
@@ -82,7 +87,7 @@ pub(super) fn look(
     view.draw(shown)
 }
 
-struct Scene<'a> {
+struct SceneViews<'a> {
     source: &'a dyn SceneSource,
     scene: usize,
     cameras: &'a [Camera],
@@ -90,7 +95,7 @@ struct Scene<'a> {
     features: Vec<OnceLock<Option<Features>>>,
 }
 
-impl Scene<'_> {
+impl SceneViews<'_> {
     /// Frames that a partner is looked for, spread over the scene.
     fn anchors(&self) -> Vec<usize> {
         let count = self.cameras.len().saturating_sub(1);

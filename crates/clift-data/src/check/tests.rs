@@ -75,9 +75,10 @@ fn check(cameras: impl Fn(usize, &mut Camera) + Send + Sync) -> SceneCheck {
     check_scene(&Changed { room: &rooms()[0], cameras, frame: |frame| frame }, 0).check
 }
 
+/// Up or down: the camera goes sideways, and a turn to the side would move points along their epipolar lines.
 fn turned(c2w: Pose, angle_deg: f64) -> Pose {
     let (sin, cos) = angle_deg.to_radians().sin_cos();
-    let turn = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
+    let turn = [[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]];
     c2w.after(Pose { rotation: turn, translation: [0.0; 3] })
 }
 
@@ -174,7 +175,15 @@ fn frames_that_repeat_or_cannot_be_read_are_told() {
 fn scenes_that_were_left_out_are_flagged_with_the_reason() {
     let mut ledger = Ledger::new(3);
     ledger.skip("a", "not a scene");
+    for name in ["0005.jpg", "0010.jpg"] {
+        ledger.skip_frame("b", name, "no such file");
+    }
     let checks = left_out(&ledger);
     assert_eq!(checks.len(), 1);
     assert!(!checks[0].ok && checks[0].key == "a" && checks[0].reasons == ["not a scene"]);
+    assert!(checks[0].notes.is_empty());
+    let mut check = SceneCheck { key: "b".into(), ok: true, ..SceneCheck::default() };
+    note_frames(&ledger, &mut check);
+    assert!(check.ok);
+    assert_eq!(check.notes, ["2 frames left out, no such file: 0005.jpg, 0010.jpg"]);
 }

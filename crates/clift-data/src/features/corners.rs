@@ -95,7 +95,7 @@ fn measure(grey: &Grey) -> Vec<f32> {
                 (0..3).for_each(|i| sum[i] += product[i] * weight);
             }
             let [xx, xy, yy] = sum;
-            measure[y * width + x] = (xx + yy) / 2.0 - ((xx - yy) * (xx - yy) / 4.0 + xy * xy).sqrt();
+            measure[y * width + x] = f32::midpoint(xx, yy) - ((xx - yy) * (xx - yy) / 4.0 + xy * xy).sqrt();
         }
     }
     measure
@@ -112,12 +112,12 @@ mod tests {
         let inside = |x: usize, y: usize| (20..50).contains(&x) && (15..40).contains(&y);
         let rgb =
             (0..height).flat_map(|y| (0..width).flat_map(move |x| [if inside(x, y) { 200 } else { 50 }; 3])).collect();
-        let mut found = find(&Grey::of(&Frame { width, height, rgb }).blurred(), 100);
-        found.sort_by(|a, b| a[1].total_cmp(&b[1]).then(a[0].total_cmp(&b[0])));
+        let found = find(&Grey::of(&Frame { width, height, rgb }).blurred(), 100);
         assert_eq!(found.len(), 4, "{found:?}");
-        for (found, corner) in found.iter().zip([[20.0, 15.0], [50.0, 15.0], [20.0, 40.0], [50.0, 40.0]]) {
+        for corner in [[20.0, 15.0], [50.0, 15.0], [20.0, 40.0], [50.0, 40.0]] {
             // The blur moves a corner inwards, by the same amount in every view.
-            assert!((0..2).all(|i| (found[i] - corner[i]).abs() < 2.0), "{found:?} {corner:?}");
+            let near = |place: &[f64; 2]| (0..2).all(|i| (place[i] - corner[i]).abs() < 2.0);
+            assert!(found.iter().any(near), "{found:?} {corner:?}");
         }
         assert_eq!(find(&Grey::of(&Frame { width: 20, height: 90, rgb: vec![0; 5400] }), 9).len(), 0);
     }

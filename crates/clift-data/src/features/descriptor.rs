@@ -46,7 +46,9 @@ impl Descriptor {
         if whole < 1e-3 {
             return None;
         }
-        sums.iter_mut().for_each(|value| *value = (*value / whole).min(MOST));
+        for value in &mut sums {
+            *value = (*value / whole).min(MOST);
+        }
         let cut = length(&sums);
         let values = sums.map(|value| (value / cut * LENGTH).round() as i16);
         let square = values.iter().map(|value| i32::from(*value) * i32::from(*value)).sum();

@@ -118,7 +118,9 @@ fn null_vector(mut rows: [[f64; 9]; 8]) -> [f64; 9] {
         let largest = places.max_by(|a, b| rows[a.0][a.1].abs().total_cmp(&rows[b.0][b.1].abs()));
         let Some((row, column)) = largest.filter(|(row, column)| rows[*row][*column].abs() > 1e-9) else { break };
         rows.swap(rank, row);
-        rows.iter_mut().for_each(|row| row.swap(rank, column));
+        for row in &mut rows {
+            row.swap(rank, column);
+        }
         order.swap(rank, column);
         let pivot = rows[rank];
         for row in &mut rows[rank + 1..] {

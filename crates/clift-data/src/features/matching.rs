@@ -59,7 +59,9 @@ mod tests {
 
     fn nearest(distances: &[i32]) -> Nearest {
         let mut nearest = Nearest::default();
-        distances.iter().enumerate().for_each(|(place, distance)| nearest.see(place, *distance));
+        for (place, distance) in distances.iter().enumerate() {
+            nearest.see(place, *distance);
+        }
         nearest
     }
 

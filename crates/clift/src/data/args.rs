@@ -35,6 +35,114 @@ Examples:
   clift data info configs/tiny.toml
   clift data info configs/re10k.toml --set data.filters.min_frames=60 --json info.json")]
     Info(InfoArgs),
+    /// Check whether scenes can be believed: pictures, cameras, and poses against the pictures
+    ///
+    /// Reads every frame of every scene, in any layout; looks at sizes, intrinsics, fields of view, rotations, baselines
+    /// and pictures that repeat; and matches corners between frames, which must lie on the epipolar lines that the
+    /// cameras predict. Prints a table with the reasons. Exits with 1 if a scene is flagged.
+    #[command(after_help = "\
+Examples:
+  clift data check /data/re10k --scenes 20
+  clift data check captures/fox --pictures fox-lines --json fox.json")]
+    Check(CheckArgs),
+    /// Make an evaluation index of one's own data: pairs of frames that overlap, and targets between them
+    ///
+    /// The way pixelSplat's index was made: a random frame, and a random partner among those whose view overlaps with
+    /// its own, in both directions, by --overlap or more. What overlaps is decided by poses alone: the share of the
+    /// rays of one view that cross the other at any depth. Scenes without such a pair become null.
+    #[command(after_help = "\
+Examples:
+  clift data index /data/re10k -o index.json
+  clift data index captures -o index.json --distance 6..20 --context 4 --targets 6")]
+    Index(IndexArgs),
+    /// Write any layout as pixelSplat's chunks or as a file per scene
+    ///
+    /// OUT/train and OUT/test receive what DIR's halves hold; a folder without halves becomes OUT/test. Pictures keep
+    /// their files, byte by byte, unless their lens distortion has to be undone. Interrupted, it goes on where it was:
+    /// SHA256SUMS tells which files are complete, and `sha256sum -c SHA256SUMS` verifies them at any time.
+    #[command(after_help = "\
+Examples:
+  clift data convert captures/fox fox-chunks --to chunks
+  clift data convert /data/re10k-txt /data/re10k --to chunks --split test
+  clift data convert /data/re10k /data/re10k-scenes --to scenes")]
+    Convert(ConvertArgs),
+}
+
+/// Arguments of `clift data check`.
+#[derive(Debug, clap::Args)]
+pub struct CheckArgs {
+    /// Scenes in any layout, or one scene
+    pub dir: PathBuf,
+    /// Which half, where there are two
+    #[arg(long, value_enum, default_value_t = Splits::Both)]
+    pub split: Splits,
+    /// Check the first N scenes of each half
+    #[arg(long, value_name = "N")]
+    pub scenes: Option<usize>,
+    /// Write what was found as JSON
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Write a picture of every scene there: two frames with epipolar lines
+    #[arg(long, value_name = "OUT")]
+    pub pictures: Option<PathBuf>,
+}
+
+/// Arguments of `clift data index`.
+#[derive(Debug, clap::Args)]
+pub struct IndexArgs {
+    /// Scenes in any layout
+    pub dir: PathBuf,
+    /// Where to write
+    #[arg(long, short, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Which half, where there are two
+    #[arg(long, value_enum, default_value_t = Splits::Test)]
+    pub split: Splits,
+    /// Context frames per scene
+    #[arg(long, value_name = "N", default_value_t = 4)]
+    pub context: usize,
+    /// Target frames per scene
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    pub targets: usize,
+    /// Fewest and most frames from the first context to the last
+    #[arg(long, value_name = "A..B", default_value = "45..135", value_parser = parse_distance)]
+    pub distance: [usize; 2],
+    /// Least overlap of the first and the last context
+    #[arg(long, value_name = "SHARE", default_value_t = 0.6)]
+    pub overlap: f64,
+    /// Decides which of the possible frames are taken
+    #[arg(long, value_name = "S", default_value_t = 123)]
+    pub seed: u64,
+}
+
+/// Arguments of `clift data convert`.
+#[derive(Debug, clap::Args)]
+pub struct ConvertArgs {
+    /// Scenes in any layout, or one scene
+    pub dir: PathBuf,
+    /// Folder to write to: new, or one that an interrupted conversion left
+    pub out: PathBuf,
+    /// What to write
+    #[arg(long, value_enum)]
+    pub to: ConvertForm,
+    /// Which half, where there are two
+    #[arg(long, value_enum, default_value_t = Splits::Both)]
+    pub split: Splits,
+    /// Size at which a chunk is closed, in megabytes of pictures
+    #[arg(long, value_name = "M", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..=4000))]
+    pub chunk_mb: u64,
+    /// Store pictures that need encoding as JPEG of this quality, 1 to 100, instead of PNG (without loss)
+    #[arg(long, value_name = "Q", value_parser = clap::value_parser!(u8).range(1..=100))]
+    pub quality: Option<u8>,
+}
+
+/// What is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ConvertForm {
+    /// NNNNNN.torch files of many scenes, with index.json
+    Chunks,
+    /// A KEY.torch file per scene
+    Scenes,
 }
 
 /// Arguments of `clift data synth`.
@@ -110,6 +218,11 @@ pub fn parse_size(text: &str) -> Result<[usize; 2], String> {
     size.filter(|size| !size.contains(&0)).ok_or_else(|| "write columns and rows, as 64x48".into())
 }
 
+fn parse_distance(text: &str) -> Result<[usize; 2], String> {
+    let distance = text.split_once("..").and_then(|(near, far)| Some([near.parse().ok()?, far.parse().ok()?]));
+    distance.ok_or_else(|| "write fewest and most frames, as 45..135".into())
+}
+
 #[cfg(test)]
 mod tests {
     use clap::Parser;
@@ -150,5 +263,24 @@ mod tests {
             panic!("no info")
         };
         assert_eq!((args.path, args.set.len(), args.json), ("a.toml".into(), 1, Some("info.json".into())));
+    }
+
+    #[test]
+    fn check_index_and_convert_take_any_folder() {
+        let Ok(DataCommand::Check(args)) = parse("check dir --json f.json --pictures out --scenes 3") else {
+            panic!("no check")
+        };
+        assert_eq!((args.split, args.scenes, args.pictures), (Splits::Both, Some(3), Some("out".into())));
+        let Ok(DataCommand::Index(args)) = parse("index dir -o i.json --distance 6..20 --targets 5") else {
+            panic!("no index")
+        };
+        assert_eq!((args.distance, args.context, args.targets, args.split), ([6, 20], 4, 5, Splits::Test));
+        let Ok(DataCommand::Convert(args)) = parse("convert dir out --to scenes") else { panic!("no convert") };
+        assert_eq!((args.to, args.chunk_mb, args.quality), (ConvertForm::Scenes, 100, None));
+        for words in
+            ["index dir", "index dir -o f --distance 6", "convert dir out", "convert dir out --to zip", "check"]
+        {
+            assert!(parse(words).is_err(), "{words}");
+        }
     }
 }

@@ -1,0 +1,22 @@
+//! Decodes a picture, rescales and crops it as training does, and writes it as PNG; `scripts/check_pillow.py` compares.
+//!
+//!     cargo run --release -p clift-data --example fit_frame -- 256x256 IN.jpg OUT.png [IN OUT ..]
+
+use std::error::Error;
+
+use clift_data::IntrinsicsNorm;
+use clift_data::image::{decode, encode_png, fit};
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let mut words = std::env::args().skip(1);
+    let size = words.next().ok_or("write the size first, as 256x256")?;
+    let (width, height) = size.split_once('x').ok_or("write the size as 256x256")?;
+    let (width, height) = (width.parse()?, height.parse()?);
+    let middle = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
+    while let (Some(from), Some(to)) = (words.next(), words.next()) {
+        let frame = decode(&std::fs::read(&from)?, &from, 0)?;
+        let (fitted, _) = fit(&frame, middle, width, height, false)?;
+        std::fs::write(to, encode_png(&fitted)?)?;
+    }
+    Ok(())
+}
