@@ -37,7 +37,7 @@ fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> std::path:
         let frames = 0..source.num_frames(scene)?;
         let mut record = SceneRecord {
             key: source.key(scene).into(),
-            url: source.url(scene)?.into(),
+            url: source.url(scene)?,
             timestamps: source.timestamps(scene)?,
             cameras: source.cameras(scene)?,
             images: frames

@@ -216,7 +216,9 @@ test              1 scene
     fn frames_without_a_picture_are_listed_scene_by_scene() {
         let mut split = SplitReport { num_scenes: 1, num_used: 1, num_described: 1, ..SplitReport::default() };
         let mut ledger = Ledger::new(1);
-        ["0005.jpg", "0016.jpg"].into_iter().for_each(|name| ledger.skip_frame("fox", name, "without a picture"));
+        for name in ["0005.jpg", "0016.jpg"] {
+            ledger.skip_frame("fox", name, "without a picture");
+        }
         (split.frames, split.notes) = (ledger.frames, vec!["both halves are the same scenes".into()]);
         let splits = BTreeMap::from([("all".into(), split)]);
         let text = Report { layout: Some(clift_data::Layout::Captures), splits, ..Report::default() }.to_string();
