@@ -104,9 +104,9 @@ fn wrong_usage_is_told_from_failure_by_the_exit_code() {
         (vec!["stage1.batch_size=0"], "`stage1.batch_size` = 0: write at least 1"),
         (vec!["stage1.accumulate=3"], "`stage1.accumulate` = 3: write 1 to 2"),
         (vec!["device=cuda"], "unknown value of `device`"),
-        (vec!["data.views.min_context=1"], "min_context is 1; a stretch has two ends, so use 2 or more"),
+        (vec!["data.views.min_context=1"], "`data.views.min_context` = 1: a stretch has two ends, so use 2 or more"),
         (vec!["clusters.grid=[9]"], "`clusters.grid` = 9: a scene has as few as 8 tokens"),
-        (vec!["data.synthetic.fov_deg=180.0"], "fov_deg is 180; use 10 to 100"),
+        (vec!["data.synthetic.fov_deg=180.0"], "`data.synthetic.fov_deg` = 180: use 10 to 100"),
     ] {
         let message = place.train("run", &set, &[]).fails(2);
         assert!(message.contains(expected), "{expected}: {message}");

@@ -376,13 +376,8 @@ fn png_checksums(bytes: &mut [u8]) {
 }
 
 fn configs(setup: &Setup) -> Vec<Vec<u8>> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
-    let mut seeds: Vec<Vec<u8>> = ["tiny.toml", "dl3dv.toml"].map(|name| read(&folder.join(name))).into();
-    // The others name no data, which is refused.
-    let text = String::from_utf8(seeds.remove(1)).expect("a config is text");
-    seeds.push(text.replacen("[data]", "[data]\nroot = \"somewhere\"", 1).into_bytes());
-    seeds.push(read(&setup.run().join("config.toml")));
-    seeds
+    let tiny = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/tiny.toml");
+    vec![read(&tiny), read(&setup.run().join("config.toml"))]
 }
 
 fn config(setup: &Setup) -> Read {
