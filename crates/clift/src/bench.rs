@@ -1,5 +1,7 @@
 //! `clift bench`.
 
+use std::path::Path;
+
 use clift_train::bench::{self, BenchEvent, BenchOptions, MAX_CHECKED_TOKENS, Report, Row, Work};
 use clift_train::{Config, read_config};
 
