@@ -79,7 +79,7 @@ fn what_cannot_be_timed_is_wrong_usage() {
     let message = clift(args(&["--json", "no/such/folder/bench.json"])).fails(2);
     assert!(message.contains("no folder"), "{message}");
     let message = clift(args(&["--set", "data.width=20"])).fails(2);
-    assert!(message.contains("20 x 16 does not divide into patches"), "{message}");
+    assert!(message.contains("`data.width` = 20: write a multiple of model.patch_size = 8"), "{message}");
 }
 
 #[test]

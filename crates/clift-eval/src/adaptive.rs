@@ -114,8 +114,10 @@ mod tests {
 
     const SETTING: Setting = Setting::baseline(Variant::Clift);
 
-    /// Scenes with (count, error, PSNR) each.
-    fn accumulator(scenes: &[(&str, &[(usize, f64, f64)])]) -> Accumulator {
+    /// (count, error, PSNR)
+    type Points<'a> = &'a [(usize, f64, f64)];
+
+    fn accumulator(scenes: &[(&str, Points)]) -> Accumulator {
         let mut views = Accumulator::default();
         for (scene, points) in scenes {
             for &(count, error, psnr) in *points {

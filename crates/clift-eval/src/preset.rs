@@ -14,11 +14,11 @@ use crate::token_count::TokenCount;
 pub enum Experiment {
     /// Quality against data size (section 4.2).
     Main,
-    /// Random tokens, K-means, K-means and condenser (section 4.3, "CLiFT construction").
+    /// Random tokens, K-means, K-means and condenser (section 4.3, "`CLiFT` Construction").
     Ablation,
     /// Tiles of the views against K-means, each with and without condenser (section 4.3).
     Patchwise,
-    /// Quality and cost against rendered tokens, half of all stored (section 4.3, "CLiFT rendering").
+    /// Quality and cost against rendered tokens, half of all stored (section 4.3, "`CLiFT` Rendering").
     Budget,
 }
 

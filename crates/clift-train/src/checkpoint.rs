@@ -7,6 +7,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
 use burn::module::Module;
+use burn::optim::OptimizerRecord;
 use burn::store::ModuleRecord;
 use clift_data::files::{make_folder, publish, remove_folder, replace};
 use clift_model::ModelConfig;
@@ -280,10 +281,14 @@ fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) ->
     let loaded = learner.model.clone().try_load_record(record);
     learner.model = loaded.map_err(|error| TrainError::bad_file("checkpoint", &model)(format!("{error:?}")))?;
     let optimizer = folder.join(OPTIMIZER);
-    // Burn 0.22 panics where a record's tensors have no parameter ids; the clone that is half loaded is dropped.
-    let loaded = catch_unwind(AssertUnwindSafe(|| learner.optimizer.clone().load(&optimizer)));
-    let loaded = loaded.map_err(|_| TrainError::bad_file("checkpoint", &optimizer)("it is no optimiser's record"))?;
-    learner.optimizer = loaded.map_err(TrainError::bad_file("checkpoint", &optimizer))?;
+    let record = OptimizerRecord::load(&optimizer).map_err(TrainError::bad_file("checkpoint", &optimizer))?;
+    let num_tensors = record.len();
+    // Burn 0.22 panics where a record's tensors have no parameter ids, and passes over what it does not know; the clone
+    // that is half loaded is dropped.
+    let loaded = catch_unwind(AssertUnwindSafe(|| learner.optimizer.clone().load_record(record)));
+    let whole = loaded.ok().filter(|loaded| loaded.to_record().len() == num_tensors);
+    let foreign = || TrainError::bad_file("checkpoint", &optimizer)("it is no record of this optimiser");
+    learner.optimizer = whole.ok_or_else(foreign)?;
     Ok(progress)
 }
 

@@ -408,7 +408,11 @@ mod tests {
         planned.available_bytes = Some(planned.parts[0].peak_bytes.max(planned.parts[2].peak_bytes) - 1);
         let warning = memory_warning(&config, &planned).expect("one part is too large");
         assert!(warning.contains(".accumulate = 2 would fit"), "{warning}");
-        planned.available_bytes = Some(4 << 30);
+        // Less than stage 2, the largest, takes scene by scene.
+        let mut one_by_one = config.clone();
+        one_by_one.stage2.accumulate = config.stage2.batch_size;
+        let least = plan(&one_by_one, false).expect("valid");
+        planned.available_bytes = Some(least.parts[2].peak_bytes - 1);
         let warning = memory_warning(&config, &planned).expect("too large");
         assert!(warning.contains("recompute = true and stage"), "{warning}");
         planned.available_bytes = Some(1 << 20);
