@@ -36,7 +36,8 @@ pub enum Preset {
     /// Tokens nearest to any cell, frame by frame: what the released code's table of render budgets uses.
     Global,
     /// As the paper's, with cells that scale with the picture: the same at 256 pixels. Around a picture of 32 pixels,
-    /// four cells of 16 are four fifths of the grid's width, and most tokens go to what is not seen.
+    /// four cells of 16 are four fifths of the grid's width, and most tokens go to what is not seen. A camera that turns
+    /// by more than a cell from one frame to the next has been cut: that frame starts without momentum and bonus.
     #[default]
     Scaled,
 }
@@ -59,7 +60,7 @@ impl Preset {
         match self {
             Self::Paper => Rules::default(),
             Self::Global => Rules { previous_bonus: 0.0, momentum: 0.0, per_cell: false, ..Rules::default() },
-            Self::Scaled => Rules { scaled_cells: true, ..Rules::default() },
+            Self::Scaled => Rules { scaled_cells: true, cuts: true, ..Rules::default() },
         }
     }
 }
@@ -91,6 +92,9 @@ pub struct Rules {
     pub per_cell: bool,
     /// Whether a cell is a sixteenth of the picture's shorter side instead of 16 pixels.
     pub scaled_cells: bool,
+    /// Whether a frame whose camera has turned by more than a cell starts without momentum and bonus. Departs from the
+    /// paper, whose frames are those of a video: smoothed over a jump, distances are those of no view.
+    pub cuts: bool,
 }
 
 impl Default for Rules {
@@ -102,6 +106,7 @@ impl Default for Rules {
             momentum: 0.5,
             per_cell: true,
             scaled_cells: false,
+            cuts: false,
         }
     }
 }
@@ -178,6 +183,8 @@ pub struct Selector {
     field: Vec<Vec<f32>>,
     /// Whether the previous frame was drawn from a token; empty before the first frame.
     previous: Vec<bool>,
+    /// The way the previous frame's camera looked.
+    forward: Option<[f64; 3]>,
 }
 
 /// Unit directions by coordinate, so that a row of distances is made several at a time.
@@ -217,7 +224,7 @@ impl Selector {
             directions.z.push(z);
         }
         let origins = rays.iter().map(|ray| ray.origin).collect();
-        Ok(Self { rules, origins, directions, grid: [0; 2], field: Vec::new(), previous: Vec::new() })
+        Ok(Self { rules, origins, directions, grid: [0; 2], field: Vec::new(), previous: Vec::new(), forward: None })
     }
 
     /// Forgets the previous frame.
@@ -225,6 +232,7 @@ impl Selector {
         self.grid = [0; 2];
         self.field.clear();
         self.previous.clear();
+        self.forward = None;
     }
 
     /// Chooses exactly `min(num_render_tokens, num_storage_tokens)` tokens for the next frame, a view of `height` by
@@ -250,6 +258,7 @@ impl Selector {
         if let Some((position, &value)) = values.find(|(_, value)| !value.is_finite()) {
             return Err(ModelError::NotFinite { what: "the target's camera", value: value as f32, position });
         }
+        self.notice_cut(&cells, self.rules.grid(height, width));
         let num_storage_tokens = self.origins.len();
         let num_render_tokens = num_render_tokens.min(num_storage_tokens);
         let per_cell = if self.rules.per_cell { num_render_tokens / cells.len() } else { 0 };
@@ -260,6 +269,18 @@ impl Selector {
             self.previous[token as usize] = true;
         }
         Ok(chosen)
+    }
+
+    /// Forgets the previous frame where the camera has turned by more than the cell in the middle spans.
+    fn notice_cut(&mut self, cells: &[[f64; 3]], [rows, columns]: [usize; 2]) {
+        let middle = rows / 2 * columns + columns / 2;
+        let forward = cells[middle];
+        let angle = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>().clamp(-1.0, 1.0).acos();
+        if self.rules.cuts && self.forward.is_some_and(|last| angle(last, forward) > angle(forward, cells[middle - 1]))
+        {
+            self.reset();
+        }
+        self.forward = Some(forward);
     }
 
     /// Distances of all tokens to all cells, the nearest of each cell, and the smoothed field for the next frame.

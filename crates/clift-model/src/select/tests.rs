@@ -31,6 +31,7 @@ struct BruteForce {
     rules: Rules,
     rays: Vec<TokenRay>,
     frames: Vec<(Vec<Vec<f64>>, Vec<usize>)>,
+    forward: Option<[f64; 3]>,
 }
 
 impl BruteForce {
@@ -45,6 +46,13 @@ impl BruteForce {
                 camera.direction(pixel(cell % columns), pixel(cell / columns))
             })
             .collect();
+        // The third column of the pose: where the camera looks.
+        let forward = [2, 6, 10].map(|i| camera.c2w[i]);
+        let turned = self.forward.map(|last| last.iter().zip(forward).map(|(a, b)| a * b).sum::<f64>().min(1.0).acos());
+        if rules.cuts && turned.is_some_and(|turned| turned > (side / camera.intrinsics[0]).atan()) {
+            self.frames.clear();
+        }
+        self.forward = Some(forward);
         let unit = |v: [f64; 3]| v.map(|x| x / v.iter().map(|x| x * x).sum::<f64>().sqrt());
         let mut field = vec![vec![0.0; self.rays.len()]; cells.len()];
         for (q, cell) in cells.iter().enumerate() {
@@ -105,9 +113,11 @@ fn frames_equal_brute_force_for_no_some_and_many_tokens_per_cell() {
     for preset in Preset::ALL {
         for count in [1, 89, 90, 350, 470, 600, 699, 700] {
             let mut selector = Selector::new(preset.rules(), &rays).unwrap();
-            let mut expected = BruteForce { rules: preset.rules(), rays: rays.clone(), frames: Vec::new() };
-            for frame in 0..4 {
-                let view = camera([0.2 * f64::from(frame), 0.0, 0.1], 0.15 * f64::from(frame));
+            let mut expected =
+                BruteForce { rules: preset.rules(), rays: rays.clone(), frames: Vec::new(), forward: None };
+            // A slow turn, a jump that `scaled` takes for a cut, and a slow turn again: its cells span 1 / 60.
+            for (frame, angle) in (0..).zip([0.0, 0.01, 0.16, 0.17]) {
+                let view = camera([0.2 * f64::from(frame), 0.0, 0.1], angle);
                 let got = selector.select(&view, height, width, count).unwrap();
                 assert_eq!(got.len(), count);
                 assert_eq!(got, expected.select(&view, height, width, count), "{preset:?}, {count}, frame {frame}");
@@ -161,6 +171,7 @@ const PLAIN: Rules = Rules {
     momentum: 0.0,
     per_cell: false,
     scaled_cells: false,
+    cuts: false,
 };
 
 #[test]
@@ -209,6 +220,22 @@ fn momentum_halves_a_step_of_the_distances() {
     selector.select(&camera(0.0), 16, 32, 1).unwrap();
     assert_eq!(selector.select(&camera(0.08), 16, 16, 1).unwrap(), [1]);
     close(distances(&selector), [0.08, 0.02]);
+}
+
+#[test]
+fn a_cut_starts_without_momentum_where_the_rules_know_cuts() {
+    let distance = |cuts: bool, turn: f64| {
+        let rules = Rules { momentum: 0.5, cuts, ..PLAIN };
+        let mut selector = Selector::new(rules, &two_tokens([0.0, 0.1])).unwrap();
+        let view = |angle: f64| ViewCamera { intrinsics: [400.0, 400.0, 8.0, 8.0], ..camera([0.0; 3], angle) };
+        selector.select(&view(0.0), 16, 16, 1).unwrap();
+        selector.select(&view(turn), 16, 16, 1).unwrap();
+        f64::from(selector.field[4 * 9 + 4][0])
+    };
+    // A cell of 16 pixels spans 0.04: a turn by 0.03 is smoothed, one by 0.05 a cut.
+    for (cuts, turn, expected) in [(true, 0.03, 0.015), (true, 0.05, 0.05), (false, 0.05, 0.025)] {
+        assert!((distance(cuts, turn) - expected).abs() < 2e-6, "{cuts}, {turn}: {}", distance(cuts, turn));
+    }
 }
 
 #[test]
