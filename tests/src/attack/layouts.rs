@@ -1,11 +1,13 @@
-//! The readers of layouts with one file per frame: a scene of the fixtures of which one file is damaged.
+//! The readers of layouts with files per scene or frame, of which one is damaged, and of published checkpoints.
 
 use std::path::Path;
 
 use clift_data::{LayoutOptions, Split, TestScenes, open_layout};
+use clift_model::Variant;
+use clift_train::import::{ImportOptions, import};
 
 use crate::setup::{Setup, fixture};
-use crate::targets::{JSON_WORDS, PLAIN, Read, Target, words_of};
+use crate::targets::{JSON_WORDS, PICKLE_WORDS, PLAIN, Read, Target, words_of};
 
 const KEY: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 const TRANSFORMS: &str = "layouts/capture/attic/transforms.json";
@@ -56,6 +58,20 @@ pub const LAYOUT_TARGETS: &[Target] = &[
         seeds: |_| vec![fixture(&format!("layouts/re10k_txt/test/{KEY}.txt"))],
         open: |setup| scene(setup, &format!("layouts/re10k_txt/test/{KEY}.txt")),
         words: TEXT_WORDS,
+        ..PLAIN
+    },
+    Target {
+        name: "scene-torch",
+        seeds: |_| vec![fixture(&format!("layouts/scenes/test/{KEY}.torch"))],
+        open: |setup| scene(setup, &format!("layouts/scenes/test/{KEY}.torch")),
+        words: PICKLE_WORDS,
+        ..PLAIN
+    },
+    Target {
+        name: "published-checkpoint",
+        seeds: |_| vec![fixture("checkpoints/re10k.ckpt")],
+        open: published_checkpoint,
+        words: PICKLE_WORDS,
         ..PLAIN
     },
     Target {
@@ -140,6 +156,23 @@ fn scene(setup: &Setup, path: &str) -> Read {
             }
         }
         Ok(())
+    })
+}
+
+fn published_checkpoint(setup: &Setup) -> Read {
+    let folder = setup.fresh("published-checkpoint");
+    let (file, out) = (folder.join("last.ckpt"), folder.join("model"));
+    let options =
+        ImportOptions { variant: Variant::ReleasedRe10k, num_heads: Some(3), convert: true, renames: Vec::new() };
+    Box::new(move |bytes| {
+        std::fs::write(&file, bytes).expect("a temporary folder is writable");
+        let imported = import(&file, &out, &options).map(drop).map_err(words_of);
+        if imported.is_ok() {
+            std::fs::remove_dir_all(&out).expect("a model was written");
+        } else {
+            assert!(!out.exists(), "what is refused leaves nothing behind");
+        }
+        imported
     })
 }
 

@@ -140,7 +140,7 @@ pub const PLAIN: Target = Target {
 /// A picture of a few bytes may have 8,192 x 8,192 pixels: the decoder's limit, the picture and its conversion.
 const PICTURE: fn(usize) -> usize = |len| (1200 << 20) + 64 * len;
 
-const PICKLE_WORDS: &[&[u8]] = &[
+pub const PICKLE_WORDS: &[&[u8]] = &[
     b"\x80\x02",
     b"]",
     b"}",
