@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::camera::Camera;
 use crate::error::DataError;
 
-/// Which scenes of a data set are used. What they leave out is in the source's [`Ledger`].
+/// Which scenes of a data set are used. What they leave out is in the source's [`Ledger`](crate::Ledger).
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SceneFilters {

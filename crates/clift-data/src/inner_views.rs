@@ -21,7 +21,7 @@ pub enum InnerViews {
 }
 
 impl InnerViews {
-    /// Whether [`InnerViews::choose`] looks at the camera centres.
+    /// Whether the choice looks at the camera centres.
     pub fn needs_centres(self) -> bool {
         self == Self::FarthestPoint
     }

@@ -56,7 +56,7 @@ impl Fit {
 /// - `tokens`: `[batch, num_tokens, dim]`
 ///
 /// # Errors
-/// [`ModelError::Tensor`] when the device does not give its values back.
+/// [`ModelError::Device`] when the device does not give its values back.
 pub fn total_variance(tokens: &Tensor<3>) -> Result<Vec<f64>, ModelError> {
     let [batch, num_tokens, _] = tokens.dims();
     let centred = tokens.clone() - tokens.clone().mean_dim(1);
