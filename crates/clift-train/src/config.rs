@@ -1,19 +1,20 @@
 //! One config file per experiment: `[data] [model] [loss] [stage1] [clusters] [stage2] [checkpoint] [eval]`.
 
+mod checks;
+
 use std::path::{Path, PathBuf};
 
 use clift_data::{
-    BoundedSampler, ClipOptions, Crop, DataError, FileOptions, Layout, PoseRotation, PoseScale, SceneFilters, Split,
-    SyntheticConfig,
+    BoundedSampler, ClipOptions, Crop, FileOptions, Layout, PoseRotation, PoseScale, SceneFilters, SyntheticConfig,
 };
-use clift_eval::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX};
+use clift_eval::perceptual::PERCEPTUAL_COMMAND;
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
 use clift_model::{Grouping, KMeans, ModelConfig};
 use serde::{Deserialize, Serialize};
 
+use self::checks::bad;
 use crate::TrainError;
-use crate::clusters::MAX_TOKENS;
 
 /// A whole experiment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -337,194 +338,6 @@ impl Default for CheckpointConfig {
     fn default() -> Self {
         Self { every: 1000, keep: 2, keep_best: true, keep_every: 0 }
     }
-}
-
-impl Config {
-    /// Checks every value that no type can check.
-    ///
-    /// # Errors
-    /// [`TrainError::BadConfig`] naming the key, the value and the fix.
-    pub fn validate(&self) -> Result<(), TrainError> {
-        if self.run_dir.as_os_str().is_empty() {
-            return Err(bad("run_dir", "\"\"", "write the folder that is to receive the run"));
-        }
-        self.model.validate()?;
-        self.data.views.validate().map_err(in_section("data.views"))?;
-        self.validate_size()?;
-        self.validate_token_counts()?;
-        self.data.validate()?;
-        self.validate_loss()?;
-        let Self { stage1, stage2, clusters, eval, checkpoint, .. } = self;
-        for (key, value, least, most) in [
-            ("stage1.batch_size", stage1.batch_size, 1, usize::MAX),
-            ("stage1.accumulate", stage1.accumulate, 1, stage1.batch_size),
-            ("stage2.batch_size", stage2.batch_size, 1, usize::MAX),
-            ("stage2.accumulate", stage2.accumulate, 1, stage2.batch_size),
-            ("clusters.num_passes", clusters.num_passes, 1, usize::MAX),
-            ("clusters.kmeans.max_iterations", clusters.kmeans.max_iterations, 1, usize::MAX),
-            ("eval.num_context", eval.num_context, 2, 10_000),
-            ("eval.num_targets", eval.num_targets, 1, 10_000),
-            ("eval.num_validation_scenes", eval.num_validation_scenes, 1, usize::MAX),
-            ("checkpoint.keep", checkpoint.keep, 1, usize::MAX),
-        ] {
-            in_range(key, value, least, most)?;
-        }
-        if checkpoint.keep_every > 0
-            && (checkpoint.every == 0 || !checkpoint.keep_every.is_multiple_of(checkpoint.every))
-        {
-            let fix = format!("write 0 or a multiple of checkpoint.every, which is {}", checkpoint.every);
-            return Err(bad("checkpoint.keep_every", checkpoint.keep_every, &fix));
-        }
-        for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.storage", &eval.storage)] {
-            if counts.is_empty() {
-                return Err(bad(key, "[]", "write at least one count"));
-            }
-        }
-        let [low, high] = stage1.keep_tokens;
-        if !(low > 0.0 && low <= high && high <= 1.0) {
-            return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
-        }
-        if !(0.0..1.0).contains(&clusters.kmeans.tolerance) {
-            return Err(bad("clusters.kmeans.tolerance", clusters.kmeans.tolerance, "write 0 or a small fraction"));
-        }
-        stage1.optimizer.validate("stage1")?;
-        stage2.optimizer.validate("stage2")?;
-        if !(0.0..=1.0).contains(&stage2.renderer_lr_factor) {
-            return Err(bad("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
-        }
-        Ok(())
-    }
-
-    /// Pictures are whole patches.
-    fn validate_size(&self) -> Result<(), TrainError> {
-        let patch_size = self.model.patch_size;
-        for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
-            if value == 0 || !value.is_multiple_of(patch_size) {
-                let below = value / patch_size * patch_size;
-                let near =
-                    if below == 0 { patch_size.to_string() } else { format!("{below} or {}", below + patch_size) };
-                let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
-                return Err(bad(key, value, &fix));
-            }
-        }
-        Ok(())
-    }
-
-    /// The weights themselves are only asked for where a run is trained: measuring one does not need them.
-    fn validate_loss(&self) -> Result<(), TrainError> {
-        let weight = self.loss.perceptual_weight;
-        if !(weight >= 0.0 && weight.is_finite()) {
-            return Err(bad("loss.perceptual_weight", weight, "write 0 or a positive number"));
-        }
-        let DataConfig { width, height, .. } = self.data;
-        if weight > 0.0 && width.min(height) < PERCEPTUAL_MIN_SIZE_PX {
-            let fix = format!(
-                "its network needs pictures of {PERCEPTUAL_MIN_SIZE_PX} x {PERCEPTUAL_MIN_SIZE_PX}, these have {width} x {height}: write 0"
-            );
-            return Err(bad("loss.perceptual_weight", weight, &fix));
-        }
-        Ok(())
-    }
-
-    /// No scene has more tokens than can be kept, or fewer than the cluster cache asks for.
-    fn validate_token_counts(&self) -> Result<(), TrainError> {
-        let views = &self.data.views;
-        let tokens_per_view = self.model.num_tokens(1, self.data.height, self.data.width)?;
-        let most_tokens = views.max_context.saturating_mul(tokens_per_view);
-        if most_tokens > MAX_TOKENS {
-            let fix = format!("{most_tokens} tokens; at most {MAX_TOKENS} are possible: fewer views or smaller ones");
-            return Err(bad("data.views.max_context", views.max_context, &fix));
-        }
-        let fewest_tokens = views.min_context * tokens_per_view;
-        if let Some(count) = self.clusters.grid.iter().find(|count| count.of(fewest_tokens).is_err()) {
-            return Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens")));
-        }
-        if self.clusters.grouping == Grouping::Patch {
-            let grid = self.clusters.grid.iter().map(|count| ("clusters.grid", count));
-            let counts = grid.chain([("eval.validation_storage", &self.eval.validation_storage)]);
-            for (key, count) in counts {
-                let too_few = |views: usize| count.of(views * tokens_per_view).is_ok_and(|count| count < views);
-                if too_few(views.min_context) || too_few(views.max_context) {
-                    return Err(bad(key, count, "write at least a tile for every context view"));
-                }
-            }
-        }
-        Ok(())
-    }
-}
-
-impl DataConfig {
-    fn validate(&self) -> Result<(), TrainError> {
-        in_range("data.num_threads", self.num_threads, 0, 1024)?;
-        in_range("data.num_prefetch", self.num_prefetch, 1, 1024)?;
-        if self.source == SourceKind::Synthetic {
-            return self.validate_synthetic();
-        }
-        if self.root.is_none() {
-            return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
-        }
-        self.filters.validate().map_err(in_section("data.filters"))
-    }
-
-    fn validate_synthetic(&self) -> Result<(), TrainError> {
-        let synthetic = &self.synthetic;
-        synthetic.validate().map_err(in_section("data.synthetic"))?;
-        if synthetic.width < self.width || synthetic.height < self.height {
-            let fix = format!(
-                "synthetic scenes are {} x {}: write data.synthetic.width and data.synthetic.height of at least {} and {}",
-                synthetic.width, synthetic.height, self.width, self.height
-            );
-            return Err(bad("data.width, data.height", format!("{}, {}", self.width, self.height), &fix));
-        }
-        if synthetic.split != Split::default() {
-            let fix = "leave it out: a run trains on one split and measures on the other";
-            return Err(bad("data.synthetic.split", synthetic.split, fix));
-        }
-        Ok(())
-    }
-}
-
-impl OptimizerConfig {
-    fn validate(&self, stage: &str) -> Result<(), TrainError> {
-        for (key, value) in [("learning_rate", self.learning_rate), ("max_grad_norm", self.max_grad_norm)] {
-            if !(value > 0.0 && value.is_finite()) {
-                return Err(bad(&format!("{stage}.optimizer.{key}"), value, "write a positive number"));
-            }
-        }
-        if !(self.weight_decay >= 0.0 && self.weight_decay.is_finite()) {
-            let key = format!("{stage}.optimizer.weight_decay");
-            return Err(bad(&key, self.weight_decay, "write 0 or a positive number"));
-        }
-        if !(self.spike_factor == 0.0 || (self.spike_factor > 1.0 && self.spike_factor.is_finite())) {
-            let key = format!("{stage}.optimizer.spike_factor");
-            return Err(bad(&key, self.spike_factor, "write 0 to look for no spikes, or a number above 1"));
-        }
-        in_range(&format!("{stage}.optimizer.max_bad_steps"), self.max_bad_steps as usize, 1, usize::MAX)
-    }
-}
-
-fn in_range(key: &str, value: usize, least: usize, most: usize) -> Result<(), TrainError> {
-    if (least..=most).contains(&value) {
-        return Ok(());
-    }
-    let fix = if most == usize::MAX { format!("write at least {least}") } else { format!("write {least} to {most}") };
-    Err(bad(key, value, &fix))
-}
-
-/// Names the key of a section's own refusal in full; for `map_err`.
-fn in_section(section: &'static str) -> impl FnOnce(DataError) -> TrainError {
-    move |error| match error {
-        // Such a problem says "is VALUE; FIX".
-        DataError::BadConfig { key, problem } => match problem.strip_prefix("is ").and_then(|is| is.split_once("; ")) {
-            Some((value, fix)) => bad(&format!("{section}.{key}"), value, fix),
-            None => DataError::BadConfig { key: format!("{section}.{key}"), problem }.into(),
-        },
-        other => other.into(),
-    }
-}
-
-fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {
-    TrainError::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
 }
 
 #[cfg(test)]
