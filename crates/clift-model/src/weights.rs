@@ -8,7 +8,7 @@ use std::path::Path;
 
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::store::{BurnToPyTorchAdapter, ModuleSnapshot, PyTorchToBurnAdapter, SafetensorsStore};
-use burn::tensor::Tensor;
+use burn::tensor::{DType, Tensor, TensorData};
 use sha2::{Digest, Sha256};
 
 use crate::ModelError;
@@ -110,7 +110,8 @@ pub(crate) fn sync_folder(path: &Path) -> std::io::Result<()> {
 /// Reads parameters written by [`save`] into a module and says which.
 ///
 /// # Errors
-/// [`ModelError::Weights`] when the file cannot be read, a shape differs or a value is not finite.
+/// [`ModelError::Weights`] when the file cannot be read, a shape differs, or a value is not finite or no 32-bit
+/// float.
 pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError> {
     let error = |reason: String| ModelError::Weights { action: "reading", reason, path: path.into() };
     if !path.is_file() {
@@ -121,6 +122,9 @@ pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError
     let result = module.load_from(&mut store).map_err(|e| error(e.to_string()))?;
     if let Some(first) = result.errors.first() {
         return Err(error(first.to_string()));
+    }
+    if let Some((name, dtype)) = first_not_f32(module) {
+        return Err(error(format!("{name} is {dtype:?}, not F32")));
     }
     if let Some(name) = first_non_finite(module) {
         return Err(error(format!("{name} is not finite")));
@@ -133,10 +137,10 @@ pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError
 /// Equal weights have equal hashes on every device.
 pub fn hash<M: Module>(module: &M) -> String {
     let mut sha = Sha256::new();
-    visit(module, |name, shape, values| {
+    visit(module, |name, shape, data| {
         sha.update(name.as_bytes());
         sha.update(format!("{shape:?}"));
-        for value in values {
+        for value in data.iter::<f32>() {
             sha.update(value.to_le_bytes());
         }
     });
@@ -149,21 +153,32 @@ pub fn hash<M: Module>(module: &M) -> String {
 /// Path of the first parameter with a NaN or an infinity.
 pub fn first_non_finite<M: Module>(module: &M) -> Option<String> {
     let mut found = None;
-    visit(module, |name, _, values| {
-        if found.is_none() && values.iter().any(|value| !value.is_finite()) {
+    visit(module, |name, _, data| {
+        if found.is_none() && data.iter::<f32>().any(|value| !value.is_finite()) {
             found = Some(name.to_owned());
         }
     });
     found
 }
 
+/// Path and type of the first parameter that does not hold 32-bit floats.
+pub fn first_not_f32<M: Module>(module: &M) -> Option<(String, DType)> {
+    let mut found = None;
+    visit(module, |name, _, data| {
+        if found.is_none() && data.dtype() != DType::F32 {
+            found = Some((name.to_owned(), data.dtype()));
+        }
+    });
+    found
+}
+
 /// Calls `f` with path, shape and values of every parameter, in the module's order.
-fn visit<M: Module>(module: &M, f: impl FnMut(&str, &[usize], &[f32])) {
+fn visit<M: Module>(module: &M, f: impl FnMut(&str, &[usize], &TensorData)) {
     struct Visitor<F> {
         path: Vec<String>,
         f: F,
     }
-    impl<F: FnMut(&str, &[usize], &[f32])> ModuleVisitor for Visitor<F> {
+    impl<F: FnMut(&str, &[usize], &TensorData)> ModuleVisitor for Visitor<F> {
         fn enter_module(&mut self, name: &str, _container: &str) {
             self.path.push(name.into());
         }
@@ -171,9 +186,7 @@ fn visit<M: Module>(module: &M, f: impl FnMut(&str, &[usize], &[f32])) {
             self.path.pop();
         }
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            let data = param.val().into_data().convert::<f32>();
-            let values = data.as_slice::<f32>().expect("converted to f32");
-            (self.f)(&self.path.join("."), &param.val().dims(), values);
+            (self.f)(&self.path.join("."), &param.val().dims(), &param.val().into_data());
         }
     }
     module.visit(&mut Visitor { path: Vec::new(), f });

@@ -10,7 +10,7 @@ use burn::module::Module;
 use burn::optim::OptimizerRecord;
 use burn::store::ModuleRecord;
 use clift_data::files::{make_folder, publish, remove_folder, replace};
-use clift_model::ModelConfig;
+use clift_model::{ModelConfig, weights};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
@@ -277,14 +277,20 @@ fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) ->
         }
     }
     let model = folder.join(MODEL);
-    let record = ModuleRecord::load(&model).map_err(TrainError::bad_file("checkpoint", &model))?;
-    let loaded = learner.model.clone().try_load_record(record);
-    learner.model = loaded.map_err(|error| TrainError::bad_file("checkpoint", &model)(format!("{error:?}")))?;
+    let bad_model = |reason: String| TrainError::bad_file("checkpoint", &model)(reason);
+    let record = ModuleRecord::load(&model).map_err(|error| bad_model(error.to_string()))?;
+    // Burn 0.22 panics where a record holds integers, or optimiser tensors without parameter ids, and passes over what
+    // it does not know; the clone that is half loaded is dropped.
+    let loaded = catch_unwind(AssertUnwindSafe(|| learner.model.clone().try_load_record(record)));
+    let loaded = loaded.map_err(|_| bad_model("it holds tensors of another type than float".into()))?;
+    let loaded = loaded.map_err(|error| bad_model(format!("{error:?}")))?;
+    if let Some((name, dtype)) = weights::first_not_f32(&loaded) {
+        return Err(bad_model(format!("{name} is {dtype:?}, not F32")));
+    }
+    learner.model = loaded;
     let optimizer = folder.join(OPTIMIZER);
     let record = OptimizerRecord::load(&optimizer).map_err(TrainError::bad_file("checkpoint", &optimizer))?;
     let num_tensors = record.len();
-    // Burn 0.22 panics where a record's tensors have no parameter ids, and passes over what it does not know; the clone
-    // that is half loaded is dropped.
     let loaded = catch_unwind(AssertUnwindSafe(|| learner.optimizer.clone().load_record(record)));
     let whole = loaded.ok().filter(|loaded| loaded.to_record().len() == num_tensors);
     let foreign = || TrainError::bad_file("checkpoint", &optimizer)("it is no record of this optimiser");
@@ -311,39 +317,68 @@ fn fingerprint(path: &Path) -> std::io::Result<Fingerprint> {
 mod tests {
     use super::*;
 
-    #[test]
-    fn an_optimizer_that_is_none_is_refused_and_so_is_a_file_without_checksum() {
-        use burn::tensor::Device;
-        use clift_model::{Clift, ModelConfig};
-
-        use crate::loss::Loss;
-
+    /// A learner and its first checkpoint below `root`.
+    fn saved(root: &Path) -> (Learner, Checkpoints, PathBuf) {
         let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
-        let device = Device::flex().autodiff();
+        let device = burn::tensor::Device::flex().autodiff();
         let optimizer = crate::optim::adamw(&crate::config::OptimizerConfig::default());
-        let mut learner = Learner {
-            model: Clift::new(&config, 0, &device),
+        let learner = Learner {
+            model: clift_model::Clift::new(&config, 0, &device),
             optimizer,
             device,
-            loss: Loss::default(),
+            loss: crate::loss::Loss::default(),
             recompute: false,
         };
-        let place = tempfile::tempdir().expect("a temporary folder");
-        let checkpoints = Checkpoints::new(place.path().into(), CheckpointConfig::default());
+        let checkpoints = Checkpoints::new(root.into(), CheckpointConfig::default());
         let step = checkpoints.save(&learner, &Progress { step: 1, ..Progress::default() }).expect("it can be saved");
+        (learner, checkpoints, step)
+    }
+
+    /// Says in `state.json` that the file is as it is now.
+    fn sign(step: &Path, name: &str) {
+        let mut state = read_state(step).expect("it is well");
+        state.files.insert(name.into(), fingerprint(&step.join(name)).expect("it can be read"));
+        write_state(step, &state).expect("it can be written");
+    }
+
+    #[test]
+    fn an_optimizer_that_is_none_is_refused_and_so_is_a_file_without_checksum() {
+        let place = tempfile::tempdir().expect("a temporary folder");
+        let (mut learner, checkpoints, step) = saved(place.path());
 
         // The weights of a model under the optimiser's name, with a checksum that fits: found by damaging files.
         std::fs::copy(step.join(MODEL), step.join(OPTIMIZER)).expect("it can be copied");
-        let mut state = read_state(&step).expect("it is well");
-        state.files.insert(OPTIMIZER.into(), fingerprint(&step.join(OPTIMIZER)).expect("it can be read"));
-        write_state(&step, &state).expect("it can be written");
+        sign(&step, OPTIMIZER);
         let refused = checkpoints.resume(&mut learner);
         assert!(refused.is_err(), "{refused:?}");
 
+        let mut state = read_state(&step).expect("it is well");
         state.files.remove(MODEL);
         write_state(&step, &state).expect("it can be written");
         let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
         assert!(message.contains("it has no checksum of model.bpk"), "{message}");
+    }
+
+    #[test]
+    fn weights_of_another_type_are_refused() {
+        let place = tempfile::tempdir().expect("a temporary folder");
+        let (mut learner, checkpoints, step) = saved(place.path());
+        let path = step.join(MODEL);
+
+        // The type in the header of the first tensor, with a checksum that fits: found by damaging files.
+        let mut bytes = std::fs::read(&path).expect("it can be read");
+        let at = bytes.windows(3).position(|window| window == b"F32").expect("a type");
+        bytes[at] = b'I';
+        std::fs::write(&path, bytes).expect("it can be written");
+        sign(&step, MODEL);
+        let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
+        assert!(message.contains("tensors of another type than float"), "{message}");
+
+        let wide = crate::bench::reference::module_in_f64(&learner.model, &burn::tensor::Device::flex());
+        wide.into_record().save(&path).expect("it can be written");
+        sign(&step, MODEL);
+        let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
+        assert!(message.contains("is F64, not F32"), "{message}");
     }
 
     #[test]
