@@ -5,9 +5,10 @@ For each seed: trains configs/synthetic.toml; trains two further condensers on t
 and one without residuals (the equations as printed); evaluates all of them on the same views. Prints a table per
 comparison: the difference of each seed over its scenes with its standard error, and the mean over seeds.
 
-What is there is not made again, so that an interrupted benchmark goes on where it was.
+What is there is not made again, so that an interrupted benchmark goes on where it was. With --jobs, seeds are trained
+side by side, each on its share of the cores, which takes less time in all; what they print is in OUT/seed-N.log then.
 
-    python3 scripts/synthetic_benchmark.py --seeds 0,1,2
+    python3 scripts/synthetic_benchmark.py --seeds 0,1,2 --jobs 3
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ import argparse
 import csv
 import json
 import math
+import os
 import statistics
 import subprocess
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -26,39 +30,66 @@ VARIANTS = "random,patch,patch_clift,kmeans,clift"
 STORAGE = "1/16,1/8,1/4,1/2,1.0"
 
 
-def clift(exe: Path, *args: str) -> None:
-    subprocess.run([exe, *args], check=True, cwd=ROOT)
-
-
 def quoted(path: Path) -> str:
     """A path as TOML, relative paths being those of the caller."""
     return json.dumps(str(path.resolve()))
 
 
-def train(exe: Path, config: Path, run: Path, seed: int, changes: Iterable[str]) -> None:
-    if (run / "eval" / "summary.json").exists():
-        return
-    args = ["train", str(config.resolve()), "--set", f"run_dir={quoted(run)}", "--set", f"seed={seed}"]
-    for change in changes:
-        args += ["--set", change]
-    clift(exe, *args)
+@dataclass
+class Seed:
+    """The runs of one seed of training."""
 
+    exe: Path
+    config: Path
+    out: Path
+    seed: int
+    threads: int | None
+    """Threads of a process that has others beside it; None for one that has the machine."""
 
-def make(exe: Path, config: Path, out: Path, seed: int) -> tuple[Path, Path]:
-    """Trains and evaluates one seed; the folders of the evaluations with and without residuals in the condenser."""
-    base, tiles, literal = (out / f"{name}-{seed}" for name in ("kmeans", "tiles", "literal"))
-    train(exe, config, base, seed, [])
-    same_stage1 = ["stage1.steps=0", f"stage1.init_from={quoted(base)}"]
-    train(exe, config, tiles, seed, [*same_stage1, 'clusters.grouping="patch"'])
-    train(exe, config, literal, seed, [*same_stage1, "model.condenser.residual=false"])
-    compared = base / "compared"
-    if not (compared / "summary.json").exists():
+    def run(self, name: str) -> Path:
+        return self.out / f"{name}-{self.seed}"
+
+    def clift(self, *args: str) -> None:
+        if self.threads is None:
+            subprocess.run([self.exe, *args], check=True, cwd=ROOT)
+            return
+        environment = os.environ | {"RAYON_NUM_THREADS": str(self.threads)}
+        with self.out.joinpath(f"seed-{self.seed}.log").open("a") as log:
+            subprocess.run([self.exe, *args], check=True, cwd=ROOT, env=environment, stdout=log, stderr=log)
+
+    def train(self, name: str, *changes: str) -> None:
+        run = self.run(name)
+        if (run / "eval" / "summary.json").exists():
+            return
+        args = ["train", str(self.config.resolve()), "--set", f"run_dir={quoted(run)}", "--set", f"seed={self.seed}"]
+        for change in changes:
+            args += ["--set", change]
+        self.clift(*args)
+
+    def same_stage1(self, name: str, change: str) -> None:
+        self.train(name, "stage1.steps=0", f"stage1.init_from={quoted(self.run('kmeans'))}", change)
+
+    def compare(self) -> None:
+        """Evaluates both groupings, each with and without its condenser, and random tokens."""
+        if (self.compared / "summary.json").exists():
+            return
         variants = "[" + ",".join(f'"{name}"' for name in VARIANTS.split(",")) + "]"
-        clift(
-            exe, "eval", str(base.resolve()), "--with", str(tiles.resolve()), "--storage", STORAGE,
-            "--set", f"eval.variants={variants}", "--out", str(compared.resolve()),
+        self.clift(
+            "eval", str(self.run("kmeans").resolve()), "--with", str(self.run("tiles").resolve()),
+            "--storage", STORAGE, "--set", f"eval.variants={variants}", "--out", str(self.compared.resolve()),
         )  # fmt: skip
-    return compared, literal / "eval"
+
+    @property
+    def compared(self) -> Path:
+        return self.run("kmeans") / "compared"
+
+    def make(self) -> tuple[Path, Path]:
+        """Trains and evaluates; the folders of the evaluations with and without residuals in the condenser."""
+        self.train("kmeans")
+        self.same_stage1("tiles", 'clusters.grouping="patch"')
+        self.compare()
+        self.same_stage1("literal", "model.condenser.residual=false")
+        return self.compared, self.run("literal") / "eval"
 
 
 def scene_means(folder: Path) -> dict[tuple[str, int], dict[str, float]]:
@@ -121,13 +152,16 @@ def report(folders: list[tuple[Path, Path]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="0,1,2", help="seeds of training, separated by commas")
+    parser.add_argument("--jobs", type=int, default=1, help="seeds that are trained at once")
     parser.add_argument("--config", type=Path, default=ROOT / "configs" / "synthetic.toml")
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "synthetic", help="folder of the runs")
     parser.add_argument("--clift", type=Path, default=ROOT / "target" / "release" / "clift")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    exe = args.clift.resolve()
-    folders = [make(exe, args.config, args.out, int(seed)) for seed in args.seeds.split(",")]
+    threads = max(1, (os.cpu_count() or 1) // args.jobs) if args.jobs > 1 else None
+    seeds = [Seed(args.clift.resolve(), args.config, args.out, int(seed), threads) for seed in args.seeds.split(",")]
+    with ThreadPoolExecutor(args.jobs) as pool:
+        folders = list(pool.map(Seed.make, seeds))
     report(folders)
 
 
