@@ -124,6 +124,13 @@ impl Networks {
 }
 
 impl Sweep {
+    /// Tokens that a target is drawn from, for every time it is drawn where a scene has `num_storage_tokens`.
+    pub fn drawn(&self, num_storage_tokens: usize) -> Vec<usize> {
+        let counts = [vec![num_storage_tokens], self.render_counts(num_storage_tokens)].concat();
+        let num_formats: usize = self.variants.iter().map(|&variant| self.formats(variant).len()).sum();
+        counts.repeat(num_formats)
+    }
+
     /// Counts that views are drawn from where a scene has `num_storage_tokens`: fewer than those, rising.
     fn render_counts(&self, num_storage_tokens: usize) -> Vec<usize> {
         let counts = self.render.iter().filter_map(|count| count.of(num_storage_tokens).ok());

@@ -54,6 +54,45 @@ impl VggShape {
     };
 }
 
+/// What a network takes on one picture, in f32 values and multiplications.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VggSizes {
+    /// Weights.
+    pub parameters: f64,
+    /// Multiply-accumulates of a forward pass.
+    pub macs: f64,
+    /// Values of all convolutions and poolings together.
+    pub outputs: f64,
+    /// Values of the features.
+    pub features: f64,
+    /// Values of the largest layer.
+    pub widest: f64,
+}
+
+impl VggShape {
+    /// Counts what a picture of so many pixels takes.
+    pub fn sizes(&self, height: usize, width: usize) -> VggSizes {
+        let mut sizes = VggSizes { parameters: 0.0, macs: 0.0, outputs: 0.0, features: 0.0, widest: 0.0 };
+        let mut inputs = 3.0;
+        for (stage, (&count, &channels)) in self.convs.iter().zip(&self.widths).enumerate() {
+            let pixels = ((height >> stage) * (width >> stage)) as f64;
+            let values = channels as f64 * pixels;
+            if stage > 0 {
+                sizes.outputs += inputs * pixels;
+            }
+            for _ in 0..count {
+                sizes.parameters += 9.0 * inputs * channels as f64 + channels as f64;
+                sizes.macs += 9.0 * inputs * values;
+                sizes.outputs += values;
+                inputs = channels as f64;
+            }
+            sizes.features += values;
+            sizes.widest = sizes.widest.max(values);
+        }
+        sizes
+    }
+}
+
 /// A frozen network.
 #[derive(Module, Debug)]
 pub struct Vgg {
@@ -122,4 +161,21 @@ impl Pooling {
 /// A parameter that gets no gradient.
 fn frozen<const D: usize>(tensor: Tensor<D>) -> Param<Tensor<D>> {
     Param::from_tensor(tensor).set_require_grad(false)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_whole_networks_have_their_published_sizes() {
+        // Convolutions of VGG-16 without the classifier: 14,714,688 weights and 15.35e9 multiplications at 224 pixels.
+        let sizes = VggShape::VGG16.sizes(224, 224);
+        assert_eq!(sizes.parameters, 14_714_688.0);
+        assert!((sizes.macs / 15.35e9 - 1.0).abs() < 1e-3, "{}", sizes.macs);
+        // 122 values a pixel.
+        assert_eq!((sizes.features, sizes.widest), (122.0 * 224.0 * 224.0, 64.0 * 224.0 * 224.0));
+        // An odd last row is left out on the way down.
+        assert_eq!(VggShape::VGG16.sizes(17, 17).features, (64 * 17 * 17 + 128 * 64 + 256 * 16 + 512 * 4 + 512) as f64);
+    }
 }

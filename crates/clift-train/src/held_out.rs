@@ -82,7 +82,7 @@ impl<'a> HeldOut<'a> {
             Stage::Stage2 => (self.config.eval.validation_storage, condensed_variant(grouping)),
             _ => (TokenCount::Share(1.0), Variant::Kmeans),
         };
-        let sweep = self.sweep(vec![storage], vec![variant]);
+        let sweep = sweep(self.config, vec![storage], vec![variant]);
         let first_format = sweep.tokens[..1].to_vec();
         let sweep = Sweep { render: Vec::new(), tokens: first_format, ..sweep };
         let mut networks = Networks {
@@ -129,7 +129,7 @@ impl<'a> HeldOut<'a> {
         let started = std::time::Instant::now();
         let mut measured = Accumulator::default();
         let lpips = self.lpips(&mut measured, sink)?;
-        let sweep = self.sweep(self.config.eval.storage.clone(), self.variants(networks)?);
+        let sweep = sweep(self.config, self.config.eval.storage.clone(), self.variants(networks)?);
         let sweep = Sweep { lpips, systems: systems.to_vec(), ..sweep };
         let total = self.items.len() as u64;
         sink.event(&Event::StageStarted { stage: Stage::Eval, done: 0, num_steps: total });
@@ -243,23 +243,6 @@ impl<'a> HeldOut<'a> {
         }
     }
 
-    fn sweep(&self, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
-        let Config { seed, eval, clusters, model, device, .. } = self.config;
-        Sweep {
-            storage,
-            render: eval.render.clone(),
-            selection: eval.selection,
-            tokens: eval.tokens.clone(),
-            variants,
-            kmeans: clusters.kmeans.clone(),
-            model: model.clone(),
-            lpips: None,
-            systems: Vec::new(),
-            is_cpu: matches!(device, DeviceName::Flex | DeviceName::Ndarray),
-            seed: derive_seed(*seed, "eval"),
-        }
-    }
-
     fn evaluate_item(
         &self,
         networks: &Networks,
@@ -309,3 +292,21 @@ pub fn write_ledger(ledger: &Ledger, path: &Path) -> Result<(), TrainError> {
     let text = serde_json::to_vec_pretty(ledger).map_err(TrainError::bad_file("ledger", path))?;
     replace(path, &text).map_err(TrainError::io("writing what was left out", path))
 }
+/// What an evaluation of a run does with every scene; LPIPS and other systems are to be added.
+pub(crate) fn sweep(config: &Config, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
+    let Config { seed, eval, clusters, model, device, .. } = config;
+    Sweep {
+        storage,
+        render: eval.render.clone(),
+        selection: eval.selection,
+        tokens: eval.tokens.clone(),
+        variants,
+        kmeans: clusters.kmeans.clone(),
+        model: model.clone(),
+        lpips: None,
+        systems: Vec::new(),
+        is_cpu: matches!(device, DeviceName::Flex | DeviceName::Ndarray),
+        seed: derive_seed(*seed, "eval"),
+    }
+}
+

@@ -11,16 +11,18 @@ mod memory;
 mod sizes;
 mod tape;
 
+use clift_eval::vgg::VggShape;
+use clift_model::ModelConfig;
 use clift_model::device::DeviceName;
 use serde::Serialize;
 
 use crate::TrainError;
 use crate::config::{Config, SourceKind};
 use crate::events::Stage;
-use calibration::{InferenceRates, InferenceTimed, inference_rates, loading_s, trained, update_rates};
+use calibration::{InferenceRates, InferenceTimed, inference_rates, loading_s, update_rates};
 use counts::{Macs, Parameters, SceneSizes};
 use memory::{InferenceSizes, UpdateSizes, inference_bytes, update_bytes};
-use sizes::{batch_sizes, drawn, largest, middle, num_tokens, picture_values, update_macs, variants};
+use sizes::{batch_sizes, drawn, evaluated, largest, measures_lpips, middle, num_tokens, picture_values, update_macs};
 
 /// Target views that an evaluation draws at once.
 const VIEWS_PER_PASS: usize = 8;
@@ -59,6 +61,8 @@ pub struct PartPlan {
     pub peak_bytes: u64,
     /// Seconds of one on the device, on average; `None` where it was not asked for.
     pub compute_s: Option<f64>,
+    /// Threads of this process at work meanwhile, on average; of updates alone.
+    pub busy_threads: Option<f64>,
     /// Seconds of one on one thread that reads and decodes; `None` where it was not asked for or the data is not there.
     pub loading_s: Option<f64>,
     /// Seconds from one to the next: both, as far as they do not overlap.
@@ -101,7 +105,8 @@ pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
         part.loading_s = per_view_s.map(|seconds| seconds * num_views);
         part.seconds = part.compute_s.map(|compute| {
             let is_cpu = matches!(config.device, DeviceName::Flex | DeviceName::Ndarray);
-            from_one_to_the_next(compute, part.loading_s.unwrap_or(0.0), num_threads, is_cpu.then_some(plan.threads))
+            let idle = part.busy_threads.filter(|_| is_cpu).map(|busy| Idle { cores: plan.threads as f64, busy });
+            from_one_to_the_next(compute, part.loading_s.unwrap_or(0.0), num_threads, idle)
         });
     }
     Ok(plan)
@@ -120,14 +125,25 @@ fn read_for(config: &Config, part: &str) -> (f64, usize) {
     }
 }
 
+/// Cores that a CPU device shares with the threads that load ahead.
+#[derive(Clone, Copy, Debug)]
+struct Idle {
+    cores: f64,
+    /// Those that the work itself keeps busy.
+    busy: f64,
+}
+
 /// Seconds between two steps of which each takes `compute_s` on the device and `loading_s` on one of `num_threads`
-/// threads that load ahead; `cores` are those that a CPU device shares with them.
-fn from_one_to_the_next(compute_s: f64, loading_s: f64, num_threads: usize, cores: Option<usize>) -> f64 {
+/// threads that load ahead, on cores that the work leaves idle where they are `shared`.
+fn from_one_to_the_next(compute_s: f64, loading_s: f64, num_threads: usize, shared: Option<Idle>) -> f64 {
     if num_threads == 0 {
         return compute_s + loading_s;
     }
-    let shared = cores.map_or(0.0, |cores| loading_s / cores as f64);
-    (compute_s + shared).max(loading_s / num_threads as f64)
+    let added_s = shared.map_or(0.0, |Idle { cores, busy }| {
+        let fits_s = (cores - busy).max(0.0) * compute_s;
+        (loading_s - fits_s).max(0.0) / cores
+    });
+    (compute_s + added_s).max(loading_s / num_threads as f64)
 }
 
 /// What [`Config::validate`] asks, but for where the data is: a plan needs none.
@@ -188,13 +204,12 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
     let all = drawn(config, stage)?;
     let macs_of_scene = all.iter().map(|scene| update_macs(config, stage, scene)).sum::<f64>() / all.len() as f64;
     let macs = batch_size as f64 * macs_of_scene;
-    let trained_parameters = trained(parameters, stage);
-    let compute_s = if is_timed {
-        let rates = update_rates(config, stage, &middle(config, stage)?)?;
-        Some(macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter)
-    } else {
-        None
-    };
+    let trained_parameters = parameters.trained(stage);
+    let rates = is_timed.then(|| update_rates(config, stage, &middle(config, stage)?)).transpose()?;
+    let pictures = (batch_size * config.data.views.num_targets) as f64;
+    let compute_s = rates.map(|rates| {
+        macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + pictures * rates.per_picture
+    });
     let sizes = UpdateSizes {
         stage,
         num_scenes: part_size as f64,
@@ -202,6 +217,8 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
         recompute: config.recompute,
         scene: largest(config, stage)?,
         num_picture_values: picture_values(config),
+        perceptual: (config.loss.perceptual_weight > 0.0)
+            .then(|| VggShape::VGG19.sizes(config.data.height, config.data.width)),
     };
     // Batches prepared ahead, as bytes.
     let waiting = (config.data.num_prefetch + 1) as f64 * batch_size as f64 * picture_values(config);
@@ -214,6 +231,7 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
         gmacs: macs / 1e9,
         peak_bytes: machine::own_bytes() + bytes as u64,
         compute_s,
+        busy_threads: rates.map(|rates| rates.busy),
         loading_s: None,
         seconds: None,
     })
@@ -253,6 +271,7 @@ fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<
         num_patches: num_tokens(config, 1)? as f64,
         num_picture_values: picture_values(config),
         num_loaded: (parameters.encoder + parameters.renderer) as f64,
+        lpips: None,
     };
     let num_scenes = match (config.clusters.num_scenes, config.data.source) {
         (0, SourceKind::Synthetic) => Some(config.data.synthetic.num_scenes),
@@ -268,6 +287,7 @@ fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<
         gmacs: macs / 1e9,
         peak_bytes: machine::own_bytes() + inference_bytes(&config.model, parameters.total as f64, &sizes) as u64,
         compute_s,
+        busy_threads: None,
         loading_s: None,
         seconds: None,
     })
@@ -278,46 +298,48 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
     let all = num_tokens(config, eval.num_context)?;
     let stored = eval.storage.iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
     let num_targets = eval.num_targets;
-    // Every variant is drawn at every count.
-    let scene = |count: usize| SceneSizes {
-        num_storage_tokens: Some(count as f64),
-        num_render_tokens: count as f64,
+    let sweep = evaluated(config);
+    let scene = |stored: usize, drawn_from: usize| SceneSizes {
+        num_storage_tokens: Some(stored as f64),
+        num_render_tokens: drawn_from as f64,
         num_targets: num_targets as f64,
         ..inference_scene_unchecked(config, all)
     };
-    let of_count: Vec<Macs> = stored.iter().map(|&count| Macs::of(&config.model, &scene(count))).collect();
-    let encoder = of_count.first().map_or(0.0, |macs| macs.encoder);
-    let condenser: f64 = of_count.iter().map(|macs| macs.condenser).sum();
-    let num_variants = variants(config).len();
-    let renderer: f64 = of_count.iter().map(|macs| num_variants as f64 * macs.renderer).sum();
+    // Multiplications of the encoder, and of all that is done with its tokens.
+    let macs_of = |model: &ModelConfig| {
+        let mut macs = (0.0, 0.0);
+        for &stored in &stored {
+            let once = Macs::of(model, &scene(stored, stored));
+            let drawn = sweep.drawn(stored).into_iter().map(|count| Macs::of(model, &scene(stored, count)).renderer);
+            macs = (once.encoder, macs.1 + once.condenser + drawn.sum::<f64>());
+        }
+        macs
+    };
+    let (encoder, rest) = macs_of(&config.model);
     let compute_s = if is_timed {
         let timed = InferenceTimed { num_context: eval.num_context, num_targets, counts: &[], is_measured: true };
         let rates = inference_rates(config, &timed)?;
         // What the timed network lacks of the whole one.
-        let of_timed: Vec<Macs> = stored.iter().map(|&count| Macs::of(&rates.timed, &scene(count))).collect();
-        let missing = |all: f64, timed: f64, per_mac: f64| (all - timed).max(0.0) * per_mac;
-        let of_encoder = of_timed.first().map_or(0.0, |macs| macs.encoder);
-        let of_rest = of_timed.iter().map(|macs| macs.condenser + num_variants as f64 * macs.renderer).sum();
+        let (of_encoder, of_rest) = macs_of(&rates.timed);
         Some(
             rates.measuring_s
-                + missing(encoder, of_encoder, rates.encode_per_mac)
-                + missing(condenser + renderer, of_rest, rates.render_per_mac),
+                + (encoder - of_encoder).max(0.0) * rates.encode_per_mac
+                + (rest - of_rest).max(0.0) * rates.render_per_mac,
         )
     } else {
         None
     };
+    let num_drawn: usize = stored.iter().map(|&count| sweep.drawn(count).len()).sum();
     let sizes = InferenceSizes {
         num_tokens: all as f64,
         num_clusters: stored.iter().max().map(|&count| count as f64),
         num_targets: num_targets.min(VIEWS_PER_PASS) as f64,
         num_patches: num_tokens(config, 1)? as f64,
         // Pictures of every count and variant are held until the scene is measured.
-        num_picture_values: (num_targets
-            * (num_variants * stored.len() + 3)
-            * config.data.width
-            * config.data.height
-            * 3) as f64,
-        num_loaded: parameters.total as f64,
+        num_picture_values: (num_targets * (num_drawn + 3) * config.data.width * config.data.height * 3) as f64,
+        num_loaded: (parameters.condenser + parameters.renderer) as f64,
+        lpips: measures_lpips(config)
+            .then(|| (VggShape::VGG16.sizes(config.data.height, config.data.width), num_targets as f64)),
     };
     // Both stages have a renderer of their own.
     let weights = (parameters.total + parameters.renderer) as f64;
@@ -326,9 +348,10 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
         unit: "scene",
         count: (eval.num_scenes > 0).then_some(eval.num_scenes as u64),
         trained_parameters: 0,
-        gmacs: (encoder + condenser + renderer) / 1e9,
+        gmacs: (encoder + rest) / 1e9,
         peak_bytes: machine::own_bytes() + inference_bytes(&config.model, weights, &sizes) as u64,
         compute_s,
+        busy_threads: None,
         loading_s: None,
         seconds: None,
     })
@@ -375,7 +398,6 @@ fn kmeans_s(rates: &InferenceRates, count: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use clift_eval::TokenCount;
-    use clift_model::ModelConfig;
 
     use super::*;
 
@@ -438,8 +460,11 @@ mod tests {
 
     #[test]
     fn loading_is_hidden_behind_the_work_as_far_as_threads_and_cores_allow() {
-        assert_eq!(from_one_to_the_next(1.0, 0.5, 0, Some(2)), 1.5);
-        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, Some(2)), 1.25);
+        let busy = |busy| Some(Idle { cores: 2.0, busy });
+        assert_eq!(from_one_to_the_next(1.0, 0.5, 0, busy(2.0)), 1.5);
+        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, busy(2.0)), 1.25);
+        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, busy(1.75)), 1.125);
+        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, busy(1.0)), 1.0);
         assert_eq!(from_one_to_the_next(1.0, 0.5, 1, None), 1.0);
         assert_eq!(from_one_to_the_next(1.0, 9.0, 3, None), 3.0);
     }

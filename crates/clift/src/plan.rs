@@ -88,13 +88,14 @@ mod tests {
             gmacs: 1.5,
             peak_bytes: 3 << 29,
             compute_s: seconds,
+            busy_threads: None,
             loading_s: None,
             seconds,
         };
         let plan = Plan {
             device: DeviceName::Flex,
             threads: 2,
-            parameters: Parameters { encoder: 10, condenser: 20, renderer: 30, total: 60 },
+            parameters: Parameters { encoder: 10, lift_norm: 0, condenser: 20, renderer: 30, total: 60 },
             num_tokens: [64, 96],
             available_bytes: None,
             parts: vec![part("stage1", "step", Some(7200), Some(0.5)), part("eval", "scene", None, Some(2.0))],

@@ -7,13 +7,16 @@ use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::order::{item_rng, step_rng};
 use clift_data::{ClipReader, Split};
+use clift_eval::lpips::Lpips;
 use clift_eval::{Accumulator, Condensed, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
+
 use clift_model::ModelConfig;
+use cpu_time::ProcessTime;
 use rand::RngExt;
 use rand::seq::index::sample;
 
 use super::counts::{Macs, Parameters, SceneSizes};
-use super::sizes::{Middle, update_macs, variants};
+use super::sizes::{Middle, evaluated, measures_lpips, update_macs};
 use crate::TrainError;
 use crate::bench::BenchOptions;
 use crate::bench::context::BenchContext;
@@ -29,9 +32,11 @@ use crate::trainer::freeze;
 /// Multiplications of a calibrated update: a second of a laptop.
 const ENOUGH_MACS: f64 = 30e9;
 
-/// Repetitions that are timed, after one that is not; the least is taken, since whatever else the machine does only
-/// adds to it.
-const REPEATS: usize = 3;
+/// Fewest and most repetitions that are timed, after one that is not.
+const REPEATS: [usize; 2] = [3, 15];
+
+/// Seconds of repetitions that are enough of them.
+const ENOUGH_S: f64 = 0.7;
 
 /// What a device takes.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -40,6 +45,39 @@ pub struct Rates {
     pub per_mac: f64,
     /// Seconds of the update of one parameter: norm, clipping, `AdamW`.
     pub per_parameter: f64,
+    /// Seconds of the perceptual loss of one target picture, forward and backward; 0 without one.
+    pub per_picture: f64,
+    /// Threads of this process that are at work during an update, on average.
+    pub busy: f64,
+}
+
+/// Seconds of a piece of work, and the threads at work meanwhile.
+struct Timed {
+    seconds: f64,
+    busy: f64,
+}
+
+impl Timed {
+    /// The median of some repetitions after one that is not timed: tokens and seeds change little, other processes a lot.
+    fn of(mut work: impl FnMut() -> Result<(), TrainError>) -> Result<Self, TrainError> {
+        Ok(Self::passing((), |()| work())?.1)
+    }
+
+    /// The same of work that changes something, and what that is in the end.
+    fn passing<T>(state: T, mut work: impl FnMut(T) -> Result<T, TrainError>) -> Result<(T, Self), TrainError> {
+        let mut state = work(state)?;
+        let [fewest, most] = REPEATS;
+        let mut seconds = Vec::new();
+        let (cpu, begun) = (ProcessTime::now(), Instant::now());
+        while seconds.len() < fewest || (seconds.len() < most && begun.elapsed().as_secs_f64() < ENOUGH_S) {
+            let started = Instant::now();
+            state = work(state)?;
+            seconds.push(started.elapsed().as_secs_f64());
+        }
+        let busy = cpu.elapsed().as_secs_f64() / begun.elapsed().as_secs_f64();
+        seconds.sort_by(f64::total_cmp);
+        Ok((state, Self { seconds: seconds[seconds.len() / 2], busy }))
+    }
 }
 
 /// What a device takes without gradients.
@@ -94,7 +132,7 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
     let num_scenes = ((ENOUGH_MACS / macs_of_scene) as usize).clamp(1, middle.num_scenes);
     let batch = drawn(&context, stage, middle, num_scenes)?;
     let optimizer = if stage == Stage::Stage2 { &config.stage2.optimizer } else { &config.stage1.optimizer };
-    let mut learner = Learner {
+    let learner = Learner {
         model: freeze(stage, context.model()),
         optimizer: adamw(optimizer),
         device: context.device.clone().autodiff(),
@@ -103,18 +141,14 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
         recompute: config.recompute,
     };
     let rate = optimizer.learning_rate;
-    let mut step_s = f64::INFINITY;
-    for repeat in 0..=REPEATS {
-        let started = Instant::now();
-        (learner, _) = learner.step(&batch, 1, rate.into(), optimizer.max_grad_norm)?;
+    let (mut learner, step) = Timed::passing(learner, |learner| {
+        let (learner, _) = learner.step(&batch, 1, rate.into(), optimizer.max_grad_norm)?;
         context.sync()?;
-        if repeat > 0 {
-            step_s = step_s.min(started.elapsed().as_secs_f64());
-        }
-    }
+        Ok(learner)
+    })?;
     let shown = Shown::upload(&batch, &learner.device)?;
     let mut optimizer_s = f64::INFINITY;
-    for _ in 0..REPEATS {
+    for _ in 0..REPEATS[0] {
         let loss = loss_of(&learner.model, &shown, &batch.tokens, &learner.loss)?.total;
         let grads = GradientsParams::from_grads(loss.backward(), &learner.model);
         context.sync()?;
@@ -126,16 +160,30 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
         optimizer_s = optimizer_s.min(started.elapsed().as_secs_f64());
     }
     let macs = num_scenes as f64 * macs_of_scene;
-    let parameters = trained(&Parameters::of(&shallow.model), stage) as f64;
-    Ok(Rates { per_mac: (step_s - optimizer_s).max(0.0) / macs, per_parameter: optimizer_s / parameters })
+    let parameters = Parameters::of(&shallow.model).trained(stage) as f64;
+    Ok(Rates {
+        per_mac: (step.seconds - optimizer_s).max(0.0) / macs,
+        per_parameter: optimizer_s / parameters,
+        per_picture: perceptual_s(config, &context)?,
+        busy: step.busy,
+    })
 }
 
-/// Parameters that a stage trains.
-pub fn trained(parameters: &Parameters, stage: Stage) -> u64 {
-    match stage {
-        Stage::Stage2 => parameters.condenser + parameters.renderer,
-        _ => parameters.encoder + parameters.renderer,
+/// Seconds of the perceptual term of one picture and of its gradient.
+fn perceptual_s(config: &Config, context: &BenchContext) -> Result<f64, TrainError> {
+    if config.loss.weights()?.is_none() {
+        return Ok(0.0);
     }
+    let loss = Loss::load(&config.loss, &context.device)?;
+    let size = [1, 1, config.data.height, config.data.width, 3];
+    let picture = |value: f64| Tensor::<5>::full(size, value, &context.device.clone().autodiff());
+    let timed = Timed::of(|| {
+        let rendering = picture(0.3).require_grad();
+        let grads = loss.of(rendering.clone(), picture(0.6)).total.backward();
+        let grad = rendering.grad(&grads).ok_or_else(|| TrainError::Tensor { reason: "no gradient".into() })?;
+        read(grad.flatten(0, 2))
+    })?;
+    Ok(timed.seconds)
 }
 
 /// A batch of made-up scenes with the middle's numbers of tokens.
@@ -175,21 +223,9 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
         num_patches: patches as f64,
     };
     let macs = Macs::of(&shallow.model, &scene);
-    let least = |work: &mut dyn FnMut() -> Result<(), TrainError>| -> Result<f64, TrainError> {
-        let mut seconds = f64::INFINITY;
-        for repeat in 0..=REPEATS {
-            let started = Instant::now();
-            work()?;
-            context.sync()?;
-            if repeat > 0 {
-                seconds = seconds.min(started.elapsed().as_secs_f64());
-            }
-        }
-        Ok(seconds)
-    };
-    let encode_s = least(&mut || read(model.lift(&views)))?;
+    let encode_s = Timed::of(|| read(model.lift(&views)))?.seconds;
     let lift = model.lift(&views);
-    let render_s = least(&mut || read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?;
+    let render_s = Timed::of(|| read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?.seconds;
     let mut kmeans = Vec::new();
     let mut measuring_s = 0.0;
     if is_measured {
@@ -201,37 +237,24 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
             patch_condensed: None,
             device: context.device.clone(),
         };
-        let eval = &config.eval;
-        let sweep = Sweep {
-            storage: eval.storage.clone(),
-            render: eval.render.clone(),
-            selection: eval.selection,
-            tokens: eval.tokens.clone(),
-            variants: variants(config).into_iter().filter(|variant| networks.can_draw(*variant)).collect(),
-            kmeans: config.clusters.kmeans.clone(),
-            model: config.model.clone(),
-            lpips: None,
-            systems: Vec::new(),
-            is_cpu: context.is_cpu,
-            seed: config.seed,
-        };
-        measuring_s = f64::INFINITY;
-        // One for both: the second time no setting draws the view that warms it up.
+        let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
+        let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
+        let sweep = Sweep { model: shallow.model.clone(), lpips, ..evaluated(config) };
+        // One for all: after the first time no setting draws the view that warms it up.
         let mut measured = Accumulator::default();
-        for _ in 0..2 {
-            let started = Instant::now();
-            evaluate_scene(&networks, &clip, &sweep, false, &mut measured)?;
-            measuring_s = measuring_s.min(started.elapsed().as_secs_f64());
-        }
+        measuring_s =
+            Timed::of(|| Ok(evaluate_scene(&networks, &clip, &sweep, false, &mut measured).map(|_| ())?))?.seconds;
     } else {
         for &count in counts {
             // One seed takes a few iterations more, another fewer.
             let seeds: Vec<u64> = (0..3).map(|seed| step_rng(context.seed(), seed, "plan clusters").random()).collect();
-            let started = Instant::now();
-            for &seed in &seeds {
-                config.clusters.kmeans.fit(lift.clone(), count, &[seed])?;
-            }
-            kmeans.push((count, started.elapsed().as_secs_f64() / seeds.len() as f64));
+            let timed = Timed::of(|| {
+                for &seed in &seeds {
+                    config.clusters.kmeans.fit(lift.clone(), count, &[seed])?;
+                }
+                Ok(())
+            })?;
+            kmeans.push((count, timed.seconds / seeds.len() as f64));
         }
     }
     let [encode_per_mac, render_per_mac] = [encode_s / macs.encoder, render_s / macs.renderer];

@@ -3,18 +3,23 @@
 // F feed-forward width
 
 use clift_model::ModelConfig;
+use clift_model::flops::Convention;
 use serde::Serialize;
 
-/// Parameters of the three networks.
+use crate::events::Stage;
+
+/// Parameters of the networks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Parameters {
     /// Of the encoder; stage 1 trains it.
     pub encoder: u64,
+    /// Of the released DL3DV network's norm of the tokens, 0 elsewhere; both stages train it.
+    pub lift_norm: u64,
     /// Of the condenser; stage 2 trains it.
     pub condenser: u64,
     /// Of the renderer; both stages train it.
     pub renderer: u64,
-    /// Of all three.
+    /// Of all.
     pub total: u64,
 }
 
@@ -26,19 +31,27 @@ impl Parameters {
         let blocks = |count: usize, one: u64| count as u64 * one;
         let encoder =
             linear(config.context_patch_len(), config.dim) + blocks(config.num_encoder_blocks, encoder_block(config));
+        let lift_norm = if config.variant.has_norms() { 2 * dim } else { 0 };
         let condenser = blocks(config.condenser.num_blocks, condenser_block(config));
         let renderer = linear(config.ray_patch_len(), config.dim)
             + blocks(config.num_renderer_blocks, decoder_block(config))
             + 2 * dim
             + linear(config.dim, config.rgb_patch_len());
-        Self { encoder, condenser, renderer, total: encoder + condenser + renderer }
+        Self { encoder, lift_norm, condenser, renderer, total: encoder + lift_norm + condenser + renderer }
+    }
+
+    /// Those that a stage trains.
+    pub fn trained(&self, stage: Stage) -> u64 {
+        let own = if stage == Stage::Stage2 { self.condenser } else { self.encoder };
+        own + self.lift_norm + self.renderer
     }
 }
 
-/// Of the queries, keys, values and output projection among a set's own members.
-fn self_attention(config: &ModelConfig) -> u64 {
+/// Of the queries, keys, values and output projection of an attention, and the norms of its heads.
+fn attention(config: &ModelConfig) -> u64 {
     let dim = config.dim as u64;
-    4 * dim * dim + 4 * dim
+    let norms = if config.variant.has_norms() { 2 * dim / config.num_heads as u64 } else { 0 };
+    4 * dim * dim + 4 * dim + norms
 }
 
 fn feed_forward(config: &ModelConfig) -> u64 {
@@ -48,19 +61,24 @@ fn feed_forward(config: &ModelConfig) -> u64 {
 
 /// Parameters of one encoder block.
 pub fn encoder_block(config: &ModelConfig) -> u64 {
-    4 * config.dim as u64 + self_attention(config) + feed_forward(config)
+    4 * config.dim as u64 + attention(config) + feed_forward(config)
 }
 
 /// Parameters of one decoder block: a norm and a cross-attention more.
 pub fn decoder_block(config: &ModelConfig) -> u64 {
-    6 * config.dim as u64 + 2 * self_attention(config) + feed_forward(config)
+    6 * config.dim as u64 + 2 * attention(config) + feed_forward(config)
 }
 
-/// Parameters of one condenser block: with residuals a norm more than that, and the gate, which has no bias.
+/// Parameters of one condenser block: a norm of the members, with residuals one of the queries, and the gate without a
+/// bias; the released networks have no norm of the members and a bias.
 pub fn condenser_block(config: &ModelConfig) -> u64 {
     let dim = config.dim as u64;
-    let norms = if config.condenser.residual { 4 } else { 3 };
-    2 * norms * dim + 2 * self_attention(config) + feed_forward(config) + dim * dim
+    let (norms, bias) = match (config.variant.is_released(), config.condenser.residual) {
+        (true, _) => (3, dim),
+        (false, true) => (4, 0),
+        (false, false) => (3, 0),
+    };
+    2 * norms * dim + 2 * attention(config) + feed_forward(config) + dim * dim + bias
 }
 
 /// How much of everything one scene has.
@@ -109,9 +127,7 @@ impl Macs {
         let encoder =
             num_tokens * config.context_patch_len() as f64 * dim + config.num_encoder_blocks as f64 * among(num_tokens);
         let condenser = sizes.num_storage_tokens.map_or(0.0, |stored| {
-            let members = num_tokens - stored;
-            let cross = 2.0 * stored * dim * dim + 2.0 * members * dim * dim + 2.0 * members * dim;
-            config.condenser.num_blocks as f64 * (among(stored) + cross + stored * dim * dim)
+            config.condense_macs(num_tokens as usize, stored as usize).count(Convention::Macs) as f64
         });
         let cross = num_targets * (2.0 * num_patches * dim * dim + 2.0 * num_patches * num_render_tokens * dim)
             + 2.0 * sizes.num_projected() * dim * dim;
@@ -137,33 +153,43 @@ impl Macs {
 mod tests {
     use burn::module::Module;
     use burn::tensor::Device;
-    use clift_model::{Clift, CondenserConfig};
+    use clift_model::{Clift, CondenserConfig, Variant};
 
     use super::*;
 
     #[test]
     fn parameters_are_counted_exactly() {
-        for residual in [false, true] {
+        let literal = CondenserConfig { residual: false, ..CondenserConfig::default() };
+        let paper = [CondenserConfig::default(), literal].map(|condenser| (Variant::Paper, condenser));
+        let released = [Variant::ReleasedRe10k, Variant::ReleasedDl3dv];
+        let released = released.map(|variant| (variant, CondenserConfig::of(variant)));
+        for (variant, condenser) in paper.into_iter().chain(released) {
             for [num_encoder_blocks, num_renderer_blocks, num_blocks] in [[1, 2, 3], [3, 1, 1]] {
+                let num_blocks = if variant.is_released() { condenser.num_blocks } else { num_blocks };
                 let config = ModelConfig {
+                    variant,
                     dim: 24,
                     num_heads: 3,
                     feed_forward_dim: 40,
                     num_encoder_blocks,
                     num_renderer_blocks,
                     patch_size: 4,
-                    condenser: CondenserConfig { num_blocks, residual },
-                    ..ModelConfig::default()
+                    condenser: CondenserConfig { num_blocks, ..condenser },
                 };
                 let model = Clift::new(&config, 0, &Device::flex());
                 let counted = Parameters::of(&config);
-                let [encoder, condenser, renderer] =
-                    [model.encoder.num_params(), model.condenser.num_params(), model.renderer.num_params()];
-                assert_eq!(
-                    [counted.encoder, counted.condenser, counted.renderer],
-                    [encoder, condenser, renderer].map(|count| count as u64)
-                );
+                let [encoder, lift_norm, condenser, renderer] = [
+                    model.encoder.num_params(),
+                    model.lift_norm.num_params(),
+                    model.condenser.num_params(),
+                    model.renderer.num_params(),
+                ]
+                .map(|count| count as u64);
+                let of_parts = [counted.encoder, counted.lift_norm, counted.condenser, counted.renderer];
+                assert_eq!(of_parts, [encoder, lift_norm, condenser, renderer], "{variant}");
                 assert_eq!(counted.total, model.num_params() as u64);
+                assert_eq!(counted.trained(Stage::Stage1), encoder + lift_norm + renderer);
+                assert_eq!(counted.trained(Stage::Stage2), condenser + lift_norm + renderer);
             }
         }
     }

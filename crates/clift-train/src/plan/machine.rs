@@ -18,7 +18,7 @@ pub fn available_bytes(device: DeviceName) -> Option<u64> {
 
 /// Memory that a process of this program holds besides its tensors: its code, threads and buffers (docs/plan.md).
 pub fn own_bytes() -> u64 {
-    25 << 20
+    20 << 20
 }
 
 fn field<'a>(text: &'a str, name: &str) -> Option<&'a str> {

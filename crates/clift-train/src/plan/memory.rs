@@ -1,6 +1,7 @@
 //! Bytes that the parts of a run need, counted from what the hand-written operations keep (docs/plan.md).
 // In f32 values: x = N D of a part's scenes, y = T Q D, z = tokens D
 
+use clift_eval::vgg::VggSizes;
 use clift_model::ModelConfig;
 
 use super::counts::{Parameters, SceneSizes, condenser_block, decoder_block, encoder_block};
@@ -11,8 +12,8 @@ use crate::events::Stage;
 const F32: f64 = 4.0;
 
 /// What the C library's heap holds for a byte of what a backward pass keeps: freed pieces below 32 MiB stay in it.
-/// Measured at 1.05 to 1.2 (docs/plan.md).
-const HEAP: f64 = 1.15;
+/// Measured at 1.05 to 1.22 (docs/plan.md).
+const HEAP: f64 = 1.2;
 
 /// Above this many values K-means asks the device for every distance instead of keeping a table.
 const MAX_KMEANS_TABLE: f64 = (1_u64 << 26) as f64;
@@ -32,15 +33,14 @@ pub struct UpdateSizes {
     pub scene: SceneSizes,
     /// Values of a scene's pictures, context and target.
     pub num_picture_values: f64,
+    /// The network of the perceptual loss on one target picture.
+    pub perceptual: Option<VggSizes>,
 }
 
 /// Most bytes of tensors alive during an update, weights and optimiser included.
 pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
     let parameters = Parameters::of(config);
-    let trained = match sizes.stage {
-        Stage::Stage2 => parameters.condenser + parameters.renderer,
-        _ => parameters.encoder + parameters.renderer,
-    } as f64;
+    let trained = parameters.trained(sizes.stage) as f64;
     let parts = parts(config, sizes);
     let pictures = sizes.num_scenes * sizes.num_picture_values;
     let earlier = if sizes.is_accumulated { trained } else { 0.0 };
@@ -48,7 +48,7 @@ pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
     // Gradients, and a few copies of the largest matrix on the way to its update.
     let optimizer = trained + 5.0 * largest_matrix(config);
     // Weights, and two moments of those that train.
-    let standing = parameters.total as f64 + 2.0 * trained;
+    let standing = parameters.total as f64 + sizes.perceptual.map_or(0.0, |vgg| vgg.parameters) + 2.0 * trained;
     F32 * (standing + backward.max(optimizer))
 }
 
@@ -87,8 +87,10 @@ fn parts(config: &ModelConfig, sizes: &UpdateSizes) -> Vec<Part> {
     parts.push(Part { kept: x, ..Part::default() });
     if let (Stage::Stage2, Some(stored)) = (stage, scene.num_storage_tokens) {
         let w = num_scenes * stored * dim;
-        let members = (x - w).max(0.0);
-        parts.push(Part { kept: members, ..Part::default() });
+        // The released networks read the tokens as they are, which are kept already.
+        let is_released = config.variant.is_released();
+        let members = if is_released { x } else { (x - w).max(0.0) };
+        parts.push(Part { kept: if is_released { 0.0 } else { members }, ..Part::default() });
         for _ in 0..config.condenser.num_blocks {
             parts.push(keeping(recompute, w, condenser_part(config, w, members)));
         }
@@ -116,6 +118,17 @@ fn parts(config: &ModelConfig, sizes: &UpdateSizes) -> Vec<Part> {
         forward: 4.0 * rgb,
         parameters: parameters as f64,
     });
+    if let Some(vgg) = sizes.perceptual {
+        let pictures = num_scenes * scene.num_targets;
+        // Layers are kept before and behind their ReLU; what the targets are in the network is there until the
+        // differences are; a convolution orders its input anew.
+        parts.push(Part {
+            kept: pictures * (2.0 * vgg.outputs + vgg.features),
+            working: pictures * 3.0 * vgg.widest,
+            forward: pictures * (2.0 * vgg.outputs + 2.0 * vgg.features + 2.0 * vgg.widest),
+            parameters: 0.0,
+        });
+    }
     parts
 }
 
@@ -135,11 +148,16 @@ fn forward_values(config: &ModelConfig, x: f64) -> f64 {
     x * (2.0 * widening(config)).max(4.0)
 }
 
+/// What the norms of the heads' queries and keys keep of `values` of them: before and after, and beside their values.
+fn head_norms(config: &ModelConfig, values: f64) -> f64 {
+    if config.variant.has_norms() { 2.5 * values } else { 0.0 }
+}
+
 fn encoder_part(config: &ModelConfig, x: f64) -> Part {
     let hidden = widening(config) * x;
     Part {
         // Input, queries, keys and values, attention's result, the second input, hidden values.
-        kept: 6.0 * x + hidden,
+        kept: 6.0 * x + hidden + head_norms(config, 2.0 * x),
         // The gradients of the sum and of the hidden values, and the norm computed again.
         working: 2.0 * x + hidden,
         forward: 6.0 * x + 2.0 * hidden,
@@ -155,7 +173,7 @@ fn decoder_part(config: &ModelConfig, y: f64, memory: f64, projected: f64) -> Pa
     // The gradient of what the views gathered, of what was projected, and of the tokens, added up over the blocks.
     let cross = 3.0 * y + memory + projected + projected - hidden;
     Part {
-        kept: of_views + memory,
+        kept: of_views + memory + head_norms(config, 3.0 * y + projected / 2.0),
         working: feed_forward.max(cross),
         forward: of_views + hidden + memory + projected,
         parameters: decoder_block(config) as f64,
@@ -165,7 +183,7 @@ fn decoder_part(config: &ModelConfig, y: f64, memory: f64, projected: f64) -> Pa
 fn condenser_part(config: &ModelConfig, w: f64, members: f64) -> Part {
     let hidden = widening(config) * w;
     Part {
-        kept: 10.0 * w + hidden + 2.0 * members,
+        kept: 10.0 * w + hidden + 2.0 * members + head_norms(config, 3.0 * w + members),
         working: (2.0 * w + hidden).max(3.0 * w + 3.0 * members - hidden),
         forward: 10.0 * w + 2.0 * hidden + 3.0 * members,
         parameters: condenser_block(config) as f64,
@@ -188,6 +206,8 @@ pub struct InferenceSizes {
     pub num_picture_values: f64,
     /// Weights that are read from a file into a network that is there already.
     pub num_loaded: f64,
+    /// The network of LPIPS on one picture, and how many targets' features are held.
+    pub lpips: Option<(VggSizes, f64)>,
 }
 
 /// Most bytes of tensors alive while `parameters` weights encode, cluster and draw a scene.
@@ -205,8 +225,15 @@ pub fn inference_bytes(config: &ModelConfig, parameters: f64, sizes: &InferenceS
     });
     // Keys and values of one block, and the views' hidden values.
     let render = if sizes.num_targets > 0.0 { 3.0 * x + y + forward_values(config, y) } else { 0.0 };
-    let working = sizes.num_picture_values + encode.max(kmeans).max(render);
-    F32 * (parameters + working.max(sizes.num_loaded))
+    // What the pictures are in its layers, unit vectors of it, and one layer computed from another.
+    let (lpips, held) = sizes.lpips.map_or((0.0, 0.0), |(vgg, targets)| {
+        // Its file is whole in memory while its weights are taken out.
+        let drawing = targets * vgg.features + 2.0 * vgg.features + 3.0 * vgg.widest;
+        (drawing.max(vgg.parameters), vgg.parameters)
+    });
+    let working = sizes.num_picture_values + encode.max(kmeans).max(render).max(lpips);
+    // A file's bytes are there until its tensors are, and both until they have replaced others.
+    F32 * (parameters + held + working.max(2.0 * sizes.num_loaded))
 }
 
 #[cfg(test)]
@@ -223,7 +250,15 @@ mod tests {
             num_patches: 1024.0,
         };
         let num_picture_values = 5.0 * 256.0 * 256.0 * 3.0;
-        UpdateSizes { stage, num_scenes: 1.0, is_accumulated: false, recompute, scene, num_picture_values }
+        UpdateSizes {
+            stage,
+            num_scenes: 1.0,
+            is_accumulated: false,
+            recompute,
+            scene,
+            num_picture_values,
+            perceptual: None,
+        }
     }
 
     #[test]

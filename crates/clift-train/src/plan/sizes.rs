@@ -1,11 +1,13 @@
 //! The sizes that steps of a run have: those in the middle, the average, and the largest.
 
-use clift_eval::Variant;
+use clift_eval::{Sweep, Variant};
+use clift_eval::lpips::LPIPS_MIN_SIZE_PX;
 
 use super::counts::{Macs, SceneSizes};
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::Stage;
+use crate::held_out::sweep;
 
 /// Points along the range of shares of tokens that are averaged over.
 const NUM_SHARES: usize = 9;
@@ -86,12 +88,18 @@ pub fn largest(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> 
     stored(config, num_context, most as f64)
 }
 
-/// What an evaluation draws at every count of tokens: what is asked for, or all that a run has weights for.
-pub fn variants(config: &Config) -> Vec<Variant> {
-    if config.eval.variants.is_empty() {
-        return vec![Variant::Random, Variant::Kmeans, Variant::Clift];
-    }
-    config.eval.variants.clone()
+/// What an evaluation does with a scene: the variants asked for, or all that a run has weights for by itself.
+pub fn evaluated(config: &Config) -> Sweep {
+    let own = [Variant::Random, Variant::Kmeans, Variant::Clift];
+    let mut variants = config.eval.variants.clone();
+    // A condenser of tiles is another run's.
+    variants.retain(|variant| *variant != Variant::PatchClift);
+    sweep(config, config.eval.storage.clone(), if variants.is_empty() { own.to_vec() } else { variants })
+}
+
+/// Whether an evaluation measures LPIPS.
+pub fn measures_lpips(config: &Config) -> bool {
+    config.eval.lpips_path().is_some() && config.data.width.min(config.data.height) >= LPIPS_MIN_SIZE_PX
 }
 
 /// Encoder tokens of a scene.
