@@ -1,6 +1,7 @@
 //! What is done of a cluster cache: a temporary folder that a killed process leaves and the next goes on with.
 //!
-//! Every set of contexts is a line of `journal.jsonl`, written after its bytes in `clusters.bin` and with their checksum.
+//! Every set of contexts is a line of `journal.jsonl`, written after its bytes in `clusters.bin` and with a checksum of
+//! both.
 //! What a kill or a power cut tore is found by that and made again.
 
 use std::collections::BTreeMap;
@@ -33,10 +34,29 @@ pub(crate) struct Origin {
 
 /// A further line: what became of one set.
 #[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Line {
+    /// Number of the set.
+    set: u64,
+    outcome: Outcome,
+    /// Of number and outcome as they are written here, and of the set's bytes.
+    crc32: u32,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-enum Line {
-    Clustered { entry: Entry, crc32: u32 },
+enum Outcome {
+    Clustered(Entry),
     Skipped { key: String, reason: String },
+}
+
+impl Line {
+    fn new(set: u64, outcome: Outcome, bytes: &[u8]) -> serde_json::Result<Self> {
+        let mut hasher = crc32fast::Hasher::new();
+        hasher.update(&serde_json::to_vec(&(set, &outcome))?);
+        hasher.update(bytes);
+        Ok(Self { set, outcome, crc32: hasher.finalize() })
+    }
 }
 
 /// A cache that is being made.
@@ -90,18 +110,21 @@ impl Journal {
             if !text.ends_with(b"\n") {
                 break;
             }
-            match serde_json::from_slice(&text) {
-                Ok(Line::Clustered { entry, crc32 }) if entry.offset_bytes == num_bytes => {
-                    let mut bytes = Vec::new();
-                    Read::by_ref(&mut data).take(entry.num_bytes()).read_to_end(&mut bytes)?;
-                    if bytes.len() as u64 != entry.num_bytes() || crc32fast::hash(&bytes) != crc32 {
-                        break;
-                    }
+            let Ok(Line { set, outcome, crc32 }) = serde_json::from_slice(&text) else { break };
+            let mut bytes = Vec::new();
+            if let Outcome::Clustered(entry) = &outcome {
+                Read::by_ref(&mut data).take(entry.num_bytes()).read_to_end(&mut bytes)?;
+            }
+            let expected = Line::new((entries.len() + skipped.len()) as u64, outcome, &bytes)?;
+            if (set, crc32) != (expected.set, expected.crc32) {
+                break;
+            }
+            match expected.outcome {
+                Outcome::Clustered(entry) => {
                     num_bytes += entry.num_bytes();
                     entries.push(entry);
                 }
-                Ok(Line::Skipped { key, reason }) => skipped.push((key, reason)),
-                _ => break,
+                Outcome::Skipped { key, reason } => skipped.push((key, reason)),
             }
         }
         drop(reader);
@@ -131,7 +154,7 @@ impl Journal {
             offset_bytes: self.entries.last().map_or(0, |last| last.offset_bytes + last.num_bytes()),
         };
         self.data.write_all(&bytes).map_err(TrainError::io(WRITING, &self.folder.join(DATA)))?;
-        self.write_line(&Line::Clustered { entry: entry.clone(), crc32: crc32fast::hash(&bytes) })?;
+        self.write_outcome(Outcome::Clustered(entry.clone()), &bytes)?;
         self.entries.push(entry);
         Ok(())
     }
@@ -141,9 +164,14 @@ impl Journal {
     /// # Errors
     /// [`TrainError::Io`].
     pub fn skip(&mut self, key: &str, reason: &str) -> Result<(), TrainError> {
-        self.write_line(&Line::Skipped { key: key.into(), reason: reason.into() })?;
+        self.write_outcome(Outcome::Skipped { key: key.into(), reason: reason.into() }, &[])?;
         self.skipped.push((key.into(), reason.into()));
         Ok(())
+    }
+
+    fn write_outcome(&mut self, outcome: Outcome, bytes: &[u8]) -> Result<(), TrainError> {
+        let line = Line::new(self.num_sets(), outcome, bytes);
+        self.write_line(&line.map_err(TrainError::bad_file("cluster cache", &self.folder.join(JOURNAL)))?)
     }
 
     fn write_line(&mut self, line: &impl Serialize) -> Result<(), TrainError> {
@@ -208,6 +236,9 @@ fn encode(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {
 
 #[cfg(test)]
 mod tests {
+    use clift_data::order::item_rng;
+    use rand::RngExt;
+
     use super::*;
 
     fn origin() -> Origin {
@@ -276,6 +307,40 @@ mod tests {
         std::fs::write(folder.join(DATA), data).unwrap();
         assert_eq!(Journal::open(&folder, origin()).unwrap().num_sets(), 1);
         assert_eq!(finished(place.path()), expected);
+    }
+
+    #[test]
+    fn what_is_taken_up_of_a_journal_damaged_anyhow_is_whole_and_the_first_of_it() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("clusters.tmp");
+        go_on(&mut Journal::open(&folder, origin()).unwrap(), 6);
+        let files = [DATA, JOURNAL].map(|name| std::fs::read(folder.join(name)).unwrap());
+        let whole = Journal::open(&folder, origin()).unwrap();
+        let mut taken_up = BTreeMap::new();
+        for case in 0..2_000 {
+            let mut rng = item_rng(0, 0, case, 0, "damage");
+            for (name, bytes) in [DATA, JOURNAL].into_iter().zip(&files) {
+                let mut bytes = bytes.clone();
+                for _ in 0..rng.random_range(0..3) {
+                    let at = rng.random_range(0..bytes.len());
+                    match rng.random_range(0..4) {
+                        0 => bytes[at] ^= 1 << rng.random_range(0..8),
+                        1 => bytes[at] = b"\n\",{}0"[rng.random_range(0..6)],
+                        2 => drop(bytes.drain(at..(at + rng.random_range(1..40)).min(bytes.len()))),
+                        _ => bytes.extend_from_within(at..),
+                    }
+                }
+                std::fs::create_dir_all(&folder).unwrap();
+                std::fs::write(folder.join(name), bytes).unwrap();
+            }
+            let journal = Journal::open(&folder, origin()).unwrap();
+            assert_eq!(journal.entries, whole.entries[..journal.entries.len()], "case {case}");
+            assert_eq!(journal.skipped, whole.skipped[..journal.skipped.len()], "case {case}");
+            let data = std::fs::read(folder.join(DATA)).unwrap();
+            assert_eq!(data, files[0][..data.len()], "case {case}");
+            *taken_up.entry(journal.num_sets()).or_insert(0) += 1;
+        }
+        assert!(taken_up.keys().copied().eq(0..=6) && taken_up[&6] > 200, "{taken_up:?}");
     }
 
     #[test]
