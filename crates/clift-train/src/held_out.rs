@@ -309,4 +309,3 @@ pub(crate) fn sweep(config: &Config, storage: Vec<TokenCount>, variants: Vec<Var
         seed: derive_seed(*seed, "eval"),
     }
 }
-
