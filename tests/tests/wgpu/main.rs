@@ -76,12 +76,15 @@ fn every_operation_gives_what_the_cpu_gives() -> Result<(), Failure> {
 /// A tolerance that a wrong input passes is none.
 #[test]
 fn every_tolerance_notices_an_input_that_is_a_little_off() {
+    let mut passed = Vec::new();
     for case in cases() {
         let place = Place::new(&cpu());
         let expected = (case.run)(&place);
         assert!(Difference::of(&(case.run)(&place), &expected).is_zero(), "{}: not the same twice", case.operation);
         let wrong = Difference::of(&(case.run)(&place.wrong()), &expected);
-        let complaints = case.complaints(&wrong);
-        assert_eq!(complaints.len(), case.num_directions(), "{}: {wrong:?} passes", case.operation);
+        if case.complaints(&wrong).len() < case.num_directions() {
+            passed.push(format!("{}: {wrong:?}", case.operation));
+        }
     }
+    assert!(passed.is_empty(), "these pass:\n{}", passed.join("\n"));
 }

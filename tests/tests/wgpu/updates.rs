@@ -18,22 +18,22 @@ const LOSS: &str = "three sums over everything above";
 pub const CASES: &[Case] = &[
     Case {
         operation: "stage 1: loss, gradient norm, update; tokens dropped",
-        forward: 1e-4,
-        backward: Some(2e-4),
+        forward: 1e-5,
+        backward: Some(1e-4),
         reason: LOSS,
         run: |place| update(place, Stage::Stage1, 1, false),
     },
     Case {
         operation: "stage 1: in two parts, blocks computed again",
-        forward: 1e-4,
-        backward: Some(2e-4),
+        forward: 1e-5,
+        backward: Some(1e-4),
         reason: LOSS,
         run: |place| update(place, Stage::Stage1, 2, true),
     },
     Case {
         operation: "stage 2: loss, gradient norm, update; encoder frozen",
-        forward: 1e-4,
-        backward: Some(2e-4),
+        forward: 1e-5,
+        backward: Some(1e-4),
         reason: "the same through the condenser",
         run: |place| update(place, Stage::Stage2, 1, false),
     },
