@@ -6,7 +6,9 @@ use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use clift_data::camera::{Intrinsics, Pose};
 use clift_data::{Clip, Views};
 use clift_eval::{upload_cameras, upload_views};
-use clift_model::{Cameras, Init, ModelConfig, SceneClusters, Variant};
+use clift_model::{
+    Cameras, Clift, Condenser, CondenserConfig, Encoder, Init, LiftNorm, ModelConfig, Renderer, SceneClusters, Variant,
+};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -75,6 +77,17 @@ impl Place {
         make(&mut Init::new(7, &self.device)).map(&mut Move)
     }
 
+    /// All networks.
+    pub fn model(&self) -> Clift {
+        let config = network(Variant::Paper);
+        self.module(|init| Clift {
+            encoder: Encoder::new(&config, init),
+            renderer: Renderer::new(&config, init),
+            condenser: Condenser::new(&config, init),
+            lift_norm: LiftNorm::new(&config, init),
+        })
+    }
+
     /// A scene's clip: waves of colour, seen from places of an arc.
     pub fn clip(&self, scene: usize) -> Clip {
         let views = |places: [f64; VIEWS]| {
@@ -86,7 +99,7 @@ impl Place {
             if self.is_wrong {
                 images[0] ^= 32;
             }
-            let c2w = places.map(|place| pose(place + 0.1 * scene as f64 + f64::from(u8::from(self.is_wrong)) * 0.02));
+            let c2w = places.map(|place| pose(place + 0.1 * scene as f64 + f64::from(self.is_wrong) * 0.02));
             Views {
                 width,
                 height,
@@ -154,7 +167,7 @@ pub fn network(variant: Variant) -> ModelConfig {
         feed_forward_dim: 48,
         num_encoder_blocks: 1,
         num_renderer_blocks: 1,
-        condenser: clift_model::CondenserConfig::of(variant),
+        condenser: CondenserConfig::of(variant),
         ..ModelConfig::default()
     }
 }

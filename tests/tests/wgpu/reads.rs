@@ -33,7 +33,7 @@ impl Log for CountReads {
 /// Reads of the device while `work` runs.
 fn count<T>(device: &Device, work: impl FnOnce() -> T) -> (T, usize) {
     // A second test of this process may have been first.
-    drop(log::set_logger(&CountReads));
+    let _ = log::set_logger(&CountReads);
     device.sync().expect("the device works");
     NUM_READS.store(0, Ordering::Relaxed);
     log::set_max_level(LevelFilter::Trace);

@@ -76,7 +76,7 @@ fn encode(place: &Place, folder: &Path, storage: TokenStorage, num_tokens: usize
     let (source, _) = scenes::open(&config.data, Split::Test).expect("rooms are made");
     let reader = ClipReader { source, options: config.data.clip_options() };
 
-    let Clift { encoder, lift_norm, condenser, renderer } = model(place).valid();
+    let Clift { encoder, lift_norm, condenser, renderer } = place.model().valid();
     let trained = Trained { encoder, lift_norm, condenser: Some(condenser), renderer, device: place.plain() };
     let options = EncodeOptions {
         context: None,
@@ -89,15 +89,6 @@ fn encode(place: &Place, folder: &Path, storage: TokenStorage, num_tokens: usize
     Scene::read(&path).expect("what was written is read").0
 }
 
-fn model(place: &Place) -> Clift {
-    place.module(|init| Clift {
-        encoder: clift_model::Encoder::new(&network(Variant::Paper), init),
-        renderer: clift_model::Renderer::new(&network(Variant::Paper), init),
-        condenser: clift_model::Condenser::new(&network(Variant::Paper), init),
-        lift_norm: clift_model::LiftNorm::new(&network(Variant::Paper), init),
-    })
-}
-
 /// Draws a file that the CPU made from three cameras: from all tokens, and from those that selection chooses.
 fn draw(place: &Place, storage: TokenStorage) -> Values {
     let folder = tempfile::tempdir().expect("a folder");
@@ -105,7 +96,7 @@ fn draw(place: &Place, storage: TokenStorage) -> Values {
     let maker = if place.is_wrong() { maker.wrong() } else { maker };
     let scene = encode(&maker, folder.path(), storage, STORED);
     let weights_file = folder.path().join("model.safetensors");
-    weights::save(&model(&maker).valid(), &weights_file).expect("the folder takes a file");
+    weights::save(&maker.model().valid(), &weights_file).expect("the folder takes a file");
     let renderer = load_renderer(&scene, &weights_file, &place.plain()).expect("the scene's renderer");
     let mut viewer = Viewer::new(&scene, renderer, Preset::Scaled.rules(), &place.plain()).expect("finite rays");
     let between = |share: f64| {

@@ -2,7 +2,7 @@
 
 use burn::module::Module;
 use clift_eval::upload_pictures;
-use clift_model::{Clift, Clusters, RenderTokens, Variant};
+use clift_model::{Clift, Clusters, RenderTokens};
 use clift_train::Stage;
 use clift_train::config::OptimizerConfig;
 use clift_train::loss::Loss;
@@ -10,7 +10,7 @@ use clift_train::optim::adamw;
 use clift_train::step::{Learner, StageBatch, TokenChoice};
 
 use crate::modules::subsets;
-use crate::place::{Place, clusters, gradients, network, parameters};
+use crate::place::{Place, clusters, gradients, parameters};
 use crate::table::{Case, Named, Values};
 
 const LOSS: &str = "three sums over everything above";
@@ -43,12 +43,7 @@ const LEARNING_RATE: f64 = 1e-3;
 
 /// A model of a stage with its optimiser.
 pub fn learner(place: &Place, stage: Stage, recompute: bool) -> Learner {
-    let mut model = place.module(|init| Clift {
-        encoder: clift_model::Encoder::new(&network(Variant::Paper), init),
-        renderer: clift_model::Renderer::new(&network(Variant::Paper), init),
-        condenser: clift_model::Condenser::new(&network(Variant::Paper), init),
-        lift_norm: clift_model::LiftNorm::new(&network(Variant::Paper), init),
-    });
+    let mut model = place.model();
     match stage {
         Stage::Stage2 => model.encoder = model.encoder.no_grad(),
         _ => model.condenser = model.condenser.no_grad(),
