@@ -16,8 +16,13 @@ pub fn adamw(config: &OptimizerConfig) -> ModuleOptimizer {
         .init()
 }
 
-/// Norm of all gradients of a module together.
+/// Norm of all gradients of a module together, on the host.
 pub fn global_norm<M: Module>(module: &M, grads: &GradientsParams) -> f64 {
+    norm_on_device(module, grads).map_or(0.0, Tensor::into_scalar::<f64>)
+}
+
+/// Norm of all gradients of a module together, `[1]`, on their device; `None` where there is none.
+pub fn norm_on_device<M: Module>(module: &M, grads: &GradientsParams) -> Option<Tensor<1>> {
     struct Squares<'a> {
         grads: &'a GradientsParams,
         sums: Vec<Tensor<1>>,
@@ -31,11 +36,7 @@ pub fn global_norm<M: Module>(module: &M, grads: &GradientsParams) -> f64 {
     }
     let mut squares = Squares { grads, sums: Vec::new() };
     module.visit(&mut squares);
-    if squares.sums.is_empty() {
-        return 0.0;
-    }
-    // One transfer for all parameters.
-    Tensor::cat(squares.sums, 0).sum().sqrt().into_scalar::<f64>()
+    (!squares.sums.is_empty()).then(|| Tensor::cat(squares.sums, 0).sum().sqrt())
 }
 
 /// Scales all gradients of a module by `max_norm / norm` where `norm` is larger.

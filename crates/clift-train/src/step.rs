@@ -11,7 +11,7 @@ use clift_model::{Cameras, Clift, Clusters, Condenser, RenderTokens, SceneCluste
 
 use crate::TrainError;
 use crate::loss::{Loss, LossParts};
-use crate::optim::{clip_global_norm, global_norm};
+use crate::optim::{clip_global_norm, norm_on_device};
 use crate::recompute;
 
 /// What one update sees: clips with equal numbers of views, and which tokens the renderer is given.
@@ -110,23 +110,22 @@ impl Learner {
     ) -> Result<(Self, Update), TrainError> {
         let Self { model, mut optimizer, device, loss, recompute } = self;
         let mut accumulator = GradientsAccumulator::<Clift>::new();
-        let (mut total, mut mse) = (0.0, 0.0);
+        let mut read = ReadOnce::default();
         for part in batch.parts(accumulate) {
             let share = part.clips.len() as f64 / batch.clips.len() as f64;
             let shown = Shown::upload(&part, &device)?;
             let parts = if recompute {
                 recompute::backward(&model, &shown, &part.tokens, &loss, share, &mut accumulator)?
             } else {
-                let parts = loss_of(&model, &shown, &part.tokens, &loss)?;
-                let grads = parts.total.clone().mul_scalar(share).backward();
+                let LossParts { total, mse } = loss_of(&model, &shown, &part.tokens, &loss)?;
+                let grads = total.clone().mul_scalar(share).backward();
                 accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
-                parts
+                LossParts { total: total.inner(), mse: mse.inner() }
             };
-            total += share * parts.total.into_scalar::<f64>();
-            mse += share * parts.mse.into_scalar::<f64>();
+            read.add(share, parts);
         }
         let grads = accumulator.grads();
-        let grad_norm = global_norm(&model, &grads);
+        let Read { loss: total, mse, grad_norm } = read.finish(norm_on_device(&model, &grads))?;
         // Looked at before the update, so that a bad batch leaves no trace in the weights.
         let applied = accept(total, grad_norm);
         let model = if applied {
@@ -141,6 +140,39 @@ impl Learner {
     /// The model on its device without autodiff.
     pub fn inference_model(&self) -> Clift {
         self.model.valid()
+    }
+}
+
+/// The numbers that an update needs on the host. They stay on the device until all are there: every read waits for the
+/// work before it, and leaves a GPU without any until the host has queued more.
+#[derive(Default)]
+struct ReadOnce {
+    shares: Vec<f64>,
+    /// Loss and mean squared error of every part.
+    values: Vec<Tensor<1>>,
+}
+
+/// What [`ReadOnce`] gives.
+struct Read {
+    loss: f64,
+    mse: f64,
+    grad_norm: f64,
+}
+
+impl ReadOnce {
+    fn add(&mut self, share: f64, parts: LossParts) {
+        self.shares.push(share);
+        self.values.extend([parts.total, parts.mse]);
+    }
+
+    /// Losses of the whole batch, and the norm, which is zero where nothing is trained.
+    fn finish(mut self, grad_norm: Option<Tensor<1>>) -> Result<Read, TrainError> {
+        self.values.extend(grad_norm);
+        let values = Tensor::cat(self.values, 0).try_into_vec_as::<f64>();
+        let values = values.map_err(|error| TrainError::Device { reason: error.to_string() })?;
+        let (parts, norm) = values.split_at(2 * self.shares.len());
+        let of = |place: usize| parts.iter().skip(place).step_by(2).zip(&self.shares).map(|(v, share)| share * v).sum();
+        Ok(Read { loss: of(0), mse: of(1), grad_norm: norm.first().copied().unwrap_or(0.0) })
     }
 }
 

@@ -1,0 +1,82 @@
+//! Latent K-means.
+
+use burn::tensor::Tensor;
+use clift_model::kmeans::Fit;
+use clift_model::{KMeans, total_variance};
+
+use crate::place::{DIM, Place};
+use crate::table::{Case, Named, Values};
+
+pub const CASES: &[Case] = &[
+    Case {
+        operation: "K-means: cluster of every token, centroids",
+        forward: 0.0,
+        backward: None,
+        reason: "the nearest mean is the nearest by more than rounding",
+        run: |place| {
+            let mut values = scattered(place);
+            if place.is_wrong() {
+                // One token moves to where another cluster is.
+                let (first, second) = values.split_at_mut(DIM);
+                first.copy_from_slice(&second[..DIM]);
+            }
+            labels(&fit(place, values, 48, 6))
+        },
+    },
+    Case {
+        operation: "K-means: inertia, variance of all tokens",
+        forward: 1e-5,
+        backward: None,
+        reason: "squared distances of 4 from sums of 60: a digit is lost",
+        run: |place| {
+            let mut values = scattered(place);
+            if place.is_wrong() {
+                values[0] += 0.3;
+            }
+            let shape = [2, values.len() / DIM / 2, DIM];
+            let variance = total_variance(&place.tensor(values.clone(), shape)).expect("the device answers");
+            let inertia = fit(place, values, 48, 6).inertia;
+            named([("inertia", inertia), ("variance", variance)])
+        },
+    },
+    Case {
+        operation: "K-means: ties, more clusters than different tokens",
+        forward: 0.0,
+        backward: None,
+        reason: "whole numbers, of which every sum is exact; of equally near means the first is taken",
+        run: |place| {
+            // Four different tokens in each scene of 16, in no order; the first is another one where it is to be wrong.
+            let first = usize::from(place.is_wrong());
+            let kind = |i: usize| if i == 0 { first } else { i * (i + 1) / 2 % 4 };
+            let token = |i: usize| (0..DIM).map(move |d| (kind(i) * (d % 3)) as f32 - 1.0);
+            let values = (0..2 * 16).flat_map(token).collect();
+            labels(&fit(place, values, 16, 7))
+        },
+    },
+];
+
+/// Tokens of two scenes about six places each.
+fn scattered(place: &Place) -> Vec<f32> {
+    let noise = crate::place::values(place.random([2, 48, DIM], 3));
+    let centre = |i: usize| (i / DIM % 6 * 7 + i % DIM * 5) as f32;
+    noise.iter().enumerate().map(|(i, noise)| 2.0 * centre(i).sin() + 0.3 * *noise as f32).collect()
+}
+
+fn fit(place: &Place, values: Vec<f32>, num_tokens: usize, num_clusters: usize) -> Fit {
+    let tokens: Tensor<3> =
+        Tensor::from_data(burn::tensor::TensorData::new(values, [2, num_tokens, DIM]), &place.plain());
+    KMeans::default().fit(tokens, num_clusters, &[11, 12]).expect("finite tokens")
+}
+
+fn labels(fit: &Fit) -> Values {
+    let scenes = fit.clusters.scenes();
+    let numbers = |ids: &[u32]| ids.iter().copied().map(f64::from).collect::<Vec<_>>();
+    let assignment = scenes.iter().flat_map(|scene| numbers(scene.assignment())).collect();
+    let centroids = scenes.iter().flat_map(|scene| numbers(scene.centroid_index())).collect();
+    named([("assignment", assignment), ("centroids", centroids)])
+}
+
+fn named<const COUNT: usize>(tensors: [(&str, Vec<f64>); COUNT]) -> Values {
+    let forward: Named = tensors.into_iter().map(|(name, values)| (name.to_owned(), values)).collect();
+    Values { forward, ..Values::default() }
+}

@@ -1,0 +1,253 @@
+//! The operations of encoder and renderer, the blocks they make, and the two networks.
+
+use burn::nn::{LayerNorm, Linear};
+use burn::tensor::Tensor;
+use clift_model::attention::{SelfAttention, cross_sdpa, self_sdpa};
+use clift_model::block::{DecoderBlock, EncoderBlock};
+use clift_model::feed_forward::{Activation, FeedForward};
+use clift_model::linear::{linear, linear_of_gelu, linear_of_norm};
+use clift_model::patch::{patchify, unpatchify};
+use clift_model::rays::plucker;
+use clift_model::{Encoder, LiftNorm, RenderTokens, Renderer, Variant};
+use clift_train::loss::mse;
+
+use crate::place::{BATCH, DIM, NUM_TOKENS, Place, SIZE, VIEWS, network, values};
+use crate::table::{Case, Values};
+
+/// A product of vectors of a few dozen numbers in f32: the order of the sum moves the last two bits.
+const PRODUCT: &str = "sums of 32 to 72 products in another order";
+const SOFTMAX: &str = "the same, and another `exp` (a GPU's may be off by 3 units in the last place)";
+const BLOCK: &str = "a chain of those above";
+
+pub const CASES: &[Case] = &[
+    Case {
+        operation: "rays of every pixel",
+        forward: 1e-6,
+        backward: None,
+        reason: "a division, a root and three products: each may round another way",
+        run: |place| forward(plucker(&place.targets()).flatten(0, 4)),
+    },
+    Case {
+        operation: "pictures to patches and back",
+        forward: 0.0,
+        backward: None,
+        reason: "values are moved, not changed",
+        run: |place| {
+            let pictures = place.random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 1);
+            let patches = patchify(pictures, 8);
+            let back = unpatchify(patches.clone(), [VIEWS, SIZE[0], SIZE[1]], 8);
+            forward(Tensor::cat(vec![patches.flatten(0, 2), back.flatten(0, 4)], 0))
+        },
+    },
+    Case {
+        operation: "linear layer",
+        forward: 5e-6,
+        backward: Some(5e-6),
+        reason: PRODUCT,
+        run: |place| {
+            let layer = place.module(|init| init.linear(DIM, 48));
+            place.differentiate(&layer, [place.tokens(1)], |layer, [x]| linear(layer, x).flatten(0, 2))
+        },
+    },
+    Case {
+        operation: "linear layer of GELU",
+        forward: 1e-5,
+        backward: Some(1e-5),
+        reason: "the same, and an `erf` from a polynomial that is good to 1.5e-7",
+        run: |place| {
+            let layer = place.module(|init| init.linear(DIM, 48));
+            let x = place.tokens(1).mul_scalar(3.0);
+            place.differentiate(&layer, [x], |layer, [x]| linear_of_gelu(layer, x).flatten(0, 2))
+        },
+    },
+    Case {
+        operation: "linear layer of a layer norm",
+        forward: 5e-6,
+        backward: Some(1e-5),
+        reason: "the same, and two means over a row",
+        run: |place| {
+            let layers = place.module(|init| (init.layer_norm(DIM), init.linear(DIM, 48)));
+            place.differentiate(&layers, [place.tokens(1)], |(norm, layer), [x]| {
+                linear_of_norm(norm, layer, x).flatten(0, 2)
+            })
+        },
+    },
+    Case {
+        operation: "feed-forward network, GELU",
+        forward: 1e-5,
+        backward: Some(2e-5),
+        reason: BLOCK,
+        run: |place| feed_forward(place, Activation::Gelu),
+    },
+    Case {
+        operation: "feed-forward network, ReLU",
+        forward: 1e-5,
+        backward: Some(2e-5),
+        reason: BLOCK,
+        run: |place| feed_forward(place, Activation::Relu),
+    },
+    Case {
+        operation: "self-attention of packed projections",
+        forward: 5e-6,
+        backward: Some(2e-5),
+        reason: SOFTMAX,
+        run: |place| {
+            let packed = place.random([BATCH, NUM_TOKENS, 3 * DIM], 1).mul_scalar(2.0);
+            place.differentiate(&none(), [packed], |_, [packed]| self_sdpa(packed, 4).flatten(0, 2))
+        },
+    },
+    Case {
+        operation: "self-attention of 130 tokens, a width of 96",
+        forward: 5e-6,
+        backward: Some(2e-5),
+        reason: "the same with larger sums: sizes at which other kernels are chosen, and no multiple of a tile",
+        run: |place| {
+            let packed = place.random([1, 130, 3 * 96], 1).mul_scalar(2.0);
+            place.differentiate(&none(), [packed], |_, [packed]| self_sdpa(packed, 4).flatten(0, 2))
+        },
+    },
+    Case {
+        operation: "cross-attention of projections",
+        forward: 5e-6,
+        backward: Some(2e-5),
+        reason: SOFTMAX,
+        run: |place| {
+            let inputs = [place.tokens(1), place.random([BATCH, NUM_TOKENS, 2 * DIM], 2).mul_scalar(2.0)];
+            place.differentiate(&none(), inputs, |_, [query, key_value]| cross_sdpa(query, key_value, 4).flatten(0, 2))
+        },
+    },
+    Case {
+        operation: "self-attention layer",
+        forward: 1e-5,
+        backward: Some(5e-5),
+        reason: BLOCK,
+        run: |place| self_attention(place, Variant::Paper),
+    },
+    Case {
+        operation: "self-attention layer with norms of queries and keys",
+        forward: 1e-5,
+        backward: Some(5e-5),
+        reason: "the same, and a root mean square over the columns of a head",
+        run: |place| self_attention(place, Variant::ReleasedDl3dv),
+    },
+    Case {
+        operation: "layer norm behind the encoder",
+        forward: 5e-6,
+        backward: Some(1e-5),
+        reason: "two means over a row, by Burn's own kernel",
+        run: |place| {
+            let norm = place.module(|init| LiftNorm::new(&network(Variant::ReleasedDl3dv), init));
+            place.differentiate(&norm, [place.tokens(1)], |norm, [x]| norm.forward(x).flatten(0, 2))
+        },
+    },
+    Case {
+        operation: "encoder block",
+        forward: 1e-5,
+        backward: Some(5e-5),
+        reason: BLOCK,
+        run: |place| {
+            let block = place.module(|init| EncoderBlock::new(&network(Variant::Paper), init));
+            place.differentiate(&block, [place.tokens(1)], |block, [x]| block.forward(x).flatten(0, 2))
+        },
+    },
+    Case {
+        operation: "decoder block, two views of a scene",
+        forward: 1e-5,
+        backward: Some(5e-5),
+        reason: BLOCK,
+        run: |place| decoder_block(place, Variant::Paper),
+    },
+    Case {
+        operation: "decoder block with norms of queries and keys",
+        forward: 1e-5,
+        backward: Some(5e-5),
+        reason: BLOCK,
+        run: |place| decoder_block(place, Variant::ReleasedDl3dv),
+    },
+    Case {
+        operation: "encoder, from pictures",
+        forward: 1e-5,
+        backward: Some(5e-5),
+        reason: "sums of 576 products, rays of their own, and a block",
+        run: |place| {
+            let encoder = place.module(|init| Encoder::new(&network(Variant::Paper), init));
+            let context = place.context();
+            place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context).flatten(0, 2))
+        },
+    },
+    Case {
+        operation: "renderer, to pictures",
+        forward: 1e-5,
+        backward: Some(5e-5),
+        reason: "sums of 384 products, a block and a sigmoid",
+        run: |place| render(place, RenderTokens::from),
+    },
+    Case {
+        operation: "renderer, few tokens for each view",
+        forward: 1e-5,
+        backward: Some(5e-5),
+        reason: "the same; rows of tokens are gathered, and their gradients added",
+        run: |place| render(place, |tokens| RenderTokens::subsets(tokens, &subsets(5))),
+    },
+    Case {
+        operation: "renderer, most tokens for each view",
+        forward: 1e-5,
+        backward: Some(5e-5),
+        reason: "the same with rows of keys and values",
+        run: |place| render(place, |tokens| RenderTokens::subsets(tokens, &subsets(8))),
+    },
+    Case {
+        operation: "mean squared error",
+        forward: 1e-6,
+        backward: Some(1e-6),
+        reason: "a sum of 4,608 squares in another order",
+        run: |place| {
+            let truth = Place::new(&place.device).random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 2);
+            let rendering = place.random([BATCH, VIEWS * SIZE[0], SIZE[1] * 3], 1);
+            place.differentiate(&none(), [rendering], |_, [x]| mse(x.reshape(truth.dims()), truth.clone()))
+        },
+    },
+];
+
+/// No module at all.
+fn none() -> Vec<Linear> {
+    Vec::new()
+}
+
+/// A result without gradient.
+fn forward(result: Tensor<1>) -> Values {
+    Values { forward: vec![("result".into(), values(result.inner()))], ..Values::default() }
+}
+
+fn feed_forward(place: &Place, activation: Activation) -> Values {
+    let layers: (LayerNorm, FeedForward) =
+        place.module(|init| (init.layer_norm(DIM), FeedForward::with(activation, DIM, 48, init)));
+    place.differentiate(&layers, [place.tokens(1)], |(norm, feed_forward), [x]| {
+        feed_forward.forward(norm, x).flatten(0, 2)
+    })
+}
+
+fn self_attention(place: &Place, variant: Variant) -> Values {
+    let layers = place.module(|init| (init.layer_norm(DIM), SelfAttention::new(&network(variant), init)));
+    place.differentiate(&layers, [place.tokens(1)], |(norm, attention), [x]| attention.forward(norm, x).flatten(0, 2))
+}
+
+fn decoder_block(place: &Place, variant: Variant) -> Values {
+    let block = place.module(|init| DecoderBlock::new(&network(variant), init));
+    let inputs = [place.random([BATCH * VIEWS, 6, DIM], 1), place.tokens(2)];
+    place.differentiate(&block, inputs, |block, [x, tokens]| block.forward(x, block.memory(tokens)).flatten(0, 2))
+}
+
+fn render(place: &Place, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {
+    let renderer = place.module(|init| Renderer::new(&network(Variant::Paper), init));
+    let targets = place.targets();
+    place.differentiate(&renderer, [place.tokens(1)], |renderer, [tokens]| {
+        renderer.forward(choose(tokens), &targets).flatten(0, 4)
+    })
+}
+
+/// So many tokens for every view of every scene, some of them twice over all views.
+pub fn subsets(count: usize) -> Vec<Vec<Vec<u32>>> {
+    let subset = |start: usize| (0..count).map(|i| ((start + 5 * i) % NUM_TOKENS) as u32).collect();
+    (0..BATCH).map(|scene| (0..VIEWS).map(|view| subset(scene + 3 * view)).collect()).collect()
+}

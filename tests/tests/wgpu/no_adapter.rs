@@ -1,0 +1,47 @@
+//! What happens where a GPU was asked for and there is none.
+#![cfg(target_os = "linux")]
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use crate::REQUIRED;
+
+/// Runs a command that finds no driver, neither Vulkan's nor OpenGL's.
+fn without_adapter(command: &mut Command) -> (Option<i32>, String) {
+    for variable in ["VK_ICD_FILENAMES", "VK_DRIVER_FILES", "__EGL_VENDOR_LIBRARY_FILENAMES"] {
+        command.env(variable, "/nonexistent");
+    }
+    let Output { status, stdout, stderr } = command.output().expect("the command starts");
+    (status.code(), [stdout, stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat())
+}
+
+#[test]
+fn the_command_line_says_so_and_starts_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = folder.path().join("run");
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/tiny.toml");
+    let set = format!("run_dir={:?}", run.display().to_string());
+    for work in ["train", "bench"] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_clift-under-test"));
+        let (code, text) = without_adapter(command.arg(work).arg(&config).args(["--device", "wgpu", "--set", &set]));
+        assert_eq!(code, Some(2), "{work}: {text}");
+        assert!(text.contains("error: device `wgpu`: no adapter was found; install a Vulkan driver"), "{text}");
+        assert!(!text.contains("panicked"), "{text}");
+        assert!(!run.exists(), "{work} leaves no run behind");
+    }
+}
+
+#[test]
+fn the_suite_passes_by_unless_it_is_required() {
+    let this = || {
+        let mut command = Command::new(std::env::current_exe().expect("the path of this test"));
+        command.args(["--exact", "--nocapture", "every_operation_gives_what_the_cpu_gives"]).env_remove(REQUIRED);
+        command
+    };
+    let (code, text) = without_adapter(&mut this());
+    assert!(code == Some(0) && text.contains("not run: device `wgpu`: no adapter was found"), "{code:?}: {text}");
+    let (code, text) = without_adapter(this().env(REQUIRED, "1"));
+    assert_eq!(code, Some(101), "{text}");
+    assert!(text.contains("CLIFT_REQUIRE_WGPU is set and the suite cannot run: device `wgpu`: no adapter"), "{text}");
+    assert!(!text.contains("panicked"), "{text}");
+}

@@ -1,0 +1,117 @@
+//! A scene's way to a file and back to pictures.
+
+use std::path::Path;
+
+use burn::module::Module;
+use clift_data::{BoundedSampler, ClipReader, Split, SyntheticConfig};
+use clift_eval::TokenCount;
+use clift_model::viewer::load_renderer;
+use clift_model::{Clift, Preset, Scene, TokenStorage, Variant, ViewCamera, Viewer, weights};
+use clift_train::config::DataConfig;
+use clift_train::encode::{Budget, EncodeOptions};
+use clift_train::trained::Trained;
+use clift_train::{Config, scenes};
+
+use crate::cpu;
+use crate::place::{Place, SIZE, network};
+use crate::table::{Case, Values};
+
+pub const CASES: &[Case] = &[
+    Case {
+        operation: "scene: capture to `.clift` file",
+        forward: 5e-5,
+        backward: None,
+        reason: "encoder, clusters and condenser one after the other; the chosen patches are the same",
+        run: |place| {
+            let folder = tempfile::tempdir().expect("a folder");
+            let scene = encode(place, folder.path(), TokenStorage::F32, NO_PAIRS);
+            let ids = scene.token_ids.iter().copied().map(f64::from).collect();
+            let tokens = scene.tokens.iter().copied().map(f64::from).collect();
+            Values { forward: vec![("patches".into(), ids), ("tokens".into(), tokens)], ..Values::default() }
+        },
+    },
+    Case {
+        operation: "scene: f32 file to pictures, all tokens and some",
+        forward: 1e-5,
+        backward: None,
+        reason: "the renderer's; the same file for both devices",
+        run: |place| draw(place, TokenStorage::F32),
+    },
+    Case {
+        operation: "scene: f16 file to pictures",
+        forward: 1e-5,
+        backward: None,
+        reason: "the same: the host unpacks 16 bits",
+        run: |place| draw(place, TokenStorage::F16),
+    },
+    Case {
+        operation: "scene: int8 file to pictures",
+        forward: 1e-5,
+        backward: None,
+        reason: "the same: the host unpacks 8 bits",
+        run: |place| draw(place, TokenStorage::Int8),
+    },
+];
+
+/// So many clusters of the room's tokens leave none of exactly two. Both tokens of a pair are equally near to its mean,
+/// so that rounding decides which of them stands for it.
+const NO_PAIRS: usize = 3;
+/// So many tokens a file to be drawn has.
+const STORED: usize = 7;
+
+/// Encodes a synthetic room on the place's device, writes it and reads it back.
+fn encode(place: &Place, folder: &Path, storage: TokenStorage, num_tokens: usize) -> Scene {
+    let [height, width] = SIZE;
+    let synthetic = SyntheticConfig {
+        num_scenes: 2,
+        num_frames: 6,
+        height,
+        width,
+        seed: u64::from(place.is_wrong()),
+        ..SyntheticConfig::default()
+    };
+    let views = BoundedSampler { min_context: 2, max_context: 2, ..BoundedSampler::default() };
+    let data = DataConfig { height, width, synthetic, views, ..DataConfig::default() };
+    let config = Config { data, model: network(Variant::Paper), ..Config::default() };
+    let (source, _) = scenes::open(&config.data, Split::Test).expect("rooms are made");
+    let reader = ClipReader { source, options: config.data.clip_options() };
+
+    let Clift { encoder, lift_norm, condenser, renderer } = place.model().valid();
+    let trained = Trained { encoder, lift_norm, condenser: Some(condenser), renderer, device: place.plain() };
+    let options = EncodeOptions {
+        context: None,
+        budget: Budget::Tokens(TokenCount::Count(num_tokens)),
+        model_path: "suite".into(),
+    };
+    let encoded = trained.encode(&config, &reader, 0, &options).expect("a room is encoded");
+    let path = folder.join("room.clift");
+    encoded.scene.write(&path, storage).expect("the folder takes a file");
+    Scene::read(&path).expect("what was written is read").0
+}
+
+/// Draws a file that the CPU made from three cameras: from all tokens, and from those that selection chooses.
+fn draw(place: &Place, storage: TokenStorage) -> Values {
+    let folder = tempfile::tempdir().expect("a folder");
+    let maker = Place::new(&cpu());
+    let maker = if place.is_wrong() { maker.wrong() } else { maker };
+    let scene = encode(&maker, folder.path(), storage, STORED);
+    let weights_file = folder.path().join("model.safetensors");
+    weights::save(&maker.model().valid(), &weights_file).expect("the folder takes a file");
+    let renderer = load_renderer(&scene, &weights_file, &place.plain()).expect("the scene's renderer");
+    let mut viewer = Viewer::new(&scene, renderer, Preset::Scaled.rules(), &place.plain()).expect("finite rays");
+    let between = |share: f64| {
+        let [a, b] = [scene.context[0], scene.context[1]];
+        let c2w =
+            std::array::from_fn(|i| if i % 4 == 3 { (1.0 - share) * a.c2w[i] + share * b.c2w[i] } else { a.c2w[i] });
+        ViewCamera { c2w, ..a }
+    };
+    let path = [0.0, 0.3, 0.8].map(between);
+    let mut values = Values::default();
+    for (name, count) in [("all tokens", STORED), ("four tokens", 4)] {
+        let frames = viewer.draw(&path, SIZE[0], SIZE[1], count).expect("finite pictures");
+        let chosen = frames.iter().flat_map(|frame| frame.tokens.iter().flatten()).map(|&id| f64::from(id)).collect();
+        let pixels = frames.iter().flat_map(|frame| &frame.pixels).map(|&pixel| f64::from(pixel)).collect();
+        values.forward.extend([(format!("{name}, chosen"), chosen), (format!("{name}, pixels"), pixels)]);
+    }
+    values
+}

@@ -1,0 +1,134 @@
+//! The rows of the comparison: an operation, how far off it may be and why, and how far off it is.
+
+use std::time::Duration;
+
+use crate::place::Place;
+
+/// Something the model computes, in both directions.
+pub struct Case {
+    /// What it is.
+    pub operation: &'static str,
+    /// Most difference of results, over the largest of them.
+    pub forward: f64,
+    /// The same of gradients, each tensor over its own largest; `None` for what has none.
+    pub backward: Option<f64>,
+    /// Why there is a difference, and why no more.
+    pub reason: &'static str,
+    /// Computes it on a device, always from the same numbers.
+    pub run: fn(&Place) -> Values,
+}
+
+/// Named tensors on the host.
+pub type Named = Vec<(String, Vec<f64>)>;
+
+/// What a [`Case`] computes.
+#[derive(Default)]
+pub struct Values {
+    /// Results.
+    pub forward: Named,
+    /// Gradients.
+    pub backward: Named,
+}
+
+/// How far two devices are apart.
+#[derive(Debug)]
+pub struct Difference {
+    forward: Worst,
+    backward: Worst,
+}
+
+/// The tensor that is farthest off.
+#[derive(Debug, Default)]
+struct Worst {
+    error: f64,
+    name: String,
+}
+
+/// Gradients of which the largest entry is below this share of the largest of all are measured against that: those that
+/// are zero in exact arithmetic, such as of what is added to every score of a softmax, are nothing but rounding.
+const SMALLEST_SCALE: f64 = 1e-3;
+
+impl Difference {
+    /// Compares what two devices computed.
+    pub fn of(got: &Values, expected: &Values) -> Self {
+        Self {
+            forward: Worst::of(&got.forward, &expected.forward, 0.0),
+            backward: Worst::of(&got.backward, &expected.backward, SMALLEST_SCALE),
+        }
+    }
+
+    /// Whether there is none.
+    pub fn is_zero(&self) -> bool {
+        self.forward.error == 0.0 && self.backward.error == 0.0
+    }
+}
+
+impl Worst {
+    fn of(got: &Named, expected: &Named, smallest_scale: f64) -> Self {
+        assert_eq!(got.len(), expected.len(), "both devices give the same tensors");
+        let largest = |values: &[f64]| values.iter().fold(0.0_f64, |most, value| most.max(value.abs()));
+        let floor = smallest_scale * expected.iter().map(|(_, values)| largest(values)).fold(0.0, f64::max);
+        let errors = got.iter().zip(expected).map(|((name, got), (expected_name, expected))| {
+            assert_eq!((name, got.len()), (expected_name, expected.len()), "name and length of a tensor");
+            let apart = got.iter().zip(expected).map(|(a, b)| (a - b).abs());
+            // `f64::max` would pass over NaN.
+            let apart = apart.fold(0.0, |most, value| if value > most || value.is_nan() { value } else { most });
+            let error = if apart == 0.0 { 0.0 } else { apart / largest(expected).max(floor) };
+            Self { error, name: name.clone() }
+        });
+        errors.fold(
+            Self::default(),
+            |worst, next| if next.error > worst.error || next.error.is_nan() { next } else { worst },
+        )
+    }
+
+    fn is_within(&self, tolerance: f64) -> bool {
+        // Not for NaN either.
+        self.error <= tolerance
+    }
+}
+
+/// The table's first two lines.
+pub fn header() -> &'static str {
+    "| operation | forward | at most | backward | at most | seconds | why |\n|---|---|---|---|---|---|---|"
+}
+
+impl Case {
+    /// One line of the table.
+    pub fn row(&self, difference: &Difference, elapsed: Duration) -> String {
+        let backward = match self.backward {
+            Some(tolerance) => format!("{} | {tolerance:.0e}", shown(difference.backward.error)),
+            None => "- | -".into(),
+        };
+        let forward = format!("{} | {}", shown(difference.forward.error), shown_bound(self.forward));
+        let seconds = elapsed.as_secs_f64();
+        format!("| {} | {forward} | {backward} | {seconds:.1} | {} |", self.operation, self.reason)
+    }
+
+    /// What is too far off.
+    pub fn complaints(&self, difference: &Difference) -> Vec<String> {
+        let directions =
+            [("result", &difference.forward, Some(self.forward)), ("gradient", &difference.backward, self.backward)];
+        let too_far = directions.into_iter().filter_map(|(what, worst, tolerance)| {
+            let tolerance = tolerance?;
+            let Worst { error, name } = worst;
+            (!worst.is_within(tolerance)).then(|| {
+                format!("{}: the {what} `{name}` is off by {error:.1e}, more than {tolerance:.0e}", self.operation)
+            })
+        });
+        too_far.collect()
+    }
+
+    /// How many tolerances there are.
+    pub fn num_directions(&self) -> usize {
+        1 + usize::from(self.backward.is_some())
+    }
+}
+
+fn shown(error: f64) -> String {
+    if error == 0.0 { "0".into() } else { format!("{error:.1e}") }
+}
+
+fn shown_bound(tolerance: f64) -> String {
+    if tolerance == 0.0 { "0".into() } else { format!("{tolerance:.0e}") }
+}

@@ -1,0 +1,113 @@
+//! Whole updates by the same code that trains: loss, gradient, AdamW.
+
+use burn::module::Module;
+use clift_eval::upload_pictures;
+use clift_model::{Clift, Clusters, RenderTokens};
+use clift_train::Stage;
+use clift_train::config::OptimizerConfig;
+use clift_train::loss::Loss;
+use clift_train::optim::adamw;
+use clift_train::step::{Learner, StageBatch, TokenChoice};
+
+use crate::modules::subsets;
+use crate::place::{Place, clusters, gradients, parameters};
+use crate::table::{Case, Named, Values};
+
+const LOSS: &str = "three sums over everything above";
+
+pub const CASES: &[Case] = &[
+    Case {
+        operation: "stage 1: loss, gradient norm, update; tokens dropped",
+        forward: 1e-5,
+        backward: Some(1e-4),
+        reason: LOSS,
+        run: |place| update(place, Stage::Stage1, 1, false),
+    },
+    Case {
+        operation: "stage 1: in two parts, blocks computed again",
+        forward: 1e-5,
+        backward: Some(1e-4),
+        reason: LOSS,
+        run: |place| update(place, Stage::Stage1, 2, true),
+    },
+    Case {
+        operation: "stage 2: loss, gradient norm, update; encoder frozen",
+        forward: 1e-5,
+        backward: Some(1e-4),
+        reason: "the same through the condenser",
+        run: |place| update(place, Stage::Stage2, 1, false),
+    },
+];
+
+const LEARNING_RATE: f64 = 1e-3;
+
+/// A model of a stage with its optimiser.
+pub fn learner(place: &Place, stage: Stage, recompute: bool) -> Learner {
+    let mut model = place.model();
+    match stage {
+        Stage::Stage2 => model.encoder = model.encoder.no_grad(),
+        _ => model.condenser = model.condenser.no_grad(),
+    }
+    let optimizer = adamw(&OptimizerConfig::default());
+    Learner { model, optimizer, device: place.device.clone(), loss: Loss::default(), recompute }
+}
+
+/// What the stage sees.
+pub fn batch(place: &Place, stage: Stage) -> StageBatch {
+    let tokens = match stage {
+        Stage::Stage2 => TokenChoice::Clusters(clusters()),
+        _ => TokenChoice::Subsets(subsets(5)),
+    };
+    StageBatch { clips: place.clips(), tokens, skipped: Vec::new() }
+}
+
+/// Makes an update.
+pub fn step(learner: Learner, batch: &StageBatch, parts: usize) -> (Learner, clift_train::step::Update) {
+    let (learner, update) = learner.step(batch, parts, LEARNING_RATE.into(), 1.0).expect("the model takes the batch");
+    assert!(update.applied, "{update:?}");
+    (learner, update)
+}
+
+fn update(place: &Place, stage: Stage, parts: usize, recompute: bool) -> Values {
+    let batch = batch(place, stage);
+    let learner = learner(place, stage, recompute);
+    let mut backward = gradient(place, &learner.model, &batch);
+    let before = parameters(&learner.model);
+    let (learner, update) = step(learner, &batch, parts);
+    let after = parameters(&learner.model);
+    let moved = moved(&before, &after, &backward);
+    backward.extend(moved);
+    let numbers = [("loss", update.loss), ("mse", update.mse), ("gradient norm", update.grad_norm)];
+    Values { forward: numbers.map(|(name, value)| (name.to_owned(), vec![value])).into(), backward }
+}
+
+/// The gradient of every parameter, by hand.
+fn gradient(place: &Place, model: &Clift, batch: &StageBatch) -> Named {
+    let lift = model.lift(&place.context());
+    let tokens: RenderTokens = match &batch.tokens {
+        TokenChoice::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
+        TokenChoice::Clusters(clusters) => {
+            let index = Clusters::new(clusters.clone()).expect("equal counts").upload(&place.device);
+            model.condenser.forward(lift, &index).into()
+        }
+        TokenChoice::All => lift.into(),
+    };
+    let targets: Vec<_> = batch.clips.iter().map(|clip| &clip.target).collect();
+    let pictures = upload_pictures(&targets, &place.device).expect("equal sizes");
+    let loss = Loss::default().of(model.renderer.forward(tokens, &place.targets()), pictures).total;
+    gradients(model, &loss.backward())
+}
+
+/// By how much of the learning rate every weight has moved, times its gradient.
+///
+/// `AdamW`'s first update is the sign of the gradient, and where that is nothing but rounding, so is its sign.
+fn moved(before: &Named, after: &Named, gradients: &Named) -> Named {
+    let weights = before.iter().zip(after);
+    let moved = weights.filter_map(|((name, before), (_, after))| {
+        let (_, gradient) = gradients.iter().find(|(of, _)| of == name)?;
+        let moved = before.iter().zip(after).zip(gradient);
+        let moved = moved.map(|((before, after), gradient)| (after - before) / LEARNING_RATE * gradient);
+        Some((format!("update of {name}"), moved.collect()))
+    });
+    moved.collect()
+}
