@@ -161,22 +161,4 @@ mod found {
             DeviceType::Other => format!("Other({number})"),
         }
     }
-
-    #[cfg(test)]
-    mod tests {
-        use super::*;
-        use crate::adapter::max_tensor_bytes;
-        use crate::device::DeviceName;
-
-        #[test]
-        fn the_used_adapter_allows_what_the_open_device_does() {
-            let Ok(device) = DeviceName::Wgpu.open() else { return };
-            let adapters = adapters();
-            let used = adapters.iter().find(|adapter| adapter.is_used).expect("the device is one of them");
-            assert_eq!(max_tensor_bytes(&device), Some(used.limits.max_tensor_bytes()));
-            assert_eq!(device.supports_dtype(burn::tensor::DType::F16), used.has_f16);
-            // WebGPU's defaults are 128 MiB and 256 MiB.
-            assert!(used.limits.max_binding_bytes >= 128 << 20 && used.limits.max_buffer_bytes >= 256 << 20);
-        }
-    }
 }

@@ -248,7 +248,7 @@ fn composed_backward<B: MatmulKernels>(
 
 /// Scores held at once, over all scenes and heads: 64 MiB in f32. A scene of 4,096 tokens with 8
 /// heads is then worked off in chunks of 512 queries.
-const MAX_SCORES: usize = 1 << 24;
+pub const MAX_SCORES: usize = 1 << 24;
 
 /// Ranges of queries whose scores fit [`MAX_SCORES`] together.
 fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, num_keys: usize) -> Vec<(usize, usize)> {

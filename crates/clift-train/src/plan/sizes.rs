@@ -1,7 +1,7 @@
 //! The sizes that steps of a run have: those in the middle, the average, and the largest.
 
-use clift_eval::{Sweep, Variant};
 use clift_eval::lpips::LPIPS_MIN_SIZE_PX;
+use clift_eval::{Sweep, Variant};
 
 use super::counts::{Macs, SceneSizes};
 use crate::TrainError;

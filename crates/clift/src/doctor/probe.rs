@@ -56,7 +56,7 @@ pub fn probe(name: DeviceName, precision: Precision) -> Result<Probe, String> {
 
 fn probe_device(name: DeviceName, precision: Precision) -> Result<Probe, String> {
     let device = name.open().map_err(|error| error.to_string())?;
-    precision.check(&device).map_err(|error| error.to_string())?;
+    precision.check("precision", &device).map_err(|error| error.to_string())?;
     let _scope = precision.scope();
     let floats = [("f32", DType::F32), ("f16", DType::F16), ("bf16", DType::BF16), ("f64", DType::F64)];
     let dtypes = floats.into_iter().filter(|(_, dtype)| device.supports_dtype(*dtype)).map(|(name, _)| name).collect();
