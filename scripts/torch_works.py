@@ -1,7 +1,7 @@
-"""PyTorch's side of bench_pytorch.py: each piece of work done as fast as plain PyTorch does it on a CPU.
+"""PyTorch's side of bench_pytorch.py and gpu_bench.py: each piece of work done as fast as plain PyTorch does it.
 
-Not run by hand: bench_pytorch.py starts one process per measurement with a JSON object as its only argument, and reads
-a JSON object back. check_torch_works.py compares every way with the twin. Modules and training step are the twin's
+Not run by hand: they start one process per measurement with a JSON object as its only argument, and read a JSON object
+back. check_torch_works.py compares every way with the twin. Modules and training step are the twin's
 (clift_torch.py); what is written anew here is what the twin does slowly on purpose. Where PyTorch has more than one
 good way, each is a variant, and the driver times them all.
 
@@ -271,7 +271,8 @@ def make_renderer(size: Size) -> twin.Renderer:
 def render(size: Size, variant: str) -> Work:
     torch.backends.mha.set_fastpath_enabled(FAST_PATH[variant])
     renderer, side = make_renderer(size), size["side"]
-    memory, (intrinsics, c2w) = torch.randn(1, num_tokens(size), size["dim"]), cameras(1, 1, side)
+    count = size.get("render_tokens", num_tokens(size))
+    memory, (intrinsics, c2w) = torch.randn(1, count, size["dim"]), cameras(1, 1, side)
     return inference(lambda: renderer(memory, twin.plucker(intrinsics, c2w, side, side)))
 
 
@@ -385,16 +386,45 @@ def start_peak() -> None:
         file.write("5")
 
 
-def measure(work: Work, repeats: int, warmup: int) -> list[float]:
+def measure(work: Work, repeats: int, warmup: int, finish: Callable[[], None] = lambda: None) -> list[float]:
+    """Seconds of every repetition; `finish` waits for a device that queues its work."""
     for _ in range(warmup):
         work()
+    finish()
     start_peak()
     samples = []
     for _ in range(repeats):
         start = time.perf_counter()
         work()
+        finish()
         samples.append(time.perf_counter() - start)
     return samples
+
+
+def on_device(spec: dict[str, Any]) -> dict[str, Any]:
+    """A work on a device: `cuda`, `mps` or `cpu`, in `f32`, `tf32` (f32 with TF32 products) or `bf16` (autocast).
+
+    The whole step runs under autocast, its backward too: gradients have the types of their forward either way.
+    """
+    device, precision = spec["device"], spec["precision"]
+    torch.set_default_device(device)
+    torch.set_float32_matmul_precision("high" if precision == "tf32" else "highest")
+    is_cuda = device.startswith("cuda")
+    finish = torch.cuda.synchronize if is_cuda else torch.mps.synchronize if device == "mps" else lambda: None
+    kind = device.split(":")[0]
+    # Rays stay f32, as ours do.
+    twin.plucker = torch.autocast(kind, enabled=False)(twin.plucker)
+    make, _ = WORKS[spec["work"]]
+    with torch.autocast(kind, dtype=torch.bfloat16, enabled=precision == "bf16"):
+        work = make(spec["size"], spec["variant"])
+        samples = measure(work, spec["repeats"], spec["warmup"], finish)
+    peak = torch.cuda.max_memory_allocated() if is_cuda else None
+    return {"samples_s": samples, "device_bytes": peak}
+
+
+def adapter(device: str) -> str:
+    """What a device calls itself."""
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else device
 
 
 def main() -> None:
@@ -403,6 +433,12 @@ def main() -> None:
     torch.manual_seed(0)
     if spec["work"] == "import":
         result = {}
+    elif spec["work"] == "where":
+        found = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
+        device = spec["device"] or found
+        result = {"device": device, "adapter": adapter(device), "torch": torch.__version__}
+    elif "device" in spec:
+        result = on_device(spec)
     elif spec["work"] == "versions":
         variants = {name: variants for name, (_, variants) in WORKS.items()}
         result = {"versions": versions(), "variants": variants}

@@ -31,6 +31,28 @@ fn thirty_steps_are_seventeen_a_kill_and_thirteen_with_any_number_of_loader_thre
 }
 
 #[test]
+fn training_with_f16_products_resumes_with_its_loss_scale() {
+    let place = Place::new();
+    let set: Vec<&str> = THIRTY.iter().copied().chain(["precision=\"f16\"", "eval.precision=\"f16\""]).collect();
+    place.train("whole", &set, &[]).ok();
+    killed_at("step/stage1/25", &place.train_args("parts", &set, &[]));
+    let message = place.train("parts", &THIRTY, &[]).fails(2);
+    assert!(message.contains("  precision: \"f16\" -> \"f32\"\n"), "{message}");
+    place.train("parts", &set, &[]).ok();
+    place.assert_same_run("parts", "whole");
+    let state = place.text("whole/stage2/checkpoints/step-000000030/state.json");
+    let state: serde_json::Value = serde_json::from_str(&state).expect("JSON");
+    assert_eq!(state["loss_scale"], serde_json::json!({"factor": 65536.0, "good_steps": 30}));
+
+    place.train("single", &THIRTY, &[]).ok();
+    let last_loss = |run: &str| place.metrics(run).last().expect("a step")["loss"].as_f64().expect("finite");
+    let apart = (last_loss("whole") / last_loss("single") - 1.0).abs();
+    assert!(apart > 0.0 && apart < 0.02, "halves round, and training goes where it went: {apart}");
+    let message = place.train("refused", &["precision=\"f16\""], &["--device", "ndarray"]).fails(2);
+    assert!(message.contains("`precision` = f16: the device has no f16"), "{message}");
+}
+
+#[test]
 fn a_killed_save_and_a_killed_rename_are_cleared_away() {
     let place = Place::new();
     place.train("whole", &THIRTY, &[]).ok();

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_model::TokenStorage;
+use clift_model::{Precision, TokenStorage};
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::measured::Variant;
@@ -45,6 +45,9 @@ pub struct EvalConfig {
     pub num_validation_scenes: usize,
     /// Token count of a stage-2 validation.
     pub validation_storage: TokenCount,
+    /// What the operands of matrix products are when scenes are encoded, condensed and drawn: `f32` or `f16`. K-means is
+    /// always f32.
+    pub precision: Precision,
 }
 
 impl EvalConfig {
@@ -98,6 +101,7 @@ impl Default for EvalConfig {
             every: 0,
             num_validation_scenes: 4,
             validation_storage: TokenCount::Share(0.125),
+            precision: Precision::F32,
         }
     }
 }

@@ -15,6 +15,7 @@ use burn::tensor::{Shape, Slice, Tensor, assert_shape};
 
 use crate::autodiff::register;
 use crate::flops::counted;
+use crate::precision::{MatmulKernels, Precision};
 
 mod layers;
 mod native;
@@ -34,7 +35,7 @@ pub fn self_sdpa(query_key_value: Tensor<3>, num_heads: usize) -> Tensor<3> {
     let [batch, count, packed] = query_key_value.dims();
     assert!(packed.is_multiple_of(3 * num_heads), "{num_heads} heads do not divide a third of {packed}");
     counted::add_attention(batch * count * count, packed / 3);
-    Tensor::from_dispatch(<Dispatch as AttentionOps>::self_sdpa(query_key_value.into_dispatch(), num_heads))
+    Tensor::from_dispatch(<Dispatch as AttentionOps>::self_sdpa(query_key_value.into_dispatch(), Heads::now(num_heads)))
 }
 
 /// Attention of every query to every key, like [`self_sdpa`].
@@ -49,34 +50,48 @@ pub fn cross_sdpa(query: Tensor<3>, key_value: Tensor<3>, num_heads: usize) -> T
     assert!(dim.is_multiple_of(num_heads), "{num_heads} heads do not divide a width of {dim}");
     counted::add_attention(batch * num_queries * num_keys, dim);
     let (query, key_value) = (query.into_dispatch(), key_value.into_dispatch());
-    Tensor::from_dispatch(<Dispatch as AttentionOps>::cross_sdpa(query, key_value, num_heads))
+    Tensor::from_dispatch(<Dispatch as AttentionOps>::cross_sdpa(query, key_value, Heads::now(num_heads)))
+}
+
+/// How attention is computed.
+#[derive(Clone, Copy, Debug)]
+pub struct Heads {
+    num_heads: usize,
+    precision: Precision,
+}
+
+impl Heads {
+    /// So many heads, in the precision of this thread now.
+    fn now(num_heads: usize) -> Self {
+        Self { num_heads, precision: Precision::current() }
+    }
 }
 
 /// The operations behind [`self_sdpa`] and [`cross_sdpa`] on a device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait AttentionOps: Backend {
     /// See [`self_sdpa`].
-    fn self_sdpa(query_key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self>;
+    fn self_sdpa(query_key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self>;
 
     /// See [`cross_sdpa`].
-    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self>;
+    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self>;
 }
 
 /// Both directions of attention on a device. The bodies here run on every one of them.
-pub trait AttentionKernels: Backend {
+pub trait AttentionKernels: MatmulKernels {
     /// The output, and what the backward can use besides it.
-    fn attend(inputs: &Projected<FloatTensor<Self>>, num_heads: usize) -> Attended<FloatTensor<Self>> {
-        Attended { output: forward::<Self>(split::<Self>(inputs), num_heads), log_sum: None }
+    fn attend(inputs: &Projected<FloatTensor<Self>>, heads: Heads) -> Attended<FloatTensor<Self>> {
+        Attended { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None }
     }
 
     /// The gradients of the inputs from that of the output.
     fn attend_backward(
         inputs: Projected<FloatTensor<Self>>,
         attended: Attended<FloatTensor<Self>>,
-        num_heads: usize,
+        heads: Heads,
         grad_output: FloatTensor<Self>,
     ) -> Projected<FloatTensor<Self>> {
-        composed_backward::<Self>(inputs, attended.output, num_heads, grad_output)
+        composed_backward::<Self>(inputs, attended.output, heads, grad_output)
     }
 }
 
@@ -106,16 +121,12 @@ pub struct Attended<T> {
 macro_rules! attention_ops {
     ($backend:ty) => {
         impl AttentionOps for $backend {
-            fn self_sdpa(query_key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self> {
-                Self::attend(&Projected::Packed(query_key_value), num_heads).output
+            fn self_sdpa(query_key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
+                Self::attend(&Projected::Packed(query_key_value), heads).output
             }
 
-            fn cross_sdpa(
-                query: FloatTensor<Self>,
-                key_value: FloatTensor<Self>,
-                num_heads: usize,
-            ) -> FloatTensor<Self> {
-                Self::attend(&Projected::Separate { query, key_value }, num_heads).output
+            fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
+                Self::attend(&Projected::Separate { query, key_value }, heads).output
             }
         }
     };
@@ -130,27 +141,27 @@ impl AttentionKernels for NdArray {}
 impl AttentionKernels for burn::backend::Cube {}
 
 impl<B: AttentionOps + AttentionKernels, C: CheckpointStrategy> AttentionOps for Autodiff<B, C> {
-    fn self_sdpa(query_key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self> {
+    fn self_sdpa(query_key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
         let (packed, node) = query_key_value.into_parts();
         match SdpaBackward.prepare::<C>([node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let state = attend::<B>(Projected::Packed(packed), num_heads);
+                let state = attend::<B>(Projected::Packed(packed), heads);
                 let output = state.attended.output.clone();
                 prep.finish(state, output)
             }
-            OpsKind::UnTracked(prep) => prep.finish(B::self_sdpa(packed, num_heads)),
+            OpsKind::UnTracked(prep) => prep.finish(B::self_sdpa(packed, heads)),
         }
     }
 
-    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, num_heads: usize) -> FloatTensor<Self> {
+    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
         let ((query, query_node), (key_value, key_value_node)) = (query.into_parts(), key_value.into_parts());
         match SdpaBackward.prepare::<C>([query_node, key_value_node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let state = attend::<B>(Projected::Separate { query, key_value }, num_heads);
+                let state = attend::<B>(Projected::Separate { query, key_value }, heads);
                 let output = state.attended.output.clone();
                 prep.finish(state, output)
             }
-            OpsKind::UnTracked(prep) => prep.finish(B::cross_sdpa(query, key_value, num_heads)),
+            OpsKind::UnTracked(prep) => prep.finish(B::cross_sdpa(query, key_value, heads)),
         }
     }
 }
@@ -162,23 +173,30 @@ struct SdpaBackward;
 struct SdpaState<T> {
     inputs: Projected<T>,
     attended: Attended<T>,
-    num_heads: usize,
+    heads: Heads,
 }
 
-fn attend<B: AttentionKernels>(inputs: Projected<FloatTensor<B>>, num_heads: usize) -> SdpaState<FloatTensor<B>> {
-    SdpaState { attended: B::attend(&inputs, num_heads), inputs, num_heads }
+fn attend<B: AttentionKernels>(inputs: Projected<FloatTensor<B>>, heads: Heads) -> SdpaState<FloatTensor<B>> {
+    SdpaState { attended: B::attend(&inputs, heads), inputs, heads }
 }
 
 impl<B: AttentionKernels> Backward<B, 1> for SdpaBackward {
     type State = SdpaState<FloatTensor<B>>;
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 1>(ops, grads, |SdpaState { inputs, attended, num_heads }, grad_output, _| {
-            match B::attend_backward(inputs, attended, num_heads, grad_output) {
+        register::<B, _, 1>(
+            ops,
+            grads,
+            |SdpaState { inputs, attended, heads }, grad_output, _| match B::attend_backward(
+                inputs,
+                attended,
+                heads,
+                grad_output,
+            ) {
                 Projected::Packed(grad) => [Some(grad)],
                 Projected::Separate { .. } => unreachable!("gradients come as the inputs did"),
-            }
-        });
+            },
+        );
     }
 }
 
@@ -186,12 +204,19 @@ impl<B: AttentionKernels> Backward<B, 2> for SdpaBackward {
     type State = SdpaState<FloatTensor<B>>;
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 2>(ops, grads, |SdpaState { inputs, attended, num_heads }, grad_output, _| {
-            match B::attend_backward(inputs, attended, num_heads, grad_output) {
+        register::<B, _, 2>(
+            ops,
+            grads,
+            |SdpaState { inputs, attended, heads }, grad_output, _| match B::attend_backward(
+                inputs,
+                attended,
+                heads,
+                grad_output,
+            ) {
                 Projected::Separate { query, key_value } => [Some(query), Some(key_value)],
                 Projected::Packed(_) => unreachable!("gradients come as the inputs did"),
-            }
-        });
+            },
+        );
     }
 }
 
@@ -208,13 +233,13 @@ fn split<B: Backend>(inputs: &Projected<FloatTensor<B>>) -> [FloatTensor<B>; 3] 
     }
 }
 
-fn composed_backward<B: Backend>(
+fn composed_backward<B: MatmulKernels>(
     inputs: Projected<FloatTensor<B>>,
     output: FloatTensor<B>,
-    num_heads: usize,
+    heads: Heads,
     grad_output: FloatTensor<B>,
 ) -> Projected<FloatTensor<B>> {
-    let [query, key, value] = backward::<B>(split::<B>(&inputs), output, num_heads, grad_output);
+    let [query, key, value] = backward::<B>(split::<B>(&inputs), output, heads, grad_output);
     match inputs {
         Projected::Packed(_) => Projected::Packed(B::float_cat(vec![query, key, value], 2)),
         Projected::Separate { .. } => Projected::Separate { query, key_value: B::float_cat(vec![key, value], 2) },
@@ -223,7 +248,7 @@ fn composed_backward<B: Backend>(
 
 /// Scores held at once, over all scenes and heads: 64 MiB in f32. A scene of 4,096 tokens with 8
 /// heads is then worked off in chunks of 512 queries.
-const MAX_SCORES: usize = 1 << 24;
+pub const MAX_SCORES: usize = 1 << 24;
 
 /// Ranges of queries whose scores fit [`MAX_SCORES`] together.
 fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, num_keys: usize) -> Vec<(usize, usize)> {
@@ -231,25 +256,28 @@ fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, num_keys: us
     (0..num_queries).step_by(chunk).map(|start| (start, (start + chunk).min(num_queries))).collect()
 }
 
-fn forward<B: Backend>([query, key, value]: [FloatTensor<B>; 3], num_heads: usize) -> FloatTensor<B> {
+fn forward<B: MatmulKernels>(
+    [query, key, value]: [FloatTensor<B>; 3],
+    Heads { num_heads, precision }: Heads,
+) -> FloatTensor<B> {
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
     let query = split_heads::<B>(B::float_mul_scalar(query, scale(dim, num_heads).into()), num_heads);
     let key_t = B::float_swap_dims(split_heads::<B>(key, num_heads), 2, 3); // [B, H, E, K]
     let value = split_heads::<B>(value, num_heads);
     let chunks = query_chunks(batch, num_heads, num_queries, num_keys).into_iter().map(|range| {
-        let scores = B::float_matmul(rows::<B>(&query, range), key_t.clone()); // [B, H, chunk, K]
-        B::float_matmul(B::softmax(scores, 3), value.clone())
+        let scores = B::product(precision, rows::<B>(&query, range), key_t.clone()); // [B, H, chunk, K]
+        B::product(precision, B::softmax(scores, 3), value.clone())
     });
     merge_heads::<B>(concat::<B>(chunks.collect()))
 }
 
 /// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`,
 /// `dQ = s dS K`, `dK = s dS^T Q`, a chunk of queries at a time.
-fn backward<B: Backend>(
+fn backward<B: MatmulKernels>(
     [query, key, value]: [FloatTensor<B>; 3],
     output: FloatTensor<B>,
-    num_heads: usize,
+    Heads { num_heads, precision }: Heads,
     grad_output: FloatTensor<B>,
 ) -> [FloatTensor<B>; 3] {
     let [batch, num_queries, dim] = query.shape().dims();
@@ -274,13 +302,13 @@ fn backward<B: Backend>(
     for range in query_chunks(batch, num_heads, num_queries, num_keys) {
         let query = rows::<B>(&query, range);
         let grad_output = rows::<B>(&grad_output, range);
-        let weights = B::softmax(B::float_matmul(query.clone(), key_t.clone()), 3);
-        let grad_weights = B::float_matmul(grad_output.clone(), value_t.clone());
+        let weights = B::softmax(B::product(precision, query.clone(), key_t.clone()), 3);
+        let grad_weights = B::product(precision, grad_output.clone(), value_t.clone());
         let grad_scores = B::float_mul(weights.clone(), B::float_sub(grad_weights, rows::<B>(&delta, range)));
-        let grad_value = B::float_matmul(B::float_swap_dims(weights, 2, 3), grad_output);
+        let grad_value = B::product(precision, B::float_swap_dims(weights, 2, 3), grad_output);
         // The query carries the scale already.
-        let grad_key = B::float_matmul(B::float_swap_dims(grad_scores.clone(), 2, 3), query);
-        grad_query.push(B::float_matmul(grad_scores, key.clone()));
+        let grad_key = B::product(precision, B::float_swap_dims(grad_scores.clone(), 2, 3), query);
+        grad_query.push(B::product(precision, grad_scores, key.clone()));
         grad_key_value = Some(match grad_key_value {
             None => (grad_key, grad_value),
             Some((key_sum, value_sum)) => (B::float_add(key_sum, grad_key), B::float_add(value_sum, grad_value)),

@@ -95,13 +95,24 @@ fn open_wgpu() -> Result<Device, ModelError> {
 #[cfg(feature = "wgpu")]
 fn open_wgpu() -> Result<Device, ModelError> {
     use burn::tensor::{DeviceKind, DeviceType};
+
+    use crate::adapter::{ADAPTER_VARIABLE, adapters};
     // Asking wgpu for a device where there is no adapter panics, so look first.
-    let adapters = std::panic::catch_unwind(|| Device::enumerate(DeviceType::Wgpu).into_vec().len()).unwrap_or(0);
-    if adapters == 0 {
+    let num_adapters = std::panic::catch_unwind(|| Device::enumerate(DeviceType::Wgpu).into_vec().len()).unwrap_or(0);
+    if num_adapters == 0 {
         return Err(ModelError::NoDevice {
             name: "wgpu".into(),
             reason: "no adapter was found; install a Vulkan driver (for software rendering: Mesa's lavapipe)".into(),
         });
+    }
+    // It panics as well where the environment names an adapter that is not there.
+    if let Ok(chosen) = std::env::var(ADAPTER_VARIABLE) {
+        let adapters = std::panic::catch_unwind(adapters).unwrap_or_default();
+        if !adapters.iter().any(|adapter| adapter.is_used) {
+            let known: Vec<_> = adapters.iter().map(|adapter| adapter.selector.as_str()).collect();
+            let reason = format!("{ADAPTER_VARIABLE} is `{chosen}`; the adapters here are {}", known.join(", "));
+            return Err(ModelError::NoDevice { name: "wgpu".into(), reason });
+        }
     }
     Ok(Device::wgpu(DeviceKind::DefaultDevice))
 }

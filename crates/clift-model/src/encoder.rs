@@ -6,7 +6,7 @@ use burn::nn::Linear;
 use burn::tensor::Tensor;
 
 use crate::block::EncoderBlock;
-use crate::linear::linear;
+use crate::linear::linear_in_f32;
 use crate::patch::patchify;
 use crate::rays::plucker;
 use crate::{Init, ModelConfig, Views};
@@ -42,7 +42,7 @@ impl Encoder {
     /// What the first block starts from: the embedded patches, in the result's shape.
     pub fn embed(&self, context: &Views) -> Tensor<3> {
         let pixels = Tensor::cat(vec![context.images.clone(), plucker(&context.cameras)], 4); // [B, V, H, W, 9]
-        linear(&self.patch_embed, patchify(pixels, self.patch_size))
+        linear_in_f32(&self.patch_embed, patchify(pixels, self.patch_size))
     }
 
     /// The blocks after [`embed`](Self::embed).

@@ -6,6 +6,7 @@
 //!
 //! Modules take a [`burn::tensor::Device`]; all devices are named in [`device`].
 
+pub mod adapter;
 pub mod attention;
 mod autodiff;
 pub mod block;
@@ -29,6 +30,7 @@ pub mod linear;
 pub mod model;
 pub mod patch;
 pub mod patchwise;
+pub mod precision;
 pub mod qk_norm;
 pub mod rays;
 pub mod renderer;
@@ -53,6 +55,7 @@ pub use kmeans::{KMeans, total_variance};
 pub use lift_norm::LiftNorm;
 pub use model::Clift;
 pub use patchwise::{Grouping, tile_clusters};
+pub use precision::Precision;
 pub use renderer::{RenderTokens, Renderer, SceneMemory};
 pub use scene::{Scene, TokenKind, TokenStorage, WorldFrame};
 pub use select::{Preset, Rules, Selector, TokenRay};

@@ -20,6 +20,7 @@ use crate::feed_forward::GeluKernels;
 use crate::flex::{contiguous, is_native, tensor, values};
 use crate::flops::counted;
 use crate::layer_norm::{LayerNormKernels, NormState};
+use crate::precision::{MatmulKernels, Precision};
 
 /// `x W + b` of a layer with a bias.
 ///
@@ -30,7 +31,19 @@ use crate::layer_norm::{LayerNormKernels, NormState};
 /// # Panics
 /// When the layer has no bias.
 pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
-    apply(layer, x, false)
+    apply(layer, x, Before { gelu: false, precision: Precision::current() })
+}
+
+/// [`linear`] in f32 whatever the precision of this thread: for layers that take rays.
+///
+/// # Shapes
+/// - `x`: `[batch, count, inputs]`
+/// - returns `[batch, count, outputs]`
+///
+/// # Panics
+/// When the layer has no bias.
+pub fn linear_in_f32(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    apply(layer, x, Before { gelu: false, precision: Precision::F32 })
 }
 
 /// `gelu(x) W + b` with `gelu(x) = x Phi(x)` and the normal distribution function `Phi`.
@@ -42,7 +55,7 @@ pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
 /// # Panics
 /// When the layer has no bias.
 pub fn linear_of_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
-    apply(layer, x, true)
+    apply(layer, x, Before { gelu: true, precision: Precision::current() })
 }
 
 /// `norm(x) W + b` with `norm(x) = (x - mean) / sqrt(variance + 1e-5) * gamma + beta` over a row.
@@ -57,10 +70,19 @@ pub fn linear_of_norm(norm: &LayerNorm, layer: &Linear, x: Tensor<3>) -> Tensor<
     norm_then_linear(x, norm.gamma.val(), norm.beta.as_ref().expect("the norm has a bias").val(), layer)
 }
 
-fn apply(layer: &Linear, x: Tensor<3>, of_gelu: bool) -> Tensor<3> {
+/// What is done before a layer's bias is added.
+#[derive(Clone, Copy, Debug)]
+pub struct Before {
+    /// Whether the input goes through a GELU.
+    gelu: bool,
+    /// What the product is computed in.
+    precision: Precision,
+}
+
+fn apply(layer: &Linear, x: Tensor<3>, before: Before) -> Tensor<3> {
     let (weight, bias) = parameters(layer, &x);
     let [x, weight, bias] = [x.into_dispatch(), weight.into_dispatch(), bias.into_dispatch()];
-    Tensor::from_dispatch(<Dispatch as LinearOps>::linear_layer(x, weight, bias, of_gelu))
+    Tensor::from_dispatch(<Dispatch as LinearOps>::linear_layer(x, weight, bias, before))
 }
 
 /// [`linear_of_norm`] with the norm's parameters as tensors.
@@ -75,6 +97,7 @@ pub(crate) fn norm_then_linear(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>, 
         beta.into_dispatch(),
         weight.into_dispatch(),
         bias.into_dispatch(),
+        Precision::current(),
     ))
 }
 
@@ -96,7 +119,7 @@ pub trait LinearOps: Backend {
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
-        of_gelu: bool,
+        before: Before,
     ) -> FloatTensor<Self>;
 
     /// See [`linear_of_norm`].
@@ -106,14 +129,20 @@ pub trait LinearOps: Backend {
         beta: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
+        precision: Precision,
     ) -> FloatTensor<Self>;
 }
 
 /// The parts of the operation on a device. The bodies here run on every one of them.
-pub trait LinearKernels: GeluKernels + LayerNormKernels {
+pub trait LinearKernels: GeluKernels + LayerNormKernels + MatmulKernels {
     /// `x W + b`: `[B, N, I] -> [B, N, O]`
-    fn linear_output(x: FloatTensor<Self>, weight: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self> {
-        output::<Self>(x, weight, bias)
+    fn linear_output(
+        precision: Precision,
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+    ) -> FloatTensor<Self> {
+        output::<Self>(precision, x, weight, bias)
     }
 
     /// Sum over rows: `[B, N, O] -> [O]`
@@ -122,10 +151,15 @@ pub trait LinearKernels: GeluKernels + LayerNormKernels {
     }
 }
 
-fn output<B: Backend>(x: FloatTensor<B>, weight: FloatTensor<B>, bias: FloatTensor<B>) -> FloatTensor<B> {
+fn output<B: MatmulKernels>(
+    precision: Precision,
+    x: FloatTensor<B>,
+    weight: FloatTensor<B>,
+    bias: FloatTensor<B>,
+) -> FloatTensor<B> {
     let [batch, count, _] = x.shape().dims();
     let [_, outputs] = weight.shape().dims();
-    let product = B::float_matmul(rows::<B>(x), weight); // [BN, O]
+    let product = B::product(precision, rows::<B>(x), weight); // [BN, O]
     let bias = B::float_expand(B::float_reshape(bias, Shape::new([1, outputs])), product.shape());
     B::float_reshape(B::float_add(product, bias), Shape::new([batch, count, outputs]))
 }
@@ -143,9 +177,14 @@ fn rows<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
 }
 
 impl LinearKernels for Flex {
-    fn linear_output(x: FloatTensor<Self>, weight: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self> {
-        if !is_native(&x) {
-            return output::<Self>(x, weight, bias);
+    fn linear_output(
+        precision: Precision,
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+    ) -> FloatTensor<Self> {
+        if !is_native(&x) || precision != Precision::F32 {
+            return output::<Self>(precision, x, weight, bias);
         }
         let [batch, count, inputs] = x.shape().dims();
         let [_, outputs] = weight.shape().dims();
@@ -175,9 +214,9 @@ fn forward<B: LinearKernels>(
     x: FloatTensor<B>,
     weight: FloatTensor<B>,
     bias: FloatTensor<B>,
-    of_gelu: bool,
+    before: Before,
 ) -> FloatTensor<B> {
-    B::linear_output(if of_gelu { B::gelu_output(x) } else { x }, weight, bias)
+    B::linear_output(before.precision, if before.gelu { B::gelu_output(x) } else { x }, weight, bias)
 }
 
 macro_rules! linear_ops {
@@ -187,9 +226,9 @@ macro_rules! linear_ops {
                 x: FloatTensor<Self>,
                 weight: FloatTensor<Self>,
                 bias: FloatTensor<Self>,
-                of_gelu: bool,
+                before: Before,
             ) -> FloatTensor<Self> {
-                forward::<Self>(x, weight, bias, of_gelu)
+                forward::<Self>(x, weight, bias, before)
             }
 
             fn norm_then_linear(
@@ -198,9 +237,10 @@ macro_rules! linear_ops {
                 beta: FloatTensor<Self>,
                 weight: FloatTensor<Self>,
                 bias: FloatTensor<Self>,
+                precision: Precision,
             ) -> FloatTensor<Self> {
                 let (normal, _statistics) = Self::norm_output(x, gamma, beta);
-                Self::linear_output(normal, weight, bias)
+                Self::linear_output(precision, normal, weight, bias)
             }
         }
     };
@@ -215,16 +255,16 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
-        of_gelu: bool,
+        before: Before,
     ) -> FloatTensor<Self> {
         let ((x, x_node), (weight, weight_node), (bias, bias_node)) =
             (x.into_parts(), weight.into_parts(), bias.into_parts());
         match LinearBackward.prepare::<C>([x_node, weight_node, bias_node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let output = forward::<B>(x.clone(), weight.clone(), bias, of_gelu);
-                prep.finish(LinearState { x, weight, of_gelu }, output)
+                let output = forward::<B>(x.clone(), weight.clone(), bias, before);
+                prep.finish(LinearState { x, weight, before }, output)
             }
-            OpsKind::UnTracked(prep) => prep.finish(forward::<B>(x, weight, bias, of_gelu)),
+            OpsKind::UnTracked(prep) => prep.finish(forward::<B>(x, weight, bias, before)),
         }
     }
 
@@ -234,6 +274,7 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
         beta: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
+        precision: Precision,
     ) -> FloatTensor<Self> {
         let ((x, x_node), (gamma, gamma_node), (beta, beta_node)) =
             (x.into_parts(), gamma.into_parts(), beta.into_parts());
@@ -242,10 +283,13 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
         match NormLinearBackward.prepare::<C>(nodes).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
                 let (normal, statistics) = B::norm_output(x.clone(), gamma.clone(), beta.clone());
-                let output = B::linear_output(normal, weight.clone(), bias);
-                prep.finish(NormLinearState { norm: NormState { x, gamma, statistics }, beta, weight }, output)
+                let output = B::linear_output(precision, normal, weight.clone(), bias);
+                prep.finish(
+                    NormLinearState { norm: NormState { x, gamma, statistics }, beta, weight, precision },
+                    output,
+                )
             }
-            OpsKind::UnTracked(prep) => prep.finish(B::norm_then_linear(x, gamma, beta, weight, bias)),
+            OpsKind::UnTracked(prep) => prep.finish(B::norm_then_linear(x, gamma, beta, weight, bias, precision)),
         }
     }
 }
@@ -257,7 +301,7 @@ struct LinearBackward;
 struct LinearState<T> {
     x: T,
     weight: T,
-    of_gelu: bool,
+    before: Before,
 }
 
 impl<B: LinearKernels> Backward<B, 3> for LinearBackward {
@@ -265,16 +309,17 @@ impl<B: LinearKernels> Backward<B, 3> for LinearBackward {
 
     /// With `a = x` or `gelu(x)`: `dW = a^T dO`, `db = sum dO`, `da = dO W^T`.
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 3>(ops, grads, |LinearState { x, weight, of_gelu }, grad, wanted| {
+        register::<B, _, 3>(ops, grads, |LinearState { x, weight, before }, grad, wanted| {
+            let Before { gelu, precision } = before;
             let [of_x, of_weight, of_bias] = wanted;
             let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
             let grad_weight = of_weight.then(|| {
-                let activation = if of_gelu { B::gelu_output(x.clone()) } else { x.clone() };
-                grad_of_weight::<B>(activation, grad.clone())
+                let activation = if gelu { B::gelu_output(x.clone()) } else { x.clone() };
+                grad_of_weight::<B>(precision, activation, grad.clone())
             });
             let grad_x = of_x.then(|| {
-                let grad = grad_of_input::<B>(grad, weight);
-                if of_gelu { B::gelu_grad(x, grad) } else { grad }
+                let grad = grad_of_input::<B>(precision, grad, weight);
+                if gelu { B::gelu_grad(x, grad) } else { grad }
             });
             [grad_x, grad_weight, grad_bias]
         });
@@ -289,6 +334,7 @@ struct NormLinearState<T> {
     norm: NormState<T>,
     beta: T,
     weight: T,
+    precision: Precision,
 }
 
 impl<B: LinearKernels> Backward<B, 5> for NormLinearBackward {
@@ -296,15 +342,15 @@ impl<B: LinearKernels> Backward<B, 5> for NormLinearBackward {
 
     /// As for [`LinearBackward`] with `a = norm(x)`, and `da` handed on through the norm.
     fn backward(self, ops: Ops<Self::State, 5>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 5>(ops, grads, |NormLinearState { norm, beta, weight }, grad, wanted| {
+        register::<B, _, 5>(ops, grads, |NormLinearState { norm, beta, weight, precision }, grad, wanted| {
             let [of_x, of_gamma, of_beta, of_weight, of_bias] = wanted;
             let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
             let grad_weight = of_weight.then(|| {
                 let (normal, _statistics) = B::norm_output(norm.x.clone(), norm.gamma.clone(), beta);
-                grad_of_weight::<B>(normal, grad.clone())
+                grad_of_weight::<B>(precision, normal, grad.clone())
             });
             let [grad_x, grad_gamma, grad_beta] = if of_x || of_gamma || of_beta {
-                B::norm_backward(norm, grad_of_input::<B>(grad, weight)).map(Some)
+                B::norm_backward(norm, grad_of_input::<B>(precision, grad, weight)).map(Some)
             } else {
                 [None, None, None]
             };
@@ -314,14 +360,18 @@ impl<B: LinearKernels> Backward<B, 5> for NormLinearBackward {
 }
 
 /// `x^T grad`: `[I, O]`
-fn grad_of_weight<B: Backend>(x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
-    B::float_matmul(B::float_swap_dims(rows::<B>(x), 0, 1), rows::<B>(grad))
+fn grad_of_weight<B: MatmulKernels>(precision: Precision, x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
+    B::product(precision, B::float_swap_dims(rows::<B>(x), 0, 1), rows::<B>(grad))
 }
 
 /// `grad W^T`: `[B, N, O] -> [B, N, I]`
-fn grad_of_input<B: Backend>(grad: FloatTensor<B>, weight: FloatTensor<B>) -> FloatTensor<B> {
+fn grad_of_input<B: MatmulKernels>(
+    precision: Precision,
+    grad: FloatTensor<B>,
+    weight: FloatTensor<B>,
+) -> FloatTensor<B> {
     let [batch, count, _] = grad.shape().dims();
     let [inputs, _] = weight.shape().dims();
-    let product = B::float_matmul(rows::<B>(grad), B::float_swap_dims(weight, 0, 1));
+    let product = B::product(precision, rows::<B>(grad), B::float_swap_dims(weight, 0, 1));
     B::float_reshape(product, Shape::new([batch, count, inputs]))
 }

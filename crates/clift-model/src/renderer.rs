@@ -6,7 +6,7 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Int, Tensor, TensorData, activation::sigmoid};
 
 use crate::block::DecoderBlock;
-use crate::linear::{linear, linear_of_norm};
+use crate::linear::{linear_in_f32, linear_of_norm};
 use crate::patch::{patchify, unpatchify};
 use crate::rays::plucker;
 use crate::{Cameras, Init, ModelConfig};
@@ -68,7 +68,7 @@ impl Renderer {
     /// What the first block starts from: the embedded rays of every patch, `[batch * views, num_queries, dim]`.
     pub fn embed(&self, targets: &Cameras) -> Tensor<3> {
         let [batch, views] = targets.dims();
-        let rays = linear(&self.ray_embed, patchify(plucker(targets), self.patch_size)); // [B, TQ, D]
+        let rays = linear_in_f32(&self.ray_embed, patchify(plucker(targets), self.patch_size)); // [B, TQ, D]
         let [_, queries, dim] = rays.dims();
         rays.reshape([batch * views, queries / views, dim])
     }

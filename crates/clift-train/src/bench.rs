@@ -6,6 +6,7 @@
 mod clustering;
 pub(crate) mod context;
 mod forward;
+pub mod half;
 pub(crate) mod inputs;
 pub(crate) mod reference;
 mod selection;
@@ -18,6 +19,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clift_eval::{TokenCount, memory, statistics};
+use clift_model::Precision;
 use clift_model::device::DeviceName;
 use serde::Serialize;
 
@@ -44,6 +46,8 @@ pub struct BenchOptions {
     pub error: bool,
     /// Tokens that are stored.
     pub storage: TokenCount,
+    /// Tokens that a view is drawn from; `None` for all of a scene.
+    pub render: Option<TokenCount>,
     /// A safetensors file whose tensor `features`, `[N, D]` in f32, K-means clusters.
     pub features: Option<PathBuf>,
 }
@@ -53,6 +57,8 @@ pub struct BenchOptions {
 pub struct Report {
     /// Where tensors were.
     pub device: DeviceName,
+    /// What the operands of matrix products were.
+    pub precision: Precision,
     /// Threads of the CPU devices.
     pub threads: usize,
     /// One per work.
@@ -123,7 +129,7 @@ pub fn run(
         tell(BenchEvent::Finished(&row));
         rows.push(row);
     }
-    Ok(Report { device: config.device, threads: rayon::current_num_threads(), rows })
+    Ok(Report { device: config.device, precision: config.precision, threads: rayon::current_num_threads(), rows })
 }
 
 fn measure(
@@ -132,6 +138,7 @@ fn measure(
     options: &BenchOptions,
     advance: &mut dyn FnMut(usize) -> Result<(), TrainError>,
 ) -> Result<Row, TrainError> {
+    let _precision = context.config.precision.scope();
     let mut task = work.prepare(context)?;
     context.sync()?;
     advance(0)?;
@@ -164,14 +171,14 @@ fn measure(
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use clift_data::BoundedSampler;
     use clift_model::ModelConfig;
 
     use super::*;
 
     /// Sixteen tokens of width 16, four views of 16 x 16.
-    fn config(device: DeviceName) -> Config {
+    pub fn config(device: DeviceName) -> Config {
         let model = ModelConfig {
             dim: 16,
             num_heads: 2,
@@ -187,9 +194,9 @@ mod tests {
         config
     }
 
-    fn options(work: &[Work]) -> BenchOptions {
+    pub fn options(work: &[Work]) -> BenchOptions {
         let storage = TokenCount::Share(0.25);
-        BenchOptions { work: work.into(), repeats: 2, warmup: 0, error: true, storage, features: None }
+        BenchOptions { work: work.into(), repeats: 2, warmup: 0, error: true, storage, render: None, features: None }
     }
 
     #[test]

@@ -17,6 +17,7 @@ use crate::TrainError;
 use crate::bad_steps::Recent;
 use crate::config::CheckpointConfig;
 use crate::exact;
+use crate::loss_scale::LossScale;
 use crate::step::Learner;
 
 const VERSION: u32 = 2;
@@ -36,6 +37,9 @@ struct State {
     /// Which network it is; earlier versions did not say.
     #[serde(default)]
     model: Option<ModelConfig>,
+    /// In training with f16 products.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    loss_scale: Option<LossScale>,
 }
 
 /// What tells a damaged file from a whole one.
@@ -127,7 +131,8 @@ impl Checkpoints {
             let file = temporary.join(name);
             files.insert(name.to_owned(), fingerprint(&file).map_err(TrainError::io(SAVING, &file))?);
         }
-        let state = State { version: VERSION, progress: progress.clone(), files, model: self.model.clone() };
+        let (progress, model, loss_scale) = (progress.clone(), self.model.clone(), learner.loss_scale);
+        let state = State { version: VERSION, progress, files, model, loss_scale };
         write_state(temporary, &state)?;
         if path.exists() {
             // Only where somebody moved newer checkpoints away and trains those steps again.
@@ -257,7 +262,7 @@ fn read_state(folder: &Path) -> Result<State, TrainError> {
 }
 
 fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) -> Result<Progress, TrainError> {
-    let State { progress, files, model, .. } = read_state(folder)?;
+    let State { progress, files, model, loss_scale, .. } = read_state(folder)?;
     if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !files.contains_key(*name)) {
         let reason = format!("it has no checksum of {name}");
         return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
@@ -295,6 +300,10 @@ fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) ->
     let whole = loaded.ok().filter(|loaded| loaded.to_record().len() == num_tensors);
     let foreign = || TrainError::bad_file("checkpoint", &optimizer)("it is no record of this optimiser");
     learner.optimizer = whole.ok_or_else(foreign)?;
+    // The precision is the config's, which resuming compares.
+    if learner.loss_scale.is_some() && loss_scale.is_some() {
+        learner.loss_scale = loss_scale;
+    }
     Ok(progress)
 }
 
@@ -328,6 +337,7 @@ mod tests {
             device,
             loss: crate::loss::Loss::default(),
             recompute: false,
+            loss_scale: None,
         };
         let checkpoints = Checkpoints::new(root.into(), CheckpointConfig::default());
         let step = checkpoints.save(&learner, &Progress { step: 1, ..Progress::default() }).expect("it can be saved");

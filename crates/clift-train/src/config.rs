@@ -10,7 +10,7 @@ use clift_data::{
 use clift_eval::perceptual::PERCEPTUAL_COMMAND;
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
-use clift_model::{Grouping, KMeans, ModelConfig};
+use clift_model::{Grouping, KMeans, ModelConfig, Precision};
 use serde::{Deserialize, Serialize};
 
 use self::checks::bad;
@@ -32,6 +32,10 @@ pub struct Config {
     /// again for the backward: the same gradients in less memory, for one more forward.
     #[serde(default)]
     pub recompute: bool,
+    /// What the operands of training's matrix products are: `f32`, or `f16` where the device has it. Weights, sums,
+    /// norms, softmax, loss and optimiser are f32 in both.
+    #[serde(default)]
+    pub precision: Precision,
     /// Scenes and views.
     pub data: DataConfig,
     /// Sizes of the network.

@@ -20,6 +20,7 @@ use clift_model::{Clift, Grouping};
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
+use crate::plan::largest_tensor;
 use crate::scenes::evaluation_items;
 
 /// The held-out views of a run.
@@ -35,8 +36,11 @@ impl<'a> HeldOut<'a> {
     /// Chooses the scenes of `reader` and their views that `eval` names, to be measured on `device`.
     ///
     /// # Errors
-    /// As [`evaluation_items`], and [`TrainError::BadConfig`] for a count a scene does not have.
+    /// As [`evaluation_items`], [`TrainError::BadConfig`] for a count a scene does not have, and what the device cannot
+    /// hold or compute.
     pub fn new(config: &'a Config, eval: &EvalConfig, reader: ClipReader, device: &Device) -> Result<Self, TrainError> {
+        eval.precision.check("eval.precision", device)?;
+        largest_tensor::check(config, device, &[Stage::Eval])?;
         let (items, ledger) = evaluation_items(eval, &reader, eval.num_scenes)?;
         // A count that a scene does not have is found now, not at the end of training.
         let tokens_per_view = config.model.num_tokens(1, config.data.height, config.data.width)?;
@@ -77,6 +81,7 @@ impl<'a> HeldOut<'a> {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Option<f64>, TrainError> {
+        let _precision = self.config.eval.precision.scope();
         let grouping = self.config.clusters.grouping;
         let (storage, variant) = match stage {
             Stage::Stage2 => (self.config.eval.validation_storage, condensed_variant(grouping)),
@@ -126,6 +131,7 @@ impl<'a> HeldOut<'a> {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
+        let _precision = self.config.eval.precision.scope();
         let started = std::time::Instant::now();
         let mut measured = Accumulator::default();
         let lpips = self.lpips(&mut measured, sink)?;

@@ -22,6 +22,7 @@ pub mod import;
 mod keys;
 pub mod lock;
 pub mod loss;
+pub mod loss_scale;
 mod mistakes;
 pub mod model_dir;
 pub mod optim;

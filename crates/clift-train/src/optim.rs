@@ -41,6 +41,17 @@ pub fn norm_on_device<M: Module>(module: &M, grads: &GradientsParams) -> Option<
 
 /// Scales all gradients of a module by `max_norm / norm` where `norm` is larger.
 pub fn clip_global_norm<M: Module>(module: &M, grads: GradientsParams, norm: f64, max_norm: f64) -> GradientsParams {
+    scale(module, grads, clip_factor(norm, max_norm))
+}
+
+/// What gradients of a global norm are multiplied by to be within `max_norm`.
+pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
+    // PyTorch's guard against a norm of zero.
+    (max_norm / (norm + 1e-6)).min(1.0)
+}
+
+/// Multiplies all gradients of a module by a factor.
+pub fn scale<M: Module>(module: &M, grads: GradientsParams, factor: f64) -> GradientsParams {
     struct Scale {
         grads: GradientsParams,
         factor: f64,
@@ -52,9 +63,7 @@ pub fn clip_global_norm<M: Module>(module: &M, grads: GradientsParams, norm: f64
             }
         }
     }
-    // PyTorch's guard against a norm of zero.
-    let factor = max_norm / (norm + 1e-6);
-    if factor >= 1.0 {
+    if factor == 1.0 {
         return grads;
     }
     let mut scale = Scale { grads, factor };

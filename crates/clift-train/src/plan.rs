@@ -6,6 +6,7 @@
 
 mod calibration;
 pub mod counts;
+pub mod largest_tensor;
 pub mod machine;
 mod memory;
 mod sizes;

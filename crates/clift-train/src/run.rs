@@ -19,6 +19,7 @@ use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
 use crate::held_out::{HeldOut, write_ledger};
 use crate::lock::RunLock;
+use crate::plan::largest_tensor;
 use crate::run_settings::{RunFile, compare, write_config};
 use crate::scenes::{self, FirstScenes};
 use crate::stage1::Stage1Batches;
@@ -59,6 +60,9 @@ impl Run {
     pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         config.validate()?;
         let device = config.device.open()?;
+        config.precision.check("precision", &device)?;
+        config.eval.precision.check("eval.precision", &device)?;
+        largest_tensor::check(&config, &device, &largest_tensor::PARTS)?;
         // Missing weights are found now, not after days of training.
         config.loss.weights()?;
         if let Some(path) = config.eval.lpips_path().filter(|path| !path.is_file()) {

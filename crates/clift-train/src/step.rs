@@ -7,11 +7,12 @@ use burn::optim::{GradientsAccumulator, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor};
 use clift_data::{Clip, Skip};
 use clift_eval::{upload_cameras, upload_pictures, upload_views};
-use clift_model::{Cameras, Clift, Clusters, Condenser, RenderTokens, SceneClusters, Views};
+use clift_model::{Cameras, Clift, Clusters, Condenser, Precision, RenderTokens, SceneClusters, Views};
 
 use crate::TrainError;
 use crate::loss::{Loss, LossParts};
-use crate::optim::{clip_global_norm, norm_on_device};
+use crate::loss_scale::LossScale;
+use crate::optim::{clip_factor, norm_on_device, scale};
 use crate::recompute;
 
 /// What one update sees: clips with equal numbers of views, and which tokens the renderer is given.
@@ -64,6 +65,8 @@ pub struct Learner {
     pub loss: Loss,
     /// Whether the backward computes every block again instead of keeping what is inside it.
     pub recompute: bool,
+    /// Of training with f16 products; `None` for f32.
+    pub loss_scale: Option<LossScale>,
 }
 
 /// What an update did.
@@ -108,17 +111,20 @@ impl Learner {
         max_grad_norm: f64,
         accept: impl FnOnce(f64, f64) -> bool,
     ) -> Result<(Self, Update), TrainError> {
-        let Self { model, mut optimizer, device, loss, recompute } = self;
+        let Self { model, mut optimizer, device, loss, recompute, loss_scale } = self;
+        let precision = if loss_scale.is_some() { Precision::F16 } else { Precision::F32 };
+        let _scope = precision.scope();
+        let factor = loss_scale.map_or(1.0, |scale| scale.factor());
         let mut accumulator = GradientsAccumulator::<Clift>::new();
         let mut read = ReadOnce::default();
         for part in batch.parts(accumulate) {
             let share = part.clips.len() as f64 / batch.clips.len() as f64;
             let shown = Shown::upload(&part, &device)?;
             let parts = if recompute {
-                recompute::backward(&model, &shown, &part.tokens, &loss, share, &mut accumulator)?
+                recompute::backward(&model, &shown, &part.tokens, &loss, share * factor, &mut accumulator)?
             } else {
                 let LossParts { total, mse } = loss_of(&model, &shown, &part.tokens, &loss)?;
-                let grads = total.clone().mul_scalar(share).backward();
+                let grads = total.clone().mul_scalar(share * factor).backward();
                 accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
                 LossParts { total: total.inner(), mse: mse.inner() }
             };
@@ -126,15 +132,29 @@ impl Learner {
         }
         let grads = accumulator.grads();
         let Read { loss: total, mse, grad_norm } = read.finish(norm_on_device(&model, &grads))?;
+        let grad_norm = grad_norm / factor;
         // Looked at before the update, so that a bad batch leaves no trace in the weights.
         let applied = accept(total, grad_norm);
         let model = if applied {
-            let grads = clip_global_norm(&model, grads, grad_norm, max_grad_norm);
+            let grads = scale(&model, grads, clip_factor(grad_norm, max_grad_norm) / factor);
             optimizer.step(rate, model, grads)
         } else {
             model
         };
-        Ok((Self { model, optimizer, device, loss, recompute }, Update { loss: total, mse, grad_norm, applied }))
+        let learner = Self { model, optimizer, device, loss, recompute, loss_scale };
+        Ok((learner, Update { loss: total, mse, grad_norm, applied }))
+    }
+
+    /// Adapts the loss scale to what an update has shown, and says whether it overflowed.
+    pub fn adapt_loss_scale(&mut self, update: &Update) -> bool {
+        let Some(scale) = &mut self.loss_scale else { return false };
+        let is_overflow = !update.applied && scale.is_overflow(update.loss, update.grad_norm);
+        match (is_overflow, update.applied) {
+            (true, _) => scale.shrink(),
+            (false, true) => scale.grow(),
+            (false, false) => {}
+        }
+        is_overflow
     }
 
     /// The model on its device without autodiff.

@@ -18,6 +18,7 @@ use crate::config::{Config, OptimizerConfig};
 use crate::events::{Event, Sink, Stage};
 use crate::held_out::HeldOut;
 use crate::loss::Loss;
+use crate::loss_scale::LossScale;
 use crate::optim::adamw;
 use crate::sinks::RunLog;
 use crate::step::{Learner, StageBatch};
@@ -71,7 +72,8 @@ impl StagePlan<'_> {
             sink.event(&Event::Message(format!("perceptual loss: weights with SHA-256 {sha256}")));
         }
         let (device, recompute) = (self.device.clone(), self.config.recompute);
-        let mut learner = Learner { model, optimizer, device, loss, recompute };
+        let loss_scale = LossScale::of(self.config.precision);
+        let mut learner = Learner { model, optimizer, device, loss, recompute, loss_scale };
         let progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
         learner.model = freeze(self.stage, learner.model);
         make_folder(&self.folder).map_err(TrainError::io("making a folder", &self.folder))?;

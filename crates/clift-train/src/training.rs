@@ -82,9 +82,16 @@ impl<'a> Training<'a> {
             fault = recent.fault(loss, grad_norm, optimizer);
             fault.is_none()
         };
-        let (learner, update) = learner.step_if(batch, accumulate, rate, optimizer.max_grad_norm, accept)?;
+        let (mut learner, update) = learner.step_if(batch, accumulate, rate, optimizer.max_grad_norm, accept)?;
         self.progress.step = step;
         self.report(update, lr, started);
+        if learner.adapt_loss_scale(&update) {
+            // Neither a good step nor a bad one: nothing is wrong with its batch.
+            let factor = learner.loss_scale.map_or(1.0, |scale| scale.factor());
+            let told = format!("step {step} left out: a gradient is beyond f16; the loss scale is {factor} now");
+            self.log.event(&Event::Message(told));
+            return Ok(learner);
+        }
         match fault {
             None => {
                 self.progress.bad_steps = 0;

@@ -10,6 +10,7 @@ use clift_model::{Convention, TokenStorage};
 use clift_train::Stage;
 use clift_train::bench::Work;
 
+pub use crate::bench::half::BenchHalfArgs;
 pub use crate::data::args::DataCommand;
 pub use crate::data::bench::BenchDataArgs;
 pub use crate::encode::EncodeArgs;
@@ -257,6 +258,8 @@ pub struct PlanArgs {
 pub enum BenchCommand {
     /// Time how fast clips are read from a folder, in order and at random
     Data(BenchDataArgs),
+    /// Time f16 products beside f32 ones, in turn, with what they change: loss, PSNR and gradient
+    Half(BenchHalfArgs),
 }
 
 /// Arguments of `clift compare`.
@@ -324,6 +327,9 @@ pub struct BenchArgs {
     /// Tokens that are stored, as a number or a share: clusters of K-means, condenser and stage 2
     #[arg(long, value_name = "COUNT", default_value = "1/4")]
     pub storage: TokenCount,
+    /// Tokens that `render` and `render_8_views` draw from, as a number or a share; all by default
+    #[arg(long, value_name = "COUNT")]
+    pub render: Option<TokenCount>,
     /// Let K-means cluster the tensor `features`, [N, D] in f32, of a safetensors file
     #[arg(long, value_name = "FILE")]
     pub features: Option<PathBuf>,
@@ -371,7 +377,7 @@ fn works_help() -> String {
     format!("Time these works alone: {}", Work::ALL.map(Work::name).join(", "))
 }
 
-fn parse_repeats(text: &str) -> Result<usize, String> {
+pub(crate) fn parse_repeats(text: &str) -> Result<usize, String> {
     match text.parse() {
         Ok(count) if count > 0 => Ok(count),
         _ => Err("write how often, at least 1".into()),

@@ -1,7 +1,10 @@
 //! `clift bench`.
 
+pub mod half;
+
 use std::path::Path;
 
+use clift_model::Precision;
 use clift_train::bench::{self, BenchEvent, BenchOptions, MAX_CHECKED_TOKENS, Report, Row, Work};
 use clift_train::{Config, read_config};
 
@@ -29,6 +32,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
         warmup: args.warmup,
         error: !args.no_error,
         storage: args.storage,
+        render: args.render,
         features: args.features.clone(),
     };
     let stop = interrupt::flag()?;
@@ -58,7 +62,8 @@ const HEADER: [&str; 5] = ["work", "median", "p95", "peak memory", "error agains
 /// The table with what must be known to read it.
 fn shown(report: &Report) -> String {
     let rows: Vec<_> = [HEADER.map(String::from)].into_iter().chain(report.rows.iter().map(cells)).collect();
-    let title = format!("{}, {} threads\n", report.device, report.threads);
+    let half = if report.precision == Precision::F16 { ", f16 products" } else { "" };
+    let title = format!("{}, {} threads{half}\n", report.device, report.threads);
     [title, table::columns(&rows)].into_iter().chain(remarks(&report.rows)).collect::<Vec<_>>().join("\n")
 }
 
@@ -125,22 +130,25 @@ render_8_views: seconds are per view
 kmeans: inertia 1.234500e3; its error is the inertia's
 * of loss and gradients, with at most 1024 tokens
 - not compared with f64";
-        assert_eq!(shown(&Report { device: DeviceName::Flex, threads: 2, rows }), expected);
+        assert_eq!(shown(&Report { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows }), expected);
     }
 
     #[test]
     fn a_table_without_remarks_ends_with_its_last_row() {
         let rows = vec![row(Work::Encode, 0.002, Some(1 << 20), Some(1e-7))];
-        let text = shown(&Report { device: DeviceName::Flex, threads: 1, rows });
+        let text = shown(&Report { device: DeviceName::Flex, precision: Precision::F32, threads: 1, rows });
         assert!(text.ends_with("\nencode  2.00 ms  4.00 ms  1 MiB        1.0e-7"), "{text}");
     }
 
     #[test]
     fn the_json_has_the_named_keys_and_null_where_nothing_was_measured() {
         let rows = vec![row(Work::Kmeans, 0.5, Some(7), Some(0.25)), row(Work::Render8Views, 0.5, None, None)];
-        let json = serde_json::to_value(Report { device: DeviceName::Flex, threads: 2, rows }).unwrap();
+        let json =
+            serde_json::to_value(Report { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows })
+                .unwrap();
         let expected = serde_json::json!({
             "device": "flex",
+            "precision": "f32",
             "threads": 2,
             "rows": [
                 {"work": "kmeans", "median_s": 0.5, "p95_s": 1.0, "peak_bytes": 7, "max_rel_error": 0.25,

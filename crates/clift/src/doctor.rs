@@ -1,11 +1,12 @@
 //! `clift doctor`: what this machine can train on.
 
+mod adapters;
 mod probe;
 mod stability;
 
 use clift_eval::machine;
-use clift_model::InstructionSet;
 use clift_model::device::DeviceName;
+use clift_model::{InstructionSet, Precision};
 use probe::{Gradient, Probe};
 
 use crate::args::DoctorArgs;
@@ -15,6 +16,9 @@ use crate::terminal::print_result;
 /// by about 1e-6 here, a wrong kernel by a number near 1.
 const TOLERANCE: f64 = 1e-3;
 
+/// The same with f16 operands, whose rounding of 5e-4 passes through four blocks.
+const TOLERANCE_F16: f64 = 3e-2;
+
 /// Prints the machine and a row per device, or the hard cases; fails if the default device does, or a case.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     if args.stability {
@@ -23,17 +27,27 @@ pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let machine = [("clift", version())].into_iter().chain(machine::rows()).chain([("kernels", kernels())]);
     let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
     print_result(&format!("{}\n", machine.join("\n")))?;
+    if let Some(adapters) = adapters::shown() {
+        print_result(&format!("{adapters}\n"))?;
+    }
     let default = DeviceName::default();
-    let reference = probe::probe(default).and_then(|probe| check(probe, None));
+    let reference = probe::probe(default, Precision::F32).and_then(|probe| check(probe, None, TOLERANCE));
+    let expected = reference.as_ref().ok();
     let mut rows = vec![HEADER.map(String::from)];
+    let mut halves = Vec::new();
     for name in DeviceName::ALL {
         let probed = if name == default {
             reference.clone()
         } else {
-            probe::probe(name).and_then(|probe| check(probe, reference.as_ref().ok()))
+            probe::probe(name, Precision::F32).and_then(|probe| check(probe, expected, TOLERANCE))
         };
-        rows.push(row(name, probed.as_ref(), reference.as_ref().ok()));
+        if probed.as_ref().is_ok_and(|probe| probe.dtypes.contains(&"f16")) {
+            let half = probe::probe(name, Precision::F16).and_then(|probe| check(probe, expected, TOLERANCE_F16));
+            halves.push(row(name, Precision::F16, half.as_ref(), expected));
+        }
+        rows.push(row(name, Precision::F32, probed.as_ref(), expected));
     }
+    rows.extend(halves);
     print_result(&table(&rows))?;
     for name in DeviceName::ALL.into_iter().filter(|name| !name.is_built()) {
         print_result(&format!("\n{name} is not in this build: cargo build --release --features {name}"))?;
@@ -71,7 +85,7 @@ fn kernels() -> String {
 }
 
 /// Refuses a gradient that is zero or not finite, or far from the reference.
-fn check(probe: Probe, reference: Option<&Probe>) -> Result<Probe, String> {
+fn check(probe: Probe, reference: Option<&Probe>, tolerance: f64) -> Result<Probe, String> {
     let Gradient { values, .. } = &probe.gradient;
     if let Some(value) = values.iter().find(|value| !value.is_finite()) {
         return Err(format!("the gradient holds {value}"));
@@ -80,17 +94,27 @@ fn check(probe: Probe, reference: Option<&Probe>) -> Result<Probe, String> {
         return Err("the gradient is zero".into());
     }
     match reference.map(|reference| probe.gradient.difference(&reference.gradient)) {
-        Some(difference) if difference.is_nan() || difference > TOLERANCE => {
-            Err(format!("the gradient differs by {difference:.1e}, more than {TOLERANCE:.0e}"))
+        Some(difference) if difference.is_nan() || difference > tolerance => {
+            Err(format!("the gradient differs by {difference:.1e}, more than {tolerance:.0e}"))
         }
         _ => Ok(probe),
     }
 }
 
-fn row(name: DeviceName, probed: Result<&Probe, &String>, reference: Option<&Probe>) -> [String; 6] {
-    let is_default = name == DeviceName::default();
+fn row(
+    name: DeviceName,
+    precision: Precision,
+    probed: Result<&Probe, &String>,
+    reference: Option<&Probe>,
+) -> [String; 6] {
+    let is_half = precision == Precision::F16;
+    let is_default = name == DeviceName::default() && !is_half;
     let dash = || "-".to_owned();
-    let device = if is_default { format!("{name} (default)") } else { name.to_string() };
+    let device = match (is_half, is_default) {
+        (true, _) => format!("{name}, f16"),
+        (false, true) => format!("{name} (default)"),
+        (false, false) => name.to_string(),
+    };
     match probed {
         Err(_) if !name.is_built() => [device, "not built".into(), dash(), dash(), dash(), dash()],
         Err(reason) => [device, format!("FAILS: {reason}"), dash(), dash(), dash(), dash()],
@@ -133,7 +157,8 @@ mod tests {
     #[test]
     fn a_gradient_that_is_zero_not_finite_or_far_off_fails() {
         let reference = probe(vec![1.0, -2.0]);
-        let checked = |values: &[f64]| check(probe(values.to_vec()), Some(&reference)).err().unwrap_or_default();
+        let checked =
+            |values: &[f64]| check(probe(values.to_vec()), Some(&reference), TOLERANCE).err().unwrap_or_default();
         assert_eq!(checked(&[1.0, -2.0001]), "");
         assert_eq!(checked(&[1.0, f64::NAN]), "the gradient holds NaN");
         assert_eq!(checked(&[0.0, 0.0]), "the gradient is zero");
@@ -147,22 +172,34 @@ mod tests {
         let failure = "panicked: a very long reason".to_owned();
         let rows = [
             HEADER.map(String::from),
-            row(DeviceName::Flex, Ok(&reference), Some(&reference)),
-            row(DeviceName::Ndarray, Err(&failure), Some(&reference)),
+            row(DeviceName::Flex, Precision::F32, Ok(&reference), Some(&reference)),
+            row(DeviceName::Ndarray, Precision::F32, Err(&failure), Some(&reference)),
+            row(DeviceName::Flex, Precision::F16, Ok(&reference), Some(&reference)),
         ];
         let expected = "\
 device          state  adapter  dtypes  fwd+bwd  gradient difference
 flex (default)  works  CPU      f32     12.5 ms  reference
-ndarray         FAILS: panicked: a very long reason";
+ndarray         FAILS: panicked: a very long reason
+flex, f16       works  CPU      f32     12.5 ms  0.0e0";
         assert_eq!(table(&rows), expected);
     }
 
     #[test]
     fn every_built_cpu_device_works_here_and_agrees_with_the_default() {
-        let reference = probe::probe(DeviceName::default()).unwrap();
+        let reference = probe::probe(DeviceName::default(), Precision::F32).unwrap();
         for name in [DeviceName::Flex, DeviceName::Ndarray] {
-            let probe = probe::probe(name).and_then(|probe| check(probe, Some(&reference)));
+            let probe = probe::probe(name, Precision::F32).and_then(|probe| check(probe, Some(&reference), TOLERANCE));
             assert!(probe.unwrap().dtypes.contains(&"f32"), "{name}");
         }
+    }
+
+    #[test]
+    fn f16_is_near_f32_where_it_is_there_and_refused_where_not() {
+        let reference = probe::probe(DeviceName::Flex, Precision::F32).unwrap();
+        let half = probe::probe(DeviceName::Flex, Precision::F16).unwrap();
+        let difference = half.gradient.difference(&reference.gradient);
+        assert!(difference > 1e-6 && difference < TOLERANCE_F16, "{difference:e}");
+        let message = probe::probe(DeviceName::Ndarray, Precision::F16).unwrap_err();
+        assert!(message.contains("has no f16"), "{message}");
     }
 }

@@ -52,6 +52,7 @@ pub fn main() -> ExitCode {
         Command::Plan(args) => plan::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => data::bench::run(&args),
+        Command::Bench(BenchArgs { command: Some(BenchCommand::Half(args)), .. }) => bench::half::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Import(args) => import::run(&args),
         Command::Export(args) => export::run(&args),

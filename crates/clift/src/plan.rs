@@ -2,8 +2,10 @@
 
 use anyhow::Context;
 use clift_data::files::replace;
+use clift_model::adapter::max_tensor_bytes;
+use clift_train::plan::largest_tensor::{self, LargestTensor, largest_tensor};
 use clift_train::plan::{self, PartPlan, Plan};
-use clift_train::read_checked_config;
+use clift_train::{Config, read_checked_config};
 
 use crate::args::PlanArgs;
 use crate::terminal::{print_note, print_result};
@@ -24,6 +26,7 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     }
     let planned = plan::plan(&config, !args.no_time)?;
     print_result(&shown(&planned))?;
+    print_result(&largest_tensors(&config)?)?;
     if let Some(warning) = plan::memory_warning(&config, &planned) {
         print_note(&format!("warning: {warning}"));
     }
@@ -34,6 +37,24 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
         print_result(&format!("plan: {}", json.display()))?;
     }
     Ok(())
+}
+
+/// The largest tensor of every part beside what the device takes in one.
+fn largest_tensors(config: &Config) -> anyhow::Result<String> {
+    // A plan can be made for a device that is not here.
+    let limit = config.device.open().ok().and_then(|device| max_tensor_bytes(&device));
+    let mut rows = vec![["part", "largest tensor", "bytes", "at most", ""].map(String::from)];
+    for part in largest_tensor::PARTS {
+        let LargestTensor { what, bytes: size, .. } = largest_tensor(config, part)?;
+        let verdict = match limit {
+            Some(limit) if size > limit => "TOO LARGE: clift train refuses it",
+            Some(_) => "fits",
+            None => "",
+        };
+        let most = limit.map_or_else(|| "-".into(), bytes);
+        rows.push([part.name().into(), what.into(), bytes(size), most, verdict.into()]);
+    }
+    Ok(format!("\n{}", table::columns(&rows)))
 }
 
 const HEADER: [&str; 8] =

@@ -53,6 +53,8 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     }
     let device = args.device.unwrap_or_default();
     let opened = device.open()?;
+    args.precision.check("--precision", &opened)?;
+    let _precision = args.precision.scope();
     let renderer = load_renderer(&scene, &weights, &opened)?;
     let mut viewer = Viewer::new(&scene, renderer, args.selection.rules(), &opened)?;
     let (num_render_tokens, calibration) = tokens(&scene, args, &mut viewer, &views[0], height, width)?;

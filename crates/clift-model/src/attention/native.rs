@@ -7,14 +7,16 @@ use burn::backend::{Flex, TensorMetadata};
 use clift_kernels::InstructionSet;
 use clift_kernels::attention::{self as kernel, Gradients, Rows, Saved, Sizes};
 
-use super::{Attended, AttentionKernels, Projected, composed_backward, forward, split};
+use super::{Attended, AttentionKernels, Heads, Projected, composed_backward, forward, split};
 use crate::flex::{contiguous, is_native, tensor, values};
+use crate::precision::Precision;
 
 impl AttentionKernels for Flex {
-    fn attend(inputs: &Projected<FloatTensor<Self>>, num_heads: usize) -> Attended<FloatTensor<Self>> {
-        if !inputs.is_native() {
-            return Attended { output: forward::<Self>(split::<Self>(inputs), num_heads), log_sum: None };
+    fn attend(inputs: &Projected<FloatTensor<Self>>, heads: Heads) -> Attended<FloatTensor<Self>> {
+        if !inputs.is_native() || heads.precision != Precision::F32 {
+            return Attended { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None };
         }
+        let Heads { num_heads, .. } = heads;
         let inputs = inputs.clone().contiguous();
         let sizes = inputs.sizes(num_heads);
         let Sizes { batch, num_queries, head_width, .. } = sizes;
@@ -29,12 +31,13 @@ impl AttentionKernels for Flex {
     fn attend_backward(
         inputs: Projected<FloatTensor<Self>>,
         attended: Attended<FloatTensor<Self>>,
-        num_heads: usize,
+        heads: Heads,
         grad_output: FloatTensor<Self>,
     ) -> Projected<FloatTensor<Self>> {
         let Some(log_sum) = attended.log_sum else {
-            return composed_backward::<Self>(inputs, attended.output, num_heads, grad_output);
+            return composed_backward::<Self>(inputs, attended.output, heads, grad_output);
         };
+        let Heads { num_heads, .. } = heads;
         let inputs = inputs.contiguous();
         let sizes = inputs.sizes(num_heads);
         let Sizes { batch, num_queries, num_keys, head_width, .. } = sizes;

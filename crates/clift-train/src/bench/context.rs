@@ -24,6 +24,7 @@ pub struct BenchContext {
     /// Whether the device works in this process's memory.
     pub is_cpu: bool,
     storage: TokenCount,
+    render: Option<TokenCount>,
     /// The file that K-means clusters.
     pub features: Option<PathBuf>,
     /// Tokens of one scene, made once.
@@ -38,22 +39,26 @@ impl BenchContext {
         let synthetic = SyntheticConfig { width, height, ..SyntheticConfig::default() };
         (config.data.source, config.data.synthetic) = (SourceKind::Synthetic, synthetic);
         config.validate()?;
+        let device = config.device.open()?;
+        config.precision.check("precision", &device)?;
         let context = Self {
-            device: config.device.open()?,
+            device,
             is_cpu: matches!(config.device, DeviceName::Flex | DeviceName::Ndarray),
             storage: options.storage,
+            render: options.render,
             features: options.features.clone(),
             lift: OnceCell::new(),
             config,
         };
         context.num_storage_tokens()?;
+        context.num_render_tokens()?;
         Ok(context)
     }
 
     /// The same with other sizes.
     fn with(&self, config: Config) -> Self {
         let (device, is_cpu, storage) = (self.device.clone(), self.is_cpu, self.storage);
-        Self { config, device, is_cpu, storage, features: None, lift: OnceCell::new() }
+        Self { config, device, is_cpu, storage, render: None, features: None, lift: OnceCell::new() }
     }
 
     /// The small network of `stage1_step_tiny`, whatever the config is: 256 tokens, 64 queries, batch 8.
@@ -69,8 +74,8 @@ impl BenchContext {
         let views = BoundedSampler { min_context: 4, num_targets: 1, ..BoundedSampler::default() };
         let data = DataConfig { width: 64, height: 64, views, ..DataConfig::default() };
         let stage1 = Stage1Config { batch_size: 8, accumulate: 1, ..Stage1Config::default() };
-        let (seed, device) = (self.config.seed, self.config.device);
-        self.with(Config { seed, device, data, model, stage1, ..Config::default() })
+        let Config { seed, device, precision, .. } = self.config;
+        self.with(Config { seed, device, precision, data, model, stage1, ..Config::default() })
     }
 
     /// The same network on at most [`MAX_CHECKED_TOKENS`] tokens: smaller pictures, then fewer scenes and views.
@@ -107,6 +112,14 @@ impl BenchContext {
 
     pub fn num_storage_tokens(&self) -> Result<usize, TrainError> {
         self.stored_of(self.num_tokens()?)
+    }
+
+    /// Tokens that a view is drawn from.
+    pub fn num_render_tokens(&self) -> Result<usize, TrainError> {
+        let all = self.num_tokens()?;
+        let Some(count) = self.render else { return Ok(all) };
+        let bad = |fix: String| TrainError::BadConfig { key: "--render".into(), value: count.to_string(), fix };
+        count.of(all).map_err(|error| bad(error.to_string()))
     }
 
     pub fn stored_of(&self, num_tokens: usize) -> Result<usize, TrainError> {

@@ -121,7 +121,7 @@ impl Forward for ClusterAttend {
     }
 }
 
-/// All tokens of a scene and cameras to pictures.
+/// The first tokens of a scene, as many as are asked for, and cameras to pictures.
 pub struct Render {
     renderer: Renderer,
     lift: Tensor<3>,
@@ -130,7 +130,8 @@ pub struct Render {
 
 impl Render {
     pub fn new(context: &BenchContext, num_views: usize) -> Result<Self, TrainError> {
-        let lift = context.lift()?;
+        let [_, _, dim] = context.lift()?.dims();
+        let lift = context.lift()?.slice([0..1, 0..context.num_render_tokens()?, 0..dim]);
         let targets = upload_cameras(&[&context.clip(num_views).target], &context.device)?;
         Ok(Self { renderer: context.model().renderer.valid(), lift, targets })
     }

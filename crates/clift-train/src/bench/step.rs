@@ -3,7 +3,7 @@
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
-use clift_model::Clift;
+use clift_model::{Clift, Precision};
 
 use super::context::BenchContext;
 use super::inputs::batch;
@@ -14,6 +14,7 @@ use crate::bad_steps::Fault;
 use crate::config::{Config, OptimizerConfig};
 use crate::events::Stage;
 use crate::loss::Loss;
+use crate::loss_scale::LossScale;
 use crate::optim::adamw;
 use crate::schedule::warm_up_cosine;
 use crate::step::{Learner, Shown, StageBatch, loss_of};
@@ -42,6 +43,7 @@ impl StepTask {
             // The network of a perceptual term is not this project's: the rows are of the model alone.
             loss: Loss::default(),
             recompute: context.config.recompute,
+            loss_scale: LossScale::of(context.config.precision),
         };
         Ok(Self {
             stage,
@@ -74,6 +76,12 @@ impl<'a> Part<'a> {
     }
 }
 
+/// What an update of a stage works off at once.
+pub(super) fn micro_batch(context: &BenchContext, stage: Stage) -> Result<StageBatch, TrainError> {
+    let Part { batch_size, accumulate, .. } = Part::of(&context.config, stage);
+    stage_batch(context, stage, batch_size.div_ceil(accumulate))
+}
+
 /// A batch that keeps every token (stage 1) or the stored ones (stage 2).
 fn stage_batch(context: &BenchContext, stage: Stage, batch_size: usize) -> Result<StageBatch, TrainError> {
     let stored = if stage == Stage::Stage2 { Some(context.num_storage_tokens()?) } else { None };
@@ -83,9 +91,11 @@ fn stage_batch(context: &BenchContext, stage: Stage, batch_size: usize) -> Resul
 impl Task for StepTask {
     fn run(&mut self) -> Result<(), TrainError> {
         let learner = self.learner.take().expect("no step failed before");
-        let (learner, update) = learner.step(&self.batch, self.accumulate, self.rate.into(), self.max_grad_norm)?;
+        let (mut learner, update) = learner.step(&self.batch, self.accumulate, self.rate.into(), self.max_grad_norm)?;
+        let is_overflow = learner.adapt_loss_scale(&update);
         self.learner = Some(learner);
-        if update.applied {
+        // An update that overflows takes as long as one that does not.
+        if update.applied || is_overflow {
             return Ok(());
         }
         let (reason, keys, checkpoint) = (Fault::NotFinite.to_string(), "made up".into(), "none".into());
@@ -115,11 +125,17 @@ impl InF64 for Shown {
     }
 }
 
-/// Loss of a batch and the gradient of every parameter.
+/// Loss of a batch and the gradient of every parameter, times [`loss_factor`].
 pub(crate) fn gradients(model: &Clift, batch: &StageBatch, shown: Shown) -> Result<(f64, GradientsParams), TrainError> {
     let loss = loss_of(model, &shown, &batch.tokens, &Loss::default())?.total;
-    let grads = GradientsParams::from_grads(loss.backward(), model);
+    let grads = GradientsParams::from_grads(loss.clone().mul_scalar(loss_factor()).backward(), model);
     Ok((values(loss.inner())[0], grads))
+}
+
+/// What training in this thread's precision starts to multiply its loss by. A power of two, which changes no relative
+/// error; the f64 reference has it too.
+pub(super) fn loss_factor() -> f64 {
+    LossScale::of(Precision::current()).map_or(1.0, |scale| scale.factor())
 }
 
 /// The largest relative error: of the loss, and of each parameter's gradient against its own largest entry.

@@ -24,6 +24,7 @@ use crate::bench::inputs::{Shape, batch, clip};
 use crate::config::Config;
 use crate::events::Stage;
 use crate::loss::Loss;
+use crate::loss_scale::LossScale;
 use crate::optim::{adamw, clip_global_norm, global_norm};
 use crate::scenes;
 use crate::step::{Learner, Shown, StageBatch, TokenChoice, loss_of};
@@ -119,6 +120,7 @@ fn context(config: &Config, num_context: usize) -> Result<BenchContext, TrainErr
         warmup: 0,
         error: false,
         storage: TokenCount::Share(1.0),
+        render: None,
         features: None,
     };
     BenchContext::new(&config, &options)
@@ -139,6 +141,7 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
         // The network of a perceptual term is not counted.
         loss: Loss::default(),
         recompute: config.recompute,
+        loss_scale: LossScale::of(config.precision),
     };
     let rate = optimizer.learning_rate;
     let (mut learner, step) = Timed::passing(learner, |learner| {

@@ -9,7 +9,7 @@ use burn::tensor::{DType, Device, Gradients, Tensor};
 use clift_data::{Clip, ClipOptions, ClipReader, SyntheticConfig, SyntheticSource, ViewIndices};
 use clift_eval::{upload_cameras, upload_pictures, upload_views};
 use clift_model::device::DeviceName;
-use clift_model::{Clift, Clusters, KMeans, ModelConfig, SceneClusters};
+use clift_model::{Clift, Clusters, KMeans, ModelConfig, Precision, SceneClusters};
 use clift_train::loss::mse;
 
 /// What a device that works can do.
@@ -50,12 +50,14 @@ impl Gradient {
 }
 
 /// Opens a device and trains a small model on it for one step; a panic becomes its message.
-pub fn probe(name: DeviceName) -> Result<Probe, String> {
-    caught(|| probe_device(name)).unwrap_or_else(|panic| Err(format!("panicked: {panic}")))
+pub fn probe(name: DeviceName, precision: Precision) -> Result<Probe, String> {
+    caught(|| probe_device(name, precision)).unwrap_or_else(|panic| Err(format!("panicked: {panic}")))
 }
 
-fn probe_device(name: DeviceName) -> Result<Probe, String> {
+fn probe_device(name: DeviceName, precision: Precision) -> Result<Probe, String> {
     let device = name.open().map_err(|error| error.to_string())?;
+    precision.check("precision", &device).map_err(|error| error.to_string())?;
+    let _scope = precision.scope();
     let floats = [("f32", DType::F32), ("f16", DType::F16), ("bf16", DType::BF16), ("f64", DType::F64)];
     let dtypes = floats.into_iter().filter(|(_, dtype)| device.supports_dtype(*dtype)).map(|(name, _)| name).collect();
     gradient(&device).map_err(|error| format!("{error:#}"))?;
@@ -133,7 +135,7 @@ fn clip() -> anyhow::Result<Clip> {
 type Hook = Box<dyn Fn(&PanicHookInfo<'_>) + Sync + Send>;
 
 /// Runs `work`; a panic in it, or the first one of a thread it waits for, is returned as one line and not printed.
-fn caught<T>(work: impl FnOnce() -> T) -> Result<T, String> {
+pub fn caught<T>(work: impl FnOnce() -> T) -> Result<T, String> {
     // The hook is one for the whole process.
     static HOOK: Mutex<()> = Mutex::new(());
     let _only_one = HOOK.lock().unwrap_or_else(PoisonError::into_inner);

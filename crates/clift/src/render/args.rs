@@ -6,8 +6,8 @@ use std::str::FromStr;
 
 use clap::builder::RangedU64ValueParser;
 use clift_eval::TokenCount;
-use clift_model::Preset;
 use clift_model::device::DeviceName;
+use clift_model::{Precision, Preset};
 
 use crate::data::args::parse_size;
 
@@ -47,6 +47,9 @@ pub struct RenderArgs {
     /// Where tensors live: flex, ndarray or wgpu
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceName>,
+    /// What the operands of matrix products are: f32, or f16 where the device has it
+    #[arg(long, value_name = "f32|f16", default_value_t)]
+    pub precision: Precision,
 }
 
 /// Where a camera goes.

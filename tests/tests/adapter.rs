@@ -1,0 +1,29 @@
+//! What adapters say of themselves is what the open device allows. Alone in its process: the Vulkan loader does not stand
+//! instances that come and go on several threads.
+
+use burn::tensor::{DType, Tensor};
+use clift_model::Precision;
+use clift_model::adapter::{adapters, max_tensor_bytes};
+use clift_model::device::DeviceName;
+
+#[test]
+fn the_used_adapter_allows_what_the_open_device_does() {
+    let device = match DeviceName::Wgpu.open() {
+        Ok(device) => device,
+        Err(error) if std::env::var_os("CLIFT_REQUIRE_WGPU").is_some() => panic!("{error}"),
+        Err(error) => return eprintln!("not run: {error}"),
+    };
+    let adapters = adapters();
+    let used = adapters.iter().find(|adapter| adapter.is_used).expect("the device is one of them");
+    let most = used.limits.max_tensor_bytes();
+    assert_eq!(max_tensor_bytes(&device), Some(most));
+    assert_eq!(max_tensor_bytes(&device.clone().autodiff()), Some(most), "with autodiff as without");
+    assert_eq!(device.supports_dtype(DType::F16), used.has_f16);
+    assert_eq!(Precision::F16.check("precision", &device).is_ok(), used.has_f16);
+
+    // A tensor as large as is said can be made and read; this is the claim that refusals rest on. Of large limits, 128 MiB.
+    let len = (most.min(128 << 20) / 4) as usize;
+    let ones = Tensor::<1>::ones([len], &device);
+    let share = ones.sum().into_scalar::<f32>() / len as f32;
+    assert!((share - 1.0).abs() < 1e-3, "{share}");
+}
