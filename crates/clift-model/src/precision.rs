@@ -180,7 +180,7 @@ mod tests {
             let [_, inputs, outputs] = weight.dims();
             let bias = Tensor::zeros([outputs], (&device, dtype));
             Linear {
-                weight: Param::from_tensor(weight.clone().reshape([inputs, outputs])),
+                weight: Param::from_tensor(weight.clone().reshape([inputs, outputs]).detach()),
                 bias: Some(Param::from_tensor(bias)),
             }
         };
@@ -189,8 +189,8 @@ mod tests {
         let weights: Vec<_> = weights.into_iter().zip(2..).map(|(shape, seed)| draw(shape, seed)).collect();
         let layers: Vec<_> = weights.iter().map(layer).collect();
         let mut norm: LayerNorm = LayerNormConfig::new(16).init(&device);
-        norm.gamma = Param::from_tensor(norm.gamma.val().detach().cast(dtype));
-        norm.beta = norm.beta.map(|beta| Param::from_tensor(beta.val().detach().cast(dtype)));
+        norm.gamma = Param::from_tensor(norm.gamma.val().cast(dtype).detach());
+        norm.beta = norm.beta.map(|beta| Param::from_tensor(beta.val().cast(dtype).detach()));
         let output = {
             let _scope = precision.scope();
             let mixed = self_sdpa(linear_of_norm(&norm, &layers[0], x.clone()), 2);

@@ -417,6 +417,7 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             device: Device::flex().autodiff(),
             loss: Loss::default(),
             recompute: false,
+            loss_scale: None,
         };
         let checkpoints = Checkpoints::new(folder.clone(), CheckpointConfig::default());
         checkpoints.resume(&mut learner).map(drop).map_err(words_of)

@@ -101,7 +101,7 @@ mod tests {
             f32_s: 0.5,
             f16_s: 0.25,
             ratio: 0.5,
-            error: 1.25e-3,
+            error: 1.2e-3,
             loss,
             psnr_to_f32,
         };
