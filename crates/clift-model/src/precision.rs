@@ -213,19 +213,25 @@ mod tests {
     }
 
     #[test]
-    fn outputs_and_gradients_are_those_of_f64_to_three_digits() {
+    fn outputs_and_gradients_are_off_as_halves_are_off() {
         let expected = results(&Device::flex(), Precision::F16, DType::F64);
         let exact = results(&Device::flex(), Precision::F32, DType::F64);
         assert_eq!(expected, exact, "f64 is never narrowed");
+        let errors = |found: &[Vec<f64>]| -> Vec<f64> {
+            let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>().sqrt();
+            let error = |(found, expected): (&Vec<f64>, &Vec<f64>)| {
+                norm(&mut found.iter().zip(expected).map(|(a, b)| a - b)) / norm(&mut expected.iter().copied())
+            };
+            found.iter().zip(&expected).map(error).collect()
+        };
         for device in devices().into_iter().filter(|device| Precision::F16.check("precision", device).is_ok()) {
-            let half = results(&device, Precision::F16, DType::F32);
-            for (i, (half, expected)) in half.iter().zip(&expected).enumerate() {
-                let scale = expected.iter().fold(0.0_f64, |scale, value| scale.max(value.abs()));
-                let error = half.iter().zip(expected).fold(0.0_f64, |error, (a, b)| error.max((a - b).abs())) / scale;
-                // Operands are rounded by 2^-12 at most, in sums whose terms partly cancel, through five products.
-                assert!(error < 1e-2, "{i}: {error:.1e}");
-                // And they are halves: f32 is a thousand times nearer.
-                assert!(error > 1e-5, "{i}: {error:.1e}");
+            let single = errors(&results(&device, Precision::F32, DType::F32));
+            let half = errors(&results(&device, Precision::F16, DType::F32));
+            for (i, (half, single)) in half.iter().zip(&single).enumerate() {
+                // A half has 13 bits less. Errors of a few numbers are a matter of luck.
+                let ratio = half / single;
+                assert!((200.0..40_000.0).contains(&ratio), "{i}: {half:.1e} and {single:.1e}");
+                assert!(*half < 3e-2, "{i}: {half:.1e}");
             }
         }
     }
