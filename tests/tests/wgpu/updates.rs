@@ -49,7 +49,7 @@ pub fn learner(place: &Place, stage: Stage, recompute: bool) -> Learner {
         _ => model.condenser = model.condenser.no_grad(),
     }
     let optimizer = adamw(&OptimizerConfig::default());
-    Learner { model, optimizer, device: place.device.clone(), loss: Loss::default(), recompute }
+    Learner { model, optimizer, device: place.device.clone(), loss: Loss::default(), recompute, loss_scale: None }
 }
 
 /// What the stage sees.

@@ -74,12 +74,13 @@ fn check_limit(config: &Config, limit: u64, parts: &[Stage]) -> Result<(), Train
 fn setting_that_fits(config: &Config, part: Stage, limit: u64) -> Result<(&'static str, String, String), TrainError> {
     let fits = |config: &Config| Ok::<_, TrainError>(largest_tensor(config, part)?.bytes <= limit);
     let mut smaller = config.clone();
-    let views = |config: &mut Config, count: usize| match part {
-        Stage::Eval => config.eval.num_context = count,
-        _ => {
-            config.data.views.max_context = count;
-            config.data.views.min_context = config.data.views.min_context.min(count);
+    let set_views = |config: &mut Config, count: usize| {
+        if part == Stage::Eval {
+            config.eval.num_context = count;
+            return;
         }
+        config.data.views.max_context = count;
+        config.data.views.min_context = config.data.views.min_context.min(count);
     };
     let accumulate = match part {
         Stage::Stage1 => Some(("stage1.accumulate", config.stage1.accumulate)),
@@ -105,7 +106,7 @@ fn setting_that_fits(config: &Config, part: Stage, limit: u64) -> Result<(&'stat
     // With one scene at a time, where there are several.
     let also = accumulate.map_or_else(String::new, |(key, _)| format!(" with {key} = {}", batch_sizes(config, part).0));
     for count in (1..now).rev() {
-        views(&mut smaller, count);
+        set_views(&mut smaller, count);
         if fits(&smaller)? {
             return Ok((key, now.to_string(), format!("write {count}{also}, or make pictures smaller")));
         }
@@ -124,6 +125,7 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(&'static str, u64)>, Tra
 }
 
 /// One network at work on some scenes.
+#[expect(clippy::struct_field_names, reason = "they are all numbers of something")]
 struct Sizes {
     num_scenes: u64,
     num_tokens: u64,
@@ -152,7 +154,7 @@ impl Sizes {
             ("the context pixels with their rays", rows * config.model.context_patch_len() as u64),
             ("the encoder's queries, keys and values", rows * 3 * dim),
             ("the encoder's feed-forward values", rows * hidden),
-            ("a chunk of the encoder's scores", self.scores(config, self.num_scenes, self.num_tokens, self.num_tokens)),
+            ("a chunk of the encoder's scores", scores(config, self.num_scenes, self.num_tokens, self.num_tokens)),
         ]
     }
 
@@ -169,14 +171,8 @@ impl Sizes {
             ("the renderer's queries, keys and values", rows * 3 * dim),
             ("the renderer's feed-forward values", rows * hidden),
             ("the keys and values of the renderer's tokens", projected.max(gathered) * 2 * dim),
-            ("a chunk of the renderer's scores", self.scores(config, groups, queries, keys)),
+            ("a chunk of the renderer's scores", scores(config, groups, queries, keys)),
         ]
-    }
-
-    /// Scores that are there at once: a chunk of queries, at least one.
-    fn scores(&self, config: &Config, groups: u64, queries: u64, keys: u64) -> u64 {
-        let of_query = (groups * config.model.num_heads as u64 * keys).max(1);
-        of_query * (MAX_SCORES as u64 / of_query).clamp(1, queries.max(1))
     }
 
     /// A scene's tokens to stored ones; counts are those with the most centroids and the most members.
@@ -187,9 +183,15 @@ impl Sizes {
             ("the keys and values of the condenser's members", members * 2 * dim),
             ("the condenser's queries, keys and values", centroids * 3 * dim),
             ("the condenser's feed-forward values", centroids * hidden),
-            ("a chunk of the condenser's scores", self.scores(config, self.num_scenes, most, most)),
+            ("a chunk of the condenser's scores", scores(config, self.num_scenes, most, most)),
         ]
     }
+}
+
+/// Scores that are there at once: a chunk of queries, at least one.
+fn scores(config: &Config, groups: u64, queries: u64, keys: u64) -> u64 {
+    let of_query = (groups * config.model.num_heads as u64 * keys).max(1);
+    of_query * (MAX_SCORES as u64 / of_query).clamp(1, queries.max(1))
 }
 
 fn of_update(config: &Config, part: Stage) -> Result<Vec<(&'static str, u64)>, TrainError> {

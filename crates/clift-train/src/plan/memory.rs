@@ -192,7 +192,6 @@ fn condenser_part(config: &ModelConfig, w: f64, members: f64) -> Part {
 
 /// What is needed to encode, cluster and draw one scene without gradients.
 #[derive(Clone, Copy, Debug, PartialEq)]
-#[expect(clippy::struct_field_names, reason = "they are all numbers of something")]
 pub struct InferenceSizes {
     /// Encoder tokens.
     pub num_tokens: f64,

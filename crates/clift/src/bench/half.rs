@@ -18,7 +18,7 @@ use crate::{interrupt, table};
 pub struct BenchHalfArgs {
     /// The experiment whose sizes are used, a TOML file
     pub config: PathBuf,
-    /// The rows, of encode, render, stage1_step and stage2_step; all of them by default
+    /// Rows of the table, separated by commas; all of them by default
     #[arg(long, value_delimiter = ',', value_name = "WORK")]
     pub work: Vec<Work>,
     /// Repetitions that count
