@@ -80,7 +80,13 @@ pub fn middle(config: &Config, stage: Stage) -> Result<Middle, TrainError> {
 pub fn largest(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> {
     let num_context = config.data.views.max_context;
     if stage != Stage::Stage2 {
-        return kept(config, num_context, config.stage1.keep_tokens[1]);
+        let [low, high] = config.stage1.keep_tokens;
+        let scene = kept(config, num_context, high)?;
+        // Shares are drawn: with all tokens views share them, with all but one every view has its own.
+        let all_but_one = (scene.num_tokens - 1.0).max(1.0);
+        let is_per_view = low < 1.0;
+        let count = if is_per_view { scene.num_render_tokens.min(all_but_one) } else { scene.num_render_tokens };
+        return Ok(SceneSizes { num_render_tokens: count, is_per_view, ..scene });
     }
     let num_tokens = num_tokens(config, num_context)?;
     let counts = config.clusters.grid.iter().map(|count| count.of(num_tokens));
