@@ -2,6 +2,9 @@
 
 use crate::{ModelError, SceneClusters};
 
+/// Share of a squared distance that is rounding: sums in another order, as another device has them, move it by less.
+pub(super) const ROUNDING: f64 = 1e-4;
+
 /// The cluster of every token of one scene.
 #[derive(Clone, Debug)]
 pub(super) struct Labels {
@@ -40,16 +43,33 @@ impl Labels {
         }
     }
 
-    /// Keeps the sample nearest to every mean; the lower id on ties.
+    /// Keeps the sample nearest to every mean; the lower id where rounding alone would decide. The two of a pair are
+    /// equally near, and without that a scene would depend on the device that encoded it.
     pub fn nearest_samples(&self, num_clusters: usize) -> Result<SceneClusters, ModelError> {
         let mut nearest: Vec<Option<usize>> = vec![None; num_clusters];
         for (token, &cluster) in self.assignment.iter().enumerate() {
             let best = &mut nearest[cluster as usize];
-            if best.is_none_or(|best| self.distance[token] < self.distance[best]) {
+            if best.is_none_or(|best| self.distance[token] < (1.0 - ROUNDING) * self.distance[best]) {
                 *best = Some(token);
             }
         }
         let centroids = nearest.into_iter().flatten().map(|token| token as u32).collect();
         SceneClusters::new(self.assignment.clone(), centroids)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_lower_of_a_pair_is_kept_however_its_distances_are_rounded() {
+        let centroids = |distance: [f64; 5]| {
+            let labels = Labels { assignment: vec![0, 1, 0, 1, 1], distance: distance.to_vec() };
+            labels.nearest_samples(2).expect("valid clusters").centroid_index().to_vec()
+        };
+        assert_eq!(centroids([2.0, 3.0, 2.0, 1.0, 1.5]), [0, 3]);
+        assert_eq!(centroids([2.000_02, 3.0, 1.999_98, 1.000_01, 1.0]), [0, 3]);
+        assert_eq!(centroids([2.01, 3.0, 1.99, 1.0, 0.99]), [2, 4], "what is nearer is nearer");
     }
 }
