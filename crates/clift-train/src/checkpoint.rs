@@ -300,6 +300,10 @@ fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) ->
     let whole = loaded.ok().filter(|loaded| loaded.to_record().len() == num_tensors);
     let foreign = || TrainError::bad_file("checkpoint", &optimizer)("it is no record of this optimiser");
     learner.optimizer = whole.ok_or_else(foreign)?;
+    if loss_scale.is_some_and(|scale| !scale.is_possible()) {
+        let reason = "its loss scale is no power of two from 1 to 2^32";
+        return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
+    }
     // The precision is the config's, which resuming compares.
     if learner.loss_scale.is_some() && loss_scale.is_some() {
         learner.loss_scale = loss_scale;

@@ -32,6 +32,11 @@ impl LossScale {
         self.factor
     }
 
+    /// Whether it can be one: a file may hold anything.
+    pub fn is_possible(&self) -> bool {
+        (1.0..=MOST).contains(&self.factor) && self.factor.log2().fract() == 0.0
+    }
+
     /// Whether a step without a finite gradient is the factor's fault, which a smaller one mends: not where the loss
     /// itself is not finite, nor once there is nothing left to halve.
     pub fn is_overflow(&self, loss: f64, grad_norm: f64) -> bool {
@@ -73,6 +78,13 @@ mod tests {
             scale.grow();
         }
         assert_eq!(scale.factor(), MOST);
+    }
+
+    #[test]
+    fn a_factor_out_of_a_file_is_a_power_of_two_within_bounds() {
+        let is_possible = |factor| LossScale { factor, good_steps: 0 }.is_possible();
+        assert!([1.0, 2.0, FIRST, MOST].into_iter().all(is_possible));
+        assert!(![0.0, -2.0, 0.5, 3.0, 2.0 * MOST, f64::INFINITY, f64::NAN].into_iter().any(is_possible));
     }
 
     #[test]
