@@ -176,6 +176,13 @@ struct SdpaState<T> {
     heads: Heads,
 }
 
+impl<T> SdpaState<T> {
+    /// The gradients of the inputs.
+    fn backward<B: AttentionKernels<FloatTensorPrimitive = T>>(self, grad_output: T) -> Projected<T> {
+        B::attend_backward(self.inputs, self.attended, self.heads, grad_output)
+    }
+}
+
 fn attend<B: AttentionKernels>(inputs: Projected<FloatTensor<B>>, heads: Heads) -> SdpaState<FloatTensor<B>> {
     SdpaState { attended: B::attend(&inputs, heads), inputs, heads }
 }
@@ -184,19 +191,10 @@ impl<B: AttentionKernels> Backward<B, 1> for SdpaBackward {
     type State = SdpaState<FloatTensor<B>>;
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 1>(
-            ops,
-            grads,
-            |SdpaState { inputs, attended, heads }, grad_output, _| match B::attend_backward(
-                inputs,
-                attended,
-                heads,
-                grad_output,
-            ) {
-                Projected::Packed(grad) => [Some(grad)],
-                Projected::Separate { .. } => unreachable!("gradients come as the inputs did"),
-            },
-        );
+        register::<B, _, 1>(ops, grads, |state, grad_output, _| match state.backward::<B>(grad_output) {
+            Projected::Packed(grad) => [Some(grad)],
+            Projected::Separate { .. } => unreachable!("gradients come as the inputs did"),
+        });
     }
 }
 
@@ -204,19 +202,10 @@ impl<B: AttentionKernels> Backward<B, 2> for SdpaBackward {
     type State = SdpaState<FloatTensor<B>>;
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 2>(
-            ops,
-            grads,
-            |SdpaState { inputs, attended, heads }, grad_output, _| match B::attend_backward(
-                inputs,
-                attended,
-                heads,
-                grad_output,
-            ) {
-                Projected::Separate { query, key_value } => [Some(query), Some(key_value)],
-                Projected::Packed(_) => unreachable!("gradients come as the inputs did"),
-            },
-        );
+        register::<B, _, 2>(ops, grads, |state, grad_output, _| match state.backward::<B>(grad_output) {
+            Projected::Separate { query, key_value } => [Some(query), Some(key_value)],
+            Projected::Packed(_) => unreachable!("gradients come as the inputs did"),
+        });
     }
 }
 

@@ -1,8 +1,7 @@
 //! What is done of a cluster cache: a temporary folder that a killed process leaves and the next goes on with.
 //!
 //! Every set of contexts is a line of `journal.jsonl`, written after its bytes in `clusters.bin` and with a checksum of
-//! both.
-//! What a kill or a power cut tore is found by that and made again.
+//! both. What a kill or a power cut tore is found by that and made again.
 
 use std::collections::BTreeMap;
 use std::fs::File;

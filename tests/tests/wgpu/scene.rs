@@ -53,7 +53,7 @@ pub const CASES: &[Case] = &[
     },
 ];
 
-/// So many of the room's 12 tokens are stored. Two pairs are among the clusters.
+/// So many of the room's 12 tokens are stored. A pair, of which rounding once chose, is among the clusters.
 const STORED: usize = 7;
 
 /// Encodes a synthetic room on the place's device, writes it and reads it back.

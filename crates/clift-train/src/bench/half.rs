@@ -70,6 +70,10 @@ impl HalfRow {
 /// [`TrainError::BadConfig`] for sizes that cannot be, [`clift_model::ModelError::BadConfig`] on a device without f16,
 /// [`TrainError::BenchInterrupted`] after `stop` was set.
 pub fn compare(config: &Config, options: &BenchOptions, stop: &AtomicBool) -> Result<HalfReport, TrainError> {
+    if let Some(other) = options.work.iter().find(|work| !WORKS.contains(work)) {
+        let fix = format!("write some of {}", WORKS.map(Work::name).join(", "));
+        return Err(TrainError::BadConfig { key: "--work".into(), value: other.name().into(), fix });
+    }
     let [single, half] = [Precision::F32, Precision::F16]
         .map(|precision| BenchContext::new(&Config { precision, ..config.clone() }, options));
     let contexts = [single?, half?];
