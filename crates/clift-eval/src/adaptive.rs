@@ -30,6 +30,9 @@ pub struct Adaptive {
     pub difference: f64,
     /// Standard error of the difference; `null` for a single scene.
     pub difference_stderr: Option<f64>,
+    /// Most that any rule could reach in place of the difference, in dB, had it known every PSNR of every scene: what is
+    /// left to gain by choosing counts at all.
+    pub difference_bound: f64,
 }
 
 /// What one scene leaves within clusters and reaches, by rising count.
@@ -99,12 +102,48 @@ fn compare(curves: &[Curve], variant: Variant, count: usize) -> Option<Adaptive>
         psnr: mean(&kept.iter().map(|(_, psnr)| *psnr).collect::<Vec<_>>())?,
         difference: mean(&differences)?,
         difference_stderr: standard_error(&differences),
+        difference_bound: upper_bound(curves, count)? - mean(&fixed)?,
     })
 }
 
 /// The smallest count of a scene that leaves at most `max_error`, with its PSNR.
 fn smallest(curve: &Curve, max_error: f64) -> Option<(usize, f64)> {
     curve.iter().find(|(_, error, _)| *error <= max_error).map(|(count, _, psnr)| (*count, *psnr))
+}
+
+/// Largest mean PSNR of any counts that are on average at most `count`: the linear relaxation, which takes the
+/// steepest segments of all scenes' concave hulls first, the last one in part.
+fn upper_bound(curves: &[Curve], count: usize) -> Option<f64> {
+    let hulls: Vec<Vec<(f64, f64)>> = curves.iter().map(|curve| concave_hull(curve)).collect();
+    let first: Vec<(f64, f64)> = hulls.iter().filter_map(|hull| hull.first().copied()).collect();
+    let mut tokens_left: f64 = first.iter().map(|(tokens, _)| count as f64 - tokens).sum();
+    let segments = hulls.iter().flat_map(|hull| hull.windows(2));
+    let mut segments: Vec<(f64, f64)> = segments.map(|ends| (ends[1].0 - ends[0].0, ends[1].1 - ends[0].1)).collect();
+    segments.retain(|(_, gain)| *gain > 0.0);
+    segments.sort_by(|a, b| (b.1 / b.0).total_cmp(&(a.1 / a.0)));
+    let mut gained = 0.0;
+    for (tokens, gain) in segments {
+        let share = (tokens_left / tokens).clamp(0.0, 1.0);
+        gained += share * gain;
+        tokens_left -= share * tokens;
+    }
+    Some(mean(&first.iter().map(|(_, psnr)| *psnr).collect::<Vec<_>>())? + gained / curves.len() as f64)
+}
+
+/// The corners `(count, PSNR)` of a curve's upper hull, by rising count and falling slope.
+fn concave_hull(curve: &Curve) -> Vec<(f64, f64)> {
+    let mut hull: Vec<(f64, f64)> = Vec::new();
+    for &(count, _, psnr) in curve {
+        let point = (count as f64, psnr);
+        // A corner on or below the line from the one before it to the new point is none.
+        while let [.., a, b] = hull[..]
+            && (b.1 - a.1) * (point.0 - a.0) <= (point.1 - a.1) * (b.0 - a.0)
+        {
+            hull.pop();
+        }
+        hull.push(point);
+    }
+    hull
 }
 
 #[cfg(test)]
@@ -140,6 +179,32 @@ mod tests {
         assert_eq!((adaptive.max_error, adaptive.psnr, adaptive.num_scenes), (0.05, 28.0, 2));
         // -0.5 dB at the wall, +3 dB at the shelf.
         assert_eq!((adaptive.difference, adaptive.difference_stderr), (1.25, Some(1.75)));
+        // And that is the best there is: 3 dB for 12 tokens of the shelf, then 12 more for as much, none for the wall.
+        assert!((adaptive.difference_bound - 1.25).abs() < 1e-12, "{adaptive:?}");
+    }
+
+    #[test]
+    fn no_choice_of_counts_is_above_the_bound_and_one_is_near() {
+        // PSNR that rises with noise, so that curves are not concave, and of one scene falls.
+        let counts = [4_usize, 8, 16, 32];
+        let psnr = |scene: usize, i: usize| ((scene * 7 + i * 5) % 11) as f64 / 4.0 + (i * (4 - scene)) as f64 - 3.0;
+        let curves: Vec<Curve> =
+            (0..5).map(|scene| (0..4).map(|i| (counts[i], 0.0, psnr(scene, i))).collect()).collect();
+        for budget in [4, 8, 13, 16, 20, 32] {
+            let mut best = f64::NEG_INFINITY;
+            for choice in 0..4_usize.pow(5) {
+                let of = |scene: usize| choice / 4_usize.pow(scene as u32) % 4;
+                if (0..5).map(|scene| counts[of(scene)]).sum::<usize>() <= 5 * budget {
+                    best = best.max((0..5).map(|scene| psnr(scene, of(scene))).sum::<f64>() / 5.0);
+                }
+            }
+            let bound = upper_bound(&curves, budget).unwrap();
+            // The relaxation cuts one segment: less than one scene's range above.
+            assert!(bound >= best - 1e-12 && bound - best < 3.0, "{budget}: {best} {bound}");
+            if matches!(budget, 4 | 32) {
+                assert!((bound - best).abs() < 1e-12, "{budget}: {best} {bound}");
+            }
+        }
     }
 
     #[test]
