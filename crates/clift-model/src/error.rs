@@ -89,7 +89,7 @@ pub enum ModelError {
         path: PathBuf,
     },
     /// A scene is to be drawn with weights it was not made for.
-    #[error("the scene was made for the renderer {expected:.12}, these weights are {got:.12}; give the run it was encoded with (--model RUN): {path}", path = path.display())]
+    #[error("the scene was made for the renderer {expected:.12}, this one is {got:.12}; give the run it was encoded with (--model RUN): {path}", path = path.display())]
     OtherRenderer {
         /// Hash in the scene.
         expected: String,

@@ -57,7 +57,7 @@ pub use model::Clift;
 pub use patchwise::{Grouping, tile_clusters};
 pub use precision::Precision;
 pub use renderer::{RenderTokens, Renderer, SceneMemory};
-pub use scene::{Scene, TokenKind, TokenStorage, WorldFrame};
+pub use scene::{Scene, TokenKind, TokenStorage, WorldFrame, check_destination};
 pub use select::{Preset, Rules, Selector, TokenRay};
 pub use viewer::{Drawn, Viewer};
 pub use views::{Cameras, Views};

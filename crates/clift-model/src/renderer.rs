@@ -23,6 +23,11 @@ pub struct Renderer {
 }
 
 impl Renderer {
+    /// Side of a patch in pixels.
+    pub const fn patch_size(&self) -> usize {
+        self.patch_size
+    }
+
     /// Makes a renderer of the sizes of `config`.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         Self {

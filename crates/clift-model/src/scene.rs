@@ -28,7 +28,9 @@ mod write;
 
 use std::fmt;
 
+pub use check::MAX_SIDE_PX;
 pub use storage::TokenStorage;
+pub use write::check_destination;
 
 use crate::{ModelConfig, TokenRay, ViewCamera};
 
@@ -36,7 +38,8 @@ use crate::{ModelConfig, TokenRay, ViewCamera};
 pub const HEADER_BYTES: usize = 2048;
 
 const FORMAT: &str = "clift-scene";
-const VERSION: &str = "1";
+/// 1 named the weights alone, not the number of heads.
+const VERSION: &str = "2";
 
 /// What the tokens of a scene are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -81,7 +84,7 @@ pub struct Scene {
     pub kind: TokenKind,
     /// Sizes of the network.
     pub model: ModelConfig,
-    /// Hash of the renderer's weights, see [`crate::weights::hash`].
+    /// Hash of the renderer, see [`crate::weights::renderer_hash`].
     pub renderer_hash: String,
     /// The run or weight file it was encoded with, as it was typed: where a renderer is looked for first.
     pub model_path: String,

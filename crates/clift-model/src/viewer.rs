@@ -12,8 +12,11 @@ use crate::{
     Cameras, Init, ModelConfig, ModelError, Renderer, Rules, Scene, SceneMemory, Selector, ViewCamera, weights,
 };
 
-/// Frames that are drawn by one call where all tokens are used: they share keys and values.
-pub const FRAMES_PER_CALL: usize = 8;
+/// Most frames that are drawn by one call where all tokens are used: they share keys and values.
+const FRAMES_PER_CALL: usize = 8;
+
+/// Most patches that one call draws of several frames: eight of 512 x 512 pixels.
+const PATCHES_PER_CALL: usize = 1 << 15;
 
 /// A renderer alone, under the name it has in weight files.
 #[derive(Module, Debug)]
@@ -43,7 +46,7 @@ pub fn load_renderer(scene: &Scene, weights: &Path, device: &Device) -> Result<R
             loaded.missing.len()
         )));
     }
-    let got = weights::hash(&module.renderer);
+    let got = weights::renderer_hash(&module.renderer, &scene.model);
     if got != scene.renderer_hash {
         return Err(ModelError::OtherRenderer { expected: scene.renderer_hash.clone(), got, path: weights.into() });
     }
@@ -98,6 +101,13 @@ impl Viewer {
         self.memory.num_render_tokens()
     }
 
+    /// How many frames one call draws at best: fewer of large pictures.
+    pub fn frames_per_call(&self, height: usize, width: usize) -> usize {
+        let patch_size = self.renderer.patch_size();
+        let num_patches = (height / patch_size * (width / patch_size)).max(1);
+        (PATCHES_PER_CALL / num_patches).clamp(1, FRAMES_PER_CALL)
+    }
+
     /// Forgets the previous frame.
     pub fn reset(&mut self) {
         self.selector.reset();
@@ -105,7 +115,7 @@ impl Viewer {
 
     /// Draws the next frames of a path, each from `num_render_tokens` tokens of its own, or all of them from all tokens.
     ///
-    /// Frames of all tokens are drawn [`FRAMES_PER_CALL`] at a time.
+    /// Frames of all tokens are drawn [`Self::frames_per_call`] at a time.
     ///
     /// # Errors
     /// [`ModelError::NotFinite`] for a camera or a picture that is not finite, [`ModelError::BadConfig`] for no tokens,
@@ -122,7 +132,7 @@ impl Viewer {
     ) -> Result<Vec<Drawn>, ModelError> {
         if num_render_tokens >= self.num_storage_tokens() {
             let mut drawn = Vec::with_capacity(views.len());
-            for views in views.chunks(FRAMES_PER_CALL) {
+            for views in views.chunks(self.frames_per_call(height, width)) {
                 drawn.extend(self.render(views, height, width, None, 0.0)?);
             }
             return Ok(drawn);
@@ -194,7 +204,7 @@ mod tests {
             key: "room".into(),
             kind: TokenKind::Clift,
             model: MODEL,
-            renderer_hash: weights::hash(renderer),
+            renderer_hash: weights::renderer_hash(renderer, &MODEL),
             model_path: String::new(),
             height: 16,
             width: 24,
@@ -262,10 +272,18 @@ mod tests {
         let (mut viewer, ..) = viewer(&Device::flex(), Preset::Paper);
         for (height, width) in [(8, 8), (32, 48), (16, 64)] {
             let view = camera(0.0, 0.0).resized([16, 24], [height, width]);
+            assert_eq!(viewer.frames_per_call(height, width), 8);
             for count in [3, 12] {
                 assert_eq!(viewer.draw(&[view], height, width, count).unwrap()[0].pixels.len(), height * width * 3);
             }
         }
+    }
+
+    #[test]
+    fn fewer_frames_of_large_pictures_are_drawn_at_once() {
+        let (viewer, ..) = viewer(&Device::flex(), Preset::Paper);
+        let sizes = [(512, 512), (1024, 1024), (2048, 1024), (1 << 14, 1 << 14), (0, 8)];
+        assert_eq!(sizes.map(|(height, width)| viewer.frames_per_call(height, width)), [8, 2, 1, 1, 8]);
     }
 
     #[test]
@@ -277,11 +295,17 @@ mod tests {
         let scene = scene(&model.renderer);
         weights::save(&model, &path).unwrap();
         let renderer = load_renderer(&scene, &path, &device).unwrap();
-        assert_eq!(weights::hash(&renderer), scene.renderer_hash);
+        assert_eq!(weights::renderer_hash(&renderer, &MODEL), scene.renderer_hash);
+
+        // The weights fit one head as well as two.
+        let mut other_heads = scene.clone();
+        other_heads.model.num_heads = 1;
+        let message = load_renderer(&other_heads, &path, &device).unwrap_err().to_string();
+        assert!(message.starts_with("the scene was made for the renderer"), "{message}");
 
         weights::save(&Clift::new(&MODEL, 4, &device), &path).unwrap();
         let message = load_renderer(&scene, &path, &device).unwrap_err().to_string();
-        let expected = format!("the scene was made for the renderer {}, these", &scene.renderer_hash[..12]);
+        let expected = format!("the scene was made for the renderer {}, this", &scene.renderer_hash[..12]);
         assert!(message.starts_with(&expected) && message.contains("(--model RUN)"), "{message}");
 
         weights::save(&model.encoder, &path).unwrap();

@@ -11,7 +11,7 @@ use burn::store::{BurnToPyTorchAdapter, ModuleSnapshot, PyTorchToBurnAdapter, Sa
 use burn::tensor::{DType, Tensor, TensorData};
 use sha2::{Digest, Sha256};
 
-use crate::ModelError;
+use crate::{ModelConfig, ModelError, Renderer};
 
 /// Which parameters of a file went into a module.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -144,6 +144,16 @@ pub fn hash<M: Module>(module: &M) -> String {
             sha.update(value.to_le_bytes());
         }
     });
+    hexadecimal(sha)
+}
+
+/// [`hash`] of a renderer's weights together with what they do not show and drawing depends on: variant and heads.
+pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
+    let ModelConfig { variant, num_heads, .. } = config;
+    hexadecimal(Sha256::new().chain_update(format!("{variant} {num_heads} {}", hash(renderer))))
+}
+
+fn hexadecimal(sha: Sha256) -> String {
     sha.finalize().iter().fold(String::new(), |mut text, byte| {
         let _ = write!(text, "{byte:02x}");
         text

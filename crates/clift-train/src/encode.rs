@@ -87,7 +87,7 @@ impl Trained {
             key: key.into(),
             kind,
             model: config.model.clone(),
-            renderer_hash: weights::hash(&self.renderer),
+            renderer_hash: weights::renderer_hash(&self.renderer, &config.model),
             model_path: options.model_path.clone(),
             height: data.height,
             width: data.width,

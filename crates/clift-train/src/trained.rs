@@ -30,8 +30,11 @@ impl ModelPath {
             first: "clift train",
             path: path.into(),
         };
-        if path.is_dir() && path.join("model.safetensors").is_file() {
-            return Ok(Self { run: path.into(), weights: path.join("model.safetensors") });
+        let inside = path.join("model.safetensors");
+        if path.is_dir() && inside.is_file() {
+            // The folder of a stage has no config of its own.
+            let has_config = path.join("config.toml").is_file();
+            return if has_config { Ok(Self { run: path.into(), weights: inside }) } else { Self::find(&inside) };
         }
         if path.is_dir() {
             let weights = [Stage::Stage2, Stage::Stage1].map(|stage| weights_of(path, stage));
@@ -127,6 +130,7 @@ mod tests {
         let stage2 = touch("stage2/model.safetensors");
         assert_eq!(ModelPath::find(&run).unwrap().weights, stage2);
         assert_eq!(ModelPath::find(&stage1).unwrap(), ModelPath { run: run.clone(), weights: stage1.clone() });
+        assert_eq!(ModelPath::find(&run.join("stage1")).unwrap(), ModelPath::find(&stage1).unwrap());
         assert_eq!(renderer_weights(&run, TokenKind::Kmeans), stage1);
         assert_eq!(renderer_weights(&stage2, TokenKind::Clift), stage2);
 

@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use clift_data::{ClipReader, FileOptions, LayoutOptions, SceneSource, Split, open_layout};
 use clift_eval::TokenCount;
-use clift_model::TokenStorage;
 use clift_model::device::DeviceName;
+use clift_model::{TokenStorage, check_destination};
+use clift_train::config::SourceKind;
 use clift_train::encode::{Budget, EncodeOptions, Encoded};
 use clift_train::trained::{ModelPath, Trained};
 use clift_train::{Config, Override, read_config, scenes};
@@ -59,14 +60,22 @@ pub struct EncodeArgs {
 
 /// Encodes one scene and writes its file.
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
+    check_destination(&args.out)?;
     let model = ModelPath::find(&args.model)?;
     let (mut config, overrides) = read_config::<Config>(&model.run.join("config.toml"), &args.set)?;
+    if let Some(change) = overrides.iter().find(|change| change.key.starts_with("model.")) {
+        let message = "is what the weights were trained with: leave it out";
+        return Err(WrongUsage(format!("--set {}: the network {message}", change.key)).into());
+    }
     for change in &overrides {
         terminal::print_note(&format!("--set {change}"));
     }
     config.device = args.device.unwrap_or(config.device);
     // A model that was imported names no data.
-    config.data.root = config.data.root.or_else(|| args.data.clone());
+    if args.data.is_some() {
+        config.data.source = SourceKind::Auto;
+        config.data.root.clone_from(&args.data);
+    }
     config.validate()?;
     let source = match &args.data {
         Some(folder) => open_folder(folder, args.split, &config, &overrides)?,
@@ -120,7 +129,7 @@ fn open_folder(
     let files = if is_meant { config.data.files.clone() } else { FileOptions::default() };
     // Filters choose what to train on; this scene was chosen by hand.
     let (source, ledger) = open_layout(folder, split, &LayoutOptions { files, ..LayoutOptions::default() })?;
-    if ledger.has_gaps() {
+    if ledger.has_gaps() || !ledger.notes.is_empty() {
         terminal::print_note(&format!("{}: {ledger}", folder.display()));
     }
     Ok(source)

@@ -6,11 +6,14 @@ use crate::ViewCamera;
 /// Most context views of a scene.
 const MAX_VIEWS: usize = 1024;
 
-/// Longest side of a context view in pixels.
-const MAX_SIDE_PX: usize = 1 << 14;
+/// Longest side of a context view, and of a picture that is drawn, in pixels.
+pub const MAX_SIDE_PX: usize = 1 << 14;
 
 /// Most patches of all context views; the encoder has a token for each.
 const MAX_PATCHES: usize = 1 << 20;
+
+/// Largest coordinate of a context camera: normalised ones reach 1, or less where targets are counted too.
+const MAX_COORDINATE: f64 = 1e3;
 
 /// Largest error of `R^T R` in a pose, as the readers of captures allow.
 const MAX_ROTATION_ERROR: f64 = 1e-2;
@@ -79,7 +82,12 @@ fn check_camera(camera: &ViewCamera) -> Result<(), String> {
     if !(fx > 0.0 && fy > 0.0 && [fx, fy, cx, cy].iter().all(|value| value.is_finite())) {
         return Err(format!("has the intrinsics {:?}", camera.intrinsics));
     }
-    check_pose(&camera.c2w)
+    check_pose(&camera.c2w)?;
+    let centre = [3, 7, 11].map(|i| camera.c2w[i]);
+    if centre.iter().any(|value| value.abs() > MAX_COORDINATE) {
+        return Err(format!("stands at {centre:?}, which no normalised camera does"));
+    }
+    Ok(())
 }
 
 fn check_pose(c2w: &[f64; 16]) -> Result<(), String> {
@@ -89,8 +97,16 @@ fn check_pose(c2w: &[f64; 16]) -> Result<(), String> {
     let product = |i: usize, j: usize| (0..3).map(|k| c2w[4 * k + i] * c2w[4 * k + j]).sum::<f64>();
     let error = |i: usize, j: usize| (product(i, j) - f64::from(u8::from(i == j))).abs();
     let worst = (0..9).map(|entry| error(entry / 3, entry % 3)).fold(0.0, f64::max);
-    if worst > MAX_ROTATION_ERROR || c2w[12..] != [0.0, 0.0, 0.0, 1.0] {
+    if c2w[12..] != [0.0, 0.0, 0.0, 1.0] {
+        return Err(format!("is no pose: its last row is {:?}, expected [0, 0, 0, 1]", &c2w[12..]));
+    }
+    if worst > MAX_ROTATION_ERROR {
         return Err(format!("is no pose: its rotation is off an orthonormal one by {worst:.1e}"));
+    }
+    let row = |i: usize| [c2w[4 * i], c2w[4 * i + 1], c2w[4 * i + 2]];
+    let ([a, b, c], [d, e, f], [x, y, z]) = (row(0), row(1), row(2));
+    if (b * f - c * e) * x + (c * d - a * f) * y + (a * e - b * d) * z < 0.0 {
+        return Err("is no pose: its rotation mirrors".to_owned());
     }
     Ok(())
 }

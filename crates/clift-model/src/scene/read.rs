@@ -75,7 +75,7 @@ fn from_bytes(bytes: &[u8]) -> Result<(Scene, TokenStorage), Refusal> {
     }
     let version = fields.get("version")?;
     if version != VERSION {
-        return Err(refusal(format!("it has version {version}, this program reads {VERSION}"), OTHER_VERSION));
+        return Err(refusal(format!("it has version {version:?}, this program reads {VERSION}"), OTHER_VERSION));
     }
     let kind = fields.get("kind")?;
     let kind = [TokenKind::Clift, TokenKind::Kmeans].into_iter().find(|known| known.name() == kind);

@@ -61,6 +61,7 @@ impl Place {
     fn refused(&self, bytes: &[u8]) -> String {
         std::fs::write(self.path(), bytes).expect("writes");
         let error = Scene::read(&self.path()).expect_err("a hostile file");
+        std::fs::remove_file(self.path()).expect("removes");
         assert!(matches!(error, ModelError::SceneFile { .. }), "{error:?}");
         let message = error.to_string();
         assert!(message.starts_with("cannot use the scene: ") && message.ends_with("room.clift"), "{message}");
@@ -185,9 +186,9 @@ fn what_is_no_scene_is_refused_with_what_to_give() {
 
 #[test]
 fn another_version_is_refused_with_both() {
-    let message = Place::new().with_header("\"version\":\"1\"", "\"version\":\"2\"");
+    let message = Place::new().with_header("\"version\":\"2\"", "\"version\":\"1\"");
     assert!(
-        message.contains("it has version 2, this program reads 1; use the version of clift that wrote it"),
+        message.contains("it has version \"1\", this program reads 2; use the version of clift that wrote it"),
         "{message}"
     );
 }
@@ -269,13 +270,44 @@ fn a_scale_whose_tokens_overflow_is_refused() {
 }
 
 #[test]
+fn only_scenes_are_written_over() {
+    let place = Place::new();
+    let refusal = |path: &std::path::Path| scene().write(path, TokenStorage::F16).unwrap_err().to_string();
+    scene().write(&place.path(), TokenStorage::F32).unwrap();
+    scene().write(&place.path(), TokenStorage::F16).unwrap();
+    // A scene that was cut off may be made again.
+    let bytes = place.bytes(TokenStorage::F32);
+    std::fs::write(place.path(), &bytes[..1000]).unwrap();
+    scene().write(&place.path(), TokenStorage::F16).unwrap();
+
+    let weights = place.0.path().join("model.safetensors");
+    std::fs::write(&weights, b"weights").unwrap();
+    let message = refusal(&weights);
+    assert!(message.contains("the file there is no scene") && message.contains("choose another name"), "{message}");
+    assert_eq!(std::fs::read(&weights).unwrap(), b"weights");
+    assert!(refusal(place.0.path()).contains("is no regular file"));
+    assert!(refusal(&place.0.path().join("no/room.clift")).contains("there is no folder"));
+    assert!(refusal(&place.path().join("room.clift")).contains("there is no folder"));
+    #[cfg(unix)]
+    {
+        let link = place.0.path().join("link.clift");
+        std::os::unix::fs::symlink(place.path(), &link).unwrap();
+        assert!(refusal(&link).contains("is no regular file"));
+        assert!(link.is_symlink(), "stays a link");
+    }
+}
+
+#[test]
 fn poses_that_are_none_are_refused() {
     let place = Place::new();
     let f32 = TokenStorage::F32;
     assert!(place.with_tensor(f32, "context_c2w", 0, &2.0_f64.to_le_bytes()).contains("context camera 0 is no pose"));
-    assert!(
-        place.with_tensor(f32, "context_c2w", 8 * 15, &0.5_f64.to_le_bytes()).contains("context camera 0 is no pose")
-    );
+    let message = place.with_tensor(f32, "context_c2w", 8 * 15, &0.5_f64.to_le_bytes());
+    assert!(message.contains("context camera 0 is no pose: its last row is [0.0, 0.0, 0.0, 0.5]"), "{message}");
+    let message = place.with_tensor(f32, "context_c2w", 8 * 5, &(-1.0_f64).to_le_bytes());
+    assert!(message.contains("context camera 0 is no pose: its rotation mirrors"), "{message}");
+    let message = place.with_tensor(f32, "context_c2w", 8 * 7, &1e5_f64.to_le_bytes());
+    assert!(message.contains("context camera 0 stands at [-1.0, 100000.0"), "{message}");
     assert!(place.with_tensor(f32, "world_scale", 0, &0.0_f64.to_le_bytes()).contains("the scale of its poses is 0"));
     let negative = (-20.0_f64).to_le_bytes();
     assert!(place.with_tensor(f32, "context_intrinsics", 8, &negative).contains("has the intrinsics [20.0, -20.0"));

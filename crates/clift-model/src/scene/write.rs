@@ -1,26 +1,64 @@
 //! Scenes to files.
 
 use std::fmt::Write as _;
-use std::io::Write as _;
+use std::fs::File;
+use std::io::{ErrorKind, Read as _, Write as _};
 use std::path::Path;
 
 use super::{FORMAT, HEADER_BYTES, Scene, TokenStorage, VERSION, dtype_name};
 use crate::ModelError;
 use crate::weights::sync_folder;
 
+/// Where nothing is lost by writing a scene: a folder that exists, and in it nothing of the name or a scene.
+///
+/// # Errors
+/// [`ModelError::SceneFile`].
+pub fn check_destination(path: &Path) -> Result<(), ModelError> {
+    let refuse = |reason: &str, fix| {
+        Err(ModelError::SceneFile { action: "write", reason: reason.to_owned(), fix, path: path.into() })
+    };
+    let folder = folder_of(path);
+    if !folder.is_dir() {
+        return refuse(&format!("there is no folder {}", folder.display()), WRITABLE_FOLDER);
+    }
+    match std::fs::symlink_metadata(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
+        Err(error) => refuse(&error.to_string(), WRITABLE_FOLDER),
+        Ok(found) if !found.is_file() => refuse("what has the name is no regular file", OTHER_NAME),
+        Ok(_) if is_scene(path) => Ok(()),
+        Ok(_) => refuse("the file there is no scene, and only scenes are written over", OTHER_NAME),
+    }
+}
+
+/// Whether a file says in its header that it is a scene, of any version, whole or not.
+fn is_scene(path: &Path) -> bool {
+    let mut start = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(8 + HEADER_BYTES as u64).read_to_end(&mut start));
+    let says = format!("\"format\":\"{FORMAT}\"");
+    read.is_ok() && start.windows(says.len()).any(|part| part == says.as_bytes())
+}
+
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+const WRITABLE_FOLDER: &str = "choose a folder that exists and can be written to";
+const OTHER_NAME: &str = "choose another name";
+
 impl Scene {
     /// Writes the scene to a temporary name beside `path` that is then renamed: no reader sees half a file.
     ///
     /// # Errors
-    /// [`ModelError::SceneFile`], and [`ModelError::BadConfig`] for tokens that `storage` cannot hold.
+    /// [`ModelError::SceneFile`], for what [`check_destination`] refuses too, and [`ModelError::BadConfig`] for tokens that
+    /// `storage` cannot hold.
     pub fn write(&self, path: &Path, storage: TokenStorage) -> Result<(), ModelError> {
         let bytes = self.to_bytes(path, storage)?;
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        check_destination(path)?;
         let mut builder = tempfile::Builder::new();
         // The umask decides who may read it, as for any file that is kept.
         #[cfg(unix)]
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        let written = builder.tempfile_in(folder).and_then(|mut file| {
+        let written = builder.tempfile_in(folder_of(path)).and_then(|mut file| {
             file.write_all(&bytes)?;
             file.as_file().sync_all()?;
             file.persist(path)?;
@@ -29,7 +67,7 @@ impl Scene {
         written.map_err(|error| ModelError::SceneFile {
             action: "write",
             reason: error.to_string(),
-            fix: "choose a folder that exists and can be written to",
+            fix: WRITABLE_FOLDER,
             path: path.into(),
         })
     }
@@ -80,7 +118,12 @@ impl Scene {
         header.push('}');
         if header.len() > HEADER_BYTES {
             let most = HEADER_BYTES - (header.len() - self.key.len() - self.model_path.len()).min(HEADER_BYTES);
-            return Err(refuse(format!("its key and the path of its model are longer than {most} bytes")));
+            return Err(ModelError::SceneFile {
+                action: "write",
+                reason: format!("the path of its model and its key are together longer than {most} bytes"),
+                fix: "give the model by a shorter path",
+                path: path.into(),
+            });
         }
         let mut bytes = (HEADER_BYTES as u64).to_le_bytes().to_vec();
         bytes.extend(header.bytes());
