@@ -1,12 +1,13 @@
 //! Camera paths to render: through the context views, around what they look at, or from a file.
 
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 use serde::Deserialize;
 
 use crate::camera::{Intrinsics, IntrinsicsNorm, Pose, cross, dot};
 use crate::error::DataError;
-use crate::normalize::{SceneFrame, from_quaternion, quaternion};
+use crate::normalize::{SceneFrame, check_near, from_quaternion, quaternion};
 
 /// Share of the contexts' extent that an orbit goes around: outside it nothing was seen.
 const ORBIT_SHARE: f64 = 0.7;
@@ -125,6 +126,9 @@ fn look_at(centre: [f64; 3], point: [f64; 3]) -> Pose {
     Pose { rotation: [0, 1, 2].map(|row| [right[row], down[row], forward[row]]), translation: centre }
 }
 
+/// Focal lengths of a file over width and height, and how far from 0 centres may be: beyond any camera.
+const INTRINSICS: RangeInclusive<f64> = 1e-3..=1e3;
+
 /// What a file of poses holds.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -162,6 +166,7 @@ pub fn read_poses(
     if !(1..=MAX_POSES).contains(&file.poses.len()) {
         return Err(bad(format!("{} poses, expected 1 to {MAX_POSES}", file.poses.len())));
     }
+    let is_near = |cx: f64, cy: f64| [cx, cy].iter().all(|centre| centre.abs() <= *INTRINSICS.end());
     let view = |(position, pose): (usize, FilePose)| {
         let bad = |what: String| bad(format!("pose {position}: {what}"));
         let (rows, last) = match pose.c2w[..] {
@@ -173,12 +178,19 @@ pub fn read_poses(
             return Err(bad(format!("its last row is {last:?}, expected [0, 0, 0, 1]")));
         }
         let c2w = frame.normalize(Pose::from_rows(&rows).map_err(|error| bad(error.to_string()))?);
+        check_near(&c2w).map_err(|error| bad(error.to_string()))?;
         let intrinsics = match pose.intrinsics_norm {
             None => default,
-            Some([fx, fy, cx, cy]) if fx > 0.0 && fy > 0.0 && [fx, fy, cx, cy].iter().all(|v| v.is_finite()) => {
+            Some([fx, fy, cx, cy]) if INTRINSICS.contains(&fx) && INTRINSICS.contains(&fy) && is_near(cx, cy) => {
                 IntrinsicsNorm { fx, fy, cx, cy }.to_pixels(width, height)
             }
-            Some(other) => return Err(bad(format!("its intrinsics are {other:?}"))),
+            Some(other) => {
+                let most = INTRINSICS.end();
+                return Err(bad(format!(
+                    "its intrinsics are {other:?}; expected fx and fy from {} to {most}, cx and cy within {most} of 0",
+                    INTRINSICS.start()
+                )));
+            }
         };
         Ok(PathView { c2w, intrinsics })
     };
@@ -307,6 +319,15 @@ mod tests {
                 r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "intrinsics_norm": [0,1,0,0]}]}"#,
                 "pose 0: its intrinsics are [0.0, 1.0",
             ),
+            (
+                r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "intrinsics_norm": [1,1,1e39,0.5]}]}"#,
+                "pose 0: its intrinsics are [1.0, 1.0, 1e39",
+            ),
+            (
+                r#"{"poses": [{"c2w": [[1,0,0,1e6],[0,1,0,0],[0,0,1,0]]}]}"#,
+                "pose 0: bad camera: it stands 1999998 times",
+            ),
+            (r#"{"poses": [{"c2w": [[1,0,0,1e300],[0,1,0,0],[0,0,1,0]]}]}"#, "pose 0: bad camera: it stands 2"),
             (r#"{"poses": [], "frames": []}"#, "unknown field `frames`"),
         ] {
             let message = read(json).unwrap_err().to_string();

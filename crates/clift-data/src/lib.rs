@@ -53,6 +53,7 @@ pub mod test_scenes;
 pub mod throughput;
 mod transforms;
 pub mod undistort;
+pub mod unfinished;
 mod unpickle;
 
 pub use batch::{ClipBatch, TrainingClips};

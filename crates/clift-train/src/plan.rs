@@ -12,6 +12,8 @@ mod memory;
 mod sizes;
 mod tape;
 
+pub use memory::drawing_bytes;
+
 use clift_eval::vgg::VggShape;
 use clift_model::ModelConfig;
 use clift_model::device::DeviceName;

@@ -6,23 +6,37 @@ mod film;
 use anyhow::Context;
 use clift_data::camera_path::{PathView, interpolate, mean_intrinsics, orbit, read_poses};
 use clift_data::files::replace;
+use clift_data::unfinished::Unfinished;
 use clift_data::{Intrinsics, Pose, SceneFrame};
 use clift_eval::Calibration;
+use clift_model::device::DeviceName;
+use clift_model::scene::MAX_SIDE_PX;
 use clift_model::viewer::load_renderer;
 use clift_model::{ModelError, Scene, ViewCamera, Viewer};
+use clift_train::plan::drawing_bytes;
+use clift_train::plan::machine::available_bytes;
 use clift_train::trained::renderer_weights;
 use serde::Serialize;
 
 use args::CameraPath;
 pub use args::RenderArgs;
+use film::Frames;
 
 use crate::WrongUsage;
+use crate::data::text::bytes;
 use crate::terminal::{print_note, print_result};
+
+/// Frames of a path that is made up, unless `--frames` says otherwise.
+const FRAMES: usize = 60;
 
 /// What `render.json` holds.
 #[derive(Debug, Serialize)]
 struct Report {
     scene: String,
+    /// As it was typed.
+    path: String,
+    /// How the tokens of a frame were chosen; `null` where all are used.
+    selection: Option<&'static str>,
     device: &'static str,
     height: usize,
     width: usize,
@@ -41,26 +55,32 @@ struct Report {
 pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let (scene, _) = Scene::read(&args.scene)?;
     let [width, height] = args.size.unwrap_or([scene.width, scene.height]);
-    // Refuses what is not whole patches.
-    scene.model.num_tokens(1, height, width)?;
+    let device = args.device.unwrap_or_default();
+    check_size(&scene, [width, height], device)?;
     film::refuse_existing(&args.out)?;
     let views = path(&scene, args, height, width)?;
     let model = args.model.clone().unwrap_or_else(|| scene.model_path.clone().into());
     let weights = renderer_weights(&model, scene.kind);
     if args.model.is_none() && !weights.exists() {
-        let message = format!("the scene was encoded with {}, which is not there", weights.display());
+        let message = format!("the scene was encoded with {weights:?}, which is not there");
         return Err(WrongUsage(format!("{message}; give the run with --model RUN")).into());
     }
-    let device = args.device.unwrap_or_default();
+    let stop = crate::interrupt::flag()?;
     let opened = device.open()?;
     args.precision.check("--precision", &opened)?;
     let _precision = args.precision.scope();
     let renderer = load_renderer(&scene, &weights, &opened)?;
     let mut viewer = Viewer::new(&scene, renderer, args.selection.rules(), &opened)?;
     let (num_render_tokens, calibration) = tokens(&scene, args, &mut viewer, &views[0], height, width)?;
-    let timing = film::film(&mut viewer, &views, [height, width], num_render_tokens, args)?;
+    // Nothing is in the folder before everything is.
+    let making = || format!("making {}", args.out.display());
+    let files = Unfinished::new(&args.out).with_context(making)?;
+    let frames = Frames { height, width, num_render_tokens, fps: args.fps };
+    let timing = film::film(&mut viewer, &views, &frames, files.path(), &stop)?;
     let report = Report {
         scene: scene.key.clone(),
+        path: args.path.to_string(),
+        selection: (num_render_tokens < scene.num_tokens()).then(|| args.selection.name()),
         device: device.as_str(),
         height,
         width,
@@ -72,8 +92,9 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         calibration: calibration.map(|times| times.some.into_iter().chain([times.all]).collect()),
     };
     let json = serde_json::to_vec_pretty(&report).context("writing the report as JSON")?;
-    let path = args.out.join("render.json");
+    let path = files.path().join("render.json");
     replace(&path, &json).with_context(|| format!("writing {}", path.display()))?;
+    files.keep().with_context(making)?;
     print_result(&format!(
         "{}: {} frames of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
          {:.1} ms per frame on {device} (median): {:.1} ms to choose tokens, {:.1} ms to draw",
@@ -84,6 +105,22 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         1e3 * timing.select_s,
         1e3 * timing.render_s,
     ))
+}
+
+/// Refuses sizes that are not whole patches, and those that no picture has or this machine cannot draw.
+fn check_size(scene: &Scene, [width, height]: [usize; 2], device: DeviceName) -> anyhow::Result<()> {
+    if width.max(height) > MAX_SIDE_PX {
+        let message = format!("--size {width}x{height}: write at most {MAX_SIDE_PX} pixels a side");
+        return Err(WrongUsage(message).into());
+    }
+    let num_patches = scene.model.num_tokens(1, height, width)?;
+    let needed = drawing_bytes(&scene.model, scene.num_tokens(), num_patches);
+    if let Some(available) = available_bytes(device).filter(|available| needed > *available) {
+        let (needed, available) = (bytes(needed), bytes(available));
+        let message = format!("--size {width}x{height} takes {needed} of memory for a frame, and {available} are free");
+        return Err(WrongUsage(message).into());
+    }
+    Ok(())
 }
 
 /// How many tokens each frame is drawn from, and what was measured to find out.
@@ -121,9 +158,18 @@ fn path(scene: &Scene, args: &RenderArgs, height: usize, width: usize) -> anyhow
     });
     let context = context.collect::<anyhow::Result<Vec<_>>>()?;
     let views = match &args.path {
-        CameraPath::Interpolate => interpolate(&context, args.frames),
-        CameraPath::Orbit => orbit(&context, args.frames),
+        CameraPath::Interpolate => interpolate(&context, args.frames.unwrap_or(FRAMES)),
+        CameraPath::Orbit => orbit(&context, args.frames.unwrap_or(FRAMES)),
         CameraPath::File(file) => {
+            if args.frames.is_some() {
+                return Err(
+                    WrongUsage("a file of poses has its own number of frames: leave --frames out".into()).into()
+                );
+            }
+            if !file.exists() {
+                let message = "there is no such file; write interpolate, orbit, or a file of poses";
+                return Err(WrongUsage(format!("--path {}: {message}", file.display())).into());
+            }
             let mean_c2w = Pose::from_matrix(&scene.world.mean_c2w)?;
             let frame = SceneFrame { mean_c2w, scale: scene.world.scale };
             let default = mean_intrinsics(&context).context("a scene without context views")?;

@@ -209,6 +209,19 @@ pub struct InferenceSizes {
     pub lpips: Option<(VggSizes, f64)>,
 }
 
+/// Keys and values of one block for tokens of `x` values, and the hidden values of views of `y`.
+fn render_values(config: &ModelConfig, x: f64, y: f64) -> f64 {
+    3.0 * x + y + forward_values(config, y)
+}
+
+/// Most bytes of tensors alive while one view of so many patches is drawn from so many tokens, weights aside.
+pub fn drawing_bytes(config: &ModelConfig, num_render_tokens: usize, num_patches: usize) -> u64 {
+    let values = |count: usize| count as f64 * config.dim as f64;
+    let picture = (num_patches * config.patch_size.pow(2) * 3) as f64;
+    // The rays of the pixels are twice the picture; it is unfolded from patches, and copied to the host.
+    (F32 * (render_values(config, values(num_render_tokens), values(num_patches)) + 5.0 * picture)) as u64
+}
+
 /// Most bytes of tensors alive while `parameters` weights encode, cluster and draw a scene.
 pub fn inference_bytes(config: &ModelConfig, parameters: f64, sizes: &InferenceSizes) -> f64 {
     let dim = config.dim as f64;
@@ -222,8 +235,7 @@ pub fn inference_bytes(config: &ModelConfig, parameters: f64, sizes: &InferenceS
         // The tokens about their mean; the table, or one score per token and cluster.
         2.0 * x + table.max(sizes.num_tokens * clusters)
     });
-    // Keys and values of one block, and the views' hidden values.
-    let render = if sizes.num_targets > 0.0 { 3.0 * x + y + forward_values(config, y) } else { 0.0 };
+    let render = if sizes.num_targets > 0.0 { render_values(config, x, y) } else { 0.0 };
     // What the pictures are in its layers, unit vectors of it, and one layer computed from another.
     let (lpips, held) = sizes.lpips.map_or((0.0, 0.0), |(vgg, targets)| {
         // Its file is whole in memory while its weights are taken out.

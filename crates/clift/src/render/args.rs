@@ -1,6 +1,7 @@
 //! Arguments of `clift render`.
 
 use std::convert::Infallible;
+use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
@@ -38,9 +39,9 @@ pub struct RenderArgs {
     /// Columns and rows of a frame, multiples of the model's patch; those of the context views by default
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<[usize; 2]>,
-    /// Frames of `interpolate` and `orbit`
-    #[arg(long, value_name = "N", default_value_t = 60, value_parser = RangedU64ValueParser::<usize>::new().range(1..=100_000))]
-    pub frames: usize,
+    /// Frames of `interpolate` and `orbit` [default: 60]; a file of poses has its own number
+    #[arg(long, value_name = "N", value_parser = RangedU64ValueParser::<usize>::new().range(1..=100_000))]
+    pub frames: Option<usize>,
     /// Frames per second of the animation
     #[arg(long, value_name = "F", default_value_t = 20, value_parser = clap::value_parser!(u16).range(1..))]
     pub fps: u16,
@@ -61,6 +62,16 @@ pub enum CameraPath {
     Orbit,
     /// As a file says.
     File(PathBuf),
+}
+
+impl fmt::Display for CameraPath {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Interpolate => f.write_str("interpolate"),
+            Self::Orbit => f.write_str("orbit"),
+            Self::File(path) => path.display().fmt(f),
+        }
+    }
 }
 
 impl FromStr for CameraPath {
@@ -101,7 +112,7 @@ mod tests {
         assert_eq!(parse("--path orbit").unwrap().path, CameraPath::Orbit);
         assert_eq!(parse("--path ./orbit").unwrap().path, CameraPath::File("./orbit".into()));
         let args = parse("--path interpolate --size 64x48 --frames 7 --selection global --render 1/4").unwrap();
-        assert_eq!((args.path, args.size, args.frames), (CameraPath::Interpolate, Some([64, 48]), 7));
+        assert_eq!((args.path, args.size, args.frames), (CameraPath::Interpolate, Some([64, 48]), Some(7)));
         assert_eq!((args.selection, args.render), (Preset::Global, Some(TokenCount::Share(0.25))));
     }
 

@@ -1,14 +1,15 @@
 //! The frames of a path, on disk.
 
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
+use clift_data::unfinished::is_empty;
 use clift_eval::Animation;
 use clift_eval::picture::Picture;
-use clift_model::viewer::FRAMES_PER_CALL;
 use clift_model::{ViewCamera, Viewer};
+use clift_train::TrainError;
 
-use super::args::RenderArgs;
 use crate::WrongUsage;
 use crate::terminal::Counter;
 
@@ -18,37 +19,46 @@ pub struct Timing {
     pub render_s: f64,
 }
 
-/// Frames of a former path would mix with those of this one.
-pub fn refuse_existing(out: &Path) -> anyhow::Result<()> {
-    let mut items = match std::fs::read_dir(out) {
-        Ok(items) => items,
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
-        Err(error) => return Err(error).with_context(|| format!("reading {}", out.display())),
-    };
-    if items.next().is_some() {
-        let message = "is not empty, and nothing is written over; choose another folder or move it away";
-        return Err(WrongUsage(format!("{} {message}", out.display())).into());
-    }
-    Ok(())
+/// What is drawn of every view.
+pub struct Frames {
+    pub height: usize,
+    pub width: usize,
+    pub num_render_tokens: usize,
+    /// Per second of the animation.
+    pub fps: u16,
 }
 
-/// Draws every view and writes the frames, one by one and as an animation.
+/// Frames of a former path would mix with those of this one.
+pub fn refuse_existing(out: &Path) -> anyhow::Result<()> {
+    if is_empty(out).with_context(|| format!("reading {}", out.display()))? {
+        return Ok(());
+    }
+    let message = "is not empty, and nothing is written over; choose another folder or move it away";
+    Err(WrongUsage(format!("{} {message}", out.display())).into())
+}
+
+/// Draws every view and writes the frames to `folder`, one by one and as an animation, until `stop` is set.
 pub fn film(
     viewer: &mut Viewer,
     views: &[ViewCamera],
-    [height, width]: [usize; 2],
-    num_render_tokens: usize,
-    args: &RenderArgs,
+    frames: &Frames,
+    folder: &Path,
+    stop: &AtomicBool,
 ) -> anyhow::Result<Timing> {
-    let out = &args.out;
-    std::fs::create_dir_all(out).with_context(|| format!("making {}", out.display()))?;
-    let mut animation = Animation::new(&out.join("animation.png"), width, height, views.len(), args.fps)?;
+    let &Frames { height, width, num_render_tokens, fps } = frames;
+    let mut animation = Animation::new(&folder.join("animation.png"), width, height, views.len(), fps)?;
     let mut counter = Counter::new("frames", views.len() as u64);
     let (mut select_s, mut render_s) = (Vec::new(), Vec::new());
-    for views in views.chunks(FRAMES_PER_CALL) {
-        for drawn in viewer.draw(views, height, width, num_render_tokens)? {
+    for some in views.chunks(viewer.frames_per_call(height, width)) {
+        let first = render_s.len();
+        if stop.load(Ordering::Relaxed) {
+            let work = format!("frame {first} of {}", views.len());
+            return Err(TrainError::Abandoned { work }.into());
+        }
+        let drawn = viewer.draw(some, height, width, num_render_tokens);
+        for drawn in drawn.with_context(|| format!("drawing frames {first} to {}", first + some.len() - 1))? {
             let picture = Picture::from_unit(&drawn.pixels, height, width)?;
-            picture.write_png(&out.join(format!("frame-{:05}.png", render_s.len())))?;
+            picture.write_png(&folder.join(format!("frame-{:05}.png", render_s.len())))?;
             animation.add(&picture)?;
             select_s.push(drawn.select_s);
             render_s.push(drawn.render_s);
