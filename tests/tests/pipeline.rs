@@ -12,7 +12,7 @@ fn keys(value: &Value) -> Vec<&str> {
 }
 
 /// Keys of `summary.json`.
-const SUMMARY_KEYS: [&str; 10] = [
+const SUMMARY_KEYS: [&str; 11] = [
     "adaptive",
     "baselines",
     "differences",
@@ -23,6 +23,7 @@ const SUMMARY_KEYS: [&str; 10] = [
     "num_skipped",
     "num_views",
     "points",
+    "selection",
 ];
 
 /// Keys of a point in it.

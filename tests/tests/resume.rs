@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::support::{Place, Ran, files, finish, signal as send, spawn, wait_for_steps};
+use crate::support::{Place, Ran, clift, files, finish, signal as send, spawn, wait_for_steps};
 
 /// Starts a run, sends it a signal after some steps and waits for its end.
 fn stop_after(place: &Place, name: &str, set: &[&str], flags: &[&str], count: usize, signal: &str) -> Ran {
@@ -170,16 +170,27 @@ fn an_evaluation_can_be_interrupted() {
     // Hundreds of scenes with rows of targets: far longer than the signal takes.
     let mut child = spawn(["eval", &run, "--set", "eval.num_scenes=0", "--set", "eval.num_sheets=400"]);
     let sheets = place.at("run/eval/sheets");
-    let before = std::fs::read_dir(&sheets).expect("the first evaluation's").count();
+    let names = || {
+        let items = std::fs::read_dir(&sheets).expect("the first evaluation's");
+        items.map(|item| item.expect("an item").path()).collect::<std::collections::BTreeSet<_>>()
+    };
+    let (before, summary) = (names(), place.bytes("run/eval/summary.json"));
+    // Sheets are made in a folder of their own, and take the place of the former ones all together.
+    let new = |path: &std::path::PathBuf| std::fs::read_dir(path).map_or(0, Iterator::count);
     let started = Instant::now();
-    while std::fs::read_dir(&sheets).expect("the folder").count() < before + 3 {
+    while names().difference(&before).map(new).sum::<usize>() < 3 {
         assert!(child.try_wait().expect("a child").is_none(), "the evaluation ended before the signal");
         assert!(started.elapsed() < Duration::from_mins(1), "no sheet within a minute");
         std::thread::sleep(Duration::from_millis(2));
     }
     send(&child, "-INT");
     let message = finish(child).fails(130);
-    assert!(message.contains("interrupted at step"), "{message}");
+    assert!(message.contains("interrupted during the evaluation, after "), "{message}");
+    assert!(message.contains(" scenes; nothing was written"), "{message}");
+    assert_eq!((names(), place.bytes("run/eval/summary.json")), (before, summary));
+    // A shorter evaluation leaves no sheet of a longer one.
+    clift(["eval", &run, "--set", "eval.num_sheets=1", "--set", "eval.num_scenes=2"]).ok();
+    assert_eq!(names().len(), 1);
 }
 
 #[test]

@@ -205,6 +205,12 @@ fn a_path_is_drawn_as_frames_and_an_animation_from_any_number_of_tokens() {
         assert_eq!((&report["num_frames"], &report["num_render_tokens"]), (&10.into(), &num_render_tokens.into()));
         assert_eq!(report["calibration"].is_array(), out == "in-time", "{report}");
         assert_eq!(report["select_s"].as_f64().unwrap() > 0.0, num_render_tokens < 8, "{report}");
+        let selection = match out {
+            "some" => "scaled".into(),
+            "global" => "global".into(),
+            _ => Value::Null,
+        };
+        assert_eq!((&report["path"], &report["selection"]), (&flags[1].into(), &selection));
     }
     // The first frame through the contexts is the first context's.
     let device = burn::tensor::Device::flex();
@@ -237,8 +243,19 @@ fn what_cannot_be_drawn_says_what_to_do() {
     let other = place.at("other/stage1/model.safetensors").display().to_string();
     let message = with(&["--model", &other]).fails(2);
     assert!(message.contains("the scene was made for the renderer ") && message.contains("--model RUN"), "{message}");
-    let message = render(&["--path", "no/poses.json"]).fails(1);
-    assert!(message.trim_end().ends_with("no/poses.json"), "{message}");
+    for size in ["1000000x8", "17179869184x17179869184"] {
+        let message = with(&["--size", size]).fails(2);
+        assert!(message.contains(&format!("--size {size}: write at most 16384 pixels a side")), "{message}");
+    }
+    let message = render(&["--path", "interpolated"]).fails(2);
+    assert!(message.contains("--path interpolated: there is no such file; write interpolate, orbit, or"), "{message}");
+    // The second pose is no camera: nothing is drawn of the first either.
+    let pose = json!({"c2w": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]});
+    let far = json!({"c2w": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0]]});
+    std::fs::write(place.at("poses.json"), json!({"poses": [pose, far]}).to_string()).unwrap();
+    let poses = place.at("poses.json").display().to_string();
+    assert!(render(&["--path", &poses]).fails(1).contains("pose 1: bad camera: it stands "));
+    assert!(render(&["--path", &poses, "--frames", "3"]).fails(2).contains("has its own number of frames"));
     assert!(!place.at("out").exists(), "nothing is left of what was refused");
 
     std::fs::create_dir(place.at("out")).unwrap();
@@ -258,6 +275,54 @@ fn what_cannot_be_drawn_says_what_to_do() {
     let weights = place.at("moved/stage2/model.safetensors").display().to_string();
     let message = clift(["render", weights.as_str(), "--path", "orbit", "--out", "again"]).fails(1);
     assert!(message.contains("its header does not say that it is a scene"), "{message}");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_path_that_is_interrupted_leaves_nothing_behind() {
+    use crate::support::{finish, signal, spawn};
+
+    let place = Place::new();
+    place.train("run", &[], &[]).ok();
+    clift(encode_args(&place, "run", "room.clift", &["--scene", KEY])).ok();
+    let flags = ["--path", "orbit", "--frames", "100000"];
+    let mut child = spawn(render_args(&place, "room.clift", "out", &flags));
+    let started = std::time::Instant::now();
+    let is_drawing = || {
+        let mut items = std::fs::read_dir(place.at("out")).into_iter().flatten().flatten();
+        items.any(|item| std::fs::read_dir(item.path()).is_ok_and(|frames| frames.count() > 3))
+    };
+    while !is_drawing() {
+        assert!(child.try_wait().expect("a child").is_none(), "the path ended before the signal");
+        assert!(started.elapsed().as_secs() < 60, "no frame within a minute");
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    signal(&child, "-INT");
+    let message = finish(child).fails(130);
+    assert!(
+        message.contains("error: interrupted during frame ") && message.contains("nothing was written"),
+        "{message}"
+    );
+    assert!(!place.at("out").exists());
+}
+
+#[test]
+fn a_scene_never_takes_the_place_of_anything_else() {
+    let place = Place::new();
+    place.train("run", &[], &["--only", "stage1"]).ok();
+    let encode =
+        |name: &str, flags: &[&str]| clift(encode_args(&place, "run", name, &[&["--scene", KEY][..], flags].concat()));
+    let weights = place.bytes("run/stage1/model.safetensors");
+    let message = encode("run/stage1/model.safetensors", &[]).fails(1);
+    assert!(message.contains("the file there is no scene, and only scenes are written over"), "{message}");
+    assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
+    assert!(encode("no/room.clift", &[]).fails(1).contains("there is no folder "));
+    encode("room.clift", &[]).ok();
+    encode("room.clift", &["--storage", "8"]).ok();
+    assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);
+    // Other heads fit the same weights, and draw another picture.
+    let message = encode("heads.clift", &["--set", "model.num_heads=1"]).fails(2);
+    assert!(message.contains("--set model.num_heads: the network is what the weights were trained with"), "{message}");
 }
 
 #[test]
@@ -293,6 +358,8 @@ fn a_scene_is_chosen_by_key_and_encoded_with_what_the_run_has() {
     let out = place.at("from-file.clift").display().to_string();
     clift(["encode", &file, mini.to_str().unwrap(), "-o", &out]).ok();
     assert_eq!(Scene::read(Path::new(&out)).unwrap().0.model_path, file);
+    let stage = place.at("run/stage1").display().to_string();
+    clift(["encode", &stage, mini.to_str().unwrap(), "-o", &out]).ok();
     std::fs::copy(&file, place.at("alone.safetensors")).unwrap();
     let alone = place.at("alone.safetensors").display().to_string();
     let message = clift(["encode", &alone, mini.to_str().unwrap(), "-o", &out]).fails(2);

@@ -204,6 +204,7 @@ pub fn evaluate_scene(
                 for num_render_tokens in sweep.render_counts(num_storage_tokens) {
                     let some = Setting { num_render_tokens, ..whole };
                     let patch_size = sweep.model.patch_size;
+                    into.selection = Some(sweep.selection);
                     let chosen = sweep.selection.choose(clip, &stored.ids, patch_size, num_render_tokens, seed)?;
                     renderings.push(drawing.render(&stored, Some(&chosen), some, rows, into)?);
                     if !rows.is_empty() {

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
 use crate::predictions::SystemName;
+use crate::selection::Selection;
 
 /// How a view was made.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -136,6 +137,8 @@ pub struct Accumulator {
     pub(crate) not_measured: Vec<NotMeasured>,
     pub(crate) missing: BTreeMap<SystemName, BTreeSet<String>>,
     pub(crate) lpips_sha256: Option<String>,
+    /// How rendered tokens were chosen, where they were.
+    pub(crate) selection: Option<Selection>,
     warm: BTreeSet<Setting>,
 }
 

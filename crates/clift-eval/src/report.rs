@@ -146,7 +146,7 @@ impl Report {
 
     fn write_table(&self, out: &mut impl Write) -> io::Result<()> {
         let Summary { baselines, points, .. } = &self.summary;
-        writeln!(out, "<h2>All points</h2>\n<div class=\"scroll\"><table><thead><tr>")?;
+        writeln!(out, "<h2>All points</h2>\n<div class=\"scroll\"><table class=\"points\"><thead><tr>")?;
         for head in TABLE_HEAD {
             write!(out, "<th scope=\"col\">{head}</th>")?;
         }
@@ -263,7 +263,7 @@ impl Report {
         let has_choices = self.exhibits.iter().any(|exhibit| !exhibit.choices.is_empty());
         writeln!(out, "<p class=\"note\">{}</p>", if has_choices { CHOICE } else { NO_CHOICE })?;
         for (number, exhibit) in self.exhibits.iter().take(MAX_EXHIBITS).enumerate() {
-            scene::write(exhibit, number, out)?;
+            scene::write(exhibit, number, self.summary.selection, out)?;
         }
         Ok(())
     }

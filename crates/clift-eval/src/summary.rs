@@ -18,6 +18,7 @@ use crate::error::EvalError;
 use crate::measured::{Accumulator, Measured, NotMeasured, Setting, Variant, ViewsOfSetting};
 use crate::paired::Difference;
 use crate::pareto::front;
+use crate::selection::Selection;
 use crate::statistics::{median, p95};
 
 /// What an identical picture counts as in a mean, in dB; larger values are counted as this too.
@@ -120,6 +121,8 @@ pub struct Summary {
     pub num_views: usize,
     /// Scenes left out, each with its reason in the log.
     pub num_skipped: usize,
+    /// How the rendered tokens of a view were chosen; `null` where every view is drawn from all stored ones.
+    pub selection: Option<Selection>,
     /// SHA-256 of the weights that LPIPS was measured with.
     pub lpips_weights_sha256: Option<String>,
     /// Numbers that are `null` everywhere, and why.
@@ -169,6 +172,7 @@ impl Accumulator {
                 nearest_view: quality(Variant::NearestView),
                 mean_image: quality(Variant::MeanImage),
             },
+            selection: self.selection,
             lpips_weights_sha256: self.lpips_sha256.clone(),
             not_measured: self.not_measured.clone(),
             missing: missing.collect(),
@@ -340,7 +344,7 @@ mod tests {
         let text = std::fs::read_to_string(folder.path().join("summary.json")).unwrap();
         let expected = serde_json::json!({
             "num_scenes": 1, "num_views": 1, "num_skipped": 1,
-            "lpips_weights_sha256": null,
+            "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
             "missing": [],
             "baselines": {

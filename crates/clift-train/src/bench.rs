@@ -105,7 +105,7 @@ pub enum BenchEvent<'a> {
 /// Times every work that `options` names on the device of `config`.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for sizes that cannot be, [`TrainError::BenchInterrupted`] between two repetitions
+/// [`TrainError::BadConfig`] for sizes that cannot be, [`TrainError::Abandoned`] between two repetitions
 /// after `stop` was set, and what the device or a file of features gives.
 pub fn run(
     config: &Config,
@@ -123,7 +123,11 @@ pub fn run(
             done += count;
             tell(BenchEvent::Progress { done, total });
             // Between repetitions, so that no time is of half a repetition.
-            if stop.load(Ordering::Relaxed) { Err(TrainError::BenchInterrupted { work: work.name() }) } else { Ok(()) }
+            if stop.load(Ordering::Relaxed) {
+                Err(TrainError::Abandoned { work: format!("`{}`", work.name()) })
+            } else {
+                Ok(())
+            }
         };
         let row = measure(work, &context, options, &mut advance)?;
         tell(BenchEvent::Finished(&row));

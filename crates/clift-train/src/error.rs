@@ -152,11 +152,11 @@ pub enum TrainError {
         /// Steps done.
         step: u64,
     },
-    /// A benchmark was asked to stop.
-    #[error("interrupted during `{work}`; nothing was written")]
-    BenchInterrupted {
-        /// The row that was not finished.
-        work: &'static str,
+    /// Work that keeps nothing of what is not done was asked to stop.
+    #[error("interrupted during {work}; nothing was written")]
+    Abandoned {
+        /// What was not finished.
+        work: String,
     },
     /// A device gave up on work it had accepted.
     #[error("the device failed: {reason}")]

@@ -1,13 +1,15 @@
 //! Measuring a run on views it never trained on: during training and at its end.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::Device;
 use clift_data::files::replace;
 use clift_data::order::derive_seed;
+use clift_data::unfinished::Unfinished;
 use clift_data::{ClipReader, EvaluationItem, Ledger};
 use clift_eval::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX};
+use clift_eval::picture::Picture;
 use clift_eval::predictions::{file_name, picture_name};
 use clift_eval::report::MAX_EXHIBITS;
 use clift_eval::{
@@ -122,7 +124,7 @@ impl<'a> HeldOut<'a> {
     ///
     /// # Errors
     /// As [`evaluate_scene`]; scenes that cannot be read are skipped and counted.
-    /// [`TrainError::Interrupted`] once `stop` is set, [`EvalError::NoPredictions`] for a system without any picture.
+    /// [`TrainError::Abandoned`] once `stop` is set, [`EvalError::NoPredictions`] for a system without any picture.
     pub fn evaluate(
         &self,
         networks: &Networks,
@@ -143,12 +145,12 @@ impl<'a> HeldOut<'a> {
         for skip in &ledger.skips {
             measured.skip(&skip.key);
         }
-        let sheets = folder.join("sheets");
-        std::fs::create_dir_all(&sheets).map_err(TrainError::io("making a folder", &sheets))?;
+        let sheets = Sheets::new(&folder.join("sheets"))?;
         let mut exhibits = Vec::new();
         for (i, item) in self.items.iter().enumerate() {
             if stop.load(Ordering::Relaxed) {
-                return Err(TrainError::Interrupted { step: i as u64 });
+                let work = format!("the evaluation, after {i} of {total} scenes");
+                return Err(TrainError::Abandoned { work });
             }
             let is_shown = i < self.config.eval.num_sheets;
             let key = self.reader.source.key(item.scene);
@@ -156,7 +158,7 @@ impl<'a> HeldOut<'a> {
                 Outcome::Measured(None) => {}
                 Outcome::Measured(Some(shown)) => {
                     let Shown { sheet, exhibit } = *shown;
-                    sheet.write_png(&sheets.join(format!("{}.png", file_name(key))))?;
+                    sheets.add(&sheet, key)?;
                     if exhibits.len() < MAX_EXHIBITS {
                         exhibits.push(exhibit);
                     }
@@ -172,6 +174,7 @@ impl<'a> HeldOut<'a> {
         for system in systems {
             self.require_pictures(system, &summary)?;
         }
+        sheets.keep()?;
         summary.write(&folder.join("summary.json"))?;
         measured.write_scenes(&folder.join("scenes.csv"))?;
         measured.write_views(&folder.join("views.csv"))?;
@@ -298,6 +301,40 @@ pub fn write_ledger(ledger: &Ledger, path: &Path) -> Result<(), TrainError> {
     let text = serde_json::to_vec_pretty(ledger).map_err(TrainError::bad_file("ledger", path))?;
     replace(path, &text).map_err(TrainError::io("writing what was left out", path))
 }
+
+/// The picture sheets of an evaluation, which replace those of a former one all together.
+struct Sheets {
+    folder: PathBuf,
+    files: Unfinished,
+}
+
+impl Sheets {
+    fn new(folder: &Path) -> Result<Self, TrainError> {
+        let files = Unfinished::new(folder).map_err(TrainError::io("making a folder", folder))?;
+        Ok(Self { folder: folder.into(), files })
+    }
+
+    fn add(&self, sheet: &Picture, key: &str) -> Result<(), TrainError> {
+        Ok(sheet.write_png(&self.files.path().join(format!("{}.png", file_name(key))))?)
+    }
+
+    fn keep(self) -> Result<(), TrainError> {
+        let Self { folder, files } = self;
+        let replace = || {
+            let kept = files.keep()?;
+            for item in std::fs::read_dir(&folder)? {
+                let item = item?;
+                let is_sheet = item.path().extension().is_some_and(|extension| extension == "png");
+                if is_sheet && !kept.contains(&item.file_name()) {
+                    std::fs::remove_file(item.path())?;
+                }
+            }
+            Ok(())
+        };
+        replace().map_err(TrainError::io("writing the sheets", &folder))
+    }
+}
+
 /// What an evaluation of a run does with every scene; LPIPS and other systems are to be added.
 pub(crate) fn sweep(config: &Config, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
     let Config { seed, eval, clusters, model, device, .. } = config;

@@ -105,7 +105,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
 
 fn train_exit_code(error: &TrainError) -> u8 {
     match error {
-        TrainError::Interrupted { .. } | TrainError::BenchInterrupted { .. } => interrupt::exit_code(),
+        TrainError::Interrupted { .. } | TrainError::Abandoned { .. } => interrupt::exit_code(),
         TrainError::BadConfig { .. }
         | TrainError::OtherRun { .. }
         | TrainError::Missing { .. }
@@ -166,7 +166,7 @@ mod tests {
         let stopped = |source| TrainError::Stopped { source, stage: "stage1", step: 3, checkpoint: "none".into() };
         assert_eq!(exit_code(&stopped(Box::new(bad_config().unwrap_err().into())).into()), WRONG_USAGE);
         assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), 130);
-        assert_eq!(exit_code(&TrainError::BenchInterrupted { work: "encode" }.into()), 130);
+        assert_eq!(exit_code(&TrainError::Abandoned { work: "`encode`".into() }.into()), 130);
         assert_eq!(exit_code(&clift_data::DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
         assert_eq!(exit_code(&anyhow::anyhow!("anything else")), FAILED);
     }

@@ -9,6 +9,7 @@ use super::markup::{Escaped, data_uri};
 use crate::exhibit::{Choice, Drawing, Exhibit, best_variant, spread};
 use crate::measured::{Setting, Variant};
 use crate::picture::Picture;
+use crate::selection::Selection;
 
 /// Most token counts of a variant that are shown.
 const MAX_COUNTS: usize = 4;
@@ -19,8 +20,8 @@ const MAX_MAPS: usize = 2;
 /// Pictures narrower than this are magnified and shown as the pixels they are.
 const SHARP_BELOW_PX: usize = 100;
 
-/// Writes the scene; `number` tells it from the others of the page.
-pub fn write(exhibit: &Exhibit, number: usize, out: &mut impl Write) -> io::Result<()> {
+/// Writes the scene; `number` tells it from the others of the page, `selection` chose the tokens of its views.
+pub fn write(exhibit: &Exhibit, number: usize, selection: Option<Selection>, out: &mut impl Write) -> io::Result<()> {
     writeln!(out, "<article class=\"scene\"><h3>{}</h3>", Escaped(&exhibit.key))?;
     writeln!(out, "<div class=\"halves\"><div>")?;
     write_drawings(exhibit, out)?;
@@ -36,7 +37,7 @@ pub fn write(exhibit: &Exhibit, number: usize, out: &mut impl Write) -> io::Resu
     let most = choices.clone().map(|choice| choice.setting.num_storage_tokens).max();
     let choices: Vec<&Choice> = choices.filter(|choice| Some(choice.setting.num_storage_tokens) == most).collect();
     for choice in spread(choices.len(), MAX_MAPS) {
-        write_choice(exhibit, number, choices[choice], out)?;
+        write_choice(exhibit, number, choices[choice], selection, out)?;
     }
     writeln!(out, "</div></div></article>")
 }
@@ -150,11 +151,18 @@ fn write_clusters(exhibit: &Exhibit, number: usize, clusters: &SceneClusters, ou
 }
 
 /// Which tokens the target is drawn from: dots for them, rings for the other stored ones.
-fn write_choice(exhibit: &Exhibit, number: usize, choice: &Choice, out: &mut impl Write) -> io::Result<()> {
+fn write_choice(
+    exhibit: &Exhibit,
+    number: usize,
+    choice: &Choice,
+    selection: Option<Selection>,
+    out: &mut impl Write,
+) -> io::Result<()> {
     let [rows, columns] = exhibit.grid;
     let Setting { num_storage_tokens: stored, num_render_tokens: rendered, .. } = choice.setting;
     let others: Vec<u32> = choice.stored.iter().copied().filter(|id| !choice.chosen.contains(id)).collect();
-    start_row(&format!("{rendered} of {stored} tokens chosen for the target"), out)?;
+    let by = selection.map_or_else(String::new, |selection| format!(" by {selection}"));
+    start_row(&format!("{rendered} of {stored} tokens chosen for the target{by}"), out)?;
     for view in 0..exhibit.context.len() {
         let count = choice.chosen.iter().filter(|&&token| token as usize / (rows * columns) == view).count();
         let content = format!(

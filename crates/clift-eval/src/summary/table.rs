@@ -77,6 +77,9 @@ impl fmt::Display for Summary {
         if points.iter().any(|point| point.pareto_time || point.pareto_bytes) {
             writeln!(f, "\nt: no other point has this PSNR in this time per frame (median); b: in as few bytes")?;
         }
+        if let Some(selection) = self.selection {
+            writeln!(f, "\nrendered tokens were chosen by {selection}")?;
+        }
         if !differences.is_empty() {
             writeln!(f, "\nPSNR of the same scenes, difference and standard error")?;
         }

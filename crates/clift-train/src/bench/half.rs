@@ -68,7 +68,7 @@ impl HalfRow {
 ///
 /// # Errors
 /// [`TrainError::BadConfig`] for sizes that cannot be, [`clift_model::ModelError::BadConfig`] on a device without f16,
-/// [`TrainError::BenchInterrupted`] after `stop` was set.
+/// [`TrainError::Abandoned`] after `stop` was set.
 pub fn compare(config: &Config, options: &BenchOptions, stop: &AtomicBool) -> Result<HalfReport, TrainError> {
     if let Some(other) = options.work.iter().find(|work| !WORKS.contains(work)) {
         let fix = format!("write some of {}", WORKS.map(Work::name).join(", "));
@@ -102,7 +102,7 @@ fn times(
     for repeat in 0..options.warmup + options.repeats {
         for ((task, context), samples) in tasks.iter_mut().zip(contexts).zip(&mut samples) {
             if stop.load(Ordering::Relaxed) {
-                return Err(TrainError::BenchInterrupted { work: work.name() });
+                return Err(TrainError::Abandoned { work: format!("`{}`", work.name()) });
             }
             let _scope = scoped(context);
             context.sync()?;
