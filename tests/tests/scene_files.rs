@@ -313,10 +313,10 @@ fn a_scene_never_takes_the_place_of_anything_else() {
     let encode =
         |name: &str, flags: &[&str]| clift(encode_args(&place, "run", name, &[&["--scene", KEY][..], flags].concat()));
     let weights = place.bytes("run/stage1/model.safetensors");
-    let message = encode("run/stage1/model.safetensors", &[]).fails(1);
+    let message = encode("run/stage1/model.safetensors", &[]).fails(2);
     assert!(message.contains("the file there is no scene, and only scenes are written over"), "{message}");
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
-    assert!(encode("no/room.clift", &[]).fails(1).contains("there is no folder "));
+    assert!(encode("no/room.clift", &[]).fails(2).contains("there is no folder "));
     encode("room.clift", &[]).ok();
     encode("room.clift", &["--storage", "8"]).ok();
     assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);

@@ -60,7 +60,7 @@ pub struct EncodeArgs {
 
 /// Encodes one scene and writes its file.
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
-    check_destination(&args.out)?;
+    check_destination(&args.out).map_err(|error| WrongUsage(error.to_string()))?;
     let model = ModelPath::find(&args.model)?;
     let (mut config, overrides) = read_config::<Config>(&model.run.join("config.toml"), &args.set)?;
     if let Some(change) = overrides.iter().find(|change| change.key.starts_with("model.")) {
