@@ -67,6 +67,11 @@ impl Ledger {
         !(self.skips.is_empty() && self.frames.is_empty())
     }
 
+    /// Whether there is anything to tell: something left out, or a note.
+    pub fn has_news(&self) -> bool {
+        self.has_gaps() || !self.notes.is_empty()
+    }
+
     /// Scenes that are used.
     pub fn num_used(&self) -> usize {
         self.num_scenes.saturating_sub(self.skips.len())
@@ -140,6 +145,17 @@ mod tests {
             4 frames without a picture (1.jpg, 5.jpg, 6.jpg, ..); both splits hold all scenes";
         assert_eq!(ledger.to_string(), expected);
         assert!(ledger.has_gaps());
+    }
+
+    #[test]
+    fn a_note_alone_is_news_and_no_gap() {
+        let mut ledger = Ledger::new(1);
+        assert!(!ledger.has_news());
+        ledger.notes.push("only model 0 is used".into());
+        assert!(ledger.has_news() && !ledger.has_gaps());
+        ledger = Ledger::new(1);
+        ledger.skip("a", "shorter than 46 frames");
+        assert!(ledger.has_news());
     }
 
     #[test]
