@@ -176,6 +176,7 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         let camera = &cameras[&image.camera_id];
         scene.photos.push(Photo { shape: Some(camera.width as f64 / camera.height as f64), ..photo });
     }
+    scene.num_without_camera = folders.num_unasked();
     Ok(scene)
 }
 

@@ -1,22 +1,30 @@
 //! Pictures: decoding and encoding files, and fitting a frame with its intrinsics to the model's size.
 
-use std::io::Cursor;
+use std::fs::File;
+use std::io::{Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
-use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
+use image::{ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{Intrinsics, IntrinsicsNorm};
 use crate::clip::Frame;
 use crate::error::DataError;
+use crate::files::read_bounded;
 use crate::lanczos::{Window, resize_lanczos_window};
 
 /// Most columns or rows of a picture that is decoded.
 pub const MAX_SIDE: u32 = 16_384;
 /// Most memory that decoding one picture may take: 8,192 x 8,192 RGB and the decoder's own copy.
 const MAX_DECODE_BYTES: u64 = 512 << 20;
+/// Bytes at the end of a file that its end marker is looked for in before all of it is read.
+const TAIL_BYTES: u64 = 512;
+/// What a JPEG ends in.
+const JPEG_END: &[u8] = &[0xff, 0xd9];
+/// What a PNG ends in: the type of its last chunk, and the checksum.
+const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 
 /// Where the principal point goes when a picture is cropped.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -86,6 +94,40 @@ pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
         return Err(bad(format!("the picture is {width}x{height}")));
     }
     Ok([width as usize, height as usize])
+}
+
+/// Checks that the end of a JPEG or PNG file of at most `limit` bytes is there. Of most files the last bytes are read; of
+/// those with something behind the picture, as phones append it, everything.
+///
+/// # Errors
+/// [`DataError::Io`], and [`DataError::BadScene`] for a truncated file.
+pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
+    const READING: &str = "reading the end of a picture";
+    let io = || DataError::io(READING, path);
+    let mut file = File::open(path).map_err(io())?;
+    let num_bytes = file.metadata().map_err(io())?.len();
+    let mut tail = Vec::new();
+    file.seek(SeekFrom::Start(num_bytes.saturating_sub(TAIL_BYTES))).map_err(io())?;
+    file.take(TAIL_BYTES).read_to_end(&mut tail).map_err(io())?;
+    let padding = tail.iter().rev().take_while(|byte| **byte == 0).count();
+    tail.truncate(tail.len() - padding);
+    if tail.ends_with(JPEG_END) || tail.ends_with(PNG_END) {
+        return Ok(());
+    }
+    let bytes = read_bounded(path, limit, READING)?;
+    let is_png = image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Png);
+    let is_whole = if is_png { bytes.windows(PNG_END.len()).any(|part| part == PNG_END) } else { has_jpeg_end(&bytes) };
+    if is_whole {
+        return Ok(());
+    }
+    let what = format!("the picture is truncated: its {num_bytes} bytes have no end marker");
+    Err(DataError::BadScene { what, path: path.to_owned() })
+}
+
+/// The EXIF orientation of a picture file, 2 to 8, if it says that the picture is to be turned or mirrored.
+pub(crate) fn exif_orientation(path: &Path) -> Option<u8> {
+    let mut decoder = ImageReader::open(path).ok()?.with_guessed_format().ok()?.into_decoder().ok()?;
+    decoder.orientation().ok().map(|orientation| orientation.to_exif()).filter(|orientation| *orientation != 1)
 }
 
 /// Whether an end marker follows the last scan; the decoder fills what is missing of a truncated JPEG with grey.

@@ -8,6 +8,7 @@ use serde::Serialize;
 use crate::camera::Camera;
 use crate::clip::SceneSource;
 use crate::error::DataError;
+use crate::ledger::Skip;
 
 /// Smallest, median and largest of some numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -53,21 +54,42 @@ pub struct SourceInfo {
     pub fov_deg: Option<Spread>,
     /// Largest distance along a world axis of a camera centre from the scene's mean centre, one number per scene.
     pub extent: Option<Spread>,
+    /// Scenes whose cameras cannot be read, and those before the first whose first picture can, with the error as the
+    /// reason.
+    pub unreadable: Vec<Skip>,
 }
 
 impl SourceInfo {
     /// Reads every scene's cameras, on all cores, and one frame.
+    ///
+    /// # Errors
+    /// The first scene's when none can be read.
     pub fn read(source: &dyn SceneSource) -> Result<Self, DataError> {
-        let scenes = (0..source.num_scenes()).into_par_iter().map(|scene| {
+        let read = (0..source.num_scenes()).into_par_iter().map(|scene| {
             let cameras = source.cameras(scene)?;
             let fov_deg: Vec<f64> = cameras.iter().map(Camera::fov_deg).map(|(x, y)| x.max(y)).collect();
             Ok((cameras.len(), fov_deg, extent(&cameras)))
         });
-        let scenes: Vec<_> = scenes.collect::<Result<_, DataError>>()?;
-        let first_picture = match scenes.iter().position(|(num_frames, ..)| *num_frames > 0) {
-            Some(scene) => Some(source.frame(scene, 0)?),
-            None => None,
-        };
+        let read: Vec<Result<_, DataError>> = read.collect();
+        let (mut scenes, mut unreadable, mut first_error, mut first_picture) = (Vec::new(), Vec::new(), None, None);
+        for (scene, found) in read.into_iter().enumerate() {
+            let mut fail = |error: DataError| {
+                unreadable.push(Skip { key: source.key(scene).to_owned(), reason: error.to_string() });
+                first_error.get_or_insert(error);
+            };
+            match found {
+                Ok(found) => {
+                    if first_picture.is_none() && found.0 > 0 {
+                        first_picture = source.frame(scene, 0).map_err(&mut fail).ok();
+                    }
+                    scenes.push(found);
+                }
+                Err(error) => fail(error),
+            }
+        }
+        if let (true, Some(error)) = (scenes.is_empty(), first_error) {
+            return Err(error);
+        }
         let lengths = scenes.iter().map(|(num_frames, ..)| *num_frames as f64).collect();
         let fields = scenes.iter().flat_map(|(_, fov_deg, _)| fov_deg).copied().collect();
         let extents = scenes.iter().map(|(.., extent)| *extent).collect();
@@ -77,6 +99,7 @@ impl SourceInfo {
             image_size: first_picture.map(|frame| [frame.width, frame.height]),
             fov_deg: Spread::of(fields),
             extent: Spread::of(extents),
+            unreadable,
         })
     }
 }
@@ -101,6 +124,22 @@ mod tests {
         assert_eq!(Spread::of(vec![4.0, 1.0, 2.0, 8.0]), Some(Spread { min: 1.0, median: 3.0, max: 8.0 }));
         assert_eq!(Spread::of(vec![5.0]), Some(Spread { min: 5.0, median: 5.0, max: 5.0 }));
         assert_eq!(Spread::of(Vec::new()), None);
+    }
+
+    #[test]
+    fn a_scene_that_cannot_be_read_is_named_and_the_others_are_described() {
+        let root = tempfile::tempdir().unwrap();
+        let train = root.path().join("train");
+        std::fs::create_dir(&train).unwrap();
+        let mini = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini/train");
+        std::fs::copy(mini.join("000000.torch"), train.join("000000.torch")).unwrap();
+        let index = r#"{"00000000000000a1": "000000.torch", "elsewhere": "000000.torch"}"#;
+        std::fs::write(train.join("index.json"), index).unwrap();
+        let source = ChunkSource::open(root.path(), Split::Train, &SceneFilters::default()).unwrap();
+        let info = SourceInfo::read(&source).unwrap();
+        assert_eq!((info.image_size, info.num_frames.map(|frames| frames.max)), (Some([64, 36]), Some(8.0)));
+        assert_eq!((info.unreadable.len(), info.unreadable[0].key.as_str()), (1, "elsewhere"));
+        assert!(info.unreadable[0].reason.contains("index.json lists scene elsewhere in it"), "{info:?}");
     }
 
     #[test]

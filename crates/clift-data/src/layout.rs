@@ -1,31 +1,28 @@
 //! Every layout that posed photos come in, recognised by what is in a folder.
 
-use std::collections::BTreeMap;
+use std::collections::HashSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::chunk::{ChunkSource, read_index};
-use crate::chunk_table::ChunkTable;
+use crate::chunk::ChunkSource;
+use crate::chunk_index::{index_of_files, note_unlisted, read_index};
 use crate::clip::SceneSource;
 use crate::error::DataError;
 use crate::filters::SceneFilters;
 use crate::ledger::Ledger;
 use crate::photo_source::{PhotoSource, PhotoSourceOptions};
-use crate::picture_folder::{file_names, has_ending};
-use crate::re10k_text::looks_like_re10k;
-use crate::scene_folder::{SceneFiles, SceneFolder, find_scenes, scene_in};
+use crate::picture_folder::file_names;
+use crate::place::{Found, Place};
+use crate::scene_folder::{SceneFiles, SceneFolder};
 use crate::split::Split;
 use crate::test_scenes::TestScenes;
 use crate::transforms::PhotoOptions;
 
 /// Folders that DL3DV's pictures are in, in the order they are preferred: 480 x 270, then larger.
 const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
-/// What the reference's tool writes beside scenes in files of their own: keys of those whose pictures have another size.
-const INVALID_KEYS: &str = "invalid_keys.txt";
 
 /// How scenes lie on disk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -88,6 +85,9 @@ pub struct LayoutOptions {
     pub files: FileOptions,
     /// Fewest columns and rows of a usable picture; for layouts of one file per frame.
     pub min_size: [usize; 2],
+    /// Whether every chunk is looked into even where no filter asks for it: what cannot be read, and what `index.json`
+    /// does not name, is then in the ledger.
+    pub reads_chunks: bool,
 }
 
 /// Scenes that were opened.
@@ -118,14 +118,6 @@ pub fn open_layout(
     Opened::open(root, split, options).map(|opened| (opened.source, opened.ledger))
 }
 
-/// A folder of scenes.
-struct Place<'a> {
-    root: &'a Path,
-    base: PathBuf,
-    split: Split,
-    has_splits: bool,
-}
-
 impl Opened {
     /// Does [`open_layout`], and says what it found.
     pub fn open(root: &Path, split: Split, options: &LayoutOptions) -> Result<Self, DataError> {
@@ -135,7 +127,9 @@ impl Opened {
         let place = Place::find(root, split)?;
         let mut opened = match place.scenes(options.layout)? {
             Found::Torch(layout) => place.open_torch(layout, options, list.as_ref())?,
-            Found::Photos(layout, scenes) => place.open_photos(layout, scenes, options, list.as_ref())?,
+            Found::Photos(layout, scenes, ledger) => {
+                place.open_photos(layout, scenes, ledger, options, list.as_ref())?
+            }
         };
         if !opened.has_splits && list.is_none() {
             let note = "no train/ and test/ folders and no test scenes in a list: both halves are the same scenes";
@@ -145,79 +139,7 @@ impl Opened {
     }
 }
 
-/// What is in a folder.
-enum Found {
-    Torch(Layout),
-    Photos(Layout, Vec<SceneFolder>),
-}
-
-impl<'a> Place<'a> {
-    fn find(root: &'a Path, split: Split) -> Result<Self, DataError> {
-        std::fs::metadata(root).map_err(DataError::io("opening the data", root))?;
-        let has_splits = [Split::Train, Split::Test].iter().any(|split| root.join(split.to_string()).is_dir())
-            && scene_in(root).is_none();
-        let base = if has_splits { root.join(split.to_string()) } else { root.to_owned() };
-        if !base.exists() {
-            let what = format!("there is no folder {split}/ beside the other split");
-            return Err(DataError::UnknownLayout { what, path: root.to_owned() });
-        }
-        Ok(Self { root, base, split, has_splits })
-    }
-
-    /// Finds the scenes of the layout asked for, or of the first that is recognised.
-    fn scenes(&self, asked: Layout) -> Result<Found, DataError> {
-        let base = &self.base;
-        if base.is_file() {
-            let layout = if asked == Layout::Auto { Layout::Captures } else { asked };
-            return Ok(Found::Photos(layout, vec![SceneFolder::of_file(base)]));
-        }
-        let names = file_names(base)?;
-        let has_torch = names.iter().any(|name| has_ending(name, "torch"));
-        let none = |what: &str| Err(DataError::UnknownLayout { what: what.into(), path: base.clone() });
-        match asked {
-            Layout::Chunks => return Ok(Found::Torch(Layout::Chunks)),
-            Layout::Scenes if has_torch => return Ok(Found::Torch(Layout::Scenes)),
-            Layout::Scenes => return none("expected .torch files"),
-            Layout::Auto if names.iter().any(|name| name == "index.json") => return Ok(Found::Torch(Layout::Chunks)),
-            Layout::Auto if has_torch => return Ok(Found::Torch(Layout::Scenes)),
-            _ => {}
-        }
-        if matches!(asked, Layout::Auto | Layout::Re10kTxt) {
-            let texts: Vec<&String> = names.iter().filter(|name| has_ending(name, "txt")).collect();
-            let is_scene = scene_in(base).is_some();
-            if !is_scene && texts.iter().take(8).any(|name| looks_like_re10k(&base.join(name))) {
-                return Ok(Found::Photos(Layout::Re10kTxt, Vec::new()));
-            }
-        }
-        let scenes = find_scenes(base)?;
-        let is_text = |scene: &SceneFolder| matches!(scene.files, SceneFiles::Re10kText { .. });
-        let found = match asked {
-            Layout::Re10kTxt => Found::Photos(asked, scenes.into_iter().filter(is_text).collect()),
-            Layout::Dl3dv => {
-                let is_transforms = |scene: &SceneFolder| matches!(scene.files, SceneFiles::Transforms(_));
-                Found::Photos(asked, scenes.into_iter().filter(is_transforms).collect())
-            }
-            Layout::Captures => Found::Photos(asked, scenes),
-            _ if scenes.iter().all(is_text) => Found::Photos(Layout::Re10kTxt, scenes),
-            _ if scenes.iter().all(SceneFolder::is_dl3dv) => Found::Photos(Layout::Dl3dv, scenes),
-            _ => Found::Photos(Layout::Captures, scenes),
-        };
-        if let Found::Photos(layout, scenes) = &found
-            && scenes.is_empty()
-        {
-            return none(match layout {
-                _ if asked == Layout::Auto => {
-                    "looked for index.json with chunks, .torch files, RealEstate10K's .txt files, and for folders with \
-                     a transforms.json or a COLMAP model, three levels down"
-                }
-                Layout::Re10kTxt => "expected RealEstate10K's .txt files",
-                Layout::Dl3dv => "expected folders with a transforms.json",
-                _ => "expected folders with a transforms.json or a COLMAP model",
-            });
-        }
-        Ok(found)
-    }
-
+impl Place<'_> {
     fn open_torch(
         &self,
         layout: Layout,
@@ -225,65 +147,36 @@ impl<'a> Place<'a> {
         list: Option<&TestScenes>,
     ) -> Result<Opened, DataError> {
         let mut ledger = Ledger::default();
-        let mut index = if layout == Layout::Chunks {
-            read_index(&self.base.join("index.json"))?
+        let index = if layout == Layout::Chunks {
+            let index = read_index(&self.base.join("index.json"))?;
+            ledger.notes.extend(note_unlisted(&self.base, &index)?);
+            index
         } else {
-            self.index_of_files(&mut ledger)?
+            index_of_files(&self.base, &mut ledger)?
         };
         let keys: Vec<String> = index.keys().cloned().collect();
         let kept = divide(list, &keys, self, &mut ledger);
-        let mut kept = kept.into_iter();
-        index.retain(|_, _| kept.next().unwrap_or_default());
-        let source = ChunkSource::of_index(&self.base, index, &options.filters)?;
+        let kept: HashSet<&str> =
+            keys.iter().zip(kept).filter(|(_, kept)| *kept).map(|(key, _)| key.as_str()).collect();
+        let is_kept = |key: &str| kept.contains(key);
+        let mut source = ChunkSource::of_index(&self.base, &index, is_kept, &options.filters, options.reads_chunks)?;
+        if layout == Layout::Chunks {
+            source.tell_unlisted(&self.base, &index);
+        }
         append(&mut ledger, source.ledger());
         Ok(Opened { source: Arc::new(source), ledger, layout, has_splits: self.has_splits })
-    }
-
-    /// Scenes in files of their own, by the names of these. Chunks whose index is missing are looked into.
-    fn index_of_files(&self, ledger: &mut Ledger) -> Result<BTreeMap<String, String>, DataError> {
-        let mut files: Vec<String> = file_names(&self.base)?;
-        files.retain(|name| has_ending(name, "torch"));
-        files.sort_unstable();
-        let stem = |file: &str| file.trim_end_matches(".torch").to_owned();
-        let first = files.iter().take(8).find_map(|file| Some((file, ChunkTable::read(&self.base.join(file)).ok()?)));
-        if first.is_some_and(|(file, table)| table.scenes.len() != 1 || !table.scenes.contains_key(&stem(file))) {
-            let tables: Vec<_> = files.par_iter().map(|file| (file, ChunkTable::read(&self.base.join(file)))).collect();
-            let mut index = BTreeMap::new();
-            for (file, table) in tables {
-                match table {
-                    Ok(table) => index.extend(table.scenes.into_keys().map(|key| (key, file.clone()))),
-                    Err(error) => {
-                        ledger.num_scenes += 1;
-                        ledger.skip(file, error.to_string());
-                    }
-                }
-            }
-            ledger.notes.push(format!("there is no index.json: the scenes of {} files were looked up", files.len()));
-            return Ok(index);
-        }
-        let mut index: BTreeMap<String, String> = files.iter().map(|file| (stem(file), file.clone())).collect();
-        let invalid = self.base.join(INVALID_KEYS);
-        if invalid.is_file() {
-            let invalid = TestScenes::read(&invalid)?;
-            for key in index.keys().filter(|key| invalid.contains(key)) {
-                ledger.num_scenes += 1;
-                ledger.skip(key, format!("in {INVALID_KEYS}"));
-            }
-            index.retain(|key, _| !invalid.contains(key));
-        }
-        Ok(index)
     }
 
     fn open_photos(
         &self,
         layout: Layout,
         scenes: Vec<SceneFolder>,
+        mut ledger: Ledger,
         options: &LayoutOptions,
         list: Option<&TestScenes>,
     ) -> Result<Opened, DataError> {
         let is_text = layout == Layout::Re10kTxt;
         let mut scenes = if scenes.is_empty() { self.re10k_clips(options)? } else { scenes };
-        let mut ledger = Ledger::default();
         let keys: Vec<String> = scenes.iter().map(|scene| scene.key.clone()).collect();
         let mut kept = divide(list, &keys, self, &mut ledger).into_iter();
         scenes.retain(|_| kept.next().unwrap_or_default());

@@ -107,13 +107,24 @@ impl fmt::Display for Ledger {
             write!(f, "; {} for other reasons", counts.values().skip(MAX_REASONS_SHOWN).sum::<usize>())?;
         }
         for (reason, names) in self.frame_names() {
-            let more = if names.len() > MAX_NAMES_SHOWN { ", .." } else { "" };
-            let noun = if names.len() == 1 { "frame" } else { "frames" };
-            let shown = names[..names.len().min(MAX_NAMES_SHOWN)].join(", ");
-            write!(f, "; {} {noun} {reason} ({shown}{more})", names.len())?;
+            write!(f, "; {} {reason} ({})", counted(names.len(), "frame"), some_of(&names))?;
         }
         self.notes.iter().try_for_each(|note| write!(f, "; {note}"))
     }
+}
+
+/// The first few names, and dots for the others.
+pub(crate) fn some_of<S: AsRef<str>>(names: &[S]) -> String {
+    let mut shown: Vec<&str> = names.iter().take(MAX_NAMES_SHOWN).map(AsRef::as_ref).collect();
+    if names.len() > shown.len() {
+        shown.push("..");
+    }
+    shown.join(", ")
+}
+
+/// A count with its noun: `1 scene`, `2 scenes`.
+pub(crate) fn counted(count: usize, noun: &str) -> String {
+    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use crate::camera::{Camera, IntrinsicsNorm, Pose};
 use crate::clip::Frame;
 use crate::error::DataError;
 use crate::files::read_bounded;
-use crate::image::{decode, read_size};
+use crate::image::{check_end, decode, exif_orientation, read_size};
 use crate::lens::Lens;
 use crate::undistort::Undistortion;
 
@@ -42,6 +42,8 @@ pub(crate) struct MissingPhoto {
 pub(crate) struct PhotoScene {
     pub photos: Vec<Photo>,
     pub missing: Vec<MissingPhoto>,
+    /// Pictures beside those of the frames that no camera is given for.
+    pub num_without_camera: usize,
     /// What else is to be known.
     pub notes: Vec<String>,
     /// Where it comes from; empty if nothing says.
@@ -76,10 +78,20 @@ impl Photo {
         read_bounded(&self.path, MAX_PICTURE_BYTES, "reading a picture")
     }
 
-    /// Columns and rows, from the head of the file.
+    /// Columns and rows, from the head of the file; its end is looked for as well.
     pub fn size(&self) -> Result<[usize; 2], DataError> {
         let size = read_size(&self.path)?;
-        self.check_shape(size)?;
+        self.check_shape(size).map_err(|error| match (error, exif_orientation(&self.path)) {
+            (DataError::BadScene { what, path }, Some(orientation)) => {
+                let what = format!(
+                    "{what}; its EXIF orientation is {orientation}, which is not applied, because cameras belong to \
+                     the pixels as they are stored"
+                );
+                DataError::BadScene { what, path }
+            }
+            (error, _) => error,
+        })?;
+        check_end(&self.path, MAX_PICTURE_BYTES)?;
         Ok(size)
     }
 

@@ -9,9 +9,9 @@ use crate::camera::Camera;
 use crate::clip::{Frame, SceneSource};
 use crate::error::DataError;
 use crate::filters::SceneFilters;
-use crate::ledger::Ledger;
+use crate::ledger::{Ledger, counted, some_of};
 use crate::photo::{MissingPhoto, Photo, PhotoScene};
-use crate::scene_folder::SceneFolder;
+use crate::scene_folder::{SceneFolder, find_by_name};
 use crate::transforms::PhotoOptions;
 
 /// Photos of the scenes that are kept in memory, about 300 bytes each.
@@ -20,6 +20,8 @@ const MAX_PHOTOS_KEPT: usize = 200_000;
 const MAX_SCENES_KEPT: usize = 256;
 /// Frames that are named in the ledger; those beyond are counted.
 const MAX_FRAMES_NAMED: usize = 10_000;
+/// The reason of a frame whose picture is not there.
+const NO_PICTURE: &str = "without a picture";
 
 /// What is asked of the scenes.
 #[derive(Clone, Debug, Default)]
@@ -54,6 +56,7 @@ struct Findings {
     num_frames: usize,
     unusable: Vec<usize>,
     missing: Vec<MissingPhoto>,
+    num_without_camera: usize,
     notes: Vec<String>,
     /// Why it is left out, with an error for when it is the only one.
     reason: Option<(String, Option<DataError>)>,
@@ -70,20 +73,27 @@ impl PhotoSource {
         let findings: Vec<_> = folders.par_iter().map(|folder| examine(folder, options)).collect();
         let mut ledger = Ledger::new(folders.len());
         let (mut scenes, mut first_error, mut num_unnamed) = (Vec::new(), None, 0);
+        let (mut num_spare, mut spare) = (0, Vec::new());
         for (folder, findings) in folders.into_iter().zip(findings) {
-            let Findings { num_frames, unusable, missing, notes, reason } = findings.unwrap_or_else(|error| Findings {
+            let findings = findings.unwrap_or_else(|error| Findings {
                 num_frames: 0,
                 unusable: Vec::new(),
                 missing: Vec::new(),
+                num_without_camera: 0,
                 notes: Vec::new(),
                 reason: Some((error.to_string(), Some(error))),
             });
+            let Findings { num_frames, unusable, missing, num_without_camera, notes, reason } = findings;
             let has_photos = num_frames > 0;
             if let Some((reason, error)) = reason {
                 ledger.skip(&folder.key, reason);
                 first_error = first_error.or(error);
             } else {
                 ledger.notes.extend(notes);
+                if num_without_camera > 0 {
+                    num_spare += num_without_camera;
+                    spare.push(format!("{num_without_camera} of {}", folder.key));
+                }
                 scenes.push(Entry { folder: folder.clone(), num_frames, unusable });
             }
             // Of a scene without any picture the frames say nothing more.
@@ -97,6 +107,10 @@ impl PhotoSource {
         }
         if num_unnamed > 0 {
             ledger.notes.push(format!("{num_unnamed} more frames left out"));
+        }
+        if num_spare > 0 {
+            let note = format!("{} without a camera, not used: {}", counted(num_spare, "picture"), some_of(&spare));
+            ledger.notes.push(note);
         }
         if let (true, Some(error)) = (scenes.is_empty(), first_error) {
             return Err(error);
@@ -159,7 +173,7 @@ impl PhotoSource {
 
 /// Reads a scene and says whether it can be used.
 fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Findings, DataError> {
-    let PhotoScene { photos, mut missing, notes, .. } = folder.read(&options.photos)?;
+    let PhotoScene { photos, mut missing, num_without_camera, notes, .. } = folder.read(&options.photos)?;
     let num_listed = photos.len() + missing.len();
     let (mut unusable, mut first_error, mut is_small) = (Vec::new(), None, false);
     let num_checked = if options.whole_scenes { 1 } else { photos.len() };
@@ -168,10 +182,14 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
             Ok([width, height]) => is_small |= width < options.min_size[0] || height < options.min_size[1],
             Err(error) => {
                 let name = photo.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-                let reason = match error {
-                    DataError::BadScene { ref what, .. } if what.contains("turned or cropped") => {
+                let reason = match &error {
+                    DataError::BadScene { what, .. } if what.contains("EXIF orientation") => {
+                        "whose picture has another shape than its camera, and an EXIF orientation, which is not applied"
+                    }
+                    DataError::BadScene { what, .. } if what.contains("turned or cropped") => {
                         "whose picture has another shape than its camera"
                     }
+                    DataError::BadScene { what, .. } if what.contains("truncated") => "whose picture is truncated",
                     _ => "whose picture cannot be read",
                 };
                 missing.push(MissingPhoto { name, reason: reason.into() });
@@ -180,18 +198,31 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
             }
         }
     }
-    // A data set whose frames have not been extracted has millions of them to name.
-    missing.truncate(if photos.is_empty() { 1 } else { MAX_FRAMES_NAMED });
     let num_frames = photos.len() - unusable.len();
     let reason = if num_frames == 0 {
+        let without_picture = missing.iter().all(|photo| photo.reason == NO_PICTURE);
+        let telling = missing.iter().find(|photo| photo.reason != NO_PICTURE).or(missing.first());
         let error = first_error.unwrap_or_else(|| {
-            let name = missing.first().map_or("none", |photo| &photo.name);
-            let what = format!("none of its {num_listed} frames has a picture, the first being {name}");
+            let what = match telling {
+                None => "it lists no frames".into(),
+                Some(MissingPhoto { name, .. }) if without_picture => {
+                    format!("none of its {num_listed} frames has a picture, the first being {name}")
+                }
+                Some(MissingPhoto { name, reason }) => {
+                    format!("none of its {num_listed} frames can be used; {name} is one {reason}")
+                }
+            };
             DataError::BadScene { what, path: folder.path().to_owned() }
         });
-        Some(("without any picture".to_owned(), Some(error)))
+        let is_plain = num_listed > 0 && without_picture;
+        Some((if is_plain { "without any picture".into() } else { error.to_string() }, Some(error)))
     } else if options.whole_scenes && !missing.is_empty() {
-        Some(("with frames that have no picture".to_owned(), first_error))
+        let reason = match (&first_error, missing.iter().find(|photo| photo.reason != NO_PICTURE)) {
+            (Some(error), _) => error.to_string(),
+            (None, Some(photo)) => format!("with frames {}", photo.reason),
+            (None, None) => "with frames that have no picture".into(),
+        };
+        Some((reason, first_error))
     } else if is_small {
         let [width, height] = options.min_size;
         Some((format!("with pictures smaller than {width}x{height}"), None))
@@ -199,7 +230,9 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
         let cameras = || Ok(photos.iter().map(|photo| photo.camera).collect());
         options.filters.reason_to_skip(num_frames, cameras)?.map(|reason| (reason, None))
     };
-    Ok(Findings { num_frames, unusable, missing, notes, reason })
+    // A data set whose frames have not been extracted has millions of them to name.
+    missing.truncate(if photos.is_empty() { 1 } else { MAX_FRAMES_NAMED });
+    Ok(Findings { num_frames, unusable, missing, num_without_camera, notes, reason })
 }
 
 impl SceneSource for PhotoSource {
@@ -212,7 +245,8 @@ impl SceneSource for PhotoSource {
     }
 
     fn find(&self, key: &str) -> Option<usize> {
-        self.positions.get(key).copied()
+        let by_name = || find_by_name(self.scenes.iter().map(|scene| scene.folder.key.as_str()), key);
+        self.positions.get(key).copied().or_else(by_name)
     }
 
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {

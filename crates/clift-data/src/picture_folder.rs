@@ -1,7 +1,7 @@
 //! Which picture file belongs to which camera: joined by name, never by order.
 
 use std::cmp::Ordering;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use crate::error::DataError;
@@ -25,6 +25,8 @@ struct PictureFolder {
     by_stem: HashMap<String, Vec<String>>,
     /// Files of other formats, by stem.
     unreadable: HashMap<String, String>,
+    /// Stems that have been looked for and are there.
+    asked: HashSet<String>,
 }
 
 impl PictureFolders {
@@ -38,7 +40,9 @@ impl PictureFolders {
         let folder = self.folder(parent).ok_or_else(missing)?;
         let (stem, _) = split_name(name);
         // A name without an ending may have a dot of its own: `frame.0001`.
-        let names = folder.by_stem.get(name).or_else(|| folder.by_stem.get(stem));
+        let named = [name, stem].into_iter().find(|stem| folder.by_stem.contains_key(*stem));
+        folder.asked.extend(named.map(str::to_owned));
+        let names = named.and_then(|stem| folder.by_stem.get(stem));
         match names.map(Vec::as_slice) {
             Some(names) if names.iter().any(|other| other == name) => Ok(path.to_owned()),
             Some([only]) => Ok(parent.join(only)),
@@ -48,20 +52,26 @@ impl PictureFolders {
         }
     }
 
+    /// How many pictures beside those that were found nobody has looked for.
+    pub fn num_unasked(&self) -> usize {
+        let folders = self.folders.values().flatten().filter(|folder| !folder.asked.is_empty());
+        folders.map(|folder| folder.by_stem.len() - folder.asked.len()).sum()
+    }
+
     /// Whether a folder is there.
     pub fn has(&mut self, folder: &Path) -> bool {
         self.folder(folder).is_some()
     }
 
-    fn folder(&mut self, folder: &Path) -> Option<&PictureFolder> {
+    fn folder(&mut self, folder: &Path) -> Option<&mut PictureFolder> {
         let entry = self.folders.entry(folder.to_owned());
-        entry.or_insert_with_key(|folder| PictureFolder::read(folder).ok()).as_ref()
+        entry.or_insert_with_key(|folder| PictureFolder::read(folder).ok()).as_mut()
     }
 }
 
 impl PictureFolder {
     fn read(folder: &Path) -> Result<Self, DataError> {
-        let mut read = Self { by_stem: HashMap::new(), unreadable: HashMap::new() };
+        let mut read = Self { by_stem: HashMap::new(), unreadable: HashMap::new(), asked: HashSet::new() };
         for name in file_names(folder)? {
             let (stem, extension) = split_name(&name);
             let Some(extension) = extension.map(str::to_ascii_lowercase) else { continue };
@@ -171,6 +181,8 @@ mod tests {
             std::fs::write(folder.path().join(name), "").unwrap();
         }
         let mut folders = PictureFolders::default();
+        assert_eq!(folders.find(&folder.path().join("x")).unwrap_err(), "without a picture");
+        assert_eq!(folders.num_unasked(), 0, "a folder without any picture that is looked for is another's");
         let mut find = |name: &str| {
             let found = folders.find(&folder.path().join(name));
             found.map(|path| path.file_name().unwrap().to_string_lossy().into_owned())
@@ -187,6 +199,11 @@ mod tests {
             assert_eq!(find(name).unwrap_err(), "without a picture", "{name}");
         }
         assert_eq!(folders.find(&folder.path().join("nowhere/a.png")).unwrap_err(), "without a picture");
+        assert_eq!(folders.num_unasked(), 0);
+        std::fs::write(folder.path().join("spare.jpg"), "").unwrap();
+        let mut folders = PictureFolders::default();
+        folders.find(&folder.path().join("a.JPG")).unwrap();
+        assert_eq!(folders.num_unasked(), 3, "b, frame.0001 and spare");
     }
 
     #[test]

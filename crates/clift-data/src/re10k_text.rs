@@ -64,6 +64,8 @@ fn parse(text: &str, pictures: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Str
             None => scene.missing.push(MissingPhoto { name: time.to_string(), reason: "without a picture".into() }),
         }
     }
+    // Time stamps rise, so that no picture is counted twice.
+    scene.num_without_camera = pictures.len() - scene.photos.len();
     Ok(scene)
 }
 

@@ -1,10 +1,11 @@
 //! Which folders hold a scene: cameras in a known form, next to pictures.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::path::{Path, PathBuf};
 
 use crate::colmap::{find_model, read_colmap};
 use crate::error::DataError;
+use crate::ledger::{counted, some_of};
 use crate::photo::PhotoScene;
 use crate::picture_folder::{file_names, has_ending, numbered_pictures};
 use crate::re10k_text::{looks_like_re10k, read_re10k_text};
@@ -55,9 +56,7 @@ impl SceneFolder {
 
     /// Whether this is a scene of DL3DV: a `transforms.json` in a folder named after a hash.
     pub fn is_dl3dv(&self) -> bool {
-        let name = self.key.rsplit('/').next().unwrap_or_default();
-        let is_hash = name.len() == HASH_LENGTH && name.bytes().all(|byte| byte.is_ascii_hexdigit());
-        is_hash && matches!(self.files, SceneFiles::Transforms(_))
+        is_dl3dv_key(&self.key) && matches!(self.files, SceneFiles::Transforms(_))
     }
 
     /// A file that is a scene by itself, named after its folder.
@@ -95,52 +94,143 @@ fn re10k_in(folder: &Path) -> Option<SceneFiles> {
     Some(SceneFiles::Re10kText { cameras, frames })
 }
 
-/// Finds the scenes in `base` and below it, sorted by key. A key is the name of the scene's folder, or the way to it
-/// where several have that name.
+/// The scenes of a folder, and what else was met.
+pub(crate) struct FoundScenes {
+    /// Sorted by key. A key is the name of the scene's folder, or the way to it where several have that name.
+    pub scenes: Vec<SceneFolder>,
+    /// Ways to data of other layouts, with what it is.
+    pub others: Vec<String>,
+    /// What is to be known of the names.
+    pub notes: Vec<String>,
+}
+
+/// Finds the scenes in `base` and below it. Of a folder that links lead to, the way without links is used, or the first
+/// in order of names.
 ///
 /// # Errors
 /// [`DataError::Io`] for a `base` that cannot be listed, and [`DataError::UnknownLayout`] for too many folders.
-pub(crate) fn find_scenes(base: &Path) -> Result<Vec<SceneFolder>, DataError> {
+pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     if let Some(files) = scene_in(base) {
         let absolute = base.canonicalize().unwrap_or_else(|_| base.to_owned());
-        return Ok(vec![SceneFolder { key: name_of(&absolute), files }]);
+        let scenes = vec![SceneFolder { key: name_of(&absolute), files }];
+        return Ok(FoundScenes { scenes, others: Vec::new(), notes: Vec::new() });
     }
-    let mut found: Vec<(PathBuf, SceneFiles)> = Vec::new();
-    let mut seen = HashSet::new();
-    let mut level = vec![PathBuf::new()];
-    file_names(base)?;
-    for _ in 0..MAX_DEPTH {
-        let mut next = Vec::new();
-        for inside in level {
-            for name in file_names(&base.join(&inside)).unwrap_or_default() {
-                let (inside, path) = (inside.join(&name), base.join(&inside).join(&name));
-                // A link may lead back up, or to a scene that has been found.
-                let mut is_new = |path: &Path| path.canonicalize().is_ok_and(|path| seen.insert(path));
-                if name.starts_with('.') || !path.is_dir() || !is_new(&path) {
-                    continue;
-                }
-                if seen.len() > MAX_FOLDERS {
-                    let what = format!("more than {MAX_FOLDERS} folders; give the folder of the scenes themselves");
-                    return Err(DataError::UnknownLayout { what, path: base.to_owned() });
-                }
-                match scene_in(&path) {
-                    Some(files) => found.push((inside, files)),
-                    None => next.push(inside),
-                }
+    let mut found: Vec<(String, SceneFiles)> = Vec::new();
+    let (mut others, mut again) = (Vec::new(), Vec::new());
+    // What each folder is, by its way without links: a scene, by its place in `found`, or none.
+    let mut seen: HashMap<PathBuf, Option<usize>> = HashMap::new();
+    seen.extend(base.canonicalize().map(|base| (base, None)));
+    let (mut folders, mut links) = (VecDeque::new(), VecDeque::new());
+    push_folders(base, "", &mut folders, &mut links)?;
+    while let Some(way) = folders.pop_front().or_else(|| links.pop_front()) {
+        let path = base.join(&way);
+        let Ok(real) = path.canonicalize() else { continue };
+        match seen.get(&real) {
+            Some(Some(scene)) => {
+                let (first, _): &(String, _) = &found[*scene];
+                again.push(format!("{way} of {first}"));
+                continue;
             }
+            Some(None) => continue,
+            None if seen.len() > MAX_FOLDERS => {
+                let what = format!("more than {MAX_FOLDERS} folders; give the folder of the scenes themselves");
+                return Err(DataError::UnknownLayout { what, path: base.to_owned() });
+            }
+            None => {}
         }
-        level = next;
+        let files = scene_in(&path);
+        seen.insert(real, files.is_some().then_some(found.len()));
+        if let Some(files) = files {
+            found.push((way, files));
+            continue;
+        }
+        if let Some(kind) = other_data_in(&path) {
+            others.push(format!("{way} ({kind})"));
+        }
+        if way.split('/').count() < MAX_DEPTH {
+            // A folder that may not be listed holds nothing for this user.
+            push_folders(&path, &way, &mut folders, &mut links).unwrap_or_default();
+        }
     }
-    let mut names = HashSet::new();
-    let shared: HashSet<String> =
-        found.iter().map(|(way, _)| name_of(way)).filter(|name| !names.insert(name.clone())).collect();
-    let key = |way: &Path| match name_of(way) {
-        name if shared.contains(&name) => way.to_string_lossy().replace('\\', "/"),
-        name => name,
-    };
-    let mut scenes: Vec<_> = found.into_iter().map(|(way, files)| SceneFolder { key: key(&way), files }).collect();
+    let mut notes = Vec::new();
+    if !again.is_empty() {
+        notes.push(format!("used once, {} being other names: {}", counted(again.len(), "folder"), some_of(&again)));
+    }
+    let mut ways: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for (way, _) in &found {
+        ways.entry(last_name(way)).or_default().push(way);
+    }
+    let twice = ways.iter().filter(|(name, ways)| is_dl3dv_key(name) && ways.len() > 1);
+    let twice: Vec<String> = twice.map(|(_, ways)| ways.join(" and ")).collect();
+    if !twice.is_empty() {
+        let note = format!("{} of DL3DV there more than once, all of which are used: ", counted(twice.len(), "scene"));
+        notes.push(note + &some_of(&twice));
+    }
+    let key = |way: &str| if ways[last_name(way)].len() > 1 { way.to_owned() } else { last_name(way).to_owned() };
+    let keys: Vec<String> = found.iter().map(|(way, _)| key(way)).collect();
+    let scenes = found.into_iter().zip(keys);
+    let mut scenes: Vec<_> = scenes.map(|((_, files), key)| SceneFolder { key, files }).collect();
     scenes.sort_by(|a, b| a.key.cmp(&b.key));
-    Ok(scenes)
+    others.sort_unstable();
+    Ok(FoundScenes { scenes, others, notes })
+}
+
+/// Appends the ways to the folders in `folder`, in order of their names and those that are links apart.
+fn push_folders(
+    folder: &Path,
+    way: &str,
+    folders: &mut VecDeque<String>,
+    links: &mut VecDeque<String>,
+) -> Result<(), DataError> {
+    let mut names = file_names(folder)?;
+    names.sort_unstable();
+    for name in names.into_iter().filter(|name| !name.starts_with('.')) {
+        let path = folder.join(&name);
+        let to = if path.is_symlink() { &mut *links } else { &mut *folders };
+        if path.is_dir() {
+            to.push_back(if way.is_empty() { name } else { format!("{way}/{name}") });
+        }
+    }
+    Ok(())
+}
+
+/// What a folder without a scene of photos holds instead, if it is data that would have to be opened by itself.
+fn other_data_in(folder: &Path) -> Option<String> {
+    let names = file_names(folder).ok()?;
+    if names.iter().any(|name| has_ending(name, "torch")) {
+        return Some("chunks or scenes in .torch files".into());
+    }
+    let mut texts = names.iter().filter(|name| has_ending(name, "txt")).take(8);
+    if texts.any(|name| looks_like_re10k(&folder.join(name))) {
+        return Some("RealEstate10K's text files".into());
+    }
+    transforms_in(folder).into_iter().next()
+}
+
+/// Files of cameras with names of their own, such as `transforms_train.json`.
+pub(crate) fn transforms_in(folder: &Path) -> Vec<String> {
+    let mut names = file_names(folder).unwrap_or_default();
+    names.retain(|name| name.starts_with("transforms") && has_ending(name, "json"));
+    names.sort_unstable();
+    names
+}
+
+/// Whether a scene is named as DL3DV's are, after a hash.
+pub fn is_dl3dv_key(key: &str) -> bool {
+    let name = last_name(key);
+    name.len() == HASH_LENGTH && name.bytes().all(|byte| byte.is_ascii_hexdigit())
+}
+
+/// The last part of a key that is a way.
+pub(crate) fn last_name(key: &str) -> &str {
+    key.rsplit('/').next().unwrap_or_default()
+}
+
+/// The scene whose key is a way that ends in `name`: the only one, or of DL3DV's copies of a scene the first.
+pub(crate) fn find_by_name<'a>(keys: impl Iterator<Item = &'a str>, name: &str) -> Option<usize> {
+    let mut found = keys.enumerate().filter(|(_, key)| key.contains('/') && last_name(key) == name);
+    let (first, _) = found.next()?;
+    (found.next().is_none() || is_dl3dv_key(name)).then_some(first)
 }
 
 fn name_of(folder: &Path) -> String {

@@ -9,12 +9,13 @@ use crate::chunk::DL3DV_PREFIX;
 use crate::error::DataError;
 use crate::files::read_bounded;
 use crate::ledger::Ledger;
+use crate::scene_folder::{is_dl3dv_key, last_name};
 use crate::split::Split;
 
 /// Most bytes of a list.
 const MAX_BYTES: u64 = 256 << 20;
 
-/// Keys of the scenes kept for testing, without DepthSplat's prefix.
+/// Keys of the scenes kept for testing, without DepthSplat's prefix, and of DL3DV's without the way to them.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct TestScenes {
     keys: BTreeSet<String>,
@@ -29,22 +30,24 @@ impl TestScenes {
         let bad = |what: String| DataError::BadIndex { what, path: path.to_owned() };
         let bytes = read_bounded(path, MAX_BYTES, "reading the list of test scenes")?;
         let text = String::from_utf8(bytes).map_err(|_| bad("the list of test scenes is not UTF-8".into()))?;
+        let text = text.trim_start_matches('\u{feff}');
         let json = |error: serde_json::Error| bad(format!("expected an index, a list or a key per line, got {error}"));
         let keys: Vec<String> = match text.trim_start().chars().next() {
             Some('{') => {
                 // What the keys stand for is passed over, whatever it is.
-                let index: HashMap<String, Option<IgnoredAny>> = serde_json::from_str(&text).map_err(json)?;
+                let index: HashMap<String, Option<IgnoredAny>> = serde_json::from_str(text).map_err(json)?;
                 index.into_keys().collect()
             }
-            Some('[') => serde_json::from_str(&text).map_err(json)?,
+            Some('[') => serde_json::from_str(text).map_err(json)?,
             _ => text.lines().map(|line| line.trim().to_owned()).filter(|line| !line.is_empty()).collect(),
         };
-        Ok(Self { keys: keys.iter().map(|key| without_prefix(key).to_owned()).collect() })
+        Ok(Self { keys: keys.iter().map(|key| plain(key).to_owned()).collect() })
     }
 
-    /// Whether a scene is one of them, with or without DepthSplat's prefix.
+    /// Whether a scene is one of them, with or without DepthSplat's prefix. Of a key that is the way to a scene, as those
+    /// of several folders of one name are, the last part counts as well.
     pub fn contains(&self, key: &str) -> bool {
-        self.keys.contains(without_prefix(key))
+        self.keys.contains(plain(key)) || self.keys.contains(last_name(key))
     }
 
     /// How many there are.
@@ -69,7 +72,7 @@ impl TestScenes {
                 .filter(|(_, kept)| !**kept)
                 .for_each(|(key, _)| ledger.skip(key, "kept for testing"));
         } else if is_shared {
-            let there: BTreeSet<&str> = keys.iter().map(|key| without_prefix(key)).collect();
+            let there: BTreeSet<&str> = keys.iter().flat_map(|key| [plain(key), last_name(key)]).collect();
             let absent = self.keys.iter().filter(|key| !there.contains(key.as_str()));
             absent.for_each(|key| ledger.skip(key, "in the list of test scenes, but not there"));
         }
@@ -78,8 +81,11 @@ impl TestScenes {
     }
 }
 
-fn without_prefix(key: &str) -> &str {
-    key.strip_prefix(DL3DV_PREFIX).unwrap_or(key)
+/// A key without DepthSplat's prefix; the hash alone of DL3DV's, wherever a copy of the scene lies.
+fn plain(key: &str) -> &str {
+    let name = last_name(key);
+    let name = name.strip_prefix(DL3DV_PREFIX).unwrap_or(name);
+    if is_dl3dv_key(name) { name } else { key.strip_prefix(DL3DV_PREFIX).unwrap_or(key) }
 }
 
 #[cfg(test)]
@@ -102,6 +108,23 @@ mod tests {
         assert_eq!((index.num_scenes(), read("").unwrap().num_scenes()), (2, 0));
         assert!(read("[1, 2]").unwrap_err().contains("expected an index, a list or a key per line, got"));
         assert!(read("{\"a\": ").unwrap_err().starts_with("bad index: "));
+    }
+
+    #[test]
+    fn a_scene_is_kept_out_of_training_wherever_its_copies_lie() {
+        let hash = "a".repeat(64);
+        let keys = [format!("1K/{hash}"), format!("bench/{hash}"), "1K/attic".into(), "bench/attic".into()];
+        for listed in [hash.clone(), format!("11K/{hash}"), format!("dl3dv_{hash}")] {
+            let list = read(&listed).unwrap();
+            assert_eq!(list.divide(&keys, Split::Train, true).0, [false, false, true, true], "{listed}");
+            let (kept, ledger) = list.divide(&keys, Split::Test, true);
+            assert_eq!((kept, ledger.skips.len()), (vec![true, true, false, false], 0), "{listed}");
+        }
+        // Other captures of one name are not the same scene: the way tells them apart, the name alone means both.
+        let kept = |listed: &str| read(listed).unwrap().divide(&keys, Split::Train, true).0;
+        assert_eq!(kept("1K/attic"), [true, true, false, true]);
+        assert_eq!(kept("attic"), [true, true, false, false]);
+        assert!(read("\u{feff}attic").unwrap().contains("attic"), "as an editor on Windows writes it");
     }
 
     #[test]

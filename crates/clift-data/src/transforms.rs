@@ -173,7 +173,9 @@ impl<'a> Optics<'a> {
 pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
-    let document: Document = serde_json::from_slice(&text).map_err(|error| bad(explain(&error, &text)))?;
+    // Editors on Windows put a byte order mark in front.
+    let json = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&text);
+    let document: Document = serde_json::from_slice(json).map_err(|error| bad(explain(&error, json)))?;
     drop(text);
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
@@ -197,7 +199,14 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let given = optics.size().map_err(in_frame)?;
         let size = match given {
             Some(size) => size,
-            None => read_size(&picture)?.map(|side| side as f64),
+            None => match read_size(&picture) {
+                Ok(size) => size.map(|side| side as f64),
+                Err(_) => {
+                    let reason = "whose picture cannot be read".into();
+                    scene.missing.push(MissingPhoto { name: name.clone(), reason });
+                    continue;
+                }
+            },
         };
         let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;
         let rows = entry.c2w_rows().map_err(in_frame)?;
@@ -206,6 +215,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
             .map_err(PhotoScene::in_frame(path, name))?;
         scene.photos.push(Photo { shape: given.map(|[width, height]| width / height), ..photo });
     }
+    scene.num_without_camera = pictures.folders.num_unasked();
     Ok(scene)
 }
 
@@ -227,16 +237,19 @@ struct Pictures<'a> {
 
 impl Pictures<'_> {
     fn find(&mut self, file_path: &str) -> Result<PathBuf, String> {
-        let slashes = if file_path.contains('/') { file_path.to_owned() } else { file_path.replace('\\', "/") };
-        let named = Path::new(&slashes);
-        if let Some(folder) = &self.options.image_folder {
-            return self.folders.find(&self.folder.join(folder).join(below_first(named)));
+        let found = self.find_at(Path::new(file_path));
+        if found.is_ok() || !file_path.contains('\\') {
+            return found;
         }
-        for first in self.options.first_folders {
-            let folder = self.folder.join(first);
-            if self.folders.has(&folder) {
-                return self.folders.find(&folder.join(below_first(named)));
-            }
+        // Windows separates folders so, and some tools write both.
+        self.find_at(Path::new(&file_path.replace('\\', "/")))
+    }
+
+    fn find_at(&mut self, named: &Path) -> Result<PathBuf, String> {
+        if let Some(folder) = self.chosen_folder() {
+            let below =
+                if is_of_another_computer(named) { self.longest_way(&folder, named) } else { below_first(named) };
+            return self.folders.find(&folder.join(below));
         }
         let given = self.folder.join(named);
         let (Some(parent), Some(name)) = (given.parent(), given.file_name()) else {
@@ -245,22 +258,53 @@ impl Pictures<'_> {
         if self.folders.has(parent) {
             return self.folders.find(&given);
         }
-        // Pictures scaled down alone, or an absolute path of another computer.
-        let last = parent.file_name().unwrap_or_default().to_string_lossy();
-        let beside = ["_2", "_4", "_8"].map(|suffix| parent.with_file_name(format!("{last}{suffix}")));
-        let here = self.folder.join(&*last);
-        match beside.into_iter().chain([here]).find(|folder| self.folders.has(folder)) {
-            Some(folder) => self.folders.find(&folder.join(name)),
-            None => Err("without a picture".into()),
+        // Pictures scaled down alone, or a path from another folder or computer.
+        let ways = ways_to(named).into_iter().map(|way| self.folder.join(way));
+        for place in std::iter::once(given.clone()).chain(ways) {
+            let Some(parent) = place.parent().filter(|parent| *parent != self.folder) else { continue };
+            let last = parent.file_name().unwrap_or_default().to_string_lossy();
+            let scaled = ["", "_2", "_4", "_8"].map(|suffix| parent.with_file_name(format!("{last}{suffix}")));
+            if let Some(folder) = scaled.into_iter().find(|folder| self.folders.has(folder)) {
+                return self.folders.find(&folder.join(name));
+            }
         }
+        if is_of_another_computer(named) {
+            return self.folders.find(&self.folder.join(name));
+        }
+        Err("without a picture".into())
+    }
+
+    /// The folder asked for, or the first of those looked for that is there.
+    fn chosen_folder(&mut self) -> Option<PathBuf> {
+        if let Some(folder) = &self.options.image_folder {
+            return Some(self.folder.join(folder));
+        }
+        let mut folders = self.options.first_folders.iter().map(|folder| self.folder.join(folder));
+        folders.find(|folder| self.folders.has(folder))
+    }
+
+    /// As many of the last parts of a path as have their folder in `folder`.
+    fn longest_way(&mut self, folder: &Path, named: &Path) -> PathBuf {
+        let mut ways = ways_to(named).into_iter();
+        let found = ways.find(|way| way.parent().is_some_and(|parent| self.folders.has(&folder.join(parent))));
+        found.unwrap_or_else(|| named.file_name().unwrap_or_default().into())
     }
 }
 
-/// A path without its first folder: `images/left/1.png` is `left/1.png` in `images_8`. Of an absolute one, the name.
+/// The last parts of a path, from all of them to the name alone.
+fn ways_to(path: &Path) -> Vec<PathBuf> {
+    let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
+    (0..parts.len()).map(|start| parts[start..].iter().collect()).collect()
+}
+
+/// Whether a path is absolute, on Windows or elsewhere.
+fn is_of_another_computer(path: &Path) -> bool {
+    let first = path.components().next().map(|part| part.as_os_str().to_string_lossy());
+    path.has_root() || first.is_some_and(|first| first.len() == 2 && first.ends_with(':'))
+}
+
+/// A path without its first folder: `images/left/1.png` is `left/1.png` in `images_8`.
 fn below_first(path: &Path) -> PathBuf {
-    if path.is_absolute() {
-        return path.file_name().unwrap_or_default().into();
-    }
     let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
     parts[parts.len().min(2).saturating_sub(1)..].iter().collect()
 }

@@ -62,7 +62,7 @@ fn chunks_are_split_at_the_size_asked_for_and_described_as_their_source_is() {
     let chunks = ChunkSource::open(root.path(), Split::Test, &SceneFilters::default()).unwrap();
     let (stored, made) = (SourceInfo::read(&chunks).unwrap(), SourceInfo::read(&synthetic(Split::Test)).unwrap());
     let described = |info: SourceInfo| {
-        let SourceInfo { num_scenes, num_frames, image_size, fov_deg, extent } = info;
+        let SourceInfo { num_scenes, num_frames, image_size, fov_deg, extent, .. } = info;
         let (fov_deg, extent) = (fov_deg.unwrap(), extent.unwrap());
         format!("{num_scenes} {num_frames:?} {image_size:?} {fov_deg:.1} {extent:.3}") // files hold f32
     };

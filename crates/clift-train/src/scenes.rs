@@ -5,7 +5,7 @@ use std::sync::Arc;
 use clift_data::export::spread_views;
 use clift_data::{
     Camera, ClipReader, DataError, EvaluationIndex, EvaluationItem, Frame, Layout, LayoutOptions, Ledger, Opened,
-    SceneSource, Split, SyntheticConfig, SyntheticSource,
+    SceneSource, Split, SyntheticConfig, SyntheticSource, is_dl3dv_key,
 };
 use clift_eval::EvalConfig;
 
@@ -37,9 +37,14 @@ fn open_files(data: &DataConfig, layout: Layout, split: Split) -> Result<(Arc<dy
     let root = data.root.as_deref();
     let root = root.ok_or_else(|| missing("data.root", "write the folder that holds train/ and test/"))?;
     let (filters, files) = (data.filters.clone(), data.files.clone());
-    let options = LayoutOptions { layout, filters, files, min_size: [data.width, data.height] };
+    let options = LayoutOptions { layout, filters, files, min_size: [data.width, data.height], reads_chunks: false };
     let Opened { source, ledger, layout, has_splits } = Opened::open(root, split, &options)?;
-    if split == Split::Train && layout == Layout::Dl3dv && !has_splits && data.files.test_scenes.is_none() {
+    let has_dl3dv = match layout {
+        Layout::Dl3dv => true,
+        Layout::Captures => (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene))),
+        _ => false,
+    };
+    if split == Split::Train && has_dl3dv && !has_splits && data.files.test_scenes.is_none() {
         let fix = "the folders hold DL3DV's benchmark scenes too, which are not to be trained on: write the path of an \
                    evaluation index, or of a file with a key per line (an empty file for none)";
         return Err(missing("data.files.test_scenes", fix));

@@ -2,6 +2,8 @@
 
 mod captures;
 mod files;
+mod found;
 mod hostile;
 mod layouts;
+mod left_out;
 mod lenses;

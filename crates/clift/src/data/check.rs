@@ -29,6 +29,8 @@ struct Row {
 #[derive(Debug, Serialize)]
 struct Report {
     scenes: Vec<Row>,
+    /// What is to be known of the whole.
+    notes: Vec<String>,
 }
 
 /// Checks every scene, prints the table and fails when one is flagged.
@@ -36,7 +38,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     if let Some(folder) = &args.pictures {
         fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
     }
-    let mut report = Report { scenes: Vec::new() };
+    let mut report = Report { scenes: Vec::new(), notes: Vec::new() };
     for half in halves(&args.dir, args.split)? {
         check_half(&half, args, &mut report)?;
     }
@@ -59,6 +61,7 @@ fn check_half(half: &Half, args: &CheckArgs, report: &mut Report) -> anyhow::Res
     for note in &ledger.notes {
         print_note(&format!("note: {note}"));
     }
+    report.notes.extend_from_slice(&ledger.notes);
     report.scenes.extend(left_out(ledger).into_iter().map(|check| Row { split: half.split, check }));
     let num_scenes = source.num_scenes().min(args.scenes.unwrap_or(usize::MAX));
     let mut counter = Counter::new(&half.name(), num_scenes as u64);
@@ -131,8 +134,10 @@ mod tests {
         };
         let reasons = vec!["it has no frames".to_owned()];
         let bad = SceneCheck { key: "b".into(), reasons, notes: vec!["so much".into()], ..SceneCheck::default() };
-        let report =
-            Report { scenes: vec![Row { split: Some(Split::Train), check: good }, Row { split: None, check: bad }] };
+        let report = Report {
+            scenes: vec![Row { split: Some(Split::Train), check: good }, Row { split: None, check: bad }],
+            notes: Vec::new(),
+        };
         let expected = "\
 scene    frames  size     field of view  epipolar
 train/a  36      576x320  93.0 deg       0.31 px   ok

@@ -6,14 +6,13 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context;
-use clift_data::{
-    ClipReader, DataError, EvaluationIndex, LayoutOptions, Ledger, Opened, SceneSource, SourceInfo, Split,
-};
+use clift_data::{ClipReader, DataError, EvaluationIndex, Ledger, Opened, SceneSource, SourceInfo, Split, has_halves};
 use clift_train::config::SourceKind;
 use clift_train::scenes::{self, FirstScenes};
 use clift_train::{Config, read_config};
 
-use super::args::InfoArgs;
+use super::args::{InfoArgs, Splits};
+use super::open::{halves_there, options};
 use super::report::{EvaluationReport, Report, SplitReport};
 use crate::WrongUsage;
 use crate::terminal::{print_note, print_result};
@@ -67,23 +66,18 @@ fn of_index(args: &InfoArgs) -> anyhow::Result<()> {
 
 fn of_folder(root: &Path) -> anyhow::Result<Report> {
     let mut report = Report { path: root.to_owned(), ..Report::default() };
-    let splits = [Split::Train, Split::Test];
-    let there: Vec<Split> = splits.into_iter().filter(|split| root.join(split.to_string()).is_dir()).collect();
-    for split in if there.is_empty() { vec![Split::Test] } else { there } {
-        let opened = match Opened::open(root, split, &LayoutOptions::default()) {
-            Ok(opened) => opened,
-            Err(error @ DataError::UnknownLayout { .. }) => return Err(error.into()),
-            Err(error) => {
-                report.splits.insert(split.to_string(), or_error(Err(error)));
-                continue;
+    let is_divided = has_halves(root);
+    for split in halves_there(root, Splits::Both) {
+        let name = if is_divided { split.to_string() } else { "all".into() };
+        let described = match Opened::open(root, split, &options()) {
+            Ok(opened) => {
+                report.layout = Some(opened.layout);
+                describe(opened.source.as_ref(), &opened.ledger)
             }
+            Err(error @ DataError::UnknownLayout { .. }) => return Err(error.into()),
+            Err(error) => Err(error),
         };
-        let name = if opened.has_splits { split.to_string() } else { "all".into() };
-        report.layout = Some(opened.layout);
-        report.splits.insert(name, or_error(describe(opened.source.as_ref(), &opened.ledger)));
-        if !opened.has_splits {
-            break;
-        }
+        report.splits.insert(name, or_error(described));
     }
     Ok(report)
 }
@@ -102,7 +96,7 @@ fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
             };
             let mut described = describe(source.as_ref(), &ledger)?;
             if split == Split::Train {
-                described.views = Some(long_enough(config, source.as_ref())?);
+                described.views = Some(long_enough(config, source.as_ref()));
             }
             Ok(described)
         });
@@ -119,6 +113,7 @@ fn describe(source: &dyn SceneSource, ledger: &Ledger) -> Result<SplitReport, cl
         num_scenes: ledger.num_scenes,
         num_used: ledger.num_used(),
         skipped: counts(ledger),
+        left_out: ledger.skips.clone(),
         frames: ledger.frames.clone(),
         notes: ledger.notes.clone(),
         num_described: source.num_scenes(),
@@ -136,15 +131,16 @@ fn or_error<E: fmt::Display>(described: Result<SplitReport, E>) -> SplitReport {
 }
 
 /// Frames that the longest of the shortest stretches has, and how many scenes have as many.
-fn long_enough(config: &Config, source: &dyn SceneSource) -> Result<[usize; 2], clift_data::DataError> {
+fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
     let views = &config.data.views;
     let gaps = (views.min_context..=views.max_context).map(|num_context| views.gap_bounds(u64::MAX, num_context)[0]);
     let needed = gaps.max().unwrap_or(0) + 1;
     let mut num_long = 0;
     for scene in 0..source.num_scenes() {
-        num_long += usize::from(source.num_frames(scene)? >= needed);
+        // A scene that cannot be read is named where the scenes are described.
+        num_long += usize::from(source.num_frames(scene).is_ok_and(|count| count >= needed));
     }
-    Ok([needed, num_long])
+    [needed, num_long]
 }
 
 fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport {
@@ -210,6 +206,35 @@ test              1 scene
         assert_eq!(crate::exit_code(&error), crate::WRONG_USAGE);
         let text = of_folder(&fixtures().join("train")).unwrap().to_string();
         assert!(text.starts_with("layout            chunks\nall               2 scenes\n"), "{text}");
+    }
+
+    #[test]
+    fn scenes_left_out_are_named_with_their_reason_and_one_bad_scene_hides_no_other() {
+        let root = tempfile::tempdir().unwrap();
+        let train = root.path().join("train");
+        std::fs::create_dir(&train).unwrap();
+        std::fs::copy(fixtures().join("train/000000.torch"), train.join("000000.torch")).unwrap();
+        std::fs::write(train.join("000001.torch"), "cut").unwrap();
+        let index = r#"{"00000000000000a1": "000000.torch", "elsewhere": "000000.torch", "cut": "000001.torch"}"#;
+        std::fs::write(train.join("index.json"), index).unwrap();
+        let report = of_folder(root.path()).unwrap();
+        let split = &report.splits["train"];
+        assert!(split.error.is_none() && split.info.is_some());
+        let keys: Vec<&str> = split.left_out.iter().map(|skip| skip.key.as_str()).collect();
+        assert!(keys.contains(&"cut") && keys.contains(&"elsewhere"), "{keys:?}");
+        let text = report.to_string();
+        assert!(text.contains("train             1 of "), "{text}");
+        for expected in ["  left out        cut: bad chunk: ", "  left out        elsewhere: bad chunk: "] {
+            assert!(text.contains(expected), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_single_capture_that_cannot_be_used_is_no_half() {
+        let root = tempfile::tempdir().unwrap();
+        std::fs::write(root.path().join("transforms.json"), r#"{"fl_x": 20, "frames": []}"#).unwrap();
+        let text = of_folder(root.path()).unwrap().to_string();
+        assert!(text.starts_with("all               bad scene: it lists no frames: "), "{text}");
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use clift_data::{LayoutOptions, Opened, Split};
+use clift_data::{LayoutOptions, Opened, Split, has_halves};
 
 use super::args::Splits;
 
@@ -21,26 +21,31 @@ impl Half {
     }
 }
 
+/// The halves asked for that are there; one, whichever, for a folder that is not divided.
+pub fn halves_there(root: &Path, splits: Splits) -> Vec<Split> {
+    let is_there = |split: &Split| root.join(split.to_string()).is_dir();
+    let there: Vec<Split> = splits.list().iter().copied().filter(is_there).collect();
+    if there.is_empty() || !has_halves(root) { splits.list()[splits.list().len() - 1..].to_vec() } else { there }
+}
+
+/// How all of a folder is opened: everything is going to be read, so that chunks are looked into.
+pub fn options() -> LayoutOptions {
+    LayoutOptions { reads_chunks: true, ..LayoutOptions::default() }
+}
+
 /// Opens the halves asked for that are there. A folder without `train/` and `test/` counts once.
 ///
 /// # Errors
 /// The first error of opening one.
 pub fn halves(root: &Path, splits: Splits) -> anyhow::Result<Vec<Half>> {
-    let is_there = |split: &Split| root.join(split.to_string()).is_dir();
-    let there: Vec<Split> = splits.list().iter().copied().filter(is_there).collect();
-    let wanted = if there.is_empty() { &splits.list()[splits.list().len() - 1..] } else { &there[..] };
     let mut halves = Vec::new();
-    for &split in wanted {
-        let mut opened = Opened::open(root, split, &LayoutOptions::default())?;
+    for split in halves_there(root, splits) {
+        let mut opened = Opened::open(root, split, &options())?;
         if !opened.has_splits {
             // Here they are no halves.
             opened.ledger.notes.retain(|note| !note.contains("both halves are the same scenes"));
         }
-        let is_whole = !opened.has_splits;
         halves.push(Half { split: opened.has_splits.then_some(split), opened });
-        if is_whole {
-            break;
-        }
     }
     Ok(halves)
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
-use clift_data::{FrameSkip, Layout, SourceInfo};
+use clift_data::{FrameSkip, Layout, Skip, SourceInfo};
 use serde::Serialize;
 
 use super::text::count;
@@ -40,6 +40,8 @@ pub struct SplitReport {
     pub num_used: usize,
     /// Scenes the filters leave out, by reason.
     pub skipped: BTreeMap<String, usize>,
+    /// The same scenes one by one, each with its reason.
+    pub left_out: Vec<Skip>,
     /// Frames left out of scenes.
     pub frames: Vec<FrameSkip>,
     /// What else is to be known.
@@ -98,6 +100,26 @@ fn left_out(skipped: &BTreeMap<String, usize>, rows: &mut Vec<(&str, String)>) {
     rows.extend(skipped.iter().map(|(reason, count)| ("  left out", format!("{count} {reason}"))));
 }
 
+/// Names the scenes that are left out, reason by reason.
+fn scenes_left_out(skips: &[Skip], rows: &mut Vec<(&str, String)>) {
+    let mut keys: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for Skip { key, reason } in skips {
+        keys.entry(reason).or_default().push(key);
+    }
+    let num_reasons = keys.len();
+    for (reason, keys) in keys.into_iter().take(MAX_SCENES_NAMED) {
+        let more = if keys.len() > MAX_SCENES_NAMED { ", .." } else { "" };
+        let shown = keys[..keys.len().min(MAX_SCENES_NAMED)].join(", ");
+        rows.push(match keys.len() {
+            1 => ("  left out", format!("{shown}: {reason}")),
+            number => ("  left out", format!("{number} {reason}: {shown}{more}")),
+        });
+    }
+    if num_reasons > MAX_SCENES_NAMED {
+        rows.push(("  left out", format!("scenes for {} more reasons", num_reasons - MAX_SCENES_NAMED)));
+    }
+}
+
 /// Names the frames that are left out, scene by scene and reason by reason.
 fn frames_left_out(frames: &[FrameSkip], rows: &mut Vec<(&str, String)>) {
     let mut names: BTreeMap<(&str, &str), Vec<&str>> = BTreeMap::new();
@@ -125,10 +147,16 @@ impl SplitReport {
         let first = format!("; described by the first {}", self.num_described);
         let first = if self.num_described < self.num_used { first.as_str() } else { "" };
         rows.push((name, format!("{used}{}{first}", count(self.num_scenes, "scene"))));
-        left_out(&self.skipped, rows);
+        scenes_left_out(&self.left_out, rows);
         frames_left_out(&self.frames, rows);
         rows.extend(self.notes.iter().map(|note| ("  note", note.clone())));
         let Some(info) = &self.info else { return };
+        for Skip { key, reason } in info.unreadable.iter().take(MAX_SCENES_NAMED) {
+            rows.push(("  unreadable", format!("{key}: {reason}")));
+        }
+        if info.unreadable.len() > MAX_SCENES_NAMED {
+            rows.push(("  unreadable", format!("{} more scenes", info.unreadable.len() - MAX_SCENES_NAMED)));
+        }
         if let Some(frames) = info.num_frames {
             rows.push(("  frames", format!("{frames} (smallest / median / largest)")));
         }

@@ -1,0 +1,180 @@
+//! What is found where, and what is told of the rest.
+
+use std::fs;
+use std::path::Path;
+
+use clift_data::{FileOptions, Layout, LayoutOptions, Opened, SceneFilters, Split, has_halves};
+
+use crate::files::{copy_folder, fixtures};
+
+const HASH: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
+
+/// Copies part of the fixtures of layouts.
+fn copy(part: &str, to: &Path) {
+    copy_folder(&fixtures().join("layouts").join(part), to);
+}
+
+fn open(root: &Path, split: Split, options: &LayoutOptions) -> Result<Opened, String> {
+    Opened::open(root, split, options).map_err(|error| error.to_string())
+}
+
+fn open_any(root: &Path, split: Split) -> Opened {
+    open(root, split, &LayoutOptions::default()).unwrap()
+}
+
+fn keys(opened: &Opened) -> Vec<&str> {
+    (0..opened.source.num_scenes()).map(|scene| opened.source.key(scene)).collect()
+}
+
+#[test]
+fn a_benchmark_scene_that_is_there_twice_is_in_no_training_set() {
+    let root = tempfile::tempdir().unwrap();
+    copy(&format!("dl3dv/1K/{HASH}"), &root.path().join("1K").join(HASH));
+    copy(&format!("dl3dv/1K/{HASH}"), &root.path().join("bench").join(HASH).join("nerfstudio"));
+    let other = HASH.replace('d', "e");
+    copy(&format!("dl3dv/1K/{HASH}"), &root.path().join("1K").join(&other));
+    let list = root.path().join("list.txt");
+    fs::write(&list, HASH).unwrap();
+    let files = FileOptions { test_scenes: Some(list), ..FileOptions::default() };
+    let options = LayoutOptions { files, ..LayoutOptions::default() };
+    let train = open(root.path(), Split::Train, &options).unwrap();
+    assert_eq!(keys(&train), [other.as_str()]);
+    assert_eq!(train.ledger.counts()["kept for testing"], 2);
+    let note = format!("1 scene of DL3DV there more than once, all of which are used: 1K/{HASH} and bench/{HASH}");
+    assert!(train.ledger.notes.contains(&note), "{:?}", train.ledger.notes);
+    let test = open(root.path(), Split::Test, &options).unwrap();
+    assert_eq!(keys(&test), [format!("1K/{HASH}"), format!("bench/{HASH}")]);
+    assert!(test.ledger.skips.is_empty(), "both are there: {}", test.ledger);
+    assert_eq!(test.source.find(HASH), Some(0), "an index names the hash alone");
+}
+
+#[test]
+fn scenes_of_dl3dv_among_others_are_not_taken_for_captures() {
+    let root = tempfile::tempdir().unwrap();
+    copy("dl3dv", root.path());
+    copy("colmap_bin/attic", &root.path().join("1K/stray"));
+    let message = open(root.path(), Split::Train, &LayoutOptions::default()).err().unwrap();
+    assert!(message.contains("1 of 2 scenes are DL3DV's") && message.contains("such as stray"), "{message}");
+    assert!(message.contains("data.source"), "{message}");
+    let asked = LayoutOptions { layout: Layout::Dl3dv, ..LayoutOptions::default() };
+    let opened = open(root.path(), Split::Train, &asked).unwrap();
+    assert_eq!(keys(&opened), [HASH]);
+    let skip = &opened.ledger.skips[0];
+    assert_eq!((skip.key.as_str(), skip.reason.as_str()), ("stray", "with cameras in another form than dl3dv has"));
+    let asked = LayoutOptions { layout: Layout::Captures, ..LayoutOptions::default() };
+    assert_eq!(open(root.path(), Split::Train, &asked).unwrap().source.num_scenes(), 2);
+}
+
+#[test]
+fn a_capture_named_as_a_half_hides_no_other() {
+    let root = tempfile::tempdir().unwrap();
+    copy("colmap_bin/attic", &root.path().join("train"));
+    copy("colmap_bin/attic", &root.path().join("truck"));
+    let opened = open_any(root.path(), Split::Train);
+    assert_eq!((keys(&opened), opened.has_splits), (vec!["train", "truck"], false));
+    fs::rename(root.path().join("truck"), root.path().join("test")).unwrap();
+    assert!(has_halves(root.path()), "two halves of one capture each");
+    copy("colmap_bin/attic", &root.path().join("truck"));
+    assert!(!has_halves(root.path()));
+    // A clip of RealEstate10K is a file beside its folder, so that the half it is alone in looks like a scene.
+    let clips = tempfile::tempdir().unwrap();
+    copy("re10k_txt/test", &clips.path().join("train"));
+    assert!(has_halves(clips.path()));
+}
+
+#[cfg(unix)]
+#[test]
+fn of_the_names_that_links_give_a_folder_its_own_is_used() {
+    use std::os::unix::fs::symlink;
+    let root = tempfile::tempdir().unwrap();
+    let place = |name: &str| root.path().join(name);
+    for name in ["far/y", "z"] {
+        copy("colmap_bin/attic", &place(name));
+    }
+    // Names before and after that of the folder: neither order of listing decides.
+    for (link, to) in [("a", "z"), ("zz", "z"), ("b", "far"), ("self", "."), ("gone", "nowhere")] {
+        symlink(place(to), place(link)).unwrap();
+    }
+    let opened = open_any(root.path(), Split::Test);
+    assert_eq!(keys(&opened), ["y", "z"]);
+    assert_eq!(opened.ledger.notes[0], "used once, 2 folders being other names: a of z, zz of z");
+}
+
+#[test]
+fn chunks_and_scenes_that_the_index_does_not_name_are_told() {
+    let root = tempfile::tempdir().unwrap();
+    let train = root.path().join("train");
+    copy_folder(&fixtures().join("re10k-mini/train"), &train);
+    fs::copy(train.join("000000.torch"), train.join("000001.torch")).unwrap();
+    fs::write(train.join("index.json"), r#"{"00000000000000a1": "000000.torch"}"#).unwrap();
+    let opened = open_any(root.path(), Split::Train);
+    assert_eq!(opened.ledger.notes, ["not in index.json and so not opened: 1 .torch file (000001.torch)"]);
+    let filters = SceneFilters { min_frames: 2, max_fov_deg: None };
+    for options in [
+        LayoutOptions { reads_chunks: true, ..LayoutOptions::default() },
+        LayoutOptions { filters, ..LayoutOptions::default() },
+    ] {
+        let opened = open(root.path(), Split::Train, &options).unwrap();
+        assert_eq!(keys(&opened), ["00000000000000a1"]);
+        let expected = "1 of 2 scenes used; 1 in a chunk but not in its index.json";
+        assert!(opened.ledger.to_string().starts_with(expected), "{}", opened.ledger);
+        assert_eq!(opened.ledger.skips[0].key, "00000000000000a2");
+    }
+    // The other half's scenes are no news.
+    let index = r#"{"00000000000000a1": "000000.torch", "00000000000000a2": "000001.torch"}"#;
+    fs::write(train.join("index.json"), index).unwrap();
+    let options = LayoutOptions { reads_chunks: true, ..LayoutOptions::default() };
+    let opened = open(root.path(), Split::Train, &options).unwrap();
+    let expected = "2 of 2 scenes used; 2 scenes also in chunks other than those that index.json names, which are not \
+                    used (00000000000000a1, 00000000000000a2)";
+    assert_eq!(opened.ledger.to_string(), expected);
+}
+
+#[test]
+fn of_a_scene_in_two_files_without_an_index_the_first_is_used() {
+    let root = tempfile::tempdir().unwrap();
+    let train = root.path().join("train");
+    copy_folder(&fixtures().join("re10k-mini/train"), &train);
+    fs::remove_file(train.join("index.json")).unwrap();
+    fs::copy(train.join("000000.torch"), train.join("000009.torch")).unwrap();
+    let opened = open_any(root.path(), Split::Train);
+    assert_eq!(opened.source.num_scenes(), 2);
+    let expected = "2 scenes in more than one file, of which the first is used (00000000000000a1 in 000000.torch and \
+                    000009.torch, 00000000000000a2 in 000000.torch and 000009.torch)";
+    assert_eq!(opened.ledger.notes[0], expected);
+    // Without the second file everything is as it was.
+    fs::remove_file(train.join("000009.torch")).unwrap();
+    assert!(open_any(root.path(), Split::Train).source.frame(1, 7).is_ok());
+}
+
+#[test]
+fn data_of_other_layouts_below_a_root_is_named() {
+    let root = tempfile::tempdir().unwrap();
+    copy("capture/attic", &root.path().join("captures/attic"));
+    copy_folder(&fixtures().join("re10k-mini"), &root.path().join("re10k"));
+    copy("re10k_txt", &root.path().join("clips"));
+    let opened = open_any(root.path(), Split::Test);
+    assert_eq!(keys(&opened), ["attic"]);
+    let expected = "not opened, each being data of its own: clips/test (RealEstate10K's text files), \
+                    re10k/test (chunks or scenes in .torch files), re10k/train (chunks or scenes in .torch files)";
+    assert_eq!(opened.ledger.notes[0], expected);
+    fs::remove_dir_all(root.path().join("captures")).unwrap();
+    fs::remove_dir_all(root.path().join("clips")).unwrap();
+    let message = open(root.path(), Split::Test, &LayoutOptions::default()).err().unwrap();
+    assert!(message.contains("there is other data, to be opened by itself: re10k/test (chunks"), "{message}");
+}
+
+#[test]
+fn cameras_in_several_files_are_named_where_none_is_called_transforms_json() {
+    let root = tempfile::tempdir().unwrap();
+    fs::create_dir(root.path().join("train")).unwrap();
+    for split in ["train", "test"] {
+        fs::write(root.path().join(format!("transforms_{split}.json")), "{}").unwrap();
+    }
+    for split in [Split::Train, Split::Test] {
+        let message = open(root.path(), split, &LayoutOptions::default()).err().unwrap();
+        let expected =
+            "there is no transforms.json, but transforms_test.json, transforms_train.json: open one by its path";
+        assert!(message.contains(expected), "{split}: {message}");
+    }
+}

@@ -1,0 +1,212 @@
+//! Pictures and frames that cannot be used, and why.
+
+use std::fs;
+use std::path::Path;
+
+use clift_data::image::{encode_jpeg, encode_png};
+use clift_data::{FileOptions, Frame, LayoutOptions, Ledger, Opened, Split};
+use serde_json::{Value, json};
+
+use crate::files::{copy_folder, fixtures};
+
+fn picture(width: usize, height: usize) -> Frame {
+    Frame { width, height, rgb: (0..width * height * 3).map(|i| (i * i / 7) as u8).collect() }
+}
+
+/// Writes pictures and a `transforms.json` that names `frames`.
+fn write(root: &Path, pictures: &[(&str, Vec<u8>)], frames: &[&str]) {
+    for (name, bytes) in pictures {
+        let path = root.join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, bytes).unwrap();
+    }
+    let frame = |(x, name): (usize, &&str)| {
+        let c2w = json!([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
+        json!({"file_path": name, "transform_matrix": c2w})
+    };
+    let frames: Vec<Value> = frames.iter().enumerate().map(frame).collect();
+    let cameras = json!({"fl_x": 40, "w": 48, "h": 32, "frames": frames});
+    fs::write(root.join("transforms.json"), cameras.to_string()).unwrap();
+}
+
+fn open(root: &Path) -> Result<Opened, String> {
+    Opened::open(root, Split::Test, &LayoutOptions::default()).map_err(|error| error.to_string())
+}
+
+fn frames_left_out(ledger: &Ledger) -> Vec<(&str, &str)> {
+    ledger.frames.iter().map(|skip| (skip.frame.as_str(), skip.reason.as_str())).collect()
+}
+
+#[test]
+fn a_picture_whose_end_is_missing_is_left_out_at_opening() {
+    let (jpeg, png) = (encode_jpeg(&picture(48, 32), 90).unwrap(), encode_png(&picture(48, 32)).unwrap());
+    let cut = |bytes: &[u8]| bytes[..bytes.len() * 3 / 4].to_vec();
+    let padded = |bytes: &[u8]| [bytes, &[0; 900]].concat();
+    let appended = |bytes: &[u8]| [bytes, &b"\x01a film of the phone".repeat(99)].concat();
+    let pictures = [
+        ("0.jpg", jpeg.clone()),
+        ("1.jpg", cut(&jpeg)),
+        ("2.png", png.clone()),
+        ("3.png", cut(&png)),
+        ("4.jpg", padded(&jpeg)),
+        ("5.png", padded(&png)),
+        ("6.jpg", appended(&jpeg)),
+        ("7.png", appended(&png)),
+        ("8.jpg", padded(&cut(&jpeg))),
+    ];
+    let root = tempfile::tempdir().unwrap();
+    write(root.path(), &pictures, &pictures.clone().map(|(name, _)| name));
+    let Opened { source, ledger, .. } = open(root.path()).unwrap();
+    let truncated = ["1.jpg", "3.png", "8.jpg"].map(|name| (name, "whose picture is truncated"));
+    assert_eq!(frames_left_out(&ledger), truncated);
+    for frame in 0..source.num_frames(0).unwrap() {
+        assert!(source.frame(0, frame).is_ok(), "{frame}");
+    }
+}
+
+#[test]
+fn a_scene_without_a_usable_picture_says_what_is_wrong_with_them() {
+    let jpeg = encode_jpeg(&picture(48, 32), 90).unwrap();
+    let turned = encode_jpeg(&picture(32, 48), 90).unwrap();
+    let scenes = tempfile::tempdir().unwrap();
+    for (name, bytes, frames) in [
+        ("corrupt", b"no picture".to_vec(), &["0.jpg"][..]),
+        ("cut", jpeg[..jpeg.len() / 2].to_vec(), &["0.jpg"]),
+        ("empty", jpeg.clone(), &[]),
+        ("heic", jpeg.clone(), &["0.heic", "1.jpg"]),
+        ("missing", jpeg.clone(), &["1.jpg"]),
+        ("turned", turned, &["0.jpg"]),
+        ("whole", jpeg.clone(), &["0.jpg"]),
+    ] {
+        let file = if name == "heic" { "1.heic" } else { "0.jpg" };
+        write(&scenes.path().join(name), &[(file, bytes)], frames);
+    }
+    let ledger = open(scenes.path()).unwrap().ledger;
+    let reason = |key: &str| ledger.skips.iter().find(|skip| skip.key == key).unwrap().reason.as_str();
+    assert!(reason("corrupt").contains("the picture cannot be read"), "{ledger}");
+    assert!(reason("cut").contains("the picture is truncated"), "{ledger}");
+    assert!(reason("empty").contains("it lists no frames"), "{ledger}");
+    assert!(
+        reason("heic").contains("none of its 2 frames can be used; 1.jpg is one whose picture is neither"),
+        "{ledger}"
+    );
+    assert_eq!(reason("missing"), "without any picture");
+    assert!(reason("turned").contains("may have been turned or cropped"), "{ledger}");
+    assert_eq!(ledger.num_used(), 1);
+
+    // Of a data set whose scenes are used whole, the first picture is looked at.
+    let root = tempfile::tempdir().unwrap();
+    for key in ["a", "b"].map(|digit| digit.repeat(64)) {
+        write(&root.path().join(key), &[("0.jpg", jpeg.clone()), ("1.jpg", jpeg.clone())], &["0.jpg", "1.jpg"]);
+    }
+    fs::write(root.path().join("a".repeat(64)).join("0.jpg"), "no picture").unwrap();
+    let ledger = open(root.path()).unwrap().ledger;
+    assert!(ledger.skips[0].reason.contains("the picture cannot be read"), "{ledger}");
+}
+
+#[test]
+fn a_picture_of_no_size_leaves_the_others_in_use() {
+    let root = tempfile::tempdir().unwrap();
+    write(root.path(), &[("0.png", encode_png(&picture(48, 32)).unwrap()), ("1.png", vec![9])], &["0.png", "1.png"]);
+    let path = root.path().join("transforms.json");
+    let mut cameras: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+    cameras.as_object_mut().unwrap().retain(|key, _| key != "w");
+    fs::write(&path, cameras.to_string()).unwrap();
+    assert_eq!(frames_left_out(&open(root.path()).unwrap().ledger), [("1.png", "whose picture cannot be read")]);
+}
+
+#[test]
+fn pictures_without_a_camera_are_counted() {
+    let png = || encode_png(&picture(48, 32)).unwrap();
+    let root = tempfile::tempdir().unwrap();
+    write(
+        &root.path().join("a"),
+        &[("images/0.png", png()), ("images/1.png", png()), ("logo.png", png())],
+        &["images/0"],
+    );
+    let pictures = ["0", "1", "2"].map(|name| (name, png()));
+    let pictures = pictures.map(|(name, png)| (format!("images/{name}.png"), png));
+    let pictures: Vec<(&str, Vec<u8>)> = pictures.iter().map(|(name, png)| (name.as_str(), png.clone())).collect();
+    write(&root.path().join("b"), &pictures, &["images/2", "images/9"]);
+    assert_eq!(open(root.path()).unwrap().ledger.notes[0], "3 pictures without a camera, not used: 1 of a, 2 of b");
+
+    for (layout, frames) in [("colmap_bin/attic", "images/left"), ("re10k_folders", "")] {
+        let copy = tempfile::tempdir().unwrap();
+        copy_folder(&fixtures().join("layouts").join(layout), copy.path());
+        let note = "1 picture without a camera, not used: ";
+        let has_note = || open(copy.path()).unwrap().ledger.notes.iter().any(|got| got.starts_with(note));
+        assert!(!has_note(), "{layout}");
+        let mut folder = copy.path().join(frames);
+        if frames.is_empty() {
+            let find = |path: &Path| walk(path).into_iter().find(|path| path.extension().is_some_and(|e| e == "png"));
+            folder = find(copy.path()).unwrap().parent().unwrap().to_owned();
+        }
+        fs::write(folder.join("99.png"), png()).unwrap();
+        assert!(has_note(), "{layout}");
+    }
+}
+
+/// All files below a folder.
+fn walk(folder: &Path) -> Vec<std::path::PathBuf> {
+    let paths = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    paths.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
+}
+
+#[test]
+fn a_byte_order_mark_is_passed_over() {
+    let root = tempfile::tempdir().unwrap();
+    write(root.path(), &[("0.png", encode_png(&picture(48, 32)).unwrap())], &["0.png"]);
+    let path = root.path().join("transforms.json");
+    let text = fs::read(&path).unwrap();
+    fs::write(&path, [b"\xef\xbb\xbf", &text[..]].concat()).unwrap();
+    assert_eq!(open(root.path()).unwrap().source.num_frames(0).unwrap(), 1);
+}
+
+#[test]
+fn pictures_are_found_by_mixed_separators_and_by_the_end_of_a_path() {
+    let png = || encode_png(&picture(48, 32)).unwrap();
+    for (file, named, image_folder) in [
+        ("images/0.png", ".\\images\\0.png", None),
+        ("images/0.png", "./images\\0.png", None),
+        ("images/left/0.png", "/home/somebody/cap/images/left/0.png", None),
+        ("images/left/0.png", "C:\\Users\\somebody\\cap\\images\\left\\0.png", None),
+        ("images/left_4/0.png", "/home/somebody/cap/images/left/0.png", None),
+        ("0.png", "/home/somebody/cap/0.png", None),
+        ("small/left/0.png", "/home/somebody/cap/images/left/0.png", Some("small")),
+        ("small/0.png", "/home/somebody/cap/images/left/0.png", Some("small")),
+        ("small/left/0.png", "images\\left\\0.png", Some("small")),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        write(root.path(), &[(file, png())], &[named]);
+        let files = FileOptions { image_folder: image_folder.map(str::to_owned), ..FileOptions::default() };
+        let options = LayoutOptions { files, ..LayoutOptions::default() };
+        let opened = Opened::open(root.path(), Split::Test, &options);
+        let opened = opened.unwrap_or_else(|error| panic!("{file} for {named}: {error}"));
+        assert_eq!(opened.source.num_frames(0).unwrap(), 1, "{file} for {named}");
+    }
+    // A relative path is not looked for where the folder it names is not.
+    let root = tempfile::tempdir().unwrap();
+    write(root.path(), &[("0.png", png())], &["images/0.png"]);
+    assert!(open(root.path()).is_err());
+}
+
+#[test]
+fn an_orientation_that_is_not_applied_is_told_where_the_shape_is_wrong() {
+    // Of phones: pixels lie as the sensor has them, and a tag says how to turn them.
+    let tagged = |frame: &Frame| {
+        let jpeg = encode_jpeg(frame, 90).unwrap();
+        let exif = b"\xff\xe1\x00\x22Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
+        [&jpeg[..2], exif, &jpeg[2..]].concat()
+    };
+    let root = tempfile::tempdir().unwrap();
+    let pictures = [("0.jpg", tagged(&picture(48, 32))), ("1.jpg", tagged(&picture(32, 48)))];
+    write(root.path(), &pictures, &["0.jpg", "1.jpg"]);
+    let opened = open(root.path()).unwrap();
+    let expected = "whose picture has another shape than its camera, and an EXIF orientation, which is not applied";
+    assert_eq!(frames_left_out(&opened.ledger), [("1.jpg", expected)]);
+    let frame = opened.source.frame(0, 0).unwrap();
+    assert_eq!((frame.width, frame.height), (48, 32), "as stored");
+    fs::remove_file(root.path().join("0.jpg")).unwrap();
+    let message = open(root.path()).err().unwrap();
+    assert!(message.contains("its EXIF orientation is 6, which is not applied"), "{message}");
+}
