@@ -34,8 +34,13 @@ fn a_capture_is_trained_on_encoded_and_drawn_and_its_missing_frame_is_named() {
 #[test]
 fn folders_of_dl3dv_are_trained_on_only_with_a_list_of_test_scenes() {
     let place = Place::new();
-    let message = place.train("run", &[&data("dl3dv", "dl3dv", "")], &[]).fails(2);
-    assert!(message.contains("`data.files.test_scenes` = missing: the folders hold DL3DV's benchmark"), "{message}");
+    for source in ["dl3dv", "auto", "captures"] {
+        let message = place.train("run", &[&data(source, "dl3dv", "")], &[]).fails(2);
+        assert!(
+            message.contains("`data.files.test_scenes` = missing: the folders hold DL3DV's benchmark"),
+            "{message}"
+        );
+    }
     std::fs::write(place.at("none.txt"), "").unwrap();
     let files = format!("files={{test_scenes='{}'}},", place.at("none.txt").display());
     let ran = place.train("run", &[&data("dl3dv", "dl3dv", &files)], &["--only", "stage1"]).ok();

@@ -63,8 +63,8 @@ struct Findings {
 }
 
 impl PhotoSource {
-    /// Reads the cameras of every scene, on all cores, and finds their pictures; of the pictures, the head of every
-    /// one, or with `whole_scenes` of each scene's first.
+    /// Reads the cameras of every scene, on all cores, and finds their pictures; of the pictures, head and end of
+    /// every one, or with `whole_scenes` of each scene's first.
     ///
     /// # Errors
     /// [`DataError::BadConfig`] for wrong filters, and the first scene's error when no scene can be read.
