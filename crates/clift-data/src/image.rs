@@ -88,8 +88,9 @@ pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
     if !matches!(reader.format(), Some(ImageFormat::Jpeg | ImageFormat::Png)) {
         return Err(bad("the picture is neither JPEG nor PNG".into()));
     }
-    let (width, height) =
-        reader.into_dimensions().map_err(|error| bad(format!("the picture cannot be read: {error}")))?;
+    let (width, height) = reader
+        .into_dimensions()
+        .map_err(|error| bad(format!("the picture cannot be read: {}", error.to_string().trim_end())))?;
     if width == 0 || height == 0 {
         return Err(bad(format!("the picture is {width}x{height}")));
     }

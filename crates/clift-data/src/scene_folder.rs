@@ -128,7 +128,7 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
         match seen.get(&real) {
             Some(Some(scene)) => {
                 let (first, _): &(String, _) = &found[*scene];
-                again.push(format!("{way} of {first}"));
+                again.push(format!("{way} to {first}"));
                 continue;
             }
             Some(None) => continue,
@@ -154,7 +154,7 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     }
     let mut notes = Vec::new();
     if !again.is_empty() {
-        notes.push(format!("used once, {} being other names: {}", counted(again.len(), "folder"), some_of(&again)));
+        notes.push(format!("{} to what is used already: {}", counted(again.len(), "link"), some_of(&again)));
     }
     let mut ways: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for (way, _) in &found {

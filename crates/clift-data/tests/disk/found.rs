@@ -97,7 +97,7 @@ fn of_the_names_that_links_give_a_folder_its_own_is_used() {
     }
     let opened = open_any(root.path(), Split::Test);
     assert_eq!(keys(&opened), ["y", "z"]);
-    assert_eq!(opened.ledger.notes[0], "used once, 2 folders being other names: a of z, zz of z");
+    assert_eq!(opened.ledger.notes[0], "2 links to what is used already: a to z, zz to z");
 }
 
 #[test]
