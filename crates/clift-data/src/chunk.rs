@@ -171,7 +171,9 @@ impl ChunkSource {
             }
         }
         self.ledger.num_scenes += unlisted.len();
-        unlisted.into_iter().for_each(|key| self.ledger.skip(key, "in a chunk but not in its index.json"));
+        for key in unlisted {
+            self.ledger.skip(key, "in a chunk but not in its index.json");
+        }
         if !elsewhere.is_empty() {
             let names: Vec<String> = elsewhere.into_iter().collect();
             let note = format!(

@@ -128,7 +128,7 @@ pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
 /// The EXIF orientation of a picture file, 2 to 8, if it says that the picture is to be turned or mirrored.
 pub(crate) fn exif_orientation(path: &Path) -> Option<u8> {
     let mut decoder = ImageReader::open(path).ok()?.with_guessed_format().ok()?.into_decoder().ok()?;
-    decoder.orientation().ok().map(|orientation| orientation.to_exif()).filter(|orientation| *orientation != 1)
+    decoder.orientation().ok().map(image::metadata::Orientation::to_exif).filter(|orientation| *orientation != 1)
 }
 
 /// Whether an end marker follows the last scan; the decoder fills what is missing of a truncated JPEG with grey.

@@ -146,19 +146,20 @@ impl<'a> Place<'a> {
 
     /// The error for a folder without scenes, with what is there instead.
     fn nothing(&self, what: &str, others: &[String]) -> DataError {
-        let mut what = what.to_owned();
-        let files =
-            [&self.base, self.root].into_iter().map(|folder| transforms_in(folder)).find(|files| !files.is_empty());
-        if let Some(files) = files {
-            what += &format!(
-                "; there is no transforms.json, but {}: open one by its path, or write the frames of all into a \
+        let mut parts = vec![what.to_owned()];
+        let folders = [&self.base, self.root];
+        let files = folders.into_iter().map(transforms_in).find(|files| !files.is_empty());
+        parts.extend(files.map(|files| {
+            format!(
+                "there is no transforms.json, but {}: open one by its path, or write the frames of all into a \
                  transforms.json",
                 some_of(&files)
-            );
-        }
+            )
+        }));
         if !others.is_empty() {
-            what += &format!("; below it there is other data, to be opened by itself: {}", some_of(others));
+            parts.push(format!("below it there is other data, to be opened by itself: {}", some_of(others)));
         }
+        let what = parts.join("; ");
         let path = if self.base.exists() { self.base.clone() } else { self.root.to_owned() };
         DataError::UnknownLayout { what, path }
     }

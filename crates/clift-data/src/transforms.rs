@@ -197,16 +197,11 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let optics = entry.optics().or(&top);
         let lens = optics.lens().map_err(in_frame)?;
         let given = optics.size().map_err(in_frame)?;
-        let size = match given {
-            Some(size) => size,
-            None => match read_size(&picture) {
-                Ok(size) => size.map(|side| side as f64),
-                Err(_) => {
-                    let reason = "whose picture cannot be read".into();
-                    scene.missing.push(MissingPhoto { name: name.clone(), reason });
-                    continue;
-                }
-            },
+        let size = given.map_or_else(|| read_size(&picture).map(|size| size.map(|side| side as f64)), Ok);
+        let Ok(size) = size else {
+            let reason = "whose picture cannot be read".into();
+            scene.missing.push(MissingPhoto { name: name.clone(), reason });
+            continue;
         };
         let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;
         let rows = entry.c2w_rows().map_err(in_frame)?;
