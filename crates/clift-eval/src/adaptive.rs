@@ -114,7 +114,7 @@ fn smallest(curve: &Curve, max_error: f64) -> Option<(usize, f64)> {
 /// Largest mean PSNR of any counts that are on average at most `count`: the linear relaxation, which takes the
 /// steepest segments of all scenes' concave hulls first, the last one in part.
 fn upper_bound(curves: &[Curve], count: usize) -> Option<f64> {
-    let hulls: Vec<Vec<(f64, f64)>> = curves.iter().map(|curve| concave_hull(curve)).collect();
+    let hulls: Vec<Vec<(f64, f64)>> = curves.iter().map(concave_hull).collect();
     let first: Vec<(f64, f64)> = hulls.iter().filter_map(|hull| hull.first().copied()).collect();
     let mut tokens_left: f64 = first.iter().map(|(tokens, _)| count as f64 - tokens).sum();
     let segments = hulls.iter().flat_map(|hull| hull.windows(2));
