@@ -129,7 +129,7 @@ fn open_folder(
     let files = if is_meant { config.data.files.clone() } else { FileOptions::default() };
     // Filters choose what to train on; this scene was chosen by hand.
     let (source, ledger) = open_layout(folder, split, &LayoutOptions { files, ..LayoutOptions::default() })?;
-    if ledger.has_gaps() || !ledger.notes.is_empty() {
+    if ledger.has_news() {
         terminal::print_note(&format!("{}: {ledger}", folder.display()));
     }
     Ok(source)

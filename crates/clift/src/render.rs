@@ -62,7 +62,9 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let model = args.model.clone().unwrap_or_else(|| scene.model_path.clone().into());
     let weights = renderer_weights(&model, scene.kind);
     if args.model.is_none() && !weights.exists() {
-        let message = format!("the scene was encoded with {weights:?}, which is not there");
+        // The path is out of a file from anywhere: no control character of it reaches the terminal.
+        let path = weights.display().to_string();
+        let message = format!("the scene was encoded with {}, which is not there", path.escape_debug());
         return Err(WrongUsage(format!("{message}; give the run with --model RUN")).into());
     }
     let stop = crate::interrupt::flag()?;
