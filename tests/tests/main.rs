@@ -4,6 +4,7 @@ mod attack;
 mod bad_input;
 mod bench;
 mod checkpoints;
+mod convert;
 #[cfg(unix)]
 mod crash;
 mod data_tools;

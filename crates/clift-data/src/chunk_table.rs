@@ -5,6 +5,7 @@ use std::path::Path;
 
 use crate::archive::{Archive, Span};
 use crate::camera::Camera;
+use crate::chunk_writer::{camera_bytes, timestamp_bytes};
 use crate::error::DataError;
 use crate::pickle::{ElementType, MAX_BYTES, MAX_VALUES, Pickle, Tensor, Value};
 
@@ -127,6 +128,13 @@ impl SceneTable {
     pub fn read_timestamps(&self, path: &Path) -> Result<Vec<i64>, DataError> {
         let bytes = self.timestamps.read(path)?;
         Ok(bytes.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect())
+    }
+
+    /// Whether a scene with these time stamps and cameras, as many as it has frames, would be written with the same
+    /// numbers.
+    pub fn is_of(&self, path: &Path, timestamps: &[i64], cameras: &[Camera]) -> Result<bool, DataError> {
+        Ok(self.timestamps.read(path)? == timestamp_bytes(timestamps)
+            && self.cameras.read(path)? == camera_bytes(cameras))
     }
 }
 

@@ -88,42 +88,54 @@ pub(crate) fn chunk_name(number: usize) -> String {
 }
 
 /// Writes a list of scenes.
-pub(crate) fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
+fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
+    replace(path, &chunk_bytes(path, scenes)?).map_err(DataError::io("writing a chunk", path))
+}
+
+/// The file at `path` of a list of scenes.
+pub(crate) fn chunk_bytes(path: &Path, scenes: &[SceneRecord]) -> Result<Vec<u8>, DataError> {
     let mut pickle = PickleWriter::new();
     pickle.raw(b"](");
     for scene in scenes {
         write_scene(scene, &mut pickle);
     }
     pickle.raw(b"e.");
-    write_archive(path, pickle)
+    pack(path, pickle)
 }
 
-/// Writes a scene by itself, as the reference's tool does.
-pub(crate) fn write_scene_file(path: &Path, scene: &SceneRecord) -> Result<(), DataError> {
+/// The file at `path` of a scene by itself, as the reference's tool writes it.
+pub(crate) fn scene_file_bytes(path: &Path, scene: &SceneRecord) -> Result<Vec<u8>, DataError> {
     let mut pickle = PickleWriter::new();
     write_scene(scene, &mut pickle);
     pickle.raw(b".");
-    write_archive(path, pickle)
+    pack(path, pickle)
 }
 
-fn write_archive(path: &Path, pickle: PickleWriter) -> Result<(), DataError> {
+fn pack(path: &Path, pickle: PickleWriter) -> Result<Vec<u8>, DataError> {
     let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
-    let bytes = pickle.pack(&prefix).map_err(|error| DataError::io("packing a chunk", path)(error.into()))?;
-    replace(path, &bytes).map_err(DataError::io("writing a chunk", path))
+    pickle.pack(&prefix).map_err(|error| DataError::io("packing a chunk", path)(error.into()))
+}
+
+/// Time stamps as a file has them.
+pub(crate) fn timestamp_bytes(timestamps: &[i64]) -> Vec<u8> {
+    timestamps.iter().flat_map(|time| time.to_le_bytes()).collect()
+}
+
+/// Cameras as a file has them: rows of 18 f32.
+pub(crate) fn camera_bytes(cameras: &[Camera]) -> Vec<u8> {
+    let rows = cameras.iter().flat_map(Camera::to_re10k);
+    rows.flat_map(|number| (number as f32).to_le_bytes()).collect()
 }
 
 fn write_scene(scene: &SceneRecord, pickle: &mut PickleWriter) {
-    let timestamps = scene.timestamps.iter().flat_map(|time| time.to_le_bytes()).collect();
-    let rows = scene.cameras.iter().flat_map(Camera::to_re10k);
-    let cameras = rows.flat_map(|number| (number as f32).to_le_bytes()).collect();
     let num_frames = scene.images.len();
     pickle.raw(b"}(");
     pickle.string("url");
     pickle.string(&scene.url);
     pickle.string("timestamps");
-    pickle.tensor("LongStorage", timestamps, &[num_frames]);
+    pickle.tensor("LongStorage", timestamp_bytes(&scene.timestamps), &[num_frames]);
     pickle.string("cameras");
-    pickle.tensor("FloatStorage", cameras, &[num_frames, 18]);
+    pickle.tensor("FloatStorage", camera_bytes(&scene.cameras), &[num_frames, 18]);
     pickle.string("images");
     pickle.raw(b"](");
     for image in &scene.images {

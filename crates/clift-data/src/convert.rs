@@ -1,18 +1,23 @@
 //! Any source as pixelSplat's chunks or as one file per scene, resumable and with checksums.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-use crate::chunk_table::ChunkTable;
-use crate::chunk_writer::{SceneRecord, chunk_name, write_chunk, write_scene_file};
+use crate::chunk_table::{ChunkTable, SceneTable};
+use crate::chunk_writer::{SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
 use crate::clip::SceneSource;
 use crate::error::DataError;
 use crate::export::Encoding;
-use crate::files::replace;
 use crate::journal::Journal;
-use crate::ledger::Skip;
+use crate::ledger::Ledger;
+use crate::picture_folder::has_ending;
+
+/// Scenes of `chunks`, by key: the file of each.
+const INDEX: &str = "index.json";
+/// The [`Ledger`] of what is not in the folder.
+const SKIPPED: &str = "skipped.json";
 
 /// What is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,13 +32,31 @@ pub enum ConvertTo {
 }
 
 /// How it is written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConvertOptions {
     /// Files.
     pub to: ConvertTo,
     /// How a frame is stored that has no file of its own: computed ones, and those whose lens distortion was undone.
     /// Others keep theirs, byte by byte.
     pub encoding: Encoding,
+    /// What the source was opened with, on one line; empty for the defaults.
+    pub opened_with: String,
+}
+
+impl ConvertOptions {
+    /// What two runs on one folder have to share, on one line.
+    fn made_as(&self) -> String {
+        let form = match self.to {
+            ConvertTo::Chunks { target_bytes } => format!("chunks of {target_bytes} bytes"),
+            ConvertTo::Scenes => "a file per scene".into(),
+        };
+        let pictures = match self.encoding {
+            Encoding::Png => "PNG".into(),
+            Encoding::Jpeg(quality) => format!("JPEG of quality {quality}"),
+        };
+        let with = if self.opened_with.is_empty() { "" } else { ", with " };
+        format!("{form}, {pictures}{with}{}", self.opened_with)
+    }
 }
 
 /// What was written.
@@ -43,45 +66,212 @@ pub struct Converted {
     pub num_scenes: usize,
     /// Scenes of these that were there already, from a conversion that did not end.
     pub num_found: usize,
+    /// Scenes that were there with other cameras, time stamps or numbers of frames than they have now; written anew.
+    pub num_changed: usize,
     /// Frames written now.
     pub num_frames: usize,
     /// Frames of these that had to be encoded.
     pub num_encoded: usize,
     /// Bytes of the pictures written now.
     pub image_bytes: u64,
-    /// Scenes that could not be read, with the reason.
-    pub skipped: Vec<Skip>,
+    /// What opening the source left out, and scenes that could not be read.
+    pub left_out: Ledger,
 }
 
-/// Writes the scenes of `source` into `folder`; one that cannot be read is left out, with the reason in the result.
-///
-/// Every file appears under its name only when it is complete, and then its SHA-256 in `SHA256SUMS`, which
-/// `sha256sum -c` reads. Called again on a folder that was not finished, it keeps the files whose sums still hold and
-/// goes on with the scenes that are missing; on one that was finished, it verifies all sums. `done` is told how many
-/// scenes are ready.
+/// Opens a [`Conversion`] and runs it.
 ///
 /// # Errors
-/// [`DataError::Io`] from writing, [`DataError::BadIndex`] for a folder with other files or of other scenes.
+/// As both.
 pub fn convert(
     source: &dyn SceneSource,
+    left_out: &Ledger,
     folder: &Path,
-    options: ConvertOptions,
-    mut done: impl FnMut(usize),
+    options: &ConvertOptions,
+    done: impl FnMut(usize),
 ) -> Result<Converted, DataError> {
-    let mut journal = Journal::open(folder)?;
-    let mut writer = Writer::resume(source, folder, &mut journal)?;
-    writer.converted.num_found = writer.index.len();
-    for scene in 0..source.num_scenes() {
-        let key = source.key(scene);
-        if !writer.index.contains_key(key) && !writer.pending_keys.contains(key) {
-            match record(source, scene, options.encoding) {
-                Ok((record, num_encoded)) => writer.add(record, num_encoded, options.to)?,
-                Err(error) => writer.converted.skipped.push(Skip { key: key.to_owned(), reason: error.to_string() }),
+    Conversion::open(source, left_out, folder, options)?.run(done)
+}
+
+/// A folder that is to receive the scenes of a source.
+///
+/// Every file appears under its name only when it is complete, its SHA-256 in `SHA256SUMS`, which `sha256sum -c`
+/// reads. In a folder that was not finished, files are kept whose sums still hold and whose scenes still have the
+/// cameras, time stamps and numbers of frames of the source, and the rest is made; in one that was finished, all sums
+/// are verified. Pictures are not compared.
+pub struct Conversion<'a> {
+    source: &'a dyn SceneSource,
+    folder: PathBuf,
+    options: ConvertOptions,
+    journal: Journal,
+    /// File of every scene that is written.
+    index: BTreeMap<String, String>,
+    /// Files with a scene that has changed.
+    stale: BTreeSet<String>,
+    pending: Vec<SceneRecord>,
+    pending_keys: HashSet<String>,
+    pending_bytes: u64,
+    converted: Converted,
+}
+
+impl<'a> Conversion<'a> {
+    /// Looks at `folder` and writes nothing. `left_out` is what opening `source` left out.
+    ///
+    /// # Errors
+    /// [`DataError::BadIndex`] for a folder with other files, of other scenes or made with other options.
+    pub fn open(
+        source: &'a dyn SceneSource,
+        left_out: &Ledger,
+        folder: &Path,
+        options: &ConvertOptions,
+    ) -> Result<Self, DataError> {
+        let journal = Journal::open(folder, &options.made_as())?;
+        let mut conversion = Self {
+            source,
+            folder: folder.to_owned(),
+            options: options.clone(),
+            journal,
+            index: BTreeMap::new(),
+            stale: BTreeSet::new(),
+            pending: Vec::new(),
+            pending_keys: HashSet::new(),
+            pending_bytes: 0,
+            converted: Converted { left_out: left_out.clone(), ..Converted::default() },
+        };
+        conversion.look()?;
+        Ok(conversion)
+    }
+
+    /// Takes up the scenes of the files that the journal knows.
+    fn look(&mut self) -> Result<(), DataError> {
+        let names: Vec<String> =
+            self.journal.names().filter(|name| has_ending(name, "torch")).map(str::to_owned).collect();
+        for name in names {
+            let path = self.folder.join(&name);
+            let tables: Vec<SceneTable> = ChunkTable::read(&path)?.scenes.into_values().collect();
+            let changed: Vec<bool> =
+                tables.par_iter().map(|table| self.is_changed(table, &path)).collect::<Result<_, _>>()?;
+            let num_changed = changed.iter().filter(|changed| **changed).count();
+            self.converted.num_changed += num_changed;
+            if num_changed > 0 {
+                self.stale.insert(name);
+            } else {
+                self.index.extend(tables.into_iter().map(|table| (table.key, name.clone())));
             }
         }
-        done(writer.index.len() + writer.pending.len());
+        self.converted.num_found = self.index.len();
+        Ok(())
     }
-    writer.finish(options.to)
+
+    /// Whether a scene that is there differs from the source's.
+    fn is_changed(&self, table: &SceneTable, path: &Path) -> Result<bool, DataError> {
+        let key = &table.key;
+        let Some(scene) = self.source.find(key).filter(|scene| self.source.key(*scene) == key) else {
+            let what = format!("it holds scene {key}, which is not to be converted; choose another folder");
+            return Err(DataError::BadIndex { what, path: path.to_owned() });
+        };
+        let now = self.source.timestamps(scene).and_then(|times| Ok((times, self.source.cameras(scene)?)));
+        // What cannot be read any more is no reason to throw away what could be.
+        let Ok((timestamps, cameras)) = now else { return Ok(false) };
+        Ok(!table.is_of(path, &timestamps, &cameras)?)
+    }
+
+    /// Writes the scenes that are missing; one that cannot be read is left out, with the reason in the result and in
+    /// `skipped.json`. `done` is told how many scenes are ready.
+    ///
+    /// # Errors
+    /// [`DataError::Io`] from writing.
+    pub fn run(mut self, mut done: impl FnMut(usize)) -> Result<Converted, DataError> {
+        self.journal.begin()?;
+        if !self.stale.is_empty() {
+            // It names files that are about to go.
+            self.journal.remove(INDEX)?;
+        }
+        for name in std::mem::take(&mut self.stale) {
+            self.journal.remove(&name)?;
+        }
+        for scene in 0..self.source.num_scenes() {
+            let key = self.source.key(scene);
+            if !self.index.contains_key(key) && !self.pending_keys.contains(key) {
+                match record(self.source, scene, self.options.encoding) {
+                    Ok((record, num_encoded)) => self.add(record, num_encoded)?,
+                    Err(error) => self.converted.left_out.skip(key, error.to_string()),
+                }
+            }
+            done(self.index.len() + self.pending.len());
+        }
+        self.finish()
+    }
+
+    fn add(&mut self, record: SceneRecord, num_encoded: usize) -> Result<(), DataError> {
+        let image_bytes = record.images.iter().map(|image| image.len() as u64).sum::<u64>();
+        if let Err(what) = record.check() {
+            self.converted.left_out.skip(record.key, what);
+            return Ok(());
+        }
+        if self.options.to == ConvertTo::Scenes && !is_file_name(&record.key) {
+            self.converted.left_out.skip(record.key, "its key is no name for a file; convert to chunks");
+            return Ok(());
+        }
+        self.converted.num_frames += record.images.len();
+        self.converted.num_encoded += num_encoded;
+        self.converted.image_bytes += image_bytes;
+        self.pending_bytes += image_bytes;
+        self.pending_keys.insert(record.key.clone());
+        self.pending.push(record);
+        match self.options.to {
+            ConvertTo::Chunks { target_bytes } if self.pending_bytes < target_bytes => Ok(()),
+            _ => self.flush(),
+        }
+    }
+
+    fn flush(&mut self) -> Result<(), DataError> {
+        let scenes = std::mem::take(&mut self.pending);
+        let Some(first) = scenes.first() else { return Ok(()) };
+        let (name, bytes) = match self.options.to {
+            ConvertTo::Chunks { .. } => {
+                let name = self.free_name();
+                let bytes = chunk_bytes(&self.folder.join(&name), &scenes)?;
+                (name, bytes)
+            }
+            ConvertTo::Scenes => {
+                let name = format!("{}.torch", first.key);
+                let bytes = scene_file_bytes(&self.folder.join(&name), first)?;
+                (name, bytes)
+            }
+        };
+        self.journal.write(&name, &bytes)?;
+        self.index.extend(scenes.into_iter().map(|scene| (scene.key, name.clone())));
+        self.pending_keys.clear();
+        self.pending_bytes = 0;
+        Ok(())
+    }
+
+    /// The first chunk name that is not in use.
+    fn free_name(&self) -> String {
+        let used: HashSet<&String> = self.index.values().collect();
+        // Of one name more than there are files, one is free.
+        (0..=used.len()).map(chunk_name).find(|name| !used.contains(name)).unwrap_or_default()
+    }
+
+    fn finish(mut self) -> Result<Converted, DataError> {
+        self.flush()?;
+        let is_chunks = self.options.to != ConvertTo::Scenes;
+        let index = (is_chunks && !self.index.is_empty()).then(|| serde_json::to_vec_pretty(&self.index));
+        let left_out = &self.converted.left_out;
+        let skipped = left_out.has_gaps().then(|| serde_json::to_vec_pretty(left_out));
+        for (name, text) in [(INDEX, index), (SKIPPED, skipped)] {
+            let Some(text) = text else {
+                // What an earlier run left out is there now.
+                self.journal.remove(name)?;
+                continue;
+            };
+            let path = self.folder.join(name);
+            let text = text.map_err(|error| DataError::BadIndex { what: error.to_string(), path })?;
+            self.journal.write(name, &text)?;
+        }
+        self.converted.num_scenes = self.index.len();
+        Ok(self.converted)
+    }
 }
 
 /// Reads a scene; also says how many of its frames had to be encoded.
@@ -100,114 +290,6 @@ fn record(source: &dyn SceneSource, scene: usize, encoding: Encoding) -> Result<
     let images = images.into_iter().map(|(bytes, _)| bytes).collect();
     let key = source.key(scene).to_owned();
     Ok((SceneRecord { key, url: source.url(scene)?, timestamps, cameras, images }, num_encoded))
-}
-
-/// Collects scenes and writes them when there are enough.
-struct Writer<'a> {
-    folder: &'a Path,
-    journal: &'a mut Journal,
-    /// File of every scene that is written.
-    index: BTreeMap<String, String>,
-    pending: Vec<SceneRecord>,
-    pending_keys: HashSet<String>,
-    pending_bytes: u64,
-    converted: Converted,
-}
-
-impl<'a> Writer<'a> {
-    /// Takes up the scenes of the files that the journal knows.
-    fn resume(source: &dyn SceneSource, folder: &'a Path, journal: &'a mut Journal) -> Result<Self, DataError> {
-        let mut index = BTreeMap::new();
-        for name in journal.names().filter(|name| Path::new(name).extension().is_some_and(|ending| ending == "torch")) {
-            let path = folder.join(name);
-            for key in ChunkTable::read(&path)?.scenes.into_keys() {
-                if source.find(&key).is_none() {
-                    let what = format!("it holds scene {key}, which is not to be converted; choose another folder");
-                    return Err(DataError::BadIndex { what, path });
-                }
-                index.insert(key, name.to_owned());
-            }
-        }
-        Ok(Self {
-            folder,
-            journal,
-            index,
-            pending: Vec::new(),
-            pending_keys: HashSet::new(),
-            pending_bytes: 0,
-            converted: Converted::default(),
-        })
-    }
-
-    fn add(&mut self, record: SceneRecord, num_encoded: usize, to: ConvertTo) -> Result<(), DataError> {
-        let image_bytes = record.images.iter().map(|image| image.len() as u64).sum::<u64>();
-        if let Err(what) = record.check() {
-            self.converted.skipped.push(Skip { key: record.key, reason: what });
-            return Ok(());
-        }
-        if to == ConvertTo::Scenes && !is_file_name(&record.key) {
-            let reason = "its key is no name for a file; convert to chunks".into();
-            self.converted.skipped.push(Skip { key: record.key, reason });
-            return Ok(());
-        }
-        self.converted.num_frames += record.images.len();
-        self.converted.num_encoded += num_encoded;
-        self.converted.image_bytes += image_bytes;
-        self.pending_bytes += image_bytes;
-        self.pending_keys.insert(record.key.clone());
-        self.pending.push(record);
-        match to {
-            ConvertTo::Chunks { target_bytes } if self.pending_bytes < target_bytes => Ok(()),
-            _ => self.flush(to),
-        }
-    }
-
-    fn flush(&mut self, to: ConvertTo) -> Result<(), DataError> {
-        let scenes = std::mem::take(&mut self.pending);
-        let Some(first) = scenes.first() else { return Ok(()) };
-        let name = match to {
-            ConvertTo::Chunks { .. } => self.free_name(),
-            ConvertTo::Scenes => format!("{}.torch", first.key),
-        };
-        let path = self.folder.join(&name);
-        match to {
-            ConvertTo::Chunks { .. } => write_chunk(&path, &scenes)?,
-            ConvertTo::Scenes => write_scene_file(&path, first)?,
-        }
-        self.journal.add(&name)?;
-        self.index.extend(scenes.into_iter().map(|scene| (scene.key, name.clone())));
-        self.pending_keys.clear();
-        self.pending_bytes = 0;
-        Ok(())
-    }
-
-    /// The first chunk name that is not in use.
-    fn free_name(&self) -> String {
-        let used: HashSet<&String> = self.index.values().collect();
-        // Of one name more than there are files, one is free.
-        (0..=used.len()).map(chunk_name).find(|name| !used.contains(name)).unwrap_or_default()
-    }
-
-    fn finish(mut self, to: ConvertTo) -> Result<Converted, DataError> {
-        self.flush(to)?;
-        if let ConvertTo::Chunks { .. } = to {
-            let path: PathBuf = self.folder.join("index.json");
-            let bad = |error: serde_json::Error| DataError::BadIndex { what: error.to_string(), path: path.clone() };
-            let text = serde_json::to_vec_pretty(&self.index).map_err(bad)?;
-            replace(&path, &text).map_err(DataError::io("writing the index", &path))?;
-            self.journal.add("index.json")?;
-        }
-        let path = self.folder.join("skipped.json");
-        if !self.converted.skipped.is_empty() {
-            let bad = |error: serde_json::Error| DataError::BadIndex { what: error.to_string(), path: path.clone() };
-            let text = serde_json::to_vec_pretty(&self.converted.skipped).map_err(bad)?;
-            replace(&path, &text).map_err(DataError::io("writing what was skipped", &path))?;
-        } else if path.exists() {
-            std::fs::remove_file(&path).map_err(DataError::io("removing an older list of what was skipped", &path))?;
-        }
-        self.converted.num_scenes = self.index.len();
-        Ok(self.converted)
-    }
 }
 
 fn is_file_name(key: &str) -> bool {

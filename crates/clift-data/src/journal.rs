@@ -1,53 +1,110 @@
-//! `SHA256SUMS`: which files of a folder are complete, and what they hold.
+//! `SHA256SUMS`: which files of a folder are complete, what they hold, and how they were made.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, OpenOptions};
-use std::io::{Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
 use crate::error::DataError;
-use crate::files::replace;
+use crate::files::{remove_leftovers, replace};
+use crate::picture_folder::has_ending;
 
 /// As `sha256sum` calls it: a line per file, sum and name.
 const FILE_NAME: &str = "SHA256SUMS";
+/// Starts the line that says how the files are made: a comment to `sha256sum -c`.
+const MADE_AS: &str = "# made as: ";
 
 /// The sums of a folder that is being written.
+///
+/// A file's line is on the disk before the file has its name: what is in the folder without a line is someone else's.
+#[derive(Debug)]
 pub(crate) struct Journal {
     folder: PathBuf,
+    /// How the files are made, on one line.
+    made_as: String,
     sums: BTreeMap<String, String>,
+    /// Files with a line that hold something else now.
+    damaged: BTreeSet<String>,
 }
 
 impl Journal {
-    /// Starts a folder, or takes up one that was started. Lines of files that are missing or hold something else are
-    /// dropped: they will be written again.
-    pub fn open(folder: &Path) -> Result<Self, DataError> {
-        std::fs::create_dir_all(folder).map_err(DataError::io("making the folder", folder))?;
+    /// Looks at a folder, new or empty or one that was started, and changes nothing in it but for removing what kills
+    /// in the middle of writing have left. Lines of files that are missing or hold something else are dropped: they will
+    /// be written again.
+    ///
+    /// # Errors
+    /// [`DataError::BadIndex`] for a folder with any other file, or whose files were made in another way.
+    pub fn open(folder: &Path, made_as: &str) -> Result<Self, DataError> {
+        let bad = |what: String| DataError::BadIndex { what, path: folder.to_path_buf() };
         let path = folder.join(FILE_NAME);
-        let mut sums = BTreeMap::new();
+        let mut journal = Self {
+            folder: folder.to_path_buf(),
+            made_as: made_as.to_owned(),
+            sums: BTreeMap::new(),
+            damaged: BTreeSet::new(),
+        };
+        let mut found = None;
         if path.exists() {
             let text = std::fs::read_to_string(&path).map_err(DataError::io("reading the checksums", &path))?;
-            // A line that was cut off has no end, and its file is written again.
+            // A line that was cut off has no end, and its file no name yet.
             for line in text.split_inclusive('\n').filter_map(|line| line.strip_suffix('\n')) {
+                found = found.or(line.strip_prefix(MADE_AS).map(str::to_owned));
                 let Some((sum, name)) = line.split_once("  ") else { continue };
                 let file = folder.join(name);
                 let is_inside = Path::new(name).file_name().is_some_and(|base| base == name);
-                if is_inside && file.is_file() && hash(&file)? == sum {
-                    sums.insert(name.to_owned(), sum.to_owned());
+                if !is_inside || !file.is_file() {
+                    continue;
+                }
+                if hash_file(&file)? == sum {
+                    journal.damaged.remove(name);
+                    journal.sums.insert(name.to_owned(), sum.to_owned());
+                } else if !journal.sums.contains_key(name) {
+                    journal.damaged.insert(name.to_owned());
                 }
             }
-        } else {
-            let mut entries = std::fs::read_dir(folder).map_err(DataError::io("reading the folder", folder))?;
-            if let Some(Ok(entry)) = entries.next() {
-                let name = entry.file_name().to_string_lossy().into_owned();
-                let what = format!("it holds {name} and no {FILE_NAME}; choose an empty folder");
-                return Err(DataError::BadIndex { what, path: folder.to_path_buf() });
+        }
+        journal.refuse_others()?;
+        // Lists of what there is are written again whatever they say.
+        let has_scenes = journal.sums.keys().chain(&journal.damaged).any(|name| has_ending(name, "torch"));
+        match found {
+            Some(found) if found != made_as && has_scenes => Err(bad(format!(
+                "its files were made as: {found}; asked for are: {made_as}; give the same options or choose another folder"
+            ))),
+            None if has_scenes => {
+                Err(bad(format!("its {FILE_NAME} does not say how the files were made; choose another folder")))
+            }
+            _ => Ok(journal),
+        }
+    }
+
+    /// Refuses a folder with a file that has no line.
+    fn refuse_others(&self) -> Result<(), DataError> {
+        let folder = &self.folder;
+        let reading = || DataError::io("reading the folder", folder);
+        remove_leftovers(folder).map_err(DataError::io("removing what a killed process left", folder))?;
+        let entries = match std::fs::read_dir(folder) {
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+            entries => entries.map_err(reading())?,
+        };
+        for entry in entries {
+            let name = entry.map_err(reading())?.file_name().to_string_lossy().into_owned();
+            if name != FILE_NAME && !self.sums.contains_key(&name) && !self.damaged.contains(&name) {
+                let what = format!("it holds {name}, which is in no line of {FILE_NAME}; choose an empty folder");
+                return Err(DataError::BadIndex { what, path: folder.clone() });
             }
         }
-        let journal = Self { folder: folder.to_path_buf(), sums };
-        journal.rewrite()?;
-        Ok(journal)
+        Ok(())
+    }
+
+    /// Makes the folder where it is new, and removes files that hold something else than their line says.
+    pub fn begin(&mut self) -> Result<(), DataError> {
+        std::fs::create_dir_all(&self.folder).map_err(DataError::io("making the folder", &self.folder))?;
+        for name in std::mem::take(&mut self.damaged) {
+            self.delete(&name)?;
+        }
+        self.rewrite()
     }
 
     /// The files that are complete.
@@ -55,30 +112,50 @@ impl Journal {
         self.sums.keys().map(String::as_str)
     }
 
-    /// Notes a file that has just been written.
-    pub fn add(&mut self, name: &str) -> Result<(), DataError> {
-        let sum = hash(&self.folder.join(name))?;
+    /// Writes a file, its line first.
+    pub fn write(&mut self, name: &str, bytes: &[u8]) -> Result<(), DataError> {
+        let sum = hex(&Sha256::digest(bytes));
         let line = format!("{sum}  {name}\n");
         if self.sums.insert(name.to_owned(), sum).is_some() {
-            return self.rewrite();
+            self.rewrite()?;
+        } else {
+            let path = self.folder.join(FILE_NAME);
+            let written = OpenOptions::new().append(true).open(&path).and_then(|mut file| {
+                file.write_all(line.as_bytes())?;
+                file.sync_data()
+            });
+            written.map_err(DataError::io("writing the checksums", &path))?;
         }
-        let path = self.folder.join(FILE_NAME);
-        let written = OpenOptions::new().append(true).open(&path).and_then(|mut file| {
-            file.write_all(line.as_bytes())?;
-            file.sync_data()
-        });
-        written.map_err(DataError::io("writing the checksums", &path))
+        let path = self.folder.join(name);
+        replace(&path, bytes).map_err(DataError::io("writing a file", &path))
+    }
+
+    /// Removes a file, if there is one of that name with a line.
+    pub fn remove(&mut self, name: &str) -> Result<(), DataError> {
+        if self.sums.contains_key(name) {
+            // A kill in between leaves a line without a file, and never a file without a line.
+            self.delete(name)?;
+            self.sums.remove(name);
+            self.rewrite()?;
+        }
+        Ok(())
+    }
+
+    fn delete(&self, name: &str) -> Result<(), DataError> {
+        let path = self.folder.join(name);
+        std::fs::remove_file(&path).map_err(DataError::io("removing a file that is to be written again", &path))
     }
 
     fn rewrite(&self) -> Result<(), DataError> {
-        let lines: Vec<String> = self.sums.iter().map(|(name, sum)| format!("{sum}  {name}\n")).collect();
+        let lines = self.sums.iter().map(|(name, sum)| format!("{sum}  {name}\n"));
+        let text: String = std::iter::once(format!("{MADE_AS}{}\n", self.made_as)).chain(lines).collect();
         let path = self.folder.join(FILE_NAME);
-        replace(&path, lines.concat().as_bytes()).map_err(DataError::io("writing the checksums", &path))
+        replace(&path, text.as_bytes()).map_err(DataError::io("writing the checksums", &path))
     }
 }
 
 /// SHA-256 of a file, in hexadecimal.
-fn hash(path: &Path) -> Result<String, DataError> {
+fn hash_file(path: &Path) -> Result<String, DataError> {
     let reading = || DataError::io("reading a file for its checksum", path);
     let mut file = File::open(path).map_err(reading())?;
     let mut digest = Sha256::new();
@@ -89,8 +166,11 @@ fn hash(path: &Path) -> Result<String, DataError> {
             count => digest.update(&buffer[..count]),
         }
     }
-    let pairs: Vec<String> = digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-    Ok(pairs.concat())
+    Ok(hex(&digest.finalize()))
+}
+
+fn hex(digest: &[u8]) -> String {
+    digest.iter().map(|byte| format!("{byte:02x}")).collect::<Vec<_>>().concat()
 }
 
 #[cfg(test)]
@@ -102,33 +182,96 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         std::fs::write(&path, b"abc").unwrap();
-        assert_eq!(hash(&path).unwrap(), "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
+        assert_eq!(hash_file(&path).unwrap(), "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
+        let mut journal = Journal::open(&folder.path().join("out"), "chunks").unwrap();
+        journal.begin().unwrap();
+        journal.write("a", b"abc").unwrap();
+        assert_eq!(journal.sums["a"], hash_file(&path).unwrap());
+    }
+
+    /// A folder with the files `a.torch`, `b.torch` and `c.torch`.
+    fn three(folder: &Path) {
+        let mut journal = Journal::open(folder, "chunks").unwrap();
+        journal.begin().unwrap();
+        for name in ["a.torch", "b.torch", "c.torch"] {
+            journal.write(name, name.as_bytes()).unwrap();
+        }
     }
 
     #[test]
     fn files_that_changed_and_lines_that_were_cut_are_forgotten() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
-        let mut journal = Journal::open(folder.path()).unwrap();
-        for name in ["a", "b", "c"] {
-            std::fs::write(at(name), name).unwrap();
-            journal.add(name).unwrap();
-        }
-        std::fs::write(at("a"), "changed").unwrap();
-        std::fs::write(at("d"), "d").unwrap();
+        three(folder.path());
+        std::fs::write(at("a.torch"), "changed").unwrap();
         let text = std::fs::read_to_string(at(FILE_NAME)).unwrap();
         std::fs::write(at(FILE_NAME), format!("{text}18ac3e7343f01689")).unwrap();
-        let journal = Journal::open(folder.path()).unwrap();
-        assert_eq!(journal.names().collect::<Vec<_>>(), ["b", "c"]);
-        assert_eq!(std::fs::read_to_string(at(FILE_NAME)).unwrap().lines().count(), 2);
+        let mut journal = Journal::open(folder.path(), "chunks").unwrap();
+        assert_eq!(journal.names().collect::<Vec<_>>(), ["b.torch", "c.torch"]);
+        assert!(at("a.torch").exists(), "looking changes nothing");
+        journal.begin().unwrap();
+        assert!(!at("a.torch").exists());
+        journal.remove("b.torch").unwrap();
+        let text = std::fs::read_to_string(at(FILE_NAME)).unwrap();
+        assert_eq!(text.lines().count(), 2);
+        assert!(text.starts_with("# made as: chunks\n") && text.ends_with("  c.torch\n"), "{text}");
+        assert!(!at("b.torch").exists());
     }
 
     #[test]
-    fn a_folder_with_something_else_in_it_is_refused() {
+    fn a_folder_with_something_else_in_it_is_refused_at_any_time_and_left_as_it_was() {
         let folder = tempfile::tempdir().unwrap();
-        std::fs::write(folder.path().join("thesis.txt"), "").unwrap();
-        let message = Journal::open(folder.path()).err().unwrap().to_string();
-        assert!(message.contains("it holds thesis.txt and no SHA256SUMS; choose an empty folder"), "{message}");
-        assert!(!folder.path().join(FILE_NAME).exists());
+        let refused = |name: &str| {
+            std::fs::write(folder.path().join(name), "").unwrap();
+            let message = Journal::open(folder.path(), "chunks").unwrap_err().to_string();
+            std::fs::remove_file(folder.path().join(name)).unwrap();
+            assert!(message.contains(&format!("it holds {name}, which is in no line of SHA256SUMS")), "{message}");
+        };
+        refused("thesis.txt");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+        three(folder.path());
+        refused("thesis.txt");
+        refused("000007.torch");
+        Journal::open(folder.path(), "chunks").unwrap();
+    }
+
+    #[test]
+    fn files_that_were_made_in_another_way_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        three(folder.path());
+        let message = |made_as: &str| Journal::open(folder.path(), made_as).unwrap_err().to_string();
+        let expected = "its files were made as: chunks; asked for are: scenes; give the same options or choose another";
+        assert!(message("scenes").contains(expected), "{}", message("scenes"));
+        let path = folder.path().join(FILE_NAME);
+        let text = std::fs::read_to_string(&path).unwrap();
+        std::fs::write(&path, text.trim_start_matches("# made as: chunks\n")).unwrap();
+        assert!(message("chunks").contains("does not say how the files were made"), "{}", message("chunks"));
+    }
+
+    #[test]
+    fn a_folder_without_scenes_may_be_made_in_another_way() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut journal = Journal::open(folder.path(), "chunks").unwrap();
+        journal.begin().unwrap();
+        journal.write("skipped.json", b"all of them").unwrap();
+        Journal::open(folder.path(), "scenes").unwrap().begin().unwrap();
+        assert!(std::fs::read_to_string(folder.path().join(FILE_NAME)).unwrap().starts_with("# made as: scenes\n"));
+    }
+
+    #[test]
+    fn what_a_kill_leaves_is_removed_and_blocks_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let leftover = folder.path().join(".clift-Ab12Cd");
+        std::fs::write(&leftover, "half a file").unwrap();
+        three(folder.path());
+        assert!(!leftover.exists());
+        std::fs::write(&leftover, "half a file").unwrap();
+        // Killed between the line and the file.
+        let path = folder.path().join(FILE_NAME);
+        let text = std::fs::read_to_string(&path).unwrap();
+        std::fs::write(&path, format!("{text}{}  d\n", hex(&Sha256::digest(b"d")))).unwrap();
+        let journal = Journal::open(folder.path(), "chunks").unwrap();
+        assert_eq!(journal.names().collect::<Vec<_>>(), ["a.torch", "b.torch", "c.torch"]);
+        assert!(!leftover.exists());
     }
 }

@@ -65,7 +65,7 @@ pub use chunk::ChunkSource;
 pub use chunk_writer::{SceneRecord, write_chunks};
 pub use clip::{Clip, Frame, SceneSource, ViewIndices, Views};
 pub use clip_reader::{ClipOptions, ClipReader};
-pub use convert::{ConvertOptions, ConvertTo, Converted, convert};
+pub use convert::{Conversion, ConvertOptions, ConvertTo, Converted, convert};
 pub use error::DataError;
 pub use export::{Encoding, write_evaluation_index, write_source};
 pub use filters::SceneFilters;

@@ -1,5 +1,6 @@
 //! An evaluation index for one's own data, drawn as pixelSplat's was: pairs of frames that overlap.
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use rayon::prelude::*;
@@ -94,27 +95,43 @@ impl OverlapOptions {
     }
 }
 
-/// Writes an index of every scene of `source` that [`EvaluationIndex`](crate::EvaluationIndex) reads, `null` for
-/// scenes without such views; nothing if no scene has any. The ledger says which and why. A scene's views depend on its cameras, its key and the
-/// seed alone: other scenes may come and go.
+/// Writes an index of every scene of `sources` that [`EvaluationIndex`](crate::EvaluationIndex) reads, `null` for
+/// scenes without such views; nothing if no scene has any. The ledger says which and why. A scene's views depend on its
+/// cameras, its key and the seed alone: other scenes may come and go.
 ///
 /// # Errors
-/// [`DataError::BadConfig`] for options that cannot hold, and [`DataError::Io`]. A scene whose cameras cannot be read is
-/// in the ledger.
+/// [`DataError::BadConfig`] for options that cannot hold, [`DataError::BadIndex`] for a key that two sources have with
+/// different cameras, and [`DataError::Io`]. A scene whose cameras cannot be read is in the ledger.
 pub fn write_overlap_index(
     path: &Path,
-    source: &dyn SceneSource,
+    sources: &[&dyn SceneSource],
     options: &OverlapOptions,
 ) -> Result<Ledger, DataError> {
     options.validate()?;
-    let draw = |scene: usize| {
-        let cameras = source.cameras(scene).map_err(|error| error.to_string())?;
-        options.draw(source.key(scene), &cameras)
+    let mut scenes: Vec<(&dyn SceneSource, usize)> = Vec::new();
+    let mut places: HashMap<&str, usize> = HashMap::new();
+    let mut notes = Vec::new();
+    for (source, scene) in sources.iter().flat_map(|source| (0..source.num_scenes()).map(|scene| (*source, scene))) {
+        let key = source.key(scene);
+        let place = *places.entry(key).or_insert(scenes.len());
+        let Some(&(other, other_scene)) = scenes.get(place) else {
+            scenes.push((source, scene));
+            continue;
+        };
+        if !matches!((other.cameras(other_scene), source.cameras(scene)), (Ok(a), Ok(b)) if a == b) {
+            let what = format!("scene {key} is in both halves with other cameras; make an index of each");
+            return Err(DataError::BadIndex { what, path: path.to_owned() });
+        }
+        notes.push(format!("scene {key} is in both halves, and counts once"));
+    }
+    let draw = |(source, scene): &(&dyn SceneSource, usize)| {
+        let cameras = source.cameras(*scene).map_err(|error| error.to_string())?;
+        options.draw(source.key(*scene), &cameras)
     };
-    let drawn: Vec<_> = (0..source.num_scenes()).into_par_iter().map(draw).collect();
-    let mut ledger = Ledger::new(drawn.len());
+    let drawn: Vec<_> = scenes.par_iter().map(draw).collect();
+    let mut ledger = Ledger { notes, ..Ledger::new(drawn.len()) };
     let mut entries = Vec::with_capacity(drawn.len());
-    for (scene, views) in drawn.into_iter().enumerate() {
+    for ((source, scene), views) in scenes.into_iter().zip(drawn) {
         let key = source.key(scene);
         let views = views.map_err(|reason| ledger.skip(key, reason)).ok();
         entries.push((key, views));
@@ -139,7 +156,7 @@ mod tests {
     fn index(source: &dyn SceneSource, options: &OverlapOptions) -> (EvaluationIndex, Ledger) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
-        let ledger = write_overlap_index(&path, source, options).unwrap();
+        let ledger = write_overlap_index(&path, &[source], options).unwrap();
         (EvaluationIndex::read(&path).unwrap(), ledger)
     }
 
@@ -170,7 +187,7 @@ mod tests {
     fn scenes_without_views_are_null_and_in_the_ledger() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
-        let ledger = write_overlap_index(&path, &rooms(40, 3.0), &OverlapOptions::default()).unwrap();
+        let ledger = write_overlap_index(&path, &[&rooms(40, 3.0)], &OverlapOptions::default()).unwrap();
         assert_eq!(ledger.to_string(), "0 of 20 scenes used; 20 shorter than 46 frames");
         assert!(!path.exists(), "an index without views");
         let (written, ledger) = index(&FirstIsShort(rooms(60, 3.0)), &OverlapOptions::default());
@@ -232,6 +249,30 @@ mod tests {
         let fewer = views(&SyntheticSource::new(fewer).unwrap(), &options);
         assert_eq!(fewer[..], all[..fewer.len()]);
         assert_ne!(all, views(&rooms(60, 3.0), &OverlapOptions { seed: 5, ..options }));
+    }
+
+    #[test]
+    fn an_index_of_two_halves_has_the_scenes_of_both_and_a_shared_one_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("index.json");
+        let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
+        let other = SyntheticConfig { num_scenes: 3, num_frames: 60, seed: 1, path_length: 3.0, ..Default::default() };
+        let other = SyntheticSource::new(other).unwrap();
+        let ledger = write_overlap_index(&path, &[&rooms(60, 3.0), &other], &options).unwrap();
+        let written = EvaluationIndex::read(&path).unwrap();
+        assert_eq!((ledger.num_scenes, written.num_keys()), (23, 23));
+        let alone = index(&other, &options).0;
+        for scene in 0..3 {
+            let key = other.key(scene);
+            assert_eq!(written.views(key, 60).unwrap(), alone.views(key, 60).unwrap());
+        }
+        let ledger = write_overlap_index(&path, &[&other, &other], &options).unwrap();
+        assert_eq!((ledger.num_scenes, ledger.notes.len()), (3, 3));
+        assert_eq!(ledger.notes[0], format!("scene {} is in both halves, and counts once", other.key(0)));
+        let rooms = rooms(60, 3.0);
+        let shorter = FirstIsShort(self::rooms(60, 3.0));
+        let message = write_overlap_index(&path, &[&rooms, &shorter], &options).unwrap_err().to_string();
+        assert!(message.contains("is in both halves with other cameras; make an index of each"), "{message}");
     }
 
     #[test]

@@ -2,12 +2,26 @@
 
 use super::*;
 use crate::{
-    Camera, ChunkSource, Frame, LayoutOptions, SceneFilters, Split, SyntheticConfig, SyntheticSource, open_layout,
+    Camera, ChunkSource, Frame, LayoutOptions, SceneFilters, Skip, Split, SyntheticConfig, SyntheticSource, open_layout,
 };
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-const CHUNKS: ConvertOptions = ConvertOptions { to: ConvertTo::Chunks { target_bytes: 1 }, encoding: Encoding::Png };
-const SCENES: ConvertOptions = ConvertOptions { to: ConvertTo::Scenes, encoding: Encoding::Png };
+const CHUNKS: ConvertOptions = options(ConvertTo::Chunks { target_bytes: 1 });
+const SCENES: ConvertOptions = options(ConvertTo::Scenes);
+
+const fn options(to: ConvertTo) -> ConvertOptions {
+    ConvertOptions { to, encoding: Encoding::Png, opened_with: String::new() }
+}
+
+/// Converts a source of which opening has left nothing out.
+fn convert_all(
+    source: &dyn SceneSource,
+    folder: &Path,
+    options: &ConvertOptions,
+    done: impl FnMut(usize),
+) -> Result<Converted, DataError> {
+    convert(source, &Ledger::new(source.num_scenes()), folder, options, done)
+}
 
 fn rooms(num_scenes: usize) -> SyntheticSource {
     let config = SyntheticConfig { num_scenes, num_frames: 3, width: 16, height: 8, ..Default::default() };
@@ -47,9 +61,9 @@ fn chunks_and_scenes_hold_the_same_and_keep_the_files_of_the_pictures() {
         let folder = tempfile::tempdir().unwrap();
         let source = mini();
         let mut seen = Vec::new();
-        let converted = convert(&source, &folder.path().join("train"), options, |done| seen.push(done)).unwrap();
+        let converted = convert_all(&source, &folder.path().join("train"), &options, |done| seen.push(done)).unwrap();
         assert_eq!((converted.num_scenes, converted.num_found, converted.num_frames), (2, 0, 16));
-        assert_eq!((converted.num_encoded, converted.skipped.len()), (0, 0));
+        assert_eq!((converted.num_encoded, converted.left_out.skips.len()), (0, 0));
         assert_eq!(seen, [1, 2]);
         let (back, ledger) = open_layout(folder.path(), Split::Train, &LayoutOptions::default()).unwrap();
         assert_eq!(ledger.num_used(), 2);
@@ -71,8 +85,8 @@ fn every_layout_is_converted_to_the_same_scene() {
         let source = open(&layouts.join(name));
         for options in [CHUNKS, SCENES] {
             let folder = tempfile::tempdir().unwrap();
-            let converted = convert(source.as_ref(), &folder.path().join("test"), options, |_| ()).unwrap();
-            assert_eq!((converted.num_scenes, &converted.skipped[..]), (source.num_scenes(), &[][..]), "{name}");
+            let converted = convert_all(source.as_ref(), &folder.path().join("test"), &options, |_| ()).unwrap();
+            assert_eq!((converted.num_scenes, &converted.left_out.skips[..]), (source.num_scenes(), &[][..]), "{name}");
             same(source.as_ref(), open(folder.path()).as_ref());
         }
         if name.starts_with("re10k") {
@@ -85,13 +99,13 @@ fn every_layout_is_converted_to_the_same_scene() {
 #[test]
 fn pictures_without_a_file_are_encoded() {
     let folder = tempfile::tempdir().unwrap();
-    let converted = convert(&rooms(3), &folder.path().join("test"), CHUNKS, |_| ()).unwrap();
+    let converted = convert_all(&rooms(3), &folder.path().join("test"), &CHUNKS, |_| ()).unwrap();
     assert_eq!((converted.num_frames, converted.num_encoded), (9, 9));
     let (back, _) = open_layout(folder.path(), Split::Test, &LayoutOptions::default()).unwrap();
     same(&rooms(3), back.as_ref());
 }
 
-/// Rooms whose cameras can be read so many times, twice per scene: as when a process is killed.
+/// Rooms of which so many frames can be read, three per scene: as when a process is killed.
 struct Interrupted {
     rooms: SyntheticSource,
     left: AtomicUsize,
@@ -108,10 +122,11 @@ impl SceneSource for Interrupted {
         self.rooms.find(key)
     }
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        assert!(self.left.fetch_sub(1, Ordering::SeqCst) > 0, "killed");
         self.rooms.cameras(scene)
     }
     fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+        let may = |left: usize| left.checked_sub(1);
+        assert!(self.left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, may).is_ok(), "killed");
         self.rooms.frame(scene, frame)
     }
 }
@@ -120,25 +135,25 @@ impl SceneSource for Interrupted {
 fn an_interrupted_conversion_goes_on_and_ends_with_the_same_files() {
     for options in [CHUNKS, SCENES] {
         let whole = tempfile::tempdir().unwrap();
-        convert(&rooms(6), whole.path(), options, |_| ()).unwrap();
+        convert_all(&rooms(6), whole.path(), &options, |_| ()).unwrap();
         let folder = tempfile::tempdir().unwrap();
-        let killed = Interrupted { rooms: rooms(6), left: AtomicUsize::new(6) };
-        let run = std::panic::AssertUnwindSafe(|| convert(&killed, folder.path(), options, |_| ()));
+        let killed = Interrupted { rooms: rooms(6), left: AtomicUsize::new(9) };
+        let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &options, |_| ()));
         assert!(std::panic::catch_unwind(run).is_err());
         assert!(!folder.path().join("index.json").exists());
         // One of the three files is damaged meanwhile: it is made again.
         let damaged = files(folder.path()).into_keys().find(|name| name.contains(".torch")).unwrap();
         std::fs::write(folder.path().join(&damaged), [&files(folder.path())[&damaged][..], b"x"].concat()).unwrap();
-        let converted = convert(&rooms(6), folder.path(), options, |_| ()).unwrap();
+        let converted = convert_all(&rooms(6), folder.path(), &options, |_| ()).unwrap();
         assert_eq!((converted.num_scenes, converted.num_found, converted.num_frames), (6, 2, 12));
         let (got, expected) = (files(folder.path()), files(whole.path()));
         assert_eq!(got.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
         for name in got.keys().filter(|name| *name != "SHA256SUMS") {
             assert!(got[name] == expected[name], "{name}");
         }
-        // Finished: nothing is read again but to verify it.
+        // Finished: no picture is read again.
         let again = Interrupted { rooms: rooms(6), left: AtomicUsize::new(0) };
-        let converted = convert(&again, folder.path(), options, |_| ()).unwrap();
+        let converted = convert_all(&again, folder.path(), &options, |_| ()).unwrap();
         assert_eq!((converted.num_found, converted.num_frames), (6, 0));
         assert_eq!(files(folder.path()).len(), expected.len());
     }
@@ -171,20 +186,135 @@ impl SceneSource for SecondIsBroken {
 #[test]
 fn a_scene_that_cannot_be_read_is_named_and_made_later() {
     let folder = tempfile::tempdir().unwrap();
-    let converted = convert(&SecondIsBroken(rooms(3)), folder.path(), SCENES, |_| ()).unwrap();
-    assert_eq!((converted.num_scenes, converted.skipped.len()), (2, 1));
-    assert!(converted.skipped[0].key.ends_with("00001") && converted.skipped[0].reason.contains("it is torn"));
+    let converted = convert_all(&SecondIsBroken(rooms(3)), folder.path(), &SCENES, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (2, 1));
+    assert!(
+        converted.left_out.skips[0].key.ends_with("00001") && converted.left_out.skips[0].reason.contains("it is torn")
+    );
     assert!(files(folder.path()).contains_key("skipped.json"));
-    let converted = convert(&rooms(3), folder.path(), SCENES, |_| ()).unwrap();
-    assert_eq!((converted.num_scenes, converted.num_found, converted.skipped.len()), (3, 2, 0));
+    let converted = convert_all(&rooms(3), folder.path(), &SCENES, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.num_found, converted.left_out.skips.len()), (3, 2, 0));
     assert!(!files(folder.path()).contains_key("skipped.json"));
 }
 
 #[test]
 fn a_folder_of_other_scenes_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    convert(&rooms(3), folder.path(), SCENES, |_| ()).unwrap();
-    let message = convert(&mini(), folder.path(), SCENES, |_| ()).unwrap_err().to_string();
+    convert_all(&rooms(3), folder.path(), &SCENES, |_| ()).unwrap();
+    let message = convert_all(&mini(), folder.path(), &SCENES, |_| ()).unwrap_err().to_string();
     assert!(message.contains("which is not to be converted; choose another folder"), "{message}");
     assert!(!is_file_name("a/b") && !is_file_name("..") && is_file_name("1K-ab.c"));
+}
+
+#[test]
+fn a_folder_that_was_made_with_other_options_is_refused_and_stays_as_it_is() {
+    let folder = tempfile::tempdir().unwrap();
+    convert_all(&rooms(2), folder.path(), &CHUNKS, |_| ()).unwrap();
+    let before = files(folder.path());
+    let others = [
+        SCENES,
+        options(ConvertTo::Chunks { target_bytes: 2 }),
+        ConvertOptions { encoding: Encoding::Jpeg(90), ..CHUNKS },
+        ConvertOptions { opened_with: "data.files.undistort=false".into(), ..CHUNKS },
+    ];
+    for other in others {
+        let message = convert_all(&rooms(2), folder.path(), &other, |_| ()).unwrap_err().to_string();
+        assert!(message.contains("its files were made as: chunks of 1 bytes, PNG; asked for are: "), "{message}");
+        assert!(message.contains("give the same options or choose another folder"), "{message}");
+        assert!(files(folder.path()) == before);
+    }
+}
+
+/// Rooms of which the second has one frame fewer, or another pose.
+struct SecondDiffers {
+    rooms: SyntheticSource,
+    num_frames: usize,
+    shift: f64,
+}
+
+impl SceneSource for SecondDiffers {
+    fn num_scenes(&self) -> usize {
+        self.rooms.num_scenes()
+    }
+    fn key(&self, scene: usize) -> &str {
+        self.rooms.key(scene)
+    }
+    fn find(&self, key: &str) -> Option<usize> {
+        self.rooms.find(key)
+    }
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+        let mut cameras = self.rooms.cameras(scene)?;
+        if scene == 1 {
+            cameras.truncate(self.num_frames);
+            cameras[0].c2w.translation[0] += self.shift;
+        }
+        Ok(cameras)
+    }
+    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+        self.rooms.frame(scene, frame)
+    }
+}
+
+#[test]
+fn scenes_that_have_changed_since_are_written_anew() {
+    for (num_frames, shift) in [(2, 0.0), (3, 0.001)] {
+        // All in one chunk; a chunk and a file for each.
+        let one = options(ConvertTo::Chunks { target_bytes: u64::MAX });
+        for (options, num_found) in [(one, 0), (CHUNKS, 2), (SCENES, 2)] {
+            let (folder, whole) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+            let before = SecondDiffers { rooms: rooms(3), num_frames, shift };
+            convert_all(&before, folder.path(), &options, |_| ()).unwrap();
+            let converted = convert_all(&rooms(3), folder.path(), &options, |_| ()).unwrap();
+            assert_eq!((converted.num_scenes, converted.num_found, converted.num_changed), (3, num_found, 1));
+            convert_all(&rooms(3), whole.path(), &options, |_| ()).unwrap();
+            let (mut got, mut expected) = (files(folder.path()), files(whole.path()));
+            for files in [&mut got, &mut expected] {
+                files.remove("SHA256SUMS"); // in the order of writing
+            }
+            assert!(got == expected, "{:?}", got.keys());
+        }
+    }
+}
+
+#[test]
+fn what_opening_left_out_is_in_the_list_of_what_was_skipped() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut left_out = Ledger::new(4);
+    left_out.skip("far", "without any picture");
+    left_out.skip_frame("near", "7.jpg", "without a picture");
+    let converted = convert(&SecondIsBroken(rooms(3)), &left_out, folder.path(), &SCENES, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.left_out.num_scenes, converted.left_out.num_used()), (2, 4, 2));
+    let text = std::fs::read(folder.path().join("skipped.json")).unwrap();
+    let saved: Ledger = serde_json::from_slice(&text).unwrap();
+    assert_eq!((&saved, saved.skips.len(), saved.frames.len()), (&converted.left_out, 2, 1));
+    assert_eq!(saved.skips[0], Skip { key: "far".into(), reason: "without any picture".into() });
+}
+
+#[test]
+fn no_index_is_written_where_no_scene_can_be_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let converted = convert_all(&NoneIsReadable(rooms(1)), folder.path(), &CHUNKS, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (0, 1));
+    assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), ["SHA256SUMS", "skipped.json"]);
+}
+
+/// Rooms without pictures.
+struct NoneIsReadable(SyntheticSource);
+
+impl SceneSource for NoneIsReadable {
+    fn num_scenes(&self) -> usize {
+        self.0.num_scenes()
+    }
+    fn key(&self, scene: usize) -> &str {
+        self.0.key(scene)
+    }
+    fn find(&self, key: &str) -> Option<usize> {
+        self.0.find(key)
+    }
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+        self.0.cameras(scene)
+    }
+    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+        Err(DataError::BadImage { key: self.key(scene).into(), frame, what: "it is torn".into() })
+    }
 }

@@ -39,7 +39,7 @@ Examples:
     ///
     /// Reads every frame of every scene, in any layout; looks at sizes, intrinsics, fields of view, rotations, baselines
     /// and pictures that repeat; and matches corners between frames, which must lie on the epipolar lines that the
-    /// cameras predict. Prints a table with the reasons. Exits with 1 if a scene is flagged.
+    /// cameras predict. Prints a table with the reasons. Exits with 1 if a scene is flagged, or if there is none.
     #[command(after_help = "\
 Examples:
   clift data check /data/re10k --scenes 20
@@ -57,14 +57,16 @@ Examples:
     Index(IndexArgs),
     /// Write any layout as pixelSplat's chunks or as a file per scene
     ///
-    /// OUT/train and OUT/test receive what DIR's halves hold; a folder without halves becomes OUT/test. Pictures keep
-    /// their files, byte by byte, unless their lens distortion has to be undone. Interrupted, it goes on where it was:
-    /// SHA256SUMS tells which files are complete, and `sha256sum -c SHA256SUMS` verifies them at any time.
+    /// OUT/train and OUT/test receive what DIR's halves hold; a folder without halves becomes OUT/test, unless
+    /// `data.files.test_scenes` divides it. Pictures keep their files, byte by byte, unless their lens distortion has to
+    /// be undone. Interrupted, it goes on where it was: SHA256SUMS tells which files are complete, and
+    /// `sha256sum -c SHA256SUMS` verifies them at any time. Exits with 1 if a half has no scene that can be converted.
     #[command(after_help = "\
 Examples:
   clift data convert captures/fox fox-chunks --to chunks
   clift data convert /data/re10k-txt /data/re10k --to chunks --split test
-  clift data convert /data/re10k /data/re10k-scenes --to scenes")]
+  clift data convert /data/re10k /data/re10k-scenes --to scenes
+  clift data convert /data/dl3dv /data/dl3dv-chunks --to chunks --set data.files.test_scenes=benchmark.txt")]
     Convert(ConvertArgs),
 }
 
@@ -85,6 +87,9 @@ pub struct CheckArgs {
     /// Write a picture of every scene there: two frames with epipolar lines
     #[arg(long, value_name = "OUT")]
     pub pictures: Option<PathBuf>,
+    /// Say where parts of the layout are, as in a config: `--set data.files.image_folder=images_4`
+    #[arg(long, value_name = "data.files.KEY=TOML")]
+    pub set: Vec<String>,
 }
 
 /// Arguments of `clift data index`.
@@ -113,6 +118,9 @@ pub struct IndexArgs {
     /// Decides which of the possible frames are taken
     #[arg(long, value_name = "S", default_value_t = 123)]
     pub seed: u64,
+    /// Say where parts of the layout are, as in a config: `--set data.files.image_folder=images_4`
+    #[arg(long, value_name = "data.files.KEY=TOML")]
+    pub set: Vec<String>,
 }
 
 /// Arguments of `clift data convert`.
@@ -134,6 +142,9 @@ pub struct ConvertArgs {
     /// Store pictures that need encoding as JPEG of this quality, 1 to 100, instead of PNG (without loss)
     #[arg(long, value_name = "Q", value_parser = clap::value_parser!(u8).range(1..=100))]
     pub quality: Option<u8>,
+    /// Say where parts of the layout are, as in a config: `--set data.files.image_folder=images_4`
+    #[arg(long, value_name = "data.files.KEY=TOML")]
+    pub set: Vec<String>,
 }
 
 /// What is written.
@@ -275,8 +286,9 @@ mod tests {
             panic!("no index")
         };
         assert_eq!((args.distance, args.context, args.targets, args.split), ([6, 20], 4, 5, Splits::Test));
-        let Ok(DataCommand::Convert(args)) = parse("convert dir out --to scenes") else { panic!("no convert") };
-        assert_eq!((args.to, args.chunk_mb, args.quality), (ConvertForm::Scenes, 100, None));
+        let words = "convert dir out --to scenes --set data.files.undistort=false";
+        let Ok(DataCommand::Convert(args)) = parse(words) else { panic!("no convert") };
+        assert_eq!((args.to, args.chunk_mb, args.quality, args.set.len()), (ConvertForm::Scenes, 100, None, 1));
         for words in
             ["index dir", "index dir -o f --distance 6", "convert dir out", "convert dir out --to zip", "check"]
         {

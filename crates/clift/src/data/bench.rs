@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clift_data::files::replace;
-use clift_data::{ClipOptions, PoseRotation, PoseScale, Throughput, ThroughputOptions, measure};
+use clift_data::{ClipOptions, FileOptions, PoseRotation, PoseScale, Throughput, ThroughputOptions, measure};
 use clift_eval::memory::{peak_bytes, start_peak};
 use serde::Serialize;
 
@@ -54,7 +54,7 @@ struct Report {
 /// Measures and prints.
 pub fn run(args: &BenchDataArgs) -> anyhow::Result<()> {
     let _peak = start_peak();
-    let Some(half) = halves(&args.dir, args.split)?.pop() else {
+    let Some(half) = halves(&args.dir, args.split, &FileOptions::default())?.pop() else {
         return Err(WrongUsage(format!("{} holds no scenes", args.dir.display())).into());
     };
     let [width, height] = args.size;

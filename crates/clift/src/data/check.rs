@@ -11,7 +11,7 @@ use clift_data::image::encode_png;
 use serde::Serialize;
 
 use super::args::CheckArgs;
-use super::open::{Half, halves};
+use super::open::{Half, files, halves};
 use super::text::count;
 use crate::table;
 use crate::terminal::{Counter, print_note, print_result};
@@ -33,13 +33,13 @@ struct Report {
     notes: Vec<String>,
 }
 
-/// Checks every scene, prints the table and fails when one is flagged.
+/// Checks every scene, prints the table and fails when one is flagged or there is none.
 pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     if let Some(folder) = &args.pictures {
         fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
     }
     let mut report = Report { scenes: Vec::new(), notes: Vec::new() };
-    for half in halves(&args.dir, args.split)? {
+    for half in halves(&args.dir, args.split, &files(&args.set)?.0)? {
         check_half(&half, args, &mut report)?;
     }
     print_result(&shown(&report))?;
@@ -47,6 +47,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
         let text = serde_json::to_vec_pretty(&report).context("writing the report as JSON")?;
         replace(path, &text).with_context(|| format!("writing {}", path.display()))?;
     }
+    anyhow::ensure!(!report.scenes.is_empty(), "no scene was checked: {}", args.dir.display());
     let flagged = report.scenes.iter().filter(|row| !row.check.ok).count();
     anyhow::ensure!(
         flagged == 0,

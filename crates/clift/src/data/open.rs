@@ -2,13 +2,39 @@
 
 use std::path::Path;
 
-use clift_data::{LayoutOptions, Opened, Split, has_halves};
+use clift_data::{FileOptions, LayoutOptions, Opened, Split, TestScenes, has_halves, is_dl3dv_key};
+use clift_train::Override;
+use clift_train::document::parse_config;
+use serde::{Deserialize, Serialize};
 
 use super::args::Splits;
+use crate::terminal::print_note;
+
+/// The keys of a config that say where the parts of a layout are: those that `--set` takes here.
+#[derive(Debug, Default, Deserialize, Serialize)]
+#[serde(default, deny_unknown_fields)]
+struct Keys {
+    data: DataKeys,
+}
+
+#[derive(Debug, Default, Deserialize, Serialize)]
+#[serde(default, deny_unknown_fields)]
+struct DataKeys {
+    files: FileOptions,
+}
+
+/// Reads `--set data.files.KEY=VALUE`; also gives back what was set.
+///
+/// # Errors
+/// [`clift_train::ConfigError`] for any other key and for values of another type.
+pub fn files(set: &[String]) -> anyhow::Result<(FileOptions, Vec<Override>)> {
+    let (keys, changes) = parse_config::<Keys>(Path::new("--set"), "", set)?;
+    Ok((keys.data.files, changes))
+}
 
 /// A half of a folder, or all of one that is not divided.
 pub struct Half {
-    /// Name of its folder; `None` for a folder that is not divided.
+    /// Which half; `None` for all of a folder that is not divided.
     pub split: Option<Split>,
     /// Its scenes.
     pub opened: Opened,
@@ -18,6 +44,13 @@ impl Half {
     /// What to call it.
     pub fn name(&self) -> String {
         self.split.map_or_else(|| "scenes".into(), |split| split.to_string())
+    }
+
+    /// Tells what opening it left out, and what else is to be known.
+    pub fn print_news(&self) {
+        if self.opened.ledger.has_news() {
+            print_note(&format!("{}: {}", self.name(), self.opened.ledger));
+        }
     }
 }
 
@@ -33,19 +66,75 @@ pub fn options() -> LayoutOptions {
     LayoutOptions { reads_chunks: true, ..LayoutOptions::default() }
 }
 
-/// Opens the halves asked for that are there. A folder without `train/` and `test/` counts once.
+/// Opens the halves asked for that are there. A folder without `train/` and `test/` counts once, unless a list of test
+/// scenes divides it.
 ///
 /// # Errors
 /// The first error of opening one.
-pub fn halves(root: &Path, splits: Splits) -> anyhow::Result<Vec<Half>> {
+pub fn halves(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Result<Vec<Half>> {
+    // An empty list keeps no scene for testing and divides nothing.
+    let list = files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
+    let has_list = list.is_some_and(|list| list.num_scenes() > 0);
+    let is_listed = has_list && !has_halves(root);
+    let wanted = if is_listed { splits.list().to_vec() } else { halves_there(root, splits) };
     let mut halves = Vec::new();
-    for split in halves_there(root, splits) {
-        let mut opened = Opened::open(root, split, &options())?;
-        if !opened.has_splits {
+    for split in wanted {
+        let mut opened = Opened::open(root, split, &LayoutOptions { files: files.clone(), ..options() })?;
+        let is_whole = !opened.has_splits && !has_list;
+        if is_whole {
             // Here they are no halves.
             opened.ledger.notes.retain(|note| !note.contains("both halves are the same scenes"));
+            let source = &opened.source;
+            if files.test_scenes.is_none() && (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene))) {
+                let note = "DL3DV's folders hold the scenes of its benchmark too; --set data.files.test_scenes=LIST \
+                            keeps those apart";
+                opened.ledger.notes.push(note.into());
+            }
         }
-        halves.push(Half { split: opened.has_splits.then_some(split), opened });
+        halves.push(Half { split: (!is_whole).then_some(split), opened });
     }
     Ok(halves)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+
+    #[test]
+    fn set_takes_the_keys_of_the_files_and_no_others() {
+        let (read, changes) = files(&["data.files.image_folder=images_4".into()]).unwrap();
+        assert_eq!(read.image_folder.as_deref(), Some("images_4"));
+        assert_eq!(changes[0].to_string(), "data.files.image_folder: (default) -> \"images_4\"");
+        assert!(files(&[]).unwrap().1.is_empty());
+        for wrong in ["data.width=64", "data.files.undistrot=true", "stage1.steps=2"] {
+            assert!(files(&[wrong.into()]).unwrap_err().is::<clift_train::ConfigError>(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_list_divides_a_folder_without_halves() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini/train");
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("list");
+        let opened = |keys: Option<&str>, splits| {
+            let test_scenes = keys.map(|keys| {
+                std::fs::write(&path, keys).unwrap();
+                PathBuf::from(&path)
+            });
+            let halves = halves(&root, splits, &FileOptions { test_scenes, ..FileOptions::default() }).unwrap();
+            let told = halves.iter().map(|half| (half.name(), half.opened.source.num_scenes()));
+            told.collect::<Vec<_>>()
+        };
+        let all = opened(None, Splits::Both);
+        assert_eq!((all.len(), &all[0].0[..]), (1, "scenes"));
+        assert_eq!(opened(Some(""), Splits::Both), all);
+        let half = Opened::open(&root, Split::Test, &LayoutOptions::default()).unwrap();
+        let key = half.source.key(0);
+        let (train, test) = (("train".to_owned(), all[0].1 - 1), ("test".to_owned(), 1));
+        assert_eq!(opened(Some(key), Splits::Both), [train.clone(), test.clone()]);
+        assert_eq!(opened(Some(key), Splits::Train), [train]);
+        assert_eq!(opened(Some(key), Splits::Test), [test]);
+    }
 }
