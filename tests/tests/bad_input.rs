@@ -58,6 +58,9 @@ fn assert_second_is_skipped(place: &Place, ran: Ran, reason: &str) {
     let stderr = ran.ok().stderr;
     let lines: Vec<_> = stderr.lines().filter(|line| line.starts_with("skipped ")).collect();
     assert!(!lines.is_empty(), "{stderr}");
+    let saved = place.text("run/skipped.jsonl");
+    assert_eq!(saved.lines().count(), 1, "once for all draws: {saved}");
+    assert!(saved.contains(KEYS[1]) && saved.contains("\"reason\":"), "{saved}");
     for line in lines {
         assert!(line.starts_with(&format!("skipped {}: ", KEYS[1])) && line.contains(reason), "{line}");
     }
@@ -222,6 +225,21 @@ fn an_unreadable_picture_is_skipped_and_named() {
     });
     let ran = train_on(&place, &data, &[], &[]);
     assert_second_is_skipped(&place, ran, "of scene 00000000000000a2 cannot be decoded: its JPEG data of ");
+}
+
+#[test]
+fn a_scene_too_short_for_any_step_is_left_out_at_the_start_and_listed() {
+    let place = Place::new();
+    let data = changed_scene(&place, |scene| {
+        scene.images.truncate(3);
+        scene.cameras.truncate(3);
+        scene.timestamps.truncate(3);
+    });
+    let ran = train_on(&place, &data, &[], &["--only", "stage1"]).ok();
+    let expected = "train: 1 of 2 scenes used; 1 shorter than the 4 frames that data.views needs";
+    assert!(ran.stderr.contains(expected), "{}", ran.stderr);
+    assert!(!ran.stderr.contains("skipped "), "{}", ran.stderr);
+    assert_eq!(place.json("run/skipped-train.json")["skips"][0]["key"], KEYS[1]);
 }
 
 #[test]

@@ -133,6 +133,12 @@ impl BoundedSampler {
             .map(|[init, last]| schedule(init, last, self.warm_up_steps, step) / self.gap_divisor(num_context))
     }
 
+    /// Frames of the shortest stretch of any step: no item can be drawn from a scene of fewer.
+    pub fn min_frames(&self) -> usize {
+        let gaps = (self.min_context..=self.max_context).map(|num_context| self.gap_bounds(0, num_context)[0]);
+        gaps.min().unwrap_or(0) + 1
+    }
+
     /// Draws the views of one item from a scene of `source`. Its cameras are read only where the choice of inner views
     /// looks at them.
     ///

@@ -21,7 +21,8 @@ use crate::held_out::{HeldOut, write_ledger};
 use crate::lock::RunLock;
 use crate::plan::largest_tensor;
 use crate::run_settings::{RunFile, compare, write_config};
-use crate::scenes::{self, FirstScenes};
+use crate::scene_subset::SceneSubset;
+use crate::scenes;
 use crate::stage1::Stage1Batches;
 use crate::stage2::Stage2Batches;
 use crate::trainer::{MakeBatch, StagePlan};
@@ -331,13 +332,18 @@ impl Run {
     }
 
     fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
-        let (source, ledger) = scenes::open(&self.config.data, split)?;
+        let data = &self.config.data;
+        // Under --overfit the training scenes are measured: the same ones.
+        let (source, ledger) = match split {
+            Split::Train => scenes::open_to_train(data)?,
+            Split::Test => scenes::open(data, split)?,
+        };
         sink.event(&Event::Message(format!("{split}: {ledger}")));
         if ledger.has_gaps() && self.config.run_dir.is_dir() {
             write_ledger(&ledger, &self.folder(&format!("skipped-{split}.json")))?;
         }
         let source: Arc<dyn SceneSource> = match self.overfit {
-            Some(count) => Arc::new(FirstScenes::of(source, count)),
+            Some(count) => Arc::new(SceneSubset::first(source, count)),
             None => source,
         };
         Ok(ClipReader { source, options: self.config.data.clip_options() })

@@ -4,13 +4,14 @@ use std::sync::Arc;
 
 use clift_data::export::spread_views;
 use clift_data::{
-    Camera, ClipReader, DataError, EvaluationIndex, EvaluationItem, Frame, Layout, LayoutOptions, Ledger, Opened,
-    SceneSource, Split, SyntheticConfig, SyntheticSource, is_dl3dv_key,
+    ClipReader, EvaluationIndex, EvaluationItem, Layout, LayoutOptions, Ledger, Opened, SceneSource, Split,
+    SyntheticConfig, SyntheticSource, is_dl3dv_key,
 };
 use clift_eval::EvalConfig;
 
 use crate::TrainError;
 use crate::config::DataConfig;
+use crate::scene_subset::SceneSubset;
 
 /// Opens one half of the data, with the ledger of what its filters left out.
 ///
@@ -52,47 +53,26 @@ fn open_files(data: &DataConfig, layout: Layout, split: Split) -> Result<(Arc<dy
     Ok((source, ledger))
 }
 
-/// The first scenes of a source, for `--overfit`.
-pub struct FirstScenes {
-    source: Arc<dyn SceneSource>,
-    num_scenes: usize,
-}
-
-impl FirstScenes {
-    /// Keeps at most `num_scenes`.
-    pub fn of(source: Arc<dyn SceneSource>, num_scenes: usize) -> Self {
-        Self { num_scenes: num_scenes.min(source.num_scenes()), source }
+/// Does [`open`] for training: without the scenes that are too short for any step's views, which are in the ledger.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_to_train(data: &DataConfig) -> Result<(Arc<dyn SceneSource>, Ledger), TrainError> {
+    let (source, mut ledger) = open(data, Split::Train)?;
+    let needed = data.views.min_frames();
+    // A scene that cannot be read is met with its reason when it is drawn.
+    let is_short = |scene: &usize| source.num_frames(*scene).is_ok_and(|num_frames| num_frames < needed);
+    let (short, long): (Vec<usize>, Vec<usize>) = (0..source.num_scenes()).partition(is_short);
+    if short.is_empty() {
+        return Ok((source, ledger));
     }
-}
-
-impl SceneSource for FirstScenes {
-    fn num_scenes(&self) -> usize {
-        self.num_scenes
+    for scene in short {
+        ledger.skip(source.key(scene), format!("shorter than the {needed} frames that data.views needs"));
     }
-
-    fn key(&self, scene: usize) -> &str {
-        self.source.key(scene)
+    if long.is_empty() {
+        return Err(TrainError::NoScenes { reason: format!("{}: {ledger}", Split::Train) });
     }
-
-    fn find(&self, key: &str) -> Option<usize> {
-        self.source.find(key).filter(|scene| *scene < self.num_scenes)
-    }
-
-    fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
-        self.source.num_frames(scene)
-    }
-
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        self.source.cameras(scene)
-    }
-
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-        self.source.frame(scene, frame)
-    }
-
-    fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
-        self.source.encoded_frame(scene, frame)
-    }
+    Ok((Arc::new(SceneSubset::new(source, long)), ledger))
 }
 
 /// Chooses the scenes and views of an evaluation: those of its index, or views spread evenly.
@@ -128,4 +108,45 @@ pub fn evaluation_items(
         return Err(TrainError::NoScenes { reason: format!("evaluation: {ledger}") });
     }
     Ok((items, ledger))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SourceKind;
+    use clift_data::{BoundedSampler, SceneRecord, write_chunks};
+
+    #[test]
+    fn scenes_too_short_for_any_step_are_left_out_of_training_and_in_the_ledger() {
+        let rooms =
+            SyntheticSource::new(SyntheticConfig { num_frames: 8, num_scenes: 2, ..Default::default() }).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let record = |(scene, num_frames): (usize, usize)| {
+            Ok(SceneRecord {
+                key: format!("of-{num_frames}"),
+                url: String::new(),
+                timestamps: (0..num_frames as i64).collect(),
+                cameras: rooms.cameras(scene)?[..num_frames].to_vec(),
+                images: vec![vec![0]; num_frames],
+            })
+        };
+        for split in [Split::Train, Split::Test] {
+            let place = folder.path().join(split.to_string());
+            write_chunks(&place, [(0, 4), (1, 5), (0, 8)].into_iter().map(record), 1).unwrap();
+        }
+        // Two contexts may lie 4 apart, three 8.
+        let views =
+            BoundedSampler { min_context: 2, max_context: 4, min_gap: [8, 9], max_gap: [8, 9], ..Default::default() };
+        let mut data = DataConfig { views, source: SourceKind::Chunks, ..DataConfig::default() };
+        data.root = Some(folder.path().to_owned());
+        let (source, ledger) = open_to_train(&data).unwrap();
+        assert_eq!((source.num_scenes(), source.key(0), source.find("of-8")), (2, "of-5", Some(1)));
+        let expected = "2 of 3 scenes used; 1 shorter than the 5 frames that data.views needs";
+        assert_eq!(ledger.to_string(), expected);
+        assert_eq!(ledger.skips[0].key, "of-4");
+        assert_eq!(open(&data, Split::Train).unwrap().0.num_scenes(), 3);
+        data.views = BoundedSampler { min_gap: [9, 9], max_gap: [9, 9], ..Default::default() };
+        let message = open_to_train(&data).err().unwrap().to_string();
+        assert!(message.contains("train: 0 of 3 scenes used; 3 shorter than the 10 frames"), "{message}");
+    }
 }

@@ -1,9 +1,11 @@
-//! What a run writes step by step: `metrics.jsonl` and `bad_steps.jsonl`.
+//! What a run writes step by step: `metrics.jsonl`, `bad_steps.jsonl` and `skipped.jsonl`.
 
+use std::collections::HashSet;
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 
+use clift_data::Skip;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
@@ -133,12 +135,27 @@ fn drop_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
     if is_whole { Ok(()) } else { clift_data::files::replace(path, &kept) }
 }
 
+/// A scene that training drew and could not use: one line of `skipped.jsonl`, at the first draw.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SkipLine {
+    /// Update it was drawn for.
+    pub step: u64,
+    /// Which stage.
+    pub stage: Stage,
+    /// The scene and why.
+    #[serde(flatten)]
+    pub skip: Skip,
+}
+
 /// The files that a stage writes step by step, in front of another sink: a line per step in `metrics.jsonl`, one per
-/// step left out in `bad_steps.jsonl`.
+/// step left out in `bad_steps.jsonl`, and one per scene left out in `skipped.jsonl`.
 pub struct RunLog<'a> {
     sink: &'a mut dyn Sink,
     metrics: StepLines,
     bad_steps: StepLines,
+    skips: StepLines,
+    /// Scenes that have a line.
+    skipped: HashSet<String>,
 }
 
 impl<'a> RunLog<'a> {
@@ -151,7 +168,17 @@ impl<'a> RunLog<'a> {
             let path = run_dir.join(name);
             StepLines::open(&path, stage, step).map_err(TrainError::io("opening the log of steps", &path))
         };
-        Ok(Self { sink, metrics: open("metrics.jsonl")?, bad_steps: open("bad_steps.jsonl")? })
+        let skips = open("skipped.jsonl")?;
+        let skipped = read_skips(skips.path()).map_err(TrainError::io("reading the log of scenes", skips.path()))?;
+        Ok(Self { sink, metrics: open("metrics.jsonl")?, bad_steps: open("bad_steps.jsonl")?, skips, skipped })
+    }
+
+    /// Tells and notes a scene that `step` could not use, once for all steps.
+    pub fn skip(&mut self, stage: Stage, step: u64, skip: &Skip) {
+        if self.skipped.insert(skip.key.clone()) {
+            self.sink.event(&Event::Skipped { key: skip.key.clone(), reason: skip.reason.clone() });
+            self.skips.write(&SkipLine { step, stage, skip: skip.clone() });
+        }
     }
 
     /// Notes a step that was left out.
@@ -164,11 +191,20 @@ impl<'a> RunLog<'a> {
     /// # Errors
     /// [`TrainError::Io`] with the first failure.
     pub fn check(&mut self) -> Result<(), TrainError> {
-        for lines in [&mut self.metrics, &mut self.bad_steps] {
+        for lines in [&mut self.metrics, &mut self.bad_steps, &mut self.skips] {
             lines.check().map_err(TrainError::io("writing the log of steps", lines.path()))?;
         }
         Ok(())
     }
+}
+
+/// Keys of the scenes that have a line.
+fn read_skips(path: &Path) -> std::io::Result<HashSet<String>> {
+    if !path.exists() {
+        return Ok(HashSet::new());
+    }
+    let text = std::fs::read_to_string(path)?;
+    text.lines().map(|line| Ok(serde_json::from_str::<SkipLine>(line)?.skip.key)).collect()
 }
 
 impl Sink for RunLog<'_> {
@@ -279,6 +315,30 @@ mod tests {
         lines.write(&2);
         assert!(!path.exists(), "a file with a gap would look whole");
         assert_eq!(lines.check().unwrap_err().kind(), std::io::ErrorKind::NotFound);
+    }
+
+    #[test]
+    fn a_scene_that_is_left_out_is_told_and_saved_once_for_all_draws_and_resumptions() {
+        let folder = tempfile::tempdir().unwrap();
+        let skip = |key: &str, reason: &str| Skip { key: key.into(), reason: reason.into() };
+        let mut count = Count::default();
+        let mut log = RunLog::open(folder.path(), Stage::Stage1, 0, &mut count).unwrap();
+        log.skip(Stage::Stage1, 1, &skip("a", "torn"));
+        log.skip(Stage::Stage1, 2, &skip("a", "torn at another frame"));
+        log.skip(Stage::Stage1, 3, &skip("b", "torn"));
+        log.check().unwrap();
+        assert_eq!(count.0, 2);
+        // From step 2 on: what step 3 said is said again.
+        let mut log = RunLog::open(folder.path(), Stage::Stage1, 2, &mut count).unwrap();
+        log.skip(Stage::Stage1, 3, &skip("b", "torn"));
+        log.skip(Stage::Stage1, 4, &skip("a", "torn"));
+        log.check().unwrap();
+        assert_eq!(count.0, 3);
+        assert_eq!(
+            std::fs::read_to_string(folder.path().join("skipped.jsonl")).unwrap(),
+            "{\"step\":1,\"stage\":\"stage1\",\"key\":\"a\",\"reason\":\"torn\"}\n\
+             {\"step\":3,\"stage\":\"stage1\",\"key\":\"b\",\"reason\":\"torn\"}\n"
+        );
     }
 
     #[test]

@@ -70,7 +70,7 @@ impl<'a> Training<'a> {
     fn step(&mut self, learner: Learner, batch: &StageBatch) -> Result<Learner, TrainError> {
         let started = Instant::now();
         for skip in &batch.skipped {
-            self.log.event(&Event::Skipped { key: skip.key.clone(), reason: skip.reason.clone() });
+            self.log.skip(self.plan.stage, self.progress.step + 1, skip);
         }
         let StagePlan { num_steps, accumulate, optimizer, .. } = *self.plan;
         let step = self.progress.step + 1;

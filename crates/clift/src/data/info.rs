@@ -8,7 +8,8 @@ use std::sync::Arc;
 use anyhow::Context;
 use clift_data::{ClipReader, DataError, EvaluationIndex, Ledger, Opened, SceneSource, SourceInfo, Split, has_halves};
 use clift_train::config::SourceKind;
-use clift_train::scenes::{self, FirstScenes};
+use clift_train::scene_subset::SceneSubset;
+use clift_train::scenes;
 use clift_train::{Config, read_config};
 
 use super::args::{InfoArgs, Splits};
@@ -91,7 +92,7 @@ fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
                 report.evaluation = Some(evaluation(config, source.clone()));
             }
             let source: Arc<dyn SceneSource> = match data.source {
-                SourceKind::Synthetic => Arc::new(FirstScenes::of(source, MAX_SYNTHETIC)),
+                SourceKind::Synthetic => Arc::new(SceneSubset::first(source, MAX_SYNTHETIC)),
                 _ => source,
             };
             let mut described = describe(source.as_ref(), &ledger)?;
