@@ -313,11 +313,15 @@ mod tests {
         for number in 0..3 {
             let expected = tensors.tensor(&format!("{number}.output")).unwrap();
             let &[height, width, 3] = expected.shape() else { panic!("{:?}", expected.shape()) };
-            let frame = decode(tensors.tensor(&format!("{number}.jpeg")).unwrap().data(), "k", 0).unwrap();
+            let file = tensors.tensor(&format!("{number}.jpeg")).unwrap().data();
+            // The frame header's sampling of the luma: 2 x 2, so that decoders have to enlarge the chroma (4:2:0).
+            let header = file.windows(2).position(|marker| marker == [0xff, 0xc0]).unwrap();
+            assert_eq!(file[header + 11], 0x22);
+            let frame = decode(file, "k", 0).unwrap();
             let (fitted, _) = fit(&frame, norm, width, height, false).unwrap();
             let differences = fitted.rgb.iter().zip(expected.data()).map(|(a, b)| a.abs_diff(*b));
             let mean = differences.clone().map(f64::from).sum::<f64>() / fitted.rgb.len() as f64;
-            // Decoders round differently; of real photos the mean is below 0.1 (docs/data-tools.md).
+            // Decoders enlarge the chroma differently; of real photos the mean is 0.07 to 0.28 (docs/data-tools.md).
             assert!(mean < 0.5 && differences.max() <= Some(8), "{number}: {mean}");
         }
     }
