@@ -57,13 +57,17 @@ fn a_list_of_test_scenes_divides_what_is_converted_and_checked() {
     let (from, out) = (repository(MINI).join("train"), place.at("out"));
     let ran = convert(&from, &out, &["--to", "scenes", "--set", &list]).ok();
     assert!(ran.stdout.contains("train: 1 scene of 2") && ran.stdout.contains("test: 1 scene of 1"), "{}", ran.stdout);
-    assert!(ran.stderr.contains("left out 00000000000000a2: kept for testing"), "{}", ran.stderr);
+    assert!(ran.stderr.contains("train: 1 of 2 scenes used; 1 kept for testing"), "{}", ran.stderr);
+    assert_eq!(place.json("out/train/skipped.json")["skips"][0]["key"], "00000000000000a2");
     assert!(out.join("train/00000000000000a1.torch").exists() && out.join("test/00000000000000a2.torch").exists());
     assert_eq!(std::fs::read_dir(out.join("test")).unwrap().count(), 2, "and the sums");
 
     let words = ["data", "check", from.to_str().unwrap(), "--split", "test", "--set", &list];
     let ran = clift(words);
     assert!(ran.stdout.contains("test/00000000000000a2") && ran.stdout.contains("\n\n1 scene, "), "{}", ran.stdout);
+    // In training it is missing for a good reason.
+    let ran = clift(["data", "check", from.to_str().unwrap(), "--set", &list]);
+    assert!(ran.stdout.contains("\n\n2 scenes, ") && !ran.stdout.contains("train/00000000000000a2"), "{}", ran.stdout);
     let message = convert(&from, &place.at("no"), &["--to", "scenes", "--set", "data.width=64"]).fails(2);
     assert!(message.contains("unknown key"), "{message}");
 }

@@ -14,6 +14,8 @@ use crate::split::Split;
 
 /// Most bytes of a list.
 const MAX_BYTES: u64 = 256 << 20;
+/// Why a training half goes without a scene that the test half has: nothing is wrong with it.
+pub const KEPT_FOR_TESTING: &str = "kept for testing";
 
 /// Keys of the scenes kept for testing, without DepthSplat's prefix, and of DL3DV's without the way to them.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -67,10 +69,7 @@ impl TestScenes {
             })
             .collect();
         if split == Split::Train {
-            keys.iter()
-                .zip(&kept)
-                .filter(|(_, kept)| !**kept)
-                .for_each(|(key, _)| ledger.skip(key, "kept for testing"));
+            keys.iter().zip(&kept).filter(|(_, kept)| !**kept).for_each(|(key, _)| ledger.skip(key, KEPT_FOR_TESTING));
         } else if is_shared {
             let there: BTreeSet<&str> = keys.iter().flat_map(|key| [plain(key), last_name(key)]).collect();
             let absent = self.keys.iter().filter(|key| !there.contains(key.as_str()));
