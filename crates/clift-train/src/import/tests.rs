@@ -3,6 +3,7 @@ use std::collections::BTreeMap;
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_data::write_state_dict;
 use clift_model::device::DeviceName;
+use clift_model::interchange::PREFIX;
 use clift_model::{Cameras, Clusters, SceneClusters, Views};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
@@ -20,6 +21,11 @@ const CHECKPOINTS: [(&str, Variant, Option<usize>); 5] = [
     ("dl3dv_one", Variant::ReleasedDl3dv, None),
     ("paper", Variant::Paper, Some(3)),
 ];
+
+/// An import that nobody interrupts.
+fn import(file: &Path, out: &Path, options: &ImportOptions) -> Result<(Config, Imported), TrainError> {
+    super::import(file, out, options, &AtomicBool::new(false))
+}
 
 fn fixture(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/checkpoints").join(name)
@@ -147,13 +153,21 @@ fn checkpoints_of_every_variant_compute_what_the_twin_computes_and_come_back_bit
         let (original, written) = (network(&file), network(&exported));
         assert_eq!(written.keys().collect::<Vec<_>>(), original.keys().collect::<Vec<_>>(), "{name}");
         assert!(written == original, "{name}: shapes or values differ");
-        let (_, imported_again) = import(&exported, &again, &options(variant, num_heads)).unwrap();
+        // The export says its heads.
+        let (_, imported_again) = import(&exported, &again, &options(variant, None)).unwrap();
         assert_eq!(imported_again.convolutions, imported.convolutions);
         assert_computes(&again, name);
 
         let exported = place.path().join("out.safetensors");
         export(&config, &model, ExportFormat::Safetensors, &exported).unwrap();
         let bytes = std::fs::read(&exported).unwrap();
+        let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
+        let said = header.metadata().clone().unwrap();
+        assert_eq!(said["num_heads"], config.model.num_heads.to_string());
+        assert_eq!(said["dim"], config.model.dim.to_string());
+        let third = place.path().join("third.safetensors");
+        export(&config, &model, ExportFormat::Safetensors, &third).unwrap();
+        assert!(std::fs::read(&third).unwrap() == bytes, "equal weights are equal files");
         let written: BTreeMap<_, _> = SafeTensors::deserialize(&bytes)
             .unwrap()
             .tensors()
@@ -180,7 +194,7 @@ fn refusal(change: impl Fn(&mut BTreeMap<String, (Vec<usize>, Vec<f32>)>), optio
         .collect();
     change(&mut tensors);
     let tensors: Vec<_> = tensors.into_iter().map(|(key, (shape, values))| (key, shape, values)).collect();
-    write_state_dict(&file, &tensors).unwrap();
+    write_state_dict(&file, &tensors, &[]).unwrap();
     refused(&file, place.path(), options)
 }
 
@@ -205,7 +219,7 @@ fn assert_says(message: &str, parts: &[&str]) {
 }
 
 #[test]
-fn missing_and_unknown_keys_are_listed_with_the_nearest_name() {
+fn missing_and_unknown_keys_are_all_listed_with_the_nearest_name() {
     let message = refusal(
         |tensors| {
             let tensor = tensors.remove("transformer.encoder.layers.0.norm1.weight").unwrap();
@@ -218,33 +232,158 @@ fn missing_and_unknown_keys_are_listed_with_the_nearest_name() {
         &message,
         &[
             "it does not hold a released-re10k network (width 15, 3 heads, 1 + 2 layers); nothing was written",
-            "missing: encoder.layers.0.norm1.weight [15]; nearest name: encoder.layers.0.norm_1.weight",
-            "unknown: transformer.encoder.layers.0.norm_1.weight [15]; nearest name: encoder.layers.0.norm1.weight",
-            "unknown: transformer.extra.deep.bias [2]",
+            "missing: transformer.encoder.layers.0.norm1.weight [15]; nearest name: transformer.encoder.layers.0.norm_1.weight",
+            "unknown: transformer.encoder.layers.0.norm_1.weight [15]; nearest name: transformer.encoder.layers.0.norm1.weight",
+            "unknown: transformer.extra.deep.bias [2]; nearest name: transformer.",
             "--rename FROM=TO",
         ],
     );
-    // A whole layer that is left out in the middle is missing, not a smaller network.
+    // A whole layer that is left out in the middle is missing, not a smaller network, and every key of it is told.
     let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("decoder.layers.0")), &re10k());
-    assert_says(&message, &["missing: decoder.layers.0.self_attn.in_proj_weight [45, 15]", "missing: 6 more"]);
+    assert_says(&message, &["missing: transformer.decoder.layers.0.self_attn.in_proj_weight [45, 15]"]);
+    assert_eq!(message.matches("missing: transformer.decoder.layers.0.").count(), 18, "{message}");
     // A condenser that is not whole is no first-stage checkpoint.
     let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("squeezer.linear1")), &re10k());
-    assert_says(&message, &["missing: squeezer.linear1.weight [15, 15]", "missing: squeezer.linear1.bias [15]"]);
+    let [weight, bias] =
+        ["weight [15, 15]", "bias [15]"].map(|rest| format!("missing: transformer.squeezer.linear1.{rest}"));
+    assert_says(&message, &[&weight, &bias]);
+    // What differs in every layer is one line, and a name that is like no missing one has a nearest all the same.
+    let rename = |from: &str, to: &str| {
+        let change = |tensors: &mut BTreeMap<String, (Vec<usize>, Vec<f32>)>| {
+            *tensors = tensors.iter().map(|(key, tensor)| (key.replace(from, to), tensor.clone())).collect();
+        };
+        refusal(change, &re10k())
+    };
+    assert_says(
+        &rename(".norm2.weight", ".ln_2.scale"),
+        &[
+            "missing: transformer.decoder.layers.N.norm2.weight [15] (N = 0, 1); nearest name: transformer.decoder.layers.N.ln_2.scale",
+            "unknown: transformer.decoder.layers.N.ln_2.scale [15] (N = 0, 1); nearest name: transformer.decoder.layers.N.norm2.weight",
+            "unknown: transformer.encoder.layers.0.ln_2.scale [15]; nearest name: transformer.encoder.layers.0.norm2.weight",
+        ],
+    );
+    assert_says(
+        &rename("output_norm", "decoder.norm"),
+        &["unknown: transformer.decoder.norm.weight [15]; nearest name: transformer.output_norm.weight"],
+    );
+    assert_says(
+        &rename("transformer.", "net.transformer."),
+        &[
+            "unknown: net.transformer.output_norm.weight [15]; nearest name: output_norm.weight",
+            "--rename net.transformer.=transformer. ",
+        ],
+    );
+}
+
+#[test]
+fn a_stray_key_of_a_layer_is_unknown_and_one_wrong_tensor_does_not_make_all_others_wrong() {
+    let message = refusal(
+        |tensors| {
+            tensors.insert("transformer.decoder.layers.3.norm1.weight".into(), (vec![15], vec![0.0; 15]));
+        },
+        &re10k(),
+    );
+    assert_says(&message, &["1 + 2 layers", "unknown: transformer.decoder.layers.3.norm1.weight [15]"]);
+    assert!(!message.contains("missing"), "{message}");
+    for (key, shape, told) in [
+        ("output_norm.weight", vec![14], "is [14], expected [15]"),
+        ("encoder.layers.0.linear1.weight", vec![15, 22], "is [15, 22], expected [22, 15]"),
+        ("linear_input.weight", vec![15, 576, 3, 3], "is [15, 576, 3, 3], expected [15, 576]"),
+    ] {
+        let key = format!("transformer.{key}");
+        let message = refusal(
+            |tensors| {
+                let values = vec![0.0; shape.iter().product()];
+                assert!(tensors.insert(key.clone(), (shape.clone(), values)).is_some());
+            },
+            &re10k(),
+        );
+        assert_says(&message, &[&format!("misshapen: {key} {told}")]);
+        assert_eq!(message.matches("misshapen").count(), 1, "{message}");
+    }
+}
+
+#[test]
+fn keys_beside_the_prefix_are_refused_where_they_are_the_networks_and_listed_where_not() {
+    let outside = |from: &str| {
+        let change = |tensors: &mut BTreeMap<String, (Vec<usize>, Vec<f32>)>| {
+            let short =
+                |key: &String| key.strip_prefix("transformer.").filter(|key| key.starts_with(from)).map(String::from);
+            *tensors =
+                tensors.iter().map(|(key, tensor)| (short(key).unwrap_or(key.clone()), tensor.clone())).collect();
+        };
+        refusal(change, &re10k())
+    };
+    assert_says(
+        &outside("squeezer."),
+        &[
+            "beside transformer.: squeezer.linear1.weight [15, 15]; nearest name: transformer.squeezer.linear1.weight",
+            "--rename squeezer=transformer.squeezer",
+        ],
+    );
+    assert_says(&outside("linear_target"), &["beside transformer.: linear_target.bias [15]"]);
+    assert_says(&outside("output_norm"), &["beside transformer.: output_norm.bias [15]"]);
+
+    let place = tempfile::tempdir().unwrap();
+    let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
+    let mut tensors = tensors_of("re10k.ckpt", str::to_owned);
+    for layer in 0..2 {
+        tensors.push((format!("ema.encoder.layers.{layer}.norm1.weight"), vec![1], vec![0.0]));
+    }
+    tensors.push(("module.perceptual_loss.vgg.0.weight".into(), vec![1], vec![0.0]));
+    write_state_dict(&file, &tensors, &[]).unwrap();
+    let (_, imported) = import(&file, &out, &re10k()).unwrap();
+    assert_eq!(imported.ignored, BTreeMap::from([("perceptual_loss".into(), 1)]));
+    assert_eq!(imported.outside, BTreeMap::from([("ema.encoder.layers.N.norm1.weight".into(), 2)]));
+}
+
+/// The network of a fixture under other keys.
+fn tensors_of(name: &str, rename: impl Fn(&str) -> String) -> Vec<(String, Vec<usize>, Vec<f32>)> {
+    let all = network(&fixture(name)).into_iter().map(|(key, (shape, bits))| {
+        let shape = shape.iter().map(|&size| size as usize).collect();
+        (rename(&key), shape, bits.into_iter().map(f32::from_bits).collect())
+    });
+    all.collect()
+}
+
+#[test]
+fn what_compiled_and_distributed_models_put_into_keys_is_taken_off_wherever_it_stands() {
+    for lead in
+        ["module.transformer.", "_orig_mod.transformer.", "transformer.module.", "transformer._orig_mod.", "module."]
+    {
+        let place = tempfile::tempdir().unwrap();
+        let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
+        write_state_dict(&file, &tensors_of("re10k.ckpt", |key| key.replace("transformer.", lead)), &[]).unwrap();
+        import(&file, &out, &re10k()).unwrap();
+        assert_computes(&out, "re10k");
+    }
+}
+
+#[test]
+fn renames_see_the_whole_key_and_one_of_nothing_is_an_error() {
+    let place = tempfile::tempdir().unwrap();
+    let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
+    write_state_dict(&file, &tensors_of("re10k.ckpt", |key| key.replace("transformer.", "net.")), &[]).unwrap();
+    let renamed = |renames: &[(&str, &str)]| {
+        let renames = renames.iter().map(|(from, to)| ((*from).to_owned(), (*to).to_owned())).collect();
+        import(&file, &out, &ImportOptions { renames, ..re10k() })
+    };
+    let message = renamed(&[("net.", "transformer."), ("net.encoder", "encoder")]).unwrap_err().to_string();
+    assert_says(&message, &["`--rename` = net.encoder=encoder: no key has \"net.encoder\" in it", "changed.ckpt"]);
+    let message = renamed(&[("net.output_norm", "transformer.output")]).unwrap_err().to_string();
+    assert_says(&message, &["unknown: net.output_norm.weight [15], renamed transformer.output.weight"]);
+    renamed(&[("net.", "transformer.")]).unwrap();
+    assert_computes(&out, "re10k");
 }
 
 #[test]
 fn renamed_keys_can_be_renamed_back() {
     let place = tempfile::tempdir().unwrap();
     let file = place.path().join("changed.ckpt");
-    let tensors: Vec<_> = network(&fixture("re10k.ckpt"))
-        .into_iter()
-        .map(|(key, (shape, bits))| {
-            let key =
-                key.replace("squeezer.linear1", "squeezer.gate").replace("transformer.", "transformer._orig_mod.");
-            (key, shape.iter().map(|&size| size as usize).collect(), bits.into_iter().map(f32::from_bits).collect())
-        })
-        .collect();
-    write_state_dict(&file, &tensors).unwrap();
+    let tensors = tensors_of("re10k.ckpt", |key| {
+        key.replace("squeezer.linear1", "squeezer.gate").replace("transformer.", "transformer._orig_mod.")
+    });
+    write_state_dict(&file, &tensors, &[]).unwrap();
     refused(&file, place.path(), &re10k());
     let renames = vec![("squeezer.gate".to_owned(), "squeezer.linear1".to_owned())];
     import(&file, &place.path().join("model"), &ImportOptions { renames, ..re10k() }).unwrap();
@@ -293,9 +432,14 @@ fn heads_must_divide_the_width() {
     };
     assert_says(
         &import(None),
-        &["`--num-heads` = 8 (the published): give the heads of this network, a divisor of its width 15"],
+        &[
+            "`--num-heads` = not given: no shape shows them, and width 768 alone is published, with 8",
+            "a divisor of its width 15 (transformer.decoder.layers.0.",
+            "re10k.ckpt",
+        ],
     );
     assert_says(&import(Some(0)), &["`--num-heads` = 0"]);
+    assert_says(&import(Some(4)), &["`--num-heads` = 4", "width 15 (transformer.decoder.layers.0.", "re10k.ckpt"]);
     // Normalised heads show their width.
     let place = tempfile::tempdir().unwrap();
     let message = refused(&fixture("dl3dv.ckpt"), place.path(), &options(Variant::ReleasedDl3dv, Some(2)));
@@ -327,7 +471,8 @@ fn truncated_damaged_and_hostile_files_are_refused() {
     let whole = std::fs::read(fixture("re10k.ckpt")).unwrap();
     for length in [0, 1, 1000, whole.len() / 2, whole.len() - 1] {
         std::fs::write(&file, &whole[..length]).unwrap();
-        assert_says(&refused(&file, place.path(), &re10k()), &["bad checkpoint: no readable ZIP archive"]);
+        let what = if length == 0 { "an empty file" } else { "no readable ZIP archive" };
+        assert_says(&refused(&file, place.path(), &re10k()), &[&format!("bad checkpoint: {what}")]);
     }
     // A flipped bit of a weight is found by the archive's checksum.
     let state = StateDict::open(&fixture("re10k.ckpt")).unwrap();
@@ -348,15 +493,43 @@ fn truncated_damaged_and_hostile_files_are_refused() {
     // Values that are not finite.
     let message =
         refusal(|tensors| tensors.get_mut("transformer.output_norm.bias").unwrap().1[3] = f32::INFINITY, &re10k());
-    assert_says(&message, &["transformer.output_norm.bias: value 3 is inf"]);
+    assert_says(&message, &["transformer.output_norm.bias [15]: value 3 is inf"]);
     // Sizes that nobody has.
     let message = refusal(
         |tensors| {
-            tensors.insert("transformer.encoder.layers.18446744073709551615.norm1.weight".into(), (vec![1], vec![0.0]));
+            let all = tensors.clone().into_iter().filter(|(key, _)| key.contains("encoder.layers.0."));
+            tensors.extend(all.map(|(key, tensor)| (key.replace(".0.", ".18446744073709551615."), tensor)));
         },
         &re10k(),
     );
     assert!(message.contains("num_encoder_blocks"), "{message}");
+}
+
+#[test]
+fn an_export_says_its_heads_and_others_are_refused() {
+    let place = tempfile::tempdir().unwrap();
+    let [folder, again] = ["model", "again"].map(|name| place.path().join(name));
+    let (config, _) = import(&fixture("re10k.ckpt"), &folder, &re10k()).unwrap();
+    let file = place.path().join("out.ckpt");
+    export(&config, &ModelPath::find(&folder).unwrap(), ExportFormat::Pytorch, &file).unwrap();
+    let message = import(&file, &again, &options(Variant::ReleasedRe10k, Some(5))).unwrap_err().to_string();
+    assert_says(&message, &["`--num-heads` = 5: the checkpoint says it has 3", "out.ckpt"]);
+    assert!(!again.exists());
+}
+
+#[test]
+fn an_interrupted_import_leaves_nothing() {
+    let place = tempfile::tempdir().unwrap();
+    let (folder, stop) = (place.path().join("model"), AtomicBool::new(true));
+    let stopped = super::import(&fixture("re10k.ckpt"), &folder, &re10k(), &stop);
+    assert!(matches!(stopped, Err(TrainError::Abandoned { .. })));
+    // While it writes, too.
+    let kept = place.path().join("kept");
+    let (config, imported) = import(&fixture("re10k.ckpt"), &kept, &re10k()).unwrap();
+    let stopped = model_dir::write(&folder, &config, &[], &imported, &stop);
+    assert!(matches!(stopped, Err(TrainError::Abandoned { .. })));
+    let left: Vec<_> = std::fs::read_dir(place.path()).unwrap().map(|item| item.unwrap().file_name()).collect();
+    assert_eq!(left, ["kept"]);
 }
 
 #[test]
@@ -367,4 +540,14 @@ fn nothing_that_exists_is_written_over() {
     let message = import(&fixture("re10k.ckpt"), &folder, &re10k()).unwrap_err().to_string();
     assert_says(&message, &["`-o` = ", "it exists already"]);
     assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 0);
+
+    let model = place.path().join("imported");
+    let (config, _) = import(&fixture("re10k.ckpt"), &model, &re10k()).unwrap();
+    let found = ModelPath::find(&model).unwrap();
+    let before = std::fs::read(&found.weights).unwrap();
+    for format in [ExportFormat::Pytorch, ExportFormat::Safetensors] {
+        let message = export(&config, &found, format, &found.weights).unwrap_err().to_string();
+        assert_says(&message, &["`-o` = ", "nothing is written over"]);
+    }
+    assert!(std::fs::read(&found.weights).unwrap() == before);
 }
