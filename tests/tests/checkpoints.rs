@@ -187,7 +187,7 @@ fn a_dl3dv_model_starts_from_an_imported_re10k_model_and_lists_what_is_new() {
     for part in [
         "encoder.blocks.0.attn.qk_norm.query.weight",
         "renderer.blocks.1.cross_attn.qk_norm.key.weight",
-        "lift_norm.norm.weight, lift_norm.norm.bias",
+        "lift_norm.norm.bias, lift_norm.norm.weight",
         "unused in the file: condenser.released.",
     ] {
         assert!(ran.stderr.contains(part), "{part}\nis not in\n{}", ran.stderr);

@@ -136,7 +136,11 @@ impl StateDict {
         let shape: Vec<Option<u64>> = stored.shape.iter().map(|size| Some(*size)).collect();
         let value = Value::Tensor(Box::new(stored));
         let (span, element_type): (Span, ElementType) = locate(&value, &shape, &FLOATS, &self.archive).map_err(bad)?;
-        let mut values = to_f32(&span.read(&self.path).map_err(as_checkpoint)?, element_type);
+        let bytes = span.read(&self.path).map_err(|error| match error {
+            DataError::BadChunk { what, .. } => bad(what),
+            other => as_checkpoint(other),
+        })?;
+        let mut values = to_f32(&bytes, element_type);
         if !is_contiguous {
             values = in_order(&values, &tensor.shape, &tensor.stride);
         }

@@ -85,7 +85,7 @@ pub fn import(
     let expected = interchange::tensors(&model, has_condenser);
     let problems = problems::problems(&keys, &state, &expected, options);
     if !problems.is_empty() {
-        let told = problems::told(&keys, &state, &problems, &model, &expected, options);
+        let told = problems::told(&keys, &state, &problems, &model, options);
         return Err(TrainError::bad_file("checkpoint", file)(told));
     }
 

@@ -67,7 +67,7 @@ fn told(imported: &Imported) -> Vec<String> {
         lines.push(format!("not of the network: {count} keys {first}.*"));
     }
     for (pattern, count) in &imported.outside {
-        lines.push(format!("passed over, neither the network's nor known otherwise: {pattern} ({count} keys)"));
+        lines.push(format!("passed over, neither the network's nor known otherwise: {count} x {pattern}"));
     }
     if !imported.passed_over.is_empty() {
         let names: Vec<&str> = imported.passed_over.iter().map(String::as_str).collect();

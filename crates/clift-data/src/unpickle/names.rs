@@ -22,7 +22,7 @@ pub(super) fn global(module: &str, name: &str, others: Others) -> Result<Option<
         return Err(Stop::Refused(shown(module, name)));
     }
     Ok(match (module, name) {
-        ("torch._utils", "_rebuild_parameter") => Some(Global::RebuildParameter),
+        ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state") => Some(Global::RebuildParameter),
         ("torch", "HalfStorage") => Some(Global::Storage(ElementType::F16)),
         ("torch", "BFloat16Storage") => Some(Global::Storage(ElementType::BF16)),
         _ => None,

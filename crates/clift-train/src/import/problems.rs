@@ -95,15 +95,14 @@ pub(super) fn problems(
     problems
 }
 
-/// Names by their pattern: the first of each, and how many there are.
-#[derive(Default)]
-struct Names(BTreeMap<String, (String, usize)>);
+/// Names by their pattern.
+struct Names<'a>(BTreeMap<String, BTreeSet<&'a str>>);
 
-impl Names {
-    fn of<'a>(names: impl Iterator<Item = &'a str>) -> Self {
-        let mut patterns = BTreeMap::new();
+impl<'a> Names<'a> {
+    fn of(names: impl Iterator<Item = &'a str>) -> Self {
+        let mut patterns: BTreeMap<_, BTreeSet<_>> = BTreeMap::new();
         for name in names {
-            patterns.entry(pattern(name)).or_insert_with(|| (name.to_owned(), 0)).1 += 1;
+            patterns.entry(pattern(name)).or_default().insert(name);
         }
         Self(patterns)
     }
@@ -117,17 +116,15 @@ impl Names {
         all.filter(|(slips, _)| *slips <= most).min_by_key(|(slips, _)| *slips).map(|(_, candidate)| candidate)
     }
 
-    /// A pattern for one key with these numbers, or for many.
+    /// The name of a pattern that has these numbers, the only one there is, or the pattern for many.
     fn told(&self, found: &str, numbers: Option<&[&str]>) -> String {
-        if let Some((first, 1)) = self.0.get(found) {
-            return first.clone();
-        }
-        match numbers {
-            Some(numbers) if numbers.len() == found.split('.').filter(|part| *part == "N").count() => {
-                let mut numbers = numbers.iter();
-                let part = |part| if part == "N" { numbers.next().copied().unwrap_or(part) } else { part };
-                found.split('.').map(part).collect::<Vec<_>>().join(".")
-            }
+        let mut numbers = numbers.unwrap_or_default().iter();
+        let part = |part| if part == "N" { numbers.next().copied().unwrap_or(part) } else { part };
+        let filled = found.split('.').map(part).collect::<Vec<_>>().join(".");
+        let names = &self.0[found];
+        match names.first() {
+            _ if names.contains(filled.as_str()) => filled,
+            Some(first) if names.len() == 1 => (*first).to_owned(),
             _ => found.to_owned(),
         }
     }
@@ -139,7 +136,6 @@ pub(super) fn told(
     state: &StateDict,
     problems: &[Problem],
     model: &ModelConfig,
-    expected: &[CheckpointTensor],
     options: &ImportOptions,
 ) -> String {
     let ModelConfig { variant, dim, num_heads, num_encoder_blocks, num_renderer_blocks, .. } = model;
@@ -152,6 +148,7 @@ pub(super) fn told(
         Names::of(found.map(|problem| problem.name.as_str()))
     };
     let (missing, unknown) = (of_kinds(&[Kind::Missing]), of_kinds(&[Kind::Unknown, Kind::Stray]));
+    let expected = interchange::tensors(model, true);
     let expected = Names::of(expected.iter().map(|tensor| tensor.key.as_str()));
     let mut lines: BTreeMap<(Kind, String, &str), Vec<&Problem>> = BTreeMap::new();
     for problem in problems {
@@ -174,7 +171,7 @@ pub(super) fn told(
         let own = (found.len() == 1).then_some(&own[..]);
         let near = match kind {
             // So near that it may be this one under another name.
-            Kind::Missing => unknown.nearest(&first.name, first.name.len() / 3).map(|found| unknown.told(found, own)),
+            Kind::Missing => unknown.nearest(&first.name, first.name.len() / 2).map(|found| unknown.told(found, own)),
             Kind::Unknown | Kind::Stray => {
                 let missing = missing.nearest(&first.name, first.name.len() / 2).map(|found| missing.told(found, own));
                 missing.or_else(|| expected.nearest(&first.name, usize::MAX).map(|found| expected.told(found, own)))

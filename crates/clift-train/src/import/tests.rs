@@ -283,7 +283,13 @@ fn a_stray_key_of_a_layer_is_unknown_and_one_wrong_tensor_does_not_make_all_othe
         },
         &re10k(),
     );
-    assert_says(&message, &["1 + 2 layers", "unknown: transformer.decoder.layers.3.norm1.weight [15]"]);
+    assert_says(
+        &message,
+        &[
+            "1 + 2 layers",
+            "unknown: transformer.decoder.layers.3.norm1.weight [15]; nearest name: transformer.decoder.layers.N.norm1.weight",
+        ],
+    );
     assert!(!message.contains("missing"), "{message}");
     for (key, shape, told) in [
         ("output_norm.weight", vec![14], "is [14], expected [15]"),
@@ -443,7 +449,10 @@ fn heads_must_divide_the_width() {
     // Normalised heads show their width.
     let place = tempfile::tempdir().unwrap();
     let message = refused(&fixture("dl3dv.ckpt"), place.path(), &options(Variant::ReleasedDl3dv, Some(2)));
-    assert_says(&message, &["misshapen: transformer.encoder.layers.0.self_attn.q_norm.weight is [2], expected [7]"]);
+    assert_says(
+        &message,
+        &["misshapen: transformer.encoder.layers.N.self_attn.q_norm.weight is [2], expected [7] (N = 0, 1, 2)"],
+    );
 }
 
 #[test]
