@@ -83,6 +83,9 @@ pub(crate) fn check_heads(model: &ModelConfig, folder: &Path) -> Result<(), Trai
         model: ModelConfig,
     }
     let path = folder.join("config.toml");
+    if !path.exists() {
+        return Ok(()); // nothing says what they are
+    }
     let text = std::fs::read_to_string(&path).map_err(TrainError::io("reading the configuration", &path))?;
     let its: Its = toml::from_str(&text).map_err(TrainError::bad_file("configuration", &path))?;
     let num_heads = its.model.num_heads;
@@ -198,6 +201,7 @@ mod tests {
         };
         assert_eq!(check("[model]\nnum_heads = 4\n[data]\nof_a_later_version = 1", 4), Ok(()));
         assert_eq!(check("seed = 3", 8), Ok(()), "the default");
+        check_heads(&ModelConfig::default(), &place.path().join("none")).unwrap();
         let message = check("[model]\nnum_heads = 4", 8).unwrap_err();
         assert!(message.contains("`model.num_heads` = 8: ") && message.contains("with 4 heads"), "{message}");
     }
