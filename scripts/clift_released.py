@@ -270,14 +270,26 @@ def read(path: str) -> dict[str, Tensor]:
     return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
 
 
+def said_heads(path: str) -> int | None:
+    """The heads that an export says it has."""
+    if path.endswith(".safetensors"):
+        from safetensors import safe_open
+
+        with safe_open(path, "pt") as file:
+            sizes = file.metadata() or {}
+    else:
+        sizes = torch.load(path, map_location="cpu", weights_only=True).get("clift", {})
+    return int(sizes["num_heads"]) if "num_heads" in sizes else None
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description="Loads an export into the PyTorch twin, strictly.")
     parser.add_argument("file", help="what `clift export` wrote")
-    parser.add_argument("--num-heads", type=int, help="heads, where no shape shows them")
+    parser.add_argument("--num-heads", type=int, help="heads, where neither a shape nor the file says them")
     parser.add_argument("--same-as", help="a checkpoint whose every value must be the same, bit for bit")
     args = parser.parse_args()
     state = read(args.file)
-    config = config_of(state, args.num_heads)
+    config = config_of(state, args.num_heads or said_heads(args.file))
     model = ReleasedClift(config)
     model.load_state_dict(state, strict=True)
     print(f"{args.file}: {len(state)} tensors, {sum(t.numel() for t in state.values())} values, {config}")

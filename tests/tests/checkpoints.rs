@@ -100,7 +100,7 @@ fn a_first_stage_model_adds_the_uncondensed_variants() {
         })
         .collect();
     let file = place.at("first.ckpt");
-    write_state_dict(&file, &first).unwrap();
+    write_state_dict(&file, &first, &[]).unwrap();
     let first = import(&place, &file.display().to_string(), "released-re10k", "3", "first");
 
     assert_eq!(variants(&evaluate(&first, &place.at("a"), &[])), ["kmeans", "random"]);
@@ -168,7 +168,10 @@ fn released_variants_train_in_both_stages_and_leave_as_checkpoints() {
         let run = place.at(variant).display().to_string();
         clift(["export", &run, "--format", "pytorch", "-o", &file]).ok();
         let name = format!("{variant}-model");
-        import(&place, &file, variant, "2", &name);
+        let folder = place.at(&name).display().to_string();
+        // The export says that the network has two heads.
+        let ran = clift(["import", &file, "--variant", variant, "-o", &folder]).ok();
+        assert!(ran.stdout.contains(" 2 heads, "), "{}", ran.stdout);
         assert!(place.model(&name) == second, "the weights come back bit for bit");
     }
 }
@@ -182,9 +185,9 @@ fn a_dl3dv_model_starts_from_an_imported_re10k_model_and_lists_what_is_new() {
     let set = [model, &format!("stage1.init_from={from:?}"), "stage1.steps=0"];
     let ran = place.train("dl3dv", &set, &["--only", "stage1"]).ok();
     for part in [
-        "encoder.blocks.0.attn.qk_norm.query.",
-        "renderer.blocks.1.cross_attn.qk_norm.key.",
-        "lift_norm.norm.",
+        "encoder.blocks.0.attn.qk_norm.query.weight",
+        "renderer.blocks.1.cross_attn.qk_norm.key.weight",
+        "lift_norm.norm.bias, lift_norm.norm.weight",
         "unused in the file: condenser.released.",
     ] {
         assert!(ran.stderr.contains(part), "{part}\nis not in\n{}", ran.stderr);
@@ -195,4 +198,70 @@ fn a_dl3dv_model_starts_from_an_imported_re10k_model_and_lists_what_is_new() {
     }
     let gamma: Vec<f32> = new.part("lift_norm.norm.weight").0.into_values().flatten().collect();
     assert_eq!(gamma, [1.0; 15]);
+}
+
+#[test]
+fn an_export_writes_over_nothing() {
+    let place = Place::new();
+    let model = import(&place, &checkpoint("re10k"), "released-re10k", "3", "model");
+    let weights = place.at("model/model.safetensors").display().to_string();
+    let before = place.bytes("model/model.safetensors");
+    for format in ["pytorch", "safetensors"] {
+        let message = clift(["export", &model, "--format", format, "-o", &weights]).fails(2);
+        assert!(message.contains("nothing is written over"), "{message}");
+    }
+    // Before any work: nothing of the model is looked at.
+    let message = clift(["export", "no/such/model", "--format", "pytorch", "-o", &weights]).fails(2);
+    assert!(message.contains("nothing is written over"), "{message}");
+    assert!(place.bytes("model/model.safetensors") == before);
+}
+
+#[test]
+fn other_heads_than_those_of_the_weights_are_refused() {
+    let place = Place::new();
+    let model = import(&place, &checkpoint("re10k"), "released-re10k", "3", "model");
+    let (data, out) = (mini(), place.at("eval").display().to_string());
+    let heads = ["--set", "model.num_heads=5"];
+    let args = ["eval", "--checkpoint", &model, "--data", &data, "--out", &out];
+    let message = clift(args.iter().chain(&SMALL).chain(&heads)).fails(2);
+    assert!(message.contains("`model.num_heads` = 5") && message.contains("3 heads"), "{message}");
+
+    let network = "model={variant='released-re10k', dim=15, num_heads=5, feed_forward_dim=22, num_encoder_blocks=1, \
+                   num_renderer_blocks=2}";
+    let weights = place.at("model/model.safetensors").display().to_string();
+    for from in [&model, &weights] {
+        let set = [network, &format!("stage1.init_from={from:?}"), "stage1.steps=0"];
+        let message = place.train("run", &set, &["--only", "stage1"]).fails(2);
+        assert!(message.contains("`model.num_heads` = 5") && message.contains("3 heads"), "{message}");
+    }
+}
+
+#[test]
+fn a_checkpoint_that_is_not_imported_is_named_with_the_command() {
+    let place = Place::new();
+    let (file, data) = (checkpoint("re10k"), mini());
+    let out = place.at("out.ckpt").display().to_string();
+    let command = format!("clift import {file} --variant");
+    for args in
+        [vec!["eval", "--checkpoint", &file, "--data", &data], vec!["export", &file, "--format", "pytorch", "-o", &out]]
+    {
+        let message = clift(args).fails(2);
+        assert!(message.contains(&command), "{message}");
+    }
+    let message = place.train("run", &[&format!("stage1.init_from={file:?}")], &["--only", "stage1"]).fails(2);
+    assert!(message.contains(&command), "{message}");
+}
+
+#[test]
+fn an_evaluation_without_the_published_index_says_so() {
+    let place = Place::new();
+    let model = import(&place, &checkpoint("re10k_first"), "released-re10k", "5", "model");
+    let (data, out) = (mini(), place.at("eval").display().to_string());
+    let index = repository("data-fixtures/re10k-mini/evaluation_index.json").display().to_string();
+    let args = ["eval", "--checkpoint", &model, "--data", &data, "--out", &out, "--storage", "6"];
+    let note = "this is not the published protocol";
+    let ran = clift(args.iter().chain(&SMALL).chain(&["--set", "eval.num_context=2"]));
+    assert!(ran.stderr.contains(note), "{}", ran.stderr);
+    let ran = clift(args.iter().chain(&SMALL).chain(&["--index", &index])).ok();
+    assert!(!ran.stderr.contains(note), "{}", ran.stderr);
 }

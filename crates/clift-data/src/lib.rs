@@ -20,6 +20,7 @@ pub mod convert;
 pub mod error;
 pub mod export;
 mod features;
+mod file_kind;
 pub mod files;
 pub mod filters;
 mod flip;

@@ -56,7 +56,7 @@ impl ElementType {
 pub enum Global {
     /// `torch._utils._rebuild_tensor_v2`
     RebuildTensor,
-    /// `torch._utils._rebuild_parameter`, in checkpoints alone.
+    /// `torch._utils._rebuild_parameter`, or `_rebuild_parameter_with_state` of one with attributes, in checkpoints alone.
     RebuildParameter,
     /// `collections.OrderedDict`
     OrderedDict,

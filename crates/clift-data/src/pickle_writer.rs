@@ -20,12 +20,18 @@ impl PickleWriter {
 
     /// A contiguous tensor that is the whole of a new storage.
     pub fn tensor(&mut self, storage_type: &str, storage: Vec<u8>, shape: &[usize]) {
+        let stride: Vec<usize> = (0..shape.len()).map(|dimension| shape[dimension + 1..].iter().product()).collect();
+        self.strided_tensor(storage_type, storage, shape, &stride);
+    }
+
+    /// A tensor in a new storage, from its first element on.
+    pub fn strided_tensor(&mut self, storage_type: &str, storage: Vec<u8>, shape: &[usize], stride: &[usize]) {
         self.raw(b"ctorch._utils\n_rebuild_tensor_v2\n((");
         self.string("storage");
         self.raw(format!("ctorch\n{storage_type}\n").as_bytes());
         self.string(&self.storages.len().to_string());
         self.string("cpu");
-        self.integer(shape.iter().product());
+        self.integer(shape.iter().fold(1, |product, size| product.wrapping_mul(*size)));
         self.raw(b"tQ");
         self.integer(0); // offset
         self.raw(b"(");
@@ -33,8 +39,8 @@ impl PickleWriter {
             self.integer(*size);
         }
         self.raw(b"t(");
-        for dimension in 0..shape.len() {
-            self.integer(shape[dimension + 1..].iter().product());
+        for step in stride {
+            self.integer(*step);
         }
         self.raw(b"t\x89ccollections\nOrderedDict\n)RtR"); // requires no gradient, has no hooks
         self.storages.push(storage);

@@ -12,6 +12,7 @@ use half::{bf16, f16};
 use crate::archive::{Archive, Span};
 use crate::chunk_table::locate;
 use crate::error::DataError;
+use crate::file_kind::refuse_others;
 use crate::files::replace;
 use crate::pickle::{ElementType, MAX_BYTES, Pickle, Tensor, Value};
 use crate::pickle_writer::PickleWriter;
@@ -19,11 +20,15 @@ use crate::pickle_writer::PickleWriter;
 /// Number formats that weights can be read from.
 const FLOATS: [ElementType; 4] = [ElementType::F32, ElementType::F16, ElementType::BF16, ElementType::F64];
 
+/// The dict beside the state dict in which [`write_state_dict`] puts the sizes of a network.
+const SIZES: &str = "clift";
+
 /// An open checkpoint. Tensors stay in the file.
 pub struct StateDict {
     path: PathBuf,
     archive: Archive,
     tensors: BTreeMap<String, Option<Tensor>>,
+    sizes: BTreeMap<String, i64>,
     passed_over: BTreeSet<String>,
     num_bytes: u64,
 }
@@ -32,10 +37,11 @@ impl StateDict {
     /// Opens a file whose outermost object is a dict with `state_dict` in it, or a state dict itself.
     ///
     /// # Errors
-    /// [`DataError::BadCheckpoint`] for a file that is truncated, no archive or without a state dict,
+    /// [`DataError::BadCheckpoint`] for a file that is truncated, something else or without a state dict,
     /// [`DataError::BadPickle`] and [`DataError::RefusedGlobal`] for a pickle that is malformed or an attack.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadCheckpoint { what, path: path.to_path_buf() };
+        refuse_others(path)?;
         let num_bytes = std::fs::metadata(path).map_err(DataError::io("opening the checkpoint", path))?.len();
         let archive = Archive::open(path).map_err(as_checkpoint)?;
         let member = archive
@@ -66,8 +72,16 @@ impl StateDict {
         if tensors.values().all(Option::is_none) {
             return Err(bad("neither it nor an entry `state_dict` in it holds tensors".into()));
         }
+        let mut sizes = BTreeMap::new();
+        if let Some(Value::Dict(items)) = pickle.item(root, SIZES) {
+            for (name, size) in items {
+                if let (Value::Str(name), Value::Int(size)) = (pickle.get(*name), pickle.get(*size)) {
+                    sizes.insert(name.clone(), *size);
+                }
+            }
+        }
         let passed_over = pickle.passed_over().clone();
-        Ok(Self { path: path.into(), archive, tensors, passed_over, num_bytes })
+        Ok(Self { path: path.into(), archive, tensors, sizes, passed_over, num_bytes })
     }
 
     /// The file.
@@ -90,32 +104,77 @@ impl StateDict {
         &self.passed_over
     }
 
+    /// A size of the network that this program wrote beside the tensors.
+    pub fn size(&self, name: &str) -> Option<i64> {
+        self.sizes.get(name).copied()
+    }
+
     /// Number format and shape of a tensor; `None` for a key that is missing or holds something else.
     pub fn tensor(&self, key: &str) -> Option<(ElementType, &[u64])> {
         let tensor = self.tensors.get(key)?.as_ref()?;
         Some((tensor.storage.element_type, &tensor.shape))
     }
 
-    /// Reads a tensor of floats, row-major, converted to f32.
+    /// Reads a tensor of floats, row-major, converted to f32. One that lies in its storage in another order, transposed
+    /// or channels-last, is put into that order.
     ///
     /// # Errors
-    /// [`DataError::BadCheckpoint`] for a key without a tensor of floats, one that is not contiguous, lies outside its
-    /// storage or holds a value that is not finite in f32.
+    /// [`DataError::BadCheckpoint`] for a key without a tensor of floats, one that is expanded, lies outside its storage
+    /// or holds a value that is not finite in f32.
     pub fn read(&self, key: &str) -> Result<Vec<f32>, DataError> {
+        let Some(Some(tensor)) = self.tensors.get(key) else {
+            let what = format!("{}: no tensor", key.escape_debug());
+            return Err(DataError::BadCheckpoint { what, path: self.path.clone() });
+        };
         let bad = |what: String| {
-            let what = format!("{}: {what}", key.escape_debug());
+            let what = format!("{} {:?}: {what}", key.escape_debug(), tensor.shape);
             DataError::BadCheckpoint { what, path: self.path.clone() }
         };
-        let Some(Some(tensor)) = self.tensors.get(key) else { return Err(bad("no tensor".into())) };
-        let shape: Vec<Option<u64>> = tensor.shape.iter().map(|size| Some(*size)).collect();
-        let value = Value::Tensor(Box::new(tensor.clone()));
+        // Of a tensor in another order, all from its first element to its last.
+        let is_contiguous = tensor.is_contiguous();
+        let stored = if is_contiguous { tensor.clone() } else { span_of(tensor).map_err(bad)? };
+        let shape: Vec<Option<u64>> = stored.shape.iter().map(|size| Some(*size)).collect();
+        let value = Value::Tensor(Box::new(stored));
         let (span, element_type): (Span, ElementType) = locate(&value, &shape, &FLOATS, &self.archive).map_err(bad)?;
-        let values = to_f32(&span.read(&self.path).map_err(as_checkpoint)?, element_type);
+        let bytes = span.read(&self.path).map_err(|error| match error {
+            DataError::BadChunk { what, .. } => bad(what),
+            other => as_checkpoint(other),
+        })?;
+        let mut values = to_f32(&bytes, element_type);
+        if !is_contiguous {
+            values = in_order(&values, &tensor.shape, &tensor.stride);
+        }
         match values.iter().position(|value| !value.is_finite()) {
             Some(position) => Err(bad(format!("value {position} is {}", values[position]))),
             None => Ok(values),
         }
     }
+}
+
+/// The stretch of storage that a tensor lies in, as a tensor of one dimension.
+fn span_of(tensor: &Tensor) -> Result<Tensor, String> {
+    let Tensor { shape, stride, .. } = tensor;
+    let length = shape.iter().zip(stride).try_fold(1_u64, |length, (&size, &stride)| {
+        // An empty tensor is contiguous, or reads one element here.
+        length.checked_add(size.saturating_sub(1).checked_mul(stride)?)
+    });
+    let count = shape.iter().try_fold(1_u64, |count, &size| count.checked_mul(size));
+    // Its elements may not overlap: a small file could claim any number of them.
+    let is_held = length.zip(count).is_some_and(|(length, count)| count <= length);
+    let (Some(length), true) = (length, is_held) else {
+        return Err(format!("stride is {stride:?}: an expanded tensor; save it as tensor.contiguous()"));
+    };
+    Ok(Tensor { shape: vec![length], stride: vec![1], ..tensor.clone() })
+}
+
+/// The elements of a tensor of these strides, row-major.
+fn in_order(stored: &[f32], shape: &[u64], stride: &[u64]) -> Vec<f32> {
+    let mut places = vec![0_usize];
+    for (&size, &stride) in shape.iter().zip(stride) {
+        let next = |&place: &usize| (0..size as usize).map(move |i| place + i * stride as usize);
+        places = places.iter().flat_map(next).collect();
+    }
+    places.into_iter().map(|place| stored[place]).collect()
 }
 
 fn to_f32(bytes: &[u8], element_type: ElementType) -> Vec<f32> {
@@ -136,20 +195,34 @@ fn as_checkpoint(error: DataError) -> DataError {
     }
 }
 
-/// Writes `{"state_dict": {key: tensor}}` in f32 so that `torch.load(path, weights_only=True)` reads it.
+/// Writes `{"state_dict": {key: tensor}, "clift": {name: size}}` in f32 so that `torch.load(path, weights_only=True)`
+/// reads it; without sizes, without the second.
 ///
 /// # Errors
 /// [`DataError::Io`]; the file is then as it was.
-pub fn write_state_dict(path: &Path, tensors: &[(String, Vec<usize>, Vec<f32>)]) -> Result<(), DataError> {
+pub fn write_state_dict(
+    path: &Path,
+    tensors: &[(String, Vec<usize>, Vec<f32>)],
+    sizes: &[(&str, usize)],
+) -> Result<(), DataError> {
     let mut pickle = PickleWriter::new();
-    pickle.raw(b"}");
+    pickle.raw(b"}(");
+    if !sizes.is_empty() {
+        pickle.string(SIZES);
+        pickle.raw(b"}(");
+        for (name, size) in sizes {
+            pickle.string(name);
+            pickle.integer(*size);
+        }
+        pickle.raw(b"u");
+    }
     pickle.string("state_dict");
     pickle.raw(b"}(");
     for (key, shape, values) in tensors {
         pickle.string(key);
         pickle.tensor("FloatStorage", values.iter().flat_map(|value| value.to_le_bytes()).collect(), shape);
     }
-    pickle.raw(b"us.");
+    pickle.raw(b"uu.");
     let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
     let bytes = pickle.pack(&prefix).map_err(|error| DataError::io("packing a checkpoint", path)(error.into()))?;
     replace(path, &bytes).map_err(DataError::io("writing a checkpoint", path))
@@ -199,9 +272,10 @@ mod tests {
         let path = folder.path().join("a.ckpt");
         let tensors =
             [("x.y".to_owned(), vec![2, 3], vec![1.0, -2.0, 3.5, 0.0, 1e-30, 5.0]), ("z".into(), vec![1], vec![7.0])];
-        write_state_dict(&path, &tensors).unwrap();
+        write_state_dict(&path, &tensors, &[("num_heads", 3)]).unwrap();
         let state = StateDict::open(&path).unwrap();
         assert_eq!(state.keys().collect::<Vec<_>>(), ["x.y", "z"]);
+        assert_eq!((state.size("num_heads"), state.size("dim")), (Some(3), None));
         for (key, shape, values) in tensors {
             let shape: Vec<u64> = shape.into_iter().map(|size| size as u64).collect();
             assert_eq!(state.tensor(&key), Some((ElementType::F32, &shape[..])));
@@ -213,9 +287,9 @@ mod tests {
     fn values_that_are_not_finite_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ckpt");
-        write_state_dict(&path, &[("x".into(), vec![2], vec![1.0, f32::NAN])]).unwrap();
+        write_state_dict(&path, &[("x".into(), vec![2], vec![1.0, f32::NAN])], &[]).unwrap();
         let message = StateDict::open(&path).unwrap().read("x").unwrap_err().to_string();
-        assert!(message.starts_with("bad checkpoint: x: value 1 is NaN: "), "{message}");
+        assert!(message.starts_with("bad checkpoint: x [2]: value 1 is NaN: "), "{message}");
     }
 
     #[test]
@@ -264,6 +338,35 @@ mod tests {
             let pickle = [b"}X\x05\0\0\0hyperc", name.as_bytes(), b"\nX\x02\0\0\0ls\x85Rs."].concat();
             let message = refused(&pickle);
             assert!(message.contains(&name.replace('\n', ".")) && message.contains("nothing was run"), "{message}");
+        }
+    }
+
+    /// A checkpoint with a tensor `x` of 0, 1, 2, .. in these shapes and strides.
+    fn strided(shape: &[usize], stride: &[usize]) -> Result<Vec<f32>, String> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.ckpt");
+        let mut pickle = PickleWriter::new();
+        pickle.raw(b"}");
+        pickle.string("x");
+        let storage = (0..24_u8).flat_map(|value| f32::from(value).to_le_bytes()).collect();
+        pickle.strided_tensor("FloatStorage", storage, shape, stride);
+        pickle.raw(b"s.");
+        std::fs::write(&path, pickle.pack("a").unwrap()).unwrap();
+        StateDict::open(&path).unwrap().read("x").map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn tensors_in_another_order_are_put_into_theirs() {
+        assert_eq!(strided(&[2, 3], &[1, 2]), Ok(vec![0.0, 2.0, 4.0, 1.0, 3.0, 5.0]));
+        // Channels-last, of two pixels.
+        assert_eq!(strided(&[1, 3, 2, 1], &[6, 1, 3, 3]), Ok(vec![0.0, 3.0, 1.0, 4.0, 2.0, 5.0]));
+        assert_eq!(strided(&[2, 2], &[12, 3]), Ok(vec![0.0, 3.0, 12.0, 15.0]), "a part of a larger one");
+        for (shape, stride) in [([4, 7], [1, 4]), ([2, 1 << 61], [1, 2]), ([3, 3], [1, 1 << 62])] {
+            let message = strided(&shape, &stride).unwrap_err();
+            assert!(message.starts_with("bad checkpoint: x [") && message.contains("exceeds its storage"), "{message}");
+        }
+        for (shape, stride) in [([1 << 40, 2], [0, 1]), ([4, 4], [1, 1])] {
+            assert!(strided(&shape, &stride).unwrap_err().contains("tensor.contiguous()"));
         }
     }
 

@@ -6,7 +6,11 @@
 
 use std::ops::Range;
 
-use crate::{CondenserConfig, ModelConfig, Variant};
+use crate::ModelConfig;
+
+mod sizes;
+
+pub use sizes::{Sizes, sizes};
 
 /// Below which prefix a training program's checkpoint keeps the network.
 pub const PREFIX: &str = "transformer.";
@@ -174,50 +178,6 @@ impl Tensors<'_> {
     }
 }
 
-/// Reads a network's sizes off the keys and shapes of a checkpoint, and whether it has a condenser. What a damaged
-/// checkpoint does not show has the published size: comparing with [`tensors`] then names what is missing.
-///
-/// `num_heads` is asked for because no shape shows it, but for the variant that normalises heads.
-pub fn sizes<'a>(
-    variant: Variant,
-    num_heads: Option<usize>,
-    keys: impl Iterator<Item = &'a str>,
-    shape: impl Fn(&str) -> Option<Vec<u64>>,
-) -> (ModelConfig, bool) {
-    let mut config = ModelConfig { variant, condenser: CondenserConfig::of(variant), ..ModelConfig::default() };
-    let size = |key: &str, dimension: usize| {
-        let shape = shape(key)?;
-        usize::try_from(*shape.get(dimension)?).ok()
-    };
-    let dims = [size("output_norm.weight", 0), size("linear_input.weight", 0), size("linear_target.weight", 0)];
-    config.dim = dims.into_iter().flatten().next().unwrap_or(config.dim);
-    let patch = size("linear_input.weight", 1).map(|values| (values as f64 / 9.0).sqrt().round() as usize);
-    config.patch_size = patch.unwrap_or(config.patch_size);
-    let hidden = [size("encoder.layers.0.linear1.weight", 0), size("decoder.layers.0.linear1.weight", 0)];
-    config.feed_forward_dim = hidden.into_iter().flatten().next().unwrap_or(config.feed_forward_dim);
-
-    let (mut layers, mut has_condenser) = ([None; 3], false);
-    for key in keys {
-        for (prefix, most) in ["encoder.layers.", "decoder.layers.", "squeezer.blocks."].iter().zip(&mut layers) {
-            let number = key.strip_prefix(prefix).and_then(|rest| rest.split('.').next()?.parse::<usize>().ok());
-            *most = (*most).max(number.map(|number| number.saturating_add(1)));
-        }
-        has_condenser |= key.starts_with("squeezer.");
-    }
-    let [encoder, renderer, condenser] = layers;
-    config.num_encoder_blocks = encoder.unwrap_or(config.num_encoder_blocks);
-    config.num_renderer_blocks = renderer.unwrap_or(config.num_renderer_blocks);
-    if variant == Variant::Paper {
-        config.condenser.num_blocks = condenser.unwrap_or(config.condenser.num_blocks);
-        config.condenser.residual = !has_condenser || shape("squeezer.blocks.0.norm_cross.weight").is_some();
-    }
-    let head_width = ["encoder", "decoder"].map(|part| size(&format!("{part}.layers.0.self_attn.q_norm.weight"), 0));
-    let shown = head_width.into_iter().flatten().find(|width| *width > 0 && config.dim.is_multiple_of(*width));
-    let shown = shown.filter(|_| variant.has_norms()).map(|width| config.dim / width);
-    config.num_heads = num_heads.or(shown).unwrap_or(config.num_heads);
-    (config, has_condenser)
-}
-
 /// A key as this module writes it: without what a compiled or distributed model adds to names, and with one name for
 /// the norms of queries and keys, whose name in published checkpoints is not known.
 pub fn plain_key(key: &str) -> String {
@@ -249,7 +209,7 @@ mod tests {
     use burn::tensor::Device;
 
     use super::*;
-    use crate::{Clift, weights};
+    use crate::{Clift, CondenserConfig, Variant, weights};
 
     fn config(variant: Variant) -> ModelConfig {
         ModelConfig {
@@ -291,22 +251,6 @@ mod tests {
                     assert_eq!(next, tensor.shape[0], "{}", tensor.key);
                 }
                 assert!(expected.is_empty(), "{variant}: {:?}", expected.keys());
-            }
-        }
-    }
-
-    #[test]
-    fn sizes_are_read_off_shapes() {
-        for variant in Variant::ALL {
-            for with_condenser in [true, false] {
-                let config = config(variant);
-                let all: BTreeMap<String, Vec<u64>> = tensors(&config, with_condenser)
-                    .into_iter()
-                    .map(|tensor| (tensor.key, tensor.shape.iter().map(|&size| size as u64).collect()))
-                    .collect();
-                let heads = (!variant.has_norms()).then_some(3);
-                let read = sizes(variant, heads, all.keys().map(String::as_str), |key| all.get(key).cloned());
-                assert_eq!(read, (config, with_condenser));
             }
         }
     }

@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs::File;
-use std::io::{ErrorKind, Read, Seek, SeekFrom, Write};
+use std::io::{Cursor, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use burn::module::{Module, ModuleVisitor, Param};
-use burn::store::{BurnToPyTorchAdapter, ModuleSnapshot, PyTorchToBurnAdapter, SafetensorsStore};
+use burn::store::{ApplyError, BurnToPyTorchAdapter, ModuleSnapshot, PyTorchToBurnAdapter, SafetensorsStore};
 use burn::tensor::{DType, Tensor, TensorData};
 use sha2::{Digest, Sha256};
 
@@ -79,7 +79,7 @@ fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
 
 /// Writes a safetensors header anew with its keys sorted: Burn's store orders them at random, file by file. The
 /// tensors' bytes stay where they are.
-fn sort_header(file: &mut File) -> std::io::Result<()> {
+fn sort_header(file: &mut (impl Read + Write + Seek)) -> std::io::Result<()> {
     let mut length = [0; 8];
     file.read_exact(&mut length)?;
     let length = u64::from_le_bytes(length);
@@ -93,6 +93,15 @@ fn sort_header(file: &mut File) -> std::io::Result<()> {
     sorted.resize(header.len(), b' ');
     file.seek(SeekFrom::Start(8))?;
     file.write_all(&sorted)
+}
+
+/// Sorts the header of a safetensors file that is still in memory.
+///
+/// # Errors
+/// For bytes that are no safetensors file.
+pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
+    sort_header(&mut Cursor::new(&mut bytes[..]))?;
+    Ok(bytes)
 }
 
 /// Makes the name of a file survive a power cut, where the system lets a folder be synced.
@@ -121,7 +130,7 @@ pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError
         SafetensorsStore::from_file(path).with_from_adapter(PyTorchToBurnAdapter).validate(false).allow_partial(true);
     let result = module.load_from(&mut store).map_err(|e| error(e.to_string()))?;
     if let Some(first) = result.errors.first() {
-        return Err(error(first.to_string()));
+        return Err(error(told(first)));
     }
     if let Some((name, dtype)) = first_not_f32(module) {
         return Err(error(format!("{name} is {dtype:?}, not F32")));
@@ -129,8 +138,30 @@ pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError
     if let Some(name) = first_non_finite(module) {
         return Err(error(format!("{name} is not finite")));
     }
-    let missing = result.missing.into_iter().map(|(name, _)| name).collect();
+    let missing = result.missing.iter().map(|(name, _)| name_in_file(name)).collect();
     Ok(Loaded { applied: result.applied, missing, unused: result.unused })
+}
+
+/// The name that a parameter of a module has in a file: Burn calls those of norms otherwise.
+fn name_in_file(path: &str) -> String {
+    for (here, there) in [(".gamma", ".weight"), (".beta", ".bias")] {
+        if let Some(module) = path.strip_suffix(here) {
+            return format!("{module}{there}");
+        }
+    }
+    path.to_owned()
+}
+
+/// Why a tensor was not taken, with shapes as files hold them: Burn keeps the weights of linear layers, which are all
+/// matrices there are, as `[inputs, outputs]`.
+fn told(error: &ApplyError) -> String {
+    let ApplyError::ShapeMismatch { path, expected, found } = error else { return error.to_string() };
+    let [expected, found] = [expected, found].map(|shape| {
+        let mut sizes = shape.to_vec();
+        sizes.reverse(); // of a vector, nothing
+        sizes
+    });
+    format!("{} is {found:?}, expected {expected:?}", name_in_file(path))
 }
 
 /// Hash of all parameters of a module: their paths, shapes and values, as 64 hexadecimal digits.
@@ -258,6 +289,35 @@ mod tests {
         let metadata = header.metadata().as_ref().expect("there");
         assert!(metadata.len() >= 2 && metadata["format"] == "clift-1", "{metadata:?}");
         assert_eq!(std::fs::read_dir(directory.path()).expect("a folder").count(), 4, "nothing else is left");
+    }
+
+    #[test]
+    fn names_and_shapes_in_messages_are_those_of_the_file() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("model.safetensors");
+        save(&model(1).encoder, &path).expect("writes");
+        let missing = load(&mut model(2), &path).expect("nothing fits, nothing breaks").missing;
+        assert!(missing.iter().any(|name| name == "renderer.output_norm.weight"), "{missing:?}");
+        assert!(!missing.iter().any(|name| name.contains(".gamma") || name.contains(".beta")), "{missing:?}");
+
+        save(&model(1), &path).expect("writes");
+        let config = ModelConfig {
+            dim: 16,
+            num_heads: 2,
+            feed_forward_dim: 20,
+            num_encoder_blocks: 1,
+            num_renderer_blocks: 1,
+            ..ModelConfig::default()
+        };
+        let mut narrow = Clift::new(&config, 0, &Device::flex());
+        let message = load(&mut narrow, &path).unwrap_err().to_string();
+        let file = std::fs::read(&path).expect("reads");
+        let file = safetensors::SafeTensors::deserialize(&file).expect("valid");
+        let name = file.names().into_iter().find(|name| message.contains(&format!("{name} is "))).expect("its name");
+        let got = format!("{name} is {:?}, expected ", file.tensor(name).expect("there").shape());
+        assert!(message.contains(&got), "{got}\nis not in\n{message}");
+        let shapes = ["is [24], expected [20]", "is [24, 16], expected [20, 16]", "is [16, 24], expected [16, 20]"];
+        assert!(shapes.iter().any(|shapes| message.contains(shapes)), "{message}");
     }
 
     #[test]

@@ -1,10 +1,11 @@
 //! A model to a file under the names of published checkpoints, for PyTorch.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use clift_data::files::replace;
 use clift_data::write_state_dict;
+use clift_model::ModelConfig;
 use clift_model::interchange::{self, CONVOLUTIONS, PREFIX};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
@@ -12,15 +13,15 @@ use safetensors::tensor::Dtype;
 use crate::TrainError;
 use crate::config::Config;
 use crate::import::Imported;
-use crate::model_dir::{Parameter, to_safetensors};
+use crate::model_dir::{Parameter, refuse_existing, to_safetensors};
 use crate::trained::ModelPath;
 
 /// What kind of file is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExportFormat {
-    /// `{"state_dict": {..}}`, which `torch.load(path, weights_only=True)` reads.
+    /// `{"state_dict": {..}, "clift": sizes}`, which `torch.load(path, weights_only=True)` reads.
     Pytorch,
-    /// The same keys in a safetensors file.
+    /// The same keys in a safetensors file, the sizes in its metadata.
     Safetensors,
 }
 
@@ -38,8 +39,10 @@ pub struct Exported {
 /// Writes a model's weights under the keys of a published checkpoint, `transformer.` before each.
 ///
 /// # Errors
-/// [`TrainError::BadFile`] for a weight file that is not the config's model, and whatever reading and writing give.
+/// [`TrainError::BadConfig`] where `out` exists, [`TrainError::BadFile`] for a weight file that is not the config's model,
+/// and whatever reading and writing give.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
+    refuse_existing(out)?;
     config.model.validate()?;
     let convolutions = match Imported::read(&model.run)? {
         Some(imported) => imported.convolutions,
@@ -75,15 +78,28 @@ pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Pa
         has_condenser,
     };
     match format {
-        ExportFormat::Pytorch => write_state_dict(out, &tensors)?,
+        ExportFormat::Pytorch => write_state_dict(out, &tensors, &sizes(&config.model))?,
         ExportFormat::Safetensors => {
             let parameters: Vec<Parameter> =
                 tensors.into_iter().map(|(path, shape, values)| Parameter { path, shape, values }).collect();
-            let bytes = to_safetensors(&parameters, out)?;
+            let said = sizes(&config.model).map(|(name, size)| (name.to_owned(), size.to_string()));
+            let bytes = to_safetensors(&parameters, HashMap::from(said), out)?;
             replace(out, &bytes).map_err(TrainError::io("writing the weights", out))?;
         }
     }
     Ok(exported)
+}
+
+/// What is said beside the tensors: no shape shows the heads.
+fn sizes(model: &ModelConfig) -> [(&'static str, usize); 6] {
+    [
+        ("dim", model.dim),
+        ("num_heads", model.num_heads),
+        ("feed_forward_dim", model.feed_forward_dim),
+        ("num_encoder_blocks", model.num_encoder_blocks),
+        ("num_renderer_blocks", model.num_renderer_blocks),
+        ("patch_size", model.patch_size),
+    ]
 }
 
 /// The parameters of a weight file by path.

@@ -1,39 +1,37 @@
 //! A published checkpoint to a model directory: weights, config, and what came from where.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use clift_data::StateDict;
 use clift_data::pickle::ElementType;
-use clift_model::interchange::{self, CheckpointTensor, PREFIX, PROJECTIONS, plain_key};
-use clift_model::{ModelConfig, Variant};
+use clift_model::Variant;
+use clift_model::interchange::{self, CheckpointTensor, PROJECTIONS, Sizes};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 use crate::config::Config;
-use crate::keys::nearest;
 use crate::model_dir::{self, Parameter};
 
-/// Keys of one kind that a message lists.
-const MAX_LISTED: usize = 12;
+mod keys;
+mod problems;
+
+use keys::Keys;
+
 /// Letters of a key that a message shows.
 const MAX_SHOWN: usize = 160;
-/// Keys that are looked through for the nearest.
-const MAX_COMPARED: usize = 1000;
-/// Kinds of keys outside the network that are told apart.
-const MAX_IGNORED: usize = 64;
 
 /// What the user says about a checkpoint.
 #[derive(Clone, Debug)]
 pub struct ImportOptions {
     /// Which network it holds.
     pub variant: Variant,
-    /// Its heads, where no shape shows them.
+    /// Its heads, where neither a shape nor the file says them.
     pub num_heads: Option<usize>,
     /// Whether parameters that are not in f32 are converted to it; they are an error otherwise.
     pub convert: bool,
-    /// Texts that are replaced in keys: `(from, to)`.
+    /// Texts that are replaced in keys as the file has them, in this order: `(from, to)`.
     pub renames: Vec<(String, String)>,
 }
 
@@ -56,8 +54,11 @@ pub struct Imported {
     pub num_converted: usize,
     /// Keys of the checkpoint, each with the parameters it became.
     pub parameters: Vec<(String, Vec<String>)>,
-    /// First parts of keys that are no part of the network, each with how many keys there are.
+    /// First parts of keys that are known to be no part of the network, each with how many keys there are.
     pub ignored: BTreeMap<String, usize>,
+    /// Keys that are neither that nor the network's, with `N` for numbers, each with how many there are.
+    #[serde(default)]
+    pub outside: BTreeMap<String, usize>,
     /// Python classes and functions that were passed over, with the objects made of them.
     pub passed_over: BTreeSet<String>,
 }
@@ -66,17 +67,26 @@ pub struct Imported {
 ///
 /// # Errors
 /// [`TrainError::BadFile`] where keys, shapes or number formats are not the network's, with all of them;
-/// [`TrainError::BadConfig`] for heads that cannot be; whatever reading the file or writing the directory gives.
-pub fn import(file: &Path, out: &Path, options: &ImportOptions) -> Result<(Config, Imported), TrainError> {
+/// [`TrainError::BadConfig`] for heads that cannot be and renames of nothing; [`TrainError::Abandoned`] once `stop`
+/// is set; whatever reading the file or writing the directory gives.
+pub fn import(
+    file: &Path,
+    out: &Path,
+    options: &ImportOptions,
+    stop: &AtomicBool,
+) -> Result<(Config, Imported), TrainError> {
     model_dir::refuse_existing(out)?;
     let state = StateDict::open(file)?;
     let keys = Keys::of(&state, options)?;
-    let (model, has_condenser) = keys.sizes(&state, options.variant, options.num_heads);
-    check_sizes(&model, options, file)?;
+    let options = &ImportOptions { num_heads: num_heads(&state, options)?, ..options.clone() };
+    let sizes = keys.sizes(&state, options.variant, options.num_heads);
+    check_sizes(&sizes, &keys, &state)?;
+    let Sizes { config: model, has_condenser, .. } = sizes;
     let expected = interchange::tensors(&model, has_condenser);
-    let problems = keys.problems(&state, &expected, options.convert);
+    let problems = problems::problems(&keys, &state, &expected, options);
     if !problems.is_empty() {
-        return Err(TrainError::bad_file("checkpoint", file)(keys.told(&state, problems, &model, options)));
+        let told = problems::told(&keys, &state, &problems, &model, options);
+        return Err(TrainError::bad_file("checkpoint", file)(told));
     }
 
     let num_bytes: u64 = expected.iter().map(|tensor| 4 * tensor.shape.iter().product::<usize>() as u64).sum();
@@ -87,6 +97,7 @@ pub fn import(file: &Path, out: &Path, options: &ImportOptions) -> Result<(Confi
     }
     let (mut parameters, mut mapping, mut convolutions, mut num_converted) = (vec![], vec![], vec![], 0);
     for tensor in &expected {
+        go_on(stop)?;
         let key = &keys.network[&tensor.key];
         let values = state.read(key)?;
         let (element_type, shape) = state.tensor(key).unwrap_or((ElementType::F32, &[]));
@@ -107,20 +118,47 @@ pub fn import(file: &Path, out: &Path, options: &ImportOptions) -> Result<(Confi
         num_converted,
         parameters: mapping,
         ignored: keys.ignored,
+        outside: keys.outside,
         passed_over: state.passed_over().clone(),
     };
     let config = model_dir::evaluation_config(model, out);
-    model_dir::write(out, &config, &parameters, &imported)?;
+    model_dir::write(out, &config, &parameters, &imported, stop)?;
     Ok((config, imported))
 }
 
-/// A key that no shape shows must be right before anything else can be said.
-fn check_sizes(model: &ModelConfig, options: &ImportOptions, file: &Path) -> Result<(), TrainError> {
+/// Stops where the user has asked for it.
+pub(crate) fn go_on(stop: &AtomicBool) -> Result<(), TrainError> {
+    if stop.load(Ordering::SeqCst) { Err(TrainError::Abandoned { work: "the import".into() }) } else { Ok(()) }
+}
+
+/// The heads that are given, or those that an export of this program says it has.
+fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>, TrainError> {
+    let said = state.size("num_heads").and_then(|size| usize::try_from(size).ok());
+    match (options.num_heads, said) {
+        (Some(given), Some(said)) if given != said => {
+            let fix = format!("the checkpoint says it has {said}: leave the option out: {}", state.path().display());
+            Err(TrainError::BadConfig { key: "--num-heads".into(), value: given.to_string(), fix })
+        }
+        (given, said) => Ok(given.or(said)),
+    }
+}
+
+/// What no shape shows must be right before anything else can be said.
+fn check_sizes(sizes: &Sizes, keys: &Keys, state: &StateDict) -> Result<(), TrainError> {
+    let Sizes { config: model, knows_heads, width_key, .. } = sizes;
+    let file = state.path();
     let num_heads = model.num_heads;
-    if num_heads == 0 || !model.dim.is_multiple_of(num_heads) {
-        let given = options.num_heads.map_or_else(|| format!("{num_heads} (the published)"), |heads| heads.to_string());
-        let fix = format!("give the heads of this network, a divisor of its width {}", model.dim);
-        return Err(TrainError::BadConfig { key: "--num-heads".into(), value: given, fix });
+    if !knows_heads || num_heads == 0 || !model.dim.is_multiple_of(num_heads) {
+        let key = width_key.as_ref().map(|key| &keys.network[key]);
+        let from = key.and_then(|key| state.tensor(key).map(|(_, shape)| format!(" ({} is {shape:?})", shown(key))));
+        let (dim, from, file) = (model.dim, from.unwrap_or_default(), file.display());
+        let (value, why) = if *knows_heads {
+            (num_heads.to_string(), "")
+        } else {
+            ("not given".into(), "no shape shows them, and width 768 alone is published, with 8: ")
+        };
+        let fix = format!("{why}give the heads of this network, a divisor of its width {dim}{from}: {file}");
+        return Err(TrainError::BadConfig { key: "--num-heads".into(), value, fix });
     }
     let bad_sizes = |error: clift_model::ModelError| TrainError::bad_file("checkpoint", file)(error);
     model.validate().map_err(bad_sizes)
@@ -137,65 +175,14 @@ fn parts<'a>(tensor: &'a CheckpointTensor, values: &'a [f32]) -> impl Iterator<I
     })
 }
 
-/// The keys of a checkpoint.
-struct Keys {
-    /// Those of the network: as `interchange` writes them, and as the file does.
-    network: BTreeMap<String, String>,
-    /// First parts of the others, and how many of them there are.
-    ignored: BTreeMap<String, usize>,
+/// Whether a part of a key is the number of a layer.
+fn is_number(part: &str) -> bool {
+    !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit())
 }
 
-/// What is wrong with one key.
-enum Problem {
-    Missing(CheckpointTensor),
-    Unknown(String),
-    Shape { key: String, got: Vec<u64>, expected: Vec<usize> },
-    Format { key: String, got: ElementType, shape: Vec<u64>, is_convertible: bool },
-    NoTensor(String),
-}
-
-impl Problem {
-    fn kind(&self) -> &'static str {
-        match self {
-            Self::Missing(_) => "missing",
-            Self::Unknown(_) => "unknown",
-            Self::Shape { .. } => "misshapen",
-            Self::Format { .. } => "not in f32",
-            Self::NoTensor(_) => "no tensor",
-        }
-    }
-
-    fn told(&self, state: &StateDict, missing: &[&str], unknown: &[&str]) -> String {
-        match self {
-            Self::Missing(tensor) => format!("{} {:?}{}", tensor.key, tensor.shape, near(&tensor.key, unknown)),
-            Self::Unknown(key) => {
-                let shape = state.tensor(key).map_or_else(String::new, |(_, shape)| format!(" {shape:?}"));
-                format!("{}{shape}{}", shown(key), near(plain(key), missing))
-            }
-            Self::Shape { key, got, expected } => format!("{} is {got:?}, expected {expected:?}", shown(key)),
-            Self::Format { key, got, shape, is_convertible } => {
-                let fix = if *is_convertible { "; --convert converts it to f32" } else { "" };
-                format!("{} {shape:?} is {got:?}{fix}", shown(key))
-            }
-            Self::NoTensor(key) => shown(key),
-        }
-    }
-}
-
-/// The candidate that a word may be a slip of. Only so many words and letters are compared: a file decides how many
-/// there are.
-fn near(word: &str, candidates: &[&str]) -> String {
-    let short = |word: &&str| word.len() <= MAX_SHOWN;
-    let found = Some(word).filter(short).and_then(|word| {
-        let candidates = candidates.iter().copied().filter(short).take(MAX_COMPARED);
-        nearest(word, candidates)
-    });
-    found.map_or_else(String::new, |name| format!("; nearest name: {}", shown(name)))
-}
-
-/// A key without the network's prefix.
-fn plain(key: &str) -> &str {
-    key.strip_prefix(PREFIX).unwrap_or(key)
+/// A key with `N` for every number in it.
+fn pattern(key: &str) -> String {
+    key.split('.').map(|part| if is_number(part) { "N" } else { part }).collect::<Vec<_>>().join(".")
 }
 
 /// A key of a file that may be hostile, for a terminal.
@@ -203,108 +190,6 @@ fn shown(key: &str) -> String {
     let short: String = key.chars().take(MAX_SHOWN).collect();
     let rest = if short.len() < key.len() { ".." } else { "" };
     format!("{}{rest}", short.escape_debug())
-}
-
-impl Keys {
-    fn of(state: &StateDict, options: &ImportOptions) -> Result<Self, TrainError> {
-        // A state dict saved on its own has no prefix.
-        let prefix = if state.keys().any(|key| key.starts_with(PREFIX)) { PREFIX } else { "" };
-        let (mut network, mut ignored) = (BTreeMap::new(), BTreeMap::new());
-        for key in state.keys() {
-            let Some(name) = key.strip_prefix(prefix).filter(|_| !key.starts_with(interchange::PERCEPTUAL_PREFIX))
-            else {
-                let first = shown(key.split('.').next().unwrap_or_default());
-                let is_known = ignored.contains_key(&first) || ignored.len() < MAX_IGNORED;
-                *ignored.entry(if is_known { first } else { "others".into() }).or_insert(0) += 1;
-                continue;
-            };
-            let renamed = options.renames.iter().fold(name.to_owned(), |name, (from, to)| name.replace(from, to));
-            if let Some(other) = network.insert(plain_key(&renamed), key.to_owned()) {
-                let (other, key, name) = (shown(&other), shown(key), shown(&plain_key(&renamed)));
-                let reason = format!("{other} and {key} are both {name}");
-                return Err(TrainError::bad_file("checkpoint", state.path())(reason));
-            }
-        }
-        Ok(Self { network, ignored })
-    }
-
-    fn sizes(&self, state: &StateDict, variant: Variant, num_heads: Option<usize>) -> (ModelConfig, bool) {
-        let shape = |name: &str| state.tensor(self.network.get(name)?).map(|(_, shape)| shape.to_vec());
-        interchange::sizes(variant, num_heads, self.network.keys().map(String::as_str), shape)
-    }
-
-    fn problems(&self, state: &StateDict, expected: &[CheckpointTensor], convert: bool) -> Vec<Problem> {
-        let mut problems = Vec::new();
-        let mut known = BTreeSet::new();
-        for tensor in expected {
-            known.insert(tensor.key.as_str());
-            let Some(key) = self.network.get(&tensor.key) else {
-                problems.push(Problem::Missing(tensor.clone()));
-                continue;
-            };
-            let Some((got, shape)) = state.tensor(key) else {
-                problems.push(Problem::NoTensor(key.clone()));
-                continue;
-            };
-            let is_convertible = matches!(got, ElementType::F16 | ElementType::BF16 | ElementType::F64);
-            if !tensor.fits(shape) {
-                let (key, got, expected) = (key.clone(), shape.to_vec(), tensor.shape.clone());
-                problems.push(Problem::Shape { key, got, expected });
-            } else if got != ElementType::F32 && !(convert && is_convertible) {
-                problems.push(Problem::Format { key: key.clone(), got, shape: shape.to_vec(), is_convertible });
-            }
-        }
-        let unknown = self.network.iter().filter(|(name, _)| !known.contains(name.as_str()));
-        problems.extend(unknown.map(|(_, key)| Problem::Unknown(key.clone())));
-        problems
-    }
-
-    /// All that is wrong, for people.
-    fn told(&self, state: &StateDict, problems: Vec<Problem>, model: &ModelConfig, options: &ImportOptions) -> String {
-        let ModelConfig { variant, dim, num_heads, num_encoder_blocks, num_renderer_blocks, .. } = model;
-        let mut text = format!(
-            "it does not hold a {variant} network (width {dim}, {num_heads} heads, {num_encoder_blocks} + \
-             {num_renderer_blocks} layers); nothing was written"
-        );
-        let missing: Vec<&str> = problems
-            .iter()
-            .filter_map(|problem| match problem {
-                Problem::Missing(tensor) => Some(tensor.key.as_str()),
-                _ => None,
-            })
-            .collect();
-        let unknown: Vec<&str> = problems
-            .iter()
-            .filter_map(|problem| match problem {
-                Problem::Unknown(key) => Some(plain(key)),
-                _ => None,
-            })
-            .collect();
-        let mut listed = BTreeMap::new();
-        for problem in &problems {
-            let kind = problem.kind();
-            let count = listed.entry(kind).or_insert(0_usize);
-            *count += 1;
-            if *count <= MAX_LISTED {
-                let _ = write!(text, "\n  {kind}: {}", problem.told(state, &missing, &unknown));
-            }
-        }
-        for (kind, count) in listed.into_iter().filter(|(_, count)| *count > MAX_LISTED) {
-            let _ = write!(text, "\n  {kind}: {} more", count - MAX_LISTED);
-        }
-        let fitting = Variant::ALL.into_iter().filter(|other| *other != options.variant).find(|other| {
-            let (model, has_condenser) = self.sizes(state, *other, options.num_heads);
-            let fits = model.validate().is_ok();
-            fits && self.problems(state, &interchange::tensors(&model, has_condenser), true).is_empty()
-        });
-        if let Some(other) = fitting {
-            let _ = write!(text, "\n  its keys and shapes are those of --variant {other}");
-        } else if !unknown.is_empty() && !missing.is_empty() {
-            let _ = write!(text, "\n  --rename FROM=TO replaces a part of its keys");
-        }
-        text.push_str("\n ");
-        text
-    }
 }
 
 impl Imported {

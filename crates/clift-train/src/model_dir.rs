@@ -19,9 +19,9 @@ use crate::TrainError;
 use crate::config::{Config, SourceKind};
 use crate::events::{Event, Sink};
 use crate::held_out::HeldOut;
-use crate::import::Imported;
+use crate::import::{Imported, go_on};
 use crate::scenes;
-use crate::trained::{ModelPath, Trained};
+use crate::trained::{ModelPath, Trained, check_heads};
 
 /// A parameter on the host, in PyTorch's layout.
 #[derive(Clone, Debug, PartialEq)]
@@ -55,13 +55,16 @@ pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
     config
 }
 
-/// Nothing that exists is written over.
-pub(crate) fn refuse_existing(folder: &Path) -> Result<(), TrainError> {
-    if !folder.exists() {
+/// Nothing that exists is written over, be it a link to nowhere.
+///
+/// # Errors
+/// [`TrainError::BadConfig`].
+pub fn refuse_existing(path: &Path) -> Result<(), TrainError> {
+    if path.symlink_metadata().is_err() {
         return Ok(());
     }
-    let fix = "it exists already; write the name of a directory that does not".to_owned();
-    Err(TrainError::BadConfig { key: "-o".into(), value: folder.display().to_string(), fix })
+    let fix = "it exists already, and nothing is written over; write a name that is free".to_owned();
+    Err(TrainError::BadConfig { key: "-o".into(), value: path.display().to_string(), fix })
 }
 
 /// SHA-256 of a file, as 64 hexadecimal digits.
@@ -91,12 +94,14 @@ impl Drop for Unfinished {
     }
 }
 
-/// Writes a model directory under a temporary name, reads the model back as every command does, and renames it.
+/// Writes a model directory under a temporary name, reads the model back as every command does, and renames it, unless
+/// `stop` is set before: then nothing is left.
 pub(crate) fn write(
     folder: &Path,
     config: &Config,
     parameters: &[Parameter],
     imported: &Imported,
+    stop: &AtomicBool,
 ) -> Result<(), TrainError> {
     let name = folder.file_name().ok_or_else(|| {
         let fix = "write the name of a directory".to_owned();
@@ -107,8 +112,11 @@ pub(crate) fn write(
     std::fs::create_dir_all(&temporary).map_err(TrainError::io(writing, &temporary))?;
     let temporary = Unfinished(temporary);
     let weights_path = temporary.0.join("model.safetensors");
-    replace(&weights_path, &to_safetensors(parameters, &weights_path)?)
-        .map_err(TrainError::io(writing, &weights_path))?;
+    let bytes = to_safetensors(parameters, HashMap::new(), &weights_path)?;
+    go_on(stop)?;
+    replace(&weights_path, &bytes).map_err(TrainError::io(writing, &weights_path))?;
+    drop(bytes);
+    go_on(stop)?;
     let config_path = temporary.0.join("config.toml");
     let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &config_path))?;
     replace(&config_path, text.as_bytes()).map_err(TrainError::io(writing, &config_path))?;
@@ -117,12 +125,17 @@ pub(crate) fn write(
     replace(&import_path, &text).map_err(TrainError::io(writing, &import_path))?;
 
     Trained::load(config, &weights_path)?;
+    go_on(stop)?;
     refuse_existing(folder)?;
     publish(&temporary.0, folder).map_err(TrainError::io(writing, folder))
 }
 
-/// The bytes of a safetensors file.
-pub(crate) fn to_safetensors(parameters: &[Parameter], path: &Path) -> Result<Vec<u8>, TrainError> {
+/// The bytes of a safetensors file, with what is said about it beside the format.
+pub(crate) fn to_safetensors(
+    parameters: &[Parameter],
+    mut metadata: HashMap<String, String>,
+    path: &Path,
+) -> Result<Vec<u8>, TrainError> {
     let bad = |error: safetensors::SafeTensorError| TrainError::bad_file("weight file", path)(error);
     let bytes: Vec<Vec<u8>> =
         parameters.iter().map(|p| p.values.iter().flat_map(|value| value.to_le_bytes()).collect()).collect();
@@ -131,8 +144,10 @@ pub(crate) fn to_safetensors(parameters: &[Parameter], path: &Path) -> Result<Ve
         .zip(&bytes)
         .map(|(p, bytes)| Ok((p.path.as_str(), TensorView::new(Dtype::F32, p.shape.clone(), bytes)?)))
         .collect();
-    let metadata = HashMap::from([("format".to_owned(), "clift-1".to_owned())]);
-    safetensors::serialize(views.map_err(bad)?, Some(metadata)).map_err(bad)
+    metadata.insert("format".into(), "clift-1".into());
+    let file = safetensors::serialize(views.map_err(bad)?, Some(metadata)).map_err(bad)?;
+    // Equal weights are equal files.
+    weights::sorted_header(file).map_err(TrainError::bad_file("weight file", path))
 }
 
 /// Evaluates the model of a directory, with the data and settings of `config`, and writes the results to `folder`.
@@ -142,7 +157,7 @@ pub(crate) fn to_safetensors(parameters: &[Parameter], path: &Path) -> Result<Ve
 ///
 /// # Errors
 /// [`TrainError::BadFile`] when `stage1` has another encoder, [`TrainError::BadConfig`] for variants that there are no
-/// weights for, and whatever data, models or evaluation give.
+/// weights for and heads that are not the model's, and whatever data, models or evaluation give.
 pub fn evaluate(
     mut config: Config,
     model: &ModelPath,
@@ -153,8 +168,12 @@ pub fn evaluate(
     sink: &mut dyn Sink,
 ) -> Result<Summary, TrainError> {
     config.validate()?;
+    check_heads(&config.model, &model.run)?;
     let last = Trained::load(&config, &model.weights)?;
     let first = stage1.map(|path| Trained::load(&config, &path.weights)).transpose()?;
+    if let Some(path) = stage1 {
+        check_heads(&config.model, &path.run)?;
+    }
     if let (Some(first), Some(path)) = (&first, stage1)
         && weights::hash(&first.encoder) != weights::hash(&last.encoder)
     {

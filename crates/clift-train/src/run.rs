@@ -10,7 +10,7 @@ use clift_data::files::{make_folder, remove_leftovers};
 use clift_data::{ClipReader, SceneSource, Split};
 use clift_eval::lpips::LPIPS_COMMAND;
 use clift_eval::{Condensed, Networks, Summary, System};
-use clift_model::{Clift, Encoder, weights};
+use clift_model::{Clift, Encoder, ModelConfig, weights};
 
 use crate::TrainError;
 use crate::cluster_journal::remove_journal;
@@ -25,6 +25,7 @@ use crate::scene_subset::SceneSubset;
 use crate::scenes;
 use crate::stage1::Stage1Batches;
 use crate::stage2::Stage2Batches;
+use crate::trained::{ModelPath, check_heads, refuse_checkpoint};
 use crate::trainer::{MakeBatch, StagePlan};
 
 /// What the command line adds to a config.
@@ -105,9 +106,11 @@ impl Run {
     /// Opens a run that exists, to evaluate it.
     ///
     /// # Errors
-    /// [`TrainError::BadFile`] for a damaged `run.json`, and what the device gives.
+    /// [`TrainError::BadFile`] for a damaged `run.json`, [`TrainError::BadConfig`] for other heads than those of the run,
+    /// and what the device gives.
     pub fn reopen(config: Config) -> Result<Self, TrainError> {
         config.validate()?;
+        check_heads(&config.model, &config.run_dir)?;
         let run = RunFile::read(&config.run_dir)?;
         let device = config.device.open()?;
         Ok(Self { config, overfit: run.overfit, device, lock: None })
@@ -237,7 +240,7 @@ impl Run {
         let start = |sink: &mut dyn Sink| {
             let mut model = self.new_model();
             if let Some(from) = &self.config.stage1.init_from {
-                init_from(&mut model, from, sink)?;
+                init_from(&mut model, &self.config.model, from, sink)?;
             }
             Ok(model)
         };
@@ -359,11 +362,16 @@ impl Run {
 }
 
 /// Starts from another run or a weight file, and says what was and was not loaded.
-fn init_from(model: &mut Clift, from: &Path, sink: &mut dyn Sink) -> Result<(), TrainError> {
+fn init_from(model: &mut Clift, config: &ModelConfig, from: &Path, sink: &mut dyn Sink) -> Result<(), TrainError> {
     // A run, a model directory or a weight file.
     let in_folder = ["stage1/model.safetensors", "model.safetensors"].map(|file| from.join(file));
     let [run, _] = &in_folder;
     let path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
+    refuse_checkpoint(path)?;
+    // A weight file on its own does not say its heads.
+    if let Ok(found) = ModelPath::find(path) {
+        check_heads(config, &found.run)?;
+    }
     let mut stage1 = model.stage1();
     let loaded = weights::load(&mut stage1, path)?;
     if loaded.applied.is_empty() {

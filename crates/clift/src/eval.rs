@@ -27,6 +27,12 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
         Ok(other)
     });
     let beside = beside.transpose()?;
+    if model.is_some() && config.eval.index.is_none() {
+        terminal::print_note(
+            "without --index, contexts and targets are spread evenly over each scene: this is not the published protocol, \
+             whose evaluation index names four contexts, and the figures do not compare with published ones",
+        );
+    }
     let mut sink = terminal::sink();
     let stop = crate::interrupt::flag()?;
     let summary = match &model {

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::ValueEnum;
 use clift_train::export::{ExportFormat, export};
+use clift_train::model_dir::refuse_existing;
 use clift_train::trained::ModelPath;
 use clift_train::{Config, read_config};
 
@@ -34,6 +35,7 @@ pub enum Format {
 
 /// Writes a model's weights for PyTorch.
 pub fn run(args: &ExportArgs) -> anyhow::Result<()> {
+    refuse_existing(&args.out)?;
     let model = ModelPath::find(&args.model)?;
     let (config, _) = read_config::<Config>(&model.run.join("config.toml"), &[])?;
     let format = match args.format {

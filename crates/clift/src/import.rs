@@ -19,13 +19,15 @@ pub struct ImportArgs {
     /// The model directory to write
     #[arg(long, short, value_name = "DIR")]
     pub out: PathBuf,
-    /// Attention heads, which no shape shows but in released-dl3dv [default: 8]
+    /// Attention heads [default: 8 for the published width 768]
+    ///
+    /// No shape shows them but in released-dl3dv. What `clift export` writes says them.
     #[arg(long, value_name = "COUNT")]
     pub num_heads: Option<usize>,
     /// Take parameters in f16, bf16 or f64 as well, converted to f32
     #[arg(long)]
     pub convert: bool,
-    /// Replace a part of every key, repeatedly: `--rename attn.qn=attn.q_norm`
+    /// Replace a part of every key as messages print it, repeatedly: `--rename attn.qn=attn.q_norm`
     #[arg(long, value_name = "FROM=TO", value_parser = parse_rename)]
     pub rename: Vec<(String, String)>,
 }
@@ -38,7 +40,8 @@ pub fn run(args: &ImportArgs) -> anyhow::Result<()> {
         convert: args.convert,
         renames: args.rename.clone(),
     };
-    let (config, imported) = import(&args.file, &args.out, &options)?;
+    let stop = crate::interrupt::flag()?;
+    let (config, imported) = import(&args.file, &args.out, &options, &stop)?;
     let model = &config.model;
     let mut lines: Vec<String> =
         imported.parameters.iter().map(|(key, paths)| format!("{key} -> {}", paths.join(", "))).collect();
@@ -62,6 +65,9 @@ fn told(imported: &Imported) -> Vec<String> {
     let mut lines = Vec::new();
     for (first, count) in &imported.ignored {
         lines.push(format!("not of the network: {count} keys {first}.*"));
+    }
+    for (pattern, count) in &imported.outside {
+        lines.push(format!("passed over, neither the network's nor known otherwise: {count} x {pattern}"));
     }
     if !imported.passed_over.is_empty() {
         let names: Vec<&str> = imported.passed_over.iter().map(String::as_str).collect();

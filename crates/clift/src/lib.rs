@@ -109,7 +109,8 @@ fn train_exit_code(error: &TrainError) -> u8 {
         TrainError::BadConfig { .. }
         | TrainError::OtherRun { .. }
         | TrainError::Missing { .. }
-        | TrainError::NoConfig { .. } => WRONG_USAGE,
+        | TrainError::NoConfig { .. }
+        | TrainError::NotImported { .. } => WRONG_USAGE,
         TrainError::Eval(error) => eval_exit_code(error),
         TrainError::Data(error) => data_exit_code(error),
         TrainError::Model(error) => model_exit_code(error),

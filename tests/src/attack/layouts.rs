@@ -1,6 +1,7 @@
 //! The readers of layouts with files per scene or frame, of which one is damaged, and of published checkpoints.
 
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 use clift_data::{LayoutOptions, Split, TestScenes, open_layout};
 use clift_model::Variant;
@@ -166,7 +167,7 @@ fn published_checkpoint(setup: &Setup) -> Read {
         ImportOptions { variant: Variant::ReleasedRe10k, num_heads: Some(3), convert: true, renames: Vec::new() };
     Box::new(move |bytes| {
         std::fs::write(&file, bytes).expect("a temporary folder is writable");
-        let imported = import(&file, &out, &options).map(drop).map_err(words_of);
+        let imported = import(&file, &out, &options, &AtomicBool::new(false)).map(drop).map_err(words_of);
         if imported.is_ok() {
             std::fs::remove_dir_all(&out).expect("a model was written");
         } else {

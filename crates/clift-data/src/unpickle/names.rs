@@ -22,7 +22,7 @@ pub(super) fn global(module: &str, name: &str, others: Others) -> Result<Option<
         return Err(Stop::Refused(shown(module, name)));
     }
     Ok(match (module, name) {
-        ("torch._utils", "_rebuild_parameter") => Some(Global::RebuildParameter),
+        ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state") => Some(Global::RebuildParameter),
         ("torch", "HalfStorage") => Some(Global::Storage(ElementType::F16)),
         ("torch", "BFloat16Storage") => Some(Global::Storage(ElementType::BF16)),
         _ => None,
@@ -41,10 +41,63 @@ fn is_attack(module: &str, name: &str) -> bool {
     let package = module.split('.').next().unwrap_or_default();
     match package {
         "os" | "posix" | "nt" | "subprocess" | "pty" | "commands" | "shutil" | "socket" | "runpy" | "ctypes"
-        | "webbrowser" | "importlib" => true,
+        | "webbrowser" | "importlib" | "pickle" | "_pickle" | "cPickle" | "marshal" | "timeit" | "requests"
+        | "http" | "ftplib" | "smtplib" | "pdb" | "bdb" | "profile" | "cProfile" | "trace" | "doctest" | "sys"
+        | "multiprocessing" | "asyncio" | "pip" | "pkgutil" => true,
         "builtins" | "__builtin__" => {
             matches!(name, "eval" | "exec" | "execfile" | "compile" | "open" | "__import__" | "input" | "breakpoint")
         }
+        "urllib" | "urllib2" => module != "urllib.parse",
+        // A project may have a package of this name.
+        "code" => module == "code",
+        "torch" => match module {
+            "torch" => matches!(name, "load" | "save" | "compile"),
+            "torch.serialization" => name != "_get_layout", // which a layout is pickled as
+            "torch.jit" => name == "load",
+            "torch.utils.cpp_extension" => true,
+            _ => module.starts_with("torch.hub") || module.starts_with("torch.package"),
+        },
         _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_only_an_attack_asks_for_is_told_from_what_training_programs_write() {
+        for (module, name) in [
+            ("os", "system"),
+            ("builtins", "eval"),
+            ("pickle", "loads"),
+            ("_pickle", "loads"),
+            ("timeit", "timeit"),
+            ("urllib.request", "urlopen"),
+            ("requests.api", "get"),
+            ("code", "interact"),
+            ("pdb", "run"),
+            ("sys", "exit"),
+            ("multiprocessing.util", "spawnv_passfds"),
+            ("torch", "load"),
+            ("torch.hub", "load"),
+            ("torch.serialization", "load"),
+        ] {
+            assert!(is_attack(module, name), "{module}.{name}");
+            assert!(matches!(global(module, name, Others::PassOver), Err(Stop::Refused(_))));
+        }
+        for (module, name) in [
+            ("builtins", "getattr"),
+            ("builtins", "set"),
+            ("torch", "device"),
+            ("torch.serialization", "_get_layout"),
+            ("torch.optim.lr_scheduler", "LambdaLR"),
+            ("urllib.parse", "ParseResult"),
+            ("code.config", "ModelConfig"),
+            ("osgeo.osr", "SpatialReference"),
+            ("pathlib", "PosixPath"),
+        ] {
+            assert!(!is_attack(module, name), "{module}.{name}");
+        }
     }
 }

@@ -3,6 +3,7 @@ use std::collections::BTreeMap;
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_data::write_state_dict;
 use clift_model::device::DeviceName;
+use clift_model::interchange::PREFIX;
 use clift_model::{Cameras, Clusters, SceneClusters, Views};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
@@ -12,6 +13,8 @@ use crate::export::{ExportFormat, export};
 use crate::read_config;
 use crate::trained::{ModelPath, Trained};
 
+mod keys;
+
 /// Name, variant and heads of every checkpoint that `scripts/make_checkpoints.py` wrote.
 const CHECKPOINTS: [(&str, Variant, Option<usize>); 5] = [
     ("re10k", Variant::ReleasedRe10k, Some(3)),
@@ -20,6 +23,11 @@ const CHECKPOINTS: [(&str, Variant, Option<usize>); 5] = [
     ("dl3dv_one", Variant::ReleasedDl3dv, None),
     ("paper", Variant::Paper, Some(3)),
 ];
+
+/// An import that nobody interrupts.
+fn import(file: &Path, out: &Path, options: &ImportOptions) -> Result<(Config, Imported), TrainError> {
+    super::import(file, out, options, &AtomicBool::new(false))
+}
 
 fn fixture(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/checkpoints").join(name)
@@ -147,13 +155,21 @@ fn checkpoints_of_every_variant_compute_what_the_twin_computes_and_come_back_bit
         let (original, written) = (network(&file), network(&exported));
         assert_eq!(written.keys().collect::<Vec<_>>(), original.keys().collect::<Vec<_>>(), "{name}");
         assert!(written == original, "{name}: shapes or values differ");
-        let (_, imported_again) = import(&exported, &again, &options(variant, num_heads)).unwrap();
+        // The export says its heads.
+        let (_, imported_again) = import(&exported, &again, &options(variant, None)).unwrap();
         assert_eq!(imported_again.convolutions, imported.convolutions);
         assert_computes(&again, name);
 
         let exported = place.path().join("out.safetensors");
         export(&config, &model, ExportFormat::Safetensors, &exported).unwrap();
         let bytes = std::fs::read(&exported).unwrap();
+        let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
+        let said = header.metadata().clone().unwrap();
+        assert_eq!(said["num_heads"], config.model.num_heads.to_string());
+        assert_eq!(said["dim"], config.model.dim.to_string());
+        let third = place.path().join("third.safetensors");
+        export(&config, &model, ExportFormat::Safetensors, &third).unwrap();
+        assert!(std::fs::read(&third).unwrap() == bytes, "equal weights are equal files");
         let written: BTreeMap<_, _> = SafeTensors::deserialize(&bytes)
             .unwrap()
             .tensors()
@@ -180,7 +196,7 @@ fn refusal(change: impl Fn(&mut BTreeMap<String, (Vec<usize>, Vec<f32>)>), optio
         .collect();
     change(&mut tensors);
     let tensors: Vec<_> = tensors.into_iter().map(|(key, (shape, values))| (key, shape, values)).collect();
-    write_state_dict(&file, &tensors).unwrap();
+    write_state_dict(&file, &tensors, &[]).unwrap();
     refused(&file, place.path(), options)
 }
 
@@ -204,51 +220,13 @@ fn assert_says(message: &str, parts: &[&str]) {
     }
 }
 
-#[test]
-fn missing_and_unknown_keys_are_listed_with_the_nearest_name() {
-    let message = refusal(
-        |tensors| {
-            let tensor = tensors.remove("transformer.encoder.layers.0.norm1.weight").unwrap();
-            tensors.insert("transformer.encoder.layers.0.norm_1.weight".into(), tensor);
-            tensors.insert("transformer.extra.deep.bias".into(), (vec![2], vec![0.0; 2]));
-        },
-        &re10k(),
-    );
-    assert_says(
-        &message,
-        &[
-            "it does not hold a released-re10k network (width 15, 3 heads, 1 + 2 layers); nothing was written",
-            "missing: encoder.layers.0.norm1.weight [15]; nearest name: encoder.layers.0.norm_1.weight",
-            "unknown: transformer.encoder.layers.0.norm_1.weight [15]; nearest name: encoder.layers.0.norm1.weight",
-            "unknown: transformer.extra.deep.bias [2]",
-            "--rename FROM=TO",
-        ],
-    );
-    // A whole layer that is left out in the middle is missing, not a smaller network.
-    let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("decoder.layers.0")), &re10k());
-    assert_says(&message, &["missing: decoder.layers.0.self_attn.in_proj_weight [45, 15]", "missing: 6 more"]);
-    // A condenser that is not whole is no first-stage checkpoint.
-    let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("squeezer.linear1")), &re10k());
-    assert_says(&message, &["missing: squeezer.linear1.weight [15, 15]", "missing: squeezer.linear1.bias [15]"]);
-}
-
-#[test]
-fn renamed_keys_can_be_renamed_back() {
-    let place = tempfile::tempdir().unwrap();
-    let file = place.path().join("changed.ckpt");
-    let tensors: Vec<_> = network(&fixture("re10k.ckpt"))
-        .into_iter()
-        .map(|(key, (shape, bits))| {
-            let key =
-                key.replace("squeezer.linear1", "squeezer.gate").replace("transformer.", "transformer._orig_mod.");
-            (key, shape.iter().map(|&size| size as usize).collect(), bits.into_iter().map(f32::from_bits).collect())
-        })
-        .collect();
-    write_state_dict(&file, &tensors).unwrap();
-    refused(&file, place.path(), &re10k());
-    let renames = vec![("squeezer.gate".to_owned(), "squeezer.linear1".to_owned())];
-    import(&file, &place.path().join("model"), &ImportOptions { renames, ..re10k() }).unwrap();
-    assert_computes(&place.path().join("model"), "re10k");
+/// The network of a fixture under other keys.
+fn tensors_of(name: &str, rename: impl Fn(&str) -> String) -> Vec<(String, Vec<usize>, Vec<f32>)> {
+    let all = network(&fixture(name)).into_iter().map(|(key, (shape, bits))| {
+        let shape = shape.iter().map(|&size| size as usize).collect();
+        (rename(&key), shape, bits.into_iter().map(f32::from_bits).collect())
+    });
+    all.collect()
 }
 
 #[test]
@@ -293,13 +271,21 @@ fn heads_must_divide_the_width() {
     };
     assert_says(
         &import(None),
-        &["`--num-heads` = 8 (the published): give the heads of this network, a divisor of its width 15"],
+        &[
+            "`--num-heads` = not given: no shape shows them, and width 768 alone is published, with 8",
+            "a divisor of its width 15 (transformer.decoder.layers.0.",
+            "re10k.ckpt",
+        ],
     );
     assert_says(&import(Some(0)), &["`--num-heads` = 0"]);
+    assert_says(&import(Some(4)), &["`--num-heads` = 4", "width 15 (transformer.decoder.layers.0.", "re10k.ckpt"]);
     // Normalised heads show their width.
     let place = tempfile::tempdir().unwrap();
     let message = refused(&fixture("dl3dv.ckpt"), place.path(), &options(Variant::ReleasedDl3dv, Some(2)));
-    assert_says(&message, &["misshapen: transformer.encoder.layers.0.self_attn.q_norm.weight is [2], expected [7]"]);
+    assert_says(
+        &message,
+        &["misshapen: transformer.encoder.layers.N.self_attn.q_norm.weight is [2], expected [7] (N = 0, 1, 2)"],
+    );
 }
 
 #[test]
@@ -327,7 +313,8 @@ fn truncated_damaged_and_hostile_files_are_refused() {
     let whole = std::fs::read(fixture("re10k.ckpt")).unwrap();
     for length in [0, 1, 1000, whole.len() / 2, whole.len() - 1] {
         std::fs::write(&file, &whole[..length]).unwrap();
-        assert_says(&refused(&file, place.path(), &re10k()), &["bad checkpoint: no readable ZIP archive"]);
+        let what = if length == 0 { "an empty file" } else { "no readable ZIP archive" };
+        assert_says(&refused(&file, place.path(), &re10k()), &[&format!("bad checkpoint: {what}")]);
     }
     // A flipped bit of a weight is found by the archive's checksum.
     let state = StateDict::open(&fixture("re10k.ckpt")).unwrap();
@@ -348,15 +335,43 @@ fn truncated_damaged_and_hostile_files_are_refused() {
     // Values that are not finite.
     let message =
         refusal(|tensors| tensors.get_mut("transformer.output_norm.bias").unwrap().1[3] = f32::INFINITY, &re10k());
-    assert_says(&message, &["transformer.output_norm.bias: value 3 is inf"]);
+    assert_says(&message, &["transformer.output_norm.bias [15]: value 3 is inf"]);
     // Sizes that nobody has.
     let message = refusal(
         |tensors| {
-            tensors.insert("transformer.encoder.layers.18446744073709551615.norm1.weight".into(), (vec![1], vec![0.0]));
+            let all = tensors.clone().into_iter().filter(|(key, _)| key.contains("encoder.layers.0."));
+            tensors.extend(all.map(|(key, tensor)| (key.replace(".0.", ".18446744073709551615."), tensor)));
         },
         &re10k(),
     );
     assert!(message.contains("num_encoder_blocks"), "{message}");
+}
+
+#[test]
+fn an_export_says_its_heads_and_others_are_refused() {
+    let place = tempfile::tempdir().unwrap();
+    let [folder, again] = ["model", "again"].map(|name| place.path().join(name));
+    let (config, _) = import(&fixture("re10k.ckpt"), &folder, &re10k()).unwrap();
+    let file = place.path().join("out.ckpt");
+    export(&config, &ModelPath::find(&folder).unwrap(), ExportFormat::Pytorch, &file).unwrap();
+    let message = import(&file, &again, &options(Variant::ReleasedRe10k, Some(5))).unwrap_err().to_string();
+    assert_says(&message, &["`--num-heads` = 5: the checkpoint says it has 3", "out.ckpt"]);
+    assert!(!again.exists());
+}
+
+#[test]
+fn an_interrupted_import_leaves_nothing() {
+    let place = tempfile::tempdir().unwrap();
+    let (folder, stop) = (place.path().join("model"), AtomicBool::new(true));
+    let stopped = super::import(&fixture("re10k.ckpt"), &folder, &re10k(), &stop);
+    assert!(matches!(stopped, Err(TrainError::Abandoned { .. })));
+    // While it writes, too.
+    let kept = place.path().join("kept");
+    let (config, imported) = import(&fixture("re10k.ckpt"), &kept, &re10k()).unwrap();
+    let stopped = model_dir::write(&folder, &config, &[], &imported, &stop);
+    assert!(matches!(stopped, Err(TrainError::Abandoned { .. })));
+    let left: Vec<_> = std::fs::read_dir(place.path()).unwrap().map(|item| item.unwrap().file_name()).collect();
+    assert_eq!(left, ["kept"]);
 }
 
 #[test]
@@ -367,4 +382,14 @@ fn nothing_that_exists_is_written_over() {
     let message = import(&fixture("re10k.ckpt"), &folder, &re10k()).unwrap_err().to_string();
     assert_says(&message, &["`-o` = ", "it exists already"]);
     assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 0);
+
+    let model = place.path().join("imported");
+    let (config, _) = import(&fixture("re10k.ckpt"), &model, &re10k()).unwrap();
+    let found = ModelPath::find(&model).unwrap();
+    let before = std::fs::read(&found.weights).unwrap();
+    for format in [ExportFormat::Pytorch, ExportFormat::Safetensors] {
+        let message = export(&config, &found, format, &found.weights).unwrap_err().to_string();
+        assert_says(&message, &["`-o` = ", "nothing is written over"]);
+    }
+    assert!(std::fs::read(&found.weights).unwrap() == before);
 }

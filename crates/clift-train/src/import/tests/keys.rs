@@ -1,0 +1,172 @@
+//! Keys that are missing, unknown, elsewhere or under other names.
+
+use super::*;
+
+#[test]
+fn missing_and_unknown_keys_are_all_listed_with_the_nearest_name() {
+    let message = refusal(
+        |tensors| {
+            let tensor = tensors.remove("transformer.encoder.layers.0.norm1.weight").unwrap();
+            tensors.insert("transformer.encoder.layers.0.norm_1.weight".into(), tensor);
+            tensors.insert("transformer.extra.deep.bias".into(), (vec![2], vec![0.0; 2]));
+        },
+        &re10k(),
+    );
+    assert_says(
+        &message,
+        &[
+            "it does not hold a released-re10k network (width 15, 3 heads, 1 + 2 layers); nothing was written",
+            "missing: transformer.encoder.layers.0.norm1.weight [15]; nearest name: transformer.encoder.layers.0.norm_1.weight",
+            "unknown: transformer.encoder.layers.0.norm_1.weight [15]; nearest name: transformer.encoder.layers.0.norm1.weight",
+            "unknown: transformer.extra.deep.bias [2]; nearest name: transformer.",
+            "--rename FROM=TO",
+        ],
+    );
+    // A whole layer that is left out in the middle is missing, not a smaller network, and every key of it is told.
+    let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("decoder.layers.0")), &re10k());
+    assert_says(&message, &["missing: transformer.decoder.layers.0.self_attn.in_proj_weight [45, 15]"]);
+    assert_eq!(message.matches("missing: transformer.decoder.layers.0.").count(), 18, "{message}");
+    // A condenser that is not whole is no first-stage checkpoint.
+    let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("squeezer.linear1")), &re10k());
+    let [weight, bias] =
+        ["weight [15, 15]", "bias [15]"].map(|rest| format!("missing: transformer.squeezer.linear1.{rest}"));
+    assert_says(&message, &[&weight, &bias]);
+    // What differs in every layer is one line, and a name that is like no missing one has a nearest all the same.
+    let rename = |from: &str, to: &str| {
+        let change = |tensors: &mut BTreeMap<String, (Vec<usize>, Vec<f32>)>| {
+            *tensors = tensors.iter().map(|(key, tensor)| (key.replace(from, to), tensor.clone())).collect();
+        };
+        refusal(change, &re10k())
+    };
+    assert_says(
+        &rename(".norm2.weight", ".ln_2.scale"),
+        &[
+            "missing: transformer.decoder.layers.N.norm2.weight [15] (N = 0, 1); nearest name: transformer.decoder.layers.N.ln_2.scale",
+            "unknown: transformer.decoder.layers.N.ln_2.scale [15] (N = 0, 1); nearest name: transformer.decoder.layers.N.norm2.weight",
+            "unknown: transformer.encoder.layers.0.ln_2.scale [15]; nearest name: transformer.encoder.layers.0.norm2.weight",
+        ],
+    );
+    assert_says(
+        &rename("output_norm", "decoder.norm"),
+        &["unknown: transformer.decoder.norm.weight [15]; nearest name: transformer.output_norm.weight"],
+    );
+    assert_says(
+        &rename("transformer.", "net.transformer."),
+        &[
+            "unknown: net.transformer.output_norm.weight [15]; nearest name: output_norm.weight",
+            "--rename net.transformer.=transformer. ",
+        ],
+    );
+}
+
+#[test]
+fn a_stray_key_of_a_layer_is_unknown_and_one_wrong_tensor_does_not_make_all_others_wrong() {
+    let message = refusal(
+        |tensors| {
+            tensors.insert("transformer.decoder.layers.3.norm1.weight".into(), (vec![15], vec![0.0; 15]));
+        },
+        &re10k(),
+    );
+    assert_says(
+        &message,
+        &[
+            "1 + 2 layers",
+            "unknown: transformer.decoder.layers.3.norm1.weight [15]; nearest name: transformer.decoder.layers.N.norm1.weight",
+        ],
+    );
+    assert!(!message.contains("missing"), "{message}");
+    for (key, shape, told) in [
+        ("output_norm.weight", vec![14], "is [14], expected [15]"),
+        ("encoder.layers.0.linear1.weight", vec![15, 22], "is [15, 22], expected [22, 15]"),
+        ("linear_input.weight", vec![15, 576, 3, 3], "is [15, 576, 3, 3], expected [15, 576]"),
+    ] {
+        let key = format!("transformer.{key}");
+        let message = refusal(
+            |tensors| {
+                let values = vec![0.0; shape.iter().product()];
+                assert!(tensors.insert(key.clone(), (shape.clone(), values)).is_some());
+            },
+            &re10k(),
+        );
+        assert_says(&message, &[&format!("misshapen: {key} {told}")]);
+        assert_eq!(message.matches("misshapen").count(), 1, "{message}");
+    }
+}
+
+#[test]
+fn keys_beside_the_prefix_are_refused_where_they_are_the_networks_and_listed_where_not() {
+    let outside = |from: &str| {
+        let change = |tensors: &mut BTreeMap<String, (Vec<usize>, Vec<f32>)>| {
+            let short =
+                |key: &String| key.strip_prefix("transformer.").filter(|key| key.starts_with(from)).map(String::from);
+            *tensors =
+                tensors.iter().map(|(key, tensor)| (short(key).unwrap_or(key.clone()), tensor.clone())).collect();
+        };
+        refusal(change, &re10k())
+    };
+    assert_says(
+        &outside("squeezer."),
+        &[
+            "beside transformer.: squeezer.linear1.weight [15, 15]; nearest name: transformer.squeezer.linear1.weight",
+            "--rename squeezer=transformer.squeezer",
+        ],
+    );
+    assert_says(&outside("linear_target"), &["beside transformer.: linear_target.bias [15]"]);
+    assert_says(&outside("output_norm"), &["beside transformer.: output_norm.bias [15]"]);
+
+    let place = tempfile::tempdir().unwrap();
+    let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
+    let mut tensors = tensors_of("re10k.ckpt", str::to_owned);
+    for layer in 0..2 {
+        tensors.push((format!("ema.encoder.layers.{layer}.norm1.weight"), vec![1], vec![0.0]));
+    }
+    tensors.push(("module.perceptual_loss.vgg.0.weight".into(), vec![1], vec![0.0]));
+    write_state_dict(&file, &tensors, &[]).unwrap();
+    let (_, imported) = import(&file, &out, &re10k()).unwrap();
+    assert_eq!(imported.ignored, BTreeMap::from([("perceptual_loss".into(), 1)]));
+    assert_eq!(imported.outside, BTreeMap::from([("ema.encoder.layers.N.norm1.weight".into(), 2)]));
+}
+
+#[test]
+fn what_compiled_and_distributed_models_put_into_keys_is_taken_off_wherever_it_stands() {
+    for lead in
+        ["module.transformer.", "_orig_mod.transformer.", "transformer.module.", "transformer._orig_mod.", "module."]
+    {
+        let place = tempfile::tempdir().unwrap();
+        let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
+        write_state_dict(&file, &tensors_of("re10k.ckpt", |key| key.replace("transformer.", lead)), &[]).unwrap();
+        import(&file, &out, &re10k()).unwrap();
+        assert_computes(&out, "re10k");
+    }
+}
+
+#[test]
+fn renames_see_the_whole_key_and_one_of_nothing_is_an_error() {
+    let place = tempfile::tempdir().unwrap();
+    let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
+    write_state_dict(&file, &tensors_of("re10k.ckpt", |key| key.replace("transformer.", "net.")), &[]).unwrap();
+    let renamed = |renames: &[(&str, &str)]| {
+        let renames = renames.iter().map(|(from, to)| ((*from).to_owned(), (*to).to_owned())).collect();
+        import(&file, &out, &ImportOptions { renames, ..re10k() })
+    };
+    let message = renamed(&[("net.", "transformer."), ("net.encoder", "encoder")]).unwrap_err().to_string();
+    assert_says(&message, &["`--rename` = net.encoder=encoder: no key has \"net.encoder\" in it", "changed.ckpt"]);
+    let message = renamed(&[("net.output_norm", "transformer.output")]).unwrap_err().to_string();
+    assert_says(&message, &["unknown: net.output_norm.weight [15], renamed transformer.output.weight"]);
+    renamed(&[("net.", "transformer.")]).unwrap();
+    assert_computes(&out, "re10k");
+}
+
+#[test]
+fn renamed_keys_can_be_renamed_back() {
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("changed.ckpt");
+    let tensors = tensors_of("re10k.ckpt", |key| {
+        key.replace("squeezer.linear1", "squeezer.gate").replace("transformer.", "transformer._orig_mod.")
+    });
+    write_state_dict(&file, &tensors, &[]).unwrap();
+    refused(&file, place.path(), &re10k());
+    let renames = vec![("squeezer.gate".to_owned(), "squeezer.linear1".to_owned())];
+    import(&file, &place.path().join("model"), &ImportOptions { renames, ..re10k() }).unwrap();
+    assert_computes(&place.path().join("model"), "re10k");
+}
