@@ -57,8 +57,12 @@ fn a_killed_save_and_a_killed_rename_are_cleared_away() {
     let place = Place::new();
     place.train("whole", &THIRTY, &[]).ok();
     killed_at("saved/stage1/17", &place.train_args("parts", &THIRTY, &[]));
-    let leftovers =
-        ["parts/.clift-x", "parts/stage1/.clift-y", "parts/stage1/checkpoints/step-000000034.tmp/model.bpk"];
+    let leftovers = [
+        "parts/.clift-x",
+        "parts/stage1/.clift-y",
+        "parts/stage1/.clift-z/.tmpAb12Cd",
+        "parts/stage1/checkpoints/step-000000034.tmp/model.bpk",
+    ];
     for name in leftovers {
         std::fs::create_dir_all(place.at(name).parent().expect("a folder")).expect("writable");
         std::fs::write(place.at(name), b"half").expect("writable");

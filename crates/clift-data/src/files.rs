@@ -70,8 +70,8 @@ pub fn remove_folder(path: &Path) -> std::io::Result<()> {
     std::fs::remove_dir_all(&doomed)
 }
 
-/// Removes what kills in the middle of [`replace`] have left in a folder and in those below it. Nobody may be writing
-/// there.
+/// Removes what kills in the middle of [`replace`], of saving weights or of [`crate::unfinished::Unfinished`] have left in
+/// a folder and in those below it. Nobody may be writing there.
 ///
 /// # Errors
 /// The operating system's; a folder that is not there holds nothing.
@@ -83,10 +83,12 @@ pub fn remove_leftovers(folder: &Path) -> std::io::Result<()> {
     for item in items {
         let item = item?;
         let kind = item.file_type()?;
-        if kind.is_dir() {
-            remove_leftovers(&item.path())?;
-        } else if kind.is_file() && item.file_name().to_string_lossy().starts_with(TEMPORARY) {
-            std::fs::remove_file(item.path())?;
+        let is_temporary = item.file_name().to_string_lossy().starts_with(TEMPORARY);
+        match (is_temporary, kind.is_dir()) {
+            (true, true) => std::fs::remove_dir_all(item.path())?,
+            (true, false) if kind.is_file() => std::fs::remove_file(item.path())?,
+            (false, true) => remove_leftovers(&item.path())?,
+            _ => {}
         }
     }
     Ok(())
@@ -217,11 +219,15 @@ mod tests {
     fn leftovers_are_removed_from_every_folder_and_nothing_else() {
         let place = tempfile::tempdir().unwrap();
         std::fs::create_dir(place.path().join("eval")).unwrap();
-        for name in [".clift-x1", "eval/.clift-y2", "eval/report.html", ".hidden", "clift-notes"] {
+        std::fs::create_dir_all(place.path().join("stage2/.clift-z3")).unwrap();
+        let files =
+            [".clift-x1", "eval/.clift-y2", "stage2/.clift-z3/.tmpQ", "eval/report.html", ".hidden", "clift-notes"];
+        for name in files {
             std::fs::write(place.path().join(name), b"x").unwrap();
         }
         remove_leftovers(place.path()).unwrap();
-        assert_eq!(names(place.path()), [".hidden", "clift-notes", "eval"]);
+        assert_eq!(names(place.path()), [".hidden", "clift-notes", "eval", "stage2"]);
+        assert!(names(&place.path().join("stage2")).is_empty());
         assert_eq!(names(&place.path().join("eval")), ["report.html"]);
         remove_leftovers(&place.path().join("missing")).unwrap();
     }

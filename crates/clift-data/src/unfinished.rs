@@ -9,7 +9,8 @@ use tempfile::TempDir;
 
 use crate::files::sync_folder;
 
-/// Start of the names of temporary folders: what a kill leaves behind can be told from everything else.
+/// Start of the names of temporary folders: what a kill leaves behind can be told from everything else, and
+/// [`crate::files::remove_leftovers`] takes it away too.
 const PREFIX: &str = ".clift-unfinished-";
 
 /// A folder inside the one that its files are for. Dropped, it leaves nothing behind.

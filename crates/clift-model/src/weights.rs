@@ -52,26 +52,33 @@ impl Loaded {
 /// [`ModelError::Weights`].
 pub fn save<M: Module>(module: &M, path: &Path) -> Result<(), ModelError> {
     let error = |reason: String| ModelError::Weights { action: "writing", reason, path: path.into() };
-    // The store writes to a name of its own beside this one, which a kill leaves there: it starts like ours.
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let temporary = path.with_file_name(format!(".clift-{name}.tmp"));
+    // The store and the crate below it have temporary names of their own, which a kill leaves behind: in a folder whose
+    // name is known. On an error it goes, as on a full disk it must.
+    let folder = tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(folder_of(path));
+    let folder = folder.map_err(|e| error(e.to_string()))?;
+    let temporary = folder.path().join("model.safetensors");
     let mut store = SafetensorsStore::from_file(&temporary)
         .with_to_adapter(BurnToPyTorchAdapter)
         .overwrite(true)
         .metadata("format", "clift-1");
-    let saved = module.save_into(&mut store).map_err(|e| e.to_string());
-    let written = saved.and_then(|()| publish(&temporary, path).map_err(|e| e.to_string()));
-    written.map_err(|reason| {
-        // On a full disk the space is needed; if even that fails, the next save writes over it.
-        drop(std::fs::remove_file(&temporary));
-        error(reason)
-    })
+    module.save_into(&mut store).map_err(|e| error(e.to_string()))?;
+    publish(&temporary, path).map_err(|e| error(e.to_string()))
+}
+
+/// Start of every temporary name: what a kill leaves behind can be told from everything else.
+pub(crate) const TEMPORARY: &str = ".clift-";
+
+pub(crate) fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Gives a finished file its name, with its header in order.
 fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
     let mut file = File::options().read(true).write(true).open(temporary)?;
     sort_header(&mut file)?;
+    // What the store writes is for its owner alone; the umask decides who may read a file that is kept.
+    let usual = File::create(temporary.with_extension("usual"))?.metadata()?.permissions();
+    file.set_permissions(usual)?;
     file.sync_all()?;
     std::fs::rename(temporary, path)?;
     sync_folder(path)
@@ -106,11 +113,10 @@ pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
 
 /// Makes the name of a file survive a power cut, where the system lets a folder be synced.
 pub(crate) fn sync_folder(path: &Path) -> std::io::Result<()> {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if cfg!(windows) {
         return Ok(()); // it opens no folders
     }
-    match File::open(folder)?.sync_all() {
+    match File::open(folder_of(path))?.sync_all() {
         Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
         synced => synced,
     }
@@ -261,6 +267,12 @@ mod tests {
         assert_ne!(hash(&other), hash(&model(1)));
         load(&mut other, &path).expect("reads").require_all(&path).expect("the same model");
         assert_eq!(hash(&other), hash(&model(1)));
+        // Nothing else is left, and whoever may read other files may read it.
+        let usual = directory.path().join("usual");
+        File::create(&usual).expect("writes");
+        let permissions = |path: &Path| std::fs::metadata(path).expect("there").permissions();
+        assert_eq!(permissions(&path), permissions(&usual));
+        assert_eq!(std::fs::read_dir(directory.path()).expect("a folder").count(), 2);
     }
 
     #[test]

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::{FORMAT, HEADER_BYTES, Scene, TokenStorage, VERSION, dtype_name};
 use crate::ModelError;
-use crate::weights::sync_folder;
+use crate::weights::{TEMPORARY, folder_of, sync_folder};
 
 /// Where nothing is lost by writing a scene: a folder that exists, and in it nothing of the name or a scene.
 ///
@@ -38,10 +38,6 @@ fn is_scene(path: &Path) -> bool {
     read.is_ok() && start.windows(says.len()).any(|part| part == says.as_bytes())
 }
 
-fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
-}
-
 const WRITABLE_FOLDER: &str = "choose a folder that exists and can be written to";
 const OTHER_NAME: &str = "choose another name";
 
@@ -55,6 +51,7 @@ impl Scene {
         let bytes = self.to_bytes(path, storage)?;
         check_destination(path)?;
         let mut builder = tempfile::Builder::new();
+        builder.prefix(TEMPORARY);
         // The umask decides who may read it, as for any file that is kept.
         #[cfg(unix)]
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
