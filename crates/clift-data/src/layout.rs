@@ -24,6 +24,10 @@ use crate::transforms::PhotoOptions;
 /// Folders that DL3DV's pictures are in, in the order they are preferred: 480 x 270, then larger.
 const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
 
+/// The note of data that is not divided: of no interest where a single half is asked for.
+pub const SAME_SCENES: &str =
+    "no train/ and test/ folders and no test scenes in a list: both halves are the same scenes";
+
 /// How scenes lie on disk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -132,8 +136,7 @@ impl Opened {
             }
         };
         if !opened.has_splits && list.is_none() {
-            let note = "no train/ and test/ folders and no test scenes in a list: both halves are the same scenes";
-            opened.ledger.notes.push(note.into());
+            opened.ledger.notes.push(SAME_SCENES.into());
         }
         Ok(opened)
     }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use clift_data::layout::SAME_SCENES;
 use clift_data::{ClipReader, FileOptions, LayoutOptions, SceneSource, Split, open_layout};
 use clift_eval::TokenCount;
 use clift_model::device::DeviceName;
@@ -128,7 +129,8 @@ fn open_folder(
     let is_meant = overrides.iter().any(|change| change.key.starts_with("data.files"));
     let files = if is_meant { config.data.files.clone() } else { FileOptions::default() };
     // Filters choose what to train on; this scene was chosen by hand.
-    let (source, ledger) = open_layout(folder, split, &LayoutOptions { files, ..LayoutOptions::default() })?;
+    let (source, mut ledger) = open_layout(folder, split, &LayoutOptions { files, ..LayoutOptions::default() })?;
+    ledger.notes.retain(|note| note != SAME_SCENES);
     if ledger.has_news() {
         terminal::print_note(&format!("{}: {ledger}", folder.display()));
     }

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use clift_data::layout::SAME_SCENES;
 use clift_data::{FileOptions, LayoutOptions, Opened, Split, TestScenes, has_halves, is_dl3dv_key};
 use clift_train::Override;
 use clift_train::document::parse_config;
@@ -83,7 +84,7 @@ pub fn halves(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Resul
         let is_whole = !opened.has_splits && !has_list;
         if is_whole {
             // Here they are no halves.
-            opened.ledger.notes.retain(|note| !note.contains("both halves are the same scenes"));
+            opened.ledger.notes.retain(|note| note != SAME_SCENES);
             let source = &opened.source;
             if files.test_scenes.is_none() && (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene))) {
                 let note = "DL3DV's folders hold the scenes of its benchmark too; --set data.files.test_scenes=LIST \
