@@ -10,7 +10,7 @@ use std::path::Path;
 use crate::error::DataError;
 
 /// Start of every temporary file's name: what a kill leaves behind can be told from everything else.
-const TEMPORARY: &str = ".clift-";
+pub const TEMPORARY: &str = ".clift-";
 
 /// Replaces `path` with `bytes`. No reader ever sees half a file, and after an error the former one is untouched.
 ///

@@ -1,4 +1,4 @@
-//! Files that appear in a folder all together, or not at all.
+//! Files that appear in a folder when all of them are made: an error before leaves none.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -45,16 +45,15 @@ impl Unfinished {
         self.files.as_ref().map_or(&self.out, |files| files.path())
     }
 
-    /// Moves the files to where they are for, over those of the same names. Returns the names.
+    /// Moves the files to where they are for, over those of the same names, one after the other. Returns the names.
     ///
     /// # Errors
     /// The operating system's.
     pub fn keep(mut self) -> std::io::Result<BTreeSet<OsString>> {
-        let mut names = BTreeSet::new();
-        for item in std::fs::read_dir(self.path())? {
-            let item = item?;
-            std::fs::rename(item.path(), self.out.join(item.file_name()))?;
-            names.insert(item.file_name());
+        let items = std::fs::read_dir(self.path())?;
+        let names = items.map(|item| Ok(item?.file_name())).collect::<std::io::Result<BTreeSet<OsString>>>()?;
+        for name in &names {
+            std::fs::rename(self.path().join(name), self.out.join(name))?;
         }
         self.is_new = false;
         sync_folder(&self.out)?;

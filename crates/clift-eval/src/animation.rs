@@ -1,34 +1,18 @@
 //! Pictures that move: animated PNG, which browsers play and other programs show as the first frame.
 
-use std::io::Write;
+use std::fs::File;
+use std::io::BufWriter;
 use std::path::{Path, PathBuf};
-
-use clift_data::files::replace;
 
 use crate::error::EvalError;
 use crate::picture::Picture;
 
-/// An animation that is being written. Kept in memory until [`Animation::finish`], so that no file is half done.
+/// An animation that is being written, frame by frame: the file is half done until [`Animation::finish`].
 pub struct Animation {
     path: PathBuf,
-    writer: png::Writer<Shared>,
-    bytes: Shared,
+    writer: png::Writer<BufWriter<File>>,
     /// Frames that are still to come: the encoder itself would write a file that lacks some.
     missing: usize,
-}
-
-/// Bytes that both the encoder and the animation hold.
-#[derive(Clone, Default)]
-struct Shared(std::rc::Rc<std::cell::RefCell<Vec<u8>>>);
-
-impl Write for Shared {
-    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        self.0.borrow_mut().write(bytes)
-    }
-
-    fn flush(&mut self) -> std::io::Result<()> {
-        Ok(())
-    }
 }
 
 impl Animation {
@@ -37,8 +21,9 @@ impl Animation {
     /// # Errors
     /// [`EvalError::Io`] for no frames or no picture.
     pub fn new(path: &Path, width: usize, height: usize, num_frames: usize, fps: u16) -> Result<Self, EvalError> {
-        let bytes = Shared::default();
-        let mut encoder = png::Encoder::new(bytes.clone(), width as u32, height as u32);
+        let writing = |source| EvalError::Io { action: "writing the animation", source, path: path.to_owned() };
+        let file = BufWriter::new(File::create(path).map_err(writing)?);
+        let mut encoder = png::Encoder::new(file, width as u32, height as u32);
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
         let started = encoder
@@ -46,7 +31,7 @@ impl Animation {
             .and_then(|()| encoder.set_frame_delay(1, fps))
             .and_then(|()| encoder.write_header());
         let writer = started.map_err(|error| failed(path, error))?;
-        Ok(Self { path: path.into(), writer, bytes, missing: num_frames })
+        Ok(Self { path: path.into(), writer, missing: num_frames })
     }
 
     /// Adds the next frame.
@@ -62,18 +47,16 @@ impl Animation {
         Ok(())
     }
 
-    /// Writes the file.
+    /// Ends the file.
     ///
     /// # Errors
-    /// [`EvalError::Io`] when frames are missing or the folder cannot be written.
+    /// [`EvalError::Io`] when frames are missing or the file cannot be written.
     pub fn finish(self) -> Result<(), EvalError> {
-        let Self { path, writer, bytes, missing } = self;
+        let Self { path, writer, missing } = self;
         if missing > 0 {
             return Err(failed(&path, format!("{missing} frames fewer than announced")));
         }
-        writer.finish().map_err(|error| failed(&path, error))?;
-        let bytes = bytes.0.take();
-        replace(&path, &bytes).map_err(|source| EvalError::Io { action: "writing the animation", source, path })
+        writer.finish().map_err(|error| failed(&path, error))
     }
 }
 
@@ -94,7 +77,6 @@ mod tests {
         for colour in colours {
             animation.add(&Picture::new(5, 3, colour)).unwrap();
         }
-        assert!(!path.exists(), "nothing before it is done");
         animation.finish().unwrap();
 
         let file = std::io::BufReader::new(std::fs::File::open(&path).unwrap());
@@ -112,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_another_size_or_missing_ones_are_errors_that_leave_no_file() {
+    fn frames_of_another_size_or_missing_ones_are_errors() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("a.png");
         let mut animation = Animation::new(&path, 5, 3, 2, 12).unwrap();
@@ -123,6 +105,6 @@ mod tests {
         animation.add(&Picture::new(5, 3, [0; 3])).unwrap();
         assert!(animation.add(&Picture::new(5, 3, [0; 3])).is_err(), "two frames of one");
         assert!(Animation::new(&path, 5, 3, 0, 12).is_err());
-        assert!(!path.exists());
+        assert!(Animation::new(&place.path().join("no/a.png"), 5, 3, 1, 12).is_err());
     }
 }

@@ -18,6 +18,11 @@ const FRAMES_PER_CALL: usize = 8;
 /// Most patches that one call draws of several frames: eight of 512 x 512 pixels.
 const PATCHES_PER_CALL: usize = 1 << 15;
 
+/// How many frames of so many patches one call draws at best.
+pub fn frames_per_call(num_patches: usize) -> usize {
+    (PATCHES_PER_CALL / num_patches.max(1)).clamp(1, FRAMES_PER_CALL)
+}
+
 /// A renderer alone, under the name it has in weight files.
 #[derive(Module, Debug)]
 struct RendererOnly {
@@ -104,8 +109,7 @@ impl Viewer {
     /// How many frames one call draws at best: fewer of large pictures.
     pub fn frames_per_call(&self, height: usize, width: usize) -> usize {
         let patch_size = self.renderer.patch_size();
-        let num_patches = (height / patch_size * (width / patch_size)).max(1);
-        (PATCHES_PER_CALL / num_patches).clamp(1, FRAMES_PER_CALL)
+        frames_per_call(height / patch_size * (width / patch_size))
     }
 
     /// Forgets the previous frame.

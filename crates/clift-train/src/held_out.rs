@@ -1,5 +1,7 @@
 //! Measuring a run on views it never trained on: during training and at its end.
 
+use std::ffi::OsStr;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -145,7 +147,7 @@ impl<'a> HeldOut<'a> {
         for skip in &ledger.skips {
             measured.skip(&skip.key);
         }
-        let sheets = Sheets::new(&folder.join("sheets"))?;
+        let sheets = Sheets::new(folder)?;
         let mut exhibits = Vec::new();
         for (i, item) in self.items.iter().enumerate() {
             if stop.load(Ordering::Relaxed) {
@@ -302,37 +304,47 @@ pub fn write_ledger(ledger: &Ledger, path: &Path) -> Result<(), TrainError> {
     replace(path, &text).map_err(TrainError::io("writing what was left out", path))
 }
 
-/// The picture sheets of an evaluation, which replace those of a former one all together.
+/// The picture sheets of an evaluation, which take the place of those of a former one in the same folder.
 struct Sheets {
     folder: PathBuf,
     files: Unfinished,
+    /// Names that sheets of the former one have.
+    former: Vec<String>,
 }
 
 impl Sheets {
-    fn new(folder: &Path) -> Result<Self, TrainError> {
-        let files = Unfinished::new(folder).map_err(TrainError::io("making a folder", folder))?;
-        Ok(Self { folder: folder.into(), files })
+    fn new(evaluation: &Path) -> Result<Self, TrainError> {
+        let folder = evaluation.join("sheets");
+        let files = Unfinished::new(&folder).map_err(TrainError::io("making a folder", &folder))?;
+        // Its table names its scenes. What else is in the folder is somebody's.
+        let table = std::fs::read_to_string(evaluation.join("scenes.csv")).unwrap_or_default();
+        let mut keys: Vec<&str> = table.lines().skip(1).filter_map(|line| line.split(',').next()).collect();
+        keys.dedup();
+        Ok(Self { folder, files, former: keys.into_iter().map(sheet_name).collect() })
     }
 
     fn add(&self, sheet: &Picture, key: &str) -> Result<(), TrainError> {
-        Ok(sheet.write_png(&self.files.path().join(format!("{}.png", file_name(key))))?)
+        Ok(sheet.write_png(&self.files.path().join(sheet_name(key)))?)
     }
 
     fn keep(self) -> Result<(), TrainError> {
-        let Self { folder, files } = self;
+        let Self { folder, files, former } = self;
         let replace = || {
             let kept = files.keep()?;
-            for item in std::fs::read_dir(&folder)? {
-                let item = item?;
-                let is_sheet = item.path().extension().is_some_and(|extension| extension == "png");
-                if is_sheet && !kept.contains(&item.file_name()) {
-                    std::fs::remove_file(item.path())?;
+            for name in former.iter().filter(|name| !kept.contains(OsStr::new(name))) {
+                match std::fs::remove_file(folder.join(name)) {
+                    Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+                    _ => {}
                 }
             }
             Ok(())
         };
         replace().map_err(TrainError::io("writing the sheets", &folder))
     }
+}
+
+fn sheet_name(key: &str) -> String {
+    format!("{}.png", file_name(key))
 }
 
 /// What an evaluation of a run does with every scene; LPIPS and other systems are to be added.

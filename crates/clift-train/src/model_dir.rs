@@ -5,10 +5,10 @@ use std::collections::HashMap;
 use std::fmt::Write;
 use std::fs::File;
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use clift_data::files::{publish, replace};
+use clift_data::files::{TEMPORARY, publish, replace};
 use clift_data::{ClipReader, PoseRotation, PoseScale, Split};
 use clift_eval::{Condensed, Networks, Summary, System, Variant as Tokens};
 use clift_model::{ModelConfig, Variant, weights};
@@ -84,16 +84,6 @@ pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
     }))
 }
 
-/// A folder that is removed unless it is renamed.
-struct Unfinished(PathBuf);
-
-impl Drop for Unfinished {
-    fn drop(&mut self) {
-        // It may have been renamed; what else fails here has failed before.
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
-
 /// Writes a model directory under a temporary name, reads the model back as every command does, and renames it, unless
 /// `stop` is set before: then nothing is left.
 pub(crate) fn write(
@@ -103,31 +93,38 @@ pub(crate) fn write(
     imported: &Imported,
     stop: &AtomicBool,
 ) -> Result<(), TrainError> {
-    let name = folder.file_name().ok_or_else(|| {
+    if folder.file_name().is_none() {
         let fix = "write the name of a directory".to_owned();
-        TrainError::BadConfig { key: "-o".into(), value: folder.display().to_string(), fix }
-    })?;
-    let temporary = folder.with_file_name(format!(".{}.{}.tmp", name.to_string_lossy(), std::process::id()));
+        return Err(TrainError::BadConfig { key: "-o".into(), value: folder.display().to_string(), fix });
+    }
+    let above = folder.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let writing = "writing the model directory";
-    std::fs::create_dir_all(&temporary).map_err(TrainError::io(writing, &temporary))?;
-    let temporary = Unfinished(temporary);
-    let weights_path = temporary.0.join("model.safetensors");
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(TEMPORARY);
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
+    // Dropped before it is renamed, it leaves nothing behind.
+    let temporary = std::fs::create_dir_all(above).and_then(|()| builder.tempdir_in(above));
+    let temporary = temporary.map_err(TrainError::io(writing, above))?;
+    let weights_path = temporary.path().join("model.safetensors");
     let bytes = to_safetensors(parameters, HashMap::new(), &weights_path)?;
     go_on(stop)?;
     replace(&weights_path, &bytes).map_err(TrainError::io(writing, &weights_path))?;
     drop(bytes);
     go_on(stop)?;
-    let config_path = temporary.0.join("config.toml");
+    let config_path = temporary.path().join("config.toml");
     let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &config_path))?;
     replace(&config_path, text.as_bytes()).map_err(TrainError::io(writing, &config_path))?;
-    let import_path = temporary.0.join("import.json");
+    let import_path = temporary.path().join("import.json");
     let text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", &import_path))?;
     replace(&import_path, &text).map_err(TrainError::io(writing, &import_path))?;
 
     Trained::load(config, &weights_path)?;
     go_on(stop)?;
     refuse_existing(folder)?;
-    publish(&temporary.0, folder).map_err(TrainError::io(writing, folder))
+    publish(temporary.path(), folder).map_err(TrainError::io(writing, folder))?;
+    let _ = temporary.keep(); // it has another name now
+    Ok(())
 }
 
 /// The bytes of a safetensors file, with what is said about it beside the format.

@@ -64,9 +64,11 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_destination(&args.out).map_err(|error| WrongUsage(error.to_string()))?;
     let model = ModelPath::find(&args.model)?;
     let (mut config, overrides) = read_config::<Config>(&model.run.join("config.toml"), &args.set)?;
-    if let Some(change) = overrides.iter().find(|change| change.key.starts_with("model.")) {
-        let message = "is what the weights were trained with: leave it out";
-        return Err(WrongUsage(format!("--set {}: the network {message}", change.key)).into());
+    // No shape shows heads: another number would be encoded, and drawn, without a word.
+    if config.model != read_config::<Config>(&model.run.join("config.toml"), &[])?.0.model {
+        return Err(
+            WrongUsage("--set model: the network is what the weights were trained with: leave it out".into()).into()
+        );
     }
     for change in &overrides {
         terminal::print_note(&format!("--set {change}"));

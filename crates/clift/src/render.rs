@@ -11,7 +11,7 @@ use clift_data::{Intrinsics, Pose, SceneFrame};
 use clift_eval::Calibration;
 use clift_model::device::DeviceName;
 use clift_model::scene::MAX_SIDE_PX;
-use clift_model::viewer::load_renderer;
+use clift_model::viewer::{frames_per_call, load_renderer};
 use clift_model::{ModelError, Scene, ViewCamera, Viewer};
 use clift_train::plan::drawing_bytes;
 use clift_train::plan::machine::available_bytes;
@@ -56,7 +56,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let (scene, _) = Scene::read(&args.scene)?;
     let [width, height] = args.size.unwrap_or([scene.width, scene.height]);
     let device = args.device.unwrap_or_default();
-    check_size(&scene, [width, height], device)?;
+    check_size(&scene, [width, height], args.render.is_some(), device)?;
     film::refuse_existing(&args.out)?;
     let views = path(&scene, args, height, width)?;
     let model = args.model.clone().unwrap_or_else(|| scene.model_path.clone().into());
@@ -110,16 +110,20 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
 }
 
 /// Refuses sizes that are not whole patches, and those that no picture has or this machine cannot draw.
-fn check_size(scene: &Scene, [width, height]: [usize; 2], device: DeviceName) -> anyhow::Result<()> {
+fn check_size(scene: &Scene, [width, height]: [usize; 2], is_some: bool, device: DeviceName) -> anyhow::Result<()> {
     if width.max(height) > MAX_SIDE_PX {
         let message = format!("--size {width}x{height}: write at most {MAX_SIDE_PX} pixels a side");
         return Err(WrongUsage(message).into());
     }
     let num_patches = scene.model.num_tokens(1, height, width)?;
-    let needed = drawing_bytes(&scene.model, scene.num_tokens(), num_patches);
+    // Frames of some tokens are drawn alone, each with its own.
+    let num_frames = if is_some { 1 } else { frames_per_call(num_patches) };
+    let needed = drawing_bytes(&scene.model, scene.num_tokens(), num_patches * num_frames);
     if let Some(available) = available_bytes(device).filter(|available| needed > *available) {
         let (needed, available) = (bytes(needed), bytes(available));
-        let message = format!("--size {width}x{height} takes {needed} of memory for a frame, and {available} are free");
+        let message = format!(
+            "frames of {width} x {height} take {needed} of memory, and {available} are free; choose a smaller --size"
+        );
         return Err(WrongUsage(message).into());
     }
     Ok(())

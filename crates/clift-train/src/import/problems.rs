@@ -147,7 +147,7 @@ pub(super) fn told(
         let found = problems.iter().filter(|problem| kinds.contains(&problem.kind));
         Names::of(found.map(|problem| problem.name.as_str()))
     };
-    let (missing, unknown) = (of_kinds(&[Kind::Missing]), of_kinds(&[Kind::Unknown, Kind::Stray]));
+    let (missing, unknown, strays) = (of_kinds(&[Kind::Missing]), of_kinds(&[Kind::Unknown]), of_kinds(&[Kind::Stray]));
     let expected = interchange::tensors(model, true);
     let expected = Names::of(expected.iter().map(|tensor| tensor.key.as_str()));
     let mut lines: BTreeMap<(Kind, String, &str), Vec<&Problem>> = BTreeMap::new();
@@ -167,25 +167,31 @@ pub(super) fn told(
             _ => (&pattern, format!(" (N = {})", layer_numbers(&found))),
         };
         let _ = write!(text, "\n  {}: {}{detail}{numbers}", kind.told(), shown(key));
-        let own = numbers_of(&first.name);
+        let (own, most) = (numbers_of(&first.name), first.name.len() / 2);
+        let prefixed = |name: String| format!("{}{name}", keys.prefix);
         let own = (found.len() == 1).then_some(&own[..]);
         let near = match kind {
-            // So near that it may be this one under another name.
-            Kind::Missing => unknown.nearest(&first.name, first.name.len() / 2).map(|found| unknown.told(found, own)),
+            // So near that it may be this one under another name; strays lack the prefix.
+            Kind::Missing => {
+                let near = |names: &Names| names.nearest(&first.name, most).map(|found| names.told(found, own));
+                near(&strays).or_else(|| near(&unknown).map(prefixed))
+            }
             Kind::Unknown | Kind::Stray => {
-                let missing = missing.nearest(&first.name, first.name.len() / 2).map(|found| missing.told(found, own));
-                missing.or_else(|| expected.nearest(&first.name, usize::MAX).map(|found| expected.told(found, own)))
+                let missing = missing.nearest(&first.name, most).map(|found| missing.told(found, own));
+                let near = missing
+                    .or_else(|| expected.nearest(&first.name, usize::MAX).map(|found| expected.told(found, own)));
+                near.map(prefixed)
             }
             _ => None,
         };
         if let Some(near) = near {
-            let _ = write!(text, "; nearest name: {}{}", keys.prefix, shown(&near));
+            let _ = write!(text, "; nearest name: {}", shown(&near));
         }
     }
     for (kind, count) in counts.iter().filter(|(_, count)| **count > MAX_LISTED) {
         let _ = write!(text, "\n  {}: {} more", kind.told(), count - MAX_LISTED);
     }
-    text.push_str(&way_on(keys, state, options, !unknown.0.is_empty()));
+    text.push_str(&way_on(keys, state, options, !unknown.0.is_empty() || !strays.0.is_empty()));
     text.push_str("\n ");
     text
 }
@@ -201,8 +207,10 @@ fn way_on(keys: &Keys, state: &StateDict, options: &ImportOptions, has_unknown: 
     if let Some(other) = fitting {
         return format!("\n  its keys and shapes are those of --variant {other}");
     }
-    if let Some(first) = keys.strays.values().next() {
-        let first = shown(first.split('.').next().unwrap_or_default());
+    // Renaming replaces wherever the text stands: only where no other key has it.
+    let first = keys.strays.keys().next().and_then(|name| name.split('.').next());
+    if let Some(first) = first.filter(|first| !keys.network.values().any(|key| key.contains(first))) {
+        let first = shown(first);
         return format!(
             "\n  --rename {first}=transformer.{first} makes such keys the network's, --rename {first}=other.{first} \
              passes over them"

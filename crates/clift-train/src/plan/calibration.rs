@@ -5,8 +5,8 @@ use std::time::Instant;
 use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
-use clift_data::ClipReader;
 use clift_data::order::{item_rng, step_rng};
+use clift_data::{ClipReader, Split};
 use clift_eval::lpips::Lpips;
 use clift_eval::{Accumulator, Condensed, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
 
@@ -279,7 +279,7 @@ pub struct InferenceTimed<'a> {
 
 /// Seconds that one thread takes to read a view of a training scene; `None` where the data is not there.
 pub fn loading_s(config: &Config) -> Option<f64> {
-    let (source, _) = scenes::open_to_train(&config.data).ok()?;
+    let (source, _) = scenes::open(&config.data, Split::Train).ok()?;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let views = &config.data.views;
     let num_scenes = reader.source.num_scenes().min(6);

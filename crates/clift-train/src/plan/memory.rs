@@ -214,7 +214,7 @@ fn render_values(config: &ModelConfig, x: f64, y: f64) -> f64 {
     3.0 * x + y + forward_values(config, y)
 }
 
-/// Most bytes of tensors alive while one view of so many patches is drawn from so many tokens, weights aside.
+/// Most bytes of tensors alive while views of so many patches in all are drawn from so many tokens, weights aside.
 pub fn drawing_bytes(config: &ModelConfig, num_render_tokens: usize, num_patches: usize) -> u64 {
     let values = |count: usize| count as f64 * config.dim as f64;
     let picture = (num_patches * config.patch_size.pow(2) * 3) as f64;

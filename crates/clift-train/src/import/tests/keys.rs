@@ -112,7 +112,17 @@ fn keys_beside_the_prefix_are_refused_where_they_are_the_networks_and_listed_whe
         ],
     );
     assert_says(&outside("linear_target"), &["beside transformer.: linear_target.bias [15]"]);
-    assert_says(&outside("output_norm"), &["beside transformer.: output_norm.bias [15]"]);
+    assert_says(
+        &outside("output_norm"),
+        &[
+            "beside transformer.: output_norm.bias [15]",
+            "missing: transformer.output_norm.bias [15]; nearest name: output_norm.bias\n",
+        ],
+    );
+    // The network has an encoder too: a rename would take it away.
+    let message = outside("encoder.layers.0.norm1");
+    assert_says(&message, &["beside transformer.: encoder.layers.0.norm1.bias [15]", "--rename FROM=TO"]);
+    assert!(!message.contains("--rename encoder="), "{message}");
 
     let place = tempfile::tempdir().unwrap();
     let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
