@@ -197,7 +197,7 @@ impl ChunkSource {
         let chunk = &self.chunks[*chunk];
         let table = chunk.table()?;
         let scene = table.scenes.get(key).ok_or_else(|| DataError::BadChunk {
-            what: format!("index.json lists scene {key} in it, but it holds {} other scenes", table.scenes.len()),
+            what: format!("scene {key} is expected in it, but it holds {} other scenes", table.scenes.len()),
             path: chunk.path.clone(),
         })?;
         Ok((&chunk.path, scene))

@@ -48,7 +48,7 @@ pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> 
 /// [`DataError::Io`] for a folder that cannot be listed, and what reading `invalid_keys.txt` gives.
 pub(crate) fn index_of_files(folder: &Path, ledger: &mut Ledger) -> Result<BTreeMap<String, String>, DataError> {
     let files = torch_files(folder)?;
-    let stem = |file: &str| file.trim_end_matches(".torch").to_owned();
+    let stem = |file: &str| file.strip_suffix(".torch").unwrap_or(file).to_owned();
     let first = files.iter().take(8).find_map(|file| Some((file, ChunkTable::read(&folder.join(file)).ok()?)));
     if first.is_some_and(|(file, table)| table.scenes.len() != 1 || !table.scenes.contains_key(&stem(file))) {
         return Ok(index_of_chunks(folder, &files, ledger));
@@ -103,4 +103,23 @@ fn torch_files(folder: &Path) -> Result<Vec<String>, DataError> {
     files.retain(|name| has_ending(name, "torch"));
     files.sort_unstable();
     Ok(files)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::chunk_writer::{SceneRecord, scene_file_bytes};
+
+    #[test]
+    fn a_key_may_end_as_a_file_does() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.torch.torch");
+        let (key, url) = ("a.torch".to_owned(), String::new());
+        let scene = SceneRecord { key, url, timestamps: Vec::new(), cameras: Vec::new(), images: Vec::new() };
+        std::fs::write(&path, scene_file_bytes(&path, &scene).unwrap()).unwrap();
+        let mut ledger = Ledger::default();
+        let index = index_of_files(folder.path(), &mut ledger).unwrap();
+        assert_eq!(index, BTreeMap::from([("a.torch".to_owned(), "a.torch.torch".to_owned())]));
+        assert!(ledger.notes.is_empty(), "it is no chunk: {ledger}");
+    }
 }

@@ -6,10 +6,13 @@ use std::path::Path;
 use crate::camera::Camera;
 use crate::error::DataError;
 use crate::files::replace;
+use crate::pickle::{MAX_BYTES, MAX_VALUES};
 use crate::pickle_writer::PickleWriter;
 
 /// Size at which a chunk is closed, in bytes of pictures: 100 MB, as in the published RealEstate10K chunks.
 pub const DEFAULT_CHUNK_BYTES: u64 = 100_000_000;
+/// Frames at which a chunk is closed whatever their size: a reader takes 1,048,576 values, some 19 per frame.
+const MAX_CHUNK_FRAMES: usize = 50_000;
 
 /// One scene to write.
 #[derive(Clone, Debug, PartialEq)]
@@ -27,14 +30,57 @@ pub struct SceneRecord {
 }
 
 impl SceneRecord {
-    /// Says which lists differ in length.
+    /// Says which lists differ in length, and whether it is more than a reader takes.
     pub(crate) fn check(&self) -> Result<(), String> {
         let Self { key, timestamps, cameras, images, .. } = self;
         let (timestamps, cameras, images) = (timestamps.len(), cameras.len(), images.len());
-        if timestamps == images && cameras == images {
+        if timestamps != images || cameras != images {
+            return Err(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps"));
+        }
+        if Fill::default().has_room(self) {
             return Ok(());
         }
-        Err(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps"))
+        Err(format!("scene {key} has {images} frames, more than a file holds (about 50,000)"))
+    }
+}
+
+/// How full a file is.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Fill {
+    /// Bytes of pictures.
+    image_bytes: u64,
+    num_frames: usize,
+    /// Values and bytes of the pickle, or a few more.
+    num_values: usize,
+    pickle_bytes: usize,
+}
+
+impl Fill {
+    fn with(self, scene: &SceneRecord) -> Self {
+        let num_frames = scene.images.len();
+        // A tensor has 19 values and 170 bytes at most; beside a frame's there are two of the scene and the five names.
+        Self {
+            image_bytes: self.image_bytes + scene.images.iter().map(|image| image.len() as u64).sum::<u64>(),
+            num_frames: self.num_frames + num_frames,
+            num_values: self.num_values + 20 * num_frames + 60,
+            pickle_bytes: self.pickle_bytes + 180 * num_frames + 600 + scene.url.len() + scene.key.len(),
+        }
+    }
+
+    /// Takes up a scene.
+    pub fn add(&mut self, scene: &SceneRecord) {
+        *self = self.with(scene);
+    }
+
+    /// Whether readers take the file with one scene more.
+    pub fn has_room(self, scene: &SceneRecord) -> bool {
+        let Self { num_values, pickle_bytes, .. } = self.with(scene);
+        num_values < MAX_VALUES && pickle_bytes < MAX_BYTES
+    }
+
+    /// Whether the file has the size that was asked for.
+    pub fn is_full(self, target_bytes: u64) -> bool {
+        self.image_bytes >= target_bytes || self.num_frames >= MAX_CHUNK_FRAMES
     }
 }
 
@@ -59,20 +105,26 @@ pub fn write_chunks(
     let mut index = BTreeMap::new();
     let mut num_chunks = 0;
     let mut pending = Vec::new();
-    let mut pending_bytes = 0;
+    let mut fill = Fill::default();
     for scene in scenes {
         let scene = scene?;
         scene.check().map_err(&bad)?;
-        if index.insert(scene.key.clone(), chunk_name(num_chunks)).is_some() {
-            return Err(bad(format!("scene {} comes twice", scene.key)));
-        }
-        pending_bytes += scene.images.iter().map(|image| image.len() as u64).sum::<u64>();
-        pending.push(scene);
-        if pending_bytes >= target_bytes {
+        if !fill.has_room(&scene) {
             write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
             num_chunks += 1;
             pending.clear();
-            pending_bytes = 0;
+            fill = Fill::default();
+        }
+        if index.insert(scene.key.clone(), chunk_name(num_chunks)).is_some() {
+            return Err(bad(format!("scene {} comes twice", scene.key)));
+        }
+        fill.add(&scene);
+        pending.push(scene);
+        if fill.is_full(target_bytes) {
+            write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
+            num_chunks += 1;
+            pending.clear();
+            fill = Fill::default();
         }
     }
     if !pending.is_empty() {
@@ -165,7 +217,7 @@ mod tests {
             url: format!("https://example.org/{key}"),
             timestamps: (0..num_frames as i64).map(|frame| frame * 33_367 + (1 << 33)).collect(),
             cameras: (0..num_frames).map(camera).collect(),
-            images: (0..num_frames).map(|frame| vec![frame as u8; 100 + frame]).collect(),
+            images: (0..num_frames).map(|frame| vec![frame as u8; 100 + frame % 50]).collect(),
         }
     }
 
@@ -196,6 +248,22 @@ mod tests {
                 assert!((got.intrinsics_norm.fx - 0.9).abs() < 1e-7); // f32
             }
         }
+    }
+
+    #[test]
+    fn what_is_written_is_never_more_than_a_reader_takes() {
+        // As many scenes of one frame as would fill two files by their pictures' size, and one scene that fills one.
+        let most = (MAX_VALUES - 61) / 20;
+        let small = (0..20_000).map(|number| record(&format!("{number:05}"), 1));
+        let folder = tempfile::tempdir().unwrap();
+        write_chunks(&folder.path().join("test"), small.chain([record("long", most)]).map(Ok), u64::MAX).unwrap();
+        let source =
+            ChunkSource::open(folder.path(), Split::Test, &SceneFilters { min_frames: 1, ..Default::default() });
+        let source = source.unwrap();
+        assert_eq!(source.ledger().to_string(), "20001 of 20001 scenes used");
+        assert_eq!(source.num_frames(source.find("long").unwrap()).unwrap(), most);
+        let message = write_chunks(&folder.path().join("train"), [Ok(record("a", most + 1))], 1).unwrap_err();
+        assert!(message.to_string().contains(" frames, more than a file holds (about 50,000)"), "{message}");
     }
 
     #[test]

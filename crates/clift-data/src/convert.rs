@@ -5,19 +5,19 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
+use crate::chunk_index::read_index;
 use crate::chunk_table::{ChunkTable, SceneTable};
-use crate::chunk_writer::{SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
+use crate::chunk_writer::{Fill, SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
 use crate::clip::SceneSource;
 use crate::error::DataError;
 use crate::export::Encoding;
-use crate::journal::Journal;
-use crate::ledger::Ledger;
+use crate::journal::{INDEX, Journal, SKIPPED};
+use crate::ledger::{Ledger, Skip, counted, some_of};
 use crate::picture_folder::has_ending;
+use crate::test_scenes::KEPT_FOR_TESTING;
 
-/// Scenes of `chunks`, by key: the file of each.
-const INDEX: &str = "index.json";
-/// The [`Ledger`] of what is not in the folder.
-const SKIPPED: &str = "skipped.json";
+/// Longest key that names a file: file systems take 255 bytes, the ending included.
+const MAX_NAME_BYTES: usize = 200;
 
 /// What is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -92,6 +92,15 @@ pub fn convert(
     Conversion::open(source, left_out, folder, options)?.run(done)
 }
 
+/// What a scene that is there is to the source's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    Same,
+    Changed,
+    /// The source had it.
+    Unreadable,
+}
+
 /// A folder that is to receive the scenes of a source.
 ///
 /// Every file appears under its name only when it is complete, its SHA-256 in `SHA256SUMS`, which `sha256sum -c`
@@ -107,9 +116,11 @@ pub struct Conversion<'a> {
     index: BTreeMap<String, String>,
     /// Files with a scene that has changed.
     stale: BTreeSet<String>,
+    /// Scenes of files that stay which opening the source has left out.
+    unreadable: BTreeSet<String>,
     pending: Vec<SceneRecord>,
     pending_keys: HashSet<String>,
-    pending_bytes: u64,
+    fill: Fill,
     converted: Converted,
 }
 
@@ -132,9 +143,10 @@ impl<'a> Conversion<'a> {
             journal,
             index: BTreeMap::new(),
             stale: BTreeSet::new(),
+            unreadable: BTreeSet::new(),
             pending: Vec::new(),
             pending_keys: HashSet::new(),
-            pending_bytes: 0,
+            fill: Fill::default(),
             converted: Converted { left_out: left_out.clone(), ..Converted::default() },
         };
         conversion.look()?;
@@ -143,36 +155,50 @@ impl<'a> Conversion<'a> {
 
     /// Takes up the scenes of the files that the journal knows.
     fn look(&mut self) -> Result<(), DataError> {
-        let names: Vec<String> =
-            self.journal.names().filter(|name| has_ending(name, "torch")).map(str::to_owned).collect();
-        for name in names {
-            let path = self.folder.join(&name);
+        let unreadable: HashSet<&str> = self.converted.left_out.skips.iter().filter_map(Skip::unreadable).collect();
+        let names: Vec<&str> = self.journal.names().filter(|name| has_ending(name, "torch")).collect();
+        let look = |name: &str| {
+            let path = self.folder.join(name);
             let tables: Vec<SceneTable> = ChunkTable::read(&path)?.scenes.into_values().collect();
-            let changed: Vec<bool> =
-                tables.par_iter().map(|table| self.is_changed(table, &path)).collect::<Result<_, _>>()?;
-            let num_changed = changed.iter().filter(|changed| **changed).count();
+            let states = tables.iter().map(|table| self.state(table, &path, &unreadable));
+            let states = states.collect::<Result<Vec<State>, DataError>>()?;
+            let scenes = tables.into_iter().map(|table| table.key).zip(states).collect();
+            Ok((name.to_owned(), scenes))
+        };
+        let looked: Vec<(String, Vec<(String, State)>)> =
+            names.into_par_iter().map(look).collect::<Result<_, DataError>>()?;
+        for (name, scenes) in looked {
+            let num_changed = scenes.iter().filter(|(_, state)| *state == State::Changed).count();
             self.converted.num_changed += num_changed;
             if num_changed > 0 {
                 self.stale.insert(name);
-            } else {
-                self.index.extend(tables.into_iter().map(|table| (table.key, name.clone())));
+                continue;
+            }
+            for (key, state) in scenes {
+                if state == State::Unreadable {
+                    self.unreadable.insert(key.clone());
+                }
+                self.index.insert(key, name.clone());
             }
         }
         self.converted.num_found = self.index.len();
         Ok(())
     }
 
-    /// Whether a scene that is there differs from the source's.
-    fn is_changed(&self, table: &SceneTable, path: &Path) -> Result<bool, DataError> {
+    /// How a scene that is there compares to the source's. `unreadable` are those that opening the source left out.
+    fn state(&self, table: &SceneTable, path: &Path, unreadable: &HashSet<&str>) -> Result<State, DataError> {
         let key = &table.key;
         let Some(scene) = self.source.find(key).filter(|scene| self.source.key(*scene) == key) else {
+            if unreadable.contains(key.as_str()) {
+                return Ok(State::Unreadable);
+            }
             let what = format!("it holds scene {key}, which is not to be converted; choose another folder");
             return Err(DataError::BadIndex { what, path: path.to_owned() });
         };
         let now = self.source.timestamps(scene).and_then(|times| Ok((times, self.source.cameras(scene)?)));
         // What cannot be read any more is no reason to throw away what could be.
-        let Ok((timestamps, cameras)) = now else { return Ok(false) };
-        Ok(!table.is_of(path, &timestamps, &cameras)?)
+        let Ok((timestamps, cameras)) = now else { return Ok(State::Same) };
+        Ok(if table.is_of(path, &timestamps, &cameras)? { State::Same } else { State::Changed })
     }
 
     /// Writes the scenes that are missing; one that cannot be read is left out, with the reason in the result and in
@@ -182,13 +208,12 @@ impl<'a> Conversion<'a> {
     /// [`DataError::Io`] from writing.
     pub fn run(mut self, mut done: impl FnMut(usize)) -> Result<Converted, DataError> {
         self.journal.begin()?;
-        if !self.stale.is_empty() {
-            // It names files that are about to go.
-            self.journal.remove(INDEX)?;
+        let stale = std::mem::take(&mut self.stale);
+        if !stale.is_empty() || self.index_names_others() {
+            // It names files that are about to go, or are gone.
+            self.journal.remove_all([INDEX])?;
         }
-        for name in std::mem::take(&mut self.stale) {
-            self.journal.remove(&name)?;
-        }
+        self.journal.remove_all(stale.iter().map(String::as_str))?;
         for scene in 0..self.source.num_scenes() {
             let key = self.source.key(scene);
             if !self.index.contains_key(key) && !self.pending_keys.contains(key) {
@@ -202,6 +227,13 @@ impl<'a> Conversion<'a> {
         self.finish()
     }
 
+    /// Whether the index that is there names files that are not.
+    fn index_names_others(&self) -> bool {
+        let there: HashSet<&str> = self.journal.names().collect();
+        let is_other = |index: BTreeMap<String, String>| index.values().any(|file| !there.contains(file.as_str()));
+        there.contains(INDEX) && read_index(&self.folder.join(INDEX)).map_or(true, is_other)
+    }
+
     fn add(&mut self, record: SceneRecord, num_encoded: usize) -> Result<(), DataError> {
         let image_bytes = record.images.iter().map(|image| image.len() as u64).sum::<u64>();
         if let Err(what) = record.check() {
@@ -212,14 +244,17 @@ impl<'a> Conversion<'a> {
             self.converted.left_out.skip(record.key, "its key is no name for a file; convert to chunks");
             return Ok(());
         }
+        if !self.fill.has_room(&record) {
+            self.flush()?;
+        }
         self.converted.num_frames += record.images.len();
         self.converted.num_encoded += num_encoded;
         self.converted.image_bytes += image_bytes;
-        self.pending_bytes += image_bytes;
+        self.fill.add(&record);
         self.pending_keys.insert(record.key.clone());
         self.pending.push(record);
         match self.options.to {
-            ConvertTo::Chunks { target_bytes } if self.pending_bytes < target_bytes => Ok(()),
+            ConvertTo::Chunks { target_bytes } if !self.fill.is_full(target_bytes) => Ok(()),
             _ => self.flush(),
         }
     }
@@ -242,7 +277,7 @@ impl<'a> Conversion<'a> {
         self.journal.write(&name, &bytes)?;
         self.index.extend(scenes.into_iter().map(|scene| (scene.key, name.clone())));
         self.pending_keys.clear();
-        self.pending_bytes = 0;
+        self.fill = Fill::default();
         Ok(())
     }
 
@@ -255,6 +290,15 @@ impl<'a> Conversion<'a> {
 
     fn finish(mut self) -> Result<Converted, DataError> {
         self.flush()?;
+        if !self.unreadable.is_empty() {
+            let names: Vec<&String> = self.unreadable.iter().collect();
+            let scenes = counted(names.len(), "scene");
+            let left_out = &mut self.converted.left_out;
+            left_out
+                .notes
+                .push(format!("{scenes} could not be read again, kept as converted before ({})", some_of(&names)));
+            left_out.skips.retain(|skip| !self.unreadable.contains(&skip.key));
+        }
         let is_chunks = self.options.to != ConvertTo::Scenes;
         let index = (is_chunks && !self.index.is_empty()).then(|| serde_json::to_vec_pretty(&self.index));
         let left_out = &self.converted.left_out;
@@ -262,7 +306,7 @@ impl<'a> Conversion<'a> {
         for (name, text) in [(INDEX, index), (SKIPPED, skipped)] {
             let Some(text) = text else {
                 // What an earlier run left out is there now.
-                self.journal.remove(name)?;
+                self.journal.remove_all([name])?;
                 continue;
             };
             let path = self.folder.join(name);
@@ -271,6 +315,13 @@ impl<'a> Conversion<'a> {
         }
         self.converted.num_scenes = self.index.len();
         Ok(self.converted)
+    }
+}
+
+impl Skip {
+    /// The key of a scene that would be used if it could be.
+    fn unreadable(&self) -> Option<&str> {
+        (!self.reason.starts_with(KEPT_FOR_TESTING)).then_some(&self.key)
     }
 }
 
@@ -293,7 +344,10 @@ fn record(source: &dyn SceneSource, scene: usize, encoding: Encoding) -> Result<
 }
 
 fn is_file_name(key: &str) -> bool {
-    !key.is_empty() && !key.starts_with('.') && !key.contains(['/', '\\', '\0', ':', '\n'])
+    !key.is_empty()
+        && !key.starts_with('.')
+        && key.len() <= MAX_NAME_BYTES
+        && !key.contains(['/', '\\', '\0', ':', '\n', '*', '?', '"', '<', '>', '|'])
 }
 
 #[cfg(test)]

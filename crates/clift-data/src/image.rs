@@ -131,10 +131,33 @@ pub(crate) fn exif_orientation(path: &Path) -> Option<u8> {
     decoder.orientation().ok().map(image::metadata::Orientation::to_exif).filter(|orientation| *orientation != 1)
 }
 
-/// Whether an end marker follows the last scan; the decoder fills what is missing of a truncated JPEG with grey.
+/// Whether the picture ends before the file does; the decoder fills what is missing of a truncated JPEG with grey.
 fn has_jpeg_end(bytes: &[u8]) -> bool {
-    let last_scan = bytes.windows(2).rposition(|pair| pair == [0xff, 0xda]);
-    last_scan.is_some_and(|scan| bytes[scan..].windows(2).any(|pair| pair == [0xff, 0xd9]))
+    let padding = bytes.iter().rev().take_while(|byte| **byte == 0).count();
+    bytes[..bytes.len() - padding].ends_with(JPEG_END) || ends_after_a_scan(bytes).unwrap_or_default()
+}
+
+/// Walks the segments of a JPEG up to the first end marker behind a scan: what is appended to it, such as a phone's film,
+/// may look like anything. `None` where the data stops within a segment.
+fn ends_after_a_scan(bytes: &[u8]) -> Option<bool> {
+    let mut rest = bytes;
+    let mut has_scan = false;
+    loop {
+        // In a scan 0xff is followed by 0 or a restart, before a marker it may be repeated.
+        let is_marker = |pair: &[u8]| pair[0] == 0xff && !matches!(pair[1], 0x00 | 0xd0..=0xd7 | 0xff);
+        let at = rest.windows(2).position(is_marker)?;
+        let marker = rest[at + 1];
+        rest = &rest[at + 2..];
+        match marker {
+            0xd9 => return Some(has_scan),
+            0x01 | 0xd8 => {} // without a length
+            _ => {
+                has_scan |= marker == 0xda;
+                let length = rest.first_chunk().map(|length| u16::from_be_bytes(*length))?;
+                rest = rest.get(usize::from(length)..)?;
+            }
+        }
+    }
 }
 
 /// Encodes a frame as JPEG of `quality` in `1..=100`.
@@ -293,6 +316,41 @@ mod tests {
         assert_eq!(decode(&[&jpeg[..], &[0; 9]].concat(), "00ff", 7).unwrap().width, 40); // padding is common
         let message = decode(b"GIF89a....", "00ff", 7).unwrap_err().to_string();
         assert!(message.ends_with("its 10 bytes are neither JPEG nor PNG"), "{message}");
+    }
+
+    #[test]
+    fn whatever_is_appended_to_a_jpeg_does_not_make_it_truncated() {
+        let jpeg = encode_jpeg(&ramp(40, 24), 90).unwrap();
+        let mut state = 1_u32;
+        let mut film: Vec<u8> = std::iter::repeat_with(|| {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 24) as u8
+        })
+        .take(400_000)
+        .collect();
+        film.extend(b"\xff\xdaend");
+        let with_film = [&jpeg[..], &film].concat();
+        assert_eq!(decode(&with_film, "k", 0).unwrap(), decode(&jpeg, "k", 0).unwrap());
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.jpg");
+        std::fs::write(&path, &with_film).unwrap();
+        check_end(&path, 1 << 20).unwrap();
+    }
+
+    #[test]
+    fn a_jpeg_ends_behind_its_scans_and_not_within_a_segment() {
+        let head = b"\xff\xd8\xff\xe1\x00\x06\xff\xd8\xff\xd9\xff\xff\xda\x00\x04\xff\xd9\x01\xff\x00\x02\xff\xd3\x03";
+        let scans = [&head[..], b"\xff\xc4\x00\x04\xff\xd9\xff\xda\x00\x02\x05\xff\x00"].concat();
+        for whole in [&head[..], &scans] {
+            assert!(has_jpeg_end(&[whole, b"\xff\xd9"].concat()));
+            assert!(has_jpeg_end(&[whole, b"\xff\xff\xd9 film \xff\xda"].concat()));
+            assert!(!has_jpeg_end(&[whole, b"\xff"].concat()));
+        }
+        // The end markers of a preview and of a table are not the picture's.
+        for length in 10..scans.len() {
+            let part = &scans[..length];
+            assert!(part.ends_with(JPEG_END) || !has_jpeg_end(part), "{length}");
+        }
     }
 
     #[test]

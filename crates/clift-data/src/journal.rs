@@ -8,13 +8,19 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use crate::error::DataError;
-use crate::files::{remove_leftovers, replace};
+use crate::files::{TEMPORARY, replace};
 use crate::picture_folder::has_ending;
 
 /// As `sha256sum` calls it: a line per file, sum and name.
 const FILE_NAME: &str = "SHA256SUMS";
 /// Starts the line that says how the files are made: a comment to `sha256sum -c`.
 const MADE_AS: &str = "# made as: ";
+/// Scenes of chunks, by key: the file of each.
+pub(crate) const INDEX: &str = "index.json";
+/// The [`Ledger`](crate::Ledger) of what is not in the folder.
+pub(crate) const SKIPPED: &str = "skipped.json";
+/// What is written beside scenes.
+const LISTS: [&str; 2] = [INDEX, SKIPPED];
 
 /// The sums of a folder that is being written.
 ///
@@ -30,8 +36,7 @@ pub(crate) struct Journal {
 }
 
 impl Journal {
-    /// Looks at a folder, new or empty or one that was started, and changes nothing in it but for removing what kills
-    /// in the middle of writing have left. Lines of files that are missing or hold something else are dropped: they will
+    /// Looks at a folder, new or empty or one that was started, and changes nothing in it. Lines of files that are missing or hold something else are dropped: they will
     /// be written again.
     ///
     /// # Errors
@@ -49,9 +54,15 @@ impl Journal {
         if path.exists() {
             let text = std::fs::read_to_string(&path).map_err(DataError::io("reading the checksums", &path))?;
             // A line that was cut off has no end, and its file no name yet.
-            for line in text.split_inclusive('\n').filter_map(|line| line.strip_suffix('\n')) {
-                found = found.or(line.strip_prefix(MADE_AS).map(str::to_owned));
-                let Some((sum, name)) = line.split_once("  ") else { continue };
+            let lines: Vec<&str> = text.split_inclusive('\n').filter_map(|line| line.strip_suffix('\n')).collect();
+            found = lines.iter().find_map(|line| line.strip_prefix(MADE_AS)).map(str::to_owned);
+            if found.is_none() {
+                // It is not one of ours, and neither are the files that it names.
+                return Err(bad(format!(
+                    "its {FILE_NAME} does not say how the files were made; choose another folder"
+                )));
+            }
+            for (sum, name) in lines.iter().filter_map(|line| line.split_once("  ")) {
                 let file = folder.join(name);
                 let is_inside = Path::new(name).file_name().is_some_and(|base| base == name);
                 if !is_inside || !file.is_file() {
@@ -72,35 +83,41 @@ impl Journal {
             Some(found) if found != made_as && has_scenes => Err(bad(format!(
                 "its files were made as: {found}; asked for are: {made_as}; give the same options or choose another folder"
             ))),
-            None if has_scenes => {
-                Err(bad(format!("its {FILE_NAME} does not say how the files were made; choose another folder")))
-            }
             _ => Ok(journal),
         }
     }
 
-    /// Refuses a folder with a file that has no line.
+    /// Refuses a folder with a file that has no line, or that is about to be removed and that no conversion writes.
     fn refuse_others(&self) -> Result<(), DataError> {
         let folder = &self.folder;
+        let bad = |what: String| DataError::BadIndex { what, path: folder.clone() };
         let reading = || DataError::io("reading the folder", folder);
-        remove_leftovers(folder).map_err(DataError::io("removing what a killed process left", folder))?;
+        if let Some(name) =
+            self.damaged.iter().find(|name| !has_ending(name, "torch") && !LISTS.contains(&name.as_str()))
+        {
+            return Err(bad(format!("its {name} is not what {FILE_NAME} says; choose an empty folder")));
+        }
         let entries = match std::fs::read_dir(folder) {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
             entries => entries.map_err(reading())?,
         };
         for entry in entries {
             let name = entry.map_err(reading())?.file_name().to_string_lossy().into_owned();
-            if name != FILE_NAME && !self.sums.contains_key(&name) && !self.damaged.contains(&name) {
-                let what = format!("it holds {name}, which is in no line of {FILE_NAME}; choose an empty folder");
-                return Err(DataError::BadIndex { what, path: folder.clone() });
+            let is_ours = name == FILE_NAME || name.starts_with(TEMPORARY);
+            if !is_ours && !self.sums.contains_key(&name) && !self.damaged.contains(&name) {
+                return Err(bad(format!(
+                    "it holds {name}, which is in no line of {FILE_NAME}; choose an empty folder"
+                )));
             }
         }
         Ok(())
     }
 
-    /// Makes the folder where it is new, and removes files that hold something else than their line says.
+    /// Makes the folder where it is new, and removes what kills in the middle of writing have left, and files that hold
+    /// something else than their line says.
     pub fn begin(&mut self) -> Result<(), DataError> {
         std::fs::create_dir_all(&self.folder).map_err(DataError::io("making the folder", &self.folder))?;
+        self.remove_leftovers().map_err(DataError::io("removing what a killed process left", &self.folder))?;
         for name in std::mem::take(&mut self.damaged) {
             self.delete(&name)?;
         }
@@ -130,13 +147,27 @@ impl Journal {
         replace(&path, bytes).map_err(DataError::io("writing a file", &path))
     }
 
-    /// Removes a file, if there is one of that name with a line.
-    pub fn remove(&mut self, name: &str) -> Result<(), DataError> {
-        if self.sums.contains_key(name) {
-            // A kill in between leaves a line without a file, and never a file without a line.
+    /// Removes the files of these names that have a line.
+    pub fn remove_all<'a>(&mut self, names: impl IntoIterator<Item = &'a str>) -> Result<(), DataError> {
+        let names: Vec<&str> = names.into_iter().filter(|name| self.sums.contains_key(*name)).collect();
+        if names.is_empty() {
+            return Ok(());
+        }
+        for name in names {
+            // A kill in between leaves lines without a file, and never a file without a line.
             self.delete(name)?;
             self.sums.remove(name);
-            self.rewrite()?;
+        }
+        self.rewrite()
+    }
+
+    /// Removes the temporary files of this folder, and of no other.
+    fn remove_leftovers(&self) -> std::io::Result<()> {
+        for entry in std::fs::read_dir(&self.folder)? {
+            let entry = entry?;
+            if entry.file_name().to_string_lossy().starts_with(TEMPORARY) && entry.file_type()?.is_file() {
+                std::fs::remove_file(entry.path())?;
+            }
         }
         Ok(())
     }
@@ -211,7 +242,7 @@ mod tests {
         assert!(at("a.torch").exists(), "looking changes nothing");
         journal.begin().unwrap();
         assert!(!at("a.torch").exists());
-        journal.remove("b.torch").unwrap();
+        journal.remove_all(["b.torch", "never.torch"]).unwrap();
         let text = std::fs::read_to_string(at(FILE_NAME)).unwrap();
         assert_eq!(text.lines().count(), 2);
         assert!(text.starts_with("# made as: chunks\n") && text.ends_with("  c.torch\n"), "{text}");
@@ -270,8 +301,43 @@ mod tests {
         let path = folder.path().join(FILE_NAME);
         let text = std::fs::read_to_string(&path).unwrap();
         std::fs::write(&path, format!("{text}{}  d\n", hex(&Sha256::digest(b"d")))).unwrap();
-        let journal = Journal::open(folder.path(), "chunks").unwrap();
+        let mut journal = Journal::open(folder.path(), "chunks").unwrap();
         assert_eq!(journal.names().collect::<Vec<_>>(), ["a.torch", "b.torch", "c.torch"]);
+        journal.begin().unwrap();
         assert!(!leftover.exists());
+    }
+
+    #[test]
+    fn a_folder_that_is_refused_keeps_everything_at_any_depth() {
+        let folder = tempfile::tempdir().unwrap();
+        let mine = [".clift-x1", "mine/.clift-y2", ".clift-z3/notes.txt"].map(|name| folder.path().join(name));
+        for path in &mine {
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, "x").unwrap();
+        }
+        let message = Journal::open(folder.path(), "chunks").unwrap_err().to_string();
+        assert!(message.contains("it holds mine, which is in no line"), "{message}");
+        assert!(mine.iter().all(|path| path.exists()));
+        std::fs::rename(folder.path().join("mine"), folder.path().join(".clift-w4")).unwrap();
+        three(folder.path());
+        assert!(!mine[0].exists() && mine[2].exists() && folder.path().join(".clift-w4/.clift-y2").exists());
+    }
+
+    #[test]
+    fn files_of_someone_elses_checksums_are_left_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let sums = format!("{}  notes.txt\n", hex(&Sha256::digest(b"first")));
+        std::fs::write(at("notes.txt"), "second").unwrap();
+        for (text, expected) in [
+            (sums.clone(), "does not say how the files were made"),
+            (format!("{MADE_AS}chunks\n{sums}"), "its notes.txt is not what SHA256SUMS says"),
+        ] {
+            std::fs::write(at(FILE_NAME), &text).unwrap();
+            let message = Journal::open(folder.path(), "chunks").and_then(|mut journal| journal.begin()).unwrap_err();
+            assert!(message.to_string().contains(expected), "{message}");
+            assert_eq!(std::fs::read_to_string(at("notes.txt")).unwrap(), "second");
+            assert_eq!(std::fs::read_to_string(at(FILE_NAME)).unwrap(), text);
+        }
     }
 }

@@ -18,7 +18,7 @@ use crate::picture_folder::file_names;
 use crate::place::{Found, Place};
 use crate::scene_folder::{SceneFiles, SceneFolder};
 use crate::split::Split;
-use crate::test_scenes::TestScenes;
+use crate::test_scenes::{KEPT_AND_ABSENT, TestScenes};
 use crate::transforms::PhotoOptions;
 
 /// Folders that DL3DV's pictures are in, in the order they are preferred: 480 x 270, then larger.
@@ -158,7 +158,7 @@ impl Place<'_> {
             index_of_files(&self.base, &mut ledger)?
         };
         let keys: Vec<String> = index.keys().cloned().collect();
-        let kept = divide(list, &keys, self, &mut ledger);
+        let kept = self.divide(list, &keys, options, &mut ledger);
         let kept: HashSet<&str> =
             keys.iter().zip(kept).filter(|(_, kept)| *kept).map(|(key, _)| key.as_str()).collect();
         let is_kept = |key: &str| kept.contains(key);
@@ -181,7 +181,7 @@ impl Place<'_> {
         let is_text = layout == Layout::Re10kTxt;
         let mut scenes = if scenes.is_empty() { self.re10k_clips(options)? } else { scenes };
         let keys: Vec<String> = scenes.iter().map(|scene| scene.key.clone()).collect();
-        let mut kept = divide(list, &keys, self, &mut ledger).into_iter();
+        let mut kept = self.divide(list, &keys, options, &mut ledger).into_iter();
         scenes.retain(|_| kept.next().unwrap_or_default());
         let is_dl3dv = layout == Layout::Dl3dv;
         let files = &options.files;
@@ -222,14 +222,38 @@ impl Place<'_> {
         };
         Ok(names.iter().filter_map(clip).collect())
     }
-}
 
-/// Which of the keys belong to the split; the rest goes into the ledger.
-fn divide(list: Option<&TestScenes>, keys: &[String], place: &Place<'_>, ledger: &mut Ledger) -> Vec<bool> {
-    let Some(list) = list else { return vec![true; keys.len()] };
-    let (kept, divided) = list.divide(keys, place.split, !place.has_splits);
-    append(ledger, &divided);
-    kept
+    /// Which of the keys belong to the split; the rest goes into the ledger.
+    fn divide(
+        &self,
+        list: Option<&TestScenes>,
+        keys: &[String],
+        options: &LayoutOptions,
+        ledger: &mut Ledger,
+    ) -> Vec<bool> {
+        let Some(list) = list else { return vec![true; keys.len()] };
+        let (kept, mut divided) = list.divide(keys, self.split, !self.has_splits);
+        if self.has_splits && self.split == Split::Train && !divided.skips.is_empty() {
+            let there = TestScenes::of_keys(&self.test_keys(options).unwrap_or_default());
+            let absent = divided.skips.iter_mut().filter(|skip| !there.contains(&skip.key));
+            absent.for_each(|skip| skip.reason = KEPT_AND_ABSENT.into());
+        }
+        append(ledger, &divided);
+        kept
+    }
+
+    /// Keys of the scenes in `test/`.
+    fn test_keys(&self, options: &LayoutOptions) -> Result<Vec<String>, DataError> {
+        let place = Place::find(self.root, Split::Test)?;
+        Ok(match place.scenes(options.layout)? {
+            Found::Torch(Layout::Chunks) => read_index(&place.base.join("index.json"))?.into_keys().collect(),
+            Found::Torch(_) => index_of_files(&place.base, &mut Ledger::default())?.into_keys().collect(),
+            Found::Photos(_, scenes, _) => {
+                let scenes = if scenes.is_empty() { place.re10k_clips(options)? } else { scenes };
+                scenes.into_iter().map(|scene| scene.key).collect()
+            }
+        })
+    }
 }
 
 fn append(ledger: &mut Ledger, more: &Ledger) {

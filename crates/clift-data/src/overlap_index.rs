@@ -10,7 +10,7 @@ use crate::camera::Camera;
 use crate::clip::{SceneSource, ViewIndices};
 use crate::error::DataError;
 use crate::export::write_index;
-use crate::ledger::Ledger;
+use crate::ledger::{Ledger, counted, some_of};
 use crate::order::{between, derive_seed, distinct, draw_from, step_rng};
 use crate::overlap::overlap;
 
@@ -110,7 +110,7 @@ pub fn write_overlap_index(
     options.validate()?;
     let mut scenes: Vec<(&dyn SceneSource, usize)> = Vec::new();
     let mut places: HashMap<&str, usize> = HashMap::new();
-    let mut notes = Vec::new();
+    let mut shared = Vec::new();
     for (source, scene) in sources.iter().flat_map(|source| (0..source.num_scenes()).map(|scene| (*source, scene))) {
         let key = source.key(scene);
         let place = *places.entry(key).or_insert(scenes.len());
@@ -118,12 +118,20 @@ pub fn write_overlap_index(
             scenes.push((source, scene));
             continue;
         };
-        if !matches!((other.cameras(other_scene), source.cameras(scene)), (Ok(a), Ok(b)) if a == b) {
-            let what = format!("scene {key} is in both halves with other cameras; make an index of each");
-            return Err(DataError::BadIndex { what, path: path.to_owned() });
+        match (other.cameras(other_scene), source.cameras(scene)) {
+            (Ok(a), Ok(b)) if a != b => {
+                let what = format!("scene {key} is in both halves with other cameras; make an index of each");
+                return Err(DataError::BadIndex { what, path: path.to_owned() });
+            }
+            (Err(_), Ok(_)) => scenes[place] = (source, scene),
+            _ => {}
         }
-        notes.push(format!("scene {key} is in both halves, and counts once"));
+        shared.push(key);
     }
+    let note = |shared: &[&str]| {
+        format!("{} in both halves, counted once ({})", counted(shared.len(), "scene"), some_of(shared))
+    };
+    let notes = (!shared.is_empty()).then(|| note(&shared)).into_iter().collect();
     let draw = |(source, scene): &(&dyn SceneSource, usize)| {
         let cameras = source.cameras(*scene).map_err(|error| error.to_string())?;
         options.draw(source.key(*scene), &cameras)
@@ -267,12 +275,50 @@ mod tests {
             assert_eq!(written.views(key, 60).unwrap(), alone.views(key, 60).unwrap());
         }
         let ledger = write_overlap_index(&path, &[&other, &other], &options).unwrap();
-        assert_eq!((ledger.num_scenes, ledger.notes.len()), (3, 3));
-        assert_eq!(ledger.notes[0], format!("scene {} is in both halves, and counts once", other.key(0)));
+        assert_eq!(ledger.num_scenes, 3);
+        let keys = [0, 1, 2].map(|scene| other.key(scene)).join(", ");
+        assert_eq!(ledger.notes, [format!("3 scenes in both halves, counted once ({keys})")]);
         let rooms = rooms(60, 3.0);
         let shorter = FirstIsShort(self::rooms(60, 3.0));
         let message = write_overlap_index(&path, &[&rooms, &shorter], &options).unwrap_err().to_string();
         assert!(message.contains("is in both halves with other cameras; make an index of each"), "{message}");
+    }
+
+    /// Rooms of which no camera can be read.
+    struct NoCameras(SyntheticSource);
+
+    impl SceneSource for NoCameras {
+        fn num_scenes(&self) -> usize {
+            self.0.num_scenes()
+        }
+        fn key(&self, scene: usize) -> &str {
+            self.0.key(scene)
+        }
+        fn find(&self, key: &str) -> Option<usize> {
+            self.0.find(key)
+        }
+        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+            Err(DataError::NoSuchScene { scene, num_scenes: 0 })
+        }
+        fn frame(&self, scene: usize, frame: usize) -> Result<crate::Frame, DataError> {
+            self.0.frame(scene, frame)
+        }
+    }
+
+    #[test]
+    fn of_a_shared_scene_the_half_counts_that_can_be_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("index.json");
+        let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
+        let (whole, broken) = (rooms(60, 3.0), NoCameras(rooms(60, 3.0)));
+        let num_used = index(&whole, &options).1.num_used();
+        let orders: [[&dyn SceneSource; 2]; 2] = [[&whole, &broken], [&broken, &whole]];
+        for sources in orders {
+            let ledger = write_overlap_index(&path, &sources, &options).unwrap();
+            assert_eq!((ledger.num_used(), ledger.notes.len()), (num_used, 1), "{ledger}");
+        }
+        let ledger = write_overlap_index(&path, &[&broken, &broken], &options).unwrap();
+        assert_eq!((ledger.num_used(), ledger.skips.len()), (0, 20), "{ledger}");
     }
 
     #[test]

@@ -16,6 +16,9 @@ use crate::split::Split;
 const MAX_BYTES: u64 = 256 << 20;
 /// Why a training half goes without a scene that the test half has: nothing is wrong with it.
 pub const KEPT_FOR_TESTING: &str = "kept for testing";
+/// Why neither half has a scene that the list keeps for testing and that lies in `train/` alone. Starts with
+/// [`KEPT_FOR_TESTING`].
+pub(crate) const KEPT_AND_ABSENT: &str = "kept for testing by the list of test scenes, but not in test/";
 
 /// Keys of the scenes kept for testing, without DepthSplat's prefix, and of DL3DV's without the way to them.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -43,7 +46,11 @@ impl TestScenes {
             Some('[') => serde_json::from_str(text).map_err(json)?,
             _ => text.lines().map(|line| line.trim().to_owned()).filter(|line| !line.is_empty()).collect(),
         };
-        Ok(Self { keys: keys.iter().map(|key| plain(key).to_owned()).collect() })
+        Ok(Self::of_keys(&keys))
+    }
+
+    pub(crate) fn of_keys(keys: &[String]) -> Self {
+        Self { keys: keys.iter().map(|key| plain(key).to_owned()).collect() }
     }
 
     /// Whether a scene is one of them, with or without DepthSplat's prefix. Of a key that is the way to a scene, as those

@@ -22,6 +22,10 @@ use crate::picture_folder::{PictureFolders, natural_order};
 const MAX_BYTES: u64 = 128 << 20;
 /// Most frames of one scene.
 pub(crate) const MAX_FRAMES: usize = 100_000;
+/// Longest name of a picture: what operating systems take as a path.
+const MAX_NAME_BYTES: usize = 4096;
+/// Folders above a picture that are looked for in the scene's own, its name included.
+const MAX_WAYS: usize = 32;
 
 /// How photos are found and what is done to them.
 #[derive(Clone, Debug, Default)]
@@ -179,6 +183,10 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
     drop(text);
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
+    if let Some(Entry { file_path: name, .. }) = entries.iter().find(|entry| entry.file_path.len() > MAX_NAME_BYTES) {
+        let start: String = name.chars().take(40).collect();
+        return Err(bad(format!("frame {start}..: its name has {} bytes, more than {MAX_NAME_BYTES}", name.len())));
+    }
     entries.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
     let mut pictures = Pictures { folder, options, folders: PictureFolders::default() };
     let (top, mut scene) = (document.optics(), PhotoScene::default());
@@ -254,7 +262,7 @@ impl Pictures<'_> {
             return self.folders.find(&given);
         }
         // Pictures scaled down alone, or a path from another folder or computer.
-        let ways = ways_to(named).into_iter().map(|way| self.folder.join(way));
+        let ways = ways_to(named).map(|way| self.folder.join(way));
         for place in std::iter::once(given.clone()).chain(ways) {
             let Some(parent) = place.parent().filter(|parent| *parent != self.folder) else { continue };
             let last = parent.file_name().unwrap_or_default().to_string_lossy();
@@ -280,16 +288,16 @@ impl Pictures<'_> {
 
     /// As many of the last parts of a path as have their folder in `folder`.
     fn longest_way(&mut self, folder: &Path, named: &Path) -> PathBuf {
-        let mut ways = ways_to(named).into_iter();
+        let mut ways = ways_to(named);
         let found = ways.find(|way| way.parent().is_some_and(|parent| self.folders.has(&folder.join(parent))));
         found.unwrap_or_else(|| named.file_name().unwrap_or_default().into())
     }
 }
 
-/// The last parts of a path, from all of them to the name alone.
-fn ways_to(path: &Path) -> Vec<PathBuf> {
+/// The last parts of a path, from all of them, or as many as are looked at, to the name alone.
+fn ways_to(path: &Path) -> impl Iterator<Item = PathBuf> {
     let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
-    (0..parts.len()).map(|start| parts[start..].iter().collect()).collect()
+    (parts.len().saturating_sub(MAX_WAYS)..parts.len()).map(move |start| parts[start..].iter().collect())
 }
 
 /// Whether a path is absolute, on Windows or elsewhere.
@@ -331,5 +339,18 @@ impl<'de, T: Deserialize<'de>, const MAX: usize> Visitor<'de> for BoundedVisitor
             list.push(item);
         }
         Ok(Bounded(list))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_a_path_of_many_folders_the_last_are_looked_at() {
+        let ways = |path: &str| ways_to(Path::new(path)).collect::<Vec<_>>();
+        assert_eq!(ways("/a/./b/c.png"), ["a/b/c.png", "b/c.png", "c.png"].map(PathBuf::from));
+        let deep = ways(&"a/".repeat(2000));
+        assert_eq!((deep.len(), deep[0].components().count()), (MAX_WAYS, MAX_WAYS));
     }
 }

@@ -123,7 +123,7 @@ proptest! {
 fn a_key_that_the_chunk_does_not_hold_is_an_error() {
     let (_folder, source) = with_chunk(&mini_chunk(), &["00ff"]);
     let message = source.cameras(0).unwrap_err().to_string();
-    assert!(message.contains("index.json lists scene 00ff in it, but it holds 2 other scenes"), "{message}");
+    assert!(message.contains("scene 00ff is expected in it, but it holds 2 other scenes"), "{message}");
 }
 
 #[test]

@@ -204,6 +204,80 @@ fn a_folder_of_other_scenes_is_refused() {
     let message = convert_all(&mini(), folder.path(), &SCENES, |_| ()).unwrap_err().to_string();
     assert!(message.contains("which is not to be converted; choose another folder"), "{message}");
     assert!(!is_file_name("a/b") && !is_file_name("..") && is_file_name("1K-ab.c"));
+    assert!(!"*?\"<>|".chars().any(|no| is_file_name(&format!("a{no}"))), "not on Windows");
+    assert!(is_file_name(&"k".repeat(200)) && !is_file_name(&"k".repeat(201)));
+}
+
+#[test]
+fn a_scene_that_can_no_longer_be_opened_stays_as_it_was_converted() {
+    for options in [CHUNKS, SCENES] {
+        let folder = tempfile::tempdir().unwrap();
+        convert_all(&rooms(3), folder.path(), &options, |_| ()).unwrap();
+        let before = files(folder.path());
+        let again = |reason: &str| {
+            let mut left_out = Ledger::new(3);
+            left_out.skip(rooms(3).key(2), reason);
+            convert(&rooms(2), &left_out, folder.path(), &options, |_| ())
+        };
+        let converted = again("its cameras cannot be read").unwrap();
+        assert_eq!((converted.num_scenes, converted.num_found, converted.left_out.num_used()), (3, 3, 3));
+        assert!(converted.left_out.notes[0].starts_with("1 scene could not be read again, kept as converted before ("));
+        assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), before.keys().collect::<Vec<_>>());
+        // Those of the test half have no place among the others, wherever else they are.
+        for reason in [KEPT_FOR_TESTING, crate::test_scenes::KEPT_AND_ABSENT] {
+            let message = again(reason).unwrap_err().to_string();
+            assert!(message.contains("which is not to be converted; choose another folder"), "{message}");
+        }
+    }
+}
+
+#[test]
+fn an_index_of_files_that_are_gone_goes_before_they_are_made_again() {
+    let folder = tempfile::tempdir().unwrap();
+    convert_all(&rooms(3), folder.path(), &CHUNKS, |_| ()).unwrap();
+    std::fs::remove_file(folder.path().join("000001.torch")).unwrap();
+    let killed = Interrupted { rooms: rooms(3), left: AtomicUsize::new(0) };
+    let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &CHUNKS, |_| ()));
+    assert!(std::panic::catch_unwind(run).is_err());
+    assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), ["000000.torch", "000002.torch", "SHA256SUMS"]);
+}
+
+/// Rooms of 30,000 and one of 60,000 frames of a byte.
+struct Long(SyntheticSource);
+
+impl SceneSource for Long {
+    fn num_scenes(&self) -> usize {
+        self.0.num_scenes()
+    }
+    fn key(&self, scene: usize) -> &str {
+        self.0.key(scene)
+    }
+    fn find(&self, key: &str) -> Option<usize> {
+        self.0.find(key)
+    }
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+        Ok(vec![self.0.cameras(scene)?[0]; if scene == 1 { 60_000 } else { 30_000 }])
+    }
+    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+        self.0.frame(scene, frame)
+    }
+    fn encoded_frame(&self, _scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
+        Ok(Some(vec![frame as u8]))
+    }
+}
+
+#[test]
+fn chunks_have_no_more_frames_than_can_be_read_and_scenes_of_more_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let one = options(ConvertTo::Chunks { target_bytes: u64::MAX });
+    let converted = convert_all(&Long(rooms(3)), folder.path(), &one, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (2, 1));
+    let reason = &converted.left_out.skips[0].reason;
+    assert!(reason.contains("has 60000 frames, more than a file holds"), "{reason}");
+    for name in ["000000.torch", "000001.torch"] {
+        let table = ChunkTable::read(&folder.path().join(name)).unwrap();
+        assert_eq!(table.scenes.into_values().map(|scene| scene.images.len()).collect::<Vec<_>>(), [30_000]);
+    }
 }
 
 #[test]

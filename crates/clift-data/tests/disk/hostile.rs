@@ -40,6 +40,13 @@ fn replaced(layout: &str, file: &str, from: &str, to: &str) -> String {
 const JSON: &str = "attic/transforms.json";
 
 #[test]
+fn a_picture_whose_name_is_no_path_is_refused_and_takes_no_memory() {
+    let name = format!("\"{}8\"", "a/".repeat(100_000));
+    let message = replaced("capture", JSON, "\"./images/8\"", &name);
+    assert!(message.contains("a/a/..: its name has 200001 bytes, more than 4096"), "{message}");
+}
+
+#[test]
 fn what_is_wrong_with_a_transforms_json_is_said() {
     for (from, to, expected) in [
         ("\"frames\"", "\"pictures\"", "missing field `frames`"),

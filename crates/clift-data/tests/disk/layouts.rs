@@ -176,10 +176,11 @@ fn scenes_of_the_list_are_kept_out_of_training_and_missing_ones_are_counted() {
     assert_eq!((source.num_scenes(), source.key(0)), (1, test.as_str()));
     assert!(ledger.to_string().starts_with("1 of 2 scenes used; 1 in the list of test scenes, but not"), "{ledger}");
 
-    // DepthSplat's training chunks prefix the keys.
+    // DepthSplat's training chunks prefix the keys; this one's test half has no such scene.
     std::fs::write(&list, format!("{KEY}\n")).unwrap();
     let (source, ledger) = open_with(&layouts().join("depthsplat"), Split::Train, files());
-    assert_eq!((source.num_scenes(), ledger.to_string()), (0, "0 of 1 scenes used; 1 kept for testing".into()));
+    let expected = "0 of 1 scenes used; 1 kept for testing by the list of test scenes, but not in test/";
+    assert_eq!((source.num_scenes(), ledger.to_string()), (0, expected.into()));
 }
 
 #[test]

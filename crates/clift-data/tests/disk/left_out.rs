@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use clift_data::image::{encode_jpeg, encode_png};
-use clift_data::{FileOptions, Frame, LayoutOptions, Ledger, Opened, Split};
+use clift_data::{FileOptions, Frame, Layout, LayoutOptions, Ledger, Opened, Split};
 use serde_json::{Value, json};
 
 use crate::files::{copy_folder, fixtures};
@@ -209,4 +209,26 @@ fn an_orientation_that_is_not_applied_is_told_where_the_shape_is_wrong() {
     fs::remove_file(root.path().join("0.jpg")).unwrap();
     let message = open(root.path()).err().unwrap();
     assert!(message.contains("its EXIF orientation is 6, which is not applied"), "{message}");
+}
+
+#[test]
+fn a_listed_scene_that_the_test_half_does_not_have_is_told_as_one_that_nobody_uses() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&fixtures().join("re10k-mini"), root.path());
+    let list = root.path().join("list");
+    fs::write(&list, "00000000000000a1\n00000000000000b1\n").unwrap();
+    let flagged = |layout| {
+        let files = FileOptions { test_scenes: Some(list.clone()), ..FileOptions::default() };
+        let options = LayoutOptions { layout, files, ..LayoutOptions::default() };
+        let opened = Opened::open(root.path(), Split::Train, &options).unwrap();
+        assert_eq!((opened.source.num_scenes(), opened.ledger.skips.len()), (1, 1));
+        let flagged = clift_data::check::left_out(&opened.ledger).into_iter();
+        flagged.map(|check| (check.key, check.reasons.concat())).collect::<Vec<_>>()
+    };
+    let reason = "kept for testing by the list of test scenes, but not in test/".to_owned();
+    assert_eq!(flagged(Layout::Auto), [("00000000000000a1".to_owned(), reason.clone())]);
+    assert_eq!(flagged(Layout::Scenes), [("00000000000000a1".to_owned(), reason)]);
+    fs::remove_dir_all(root.path().join("test")).unwrap();
+    copy_folder(&root.path().join("train"), &root.path().join("test"));
+    assert!(flagged(Layout::Auto).is_empty(), "the test half has it");
 }
