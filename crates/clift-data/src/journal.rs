@@ -36,8 +36,8 @@ pub(crate) struct Journal {
 }
 
 impl Journal {
-    /// Looks at a folder, new or empty or one that was started, and changes nothing in it. Lines of files that are missing or hold something else are dropped: they will
-    /// be written again.
+    /// Looks at a folder, new or empty or one that was started, and changes nothing in it. Lines of files that are missing
+    /// or hold something else are dropped: they will be written again.
     ///
     /// # Errors
     /// [`DataError::BadIndex`] for a folder with any other file, or whose files were made in another way.
