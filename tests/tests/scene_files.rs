@@ -2,14 +2,14 @@
 
 use std::path::Path;
 
-use clift_data::export::spread_views;
-use clift_data::{Clip, ClipReader, Split};
+use clift_data::index::spread_views;
+use clift_data::{Clip, ClipReader, Split, open_dataset};
 use clift_eval::metrics::{psnr, ssim};
 use clift_eval::picture::Picture;
 use clift_eval::view_cameras;
 use clift_model::viewer::load_renderer;
 use clift_model::{Preset, Scene, TokenKind, TokenStorage, Viewer};
-use clift_train::{Config, read_config, scenes};
+use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
 use crate::support::{Place, clift, repository};
@@ -37,7 +37,7 @@ fn config(place: &Place, run: &str) -> Config {
 /// The first test scene with the views that `clift eval` gives it.
 fn first_clip(place: &Place, run: &str) -> (Clip, ClipReader) {
     let config = config(place, run);
-    let (source, _) = scenes::open(&config.data, Split::Test).expect("the run's rooms");
+    let source = open_dataset(&config.data, Split::Test).expect("the run's rooms").source;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let views = spread_views(8, config.eval.num_context, config.eval.num_targets).expect("enough frames");
     assert_eq!(views.context, [0, 7]);

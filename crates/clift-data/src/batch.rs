@@ -1,14 +1,16 @@
 //! The training batch of a step: which scenes, which views, and what was left out.
 
-use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 
-use crate::clip::{Clip, SceneSource, ViewIndices};
+use crate::clip::{Clip, ViewIndices};
 use crate::error::DataError;
 use crate::ledger::Skip;
-use crate::order::{SceneOrder, item_rng, unit};
+use crate::order::SceneOrder;
+use crate::random::{item_rng, unit};
 use crate::sampler::BoundedSampler;
+use crate::scene_source::SceneSource;
+use crate::slot_filler::{NoUsableScene, SlotFiller};
 
 /// Tries of one slot, a scene that comes up again included, before the batch may fail.
 const MIN_ATTEMPTS: u32 = 16;
@@ -46,7 +48,7 @@ impl TrainingClips {
     /// Prepares batches of `batch_size` clips from `source`, whose frames `read` turns into clips.
     ///
     /// `seed` decides everything random; give each stage of a run its own
-    /// ([`derive_seed`](crate::order::derive_seed)).
+    /// ([`derive_seed`](crate::random::derive_seed)).
     ///
     /// # Errors
     /// [`DataError::BadConfig`] when the sampler does not validate, there is no scene or `batch_size` is 0.
@@ -93,30 +95,19 @@ impl TrainingClips {
         num_context: usize,
         skipped: &mut Vec<Skip>,
     ) -> Result<Clip, DataError> {
-        let mut last = Skip { key: String::new(), reason: String::new() };
-        let mut tried = BTreeSet::new();
-        let mut attempts = 0;
-        let enough = self.source.num_scenes().min(MAX_SCENES_TRIED);
-        for ahead in 0..MAX_STEPS_AHEAD {
-            if attempts >= MIN_ATTEMPTS && tried.len() >= enough {
-                break;
-            }
-            let scene = self.order.scene(step.saturating_add(u64::from(ahead)), slot);
-            // The first tries may draw other views of a scene that failed; later ones look for other scenes.
-            if !tried.insert(scene) && ahead >= MIN_ATTEMPTS {
-                continue;
-            }
-            attempts += 1;
-            match self.read_scene(scene, step, slot, ahead, num_context) {
-                Ok(clip) => return Ok(clip),
-                Err(error) => {
-                    last = Skip { key: self.source.key(scene).into(), reason: error.to_string() };
-                    skipped.push(last.clone());
-                }
-            }
-        }
-        let Skip { key, reason } = last;
-        Err(DataError::NoUsableScene { step, slot, attempts, key, reason })
+        let filler = SlotFiller {
+            min_attempts: MIN_ATTEMPTS,
+            min_scenes: self.source.num_scenes().min(MAX_SCENES_TRIED),
+            max_attempts: MAX_STEPS_AHEAD,
+        };
+        let scene = |ahead: u32| self.order.scene(step.saturating_add(u64::from(ahead)), slot);
+        let read = |scene: usize, ahead: u32| {
+            let skip = |error: DataError| Skip { key: self.source.key(scene).into(), reason: error.to_string() };
+            self.read_scene(scene, step, slot, ahead, num_context).map_err(skip)
+        };
+        filler.fill(scene, read, skipped).map_err(|NoUsableScene { attempts, last: Skip { key, reason } }| {
+            DataError::NoUsableScene { step, slot, attempts, key, reason }
+        })
     }
 
     fn read_scene(
@@ -149,44 +140,15 @@ impl fmt::Debug for TrainingClips {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::camera::{Camera, Pose};
-    use crate::clip::{Frame, Views};
+    use crate::camera::Pose;
+    use crate::clip::Views;
     use crate::loader::Prefetcher;
-
-    /// Scenes without pictures, of these numbers of frames.
-    struct Lengths(Vec<usize>, Vec<String>);
-
-    impl Lengths {
-        fn new(lengths: Vec<usize>) -> Arc<Self> {
-            let keys = (0..lengths.len()).map(|scene| format!("scene-{scene}")).collect();
-            Arc::new(Self(lengths, keys))
-        }
-    }
-
-    impl SceneSource for Lengths {
-        fn num_scenes(&self) -> usize {
-            self.0.len()
-        }
-        fn key(&self, scene: usize) -> &str {
-            &self.1[scene]
-        }
-        fn find(&self, key: &str) -> Option<usize> {
-            self.1.iter().position(|other| other == key)
-        }
-        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-            panic!("drawing views reads the cameras of scene {scene}, and reading the clip would again")
-        }
-        fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
-            Ok(self.0[scene])
-        }
-        fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-            Err(DataError::NoSuchFrame { key: self.1[scene].clone(), frame, num_frames: self.0[scene] })
-        }
-    }
+    use crate::testing::Lengths;
+    use std::collections::BTreeSet;
 
     fn clips(lengths: Vec<usize>, batch_size: usize, seed: u64) -> TrainingClips {
-        let source = Lengths::new(lengths);
-        let keys = source.1.clone();
+        let source = Arc::new(Lengths::new(lengths));
+        let keys = source.keys.clone();
         let read = move |scene: usize, views: &ViewIndices| {
             let only = |frame_index: &[usize]| Views {
                 width: 0,
@@ -203,6 +165,26 @@ mod tests {
 
     fn mixed() -> TrainingClips {
         clips((0..40).map(|scene| if scene % 3 == 0 { 10 } else { 200 }).collect(), 4, 9)
+    }
+
+    /// Checksums of the batches of the version before `SlotFiller`.
+    #[test]
+    fn a_thousand_batches_are_those_of_earlier_versions() {
+        let rare = (0..300).map(|scene| if scene % 23 == 5 { 90 } else { 10 + scene % 17 }).collect();
+        for (clips, expected) in [(mixed().with_flip(true), 0xd652_d9cf), (clips(rare, 8, 12345), 0x1fc9_670d)] {
+            let mut checksum = crc32fast::Hasher::new();
+            for step in 0..1000 {
+                let batch = clips.batch(step).unwrap();
+                let clip = |clip: &Clip| {
+                    let Clip { key, context, target } = clip;
+                    format!("{:?}", (key, &context.frame_index, &target.frame_index, context.c2w[0].translation[0]))
+                };
+                let clips: Vec<String> = batch.clips.iter().map(clip).collect();
+                let skips: Vec<_> = batch.skipped.iter().map(|skip| (&skip.key, &skip.reason)).collect();
+                checksum.update(format!("{step} [{}] {skips:?}\n", clips.join(", ")).as_bytes());
+            }
+            assert_eq!(checksum.finalize(), expected);
+        }
     }
 
     #[test]
@@ -301,7 +283,7 @@ mod tests {
     fn a_sampler_that_cannot_hold_is_refused_at_the_start() {
         let sampler = BoundedSampler { num_targets: 0, ..Default::default() };
         let read = |_: usize, _: &ViewIndices| unreachable!("nothing is read");
-        let made = TrainingClips::new(Lengths::new(vec![9]), Arc::new(read), sampler, 1, 0);
+        let made = TrainingClips::new(Arc::new(Lengths::new(vec![9])), Arc::new(read), sampler, 1, 0);
         assert!(made.unwrap_err().to_string().starts_with("num_targets is 0"));
     }
 

@@ -9,13 +9,13 @@ use rayon::prelude::*;
 use crate::camera::Camera;
 use crate::chunk_index::read_index;
 use crate::chunk_table::{ChunkTable, SceneTable};
-use crate::clip::{Frame, SceneSource};
+use crate::clip::Frame;
 use crate::error::DataError;
 use crate::filters::SceneFilters;
 use crate::image::decode;
+use crate::keys::{DL3DV_PREFIX, find_by_name};
 use crate::ledger::{Ledger, counted, some_of};
-use crate::scene_folder::find_by_name;
-use crate::split::Split;
+use crate::scene_source::{SceneSource, Split};
 
 /// One chunk file; its table is read when a scene of it is first needed.
 struct Chunk {
@@ -246,9 +246,6 @@ impl SceneSource for ChunkSource {
         self.read_encoded(scene, frame).map(Some)
     }
 }
-
-/// What DepthSplat puts before the keys of DL3DV's training scenes.
-pub(crate) const DL3DV_PREFIX: &str = "dl3dv_";
 
 #[cfg(test)]
 mod tests;

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::chunk_table::ChunkTable;
 use crate::error::DataError;
 use crate::ledger::{Ledger, counted, some_of};
-use crate::picture_folder::{file_names, has_ending};
+use crate::listing::{file_names, has_ending};
 use crate::test_scenes::TestScenes;
 
 /// What the reference's tool writes beside scenes in files of their own: keys of those whose pictures have another size.

@@ -7,7 +7,9 @@ use crate::archive::{Archive, Span};
 use crate::camera::Camera;
 use crate::chunk_writer::{camera_bytes, timestamp_bytes};
 use crate::error::DataError;
-use crate::pickle::{ElementType, MAX_BYTES, MAX_VALUES, Pickle, Tensor, Value};
+use crate::pickle::Pickle;
+use crate::tensor_span::tensor_span;
+use crate::values::{ElementType, MAX_BYTES, MAX_VALUES, Value};
 
 /// Most frames of all scenes of a chunk. Scenes may share a list of frames, so that the size of the pickle does not
 /// limit them; those that do not share have 8 values or more per frame, and fewer frames than this.
@@ -91,14 +93,18 @@ impl Builder<'_> {
         let num_frames = image_ids.len() as u64;
         let mut images = Vec::with_capacity(image_ids.len());
         for (frame, id) in image_ids.iter().enumerate() {
-            let (span, _) = locate(pickle.get(*id), &[None], &[ElementType::U8], archive)
+            let (span, _) = tensor_span(pickle.get(*id), &[None], &[ElementType::U8], archive)
                 .map_err(|what| in_scene(format!("`images[{frame}]`: {what}")))?;
             images.push(span);
         }
-        let (cameras, camera_type) =
-            locate(item("cameras")?, &[Some(num_frames), Some(18)], &[ElementType::F32, ElementType::F64], archive)
-                .map_err(|what| in_scene(format!("`cameras`: {what}")))?;
-        let (timestamps, _) = locate(item("timestamps")?, &[Some(num_frames)], &[ElementType::I64], archive)
+        let (cameras, camera_type) = tensor_span(
+            item("cameras")?,
+            &[Some(num_frames), Some(18)],
+            &[ElementType::F32, ElementType::F64],
+            archive,
+        )
+        .map_err(|what| in_scene(format!("`cameras`: {what}")))?;
+        let (timestamps, _) = tensor_span(item("timestamps")?, &[Some(num_frames)], &[ElementType::I64], archive)
             .map_err(|what| in_scene(format!("`timestamps`: {what}")))?;
         let table = SceneTable { key: key.clone(), url: url.to_owned(), timestamps, cameras, camera_type, images };
         self.scenes.insert(key.clone(), table);
@@ -136,42 +142,4 @@ impl SceneTable {
         Ok(self.timestamps.read(path)? == timestamp_bytes(timestamps)
             && self.cameras.read(path)? == camera_bytes(cameras))
     }
-}
-
-/// Where a tensor's bytes lie, after checking type, shape (`None` is any size), layout and bounds.
-pub(crate) fn locate(
-    value: &Value,
-    shape: &[Option<u64>],
-    element_types: &[ElementType],
-    archive: &Archive,
-) -> Result<(Span, ElementType), String> {
-    let Value::Tensor(tensor) = value else { return Err("no tensor".into()) };
-    let Tensor { storage, offset, .. } = &**tensor;
-    let element_type = storage.element_type;
-    if !element_types.contains(&element_type) {
-        return Err(format!("elements are {element_type:?}, expected one of {element_types:?}"));
-    }
-    let matches = tensor.shape.len() == shape.len()
-        && tensor.shape.iter().zip(shape).all(|(got, expected)| expected.is_none_or(|expected| *got == expected));
-    if !matches {
-        let expected: Vec<_> = shape.iter().map(|size| size.map_or("any".into(), |size| size.to_string())).collect();
-        return Err(format!("shape is {:?}, expected [{}]", tensor.shape, expected.join(", ")));
-    }
-    if !tensor.is_contiguous() {
-        return Err(format!("stride is {:?}, expected a contiguous tensor", tensor.stride));
-    }
-    let member = archive
-        .member(&format!("data/{}", storage.key))
-        .ok_or_else(|| format!("its storage data/{} is not in the archive", storage.key))?;
-    let size = element_type.num_bytes();
-    let span = tensor
-        .shape
-        .iter()
-        .try_fold(size, |product, size| product.checked_mul(*size))
-        .zip(offset.checked_mul(size))
-        .and_then(|(length, start)| member.part(start, length))
-        .ok_or_else(|| {
-            format!("shape {:?} at offset {offset} exceeds its storage of {} bytes", tensor.shape, member.len())
-        })?;
-    Ok((span, element_type))
 }

@@ -6,8 +6,8 @@ use std::path::Path;
 use crate::camera::Camera;
 use crate::error::DataError;
 use crate::files::replace;
-use crate::pickle::{MAX_BYTES, MAX_VALUES};
 use crate::pickle_writer::PickleWriter;
+use crate::values::{MAX_BYTES, MAX_VALUES};
 
 /// Size at which a chunk is closed, in bytes of pictures: 100 MB, as in the published RealEstate10K chunks.
 pub const DEFAULT_CHUNK_BYTES: u64 = 100_000_000;

@@ -1,7 +1,7 @@
 //! What the readers give and the model takes: frames, views, clips.
 
-use crate::camera::{Camera, Intrinsics, Pose};
-use crate::error::DataError;
+use crate::camera::{Intrinsics, Pose};
+pub use crate::scene_source::SceneSource;
 
 /// One decoded picture, 8-bit RGB, row-major `[height, width, 3]`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -56,35 +56,4 @@ pub struct Clip {
     pub context: Views,
     /// Views to render, with their ground truth.
     pub target: Views,
-}
-
-/// Scenes with random access to single frames: chunks or photos on disk, or synthetic ones made on the fly.
-pub trait SceneSource: Send + Sync {
-    /// How many scenes there are.
-    fn num_scenes(&self) -> usize;
-    /// Key of scene `scene` in `0..num_scenes()`.
-    fn key(&self, scene: usize) -> &str;
-    /// Position of a key, if the source has it.
-    fn find(&self, key: &str) -> Option<usize>;
-    /// Cameras of every frame of a scene, in frame order.
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError>;
-    /// How many frames a scene has; unless a source knows better, by reading its cameras.
-    fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
-        Ok(self.cameras(scene)?.len())
-    }
-    /// Time stamp of every frame: microseconds in RealEstate10K, otherwise frame numbers; by default positions.
-    fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
-        Ok((0..self.num_frames(scene)? as i64).collect())
-    }
-    /// Where a scene comes from; empty if nothing says.
-    fn url(&self, _scene: usize) -> Result<String, DataError> {
-        Ok(String::new())
-    }
-    /// Decodes one frame.
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError>;
-    /// The JPEG or PNG file that [`SceneSource::frame`] decodes, byte by byte; `None` where there is none: the picture
-    /// is computed, or resampled on load.
-    fn encoded_frame(&self, _scene: usize, _frame: usize) -> Result<Option<Vec<u8>>, DataError> {
-        Ok(None)
-    }
 }

@@ -4,10 +4,11 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use crate::camera::{Camera, Intrinsics};
-use crate::clip::{Clip, Frame, SceneSource, ViewIndices, Views};
+use crate::clip::{Clip, Frame, ViewIndices, Views};
 use crate::error::DataError;
 use crate::image::fit;
 use crate::normalize::{PoseRotation, PoseScale, SceneFrame, check_near};
+use crate::scene_source::SceneSource;
 
 /// How frames and poses are prepared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -97,6 +98,7 @@ impl ClipReader {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::TestSource;
     use crate::{ChunkSource, Pose, SceneFilters, Split};
     use std::path::Path;
     use std::sync::atomic::{AtomicUsize, Ordering};
@@ -109,39 +111,22 @@ mod tests {
         exact_principal_point: false,
     };
 
-    /// The fixture's test scene, with the pose of frame 4 replaced and the decoded frames counted.
-    struct Watched {
-        chunks: ChunkSource,
-        frame_4: Option<Pose>,
-        num_decoded: AtomicUsize,
-    }
-
-    impl SceneSource for Watched {
-        fn num_scenes(&self) -> usize {
-            self.chunks.num_scenes()
-        }
-        fn key(&self, scene: usize) -> &str {
-            self.chunks.key(scene)
-        }
-        fn find(&self, key: &str) -> Option<usize> {
-            self.chunks.find(key)
-        }
-        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-            let mut cameras = self.chunks.cameras(scene)?;
-            cameras[4].c2w = self.frame_4.unwrap_or(cameras[4].c2w);
-            Ok(cameras)
-        }
-        fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-            self.num_decoded.fetch_add(1, Ordering::Relaxed);
-            self.chunks.frame(scene, frame)
-        }
-    }
-
-    fn reader(frame_4: Option<Pose>, options: ClipOptions) -> (ClipReader, Arc<Watched>) {
+    /// Reads the fixture's test scene, with the pose of frame 4 replaced and the decoded frames counted.
+    fn reader(frame_4: Option<Pose>, options: ClipOptions) -> (ClipReader, Arc<AtomicUsize>) {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
         let chunks = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
-        let source = Arc::new(Watched { chunks, frame_4, num_decoded: AtomicUsize::new(0) });
-        (ClipReader { source: source.clone(), options }, source)
+        let num_decoded = Arc::new(AtomicUsize::new(0));
+        let counter = num_decoded.clone();
+        let source = TestSource::new(chunks)
+            .with_cameras(move |_, mut cameras| {
+                cameras[4].c2w = frame_4.unwrap_or(cameras[4].c2w);
+                Ok(cameras)
+            })
+            .with_frames(move |_, _, frame| {
+                counter.fetch_add(1, Ordering::Relaxed);
+                Ok(frame)
+            });
+        (ClipReader { source: Arc::new(source), options }, num_decoded)
     }
 
     fn views(context: &[usize], target: &[usize]) -> ViewIndices {
@@ -150,9 +135,9 @@ mod tests {
 
     #[test]
     fn a_clip_holds_its_views_in_the_order_asked_for_and_decodes_each_frame_once() {
-        let (reader, source) = reader(None, OPTIONS);
+        let (reader, num_decoded) = reader(None, OPTIONS);
         let clip = reader.read(0, &views(&[7, 0, 2], &[2, 2, 5])).unwrap();
-        assert_eq!(source.num_decoded.load(Ordering::Relaxed), 4);
+        assert_eq!(num_decoded.load(Ordering::Relaxed), 4);
         assert_eq!((clip.key.as_str(), clip.context.num_views()), ("00000000000000b1", 3));
         assert_eq!((&clip.context.frame_index[..], &clip.target.frame_index[..]), (&[7, 0, 2][..], &[2, 2, 5][..]));
         let bytes = 32 * 32 * 3;

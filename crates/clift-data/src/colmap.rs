@@ -11,9 +11,9 @@ use std::path::{Path, PathBuf};
 use crate::camera::{Intrinsics, IntrinsicsNorm, Pose};
 use crate::error::DataError;
 use crate::lens::Lens;
-use crate::photo::{MissingPhoto, Photo, PhotoScene};
-use crate::picture_folder::{PictureFolders, natural_order};
-use crate::transforms::{MAX_FRAMES, PhotoOptions};
+use crate::listing::natural_order;
+use crate::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoOptions, PhotoScene};
+use crate::picture_folder::PictureFolders;
 
 /// Most cameras of a model: one per image.
 const MAX_CAMERAS: usize = MAX_FRAMES;

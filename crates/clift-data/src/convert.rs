@@ -8,12 +8,12 @@ use rayon::prelude::*;
 use crate::chunk_index::read_index;
 use crate::chunk_table::{ChunkTable, SceneTable};
 use crate::chunk_writer::{Fill, SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
-use crate::clip::SceneSource;
 use crate::error::DataError;
 use crate::export::Encoding;
 use crate::journal::{INDEX, Journal, SKIPPED};
 use crate::ledger::{Ledger, Skip, counted, some_of};
-use crate::picture_folder::has_ending;
+use crate::listing::has_ending;
+use crate::scene_source::SceneSource;
 use crate::test_scenes::KEPT_FOR_TESTING;
 
 /// Longest key that names a file: file systems take 255 bytes, the ending included.

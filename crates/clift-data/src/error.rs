@@ -187,6 +187,12 @@ pub enum DataError {
         /// How many scenes the source has.
         num_scenes: usize,
     },
+    /// No scene is left to train or evaluate on.
+    #[error("no usable scene: {reason}")]
+    NoScenes {
+        /// Split, and why its scenes were skipped.
+        reason: String,
+    },
     /// A batch slot found no usable scene within its tries.
     #[error(
         "no usable scene for slot {slot} of step {step} in {attempts} tries; the last, {key}, failed with: {reason}"
@@ -205,7 +211,17 @@ pub enum DataError {
     },
     /// The code that makes a batch panicked.
     #[error(transparent)]
-    WorkerPanic(#[from] crate::loader::WorkerPanic),
+    WorkerPanic(#[from] WorkerPanic),
+}
+
+/// The code that makes a batch panicked; the other batches are unaffected.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("making the batch of step {step} panicked: {message}")]
+pub struct WorkerPanic {
+    /// Step of the batch.
+    pub step: u64,
+    /// Message of the panic.
+    pub message: String,
 }
 
 impl DataError {

@@ -7,10 +7,12 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::chunk_writer::{SceneRecord, write_chunks};
-use crate::clip::{Frame, SceneSource, ViewIndices};
+use crate::clip::{Frame, ViewIndices};
 use crate::error::DataError;
 use crate::files::replace;
 use crate::image::{encode_jpeg, encode_png};
+use crate::index::spread_views;
+use crate::scene_source::SceneSource;
 
 /// How frames are stored.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -73,23 +75,6 @@ pub fn write_source(
     Ok(total)
 }
 
-/// Contexts from the first to the last of `num_frames` frames, and targets spread over the frames between them;
-/// `None` for fewer frames than views, or fewer than 2 contexts.
-pub fn spread_views(num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
-    let num_views = num_context.checked_add(num_targets)?;
-    if num_context < 2 || num_frames < num_views {
-        return None;
-    }
-    let spread = |place: usize, count: usize, of: usize| (place * (of - 1) + (count - 1) / 2) / (count - 1);
-    let context: Vec<usize> = (0..num_context).map(|place| spread(place, num_context, num_frames)).collect();
-    let rest: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();
-    // With two to spare the ends are left out, which lie next to a context.
-    let has_spare = rest.len() >= num_targets + 2;
-    let place = |target: usize| if has_spare { spread(target + 1, num_targets + 2, rest.len()) } else { target };
-    let target = (0..num_targets).map(|target| rest[place(target)]).collect();
-    Some(ViewIndices { context, target })
-}
-
 /// Writes an evaluation index of every scene of `source`, with the views of [`spread_views`] (`null` where there are
 /// too few frames); returns how many scenes have views.
 ///
@@ -137,20 +122,6 @@ mod tests {
     fn source(num_frames: usize) -> SyntheticSource {
         let config = SyntheticConfig { num_scenes: 3, num_frames, width: 8, height: 8, ..Default::default() };
         SyntheticSource::new(config).unwrap()
-    }
-
-    #[test]
-    fn views_run_from_the_first_to_the_last_frame_and_targets_are_no_contexts() {
-        for num_frames in 7..200 {
-            let ViewIndices { context, target } = spread_views(num_frames, 4, 3).unwrap();
-            assert_eq!((context[0], context[3]), (0, num_frames - 1));
-            assert_eq!((context.len(), target.len()), (4, 3));
-            assert!(context.is_sorted_by(|a, b| a < b) && target.is_sorted_by(|a, b| a < b), "{context:?} {target:?}");
-            assert!(target.iter().all(|frame| !context.contains(frame) && *frame < num_frames));
-        }
-        assert_eq!(spread_views(16, 4, 3).unwrap().context, [0, 5, 10, 15]);
-        assert!([spread_views(6, 4, 3), spread_views(9, 1, 3), spread_views(0, 0, 0)].iter().all(Option::is_none));
-        assert!([spread_views(9, 2, usize::MAX), spread_views(9, usize::MAX, 2)].iter().all(Option::is_none));
     }
 
     #[test]

@@ -9,10 +9,10 @@ use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 use serde::{Deserialize, Serialize};
 
+use crate::bounded::read_bounded;
 use crate::camera::{Intrinsics, IntrinsicsNorm};
 use crate::clip::Frame;
 use crate::error::DataError;
-use crate::files::read_bounded;
 use crate::lanczos::{Window, resize_lanczos_window};
 
 /// Most columns or rows of a picture that is decoded.

@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use serde::de::{Deserializer, MapAccess, Visitor};
 
-use crate::clip::{SceneSource, ViewIndices};
+use crate::clip::ViewIndices;
 use crate::error::DataError;
 use crate::ledger::Ledger;
+use crate::scene_source::SceneSource;
 
 /// An index as published: `{key: {"context": [..], "target": [..]} | null | {}}`, in the order of the file.
 #[derive(Clone, Debug)]
@@ -157,16 +158,48 @@ impl<'de> Deserialize<'de> for IndexFile {
     }
 }
 
+/// Contexts from the first to the last of `num_frames` frames, and targets spread over the frames between them;
+/// `None` for fewer frames than views, or fewer than 2 contexts.
+pub fn spread_views(num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
+    let num_views = num_context.checked_add(num_targets)?;
+    if num_context < 2 || num_frames < num_views {
+        return None;
+    }
+    let spread = |place: usize, count: usize, of: usize| (place * (of - 1) + (count - 1) / 2) / (count - 1);
+    let context: Vec<usize> = (0..num_context).map(|place| spread(place, num_context, num_frames)).collect();
+    let rest: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();
+    // With two to spare the ends are left out, which lie next to a context.
+    let has_spare = rest.len() >= num_targets + 2;
+    let place = |target: usize| if has_spare { spread(target + 1, num_targets + 2, rest.len()) } else { target };
+    let target = (0..num_targets).map(|target| rest[place(target)]).collect();
+    Some(ViewIndices { context, target })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Camera, ChunkSource, Frame, SceneFilters, Split, SyntheticConfig, SyntheticSource};
+    use crate::testing::TestSource;
+    use crate::{ChunkSource, SceneFilters, Split, SyntheticConfig, SyntheticSource};
 
     fn index(json: &str) -> Result<EvaluationIndex, DataError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         std::fs::write(&path, json).unwrap();
         EvaluationIndex::read(&path)
+    }
+
+    #[test]
+    fn views_run_from_the_first_to_the_last_frame_and_targets_are_no_contexts() {
+        for num_frames in 7..200 {
+            let ViewIndices { context, target } = spread_views(num_frames, 4, 3).unwrap();
+            assert_eq!((context[0], context[3]), (0, num_frames - 1));
+            assert_eq!((context.len(), target.len()), (4, 3));
+            assert!(context.is_sorted_by(|a, b| a < b) && target.is_sorted_by(|a, b| a < b), "{context:?} {target:?}");
+            assert!(target.iter().all(|frame| !context.contains(frame) && *frame < num_frames));
+        }
+        assert_eq!(spread_views(16, 4, 3).unwrap().context, [0, 5, 10, 15]);
+        assert!([spread_views(6, 4, 3), spread_views(9, 1, 3), spread_views(0, 0, 0)].iter().all(Option::is_none));
+        assert!([spread_views(9, 2, usize::MAX), spread_views(9, usize::MAX, 2)].iter().all(Option::is_none));
     }
 
     #[test]
@@ -221,34 +254,12 @@ mod tests {
         assert_eq!(ledger.counts()["not in the data"], 1);
     }
 
-    /// Five scenes of eight frames, of which the second cannot be read.
-    struct SecondIsBroken(SyntheticSource);
-
-    impl SceneSource for SecondIsBroken {
-        fn num_scenes(&self) -> usize {
-            self.0.num_scenes()
-        }
-        fn key(&self, scene: usize) -> &str {
-            self.0.key(scene)
-        }
-        fn find(&self, key: &str) -> Option<usize> {
-            self.0.find(key)
-        }
-        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-            if scene == 1 {
-                return Err(DataError::BadCamera { what: "the pose holds NaN".into() });
-            }
-            self.0.cameras(scene)
-        }
-        fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-            self.0.frame(scene, frame)
-        }
-    }
-
     #[test]
     fn an_entry_that_cannot_be_used_does_not_stop_the_rest_and_a_limit_ends_the_search() {
         let config = SyntheticConfig { num_scenes: 5, num_frames: 8, ..Default::default() };
-        let source = SecondIsBroken(SyntheticSource::new(config).unwrap());
+        let broken = || DataError::BadCamera { what: "the pose holds NaN".into() };
+        let source = TestSource::new(SyntheticSource::new(config).unwrap())
+            .with_cameras(move |scene, cameras| if scene == 1 { Err(broken()) } else { Ok(cameras) });
         let last_frames = [8, 7, 7, 7, 7]; // the first scene has no frame 8
         let entries: Vec<String> = (0..5)
             .map(|scene| {

@@ -1,45 +1,13 @@
 //! A short description of a source, for people: counts, sizes, fields of view, extents.
 
-use std::fmt;
-
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::camera::Camera;
-use crate::clip::SceneSource;
 use crate::error::DataError;
 use crate::ledger::Skip;
-
-/// Smallest, median and largest of some numbers.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Spread {
-    /// Smallest.
-    pub min: f64,
-    /// The middle one; the mean of the middle two of an even count.
-    pub median: f64,
-    /// Largest.
-    pub max: f64,
-}
-
-impl Spread {
-    /// The spread of at least one number; `None` of none.
-    pub fn of(mut numbers: Vec<f64>) -> Option<Self> {
-        numbers.sort_by(f64::total_cmp);
-        let (min, max) = (*numbers.first()?, *numbers.last()?);
-        let middle = numbers.len() / 2;
-        let median =
-            if numbers.len() % 2 == 1 { numbers[middle] } else { f64::midpoint(numbers[middle - 1], numbers[middle]) };
-        Some(Self { min, median, max })
-    }
-}
-
-impl fmt::Display for Spread {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let digits = f.precision().unwrap_or(0);
-        let Self { min, median, max } = self;
-        write!(f, "{min:.digits$} / {median:.digits$} / {max:.digits$}")
-    }
-}
+use crate::scene_source::SceneSource;
+use crate::statistics::MinMedianMax;
 
 /// What a source holds. Spreads and sizes are `None` for a source without scenes.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -47,13 +15,13 @@ pub struct SourceInfo {
     /// How many scenes there are.
     pub num_scenes: usize,
     /// Frames per scene.
-    pub num_frames: Option<Spread>,
+    pub num_frames: Option<MinMedianMax>,
     /// Columns and rows of the first frame there is.
     pub image_size: Option<[usize; 2]>,
     /// The wider of the two fields of view, one number per frame.
-    pub fov_deg: Option<Spread>,
+    pub fov_deg: Option<MinMedianMax>,
     /// Largest distance along a world axis of a camera centre from the scene's mean centre, one number per scene.
-    pub extent: Option<Spread>,
+    pub extent: Option<MinMedianMax>,
     /// Scenes whose cameras cannot be read, and those before the first whose first picture can, with the error as the
     /// reason.
     pub unreadable: Vec<Skip>,
@@ -90,15 +58,15 @@ impl SourceInfo {
         if let (true, Some(error)) = (scenes.is_empty(), first_error) {
             return Err(error);
         }
-        let lengths = scenes.iter().map(|(num_frames, ..)| *num_frames as f64).collect();
-        let fields = scenes.iter().flat_map(|(_, fov_deg, _)| fov_deg).copied().collect();
-        let extents = scenes.iter().map(|(.., extent)| *extent).collect();
+        let lengths: Vec<f64> = scenes.iter().map(|(num_frames, ..)| *num_frames as f64).collect();
+        let fields: Vec<f64> = scenes.iter().flat_map(|(_, fov_deg, _)| fov_deg).copied().collect();
+        let extents: Vec<f64> = scenes.iter().map(|(.., extent)| *extent).collect();
         Ok(Self {
             num_scenes: source.num_scenes(),
-            num_frames: Spread::of(lengths),
+            num_frames: MinMedianMax::of(&lengths),
             image_size: first_picture.map(|frame| [frame.width, frame.height]),
-            fov_deg: Spread::of(fields),
-            extent: Spread::of(extents),
+            fov_deg: MinMedianMax::of(&fields),
+            extent: MinMedianMax::of(&extents),
             unreadable,
         })
     }
@@ -118,13 +86,6 @@ mod tests {
     use super::*;
     use crate::{ChunkSource, SceneFilters, Split};
     use std::path::Path;
-
-    #[test]
-    fn the_median_of_an_even_count_is_between_the_middle_two() {
-        assert_eq!(Spread::of(vec![4.0, 1.0, 2.0, 8.0]), Some(Spread { min: 1.0, median: 3.0, max: 8.0 }));
-        assert_eq!(Spread::of(vec![5.0]), Some(Spread { min: 5.0, median: 5.0, max: 5.0 }));
-        assert_eq!(Spread::of(Vec::new()), None);
-    }
 
     #[test]
     fn a_scene_that_cannot_be_read_is_named_and_the_others_are_described() {
@@ -148,7 +109,7 @@ mod tests {
         let source = ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap();
         let info = SourceInfo::read(&source).unwrap();
         assert_eq!((info.num_scenes, info.image_size), (2, Some([64, 36])));
-        assert_eq!(info.num_frames, Some(Spread { min: 8.0, median: 8.0, max: 8.0 }));
+        assert_eq!(info.num_frames, Some(MinMedianMax { min: 8.0, median: 8.0, max: 8.0 }));
         // 2 atan(0.5 / 0.9) = 58.1 degrees; centres are 0, 0.1, .., 0.7 along x, 0.35 from their mean.
         assert_eq!(format!("{:.1}", info.fov_deg.unwrap()), "58.1 / 58.1 / 58.1");
         assert_eq!(format!("{:.3}", info.extent.unwrap()), "0.350 / 0.350 / 0.350");

@@ -3,7 +3,7 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::order::distinct;
+use crate::random::distinct;
 
 /// How the contexts between the ends of a stretch are chosen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -78,7 +78,7 @@ fn farthest_points(left: usize, right: usize, count: usize, centres: &[[f64; 3]]
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::order::step_rng;
+    use crate::random::step_rng;
 
     fn choose(inner: InnerViews, left: usize, right: usize, count: usize, centres: &[[f64; 3]]) -> Vec<usize> {
         inner.choose(&mut step_rng(1, 2, "test"), left, right, count, centres)

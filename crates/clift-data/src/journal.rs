@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 
 use crate::error::DataError;
 use crate::files::{TEMPORARY, replace};
-use crate::picture_folder::has_ending;
+use crate::listing::has_ending;
 
 /// As `sha256sum` calls it: a line per file, sum and name.
 const FILE_NAME: &str = "SHA256SUMS";
@@ -131,7 +131,7 @@ impl Journal {
 
     /// Writes a file, its line first.
     pub fn write(&mut self, name: &str, bytes: &[u8]) -> Result<(), DataError> {
-        let sum = hex(&Sha256::digest(bytes));
+        let sum = hex::encode(Sha256::digest(bytes));
         let line = format!("{sum}  {name}\n");
         if self.sums.insert(name.to_owned(), sum).is_some() {
             self.rewrite()?;
@@ -197,11 +197,7 @@ fn hash_file(path: &Path) -> Result<String, DataError> {
             count => digest.update(&buffer[..count]),
         }
     }
-    Ok(hex(&digest.finalize()))
-}
-
-fn hex(digest: &[u8]) -> String {
-    digest.iter().map(|byte| format!("{byte:02x}")).collect::<Vec<_>>().concat()
+    Ok(hex::encode(digest.finalize()))
 }
 
 #[cfg(test)]
@@ -300,7 +296,7 @@ mod tests {
         // Killed between the line and the file.
         let path = folder.path().join(FILE_NAME);
         let text = std::fs::read_to_string(&path).unwrap();
-        std::fs::write(&path, format!("{text}{}  d\n", hex(&Sha256::digest(b"d")))).unwrap();
+        std::fs::write(&path, format!("{text}{}  d\n", hex::encode(Sha256::digest(b"d")))).unwrap();
         let mut journal = Journal::open(folder.path(), "chunks").unwrap();
         assert_eq!(journal.names().collect::<Vec<_>>(), ["a.torch", "b.torch", "c.torch"]);
         journal.begin().unwrap();
@@ -327,7 +323,7 @@ mod tests {
     fn files_of_someone_elses_checksums_are_left_alone() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
-        let sums = format!("{}  notes.txt\n", hex(&Sha256::digest(b"first")));
+        let sums = format!("{}  notes.txt\n", hex::encode(Sha256::digest(b"first")));
         std::fs::write(at("notes.txt"), "second").unwrap();
         for (text, expected) in [
             (sums.clone(), "does not say how the files were made"),

@@ -6,15 +6,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-/// The code that makes a batch panicked; the other batches are unaffected.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("making the batch of step {step} panicked: {message}")]
-pub struct WorkerPanic {
-    /// Step of the batch.
-    pub step: u64,
-    /// What the panic said.
-    pub message: String,
-}
+use crate::error::WorkerPanic;
 
 type Make<T, E> = dyn Fn(u64) -> Result<T, E> + Send + Sync;
 

@@ -7,12 +7,13 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
-use crate::clip::{SceneSource, ViewIndices};
+use crate::clip::ViewIndices;
 use crate::error::DataError;
 use crate::export::write_index;
 use crate::ledger::{Ledger, counted, some_of};
-use crate::order::{between, derive_seed, distinct, draw_from, step_rng};
 use crate::overlap::overlap;
+use crate::random::{between, derive_seed, distinct, draw_from, step_rng};
+use crate::scene_source::SceneSource;
 
 /// What an index asks for. The defaults are those of the published RealEstate10K index with four contexts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -154,6 +155,7 @@ pub fn write_overlap_index(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::TestSource;
     use crate::{EvaluationIndex, SyntheticConfig, SyntheticSource};
 
     fn rooms(num_frames: usize, path_length: f64) -> SyntheticSource {
@@ -198,32 +200,17 @@ mod tests {
         let ledger = write_overlap_index(&path, &[&rooms(40, 3.0)], &OverlapOptions::default()).unwrap();
         assert_eq!(ledger.to_string(), "0 of 20 scenes used; 20 shorter than 46 frames");
         assert!(!path.exists(), "an index without views");
-        let (written, ledger) = index(&FirstIsShort(rooms(60, 3.0)), &OverlapOptions::default());
+        let (written, ledger) = index(&first_is_short(rooms(60, 3.0)), &OverlapOptions::default());
         assert_eq!((written.num_keys(), written.usable().count()), (20, 19));
         assert_eq!(ledger.to_string(), "19 of 20 scenes used; 1 shorter than 46 frames");
     }
 
     /// Rooms of which the first has ten frames.
-    struct FirstIsShort(SyntheticSource);
-
-    impl SceneSource for FirstIsShort {
-        fn num_scenes(&self) -> usize {
-            self.0.num_scenes()
-        }
-        fn key(&self, scene: usize) -> &str {
-            self.0.key(scene)
-        }
-        fn find(&self, key: &str) -> Option<usize> {
-            self.0.find(key)
-        }
-        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-            let mut cameras = self.0.cameras(scene)?;
+    fn first_is_short(rooms: SyntheticSource) -> TestSource {
+        TestSource::new(rooms).with_cameras(|scene, mut cameras| {
             cameras.truncate(if scene == 0 { 10 } else { usize::MAX });
             Ok(cameras)
-        }
-        fn frame(&self, scene: usize, frame: usize) -> Result<crate::Frame, DataError> {
-            self.0.frame(scene, frame)
-        }
+        })
     }
 
     #[test]
@@ -279,30 +266,9 @@ mod tests {
         let keys = [0, 1, 2].map(|scene| other.key(scene)).join(", ");
         assert_eq!(ledger.notes, [format!("3 scenes in both halves, counted once ({keys})")]);
         let rooms = rooms(60, 3.0);
-        let shorter = FirstIsShort(self::rooms(60, 3.0));
+        let shorter = first_is_short(self::rooms(60, 3.0));
         let message = write_overlap_index(&path, &[&rooms, &shorter], &options).unwrap_err().to_string();
         assert!(message.contains("is in both halves with other cameras; make an index of each"), "{message}");
-    }
-
-    /// Rooms of which no camera can be read.
-    struct NoCameras(SyntheticSource);
-
-    impl SceneSource for NoCameras {
-        fn num_scenes(&self) -> usize {
-            self.0.num_scenes()
-        }
-        fn key(&self, scene: usize) -> &str {
-            self.0.key(scene)
-        }
-        fn find(&self, key: &str) -> Option<usize> {
-            self.0.find(key)
-        }
-        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-            Err(DataError::NoSuchScene { scene, num_scenes: 0 })
-        }
-        fn frame(&self, scene: usize, frame: usize) -> Result<crate::Frame, DataError> {
-            self.0.frame(scene, frame)
-        }
     }
 
     #[test]
@@ -310,7 +276,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
-        let (whole, broken) = (rooms(60, 3.0), NoCameras(rooms(60, 3.0)));
+        let whole = rooms(60, 3.0);
+        let broken = TestSource::new(rooms(60, 3.0))
+            .with_cameras(|scene, _| Err(DataError::NoSuchScene { scene, num_scenes: 0 }));
         let num_used = index(&whole, &options).1.num_used();
         let orders: [[&dyn SceneSource; 2]; 2] = [[&whole, &broken], [&broken, &whole]];
         for sources in orders {

@@ -2,19 +2,32 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::bounded::read_bounded;
 use crate::camera::{Camera, IntrinsicsNorm, Pose};
 use crate::clip::Frame;
 use crate::error::DataError;
-use crate::files::read_bounded;
 use crate::image::{check_end, decode, exif_orientation, read_size};
 use crate::lens::Lens;
 use crate::undistort::Undistortion;
 
+/// Most frames of one scene.
+pub(crate) const MAX_FRAMES: usize = 100_000;
 /// Most bytes of one picture file.
 const MAX_PICTURE_BYTES: u64 = 256 << 20;
 /// By how much the shape (width over height) of a picture may differ from that of its camera: rounding of a picture
 /// scaled down to a few dozen pixels.
 const MAX_SHAPE_ERROR: f64 = 0.02;
+
+/// How photos are found and what is done to them.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct PhotoOptions {
+    /// Folder of the pictures, beside the cameras' file, instead of the one that it names.
+    pub image_folder: Option<String>,
+    /// Folders to look for when none is asked for, before the one that the cameras' file names.
+    pub first_folders: &'static [&'static str],
+    /// Whether lens distortion is undone; otherwise it is ignored.
+    pub undistort: bool,
+}
 
 /// One picture on disk.
 #[derive(Clone, Debug)]

@@ -6,13 +6,14 @@ use std::sync::{Arc, Mutex};
 use rayon::prelude::*;
 
 use crate::camera::Camera;
-use crate::clip::{Frame, SceneSource};
+use crate::clip::Frame;
 use crate::error::DataError;
 use crate::filters::SceneFilters;
+use crate::keys::find_by_name;
 use crate::ledger::{Ledger, counted, some_of};
-use crate::photo::{MissingPhoto, Photo, PhotoScene};
-use crate::scene_folder::{SceneFolder, find_by_name};
-use crate::transforms::PhotoOptions;
+use crate::photo::{MissingPhoto, Photo, PhotoOptions, PhotoScene};
+use crate::scene_folder::SceneFolder;
+use crate::scene_source::SceneSource;
 
 /// Photos of the scenes that are kept in memory, about 300 bytes each.
 const MAX_PHOTOS_KEPT: usize = 200_000;

@@ -2,132 +2,16 @@
 //! build plain values, and the only Python names accepted are those of tensors, their storages and `OrderedDict`.
 //!
 //! Values live in one flat arena and refer to each other by [`ValueId`], so a hostile file can neither build a
-//! cycle that leaks nor a nesting that overflows the stack, and what it can allocate is bounded by [`MAX_BYTES`]
-//! and [`MAX_VALUES`].
+//! cycle that leaks nor a nesting that overflows the stack, and the memory of a pickle is bounded by
+//! [`MAX_BYTES`](crate::values::MAX_BYTES) and [`MAX_VALUES`](crate::values::MAX_VALUES).
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use crate::allow_list::{UnknownClasses, UnpickleError};
 use crate::error::DataError;
-use crate::unpickle::{Others, Stop, Unpickled, unpickle};
-
-/// Largest pickle that is read; a chunk of 2,000 frames has about 150 kB.
-pub const MAX_BYTES: usize = 16 << 20;
-/// Most values one pickle may build, of at most 250 bytes each; a chunk has about 15 per frame.
-pub const MAX_VALUES: usize = 1 << 20;
-
-/// Place of a value in its [`Pickle`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ValueId(pub(crate) u32);
-
-/// Element type of a storage.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ElementType {
-    /// `torch.ByteStorage`
-    U8,
-    /// `torch.IntStorage`
-    I32,
-    /// `torch.LongStorage`
-    I64,
-    /// `torch.FloatStorage`
-    F32,
-    /// `torch.DoubleStorage`
-    F64,
-    /// `torch.HalfStorage`, in checkpoints alone.
-    F16,
-    /// `torch.BFloat16Storage`, in checkpoints alone.
-    BF16,
-}
-
-impl ElementType {
-    /// Bytes of one element.
-    pub fn num_bytes(self) -> u64 {
-        match self {
-            Self::U8 => 1,
-            Self::F16 | Self::BF16 => 2,
-            Self::I32 | Self::F32 => 4,
-            Self::I64 | Self::F64 => 8,
-        }
-    }
-}
-
-/// A Python name from the allow-list.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Global {
-    /// `torch._utils._rebuild_tensor_v2`
-    RebuildTensor,
-    /// `torch._utils._rebuild_parameter`, or `_rebuild_parameter_with_state` of one with attributes, in checkpoints alone.
-    RebuildParameter,
-    /// `collections.OrderedDict`
-    OrderedDict,
-    /// `torch.ByteStorage` and its like.
-    Storage(ElementType),
-}
-
-/// A storage that the archive keeps beside the pickle.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Storage {
-    /// Type of its elements.
-    pub element_type: ElementType,
-    /// Name of its archive member, below `data/`.
-    pub key: String,
-    /// How many elements the pickle says it has.
-    pub num_elements: u64,
-}
-
-/// A tensor as a view of a storage; counts are in elements and not yet checked against the archive.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Tensor {
-    /// Where its elements are.
-    pub storage: Storage,
-    /// First element.
-    pub offset: u64,
-    /// Sizes of its dimensions.
-    pub shape: Vec<u64>,
-    /// Steps between neighbours, one per dimension.
-    pub stride: Vec<u64>,
-}
-
-impl Tensor {
-    /// Whether its elements lie one after the other, in row-major order.
-    pub fn is_contiguous(&self) -> bool {
-        let mut step = 1_u64;
-        self.shape.iter().zip(&self.stride).rev().all(|(&size, &stride)| {
-            let fits = size <= 1 || stride == step;
-            step = step.saturating_mul(size);
-            fits
-        })
-    }
-}
-
-/// One unpickled value.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Value {
-    /// `None`
-    None,
-    /// `True` or `False`
-    Bool(bool),
-    /// An integer of at most 64 bits.
-    Int(i64),
-    /// A float.
-    Float(f64),
-    /// A string.
-    Str(String),
-    /// A list.
-    List(Vec<ValueId>),
-    /// A tuple.
-    Tuple(Vec<ValueId>),
-    /// A dict in order of insertion; a key that is set twice is in it twice, and the later one counts.
-    Dict(Vec<(ValueId, ValueId)>),
-    /// A Python name.
-    Global(Global),
-    /// A storage.
-    Storage(Box<Storage>),
-    /// A tensor.
-    Tensor(Box<Tensor>),
-    /// Something of a checkpoint that was passed over: an object of a class that is not known, what was made from it.
-    Opaque,
-}
+use crate::unpickle::{Unpickled, unpickle};
+use crate::values::{Value, ValueId};
 
 /// An unpickled object and everything it refers to.
 #[derive(Clone, Debug)]
@@ -145,7 +29,7 @@ impl Pickle {
     /// else: unknown opcodes, calls of anything but a tensor or an empty `OrderedDict`, truncation, exceeded limits.
     /// `path` is only named in the message.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, DataError> {
-        Self::read(bytes, path, Others::Refuse)
+        Self::read(bytes, path, UnknownClasses::Refuse)
     }
 
     /// Reads a pickle with objects of any class, such as a training program's checkpoint: those are passed over as
@@ -154,13 +38,13 @@ impl Pickle {
     /// # Errors
     /// As [`Pickle::parse`]; [`DataError::RefusedGlobal`] only for names whose sole use in a pickle is an attack.
     pub fn parse_checkpoint(bytes: &[u8], path: &Path) -> Result<Self, DataError> {
-        Self::read(bytes, path, Others::PassOver)
+        Self::read(bytes, path, UnknownClasses::Skip)
     }
 
-    fn read(bytes: &[u8], path: &Path, others: Others) -> Result<Self, DataError> {
-        let Unpickled { values, root, passed_over } = unpickle(bytes, others).map_err(|stop| match stop {
-            Stop::Refused(name) => DataError::RefusedGlobal { name, path: path.to_path_buf() },
-            Stop::Bad(what) => DataError::BadPickle { what, path: path.to_path_buf() },
+    fn read(bytes: &[u8], path: &Path, unknown: UnknownClasses) -> Result<Self, DataError> {
+        let Unpickled { values, root, passed_over } = unpickle(bytes, unknown).map_err(|stop| match stop {
+            UnpickleError::Refused(name) => DataError::RefusedGlobal { name, path: path.to_path_buf() },
+            UnpickleError::Bad(what) => DataError::BadPickle { what, path: path.to_path_buf() },
         })?;
         Ok(Self { values, root, passed_over })
     }
@@ -191,6 +75,7 @@ impl Pickle {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::values::{ElementType, MAX_BYTES, MAX_VALUES, Storage, Tensor};
     use proptest::prelude::*;
 
     /// `[{"x": tensor [2, 3] of storage 7 at 4}, -2, 2**40, 0.5, None, True]` as protocol 2 writes it.

@@ -3,12 +3,11 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
+use crate::bounded::read_bounded;
 use crate::camera::Camera;
 use crate::error::DataError;
-use crate::files::read_bounded;
-use crate::photo::{MissingPhoto, Photo, PhotoScene};
+use crate::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoScene};
 use crate::picture_folder::numbered_pictures;
-use crate::transforms::MAX_FRAMES;
 
 /// Most bytes of one file: a hundred times those of the longest clip.
 const MAX_BYTES: u64 = 16 << 20;

@@ -3,10 +3,11 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::clip::{SceneSource, ViewIndices};
+use crate::clip::ViewIndices;
 use crate::error::DataError;
 use crate::inner_views::InnerViews;
-use crate::order::{below, between, draw_from, step_rng};
+use crate::random::{below, between, draw_from, step_rng};
+use crate::scene_source::SceneSource;
 
 /// Most context or target views of an item.
 const MAX_VIEWS: usize = 10_000;

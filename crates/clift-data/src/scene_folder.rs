@@ -5,18 +5,18 @@ use std::path::{Path, PathBuf};
 
 use crate::colmap::{find_model, read_colmap};
 use crate::error::DataError;
+use crate::keys::{is_dl3dv_key, last_name};
 use crate::ledger::{counted, some_of};
-use crate::photo::PhotoScene;
-use crate::picture_folder::{file_names, has_ending, numbered_pictures};
+use crate::listing::{file_names, has_ending};
+use crate::photo::{PhotoOptions, PhotoScene};
+use crate::picture_folder::numbered_pictures;
 use crate::re10k_text::{looks_like_re10k, read_re10k_text};
-use crate::transforms::{PhotoOptions, read_transforms};
+use crate::transforms::read_transforms;
 
 /// How far below the root scenes are looked for: DL3DV has them two folders down.
 const MAX_DEPTH: usize = 3;
 /// Most folders that are looked at.
 const MAX_FOLDERS: usize = 200_000;
-/// Digits of the hashes that DL3DV's scenes are named after.
-const HASH_LENGTH: usize = 64;
 
 /// The cameras of one scene.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -213,24 +213,6 @@ pub(crate) fn transforms_in(folder: &Path) -> Vec<String> {
     names.retain(|name| name.starts_with("transforms") && has_ending(name, "json"));
     names.sort_unstable();
     names
-}
-
-/// Whether a scene is named as DL3DV's are, after a hash.
-pub fn is_dl3dv_key(key: &str) -> bool {
-    let name = last_name(key);
-    name.len() == HASH_LENGTH && name.bytes().all(|byte| byte.is_ascii_hexdigit())
-}
-
-/// The last part of a key that is a way.
-pub(crate) fn last_name(key: &str) -> &str {
-    key.rsplit('/').next().unwrap_or_default()
-}
-
-/// The scene whose key is a way that ends in `name`: the only one, or of DL3DV's copies of a scene the first.
-pub(crate) fn find_by_name<'a>(keys: impl Iterator<Item = &'a str>, name: &str) -> Option<usize> {
-    let mut found = keys.enumerate().filter(|(_, key)| key.contains('/') && last_name(key) == name);
-    let (first, _) = found.next()?;
-    (found.next().is_none() || is_dl3dv_key(name)).then_some(first)
 }
 
 fn name_of(folder: &Path) -> String {

@@ -10,12 +10,13 @@ use std::path::{Path, PathBuf};
 use half::{bf16, f16};
 
 use crate::archive::{Archive, Span};
-use crate::chunk_table::locate;
 use crate::error::DataError;
 use crate::file_kind::refuse_others;
 use crate::files::replace;
-use crate::pickle::{ElementType, MAX_BYTES, Pickle, Tensor, Value};
+use crate::pickle::Pickle;
 use crate::pickle_writer::PickleWriter;
+use crate::tensor_span::{in_row_major_order, storage_stretch, tensor_span};
+use crate::values::{ElementType, MAX_BYTES, Tensor, Value};
 
 /// Number formats that weights can be read from.
 const FLOATS: [ElementType; 4] = [ElementType::F32, ElementType::F16, ElementType::BF16, ElementType::F64];
@@ -132,49 +133,24 @@ impl StateDict {
         };
         // Of a tensor in another order, all from its first element to its last.
         let is_contiguous = tensor.is_contiguous();
-        let stored = if is_contiguous { tensor.clone() } else { span_of(tensor).map_err(bad)? };
+        let stored = if is_contiguous { tensor.clone() } else { storage_stretch(tensor).map_err(bad)? };
         let shape: Vec<Option<u64>> = stored.shape.iter().map(|size| Some(*size)).collect();
         let value = Value::Tensor(Box::new(stored));
-        let (span, element_type): (Span, ElementType) = locate(&value, &shape, &FLOATS, &self.archive).map_err(bad)?;
+        let (span, element_type): (Span, ElementType) =
+            tensor_span(&value, &shape, &FLOATS, &self.archive).map_err(bad)?;
         let bytes = span.read(&self.path).map_err(|error| match error {
             DataError::BadChunk { what, .. } => bad(what),
             other => as_checkpoint(other),
         })?;
         let mut values = to_f32(&bytes, element_type);
         if !is_contiguous {
-            values = in_order(&values, &tensor.shape, &tensor.stride);
+            values = in_row_major_order(&values, &tensor.shape, &tensor.stride);
         }
         match values.iter().position(|value| !value.is_finite()) {
             Some(position) => Err(bad(format!("value {position} is {}", values[position]))),
             None => Ok(values),
         }
     }
-}
-
-/// The stretch of storage that a tensor lies in, as a tensor of one dimension.
-fn span_of(tensor: &Tensor) -> Result<Tensor, String> {
-    let Tensor { shape, stride, .. } = tensor;
-    let length = shape.iter().zip(stride).try_fold(1_u64, |length, (&size, &stride)| {
-        // An empty tensor is contiguous, or reads one element here.
-        length.checked_add(size.saturating_sub(1).checked_mul(stride)?)
-    });
-    let count = shape.iter().try_fold(1_u64, |count, &size| count.checked_mul(size));
-    // Its elements may not overlap: a small file could claim any number of them.
-    let is_held = length.zip(count).is_some_and(|(length, count)| count <= length);
-    let (Some(length), true) = (length, is_held) else {
-        return Err(format!("stride is {stride:?}: an expanded tensor; save it as tensor.contiguous()"));
-    };
-    Ok(Tensor { shape: vec![length], stride: vec![1], ..tensor.clone() })
-}
-
-/// The elements of a tensor of these strides, row-major.
-fn in_order(stored: &[f32], shape: &[u64], stride: &[u64]) -> Vec<f32> {
-    let mut places = vec![0_usize];
-    for (&size, &stride) in shape.iter().zip(stride) {
-        let next = |&place: &usize| (0..size as usize).map(move |i| place + i * stride as usize);
-        places = places.iter().flat_map(next).collect();
-    }
-    places.into_iter().map(|place| stored[place]).collect()
 }
 
 fn to_f32(bytes: &[u8], element_type: ElementType) -> Vec<f32> {

@@ -16,7 +16,7 @@ use crate::camera::Camera;
 use crate::clip::{Frame, SceneSource};
 use crate::error::DataError;
 use crate::order::step_rng;
-use crate::split::Split;
+use crate::scene_source::Split;
 pub use config::SyntheticConfig;
 use scene::Scene;
 

@@ -5,12 +5,11 @@ use std::path::Path;
 
 use serde::de::IgnoredAny;
 
-use crate::chunk::DL3DV_PREFIX;
+use crate::bounded::read_bounded;
 use crate::error::DataError;
-use crate::files::read_bounded;
+use crate::keys::{last_name, plain_key};
 use crate::ledger::Ledger;
-use crate::scene_folder::{is_dl3dv_key, last_name};
-use crate::split::Split;
+use crate::scene_source::Split;
 
 /// Most bytes of a list.
 const MAX_BYTES: u64 = 256 << 20;
@@ -50,13 +49,13 @@ impl TestScenes {
     }
 
     pub(crate) fn of_keys(keys: &[String]) -> Self {
-        Self { keys: keys.iter().map(|key| plain(key).to_owned()).collect() }
+        Self { keys: keys.iter().map(|key| plain_key(key).to_owned()).collect() }
     }
 
     /// Whether a scene is one of them, with or without DepthSplat's prefix. Of a key that is the way to a scene, as those
     /// of several folders of one name are, the last part counts as well.
     pub fn contains(&self, key: &str) -> bool {
-        self.keys.contains(plain(key)) || self.keys.contains(last_name(key))
+        self.keys.contains(plain_key(key)) || self.keys.contains(last_name(key))
     }
 
     /// How many there are.
@@ -78,20 +77,13 @@ impl TestScenes {
         if split == Split::Train {
             keys.iter().zip(&kept).filter(|(_, kept)| !**kept).for_each(|(key, _)| ledger.skip(key, KEPT_FOR_TESTING));
         } else if is_shared {
-            let there: BTreeSet<&str> = keys.iter().flat_map(|key| [plain(key), last_name(key)]).collect();
+            let there: BTreeSet<&str> = keys.iter().flat_map(|key| [plain_key(key), last_name(key)]).collect();
             let absent = self.keys.iter().filter(|key| !there.contains(key.as_str()));
             absent.for_each(|key| ledger.skip(key, "in the list of test scenes, but not there"));
         }
         ledger.num_scenes = ledger.skips.len();
         (kept, ledger)
     }
-}
-
-/// A key without DepthSplat's prefix; the hash alone of DL3DV's, wherever a copy of the scene lies.
-fn plain(key: &str) -> &str {
-    let name = last_name(key);
-    let name = name.strip_prefix(DL3DV_PREFIX).unwrap_or(name);
-    if is_dl3dv_key(name) { name } else { key.strip_prefix(DL3DV_PREFIX).unwrap_or(key) }
 }
 
 #[cfg(test)]

@@ -5,11 +5,13 @@ use std::time::Instant;
 
 use serde::Serialize;
 
-use crate::clip::{SceneSource, ViewIndices};
+use crate::clip::ViewIndices;
 use crate::clip_reader::{ClipOptions, ClipReader};
 use crate::error::DataError;
 use crate::loader::Prefetcher;
-use crate::order::{below, distinct, item_rng};
+use crate::random::{below, distinct, item_rng};
+use crate::scene_source::SceneSource;
+use crate::statistics::{p95, upper_median};
 
 /// Batches of one clip that are prepared ahead.
 const NUM_PREFETCH: usize = 8;
@@ -104,7 +106,6 @@ pub fn measure(source: &Arc<dyn SceneSource>, options: &ThroughputOptions) -> Re
         latencies.push(started.elapsed().as_secs_f64());
     }
     let random_s: f64 = latencies.iter().sum();
-    latencies.sort_by(f64::total_cmp);
     let named = |clips: Vec<(usize, ViewIndices)>| {
         let name = |(scene, ViewIndices { context, target }): (usize, ViewIndices)| ReadClip {
             key: source.key(scene).to_owned(),
@@ -117,8 +118,8 @@ pub fn measure(source: &Arc<dyn SceneSource>, options: &ThroughputOptions) -> Re
         size: [clip.width, clip.height],
         num_threads,
         sequential_clips_per_s: num_clips as f64 / sequential_s,
-        random_median_s: latencies[num_clips / 2],
-        random_p95_s: latencies[num_clips * 95 / 100],
+        random_median_s: upper_median(&latencies),
+        random_p95_s: p95(&latencies),
         random_clips_per_s: num_clips as f64 / random_s,
         sequential: named(in_order),
         random: named(random),

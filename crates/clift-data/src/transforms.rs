@@ -10,33 +10,21 @@ use std::path::{Component, Path, PathBuf};
 use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
+use crate::bounded::read_bounded;
 use crate::camera::{Intrinsics, IntrinsicsNorm, Pose};
 use crate::error::DataError;
-use crate::files::read_bounded;
 use crate::image::read_size;
 use crate::lens::Lens;
-use crate::photo::{MissingPhoto, Photo, PhotoScene};
-use crate::picture_folder::{PictureFolders, natural_order};
+use crate::listing::natural_order;
+use crate::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoOptions, PhotoScene};
+use crate::picture_folder::PictureFolders;
 
 /// Most bytes of one `transforms.json`.
 const MAX_BYTES: u64 = 128 << 20;
-/// Most frames of one scene.
-pub(crate) const MAX_FRAMES: usize = 100_000;
 /// Longest name of a picture: what operating systems take as a path.
 const MAX_NAME_BYTES: usize = 4096;
 /// Folders above a picture that are looked for in the scene's own, its name included.
 const MAX_WAYS: usize = 32;
-
-/// How photos are found and what is done to them.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct PhotoOptions {
-    /// Folder of the pictures, beside the cameras' file, instead of the one that it names.
-    pub image_folder: Option<String>,
-    /// Folders to look for when none is asked for, before the one that the cameras' file names.
-    pub first_folders: &'static [&'static str],
-    /// Whether lens distortion is undone; otherwise it is ignored.
-    pub undistort: bool,
-}
 
 /// Defines a struct with the keys of a camera, which may stand at the top or in a frame.
 macro_rules! with_optics {

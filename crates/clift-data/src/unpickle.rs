@@ -1,33 +1,21 @@
-//! The machine behind [`crate::pickle`]: a stack, a memo, and the opcodes that `torch.save` writes.
+//! The opcodes that `torch.save` writes, on a [`PickleMachine`].
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 
-use crate::pickle::{Global, MAX_BYTES, MAX_VALUES, Storage, Tensor, Value, ValueId};
+use crate::allow_list::{UnknownClasses, UnpickleError};
+use crate::pickle_machine::PickleMachine;
+use crate::values::{Global, MAX_BYTES, Storage, Tensor, Value, ValueId};
 
-mod names;
 mod objects;
-
-use names::{global, shown};
 
 /// Deepest nesting of unfinished lists, dicts and tuples; chunks need five.
 const MAX_DEPTH: usize = 32;
 /// The same in checkpoints, whose configuration objects nest.
 const MAX_CHECKPOINT_DEPTH: usize = 256;
-/// Most names that are remembered to be told.
-const MAX_PASSED_OVER: usize = 256;
 /// Most dimensions of a tensor.
 const MAX_DIMENSIONS: usize = 4;
 /// Longest name of a storage; `torch.save` numbers them.
 const MAX_STORAGE_KEY_BYTES: usize = 32;
-
-/// What is done with objects of classes that are not known.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Others {
-    /// The file is refused.
-    Refuse,
-    /// They are read past, as [`Value::Opaque`].
-    PassOver,
-}
 
 /// What a pickle holds.
 pub(crate) struct Unpickled {
@@ -39,54 +27,20 @@ pub(crate) struct Unpickled {
 }
 
 /// Reads a pickle.
-pub(crate) fn unpickle(bytes: &[u8], others: Others) -> Result<Unpickled, Stop> {
-    let mut reader = Reader {
-        bytes,
-        at: 0,
-        others,
-        values: Vec::new(),
-        stack: Vec::new(),
-        marks: Vec::new(),
-        memo: HashMap::new(),
-        passed_over: BTreeSet::new(),
-    };
-    match reader.run() {
-        Ok(root) => Ok(Unpickled { values: reader.values, root, passed_over: reader.passed_over }),
-        Err(Stop::Bad(what)) => Err(Stop::Bad(format!("{what} (at byte {})", reader.at))),
+pub(crate) fn unpickle(bytes: &[u8], unknown: UnknownClasses) -> Result<Unpickled, UnpickleError> {
+    let mut machine = PickleMachine::new(bytes, unknown);
+    match machine.run() {
+        Ok(root) => Ok(Unpickled { root, passed_over: machine.passed_over, values: machine.values }),
+        Err(UnpickleError::Bad(what)) => Err(UnpickleError::Bad(format!("{what} (at byte {})", machine.at))),
         Err(refused) => Err(refused),
     }
 }
 
-/// Why reading stopped.
-pub(crate) enum Stop {
-    /// A Python name that is not allowed.
-    Refused(String),
-    /// Anything else.
-    Bad(String),
-}
-
-impl From<&str> for Stop {
-    fn from(what: &str) -> Self {
-        Self::Bad(what.to_owned())
-    }
-}
-
-/// The pickle machine: a stack, marks into it, and a memo.
-struct Reader<'a> {
-    bytes: &'a [u8],
-    at: usize,
-    others: Others,
-    values: Vec<Value>,
-    stack: Vec<ValueId>,
-    marks: Vec<usize>,
-    memo: HashMap<u32, ValueId>,
-    passed_over: BTreeSet<String>,
-}
-
-impl Reader<'_> {
-    fn run(&mut self) -> Result<ValueId, Stop> {
+impl PickleMachine<'_> {
+    fn run(&mut self) -> Result<ValueId, UnpickleError> {
         if self.bytes.len() > MAX_BYTES {
-            return Err(Stop::Bad(format!("it has {} bytes, more than the limit of {MAX_BYTES}", self.bytes.len())));
+            let what = format!("it has {} bytes, more than the limit of {MAX_BYTES}", self.bytes.len());
+            return Err(UnpickleError::Bad(what));
         }
         let max_depth = if self.passes_over() { MAX_CHECKPOINT_DEPTH } else { MAX_DEPTH };
         loop {
@@ -94,11 +48,11 @@ impl Reader<'_> {
                 b'.' => return self.pop(),
                 0x80 => match self.u8()? {
                     2..=5 => {}
-                    version => return Err(Stop::Bad(format!("protocol {version}, expected 2 to 5"))),
+                    version => return Err(UnpickleError::Bad(format!("protocol {version}, expected 2 to 5"))),
                 },
                 0x95 => drop(self.take(8)?), // FRAME: a length that only matters to streams
                 b'(' if self.marks.len() == max_depth => {
-                    return Err(Stop::Bad(format!("nested deeper than {max_depth} levels")));
+                    return Err(UnpickleError::Bad(format!("nested deeper than {max_depth} levels")));
                 }
                 b'(' => self.marks.push(self.stack.len()),
                 opcode => {
@@ -107,7 +61,9 @@ impl Reader<'_> {
                         || self.read_reference(opcode)?
                         || self.passes_over() && self.read_object(opcode)?;
                     if !known {
-                        return Err(Stop::Bad(format!("opcode {opcode:#04x}, which torch.save does not write")));
+                        return Err(UnpickleError::Bad(format!(
+                            "opcode {opcode:#04x}, which torch.save does not write"
+                        )));
                     }
                 }
             }
@@ -115,7 +71,7 @@ impl Reader<'_> {
     }
 
     /// Numbers, strings, `None`, `True`, `False`.
-    fn read_scalar(&mut self, opcode: u8) -> Result<bool, Stop> {
+    fn read_scalar(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
         let value = match opcode {
             b'N' => Value::None,
             0x88 => Value::Bool(true),
@@ -155,7 +111,7 @@ impl Reader<'_> {
     }
 
     /// Lists, tuples and dicts.
-    fn read_container(&mut self, opcode: u8) -> Result<bool, Stop> {
+    fn read_container(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
         match opcode {
             b']' => self.push(Value::List(Vec::new()))?,
             b'}' => self.push(Value::Dict(Vec::new()))?,
@@ -195,7 +151,7 @@ impl Reader<'_> {
     }
 
     /// The memo, Python names, storages and calls.
-    fn read_reference(&mut self, opcode: u8) -> Result<bool, Stop> {
+    fn read_reference(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
         match opcode {
             b'q' => {
                 let slot = u32::from(self.u8()?);
@@ -244,10 +200,10 @@ impl Reader<'_> {
     }
 
     /// `("storage", <storage type>, key, device, number of elements)`
-    fn storage(&self, id: ValueId) -> Result<Storage, Stop> {
+    fn storage(&self, id: ValueId) -> Result<Storage, UnpickleError> {
         let Value::Tuple(fields) = self.get(id) else { return Err("a storage that is not a tuple".into()) };
         let [kind, storage_type, key, _device, num_elements] = fields[..] else {
-            return Err(Stop::Bad(format!("a storage of {} fields, expected 5", fields.len())));
+            return Err(UnpickleError::Bad(format!("a storage of {} fields, expected 5", fields.len())));
         };
         match (self.get(kind), self.get(storage_type), self.get(key), self.get(num_elements)) {
             (Value::Str(kind), Value::Global(Global::Storage(element_type)), Value::Str(key), Value::Int(count))
@@ -260,7 +216,7 @@ impl Reader<'_> {
     }
 
     /// The only calls that are understood; all of them only describe data.
-    fn call(&self, callee: ValueId, arguments: ValueId) -> Result<Value, Stop> {
+    fn call(&self, callee: ValueId, arguments: ValueId) -> Result<Value, UnpickleError> {
         let Value::Tuple(arguments) = self.get(arguments) else {
             return Err("a call whose arguments are no tuple".into());
         };
@@ -270,7 +226,8 @@ impl Reader<'_> {
                 let (Value::Storage(storage), Value::Int(offset)) = (self.get(*storage), self.get(*offset)) else {
                     return Err("a tensor without a storage".into());
                 };
-                let offset = u64::try_from(*offset).map_err(|_| Stop::from("a tensor with a negative offset"))?;
+                let offset =
+                    u64::try_from(*offset).map_err(|_| UnpickleError::from("a tensor with a negative offset"))?;
                 let (shape, stride) = (self.counts(*shape)?, self.counts(*stride)?);
                 if shape.len() != stride.len() {
                     return Err("a tensor with more sizes than strides, or fewer".into());
@@ -286,118 +243,18 @@ impl Reader<'_> {
     }
 
     /// A short tuple of non-negative integers.
-    fn counts(&self, id: ValueId) -> Result<Vec<u64>, Stop> {
+    fn counts(&self, id: ValueId) -> Result<Vec<u64>, UnpickleError> {
         let Value::Tuple(items) = self.get(id) else { return Err("a tensor whose sizes are no tuple".into()) };
         if items.len() > MAX_DIMENSIONS {
-            return Err(Stop::Bad(format!("a tensor of {} dimensions, more than {MAX_DIMENSIONS}", items.len())));
+            return Err(UnpickleError::Bad(format!(
+                "a tensor of {} dimensions, more than {MAX_DIMENSIONS}",
+                items.len()
+            )));
         }
         let count = |id: &ValueId| match self.get(*id) {
             Value::Int(count) => u64::try_from(*count).map_err(|_| "a tensor with a negative size or stride".into()),
             _ => Err("a tensor with a size or stride that is no integer".into()),
         };
         items.iter().map(count).collect()
-    }
-
-    fn get(&self, id: ValueId) -> &Value {
-        &self.values[id.0 as usize]
-    }
-
-    fn push(&mut self, value: Value) -> Result<(), Stop> {
-        if self.values.len() == MAX_VALUES {
-            return Err(Stop::Bad(format!("more than {MAX_VALUES} values")));
-        }
-        self.stack.push(ValueId(self.values.len() as u32));
-        self.values.push(value);
-        Ok(())
-    }
-
-    fn pop(&mut self) -> Result<ValueId, Stop> {
-        if self.stack.len() == self.marks.last().copied().unwrap_or(0) {
-            return Err("an opcode without its operands".into());
-        }
-        self.stack.pop().ok_or_else(|| "an opcode without its operands".into())
-    }
-
-    fn pop_to_mark(&mut self) -> Result<Vec<ValueId>, Stop> {
-        let mark = self.marks.pop().ok_or("an opcode without its mark")?;
-        Ok(self.stack.split_off(mark))
-    }
-
-    /// The value an opcode works on without taking it off the stack.
-    fn top(&self) -> Result<ValueId, Stop> {
-        let floor = self.marks.last().copied().unwrap_or(0);
-        self.stack[floor..].last().copied().ok_or_else(|| "an opcode without its operands".into())
-    }
-
-    fn extend_list(&mut self, items: &[ValueId]) -> Result<(), Stop> {
-        let list = self.top()?;
-        if self.is_passed_over(list) {
-            return Ok(());
-        }
-        let Value::List(list) = &mut self.values[list.0 as usize] else {
-            return Err("an append to something other than a list".into());
-        };
-        list.extend_from_slice(items);
-        Ok(())
-    }
-
-    fn extend_dict(&mut self, items: &[ValueId]) -> Result<(), Stop> {
-        let dict = self.top()?;
-        if self.is_passed_over(dict) {
-            return Ok(());
-        }
-        let Value::Dict(dict) = &mut self.values[dict.0 as usize] else {
-            return Err("an item set on something other than a dict".into());
-        };
-        if !items.len().is_multiple_of(2) {
-            return Err("a dict key without a value".into());
-        }
-        dict.extend(items.chunks_exact(2).map(|pair| (pair[0], pair[1])));
-        Ok(())
-    }
-
-    fn remember(&mut self, slot: u32) -> Result<(), Stop> {
-        let value = self.top()?;
-        if self.memo.len() == MAX_VALUES {
-            return Err(Stop::Bad(format!("more than {MAX_VALUES} remembered values")));
-        }
-        self.memo.insert(slot, value);
-        Ok(())
-    }
-
-    fn recall(&mut self, slot: u32) -> Result<(), Stop> {
-        let value = *self.memo.get(&slot).ok_or_else(|| Stop::Bad(format!("memo slot {slot} was never set")))?;
-        self.stack.push(value);
-        Ok(())
-    }
-
-    fn take(&mut self, length: usize) -> Result<&[u8], Stop> {
-        let rest = &self.bytes[self.at..];
-        let taken = rest.get(..length).ok_or("it ends in the middle of a value")?;
-        self.at += length;
-        Ok(taken)
-    }
-
-    fn array<const LENGTH: usize>(&mut self) -> Result<[u8; LENGTH], Stop> {
-        let mut array = [0; LENGTH];
-        array.copy_from_slice(self.take(LENGTH)?);
-        Ok(array)
-    }
-
-    fn u8(&mut self) -> Result<u8, Stop> {
-        Ok(self.array::<1>()?[0])
-    }
-
-    fn text(&mut self, length: usize) -> Result<String, Stop> {
-        let bytes = self.take(length)?.to_vec();
-        String::from_utf8(bytes).map_err(|_| "a string that is not UTF-8".into())
-    }
-
-    /// A line of text without its newline.
-    fn line(&mut self) -> Result<String, Stop> {
-        let length = self.bytes[self.at..].iter().position(|&byte| byte == b'\n');
-        let line = self.text(length.ok_or("it ends in the middle of a name")?)?;
-        self.at += 1;
-        Ok(line)
     }
 }

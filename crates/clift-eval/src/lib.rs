@@ -24,7 +24,6 @@ mod rendered;
 pub mod report;
 pub mod selection;
 pub mod sheet;
-pub mod statistics;
 mod stored;
 mod student;
 pub mod summary;

@@ -10,6 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use clift_data::files::replace;
+use clift_data::statistics::{median, p95};
 use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +20,6 @@ use crate::measured::{Accumulator, Measured, NotMeasured, Setting, Variant, View
 use crate::paired::Difference;
 use crate::pareto::front;
 use crate::selection::Selection;
-use crate::statistics::{median, p95};
 
 /// What an identical picture counts as in a mean, in dB; larger values are counted as this too.
 ///

@@ -1,7 +1,6 @@
 //! Weights of networks that cannot come with this program: safetensors files that `scripts/convert_vgg.py` writes.
 
 use std::collections::BTreeMap;
-use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
@@ -64,10 +63,7 @@ impl WeightFile {
             }
             tensors.insert(name, (view.shape().to_vec(), values));
         }
-        let sha256 = Sha256::digest(&bytes).iter().fold(String::new(), |mut text, byte| {
-            let _ = write!(text, "{byte:02x}");
-            text
-        });
+        let sha256 = hex::encode(Sha256::digest(&bytes));
         Ok(Self { wanted, tensors, sha256, path: path.into() })
     }
 

@@ -1,7 +1,6 @@
 //! Weight files: safetensors in PyTorch's layout, and the hash that names a set of weights.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{Cursor, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::Path;
@@ -181,20 +180,13 @@ pub fn hash<M: Module>(module: &M) -> String {
             sha.update(value.to_le_bytes());
         }
     });
-    hexadecimal(sha)
+    hex::encode(sha.finalize())
 }
 
 /// [`hash`] of a renderer's weights together with what they do not show and drawing depends on: variant and heads.
 pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
     let ModelConfig { variant, num_heads, .. } = config;
-    hexadecimal(Sha256::new().chain_update(format!("{variant} {num_heads} {}", hash(renderer))))
-}
-
-fn hexadecimal(sha: Sha256) -> String {
-    sha.finalize().iter().fold(String::new(), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
+    hex::encode(Sha256::digest(format!("{variant} {num_heads} {}", hash(renderer))))
 }
 
 /// Path of the first parameter with a NaN or an infinity.

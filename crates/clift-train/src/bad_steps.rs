@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 
+use clift_data::statistics::upper_median;
 use serde::{Deserialize, Serialize};
 
 use crate::config::OptimizerConfig;
@@ -83,12 +84,7 @@ impl Recent {
 
 /// The upper median, which is one of the values: no rounding.
 fn median(window: &VecDeque<f64>) -> Option<f64> {
-    if window.len() < MIN_STEPS {
-        return None;
-    }
-    let mut values: Vec<f64> = window.iter().copied().collect();
-    let middle = values.len() / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+    (window.len() >= MIN_STEPS).then(|| upper_median(&window.iter().copied().collect::<Vec<_>>()))
 }
 
 /// A line of `bad_steps.jsonl`. JSON holds no NaN and no infinity: such a number is `null`.

@@ -18,7 +18,8 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use clift_eval::{TokenCount, memory, statistics};
+use clift_data::statistics::{median, p95};
+use clift_eval::{TokenCount, memory};
 use clift_model::Precision;
 use clift_model::device::DeviceName;
 use serde::Serialize;
@@ -170,7 +171,7 @@ fn measure(
     } else {
         None
     };
-    let (median_s, p95_s) = (statistics::median(&samples_s), statistics::p95(&samples_s));
+    let (median_s, p95_s) = (median(&samples_s), p95(&samples_s));
     Ok(Row { work, median_s, p95_s, peak_bytes, max_rel_error, samples_s, inertia })
 }
 
@@ -243,7 +244,7 @@ pub(crate) mod tests {
     #[test]
     fn the_scenes_of_a_config_need_not_be_there_but_its_sizes_must_fit() {
         let mut config = config(DeviceName::Flex);
-        config.data.source = crate::config::SourceKind::Chunks;
+        config.data.source = clift_data::SourceKind::Chunks;
         let prepared = |config: &Config, storage: &str| {
             let storage = storage.parse().expect("a count");
             BenchContext::new(config, &BenchOptions { storage, ..options(&[]) }).map(|context| context.num_tokens())

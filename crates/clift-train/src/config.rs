@@ -4,9 +4,7 @@ mod checks;
 
 use std::path::{Path, PathBuf};
 
-use clift_data::{
-    BoundedSampler, ClipOptions, Crop, FileOptions, Layout, PoseRotation, PoseScale, SceneFilters, SyntheticConfig,
-};
+use clift_data::DataConfig;
 use clift_eval::perceptual::PERCEPTUAL_COMMAND;
 use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
@@ -57,115 +55,6 @@ pub struct Config {
     /// What is evaluated, during training and after it.
     #[serde(default)]
     pub eval: EvalConfig,
-}
-
-/// Where scenes come from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum SourceKind {
-    /// Ray-traced rooms made on the fly.
-    #[default]
-    Synthetic,
-    /// Whichever of those below is found under `root`.
-    Auto,
-    /// `{train,test}/NNNNNN.torch` with `index.json` under `root`, as pixelSplat has them.
-    Chunks,
-    /// `{train,test}/KEY.torch`, a file per scene.
-    Scenes,
-    /// RealEstate10K's `{train,test}/KEY.txt`, and folders of frames.
-    Re10kTxt,
-    /// DL3DV's folders, by hash.
-    Dl3dv,
-    /// Own captures: folders with `transforms.json` or a COLMAP model.
-    Captures,
-}
-
-impl SourceKind {
-    /// The layout on disk; `None` for scenes that are made.
-    pub fn layout(self) -> Option<Layout> {
-        match self {
-            Self::Synthetic => None,
-            Self::Auto => Some(Layout::Auto),
-            Self::Chunks => Some(Layout::Chunks),
-            Self::Scenes => Some(Layout::Scenes),
-            Self::Re10kTxt => Some(Layout::Re10kTxt),
-            Self::Dl3dv => Some(Layout::Dl3dv),
-            Self::Captures => Some(Layout::Captures),
-        }
-    }
-}
-
-/// Scenes and how views are drawn from them.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct DataConfig {
-    /// Where scenes come from.
-    pub source: SourceKind,
-    /// Folder with `train/` and `test/`, or of scenes, or of one scene; for scenes on disk.
-    pub root: Option<PathBuf>,
-    /// Where the parts of a layout are, if not where they are expected; for scenes on disk.
-    pub files: FileOptions,
-    /// Columns of every view, a multiple of the patch.
-    pub width: usize,
-    /// Rows of every view, a multiple of the patch.
-    pub height: usize,
-    /// How the mean orientation of the contexts is taken.
-    pub pose_rotation: PoseRotation,
-    /// Which cameras set the scale of a scene: contexts only, or targets as well (the reference's numbers).
-    pub pose_scale: PoseScale,
-    /// Whether the principal point follows the crop exactly: an older way to write `crop = "exact"`.
-    pub exact_principal_point: bool,
-    /// Where the principal point goes when pictures are cropped: `protocol`, as in published numbers, or `exact`.
-    #[serde(skip_serializing_if = "Crop::is_default")]
-    pub crop: Crop,
-    /// Whether stage 1 flips half of its clips left to right. Stage 2 trains on clusters of clips as they are.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
-    pub flip: bool,
-    /// Which scenes of the files are used.
-    pub filters: SceneFilters,
-    /// The synthetic scenes.
-    pub synthetic: SyntheticConfig,
-    /// How context and target frames are drawn for training.
-    pub views: BoundedSampler,
-    /// Threads that prepare batches; 0 prepares them between the steps.
-    pub num_threads: usize,
-    /// Batches prepared ahead.
-    pub num_prefetch: usize,
-}
-
-impl Default for DataConfig {
-    fn default() -> Self {
-        Self {
-            source: SourceKind::Synthetic,
-            root: None,
-            files: FileOptions::default(),
-            width: 256,
-            height: 256,
-            pose_rotation: PoseRotation::default(),
-            pose_scale: PoseScale::default(),
-            exact_principal_point: false,
-            crop: Crop::Protocol,
-            flip: false,
-            filters: SceneFilters::default(),
-            synthetic: SyntheticConfig::default(),
-            views: BoundedSampler::default(),
-            num_threads: 1,
-            num_prefetch: 4,
-        }
-    }
-}
-
-impl DataConfig {
-    /// How frames and poses are prepared.
-    pub fn clip_options(&self) -> ClipOptions {
-        ClipOptions {
-            width: self.width,
-            height: self.height,
-            pose_rotation: self.pose_rotation,
-            pose_scale: self.pose_scale,
-            exact_principal_point: self.exact_principal_point || self.crop == Crop::Exact,
-        }
-    }
 }
 
 /// The training loss: mean squared error plus a weighted perceptual term (paper section 3.3).
@@ -346,6 +235,8 @@ impl Default for CheckpointConfig {
 
 #[cfg(test)]
 mod tests {
+    use clift_data::{Crop, SourceKind};
+
     use super::*;
 
     #[test]

@@ -186,8 +186,8 @@ pub enum TrainError {
     Eval(#[from] clift_eval::EvalError),
 }
 
-impl From<clift_data::loader::WorkerPanic> for TrainError {
-    fn from(panic: clift_data::loader::WorkerPanic) -> Self {
+impl From<clift_data::WorkerPanic> for TrainError {
+    fn from(panic: clift_data::WorkerPanic) -> Self {
         Self::Data(panic.into())
     }
 }

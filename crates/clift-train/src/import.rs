@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use clift_data::ElementType;
 use clift_data::StateDict;
-use clift_data::pickle::ElementType;
 use clift_model::Variant;
 use clift_model::interchange::{self, CheckpointTensor, PROJECTIONS, Sizes};
 use serde::{Deserialize, Serialize};

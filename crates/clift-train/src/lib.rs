@@ -31,7 +31,6 @@ pub mod plan;
 mod recompute;
 pub mod run;
 mod run_settings;
-pub mod scene_subset;
 pub mod scenes;
 pub mod schedule;
 pub mod sinks;

@@ -2,25 +2,23 @@
 //! That of an imported model has `import.json` too.
 
 use std::collections::HashMap;
-use std::fmt::Write;
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::files::{TEMPORARY, publish, replace};
-use clift_data::{ClipReader, PoseRotation, PoseScale, Split};
+use clift_data::{ClipReader, OpenedSource, PoseRotation, PoseScale, SourceKind, Split, open_dataset};
 use clift_eval::{Condensed, Networks, Summary, System, Variant as Tokens};
 use clift_model::{ModelConfig, Variant, weights};
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 
 use crate::TrainError;
-use crate::config::{Config, SourceKind};
+use crate::config::Config;
 use crate::events::{Event, Sink};
 use crate::held_out::HeldOut;
 use crate::import::{Imported, go_on};
-use crate::scenes;
 use crate::trained::{ModelPath, Trained, check_heads};
 
 /// A parameter on the host, in PyTorch's layout.
@@ -78,10 +76,7 @@ pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
             count => sha.update(&buffer[..count]),
         }
     }
-    Ok(sha.finalize().iter().fold(String::new(), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}");
-        text
-    }))
+    Ok(hex::encode(sha.finalize()))
 }
 
 /// Writes a model directory under a temporary name, reads the model back as every command does, and renames it, unless
@@ -188,7 +183,7 @@ pub fn evaluate(
             return Err(TrainError::BadConfig { key: "eval.variants".into(), value: variant.name().into(), fix });
         }
     }
-    let (source, ledger) = scenes::open(&config.data, Split::Test)?;
+    let OpenedSource { source, report: ledger, .. } = open_dataset(&config.data, Split::Test)?;
     sink.event(&Event::Message(format!("{}: {ledger}", Split::Test)));
     let reader = ClipReader { source, options: config.data.clip_options() };
     let held_out = HeldOut::new(&config, &config.eval, reader, &last.device)?;

@@ -14,13 +14,14 @@ mod tape;
 
 pub use memory::drawing_bytes;
 
+use clift_data::SourceKind;
 use clift_eval::vgg::VggShape;
 use clift_model::ModelConfig;
 use clift_model::device::DeviceName;
 use serde::Serialize;
 
 use crate::TrainError;
-use crate::config::{Config, SourceKind};
+use crate::config::Config;
 use crate::events::Stage;
 use calibration::{InferenceRates, InferenceTimed, inference_rates, loading_s, update_rates};
 use counts::{Macs, Parameters, SceneSizes};

@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 use burn::module::Module;
 use burn::tensor::Device;
 use clift_data::files::{make_folder, remove_leftovers};
-use clift_data::{ClipReader, SceneSource, Split};
+use clift_data::{ClipReader, OpenedSource, SceneSource, SceneSubset, Split, open_dataset, open_training_dataset};
 use clift_eval::lpips::LPIPS_COMMAND;
 use clift_eval::{Condensed, Networks, Summary, System};
 use clift_model::{Clift, Encoder, ModelConfig, weights};
@@ -21,8 +21,6 @@ use crate::held_out::{HeldOut, write_ledger};
 use crate::lock::RunLock;
 use crate::plan::largest_tensor;
 use crate::run_settings::{RunFile, compare, write_config};
-use crate::scene_subset::SceneSubset;
-use crate::scenes;
 use crate::stage1::Stage1Batches;
 use crate::stage2::Stage2Batches;
 use crate::trained::{ModelPath, check_heads, refuse_checkpoint};
@@ -337,9 +335,9 @@ impl Run {
     fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
         let data = &self.config.data;
         // Under --overfit the training scenes are measured: the same ones.
-        let (source, ledger) = match split {
-            Split::Train => scenes::open_to_train(data)?,
-            Split::Test => scenes::open(data, split)?,
+        let OpenedSource { source, report: ledger, .. } = match split {
+            Split::Train => open_training_dataset(data)?,
+            Split::Test => open_dataset(data, split)?,
         };
         sink.event(&Event::Message(format!("{split}: {ledger}")));
         if ledger.has_gaps() && self.config.run_dir.is_dir() {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use clift_data::order::{below, derive_seed, item_rng, step_rng};
 use clift_data::sampler::targets_excluding;
-use clift_data::{Clip, ClipReader, Skip, ViewIndices};
+use clift_data::{Clip, ClipReader, NoUsableScene, Skip, SlotFiller, ViewIndices};
 use clift_model::SceneClusters;
 
 use crate::TrainError;
@@ -13,8 +13,8 @@ use crate::clusters::{ClusterCache, Entry};
 use crate::config::Config;
 use crate::step::{StageBatch, TokenChoice};
 
-/// Entries tried for one slot before the batch fails.
-const MAX_ATTEMPTS: u32 = 16;
+/// Attempts of one slot, repeated entries included, before the batch fails.
+const FILLER: SlotFiller = SlotFiller { min_attempts: 16, min_scenes: 0, max_attempts: 16 };
 
 /// Makes the batches of stage 2: a pure function of (seed, step) and the cluster cache.
 pub struct Stage2Batches {
@@ -85,16 +85,20 @@ impl Stage2Batches {
         group: &[usize],
         skipped: &mut Vec<Skip>,
     ) -> Result<(Clip, SceneClusters), TrainError> {
-        for attempt in 0..MAX_ATTEMPTS {
+        // The entry is the first value of its attempt's stream, the targets are the following ones.
+        let draw = |attempt| {
             let mut rng = item_rng(self.seed, step, slot as u32, attempt, "entry and targets");
-            let entry = &self.cache.entries()[group[below(&mut rng, group.len())]];
-            match self.read(entry, &mut rng) {
-                Ok(item) => return Ok(item),
-                Err(error) => skipped.push(Skip { key: entry.key.clone(), reason: error.to_string() }),
-            }
-        }
-        let reason = skipped.last().map_or_else(String::new, |skip| format!("{}: {}", skip.key, skip.reason));
-        Err(TrainError::NoScenes { reason: format!("slot {slot} of step {step}, {MAX_ATTEMPTS} tries; {reason}") })
+            (group[below(&mut rng, group.len())], rng)
+        };
+        let read = |entry: usize, attempt| {
+            let entry = &self.cache.entries()[entry];
+            let skip = |error: TrainError| Skip { key: entry.key.clone(), reason: error.to_string() };
+            self.read(entry, &mut draw(attempt).1).map_err(skip)
+        };
+        FILLER.fill(|attempt| draw(attempt).0, read, skipped).map_err(|NoUsableScene { attempts, last }| {
+            let Skip { key, reason } = last;
+            TrainError::NoScenes { reason: format!("slot {slot} of step {step}, {attempts} tries; {key}: {reason}") }
+        })
     }
 
     fn read(&self, entry: &Entry, rng: &mut impl rand::Rng) -> Result<(Clip, SceneClusters), TrainError> {

@@ -4,14 +4,16 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::layout::SAME_SCENES;
-use clift_data::{ClipReader, FileOptions, LayoutOptions, SceneSource, Split, open_layout};
+use clift_data::{
+    ClipReader, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset,
+    open_source,
+};
 use clift_eval::TokenCount;
 use clift_model::device::DeviceName;
 use clift_model::{TokenStorage, check_destination};
-use clift_train::config::SourceKind;
 use clift_train::encode::{Budget, EncodeOptions, Encoded};
 use clift_train::trained::{ModelPath, Trained};
-use clift_train::{Config, Override, read_config, scenes};
+use clift_train::{Config, Override, read_config};
 
 use crate::WrongUsage;
 use crate::data::text::{bytes, count};
@@ -82,7 +84,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     config.validate()?;
     let source = match &args.data {
         Some(folder) => open_folder(folder, args.split, &config, &overrides)?,
-        None => scenes::open(&config.data, args.split)?.0,
+        None => open_dataset(&config.data, args.split)?.source,
     };
     let scene = choose(source.as_ref(), args.scene.as_deref())?;
     let reader = ClipReader { source, options: config.data.clip_options() };
@@ -131,7 +133,8 @@ fn open_folder(
     let is_meant = overrides.iter().any(|change| change.key.starts_with("data.files"));
     let files = if is_meant { config.data.files.clone() } else { FileOptions::default() };
     // Filters choose what to train on; this scene was chosen by hand.
-    let (source, mut ledger) = open_layout(folder, split, &LayoutOptions { files, ..LayoutOptions::default() })?;
+    let options = SourceOptions { files, ..SourceOptions::default() };
+    let OpenedSource { source, report: mut ledger, .. } = open_source(&DatasetRoot::find(folder)?, split, &options)?;
     ledger.notes.retain(|note| note != SAME_SCENES);
     if ledger.has_news() {
         terminal::print_note(&format!("{}: {ledger}", folder.display()));

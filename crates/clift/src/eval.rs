@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use clift_data::SourceKind;
 use clift_eval::{System, SystemName};
-use clift_train::config::SourceKind;
 use clift_train::trained::ModelPath;
 use clift_train::{Config, Run, model_dir, read_config};
 

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use clift_data::{LayoutOptions, Split, TestScenes, open_layout};
+use clift_data::{DatasetRoot, SourceOptions, Split, TestScenes, open_source};
 use clift_model::Variant;
 use clift_train::import::{ImportOptions, import};
 
@@ -148,7 +148,9 @@ fn scene(setup: &Setup, path: &str) -> Read {
     let file = root.join(inside);
     Box::new(move |bytes| {
         std::fs::write(&file, bytes).expect("a temporary folder is writable");
-        let (source, _) = open_layout(&root, Split::Test, &LayoutOptions::default()).map_err(words_of)?;
+        let opened =
+            DatasetRoot::find(&root).and_then(|root| open_source(&root, Split::Test, &SourceOptions::default()));
+        let source = opened.map_err(words_of)?.source;
         for scene in 0..source.num_scenes() {
             source.cameras(scene).map_err(words_of)?;
             source.timestamps(scene).map_err(words_of)?;

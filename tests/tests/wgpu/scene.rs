@@ -3,14 +3,13 @@
 use std::path::Path;
 
 use burn::module::Module;
-use clift_data::{BoundedSampler, ClipReader, Split, SyntheticConfig};
+use clift_data::{BoundedSampler, ClipReader, DataConfig, Split, SyntheticConfig, open_dataset};
 use clift_eval::TokenCount;
 use clift_model::viewer::load_renderer;
 use clift_model::{Clift, Preset, Scene, TokenStorage, Variant, ViewCamera, Viewer, weights};
-use clift_train::config::DataConfig;
+use clift_train::Config;
 use clift_train::encode::{Budget, EncodeOptions};
 use clift_train::trained::Trained;
-use clift_train::{Config, scenes};
 
 use crate::cpu;
 use crate::place::{Place, SIZE, network};
@@ -70,7 +69,7 @@ fn encode(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
     let views = BoundedSampler { min_context: 2, max_context: 2, ..BoundedSampler::default() };
     let data = DataConfig { height, width, synthetic, views, ..DataConfig::default() };
     let config = Config { data, model: network(Variant::Paper), ..Config::default() };
-    let (source, _) = scenes::open(&config.data, Split::Test).expect("rooms are made");
+    let source = open_dataset(&config.data, Split::Test).expect("rooms are made").source;
     let reader = ClipReader { source, options: config.data.clip_options() };
 
     let Clift { encoder, lift_norm, condenser, renderer } = place.model().valid();

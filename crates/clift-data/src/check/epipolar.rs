@@ -165,7 +165,6 @@ fn evenly(values: &[f64], count: usize) -> impl Iterator<Item = f64> {
     (0..kept).map(move |place| values[place * values.len() / kept])
 }
 
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
+fn median(values: Vec<f64>) -> Option<f64> {
+    (!values.is_empty()).then(|| crate::statistics::upper_median(&values))
 }

@@ -1,8 +1,10 @@
 //! Converted scenes are the same scenes.
 
 use super::*;
+use crate::testing::TestSource;
 use crate::{
-    Camera, ChunkSource, Frame, LayoutOptions, SceneFilters, Skip, Split, SyntheticConfig, SyntheticSource, open_layout,
+    ChunkSource, DatasetRoot, OpenedSource, SceneFilters, Skip, SourceOptions, Split, SyntheticConfig, SyntheticSource,
+    open_source,
 };
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -21,6 +23,10 @@ fn convert_all(
     done: impl FnMut(usize),
 ) -> Result<Converted, DataError> {
     convert(source, &Ledger::new(source.num_scenes()), folder, options, done)
+}
+
+fn open(root: &Path, split: Split) -> OpenedSource {
+    open_source(&DatasetRoot::find(root).unwrap(), split, &SourceOptions::default()).unwrap()
 }
 
 fn rooms(num_scenes: usize) -> SyntheticSource {
@@ -65,8 +71,8 @@ fn chunks_and_scenes_hold_the_same_and_keep_the_files_of_the_pictures() {
         assert_eq!((converted.num_scenes, converted.num_found, converted.num_frames), (2, 0, 16));
         assert_eq!((converted.num_encoded, converted.left_out.skips.len()), (0, 0));
         assert_eq!(seen, [1, 2]);
-        let (back, ledger) = open_layout(folder.path(), Split::Train, &LayoutOptions::default()).unwrap();
-        assert_eq!(ledger.num_used(), 2);
+        let OpenedSource { source: back, report, .. } = open(folder.path(), Split::Train);
+        assert_eq!(report.num_used(), 2);
         same(&source, back.as_ref());
         for scene in 0..2 {
             let other = back.find(source.key(scene)).unwrap();
@@ -80,7 +86,7 @@ fn chunks_and_scenes_hold_the_same_and_keep_the_files_of_the_pictures() {
 #[test]
 fn every_layout_is_converted_to_the_same_scene() {
     let layouts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/layouts");
-    let open = |root: &Path| open_layout(root, Split::Test, &LayoutOptions::default()).unwrap().0;
+    let open = |root: &Path| open(root, Split::Test).source;
     for name in ["re10k_txt", "re10k_folders", "dl3dv_flat", "capture", "colmap_bin", "scenes"] {
         let source = open(&layouts.join(name));
         for options in [CHUNKS, SCENES] {
@@ -101,34 +107,17 @@ fn pictures_without_a_file_are_encoded() {
     let folder = tempfile::tempdir().unwrap();
     let converted = convert_all(&rooms(3), &folder.path().join("test"), &CHUNKS, |_| ()).unwrap();
     assert_eq!((converted.num_frames, converted.num_encoded), (9, 9));
-    let (back, _) = open_layout(folder.path(), Split::Test, &LayoutOptions::default()).unwrap();
-    same(&rooms(3), back.as_ref());
+    same(&rooms(3), open(folder.path(), Split::Test).source.as_ref());
 }
 
 /// Rooms of which so many frames can be read, three per scene: as when a process is killed.
-struct Interrupted {
-    rooms: SyntheticSource,
-    left: AtomicUsize,
-}
-
-impl SceneSource for Interrupted {
-    fn num_scenes(&self) -> usize {
-        self.rooms.num_scenes()
-    }
-    fn key(&self, scene: usize) -> &str {
-        self.rooms.key(scene)
-    }
-    fn find(&self, key: &str) -> Option<usize> {
-        self.rooms.find(key)
-    }
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        self.rooms.cameras(scene)
-    }
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+fn interrupted(num_scenes: usize, num_frames: usize) -> TestSource {
+    let left = AtomicUsize::new(num_frames);
+    TestSource::new(rooms(num_scenes)).with_frames(move |_, _, frame| {
         let may = |left: usize| left.checked_sub(1);
-        assert!(self.left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, may).is_ok(), "killed");
-        self.rooms.frame(scene, frame)
-    }
+        assert!(left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, may).is_ok(), "killed");
+        Ok(frame)
+    })
 }
 
 #[test]
@@ -137,7 +126,7 @@ fn an_interrupted_conversion_goes_on_and_ends_with_the_same_files() {
         let whole = tempfile::tempdir().unwrap();
         convert_all(&rooms(6), whole.path(), &options, |_| ()).unwrap();
         let folder = tempfile::tempdir().unwrap();
-        let killed = Interrupted { rooms: rooms(6), left: AtomicUsize::new(9) };
+        let killed = interrupted(6, 9);
         let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &options, |_| ()));
         assert!(std::panic::catch_unwind(run).is_err());
         assert!(!folder.path().join("index.json").exists());
@@ -152,41 +141,22 @@ fn an_interrupted_conversion_goes_on_and_ends_with_the_same_files() {
             assert!(got[name] == expected[name], "{name}");
         }
         // Finished: no picture is read again.
-        let again = Interrupted { rooms: rooms(6), left: AtomicUsize::new(0) };
+        let again = interrupted(6, 0);
         let converted = convert_all(&again, folder.path(), &options, |_| ()).unwrap();
         assert_eq!((converted.num_found, converted.num_frames), (6, 0));
         assert_eq!(files(folder.path()).len(), expected.len());
     }
 }
 
-/// Rooms of which the second cannot be read.
-struct SecondIsBroken(SyntheticSource);
-
-impl SceneSource for SecondIsBroken {
-    fn num_scenes(&self) -> usize {
-        self.0.num_scenes()
-    }
-    fn key(&self, scene: usize) -> &str {
-        self.0.key(scene)
-    }
-    fn find(&self, key: &str) -> Option<usize> {
-        self.0.find(key)
-    }
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        self.0.cameras(scene)
-    }
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-        if scene == 1 {
-            return Err(DataError::BadImage { key: self.key(scene).into(), frame, what: "it is torn".into() });
-        }
-        self.0.frame(scene, frame)
-    }
+/// Three rooms of which the second cannot be read.
+fn second_is_torn() -> TestSource {
+    TestSource::new(rooms(3)).with_torn_frames(|scene| scene == 1)
 }
 
 #[test]
 fn a_scene_that_cannot_be_read_is_named_and_made_later() {
     let folder = tempfile::tempdir().unwrap();
-    let converted = convert_all(&SecondIsBroken(rooms(3)), folder.path(), &SCENES, |_| ()).unwrap();
+    let converted = convert_all(&second_is_torn(), folder.path(), &SCENES, |_| ()).unwrap();
     assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (2, 1));
     assert!(
         converted.left_out.skips[0].key.ends_with("00001") && converted.left_out.skips[0].reason.contains("it is torn")
@@ -236,41 +206,21 @@ fn an_index_of_files_that_are_gone_goes_before_they_are_made_again() {
     let folder = tempfile::tempdir().unwrap();
     convert_all(&rooms(3), folder.path(), &CHUNKS, |_| ()).unwrap();
     std::fs::remove_file(folder.path().join("000001.torch")).unwrap();
-    let killed = Interrupted { rooms: rooms(3), left: AtomicUsize::new(0) };
+    let killed = interrupted(3, 0);
     let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &CHUNKS, |_| ()));
     assert!(std::panic::catch_unwind(run).is_err());
     assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), ["000000.torch", "000002.torch", "SHA256SUMS"]);
-}
-
-/// Rooms of 30,000 and one of 60,000 frames of a byte.
-struct Long(SyntheticSource);
-
-impl SceneSource for Long {
-    fn num_scenes(&self) -> usize {
-        self.0.num_scenes()
-    }
-    fn key(&self, scene: usize) -> &str {
-        self.0.key(scene)
-    }
-    fn find(&self, key: &str) -> Option<usize> {
-        self.0.find(key)
-    }
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        Ok(vec![self.0.cameras(scene)?[0]; if scene == 1 { 60_000 } else { 30_000 }])
-    }
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-        self.0.frame(scene, frame)
-    }
-    fn encoded_frame(&self, _scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
-        Ok(Some(vec![frame as u8]))
-    }
 }
 
 #[test]
 fn chunks_have_no_more_frames_than_can_be_read_and_scenes_of_more_are_left_out() {
     let folder = tempfile::tempdir().unwrap();
     let one = options(ConvertTo::Chunks { target_bytes: u64::MAX });
-    let converted = convert_all(&Long(rooms(3)), folder.path(), &one, |_| ()).unwrap();
+    let num_frames = |scene| if scene == 1 { 60_000 } else { 30_000 };
+    let long = TestSource::new(rooms(3))
+        .with_cameras(move |scene, cameras| Ok(vec![cameras[0]; num_frames(scene)]))
+        .with_encoded_frames(|_, frame| Some(vec![frame as u8]));
+    let converted = convert_all(&long, folder.path(), &one, |_| ()).unwrap();
     assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (2, 1));
     let reason = &converted.left_out.skips[0].reason;
     assert!(reason.contains("has 60000 frames, more than a file holds"), "{reason}");
@@ -299,36 +249,6 @@ fn a_folder_that_was_made_with_other_options_is_refused_and_stays_as_it_is() {
     }
 }
 
-/// Rooms of which the second has one frame fewer, or another pose.
-struct SecondDiffers {
-    rooms: SyntheticSource,
-    num_frames: usize,
-    shift: f64,
-}
-
-impl SceneSource for SecondDiffers {
-    fn num_scenes(&self) -> usize {
-        self.rooms.num_scenes()
-    }
-    fn key(&self, scene: usize) -> &str {
-        self.rooms.key(scene)
-    }
-    fn find(&self, key: &str) -> Option<usize> {
-        self.rooms.find(key)
-    }
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        let mut cameras = self.rooms.cameras(scene)?;
-        if scene == 1 {
-            cameras.truncate(self.num_frames);
-            cameras[0].c2w.translation[0] += self.shift;
-        }
-        Ok(cameras)
-    }
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-        self.rooms.frame(scene, frame)
-    }
-}
-
 #[test]
 fn scenes_that_have_changed_since_are_written_anew() {
     for (num_frames, shift) in [(2, 0.0), (3, 0.001)] {
@@ -336,7 +256,13 @@ fn scenes_that_have_changed_since_are_written_anew() {
         let one = options(ConvertTo::Chunks { target_bytes: u64::MAX });
         for (options, num_found) in [(one, 0), (CHUNKS, 2), (SCENES, 2)] {
             let (folder, whole) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-            let before = SecondDiffers { rooms: rooms(3), num_frames, shift };
+            let before = TestSource::new(rooms(3)).with_cameras(move |scene, mut cameras| {
+                if scene == 1 {
+                    cameras.truncate(num_frames);
+                    cameras[0].c2w.translation[0] += shift;
+                }
+                Ok(cameras)
+            });
             convert_all(&before, folder.path(), &options, |_| ()).unwrap();
             let converted = convert_all(&rooms(3), folder.path(), &options, |_| ()).unwrap();
             assert_eq!((converted.num_scenes, converted.num_found, converted.num_changed), (3, num_found, 1));
@@ -356,7 +282,7 @@ fn what_opening_left_out_is_in_the_list_of_what_was_skipped() {
     let mut left_out = Ledger::new(4);
     left_out.skip("far", "without any picture");
     left_out.skip_frame("near", "7.jpg", "without a picture");
-    let converted = convert(&SecondIsBroken(rooms(3)), &left_out, folder.path(), &SCENES, |_| ()).unwrap();
+    let converted = convert(&second_is_torn(), &left_out, folder.path(), &SCENES, |_| ()).unwrap();
     assert_eq!((converted.num_scenes, converted.left_out.num_scenes, converted.left_out.num_used()), (2, 4, 2));
     let text = std::fs::read(folder.path().join("skipped.json")).unwrap();
     let saved: Ledger = serde_json::from_slice(&text).unwrap();
@@ -367,28 +293,8 @@ fn what_opening_left_out_is_in_the_list_of_what_was_skipped() {
 #[test]
 fn no_index_is_written_where_no_scene_can_be_read() {
     let folder = tempfile::tempdir().unwrap();
-    let converted = convert_all(&NoneIsReadable(rooms(1)), folder.path(), &CHUNKS, |_| ()).unwrap();
+    let converted =
+        convert_all(&TestSource::new(rooms(1)).with_torn_frames(|_| true), folder.path(), &CHUNKS, |_| ()).unwrap();
     assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (0, 1));
     assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), ["SHA256SUMS", "skipped.json"]);
-}
-
-/// Rooms without pictures.
-struct NoneIsReadable(SyntheticSource);
-
-impl SceneSource for NoneIsReadable {
-    fn num_scenes(&self) -> usize {
-        self.0.num_scenes()
-    }
-    fn key(&self, scene: usize) -> &str {
-        self.0.key(scene)
-    }
-    fn find(&self, key: &str) -> Option<usize> {
-        self.0.find(key)
-    }
-    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        self.0.cameras(scene)
-    }
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-        Err(DataError::BadImage { key: self.key(scene).into(), frame, what: "it is torn".into() })
-    }
 }

@@ -1,7 +1,7 @@
 //! What the sampler promises.
 
 use super::*;
-use crate::order::item_rng;
+use crate::random::item_rng;
 use proptest::prelude::*;
 use std::collections::BTreeSet;
 

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
-use crate::split::Split;
+use crate::scene_source::Split;
 
 /// Most scenes of one source: the table of key blocks is then below 1 MiB.
 pub(super) const MAX_SCENES: usize = 32_000_000;

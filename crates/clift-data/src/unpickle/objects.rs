@@ -1,38 +1,13 @@
 //! What the pickles of checkpoints have beyond those of chunks: objects of any class, sets and bytes. All of it is
 //! passed over.
 
-use super::{MAX_PASSED_OVER, Others, Reader, Stop, global, shown};
-use crate::pickle::{Value, ValueId};
+use crate::allow_list::UnpickleError;
+use crate::pickle_machine::PickleMachine;
+use crate::values::Value;
 
-impl Reader<'_> {
-    pub(super) fn passes_over(&self) -> bool {
-        self.others == Others::PassOver
-    }
-
-    /// Whether a value was passed over, and what is put into it is too.
-    pub(super) fn is_passed_over(&self, id: ValueId) -> bool {
-        matches!(self.get(id), Value::Opaque)
-    }
-
-    /// What cannot be understood is an error in a chunk, and passed over in a checkpoint.
-    pub(super) fn or_opaque(&self, value: Result<Value, Stop>) -> Result<Value, Stop> {
-        if self.passes_over() { Ok(value.unwrap_or(Value::Opaque)) } else { value }
-    }
-
-    pub(super) fn push_global(&mut self, module: &str, name: &str) -> Result<(), Stop> {
-        let value = if let Some(global) = global(module, name, self.others)? {
-            Value::Global(global)
-        } else {
-            if self.passed_over.len() < MAX_PASSED_OVER {
-                self.passed_over.insert(shown(module, name));
-            }
-            Value::Opaque
-        };
-        self.push(value)
-    }
-
+impl PickleMachine<'_> {
     /// Objects, sets, bytes and what else only checkpoints have.
-    pub(super) fn read_object(&mut self, opcode: u8) -> Result<bool, Stop> {
+    pub(super) fn read_object(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
         match opcode {
             // BUILD: the state of an object, which stays on the stack.
             b'b' => {
@@ -83,14 +58,14 @@ impl Reader<'_> {
     }
 
     /// An object in the place of what it is made from.
-    fn replace(&mut self, count: usize) -> Result<(), Stop> {
+    fn replace(&mut self, count: usize) -> Result<(), UnpickleError> {
         for _ in 0..count {
             self.pop()?;
         }
         self.push(Value::Opaque)
     }
 
-    fn pass_over(&mut self, num_bytes: usize) -> Result<(), Stop> {
+    fn pass_over(&mut self, num_bytes: usize) -> Result<(), UnpickleError> {
         self.take(num_bytes)?;
         self.push(Value::Opaque)
     }

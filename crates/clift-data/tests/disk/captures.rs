@@ -5,12 +5,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::image::{decode, encode_png};
-use clift_data::{
-    FileOptions, Frame, IntrinsicsNorm, LayoutOptions, Ledger, Lens, SceneSource, Split, Undistortion, open_layout,
-};
+use clift_data::{FileOptions, Frame, IntrinsicsNorm, Ledger, Lens, SceneSource, SourceOptions, Split, Undistortion};
 use serde_json::{Value, json};
 
 use crate::files::{copy_folder, fixtures};
+use crate::open_at;
 
 const SIZE: [usize; 2] = [24, 16];
 
@@ -42,7 +41,8 @@ impl Capture {
     }
 
     fn open(&self) -> Result<(Arc<dyn SceneSource>, Ledger), String> {
-        open_layout(self.0.path(), Split::Test, &LayoutOptions::default()).map_err(|error| error.to_string())
+        let opened = open_at(self.0.path(), Split::Test, &SourceOptions::default());
+        opened.map(|opened| (opened.source, opened.report)).map_err(|error| error.to_string())
     }
 
     /// Which of the pictures each frame is, and where its camera stands.
@@ -133,7 +133,7 @@ fn colmap(model: &str) -> (tempfile::TempDir, Frame) {
 
 fn open(root: &Path, undistort: Option<bool>) -> Arc<dyn SceneSource> {
     let files = FileOptions { undistort, ..FileOptions::default() };
-    open_layout(root, Split::Test, &LayoutOptions { files, ..LayoutOptions::default() }).unwrap().0
+    open_at(root, Split::Test, &SourceOptions { files, ..SourceOptions::default() }).unwrap().source
 }
 
 #[test]
@@ -170,7 +170,7 @@ fn other_models_are_noted_and_pictures_are_found_from_any_place_of_the_model() {
     let (root, picture) = colmap("PINHOLE 64 36 56 57 31 19");
     let scene = root.path().join("attic");
     copy_folder(&scene.join("sparse/0"), &scene.join("sparse/1"));
-    let (_, ledger) = open_layout(root.path(), Split::Test, &LayoutOptions::default()).unwrap();
+    let ledger = open_at(root.path(), Split::Test, &SourceOptions::default()).unwrap().report;
     assert!(ledger.notes[0].ends_with("sparse/0 has 1 more models, which are not used: only model 0 is"), "{ledger}");
     let models: [(&str, PathBuf); 3] =
         [("colmap/sparse/0", "images".into()), ("dense/sparse", "dense/images".into()), ("sparse", "images_4".into())];

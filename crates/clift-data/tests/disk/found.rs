@@ -3,9 +3,10 @@
 use std::fs;
 use std::path::Path;
 
-use clift_data::{FileOptions, Layout, LayoutOptions, Opened, SceneFilters, Split, has_halves};
+use clift_data::{DatasetRoot, FileOptions, OpenedSource, SceneFilters, SourceKind, SourceOptions, Split};
 
 use crate::files::{copy_folder, fixtures};
+use crate::open_at;
 
 const HASH: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 
@@ -14,15 +15,19 @@ fn copy(part: &str, to: &Path) {
     copy_folder(&fixtures().join("layouts").join(part), to);
 }
 
-fn open(root: &Path, split: Split, options: &LayoutOptions) -> Result<Opened, String> {
-    Opened::open(root, split, options).map_err(|error| error.to_string())
+fn open(root: &Path, split: Split, options: &SourceOptions) -> Result<OpenedSource, String> {
+    open_at(root, split, options).map_err(|error| error.to_string())
 }
 
-fn open_any(root: &Path, split: Split) -> Opened {
-    open(root, split, &LayoutOptions::default()).unwrap()
+fn has_splits(root: &Path) -> bool {
+    DatasetRoot::find(root).unwrap().has_splits()
 }
 
-fn keys(opened: &Opened) -> Vec<&str> {
+fn open_any(root: &Path, split: Split) -> OpenedSource {
+    open(root, split, &SourceOptions::default()).unwrap()
+}
+
+fn keys(opened: &OpenedSource) -> Vec<&str> {
     (0..opened.source.num_scenes()).map(|scene| opened.source.key(scene)).collect()
 }
 
@@ -36,15 +41,15 @@ fn a_benchmark_scene_that_is_there_twice_is_in_no_training_set() {
     let list = root.path().join("list.txt");
     fs::write(&list, HASH).unwrap();
     let files = FileOptions { test_scenes: Some(list), ..FileOptions::default() };
-    let options = LayoutOptions { files, ..LayoutOptions::default() };
+    let options = SourceOptions { files, ..SourceOptions::default() };
     let train = open(root.path(), Split::Train, &options).unwrap();
     assert_eq!(keys(&train), [other.as_str()]);
-    assert_eq!(train.ledger.counts()["kept for testing"], 2);
+    assert_eq!(train.report.counts()["kept for testing"], 2);
     let note = format!("1 scene of DL3DV there more than once, all of which are used: 1K/{HASH} and bench/{HASH}");
-    assert!(train.ledger.notes.contains(&note), "{:?}", train.ledger.notes);
+    assert!(train.report.notes.contains(&note), "{:?}", train.report.notes);
     let test = open(root.path(), Split::Test, &options).unwrap();
     assert_eq!(keys(&test), [format!("1K/{HASH}"), format!("bench/{HASH}")]);
-    assert!(test.ledger.skips.is_empty(), "both are there: {}", test.ledger);
+    assert!(test.report.skips.is_empty(), "both are there: {}", test.report);
     assert_eq!(test.source.find(HASH), Some(0), "an index names the hash alone");
 }
 
@@ -53,15 +58,15 @@ fn scenes_of_dl3dv_among_others_are_not_taken_for_captures() {
     let root = tempfile::tempdir().unwrap();
     copy("dl3dv", root.path());
     copy("colmap_bin/attic", &root.path().join("1K/stray"));
-    let message = open(root.path(), Split::Train, &LayoutOptions::default()).err().unwrap();
+    let message = open(root.path(), Split::Train, &SourceOptions::default()).err().unwrap();
     assert!(message.contains("1 of 2 scenes are DL3DV's") && message.contains("such as stray"), "{message}");
     assert!(message.contains("data.source"), "{message}");
-    let asked = LayoutOptions { layout: Layout::Dl3dv, ..LayoutOptions::default() };
+    let asked = SourceOptions { kind: SourceKind::Dl3dv, ..SourceOptions::default() };
     let opened = open(root.path(), Split::Train, &asked).unwrap();
     assert_eq!(keys(&opened), [HASH]);
-    let skip = &opened.ledger.skips[0];
+    let skip = &opened.report.skips[0];
     assert_eq!((skip.key.as_str(), skip.reason.as_str()), ("stray", "with cameras in another form than dl3dv has"));
-    let asked = LayoutOptions { layout: Layout::Captures, ..LayoutOptions::default() };
+    let asked = SourceOptions { kind: SourceKind::Captures, ..SourceOptions::default() };
     assert_eq!(open(root.path(), Split::Train, &asked).unwrap().source.num_scenes(), 2);
 }
 
@@ -73,13 +78,13 @@ fn a_capture_named_as_a_half_hides_no_other() {
     let opened = open_any(root.path(), Split::Train);
     assert_eq!((keys(&opened), opened.has_splits), (vec!["train", "truck"], false));
     fs::rename(root.path().join("truck"), root.path().join("test")).unwrap();
-    assert!(has_halves(root.path()), "two halves of one capture each");
+    assert!(has_splits(root.path()), "two halves of one capture each");
     copy("colmap_bin/attic", &root.path().join("truck"));
-    assert!(!has_halves(root.path()));
+    assert!(!has_splits(root.path()));
     // A clip of RealEstate10K is a file beside its folder, so that the half it is alone in looks like a scene.
     let clips = tempfile::tempdir().unwrap();
     copy("re10k_txt/test", &clips.path().join("train"));
-    assert!(has_halves(clips.path()));
+    assert!(has_splits(clips.path()));
 }
 
 #[cfg(unix)]
@@ -97,7 +102,7 @@ fn of_the_names_that_links_give_a_folder_its_own_is_used() {
     }
     let opened = open_any(root.path(), Split::Test);
     assert_eq!(keys(&opened), ["y", "z"]);
-    assert_eq!(opened.ledger.notes[0], "2 links to what is used already: a to z, zz to z");
+    assert_eq!(opened.report.notes[0], "2 links to what is used already: a to z, zz to z");
 }
 
 #[test]
@@ -108,26 +113,26 @@ fn chunks_and_scenes_that_the_index_does_not_name_are_told() {
     fs::copy(train.join("000000.torch"), train.join("000001.torch")).unwrap();
     fs::write(train.join("index.json"), r#"{"00000000000000a1": "000000.torch"}"#).unwrap();
     let opened = open_any(root.path(), Split::Train);
-    assert_eq!(opened.ledger.notes, ["not in index.json and so not opened: 1 .torch file (000001.torch)"]);
+    assert_eq!(opened.report.notes, ["not in index.json and so not opened: 1 .torch file (000001.torch)"]);
     let filters = SceneFilters { min_frames: 2, max_fov_deg: None };
     for options in [
-        LayoutOptions { reads_chunks: true, ..LayoutOptions::default() },
-        LayoutOptions { filters, ..LayoutOptions::default() },
+        SourceOptions { reads_chunks: true, ..SourceOptions::default() },
+        SourceOptions { filters, ..SourceOptions::default() },
     ] {
         let opened = open(root.path(), Split::Train, &options).unwrap();
         assert_eq!(keys(&opened), ["00000000000000a1"]);
         let expected = "1 of 2 scenes used; 1 in a chunk but not in its index.json";
-        assert!(opened.ledger.to_string().starts_with(expected), "{}", opened.ledger);
-        assert_eq!(opened.ledger.skips[0].key, "00000000000000a2");
+        assert!(opened.report.to_string().starts_with(expected), "{}", opened.report);
+        assert_eq!(opened.report.skips[0].key, "00000000000000a2");
     }
     // The other half's scenes are no news.
     let index = r#"{"00000000000000a1": "000000.torch", "00000000000000a2": "000001.torch"}"#;
     fs::write(train.join("index.json"), index).unwrap();
-    let options = LayoutOptions { reads_chunks: true, ..LayoutOptions::default() };
+    let options = SourceOptions { reads_chunks: true, ..SourceOptions::default() };
     let opened = open(root.path(), Split::Train, &options).unwrap();
     let expected = "2 of 2 scenes used; 2 scenes also in chunks other than those that index.json names, which are not \
                     used (00000000000000a1, 00000000000000a2)";
-    assert_eq!(opened.ledger.to_string(), expected);
+    assert_eq!(opened.report.to_string(), expected);
 }
 
 #[test]
@@ -141,7 +146,7 @@ fn of_a_scene_in_two_files_without_an_index_the_first_is_used() {
     assert_eq!(opened.source.num_scenes(), 2);
     let expected = "2 scenes in more than one file, of which the first is used (00000000000000a1 in 000000.torch and \
                     000009.torch, 00000000000000a2 in 000000.torch and 000009.torch)";
-    assert_eq!(opened.ledger.notes[0], expected);
+    assert_eq!(opened.report.notes[0], expected);
     // Without the second file everything is as it was.
     fs::remove_file(train.join("000009.torch")).unwrap();
     assert!(open_any(root.path(), Split::Train).source.frame(1, 7).is_ok());
@@ -157,10 +162,10 @@ fn data_of_other_layouts_below_a_root_is_named() {
     assert_eq!(keys(&opened), ["attic"]);
     let expected = "not opened, each being data of its own: clips/test (RealEstate10K's text files), \
                     re10k/test (chunks or scenes in .torch files), re10k/train (chunks or scenes in .torch files)";
-    assert_eq!(opened.ledger.notes[0], expected);
+    assert_eq!(opened.report.notes[0], expected);
     fs::remove_dir_all(root.path().join("captures")).unwrap();
     fs::remove_dir_all(root.path().join("clips")).unwrap();
-    let message = open(root.path(), Split::Test, &LayoutOptions::default()).err().unwrap();
+    let message = open(root.path(), Split::Test, &SourceOptions::default()).err().unwrap();
     assert!(message.contains("there is other data, to be opened by itself: re10k/test (chunks"), "{message}");
 }
 
@@ -172,7 +177,7 @@ fn cameras_in_several_files_are_named_where_none_is_called_transforms_json() {
         fs::write(root.path().join(format!("transforms_{split}.json")), "{}").unwrap();
     }
     for split in [Split::Train, Split::Test] {
-        let message = open(root.path(), split, &LayoutOptions::default()).err().unwrap();
+        let message = open(root.path(), split, &SourceOptions::default()).err().unwrap();
         let expected =
             "there is no transforms.json, but transforms_test.json, transforms_train.json: open one by its path";
         assert!(message.contains(expected), "{split}: {message}");

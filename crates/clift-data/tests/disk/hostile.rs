@@ -4,13 +4,14 @@ use std::fs;
 use std::path::Path;
 
 use crate::files::{copy_folder, fixtures};
-use clift_data::{LayoutOptions, Split, open_layout};
+use crate::open_at;
+use clift_data::{OpenedSource, SourceOptions, Split};
 use proptest::prelude::*;
 
 /// Opens a scene and reads all of it; the first error as text.
 fn read(root: &Path) -> Result<usize, String> {
     let text = |error: clift_data::DataError| error.to_string();
-    let (source, _) = open_layout(root, Split::Test, &LayoutOptions::default()).map_err(text)?;
+    let source = open_at(root, Split::Test, &SourceOptions::default()).map_err(text)?.source;
     for scene in 0..source.num_scenes() {
         for frame in 0..source.cameras(scene).map_err(text)?.len() {
             source.frame(scene, frame).map_err(text)?;
@@ -103,7 +104,8 @@ fn a_turned_picture_is_left_out_for_its_shape() {
     let png = clift_data::image::encode_png(&picture).unwrap();
     fs::write(root.path().join("attic/images/10.png"), &png).unwrap();
     fs::write(root.path().join("attic/images/11.png"), "no picture").unwrap();
-    let (source, ledger) = open_layout(root.path(), Split::Test, &LayoutOptions::default()).unwrap();
+    let OpenedSource { source, report: ledger, .. } =
+        open_at(root.path(), Split::Test, &SourceOptions::default()).unwrap();
     assert_eq!(source.num_frames(0).unwrap(), 4);
     let left_out: Vec<_> = ledger.frames.iter().map(|skip| (skip.frame.as_str(), skip.reason.as_str())).collect();
     let expected = [
@@ -253,7 +255,8 @@ fn links_in_a_circle_and_pipes_end() {
     assert_eq!(read(root.path()), Ok(1));
     // A scene that is a device, and a picture that is one.
     symlink("/dev/zero", root.path().join("attic/images/99.png")).unwrap();
-    let (source, ledger) = open_layout(root.path(), Split::Test, &LayoutOptions::default()).unwrap();
+    let OpenedSource { source, report: ledger, .. } =
+        open_at(root.path(), Split::Test, &SourceOptions::default()).unwrap();
     assert_eq!(source.num_frames(0).unwrap(), 6);
     assert!(ledger.frames.iter().any(|skip| skip.reason == "whose picture cannot be read"), "{ledger}");
 }

@@ -4,35 +4,36 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::files::{copy_folder, fixtures};
+use crate::open_at;
 use clift_data::normalize::{PoseRotation, PoseScale};
 use clift_data::{
-    Clip, ClipOptions, ClipReader, FileOptions, Layout, LayoutOptions, Ledger, Opened, SceneFilters, SceneSource,
-    SourceInfo, Split, ViewIndices, open_layout,
+    Clip, ClipOptions, ClipReader, FileOptions, Ledger, OpenedSource, SceneFilters, SceneSource, SourceInfo,
+    SourceKind, SourceOptions, Split, ViewIndices,
 };
 
 const KEY: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 
 /// Folder, split, layout and key of each.
-const LAYOUTS: [(&str, Split, Layout, &str); 10] = [
-    ("chunks", Split::Test, Layout::Chunks, KEY),
-    ("depthsplat", Split::Train, Layout::Chunks, "dl3dv_"),
-    ("scenes", Split::Test, Layout::Scenes, KEY),
-    ("re10k_txt", Split::Test, Layout::Re10kTxt, KEY),
-    ("re10k_folders", Split::Test, Layout::Re10kTxt, KEY),
-    ("dl3dv_flat", Split::Test, Layout::Dl3dv, KEY),
-    ("dl3dv", Split::Test, Layout::Dl3dv, KEY),
-    ("dl3dv_benchmark", Split::Test, Layout::Dl3dv, KEY),
-    ("capture", Split::Test, Layout::Captures, "attic"),
-    ("colmap_bin", Split::Test, Layout::Captures, "attic"),
+const LAYOUTS: [(&str, Split, SourceKind, &str); 10] = [
+    ("chunks", Split::Test, SourceKind::Chunks, KEY),
+    ("depthsplat", Split::Train, SourceKind::Chunks, "dl3dv_"),
+    ("scenes", Split::Test, SourceKind::Scenes, KEY),
+    ("re10k_txt", Split::Test, SourceKind::Re10kTxt, KEY),
+    ("re10k_folders", Split::Test, SourceKind::Re10kTxt, KEY),
+    ("dl3dv_flat", Split::Test, SourceKind::Dl3dv, KEY),
+    ("dl3dv", Split::Test, SourceKind::Dl3dv, KEY),
+    ("dl3dv_benchmark", Split::Test, SourceKind::Dl3dv, KEY),
+    ("capture", Split::Test, SourceKind::Captures, "attic"),
+    ("colmap_bin", Split::Test, SourceKind::Captures, "attic"),
 ];
 
 fn layouts() -> PathBuf {
     fixtures().join("layouts")
 }
 
-fn open(root: &Path, split: Split, layout: Layout) -> Opened {
-    let options = LayoutOptions { layout, ..LayoutOptions::default() };
-    Opened::open(root, split, &options).unwrap_or_else(|error| panic!("{}: {error}", root.display()))
+fn open(root: &Path, split: Split, layout: SourceKind) -> OpenedSource {
+    let options = SourceOptions { kind: layout, ..SourceOptions::default() };
+    open_at(root, split, &options).unwrap_or_else(|error| panic!("{}: {error}", root.display()))
 }
 
 fn clip(source: Arc<dyn SceneSource>) -> Clip {
@@ -56,12 +57,12 @@ fn numbers(clip: &Clip) -> Vec<f64> {
 
 #[test]
 fn all_layouts_of_a_scene_give_the_same_clip() {
-    let expected = clip(open(&layouts().join("chunks"), Split::Test, Layout::Auto).source);
-    let text_model = ("colmap_txt", Split::Test, Layout::Captures, "attic");
+    let expected = clip(open(&layouts().join("chunks"), Split::Test, SourceKind::Auto).source);
+    let text_model = ("colmap_txt", Split::Test, SourceKind::Captures, "attic");
     for (name, split, layout, key) in LAYOUTS.into_iter().chain([text_model]) {
-        for asked in [Layout::Auto, layout] {
+        for asked in [SourceKind::Auto, layout] {
             let opened = open(&layouts().join(name), split, asked);
-            assert_eq!((opened.layout, opened.source.num_scenes()), (layout, 1), "{name}");
+            assert_eq!((opened.kind, opened.source.num_scenes()), (layout, 1), "{name}");
             let source = opened.source;
             assert!(source.key(0).starts_with(key), "{name}: {}", source.key(0));
             let found = if key == "attic" { key } else { KEY };
@@ -83,7 +84,7 @@ fn all_layouts_of_a_scene_give_the_same_clip() {
 fn cameras_are_those_of_the_script_that_wrote_them() {
     // What the script says of frame 3: 1.0 + 0.2 * 3, -0.5 + 0.03 * 9, 2.0 - 0.1 * 3.
     for (name, split, ..) in LAYOUTS {
-        let source = open(&layouts().join(name), split, Layout::Auto).source;
+        let source = open(&layouts().join(name), split, SourceKind::Auto).source;
         let camera = source.cameras(0).unwrap()[3];
         let k = camera.intrinsics_norm;
         let expected = [1.6, -0.23, 1.7, 0.875, 1.5625, 0.515_625, 0.468_75];
@@ -97,17 +98,17 @@ fn cameras_are_those_of_the_script_that_wrote_them() {
 
 #[test]
 fn time_stamps_and_addresses_are_those_of_the_files() {
-    let times = |name: &str| open(&layouts().join(name), Split::Test, Layout::Auto).source.timestamps(0).unwrap();
+    let times = |name: &str| open(&layouts().join(name), Split::Test, SourceKind::Auto).source.timestamps(0).unwrap();
     assert_eq!(times("re10k_txt")[..2], [1_000_000, 1_033_367]);
     assert_eq!(times("dl3dv"), [1, 2, 3, 4, 5, 6]);
     assert_eq!(times("capture"), [8, 9, 10, 11, 12, 13]);
-    let url = |name: &str| open(&layouts().join(name), Split::Test, Layout::Auto).source.url(0).unwrap();
+    let url = |name: &str| open(&layouts().join(name), Split::Test, SourceKind::Auto).source.url(0).unwrap();
     assert_eq!((url("re10k_txt").as_str(), url("dl3dv").as_str()), ("https://example.org/watch", ""));
 }
 
 #[test]
 fn a_frame_without_a_picture_is_named_and_left_out_of_a_capture() {
-    let Opened { ledger, source, .. } = open(&layouts().join("capture"), Split::Test, Layout::Auto);
+    let OpenedSource { report: ledger, source, .. } = open(&layouts().join("capture"), Split::Test, SourceKind::Auto);
     assert_eq!(source.num_frames(0).unwrap(), 6);
     let expected = "1 of 1 scenes used; 1 frame without a picture (./images/99); no train/ and test/ folders and no \
                     test scenes in a list: both halves are the same scenes";
@@ -117,13 +118,13 @@ fn a_frame_without_a_picture_is_named_and_left_out_of_a_capture() {
 #[test]
 fn a_capture_may_be_given_as_a_folder_of_folders_a_folder_or_a_file() {
     let capture = layouts().join("capture");
-    let expected = clip(open(&capture, Split::Test, Layout::Auto).source);
+    let expected = clip(open(&capture, Split::Test, SourceKind::Auto).source);
     for part in ["attic", "attic/transforms.json"] {
-        let opened = open(&capture.join(part), Split::Train, Layout::Auto);
-        assert_eq!((opened.source.key(0), opened.layout), ("attic", Layout::Captures));
+        let opened = open(&capture.join(part), Split::Train, SourceKind::Auto);
+        assert_eq!((opened.source.key(0), opened.kind), ("attic", SourceKind::Captures));
         assert_eq!(clip(opened.source), expected, "{part}");
     }
-    let model = open(&layouts().join("colmap_txt/attic"), Split::Test, Layout::Auto).source;
+    let model = open(&layouts().join("colmap_txt/attic"), Split::Test, SourceKind::Auto).source;
     assert_eq!((model.key(0), model.num_scenes()), ("attic", 1));
 }
 
@@ -139,7 +140,8 @@ fn two_scenes(root: &Path) -> [String; 2] {
 }
 
 fn open_with(root: &Path, split: Split, files: FileOptions) -> (Arc<dyn SceneSource>, Ledger) {
-    open_layout(root, split, &LayoutOptions { files, ..LayoutOptions::default() }).unwrap()
+    let opened = open_at(root, split, &SourceOptions { files, ..SourceOptions::default() }).unwrap();
+    (opened.source, opened.report)
 }
 
 #[test]
@@ -186,8 +188,9 @@ fn scenes_of_the_list_are_kept_out_of_training_and_missing_ones_are_counted() {
 #[test]
 fn filters_and_sizes_leave_scenes_out_with_a_reason() {
     let ledger = |filters: SceneFilters, min_size: [usize; 2]| {
-        let options = LayoutOptions { filters, min_size, ..LayoutOptions::default() };
-        let (source, ledger) = open_layout(&layouts().join("dl3dv"), Split::Test, &options).unwrap();
+        let options = SourceOptions { filters, min_size, ..SourceOptions::default() };
+        let OpenedSource { source, report: ledger, .. } =
+            open_at(&layouts().join("dl3dv"), Split::Test, &options).unwrap();
         assert_eq!(source.num_scenes(), ledger.num_used());
         ledger.skips.into_iter().map(|skip| skip.reason).collect::<Vec<_>>()
     };
@@ -207,9 +210,9 @@ fn the_folder_of_pictures_may_be_chosen() {
     copy_folder(&scene.join("images_8"), &scene.join("small"));
     let chosen = |folder: &str| {
         let files = FileOptions { image_folder: Some(folder.into()), ..FileOptions::default() };
-        open_layout(root.path(), Split::Test, &LayoutOptions { files, ..LayoutOptions::default() })
+        open_at(root.path(), Split::Test, &SourceOptions { files, ..SourceOptions::default() })
     };
-    assert_eq!(chosen("small").unwrap().0.num_frames(0).unwrap(), 6);
+    assert_eq!(chosen("small").unwrap().source.num_frames(0).unwrap(), 6);
     let message = chosen("large").err().unwrap().to_string();
     assert!(
         message.contains("none of its 6 frames has a picture, the first being images/frame_00001.png"),
@@ -225,7 +228,7 @@ fn frames_of_real_estate_10k_are_found_where_the_user_says() {
     let elsewhere = root.path().join("extracted");
     copy_folder(&layouts().join("re10k_txt/frames"), &elsewhere.join("test"));
     let data = root.path().join("data");
-    let message = open_layout(&data, Split::Test, &LayoutOptions::default()).err().unwrap().to_string();
+    let message = open_at(&data, Split::Test, &SourceOptions::default()).err().unwrap().to_string();
     assert!(message.contains("none of its 6 frames has a picture, the first being 1000000"), "{message}");
     let files = FileOptions { frames: Some(elsewhere), ..FileOptions::default() };
     assert_eq!(open_with(&data, Split::Test, files).0.num_frames(0).unwrap(), 6);
@@ -245,9 +248,9 @@ fn files_of_scenes_are_opened_without_an_index_and_chunks_that_lost_theirs_too()
     copy_folder(&layouts().join("chunks"), chunks.path());
     std::fs::remove_file(chunks.path().join("test/index.json")).unwrap();
     std::fs::write(chunks.path().join("test/000001.torch"), "cut").unwrap();
-    let opened = open(chunks.path(), Split::Test, Layout::Auto);
+    let opened = open(chunks.path(), Split::Test, SourceKind::Auto);
     assert_eq!((opened.source.key(0), opened.source.num_frames(0).unwrap()), (KEY, 6));
-    let ledger = opened.ledger.to_string();
+    let ledger = opened.report.to_string();
     assert!(ledger.starts_with("1 of 2 scenes used; 1 bad chunk: "), "{ledger}");
     assert!(ledger.ends_with("there is no index.json: the scenes of 2 files were looked up"), "{ledger}");
 }
@@ -258,7 +261,7 @@ fn scenes_of_one_name_are_told_apart_by_the_way_to_them() {
     for place in ["a/attic", "b/c/attic", "b/cellar"] {
         copy_folder(&layouts().join("capture/attic"), &root.path().join(place));
     }
-    let source = open(root.path(), Split::Test, Layout::Auto).source;
+    let source = open(root.path(), Split::Test, SourceKind::Auto).source;
     let keys: Vec<&str> = (0..source.num_scenes()).map(|scene| source.key(scene)).collect();
     assert_eq!(keys, ["a/attic", "b/c/attic", "cellar"]);
 }
@@ -267,17 +270,17 @@ fn scenes_of_one_name_are_told_apart_by_the_way_to_them() {
 fn halves_in_folders_of_their_own_are_told_from_a_shared_folder() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&layouts().join("capture"), &root.path().join("train"));
-    let opened = open(root.path(), Split::Train, Layout::Auto);
-    assert!(opened.has_splits && opened.ledger.notes.is_empty());
-    let error = open_layout(root.path(), Split::Test, &LayoutOptions::default()).err().unwrap();
+    let opened = open(root.path(), Split::Train, SourceKind::Auto);
+    assert!(opened.has_splits && opened.report.notes.is_empty());
+    let error = open_at(root.path(), Split::Test, &SourceOptions::default()).err().unwrap();
     assert!(error.to_string().starts_with("no scenes found: there is no folder test/ beside the other split: "));
-    assert!(!open(&root.path().join("train"), Split::Test, Layout::Auto).has_splits);
+    assert!(!open(&root.path().join("train"), Split::Test, SourceKind::Auto).has_splits);
 }
 
 #[test]
 fn any_layout_is_described() {
     for (name, split, ..) in LAYOUTS {
-        let info = SourceInfo::read(open(&layouts().join(name), split, Layout::Auto).source.as_ref()).unwrap();
+        let info = SourceInfo::read(open(&layouts().join(name), split, SourceKind::Auto).source.as_ref()).unwrap();
         assert_eq!((info.num_scenes, info.image_size), (1, Some([32, 18])), "{name}");
         // atan(0.515625 / 0.875) + atan(0.484375 / 0.875), by hand
         assert_eq!(format!("{:.1}", info.fov_deg.unwrap().max), "59.5", "{name}");

@@ -4,10 +4,11 @@ use std::fs;
 use std::path::Path;
 
 use clift_data::image::{encode_jpeg, encode_png};
-use clift_data::{FileOptions, Frame, Layout, LayoutOptions, Ledger, Opened, Split};
+use clift_data::{FileOptions, Frame, Ledger, OpenedSource, SourceKind, SourceOptions, Split};
 use serde_json::{Value, json};
 
 use crate::files::{copy_folder, fixtures};
+use crate::open_at;
 
 fn picture(width: usize, height: usize) -> Frame {
     Frame { width, height, rgb: (0..width * height * 3).map(|i| (i * i / 7) as u8).collect() }
@@ -29,8 +30,8 @@ fn write(root: &Path, pictures: &[(&str, Vec<u8>)], frames: &[&str]) {
     fs::write(root.join("transforms.json"), cameras.to_string()).unwrap();
 }
 
-fn open(root: &Path) -> Result<Opened, String> {
-    Opened::open(root, Split::Test, &LayoutOptions::default()).map_err(|error| error.to_string())
+fn open(root: &Path) -> Result<OpenedSource, String> {
+    open_at(root, Split::Test, &SourceOptions::default()).map_err(|error| error.to_string())
 }
 
 fn frames_left_out(ledger: &Ledger) -> Vec<(&str, &str)> {
@@ -56,7 +57,7 @@ fn a_picture_whose_end_is_missing_is_left_out_at_opening() {
     ];
     let root = tempfile::tempdir().unwrap();
     write(root.path(), &pictures, &pictures.clone().map(|(name, _)| name));
-    let Opened { source, ledger, .. } = open(root.path()).unwrap();
+    let OpenedSource { source, report: ledger, .. } = open(root.path()).unwrap();
     let truncated = ["1.jpg", "3.png", "8.jpg"].map(|name| (name, "whose picture is truncated"));
     assert_eq!(frames_left_out(&ledger), truncated);
     for frame in 0..source.num_frames(0).unwrap() {
@@ -81,7 +82,7 @@ fn a_scene_without_a_usable_picture_says_what_is_wrong_with_them() {
         let file = if name == "heic" { "1.heic" } else { "0.jpg" };
         write(&scenes.path().join(name), &[(file, bytes)], frames);
     }
-    let ledger = open(scenes.path()).unwrap().ledger;
+    let ledger = open(scenes.path()).unwrap().report;
     let reason = |key: &str| ledger.skips.iter().find(|skip| skip.key == key).unwrap().reason.as_str();
     assert!(reason("corrupt").contains("the picture cannot be read"), "{ledger}");
     assert!(reason("cut").contains("the picture is truncated"), "{ledger}");
@@ -100,7 +101,7 @@ fn a_scene_without_a_usable_picture_says_what_is_wrong_with_them() {
         write(&root.path().join(key), &[("0.jpg", jpeg.clone()), ("1.jpg", jpeg.clone())], &["0.jpg", "1.jpg"]);
     }
     fs::write(root.path().join("a".repeat(64)).join("0.jpg"), "no picture").unwrap();
-    let ledger = open(root.path()).unwrap().ledger;
+    let ledger = open(root.path()).unwrap().report;
     assert!(ledger.skips[0].reason.contains("the picture cannot be read"), "{ledger}");
 }
 
@@ -112,7 +113,7 @@ fn a_picture_of_no_size_leaves_the_others_in_use() {
     let mut cameras: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
     cameras.as_object_mut().unwrap().retain(|key, _| key != "w");
     fs::write(&path, cameras.to_string()).unwrap();
-    assert_eq!(frames_left_out(&open(root.path()).unwrap().ledger), [("1.png", "whose picture cannot be read")]);
+    assert_eq!(frames_left_out(&open(root.path()).unwrap().report), [("1.png", "whose picture cannot be read")]);
 }
 
 #[test]
@@ -128,13 +129,13 @@ fn pictures_without_a_camera_are_counted() {
     let pictures = pictures.map(|(name, png)| (format!("images/{name}.png"), png));
     let pictures: Vec<(&str, Vec<u8>)> = pictures.iter().map(|(name, png)| (name.as_str(), png.clone())).collect();
     write(&root.path().join("b"), &pictures, &["images/2", "images/9"]);
-    assert_eq!(open(root.path()).unwrap().ledger.notes[0], "3 pictures without a camera, not used: 1 of a, 2 of b");
+    assert_eq!(open(root.path()).unwrap().report.notes[0], "3 pictures without a camera, not used: 1 of a, 2 of b");
 
     for (layout, frames) in [("colmap_bin/attic", "images/left"), ("re10k_folders", "")] {
         let copy = tempfile::tempdir().unwrap();
         copy_folder(&fixtures().join("layouts").join(layout), copy.path());
         let note = "1 picture without a camera, not used: ";
-        let has_note = || open(copy.path()).unwrap().ledger.notes.iter().any(|got| got.starts_with(note));
+        let has_note = || open(copy.path()).unwrap().report.notes.iter().any(|got| got.starts_with(note));
         assert!(!has_note(), "{layout}");
         let mut folder = copy.path().join(frames);
         if frames.is_empty() {
@@ -179,8 +180,8 @@ fn pictures_are_found_by_mixed_separators_and_by_the_end_of_a_path() {
         let root = tempfile::tempdir().unwrap();
         write(root.path(), &[(file, png())], &[named]);
         let files = FileOptions { image_folder: image_folder.map(str::to_owned), ..FileOptions::default() };
-        let options = LayoutOptions { files, ..LayoutOptions::default() };
-        let opened = Opened::open(root.path(), Split::Test, &options);
+        let options = SourceOptions { files, ..SourceOptions::default() };
+        let opened = open_at(root.path(), Split::Test, &options);
         let opened = opened.unwrap_or_else(|error| panic!("{file} for {named}: {error}"));
         assert_eq!(opened.source.num_frames(0).unwrap(), 1, "{file} for {named}");
     }
@@ -203,7 +204,7 @@ fn an_orientation_that_is_not_applied_is_told_where_the_shape_is_wrong() {
     write(root.path(), &pictures, &["0.jpg", "1.jpg"]);
     let opened = open(root.path()).unwrap();
     let expected = "whose picture has another shape than its camera, and an EXIF orientation, which is not applied";
-    assert_eq!(frames_left_out(&opened.ledger), [("1.jpg", expected)]);
+    assert_eq!(frames_left_out(&opened.report), [("1.jpg", expected)]);
     let frame = opened.source.frame(0, 0).unwrap();
     assert_eq!((frame.width, frame.height), (48, 32), "as stored");
     fs::remove_file(root.path().join("0.jpg")).unwrap();
@@ -219,16 +220,16 @@ fn a_listed_scene_that_the_test_half_does_not_have_is_told_as_one_that_nobody_us
     fs::write(&list, "00000000000000a1\n00000000000000b1\n").unwrap();
     let flagged = |layout| {
         let files = FileOptions { test_scenes: Some(list.clone()), ..FileOptions::default() };
-        let options = LayoutOptions { layout, files, ..LayoutOptions::default() };
-        let opened = Opened::open(root.path(), Split::Train, &options).unwrap();
-        assert_eq!((opened.source.num_scenes(), opened.ledger.skips.len()), (1, 1));
-        let flagged = clift_data::check::left_out(&opened.ledger).into_iter();
+        let options = SourceOptions { kind: layout, files, ..SourceOptions::default() };
+        let opened = open_at(root.path(), Split::Train, &options).unwrap();
+        assert_eq!((opened.source.num_scenes(), opened.report.skips.len()), (1, 1));
+        let flagged = clift_data::check::left_out(&opened.report).into_iter();
         flagged.map(|check| (check.key, check.reasons.concat())).collect::<Vec<_>>()
     };
     let reason = "kept for testing by the list of test scenes, but not in test/".to_owned();
-    assert_eq!(flagged(Layout::Auto), [("00000000000000a1".to_owned(), reason.clone())]);
-    assert_eq!(flagged(Layout::Scenes), [("00000000000000a1".to_owned(), reason)]);
+    assert_eq!(flagged(SourceKind::Auto), [("00000000000000a1".to_owned(), reason.clone())]);
+    assert_eq!(flagged(SourceKind::Scenes), [("00000000000000a1".to_owned(), reason)]);
     fs::remove_dir_all(root.path().join("test")).unwrap();
     copy_folder(&root.path().join("train"), &root.path().join("test"));
-    assert!(flagged(Layout::Auto).is_empty(), "the test half has it");
+    assert!(flagged(SourceKind::Auto).is_empty(), "the test half has it");
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use clift_data::{BoundedSampler, Clip, SyntheticConfig};
+use clift_data::{BoundedSampler, Clip, DataConfig, SourceKind, SyntheticConfig};
 use clift_eval::{TokenCount, upload_views};
 use clift_model::device::DeviceName;
 use clift_model::{Clift, ModelConfig};
@@ -13,7 +13,7 @@ use clift_model::{Clift, ModelConfig};
 use super::inputs::{Shape, clip, model};
 use super::{BenchOptions, MAX_CHECKED_TOKENS};
 use crate::TrainError;
-use crate::config::{Config, DataConfig, SourceKind, Stage1Config};
+use crate::config::{Config, Stage1Config};
 
 /// The sizes and the device that all rows share.
 pub struct BenchContext {

@@ -6,7 +6,7 @@ use std::time::Instant;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
-use clift_eval::statistics;
+use clift_data::statistics::median;
 use clift_model::Precision;
 use clift_model::device::DeviceName;
 use serde::Serialize;
@@ -114,7 +114,7 @@ fn times(
             }
         }
     }
-    Ok(samples.map(|samples| statistics::median(&samples)))
+    Ok(samples.map(|samples| median(&samples)))
 }
 
 struct Compared {

@@ -1,10 +1,10 @@
 //! What no type can check of a config: ranges, and values that have to fit each other.
 
-use clift_data::{DataError, Split};
+use clift_data::{DataConfig, DataError, SourceKind, Split};
 use clift_eval::perceptual::PERCEPTUAL_MIN_SIZE_PX;
 use clift_model::Grouping;
 
-use super::{Config, DataConfig, OptimizerConfig, SourceKind};
+use super::{Config, OptimizerConfig};
 use crate::TrainError;
 use crate::clusters::MAX_TOKENS;
 
@@ -21,7 +21,7 @@ impl Config {
         self.data.views.validate().map_err(in_section("data.views"))?;
         self.validate_size()?;
         self.validate_token_counts()?;
-        self.data.validate()?;
+        validate_data(&self.data)?;
         self.validate_loss()?;
         let Self { stage1, stage2, clusters, eval, checkpoint, .. } = self;
         for (key, value, least, most) in [
@@ -122,35 +122,33 @@ impl Config {
     }
 }
 
-impl DataConfig {
-    fn validate(&self) -> Result<(), TrainError> {
-        in_range("data.num_threads", self.num_threads, 0, 1024)?;
-        in_range("data.num_prefetch", self.num_prefetch, 1, 1024)?;
-        if self.source == SourceKind::Synthetic {
-            return self.validate_synthetic();
-        }
-        if self.root.is_none() {
-            return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
-        }
-        self.filters.validate().map_err(in_section("data.filters"))
+fn validate_data(data: &DataConfig) -> Result<(), TrainError> {
+    in_range("data.num_threads", data.num_threads, 0, 1024)?;
+    in_range("data.num_prefetch", data.num_prefetch, 1, 1024)?;
+    if data.source == SourceKind::Synthetic {
+        return validate_synthetic(data);
     }
+    if data.root.is_none() {
+        return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
+    }
+    data.filters.validate().map_err(in_section("data.filters"))
+}
 
-    fn validate_synthetic(&self) -> Result<(), TrainError> {
-        let synthetic = &self.synthetic;
-        synthetic.validate().map_err(in_section("data.synthetic"))?;
-        if synthetic.width < self.width || synthetic.height < self.height {
-            let fix = format!(
-                "synthetic scenes are {} x {}: write data.synthetic.width and data.synthetic.height of at least {} and {}",
-                synthetic.width, synthetic.height, self.width, self.height
-            );
-            return Err(bad("data.width, data.height", format!("{}, {}", self.width, self.height), &fix));
-        }
-        if synthetic.split != Split::default() {
-            let fix = "leave it out: a run trains on one split and measures on the other";
-            return Err(bad("data.synthetic.split", synthetic.split, fix));
-        }
-        Ok(())
+fn validate_synthetic(data: &DataConfig) -> Result<(), TrainError> {
+    let synthetic = &data.synthetic;
+    synthetic.validate().map_err(in_section("data.synthetic"))?;
+    if synthetic.width < data.width || synthetic.height < data.height {
+        let fix = format!(
+            "synthetic scenes are {} x {}: write data.synthetic.width and data.synthetic.height of at least {} and {}",
+            synthetic.width, synthetic.height, data.width, data.height
+        );
+        return Err(bad("data.width, data.height", format!("{}, {}", data.width, data.height), &fix));
     }
+    if synthetic.split != Split::default() {
+        let fix = "leave it out: a run trains on one split and measures on the other";
+        return Err(bad("data.synthetic.split", synthetic.split, fix));
+    }
+    Ok(())
 }
 
 impl OptimizerConfig {

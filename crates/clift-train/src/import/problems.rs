@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
+use clift_data::ElementType;
 use clift_data::StateDict;
-use clift_data::pickle::ElementType;
 use clift_model::interchange::{self, CheckpointTensor, PREFIX, plain_key};
 use clift_model::{ModelConfig, Variant};
 

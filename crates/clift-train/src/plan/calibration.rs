@@ -6,7 +6,8 @@ use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::order::{item_rng, step_rng};
-use clift_data::{ClipReader, Split};
+use clift_data::statistics::upper_median;
+use clift_data::{ClipReader, Split, open_dataset};
 use clift_eval::lpips::Lpips;
 use clift_eval::{Accumulator, Condensed, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
 
@@ -26,7 +27,6 @@ use crate::events::Stage;
 use crate::loss::Loss;
 use crate::loss_scale::LossScale;
 use crate::optim::{adamw, clip_global_norm, global_norm};
-use crate::scenes;
 use crate::step::{Learner, Shown, StageBatch, TokenChoice, loss_of};
 use crate::trainer::freeze;
 
@@ -76,8 +76,7 @@ impl Timed {
             seconds.push(started.elapsed().as_secs_f64());
         }
         let busy = cpu.elapsed().as_secs_f64() / begun.elapsed().as_secs_f64();
-        seconds.sort_by(f64::total_cmp);
-        Ok((state, Self { seconds: seconds[seconds.len() / 2], busy }))
+        Ok((state, Self { seconds: upper_median(&seconds), busy }))
     }
 }
 
@@ -279,7 +278,7 @@ pub struct InferenceTimed<'a> {
 
 /// Seconds that one thread takes to read a view of a training scene; `None` where the data is not there.
 pub fn loading_s(config: &Config) -> Option<f64> {
-    let (source, _) = scenes::open(&config.data, Split::Train).ok()?;
+    let source = open_dataset(&config.data, Split::Train).ok()?.source;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let views = &config.data.views;
     let num_scenes = reader.source.num_scenes().min(6);

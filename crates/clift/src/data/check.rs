@@ -58,7 +58,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
 }
 
 fn check_half(half: &Half, args: &CheckArgs, report: &mut Report) -> anyhow::Result<()> {
-    let (source, ledger) = (&half.opened.source, &half.opened.ledger);
+    let (source, ledger) = (&half.opened.source, &half.opened.report);
     for note in &ledger.notes {
         print_note(&format!("note: {note}"));
     }

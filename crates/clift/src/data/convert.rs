@@ -39,7 +39,7 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
         let folder = args.out.join(half.split.unwrap_or(Split::Test).to_string());
         refuse_overlap(&args.dir, &folder)?;
         let opened = &half.opened;
-        conversions.push((half, Conversion::open(opened.source.as_ref(), &opened.ledger, &folder, &options)?, folder));
+        conversions.push((half, Conversion::open(opened.source.as_ref(), &opened.report, &folder, &options)?, folder));
     }
     let mut empty = Vec::new();
     for (half, conversion, folder) in conversions {

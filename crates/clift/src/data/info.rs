@@ -6,9 +6,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context;
-use clift_data::{ClipReader, DataError, EvaluationIndex, Ledger, Opened, SceneSource, SourceInfo, Split, has_halves};
-use clift_train::config::SourceKind;
-use clift_train::scene_subset::SceneSubset;
+use clift_data::{
+    ClipReader, DataError, DatasetRoot, EvaluationIndex, Ledger, OpenedSource, SceneSource, SceneSubset, SourceInfo,
+    SourceKind, Split, open_dataset, open_source,
+};
 use clift_train::scenes;
 use clift_train::{Config, read_config};
 
@@ -67,13 +68,13 @@ fn of_index(args: &InfoArgs) -> anyhow::Result<()> {
 
 fn of_folder(root: &Path) -> anyhow::Result<Report> {
     let mut report = Report { path: root.to_owned(), ..Report::default() };
-    let is_divided = has_halves(root);
-    for split in halves_there(root, Splits::Both) {
-        let name = if is_divided { split.to_string() } else { "all".into() };
-        let described = match Opened::open(root, split, &options()) {
+    let root = DatasetRoot::find(root)?;
+    for split in halves_there(&root, Splits::Both) {
+        let name = if root.has_splits() { split.to_string() } else { "all".into() };
+        let described = match open_source(&root, split, &options()) {
             Ok(opened) => {
-                report.layout = Some(opened.layout);
-                describe(opened.source.as_ref(), &opened.ledger)
+                report.layout = Some(opened.kind);
+                describe(opened.source.as_ref(), &opened.report)
             }
             Err(error @ DataError::UnknownLayout { .. }) => return Err(error.into()),
             Err(error) => Err(error),
@@ -87,7 +88,7 @@ fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
     let data = &config.data;
     let mut report = Report { path: path.to_owned(), ..Report::default() };
     for split in [Split::Train, Split::Test] {
-        let described = scenes::open(data, split).and_then(|(source, ledger)| {
+        let described = open_dataset(data, split).and_then(|OpenedSource { source, report: ledger, .. }| {
             if split == Split::Test {
                 report.evaluation = Some(evaluation(config, source.clone()));
             }
@@ -247,7 +248,7 @@ test              1 scene
         }
         (split.frames, split.notes) = (ledger.frames, vec!["both halves are the same scenes".into()]);
         let splits = BTreeMap::from([("all".into(), split)]);
-        let text = Report { layout: Some(clift_data::Layout::Captures), splits, ..Report::default() }.to_string();
+        let text = Report { layout: Some(SourceKind::Captures), splits, ..Report::default() }.to_string();
         let expected = "layout            captures
 all               1 scene
   left out        of fox 2 frames without a picture: 0005.jpg, 0016.jpg

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use clift_data::layout::SAME_SCENES;
-use clift_data::{FileOptions, LayoutOptions, Opened, Split, TestScenes, has_halves, is_dl3dv_key};
+use clift_data::{DatasetRoot, FileOptions, OpenedSource, SourceOptions, Split, TestScenes, is_dl3dv_key, open_source};
 use clift_train::Override;
 use clift_train::document::parse_config;
 use serde::{Deserialize, Serialize};
@@ -38,7 +38,7 @@ pub struct Half {
     /// Which half; `None` for all of a folder that is not divided.
     pub split: Option<Split>,
     /// Its scenes.
-    pub opened: Opened,
+    pub opened: OpenedSource,
 }
 
 impl Half {
@@ -49,22 +49,22 @@ impl Half {
 
     /// Tells what opening it left out, and what else is to be known.
     pub fn print_news(&self) {
-        if self.opened.ledger.has_news() {
-            print_note(&format!("{}: {}", self.name(), self.opened.ledger));
+        if self.opened.report.has_news() {
+            print_note(&format!("{}: {}", self.name(), self.opened.report));
         }
     }
 }
 
 /// The halves asked for that are there; one, whichever, for a folder that is not divided.
-pub fn halves_there(root: &Path, splits: Splits) -> Vec<Split> {
-    let is_there = |split: &Split| root.join(split.to_string()).is_dir();
+pub fn halves_there(root: &DatasetRoot, splits: Splits) -> Vec<Split> {
+    let is_there = |split: &Split| root.path().join(split.to_string()).is_dir();
     let there: Vec<Split> = splits.list().iter().copied().filter(is_there).collect();
-    if there.is_empty() || !has_halves(root) { splits.list()[splits.list().len() - 1..].to_vec() } else { there }
+    if there.is_empty() || !root.has_splits() { splits.list()[splits.list().len() - 1..].to_vec() } else { there }
 }
 
 /// How all of a folder is opened: everything is going to be read, so that chunks are looked into.
-pub fn options() -> LayoutOptions {
-    LayoutOptions { reads_chunks: true, ..LayoutOptions::default() }
+pub fn options() -> SourceOptions {
+    SourceOptions { reads_chunks: true, ..SourceOptions::default() }
 }
 
 /// Opens the halves asked for that are there. A folder without `train/` and `test/` counts once, unless a list of test
@@ -76,20 +76,21 @@ pub fn halves(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Resul
     // An empty list keeps no scene for testing and divides nothing.
     let list = files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
     let has_list = list.is_some_and(|list| list.num_scenes() > 0);
-    let is_listed = has_list && !has_halves(root);
-    let wanted = if is_listed { splits.list().to_vec() } else { halves_there(root, splits) };
+    let root = DatasetRoot::find(root)?;
+    let is_listed = has_list && !root.has_splits();
+    let wanted = if is_listed { splits.list().to_vec() } else { halves_there(&root, splits) };
     let mut halves = Vec::new();
     for split in wanted {
-        let mut opened = Opened::open(root, split, &LayoutOptions { files: files.clone(), ..options() })?;
+        let mut opened = open_source(&root, split, &SourceOptions { files: files.clone(), ..options() })?;
         let is_whole = !opened.has_splits && !has_list;
         if is_whole {
             // Here they are no halves.
-            opened.ledger.notes.retain(|note| note != SAME_SCENES);
+            opened.report.notes.retain(|note| note != SAME_SCENES);
             let source = &opened.source;
             if files.test_scenes.is_none() && (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene))) {
                 let note = "DL3DV's folders hold the scenes of its benchmark too; --set data.files.test_scenes=LIST \
                             keeps those apart";
-                opened.ledger.notes.push(note.into());
+                opened.report.notes.push(note.into());
             }
         }
         halves.push(Half { split: (!is_whole).then_some(split), opened });
@@ -131,7 +132,7 @@ mod tests {
         let all = opened(None, Splits::Both);
         assert_eq!((all.len(), &all[0].0[..]), (1, "scenes"));
         assert_eq!(opened(Some(""), Splits::Both), all);
-        let half = Opened::open(&root, Split::Test, &LayoutOptions::default()).unwrap();
+        let half = open_source(&DatasetRoot::find(&root).unwrap(), Split::Test, &SourceOptions::default()).unwrap();
         let key = half.source.key(0);
         let (train, test) = (("train".to_owned(), all[0].1 - 1), ("test".to_owned(), 1));
         assert_eq!(opened(Some(key), Splits::Both), [train.clone(), test.clone()]);

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
-use clift_data::{FrameSkip, Layout, Skip, SourceInfo};
+use clift_data::{FrameSkip, Skip, SourceInfo, SourceKind};
 use serde::Serialize;
 
 use super::text::count;
@@ -20,7 +20,7 @@ pub struct Report {
     /// What was looked at.
     pub path: PathBuf,
     /// How the scenes lie on disk; for a folder.
-    pub layout: Option<Layout>,
+    pub layout: Option<SourceKind>,
     /// By name; `all` for a folder without `train/` and `test/`.
     pub splits: BTreeMap<String, SplitReport>,
     /// Scenes that are evaluated, or why there are none; for a config.

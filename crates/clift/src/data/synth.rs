@@ -200,7 +200,7 @@ num_targets = 3{eval}"
 
 #[cfg(test)]
 mod tests {
-    use clift_data::export::spread_views;
+    use clift_data::index::spread_views;
     use clift_train::Config;
 
     use super::*;

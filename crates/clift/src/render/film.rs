@@ -4,6 +4,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
+use clift_data::statistics::upper_median;
 use clift_data::unfinished::is_empty;
 use clift_eval::Animation;
 use clift_eval::picture::Picture;
@@ -66,10 +67,5 @@ pub fn film(
         counter.set(render_s.len() as u64);
     }
     animation.finish()?;
-    Ok(Timing { select_s: median(select_s), render_s: median(render_s) })
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or_default()
+    Ok(Timing { select_s: upper_median(&select_s), render_s: upper_median(&render_s) })
 }

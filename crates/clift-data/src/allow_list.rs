@@ -1,10 +1,32 @@
 //! The Python names that a pickle may use.
 
-use super::{Others, Stop};
-use crate::pickle::{ElementType, Global};
+use crate::values::{ElementType, Global};
 
-/// Looks a Python name up in the allow-list; `None` for one that is to be passed over.
-pub(super) fn global(module: &str, name: &str, others: Others) -> Result<Option<Global>, Stop> {
+/// Treatment of objects whose classes are not on the allow-list.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum UnknownClasses {
+    /// The file is refused.
+    Refuse,
+    /// The objects are skipped, as [`Value::Opaque`](crate::values::Value::Opaque).
+    Skip,
+}
+
+/// Errors of reading a pickle.
+pub(crate) enum UnpickleError {
+    /// A Python name that is not allowed.
+    Refused(String),
+    /// Any other error.
+    Bad(String),
+}
+
+impl From<&str> for UnpickleError {
+    fn from(what: &str) -> Self {
+        Self::Bad(what.to_owned())
+    }
+}
+
+/// Looks a Python name up in the allow-list; `None` for a name whose objects are skipped.
+pub(crate) fn global(module: &str, name: &str, unknown: UnknownClasses) -> Result<Option<Global>, UnpickleError> {
     let known = match (module, name) {
         ("torch._utils", "_rebuild_tensor_v2") => Some(Global::RebuildTensor),
         ("collections", "OrderedDict") => Some(Global::OrderedDict),
@@ -18,8 +40,8 @@ pub(super) fn global(module: &str, name: &str, others: Others) -> Result<Option<
     if known.is_some() {
         return Ok(known);
     }
-    if others == Others::Refuse || is_attack(module, name) {
-        return Err(Stop::Refused(shown(module, name)));
+    if unknown == UnknownClasses::Refuse || is_attack(module, name) {
+        return Err(UnpickleError::Refused(shown(module, name)));
     }
     Ok(match (module, name) {
         ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state") => Some(Global::RebuildParameter),
@@ -30,7 +52,7 @@ pub(super) fn global(module: &str, name: &str, others: Others) -> Result<Option<
 }
 
 /// A name from a file that may be hostile: short enough for a terminal, and without control characters.
-pub(super) fn shown(module: &str, name: &str) -> String {
+pub(crate) fn shown(module: &str, name: &str) -> String {
     let name: String = format!("{module}.{name}").chars().take(120).collect();
     name.escape_debug().to_string()
 }
@@ -84,7 +106,7 @@ mod tests {
             ("torch.serialization", "load"),
         ] {
             assert!(is_attack(module, name), "{module}.{name}");
-            assert!(matches!(global(module, name, Others::PassOver), Err(Stop::Refused(_))));
+            assert!(matches!(global(module, name, UnknownClasses::Skip), Err(UnpickleError::Refused(_))));
         }
         for (module, name) in [
             ("builtins", "getattr"),

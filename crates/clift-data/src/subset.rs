@@ -3,7 +3,10 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use clift_data::{Camera, DataError, Frame, SceneSource};
+use crate::camera::Camera;
+use crate::clip::Frame;
+use crate::error::DataError;
+use crate::scene_source::SceneSource;
 
 /// The chosen scenes of a source, in the order they were chosen in.
 pub struct SceneSubset {

@@ -1,0 +1,120 @@
+//! Opening of the scenes that a config names.
+
+use std::sync::Arc;
+
+use crate::config::DataConfig;
+use crate::error::DataError;
+use crate::keys::is_dl3dv_key;
+use crate::kind::SourceKind;
+use crate::layout::{OpenedSource, open_source};
+use crate::ledger::Ledger;
+use crate::options::SourceOptions;
+use crate::place::DatasetRoot;
+use crate::scene_source::{SceneSource, Split};
+use crate::subset::SceneSubset;
+use crate::synthetic::{SyntheticConfig, SyntheticSource};
+
+/// Opens one split of the data set of a config.
+///
+/// # Errors
+/// The errors of opening the source, [`DataError::BadConfig`] for a missing key, and [`DataError::NoScenes`] when the
+/// filters skip every scene.
+pub fn open_dataset(config: &DataConfig, split: Split) -> Result<OpenedSource, DataError> {
+    let opened = match config.source {
+        SourceKind::Synthetic => {
+            let source = SyntheticSource::new(SyntheticConfig { split, ..config.synthetic.clone() })?;
+            let report = Ledger::new(source.num_scenes());
+            OpenedSource { source: Arc::new(source), kind: config.source, has_splits: true, report }
+        }
+        kind => open_files(config, kind, split)?,
+    };
+    if opened.source.num_scenes() == 0 {
+        return Err(DataError::NoScenes { reason: format!("{split}: {}", opened.report) });
+    }
+    Ok(opened)
+}
+
+fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<OpenedSource, DataError> {
+    let missing = |key: &str, fix: &str| DataError::bad_config(key, format!("is missing; {fix}"));
+    let root = config.root.as_deref();
+    let root = root.ok_or_else(|| missing("data.root", "write the folder that holds train/ and test/"))?;
+    let (filters, files) = (config.filters.clone(), config.files.clone());
+    let options = SourceOptions { kind, filters, files, min_size: [config.width, config.height], reads_chunks: false };
+    let opened = open_source(&DatasetRoot::find(root)?, split, &options)?;
+    let source = &opened.source;
+    let has_dl3dv = match opened.kind {
+        SourceKind::Dl3dv => true,
+        SourceKind::Captures => (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene))),
+        _ => false,
+    };
+    if split == Split::Train && has_dl3dv && !opened.has_splits && config.files.test_scenes.is_none() {
+        let fix = "the folders hold DL3DV's benchmark scenes too, which are not to be trained on: write the path of an \
+                   evaluation index, or of a file with a key per line (an empty file for none)";
+        return Err(missing("data.files.test_scenes", fix));
+    }
+    Ok(opened)
+}
+
+/// Opens the training split as [`open_dataset`] does, without the scenes that are too short for any step's views; these
+/// are in the report.
+///
+/// # Errors
+/// As [`open_dataset`].
+pub fn open_training_dataset(config: &DataConfig) -> Result<OpenedSource, DataError> {
+    let mut opened = open_dataset(config, Split::Train)?;
+    let source = opened.source.clone();
+    let needed = config.views.min_frames();
+    // A scene that cannot be read is reported with its reason when it is sampled.
+    let is_short = |scene: &usize| source.num_frames(*scene).is_ok_and(|num_frames| num_frames < needed);
+    let (short, long): (Vec<usize>, Vec<usize>) = (0..source.num_scenes()).partition(is_short);
+    if short.is_empty() {
+        return Ok(opened);
+    }
+    for scene in short {
+        opened.report.skip(source.key(scene), format!("shorter than the {needed} frames that data.views needs"));
+    }
+    if long.is_empty() {
+        return Err(DataError::NoScenes { reason: format!("{}: {}", Split::Train, opened.report) });
+    }
+    Ok(OpenedSource { source: Arc::new(SceneSubset::new(source, long)), ..opened })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{BoundedSampler, SceneRecord, SyntheticConfig, write_chunks};
+
+    #[test]
+    fn training_skips_scenes_too_short_for_any_step() {
+        let rooms =
+            SyntheticSource::new(SyntheticConfig { num_frames: 8, num_scenes: 2, ..Default::default() }).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let record = |(scene, num_frames): (usize, usize)| {
+            Ok(SceneRecord {
+                key: format!("of-{num_frames}"),
+                url: String::new(),
+                timestamps: (0..num_frames as i64).collect(),
+                cameras: rooms.cameras(scene)?[..num_frames].to_vec(),
+                images: vec![vec![0]; num_frames],
+            })
+        };
+        for split in [Split::Train, Split::Test] {
+            let place = folder.path().join(split.to_string());
+            write_chunks(&place, [(0, 4), (1, 5), (0, 8)].into_iter().map(record), 1).unwrap();
+        }
+        // Two contexts may lie 4 apart, three 8.
+        let views =
+            BoundedSampler { min_context: 2, max_context: 4, min_gap: [8, 9], max_gap: [8, 9], ..Default::default() };
+        let mut data = DataConfig { views, source: SourceKind::Chunks, ..DataConfig::default() };
+        data.root = Some(folder.path().to_owned());
+        let OpenedSource { source, report, .. } = open_training_dataset(&data).unwrap();
+        assert_eq!((source.num_scenes(), source.key(0), source.find("of-8")), (2, "of-5", Some(1)));
+        let expected = "2 of 3 scenes used; 1 shorter than the 5 frames that data.views needs";
+        assert_eq!(report.to_string(), expected);
+        assert_eq!(report.skips[0].key, "of-4");
+        assert_eq!(open_dataset(&data, Split::Train).unwrap().source.num_scenes(), 3);
+        data.views = BoundedSampler { min_gap: [9, 9], max_gap: [9, 9], ..Default::default() };
+        let message = open_training_dataset(&data).err().unwrap().to_string();
+        assert!(message.contains("train: 0 of 3 scenes used; 3 shorter than the 10 frames"), "{message}");
+    }
+}

@@ -1,0 +1,71 @@
+//! File names of a folder, and their natural order.
+
+use std::cmp::Ordering;
+use std::path::Path;
+
+use crate::error::DataError;
+
+/// Most entries of one folder that are looked at.
+const MAX_ENTRIES: usize = 1_000_000;
+
+/// Names of the entries of a folder, in no order; those that are no UTF-8 are passed over.
+///
+/// # Errors
+/// [`DataError::Io`], and [`DataError::UnknownLayout`] for more than a million entries.
+pub(crate) fn file_names(folder: &Path) -> Result<Vec<String>, DataError> {
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(DataError::io("listing the folder", folder))? {
+        let name = entry.map_err(DataError::io("listing the folder", folder))?.file_name();
+        names.extend(name.into_string());
+        if names.len() > MAX_ENTRIES {
+            let what = format!("the folder has more than {MAX_ENTRIES} entries");
+            return Err(DataError::UnknownLayout { what, path: folder.to_owned() });
+        }
+    }
+    Ok(names)
+}
+
+/// Whether a name ends in a dot and `ending`, as it is written.
+pub(crate) fn has_ending(name: &str, ending: &str) -> bool {
+    name.strip_suffix(ending).is_some_and(|stem| stem.ends_with('.'))
+}
+
+/// Compares names as people count: `frame_2` before `frame_10`. Equal only for equal names.
+pub(crate) fn natural_order(a: &str, b: &str) -> Ordering {
+    let (mut left, mut right) = (a.as_bytes(), b.as_bytes());
+    while let (Some(&x), Some(&y)) = (left.first(), right.first()) {
+        let order = if x.is_ascii_digit() && y.is_ascii_digit() {
+            let (x, y) = (take_number(&mut left), take_number(&mut right));
+            x.len().cmp(&y.len()).then_with(|| x.cmp(y))
+        } else {
+            (left, right) = (&left[1..], &right[1..]);
+            x.cmp(&y)
+        };
+        if order.is_ne() {
+            return order;
+        }
+    }
+    left.len().cmp(&right.len()).then_with(|| a.cmp(b))
+}
+
+/// Takes the digits at the front, without leading zeros.
+fn take_number<'a>(text: &mut &'a [u8]) -> &'a [u8] {
+    let end = text.iter().position(|byte| !byte.is_ascii_digit()).unwrap_or(text.len());
+    let (digits, rest) = text.split_at(end);
+    *text = rest;
+    let zeros = digits.iter().take_while(|digit| **digit == b'0').count();
+    &digits[zeros..]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_in_the_order_people_count_in() {
+        let mut names = ["b1", "frame_10.png", "frame_2.png", "frame_002.png", "frame_1a.png", "a", "10", "9", ""];
+        names.sort_unstable_by(|a, b| natural_order(a, b));
+        let sorted = ["", "9", "10", "a", "b1", "frame_1a.png", "frame_002.png", "frame_2.png", "frame_10.png"];
+        assert_eq!(names, sorted);
+    }
+}

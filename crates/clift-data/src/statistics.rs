@@ -1,0 +1,118 @@
+//! Summary statistics of samples.
+
+use std::fmt;
+
+use serde::Serialize;
+
+/// Returns the median: the mean of the two middle values for an even count, NaN for no values.
+pub fn median(values: &[f64]) -> f64 {
+    let sorted = sorted(values);
+    let middle = sorted.len() / 2;
+    match sorted.len() {
+        0 => f64::NAN,
+        count if count.is_multiple_of(2) => f64::midpoint(sorted[middle - 1], sorted[middle]),
+        _ => sorted[middle],
+    }
+}
+
+/// Returns the upper median, which is always one of the values: for an even count the larger of the two middle ones,
+/// NaN for no values.
+pub fn upper_median(values: &[f64]) -> f64 {
+    let mut values = values.to_vec();
+    let middle = values.len() / 2;
+    if values.is_empty() { f64::NAN } else { *values.select_nth_unstable_by(middle, f64::total_cmp).1 }
+}
+
+/// Returns the mean, summed in the given order; NaN for no values.
+pub fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// Returns the standard error of the mean: the sample standard deviation over the square root of the count. NaN for
+/// fewer than two values.
+pub fn standard_error(values: &[f64]) -> f64 {
+    let (count, mean) = (values.len() as f64, mean(values));
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    (squares / (count - 1.0) / count).sqrt()
+}
+
+/// Returns the smallest value that 95 % of the values do not exceed (nearest rank): the largest of fewer than 20
+/// values, NaN for no values.
+pub fn p95(values: &[f64]) -> f64 {
+    let sorted = sorted(values);
+    // In whole numbers: 0.95 * 20 is above 19 in binary.
+    let rank = (sorted.len() * 95).div_ceil(100);
+    rank.checked_sub(1).map_or(f64::NAN, |index| sorted[index])
+}
+
+/// Smallest value, median and largest value. Prints as `1.0 / 2.5 / 4.0`, with the precision of the format string.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct MinMedianMax {
+    /// Smallest value.
+    pub min: f64,
+    /// Median, as [`median`].
+    pub median: f64,
+    /// Largest value.
+    pub max: f64,
+}
+
+impl MinMedianMax {
+    /// Summarises the values; `None` for no values.
+    pub fn of(values: &[f64]) -> Option<Self> {
+        let sorted = sorted(values);
+        Some(Self { min: *sorted.first()?, median: median(values), max: *sorted.last()? })
+    }
+}
+
+impl fmt::Display for MinMedianMax {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let digits = f.precision().unwrap_or(0);
+        let Self { min, median, max } = self;
+        write!(f, "{min:.digits$} / {median:.digits$} / {max:.digits$}")
+    }
+}
+
+fn sorted(values: &[f64]) -> Vec<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn medians_ignore_the_order_of_the_values() {
+        for (values, middle, upper) in
+            [(&[3.0, 1.0, 2.0][..], 2.0, 2.0), (&[4.0, 1.0, 3.0, 2.0], 2.5, 3.0), (&[7.0], 7.0, 7.0)]
+        {
+            assert_eq!((median(values), upper_median(values)), (middle, upper));
+        }
+        assert!(median(&[]).is_nan() && upper_median(&[]).is_nan());
+    }
+
+    #[test]
+    fn p95_is_the_value_of_the_nearest_rank() {
+        let values = |count: u32| (1..=count).rev().map(f64::from).collect::<Vec<_>>();
+        let expected = [(1, 1.0), (5, 5.0), (19, 19.0), (20, 19.0), (21, 20.0), (100, 95.0), (101, 96.0)];
+        for (count, expected) in expected {
+            assert_eq!(p95(&values(count)), expected, "of {count}");
+        }
+        assert!(p95(&[]).is_nan());
+    }
+
+    #[test]
+    fn standard_error_divides_by_one_less_than_the_count() {
+        // Deviation sqrt(32), over sqrt(2).
+        assert_eq!((mean(&[22.0, 30.0]), standard_error(&[22.0, 30.0])), (26.0, 4.0));
+        assert!(mean(&[]).is_nan() && standard_error(&[]).is_nan() && standard_error(&[1.0]).is_nan());
+    }
+
+    #[test]
+    fn min_median_max_prints_with_the_precision_asked_for() {
+        let summary = MinMedianMax::of(&[4.0, 1.0, 2.0, 8.0]).unwrap();
+        assert_eq!(summary, MinMedianMax { min: 1.0, median: 3.0, max: 8.0 });
+        assert_eq!((format!("{summary:.1}"), MinMedianMax::of(&[])), ("1.0 / 3.0 / 8.0".into(), None));
+    }
+}
