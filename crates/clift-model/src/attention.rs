@@ -14,7 +14,7 @@ use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, 
 use burn::tensor::{Shape, Slice, Tensor, assert_shape};
 
 use crate::autodiff::register;
-use crate::flops::counted;
+use crate::mac_counter;
 use crate::precision::{MatmulKernels, Precision};
 
 mod layers;
@@ -34,7 +34,7 @@ pub use layers::{CrossAttention, SelfAttention};
 pub fn self_sdpa(query_key_value: Tensor<3>, num_heads: usize) -> Tensor<3> {
     let [batch, count, packed] = query_key_value.dims();
     assert!(packed.is_multiple_of(3 * num_heads), "{num_heads} heads do not divide a third of {packed}");
-    counted::add_attention(batch * count * count, packed / 3);
+    mac_counter::add_attention(batch * count * count, packed / 3);
     Tensor::from_dispatch(<Dispatch as AttentionOps>::self_sdpa(query_key_value.into_dispatch(), Heads::now(num_heads)))
 }
 
@@ -48,7 +48,7 @@ pub fn cross_sdpa(query: Tensor<3>, key_value: Tensor<3>, num_heads: usize) -> T
     let [_, num_keys, _] = key_value.dims();
     assert_shape!(key_value, [batch, num_keys, 2 * dim]);
     assert!(dim.is_multiple_of(num_heads), "{num_heads} heads do not divide a width of {dim}");
-    counted::add_attention(batch * num_queries * num_keys, dim);
+    mac_counter::add_attention(batch * num_queries * num_keys, dim);
     let (query, key_value) = (query.into_dispatch(), key_value.into_dispatch());
     Tensor::from_dispatch(<Dispatch as AttentionOps>::cross_sdpa(query, key_value, Heads::now(num_heads)))
 }

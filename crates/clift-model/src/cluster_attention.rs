@@ -13,7 +13,7 @@ use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, 
 use burn::tensor::{FloatDType, Int, Shape, Slice, Tensor, assert_shape};
 
 use crate::autodiff::register;
-use crate::flops::counted;
+use crate::mac_counter;
 
 mod native;
 
@@ -38,7 +38,7 @@ pub fn cluster_attention(
     assert_shape!(key_value, [batch, num_members, 2 * dim]);
     assert_shape!(segment, [batch * num_members]);
     assert!(dim.is_multiple_of(num_heads), "{num_heads} heads do not divide a width of {dim}");
-    counted::add_attention(batch * num_members, dim);
+    mac_counter::add_attention(batch * num_members, dim);
     Tensor::from_dispatch(<Dispatch as ClusterAttentionOps>::cluster_attention(
         query.into_dispatch(),
         key_value.into_dispatch(),

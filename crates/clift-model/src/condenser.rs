@@ -8,7 +8,7 @@ use burn::tensor::{Tensor, assert_shape};
 use crate::attention::{CrossAttention, SelfAttention};
 use crate::cluster_attention::cluster_attention;
 use crate::feed_forward::FeedForward;
-use crate::flops::counted;
+use crate::mac_counter;
 use crate::{ClusterIndex, Init, ModelConfig};
 
 mod released;
@@ -94,7 +94,7 @@ impl CondenserBlock {
         let update = self.feed_forward.forward(&self.norm_ff, gathered.clone()); // eq. 3
         let update = self.add_or_replace(&gathered, update);
         let [batch, stored, dim] = update.dims();
-        counted::add_linear(batch * stored, dim, dim); // the one layer without a bias, which is Burn's own
+        mac_counter::add_linear(batch * stored, dim, dim); // the one layer without a bias, which is Burn's own
         centroids + self.gate.forward(update) // eq. 4
     }
 

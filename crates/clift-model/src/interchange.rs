@@ -2,11 +2,10 @@
 //!
 //! A key of a checkpoint is one tensor there and one or two parameters here: PyTorch packs the projections of
 //! cross-attention into one matrix. Shapes are PyTorch's, linear weights `[outputs, inputs]`.
-// D width, F hidden width, E width of a head
 
 use std::ops::Range;
 
-use crate::ModelConfig;
+use crate::{ModelConfig, Part};
 
 mod sizes;
 
@@ -51,131 +50,73 @@ pub fn is_projection(key: &str) -> bool {
     key.strip_suffix(".weight").is_some_and(|layer| PROJECTIONS.contains(&layer))
 }
 
-/// Every tensor of a model's checkpoint, with or without the condenser.
+/// Paths of modules, and the start of their keys; the first that fits is taken.
+const MODULES: [(&str, &str); 10] = [
+    ("encoder.patch_embed", "linear_input"),
+    ("encoder.blocks", "encoder.layers"),
+    ("lift_norm.norm", "input_norm"),
+    ("renderer.ray_embed", "linear_target"),
+    ("renderer.blocks", "decoder.layers"),
+    ("renderer.output_norm", "output_norm"),
+    ("renderer.to_pixels", "patch_to_image.0"),
+    ("condenser.released.gate", "squeezer.linear1"),
+    ("condenser.released", "squeezer.cross_attn"),
+    ("condenser.blocks", "squeezer.blocks"),
+];
+
+/// Layers inside a block that follows PyTorch's transformer layers.
+const LAYERS: [(&str, &str); 13] = [
+    (".attn.", ".self_attn."),
+    (".cross_attn.", ".multihead_attn."),
+    (".cluster_attn.", ".multihead_attn."),
+    (".in_proj.", ".in_proj_"),
+    // One packed matrix there, queries apart from keys and values here.
+    (".q_proj.", ".in_proj_"),
+    (".kv_proj.", ".in_proj_"),
+    (".qk_norm.query.", ".q_norm."),
+    (".qk_norm.key.", ".k_norm."),
+    (".feed_forward.up.", ".linear1."),
+    (".feed_forward.down.", ".linear2."),
+    (".norm_attn.", ".norm1."),
+    (".norm_self.", ".norm1."),
+    (".norm_cross.", ".norm2."),
+];
+
+/// Lists every tensor of a model's checkpoint, with or without the condenser.
 pub fn tensors(config: &ModelConfig, has_condenser: bool) -> Vec<CheckpointTensor> {
-    let mut list = Tensors { config, list: Vec::new() };
-    let ModelConfig { dim, feed_forward_dim: hidden, .. } = *config;
-    list.linear("linear_input", "encoder.patch_embed", [dim, config.context_patch_len()]);
-    for i in 0..config.num_encoder_blocks {
-        let (key, path) = (format!("encoder.layers.{i}"), format!("encoder.blocks.{i}"));
-        list.self_attention(&format!("{key}.self_attn"), &format!("{path}.attn"));
-        list.feed_forward(&key, &path, hidden);
-        list.norm(&format!("{key}.norm1"), &format!("{path}.norm_attn"));
-        list.norm(&format!("{key}.norm2"), &format!("{path}.norm_ff"));
-    }
-    if config.variant.has_norms() {
-        list.norm("input_norm", "lift_norm.norm");
-    }
-    list.linear("linear_target", "renderer.ray_embed", [dim, config.ray_patch_len()]);
-    for i in 0..config.num_renderer_blocks {
-        list.decoder_layer(&format!("decoder.layers.{i}"), &format!("renderer.blocks.{i}"), "cross_attn");
-    }
-    list.norm("output_norm", "renderer.output_norm");
-    list.linear("patch_to_image.0", "renderer.to_pixels", [config.rgb_patch_len(), dim]);
-    if has_condenser && config.variant.is_released() {
-        list.decoder_layer("squeezer.cross_attn", "condenser.released", "cluster_attn");
-        list.linear("squeezer.linear1", "condenser.released.gate", [dim, dim]);
-    } else if has_condenser {
-        for i in 0..config.condenser.num_blocks {
-            list.paper_condenser_block(&format!("squeezer.blocks.{i}"), &format!("condenser.blocks.{i}"));
+    let mut list: Vec<CheckpointTensor> = Vec::new();
+    for layer in config.layers().iter().filter(|layer| has_condenser || layer.part != Part::Condenser) {
+        for (path, shape) in layer.parameters() {
+            let key = published_key(&path);
+            // Weight and bias of the queries come right before those of the keys and values.
+            if let Some(packed) = list.iter_mut().rev().take(2).find(|tensor| tensor.key == key) {
+                let first = packed.shape[0];
+                packed.shape[0] += shape[0];
+                packed.parts.push((path, first..packed.shape[0]));
+            } else {
+                let parts = vec![(path, 0..shape[0])];
+                list.push(CheckpointTensor { key, shape, parts });
+            }
         }
     }
-    list.list
+    list
 }
 
-struct Tensors<'a> {
-    config: &'a ModelConfig,
-    list: Vec<CheckpointTensor>,
-}
-
-impl Tensors<'_> {
-    fn whole(&mut self, key: String, path: String, shape: Vec<usize>) {
-        let rows = 0..shape[0];
-        self.list.push(CheckpointTensor { key, shape, parts: vec![(path, rows)] });
-    }
-
-    fn linear(&mut self, key: &str, path: &str, [outputs, inputs]: [usize; 2]) {
-        self.whole(format!("{key}.weight"), format!("{path}.weight"), vec![outputs, inputs]);
-        self.whole(format!("{key}.bias"), format!("{path}.bias"), vec![outputs]);
-    }
-
-    fn norm(&mut self, key: &str, path: &str) {
-        for name in ["weight", "bias"] {
-            self.whole(format!("{key}.{name}"), format!("{path}.{name}"), vec![self.config.dim]);
+/// Returns the key of a parameter in a checkpoint: its path where no rule fits.
+fn published_key(path: &str) -> String {
+    let mut modules = MODULES.iter();
+    let found = modules.find_map(|(module, key)| path.strip_prefix(module).map(|layer| (key, layer.to_owned())));
+    let Some((module, mut layer)) = found else { return path.to_owned() };
+    if path.starts_with("condenser.blocks") {
+        // The paper's block has the names of this project.
+        layer = layer.replace(".in_proj.", ".in_proj_");
+    } else {
+        let norm_ff = (".norm_ff.", if path.starts_with("encoder") { ".norm2." } else { ".norm3." });
+        for (ours, theirs) in LAYERS.into_iter().chain([norm_ff]) {
+            layer = layer.replace(ours, theirs);
         }
     }
-
-    fn feed_forward(&mut self, key: &str, path: &str, hidden: usize) {
-        let dim = self.config.dim;
-        self.linear(&format!("{key}.linear1"), &format!("{path}.feed_forward.up"), [hidden, dim]);
-        self.linear(&format!("{key}.linear2"), &format!("{path}.feed_forward.down"), [dim, hidden]);
-    }
-
-    fn self_attention(&mut self, key: &str, path: &str) {
-        let dim = self.config.dim;
-        self.whole(format!("{key}.in_proj_weight"), format!("{path}.in_proj.weight"), vec![3 * dim, dim]);
-        self.whole(format!("{key}.in_proj_bias"), format!("{path}.in_proj.bias"), vec![3 * dim]);
-        self.attention_rest(key, path);
-    }
-
-    /// One packed matrix there, queries apart from keys and values here.
-    fn cross_attention(&mut self, key: &str, path: &str) {
-        let dim = self.config.dim;
-        for (name, shape) in [("weight", vec![3 * dim, dim]), ("bias", vec![3 * dim])] {
-            let parts =
-                vec![(format!("{path}.q_proj.{name}"), 0..dim), (format!("{path}.kv_proj.{name}"), dim..3 * dim)];
-            self.list.push(CheckpointTensor { key: format!("{key}.in_proj_{name}"), shape, parts });
-        }
-        self.attention_rest(key, path);
-    }
-
-    fn attention_rest(&mut self, key: &str, path: &str) {
-        let ModelConfig { dim, num_heads, variant, .. } = *self.config;
-        self.linear(&format!("{key}.out_proj"), &format!("{path}.out_proj"), [dim, dim]);
-        if variant.has_norms() {
-            let head_width = vec![dim / num_heads];
-            self.whole(format!("{key}.q_norm.weight"), format!("{path}.qk_norm.query.weight"), head_width.clone());
-            self.whole(format!("{key}.k_norm.weight"), format!("{path}.qk_norm.key.weight"), head_width);
-        }
-    }
-
-    fn decoder_layer(&mut self, key: &str, path: &str, cross: &str) {
-        self.self_attention(&format!("{key}.self_attn"), &format!("{path}.self_attn"));
-        self.cross_attention(&format!("{key}.multihead_attn"), &format!("{path}.{cross}"));
-        self.feed_forward(key, path, self.config.feed_forward_dim);
-        for (there, here) in [("norm1", "norm_self"), ("norm2", "norm_cross"), ("norm3", "norm_ff")] {
-            self.norm(&format!("{key}.{there}"), &format!("{path}.{here}"));
-        }
-    }
-
-    /// The paper's block has the names of this project on both sides.
-    fn paper_condenser_block(&mut self, key: &str, path: &str) {
-        let ModelConfig { dim, feed_forward_dim: hidden, .. } = *self.config;
-        let both = |name: &str| (format!("{key}.{name}"), format!("{path}.{name}"));
-        let (attn, attn_here) = both("self_attn");
-        self.self_attention(&attn, &attn_here);
-        let norms: &[&str] = if self.config.condenser.residual {
-            &["norm_self", "norm_cross", "norm_memory", "norm_ff"]
-        } else {
-            &["norm_self", "norm_memory", "norm_ff"]
-        };
-        for name in norms {
-            let (there, here) = both(name);
-            self.norm(&there, &here);
-        }
-        for (name, shape) in [
-            ("cluster_attn.q_proj", [dim, dim]),
-            ("cluster_attn.kv_proj", [2 * dim, dim]),
-            ("cluster_attn.out_proj", [dim, dim]),
-            ("feed_forward.up", [hidden, dim]),
-            ("feed_forward.down", [dim, hidden]),
-        ] {
-            let (there, here) = both(name);
-            self.linear(&there, &here, shape);
-        }
-        let (gate, gate_here) = both("gate.weight");
-        self.whole(gate, gate_here, vec![dim, dim]);
-    }
+    format!("{module}{layer}")
 }
 
 /// A key as this module writes it: without what a compiled or distributed model adds to names, and with one name for

@@ -7,7 +7,7 @@
 
 mod labels;
 mod samples;
-mod seeding;
+pub(crate) mod seeding;
 
 use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};

@@ -18,8 +18,8 @@ use clift_kernels::{InstructionSet, layer_norm, linear as kernel};
 use crate::autodiff::register;
 use crate::feed_forward::GeluKernels;
 use crate::flex::{contiguous, is_native, tensor, values};
-use crate::flops::counted;
 use crate::layer_norm::{LayerNormKernels, NormState};
+use crate::mac_counter;
 use crate::precision::{MatmulKernels, Precision};
 
 /// `x W + b` of a layer with a bias.
@@ -107,7 +107,7 @@ fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
     let bias = layer.bias.as_ref().expect("the layer has a bias").val();
     let ([inputs, outputs], [batch, count, _]) = (weight.dims(), x.dims());
     assert_shape!(x, [.., inputs]);
-    counted::add_linear(batch * count, inputs, outputs);
+    mac_counter::add_linear(batch * count, inputs, outputs);
     (weight, bias)
 }
 

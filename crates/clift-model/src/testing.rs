@@ -6,6 +6,7 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
 
 use crate::device::DeviceName;
+use crate::{CondenserConfig, ModelConfig, Variant};
 
 /// Every device of this build that opens: flex, ndarray, and wgpu where an adapter is found.
 pub fn devices() -> Vec<Device> {
@@ -15,6 +16,23 @@ pub fn devices() -> Vec<Device> {
 /// The CPU devices, which have f64.
 pub fn cpu_devices() -> Vec<Device> {
     [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().expect("a CPU device")).into()
+}
+
+/// Small networks of every variant, the paper's with and without residuals, whose sizes differ from each other.
+pub fn small_configs() -> Vec<ModelConfig> {
+    let literal = CondenserConfig { residual: false, ..CondenserConfig::default() };
+    let all = Variant::ALL.map(|variant| (variant, CondenserConfig::of(variant)));
+    let config = |(variant, condenser)| ModelConfig {
+        variant,
+        dim: 24,
+        num_heads: 3,
+        feed_forward_dim: 40,
+        num_encoder_blocks: 3,
+        num_renderer_blocks: 2,
+        condenser,
+        ..ModelConfig::default()
+    };
+    all.into_iter().chain([(Variant::Paper, literal)]).map(config).collect()
 }
 
 /// Values in f64, row-major.

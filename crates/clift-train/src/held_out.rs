@@ -24,7 +24,7 @@ use clift_model::{Clift, Grouping};
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
-use crate::plan::largest_tensor;
+use crate::footprint::largest_tensor;
 use crate::scenes::evaluation_items;
 
 /// The held-out views of a run.

@@ -17,6 +17,7 @@ pub mod events;
 mod exact;
 pub mod export;
 mod extend;
+pub mod footprint;
 pub mod held_out;
 pub mod import;
 mod keys;

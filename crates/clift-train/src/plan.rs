@@ -5,31 +5,21 @@
 //! far that is from what runs then take.
 
 mod calibration;
-pub mod counts;
-pub mod largest_tensor;
-pub mod machine;
-mod memory;
-mod sizes;
-mod tape;
-
-pub use memory::drawing_bytes;
 
 use clift_data::SourceKind;
-use clift_eval::vgg::VggShape;
-use clift_model::ModelConfig;
 use clift_model::device::DeviceName;
+use clift_model::{ModelConfig, Parameters, Part, SceneSizes};
 use serde::Serialize;
 
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::Stage;
-use calibration::{InferenceRates, InferenceTimed, inference_rates, loading_s, update_rates};
-use counts::{Macs, Parameters, SceneSizes};
-use memory::{InferenceSizes, UpdateSizes, inference_bytes, update_bytes};
-use sizes::{batch_sizes, drawn, evaluated, largest, measures_lpips, middle, num_tokens, picture_values, update_macs};
-
-/// Target views that an evaluation draws at once.
-const VIEWS_PER_PASS: usize = 8;
+use crate::footprint::machine::available_bytes;
+use crate::footprint::memory::peak_bytes;
+use crate::footprint::scene_sizes::{
+    batch_sizes, cluster_counts, drawn, evaluated, middle, num_tokens, scene, stored, trained_parts,
+};
+use calibration::{InferenceRates, InferenceTimed, inference_rates, loading_s, macs_of, update_macs, update_rates};
 
 /// What a run is going to take.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -93,16 +83,13 @@ pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
         threads: rayon::current_num_threads(),
         parameters,
         num_tokens: [num_tokens(config, views.min_context)?, num_tokens(config, views.max_context)?],
-        available_bytes: machine::available_bytes(config.device),
+        available_bytes: available_bytes(config.device),
         parts: Vec::new(),
     };
-    for part in [Stage::Stage1, Stage::Clusters, Stage::Stage2] {
-        plan.parts.push(match part {
-            Stage::Clusters => clusters(config, &parameters, is_timed)?,
-            stage => update(config, stage, &parameters, is_timed)?,
-        });
-    }
-    plan.parts.push(evaluation(config, &parameters, is_timed)?);
+    plan.parts.push(update(config, Stage::Stage1, &parameters, is_timed)?);
+    plan.parts.push(clusters(config, is_timed)?);
+    plan.parts.push(update(config, Stage::Stage2, &parameters, is_timed)?);
+    plan.parts.push(evaluation(config, is_timed)?);
     let per_view_s = if is_timed { loading_s(config) } else { None };
     for part in &mut plan.parts {
         let (num_views, num_threads) = read_for(config, part.part);
@@ -160,80 +147,25 @@ pub fn check(config: &Config) -> Result<(), TrainError> {
     config.validate()
 }
 
-/// The first part whose memory is beyond the device's, in words, with what would help.
-pub fn memory_warning(config: &Config, plan: &Plan) -> Option<String> {
-    let available = plan.available_bytes?;
-    let part = plan.parts.iter().filter(|part| part.peak_bytes > available).max_by_key(|part| part.peak_bytes)?;
-    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
-    let needs = format!(
-        "{} needs about {:.1} GiB, and {:.1} GiB are there on {}",
-        part.part,
-        gib(part.peak_bytes),
-        gib(available),
-        plan.device
-    );
-    let stage = match part.part {
-        "stage1" => Stage::Stage1,
-        "stage2" => Stage::Stage2,
-        _ => return Some(format!("{needs}: fewer context views, or smaller ones, would fit")),
-    };
-    let fits = |config: &Config| {
-        let part = update(config, stage, &plan.parameters, false);
-        part.is_ok_and(|part| part.peak_bytes <= available)
-    };
-    let (batch_size, _) = batch_sizes(config, stage);
-    let was_recomputed = config.recompute;
-    for recompute in [config.recompute, true] {
-        let mut config = Config { recompute, ..config.clone() };
-        let also = if recompute && !was_recomputed { "recompute = true and " } else { "" };
-        for parts in 1..=batch_size {
-            match stage {
-                Stage::Stage2 => config.stage2.accumulate = parts,
-                _ => config.stage1.accumulate = parts,
-            }
-            if fits(&config) {
-                return Some(format!("{needs}: {also}{}.accumulate = {parts} would fit", part.part));
-            }
-        }
-    }
-    Some(format!("{needs}: even one scene at a time with recompute = true does not fit"))
-}
-
 fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool) -> Result<PartPlan, TrainError> {
-    let (batch_size, part_size) = batch_sizes(config, stage);
-    let (part, steps) = match stage {
-        Stage::Stage2 => ("stage2", config.stage2.steps),
-        _ => ("stage1", config.stage1.steps),
-    };
+    let (batch_size, _) = batch_sizes(config, stage);
+    let steps = if stage == Stage::Stage2 { config.stage2.steps } else { config.stage1.steps };
     let all = drawn(config, stage)?;
     let macs_of_scene = all.iter().map(|scene| update_macs(config, stage, scene)).sum::<f64>() / all.len() as f64;
     let macs = batch_size as f64 * macs_of_scene;
-    let trained_parameters = parameters.trained(stage);
+    let trained_parameters = parameters.of_parts(trained_parts(stage));
     let rates = is_timed.then(|| update_rates(config, stage, &middle(config, stage)?)).transpose()?;
-    let pictures = (batch_size * config.data.views.num_targets) as f64;
+    let images = (batch_size * config.data.views.num_targets) as f64;
     let compute_s = rates.map(|rates| {
-        macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + pictures * rates.per_picture
+        macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_picture
     });
-    let sizes = UpdateSizes {
-        stage,
-        num_scenes: part_size as f64,
-        is_accumulated: part_size < batch_size,
-        recompute: config.recompute,
-        scene: largest(config, stage)?,
-        num_picture_values: picture_values(config),
-        perceptual: (config.loss.perceptual_weight > 0.0)
-            .then(|| VggShape::VGG19.sizes(config.data.height, config.data.width)),
-    };
-    // Batches prepared ahead, as bytes.
-    let waiting = (config.data.num_prefetch + 1) as f64 * batch_size as f64 * picture_values(config);
-    let bytes = update_bytes(&config.model, &sizes) + waiting;
     Ok(PartPlan {
-        part,
+        part: stage.name(),
         unit: "step",
         count: Some(steps),
         trained_parameters,
         gmacs: macs / 1e9,
-        peak_bytes: machine::own_bytes() + bytes as u64,
+        peak_bytes: peak_bytes(config, stage)?,
         compute_s,
         busy_threads: rates.map(|rates| rates.busy),
         loading_s: None,
@@ -241,41 +173,22 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
     })
 }
 
-fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<PartPlan, TrainError> {
+fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let views = &config.data.views;
     let num_context = usize::midpoint(views.min_context, views.max_context);
-    let most = num_tokens(config, views.max_context)?;
-    let counts = |num_tokens: usize| {
-        let counts = config.clusters.grid.iter().map(|count| count.of(num_tokens));
-        let counts = counts.collect::<Result<Vec<_>, _>>();
-        counts.map(|mut counts| {
-            counts.sort_unstable();
-            counts
-        })
-    };
-    let scene = |num_context: usize| inference_scene(config, num_context, 0);
     let mut macs = 0.0;
     for num_context in views.min_context..=views.max_context {
-        macs += Macs::of(&config.model, &scene(num_context)?).encoder;
+        macs += macs_of(&config.model, Part::Encoder, &scene(config, num_context, 0)?);
     }
     macs /= (views.max_context - views.min_context + 1) as f64;
     let compute_s = if is_timed {
-        let counts = counts(num_tokens(config, num_context)?)?;
+        let counts = cluster_counts(config, num_tokens(config, num_context)?)?;
         let timed = InferenceTimed { num_context, num_targets: 1, counts: &probed(&counts), is_measured: false };
         let rates = inference_rates(config, &timed)?;
         let kmeans = counts.iter().map(|&count| kmeans_s(&rates, count)).sum::<f64>() / counts.len() as f64;
         Some(macs * rates.encode_per_mac + kmeans)
     } else {
         None
-    };
-    let sizes = InferenceSizes {
-        num_tokens: most as f64,
-        num_clusters: counts(most)?.last().map(|&count| count as f64),
-        num_targets: 0.0,
-        num_patches: num_tokens(config, 1)? as f64,
-        num_picture_values: picture_values(config),
-        num_loaded: (parameters.encoder + parameters.renderer) as f64,
-        lpips: None,
     };
     let num_scenes = match (config.clusters.num_scenes, config.data.source) {
         (0, SourceKind::Synthetic) => Some(config.data.synthetic.num_scenes),
@@ -284,12 +197,12 @@ fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<
         (count, _) => Some(count),
     };
     Ok(PartPlan {
-        part: "clusters",
+        part: Stage::Clusters.name(),
         unit: "scene",
         count: num_scenes.map(|count| (count * config.clusters.num_passes) as u64),
         trained_parameters: 0,
         gmacs: macs / 1e9,
-        peak_bytes: machine::own_bytes() + inference_bytes(&config.model, parameters.total as f64, &sizes) as u64,
+        peak_bytes: peak_bytes(config, Stage::Clusters)?,
         compute_s,
         busy_threads: None,
         loading_s: None,
@@ -297,34 +210,31 @@ fn clusters(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<
     })
 }
 
-fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Result<PartPlan, TrainError> {
+fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let eval = &config.eval;
-    let all = num_tokens(config, eval.num_context)?;
-    let stored = eval.storage.iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
     let num_targets = eval.num_targets;
+    let scene = scene(config, eval.num_context, num_targets)?;
+    let counts = eval.storage.iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>()?;
     let sweep = evaluated(config);
-    let scene = |stored: usize, drawn_from: usize| SceneSizes {
-        num_storage_tokens: Some(stored as f64),
-        num_render_tokens: drawn_from as f64,
-        num_targets: num_targets as f64,
-        ..inference_scene_unchecked(config, all)
-    };
     // Multiplications of the encoder, and of all that is done with its tokens.
-    let macs_of = |model: &ModelConfig| {
-        let mut macs = (0.0, 0.0);
-        for &stored in &stored {
-            let once = Macs::of(model, &scene(stored, stored));
-            let drawn = sweep.drawn(stored).into_iter().map(|count| Macs::of(model, &scene(stored, count)).renderer);
-            macs = (once.encoder, macs.1 + once.condenser + drawn.sum::<f64>());
+    let encode_and_rest = |model: &ModelConfig| {
+        let mut rest = 0.0;
+        for &count in &counts {
+            let scene = stored(scene, count);
+            let rendered = sweep
+                .drawn(count)
+                .into_iter()
+                .map(|num_render_tokens| macs_of(model, Part::Renderer, &SceneSizes { num_render_tokens, ..scene }));
+            rest += macs_of(model, Part::Condenser, &scene) + rendered.sum::<f64>();
         }
-        macs
+        (macs_of(model, Part::Encoder, &scene), rest)
     };
-    let (encoder, rest) = macs_of(&config.model);
+    let (encoder, rest) = encode_and_rest(&config.model);
     let compute_s = if is_timed {
         let timed = InferenceTimed { num_context: eval.num_context, num_targets, counts: &[], is_measured: true };
         let rates = inference_rates(config, &timed)?;
         // What the timed network lacks of the whole one.
-        let (of_encoder, of_rest) = macs_of(&rates.timed);
+        let (of_encoder, of_rest) = encode_and_rest(&rates.timed);
         Some(
             rates.measuring_s
                 + (encoder - of_encoder).max(0.0) * rates.encode_per_mac
@@ -333,49 +243,18 @@ fn evaluation(config: &Config, parameters: &Parameters, is_timed: bool) -> Resul
     } else {
         None
     };
-    let num_drawn: usize = stored.iter().map(|&count| sweep.drawn(count).len()).sum();
-    let sizes = InferenceSizes {
-        num_tokens: all as f64,
-        num_clusters: stored.iter().max().map(|&count| count as f64),
-        num_targets: num_targets.min(VIEWS_PER_PASS) as f64,
-        num_patches: num_tokens(config, 1)? as f64,
-        // Pictures of every count and variant are held until the scene is measured.
-        num_picture_values: (num_targets * (num_drawn + 3) * config.data.width * config.data.height * 3) as f64,
-        num_loaded: (parameters.condenser + parameters.renderer) as f64,
-        lpips: measures_lpips(config)
-            .then(|| (VggShape::VGG16.sizes(config.data.height, config.data.width), num_targets as f64)),
-    };
-    // Both stages have a renderer of their own.
-    let weights = (parameters.total + parameters.renderer) as f64;
     Ok(PartPlan {
-        part: "eval",
+        part: Stage::Eval.name(),
         unit: "scene",
         count: (eval.num_scenes > 0).then_some(eval.num_scenes as u64),
         trained_parameters: 0,
         gmacs: (encoder + rest) / 1e9,
-        peak_bytes: machine::own_bytes() + inference_bytes(&config.model, weights, &sizes) as u64,
+        peak_bytes: peak_bytes(config, Stage::Eval)?,
         compute_s,
         busy_threads: None,
         loading_s: None,
         seconds: None,
     })
-}
-
-fn inference_scene(config: &Config, num_context: usize, num_targets: usize) -> Result<SceneSizes, TrainError> {
-    let all = num_tokens(config, num_context)?;
-    Ok(SceneSizes { num_targets: num_targets as f64, ..inference_scene_unchecked(config, all) })
-}
-
-fn inference_scene_unchecked(config: &Config, num_tokens: usize) -> SceneSizes {
-    let patch = config.model.patch_size;
-    SceneSizes {
-        num_tokens: num_tokens as f64,
-        num_storage_tokens: None,
-        num_render_tokens: num_tokens as f64,
-        is_per_view: false,
-        num_targets: 0.0,
-        num_patches: ((config.data.width / patch) * (config.data.height / patch)) as f64,
-    }
 }
 
 /// The smallest, the middle and the largest of some rising counts.
@@ -423,28 +302,6 @@ mod tests {
         assert!(plan.parts.iter().all(|part| part.seconds.is_none() && part.peak_bytes > 300 << 20));
         assert_eq!(plan.parameters.encoder + plan.parameters.renderer, 81_239_232);
         assert_eq!((plan.parts[0].count, plan.parts[1].count), (Some(90_000), None));
-    }
-
-    #[test]
-    fn too_much_memory_is_said_with_the_smallest_change_that_fits() {
-        let mut config = config();
-        config.data.views.max_context = 4;
-        let mut planned = plan(&config, false).expect("valid");
-        planned.available_bytes = Some(u64::MAX);
-        assert_eq!(memory_warning(&config, &planned), None);
-        planned.available_bytes = Some(planned.parts[0].peak_bytes.max(planned.parts[2].peak_bytes) - 1);
-        let warning = memory_warning(&config, &planned).expect("one part is too large");
-        assert!(warning.contains(".accumulate = 2 would fit"), "{warning}");
-        // Less than stage 2, the largest, takes scene by scene.
-        let mut one_by_one = config.clone();
-        one_by_one.stage2.accumulate = config.stage2.batch_size;
-        let least = plan(&one_by_one, false).expect("valid");
-        planned.available_bytes = Some(least.parts[2].peak_bytes - 1);
-        let warning = memory_warning(&config, &planned).expect("too large");
-        assert!(warning.contains("recompute = true and stage"), "{warning}");
-        planned.available_bytes = Some(1 << 20);
-        let warning = memory_warning(&config, &planned).expect("too large");
-        assert!(warning.ends_with("even one scene at a time with recompute = true does not fit"), "{warning}");
     }
 
     #[test]

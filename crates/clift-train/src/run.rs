@@ -17,9 +17,10 @@ use crate::cluster_journal::remove_journal;
 use crate::clusters::{ClusterCache, ClusterJob};
 use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
+use crate::footprint::largest_tensor;
+use crate::footprint::scene_sizes::PARTS;
 use crate::held_out::{HeldOut, write_ledger};
 use crate::lock::RunLock;
-use crate::plan::largest_tensor;
 use crate::run_settings::{RunFile, compare, write_config};
 use crate::stage1::Stage1Batches;
 use crate::stage2::Stage2Batches;
@@ -62,7 +63,7 @@ impl Run {
         let device = config.device.open()?;
         config.precision.check("precision", &device)?;
         config.eval.precision.check("eval.precision", &device)?;
-        largest_tensor::check(&config, &device, &largest_tensor::PARTS)?;
+        largest_tensor::check(&config, &device, &PARTS)?;
         // Missing weights are found now, not after days of training.
         config.loss.weights()?;
         if let Some(path) = config.eval.lpips_path().filter(|path| !path.is_file()) {

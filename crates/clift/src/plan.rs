@@ -3,7 +3,9 @@
 use anyhow::Context;
 use clift_data::files::replace;
 use clift_model::adapter::max_tensor_bytes;
-use clift_train::plan::largest_tensor::{self, LargestTensor, largest_tensor};
+use clift_train::footprint::largest_tensor::{LargestTensor, largest_tensor};
+use clift_train::footprint::memory::memory_warning;
+use clift_train::footprint::scene_sizes::PARTS;
 use clift_train::plan::{self, PartPlan, Plan};
 use clift_train::{Config, read_checked_config};
 
@@ -27,7 +29,7 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let planned = plan::plan(&config, !args.no_time)?;
     print_result(&shown(&planned))?;
     print_result(&largest_tensors(&config)?)?;
-    if let Some(warning) = plan::memory_warning(&config, &planned) {
+    if let Some(warning) = memory_warning(&config, planned.available_bytes)? {
         print_note(&format!("warning: {warning}"));
     }
     if let Some(json) = &args.json {
@@ -44,7 +46,7 @@ fn largest_tensors(config: &Config) -> anyhow::Result<String> {
     // A plan can be made for a device that is not here.
     let limit = config.device.open().ok().and_then(|device| max_tensor_bytes(&device));
     let mut rows = vec![["part", "largest tensor", "bytes", "at most", ""].map(String::from)];
-    for part in largest_tensor::PARTS {
+    for part in PARTS {
         let LargestTensor { what, bytes: size, .. } = largest_tensor(config, part)?;
         let verdict = match limit {
             Some(limit) if size > limit => "TOO LARGE: clift train refuses it",
@@ -52,7 +54,7 @@ fn largest_tensors(config: &Config) -> anyhow::Result<String> {
             None => "",
         };
         let most = limit.map_or_else(|| "-".into(), bytes);
-        rows.push([part.name().into(), what.into(), bytes(size), most, verdict.into()]);
+        rows.push([part.name().into(), what, bytes(size), most, verdict.into()]);
     }
     Ok(format!("\n{}", table::columns(&rows)))
 }
@@ -94,8 +96,8 @@ fn cells(part: &PartPlan) -> [String; 8] {
 
 #[cfg(test)]
 mod tests {
+    use clift_model::Parameters;
     use clift_model::device::DeviceName;
-    use clift_train::plan::counts::Parameters;
 
     use super::*;
 

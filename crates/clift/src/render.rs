@@ -9,12 +9,12 @@ use clift_data::files::replace;
 use clift_data::unfinished::Unfinished;
 use clift_data::{Intrinsics, Pose, SceneFrame};
 use clift_eval::Calibration;
+use clift_model::cost::render_bytes;
 use clift_model::device::DeviceName;
 use clift_model::scene::MAX_SIDE_PX;
 use clift_model::viewer::{frames_per_call, load_renderer};
 use clift_model::{ModelError, Scene, ViewCamera, Viewer};
-use clift_train::plan::drawing_bytes;
-use clift_train::plan::machine::available_bytes;
+use clift_train::footprint::machine::available_bytes;
 use clift_train::trained::renderer_weights;
 use serde::Serialize;
 
@@ -118,7 +118,7 @@ fn check_size(scene: &Scene, [width, height]: [usize; 2], is_some: bool, device:
     let num_patches = scene.model.num_tokens(1, height, width)?;
     // Frames of some tokens are drawn alone, each with its own.
     let num_frames = if is_some { 1 } else { frames_per_call(num_patches) };
-    let needed = drawing_bytes(&scene.model, scene.num_tokens(), num_patches * num_frames);
+    let needed = render_bytes(&scene.model, scene.num_tokens(), num_patches * num_frames);
     if let Some(available) = available_bytes(device).filter(|available| needed > *available) {
         let (needed, available) = (bytes(needed), bytes(available));
         let message = format!(

@@ -1,6 +1,8 @@
 //! `clift train`.
 
-use clift_train::{Config, Run, RunOptions, plan, read_checked_config};
+use clift_train::footprint::machine::available_bytes;
+use clift_train::footprint::memory::memory_warning;
+use clift_train::{Config, Run, RunOptions, read_checked_config};
 
 use crate::args::TrainArgs;
 use crate::terminal;
@@ -13,9 +15,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     }
     config.device = args.device.unwrap_or(config.device);
     // Now, and not when the system ends the run after hours of other work.
-    if let Ok(planned) = plan::plan(&config, false)
-        && let Some(warning) = plan::memory_warning(&config, &planned)
-    {
+    if let Ok(Some(warning)) = memory_warning(&config, available_bytes(config.device)) {
         terminal::print_note(&format!("warning: {warning}"));
     }
 

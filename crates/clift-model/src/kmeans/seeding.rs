@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use super::samples::Samples;
 
 /// Most entries of the table, unless twice the clusters need more (256 MiB in f32).
-pub(super) const MAX_TABLE_LEN: usize = 1 << 26;
+pub(crate) const MAX_TABLE_LEN: usize = 1 << 26;
 
 /// Rounds that draw the pool; Bahmani et al. find no gain in more.
 const NUM_ROUNDS: usize = 5;

@@ -11,19 +11,18 @@ use clift_data::{ClipReader, Split, open_dataset};
 use clift_eval::lpips::Lpips;
 use clift_eval::{Accumulator, Condensed, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
 
-use clift_model::ModelConfig;
+use clift_model::{Convention, ModelConfig, Parameters, Part, SceneSizes};
 use cpu_time::ProcessTime;
 use rand::RngExt;
 use rand::seq::index::sample;
 
-use super::counts::{Macs, Parameters, SceneSizes};
-use super::sizes::{Middle, evaluated, measures_lpips, update_macs};
 use crate::TrainError;
 use crate::bench::BenchOptions;
 use crate::bench::context::BenchContext;
 use crate::bench::inputs::{Shape, batch, clip};
 use crate::config::Config;
 use crate::events::Stage;
+use crate::footprint::scene_sizes::{Middle, evaluated, measures_lpips, scene, trained_parts};
 use crate::loss::Loss;
 use crate::loss_scale::LossScale;
 use crate::optim::{adamw, clip_global_norm, global_norm};
@@ -95,6 +94,20 @@ pub struct InferenceRates {
     pub timed: ModelConfig,
 }
 
+/// Multiplications of one network on a scene.
+pub fn macs_of(model: &ModelConfig, network: Part, scene: &SceneSizes) -> f64 {
+    model.macs(network, scene).count(Convention::Macs) as f64
+}
+
+/// Multiplications of a scene's share of an update: a forward and a backward pass of twice its multiplications, which
+/// is what linear layers take; recomputing is a second forward.
+pub fn update_macs(config: &Config, stage: Stage, scene: &SceneSizes) -> f64 {
+    let [encoder, condenser, renderer] =
+        [Part::Encoder, Part::Condenser, Part::Renderer].map(|network| macs_of(&config.model, network, scene));
+    let passes = if config.recompute { 4.0 } else { 3.0 };
+    if stage == Stage::Stage2 { encoder + passes * (condenser + renderer) } else { passes * (encoder + renderer) }
+}
+
 /// The config with one block of each kind, which take as long as any other.
 fn shallow(config: &Config) -> Config {
     let mut config = config.clone();
@@ -162,7 +175,7 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
         optimizer_s = optimizer_s.min(started.elapsed().as_secs_f64());
     }
     let macs = num_scenes as f64 * macs_of_scene;
-    let parameters = Parameters::of(&shallow.model).trained(stage) as f64;
+    let parameters = Parameters::of(&shallow.model).of_parts(trained_parts(stage)) as f64;
     Ok(Rates {
         per_mac: (step.seconds - optimizer_s).max(0.0) / macs,
         per_parameter: optimizer_s / parameters,
@@ -190,7 +203,7 @@ fn perceptual_s(config: &Config, context: &BenchContext) -> Result<f64, TrainErr
 
 /// A batch of made-up scenes with the middle's numbers of tokens.
 fn drawn(context: &BenchContext, stage: Stage, middle: &Middle, num_scenes: usize) -> Result<StageBatch, TrainError> {
-    let (num_tokens, kept) = (context.num_tokens()?, middle.scene.num_render_tokens as usize);
+    let (num_tokens, kept) = (context.num_tokens()?, middle.scene.num_render_tokens);
     let stored = (stage == Stage::Stage2).then_some(kept);
     let mut batch = batch(context.shape(), num_scenes, num_tokens, stored, context.seed())?;
     if stage != Stage::Stage2 && kept < num_tokens {
@@ -214,17 +227,9 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
     let clip = clip(shape, context.seed(), 0);
     let views = upload_views(&[&clip.context], &context.device)?;
     let cameras = upload_cameras(&[&clip.target], &context.device)?;
-    let patches = (shape.size[0] / config.model.patch_size) * (shape.size[1] / config.model.patch_size);
-    let num_tokens = context.num_tokens()? as f64;
-    let scene = SceneSizes {
-        num_tokens,
-        num_storage_tokens: None,
-        num_render_tokens: num_tokens,
-        is_per_view: false,
-        num_targets: num_targets as f64,
-        num_patches: patches as f64,
-    };
-    let macs = Macs::of(&shallow.model, &scene);
+    let scene = scene(config, num_context, num_targets)?;
+    let [encode_macs, render_macs] =
+        [Part::Encoder, Part::Renderer].map(|network| macs_of(&shallow.model, network, &scene));
     let encode_s = Timed::of(|| read(model.lift(&views)))?.seconds;
     let lift = model.lift(&views);
     let render_s = Timed::of(|| read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?.seconds;
@@ -259,7 +264,7 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
             kmeans.push((count, timed.seconds / seeds.len() as f64));
         }
     }
-    let [encode_per_mac, render_per_mac] = [encode_s / macs.encoder, render_s / macs.renderer];
+    let [encode_per_mac, render_per_mac] = [encode_s / encode_macs, render_s / render_macs];
     Ok(InferenceRates { encode_per_mac, render_per_mac, kmeans, measuring_s, timed: shallow.model })
 }
 

@@ -1,14 +1,11 @@
-//! The largest single tensor of a run. A GPU has a limit for one beside that of its memory: a tensor lies in one buffer,
-//! and a shader sees at most `max_storage_buffer_binding_size` of it (below 2 GiB on Vulkan and Direct3D 12).
-// B scenes of a part, N tokens, T target views, Q patches of a view, R render tokens, S stored, M members, D width,
-// F feed-forward width
+//! The largest tensor of every part of a run, and the refusal of those that a device cannot hold.
 
 use burn::tensor::Device;
 use clift_model::adapter::max_tensor_bytes;
-use clift_model::attention::MAX_SCORES;
+use clift_model::cost::{kmeans_values, largest_tensors};
+use clift_model::{Part, SceneSizes};
 
-use super::VIEWS_PER_PASS;
-use super::sizes::{batch_sizes, num_tokens};
+use super::scene_sizes::{VIEWS_PER_PASS, batch_sizes, cluster_counts, scene, set_accumulate, stored};
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::Stage;
@@ -16,25 +13,19 @@ use crate::events::Stage;
 /// Bytes of an f32; f16 operands are smaller copies of what is there in f32.
 const F32: u64 = 4;
 
-/// Above this many values K-means keeps no table of distances.
-const MAX_KMEANS_TABLE: u64 = 1 << 26;
-
 /// Maps of the first layers of both VGG networks, at the size of the picture.
 const VGG_CHANNELS: u64 = 64;
 
 /// A tensor of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LargestTensor {
     /// The part of the run in which it is largest.
     pub part: Stage,
     /// Which one.
-    pub what: &'static str,
+    pub what: String,
     /// Its bytes.
     pub bytes: u64,
 }
-
-/// The parts of a run.
-pub const PARTS: [Stage; 4] = [Stage::Stage1, Stage::Clusters, Stage::Stage2, Stage::Eval];
 
 /// The largest tensor of one part of a run, at the most views and tokens that it can draw.
 ///
@@ -90,10 +81,7 @@ fn setting_that_fits(config: &Config, part: Stage, limit: u64) -> Result<(&'stat
     if let Some((key, now)) = accumulate {
         let (batch_size, _) = batch_sizes(config, part);
         for parts in now..=batch_size {
-            match part {
-                Stage::Stage2 => smaller.stage2.accumulate = parts,
-                _ => smaller.stage1.accumulate = parts,
-            }
+            set_accumulate(&mut smaller, part, parts);
             if fits(&smaller)? {
                 return Ok((key, now.to_string(), format!("write {parts}")));
             }
@@ -115,8 +103,8 @@ fn setting_that_fits(config: &Config, part: Stage, limit: u64) -> Result<(&'stat
     Ok(("data.width, data.height", size, "even one view does not fit: make pictures smaller".into()))
 }
 
-/// The tensors of a part that can be its largest, with their numbers of values.
-fn tensors(config: &Config, part: Stage) -> Result<Vec<(&'static str, u64)>, TrainError> {
+/// Lists the tensors that can be the largest of a part, with their numbers of values.
+fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainError> {
     match part {
         Stage::Stage1 | Stage::Stage2 => of_update(config, part),
         Stage::Clusters => of_clusters(config),
@@ -124,138 +112,72 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(&'static str, u64)>, Tra
     }
 }
 
-/// One network at work on some scenes.
-#[expect(clippy::struct_field_names, reason = "they are all numbers of something")]
-struct Sizes {
-    num_scenes: u64,
-    num_tokens: u64,
-    num_targets: u64,
-    num_patches: u64,
-    /// Pixels of a view.
-    num_pixels: u64,
-}
-
-impl Sizes {
-    fn of(config: &Config, num_context: usize, num_scenes: usize, num_targets: usize) -> Result<Self, TrainError> {
-        Ok(Self {
-            num_scenes: num_scenes as u64,
-            num_tokens: num_tokens(config, num_context)? as u64,
-            num_targets: num_targets as u64,
-            num_patches: num_tokens(config, 1)? as u64,
-            num_pixels: (config.data.width * config.data.height) as u64,
-        })
-    }
-
-    /// Context views of all scenes to tokens.
-    fn encoding(&self, config: &Config) -> Vec<(&'static str, u64)> {
-        let [dim, hidden] = [config.model.dim, config.model.feed_forward_dim].map(|width| width as u64);
-        let rows = self.num_scenes * self.num_tokens;
-        vec![
-            ("the context pixels with their rays", rows * config.model.context_patch_len() as u64),
-            ("the encoder's queries, keys and values", rows * 3 * dim),
-            ("the encoder's feed-forward values", rows * hidden),
-            ("a chunk of the encoder's scores", scores(config, self.num_scenes, self.num_tokens, self.num_tokens)),
-        ]
-    }
-
-    /// Target views of all scenes, each from `per_view` tokens of its own, or all from `memory` keys and values.
-    fn drawing(&self, config: &Config, keys: u64, groups: u64, projected: u64) -> Vec<(&'static str, u64)> {
-        let [dim, hidden] = [config.model.dim, config.model.feed_forward_dim].map(|width| width as u64);
-        let Self { num_scenes, num_targets, num_patches, num_pixels, .. } = *self;
-        let views = num_scenes * num_targets;
-        let rows = views * num_patches;
-        let gathered = groups * keys;
-        let queries = rows / groups.max(1);
-        vec![
-            ("the target rays", views * num_pixels * 6),
-            ("the renderer's queries, keys and values", rows * 3 * dim),
-            ("the renderer's feed-forward values", rows * hidden),
-            ("the keys and values of the renderer's tokens", projected.max(gathered) * 2 * dim),
-            ("a chunk of the renderer's scores", scores(config, groups, queries, keys)),
-        ]
-    }
-
-    /// A scene's tokens to stored ones; counts are those with the most centroids and the most members.
-    fn condensing(&self, config: &Config, fewest: u64, most: u64) -> Vec<(&'static str, u64)> {
-        let [dim, hidden] = [config.model.dim, config.model.feed_forward_dim].map(|width| width as u64);
-        let (centroids, members) = (self.num_scenes * most, self.num_scenes * (self.num_tokens - fewest));
-        vec![
-            ("the keys and values of the condenser's members", members * 2 * dim),
-            ("the condenser's queries, keys and values", centroids * 3 * dim),
-            ("the condenser's feed-forward values", centroids * hidden),
-            ("a chunk of the condenser's scores", scores(config, self.num_scenes, most, most)),
-        ]
-    }
-}
-
-/// Scores that are there at once: a chunk of queries, at least one.
-fn scores(config: &Config, groups: u64, queries: u64, keys: u64) -> u64 {
-    let of_query = (groups * config.model.num_heads as u64 * keys).max(1);
-    of_query * (MAX_SCORES as u64 / of_query).clamp(1, queries.max(1))
-}
-
-fn of_update(config: &Config, part: Stage) -> Result<Vec<(&'static str, u64)>, TrainError> {
+fn of_update(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainError> {
     let views = &config.data.views;
     let (_, num_scenes) = batch_sizes(config, part);
-    let sizes = Sizes::of(config, views.max_context, num_scenes, views.num_targets)?;
-    let mut all = sizes.encoding(config);
-    let num_views = sizes.num_scenes * sizes.num_targets;
-    let rows = sizes.num_scenes * sizes.num_tokens;
+    let scene = scene(config, views.max_context, views.num_targets)?;
+    let of = |network: Part, scene: &SceneSizes| largest_tensors(&config.model, network, scene, num_scenes);
+    let mut all = of(Part::Encoder, &scene);
     if part == Stage::Stage2 {
-        let (fewest, most) = counts(config, sizes.num_tokens as usize)?;
-        all.extend(sizes.condensing(config, fewest, most));
-        all.extend(sizes.drawing(config, most, sizes.num_scenes, sizes.num_scenes * most));
+        let [fewest, most] = fewest_and_most(scene, &cluster_counts(config, scene.num_tokens)?);
+        all.extend(of(Part::Condenser, &fewest));
+        all.extend(of(Part::Condenser, &most));
+        all.extend(of(Part::Renderer, &most));
     } else {
         let [low, high] = config.stage1.keep_tokens;
-        let kept = ((sizes.num_tokens as f64 * high) as u64).clamp(1, sizes.num_tokens);
+        let kept = ((scene.num_tokens as f64 * high) as usize).clamp(1, scene.num_tokens);
         // Shares are drawn: with all tokens views share them, with all but one every view has a set of its own.
-        let own = if low < 1.0 { kept.min((sizes.num_tokens - 1).max(1)) } else { 0 };
-        if own > 0 {
-            all.extend(sizes.drawing(config, own, num_views, rows.min(num_views * own)));
+        if low < 1.0 {
+            let num_render_tokens = kept.min((scene.num_tokens - 1).max(1));
+            all.extend(of(Part::Renderer, &SceneSizes { num_render_tokens, is_per_view: true, ..scene }));
         }
-        if kept == sizes.num_tokens {
-            all.extend(sizes.drawing(config, kept, sizes.num_scenes, rows));
+        if kept == scene.num_tokens {
+            all.extend(of(Part::Renderer, &scene));
         }
     }
     if config.loss.perceptual_weight > 0.0 {
-        all.push(("the first maps of the perceptual loss", num_views * sizes.num_pixels * VGG_CHANNELS));
+        all.push(("the first maps of the perceptual loss".into(), num_scenes as u64 * vgg_maps(config, &scene)));
     }
     Ok(all)
 }
 
-/// Fewest and most tokens that stage 2 stores.
-fn counts(config: &Config, num_tokens: usize) -> Result<(u64, u64), TrainError> {
-    let counts = config.clusters.grid.iter().map(|count| count.of(num_tokens)).collect::<Result<Vec<_>, _>>()?;
-    let (fewest, most) = (counts.iter().min().copied(), counts.iter().max().copied());
-    Ok((fewest.unwrap_or(num_tokens) as u64, most.unwrap_or(num_tokens) as u64))
+/// The scenes with the fewest and the most stored tokens of `counts`.
+fn fewest_and_most(scene: SceneSizes, counts: &[usize]) -> [SceneSizes; 2] {
+    let all = scene.num_tokens;
+    [counts.iter().min(), counts.iter().max()].map(|count| stored(scene, count.copied().unwrap_or(all)))
 }
 
-fn kmeans(num_tokens: u64, most: u64) -> (&'static str, u64) {
-    let table = num_tokens * num_tokens;
-    ("the distances of K-means", if table <= MAX_KMEANS_TABLE { table } else { num_tokens * most })
+/// Values of the first feature maps of all target views.
+fn vgg_maps(config: &Config, scene: &SceneSizes) -> u64 {
+    (scene.num_targets * config.data.width * config.data.height) as u64 * VGG_CHANNELS
 }
 
-fn of_clusters(config: &Config) -> Result<Vec<(&'static str, u64)>, TrainError> {
-    let sizes = Sizes::of(config, config.data.views.max_context, 1, 0)?;
-    let mut all = sizes.encoding(config);
-    all.push(kmeans(sizes.num_tokens, counts(config, sizes.num_tokens as usize)?.1));
+fn kmeans(scene: &SceneSizes) -> (String, u64) {
+    ("the distances of K-means".into(), kmeans_values(scene.num_tokens, scene.num_render_tokens))
+}
+
+fn of_clusters(config: &Config) -> Result<Vec<(String, u64)>, TrainError> {
+    let scene = scene(config, config.data.views.max_context, 0)?;
+    let mut all = largest_tensors(&config.model, Part::Encoder, &scene, 1);
+    let [_, most] = fewest_and_most(scene, &cluster_counts(config, scene.num_tokens)?);
+    all.push(kmeans(&most));
     Ok(all)
 }
 
-fn of_evaluation(config: &Config) -> Result<Vec<(&'static str, u64)>, TrainError> {
+fn of_evaluation(config: &Config) -> Result<Vec<(String, u64)>, TrainError> {
     let eval = &config.eval;
-    let sizes = Sizes::of(config, eval.num_context, 1, eval.num_targets.clamp(1, VIEWS_PER_PASS))?;
-    let counts = eval.storage.iter().map(|count| count.of(sizes.num_tokens as usize)).collect::<Result<Vec<_>, _>>();
+    let scene = scene(config, eval.num_context, eval.num_targets.clamp(1, VIEWS_PER_PASS))?;
+    let counts = eval.storage.iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>();
     // Of an index, which may have fewer contexts or more, nothing is known here.
-    let counts = counts.unwrap_or_else(|_| vec![sizes.num_tokens as usize]);
-    let fewest = counts.iter().min().map_or(sizes.num_tokens, |&count| count as u64);
-    let most = counts.iter().max().map_or(sizes.num_tokens, |&count| count as u64);
-    let mut all = sizes.encoding(config);
-    all.push(kmeans(sizes.num_tokens, most));
-    all.extend(sizes.condensing(config, fewest, most));
-    all.extend(sizes.drawing(config, most, 1, most));
+    let [fewest, most] = fewest_and_most(scene, &counts.unwrap_or_else(|_| vec![scene.num_tokens]));
+    let of = |network: Part, scene: &SceneSizes| largest_tensors(&config.model, network, scene, 1);
+    let mut all = of(Part::Encoder, &scene);
+    all.push(kmeans(&most));
+    all.extend(of(Part::Condenser, &fewest));
+    all.extend(of(Part::Condenser, &most));
+    all.extend(of(Part::Renderer, &most));
     if eval.lpips_path().is_some() {
-        all.push(("the first maps of LPIPS", sizes.num_targets * sizes.num_pixels * VGG_CHANNELS));
+        all.push(("the first maps of LPIPS".into(), vgg_maps(config, &scene)));
     }
     Ok(all)
 }
@@ -263,8 +185,10 @@ fn of_evaluation(config: &Config) -> Result<Vec<(&'static str, u64)>, TrainError
 #[cfg(test)]
 mod tests {
     use clift_eval::TokenCount;
+    use clift_model::attention::MAX_SCORES;
 
     use super::*;
+    use crate::footprint::scene_sizes::PARTS;
 
     /// The paper's network on six contexts of 256 x 256 and six targets, N = 6,144, T Q = 6,144.
     fn paper() -> Config {
@@ -274,7 +198,7 @@ mod tests {
         config
     }
 
-    fn largest(config: &Config, part: Stage) -> (&'static str, u64) {
+    fn largest(config: &Config, part: Stage) -> (String, u64) {
         let LargestTensor { what, bytes, .. } = largest_tensor(config, part).expect("valid");
         (what, bytes)
     }
@@ -284,14 +208,14 @@ mod tests {
         let mut config = paper();
         config.stage1.accumulate = 16;
         // 4 scenes x 6 views x 6,143 tokens x 2 x 768 values.
-        let own = ("the keys and values of the renderer's tokens", 4 * 6 * 6143 * 2 * 768 * 4);
+        let own = ("the keys and values of the renderer's tokens".into(), 4 * 6 * 6143 * 2 * 768 * 4);
         assert_eq!(largest(&config, Stage::Stage1), own);
         // With all tokens in every step views share them: 4 x 6,144 x 3 x 768 of the encoder are more.
         config.stage1.keep_tokens = [1.0, 1.0];
         let packed = 4 * 6144 * 3 * 768 * 4;
         assert_eq!(largest(&config, Stage::Stage1).1, packed);
         config.loss.perceptual_weight = 0.5;
-        let maps = ("the first maps of the perceptual loss", 4 * 6 * 65_536 * 64 * 4);
+        let maps = ("the first maps of the perceptual loss".into(), 4 * 6 * 65_536 * 64 * 4);
         assert_eq!(largest(&config, Stage::Stage1), maps);
     }
 
@@ -304,10 +228,10 @@ mod tests {
         let scores = 8 * 6144 * (MAX_SCORES as u64 / (8 * 6144)) * 4;
         assert_eq!(largest(&config, Stage::Stage2).1, scores);
         // A table of 6,144^2 distances.
-        assert_eq!(largest(&config, Stage::Clusters), ("the distances of K-means", 6144 * 6144 * 4));
+        assert_eq!(largest(&config, Stage::Clusters), ("the distances of K-means".into(), 6144 * 6144 * 4));
         config.data.views.max_context = 9;
         // 9,216^2 are more than a table may have: distances to 9,216 clusters.
-        assert_eq!(largest(&config, Stage::Clusters), ("the distances of K-means", 9216 * 9216 * 4));
+        assert_eq!(largest(&config, Stage::Clusters), ("the distances of K-means".into(), 9216 * 9216 * 4));
         config.eval.num_context = 1;
         config.eval.num_targets = 100;
         // Eight views at a time: 8 x 1,024 x 3 x 768.

@@ -1,0 +1,62 @@
+//! The largest tensors of a network. A GPU has a limit for one beside that of its memory: a tensor is one buffer, and a
+//! shader sees at most `max_storage_buffer_binding_size` of it (below 2 GiB on Vulkan and Direct3D 12).
+
+use super::SceneSizes;
+use crate::attention::MAX_SCORES;
+use crate::kmeans::seeding::MAX_TABLE_LEN;
+use crate::{Layer, LayerKind, ModelConfig, Part, Sequence};
+
+/// Lists the tensors that can be the largest of one network at work on equal scenes: what each is, and its number of
+/// values.
+pub fn largest_tensors(config: &ModelConfig, part: Part, sizes: &SceneSizes, num_scenes: usize) -> Vec<(String, u64)> {
+    let layers = config.layers();
+    let tensors = layers.iter().filter(|layer| layer.part == part).filter_map(|layer| tensor(layer, sizes, num_scenes));
+    tensors.collect()
+}
+
+/// Returns the largest tensor of a layer, if no other layer of its block has a larger one.
+fn tensor(layer: &Layer, sizes: &SceneSizes, num_scenes: usize) -> Option<(String, u64)> {
+    let network = match layer.part {
+        Part::Encoder => "encoder",
+        Part::TokenNorm => "token norm",
+        Part::Condenser => "condenser",
+        Part::Renderer => "renderer",
+    };
+    let scenes = num_scenes as u64;
+    let rows = scenes * sizes.num_rows(layer.rows);
+    let name = layer.path.rsplit('.').next().unwrap_or_default();
+    Some(match (layer.kind, name) {
+        (LayerKind::Linear { inputs, .. }, "patch_embed") => {
+            ("the context pixels with their rays".into(), rows * inputs as u64)
+        }
+        (LayerKind::Linear { inputs, .. }, "ray_embed") => ("the target rays".into(), rows * inputs as u64),
+        (LayerKind::Linear { outputs, .. }, "in_proj") => {
+            (format!("the {network}'s queries, keys and values"), rows * outputs as u64)
+        }
+        (LayerKind::Linear { outputs, .. }, "kv_proj") => {
+            let tokens = if layer.part == Part::Condenser { "members" } else { "tokens" };
+            let gathered = scenes * sizes.num_gathered(layer.rows);
+            (format!("the keys and values of the {network}'s {tokens}"), rows.max(gathered) * outputs as u64)
+        }
+        (LayerKind::Attention { heads, keys, .. }, _) => {
+            (format!("a chunk of the {network}'s scores"), scores(rows, heads, keys, sizes, scenes))
+        }
+        (LayerKind::Activation { width }, _) => (format!("the {network}'s feed-forward values"), rows * width as u64),
+        _ => return None,
+    })
+}
+
+/// Scores that exist at once: those of a chunk of queries, at least one.
+fn scores(num_queries: u64, heads: usize, keys: Sequence, sizes: &SceneSizes, scenes: u64) -> u64 {
+    let groups = scenes * sizes.num_groups(keys);
+    let of_query = (groups * heads as u64 * sizes.group_len(keys)).max(1);
+    of_query * (MAX_SCORES as u64 / of_query).clamp(1, (num_queries / groups.max(1)).max(1))
+}
+
+/// Returns the number of distances in the largest tensor of latent K-means: all pairs of tokens, or of tokens and
+/// clusters where that table would be too large.
+pub fn kmeans_values(num_tokens: usize, num_clusters: usize) -> u64 {
+    let table = num_tokens.saturating_mul(num_tokens);
+    let values = if table <= MAX_TABLE_LEN { table } else { num_tokens * num_clusters };
+    values as u64
+}

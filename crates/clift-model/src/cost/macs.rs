@@ -1,0 +1,237 @@
+//! Multiply-accumulates of the networks, and the conventions of counting them.
+
+use std::fmt;
+use std::str::FromStr;
+
+use super::SceneSizes;
+use crate::{Layer, LayerKind, ModelConfig, ModelError, Part};
+
+/// Multiply-accumulates of a forward pass of one scene. Norms, activations, softmax and the rays of pixels are not
+/// counted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Macs {
+    /// Of linear layers.
+    pub linear: u64,
+    /// Of scores (`Q K^T`) and weighted sums (`A V`).
+    pub attention: u64,
+    /// Values that layer norms normalise.
+    pub normalised: u64,
+}
+
+/// How an amount of work is told.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Convention {
+    /// As the paper's numbers come out (render-budget table): one per multiply-accumulate of linear layers, attention
+    /// left out, and five per value of `3 L + 2` layer norms. The first two are what fvcore counts where attention is
+    /// one fused operation; the number of norms is fitted to the five printed values (`3 L + 1` are there).
+    Paper,
+    /// Multiply-accumulates, attention included.
+    #[default]
+    Macs,
+    /// Floating-point operations: two per multiply-accumulate, attention included.
+    Flops,
+}
+
+impl Convention {
+    /// All conventions.
+    pub const ALL: [Self; 3] = [Self::Paper, Self::Macs, Self::Flops];
+
+    /// The name as it is typed.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Paper => "paper",
+            Self::Macs => "macs",
+            Self::Flops => "flops",
+        }
+    }
+
+    /// The unit of a thousand million of it.
+    pub const fn unit(self) -> &'static str {
+        match self {
+            Self::Paper => "GFLOPs (paper)",
+            Self::Macs => "GMACs",
+            Self::Flops => "GFLOPs",
+        }
+    }
+}
+
+impl fmt::Display for Convention {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Convention {
+    type Err = ModelError;
+
+    fn from_str(name: &str) -> Result<Self, ModelError> {
+        Self::ALL.into_iter().find(|convention| convention.name() == name).ok_or_else(|| ModelError::BadConfig {
+            key: "convention",
+            value: name.into(),
+            fix: format!("write one of {}", Self::ALL.map(Self::name).join(", ")),
+        })
+    }
+}
+
+impl Macs {
+    /// The amount of work in a convention.
+    pub fn count(self, convention: Convention) -> u64 {
+        match convention {
+            Convention::Paper => self.linear + 5 * self.normalised,
+            Convention::Macs => self.linear + self.attention,
+            Convention::Flops => 2 * (self.linear + self.attention),
+        }
+    }
+}
+
+impl Layer {
+    /// Returns the work of this layer in a forward pass of one scene.
+    fn macs(&self, sizes: &SceneSizes) -> Macs {
+        let rows = sizes.num_rows(self.rows);
+        let pairs = |num_pairs: u64, width: usize| Macs { attention: 2 * num_pairs * width as u64, ..Macs::default() };
+        match self.kind {
+            LayerKind::Linear { inputs, outputs, .. } => {
+                Macs { linear: rows * (inputs * outputs) as u64, ..Macs::default() }
+            }
+            LayerKind::LayerNorm { width } => Macs { normalised: rows * width as u64, ..Macs::default() },
+            LayerKind::Attention { width, keys, .. } => pairs(rows * sizes.group_len(keys), width),
+            LayerKind::ClusterAttention { width, keys } => pairs(sizes.num_rows(keys), width),
+            LayerKind::HeadNorm { .. } | LayerKind::Activation { .. } => Macs::default(),
+        }
+    }
+}
+
+impl ModelConfig {
+    /// Returns the work of one network on a scene.
+    pub fn macs(&self, part: Part, sizes: &SceneSizes) -> Macs {
+        let layers = self.layers();
+        let macs = layers.iter().filter(|layer| layer.part == part).map(|layer| layer.macs(sizes));
+        macs.fold(Macs::default(), |sum, macs| Macs {
+            linear: sum.linear + macs.linear,
+            attention: sum.attention + macs.attention,
+            normalised: sum.normalised + macs.normalised,
+        })
+    }
+
+    /// Returns the work of rendering one view alone from `num_render_tokens` tokens, their keys and values included.
+    ///
+    /// # Errors
+    /// [`ModelError::NotDivisible`] when a side is not a positive multiple of the patch.
+    pub fn render_macs(&self, height: usize, width: usize, num_render_tokens: usize) -> Result<Macs, ModelError> {
+        let num_patches = self.num_tokens(1, height, width)?;
+        let mut macs = self.macs(Part::Renderer, &SceneSizes::new(num_render_tokens, 1, num_patches));
+        // The norm that the paper counts and the network does not have.
+        macs.normalised += (num_patches * self.dim) as u64;
+        Ok(macs)
+    }
+
+    /// Returns the work of encoding a scene of `num_views` context views.
+    ///
+    /// # Errors
+    /// [`ModelError::NotDivisible`] when a side is not a positive multiple of the patch.
+    pub fn encode_macs(&self, num_views: usize, height: usize, width: usize) -> Result<Macs, ModelError> {
+        let num_tokens = self.num_tokens(num_views, height, width)?;
+        Ok(self.macs(Part::Encoder, &SceneSizes::new(num_tokens, 0, 0)))
+    }
+
+    /// Returns the work of condensing `num_tokens` tokens into `num_storage_tokens`.
+    pub fn condense_macs(&self, num_tokens: usize, num_storage_tokens: usize) -> Macs {
+        let num_storage_tokens = Some(num_storage_tokens);
+        self.macs(Part::Condenser, &SceneSizes { num_storage_tokens, ..SceneSizes::new(num_tokens, 0, 0) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{DType, Device, Tensor};
+
+    use super::*;
+    use crate::testing::{random, small_configs};
+    use crate::{Cameras, Clift, Clusters, SceneClusters, Views, mac_counter};
+
+    #[test]
+    fn the_papers_numbers_come_out_to_the_printed_digits() {
+        let config = ModelConfig::default();
+        let printed = [(4096, "70.6", 1), (3072, "63.3", 1), (2048, "56.1", 1), (1024, "48.9", 1), (512, "45.23", 2)];
+        for (tokens, expected, decimals) in printed {
+            let macs = config.render_macs(256, 256, tokens).unwrap();
+            assert_eq!(format!("{:.decimals$}", macs.count(Convention::Paper) as f64 / 1e9), expected);
+        }
+    }
+
+    #[test]
+    fn the_full_size_networks_cost_what_the_formulas_say() {
+        let config = ModelConfig::default();
+        for tokens in [4096_u64, 512, 1] {
+            let macs = config.render_macs(256, 256, tokens as usize).unwrap();
+            assert_eq!(macs.linear, 41_523_609_600 + 7_077_888 * tokens);
+            assert_eq!(macs.attention, 9_663_676_416 + 9_437_184 * tokens);
+            assert_eq!(macs.count(Convention::Flops), 2 * macs.count(Convention::Macs));
+        }
+        let giga = |macs: Macs| (macs.count(Convention::Macs) as f64 / 1e8).round() / 10.0;
+        assert_eq!(giga(config.render_macs(256, 448, 7168).unwrap()), 271.4);
+        assert_eq!(giga(config.encode_macs(4, 256, 256).unwrap()), 291.7);
+        assert!(config.render_macs(250, 256, 1).is_err());
+    }
+
+    #[test]
+    fn a_convention_has_a_name() {
+        for convention in Convention::ALL {
+            assert_eq!(convention.to_string().parse::<Convention>().unwrap(), convention);
+        }
+        assert!("flop".parse::<Convention>().unwrap_err().to_string().contains("paper, macs, flops"));
+    }
+
+    #[test]
+    fn a_real_forward_multiplies_as_often_as_convention_macs_says() {
+        let device = Device::flex();
+        for config in small_configs() {
+            let model = Clift::new(&config, 0, &device);
+            for (num_views, [height, width], stored) in [(2, [16, 24], 5), (3, [8, 16], 1), (2, [24, 8], 6)] {
+                let cameras = |views: usize| Cameras {
+                    height,
+                    width,
+                    c2w: Tensor::<2>::eye(4, &device).reshape([1, 1, 4, 4]).expand([1, views, 4, 4]),
+                    intrinsics: Tensor::<1>::from_floats([9.0, 9.0, 8.0, 8.0], &device)
+                        .reshape([1, 1, 4])
+                        .expand([1, views, 4]),
+                };
+                let images = random([1, num_views, height, width, 3], 1, &device).cast(DType::F32);
+                let num_tokens = config.num_tokens(num_views, height, width).unwrap();
+
+                mac_counter::take();
+                let lift = model.encoder.forward(&Views { images, cameras: cameras(num_views) });
+                let expected = config.encode_macs(num_views, height, width).unwrap();
+                assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "encoder");
+
+                let assignment = (0..num_tokens as u32).map(|token| token % stored).collect();
+                let scene = SceneClusters::new(assignment, (0..stored).collect()).unwrap();
+                let index = Clusters::new(vec![scene]).unwrap().upload(&device);
+                let tokens = model.condenser.forward(lift.clone(), &index);
+                let expected = config.condense_macs(num_tokens, stored as usize);
+                assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "condenser");
+
+                for tokens in [tokens, lift] {
+                    let count = tokens.dims()[1];
+                    let expected = config.render_macs(height, width, count).unwrap();
+                    model.renderer.forward(tokens.clone(), &cameras(1));
+                    assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "renderer, {count} tokens");
+                    model.renderer.draw(&model.renderer.memory(&tokens), &cameras(1));
+                    assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "prepared, {count} tokens");
+
+                    model.renderer.forward(tokens, &cameras(3));
+                    let sizes = SceneSizes::new(count, 3, config.num_tokens(1, height, width).unwrap());
+                    let expected = config.macs(Part::Renderer, &sizes);
+                    assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "three views");
+                }
+                let whole = SceneClusters::identity(num_tokens);
+                model.condenser.forward(
+                    random([1, num_tokens, config.dim], 2, &device).cast(DType::F32),
+                    &Clusters::new(vec![whole]).unwrap().upload(&device),
+                );
+                let expected = config.condense_macs(num_tokens, num_tokens);
+                assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "every token its own cluster");
+            }
+        }
+    }
+}

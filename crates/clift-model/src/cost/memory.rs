@@ -1,0 +1,381 @@
+//! Bytes of tensors that the networks need, counted from what the hand-written operations save (docs/plan.md).
+// In f32 values: x = N D of a block's own rows
+
+use super::{Parameters, SceneSizes, kmeans_values};
+use crate::{Layer, LayerKind, ModelConfig, Part, Rows};
+
+/// Bytes of an f32.
+const F32: f64 = 4.0;
+
+/// Bytes of the C library's heap for a byte that a backward pass keeps: freed pieces below 32 MiB stay in the heap.
+/// Measured at 1.05 to 1.22 (docs/plan.md).
+const HEAP: f64 = 1.2;
+
+/// A segment of a forward and backward pass; numbers of f32 values.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Segment {
+    /// Kept from the forward until the segment's backward is done.
+    pub kept: f64,
+    /// Needed on top while its backward runs: gradients on their way, and what is recomputed.
+    pub working: f64,
+    /// Needed on top while its forward runs.
+    pub forward: f64,
+    /// Parameters whose gradients it leaves behind.
+    pub parameters: f64,
+}
+
+/// Returns the most values alive at once: the forward adds what is kept; the backward, from the end, gives it back and
+/// leaves gradients of parameters.
+fn peak(segments: &[Segment]) -> f64 {
+    let (mut kept, mut most) = (0.0_f64, 0.0_f64);
+    for segment in segments {
+        most = most.max(kept + segment.forward.max(segment.kept));
+        kept += segment.kept;
+    }
+    let mut gradients = 0.0;
+    for segment in segments.iter().rev() {
+        gradients += segment.parameters;
+        most = most.max(kept + segment.working + gradients);
+        kept -= segment.kept;
+    }
+    most
+}
+
+/// Sizes of one micro-batch of an update.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct UpdateSizes {
+    /// Networks that are trained; the condenser runs only if it is among them.
+    pub trained: &'static [Part],
+    /// Scenes of the micro-batch.
+    pub num_scenes: usize,
+    /// Whether the gradients of several micro-batches are summed.
+    pub is_accumulated: bool,
+    /// Whether every block keeps its input alone and recomputes the rest.
+    pub recompute: bool,
+    /// One scene.
+    pub scene: SceneSizes,
+    /// Values of a scene's images, context and target.
+    pub num_image_values: usize,
+    /// The network of a perceptual loss on all target views, zeros without one.
+    pub loss: Segment,
+    /// The weights of that network.
+    pub loss_parameters: f64,
+}
+
+/// Returns the most bytes of tensors alive during an update, weights and optimizer included.
+pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
+    let layers = config.layers();
+    let parameters = Parameters::of(config);
+    let trained = parameters.of_parts(sizes.trained) as f64;
+    let images = (sizes.num_scenes * sizes.num_image_values) as f64;
+    let earlier = if sizes.is_accumulated { trained } else { 0.0 };
+    let backward = HEAP * peak(&segments(config, &layers, sizes)) + images + earlier;
+    let matrix_len = |layer: &Layer| match layer.kind {
+        LayerKind::Linear { inputs, outputs, .. } => inputs * outputs,
+        _ => 0,
+    };
+    let largest_matrix = layers.iter().map(matrix_len).max().unwrap_or_default() as f64;
+    // Gradients, and a few copies of the largest matrix on the way to its update.
+    let optimizer = trained + 5.0 * largest_matrix;
+    // Weights, and two moments of those that train.
+    let standing = parameters.total as f64 + sizes.loss_parameters + 2.0 * trained;
+    F32 * (standing + backward.max(optimizer))
+}
+
+/// Returns the segments of an update in the order of its forward pass.
+fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<Segment> {
+    let UpdateSizes { trained, num_scenes, recompute, scene, .. } = *sizes;
+    let values = |rows: &[Rows]| num_scenes as f64 * (scene.num_rows(rows) as f64) * config.dim as f64;
+    let of_part = |part: Part| {
+        let groups = layers.chunk_by(|a, b| (a.part, a.block) == (b.part, b.block));
+        groups.filter(move |layers| layers[0].part == part).map(move |layers| {
+            let group = LayerGroup { layers, config, scene, num_scenes: num_scenes as f64 };
+            group.segment(trained.contains(&part), recompute)
+        })
+    };
+    let keep = |kept: f64| Segment { kept, ..Segment::default() };
+    let mut segments: Vec<Segment> = of_part(Part::Encoder).collect();
+    // The tokens themselves are kept by the first who reads them.
+    let mut tokens = values(&[Rows::ContextPatches]);
+    segments.push(keep(tokens));
+    if trained.contains(&Part::Condenser) {
+        // Members are gathered for all blocks; a condenser of all tokens reads those that are kept already.
+        let gathers_members = layers.iter().any(|layer| layer.rows == [Rows::Members]);
+        segments.push(keep(if gathers_members { values(&[Rows::Members]) } else { 0.0 }));
+        segments.extend(of_part(Part::Condenser));
+        tokens = values(&[Rows::StoredTokens]);
+        segments.push(keep(tokens));
+    }
+    let projected = values(&[Rows::RenderTokens]);
+    if projected < tokens {
+        // Subsets smaller than the scene are gathered first, and shared by all blocks.
+        segments.push(Segment { kept: projected, working: tokens, ..Segment::default() });
+    }
+    segments.extend(of_part(Part::Renderer));
+    segments.push(sizes.loss);
+    segments
+}
+
+/// The layers of one block, or consecutive layers outside the blocks, at work on some scenes.
+struct LayerGroup<'a> {
+    layers: &'a [Layer],
+    config: &'a ModelConfig,
+    scene: SceneSizes,
+    num_scenes: f64,
+}
+
+impl LayerGroup<'_> {
+    fn segment(&self, is_trained: bool, recompute: bool) -> Segment {
+        let first = &self.layers[0];
+        let segment = match first.block {
+            Some(_) if !is_trained => {
+                let x = self.own_values();
+                return Segment { forward: forward_values(self.config, x) + x, ..Segment::default() };
+            }
+            Some(_) => self.block(),
+            None if first.saves_input => self.embedding(),
+            None => self.output(),
+        };
+        match first.block {
+            _ if !is_trained => Segment { kept: 0.0, parameters: 0.0, ..segment },
+            Some(_) if recompute => {
+                Segment { kept: self.own_values(), working: segment.working + segment.kept, ..segment }
+            }
+            _ => segment,
+        }
+    }
+
+    /// Patches are gathered from images and rays, 15 values a pixel on the way.
+    fn embedding(&self) -> Segment {
+        let (patches, values) = (self.saved(), self.own_values());
+        Segment { kept: patches, working: values, forward: patches * 2.5 + values, parameters: self.parameters() }
+    }
+
+    /// The norm's input, the sigmoid's result, the difference; images and their gradients in two orders.
+    fn output(&self) -> Segment {
+        let rgb = self.num_scenes * self.values(self.layers[0].rows, self.config.rgb_patch_len());
+        Segment {
+            kept: self.saved() + 2.0 * rgb,
+            working: 2.0 * self.own_values() + 3.0 * rgb,
+            forward: 4.0 * rgb,
+            parameters: self.parameters(),
+        }
+    }
+
+    /// A transformer block. What it saves follows from its layers; what it needs on top is a formula of its kind of
+    /// attention to memory, compared with measured peaks.
+    fn block(&self) -> Segment {
+        let (x, saved) = (self.own_values(), self.saved());
+        let hidden = self.sum(|layer| match layer.kind {
+            LayerKind::Activation { width } => self.values(layer.rows, width),
+            _ => 0.0,
+        });
+        let head_norms = self.sum(|layer| match layer.kind {
+            // As measured: before and after, and beside the values of attention.
+            LayerKind::HeadNorm { width, heads } => 2.5 * self.values(layer.rows, width * heads),
+            _ => 0.0,
+        });
+        let mut memory = (0.0, 0.0);
+        for layer in self.layers {
+            let own = |count: u64, width: usize| self.num_scenes * (count * width as u64) as f64;
+            match layer.kind {
+                LayerKind::Attention { width, keys, .. } if keys != layer.rows => {
+                    let gathered = 2.0 * own(self.scene.num_gathered(keys), width);
+                    let projected = 2.0 * own(self.scene.num_rows(keys), width);
+                    // The gradient of what the views gathered, of what was projected, and of the tokens, added up over
+                    // the blocks.
+                    memory = (3.0 * x + gathered + 2.0 * projected - hidden, projected);
+                }
+                LayerKind::ClusterAttention { width, keys } => {
+                    let members = own(self.scene.num_rows(keys), width);
+                    memory = (3.0 * x + 3.0 * members - hidden, members);
+                }
+                _ => {}
+            }
+        }
+        // The gradients of the sum and of the hidden values, and the norm recomputed.
+        let feed_forward = 2.0 * x + hidden;
+        Segment {
+            kept: saved + head_norms,
+            working: feed_forward.max(memory.0),
+            forward: saved + hidden + memory.1,
+            parameters: self.parameters(),
+        }
+    }
+
+    /// Values that layers save for their backward, but for the norms of heads.
+    fn saved(&self) -> f64 {
+        self.sum(|layer| match layer.kind {
+            _ if !layer.saves_input => 0.0,
+            LayerKind::Linear { inputs: width, .. }
+            | LayerKind::LayerNorm { width }
+            | LayerKind::Activation { width } => self.values(layer.rows, width),
+            // Queries, keys and values.
+            LayerKind::Attention { width, keys, .. } | LayerKind::ClusterAttention { width, keys } => {
+                let key_values = 2 * self.scene.num_gathered(keys) * width as u64;
+                self.values(layer.rows, width) + key_values as f64
+            }
+            LayerKind::HeadNorm { .. } => 0.0,
+        })
+    }
+
+    /// Values of the rows that the first layer processes, at the width of a token.
+    fn own_values(&self) -> f64 {
+        self.num_scenes * self.values(self.layers[0].rows, self.config.dim)
+    }
+
+    fn parameters(&self) -> f64 {
+        self.layers.iter().map(Layer::num_parameters).sum::<u64>() as f64
+    }
+
+    /// Sums values of layers over all scenes.
+    fn sum(&self, of_scene: impl Fn(&Layer) -> f64) -> f64 {
+        self.num_scenes * self.layers.iter().map(of_scene).sum::<f64>()
+    }
+
+    fn values(&self, rows: &[Rows], width: usize) -> f64 {
+        (self.scene.num_rows(rows) * width as u64) as f64
+    }
+}
+
+/// Values alive in a block's forward without a tape, beside its input of `x` values.
+fn forward_values(config: &ModelConfig, x: f64) -> f64 {
+    // The norm's result and the three projections, or the hidden values before and after their GELU.
+    x * (2.0 * config.feed_forward_dim as f64 / config.dim as f64).max(4.0)
+}
+
+/// Sizes of encoding, clustering and rendering one scene without gradients.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct InferenceSizes {
+    /// Weights of all networks in memory.
+    pub num_parameters: u64,
+    /// Weights that are read from a file into a network that exists already.
+    pub num_loaded: u64,
+    /// Encoder tokens.
+    pub num_tokens: usize,
+    /// Most clusters of K-means; `None` without K-means.
+    pub num_clusters: Option<usize>,
+    /// Target views that are rendered at once.
+    pub num_targets: usize,
+    /// Patches of a view.
+    pub num_patches: usize,
+    /// Values of all images of the scene.
+    pub num_image_values: usize,
+    /// Most values of a metric's network at work, beside its weights.
+    pub metric_working: f64,
+    /// Weights of a metric's network.
+    pub metric_parameters: f64,
+}
+
+/// Returns the most bytes of tensors alive while a scene is encoded, clustered and rendered.
+pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
+    let values = |rows: usize| (rows * config.dim) as f64;
+    let x = values(sizes.num_tokens);
+    let patches = (sizes.num_tokens * config.context_patch_len()) as f64;
+    let encode = (x + forward_values(config, x)).max(2.5 * patches + x);
+    // The tokens about their mean, and distances.
+    let distances = |num_clusters| 2.0 * x + kmeans_values(sizes.num_tokens, num_clusters) as f64;
+    let kmeans = sizes.num_clusters.map_or(0.0, distances);
+    let render = match sizes.num_targets {
+        0 => 0.0,
+        num_targets => render_values(config, x, values(num_targets * sizes.num_patches)),
+    };
+    let working = sizes.num_image_values as f64 + encode.max(kmeans).max(render).max(sizes.metric_working);
+    // A file's bytes are there until its tensors are, and both until they have replaced others.
+    let working = working.max(2.0 * sizes.num_loaded as f64);
+    F32 * (sizes.num_parameters as f64 + sizes.metric_parameters + working)
+}
+
+/// Returns the most bytes of tensors alive, weights aside, while views of `num_patches` patches in all are rendered
+/// from `num_render_tokens` tokens.
+pub fn render_bytes(config: &ModelConfig, num_render_tokens: usize, num_patches: usize) -> u64 {
+    let values = |rows: usize| (rows * config.dim) as f64;
+    let image = (num_patches * config.rgb_patch_len()) as f64;
+    // The rays of the pixels are twice the image; it is unfolded from patches, and copied to the host.
+    (F32 * (render_values(config, values(num_render_tokens), values(num_patches)) + 5.0 * image)) as u64
+}
+
+/// Keys and values of one block for tokens of `x` values, and the hidden values of views of `y`.
+fn render_values(config: &ModelConfig, x: f64, y: f64) -> f64 {
+    3.0 * x + y + forward_values(config, y)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn update(trained: &'static [Part], recompute: bool) -> UpdateSizes {
+        let scene = SceneSizes::new(4096, 1, 1024);
+        let stored = SceneSizes { num_storage_tokens: Some(1024), num_render_tokens: 1024, ..scene };
+        UpdateSizes {
+            trained,
+            num_scenes: 1,
+            is_accumulated: false,
+            recompute,
+            scene: if trained == STAGE2 { stored } else { scene },
+            num_image_values: 5 * 256 * 256 * 3,
+            loss: Segment::default(),
+            loss_parameters: 0.0,
+        }
+    }
+
+    const STAGE1: &[Part] = &[Part::Encoder, Part::Renderer];
+    const STAGE2: &[Part] = &[Part::Condenser, Part::Renderer];
+
+    #[test]
+    fn the_papers_update_is_within_fifteen_percent_of_its_measured_peak() {
+        // docs/performance.md, full size, batch 1; a process of this program holds 26 MB besides its tensors.
+        let config = ModelConfig::default();
+        for (trained, recompute, measured) in [(STAGE1, false, 2.26e9), (STAGE1, true, 1.72e9), (STAGE2, false, 1.43e9)]
+        {
+            let counted = update_bytes(&config, &update(trained, recompute)) + 26e6;
+            let error = (counted / measured - 1.0).abs();
+            assert!(error < 0.15, "{trained:?} {recompute}: {counted:.3e} for {measured:.3e}");
+        }
+    }
+
+    #[test]
+    fn memory_grows_with_scenes_and_shrinks_with_recomputed_blocks() {
+        let config = ModelConfig::default();
+        let one = update(STAGE1, false);
+        let two = UpdateSizes { num_scenes: 2, ..one };
+        let again = UpdateSizes { num_scenes: 2, ..update(STAGE1, true) };
+        let bytes = |sizes: &UpdateSizes| update_bytes(&config, sizes);
+        assert!(bytes(&two) > 1.3 * bytes(&one));
+        assert!(bytes(&again) < 0.7 * bytes(&two));
+        assert!(bytes(&UpdateSizes { is_accumulated: true, ..one }) > bytes(&one));
+    }
+
+    #[test]
+    fn blocks_save_the_inputs_of_their_layers() {
+        // Rows of width D: encoder 6 and F; renderer 9 and F, and keys and values of its tokens; condenser 10 and F,
+        // and keys and values of its members.
+        let config = ModelConfig::default();
+        let layers = config.layers();
+        let scene = update(STAGE2, false).scene;
+        let [dim, hidden] = [config.dim, config.feed_forward_dim].map(|width| width as f64);
+        let x = |rows: f64, count: f64| rows * (count * dim + hidden);
+        for (part, expected) in [
+            (Part::Encoder, x(4096.0, 6.0)),
+            (Part::Renderer, x(1024.0, 9.0) + 2.0 * 1024.0 * dim),
+            (Part::Condenser, x(1024.0, 10.0) + 2.0 * 3072.0 * dim),
+        ] {
+            let mut groups = layers.chunk_by(|a, b| (a.part, a.block) == (b.part, b.block));
+            let layers = groups.find(|layers| layers[0].part == part && layers[0].block.is_some()).expect("a block");
+            let group = LayerGroup { layers, config: &config, scene, num_scenes: 1.0 };
+            assert_eq!(group.segment(true, false).kept, expected, "{part:?}");
+        }
+    }
+
+    #[test]
+    fn the_peak_is_where_the_kept_the_working_and_the_gradients_are_most() {
+        let segment = |kept, working, forward, parameters| Segment { kept, working, forward, parameters };
+        assert_eq!(peak(&[]), 0.0);
+        // At the start of the backward.
+        assert_eq!(peak(&[segment(5.0, 1.0, 0.0, 1.0), segment(5.0, 2.0, 0.0, 1.0)]), 13.0);
+        // At its end, by the gradients.
+        assert_eq!(peak(&[segment(1.0, 1.0, 0.0, 10.0), segment(1.0, 1.0, 0.0, 10.0)]), 22.0);
+        // In the forward.
+        assert_eq!(peak(&[segment(1.0, 0.0, 9.0, 0.0), segment(2.0, 1.0, 0.0, 0.0)]), 9.0);
+    }
+}

@@ -1,0 +1,28 @@
+//! Counts the multiply-accumulates that ran on a thread, in tests only: layers and attention report theirs here.
+
+use std::cell::Cell;
+
+thread_local! {
+    static LINEAR: Cell<u64> = const { Cell::new(0) };
+    static ATTENTION: Cell<u64> = const { Cell::new(0) };
+}
+
+/// Adds a product of `rows` rows of `inputs` values by a matrix of `outputs` columns.
+pub fn add_linear(rows: usize, inputs: usize, outputs: usize) {
+    if cfg!(test) {
+        LINEAR.set(LINEAR.get() + (rows * inputs * outputs) as u64);
+    }
+}
+
+/// Adds scores and weighted sums of `pairs` pairs of a query and a key; `dim` is the width of all heads together.
+pub fn add_attention(pairs: usize, dim: usize) {
+    if cfg!(test) {
+        ATTENTION.set(ATTENTION.get() + (2 * pairs * dim) as u64);
+    }
+}
+
+/// Returns the counts since the last call: linear layers, attention.
+#[cfg(test)]
+pub fn take() -> (u64, u64) {
+    (LINEAR.take(), ATTENTION.take())
+}

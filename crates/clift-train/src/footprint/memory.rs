@@ -1,0 +1,164 @@
+//! Peak memory of every part of a run, and a warning where the device has less.
+
+use clift_eval::vgg::VggShape;
+use clift_model::Parameters;
+use clift_model::cost::{InferenceSizes, Segment, UpdateSizes, inference_bytes, update_bytes};
+
+use super::machine::own_bytes;
+use super::scene_sizes::{
+    PARTS, VIEWS_PER_PASS, batch_sizes, cluster_counts, evaluated, image_values, largest, measures_lpips, num_tokens,
+    set_accumulate, trained_parts,
+};
+use crate::TrainError;
+use crate::config::Config;
+use crate::events::Stage;
+
+/// Returns the most memory of the process during a part of a run.
+///
+/// # Errors
+/// [`TrainError::BadConfig`] for sizes that cannot be.
+pub fn peak_bytes(config: &Config, part: Stage) -> Result<u64, TrainError> {
+    let bytes = match part {
+        Stage::Stage1 | Stage::Stage2 => update(config, part)?,
+        Stage::Clusters => inference_bytes(&config.model, &clusters(config)?),
+        Stage::Eval => inference_bytes(&config.model, &evaluation(config)?),
+    };
+    Ok(own_bytes() + bytes as u64)
+}
+
+/// Describes the part of a run that needs most of those beyond the `available` memory, with a change that would help;
+/// `None` where all fit, or where the system does not show its memory.
+///
+/// # Errors
+/// [`TrainError::BadConfig`] for sizes that cannot be.
+pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<String>, TrainError> {
+    let Some(available) = available else { return Ok(None) };
+    let mut largest = None;
+    for part in PARTS {
+        let bytes = peak_bytes(config, part)?;
+        if bytes > available && largest.is_none_or(|(_, most)| bytes >= most) {
+            largest = Some((part, bytes));
+        }
+    }
+    let Some((part, bytes)) = largest else { return Ok(None) };
+    let name = part.name();
+    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+    let device = config.device;
+    let needs =
+        format!("{name} needs about {:.1} GiB, and {:.1} GiB are there on {device}", gib(bytes), gib(available));
+    if trained_parts(part).is_empty() {
+        return Ok(Some(format!("{needs}: fewer context views, or smaller ones, would fit")));
+    }
+    let (batch_size, _) = batch_sizes(config, part);
+    let was_recomputed = config.recompute;
+    for recompute in [config.recompute, true] {
+        let mut config = Config { recompute, ..config.clone() };
+        let also = if recompute && !was_recomputed { "recompute = true and " } else { "" };
+        for parts in 1..=batch_size {
+            set_accumulate(&mut config, part, parts);
+            if peak_bytes(&config, part)? <= available {
+                return Ok(Some(format!("{needs}: {also}{name}.accumulate = {parts} would fit")));
+            }
+        }
+    }
+    Ok(Some(format!("{needs}: even one scene at a time with recompute = true does not fit")))
+}
+
+fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
+    let (batch_size, num_scenes) = batch_sizes(config, stage);
+    let num_image_values = image_values(config);
+    let vgg =
+        (config.loss.perceptual_weight > 0.0).then(|| VggShape::VGG19.sizes(config.data.height, config.data.width));
+    // Layers are kept before and behind their ReLU; what the targets are in the network is there until the differences
+    // are; a convolution orders its input anew.
+    let images = (num_scenes * config.data.views.num_targets) as f64;
+    let loss = vgg.map_or_else(Segment::default, |vgg| Segment {
+        kept: images * (2.0 * vgg.outputs + vgg.features),
+        working: images * 3.0 * vgg.widest,
+        forward: images * (2.0 * vgg.outputs + 2.0 * vgg.features + 2.0 * vgg.widest),
+        parameters: 0.0,
+    });
+    let sizes = UpdateSizes {
+        trained: trained_parts(stage),
+        num_scenes,
+        is_accumulated: num_scenes < batch_size,
+        recompute: config.recompute,
+        scene: largest(config, stage)?,
+        num_image_values,
+        loss,
+        loss_parameters: vgg.map_or(0.0, |vgg| vgg.parameters),
+    };
+    // Batches prepared ahead, as bytes.
+    let waiting = (config.data.num_prefetch + 1) * batch_size * num_image_values;
+    Ok(update_bytes(&config.model, &sizes) + waiting as f64)
+}
+
+fn clusters(config: &Config) -> Result<InferenceSizes, TrainError> {
+    let parameters = Parameters::of(&config.model);
+    let most = num_tokens(config, config.data.views.max_context)?;
+    Ok(InferenceSizes {
+        num_parameters: parameters.total,
+        num_loaded: parameters.encoder + parameters.renderer,
+        num_tokens: most,
+        num_clusters: cluster_counts(config, most)?.last().copied(),
+        num_targets: 0,
+        num_patches: num_tokens(config, 1)?,
+        num_image_values: image_values(config),
+        metric_working: 0.0,
+        metric_parameters: 0.0,
+    })
+}
+
+fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
+    let eval = &config.eval;
+    let parameters = Parameters::of(&config.model);
+    let all = num_tokens(config, eval.num_context)?;
+    let stored = eval.storage.iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
+    let sweep = evaluated(config);
+    let num_drawn: usize = stored.iter().map(|&count| sweep.drawn(count).len()).sum();
+    let vgg = measures_lpips(config).then(|| VggShape::VGG16.sizes(config.data.height, config.data.width));
+    Ok(InferenceSizes {
+        // Both stages have a renderer of their own.
+        num_parameters: parameters.total + parameters.renderer,
+        num_loaded: parameters.condenser + parameters.renderer,
+        num_tokens: all,
+        num_clusters: stored.iter().max().copied(),
+        num_targets: eval.num_targets.min(VIEWS_PER_PASS),
+        num_patches: num_tokens(config, 1)?,
+        // Images of every count and variant are held until the scene is measured.
+        num_image_values: eval.num_targets * (num_drawn + 3) * config.data.width * config.data.height * 3,
+        // What the images are in its layers, unit vectors of it, and one layer computed from another. Its file is whole
+        // in memory while its weights are taken out.
+        metric_working: vgg.map_or(0.0, |vgg| {
+            let rendering = (eval.num_targets + 2) as f64 * vgg.features + 3.0 * vgg.widest;
+            rendering.max(vgg.parameters)
+        }),
+        metric_parameters: vgg.map_or(0.0, |vgg| vgg.parameters),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn too_much_memory_is_said_with_the_smallest_change_that_fits() {
+        let mut config = Config { run_dir: "run".into(), ..Config::default() };
+        (config.data.synthetic.width, config.data.synthetic.height) = (256, 256);
+        config.data.views.max_context = 4;
+        let peak = |config: &Config, stage: Stage| peak_bytes(config, stage).expect("valid");
+        let warning = |available: u64| memory_warning(&config, Some(available)).expect("valid");
+        assert_eq!(warning(u64::MAX), None);
+        assert_eq!(memory_warning(&config, None).expect("valid"), None);
+        let most = peak(&config, Stage::Stage1).max(peak(&config, Stage::Stage2));
+        let text = warning(most - 1).expect("one part is too large");
+        assert!(text.contains(".accumulate = 2 would fit"), "{text}");
+        // Less than stage 2, the largest, takes scene by scene.
+        let mut one_by_one = config.clone();
+        one_by_one.stage2.accumulate = config.stage2.batch_size;
+        let text = warning(peak(&one_by_one, Stage::Stage2) - 1).expect("too large");
+        assert!(text.contains("recompute = true and stage"), "{text}");
+        let text = warning(1 << 20).expect("too large");
+        assert!(text.ends_with("even one scene at a time with recompute = true does not fit"), "{text}");
+    }
+}
