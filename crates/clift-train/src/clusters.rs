@@ -14,46 +14,12 @@ use clift_data::order::{below, derive_seed, item_rng};
 use clift_data::{ClipReader, DataError, Ledger, ViewIndices};
 use clift_eval::upload_views;
 use clift_model::{Encoder, Grouping, SceneClusters, tile_clusters};
-use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
+use crate::cluster_entry::{Entry, Index, VERSION};
 use crate::cluster_journal::{Journal, Origin};
 use crate::config::{ClustersConfig, Config};
 use crate::events::{Event, Sink, Stage};
-
-const VERSION: u32 = 1;
-
-/// Most tokens of a scene: ids are kept in 16 bits.
-pub const MAX_TOKENS: usize = 1 << 16;
-
-/// One clustered context set of a scene.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Entry {
-    /// Key of the scene.
-    pub key: String,
-    /// Frames of the contexts.
-    pub context: Vec<usize>,
-    /// Tokens of the scene.
-    pub num_tokens: usize,
-    /// Clusters.
-    pub num_storage_tokens: usize,
-    /// Where the entry starts in `clusters.bin`.
-    pub offset_bytes: u64,
-}
-
-/// What `index.json` holds.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct Index {
-    pub version: u32,
-    /// Hash of the encoder's weights.
-    pub encoder: String,
-    /// The settings that decide the clusters, as JSON in a string: read back, numbers could differ in the last digit.
-    pub settings: String,
-    pub skipped: Ledger,
-    pub entries: Vec<Entry>,
-}
 
 /// What the cache of a run is made from.
 pub struct ClusterJob<'a> {
@@ -131,7 +97,7 @@ impl ClusterJob<'_> {
                 let fit = kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
                 fit.clusters.scenes()[0].clone()
             }
-            Grouping::Patch => {
+            Grouping::Tile => {
                 let grid = [clip.context.height, clip.context.width].map(|side| side / config.model.patch_size);
                 tile_clusters(num_context, grid, count)?
             }
@@ -215,20 +181,14 @@ impl ClusterCache {
     }
 }
 
-impl Entry {
-    /// Whether a scene can have so many tokens and clusters. No number is allocated or added up before.
-    fn is_possible(&self) -> bool {
-        (1..=MAX_TOKENS).contains(&self.num_tokens) && (1..=self.num_tokens).contains(&self.num_storage_tokens)
-    }
-
-    pub(crate) fn num_bytes(&self) -> u64 {
-        (self.num_tokens as u64).saturating_add(self.num_storage_tokens as u64).saturating_mul(2)
-    }
-}
-
 /// The settings that decide which clusters come out.
 fn settings(config: &Config) -> String {
     let data = &config.data;
+    let mut clusters = serde_json::json!(config.clusters);
+    if config.clusters.grouping == Grouping::Tile {
+        // The former name: with the present one, existing caches would be stale.
+        clusters["grouping"] = "patch".into();
+    }
     serde_json::json!({
         "seed": config.seed,
         "source": data.source,
@@ -240,7 +200,7 @@ fn settings(config: &Config) -> String {
         "exact_principal_point": data.clip_options().exact_principal_point,
         "filters": data.filters,
         "views": data.views,
-        "clusters": config.clusters,
+        "clusters": clusters,
     })
     .to_string()
 }

@@ -19,7 +19,7 @@ use crate::TrainError;
 use crate::config::{Config, SourceKind};
 use crate::events::{Event, Sink};
 use crate::held_out::HeldOut;
-use crate::import::{Imported, go_on};
+use crate::import_record::{Imported, go_on};
 use crate::scenes;
 use crate::trained::{ModelPath, Trained, check_heads};
 

@@ -181,10 +181,11 @@ pub fn memory_warning(config: &Config, plan: &Plan) -> Option<String> {
         part.is_ok_and(|part| part.peak_bytes <= available)
     };
     let (batch_size, _) = batch_sizes(config, stage);
-    let was_recomputed = config.recompute;
-    for recompute in [config.recompute, true] {
-        let mut config = Config { recompute, ..config.clone() };
-        let also = if recompute && !was_recomputed { "recompute = true and " } else { "" };
+    let was_recomputed = config.activation_checkpointing;
+    for activation_checkpointing in [config.activation_checkpointing, true] {
+        let mut config = Config { activation_checkpointing, ..config.clone() };
+        let also =
+            if activation_checkpointing && !was_recomputed { "activation_checkpointing = true and " } else { "" };
         for parts in 1..=batch_size {
             match stage {
                 Stage::Stage2 => config.stage2.accumulate = parts,
@@ -195,7 +196,7 @@ pub fn memory_warning(config: &Config, plan: &Plan) -> Option<String> {
             }
         }
     }
-    Some(format!("{needs}: even one scene at a time with recompute = true does not fit"))
+    Some(format!("{needs}: even one scene at a time with activation_checkpointing = true does not fit"))
 }
 
 fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool) -> Result<PartPlan, TrainError> {
@@ -217,7 +218,7 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
         stage,
         num_scenes: part_size as f64,
         is_accumulated: part_size < batch_size,
-        recompute: config.recompute,
+        recompute: config.activation_checkpointing,
         scene: largest(config, stage)?,
         num_picture_values: picture_values(config),
         perceptual: (config.loss.perceptual_weight > 0.0)
@@ -440,10 +441,13 @@ mod tests {
         let least = plan(&one_by_one, false).expect("valid");
         planned.available_bytes = Some(least.parts[2].peak_bytes - 1);
         let warning = memory_warning(&config, &planned).expect("too large");
-        assert!(warning.contains("recompute = true and stage"), "{warning}");
+        assert!(warning.contains("activation_checkpointing = true and stage"), "{warning}");
         planned.available_bytes = Some(1 << 20);
         let warning = memory_warning(&config, &planned).expect("too large");
-        assert!(warning.ends_with("even one scene at a time with recompute = true does not fit"), "{warning}");
+        assert!(
+            warning.ends_with("even one scene at a time with activation_checkpointing = true does not fit"),
+            "{warning}"
+        );
     }
 
     #[test]

@@ -270,17 +270,8 @@ impl Run {
     }
 
     fn plan(&self, stage: Stage, batches: Arc<MakeBatch>) -> StagePlan<'_> {
-        let Config { stage1, stage2, .. } = &self.config;
-        let (num_steps, accumulate, optimizer, renderer_lr_factor) = match stage {
-            Stage::Stage2 => (stage2.steps, stage2.accumulate, &stage2.optimizer, stage2.renderer_lr_factor),
-            _ => (stage1.steps, stage1.accumulate, &stage1.optimizer, 1.0),
-        };
         StagePlan {
-            stage,
-            num_steps,
-            accumulate,
-            optimizer,
-            renderer_lr_factor,
+            settings: self.config.stage(stage),
             batches,
             config: &self.config,
             folder: self.folder(stage.name()),

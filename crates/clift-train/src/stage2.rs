@@ -9,9 +9,10 @@ use clift_data::{Clip, ClipReader, Skip, ViewIndices};
 use clift_model::SceneClusters;
 
 use crate::TrainError;
-use crate::clusters::{ClusterCache, Entry};
+use crate::batch::{StageBatch, TokenChoice};
+use crate::cluster_entry::Entry;
+use crate::clusters::ClusterCache;
 use crate::config::Config;
-use crate::step::{StageBatch, TokenChoice};
 
 /// Entries tried for one slot before the batch fails.
 const MAX_ATTEMPTS: u32 = 16;

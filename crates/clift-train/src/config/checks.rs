@@ -4,9 +4,9 @@ use clift_data::{DataError, Split};
 use clift_eval::perceptual::PERCEPTUAL_MIN_SIZE_PX;
 use clift_model::Grouping;
 
-use super::{Config, DataConfig, OptimizerConfig, SourceKind};
 use crate::TrainError;
-use crate::clusters::MAX_TOKENS;
+use crate::config::{Config, DataConfig, MAX_TOKENS, OptimizerConfig, SourceKind};
+use crate::events::Stage;
 
 impl Config {
     /// Checks every value that no type can check.
@@ -15,7 +15,7 @@ impl Config {
     /// [`TrainError::BadConfig`] naming the key, the value and the fix.
     pub fn validate(&self) -> Result<(), TrainError> {
         if self.run_dir.as_os_str().is_empty() {
-            return Err(bad("run_dir", "\"\"", "write the folder that is to receive the run"));
+            return Err(TrainError::bad_config("run_dir", "\"\"", "write the folder that is to receive the run"));
         }
         self.model.validate()?;
         self.data.views.validate().map_err(in_section("data.views"))?;
@@ -24,11 +24,13 @@ impl Config {
         self.data.validate()?;
         self.validate_loss()?;
         let Self { stage1, stage2, clusters, eval, checkpoint, .. } = self;
+        for settings in [Stage::Stage1, Stage::Stage2].map(|stage| self.stage(stage)) {
+            let name = settings.stage.name();
+            in_range(&format!("{name}.batch_size"), settings.batch_size, 1, usize::MAX)?;
+            in_range(&format!("{name}.accumulate"), settings.accumulate, 1, settings.batch_size)?;
+            settings.optimizer.validate(name)?;
+        }
         for (key, value, least, most) in [
-            ("stage1.batch_size", stage1.batch_size, 1, usize::MAX),
-            ("stage1.accumulate", stage1.accumulate, 1, stage1.batch_size),
-            ("stage2.batch_size", stage2.batch_size, 1, usize::MAX),
-            ("stage2.accumulate", stage2.accumulate, 1, stage2.batch_size),
             ("clusters.num_passes", clusters.num_passes, 1, usize::MAX),
             ("clusters.kmeans.max_iterations", clusters.kmeans.max_iterations, 1, usize::MAX),
             ("eval.num_context", eval.num_context, 2, 10_000),
@@ -42,24 +44,30 @@ impl Config {
             && (checkpoint.every == 0 || !checkpoint.keep_every.is_multiple_of(checkpoint.every))
         {
             let fix = format!("write 0 or a multiple of checkpoint.every, which is {}", checkpoint.every);
-            return Err(bad("checkpoint.keep_every", checkpoint.keep_every, &fix));
+            return Err(TrainError::bad_config("checkpoint.keep_every", checkpoint.keep_every, &fix));
         }
         for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.storage", &eval.storage)] {
             if counts.is_empty() {
-                return Err(bad(key, "[]", "write at least one count"));
+                return Err(TrainError::bad_config(key, "[]", "write at least one count"));
             }
         }
         let [low, high] = stage1.keep_tokens;
         if !(low > 0.0 && low <= high && high <= 1.0) {
-            return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
+            return Err(TrainError::bad_config(
+                "stage1.keep_tokens",
+                format!("[{low}, {high}]"),
+                "write 0 < smallest <= largest <= 1",
+            ));
         }
         if !(0.0..1.0).contains(&clusters.kmeans.tolerance) {
-            return Err(bad("clusters.kmeans.tolerance", clusters.kmeans.tolerance, "write 0 or a small fraction"));
+            return Err(TrainError::bad_config(
+                "clusters.kmeans.tolerance",
+                clusters.kmeans.tolerance,
+                "write 0 or a small fraction",
+            ));
         }
-        stage1.optimizer.validate("stage1")?;
-        stage2.optimizer.validate("stage2")?;
         if !(0.0..=1.0).contains(&stage2.renderer_lr_factor) {
-            return Err(bad("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
+            return Err(TrainError::bad_config("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
         }
         Ok(())
     }
@@ -73,7 +81,7 @@ impl Config {
                 let near =
                     if below == 0 { patch_size.to_string() } else { format!("{below} or {}", below + patch_size) };
                 let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
-                return Err(bad(key, value, &fix));
+                return Err(TrainError::bad_config(key, value, &fix));
             }
         }
         Ok(())
@@ -83,14 +91,14 @@ impl Config {
     fn validate_loss(&self) -> Result<(), TrainError> {
         let weight = self.loss.perceptual_weight;
         if !(weight >= 0.0 && weight.is_finite()) {
-            return Err(bad("loss.perceptual_weight", weight, "write 0 or a positive number"));
+            return Err(TrainError::bad_config("loss.perceptual_weight", weight, "write 0 or a positive number"));
         }
         let DataConfig { width, height, .. } = self.data;
         if weight > 0.0 && width.min(height) < PERCEPTUAL_MIN_SIZE_PX {
             let fix = format!(
                 "its network needs pictures of {PERCEPTUAL_MIN_SIZE_PX} x {PERCEPTUAL_MIN_SIZE_PX}, these have {width} x {height}: write 0"
             );
-            return Err(bad("loss.perceptual_weight", weight, &fix));
+            return Err(TrainError::bad_config("loss.perceptual_weight", weight, &fix));
         }
         Ok(())
     }
@@ -102,19 +110,23 @@ impl Config {
         let most_tokens = views.max_context.saturating_mul(tokens_per_view);
         if most_tokens > MAX_TOKENS {
             let fix = format!("{most_tokens} tokens; at most {MAX_TOKENS} are possible: fewer views or smaller ones");
-            return Err(bad("data.views.max_context", views.max_context, &fix));
+            return Err(TrainError::bad_config("data.views.max_context", views.max_context, &fix));
         }
         let fewest_tokens = views.min_context * tokens_per_view;
         if let Some(count) = self.clusters.grid.iter().find(|count| count.of(fewest_tokens).is_err()) {
-            return Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens")));
+            return Err(TrainError::bad_config(
+                "clusters.grid",
+                count,
+                &format!("a scene has as few as {fewest_tokens} tokens"),
+            ));
         }
-        if self.clusters.grouping == Grouping::Patch {
+        if self.clusters.grouping == Grouping::Tile {
             let grid = self.clusters.grid.iter().map(|count| ("clusters.grid", count));
             let counts = grid.chain([("eval.validation_storage", &self.eval.validation_storage)]);
             for (key, count) in counts {
                 let too_few = |views: usize| count.of(views * tokens_per_view).is_ok_and(|count| count < views);
                 if too_few(views.min_context) || too_few(views.max_context) {
-                    return Err(bad(key, count, "write at least a tile for every context view"));
+                    return Err(TrainError::bad_config(key, count, "write at least a tile for every context view"));
                 }
             }
         }
@@ -130,7 +142,7 @@ impl DataConfig {
             return self.validate_synthetic();
         }
         if self.root.is_none() {
-            return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
+            return Err(TrainError::bad_config("data.root", "missing", "write the folder that holds train/ and test/"));
         }
         self.filters.validate().map_err(in_section("data.filters"))
     }
@@ -143,11 +155,15 @@ impl DataConfig {
                 "synthetic scenes are {} x {}: write data.synthetic.width and data.synthetic.height of at least {} and {}",
                 synthetic.width, synthetic.height, self.width, self.height
             );
-            return Err(bad("data.width, data.height", format!("{}, {}", self.width, self.height), &fix));
+            return Err(TrainError::bad_config(
+                "data.width, data.height",
+                format!("{}, {}", self.width, self.height),
+                &fix,
+            ));
         }
         if synthetic.split != Split::default() {
             let fix = "leave it out: a run trains on one split and measures on the other";
-            return Err(bad("data.synthetic.split", synthetic.split, fix));
+            return Err(TrainError::bad_config("data.synthetic.split", synthetic.split, fix));
         }
         Ok(())
     }
@@ -157,16 +173,24 @@ impl OptimizerConfig {
     fn validate(&self, stage: &str) -> Result<(), TrainError> {
         for (key, value) in [("learning_rate", self.learning_rate), ("max_grad_norm", self.max_grad_norm)] {
             if !(value > 0.0 && value.is_finite()) {
-                return Err(bad(&format!("{stage}.optimizer.{key}"), value, "write a positive number"));
+                return Err(TrainError::bad_config(
+                    &format!("{stage}.optimizer.{key}"),
+                    value,
+                    "write a positive number",
+                ));
             }
         }
         if !(self.weight_decay >= 0.0 && self.weight_decay.is_finite()) {
             let key = format!("{stage}.optimizer.weight_decay");
-            return Err(bad(&key, self.weight_decay, "write 0 or a positive number"));
+            return Err(TrainError::bad_config(&key, self.weight_decay, "write 0 or a positive number"));
         }
         if !(self.spike_factor == 0.0 || (self.spike_factor > 1.0 && self.spike_factor.is_finite())) {
             let key = format!("{stage}.optimizer.spike_factor");
-            return Err(bad(&key, self.spike_factor, "write 0 to look for no spikes, or a number above 1"));
+            return Err(TrainError::bad_config(
+                &key,
+                self.spike_factor,
+                "write 0 to look for no spikes, or a number above 1",
+            ));
         }
         in_range(&format!("{stage}.optimizer.max_bad_steps"), self.max_bad_steps as usize, 1, usize::MAX)
     }
@@ -177,7 +201,7 @@ fn in_range(key: &str, value: usize, least: usize, most: usize) -> Result<(), Tr
         return Ok(());
     }
     let fix = if most == usize::MAX { format!("write at least {least}") } else { format!("write {least} to {most}") };
-    Err(bad(key, value, &fix))
+    Err(TrainError::bad_config(key, value, &fix))
 }
 
 /// Names the key of a section's own refusal in full; for `map_err`.
@@ -185,13 +209,9 @@ fn in_section(section: &'static str) -> impl FnOnce(DataError) -> TrainError {
     move |error| match error {
         // Such a problem says "is VALUE; FIX".
         DataError::BadConfig { key, problem } => match problem.strip_prefix("is ").and_then(|is| is.split_once("; ")) {
-            Some((value, fix)) => bad(&format!("{section}.{key}"), value, fix),
+            Some((value, fix)) => TrainError::bad_config(&format!("{section}.{key}"), value, fix),
             None => DataError::BadConfig { key: format!("{section}.{key}"), problem }.into(),
         },
         other => other.into(),
     }
-}
-
-pub(super) fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {
-    TrainError::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
 }

@@ -26,7 +26,11 @@ pub struct Middle {
 /// Multiplications of a scene's share of an update.
 pub fn update_macs(config: &Config, stage: Stage, scene: &SceneSizes) -> f64 {
     let macs = Macs::of(&config.model, scene);
-    if stage == Stage::Stage2 { macs.stage2_update(config.recompute) } else { macs.stage1_update(config.recompute) }
+    if stage == Stage::Stage2 {
+        macs.stage2_update(config.activation_checkpointing)
+    } else {
+        macs.stage1_update(config.activation_checkpointing)
+    }
 }
 
 /// Scenes of a batch, and of one of its parts at most.
