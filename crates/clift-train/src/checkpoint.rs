@@ -12,7 +12,7 @@ use clift_model::{ModelConfig, weights};
 
 use crate::TrainError;
 use crate::config::CheckpointConfig;
-use crate::progress::{Best, Fingerprint, Progress, State};
+use crate::progress::{Best, Fingerprint, Progress, State, VERSION};
 use crate::step::Learner;
 
 const MODEL: &str = "model.bpk";
@@ -72,7 +72,7 @@ impl Checkpoints {
             files.insert(name.to_owned(), Fingerprint::of(&file).map_err(TrainError::io(SAVING, &file))?);
         }
         let (progress, model, loss_scale) = (progress.clone(), self.model.clone(), learner.loss_scale);
-        State::new(progress, files, model, loss_scale).write(temporary)?;
+        State { version: VERSION, progress, files, model, loss_scale }.write(temporary)?;
         if path.exists() {
             // Only where somebody moved newer checkpoints away and trains those steps again.
             std::fs::remove_dir_all(path).map_err(TrainError::io("replacing a checkpoint", path))?;
@@ -87,9 +87,7 @@ impl Checkpoints {
     /// [`TrainError::Io`] and [`TrainError::BadFile`]; the checkpoint is then as it was.
     pub fn update(&self, progress: &Progress) -> Result<(), TrainError> {
         let path = self.path_of(progress.step);
-        let mut state = State::read(&path)?;
-        state.progress = progress.clone();
-        state.write(&path)?;
+        State { progress: progress.clone(), ..State::read(&path)? }.write(&path)?;
         self.prune(progress)
     }
 

@@ -1,9 +1,10 @@
 //! Entries of a cluster cache and their index.
 
 use clift_data::Ledger;
+use clift_model::Grouping;
 use serde::{Deserialize, Serialize};
 
-use crate::config::MAX_TOKENS;
+use crate::config::{Config, MAX_TOKENS};
 
 pub(crate) const VERSION: u32 = 1;
 
@@ -30,7 +31,7 @@ pub(crate) struct Index {
     pub version: u32,
     /// Hash of the encoder's weights.
     pub encoder: String,
-    /// The settings that decide the clusters, as JSON in a string: read back, numbers could differ in the last digit.
+    /// The settings that decide the clusters, as JSON in a string, compared as text.
     pub settings: String,
     pub skipped: Ledger,
     pub entries: Vec<Entry>,
@@ -45,4 +46,28 @@ impl Entry {
     pub(crate) fn num_bytes(&self) -> u64 {
         (self.num_tokens as u64).saturating_add(self.num_storage_tokens as u64).saturating_mul(2)
     }
+}
+
+/// The settings that decide which clusters come out.
+pub(crate) fn settings(config: &Config) -> String {
+    let data = &config.data;
+    let mut clusters = serde_json::json!(config.clusters);
+    if config.clusters.grouping == Grouping::Tile {
+        // The former name: with the present one, existing caches would be stale.
+        clusters["grouping"] = "patch".into();
+    }
+    serde_json::json!({
+        "seed": config.seed,
+        "source": data.source,
+        "root": data.root,
+        "files": data.files,
+        "synthetic": data.synthetic,
+        "size": [data.width, data.height],
+        "poses": [serde_json::json!(data.pose_rotation), serde_json::json!(data.pose_scale)],
+        "exact_principal_point": data.clip_options().exact_principal_point,
+        "filters": data.filters,
+        "views": data.views,
+        "clusters": clusters,
+    })
+    .to_string()
 }

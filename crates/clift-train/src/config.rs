@@ -14,6 +14,7 @@ use clift_model::{Grouping, KMeans, ModelConfig, Precision};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
+use crate::error::bad;
 
 /// Most tokens of a scene: ids are kept in 16 bits.
 pub const MAX_TOKENS: usize = 1 << 16;
@@ -193,13 +194,9 @@ impl LossConfig {
             format!("{what}; `{PERCEPTUAL_COMMAND}` makes them, loss.perceptual_weight = 0 trains without the term")
         };
         match self.vgg_weights.as_deref() {
-            None => Err(TrainError::bad_config(
-                "loss.vgg_weights",
-                "missing",
-                &fix("the perceptual term needs the weights of VGG-19"),
-            )),
+            None => Err(bad("loss.vgg_weights", "missing", &fix("the perceptual term needs the weights of VGG-19"))),
             Some(path) if !path.is_file() => {
-                Err(TrainError::bad_config("loss.vgg_weights", path.display(), &fix("there is no such file")))
+                Err(bad("loss.vgg_weights", path.display(), &fix("there is no such file")))
             }
             Some(path) => Ok(Some(path)),
         }

@@ -198,13 +198,13 @@ impl TrainError {
         move |source| Self::Io { action, source, path: path.to_path_buf() }
     }
 
-    /// A [`TrainError::BadConfig`].
-    pub(crate) fn bad_config(key: &str, value: impl std::fmt::Display, fix: &str) -> Self {
-        Self::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
-    }
-
     /// A [`TrainError::BadFile`]; for `map_err`.
     pub(crate) fn bad_file<E: std::fmt::Display>(what: &'static str, path: &Path) -> impl FnOnce(E) -> Self {
         move |reason| Self::BadFile { what, reason: reason.to_string(), path: path.to_path_buf() }
     }
+}
+
+/// A [`TrainError::BadConfig`].
+pub(crate) fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {
+    TrainError::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
 }

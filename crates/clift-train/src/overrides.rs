@@ -32,7 +32,7 @@ impl fmt::Display for Override {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { key, from, to, is_renamed } = self;
         if *is_renamed {
-            return write!(f, "the configuration has `{key}`, which is named `{to}` now");
+            return write!(f, "`{key}` is named `{to}` now");
         }
         write!(f, "--set {key}: {} -> {to}", from.as_deref().unwrap_or("(default)"))
     }

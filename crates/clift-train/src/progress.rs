@@ -14,7 +14,8 @@ use crate::TrainError;
 use crate::bad_steps::Recent;
 use crate::loss_scale::LossScale;
 
-const VERSION: u32 = 3;
+/// The version that is written.
+pub(crate) const VERSION: u32 = 3;
 /// Has the numbers of [`Progress`] as strings.
 const STRING_VERSION: u32 = 2;
 
@@ -22,7 +23,7 @@ const STRING_VERSION: u32 = 2;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct State {
-    version: u32,
+    pub version: u32,
     pub progress: Progress,
     /// The other files, by name.
     pub files: BTreeMap<String, Fingerprint>,
@@ -78,15 +79,6 @@ fn null_as_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Err
 }
 
 impl State {
-    pub fn new(
-        progress: Progress,
-        files: BTreeMap<String, Fingerprint>,
-        model: Option<ModelConfig>,
-        loss_scale: Option<LossScale>,
-    ) -> Self {
-        Self { version: VERSION, progress, files, model, loss_scale }
-    }
-
     /// Reads `state.json` of a checkpoint, also of version 2.
     ///
     /// # Errors
@@ -163,7 +155,7 @@ mod tests {
         let mut recent = Recent::default();
         values.iter().for_each(|&value| recent.push(value, -value));
         let progress = Progress { step: 7, best: Some(Best { step: 5, psnr }), recent, ..Progress::default() };
-        State::new(progress, BTreeMap::new(), None, None)
+        State { version: VERSION, progress, files: BTreeMap::new(), model: None, loss_scale: None }
     }
 
     /// Finite numbers of every sign and exponent, and the extreme ones.

@@ -13,8 +13,9 @@ use clift_eval::{Condensed, Networks, Summary, System};
 use clift_model::{Clift, Encoder, ModelConfig, weights};
 
 use crate::TrainError;
+use crate::cluster_builder::ClusterJob;
 use crate::cluster_journal::remove_journal;
-use crate::clusters::{ClusterCache, ClusterJob};
+use crate::clusters::ClusterCache;
 use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
 use crate::held_out::{HeldOut, write_ledger};

@@ -165,6 +165,16 @@ mod tests {
     }
 
     #[test]
+    fn a_run_with_former_names_is_resumed() {
+        let mut tiles = old();
+        tiles.clusters.grouping = clift_model::Grouping::Tile;
+        let text = toml::to_string_pretty(&tiles).unwrap();
+        let former = text.replace("activation_checkpointing", "recompute").replace("\"tile\"", "\"patch\"");
+        assert!(former.contains("recompute = false") && former.contains("grouping = \"patch\""));
+        assert!(differ(&former, &tiles, false).unwrap().is_empty());
+    }
+
+    #[test]
     fn a_key_that_this_version_does_not_have_is_a_difference() {
         let text = format!("wings = 2\n{}", toml::to_string_pretty(&old()).unwrap());
         let message = differ(&text, &old(), false).unwrap_err().to_string();

@@ -6,6 +6,7 @@ use clift_model::Grouping;
 
 use crate::TrainError;
 use crate::config::{Config, DataConfig, MAX_TOKENS, OptimizerConfig, SourceKind};
+use crate::error::bad;
 use crate::events::Stage;
 
 impl Config {
@@ -15,7 +16,7 @@ impl Config {
     /// [`TrainError::BadConfig`] naming the key, the value and the fix.
     pub fn validate(&self) -> Result<(), TrainError> {
         if self.run_dir.as_os_str().is_empty() {
-            return Err(TrainError::bad_config("run_dir", "\"\"", "write the folder that is to receive the run"));
+            return Err(bad("run_dir", "\"\"", "write the folder that is to receive the run"));
         }
         self.model.validate()?;
         self.data.views.validate().map_err(in_section("data.views"))?;
@@ -44,30 +45,22 @@ impl Config {
             && (checkpoint.every == 0 || !checkpoint.keep_every.is_multiple_of(checkpoint.every))
         {
             let fix = format!("write 0 or a multiple of checkpoint.every, which is {}", checkpoint.every);
-            return Err(TrainError::bad_config("checkpoint.keep_every", checkpoint.keep_every, &fix));
+            return Err(bad("checkpoint.keep_every", checkpoint.keep_every, &fix));
         }
         for (key, counts) in [("clusters.grid", &clusters.grid), ("eval.storage", &eval.storage)] {
             if counts.is_empty() {
-                return Err(TrainError::bad_config(key, "[]", "write at least one count"));
+                return Err(bad(key, "[]", "write at least one count"));
             }
         }
         let [low, high] = stage1.keep_tokens;
         if !(low > 0.0 && low <= high && high <= 1.0) {
-            return Err(TrainError::bad_config(
-                "stage1.keep_tokens",
-                format!("[{low}, {high}]"),
-                "write 0 < smallest <= largest <= 1",
-            ));
+            return Err(bad("stage1.keep_tokens", format!("[{low}, {high}]"), "write 0 < smallest <= largest <= 1"));
         }
         if !(0.0..1.0).contains(&clusters.kmeans.tolerance) {
-            return Err(TrainError::bad_config(
-                "clusters.kmeans.tolerance",
-                clusters.kmeans.tolerance,
-                "write 0 or a small fraction",
-            ));
+            return Err(bad("clusters.kmeans.tolerance", clusters.kmeans.tolerance, "write 0 or a small fraction"));
         }
         if !(0.0..=1.0).contains(&stage2.renderer_lr_factor) {
-            return Err(TrainError::bad_config("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
+            return Err(bad("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
         }
         Ok(())
     }
@@ -81,7 +74,7 @@ impl Config {
                 let near =
                     if below == 0 { patch_size.to_string() } else { format!("{below} or {}", below + patch_size) };
                 let fix = format!("write a multiple of model.patch_size = {patch_size}, such as {near}");
-                return Err(TrainError::bad_config(key, value, &fix));
+                return Err(bad(key, value, &fix));
             }
         }
         Ok(())
@@ -91,14 +84,14 @@ impl Config {
     fn validate_loss(&self) -> Result<(), TrainError> {
         let weight = self.loss.perceptual_weight;
         if !(weight >= 0.0 && weight.is_finite()) {
-            return Err(TrainError::bad_config("loss.perceptual_weight", weight, "write 0 or a positive number"));
+            return Err(bad("loss.perceptual_weight", weight, "write 0 or a positive number"));
         }
         let DataConfig { width, height, .. } = self.data;
         if weight > 0.0 && width.min(height) < PERCEPTUAL_MIN_SIZE_PX {
             let fix = format!(
                 "its network needs pictures of {PERCEPTUAL_MIN_SIZE_PX} x {PERCEPTUAL_MIN_SIZE_PX}, these have {width} x {height}: write 0"
             );
-            return Err(TrainError::bad_config("loss.perceptual_weight", weight, &fix));
+            return Err(bad("loss.perceptual_weight", weight, &fix));
         }
         Ok(())
     }
@@ -110,15 +103,11 @@ impl Config {
         let most_tokens = views.max_context.saturating_mul(tokens_per_view);
         if most_tokens > MAX_TOKENS {
             let fix = format!("{most_tokens} tokens; at most {MAX_TOKENS} are possible: fewer views or smaller ones");
-            return Err(TrainError::bad_config("data.views.max_context", views.max_context, &fix));
+            return Err(bad("data.views.max_context", views.max_context, &fix));
         }
         let fewest_tokens = views.min_context * tokens_per_view;
         if let Some(count) = self.clusters.grid.iter().find(|count| count.of(fewest_tokens).is_err()) {
-            return Err(TrainError::bad_config(
-                "clusters.grid",
-                count,
-                &format!("a scene has as few as {fewest_tokens} tokens"),
-            ));
+            return Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens")));
         }
         if self.clusters.grouping == Grouping::Tile {
             let grid = self.clusters.grid.iter().map(|count| ("clusters.grid", count));
@@ -126,7 +115,7 @@ impl Config {
             for (key, count) in counts {
                 let too_few = |views: usize| count.of(views * tokens_per_view).is_ok_and(|count| count < views);
                 if too_few(views.min_context) || too_few(views.max_context) {
-                    return Err(TrainError::bad_config(key, count, "write at least a tile for every context view"));
+                    return Err(bad(key, count, "write at least a tile for every context view"));
                 }
             }
         }
@@ -142,7 +131,7 @@ impl DataConfig {
             return self.validate_synthetic();
         }
         if self.root.is_none() {
-            return Err(TrainError::bad_config("data.root", "missing", "write the folder that holds train/ and test/"));
+            return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
         }
         self.filters.validate().map_err(in_section("data.filters"))
     }
@@ -155,15 +144,11 @@ impl DataConfig {
                 "synthetic scenes are {} x {}: write data.synthetic.width and data.synthetic.height of at least {} and {}",
                 synthetic.width, synthetic.height, self.width, self.height
             );
-            return Err(TrainError::bad_config(
-                "data.width, data.height",
-                format!("{}, {}", self.width, self.height),
-                &fix,
-            ));
+            return Err(bad("data.width, data.height", format!("{}, {}", self.width, self.height), &fix));
         }
         if synthetic.split != Split::default() {
             let fix = "leave it out: a run trains on one split and measures on the other";
-            return Err(TrainError::bad_config("data.synthetic.split", synthetic.split, fix));
+            return Err(bad("data.synthetic.split", synthetic.split, fix));
         }
         Ok(())
     }
@@ -173,24 +158,16 @@ impl OptimizerConfig {
     fn validate(&self, stage: &str) -> Result<(), TrainError> {
         for (key, value) in [("learning_rate", self.learning_rate), ("max_grad_norm", self.max_grad_norm)] {
             if !(value > 0.0 && value.is_finite()) {
-                return Err(TrainError::bad_config(
-                    &format!("{stage}.optimizer.{key}"),
-                    value,
-                    "write a positive number",
-                ));
+                return Err(bad(&format!("{stage}.optimizer.{key}"), value, "write a positive number"));
             }
         }
         if !(self.weight_decay >= 0.0 && self.weight_decay.is_finite()) {
             let key = format!("{stage}.optimizer.weight_decay");
-            return Err(TrainError::bad_config(&key, self.weight_decay, "write 0 or a positive number"));
+            return Err(bad(&key, self.weight_decay, "write 0 or a positive number"));
         }
         if !(self.spike_factor == 0.0 || (self.spike_factor > 1.0 && self.spike_factor.is_finite())) {
             let key = format!("{stage}.optimizer.spike_factor");
-            return Err(TrainError::bad_config(
-                &key,
-                self.spike_factor,
-                "write 0 to look for no spikes, or a number above 1",
-            ));
+            return Err(bad(&key, self.spike_factor, "write 0 to look for no spikes, or a number above 1"));
         }
         in_range(&format!("{stage}.optimizer.max_bad_steps"), self.max_bad_steps as usize, 1, usize::MAX)
     }
@@ -201,7 +178,7 @@ fn in_range(key: &str, value: usize, least: usize, most: usize) -> Result<(), Tr
         return Ok(());
     }
     let fix = if most == usize::MAX { format!("write at least {least}") } else { format!("write {least} to {most}") };
-    Err(TrainError::bad_config(key, value, &fix))
+    Err(bad(key, value, &fix))
 }
 
 /// Names the key of a section's own refusal in full; for `map_err`.
@@ -209,7 +186,7 @@ fn in_section(section: &'static str) -> impl FnOnce(DataError) -> TrainError {
     move |error| match error {
         // Such a problem says "is VALUE; FIX".
         DataError::BadConfig { key, problem } => match problem.strip_prefix("is ").and_then(|is| is.split_once("; ")) {
-            Some((value, fix)) => TrainError::bad_config(&format!("{section}.{key}"), value, fix),
+            Some((value, fix)) => bad(&format!("{section}.{key}"), value, fix),
             None => DataError::BadConfig { key: format!("{section}.{key}"), problem }.into(),
         },
         other => other.into(),
