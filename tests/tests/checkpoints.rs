@@ -145,7 +145,7 @@ fn a_checkpoint_that_does_not_fit_leaves_nothing_behind() {
 fn released_variants_train_in_both_stages_and_leave_as_checkpoints() {
     let place = Place::new();
     for variant in ["released-re10k", "released-dl3dv"] {
-        let set = [&format!("model.variant={variant}")[..], "checkpoint.every=2", "recompute=true"];
+        let set = [&format!("model.variant={variant}")[..], "checkpoint.every=2", "activation_checkpointing=true"];
         place.train(variant, &set, &[]).ok();
         let [first, second] = ["stage1", "stage2"].map(|stage| place.weights(variant, stage));
         let moved = |part: &str| {

@@ -212,7 +212,7 @@ fn the_perceptual_term_trains_both_stages_and_is_refused_without_weights() {
         assert!(number("loss") > mse, "PSNR is of the squared error alone: {line}");
     }
     // The same updates, computed again; the same losses to the last digit of f32.
-    place.train("again", &[weight, &file, "recompute=true"], &[]).ok();
+    place.train("again", &[weight, &file, "activation_checkpointing=true"], &[]).ok();
     place.assert_same_result("again", "run");
     // And it does make a difference.
     place.train("plain", &[], &[]).ok();

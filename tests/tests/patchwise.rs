@@ -8,7 +8,7 @@ const STORAGE: &str = "eval.validation_storage=0.5";
 /// The run `name` whose stage 2 is trained on tiles, on the stage 1 of `run`.
 fn train_on_tiles(place: &Place, name: &str) {
     let from = format!("stage1.init_from=\"{}\"", place.at("run").display());
-    place.train(name, &["stage1.steps=0", &from, "clusters.grouping=\"patch\"", STORAGE], &[]).ok();
+    place.train(name, &["stage1.steps=0", &from, "clusters.grouping=\"tile\"", STORAGE], &[]).ok();
 }
 
 #[test]
@@ -54,20 +54,20 @@ fn a_run_on_tiles_neither_encodes_scenes_nor_stands_beside_its_own_kind() {
     let place = Place::new();
     place.train("run", &[], &[]).ok();
     train_on_tiles(&place, "tiles");
-    let message = place.train("few", &["clusters.grouping=\"patch\""], &[]).fails(2);
+    let message = place.train("few", &["clusters.grouping=\"tile\""], &[]).fails(2);
     assert!(message.contains("eval.validation_storage") && message.contains("a tile for every"), "{message}");
     let run = place.at("run").display().to_string();
     let tiles = place.at("tiles").display().to_string();
     let message = place.eval("run", &["--with", &run]).fails(2);
     assert!(message.contains("trained on the same groups of tokens"), "{message}");
     let message = place.eval("run", &["--preset", "patchwise", "--storage", "1/2"]).fails(2);
-    assert!(message.contains("clusters.grouping = \"patch\"") && message.contains("--with"), "{message}");
+    assert!(message.contains("clusters.grouping = \"tile\"") && message.contains("--with"), "{message}");
     let file = place.at("room.clift").display().to_string();
     let message = clift(["encode", &tiles, "--scene", "synthetic-0-test-00000", "-o", &file]).fails(2);
     assert!(message.contains("clusters.grouping"), "{message}");
 
     // Another stage 1, another encoder: its condenser has never seen these tokens.
-    place.train("other", &["seed=1", "clusters.grouping=\"patch\"", STORAGE], &[]).ok();
+    place.train("other", &["seed=1", "clusters.grouping=\"tile\"", STORAGE], &[]).ok();
     let other = place.at("other").display().to_string();
     let message = place.eval("run", &["--with", &other]).fails(1);
     assert!(message.contains("other/stage2/model.safetensors"), "{message}");

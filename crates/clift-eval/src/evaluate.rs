@@ -92,7 +92,7 @@ impl Networks {
     pub fn set_condensed(&mut self, grouping: Grouping, condensed: Condensed) {
         match grouping {
             Grouping::Kmeans => self.condensed = Some(condensed),
-            Grouping::Patch => self.patch_condensed = Some(condensed),
+            Grouping::Tile => self.patch_condensed = Some(condensed),
         }
     }
 

@@ -17,7 +17,7 @@ pub enum Grouping {
     #[default]
     Kmeans,
     /// Tiles of every view: the paper's baseline.
-    Patch,
+    Tile,
 }
 
 /// Rows and columns of a view's tokens that a tile covers.

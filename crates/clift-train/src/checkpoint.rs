@@ -1,84 +1,24 @@
 //! The state of a stage on disk: a folder per step, written under a temporary name, synced and renamed.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::Read;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
 use burn::module::Module;
 use burn::optim::OptimizerRecord;
 use burn::store::ModuleRecord;
-use clift_data::files::{make_folder, publish, remove_folder, replace};
+use clift_data::files::{make_folder, publish, remove_folder};
 use clift_model::{ModelConfig, weights};
-use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
-use crate::bad_steps::Recent;
 use crate::config::CheckpointConfig;
-use crate::exact;
-use crate::loss_scale::LossScale;
+use crate::progress::{Best, Fingerprint, Progress, State, VERSION};
 use crate::step::Learner;
 
-const VERSION: u32 = 2;
 const MODEL: &str = "model.bpk";
 const OPTIMIZER: &str = "optimizer.bpk";
 const SAVING: &str = "writing a checkpoint";
 const LISTING: &str = "listing checkpoints";
-
-/// What `state.json` of a checkpoint holds.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct State {
-    version: u32,
-    progress: Progress,
-    /// The other files, by name.
-    files: BTreeMap<String, Fingerprint>,
-    /// Which network it is; earlier versions did not say.
-    #[serde(default)]
-    model: Option<ModelConfig>,
-    /// In training with f16 products.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    loss_scale: Option<LossScale>,
-}
-
-/// What tells a damaged file from a whole one.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Fingerprint {
-    num_bytes: u64,
-    crc32: u32,
-}
-
-/// Where training goes on. With the weights and the optimiser this is all: batches, schedules and everything random are
-/// functions of the seed and the step.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Progress {
-    /// Updates made, with those left out.
-    pub step: u64,
-    /// Updates in a row that were left out just before.
-    pub bad_steps: u32,
-    /// Updates left out in all.
-    pub num_bad_steps: u64,
-    /// The last step whose validation is done; 0 for none.
-    pub validated: u64,
-    /// The best validation so far of a step with a checkpoint.
-    pub best: Option<Best>,
-    /// What the next step is compared with.
-    pub recent: Recent,
-}
-
-/// The best validation of a stage.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Best {
-    /// Its step.
-    pub step: u64,
-    /// Mean PSNR of the held-out views, in dB.
-    #[serde(with = "exact")]
-    pub psnr: f64,
-}
 
 /// The checkpoints of one stage.
 #[derive(Clone, Debug)]
@@ -129,11 +69,10 @@ impl Checkpoints {
         let mut files = BTreeMap::new();
         for name in [MODEL, OPTIMIZER] {
             let file = temporary.join(name);
-            files.insert(name.to_owned(), fingerprint(&file).map_err(TrainError::io(SAVING, &file))?);
+            files.insert(name.to_owned(), Fingerprint::of(&file).map_err(TrainError::io(SAVING, &file))?);
         }
         let (progress, model, loss_scale) = (progress.clone(), self.model.clone(), learner.loss_scale);
-        let state = State { version: VERSION, progress, files, model, loss_scale };
-        write_state(temporary, &state)?;
+        State { version: VERSION, progress, files, model, loss_scale }.write(temporary)?;
         if path.exists() {
             // Only where somebody moved newer checkpoints away and trains those steps again.
             std::fs::remove_dir_all(path).map_err(TrainError::io("replacing a checkpoint", path))?;
@@ -148,8 +87,7 @@ impl Checkpoints {
     /// [`TrainError::Io`] and [`TrainError::BadFile`]; the checkpoint is then as it was.
     pub fn update(&self, progress: &Progress) -> Result<(), TrainError> {
         let path = self.path_of(progress.step);
-        let state = State { progress: progress.clone(), ..read_state(&path)? };
-        write_state(&path, &state)?;
+        State { progress: progress.clone(), ..State::read(&path)? }.write(&path)?;
         self.prune(progress)
     }
 
@@ -243,26 +181,8 @@ fn remove_if_there(folder: &Path) -> Result<(), TrainError> {
     Ok(())
 }
 
-fn write_state(folder: &Path, state: &State) -> Result<(), TrainError> {
-    let path = folder.join("state.json");
-    let text = serde_json::to_vec(state).map_err(TrainError::bad_file("checkpoint", &path))?;
-    replace(&path, &text).map_err(TrainError::io(SAVING, &path))
-}
-
-fn read_state(folder: &Path) -> Result<State, TrainError> {
-    let path = folder.join("state.json");
-    let bad = |reason: String| TrainError::bad_file("checkpoint", &path)(reason);
-    let text = std::fs::read(&path).map_err(TrainError::io("reading a checkpoint", &path))?;
-    let value: serde_json::Value = serde_json::from_slice(&text).map_err(|error| bad(error.to_string()))?;
-    let version = &value["version"];
-    if *version != VERSION {
-        return Err(bad(format!("it has version {version}, this program reads {VERSION}")));
-    }
-    serde_json::from_value(value).map_err(|error| bad(error.to_string()))
-}
-
 fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) -> Result<Progress, TrainError> {
-    let State { progress, files, model, loss_scale, .. } = read_state(folder)?;
+    let State { progress, files, model, loss_scale, .. } = State::read(folder)?;
     if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !files.contains_key(*name)) {
         let reason = format!("it has no checksum of {name}");
         return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
@@ -275,7 +195,7 @@ fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) ->
     }
     for (name, expected) in &files {
         let file = folder.join(name);
-        let found = fingerprint(&file).map_err(TrainError::io("reading a checkpoint", &file))?;
+        let found = Fingerprint::of(&file).map_err(TrainError::io("reading a checkpoint", &file))?;
         if found != *expected {
             let reason = format!("{} bytes with other contents, {} expected", found.num_bytes, expected.num_bytes);
             return Err(TrainError::bad_file("checkpoint", &file)(reason));
@@ -311,21 +231,6 @@ fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) ->
     Ok(progress)
 }
 
-fn fingerprint(path: &Path) -> std::io::Result<Fingerprint> {
-    let mut file = File::open(path)?;
-    let mut hasher = crc32fast::Hasher::new();
-    let (mut num_bytes, mut buffer) = (0, vec![0; 1 << 20]);
-    loop {
-        match file.read(&mut buffer)? {
-            0 => return Ok(Fingerprint { num_bytes, crc32: hasher.finalize() }),
-            count => {
-                hasher.update(&buffer[..count]);
-                num_bytes += count as u64;
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -340,7 +245,7 @@ mod tests {
             optimizer,
             device,
             loss: crate::loss::Loss::default(),
-            recompute: false,
+            activation_checkpointing: false,
             loss_scale: None,
         };
         let checkpoints = Checkpoints::new(root.into(), CheckpointConfig::default());
@@ -350,9 +255,9 @@ mod tests {
 
     /// Says in `state.json` that the file is as it is now.
     fn sign(step: &Path, name: &str) {
-        let mut state = read_state(step).expect("it is well");
-        state.files.insert(name.into(), fingerprint(&step.join(name)).expect("it can be read"));
-        write_state(step, &state).expect("it can be written");
+        let mut state = State::read(step).expect("it is well");
+        state.files.insert(name.into(), Fingerprint::of(&step.join(name)).expect("it can be read"));
+        state.write(step).expect("it can be written");
     }
 
     #[test]
@@ -366,9 +271,9 @@ mod tests {
         let refused = checkpoints.resume(&mut learner);
         assert!(refused.is_err(), "{refused:?}");
 
-        let mut state = read_state(&step).expect("it is well");
+        let mut state = State::read(&step).expect("it is well");
         state.files.remove(MODEL);
-        write_state(&step, &state).expect("it can be written");
+        state.write(&step).expect("it can be written");
         let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
         assert!(message.contains("it has no checksum of model.bpk"), "{message}");
     }
@@ -416,18 +321,5 @@ mod tests {
         let step = |name: &str| step_of(Path::new(name));
         assert_eq!((step("a/step-000000017"), step("a/step-1000000000")), (Some(17), Some(1_000_000_000)));
         assert_eq!((step("a/step-000000017.tmp"), step("a/best")), (None, None));
-    }
-
-    #[test]
-    fn a_fingerprint_sees_every_bit() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("model.bpk");
-        let mut bytes = vec![7; 3_000_000];
-        std::fs::write(&path, &bytes).unwrap();
-        let whole = fingerprint(&path).unwrap();
-        assert_eq!(whole.num_bytes, 3_000_000);
-        bytes[2_000_001] ^= 1;
-        std::fs::write(&path, &bytes).unwrap();
-        assert_ne!(fingerprint(&path).unwrap(), whole);
     }
 }

@@ -14,7 +14,8 @@ use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
-use crate::clusters::{Entry, Index, MAX_TOKENS};
+use crate::cluster_entry::{Entry, Index};
+use crate::config::MAX_TOKENS;
 
 const WRITING: &str = "writing the cluster cache";
 const DATA: &str = "clusters.bin";

@@ -11,8 +11,11 @@ use clift_model::device::DeviceName;
 use clift_model::{Grouping, KMeans, ModelConfig, Precision};
 use serde::{Deserialize, Serialize};
 
-use self::checks::bad;
 use crate::TrainError;
+use crate::error::bad;
+
+/// Most tokens of a scene: ids are kept in 16 bits.
+pub const MAX_TOKENS: usize = 1 << 16;
 
 /// A whole experiment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -26,10 +29,10 @@ pub struct Config {
     /// Where tensors live: `flex`, `ndarray` or `wgpu`.
     #[serde(default)]
     pub device: DeviceName,
-    /// Whether a training step keeps only the input of every transformer block and computes what is inside
-    /// again for the backward: the same gradients in less memory, for one more forward.
+    /// Whether a training step stores only the input of every transformer block and computes the rest of the block
+    /// again in the backward: the same gradients in less memory, for one more forward.
     #[serde(default)]
-    pub recompute: bool,
+    pub activation_checkpointing: bool,
     /// What the operands of training's matrix products are: `f32`, or `f16` where the device has it. Weights, sums,
     /// norms, softmax, loss and optimiser are f32 in both.
     #[serde(default)]
@@ -158,7 +161,7 @@ impl Default for Stage1Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ClustersConfig {
-    /// What stage 2 learns to condense: clusters of latent K-means (`kmeans`), or tiles of the views (`patch`), which
+    /// What stage 2 learns to condense: clusters of latent K-means (`kmeans`), or tiles of the views (`tile`), which
     /// the paper compares them with.
     pub grouping: Grouping,
     /// Token counts that stage 2 trains on. Departs from the reference, which draws any ratio per

@@ -1,148 +1,116 @@
-//! Points at the place in a configuration that is wrong, in the layout of a compiler's message.
+//! Points at the line of a configuration that is wrong, in the layout of a compiler's message.
 
-use std::fmt;
 use std::ops::Range;
 use std::path::Path;
 
-/// One mistake in a configuration: what, where, the line with a caret under the place, and the fix.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Diagnostic {
-    title: String,
-    place: String,
-    line_number: Option<usize>,
-    /// The line's text, the column and the width of the caret in characters, and what stands beside it.
-    snippet: Option<(String, usize, usize, String)>,
-    help: Vec<String>,
-}
-
-impl Diagnostic {
-    /// Adds a line of help at the end.
-    #[must_use]
-    pub(crate) fn with_help(mut self, help: String) -> Self {
-        self.help.push(help);
-        self
-    }
-}
-
-impl fmt::Display for Diagnostic {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let number = self.line_number.map(|number| number.to_string()).unwrap_or_default();
-        let gutter = " ".repeat(number.len());
-        write!(f, "{}\n{gutter}--> {}", self.title, self.place)?;
-        if let Some((line, column, width, label)) = &self.snippet {
-            let (indent, carets) = (" ".repeat(*column), "^".repeat((*width).max(1)));
-            write!(f, "\n{gutter} |\n{number} | {line}\n{gutter} | {indent}{carets}")?;
-            if !label.is_empty() {
-                write!(f, " {label}")?;
-            }
-        }
-        for help in &self.help {
-            write!(f, "\n{gutter} = help: {help}")?;
-        }
-        Ok(())
-    }
-}
+use codespan_reporting::diagnostic::{Diagnostic, Label};
+use codespan_reporting::files::SimpleFiles;
+use codespan_reporting::term::{self, Chars};
 
 /// The texts a configuration was read from, one after the other, so that one offset names a place in any of them.
 pub(crate) struct Sources<'a> {
-    path: &'a Path,
-    file: &'a str,
-    overrides: &'a [String],
+    /// The file and the overrides, by position in `texts`.
+    files: SimpleFiles<String, &'a str>,
+    /// Every text with the offset of its first byte.
+    texts: Vec<(usize, &'a str)>,
 }
 
 impl<'a> Sources<'a> {
-    pub(crate) fn new(path: &'a Path, file: &'a str, overrides: &'a [String]) -> Self {
-        Self { path, file, overrides }
-    }
-
-    /// Offset of the first byte of an override.
-    pub(crate) fn override_start(&self, index: usize) -> usize {
-        let before: usize = self.overrides[..index].iter().map(|text| text.len() + 1).sum();
-        self.file.len() + 1 + before
+    pub(crate) fn new(path: &Path, file: &'a str, overrides: &'a [String]) -> Self {
+        let (mut files, mut texts, mut start) = (SimpleFiles::new(), Vec::new(), 0);
+        let names = std::iter::once(path.display().to_string()).chain(std::iter::repeat("--set".to_owned()));
+        for (name, text) in names.zip(std::iter::once(file).chain(overrides.iter().map(String::as_str))) {
+            files.add(name, text);
+            texts.push((start, text));
+            start += text.len() + 1;
+        }
+        Self { files, texts }
     }
 
     /// The overrides with blanks in front, which move their spans behind the file's, so that one span names one place.
     pub(crate) fn padded_overrides(&self) -> Vec<String> {
-        let padded = |index| format!("{}{}", " ".repeat(self.override_start(index)), self.overrides[index]);
-        (0..self.overrides.len()).map(padded).collect()
+        self.texts[1..].iter().map(|(start, text)| format!("{}{text}", " ".repeat(*start))).collect()
     }
 
-    /// Where a span of the texts is, in words.
-    pub(crate) fn place(&self, span: &Range<usize>) -> String {
-        if span.start > self.file.len() {
-            return "by --set".to_owned();
-        }
-        let start = floor_char_boundary(self.file, span.start);
-        format!("in line {}", self.file[..start].matches('\n').count() + 1)
+    /// Offset of the first byte of an override.
+    pub(crate) fn override_start(&self, index: usize) -> usize {
+        self.texts[index + 1].0
     }
 
-    /// Describes a mistake at a span of the texts; a span beyond one line is marked on its first line.
-    pub(crate) fn at(&self, span: Range<usize>, title: String, label: String) -> Diagnostic {
-        let index = (0..self.overrides.len()).rev().find(|&index| span.start >= self.override_start(index));
-        let (text, start) = match index {
-            Some(index) => (self.overrides[index].as_str(), span.start - self.override_start(index)),
-            None => (self.file, span.start),
-        };
-        let start = floor_char_boundary(text, start);
-        let end = floor_char_boundary(text, start + span.len()).max(start);
-        let line_start = text[..start].rfind('\n').map_or(0, |newline| newline + 1);
-        let line_end = text[start..].find('\n').map_or(text.len(), |newline| start + newline);
-        let line = text[line_start..line_end].trim_end_matches('\r').replace('\t', " ");
-        let column = text[line_start..start].chars().count();
-        let width = text[start..end.min(line_end)].trim_end().chars().count();
-        let line_number = index.is_none().then(|| text[..start].matches('\n').count() + 1);
-        let place = match line_number {
-            Some(number) => format!("{}:{number}:{}", self.path.display(), column + 1),
-            None => "--set".to_owned(),
-        };
-        Diagnostic { title, place, line_number, snippet: Some((line, column, width, label)), help: Vec::new() }
+    /// Describes a mistake at a span of the texts.
+    pub(crate) fn at(&self, span: Range<usize>, title: String, label: String) -> Diagnostic<usize> {
+        let (id, range) = self.find(span);
+        Diagnostic::error().with_message(title).with_label(Label::primary(id, range).with_message(label))
+    }
+
+    /// Marks a further span of the texts.
+    pub(crate) fn mark(&self, span: Range<usize>, label: String) -> Label<usize> {
+        let (id, range) = self.find(span);
+        Label::secondary(id, range).with_message(label)
     }
 
     /// Describes a mistake of the whole file.
-    pub(crate) fn whole(&self, title: String) -> Diagnostic {
-        let place = self.path.display().to_string();
-        Diagnostic { title, place, line_number: None, snippet: None, help: Vec::new() }
+    pub(crate) fn whole(&self, title: String) -> Diagnostic<usize> {
+        let file = self.files.get(0).map(|file| format!("in {}", file.name()));
+        Diagnostic::error().with_message(title).with_notes(file.into_iter().collect())
     }
-}
 
-fn floor_char_boundary(text: &str, index: usize) -> usize {
-    (0..=index.min(text.len())).rev().find(|&index| text.is_char_boundary(index)).unwrap_or(0)
+    /// The text that a span is in, and the place in that text.
+    fn find(&self, span: Range<usize>) -> (usize, Range<usize>) {
+        let id = self.texts.partition_point(|(start, _)| *start <= span.start) - 1;
+        let (start, text) = self.texts[id];
+        let [from, to] = [span.start, span.end].map(|at| text.floor_char_boundary(at.saturating_sub(start)));
+        (id, from..to.max(from))
+    }
+
+    /// Prints a diagnostic without the word "error" in front.
+    pub(crate) fn render(&self, diagnostic: &Diagnostic<usize>) -> String {
+        let config = term::Config { chars: Chars::ascii(), ..term::Config::default() };
+        let text = term::emit_into_string(&config, &self.files, diagnostic);
+        let text = text.unwrap_or_else(|_| diagnostic.message.clone());
+        text.strip_prefix("error: ").unwrap_or(&text).trim_end().to_owned()
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn rendered(file: &str, overrides: &[String], span: Range<usize>) -> String {
+        let sources = Sources::new(Path::new("run.toml"), file, overrides);
+        sources.render(&sources.at(span, "bad name".into(), "too big".into()).with_note("help: shrink it"))
+    }
+
     #[test]
-    fn a_place_is_shown_with_its_line_and_a_caret_under_each_character() {
+    fn a_caret_is_under_each_character_of_the_place() {
         let file = "a = 1\r\nname = \"Größe\" # x\n";
         let start = file.find("\"Gr").unwrap();
-        let sources = Sources::new(Path::new("run.toml"), file, &[]);
-        let diagnostic =
-            sources.at(start..start + 9, "bad name".into(), "too big".into()).with_help("shrink it".into());
         let expected = "bad name
- --> run.toml:2:8
+  --> run.toml:2:8
   |
 2 | name = \"Größe\" # x
   |        ^^^^^^^ too big
+  |
   = help: shrink it";
-        assert_eq!(diagnostic.to_string(), expected);
+        assert_eq!(rendered(file, &[], start..start + 9), expected);
     }
 
     #[test]
     fn a_place_in_an_override_shows_the_override() {
-        let overrides = ["a=1".to_owned(), "bb=2".to_owned()];
-        let sources = Sources::new(Path::new("run.toml"), "a = 0\n", &overrides);
-        let start = sources.override_start(1);
-        let expected = "unknown key\n--> --set\n |\n | bb=2\n | ^^";
-        assert_eq!(sources.at(start..start + 2, "unknown key".into(), String::new()).to_string(), expected);
+        let expected = "bad name
+  --> --set:1:1
+  |
+1 | bb=2
+  | ^^ too big
+  |
+  = help: shrink it";
+        assert_eq!(rendered("a = 0\n", &["a=1".into(), "bb=2".into()], 11..13), expected);
     }
 
     #[test]
-    fn a_span_at_the_end_of_the_file_still_has_a_caret() {
-        let sources = Sources::new(Path::new("run.toml"), "a = ", &[]);
-        let shown = sources.at(4..4, "no value".into(), String::new()).to_string();
-        assert!(shown.ends_with("1 | a = \n  |     ^"), "{shown}");
-        assert!(sources.at(90..99, String::new(), String::new()).to_string().contains("a ="));
+    fn a_span_at_or_beyond_the_end_still_has_a_caret() {
+        assert!(rendered("a = ", &[], 4..4).contains("1 | a = \n  |     ^ too big"));
+        assert!(rendered("a = ", &[], 90..99).contains("a ="));
+        assert!(rendered("", &[], 0..0).contains("bad name"));
     }
 }

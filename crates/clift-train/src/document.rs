@@ -9,7 +9,8 @@ use toml::de::DeTable;
 
 use crate::TrainError;
 use crate::config::Config;
-use crate::diagnostic::{Diagnostic, Sources};
+use crate::diagnostic::Sources;
+use crate::former_names::rename;
 use crate::keys::Keys;
 use crate::mistakes;
 pub use crate::overrides::Override;
@@ -29,19 +30,19 @@ pub enum ConfigError {
     },
     /// The file is not TOML.
     #[error("{0}")]
-    Syntax(Box<Diagnostic>),
+    Syntax(String),
     /// A `--set` is not `key=TOML`, or goes below a key that is no section.
     #[error("{0}")]
-    Override(Box<Diagnostic>),
+    Override(String),
     /// Keys that the configuration does not have, all of them.
-    #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n\n"))]
-    UnknownKeys(Vec<Diagnostic>),
+    #[error("{0}")]
+    UnknownKeys(String),
     /// A key is missing, or its value has the wrong type or is not one of those allowed.
     #[error("{0}")]
-    Value(Box<Diagnostic>),
+    Value(String),
     /// A value is out of its range, or does not fit another one.
     #[error("{0}")]
-    Range(Box<Diagnostic>),
+    Range(String),
     /// Something else is wrong with the values.
     #[error(transparent)]
     Other(Box<TrainError>),
@@ -59,8 +60,7 @@ pub fn read_config<T: DeserializeOwned + Serialize>(
     path: &Path,
     overrides: &[String],
 ) -> Result<(T, Vec<Override>), ConfigError> {
-    let file = std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })?;
-    parse_config(path, &file, overrides)
+    parse_config(path, &read(path)?, overrides)
 }
 
 /// Does [`read_config`] on text that is in memory; `path` is only named in messages.
@@ -72,11 +72,7 @@ pub fn parse_config<T: DeserializeOwned + Serialize>(
     file: &str,
     overrides: &[String],
 ) -> Result<(T, Vec<Override>), ConfigError> {
-    let sources = Sources::new(path, file, overrides);
-    let padded = sources.padded_overrides();
-    let (root, changed) = merged(&sources, file, &padded)?;
-    let config = read_table(root, &sources)?;
-    Ok((config, changed))
+    parse_checked(path, file, overrides, |_| Ok(()))
 }
 
 /// Does [`read_config`] for a whole experiment, and then asks `check` whether its values fit.
@@ -88,18 +84,40 @@ pub fn read_checked_config(
     overrides: &[String],
     check: impl FnOnce(&Config) -> Result<(), TrainError>,
 ) -> Result<(Config, Vec<Override>), ConfigError> {
-    let file = std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })?;
-    let sources = Sources::new(path, &file, overrides);
+    parse_checked(path, &read(path)?, overrides, check)
+}
+
+fn read(path: &Path) -> Result<String, ConfigError> {
+    std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })
+}
+
+fn parse_checked<T: DeserializeOwned + Serialize>(
+    path: &Path,
+    file: &str,
+    overrides: &[String],
+    check: impl FnOnce(&T) -> Result<(), TrainError>,
+) -> Result<(T, Vec<Override>), ConfigError> {
+    let sources = Sources::new(path, file, overrides);
     let padded = sources.padded_overrides();
-    let (root, changed) = merged(&sources, &file, &padded)?;
-    let config: Config = read_table(root.clone(), &sources)?;
-    match check(&config) {
-        Ok(()) => Ok((config, changed)),
-        Err(error) => Err(match mistakes::out_of_range(&error, root.get_ref(), &sources) {
-            Some(diagnostic) => ConfigError::Range(Box::new(diagnostic)),
-            None => ConfigError::Other(Box::new(error)),
-        }),
+    let keys = Keys::of::<T>();
+    let (mut root, mut changed) = merged(&sources, file, &padded)?;
+    changed.extend(rename(root.get_mut(), &keys));
+    let unknown = mistakes::unknown_keys(&keys, root.get_ref(), &sources);
+    if !unknown.is_empty() {
+        let all: Vec<_> = unknown.iter().map(|diagnostic| sources.render(diagnostic)).collect();
+        return Err(ConfigError::UnknownKeys(all.join("\n\n")));
     }
+    let value = |diagnostic| ConfigError::Value(sources.render(&diagnostic));
+    let config = T::deserialize(toml::Deserializer::from(root.clone()))
+        .map_err(|error| value(mistakes::wrong_value(&error, root.get_ref(), &sources)))?;
+    if let Some(diagnostic) = mistakes::too_long(&config, root.get_ref(), &sources) {
+        return Err(value(diagnostic));
+    }
+    check(&config).map_err(|error| match mistakes::out_of_range(&error, root.get_ref(), &sources) {
+        Some(diagnostic) => ConfigError::Range(sources.render(&diagnostic)),
+        None => ConfigError::Other(Box::new(error)),
+    })?;
+    Ok((config, changed))
 }
 
 /// The file's table with the overrides in it, and what those changed.
@@ -110,38 +128,27 @@ fn merged<'t>(
 ) -> Result<(Spanned<DeTable<'t>>, Vec<Override>), ConfigError> {
     let mut root = DeTable::parse(file).map_err(|error| {
         let span = error.span().unwrap_or(0..0);
-        ConfigError::Syntax(Box::new(sources.at(span, "the file is not TOML".into(), error.message().into())))
+        let diagnostic = sources.at(span, "the file is not TOML".into(), error.message().into());
+        ConfigError::Syntax(sources.render(&diagnostic))
     })?;
+    let refused = |diagnostic: &_| ConfigError::Override(sources.render(diagnostic));
     let mut changed: Vec<Override> = Vec::new();
     for (index, text) in padded.iter().enumerate() {
         let start = sources.override_start(index);
-        let (key, value) = parse_override(sources, text, start).map_err(ConfigError::Override)?;
+        let (key, value) = parse_override(sources, text, start).map_err(|diagnostic| refused(&diagnostic))?;
         let to = show(value.get_ref());
         let from = merge(root.get_mut(), &key, value).map_err(|blocked| {
             let title = format!("`{}` is a value, not a section", blocked.get_ref());
-            ConfigError::Override(Box::new(sources.at(blocked.span(), title, "cannot hold a key".into())))
+            refused(&sources.at(blocked.span(), title, "cannot hold a key".into()))
         })?;
         let key = dotted(&key);
         match changed.iter_mut().find(|change| change.key == key) {
             Some(change) => change.to = to,
-            None => changed.push(Override { key, from: from.as_ref().map(show), to }),
+            None => changed.push(Override { key, from: from.as_ref().map(show), to, is_renamed: false }),
         }
     }
     changed.retain(|change| change.from.as_ref() != Some(&change.to));
     Ok((root, changed))
-}
-
-fn read_table<T: DeserializeOwned + Serialize>(root: Spanned<DeTable>, sources: &Sources) -> Result<T, ConfigError> {
-    let unknown = mistakes::unknown_keys(&Keys::of::<T>(), root.get_ref(), sources);
-    if !unknown.is_empty() {
-        return Err(ConfigError::UnknownKeys(unknown));
-    }
-    let config = T::deserialize(toml::Deserializer::from(root.clone()))
-        .map_err(|error| ConfigError::Value(Box::new(mistakes::wrong_value(&error, root.get_ref(), sources))))?;
-    match mistakes::too_long(&config, root.get_ref(), sources) {
-        Some(diagnostic) => Err(ConfigError::Value(Box::new(diagnostic))),
-        None => Ok(config),
-    }
 }
 
 #[cfg(test)]
@@ -219,10 +226,10 @@ mod tests {
         assert_eq!((config.device.as_str(), config.clusters.grid.as_slice()), ("wgpu", &[0.5, 1.0][..]));
         let shown: Vec<String> = changed.iter().map(ToString::to_string).collect();
         let expected = [
-            "stage1.steps: 90000 -> 30",
-            "clusters.grid: (default) -> [0.5, 1]",
-            "device: (default) -> \"wgpu\"",
-            "stage1.lr: (default) -> 3e-4",
+            "--set stage1.steps: 90000 -> 30",
+            "--set clusters.grid: (default) -> [0.5, 1]",
+            "--set device: (default) -> \"wgpu\"",
+            "--set stage1.lr: (default) -> 3e-4",
         ];
         assert_eq!(shown, expected);
     }
@@ -243,10 +250,11 @@ mod tests {
     #[test]
     fn an_unknown_key_is_shown_with_the_nearest_one() {
         let expected = "unknown key `num_head` in [model]
- --> tiny.toml:2:1
+  --> tiny.toml:2:1
   |
 2 | num_head = 4
   | ^^^^^^^^ did you mean `num_heads`?
+  |
   = help: [model] has `num_heads`, `norm`";
         assert_eq!(message("[model]\nnum_head = 4\n", &[]), expected);
     }
@@ -254,17 +262,19 @@ mod tests {
     #[test]
     fn every_unknown_key_is_shown_and_one_of_another_section_is_sent_there() {
         let expected = "unknown key `batch_size` in [model]
- --> tiny.toml:3:1
+  --> tiny.toml:3:1
   |
 3 | batch_size = 4
   | ^^^^^^^^^^ `batch_size` belongs to [stage1]
+  |
   = help: [model] has `num_heads`, `norm`
 
 unknown section [stage2]
- --> tiny.toml:4:2
+  --> tiny.toml:4:2
   |
 4 | [stage2]
   |  ^^^^^^ did you mean [stage1]?
+  |
   = help: the top level has `device`, `model`, `stage1`, `clusters`";
         assert_eq!(message("[model]\nnum_heads = 4\nbatch_size = 4\n[stage2]\n", &[]), expected);
     }
@@ -272,45 +282,46 @@ unknown section [stage2]
     #[test]
     fn an_unknown_key_of_an_override_is_shown_in_the_override() {
         let expected = "unknown key `step` in [stage1]
---> --set
- |
- | stage1.step=100
- |        ^^^^ did you mean `steps`?
- = help: [stage1] has `steps`, `lr`, `batch_size`";
+  --> --set:1:8
+  |
+1 | stage1.step=100
+  |        ^^^^ did you mean `steps`?
+  |
+  = help: [stage1] has `steps`, `lr`, `batch_size`";
         assert_eq!(message(FILE, &["device=wgpu", "stage1.step=100"]), expected);
     }
 
     #[test]
     fn a_wrong_type_says_what_was_expected_and_what_stands_there() {
         let expected = "wrong value of `stage1.steps`
- --> tiny.toml:4:9
+  --> tiny.toml:4:9
   |
 4 | steps = \"100\"
   |         ^^^^^ expected a whole number of 0 or more, got the string \"100\"";
         assert_eq!(message("[model]\nnum_heads = 4\n[stage1]\nsteps = \"100\"\n", &[]), expected);
 
         let expected = "wrong value of `stage1.steps`
---> --set
- |
- | stage1.steps=1O0
- |              ^^^ expected a whole number of 0 or more, got the string \"1O0\"";
+  --> --set:1:14
+  |
+1 | stage1.steps=1O0
+  |              ^^^ expected a whole number of 0 or more, got the string \"1O0\"";
         assert_eq!(message(FILE, &["stage1.steps=1O0"]), expected);
 
         let expected = "wrong value of `clusters.grid`
---> --set
- |
- | clusters.grid=[0.5, true]
- |                     ^^^^ expected a number, got true";
+  --> --set:1:21
+  |
+1 | clusters.grid=[0.5, true]
+  |                     ^^^^ expected a number, got true";
         assert_eq!(message(FILE, &["clusters.grid=[0.5, true]"]), expected);
     }
 
     #[test]
     fn a_list_that_is_too_long_is_not_cut() {
         let expected = "wrong value of `clusters.range`
---> --set
- |
- | clusters.range=[0, 1, 2]
- |                ^^^^^^^^^ expected a list of 2, got one of 3";
+  --> --set:1:16
+  |
+1 | clusters.range=[0, 1, 2]
+  |                ^^^^^^^^^ expected a list of 2, got one of 3";
         assert_eq!(message(FILE, &["clusters.range=[0, 1, 2]"]), expected);
         assert!(message(FILE, &["clusters.range=[0]"]).starts_with("wrong value of `clusters.range`"));
     }
@@ -318,34 +329,35 @@ unknown section [stage2]
     #[test]
     fn a_negative_count_is_refused() {
         let expected = "wrong value of `stage1.steps`
---> --set
- |
- | stage1.steps=-3
- |              ^^ expected a whole number of 0 or more, got the number -3";
+  --> --set:1:14
+  |
+1 | stage1.steps=-3
+  |              ^^ expected a whole number of 0 or more, got the number -3";
         assert_eq!(message(FILE, &["stage1.steps=-3"]), expected);
     }
 
     #[test]
     fn an_unknown_choice_is_shown_with_the_allowed_ones() {
         let expected = "unknown value of `model.norm`
- --> tiny.toml:3:8
+  --> tiny.toml:3:8
   |
 3 | norm = \"rsm\"
   |        ^^^^^ did you mean \"rms\"?
+  |
   = help: it is one of \"layer\", \"rms\"";
         assert_eq!(message("[model]\nnum_heads = 4\nnorm = \"rsm\"\n", &[]), expected);
     }
 
     #[test]
     fn a_missing_key_is_named_with_its_section() {
-        assert_eq!(message("[model]\n", &[]), "the key `model.num_heads` is missing\n--> tiny.toml");
-        assert_eq!(message("", &[]), "the key `model` is missing\n--> tiny.toml");
+        assert_eq!(message("[model]\n", &[]), "the key `model.num_heads` is missing\n = in tiny.toml");
+        assert_eq!(message("", &[]), "the key `model` is missing\n = in tiny.toml");
     }
 
     #[test]
     fn a_file_that_is_not_toml_is_shown_where_it_breaks() {
         let expected = "the file is not TOML
- --> tiny.toml:2:13
+  --> tiny.toml:2:13
   |
 2 | num_heads = eight
   |             ^^^^^ string values must be quoted, expected literal string";
@@ -355,29 +367,31 @@ unknown section [stage2]
     #[test]
     fn an_override_that_is_no_toml_shows_how_to_write_it() {
         let expected = "the value of `device` is not TOML
---> --set
- |
- | device=a b
- |        ^^^ string values must be quoted, expected literal string
- = help: a string is written --set 'device=\"a b\"', a list --set 'device=[1, 2]'";
+  --> --set:1:8
+  |
+1 | device=a b
+  |        ^^^ string values must be quoted, expected literal string
+  |
+  = help: a string is written --set 'device=\"a b\"', a list --set 'device=[1, 2]'";
         assert_eq!(message(FILE, &["device=a b"]), expected);
 
         let expected = "an override is not `key=value` on one line
---> --set
- |
- | stage1.steps
- | ^^^^^^^^^^^^
- = help: for example --set stage1.steps=100";
+  --> --set:1:1
+  |
+1 | stage1.steps
+  | ^^^^^^^^^^^^
+  |
+  = help: for example --set stage1.steps=100";
         assert_eq!(message(FILE, &["stage1.steps"]), expected);
     }
 
     #[test]
     fn an_override_cannot_go_below_a_value() {
         let expected = "`steps` is a value, not a section
---> --set
- |
- | stage1.steps.x=1
- |        ^^^^^ cannot hold a key";
+  --> --set:1:8
+  |
+1 | stage1.steps.x=1
+  |        ^^^^^ cannot hold a key";
         assert_eq!(message(FILE, &["stage1.steps.x=1"]), expected);
     }
 

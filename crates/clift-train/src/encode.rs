@@ -58,7 +58,7 @@ impl Trained {
     ) -> Result<Encoded, TrainError> {
         if config.clusters.grouping != Grouping::Kmeans {
             let fix = "scenes are of K-means tokens: encode with a run whose clusters.grouping is \"kmeans\"".into();
-            return Err(TrainError::BadConfig { key: "clusters.grouping".into(), value: "\"patch\"".into(), fix });
+            return Err(TrainError::BadConfig { key: "clusters.grouping".into(), value: "\"tile\"".into(), fix });
         }
         let key = reader.source.key(scene);
         let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();

@@ -203,3 +203,8 @@ impl TrainError {
         move |reason| Self::BadFile { what, reason: reason.to_string(), path: path.to_path_buf() }
     }
 }
+
+/// A [`TrainError::BadConfig`].
+pub(crate) fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {
+    TrainError::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
+}

@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 /// One part of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, strum::IntoStaticStr)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "snake_case")]
 pub enum Stage {
     /// Encoder and renderer.
     Stage1,
@@ -20,13 +21,8 @@ pub enum Stage {
 
 impl Stage {
     /// The name in files, on the command line and in folders.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Stage1 => "stage1",
-            Self::Clusters => "clusters",
-            Self::Stage2 => "stage2",
-            Self::Eval => "eval",
-        }
+    pub fn name(self) -> &'static str {
+        self.into()
     }
 }
 

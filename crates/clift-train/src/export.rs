@@ -12,7 +12,7 @@ use safetensors::tensor::Dtype;
 
 use crate::TrainError;
 use crate::config::Config;
-use crate::import::Imported;
+use crate::import_record::Imported;
 use crate::model_dir::{Parameter, refuse_existing, to_safetensors};
 use crate::trained::ModelPath;
 

@@ -243,7 +243,7 @@ impl<'a> HeldOut<'a> {
                 let fix = match variant {
                     Variant::Clift => "stage 2 was not trained on clusters of K-means: leave it out".into(),
                     Variant::PatchClift => {
-                        "stage 2 was not trained on tiles: train a run with clusters.grouping = \"patch\" and \
+                        "stage 2 was not trained on tiles: train a run with clusters.grouping = \"tile\" and \
                          stage1.init_from this one, and evaluate it with --with"
                             .into()
                     }
@@ -283,7 +283,7 @@ impl<'a> HeldOut<'a> {
 const fn condensed_variant(grouping: Grouping) -> Variant {
     match grouping {
         Grouping::Kmeans => Variant::Clift,
-        Grouping::Patch => Variant::PatchClift,
+        Grouping::Tile => Variant::PatchClift,
     }
 }
 

@@ -1,67 +1,23 @@
 //! A published checkpoint to a model directory: weights, config, and what came from where.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 use clift_data::ElementType;
 use clift_data::StateDict;
-use clift_model::Variant;
-use clift_model::interchange::{self, CheckpointTensor, PROJECTIONS, Sizes};
-use serde::{Deserialize, Serialize};
+use clift_model::interchange;
+use clift_model::interchange::CheckpointTensor;
+use clift_model::interchange::Sizes;
 
+use self::keys::{Keys, shown};
 use crate::TrainError;
 use crate::config::Config;
+use crate::import_record::go_on;
+pub use crate::import_record::{ImportOptions, Imported};
 use crate::model_dir::{self, Parameter};
 
 mod keys;
 mod problems;
-
-use keys::Keys;
-
-/// Letters of a key that a message shows.
-const MAX_SHOWN: usize = 160;
-
-/// What the user says about a checkpoint.
-#[derive(Clone, Debug)]
-pub struct ImportOptions {
-    /// Which network it holds.
-    pub variant: Variant,
-    /// Its heads, where neither a shape nor the file says them.
-    pub num_heads: Option<usize>,
-    /// Whether parameters that are not in f32 are converted to it; they are an error otherwise.
-    pub convert: bool,
-    /// Texts that are replaced in keys as the file has them, in this order: `(from, to)`.
-    pub renames: Vec<(String, String)>,
-}
-
-/// What an import did; `import.json` of the model directory.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Imported {
-    /// Version of this file.
-    pub version: u32,
-    /// Name of the checkpoint.
-    pub file: String,
-    /// SHA-256 of its bytes.
-    pub sha256: String,
-    /// The network.
-    pub variant: Variant,
-    /// Whether it has a condenser, as a second-stage checkpoint has.
-    pub has_condenser: bool,
-    /// Projections that are 1x1 convolutions there; `clift export` writes them so.
-    pub convolutions: Vec<String>,
-    /// Parameters that were not in f32.
-    pub num_converted: usize,
-    /// Keys of the checkpoint, each with the parameters it became.
-    pub parameters: Vec<(String, Vec<String>)>,
-    /// First parts of keys that are known to be no part of the network, each with how many keys there are.
-    pub ignored: BTreeMap<String, usize>,
-    /// Keys that are neither that nor the network's, with `N` for numbers, each with how many there are.
-    #[serde(default)]
-    pub outside: BTreeMap<String, usize>,
-    /// Python classes and functions that were passed over, with the objects made of them.
-    pub passed_over: BTreeSet<String>,
-}
 
 /// Reads a checkpoint and writes a model directory: all of it or nothing.
 ///
@@ -126,11 +82,6 @@ pub fn import(
     Ok((config, imported))
 }
 
-/// Stops where the user has asked for it.
-pub(crate) fn go_on(stop: &AtomicBool) -> Result<(), TrainError> {
-    if stop.load(Ordering::SeqCst) { Err(TrainError::Abandoned { work: "the import".into() }) } else { Ok(()) }
-}
-
 /// The heads that are given, or those that an export of this program says it has.
 fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>, TrainError> {
     let said = state.size("num_heads").and_then(|size| usize::try_from(size).ok());
@@ -173,43 +124,6 @@ fn parts<'a>(tensor: &'a CheckpointTensor, values: &'a [f32]) -> impl Iterator<I
         let values = values[rows.start * row_len..rows.end * row_len].to_vec();
         Parameter { path: path.clone(), shape, values }
     })
-}
-
-/// Whether a part of a key is the number of a layer.
-fn is_number(part: &str) -> bool {
-    !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit())
-}
-
-/// A key with `N` for every number in it.
-fn pattern(key: &str) -> String {
-    key.split('.').map(|part| if is_number(part) { "N" } else { part }).collect::<Vec<_>>().join(".")
-}
-
-/// A key of a file that may be hostile, for a terminal.
-fn shown(key: &str) -> String {
-    let short: String = key.chars().take(MAX_SHOWN).collect();
-    let rest = if short.len() < key.len() { ".." } else { "" };
-    format!("{}{rest}", short.escape_debug())
-}
-
-impl Imported {
-    /// Reads the record of a model directory; `None` for a model that was trained here.
-    ///
-    /// # Errors
-    /// [`TrainError::BadFile`] for a damaged file.
-    pub fn read(folder: &Path) -> Result<Option<Self>, TrainError> {
-        let path: PathBuf = folder.join("import.json");
-        if !path.exists() {
-            return Ok(None);
-        }
-        let text = std::fs::read(&path).map_err(TrainError::io("reading what was imported", &path))?;
-        let imported: Self = serde_json::from_slice(&text).map_err(TrainError::bad_file("import.json", &path))?;
-        if let Some(layer) = imported.convolutions.iter().find(|layer| !PROJECTIONS.contains(&layer.as_str())) {
-            let reason = format!("{layer:?} is no projection");
-            return Err(TrainError::bad_file("import.json", &path)(reason));
-        }
-        Ok(Some(imported))
-    }
 }
 
 #[cfg(test)]

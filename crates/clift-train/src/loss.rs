@@ -1,16 +1,53 @@
 //! The training loss (paper section 3.3): mean squared error, and a weighted perceptual term beside it.
 
+use std::fmt;
+use std::sync::Arc;
+
 use burn::tensor::{Device, Tensor};
 use clift_eval::Perceptual;
 
 use crate::TrainError;
 use crate::config::LossConfig;
 
-/// What a step minimises, the same in both stages. The default is the mean squared error alone.
+/// A term of the training loss.
+pub trait ImageLoss: fmt::Debug + Send + Sync {
+    /// Computes the term, `[1]`, of renderings.
+    ///
+    /// # Shapes
+    /// - `rendering`, `target`: `[batch, views, height, width, 3]` in `[0, 1]`
+    fn loss(&self, rendering: &Tensor<5>, target: &Tensor<5>) -> Tensor<1>;
+
+    /// A line about the term for the log of a run.
+    fn describe(&self) -> Option<String> {
+        None
+    }
+}
+
+/// Mean squared error over all values of all images.
+#[derive(Clone, Copy, Debug)]
+pub struct MeanSquared;
+
+impl ImageLoss for MeanSquared {
+    fn loss(&self, rendering: &Tensor<5>, target: &Tensor<5>) -> Tensor<1> {
+        mse(rendering.clone(), target.clone())
+    }
+}
+
+impl ImageLoss for Perceptual {
+    fn loss(&self, rendering: &Tensor<5>, target: &Tensor<5>) -> Tensor<1> {
+        self.forward(rendering.clone(), target.clone())
+    }
+
+    fn describe(&self) -> Option<String> {
+        Some(format!("perceptual loss: weights with SHA-256 {}", self.sha256()))
+    }
+}
+
+/// What a step minimises, the same in both stages: the mean squared error and weighted terms. The default has no
+/// further term.
 #[derive(Clone, Debug, Default)]
 pub struct Loss {
-    /// Weight and network of the perceptual term.
-    perceptual: Option<(f64, Perceptual)>,
+    terms: Vec<(f64, Arc<dyn ImageLoss>)>,
 }
 
 /// The loss of a batch, on the tape.
@@ -28,15 +65,18 @@ impl Loss {
     /// # Errors
     /// As [`LossConfig::weights`] and [`Perceptual::load`].
     pub fn load(config: &LossConfig, device: &Device) -> Result<Self, TrainError> {
-        let Some(path) = config.weights()? else { return Ok(Self::default()) };
-        // Constants of the loss: without autodiff.
-        let network = Perceptual::load(path, &device.clone().without_autodiff())?;
-        Ok(Self { perceptual: Some((config.perceptual_weight, network)) })
+        let mut loss = Self::default();
+        if let Some(path) = config.weights()? {
+            // Constants of the loss: without autodiff.
+            let network = Perceptual::load(path, &device.clone().without_autodiff())?;
+            loss.terms.push((config.perceptual_weight, Arc::new(network)));
+        }
+        Ok(loss)
     }
 
-    /// SHA-256 of the weights of the perceptual term, where there is one.
-    pub fn sha256(&self) -> Option<&str> {
-        self.perceptual.as_ref().map(|(_, network)| network.sha256())
+    /// Lines about the terms for the log of a run.
+    pub fn describe(&self) -> impl Iterator<Item = String> {
+        self.terms.iter().filter_map(|(_, term)| term.describe())
     }
 
     /// The loss of renderings.
@@ -44,12 +84,9 @@ impl Loss {
     /// # Shapes
     /// - `rendering`, `target`: `[batch, views, height, width, 3]` in `[0, 1]`
     pub fn of(&self, rendering: Tensor<5>, target: Tensor<5>) -> LossParts {
-        let mse = mse(rendering.clone(), target.clone());
-        let total = match &self.perceptual {
-            Some((weight, network)) => mse.clone() + network.forward(rendering, target).mul_scalar(*weight),
-            None => mse.clone(),
-        };
-        LossParts { total, mse }
+        let mse = MeanSquared.loss(&rendering, &target);
+        let weighted = self.terms.iter().map(|(weight, term)| term.loss(&rendering, &target).mul_scalar(*weight));
+        LossParts { total: weighted.fold(mse.clone(), |total, term| total + term), mse }
     }
 }
 

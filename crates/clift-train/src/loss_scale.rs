@@ -118,13 +118,13 @@ mod tests {
             ..clift_model::ModelConfig::default()
         };
         let batch = batch(Shape { num_context: 2, num_targets: 2, size: [16, 16] }, 2, 8, None, 1).unwrap();
-        for recompute in [false, true] {
+        for activation_checkpointing in [false, true] {
             let learner = |loss_scale| Learner {
                 model: crate::trainer::freeze(crate::Stage::Stage1, model(&sizes, 3, &device)),
                 optimizer: crate::optim::adamw(&OptimizerConfig::default()),
                 device: device.clone().autodiff(),
                 loss: crate::loss::Loss::default(),
-                recompute,
+                activation_checkpointing,
                 loss_scale,
             };
             let (_, expected) = learner(None).step(&batch, 1, 1e-4.into(), 1.0).unwrap();

@@ -3,15 +3,16 @@
 use std::ops::Range;
 
 use clift_model::ModelError;
+use codespan_reporting::diagnostic::Diagnostic;
 use serde::Serialize;
 use toml::de::{DeTable, DeValue};
 
 use crate::TrainError;
-use crate::diagnostic::{Diagnostic, Sources};
+use crate::diagnostic::Sources;
 use crate::keys::{Keys, nearest};
 
 /// Finds every key that the type does not know, in the order of the text.
-pub(crate) fn unknown_keys(keys: &Keys, root: &DeTable, sources: &Sources) -> Vec<Diagnostic> {
+pub(crate) fn unknown_keys(keys: &Keys, root: &DeTable, sources: &Sources) -> Vec<Diagnostic<usize>> {
     let mut found = Vec::new();
     collect_unknown(keys, keys, root, "", sources, &mut found);
     found.sort_by_key(|(start, _)| *start);
@@ -24,7 +25,7 @@ fn collect_unknown(
     table: &DeTable,
     section: &str,
     sources: &Sources,
-    found: &mut Vec<(usize, Diagnostic)>,
+    found: &mut Vec<(usize, Diagnostic<usize>)>,
 ) {
     if keys.fields.is_none() {
         return; // a map, whose keys are free, or a value of the wrong type, which its own message explains
@@ -51,7 +52,7 @@ fn unknown_key(
     section: &str,
     is_section: bool,
     sources: &Sources,
-) -> Diagnostic {
+) -> Diagnostic<usize> {
     let place = if section.is_empty() { String::new() } else { format!(" in [{section}]") };
     let title = match (is_section, section.is_empty()) {
         (true, true) => format!("unknown section [{name}]"),
@@ -67,11 +68,11 @@ fn unknown_key(
     };
     let known = quoted(keys.names());
     let owner = if section.is_empty() { "the top level".to_owned() } else { format!("[{section}]") };
-    sources.at(span, title, label).with_help(format!("{owner} has {known}"))
+    sources.at(span, title, label).with_note(format!("help: {owner} has {known}"))
 }
 
 /// Turns the deserialiser's message into words, at the value it is about.
-pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sources) -> Diagnostic {
+pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sources) -> Diagnostic<usize> {
     let message = error.message();
     let span = error.span();
     let path = span.as_ref().and_then(|span| path_at(root, span)).unwrap_or_default();
@@ -86,9 +87,9 @@ pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sou
         let allowed: Vec<&str> = message.split('`').skip(3).step_by(2).collect();
         let label = nearest(variant, allowed.iter().copied())
             .map_or_else(String::new, |near| format!("did you mean \"{near}\"?"));
-        let help =
-            format!("it is one of {}", allowed.iter().map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(", "));
-        return sources.at(span, format!("unknown value{of_path}"), label).with_help(help);
+        let allowed = allowed.iter().map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(", ");
+        let help = format!("help: it is one of {allowed}");
+        return sources.at(span, format!("unknown value{of_path}"), label).with_note(help);
     }
     let wrong = message.strip_prefix("invalid type: ").or_else(|| message.strip_prefix("invalid value: "));
     match wrong.and_then(|wrong| wrong.rsplit_once(", expected ")) {
@@ -101,12 +102,12 @@ pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sou
 }
 
 /// Finds a list that is longer than what was made of it: the deserialiser takes what it needs and forgets the rest.
-pub(crate) fn too_long<T: Serialize>(config: &T, root: &DeTable, sources: &Sources) -> Option<Diagnostic> {
+pub(crate) fn too_long<T: Serialize>(config: &T, root: &DeTable, sources: &Sources) -> Option<Diagnostic<usize>> {
     let made = toml::Value::try_from(config).ok()?;
     find_too_long(made.as_table()?, root, "", sources)
 }
 
-fn find_too_long(made: &toml::Table, table: &DeTable, section: &str, sources: &Sources) -> Option<Diagnostic> {
+fn find_too_long(made: &toml::Table, table: &DeTable, section: &str, sources: &Sources) -> Option<Diagnostic<usize>> {
     table.iter().find_map(|(key, value)| {
         let name = key.get_ref().as_ref();
         let path = join(section, name);
@@ -123,7 +124,7 @@ fn find_too_long(made: &toml::Table, table: &DeTable, section: &str, sources: &S
 
 /// Puts a value that was refused by its key where it stands, with the places of the other keys the refusal names.
 /// `None` for a refusal that names no key.
-pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &Sources) -> Option<Diagnostic> {
+pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &Sources) -> Option<Diagnostic<usize>> {
     let (keys, fix) = match error {
         TrainError::BadConfig { key, fix, .. } => (key.as_str(), fix.as_str()),
         TrainError::Model(ModelError::BadConfig { key, fix, .. }) => (*key, fix.as_str()),
@@ -139,16 +140,13 @@ pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &Sources
         None if matches!(error, TrainError::BadConfig { value, .. } if value == "missing") => sources.whole(title),
         None => {
             let keys = quoted(keys.iter().copied());
-            sources.whole(title).with_help(format!("the file does not set {keys}"))
+            sources.whole(title).with_note(format!("the file does not set {keys}"))
         }
     };
-    for (key, span) in set.iter().skip(1) {
-        diagnostic = diagnostic.with_help(format!("`{key}` is set {}", sources.place(span)));
-    }
-    for key in dotted_keys(fix).into_iter().filter(|key| !keys.contains(key)) {
-        if let Some(span) = span_of(root, key) {
-            diagnostic = diagnostic.with_help(format!("`{key}` is set {}", sources.place(&span)));
-        }
+    let also = dotted_keys(fix).into_iter().filter(|key| !keys.contains(key));
+    let also = also.filter_map(|key| span_of(root, key).map(|span| (key, span)));
+    for (key, span) in set.into_iter().skip(1).chain(also) {
+        diagnostic = diagnostic.with_label(sources.mark(span, format!("`{key}` is set here")));
     }
     Some(diagnostic)
 }

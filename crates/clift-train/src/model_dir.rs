@@ -18,7 +18,8 @@ use crate::TrainError;
 use crate::config::Config;
 use crate::events::{Event, Sink};
 use crate::held_out::HeldOut;
-use crate::import::{Imported, go_on};
+use crate::import_record::Imported;
+use crate::import_record::go_on;
 use crate::trained::{ModelPath, Trained, check_heads};
 
 /// A parameter on the host, in PyTorch's layout.

@@ -3,12 +3,13 @@
 use std::borrow::Cow;
 use std::fmt;
 
+use codespan_reporting::diagnostic::Diagnostic;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use crate::diagnostic::{Diagnostic, Sources};
+use crate::diagnostic::Sources;
 
-/// What a `--set` changed with respect to the file.
+/// What a `--set`, or a former name in the file, changed with respect to the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Override {
     /// Dotted key.
@@ -17,11 +18,23 @@ pub struct Override {
     pub from: Option<String>,
     /// The value now, as TOML.
     pub to: String,
+    /// Whether `key` is a former name, and `to` the present one.
+    pub is_renamed: bool,
+}
+
+impl Override {
+    pub(crate) fn renamed(key: String, to: String) -> Self {
+        Self { key, from: None, to, is_renamed: true }
+    }
 }
 
 impl fmt::Display for Override {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {} -> {}", self.key, self.from.as_deref().unwrap_or("(default)"), self.to)
+        let Self { key, from, to, is_renamed } = self;
+        if *is_renamed {
+            return write!(f, "`{key}` is named `{to}` now");
+        }
+        write!(f, "--set {key}: {} -> {to}", from.as_deref().unwrap_or("(default)"))
     }
 }
 
@@ -33,11 +46,11 @@ pub(crate) fn parse_override<'t>(
     sources: &Sources,
     text: &'t str,
     start: usize,
-) -> Result<KeyValue<'t>, Box<Diagnostic>> {
+) -> Result<KeyValue<'t>, Box<Diagnostic<usize>>> {
     let Some(equals) = text.find('=').filter(|_| !text.contains(['\n', '\r'])) else {
         let title = "an override is not `key=value` on one line".to_owned();
         let diagnostic = sources.at(start..text.len(), title, String::new());
-        return Err(Box::new(diagnostic.with_help("for example --set stage1.steps=100".into())));
+        return Err(Box::new(diagnostic.with_note("help: for example --set stage1.steps=100")));
     };
     let key_only = format!("{}=0", &text[..equals]);
     let (key, _) = DeTable::parse(&key_only).map(|table| split(table.into_inner(), usize::MAX)).map_err(|error| {
@@ -59,8 +72,8 @@ pub(crate) fn parse_override<'t>(
     let title = format!("the value of `{key}` is not TOML");
     let diagnostic = sources.at(word_start..text.len(), title, error.message().into());
     let unquoted = word.trim_matches(['"', '\'']);
-    let help = format!("a string is written --set '{key}=\"{unquoted}\"', a list --set '{key}=[1, 2]'");
-    Err(Box::new(diagnostic.with_help(help)))
+    let help = format!("help: a string is written --set '{key}=\"{unquoted}\"', a list --set '{key}=[1, 2]'");
+    Err(Box::new(diagnostic.with_note(help)))
 }
 
 /// Follows the only key of a table down to the value, at most `depth` keys deep.

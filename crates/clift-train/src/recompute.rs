@@ -1,4 +1,4 @@
-//! The backward of a step that keeps only the input of every block and computes the rest again.
+//! Activation checkpointing: the backward of a step that stores only the input of every block and computes the rest again.
 //!
 //! Memory grows by one input per block instead of everything inside it, for one more forward. The
 //! gradients are those of the plain backward: the same operations on the same numbers.
@@ -11,8 +11,9 @@ use clift_model::block::EncoderBlock;
 use clift_model::{Cameras, Clift, Views};
 
 use crate::TrainError;
+use crate::batch::TokenChoice;
+use crate::device_batch::Shown;
 use crate::loss::{Loss, LossParts};
-use crate::step::{Shown, TokenChoice};
 
 /// Adds the gradients of `share` times the loss of what is shown, and returns the loss.
 pub(crate) fn backward(
@@ -132,9 +133,10 @@ mod tests {
     use clift_model::{CondenserConfig, ModelConfig, Variant};
 
     use super::*;
+    use crate::batch::StageBatch;
     use crate::bench::inputs::{Shape, batch, model};
+    use crate::device_batch::loss_of;
     use crate::events::Stage;
-    use crate::step::{StageBatch, loss_of};
     use crate::trainer::freeze;
 
     const SHAPE: Shape = Shape { num_context: 2, num_targets: 3, size: [16, 24] };

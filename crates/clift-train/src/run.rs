@@ -13,8 +13,9 @@ use clift_eval::{Condensed, Networks, Summary, System};
 use clift_model::{Clift, Encoder, ModelConfig, weights};
 
 use crate::TrainError;
+use crate::cluster_builder::ClusterJob;
 use crate::cluster_journal::remove_journal;
-use crate::clusters::{ClusterCache, ClusterJob};
+use crate::clusters::ClusterCache;
 use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
@@ -269,17 +270,8 @@ impl Run {
     }
 
     fn plan(&self, stage: Stage, batches: Arc<MakeBatch>) -> StagePlan<'_> {
-        let Config { stage1, stage2, .. } = &self.config;
-        let (num_steps, accumulate, optimizer, renderer_lr_factor) = match stage {
-            Stage::Stage2 => (stage2.steps, stage2.accumulate, &stage2.optimizer, stage2.renderer_lr_factor),
-            _ => (stage1.steps, stage1.accumulate, &stage1.optimizer, 1.0),
-        };
         StagePlan {
-            stage,
-            num_steps,
-            accumulate,
-            optimizer,
-            renderer_lr_factor,
+            settings: self.config.stage(stage),
             batches,
             config: &self.config,
             folder: self.folder(stage.name()),

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 use crate::config::Config;
+use crate::document::parse_config;
 use crate::events::Stage;
 use crate::extend::{Extended, Extension};
 
@@ -15,7 +16,7 @@ const VERSION: u32 = 1;
 
 /// Keys that may change between the start of a run and its resumption.
 const FREE_KEYS: [&str; 7] =
-    ["run_dir", "device", "recompute", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
+    ["run_dir", "device", "activation_checkpointing", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
 
 /// Keys that `--extend` may raise.
 const STEP_COUNTS: [(&str, Stage); 2] = [("stage1.steps", Stage::Stage1), ("stage2.steps", Stage::Stage2)];
@@ -80,8 +81,8 @@ pub(crate) fn compare(
     let text = std::fs::read_to_string(&path).map_err(TrainError::io("reading the run's config", &path))?;
     let bad = || TrainError::bad_file("config", &path);
     // A key that an older version did not have yet has its default; one that this version does not have is a difference.
-    let old = match toml::from_str::<Config>(&text) {
-        Ok(old) => toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?,
+    let old = match parse_config::<Config>(&path, &text, &[]) {
+        Ok((old, _)) => toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?,
         Err(_) => text.parse().map_err(|error: toml::de::Error| bad()(error.message().to_owned()))?,
     };
     let new = toml::Table::try_from(config).map_err(|error| bad()(error.to_string()))?;
@@ -161,6 +162,16 @@ mod tests {
         other.stage2.optimizer.spike_factor = 7.0;
         let message = differ(&shorter, &other, false).unwrap_err().to_string();
         assert!(message.contains("  stage2.optimizer.spike_factor: 100.0 -> 7.0\n"), "{message}");
+    }
+
+    #[test]
+    fn a_run_with_former_names_is_resumed() {
+        let mut tiles = old();
+        tiles.clusters.grouping = clift_model::Grouping::Tile;
+        let text = toml::to_string_pretty(&tiles).unwrap();
+        let former = text.replace("activation_checkpointing", "recompute").replace("\"tile\"", "\"patch\"");
+        assert!(former.contains("recompute = false") && former.contains("grouping = \"patch\""));
+        assert!(differ(&former, &tiles, false).unwrap().is_empty());
     }
 
     #[test]

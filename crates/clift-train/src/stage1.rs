@@ -8,8 +8,8 @@ use rand::RngExt;
 use rand::seq::index::sample;
 
 use crate::TrainError;
+use crate::batch::{StageBatch, TokenChoice};
 use crate::config::Config;
-use crate::step::{StageBatch, TokenChoice};
 
 /// Makes the batches of stage 1: a pure function of (seed, step).
 pub struct Stage1Batches {

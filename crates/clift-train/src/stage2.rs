@@ -9,9 +9,10 @@ use clift_data::{Clip, ClipReader, NoUsableScene, Skip, SlotFiller, ViewIndices}
 use clift_model::SceneClusters;
 
 use crate::TrainError;
-use crate::clusters::{ClusterCache, Entry};
+use crate::batch::{StageBatch, TokenChoice};
+use crate::cluster_entry::Entry;
+use crate::clusters::ClusterCache;
 use crate::config::Config;
-use crate::step::{StageBatch, TokenChoice};
 
 /// Attempts of one slot, repeated entries included, before the batch fails.
 const FILLER: SlotFiller = SlotFiller { min_attempts: 16, min_scenes: 0, max_attempts: 16 };

@@ -1,57 +1,18 @@
 //! One optimiser update, the same for both stages.
-// B scenes, T target views, N tokens, K kept tokens, S centroids, D width
 
 use burn::module::Module;
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::{GradientsAccumulator, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor};
-use clift_data::{Clip, Skip};
-use clift_eval::{upload_cameras, upload_pictures, upload_views};
-use clift_model::{Cameras, Clift, Clusters, Condenser, Precision, RenderTokens, SceneClusters, Views};
+use clift_model::{Clift, Precision};
 
 use crate::TrainError;
+use crate::batch::StageBatch;
+use crate::device_batch::{Shown, loss_of};
 use crate::loss::{Loss, LossParts};
 use crate::loss_scale::LossScale;
 use crate::optim::{clip_factor, norm_on_device, scale};
 use crate::recompute;
-
-/// What one update sees: clips with equal numbers of views, and which tokens the renderer is given.
-#[derive(Clone, Debug)]
-pub struct StageBatch {
-    /// One clip per slot.
-    pub clips: Vec<Clip>,
-    /// The tokens, slot by slot.
-    pub tokens: TokenChoice,
-    /// Scenes left out on the way.
-    pub skipped: Vec<Skip>,
-}
-
-/// Which tokens the renderer is given.
-#[derive(Clone, Debug, PartialEq)]
-pub enum TokenChoice {
-    /// Stage 1: a subset of the scene's tokens for every target view, `[slots][views][K]`.
-    Subsets(Vec<Vec<Vec<u32>>>),
-    /// Stage 1: every token.
-    All,
-    /// Stage 2: the condensed centroids of every scene.
-    Clusters(Vec<SceneClusters>),
-}
-
-impl StageBatch {
-    /// Cuts the batch into `count` parts of nearly equal size.
-    fn parts(&self, count: usize) -> impl Iterator<Item = Self> + '_ {
-        let batch_size = self.clips.len();
-        (0..count).map(move |part| {
-            let range = part * batch_size / count..(part + 1) * batch_size / count;
-            let tokens = match &self.tokens {
-                TokenChoice::Subsets(subsets) => TokenChoice::Subsets(subsets[range.clone()].to_vec()),
-                TokenChoice::All => TokenChoice::All,
-                TokenChoice::Clusters(clusters) => TokenChoice::Clusters(clusters[range.clone()].to_vec()),
-            };
-            Self { clips: self.clips[range].to_vec(), tokens, skipped: Vec::new() }
-        })
-    }
-}
 
 /// A model with its optimiser on an autodiff device.
 pub struct Learner {
@@ -64,7 +25,7 @@ pub struct Learner {
     /// What is minimised.
     pub loss: Loss,
     /// Whether the backward computes every block again instead of keeping what is inside it.
-    pub recompute: bool,
+    pub activation_checkpointing: bool,
     /// Of training with f16 products; `None` for f32.
     pub loss_scale: Option<LossScale>,
 }
@@ -111,7 +72,7 @@ impl Learner {
         max_grad_norm: f64,
         accept: impl FnOnce(f64, f64) -> bool,
     ) -> Result<(Self, Update), TrainError> {
-        let Self { model, mut optimizer, device, loss, recompute, loss_scale } = self;
+        let Self { model, mut optimizer, device, loss, activation_checkpointing, loss_scale } = self;
         let precision = if loss_scale.is_some() { Precision::F16 } else { Precision::F32 };
         let _scope = precision.scope();
         let factor = loss_scale.map_or(1.0, |scale| scale.factor());
@@ -120,7 +81,7 @@ impl Learner {
         for part in batch.parts(accumulate) {
             let share = part.clips.len() as f64 / batch.clips.len() as f64;
             let shown = Shown::upload(&part, &device)?;
-            let parts = if recompute {
+            let parts = if activation_checkpointing {
                 recompute::backward(&model, &shown, &part.tokens, &loss, share * factor, &mut accumulator)?
             } else {
                 let LossParts { total, mse } = loss_of(&model, &shown, &part.tokens, &loss)?;
@@ -141,7 +102,7 @@ impl Learner {
         } else {
             model
         };
-        let learner = Self { model, optimizer, device, loss, recompute, loss_scale };
+        let learner = Self { model, optimizer, device, loss, activation_checkpointing, loss_scale };
         Ok((learner, Update { loss: total, mse, grad_norm, applied }))
     }
 
@@ -193,55 +154,5 @@ impl ReadOnce {
         let (parts, norm) = values.split_at(2 * self.shares.len());
         let of = |place: usize| parts.iter().skip(place).step_by(2).zip(&self.shares).map(|(v, share)| share * v).sum();
         Ok(Read { loss: of(0), mse: of(1), grad_norm: norm.first().copied().unwrap_or(0.0) })
-    }
-}
-
-/// What a batch shows, on a device.
-pub(crate) struct Shown {
-    /// The given views.
-    pub context: Views,
-    /// Where the targets were taken from.
-    pub targets: Cameras,
-    /// The targets, `[B, T, H, W, 3]`.
-    pub pictures: Tensor<5>,
-}
-
-impl Shown {
-    /// Copies the views of a batch to a device.
-    pub fn upload(batch: &StageBatch, device: &Device) -> Result<Self, TrainError> {
-        let contexts: Vec<_> = batch.clips.iter().map(|clip| &clip.context).collect();
-        let targets: Vec<_> = batch.clips.iter().map(|clip| &clip.target).collect();
-        Ok(Self {
-            context: upload_views(&contexts, device)?,
-            targets: upload_cameras(&targets, device)?,
-            pictures: upload_pictures(&targets, device)?,
-        })
-    }
-}
-
-/// Renders the targets and compares, on the tape.
-pub(crate) fn loss_of(
-    model: &Clift,
-    shown: &Shown,
-    choice: &TokenChoice,
-    loss: &Loss,
-) -> Result<LossParts, TrainError> {
-    let lift = model.lift(&shown.context); // [B, N, D]
-    let tokens = choice.apply(&model.condenser, lift)?;
-    let rendering = model.renderer.forward(tokens, &shown.targets);
-    Ok(loss.of(rendering, shown.pictures.clone()))
-}
-
-impl TokenChoice {
-    /// What the renderer is given of a scene's tokens.
-    pub(crate) fn apply(&self, condenser: &Condenser, lift: Tensor<3>) -> Result<RenderTokens, TrainError> {
-        Ok(match self {
-            Self::All => lift.into(),
-            Self::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
-            Self::Clusters(clusters) => {
-                let index = Clusters::new(clusters.clone())?.upload(&lift.device());
-                condenser.forward(lift, &index).into()
-            }
-        })
     }
 }

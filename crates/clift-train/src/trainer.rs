@@ -2,43 +2,27 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
-use std::time::Instant;
 
 use burn::module::{Module, ParamGroup};
 use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleLrScheduler};
 use burn::tensor::Device;
 use clift_data::Prefetcher;
-use clift_data::files::make_folder;
 use clift_model::Clift;
 
 use crate::TrainError;
+use crate::batch::StageBatch;
 use crate::checkpoint::Checkpoints;
-use crate::config::{Config, OptimizerConfig};
-use crate::events::{Event, Sink, Stage};
-use crate::held_out::HeldOut;
-use crate::loss::Loss;
-use crate::loss_scale::LossScale;
-use crate::optim::adamw;
-use crate::sinks::RunLog;
-use crate::step::{Learner, StageBatch};
-use crate::training::Training;
+use crate::config::Config;
+use crate::events::Stage;
+use crate::stage_settings::{Part, StageSettings};
 
 /// Makes the batch of a step, in any thread.
 pub type MakeBatch = dyn Fn(u64) -> Result<StageBatch, TrainError> + Send + Sync;
 
 /// What one stage trains, on what, for how long.
 pub struct StagePlan<'a> {
-    /// Which stage.
-    pub stage: Stage,
-    /// Optimiser updates.
-    pub num_steps: u64,
-    /// Parts a batch is worked off in.
-    pub accumulate: usize,
-    /// The update rule.
-    pub optimizer: &'a OptimizerConfig,
-    /// Learning rate of the renderer over that of the rest.
-    pub renderer_lr_factor: f64,
+    /// Stage, steps, update rule and trained parts.
+    pub settings: StageSettings<'a>,
     /// The batches.
     pub batches: Arc<MakeBatch>,
     /// Loader, checkpoints and validations.
@@ -50,47 +34,10 @@ pub struct StagePlan<'a> {
 }
 
 impl StagePlan<'_> {
-    /// Trains from where the stage stands and returns the model when all steps are done. `start` gives
-    /// the model to start from, and is called only where there is no checkpoint.
-    ///
-    /// # Errors
-    /// [`TrainError::Interrupted`] after `stop` was set and the state saved, [`TrainError::Diverged`]
-    /// after too many bad steps, [`TrainError::Stopped`] with whatever data, model or disk give.
-    pub fn train(
-        &self,
-        start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
-        held_out: &HeldOut,
-        stop: &AtomicBool,
-        sink: &mut dyn Sink,
-    ) -> Result<Clift, TrainError> {
-        let started = Instant::now();
-        let checkpoints = self.checkpoints();
-        let model = if checkpoints.newest()?.is_some() { self.blank_model() } else { start(sink)? };
-        let optimizer = adamw(self.optimizer);
-        let loss = Loss::load(&self.config.loss, &self.device)?;
-        if let Some(sha256) = loss.sha256() {
-            sink.event(&Event::Message(format!("perceptual loss: weights with SHA-256 {sha256}")));
-        }
-        let (device, recompute) = (self.device.clone(), self.config.recompute);
-        let loss_scale = LossScale::of(self.config.precision);
-        let mut learner = Learner { model, optimizer, device, loss, recompute, loss_scale };
-        let progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
-        learner.model = freeze(self.stage, learner.model);
-        make_folder(&self.folder).map_err(TrainError::io("making a folder", &self.folder))?;
-        let run_dir = self.folder.parent().unwrap_or(&self.folder);
-        let mut log = RunLog::open(run_dir, self.stage, progress.step, sink)?;
-        log.event(&Event::StageStarted { stage: self.stage, done: progress.step, num_steps: self.num_steps });
-
-        let mut training = Training::new(self, checkpoints, progress, held_out, stop, log);
-        let model = training.run(learner).map_err(|error| training.name_checkpoint(error))?;
-        training.log.event(&Event::StageFinished { stage: self.stage, elapsed_s: started.elapsed().as_secs_f64() });
-        Ok(model)
-    }
-
     /// The batches of the steps after `step`.
     pub(crate) fn prefetch(&self, step: u64) -> Prefetcher<StageBatch, TrainError> {
         let (data, make) = (&self.config.data, self.batches.clone());
-        Prefetcher::new(move |step| make(step), step, self.num_steps, data.num_threads, data.num_prefetch)
+        Prefetcher::new(move |step| make(step), step, self.settings.steps, data.num_threads, data.num_prefetch)
     }
 
     /// The checkpoints of the stage.
@@ -100,22 +47,25 @@ impl StagePlan<'_> {
     }
 
     /// A model whose parameters a checkpoint is about to replace.
-    fn blank_model(&self) -> Clift {
+    pub(crate) fn blank_model(&self) -> Clift {
         Clift::new(&self.config.model, self.config.seed, &self.device)
     }
 
     /// The rates of a step, of which `lr` is that of the first parameter group.
     pub(crate) fn learning_rate(&self, lr: f64) -> ModuleLearningRate {
         let renderer = ParamGroup::from_predicate("renderer");
-        ModuleLrScheduler::new(lr).with_group(renderer, constant(lr * self.renderer_lr_factor)).step()
+        ModuleLrScheduler::new(lr).with_group(renderer, constant(lr * self.settings.renderer_lr_factor)).step()
     }
 }
 
-/// Parameters the stage does not train get no gradient and no decay.
+/// Parameters of parts that the stage does not train get no gradient and no decay.
 pub(crate) fn freeze(stage: Stage, mut model: Clift) -> Clift {
-    match stage {
-        Stage::Stage2 => model.encoder = model.encoder.no_grad(),
-        _ => model.condenser = model.condenser.no_grad(),
+    let trained = stage.trained();
+    if !trained.contains(&Part::Encoder) {
+        model.encoder = model.encoder.no_grad();
+    }
+    if !trained.contains(&Part::Condenser) {
+        model.condenser = model.condenser.no_grad();
     }
     model
 }

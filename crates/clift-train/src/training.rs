@@ -7,13 +7,16 @@ use clift_model::Clift;
 
 use crate::TrainError;
 use crate::bad_steps::{BadScene, BadStep, Fault};
-use crate::checkpoint::{Best, Checkpoints, Progress};
+use crate::batch::StageBatch;
+use crate::checkpoint::Checkpoints;
 use crate::events::{Event, Sink, StepEvent};
 use crate::held_out::HeldOut;
 use crate::loss::psnr_of;
+use crate::progress::{Best, Progress};
 use crate::schedule::warm_up_cosine;
 use crate::sinks::RunLog;
-use crate::step::{Learner, StageBatch, Update};
+use crate::stage_settings::StageSettings;
+use crate::step::{Learner, Update};
 use crate::trainer::StagePlan;
 
 /// A stage while it trains.
@@ -70,9 +73,9 @@ impl<'a> Training<'a> {
     fn step(&mut self, learner: Learner, batch: &StageBatch) -> Result<Learner, TrainError> {
         let started = Instant::now();
         for skip in &batch.skipped {
-            self.log.skip(self.plan.stage, self.progress.step + 1, skip);
+            self.log.skip(self.plan.settings.stage, self.progress.step + 1, skip);
         }
-        let StagePlan { num_steps, accumulate, optimizer, .. } = *self.plan;
+        let StageSettings { steps: num_steps, accumulate, optimizer, .. } = self.plan.settings;
         let step = self.progress.step + 1;
         let lr = warm_up_cosine(step, optimizer.learning_rate, optimizer.warm_up_steps, num_steps);
         let (rate, recent) = (self.plan.learning_rate(lr), &self.progress.recent);
@@ -104,9 +107,9 @@ impl<'a> Training<'a> {
 
     fn report(&mut self, update: Update, lr: f64, started: Instant) {
         self.log.event(&Event::Step(StepEvent {
-            stage: self.plan.stage,
+            stage: self.plan.settings.stage,
             step: self.progress.step,
-            num_steps: self.plan.num_steps,
+            num_steps: self.plan.settings.steps,
             loss: update.loss,
             psnr: psnr_of(update.mse),
             lr,
@@ -122,7 +125,7 @@ impl<'a> Training<'a> {
         let finite = |value: f64| value.is_finite().then_some(value);
         let line = BadStep {
             step: self.progress.step,
-            stage: self.plan.stage,
+            stage: self.plan.settings.stage,
             reason: fault,
             loss: finite(update.loss),
             grad_norm: finite(update.grad_norm),
@@ -134,7 +137,7 @@ impl<'a> Training<'a> {
         self.log.bad_step(&line);
         let keys = line.scenes.iter().map(|scene| scene.key.as_str()).collect::<Vec<_>>().join(", ");
         let Progress { step, bad_steps: count, .. } = self.progress;
-        if count < self.plan.optimizer.max_bad_steps {
+        if count < self.plan.settings.optimizer.max_bad_steps {
             self.log.event(&Event::Warning(format!("step {step} left out: {fault} (scenes {keys})")));
             return Ok(());
         }
@@ -169,7 +172,7 @@ impl<'a> Training<'a> {
         if !is_due || validated == step {
             return Ok(());
         }
-        let (stage, samples) = (self.plan.stage, self.plan.folder.join("samples"));
+        let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
         let model = learner.inference_model();
         let psnr = self.held_out.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
         if psnr.is_none() && self.stop.load(Ordering::Relaxed) {
@@ -196,7 +199,7 @@ impl<'a> Training<'a> {
     }
 
     fn is_last(&self) -> bool {
-        self.progress.step == self.plan.num_steps
+        self.progress.step == self.plan.settings.steps
     }
 
     fn newest_checkpoint(&self) -> String {
@@ -212,7 +215,7 @@ impl<'a> Training<'a> {
         }
         TrainError::Stopped {
             source: Box::new(error),
-            stage: self.plan.stage.name(),
+            stage: self.plan.settings.stage.name(),
             step: self.progress.step,
             checkpoint: self.newest_checkpoint(),
         }

@@ -17,7 +17,7 @@ use crate::{WrongUsage, interrupt, table};
 pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let (mut config, overrides) = read_config::<Config>(args.config.as_deref().unwrap_or(Path::new("")), &args.set)?;
     for change in overrides {
-        print_note(&format!("--set {change}"));
+        print_note(&change.to_string());
     }
     config.device = args.device.unwrap_or(config.device);
     // Found out now and not after minutes of work.

@@ -73,7 +73,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         );
     }
     for change in &overrides {
-        terminal::print_note(&format!("--set {change}"));
+        terminal::print_note(&change.to_string());
     }
     config.device = args.device.unwrap_or(config.device);
     // A model that was imported names no data.

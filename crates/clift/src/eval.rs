@@ -50,7 +50,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
 fn read(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
     let (mut config, overrides) = read_config::<Config>(&folder.join("config.toml"), &args.set)?;
     for change in overrides {
-        terminal::print_note(&format!("--set {change}"));
+        terminal::print_note(&change.to_string());
     }
     // A run may have been moved since it was trained.
     config.run_dir = folder.to_path_buf();

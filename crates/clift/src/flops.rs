@@ -68,7 +68,7 @@ fn sizes(args: &FlopsArgs) -> anyhow::Result<Sizes> {
     };
     let (config, overrides) = read_config::<Config>(path, &args.set)?;
     for change in overrides {
-        print_note(&format!("--set {change}"));
+        print_note(&change.to_string());
     }
     config.validate()?;
     let Config { model, data, eval, .. } = config;

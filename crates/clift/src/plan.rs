@@ -18,7 +18,7 @@ use crate::{WrongUsage, table};
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let (mut config, overrides) = read_checked_config(&args.config, &args.set, plan::check)?;
     for change in overrides {
-        print_note(&format!("--set {change}"));
+        print_note(&change.to_string());
     }
     config.device = args.device.unwrap_or(config.device);
     if let Some(json) = &args.json

@@ -11,7 +11,7 @@ use crate::terminal;
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let (mut config, overrides) = read_checked_config(&args.config, &args.set, Config::validate)?;
     for change in overrides {
-        terminal::print_note(&format!("--set {change}"));
+        terminal::print_note(&change.to_string());
     }
     config.device = args.device.unwrap_or(config.device);
     // Now, and not when the system ends the run after hours of other work.

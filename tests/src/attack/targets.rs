@@ -416,7 +416,7 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             optimizer: adamw(&OptimizerConfig::default()),
             device: Device::flex().autodiff(),
             loss: Loss::default(),
-            recompute: false,
+            activation_checkpointing: false,
             loss_scale: None,
         };
         let checkpoints = Checkpoints::new(folder.clone(), CheckpointConfig::default());

@@ -4,10 +4,11 @@ use burn::module::Module;
 use clift_eval::upload_pictures;
 use clift_model::{Clift, Clusters, RenderTokens};
 use clift_train::Stage;
+use clift_train::batch::{StageBatch, TokenChoice};
 use clift_train::config::OptimizerConfig;
 use clift_train::loss::Loss;
 use clift_train::optim::adamw;
-use clift_train::step::{Learner, StageBatch, TokenChoice};
+use clift_train::step::Learner;
 
 use crate::modules::subsets;
 use crate::place::{Place, clusters, gradients, parameters};
@@ -42,14 +43,21 @@ pub const CASES: &[Case] = &[
 const LEARNING_RATE: f64 = 1e-3;
 
 /// A model of a stage with its optimiser.
-pub fn learner(place: &Place, stage: Stage, recompute: bool) -> Learner {
+pub fn learner(place: &Place, stage: Stage, activation_checkpointing: bool) -> Learner {
     let mut model = place.model();
     match stage {
         Stage::Stage2 => model.encoder = model.encoder.no_grad(),
         _ => model.condenser = model.condenser.no_grad(),
     }
     let optimizer = adamw(&OptimizerConfig::default());
-    Learner { model, optimizer, device: place.device.clone(), loss: Loss::default(), recompute, loss_scale: None }
+    Learner {
+        model,
+        optimizer,
+        device: place.device.clone(),
+        loss: Loss::default(),
+        activation_checkpointing,
+        loss_scale: None,
+    }
 }
 
 /// What the stage sees.
@@ -68,9 +76,9 @@ pub fn step(learner: Learner, batch: &StageBatch, parts: usize) -> (Learner, cli
     (learner, update)
 }
 
-fn update(place: &Place, stage: Stage, parts: usize, recompute: bool) -> Values {
+fn update(place: &Place, stage: Stage, parts: usize, activation_checkpointing: bool) -> Values {
     let batch = batch(place, stage);
-    let learner = learner(place, stage, recompute);
+    let learner = learner(place, stage, activation_checkpointing);
     let mut backward = gradient(place, &learner.model, &batch);
     let before = parameters(&learner.model);
     let (learner, update) = step(learner, &batch, parts);

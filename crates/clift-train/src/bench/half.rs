@@ -19,9 +19,9 @@ use super::task::{Forward, Task};
 use super::{BenchOptions, Work};
 use crate::TrainError;
 use crate::config::Config;
+use crate::device_batch::Shown;
 use crate::events::Stage;
 use crate::loss::psnr_of;
-use crate::step::Shown;
 use crate::trainer::freeze;
 
 /// The works that are compared.

@@ -9,7 +9,7 @@ use clift_model::{Clift, ModelConfig, SceneClusters};
 use rand::{Rng, RngExt};
 
 use crate::TrainError;
-use crate::step::{StageBatch, TokenChoice};
+use crate::batch::{StageBatch, TokenChoice};
 
 /// How many pictures of which size an item has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

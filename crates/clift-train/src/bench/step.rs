@@ -11,13 +11,15 @@ use super::reference::{InF64, module_in_f64, relative_error, values};
 use super::task::Task;
 use crate::TrainError;
 use crate::bad_steps::Fault;
-use crate::config::{Config, OptimizerConfig};
+use crate::batch::StageBatch;
+use crate::device_batch::{Shown, loss_of};
 use crate::events::Stage;
 use crate::loss::Loss;
 use crate::loss_scale::LossScale;
 use crate::optim::adamw;
 use crate::schedule::warm_up_cosine;
-use crate::step::{Learner, Shown, StageBatch, loss_of};
+use crate::stage_settings::StageSettings;
+use crate::step::Learner;
 use crate::trainer::freeze;
 
 /// Updates of one batch: forward, loss, backward, clipping, `AdamW`.
@@ -35,14 +37,14 @@ pub struct StepTask {
 
 impl StepTask {
     pub fn new(context: &BenchContext, stage: Stage) -> Result<Self, TrainError> {
-        let Part { steps, batch_size, accumulate, optimizer } = Part::of(&context.config, stage);
+        let StageSettings { steps, batch_size, accumulate, optimizer, .. } = context.config.stage(stage);
         let learner = Learner {
             model: freeze(stage, context.model()),
             optimizer: adamw(optimizer),
             device: context.device.clone().autodiff(),
             // The network of a perceptual term is not this project's: the rows are of the model alone.
             loss: Loss::default(),
-            recompute: context.config.recompute,
+            activation_checkpointing: context.config.activation_checkpointing,
             loss_scale: LossScale::of(context.config.precision),
         };
         Ok(Self {
@@ -57,28 +59,9 @@ impl StepTask {
     }
 }
 
-/// What the two stages have in common in a config.
-struct Part<'a> {
-    steps: u64,
-    batch_size: usize,
-    accumulate: usize,
-    optimizer: &'a OptimizerConfig,
-}
-
-impl<'a> Part<'a> {
-    fn of(config: &'a Config, stage: Stage) -> Self {
-        let Config { stage1, stage2, .. } = config;
-        let (steps, batch_size, accumulate, optimizer) = match stage {
-            Stage::Stage2 => (stage2.steps, stage2.batch_size, stage2.accumulate, &stage2.optimizer),
-            _ => (stage1.steps, stage1.batch_size, stage1.accumulate, &stage1.optimizer),
-        };
-        Self { steps, batch_size, accumulate, optimizer }
-    }
-}
-
 /// What an update of a stage works off at once.
 pub(super) fn micro_batch(context: &BenchContext, stage: Stage) -> Result<StageBatch, TrainError> {
-    let Part { batch_size, accumulate, .. } = Part::of(&context.config, stage);
+    let StageSettings { batch_size, accumulate, .. } = context.config.stage(stage);
     stage_batch(context, stage, batch_size.div_ceil(accumulate))
 }
 
@@ -104,7 +87,7 @@ impl Task for StepTask {
 
     fn error(self: Box<Self>, reference: &Device) -> Result<Option<f64>, TrainError> {
         let Self { stage, reduced, .. } = *self;
-        let batch_size = Part::of(&reduced.config, stage).batch_size;
+        let batch_size = reduced.config.stage(stage).batch_size;
         let batch = stage_batch(&reduced, stage, batch_size)?;
         let model = freeze(stage, reduced.model());
         let ours = gradients(&model, &batch, Shown::upload(&batch, &reduced.device.clone().autodiff())?)?;

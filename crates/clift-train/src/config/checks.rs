@@ -4,9 +4,11 @@ use clift_data::{DataConfig, DataError, SourceKind, Split};
 use clift_eval::perceptual::PERCEPTUAL_MIN_SIZE_PX;
 use clift_model::Grouping;
 
-use super::{Config, OptimizerConfig};
+
 use crate::TrainError;
-use crate::clusters::MAX_TOKENS;
+use crate::config::{Config, DataConfig, MAX_TOKENS, OptimizerConfig, SourceKind};
+use crate::error::bad;
+use crate::events::Stage;
 
 impl Config {
     /// Checks every value that no type can check.
@@ -24,11 +26,13 @@ impl Config {
         validate_data(&self.data)?;
         self.validate_loss()?;
         let Self { stage1, stage2, clusters, eval, checkpoint, .. } = self;
+        for settings in [Stage::Stage1, Stage::Stage2].map(|stage| self.stage(stage)) {
+            let name = settings.stage.name();
+            in_range(&format!("{name}.batch_size"), settings.batch_size, 1, usize::MAX)?;
+            in_range(&format!("{name}.accumulate"), settings.accumulate, 1, settings.batch_size)?;
+            settings.optimizer.validate(name)?;
+        }
         for (key, value, least, most) in [
-            ("stage1.batch_size", stage1.batch_size, 1, usize::MAX),
-            ("stage1.accumulate", stage1.accumulate, 1, stage1.batch_size),
-            ("stage2.batch_size", stage2.batch_size, 1, usize::MAX),
-            ("stage2.accumulate", stage2.accumulate, 1, stage2.batch_size),
             ("clusters.num_passes", clusters.num_passes, 1, usize::MAX),
             ("clusters.kmeans.max_iterations", clusters.kmeans.max_iterations, 1, usize::MAX),
             ("eval.num_context", eval.num_context, 2, 10_000),
@@ -56,8 +60,6 @@ impl Config {
         if !(0.0..1.0).contains(&clusters.kmeans.tolerance) {
             return Err(bad("clusters.kmeans.tolerance", clusters.kmeans.tolerance, "write 0 or a small fraction"));
         }
-        stage1.optimizer.validate("stage1")?;
-        stage2.optimizer.validate("stage2")?;
         if !(0.0..=1.0).contains(&stage2.renderer_lr_factor) {
             return Err(bad("stage2.renderer_lr_factor", stage2.renderer_lr_factor, "write 0 to 1"));
         }
@@ -108,7 +110,7 @@ impl Config {
         if let Some(count) = self.clusters.grid.iter().find(|count| count.of(fewest_tokens).is_err()) {
             return Err(bad("clusters.grid", count, &format!("a scene has as few as {fewest_tokens} tokens")));
         }
-        if self.clusters.grouping == Grouping::Patch {
+        if self.clusters.grouping == Grouping::Tile {
             let grid = self.clusters.grid.iter().map(|count| ("clusters.grid", count));
             let counts = grid.chain([("eval.validation_storage", &self.eval.validation_storage)]);
             for (key, count) in counts {
@@ -188,8 +190,4 @@ fn in_section(section: &'static str) -> impl FnOnce(DataError) -> TrainError {
         },
         other => other.into(),
     }
-}
-
-pub(super) fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {
-    TrainError::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
 }

@@ -6,9 +6,11 @@ use clift_data::StateDict;
 use clift_model::Variant;
 use clift_model::interchange::{self, PERCEPTUAL_PREFIX, PREFIX, Sizes, plain_key};
 
-use super::{ImportOptions, pattern, shown};
 use crate::TrainError;
+use crate::import_record::ImportOptions;
 
+/// Letters of a key that a message shows.
+pub(super) const MAX_SHOWN: usize = 160;
 /// Kinds of keys outside the network that are told apart.
 const MAX_OUTSIDE: usize = 200;
 
@@ -87,4 +89,21 @@ fn starts_as_network(name: &str) -> bool {
     matches!(first, "encoder" | "decoder" | "squeezer" | "patch_to_image")
         || first.starts_with("linear_")
         || first.ends_with("_norm")
+}
+
+/// Whether a part of a key is the number of a layer.
+pub(super) fn is_number(part: &str) -> bool {
+    !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit())
+}
+
+/// A key with `N` for every number in it.
+pub(super) fn pattern(key: &str) -> String {
+    key.split('.').map(|part| if is_number(part) { "N" } else { part }).collect::<Vec<_>>().join(".")
+}
+
+/// A key of a file that may be hostile, for a terminal.
+pub(super) fn shown(key: &str) -> String {
+    let short: String = key.chars().take(MAX_SHOWN).collect();
+    let rest = if short.len() < key.len() { ".." } else { "" };
+    format!("{}{rest}", short.escape_debug())
 }

@@ -8,8 +8,8 @@ use clift_data::StateDict;
 use clift_model::interchange::{self, CheckpointTensor, PREFIX, plain_key};
 use clift_model::{ModelConfig, Variant};
 
-use super::keys::Keys;
-use super::{ImportOptions, MAX_SHOWN, pattern, shown};
+use super::keys::{Keys, MAX_SHOWN, is_number, pattern, shown};
+use crate::import_record::ImportOptions;
 
 /// Lines of one kind; a network has about sixty patterns of keys.
 const MAX_LISTED: usize = 200;
@@ -27,27 +27,18 @@ pub(super) struct Problem {
     detail: String,
 }
 
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, strum::Display)]
+#[strum(serialize_all = "lowercase")]
 enum Kind {
     Misshapen,
+    #[strum(to_string = "not in f32")]
     NotF32,
+    #[strum(to_string = "no tensor")]
     NoTensor,
     Missing,
     Unknown,
+    #[strum(to_string = "beside transformer.")]
     Stray,
-}
-
-impl Kind {
-    fn told(self) -> &'static str {
-        match self {
-            Self::Misshapen => "misshapen",
-            Self::NotF32 => "not in f32",
-            Self::NoTensor => "no tensor",
-            Self::Missing => "missing",
-            Self::Unknown => "unknown",
-            Self::Stray => "beside transformer.",
-        }
-    }
 }
 
 /// Compares a checkpoint with the tensors that a network has.
@@ -166,7 +157,7 @@ pub(super) fn told(
             1 => (&first.key, String::new()),
             _ => (&pattern, format!(" (N = {})", layer_numbers(&found))),
         };
-        let _ = write!(text, "\n  {}: {}{detail}{numbers}", kind.told(), shown(key));
+        let _ = write!(text, "\n  {kind}: {}{detail}{numbers}", shown(key));
         let (own, most) = (numbers_of(&first.name), first.name.len() / 2);
         let prefixed = |name: String| format!("{}{name}", keys.prefix);
         let own = (found.len() == 1).then_some(&own[..]);
@@ -189,7 +180,7 @@ pub(super) fn told(
         }
     }
     for (kind, count) in counts.iter().filter(|(_, count)| **count > MAX_LISTED) {
-        let _ = write!(text, "\n  {}: {} more", kind.told(), count - MAX_LISTED);
+        let _ = write!(text, "\n  {kind}: {} more", count - MAX_LISTED);
     }
     text.push_str(&way_on(keys, state, options, !unknown.0.is_empty() || !strays.0.is_empty()));
     text.push_str("\n ");
@@ -239,5 +230,5 @@ fn layer_numbers(found: &[&Problem]) -> String {
 }
 
 fn numbers_of(key: &str) -> Vec<&str> {
-    key.split('.').filter(|part| super::is_number(part)).collect()
+    key.split('.').filter(|part| is_number(part)).collect()
 }

@@ -1,10 +1,12 @@
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_data::write_state_dict;
 use clift_model::device::DeviceName;
 use clift_model::interchange::PREFIX;
-use clift_model::{Cameras, Clusters, SceneClusters, Views};
+use clift_model::{Cameras, Clusters, SceneClusters, Variant, Views};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 

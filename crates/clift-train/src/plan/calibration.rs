@@ -17,16 +17,18 @@ use rand::RngExt;
 use rand::seq::index::sample;
 
 use crate::TrainError;
+use crate::batch::{StageBatch, TokenChoice};
 use crate::bench::BenchOptions;
 use crate::bench::context::BenchContext;
 use crate::bench::inputs::{Shape, batch, clip};
 use crate::config::Config;
+use crate::device_batch::{Shown, loss_of};
 use crate::events::Stage;
 use crate::footprint::scene_sizes::{Middle, evaluated, measures_lpips, scene, trained_parts};
 use crate::loss::Loss;
 use crate::loss_scale::LossScale;
 use crate::optim::{adamw, clip_global_norm, global_norm};
-use crate::step::{Learner, Shown, StageBatch, TokenChoice, loss_of};
+use crate::step::Learner;
 use crate::trainer::freeze;
 
 /// Multiplications of a calibrated update: a second of a laptop.
@@ -152,7 +154,7 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
         device: context.device.clone().autodiff(),
         // The network of a perceptual term is not counted.
         loss: Loss::default(),
-        recompute: config.recompute,
+        activation_checkpointing: config.activation_checkpointing,
         loss_scale: LossScale::of(config.precision),
     };
     let rate = optimizer.learning_rate;

@@ -6,9 +6,9 @@ use clift_model::{KMeans, ModelError, SceneClusters};
 use super::compare::{most, update_error};
 use super::updates::{network, num_tokens, shape};
 use super::{Bound, Case, Outcome, Place};
+use crate::batch::TokenChoice;
 use crate::bench::inputs::{batch, clusters, model, uniform};
 use crate::bench::reference::{InF64, values};
-use crate::step::TokenChoice;
 use crate::trainer::freeze;
 use crate::{Stage, TrainError};
 

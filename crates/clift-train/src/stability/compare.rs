@@ -7,9 +7,10 @@ use clift_model::Clift;
 
 use super::Place;
 use crate::TrainError;
+use crate::batch::StageBatch;
 use crate::bench::reference::{InF64, module_in_f64, values};
 use crate::bench::step::gradients;
-use crate::step::{Shown, StageBatch};
+use crate::device_batch::Shown;
 
 /// Part of the largest gradient below which a parameter's own counts as that: a gradient that is zero in exact
 /// arithmetic, as that of a query with one key, is noise in any other.

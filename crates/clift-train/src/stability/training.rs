@@ -7,12 +7,13 @@ use clift_model::Clift;
 
 use super::updates::{network, num_tokens, shape};
 use super::{Bound, Case, Outcome};
+use crate::batch::StageBatch;
 use crate::bench::inputs::{batch, model};
 use crate::bench::reference::{InF64, module_in_f64, values};
 use crate::config::OptimizerConfig;
+use crate::device_batch::{Shown, loss_of};
 use crate::loss::Loss;
 use crate::optim::{adamw, clip_global_norm, global_norm};
-use crate::step::{Shown, StageBatch, loss_of};
 use crate::trainer::freeze;
 use crate::{Stage, TrainError};
 

@@ -7,8 +7,8 @@ use clift_model::ModelConfig;
 use super::compare::update_error;
 use super::{Bound, Case, Outcome, Place};
 use crate::TrainError;
+use crate::batch::StageBatch;
 use crate::bench::inputs::{Shape, batch, model};
-use crate::step::StageBatch;
 
 /// f32 through a few blocks, forward and backward, as the tests of single blocks have it, times the blocks.
 const GRADIENT: Bound = Bound::Most(1e-4);

@@ -48,7 +48,7 @@ pub struct BenchHalfArgs {
 pub fn run(args: &BenchHalfArgs) -> anyhow::Result<()> {
     let (mut config, overrides) = read_config::<Config>(&args.config, &args.set)?;
     for change in overrides {
-        print_note(&format!("--set {change}"));
+        print_note(&change.to_string());
     }
     config.device = args.device.unwrap_or(config.device);
     let options = BenchOptions {

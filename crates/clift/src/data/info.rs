@@ -39,7 +39,7 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     } else {
         let (config, overrides) = read_config::<Config>(&args.path, &args.set)?;
         for change in overrides {
-            print_note(&format!("--set {change}"));
+            print_note(&change.to_string());
         }
         config.validate()?;
         of_config(&args.path, &config)?

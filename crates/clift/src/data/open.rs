@@ -108,7 +108,7 @@ mod tests {
     fn set_takes_the_keys_of_the_files_and_no_others() {
         let (read, changes) = files(&["data.files.image_folder=images_4".into()]).unwrap();
         assert_eq!(read.image_folder.as_deref(), Some("images_4"));
-        assert_eq!(changes[0].to_string(), "data.files.image_folder: (default) -> \"images_4\"");
+        assert_eq!(changes[0].to_string(), "--set data.files.image_folder: (default) -> \"images_4\"");
         assert!(files(&[]).unwrap().1.is_empty());
         for wrong in ["data.width=64", "data.files.undistrot=true", "stage1.steps=2"] {
             assert!(files(&[wrong.into()]).unwrap_err().is::<clift_train::ConfigError>(), "{wrong}");
