@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use clift_model::{Precision, TokenStorage};
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::measured::Variant;
-use crate::selection::Selection;
+use crate::method::Variant;
 use crate::token_count::TokenCount;
+use crate::token_selection::Selection;
 
 /// Which scenes and views are rendered, with how many tokens.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -17,7 +17,7 @@ const SAMPLE_COVARIANCE: f64 = 121.0 / 120.0;
 /// Measures the peak signal-to-noise ratio in dB, after clamping both pictures to [0, 1].
 ///
 /// The mean squared error is over all values. Identical pictures have no error and give `+inf`;
-/// [`crate::summary`] says how that enters a mean.
+/// [`crate::scene_means::PSNR_CAP_DB`] is what a mean takes for it.
 ///
 /// # Errors
 /// [`EvalError::SizeMismatch`], and [`EvalError::NotFinite`] where clamping would hide a NaN or an infinity.
@@ -38,11 +38,11 @@ pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, EvalError> {
 /// picture, mean over positions and then channels. The pictures are not clamped.
 ///
 /// # Errors
-/// [`EvalError::TooSmallForSsim`] below 11 x 11 pixels, [`EvalError::SizeMismatch`], [`EvalError::NotFinite`].
+/// [`EvalError::ImageTooSmall`] below 11 x 11 pixels, [`EvalError::SizeMismatch`], [`EvalError::NotFinite`].
 pub fn ssim(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, EvalError> {
     check(pred, target, height * width * 3)?;
     if height < SSIM_MIN_SIZE_PX || width < SSIM_MIN_SIZE_PX {
-        return Err(EvalError::TooSmallForSsim { width, height });
+        return Err(EvalError::ImageTooSmall { metric: "SSIM", min: SSIM_MIN_SIZE_PX, width, height });
     }
     // One thread: a 256 x 256 picture takes 13 ms, and callers have many pictures to spread over cores.
     let per_channel = [0, 1, 2].map(|channel| {

@@ -1,9 +1,11 @@
 //! What the networks cost, by their sizes alone: multiply-accumulates, and the paper's way of counting them.
 // N tokens, S stored, R rendered, Q patches of a view, D width, F feed-forward width, L blocks
 
-use std::fmt;
 use std::str::FromStr;
 
+use strum::{Display, IntoStaticStr, VariantArray};
+
+use crate::names::parse_value;
 use crate::{ModelConfig, ModelError};
 
 /// Multiply-accumulates of a forward pass of one scene. Norms, activations, softmax and the rays of pixels are not
@@ -19,7 +21,8 @@ pub struct Macs {
 }
 
 /// How an amount of work is told.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "lowercase")]
 pub enum Convention {
     /// As the paper's numbers come out (render-budget table): one per multiply-accumulate of linear layers, attention
     /// left out, and five per value of `3 L + 2` layer norms. The first two are what fvcore counts where attention is
@@ -34,15 +37,11 @@ pub enum Convention {
 
 impl Convention {
     /// All conventions.
-    pub const ALL: [Self; 3] = [Self::Paper, Self::Macs, Self::Flops];
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// The name as it is typed.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Paper => "paper",
-            Self::Macs => "macs",
-            Self::Flops => "flops",
-        }
+    /// Returns the name as it is typed.
+    pub fn name(self) -> &'static str {
+        self.into()
     }
 
     /// The unit of a thousand million of it.
@@ -55,21 +54,11 @@ impl Convention {
     }
 }
 
-impl fmt::Display for Convention {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
 impl FromStr for Convention {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
-        Self::ALL.into_iter().find(|convention| convention.name() == name).ok_or_else(|| ModelError::BadConfig {
-            key: "convention",
-            value: name.into(),
-            fix: format!("write one of {}", Self::ALL.map(Self::name).join(", ")),
-        })
+        parse_value("convention", name)
     }
 }
 

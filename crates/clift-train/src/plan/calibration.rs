@@ -8,7 +8,7 @@ use burn::tensor::Tensor;
 use clift_data::order::{item_rng, step_rng};
 use clift_data::{ClipReader, Split};
 use clift_eval::lpips::Lpips;
-use clift_eval::{Accumulator, Condensed, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
+use clift_eval::{Condensed, EvalResults, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
 
 use clift_model::ModelConfig;
 use cpu_time::ProcessTime;
@@ -244,7 +244,7 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
         let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
         let sweep = Sweep { model: shallow.model.clone(), lpips, ..evaluated(config) };
         // One for all: after the first time no setting draws the view that warms it up.
-        let mut measured = Accumulator::default();
+        let mut measured = EvalResults::default();
         measuring_s =
             Timed::of(|| Ok(evaluate_scene(&networks, &clip, &sweep, false, &mut measured).map(|_| ())?))?.seconds;
     } else {
