@@ -178,8 +178,7 @@ pub fn evaluate_scene(
     let is_shown = !rows.is_empty();
     let judge = Judge::new(&clip.target, sweep.lpips.as_ref());
     let drawing = Drawing { clip, judge: &judge, cameras: upload_cameras(&[&clip.target], &networks.device)?, sweep };
-    let renderings = baselines(clip, &judge, &rows)?;
-    let mut material = SceneResults { renderings, rows: rows.clone(), ..SceneResults::default() };
+    let mut material = SceneResults::new(baselines(clip, &judge, &rows)?, rows.clone());
     for rendering in &material.renderings {
         record(clip, rendering, into)?;
     }

@@ -113,29 +113,15 @@ pub(crate) fn check(pred: &[f32], target: &[f32], expected: usize) -> Result<(),
 
 #[cfg(test)]
 mod tests {
-    use safetensors::SafeTensors;
-
     use super::*;
-
-    fn floats(fixture: &SafeTensors, name: &str) -> Vec<f64> {
-        let tensor = fixture.tensor(name).unwrap();
-        match tensor.dtype() {
-            safetensors::Dtype::F32 => {
-                tensor.data().as_chunks::<4>().0.iter().map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect()
-            }
-            _ => tensor.data().as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect(),
-        }
-    }
+    use crate::testing::Reference;
 
     #[test]
     fn psnr_and_ssim_equal_torch_and_scikit_image() {
-        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data-fixtures/reference/metrics.safetensors");
-        let bytes = std::fs::read(path).unwrap();
-        let fixture = SafeTensors::deserialize(&bytes).unwrap();
-        let [count, height, width, 3] = *fixture.tensor("input.prediction").unwrap().shape() else { panic!() };
-        let [pred, target] = ["input.prediction", "input.target"]
-            .map(|name| floats(&fixture, name).iter().map(|&value| value as f32).collect::<Vec<_>>());
-        let (expected_psnr, expected_ssim) = (floats(&fixture, "output.psnr"), floats(&fixture, "output.ssim"));
+        let fixture = Reference::open("metrics");
+        let [count, height, width, 3] = fixture.shape("input.prediction")[..] else { panic!() };
+        let [pred, target] = ["input.prediction", "input.target"].map(|name| fixture.f32s(name));
+        let (expected_psnr, expected_ssim) = (fixture.f64s("output.psnr"), fixture.f64s("output.ssim"));
 
         let size = height * width * 3;
         for i in 0..count {

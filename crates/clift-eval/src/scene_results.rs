@@ -11,7 +11,6 @@ use crate::view_metrics::EvalKey;
 const MAX_ROWS: usize = 6;
 
 /// Images, clusters and selected tokens of one scene.
-#[derive(Default)]
 pub struct SceneResults {
     /// The renderings of every key, baselines first.
     pub(crate) renderings: Vec<Rendered>,
@@ -23,6 +22,13 @@ pub struct SceneResults {
     pub(crate) others: Vec<Scored>,
     /// The views whose images are kept; at least one.
     pub(crate) rows: Vec<usize>,
+}
+
+impl SceneResults {
+    /// Starts with the baselines, of which the images of `rows` are kept.
+    pub(crate) fn new(baselines: Vec<Rendered>, rows: Vec<usize>) -> Self {
+        Self { renderings: baselines, clusters: Vec::new(), choices: Vec::new(), others: Vec::new(), rows }
+    }
 }
 
 /// Returns the views whose images are kept: all, or six of them from the first to the last.

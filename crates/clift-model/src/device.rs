@@ -115,10 +115,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_round_trip_and_unknown_ones_list_the_known() {
-        for name in DeviceName::ALL {
-            assert_eq!(name.as_str().parse::<DeviceName>().expect("a listed name"), name);
-        }
+    fn an_unknown_name_lists_the_known() {
         let message = "cuda".parse::<DeviceName>().unwrap_err().to_string();
         assert_eq!(message, "device `cuda`: unknown; the names are flex, ndarray, wgpu");
     }

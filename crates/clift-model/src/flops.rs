@@ -197,14 +197,6 @@ mod tests {
         assert!(config.render_macs(250, 256, 1).is_err());
     }
 
-    #[test]
-    fn a_convention_has_a_name() {
-        for convention in Convention::ALL {
-            assert_eq!(convention.to_string().parse::<Convention>().unwrap(), convention);
-        }
-        assert!("flop".parse::<Convention>().unwrap_err().to_string().contains("paper, macs, flops"));
-    }
-
     /// What a network really multiplies, against the formula.
     #[test]
     fn a_real_forward_multiplies_as_often_as_convention_macs_says() {

@@ -26,6 +26,8 @@ mod read;
 mod storage;
 mod write;
 
+use strum::{Display, IntoStaticStr, VariantArray};
+
 pub use check::MAX_SIDE_PX;
 pub use storage::TokenStorage;
 pub use write::check_destination;
@@ -40,7 +42,7 @@ const FORMAT: &str = "clift-scene";
 const VERSION: &str = "2";
 
 /// What the tokens of a scene are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, strum::Display, strum::IntoStaticStr, strum::VariantArray)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "lowercase")]
 pub enum TokenKind {
     /// Condensed tokens: drawn with the renderer of stage 2.
