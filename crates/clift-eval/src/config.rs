@@ -6,8 +6,8 @@ use clift_model::{Precision, TokenStorage};
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::method::Variant;
+use crate::selection::Selection;
 use crate::token_count::TokenCount;
-use crate::token_selection::Selection;
 
 /// Which scenes and views are rendered, with how many tokens.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

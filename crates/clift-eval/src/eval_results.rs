@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
 use crate::method::SystemName;
-use crate::token_selection::Selection;
+use crate::selection::Selection;
 use crate::view_metrics::{Cost, EvalKey, ViewMetrics};
 
 /// Something that a summary has no number of.

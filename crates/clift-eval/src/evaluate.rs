@@ -18,10 +18,10 @@ use crate::method::Variant;
 use crate::predictions::System;
 use crate::rendered::{Judge, Rendered, baselines};
 use crate::scene_results::{SceneResults, sheet_rows};
-use crate::selection::{Chosen, choose_tokens};
+use crate::selection::Selection;
 use crate::stored::{GroupsOnce, Stored, rows_of};
+use crate::token_choice::{SelectedTokens, choose};
 use crate::token_count::TokenCount;
-use crate::token_selection::Selection;
 use crate::upload::{upload_cameras, upload_views};
 use crate::view_metrics::EvalKey;
 
@@ -206,8 +206,7 @@ pub fn evaluate_scene(
                     let some = EvalKey { num_render_tokens, ..whole };
                     let patch_size = sweep.model.patch_size;
                     into.selection = Some(sweep.selection);
-                    let chosen =
-                        choose_tokens(sweep.selection, clip, &stored.ids, patch_size, num_render_tokens, seed)?;
+                    let chosen = choose(sweep.selection, clip, &stored.ids, patch_size, num_render_tokens, seed)?;
                     renderings.push(drawing.render(&stored, Some(&chosen), some, rows, into)?);
                     if !rows.is_empty() {
                         material.choices.push((some, stored.ids.clone(), chosen));
@@ -272,7 +271,7 @@ impl Drawing<'_> {
     fn render(
         &self,
         stored: &Stored,
-        chosen: Option<&[Chosen]>,
+        chosen: Option<&[SelectedTokens]>,
         setting: EvalKey,
         rows: &[usize],
         into: &mut EvalResults,

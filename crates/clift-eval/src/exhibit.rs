@@ -8,8 +8,8 @@ use crate::method::Variant;
 use crate::picture::{Picture, error_map};
 use crate::rendered::{Rendered, truth};
 use crate::scene_results::SceneResults;
-use crate::selection::Chosen;
 use crate::sheet::{Cell, Row, sheet};
+use crate::token_choice::SelectedTokens;
 use crate::view_metrics::{EvalKey, best_variant};
 
 /// Longer side of an exhibit's pictures: a report holds dozens of them.
@@ -99,7 +99,7 @@ impl Exhibit {
         }
         drawings.sort_by_key(|drawing| drawing.setting);
         drawings.dedup_by_key(|drawing| drawing.setting);
-        let choice = |(setting, stored, chosen): &(EvalKey, Vec<u32>, Vec<Chosen>)| {
+        let choice = |(setting, stored, chosen): &(EvalKey, Vec<u32>, Vec<SelectedTokens>)| {
             let chosen = chosen[view].tokens.iter().map(|&token| stored[token as usize]).collect();
             Choice { setting: *setting, stored: stored.clone(), chosen }
         };

@@ -8,8 +8,8 @@ use strum::{IntoStaticStr, VariantArray};
 
 use crate::config::EvalConfig;
 use crate::method::Variant;
+use crate::selection::Selection;
 use crate::token_count::TokenCount;
-use crate::token_selection::Selection;
 
 /// An experiment of the paper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, IntoStaticStr, VariantArray)]

@@ -4,7 +4,7 @@ use clift_model::SceneClusters;
 
 use crate::predictions::Scored;
 use crate::rendered::Rendered;
-use crate::selection::Chosen;
+use crate::token_choice::SelectedTokens;
 use crate::view_metrics::EvalKey;
 
 /// Largest number of views whose images are kept; more targets are thinned evenly.
@@ -17,7 +17,7 @@ pub struct SceneResults {
     /// The clusters of every storage count.
     pub(crate) clusters: Vec<SceneClusters>,
     /// The patches of the stored tokens, and the tokens selected for every target.
-    pub(crate) choices: Vec<(EvalKey, Vec<u32>, Vec<Chosen>)>,
+    pub(crate) choices: Vec<(EvalKey, Vec<u32>, Vec<SelectedTokens>)>,
     /// The images of other systems.
     pub(crate) others: Vec<Scored>,
     /// The views whose images are kept; at least one.

@@ -19,8 +19,8 @@ use crate::method::Variant;
 use crate::paired::{PairedDifference, differences};
 use crate::pareto::front;
 use crate::scene_means::{capped, mean, scene_means, standard_error};
+use crate::selection::Selection;
 use crate::statistics::{median, p95};
-use crate::token_selection::Selection;
 use crate::view_metrics::{EvalKey, ViewMetrics};
 
 /// Means of a baseline.

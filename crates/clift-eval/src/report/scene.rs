@@ -11,7 +11,7 @@ use crate::exhibit::{Choice, Drawing, Exhibit};
 use crate::method::Variant;
 use crate::picture::Picture;
 use crate::scene_results::spread;
-use crate::token_selection::Selection;
+use crate::selection::Selection;
 use crate::view_metrics::{EvalKey, best_variant};
 
 /// Most token counts of a variant that are shown.
