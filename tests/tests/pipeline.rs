@@ -12,8 +12,7 @@ fn keys(value: &Value) -> Vec<&str> {
 }
 
 /// Keys of `summary.json`.
-const SUMMARY_KEYS: [&str; 11] = [
-    "adaptive",
+const SUMMARY_KEYS: [&str; 10] = [
     "baselines",
     "differences",
     "lpips_weights_sha256",

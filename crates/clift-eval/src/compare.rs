@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::EvalError;
+use crate::error::EvalError;
+use crate::scene_means::capped;
 use crate::student::quantile_95;
-use crate::summary::PSNR_CAP_DB;
 
 /// What both evaluations measure.
 const METRICS: [&str; 3] = ["psnr", "ssim", "lpips_vgg"];
@@ -74,7 +74,7 @@ impl Evaluation {
                 num_render_tokens: row.num_render_tokens,
                 tokens: row.tokens,
             };
-            let psnr = row.psnr.map(|psnr| psnr.min(PSNR_CAP_DB));
+            let psnr = row.psnr.map(capped);
             views.entry(made).or_default().insert((row.scene, row.target_frame), [psnr, row.ssim, row.lpips_vgg]);
         }
         Ok(Self { path: path.into(), views })

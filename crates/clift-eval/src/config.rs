@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clift_model::{Precision, TokenStorage};
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::measured::Variant;
+use crate::method::Variant;
 use crate::selection::Selection;
 use crate::token_count::TokenCount;
 

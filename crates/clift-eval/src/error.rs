@@ -34,17 +34,13 @@ pub enum EvalError {
         /// The NaN or infinity.
         value: f32,
     },
-    /// SSIM has no window that lies wholly inside the image.
-    #[error("SSIM needs at least {min} x {min} pixels, got {width} x {height}", min = crate::metrics::SSIM_MIN_SIZE_PX)]
-    TooSmallForSsim {
-        /// Columns.
-        width: usize,
-        /// Rows.
-        height: usize,
-    },
-    /// LPIPS has no value left of a picture after its last stage.
-    #[error("LPIPS needs at least {min} x {min} pixels, got {width} x {height}", min = crate::lpips::LPIPS_MIN_SIZE_PX)]
-    TooSmallForLpips {
+    /// An image is smaller than a metric allows.
+    #[error("{metric} needs at least {min} x {min} pixels, got {width} x {height}")]
+    ImageTooSmall {
+        /// Name of the metric.
+        metric: &'static str,
+        /// Smallest side, in pixels.
+        min: usize,
         /// Columns.
         width: usize,
         /// Rows.

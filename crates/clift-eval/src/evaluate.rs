@@ -8,20 +8,22 @@ use clift_data::order::derive_seed;
 use clift_model::scene::file_bytes;
 use clift_model::{
     Cameras, Clift, Condenser, Convention, Encoder, Grouping, KMeans, LiftNorm, ModelConfig, Renderer, TokenStorage,
-    total_variance,
 };
 
-use crate::EvalError;
-use crate::exhibit::{Material, Shown, sheet_rows};
+use crate::error::EvalError;
+use crate::eval_results::EvalResults;
 use crate::lpips::Lpips;
-use crate::measured::{Accumulator, Setting, Variant};
 use crate::memory;
+use crate::method::Variant;
 use crate::predictions::System;
 use crate::rendered::{Judge, Rendered, baselines};
-use crate::selection::{Chosen, Selection};
+use crate::scene_results::{SceneResults, sheet_rows};
+use crate::selection::Selection;
 use crate::stored::{GroupsOnce, Stored, rows_of};
+use crate::token_choice::{SelectedTokens, choose};
 use crate::token_count::TokenCount;
 use crate::upload::{upload_cameras, upload_views};
+use crate::view_metrics::EvalKey;
 
 /// The networks of an evaluation, on a device without autodiff.
 #[derive(Clone, Debug)]
@@ -145,7 +147,7 @@ impl Sweep {
     }
 }
 
-/// Renders and measures the targets of one scene; returns its pictures when they are to be shown.
+/// Renders and measures the targets of one scene; returns its images where they are to be shown.
 ///
 /// Sampling per scene as in the paper: one random subset shared by all its targets.
 ///
@@ -157,8 +159,8 @@ pub fn evaluate_scene(
     clip: &Clip,
     sweep: &Sweep,
     is_shown: bool,
-    into: &mut Accumulator,
-) -> Result<Option<Shown>, EvalError> {
+    into: &mut EvalResults,
+) -> Result<Option<SceneResults>, EvalError> {
     let features = networks.encoder.forward(&upload_views(&[&clip.context], &networks.device)?);
     // Where stage 2 has trained a norm of the tokens, condensed ones are of that norm, and of its clusters.
     let normed: Vec<(Variant, Tensor<3>)> = [Variant::Clift, Variant::PatchClift]
@@ -172,12 +174,11 @@ pub fn evaluate_scene(
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
     let views = (clip.context.num_views(), grid);
-    let variance = total_variance(&lift)?[0];
     let rows = if is_shown { sheet_rows(clip.target.num_views()) } else { Vec::new() };
     let is_shown = !rows.is_empty();
     let judge = Judge::new(&clip.target, sweep.lpips.as_ref());
     let drawing = Drawing { clip, judge: &judge, cameras: upload_cameras(&[&clip.target], &networks.device)?, sweep };
-    let mut material = Material { renderings: baselines(clip, &judge, &rows)?, ..Material::default() };
+    let mut material = SceneResults::new(baselines(clip, &judge, &rows)?, rows.clone());
     for rendering in &material.renderings {
         record(clip, rendering, into)?;
     }
@@ -194,7 +195,7 @@ pub fn evaluate_scene(
             for (i, &tokens) in sweep.formats(variant).iter().enumerate() {
                 let rows = if i == 0 { &rows[..] } else { &[] };
                 let stored = Stored::new(variant, networks, lift, index, tokens)?;
-                let whole = Setting {
+                let whole = EvalKey {
                     variant,
                     num_storage_tokens,
                     num_render_tokens: num_storage_tokens,
@@ -202,10 +203,10 @@ pub fn evaluate_scene(
                 };
                 let mut renderings = vec![drawing.render(&stored, None, whole, rows, into)?];
                 for num_render_tokens in sweep.render_counts(num_storage_tokens) {
-                    let some = Setting { num_render_tokens, ..whole };
+                    let some = EvalKey { num_render_tokens, ..whole };
                     let patch_size = sweep.model.patch_size;
                     into.selection = Some(sweep.selection);
-                    let chosen = sweep.selection.choose(clip, &stored.ids, patch_size, num_render_tokens, seed)?;
+                    let chosen = choose(sweep.selection, clip, &stored.ids, patch_size, num_render_tokens, seed)?;
                     renderings.push(drawing.render(&stored, Some(&chosen), some, rows, into)?);
                     if !rows.is_empty() {
                         material.choices.push((some, stored.ids.clone(), chosen));
@@ -223,9 +224,6 @@ pub fn evaluate_scene(
                 }
             }
         }
-        if let Some(error) = index.cluster_error(variance) {
-            into.add_cluster_error(&clip.key, num_storage_tokens, error);
-        }
         if is_shown {
             let own = own.iter().find(|(of, ..)| *of == Variant::Clift);
             let index = own.map_or(&index, |(.., index)| index);
@@ -242,11 +240,11 @@ pub fn evaluate_scene(
         }
         material.others.push(scored);
     }
-    if is_shown { Shown::new(clip, &material, &rows, sweep.model.patch_size).map(Some) } else { Ok(None) }
+    Ok(is_shown.then_some(material))
 }
 
 /// Adds what was measured of a scene in one setting.
-fn record(clip: &Clip, rendering: &Rendered, into: &mut Accumulator) -> Result<(), EvalError> {
+fn record(clip: &Clip, rendering: &Rendered, into: &mut EvalResults) -> Result<(), EvalError> {
     for (&frame, &measured) in clip.target.frame_index.iter().zip(&rendering.measured) {
         // A target drawn twice is one view.
         if !into.contains(&clip.key, frame, rendering.setting) {
@@ -273,10 +271,10 @@ impl Drawing<'_> {
     fn render(
         &self,
         stored: &Stored,
-        chosen: Option<&[Chosen]>,
-        setting: Setting,
+        chosen: Option<&[SelectedTokens]>,
+        setting: EvalKey,
         rows: &[usize],
-        into: &mut Accumulator,
+        into: &mut EvalResults,
     ) -> Result<Rendered, EvalError> {
         let target = &self.clip.target;
         let device = stored.tokens.device();

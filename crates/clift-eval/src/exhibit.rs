@@ -1,20 +1,16 @@
 //! What is shown of a scene: a contact sheet, and small pictures for the report.
 
-use std::collections::BTreeSet;
-
 use clift_data::Clip;
 use clift_model::SceneClusters;
 
-use crate::EvalError;
-use crate::measured::{Setting, Variant};
+use crate::error::EvalError;
+use crate::method::Variant;
 use crate::picture::{Picture, error_map};
-use crate::predictions::Scored;
 use crate::rendered::{Rendered, truth};
-use crate::selection::Chosen;
+use crate::scene_results::SceneResults;
 use crate::sheet::{Cell, Row, sheet};
-
-/// Most rows of a sheet; more targets are thinned evenly.
-const MAX_ROWS: usize = 6;
+use crate::token_choice::SelectedTokens;
+use crate::view_metrics::{EvalKey, best_variant};
 
 /// Longer side of an exhibit's pictures: a report holds dozens of them.
 const MAX_SIDE_PX: usize = 128;
@@ -55,7 +51,7 @@ pub struct Exhibit {
 #[derive(Clone, Debug)]
 pub struct Drawing {
     /// How it was drawn.
-    pub setting: Setting,
+    pub setting: EvalKey,
     /// Its PSNR in dB.
     pub psnr: f64,
     /// What it looks like.
@@ -66,45 +62,36 @@ pub struct Drawing {
 #[derive(Clone, Debug)]
 pub struct Choice {
     /// How it was drawn.
-    pub setting: Setting,
+    pub setting: EvalKey,
     /// Patches of the context views that the stored tokens stand on.
     pub stored: Vec<u32>,
     /// Those of them that were chosen.
     pub chosen: Vec<u32>,
 }
 
-/// What a sweep has of a scene.
-#[derive(Default)]
-pub(crate) struct Material {
-    /// Every setting, baselines first.
-    pub renderings: Vec<Rendered>,
-    /// By storage count.
-    pub clusters: Vec<SceneClusters>,
-    /// The patches that stored tokens stand on, and what was chosen of them for every target.
-    pub choices: Vec<(Setting, Vec<u32>, Vec<Chosen>)>,
-    /// Other systems' pictures.
-    pub others: Vec<Scored>,
-}
-
 impl Shown {
-    /// Makes sheet and exhibit; `rows` are the views whose pictures were kept.
-    pub(crate) fn new(clip: &Clip, material: &Material, rows: &[usize], patch_size: usize) -> Result<Self, EvalError> {
-        let sheet = scene_sheet(clip, &material.renderings, rows)?;
-        Ok(Self { sheet, exhibit: Exhibit::new(clip, material, rows[rows.len() / 2], patch_size)? })
+    /// Makes sheet and exhibit of the results of a scene, whose patches have `patch_size` pixels.
+    ///
+    /// # Errors
+    /// [`EvalError::SizeMismatch`] for results of another clip.
+    pub fn new(clip: &Clip, results: &SceneResults, patch_size: usize) -> Result<Self, EvalError> {
+        let rows = &results.rows;
+        let sheet = scene_sheet(clip, &results.renderings, rows)?;
+        Ok(Self { sheet, exhibit: Exhibit::new(clip, results, rows[rows.len() / 2], patch_size)? })
     }
 }
 
 impl Exhibit {
-    fn new(clip: &Clip, material: &Material, view: usize, patch_size: usize) -> Result<Self, EvalError> {
+    fn new(clip: &Clip, results: &SceneResults, view: usize, patch_size: usize) -> Result<Self, EvalError> {
         let (height, width) = (clip.target.height, clip.target.width);
         let context = clip.context.images.chunks(height * width * 3);
         let context = context.map(|rgb| Ok(small(Picture::from_rgb8(rgb, height, width)?)));
         let mut drawings = Vec::new();
-        for rendered in &material.renderings {
+        for rendered in &results.renderings {
             let picture = small(Picture::from_unit(&rendered.shown[&view], height, width)?);
             drawings.push(Drawing { setting: rendered.setting, psnr: rendered.measured[view].psnr, picture });
         }
-        for scored in &material.others {
+        for scored in &results.others {
             if let (Some(pixels), Some(measured)) = (scored.shown.get(&view), scored.measured.get(&view)) {
                 let picture = small(Picture::from_unit(pixels, height, width)?);
                 drawings.push(Drawing { setting: scored.setting, psnr: measured.psnr, picture });
@@ -112,14 +99,14 @@ impl Exhibit {
         }
         drawings.sort_by_key(|drawing| drawing.setting);
         drawings.dedup_by_key(|drawing| drawing.setting);
-        let choice = |(setting, stored, chosen): &(Setting, Vec<u32>, Vec<Chosen>)| {
+        let choice = |(setting, stored, chosen): &(EvalKey, Vec<u32>, Vec<SelectedTokens>)| {
             let chosen = chosen[view].tokens.iter().map(|&token| stored[token as usize]).collect();
             Choice { setting: *setting, stored: stored.clone(), chosen }
         };
-        let mut choices: Vec<Choice> = material.choices.iter().map(choice).collect();
+        let mut choices: Vec<Choice> = results.choices.iter().map(choice).collect();
         choices.sort_by_key(|choice| choice.setting);
         choices.dedup_by_key(|choice| choice.setting);
-        let mut clusters = material.clusters.clone();
+        let mut clusters = results.clusters.clone();
         clusters.sort_by_key(|clusters| clusters.centroid_index().len());
         clusters.dedup_by_key(|clusters| clusters.centroid_index().len());
         Ok(Self {
@@ -141,33 +128,11 @@ fn small(picture: Picture) -> Picture {
     if too_large { picture.fitted(MAX_SIDE_PX, MAX_SIDE_PX) } else { picture }
 }
 
-/// The variant that stands for the method: the condensed one where there is a condenser.
-pub(crate) fn best_variant(settings: impl IntoIterator<Item = Setting>) -> Option<Variant> {
-    let there: BTreeSet<Variant> = settings.into_iter().map(|setting| setting.variant).collect();
-    [Variant::Clift, Variant::PatchClift, Variant::Kmeans, Variant::Random]
-        .into_iter()
-        .find(|variant| there.contains(variant))
-}
-
-/// The views a sheet shows: all, or `MAX_ROWS` of them from the first to the last.
-pub(crate) fn sheet_rows(num_views: usize) -> Vec<usize> {
-    spread(num_views, MAX_ROWS)
-}
-
-/// All of `0..count`, or `most` of them from the first to the last; `most` is at least 2.
-pub(crate) fn spread(count: usize, most: usize) -> Vec<usize> {
-    if count <= most {
-        return (0..count).collect();
-    }
-    (0..most).map(|i| i * (count - 1) / (most - 1)).collect()
-}
-
 /// Columns: contexts, target, nearest view, then the fewest and the most tokens of the best variant
 /// there is, and the error of the last.
 fn scene_sheet(clip: &Clip, renderings: &[Rendered], shown_views: &[usize]) -> Result<Picture, EvalError> {
     let best = best_variant(renderings.iter().map(|rendering| rendering.setting));
-    let whole = |setting: Setting| setting.num_render_tokens == setting.num_storage_tokens;
-    let shown = renderings.iter().filter(|r| Some(r.setting.variant) == best && whole(r.setting));
+    let shown = renderings.iter().filter(|r| Some(r.setting.variant) == best && r.setting.is_whole());
     let mut shown: Vec<&Rendered> = shown.collect();
     shown.sort_by_key(|r| r.setting.num_storage_tokens);
     shown.dedup_by_key(|r| r.setting.num_storage_tokens);
@@ -214,22 +179,6 @@ fn scene_sheet(clip: &Clip, renderings: &[Rendered], shown_views: &[usize]) -> R
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_sheet_of_many_views_goes_from_the_first_to_the_last() {
-        assert_eq!(sheet_rows(3), [0, 1, 2]);
-        assert_eq!(sheet_rows(6), [0, 1, 2, 3, 4, 5]);
-        let rows = sheet_rows(121);
-        assert_eq!((rows.len(), rows[0], rows[MAX_ROWS - 1]), (MAX_ROWS, 0, 120));
-    }
-
-    #[test]
-    fn the_condensed_variant_stands_for_the_method_where_it_is_there() {
-        let settings = [Variant::NearestView, Variant::Random, Variant::Kmeans].map(Setting::baseline);
-        assert_eq!(best_variant(settings), Some(Variant::Kmeans));
-        assert_eq!(best_variant(settings.into_iter().chain([Setting::baseline(Variant::Clift)])), Some(Variant::Clift));
-        assert_eq!(best_variant([Setting::baseline(Variant::MeanImage)]), None);
-    }
 
     #[test]
     fn small_pictures_stay_as_they_are_and_large_ones_shrink() {

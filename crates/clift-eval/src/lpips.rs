@@ -6,7 +6,7 @@ use std::path::Path;
 use burn::module::Module;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 
-use crate::EvalError;
+use crate::error::EvalError;
 use crate::metrics::check;
 use crate::vgg::{MIN_SIZE_PX, NUM_STAGES, Vgg, VggShape};
 use crate::weight_file::{Wanted, WeightFile};
@@ -69,11 +69,11 @@ impl Lpips {
     /// Looks at a picture, `[height, width, 3]` with values in [0, 1]; others are not clamped.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`], [`EvalError::NotFinite`], and [`EvalError::TooSmallForLpips`] below 16 x 16 pixels.
+    /// [`EvalError::SizeMismatch`], [`EvalError::NotFinite`], and [`EvalError::ImageTooSmall`] below 16 x 16 pixels.
     pub fn features(&self, picture: &[f32], height: usize, width: usize) -> Result<LpipsFeatures, EvalError> {
         check(picture, picture, height * width * 3)?;
         if height.min(width) < LPIPS_MIN_SIZE_PX {
-            return Err(EvalError::TooSmallForLpips { width, height });
+            return Err(EvalError::ImageTooSmall { metric: "LPIPS", min: LPIPS_MIN_SIZE_PX, width, height });
         }
         let pixels = TensorData::new(picture.to_vec(), [1, height, width, 3]);
         let dtype = self.heads[0].dtype();

@@ -17,7 +17,7 @@ const SAMPLE_COVARIANCE: f64 = 121.0 / 120.0;
 /// Measures the peak signal-to-noise ratio in dB, after clamping both pictures to [0, 1].
 ///
 /// The mean squared error is over all values. Identical pictures have no error and give `+inf`;
-/// [`crate::summary`] says how that enters a mean.
+/// [`crate::scene_means::PSNR_CAP_DB`] is what a mean takes for it.
 ///
 /// # Errors
 /// [`EvalError::SizeMismatch`], and [`EvalError::NotFinite`] where clamping would hide a NaN or an infinity.
@@ -38,11 +38,11 @@ pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, EvalError> {
 /// picture, mean over positions and then channels. The pictures are not clamped.
 ///
 /// # Errors
-/// [`EvalError::TooSmallForSsim`] below 11 x 11 pixels, [`EvalError::SizeMismatch`], [`EvalError::NotFinite`].
+/// [`EvalError::ImageTooSmall`] below 11 x 11 pixels, [`EvalError::SizeMismatch`], [`EvalError::NotFinite`].
 pub fn ssim(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, EvalError> {
     check(pred, target, height * width * 3)?;
     if height < SSIM_MIN_SIZE_PX || width < SSIM_MIN_SIZE_PX {
-        return Err(EvalError::TooSmallForSsim { width, height });
+        return Err(EvalError::ImageTooSmall { metric: "SSIM", min: SSIM_MIN_SIZE_PX, width, height });
     }
     // One thread: a 256 x 256 picture takes 13 ms, and callers have many pictures to spread over cores.
     let per_channel = [0, 1, 2].map(|channel| {
@@ -113,29 +113,15 @@ pub(crate) fn check(pred: &[f32], target: &[f32], expected: usize) -> Result<(),
 
 #[cfg(test)]
 mod tests {
-    use safetensors::SafeTensors;
-
     use super::*;
-
-    fn floats(fixture: &SafeTensors, name: &str) -> Vec<f64> {
-        let tensor = fixture.tensor(name).unwrap();
-        match tensor.dtype() {
-            safetensors::Dtype::F32 => {
-                tensor.data().as_chunks::<4>().0.iter().map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect()
-            }
-            _ => tensor.data().as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect(),
-        }
-    }
+    use crate::testing::Reference;
 
     #[test]
     fn psnr_and_ssim_equal_torch_and_scikit_image() {
-        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data-fixtures/reference/metrics.safetensors");
-        let bytes = std::fs::read(path).unwrap();
-        let fixture = SafeTensors::deserialize(&bytes).unwrap();
-        let [count, height, width, 3] = *fixture.tensor("input.prediction").unwrap().shape() else { panic!() };
-        let [pred, target] = ["input.prediction", "input.target"]
-            .map(|name| floats(&fixture, name).iter().map(|&value| value as f32).collect::<Vec<_>>());
-        let (expected_psnr, expected_ssim) = (floats(&fixture, "output.psnr"), floats(&fixture, "output.ssim"));
+        let fixture = Reference::open("metrics");
+        let [count, height, width, 3] = fixture.shape("input.prediction")[..] else { panic!() };
+        let [pred, target] = ["input.prediction", "input.target"].map(|name| fixture.f32s(name));
+        let (expected_psnr, expected_ssim) = (fixture.f64s("output.psnr"), fixture.f64s("output.ssim"));
 
         let size = height * width * 3;
         for i in 0..count {

@@ -6,7 +6,7 @@ use std::path::Path;
 use burn::module::Module;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 
-use crate::EvalError;
+use crate::error::EvalError;
 use crate::vgg::{MIN_SIZE_PX, Vgg, VggShape};
 use crate::weight_file::{Wanted, WeightFile};
 

@@ -10,6 +10,7 @@ use embedded_graphics::text::{Baseline, Text};
 use image::{ImageEncoder, RgbImage};
 
 use crate::error::EvalError;
+use crate::metrics::check;
 
 /// Mean absolute error over red, green and blue that [`error_map`] shows as its brightest colour.
 pub const ERROR_FULL_SCALE: f32 = 0.25;
@@ -178,7 +179,7 @@ impl DrawTarget for Picture {
 /// [`EvalError::SizeMismatch`] when either picture does not hold `height * width * 3` values, and
 /// [`EvalError::NotFinite`], which would otherwise be painted as no error.
 pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<Picture, EvalError> {
-    crate::metrics::check(pred, target, height * width * 3)?;
+    check(pred, target, height * width * 3)?;
     let colours: Vec<u8> = pred
         .as_chunks::<3>()
         .0

@@ -2,15 +2,18 @@
 
 use std::str::FromStr;
 
+use clift_model::names::parse_value;
 use clift_model::{ModelError, Preset};
+use strum::{IntoStaticStr, VariantArray};
 
 use crate::config::EvalConfig;
-use crate::measured::Variant;
+use crate::method::Variant;
 use crate::selection::Selection;
 use crate::token_count::TokenCount;
 
 /// An experiment of the paper.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "lowercase")]
 pub enum Experiment {
     /// Quality against data size (section 4.2).
     Main,
@@ -23,19 +26,6 @@ pub enum Experiment {
 }
 
 impl Experiment {
-    /// All of them.
-    pub const ALL: [Self; 4] = [Self::Main, Self::Ablation, Self::Patchwise, Self::Budget];
-
-    /// The name as it is typed.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Main => "main",
-            Self::Ablation => "ablation",
-            Self::Patchwise => "patchwise",
-            Self::Budget => "budget",
-        }
-    }
-
     /// Sets variants, token counts and selection; scenes and views stay.
     ///
     /// Counts are shares, so that other sizes than the paper's 4,096 tokens are served: its patch-wise table has 256
@@ -66,11 +56,7 @@ impl FromStr for Experiment {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
-        Self::ALL.into_iter().find(|experiment| experiment.name() == name).ok_or_else(|| ModelError::BadConfig {
-            key: "preset",
-            value: name.into(),
-            fix: format!("write one of {}", Self::ALL.map(Self::name).join(", ")),
-        })
+        parse_value("preset", name)
     }
 }
 
@@ -97,10 +83,8 @@ mod tests {
     }
 
     #[test]
-    fn an_experiment_is_named_and_others_are_refused() {
-        for experiment in Experiment::ALL {
-            assert_eq!(experiment.name().parse::<Experiment>().unwrap(), experiment);
-        }
+    fn an_unknown_experiment_lists_the_known() {
+        assert_eq!("budget".parse::<Experiment>().unwrap(), Experiment::Budget);
         let message = "table1".parse::<Experiment>().unwrap_err().to_string();
         assert!(message.contains("main, ablation, patchwise, budget"), "{message}");
     }

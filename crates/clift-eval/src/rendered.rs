@@ -8,8 +8,9 @@ use clift_data::{Clip, Views as HostViews};
 use crate::EvalError;
 use crate::baseline::{mean_image, nearest_image};
 use crate::lpips::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures};
-use crate::measured::{Measured, Setting, Variant};
+use crate::method::Variant;
 use crate::metrics::{SSIM_MIN_SIZE_PX, psnr, ssim};
+use crate::view_metrics::{EvalKey, ViewMetrics};
 
 /// Memory for what LPIPS sees in the targets of a scene, which every setting is compared with: 31 pictures of
 /// 256 x 256. What it sees in further ones is computed each time.
@@ -29,7 +30,7 @@ impl<'a> Judge<'a> {
     }
 
     /// Measures a rendering of a target; a metric whose window the picture is too small for is left out.
-    pub fn measure(&self, pixels: &[f32], view: usize) -> Result<Measured, EvalError> {
+    pub fn measure(&self, pixels: &[f32], view: usize) -> Result<ViewMetrics, EvalError> {
         let truth = truth(self.target, view);
         let (height, width) = (self.target.height, self.target.width);
         let large_enough = height.min(width) >= SSIM_MIN_SIZE_PX;
@@ -38,7 +39,7 @@ impl<'a> Judge<'a> {
             Some(lpips) => Some(self.lpips(lpips, pixels, &truth, view)?),
             None => None,
         };
-        Ok(Measured { lpips_vgg, ..Measured::quality(psnr(pixels, &truth)?, ssim) })
+        Ok(ViewMetrics { lpips_vgg, ..ViewMetrics::quality(psnr(pixels, &truth)?, ssim) })
     }
 
     fn lpips(&self, lpips: &Lpips, pixels: &[f32], truth: &[f32], view: usize) -> Result<f64, EvalError> {
@@ -61,15 +62,15 @@ impl<'a> Judge<'a> {
 /// All targets of a scene in one setting.
 pub(crate) struct Rendered {
     /// How they were made.
-    pub setting: Setting,
+    pub setting: EvalKey,
     /// By view.
-    pub measured: Vec<Measured>,
+    pub measured: Vec<ViewMetrics>,
     /// The pictures that are shown, by view: `height * width * 3` values of RGB.
     pub shown: BTreeMap<usize, Vec<f32>>,
 }
 
 impl Rendered {
-    pub fn new(setting: Setting) -> Self {
+    pub fn new(setting: EvalKey) -> Self {
         Self { setting, measured: Vec::new(), shown: BTreeMap::new() }
     }
 
@@ -87,8 +88,8 @@ impl Rendered {
 /// What every method must beat, measured.
 pub(crate) fn baselines(clip: &Clip, judge: &Judge, rows: &[usize]) -> Result<Vec<Rendered>, EvalError> {
     let mean = mean_image(&clip.context)?;
-    let mut nearest = Rendered::new(Setting::baseline(Variant::NearestView));
-    let mut means = Rendered::new(Setting::baseline(Variant::MeanImage));
+    let mut nearest = Rendered::new(EvalKey::baseline(Variant::NearestView));
+    let mut means = Rendered::new(EvalKey::baseline(Variant::MeanImage));
     for &pose in &clip.target.c2w {
         nearest.add(nearest_image(&clip.context, pose)?, judge, rows)?;
         means.add(mean.clone(), judge, rows)?;

@@ -11,7 +11,7 @@ use rand::seq::SliceRandom;
 
 use crate::EvalError;
 use crate::evaluate::Networks;
-use crate::measured::Variant;
+use crate::method::Variant;
 
 /// Stored tokens of one scene.
 pub(crate) struct Stored<'a> {
@@ -91,11 +91,6 @@ impl<'a> GroupsOnce<'a> {
 
     pub fn clusters(&self) -> Result<&Clusters, EvalError> {
         Ok(&self.fit()?.clusters)
-    }
-
-    /// Share of `total_variance` that is left within clusters, where K-means was asked for.
-    pub fn cluster_error(&self, total_variance: f64) -> Option<f64> {
-        self.fit.get().map(|fit| fit.error(0, total_variance))
     }
 
     fn fit(&self) -> Result<&Fit, EvalError> {

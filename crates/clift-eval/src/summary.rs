@@ -3,10 +3,10 @@
 //! A mean is over the views of a scene first and over the scenes then, so that a scene with many
 //! targets weighs no more than one with few. The mean over all views stands beside it.
 
-mod scenes;
+pub mod scenes;
 mod table;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use clift_data::files::replace;
@@ -14,19 +14,14 @@ use clift_data::statistics::{median, p95};
 use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
-use crate::adaptive::Adaptive;
 use crate::error::EvalError;
-use crate::measured::{Accumulator, Measured, NotMeasured, Setting, Variant, ViewsOfSetting};
-use crate::paired::Difference;
+use crate::eval_results::{EvalResults, NotMeasured, SceneViews};
+use crate::method::Variant;
+use crate::paired::{PairedDifference, differences};
 use crate::pareto::front;
+use crate::scene_means::{capped, mean, scene_means, standard_error};
 use crate::selection::Selection;
-
-/// What an identical picture counts as in a mean, in dB; larger values are counted as this too.
-///
-/// Its PSNR is infinite, which no mean survives and JSON cannot hold. 100 dB is what one wrong 8-bit
-/// level in one of the values of a 256 x 256 picture gives (101 dB), so nothing real is cut off.
-/// Leaving such views out instead would lower the mean of the method that got them right.
-pub const PSNR_CAP_DB: f64 = 100.0;
+use crate::view_metrics::{EvalKey, ViewMetrics};
 
 /// Means of a baseline.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -67,7 +62,7 @@ pub struct Point {
     pub psnr_stderr: Option<f64>,
     /// Mean PSNR over all views, in dB: differs from `psnr` where scenes have different numbers of views.
     pub psnr_per_view: Option<f64>,
-    /// Views whose PSNR is infinite, counted as [`PSNR_CAP_DB`] in the means.
+    /// Views whose PSNR is infinite, counted as [`crate::scene_means::PSNR_CAP_DB`] in the means.
     pub num_identical_views: usize,
     /// Mean over scenes of the scene's mean SSIM.
     pub ssim: Option<f64>,
@@ -134,91 +129,111 @@ pub struct Summary {
     /// One per setting, ordered by variant and then by rising token counts.
     pub points: Vec<Point>,
     /// What the paper finds better less what it finds worse, scene by scene.
-    pub differences: Vec<Difference>,
-    /// A count for every scene against one for all.
-    pub adaptive: Vec<Adaptive>,
+    pub differences: Vec<PairedDifference>,
 }
 
-impl Accumulator {
-    /// Averages over each scene's views, and over the scenes then.
-    pub fn summary(&self) -> Summary {
-        let targets: BTreeSet<_> = self.views.values().flat_map(BTreeMap::keys).collect();
-        let scenes: BTreeSet<_> = targets.iter().map(|(scene, _)| scene).collect();
-        let quality = |variant| {
-            let views = self.views.get(&Setting::baseline(variant));
-            Quality {
-                psnr: views.and_then(|views| mean(&scene_means(views, |view| Some(capped(view.psnr))))),
-                ssim: views.and_then(|views| mean(&scene_means(views, |view| view.ssim))),
-                lpips_vgg: views.and_then(|views| mean(&scene_means(views, |view| view.lpips_vgg))),
-            }
-        };
-        let missing = self.missing.iter().map(|(&system, pictures)| Missing {
+impl Summary {
+    /// Averages over the views of each scene first and over the scenes then.
+    pub fn new(results: &EvalResults) -> Self {
+        let views: BTreeSet<(&str, usize)> = results
+            .views()
+            .flat_map(|(_, scenes)| scenes)
+            .flat_map(|(scene, frames)| frames.keys().map(move |&frame| (scene.as_str(), frame)))
+            .collect();
+        let scenes: BTreeSet<&str> = views.iter().map(|(scene, _)| *scene).collect();
+        let quality = |variant| results.of(EvalKey::baseline(variant)).map(Quality::new).unwrap_or_default();
+        let missing = results.missing.iter().map(|(&system, pictures)| Missing {
             variant: Variant::System(system),
             num_missing: pictures.len(),
             pictures: pictures.iter().cloned().collect(),
         });
-        let mut points: Vec<Point> = self
-            .views
-            .iter()
-            .filter(|(setting, _)| !matches!(setting.variant, Variant::NearestView | Variant::MeanImage))
-            .map(|(setting, views)| self.point(*setting, views))
+        let mut points: Vec<Point> = results
+            .views()
+            .filter(|(key, _)| !matches!(key.variant, Variant::NearestView | Variant::MeanImage))
+            .map(|(key, views)| Point::new(results, key, views))
             .collect();
         mark_fronts(&mut points);
-        Summary {
+        Self {
             num_scenes: scenes.len(),
-            num_views: targets.len(),
-            num_skipped: self.skipped.len(),
+            num_views: views.len(),
+            num_skipped: results.skipped.len(),
+            selection: results.selection,
+            lpips_weights_sha256: results.lpips_sha256.clone(),
+            not_measured: results.not_measured.clone(),
+            missing: missing.collect(),
             baselines: Baselines {
                 nearest_view: quality(Variant::NearestView),
                 mean_image: quality(Variant::MeanImage),
             },
-            selection: self.selection,
-            lpips_weights_sha256: self.lpips_sha256.clone(),
-            not_measured: self.not_measured.clone(),
-            missing: missing.collect(),
             points,
-            differences: self.differences(),
-            adaptive: self.adaptive(),
+            differences: differences(results),
         }
     }
 
-    fn point(&self, setting: Setting, views: &ViewsOfSetting) -> Point {
-        let per_scene = scene_means(views, |view| Some(capped(view.psnr)));
-        let over_scenes = |value: fn(&Measured) -> Option<f64>| mean(&scene_means(views, value));
-        let over_views =
-            |value: fn(&Measured) -> Option<f64>| mean(&views.values().filter_map(value).collect::<Vec<_>>());
-        let of_times = |value: fn(&Measured) -> Option<f64>, statistic: fn(&[f64]) -> f64| {
-            let times: Vec<f64> = views.values().filter_map(value).collect();
-            (!times.is_empty()).then(|| statistic(&times))
+    /// Writes `summary.json`.
+    ///
+    /// # Errors
+    /// [`EvalError::Io`] when the folder cannot be written.
+    pub fn write(&self, path: &Path) -> Result<(), EvalError> {
+        serde_json::to_vec_pretty(self)
+            .map_err(std::io::Error::from)
+            .and_then(|json| replace(path, &[&json[..], b"\n"].concat()))
+            .map_err(|source| EvalError::Io { action: "writing the summary", source, path: path.to_owned() })
+    }
+}
+
+impl Quality {
+    fn new(views: &SceneViews) -> Self {
+        Self {
+            psnr: mean(&scene_means(views, |view| Some(capped(view.psnr)))),
+            ssim: mean(&scene_means(views, |view| view.ssim)),
+            lpips_vgg: mean(&scene_means(views, |view| view.lpips_vgg)),
+        }
+    }
+}
+
+impl Point {
+    fn new(results: &EvalResults, key: EvalKey, scenes: &SceneViews) -> Self {
+        let Quality { psnr, ssim, lpips_vgg } = Quality::new(scenes);
+        let views: Vec<&ViewMetrics> = scenes.values().flat_map(|frames| frames.values()).collect();
+        let values = |value: fn(&ViewMetrics) -> Option<f64>| -> Vec<f64> {
+            views.iter().filter_map(|view| value(view)).collect()
         };
-        let (render_s, frame_s) = (|view: &Measured| view.render_s, Measured::frame_s);
-        let cost = self.costs.get(&setting).copied().unwrap_or_default();
-        Point {
-            variant: setting.variant,
-            num_storage_tokens: setting.num_storage_tokens,
-            num_render_tokens: setting.num_render_tokens,
-            tokens: setting.tokens,
+        let statistic = |values: &[f64], statistic: fn(&[f64]) -> f64| (!values.is_empty()).then(|| statistic(values));
+        let (render_s, frame_s) = (values(|view| view.render_s), values(ViewMetrics::frame_s));
+        let cost = results.cost(key);
+        Self {
+            variant: key.variant,
+            num_storage_tokens: key.num_storage_tokens,
+            num_render_tokens: key.num_render_tokens,
+            tokens: key.tokens,
             num_views: views.len(),
-            psnr: mean(&per_scene),
-            psnr_stderr: standard_error(&per_scene),
-            psnr_per_view: over_views(|view| Some(capped(view.psnr))),
-            num_identical_views: views.values().filter(|view| view.psnr == f64::INFINITY).count(),
-            ssim: over_scenes(|view| view.ssim),
-            ssim_per_view: over_views(|view| view.ssim),
-            lpips_vgg: over_scenes(|view| view.lpips_vgg),
-            lpips_vgg_per_view: over_views(|view| view.lpips_vgg),
-            render_s: over_views(render_s),
-            render_median_s: of_times(render_s, median),
-            render_p95_s: of_times(render_s, p95),
-            select_s: over_views(|view| view.select_s),
-            frame_median_s: of_times(frame_s, median),
-            frame_p95_s: of_times(frame_s, p95),
+            psnr,
+            psnr_stderr: standard_error(&scene_means(scenes, |view| Some(capped(view.psnr)))),
+            psnr_per_view: mean(&values(|view| Some(capped(view.psnr)))),
+            num_identical_views: views.iter().filter(|view| view.psnr == f64::INFINITY).count(),
+            ssim,
+            ssim_per_view: mean(&values(|view| view.ssim)),
+            lpips_vgg,
+            lpips_vgg_per_view: mean(&values(|view| view.lpips_vgg)),
+            render_s: mean(&render_s),
+            render_median_s: statistic(&render_s, median),
+            render_p95_s: statistic(&render_s, p95),
+            select_s: mean(&values(|view| view.select_s)),
+            frame_median_s: statistic(&frame_s, median),
+            frame_p95_s: statistic(&frame_s, p95),
             gflops: cost.gflops,
             scene_bytes: cost.scene_bytes,
             peak_bytes: cost.peak_bytes,
             pareto_time: false,
             pareto_bytes: false,
         }
+    }
+
+    /// Returns the key of the point.
+    pub(crate) const fn key(&self) -> EvalKey {
+        let Self { variant, num_storage_tokens, num_render_tokens, tokens, .. } = *self;
+        EvalKey { variant, num_storage_tokens, num_render_tokens, tokens }
     }
 }
 
@@ -235,76 +250,32 @@ fn mark_fronts(points: &mut [Point]) {
     }
 }
 
-impl Summary {
-    /// Writes `summary.json`.
-    ///
-    /// # Errors
-    /// [`EvalError::Io`] when the folder cannot be written.
-    pub fn write(&self, path: &Path) -> Result<(), EvalError> {
-        serde_json::to_vec_pretty(self)
-            .map_err(std::io::Error::from)
-            .and_then(|json| replace(path, &[&json[..], b"\n"].concat()))
-            .map_err(|source| EvalError::Io { action: "writing the summary", source, path: path.to_owned() })
-    }
-}
-
-pub(crate) fn capped(psnr: f64) -> f64 {
-    psnr.min(PSNR_CAP_DB)
-}
-
-/// Mean of each scene's views, for the scenes that have a value; the map keeps a scene's views together.
-fn scene_means(views: &ViewsOfSetting, value: impl Fn(&Measured) -> Option<f64>) -> Vec<f64> {
-    let views: Vec<_> = views.iter().collect();
-    views
-        .chunk_by(|((a, _), _), ((b, _), _)| a == b)
-        .filter_map(|scene| mean(&scene.iter().filter_map(|(_, view)| value(view)).collect::<Vec<_>>()))
-        .collect()
-}
-
-/// Mean PSNR of every scene.
-pub(crate) fn scene_values(views: &ViewsOfSetting) -> BTreeMap<&str, f64> {
-    let mut scenes: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
-    for ((scene, _), view) in views {
-        scenes.entry(scene).or_default().push(capped(view.psnr));
-    }
-    scenes.into_iter().filter_map(|(scene, psnr)| Some((scene, mean(&psnr)?))).collect()
-}
-
-pub(crate) fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-}
-
-/// Sample standard deviation over the square root of the count.
-pub(crate) fn standard_error(values: &[f64]) -> Option<f64> {
-    let count = values.len() as f64;
-    let mean = mean(values)?;
-    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    (values.len() > 1).then(|| (squares / (count - 1.0) / count).sqrt())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::measured::{Cost, Measured};
 
-    const SETTING: Setting = Setting {
+    const KEY: EvalKey = EvalKey {
         variant: Variant::Clift,
         num_storage_tokens: 64,
         num_render_tokens: 32,
         tokens: Some(TokenStorage::F16),
     };
 
-    fn measured(views: &[(&str, usize, f64)]) -> Accumulator {
-        let mut accumulator = Accumulator::default();
+    fn results(views: &[(&str, usize, f64)]) -> EvalResults {
+        let mut results = EvalResults::default();
         for &(scene, frame, psnr) in views {
-            accumulator.add(scene, frame, SETTING, Measured::quality(psnr, Some(psnr / 100.0))).unwrap();
+            results.add(scene, frame, KEY, ViewMetrics::quality(psnr, Some(psnr / 100.0))).unwrap();
         }
-        accumulator
+        results
+    }
+
+    fn summary(views: &[(&str, usize, f64)]) -> Summary {
+        Summary::new(&results(views))
     }
 
     #[test]
     fn a_scene_with_many_views_weighs_no_more_than_one_with_few() {
-        let summary = measured(&[("a", 0, 20.0), ("a", 1, 22.0), ("a", 2, 24.0), ("b", 0, 30.0)]).summary();
+        let summary = summary(&[("a", 0, 20.0), ("a", 1, 22.0), ("a", 2, 24.0), ("b", 0, 30.0)]);
         let point = &summary.points[0];
         assert_eq!((point.psnr, point.psnr_per_view), (Some(26.0), Some(24.0)));
         // Scene means 22 and 30: standard deviation sqrt(32), over sqrt(2).
@@ -314,12 +285,12 @@ mod tests {
 
     #[test]
     fn the_standard_error_of_one_scene_is_not_known() {
-        assert_eq!(measured(&[("a", 0, 20.0), ("a", 1, 22.0)]).summary().points[0].psnr_stderr, None);
+        assert_eq!(summary(&[("a", 0, 20.0), ("a", 1, 22.0)]).points[0].psnr_stderr, None);
     }
 
     #[test]
     fn an_identical_picture_counts_as_the_cap_and_is_counted() {
-        let point = measured(&[("a", 0, f64::INFINITY), ("b", 0, 20.0)]).summary().points.remove(0);
+        let point = summary(&[("a", 0, f64::INFINITY), ("b", 0, 20.0)]).points.remove(0);
         assert_eq!((point.psnr, point.num_identical_views), (Some(60.0), 1));
     }
 
@@ -327,20 +298,23 @@ mod tests {
     fn the_summary_does_not_depend_on_the_order_of_the_views() {
         // Sums of these differ in the last bit when they are added in another order.
         let mut views = [("a", 0, 20.1), ("a", 1, 22.7), ("a", 2, 1e-9), ("b", 0, 30.3), ("c", 5, 17.77)];
-        let summary = measured(&views).summary();
+        let forward = summary(&views);
         views.reverse();
-        assert_eq!(measured(&views).summary(), summary);
+        assert_eq!(summary(&views), forward);
     }
 
     #[test]
     fn what_was_not_measured_is_null_and_the_file_has_the_documented_names() {
-        let mut views = measured(&[("a", 0, 20.0)]);
-        views.add("a", 0, Setting::baseline(Variant::NearestView), Measured::quality(18.0, Some(0.5))).unwrap();
-        views.costs.insert(SETTING, Cost { gflops: Some(2.5), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) });
+        let mut views = results(&[("a", 0, 20.0)]);
+        views.add("a", 0, EvalKey::baseline(Variant::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
+        views.add_gflops(KEY, 2.5);
+        views.add_scene_bytes(KEY, 99_000);
+        views.set_warm(KEY, Some(1 << 20));
         views.skip("c");
         views.note_not_measured("lpips_vgg", "no weights".into());
         let folder = tempfile::tempdir().unwrap();
-        views.summary().write(&folder.path().join("summary.json")).unwrap();
+        let summary = Summary::new(&views);
+        summary.write(&folder.path().join("summary.json")).unwrap();
         let text = std::fs::read_to_string(folder.path().join("summary.json")).unwrap();
         let expected = serde_json::json!({
             "num_scenes": 1, "num_views": 1, "num_skipped": 1,
@@ -360,21 +334,26 @@ mod tests {
                 "gflops": 2.5, "scene_bytes": 99_000, "peak_bytes": 1_048_576,
                 "pareto_time": false, "pareto_bytes": true
             }],
-            "differences": [], "adaptive": []
+            "differences": []
         });
         assert_eq!(serde_json::from_str::<serde_json::Value>(&text).unwrap(), expected);
-        assert_eq!(serde_json::from_str::<Summary>(&text).unwrap(), views.summary());
+        assert_eq!(serde_json::from_str::<Summary>(&text).unwrap(), summary);
+        // Files of earlier versions have a key more.
+        let mut former = expected;
+        former["adaptive"] = serde_json::json!([]);
+        assert_eq!(serde_json::from_value::<Summary>(former).unwrap(), summary);
     }
 
     #[test]
     fn times_have_a_median_and_a_95th_percentile_alone_and_with_selection() {
-        let mut views = Accumulator::default();
+        let mut views = EvalResults::default();
         for frame in 0..20 {
             let ms = if frame == 7 { 100.0 } else { 1.0 + frame as f64 };
-            let measured = Measured { render_s: Some(ms * 1e-3), select_s: Some(0.5), ..Measured::quality(20.0, None) };
-            views.add("a", frame, SETTING, measured).unwrap();
+            let measured =
+                ViewMetrics { render_s: Some(ms * 1e-3), select_s: Some(0.5), ..ViewMetrics::quality(20.0, None) };
+            views.add("a", frame, KEY, measured).unwrap();
         }
-        let point = views.summary().points.remove(0);
+        let point = Summary::new(&views).points.remove(0);
         let near = |got: Option<f64>, expected: f64| (got.unwrap() - expected).abs() < 1e-12;
         // 1 to 20 without 8, and 100: the middle two are 11 and 12, the 19th of 20 is 20.
         assert!(near(point.render_median_s, 0.0115) && near(point.render_p95_s, 0.020), "{point:?}");
@@ -384,15 +363,15 @@ mod tests {
 
     #[test]
     fn the_fronts_of_time_and_of_bytes_are_each_marked() {
-        let mut views = Accumulator::default();
+        let mut views = EvalResults::default();
         // (stored, dB, ms, bytes): the second is slower and worse than the first but smaller than the third.
         for (stored, psnr, ms, bytes) in [(8, 20.0, 1.0, 900), (4, 19.0, 2.0, 400), (16, 22.0, 3.0, 1600)] {
-            let setting = Setting { num_storage_tokens: stored, ..SETTING };
-            let measured = Measured { render_s: Some(ms * 1e-3), ..Measured::quality(psnr, None) };
-            views.add("a", 0, setting, measured).unwrap();
-            views.add_scene_bytes(setting, bytes);
+            let key = EvalKey { num_storage_tokens: stored, ..KEY };
+            let measured = ViewMetrics { render_s: Some(ms * 1e-3), ..ViewMetrics::quality(psnr, None) };
+            views.add("a", 0, key, measured).unwrap();
+            views.add_scene_bytes(key, bytes);
         }
-        let points = views.summary().points;
+        let points = Summary::new(&views).points;
         let marks: Vec<_> = points.iter().map(|p| (p.num_storage_tokens, p.pareto_time, p.pareto_bytes)).collect();
         assert_eq!(marks, [(4, false, true), (8, true, true), (16, true, true)]);
     }

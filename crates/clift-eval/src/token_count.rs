@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use crate::EvalError;
+use crate::error::EvalError;
 
 /// A count of tokens (`256`) or a share of all of them (`"1/16"`, `0.0625`), as a config and the
 /// command line give it.

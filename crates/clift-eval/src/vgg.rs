@@ -9,7 +9,7 @@ use burn::tensor::module::{avg_pool2d, max_pool2d};
 use burn::tensor::ops::{AvgPoolOptions, MaxPoolOptions};
 use burn::tensor::{DType, Device, Tensor};
 
-use crate::EvalError;
+use crate::error::EvalError;
 use crate::weight_file::WeightFile;
 
 /// Number of stages; pictures are halved between them.

@@ -7,7 +7,7 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
 use sha2::{Digest, Sha256};
 
-use crate::EvalError;
+use crate::error::EvalError;
 
 /// Larger files are refused before they are read; VGG-16 with its heads takes 59 MB.
 const MAX_BYTES: u64 = 256 << 20;

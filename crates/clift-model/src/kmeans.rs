@@ -131,7 +131,7 @@ impl KMeans {
 mod tests {
     use std::collections::BTreeSet;
 
-    use burn::tensor::Device;
+    use burn::tensor::{Device, TensorData};
 
     use super::labels::ROUNDING;
     use super::*;
@@ -332,5 +332,26 @@ mod tests {
                 assert_eq!(message, "bad clusters: a token of scene 1 is not finite");
             }
         }
+    }
+
+    #[test]
+    fn the_error_is_the_variance_within_clusters_over_the_total() {
+        // Tokens of two values at two places, far apart, with a little noise.
+        let rows: Vec<[f64; 2]> =
+            (0..64).map(|i| [f64::from(i % 2) * 10.0, f64::from(i * 7919 % 101) * 1e-3]).collect();
+        let values: Vec<f32> = rows.iter().flatten().map(|&value| value as f32).collect();
+        let tokens = Tensor::from_data(TensorData::new(values, [1, 64, 2]), &Device::flex());
+        let spread = |rows: &[[f64; 2]]| {
+            let mean = [0, 1].map(|i| rows.iter().map(|row| row[i]).sum::<f64>() / rows.len() as f64);
+            rows.iter().flat_map(|row| [row[0] - mean[0], row[1] - mean[1]]).map(|d| d * d).sum::<f64>()
+        };
+        let (even, odd): (Vec<_>, Vec<_>) = rows.iter().partition(|row| row[0] == 0.0);
+        let expected = (spread(&even) + spread(&odd)) / spread(&rows);
+        let error = |tokens: Tensor<3>| {
+            let variance = total_variance(&tokens).unwrap()[0];
+            KMeans::default().fit(tokens, 2, &[1]).unwrap().error(0, variance)
+        };
+        assert!((error(tokens) / expected - 1.0).abs() < 1e-3); // f32
+        assert_eq!(error(Tensor::ones([1, 8, 2], &Device::flex())), 0.0, "equal tokens");
     }
 }

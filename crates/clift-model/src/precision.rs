@@ -16,12 +16,15 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
 use burn::tensor::{DType, Device, FloatDType, Tensor};
 use serde::{Deserialize, Serialize};
+use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::ModelError;
+use crate::names::parse;
 
 /// What the operands of matrix products are.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
 pub enum Precision {
     /// 24 bits of fraction.
     #[default]
@@ -46,12 +49,9 @@ impl Precision {
         PrecisionScope { former: CURRENT.replace(self), of_this_thread: PhantomData }
     }
 
-    /// The name as it is typed.
+    /// Returns the name as it is typed.
     pub fn as_str(self) -> &'static str {
-        match self {
-            Self::F32 => "f32",
-            Self::F16 => "f16",
-        }
+        self.into()
     }
 
     /// Refuses f16, which `key` asks for, on a device without it.
@@ -79,17 +79,11 @@ impl Precision {
     }
 }
 
-impl std::fmt::Display for Precision {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.pad(self.as_str())
-    }
-}
-
 impl std::str::FromStr for Precision {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        [Self::F32, Self::F16].into_iter().find(|one| one.as_str() == name).ok_or_else(|| "write f32 or f16".into())
+        parse(name).ok_or_else(|| "write f32 or f16".into())
     }
 }
 

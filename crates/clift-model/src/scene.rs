@@ -26,7 +26,7 @@ mod read;
 mod storage;
 mod write;
 
-use std::fmt;
+use strum::{Display, IntoStaticStr, VariantArray};
 
 pub use check::MAX_SIDE_PX;
 pub use storage::TokenStorage;
@@ -42,7 +42,8 @@ const FORMAT: &str = "clift-scene";
 const VERSION: &str = "2";
 
 /// What the tokens of a scene are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "lowercase")]
 pub enum TokenKind {
     /// Condensed tokens: drawn with the renderer of stage 2.
     Clift,
@@ -51,18 +52,9 @@ pub enum TokenKind {
 }
 
 impl TokenKind {
-    /// The name in files and tables.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Clift => "clift",
-            Self::Kmeans => "kmeans",
-        }
-    }
-}
-
-impl fmt::Display for TokenKind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
+    /// Returns the name in files and tables.
+    pub fn name(self) -> &'static str {
+        self.into()
     }
 }
 

@@ -9,7 +9,9 @@
 use std::str::FromStr;
 
 use rayon::prelude::*;
+use strum::{Display, IntoStaticStr, VariantArray};
 
+use crate::names::parse_value;
 use crate::{ModelError, ViewCamera};
 
 /// Side of a cell of the target's grid, in pixels.
@@ -28,7 +30,8 @@ const CELLS_PER_TASK: usize = 16;
 const GROUP: usize = 32;
 
 /// A published set of rules.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "lowercase")]
 pub enum Preset {
     /// Algorithm 1 as printed: the nearest tokens of every cell, momentum, and a bonus for tokens of the previous
     /// frame.
@@ -44,15 +47,11 @@ pub enum Preset {
 
 impl Preset {
     /// All presets.
-    pub const ALL: [Self; 3] = [Self::Paper, Self::Global, Self::Scaled];
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// The name as it is typed.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Paper => "paper",
-            Self::Global => "global",
-            Self::Scaled => "scaled",
-        }
+    /// Returns the name as it is typed.
+    pub fn name(self) -> &'static str {
+        self.into()
     }
 
     /// The rules behind the name.
@@ -69,11 +68,7 @@ impl FromStr for Preset {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
-        Self::ALL.into_iter().find(|preset| preset.name() == name).ok_or_else(|| ModelError::BadConfig {
-            key: "selection",
-            value: name.into(),
-            fix: format!("write one of {}", Self::ALL.map(Self::name).join(", ")),
-        })
+        parse_value("selection", name)
     }
 }
 

@@ -14,8 +14,9 @@ use clift_eval::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX};
 use clift_eval::picture::Picture;
 use clift_eval::predictions::{file_name, picture_name};
 use clift_eval::report::MAX_EXHIBITS;
+use clift_eval::summary::scenes::write_scenes;
 use clift_eval::{
-    Accumulator, Condensed, EvalConfig, EvalError, Exhibit, Lpips, Networks, Report, Shown, Summary, Sweep, System,
+    Condensed, EvalConfig, EvalError, EvalResults, Exhibit, Lpips, Networks, Report, Shown, Summary, Sweep, System,
     TokenCount, Variant, evaluate_scene,
 };
 use clift_model::device::DeviceName;
@@ -103,7 +104,7 @@ impl<'a> HeldOut<'a> {
             device: self.device.clone(),
         };
         networks.set_condensed(grouping, Condensed::of(model));
-        let mut measured = Accumulator::default();
+        let mut measured = EvalResults::default();
         for (i, item) in self.items.iter().take(self.config.eval.num_validation_scenes).enumerate() {
             if stop.load(Ordering::Relaxed) {
                 return Ok(None);
@@ -114,7 +115,7 @@ impl<'a> HeldOut<'a> {
                 shown.sheet.write_png(&folder.join(format!("step-{step:09}.png")))?;
             }
         }
-        let summary = measured.summary();
+        let summary = Summary::new(&measured);
         let Some(point) = summary.points.first() else { return Ok(None) };
         let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
         sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
@@ -137,7 +138,7 @@ impl<'a> HeldOut<'a> {
     ) -> Result<Summary, TrainError> {
         let _precision = self.config.eval.precision.scope();
         let started = std::time::Instant::now();
-        let mut measured = Accumulator::default();
+        let mut measured = EvalResults::default();
         let lpips = self.lpips(&mut measured, sink)?;
         let sweep = sweep(self.config, self.config.eval.storage.clone(), self.variants(networks)?);
         let sweep = Sweep { lpips, systems: systems.to_vec(), ..sweep };
@@ -169,7 +170,7 @@ impl<'a> HeldOut<'a> {
             }
             sink.event(&Event::Progress { stage: Stage::Eval, done: i as u64 + 1, total });
         }
-        let summary = measured.summary();
+        let summary = Summary::new(&measured);
         if summary.num_views == 0 {
             return Err(TrainError::NoScenes { reason: "every scene of the evaluation failed".into() });
         }
@@ -178,7 +179,7 @@ impl<'a> HeldOut<'a> {
         }
         sheets.keep()?;
         summary.write(&folder.join("summary.json"))?;
-        measured.write_scenes(&folder.join("scenes.csv"))?;
+        write_scenes(&measured, &folder.join("scenes.csv"))?;
         measured.write_views(&folder.join("views.csv"))?;
         write_ledger(&ledger, &folder.join("skipped.json"))?;
         self.report(&summary, ledger, exhibits)?.write(&folder.join("report.html"))?;
@@ -187,7 +188,7 @@ impl<'a> HeldOut<'a> {
     }
 
     /// LPIPS, or a note why it is not measured.
-    fn lpips(&self, measured: &mut Accumulator, sink: &mut dyn Sink) -> Result<Option<Lpips>, TrainError> {
+    fn lpips(&self, measured: &mut EvalResults, sink: &mut dyn Sink) -> Result<Option<Lpips>, TrainError> {
         let data = &self.config.data;
         let reason = match self.config.eval.lpips_path() {
             _ if data.width.min(data.height) < LPIPS_MIN_SIZE_PX => {
@@ -260,12 +261,13 @@ impl<'a> HeldOut<'a> {
         item: &EvaluationItem,
         sweep: &Sweep,
         is_shown: bool,
-        measured: &mut Accumulator,
+        measured: &mut EvalResults,
         sink: &mut dyn Sink,
     ) -> Result<Outcome, TrainError> {
         match self.reader.read(item.scene, &item.views) {
             Ok(clip) => {
-                let shown = evaluate_scene(networks, &clip, sweep, is_shown, measured)?;
+                let results = evaluate_scene(networks, &clip, sweep, is_shown, measured)?;
+                let shown = results.map(|results| Shown::new(&clip, &results, sweep.model.patch_size)).transpose()?;
                 Ok(Outcome::Measured(shown.map(Box::new)))
             }
             Err(error) => {

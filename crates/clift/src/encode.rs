@@ -11,7 +11,8 @@ use clift_data::{
 use clift_eval::TokenCount;
 use clift_model::device::DeviceName;
 use clift_model::{TokenStorage, check_destination};
-use clift_train::encode::{Budget, EncodeOptions, Encoded};
+use clift_train::encode::EncodeOptions;
+use clift_train::encode::Encoded;
 use clift_train::trained::{ModelPath, Trained};
 use clift_train::{Config, Override, read_config};
 
@@ -44,12 +45,9 @@ pub struct EncodeArgs {
     /// Frames the encoder sees, as 0,5,9; by default as many as in training, spread along the path
     #[arg(long, value_name = "FRAMES", value_delimiter = ',')]
     pub context: Vec<usize>,
-    /// Tokens to keep, a number or a share [default: 1/4]
-    #[arg(long, value_name = "COUNT", conflicts_with = "max_error")]
-    pub storage: Option<TokenCount>,
-    /// Keep the fewest tokens of the run's clusters.grid that leave at most this share of the tokens' variance unexplained
-    #[arg(long, value_name = "E", value_parser = parse_error_share)]
-    pub max_error: Option<f64>,
+    /// Tokens to keep, a number or a share
+    #[arg(long, value_name = "COUNT", default_value = "1/4")]
+    pub storage: TokenCount,
     /// Number format of the tokens in the file: f32, f16 or int8
     #[arg(long, value_name = "FORMAT", default_value_t)]
     pub tokens: TokenStorage,
@@ -88,13 +86,9 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     };
     let scene = choose(source.as_ref(), args.scene.as_deref())?;
     let reader = ClipReader { source, options: config.data.clip_options() };
-    let budget = match args.max_error {
-        Some(error) => Budget::MaxError(error),
-        None => Budget::Tokens(args.storage.unwrap_or(TokenCount::Share(0.25))),
-    };
     let options = EncodeOptions {
         context: (!args.context.is_empty()).then(|| args.context.clone()),
-        budget,
+        storage: args.storage,
         model_path: args.model.to_string_lossy().into_owned(),
     };
     let encoded = Trained::load(&config, &model.weights)?.encode(&config, &reader, scene, &options)?;
@@ -104,21 +98,19 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
 
 /// What was written, for people.
 fn told(encoded: &Encoded, storage: TokenStorage, path: &Path) -> String {
-    let Encoded { scene, num_lift_tokens, tried } = encoded;
+    let Encoded { scene, num_lift_tokens, cluster_error } = encoded;
+    let num_tokens = scene.num_tokens();
     let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-    let errors: Vec<String> = tried.iter().map(|(count, error)| format!("{count:>6}  {error:.4}")).collect();
     format!(
-        "{}: {} of {num_lift_tokens} tokens ({}, {storage}), {}\nscene {}, {} of {} x {}: frames {frames}\n\
-         tokens  variance left within clusters\n{}",
+        "{}: {num_tokens} of {num_lift_tokens} tokens ({}, {storage}), {}\nscene {}, {} of {} x {}: frames {frames}\n\
+         tokens  variance left within clusters\n{num_tokens:>6}  {cluster_error:.4}",
         path.display(),
-        scene.num_tokens(),
         scene.kind,
         bytes(scene.file_bytes(storage)),
         scene.key,
         count(scene.context.len(), "view"),
         scene.width,
         scene.height,
-        errors.join("\n"),
     )
 }
 
@@ -163,9 +155,4 @@ fn choose(source: &dyn SceneSource, key: Option<&str>) -> anyhow::Result<usize> 
 fn parse_split(text: &str) -> Result<Split, String> {
     let splits = [Split::Train, Split::Test];
     splits.into_iter().find(|split| split.to_string() == text).ok_or_else(|| "write train or test".into())
-}
-
-fn parse_error_share(text: &str) -> Result<f64, String> {
-    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
-    share.ok_or_else(|| "write a share of the variance, 0 to 1".into())
 }

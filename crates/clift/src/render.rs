@@ -8,13 +8,16 @@ use clift_data::camera_path::{PathView, interpolate, mean_intrinsics, orbit, rea
 use clift_data::files::replace;
 use clift_data::unfinished::Unfinished;
 use clift_data::{Intrinsics, Pose, SceneFrame};
-use clift_eval::Calibration;
 use clift_model::cost::render_bytes;
 use clift_model::device::DeviceName;
 use clift_model::scene::MAX_SIDE_PX;
 use clift_model::viewer::{frames_per_call, load_renderer};
-use clift_model::{ModelError, Scene, ViewCamera, Viewer};
+use clift_model::ModelError;
+use clift_model::Scene;
+use clift_model::ViewCamera;
+use clift_model::Viewer;
 use clift_train::footprint::machine::available_bytes;
+use clift_model::RenderBudget;
 use clift_train::trained::renderer_weights;
 use serde::Serialize;
 
@@ -137,12 +140,12 @@ fn tokens(
     view: &ViewCamera,
     height: usize,
     width: usize,
-) -> anyhow::Result<(usize, Option<Calibration>)> {
+) -> anyhow::Result<(usize, Option<RenderBudget>)> {
     let num_storage_tokens = scene.num_tokens();
     let Some(budget_ms) = args.budget_ms else {
         return Ok((args.render.map_or(Ok(num_storage_tokens), |count| count.of(num_storage_tokens))?, None));
     };
-    let times = Calibration::measure(viewer, view, height, width)?;
+    let times = RenderBudget::measure(viewer, view, height, width)?;
     for (count, seconds) in times.some.iter().chain([&times.all]) {
         print_note(&format!("measured: {count} tokens, {:.1} ms per frame", 1e3 * seconds));
     }

@@ -8,7 +8,7 @@ use clift_eval::TokenCount;
 use clift_model::viewer::load_renderer;
 use clift_model::{Clift, Preset, Scene, TokenStorage, Variant, ViewCamera, Viewer, weights};
 use clift_train::Config;
-use clift_train::encode::{Budget, EncodeOptions};
+use clift_train::encode::EncodeOptions;
 use clift_train::trained::Trained;
 
 use crate::cpu;
@@ -74,8 +74,7 @@ fn encode(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
 
     let Clift { encoder, lift_norm, condenser, renderer } = place.model().valid();
     let trained = Trained { encoder, lift_norm, condenser: Some(condenser), renderer, device: place.plain() };
-    let options =
-        EncodeOptions { context: None, budget: Budget::Tokens(TokenCount::Count(STORED)), model_path: "suite".into() };
+    let options = EncodeOptions { context: None, storage: TokenCount::Count(STORED), model_path: "suite".into() };
     let encoded = trained.encode(&config, &reader, 0, &options).expect("a room is encoded");
     let path = folder.join("room.clift");
     encoded.scene.write(&path, storage).expect("the folder takes a file");

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use super::{Comparison, Difference, Made, Pair};
+use crate::compare::{Comparison, Difference, Made, Pair};
 
 impl fmt::Display for Made {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -6,9 +6,9 @@ use clift_model::TokenStorage;
 
 use super::axis::{Scale, milliseconds};
 use super::plot::{Level, Look, Mark, Plot, Series};
-use crate::exhibit::best_variant;
-use crate::measured::{Setting, Variant};
-use crate::summary::{Point, Summary};
+use crate::method::Variant;
+use crate::summary::{Point, Quality, Summary};
+use crate::view_metrics::best_variant;
 
 const QUALITY: &str = "PSNR, dB";
 
@@ -31,7 +31,7 @@ pub fn figures(summary: &Summary) -> Vec<Figure> {
         }),
         note: "",
     }];
-    if summary.points.iter().any(|point| is_whole(point) && point.scene_bytes.is_some()) {
+    if summary.points.iter().any(|point| point.key().is_whole() && point.scene_bytes.is_some()) {
         let kb = |point: &Point| point.scene_bytes.map(|bytes| bytes as f64 / 1e3);
         let mut plot = by_variant(summary, "scene, kB", Scale::Log, kb);
         let on_front = summary.points.iter().filter(|point| point.pareto_bytes);
@@ -39,35 +39,19 @@ pub fn figures(summary: &Summary) -> Vec<Figure> {
         plot.front.sort_by(|a, b| a.0.total_cmp(&b.0));
         figures.push(Figure { heading: "Quality against the size of a scene", plot, note: "" });
     }
-    if summary.points.iter().any(|point| !is_whole(point)) {
+    if summary.points.iter().any(|point| !point.key().is_whole()) {
         figures.push(Figure {
             heading: "Quality against rendered tokens",
             plot: by_rendered(summary),
             note: "The last mark of a line is drawn from all tokens that are stored.",
         });
     }
-    if summary.points.iter().any(|point| seconds(point).is_some()) {
+    if summary.points.iter().any(|point| point.frame_median_s.is_some()) {
         let note =
             "Each view is drawn alone, the choice of its tokens included where they are chosen: medians over views.";
         figures.push(Figure { heading: "Quality against time per frame", plot: by_time(summary), note });
     }
     figures
-}
-
-/// The setting of a point.
-pub fn setting(point: &Point) -> Setting {
-    let Point { variant, num_storage_tokens, num_render_tokens, tokens, .. } = *point;
-    Setting { variant, num_storage_tokens, num_render_tokens, tokens }
-}
-
-/// Whether a point's views are drawn from all tokens that are stored.
-pub fn is_whole(point: &Point) -> bool {
-    point.num_render_tokens == point.num_storage_tokens
-}
-
-/// Median time per frame: choosing tokens and drawing.
-pub fn seconds(point: &Point) -> Option<f64> {
-    point.frame_median_s
 }
 
 /// The look of a variant, the same in every plot.
@@ -121,9 +105,7 @@ fn series(summary: &Summary, is_joined: bool, mark: impl Fn(&Point) -> Option<Ma
 fn levels(summary: &Summary) -> Vec<Level> {
     let baselines = summary.baselines;
     let all = [("nearest view", "nearest", baselines.nearest_view), ("mean image", "mean", baselines.mean_image)];
-    let level = |(name, class, quality): (&str, _, crate::summary::Quality)| {
-        Some(Level { name: name.into(), class, y: quality.psnr? })
-    };
+    let level = |(name, class, quality): (&str, _, Quality)| Some(Level { name: name.into(), class, y: quality.psnr? });
     all.into_iter().filter_map(level).collect()
 }
 
@@ -131,21 +113,21 @@ fn levels(summary: &Summary) -> Vec<Level> {
 fn mark(point: &Point, x: f64) -> Option<Mark> {
     let y = point.psnr?;
     let Point { num_storage_tokens: stored, num_render_tokens: rendered, .. } = *point;
-    let tokens = match (stored, is_whole(point)) {
+    let tokens = match (stored, point.key().is_whole()) {
         (0, _) => String::new(),
         (_, true) => format!(", {stored} tokens"),
         (_, false) => format!(", {rendered} of {stored} tokens"),
     };
     let format = point.tokens.map(|tokens| format!(" in {}", tokens.name())).unwrap_or_default();
     let error = point.psnr_stderr.map(|error| format!(" \u{b1} {error:.2}")).unwrap_or_default();
-    let time = seconds(point).map(|s| format!(", {} ms per frame", milliseconds(s))).unwrap_or_default();
+    let time = point.frame_median_s.map(|s| format!(", {} ms per frame", milliseconds(s))).unwrap_or_default();
     let title = format!("{}{tokens}{format}: {y:.2}{error} dB{time}", point.variant.name());
     Some(Mark { x, y, error: point.psnr_stderr, title })
 }
 
 /// A line per variant, of the points that are drawn from all they store.
 fn by_variant(summary: &Summary, x_label: &'static str, x_scale: Scale, x: impl Fn(&Point) -> Option<f64>) -> Plot {
-    let whole = |point: &Point| if is_whole(point) { x(point).and_then(|x| mark(point, x)) } else { None };
+    let whole = |point: &Point| if point.key().is_whole() { x(point).and_then(|x| mark(point, x)) } else { None };
     let title = format!("PSNR against {x_label}, a line per variant, with the standard error over scenes");
     Plot {
         title,
@@ -160,7 +142,7 @@ fn by_variant(summary: &Summary, x_label: &'static str, x_scale: Scale, x: impl 
 
 /// A line per storage count of the best variant.
 fn by_rendered(summary: &Summary) -> Plot {
-    let best = best_variant(summary.points.iter().map(setting));
+    let best = best_variant(summary.points.iter().map(Point::key));
     let mut lines: BTreeMap<usize, Vec<Mark>> = BTreeMap::new();
     // Of the finest format, where there are several.
     let is_best = |point: &&Point| Some(point.variant) == best;
@@ -194,9 +176,9 @@ fn by_rendered(summary: &Summary) -> Plot {
 
 /// Every point over its time per frame, and the front.
 fn by_time(summary: &Summary) -> Plot {
-    let place = |point: &Point| Some((seconds(point)? * 1e3, point.psnr?));
+    let place = |point: &Point| Some((point.frame_median_s? * 1e3, point.psnr?));
     let at_time = |point: &Point| {
-        let mark = seconds(point).and_then(|seconds| mark(point, seconds * 1e3))?;
+        let mark = point.frame_median_s.and_then(|seconds| mark(point, seconds * 1e3))?;
         Some(Mark { error: None, ..mark })
     };
     let mut front: Vec<_> = summary.points.iter().filter(|point| point.pareto_time).filter_map(place).collect();

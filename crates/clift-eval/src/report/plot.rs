@@ -1,9 +1,10 @@
 //! A plot as inline SVG: points with error bars, joined or not, over two axes. Colours are the page's.
 
-use std::io::{self, Write};
+use std::fmt::Write;
+
+use maud::{Markup, html};
 
 use super::axis::{Axis, Scale};
-use super::markup::Escaped;
 
 // Small enough that the text can still be read where the plot is shrunk to the width of a phone.
 const WIDTH: f64 = 460.0;
@@ -49,7 +50,7 @@ pub struct Mark {
     pub y: f64,
     /// Half the length of its error bar.
     pub error: Option<f64>,
-    /// What a pointer that rests on it is told.
+    /// Text that is shown where the pointer rests on the mark.
     pub title: String,
 }
 
@@ -97,11 +98,8 @@ pub struct Plot {
 }
 
 impl Plot {
-    /// Writes the SVG, or a sentence where there is nothing to draw.
-    ///
-    /// # Errors
-    /// The writer's.
-    pub fn write(&self, out: &mut impl Write) -> io::Result<()> {
+    /// Returns the SVG and its legend, or a sentence where there is nothing to draw.
+    pub fn to_html(&self) -> Markup {
         let marks = || self.series.iter().flat_map(|series| &series.marks);
         let ends = |mark: &Mark| {
             let error = mark.error.unwrap_or_default();
@@ -111,117 +109,112 @@ impl Plot {
         let levels = self.levels.iter().map(|level| level.y);
         let y_axis = Axis::new(Scale::Linear, marks().flat_map(ends).chain(levels));
         let (Some(x_axis), Some(y_axis)) = (x_axis, y_axis) else {
-            return writeln!(out, "<p class=\"none\">Nothing was measured that could be drawn here.</p>");
+            return html! { p.none { "Nothing was measured that could be drawn here." } };
         };
         let x = |value: f64| LEFT + x_axis.place(value) * (WIDTH - LEFT - RIGHT);
         let y = |value: f64| HEIGHT - BOTTOM - y_axis.place(value) * (HEIGHT - TOP - BOTTOM);
         let (right, bottom) = (WIDTH - RIGHT, HEIGHT - BOTTOM);
-
-        write!(out, "<svg class=\"plot\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" ")?;
-        writeln!(out, "aria-label=\"{0}\"><title>{0}</title>", Escaped(&self.title))?;
-        for (tick, label) in y_axis.ticks() {
-            let y = y(tick);
-            write!(out, "<path class=\"grid\" d=\"M{LEFT} {y:.1}H{right}\"/>")?;
-            writeln!(
-                out,
-                "<text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{label}</text>",
-                LEFT - 7.0,
-                y + 4.0
-            )?;
-        }
-        writeln!(out, "<path class=\"axis\" d=\"M{LEFT} {bottom}H{right}\"/>")?;
-        for (tick, label) in x_axis.ticks() {
-            let x = x(tick);
-            write!(out, "<path class=\"axis\" d=\"M{x:.1} {bottom}v5\"/>")?;
-            writeln!(
-                out,
-                "<text class=\"tick\" x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{label}</text>",
-                bottom + 19.0
-            )?;
-        }
-        let (middle, foot) = (f64::midpoint(LEFT, right), HEIGHT - 8.0);
-        writeln!(
-            out,
-            "<text class=\"label\" x=\"{middle}\" y=\"{foot}\" text-anchor=\"middle\">{}</text>",
-            self.x_label
-        )?;
-        let middle = f64::midpoint(TOP, bottom);
-        writeln!(
-            out,
-            "<text class=\"label\" transform=\"translate(14 {middle}) rotate(-90)\" text-anchor=\"middle\">{}</text>",
-            self.y_label
-        )?;
-
-        for level in &self.levels {
-            writeln!(out, "<path class=\"level {}\" d=\"M{LEFT} {:.1}H{right}\"/>", level.class, y(level.y))?;
-        }
-        if let Some(((first_x, first_y), rest)) = self.front.split_first() {
-            write!(out, "<path class=\"front\" d=\"M{:.1} {:.1}", x(*first_x), y(*first_y))?;
-            for (next_x, next_y) in rest {
-                write!(out, "H{:.1}V{:.1}", x(*next_x), y(*next_y))?;
+        let (middle_x, middle_y) = (f64::midpoint(LEFT, right), f64::midpoint(TOP, bottom));
+        html! {
+            svg.plot viewBox={ "0 0 " (WIDTH) " " (HEIGHT) } role="img" aria-label=(self.title) {
+                title { (self.title) }
+                @for (tick, label) in y_axis.ticks() {
+                    @let y = y(tick);
+                    path.grid d=(format!("M{LEFT} {y:.1}H{right}")) {}
+                    text.tick x=(tenths(LEFT - 7.0)) y=(tenths(y + 4.0)) text-anchor="end" { (label) }
+                }
+                path.axis d=(format!("M{LEFT} {bottom}H{right}")) {}
+                @for (tick, label) in x_axis.ticks() {
+                    @let x = x(tick);
+                    path.axis d=(format!("M{x:.1} {bottom}v5")) {}
+                    text.tick x=(tenths(x)) y=(tenths(bottom + 19.0)) text-anchor="middle" { (label) }
+                }
+                text.label x=(middle_x) y=(HEIGHT - 8.0) text-anchor="middle" { (self.x_label) }
+                text.label transform=(format!("translate(14 {middle_y}) rotate(-90)")) text-anchor="middle" {
+                    (self.y_label)
+                }
+                @for Level { class, y: level, .. } in &self.levels {
+                    path class={ "level " (class) } d=(format!("M{LEFT} {:.1}H{right}", y(*level))) {}
+                }
+                @if !self.front.is_empty() {
+                    path.front d=(staircase(self.front.iter().map(|point| (x(point.0), y(point.1))))) {}
+                }
+                @for (front_x, front_y) in &self.front {
+                    circle.front cx=(tenths(x(*front_x))) cy=(tenths(y(*front_y))) r="8" {}
+                }
+                // The first, which is the method, on top.
+                @for series in self.series.iter().rev() { (series.to_html(x, y)) }
             }
-            writeln!(out, "\"/>")?;
-            for (front_x, front_y) in &self.front {
-                writeln!(out, "<circle class=\"front\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"8\"/>", x(*front_x), y(*front_y))?;
-            }
+            (self.legend())
         }
-        // The first, which is the method, on top.
-        for series in self.series.iter().rev() {
-            series.write(out, &x, &y)?;
-        }
-        writeln!(out, "</svg>")?;
-        self.write_legend(out)
     }
 
-    fn write_legend(&self, out: &mut impl Write) -> io::Result<()> {
-        write!(out, "<ul class=\"legend\">")?;
-        for Series { name, look: Look { class, marker }, is_joined, .. } in &self.series {
-            let line = if *is_joined { "<path class=\"line\" d=\"M-12 0H12\"/>" } else { "" };
-            write!(
-                out,
-                "<li>{KEY}<g class=\"{class}\">{line}<path class=\"mark\" d=\"{marker}\"/></g></svg>{}</li>",
-                Escaped(name)
-            )?;
+    fn legend(&self) -> Markup {
+        let key = |symbol: Markup| html! { svg.key viewBox="-14 -8 28 16" aria-hidden="true" { (symbol) } };
+        html! {
+            ul.legend {
+                @for Series { name, look: Look { class, marker }, is_joined, .. } in &self.series {
+                    li {
+                        (key(html! {
+                            g class=(class) {
+                                @if *is_joined { path.line d="M-12 0H12" {} }
+                                path.mark d=(marker) {}
+                            }
+                        }))
+                        (name)
+                    }
+                }
+                @for Level { name, class, .. } in &self.levels {
+                    li { (key(html! { path class={ "level " (class) } d="M-12 0H12" {} })) (name) }
+                }
+                @if !self.front.is_empty() {
+                    li { (key(html! { path.front d="M-12 5H0V-5H12" {} })) "Pareto front" }
+                }
+            }
         }
-        for Level { name, class, .. } in &self.levels {
-            write!(out, "<li>{KEY}<path class=\"level {class}\" d=\"M-12 0H12\"/></svg>{}</li>", Escaped(name))?;
-        }
-        if !self.front.is_empty() {
-            write!(out, "<li>{KEY}<path class=\"front\" d=\"M-12 5H0V-5H12\"/></svg>Pareto front</li>")?;
-        }
-        writeln!(out, "</ul>")
     }
 }
 
-/// The start of a picture in a legend.
-const KEY: &str = "<svg class=\"key\" viewBox=\"-14 -8 28 16\" aria-hidden=\"true\">";
-
 impl Series {
-    fn write(&self, out: &mut impl Write, x: &impl Fn(f64) -> f64, y: &impl Fn(f64) -> f64) -> io::Result<()> {
+    fn to_html(&self, x: impl Fn(f64) -> f64, y: impl Fn(f64) -> f64) -> Markup {
         let Self { look: Look { class, marker }, is_joined, marks, .. } = self;
-        writeln!(out, "<g class=\"{class}\">")?;
-        for mark in marks {
-            let Some(error) = mark.error.filter(|error| *error > 0.0) else { continue };
-            let (x, low, high) = (x(mark.x), y(mark.y - error), y(mark.y + error));
-            let (left, right) = (x - 4.0, x + 4.0);
-            writeln!(
-                out,
-                "<path class=\"error\" d=\"M{x:.1} {low:.1}V{high:.1}M{left:.1} {low:.1}H{right:.1}M{left:.1} {high:.1}H{right:.1}\"/>"
-            )?;
+        let points: Vec<String> = marks.iter().map(|mark| format!("{:.1},{:.1}", x(mark.x), y(mark.y))).collect();
+        html! {
+            g class=(class) {
+                @for mark in marks {
+                    @if let Some(error) = mark.error.filter(|error| *error > 0.0) {
+                        path.error d=(error_bar(x(mark.x), y(mark.y - error), y(mark.y + error))) {}
+                    }
+                }
+                @if *is_joined && marks.len() > 1 { polyline.line points=(points.join(" ")) {} }
+                @for mark in marks {
+                    path.mark transform=(format!("translate({:.1} {:.1})", x(mark.x), y(mark.y))) d=(marker) {
+                        title { (mark.title) }
+                    }
+                }
+            }
         }
-        if *is_joined && marks.len() > 1 {
-            let points: Vec<String> = marks.iter().map(|mark| format!("{:.1},{:.1}", x(mark.x), y(mark.y))).collect();
-            writeln!(out, "<polyline class=\"line\" points=\"{}\"/>", points.join(" "))?;
-        }
-        for mark in marks {
-            let (x, y, title) = (x(mark.x), y(mark.y), Escaped(&mark.title));
-            writeln!(
-                out,
-                "<path class=\"mark\" transform=\"translate({x:.1} {y:.1})\" d=\"{marker}\"><title>{title}</title></path>"
-            )?;
-        }
-        writeln!(out, "</g>")
     }
+}
+
+/// Returns a coordinate in tenths of a pixel.
+fn tenths(value: f64) -> String {
+    format!("{value:.1}")
+}
+
+/// Returns the path of an upright bar with its two ends.
+fn error_bar(x: f64, low: f64, high: f64) -> String {
+    let (left, right) = (x - 4.0, x + 4.0);
+    format!("M{x:.1} {low:.1}V{high:.1}M{left:.1} {low:.1}H{right:.1}M{left:.1} {high:.1}H{right:.1}")
+}
+
+/// Returns the path of a staircase through points by rising x.
+fn staircase(points: impl Iterator<Item = (f64, f64)>) -> String {
+    let mut path = String::new();
+    for (i, (x, y)) in points.enumerate() {
+        let _ = if i == 0 { write!(path, "M{x:.1} {y:.1}") } else { write!(path, "H{x:.1}V{y:.1}") };
+    }
+    path
 }
 
 #[cfg(test)]
@@ -246,9 +239,7 @@ mod tests {
     }
 
     fn text(plot: &Plot) -> String {
-        let mut out = Vec::new();
-        plot.write(&mut out).unwrap();
-        String::from_utf8(out).unwrap()
+        plot.to_html().into_string()
     }
 
     #[test]

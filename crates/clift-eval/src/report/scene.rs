@@ -1,15 +1,18 @@
 //! One scene of a report: its pictures, its clusters, the tokens chosen for a view.
 
-use std::io::{self, Write};
+use std::io;
 
 use clift_model::SceneClusters;
+use maud::{Markup, html};
 
 use super::axis::grouped;
-use super::markup::{Escaped, data_uri};
-use crate::exhibit::{Choice, Drawing, Exhibit, best_variant, spread};
-use crate::measured::{Setting, Variant};
+use super::html::data_uri;
+use crate::exhibit::{Choice, Drawing, Exhibit};
+use crate::method::Variant;
 use crate::picture::Picture;
+use crate::scene_results::spread;
 use crate::selection::Selection;
+use crate::view_metrics::{EvalKey, best_variant};
 
 /// Most token counts of a variant that are shown.
 const MAX_COUNTS: usize = 4;
@@ -20,175 +23,173 @@ const MAX_MAPS: usize = 2;
 /// Pictures narrower than this are magnified and shown as the pixels they are.
 const SHARP_BELOW_PX: usize = 100;
 
-/// Writes the scene; `number` tells it from the others of the page, `selection` chose the tokens of its views.
-pub fn write(exhibit: &Exhibit, number: usize, selection: Option<Selection>, out: &mut impl Write) -> io::Result<()> {
-    writeln!(out, "<article class=\"scene\"><h3>{}</h3>", Escaped(&exhibit.key))?;
-    writeln!(out, "<div class=\"halves\"><div>")?;
-    write_drawings(exhibit, out)?;
-    writeln!(out, "</div><div>")?;
-    write_contexts(exhibit, number, out)?;
+/// Returns the section of a scene; `number` tells it from the others of the page, `selection` chose the tokens of its
+/// views.
+pub fn section(exhibit: &Exhibit, number: usize, selection: Option<Selection>) -> io::Result<Markup> {
     let is_map = |clusters: &&SceneClusters| clusters.centroid_index().len() < clusters.assignment().len();
     let maps: Vec<&SceneClusters> = exhibit.clusters.iter().filter(is_map).collect();
-    for map in spread(maps.len(), MAX_MAPS) {
-        write_clusters(exhibit, number, maps[map], out)?;
-    }
     let best = best_variant(exhibit.choices.iter().map(|choice| choice.setting));
     let choices = exhibit.choices.iter().filter(|choice| Some(choice.setting.variant) == best);
     let most = choices.clone().map(|choice| choice.setting.num_storage_tokens).max();
     let choices: Vec<&Choice> = choices.filter(|choice| Some(choice.setting.num_storage_tokens) == most).collect();
-    for choice in spread(choices.len(), MAX_MAPS) {
-        write_choice(exhibit, number, choices[choice], selection, out)?;
-    }
-    writeln!(out, "</div></div></article>")
+    Ok(html! {
+        article.scene {
+            h3 { (exhibit.key) }
+            div.halves {
+                div { (drawings(exhibit)?) }
+                div {
+                    (contexts(exhibit, number)?)
+                    @for map in spread(maps.len(), MAX_MAPS) { (clusters(exhibit, number, maps[map])?) }
+                    @for choice in spread(choices.len(), MAX_MAPS) {
+                        (chosen(exhibit, number, choices[choice], selection))
+                    }
+                }
+            }
+        }
+    })
 }
 
-fn start_row(heading: &str, out: &mut impl Write) -> io::Result<()> {
-    writeln!(out, "<div class=\"row\"><h4>{heading}</h4><div class=\"strip\">")
-}
-
-fn end_row(out: &mut impl Write) -> io::Result<()> {
-    writeln!(out, "</div></div>")
-}
-
-/// The context views, which the maps below refer to by name.
-fn write_contexts(exhibit: &Exhibit, number: usize, out: &mut impl Write) -> io::Result<()> {
-    start_row("context views", out)?;
-    for (view, (picture, frame)) in exhibit.context.iter().zip(&exhibit.context_frames).enumerate() {
-        let class = sharpness(picture);
-        let image = format!("id=\"s{number}v{view}\" class=\"{class}\" href=\"{}\"", data_uri(picture)?);
-        write_map(
-            exhibit,
-            &format!("Context view, frame {frame}"),
-            &format!("<image {image} {}/>", area(exhibit)),
-            out,
-        )?;
-        writeln!(out, "<figcaption>frame {frame}</figcaption></figure>")?;
-    }
-    end_row(out)
+fn row(heading: &str, strip: Markup) -> Markup {
+    html! { div.row { h4 { (heading) } div.strip { (strip) } } }
 }
 
 /// Target and nearest view, then a row per variant.
-fn write_drawings(exhibit: &Exhibit, out: &mut impl Write) -> io::Result<()> {
-    let frame = exhibit.target_frame;
-    start_row("target", out)?;
-    write_picture(&exhibit.target, &format!("Target view, frame {frame}"), &format!("frame {frame}"), out)?;
-    for drawing in exhibit.drawings.iter().filter(|drawing| drawing.setting.variant == Variant::NearestView) {
-        write_drawing(drawing, "nearest view", out)?;
-    }
-    end_row(out)?;
-    let whole = |setting: Setting| setting.num_render_tokens == setting.num_storage_tokens;
-    for variant in [Variant::Clift, Variant::Kmeans, Variant::PatchClift, Variant::Patch, Variant::Random] {
-        let drawings = exhibit.drawings.iter().filter(|d| d.setting.variant == variant && whole(d.setting));
-        write_strip(variant.name(), &drawings.collect::<Vec<_>>(), out)?;
-    }
-    for drawing in &exhibit.drawings {
-        if let Variant::System(name) = drawing.setting.variant {
-            start_row(&Escaped(name.as_str()).to_string(), out)?;
-            write_drawing(drawing, "its picture", out)?;
-            end_row(out)?;
-        }
-    }
+fn drawings(exhibit: &Exhibit) -> io::Result<Markup> {
+    let target_frame = exhibit.target_frame;
+    let of = |variant: Variant| exhibit.drawings.iter().filter(move |drawing| drawing.setting.variant == variant);
     let best = best_variant(exhibit.drawings.iter().map(|drawing| drawing.setting));
-    let some = exhibit.drawings.iter().filter(|d| Some(d.setting.variant) == best && !whole(d.setting));
+    let some = exhibit.drawings.iter().filter(|d| Some(d.setting.variant) == best && !d.setting.is_whole());
     let most = some.clone().map(|drawing| drawing.setting.num_storage_tokens).max();
-    let some: Vec<&Drawing> = some.filter(|d| Some(d.setting.num_storage_tokens) == most).collect();
-    write_strip(&format!("{}, some tokens", best.map_or("", Variant::name)), &some, out)
+    let some = some.filter(|drawing| Some(drawing.setting.num_storage_tokens) == most);
+    let target = html! {
+        (image(&exhibit.target, &format!("Target view, frame {target_frame}"), frame(target_frame))?)
+        @for nearest in of(Variant::NearestView) { (drawing(nearest, "nearest view")?) }
+    };
+    Ok(html! {
+        (row("target", target))
+        @for variant in [Variant::Clift, Variant::Kmeans, Variant::PatchClift, Variant::Patch, Variant::Random] {
+            (strip(variant.name(), &of(variant).filter(|drawing| drawing.setting.is_whole()).collect::<Vec<_>>())?)
+        }
+        @for other in &exhibit.drawings {
+            @if let Variant::System(name) = other.setting.variant {
+                (row(name.as_str(), drawing(other, "its picture")?))
+            }
+        }
+        (strip(&format!("{}, some tokens", best.map_or("", Variant::name)), &some.collect::<Vec<_>>())?)
+    })
 }
 
 /// At most `MAX_COUNTS` drawings, by rising token counts; nothing for none.
-fn write_strip(heading: &str, drawings: &[&Drawing], out: &mut impl Write) -> io::Result<()> {
-    if drawings.is_empty() {
-        return Ok(());
-    }
-    start_row(heading, out)?;
-    for drawing in spread(drawings.len(), MAX_COUNTS) {
-        let Setting { num_storage_tokens: stored, num_render_tokens: rendered, .. } = drawings[drawing].setting;
-        let tokens = if stored == rendered { format!("{stored} tokens") } else { format!("{rendered} of {stored}") };
-        write_drawing(drawings[drawing], &tokens, out)?;
-    }
-    end_row(out)
+fn strip(heading: &str, drawings: &[&Drawing]) -> io::Result<Markup> {
+    let tokens = |EvalKey { num_storage_tokens: stored, num_render_tokens: rendered, .. }| {
+        if stored == rendered { format!("{stored} tokens") } else { format!("{rendered} of {stored}") }
+    };
+    let shown = html! {
+        @for i in spread(drawings.len(), MAX_COUNTS) { (drawing(drawings[i], &tokens(drawings[i].setting))?) }
+    };
+    Ok(if drawings.is_empty() { Markup::default() } else { row(heading, shown) })
 }
 
-fn write_drawing(drawing: &Drawing, what: &str, out: &mut impl Write) -> io::Result<()> {
+fn drawing(drawing: &Drawing, what: &str) -> io::Result<Markup> {
     let psnr = if drawing.psnr.is_finite() { grouped(drawing.psnr, 2) } else { "\u{221e}".into() };
     let alt = format!("The target as {} draws it, {what}, {psnr} dB", drawing.setting.variant.name().replace('_', " "));
-    write_picture(&drawing.picture, &alt, &format!("{what}<br>{psnr} dB"), out)
+    image(&drawing.picture, &alt, html! { (what) br; (psnr) " dB" })
 }
 
-fn write_picture(picture: &Picture, alt: &str, caption: &str, out: &mut impl Write) -> io::Result<()> {
-    let (width, height, class) = (picture.width(), picture.height(), sharpness(picture));
-    write!(out, "<figure><img class=\"{class}\" width=\"{width}\" height=\"{height}\" alt=\"{}\" ", Escaped(alt))?;
-    writeln!(out, "src=\"{}\"><figcaption>{caption}</figcaption></figure>", data_uri(picture)?)
+fn image(picture: &Picture, alt: &str, caption: Markup) -> io::Result<Markup> {
+    let (width, height) = (picture.width(), picture.height());
+    Ok(html! {
+        figure {
+            img class=(sharpness(picture)) width=(width) height=(height) alt=(alt) src=(data_uri(picture)?);
+            figcaption { (caption) }
+        }
+    })
 }
 
 fn sharpness(picture: &Picture) -> &'static str {
     if picture.width() < SHARP_BELOW_PX { "sharp" } else { "smooth" }
 }
 
-/// Every patch of the context views in the colour of its cluster, centroids ringed.
-fn write_clusters(exhibit: &Exhibit, number: usize, clusters: &SceneClusters, out: &mut impl Write) -> io::Result<()> {
+fn frame(frame: usize) -> Markup {
+    html! { "frame " (frame) }
+}
+
+/// The context views, which the maps below refer to by name.
+fn contexts(exhibit: &Exhibit, number: usize) -> io::Result<Markup> {
     let [rows, columns] = exhibit.grid;
-    let per_view = rows * columns;
-    start_row(&format!("{} clusters", clusters.centroid_index().len()), out)?;
-    for (view, assignment) in clusters.assignment().chunks(per_view).enumerate().take(exhibit.context.len()) {
+    let strip = html! {
+        @for (view, (picture, &index)) in exhibit.context.iter().zip(&exhibit.context_frames).enumerate() {
+            @let content = html! {
+                image id={ "s" (number) "v" (view) } class=(sharpness(picture)) href=(data_uri(picture)?)
+                    width=(columns) height=(rows) preserveAspectRatio="none" {}
+            };
+            (map(exhibit, &format!("Context view, frame {index}"), content, frame(index)))
+        }
+    };
+    Ok(row("context views", strip))
+}
+
+/// Every patch of the context views in the colour of its cluster, centroids ringed.
+fn clusters(exhibit: &Exhibit, number: usize, clusters: &SceneClusters) -> io::Result<Markup> {
+    let [rows, columns] = exhibit.grid;
+    let (per_view, centroids) = (rows * columns, clusters.centroid_index());
+    let tint = |assignment: &[u32]| {
         let mut tint = Picture::new(columns, rows, [0; 3]);
         for (patch, &cluster) in assignment.iter().enumerate() {
             tint.paste(&Picture::new(1, 1, cluster_colour(cluster)), patch % columns, patch / columns);
         }
-        let rings = rings(clusters.centroid_index(), view, exhibit.grid, 0.3);
-        let count = clusters.centroid_index().iter().filter(|&&token| token as usize / per_view == view).count();
-        let content = format!(
-            "<use class=\"grey\" href=\"#s{number}v{view}\"/><image class=\"tint\" href=\"{}\" {}/>\
-             <path class=\"ring\" d=\"{rings}\"/>",
-            data_uri(&tint)?,
-            area(exhibit),
-        );
-        let frame = exhibit.context_frames[view];
-        write_map(exhibit, &format!("Clusters over the context view of frame {frame}"), &content, out)?;
-        writeln!(out, "<figcaption>frame {frame}<br>{count} centroids</figcaption></figure>")?;
-    }
-    end_row(out)
+        data_uri(&tint)
+    };
+    let strip = html! {
+        @for (view, (assignment, index)) in
+            clusters.assignment().chunks(per_view).zip(&exhibit.context_frames).enumerate()
+        {
+            @let content = html! {
+                use.grey href={ "#s" (number) "v" (view) } {}
+                image.tint href=(tint(assignment)?) width=(columns) height=(rows) preserveAspectRatio="none" {}
+                path.ring d=(rings(centroids, view, exhibit.grid, 0.3)) {}
+            };
+            @let caption = html! { "frame " (index) br; (num_in_view(centroids, view, per_view)) " centroids" };
+            (map(exhibit, &format!("Clusters over the context view of frame {index}"), content, caption))
+        }
+    };
+    Ok(row(&format!("{} clusters", centroids.len()), strip))
 }
 
 /// Which tokens the target is drawn from: dots for them, rings for the other stored ones.
-fn write_choice(
-    exhibit: &Exhibit,
-    number: usize,
-    choice: &Choice,
-    selection: Option<Selection>,
-    out: &mut impl Write,
-) -> io::Result<()> {
-    let [rows, columns] = exhibit.grid;
-    let Setting { num_storage_tokens: stored, num_render_tokens: rendered, .. } = choice.setting;
+fn chosen(exhibit: &Exhibit, number: usize, choice: &Choice, selection: Option<Selection>) -> Markup {
+    let per_view = exhibit.grid.iter().product();
+    let EvalKey { num_storage_tokens: stored, num_render_tokens: rendered, .. } = choice.setting;
     let others: Vec<u32> = choice.stored.iter().copied().filter(|id| !choice.chosen.contains(id)).collect();
     let by = selection.map_or_else(String::new, |selection| format!(" by {selection}"));
-    start_row(&format!("{rendered} of {stored} tokens chosen for the target{by}"), out)?;
-    for view in 0..exhibit.context.len() {
-        let count = choice.chosen.iter().filter(|&&token| token as usize / (rows * columns) == view).count();
-        let content = format!(
-            "<use class=\"dim\" href=\"#s{number}v{view}\"/><path class=\"stored\" d=\"{}\"/>\
-             <path class=\"chosen\" d=\"{}\"/>",
-            rings(&others, view, exhibit.grid, 0.22),
-            rings(&choice.chosen, view, exhibit.grid, 0.34),
-        );
-        let frame = exhibit.context_frames[view];
-        write_map(exhibit, &format!("Chosen tokens over the context view of frame {frame}"), &content, out)?;
-        writeln!(out, "<figcaption>frame {frame}<br>{count} chosen</figcaption></figure>")?;
+    let strip = html! {
+        @for (view, index) in exhibit.context_frames.iter().enumerate() {
+            @let content = html! {
+                use.dim href={ "#s" (number) "v" (view) } {}
+                path.stored d=(rings(&others, view, exhibit.grid, 0.22)) {}
+                path.chosen d=(rings(&choice.chosen, view, exhibit.grid, 0.34)) {}
+            };
+            @let caption = html! { "frame " (index) br; (num_in_view(&choice.chosen, view, per_view)) " chosen" };
+            (map(exhibit, &format!("Chosen tokens over the context view of frame {index}"), content, caption))
+        }
+    };
+    row(&format!("{rendered} of {stored} tokens chosen for the target{by}"), strip)
+}
+
+/// A figure in units of patches.
+fn map(exhibit: &Exhibit, label: &str, content: Markup, caption: Markup) -> Markup {
+    let [rows, columns] = exhibit.grid;
+    html! {
+        figure {
+            svg viewBox={ "0 0 " (columns) " " (rows) } role="img" aria-label=(label) { (content) }
+            figcaption { (caption) }
+        }
     }
-    end_row(out)
 }
 
-/// A picture in units of patches; the figure is left open for its caption.
-fn write_map(exhibit: &Exhibit, label: &str, content: &str, out: &mut impl Write) -> io::Result<()> {
-    let [rows, columns] = exhibit.grid;
-    write!(out, "<figure><svg viewBox=\"0 0 {columns} {rows}\" role=\"img\" aria-label=\"{}\">", Escaped(label))?;
-    writeln!(out, "{content}</svg>")
-}
-
-/// Where a picture lies that fills a view.
-fn area(exhibit: &Exhibit) -> String {
-    let [rows, columns] = exhibit.grid;
-    format!("width=\"{columns}\" height=\"{rows}\" preserveAspectRatio=\"none\"")
+/// Counts the patches of one view.
+fn num_in_view(ids: &[u32], view: usize, per_view: usize) -> usize {
+    ids.iter().filter(|&&id| id as usize / per_view == view).count()
 }
 
 /// A path of circles around the centres of the patches of one view.

@@ -1,23 +1,24 @@
 use clift_model::{SceneClusters, TokenStorage};
 
 use super::*;
+use crate::eval_results::EvalResults;
 use crate::exhibit::{Choice, Drawing};
-use crate::measured::{Accumulator, Measured, Setting, Variant};
+use crate::method::{SystemName, Variant};
 use crate::picture::Picture;
-use crate::predictions::SystemName;
+use crate::view_metrics::{EvalKey, ViewMetrics};
 
 const HOSTILE: &str = "<script>alert('room')</script>";
 
-fn setting(variant: Variant, num_storage_tokens: usize, num_render_tokens: usize) -> Setting {
-    Setting { variant, num_storage_tokens, num_render_tokens, tokens: Some(TokenStorage::F32) }
+fn setting(variant: Variant, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
+    EvalKey { variant, num_storage_tokens, num_render_tokens, tokens: Some(TokenStorage::F32) }
 }
 
 /// Two variants at two counts and one choice, over two scenes.
 fn summary() -> Summary {
-    let mut views = Accumulator::default();
+    let mut views = EvalResults::default();
     for (scene, shift) in [("a", 0.0), ("b", 1.0)] {
         views
-            .add(scene, 3, Setting::baseline(Variant::NearestView), Measured::quality(15.0 + shift, Some(0.4)))
+            .add(scene, 3, EvalKey::baseline(Variant::NearestView), ViewMetrics::quality(15.0 + shift, Some(0.4)))
             .unwrap();
         for (variant, stored, rendered, psnr, ms) in [
             (Variant::Clift, 4, 4, 16.0, 2.0),
@@ -26,21 +27,22 @@ fn summary() -> Summary {
             (Variant::Random, 4, 4, 14.0, 2.5),
         ] {
             let setting = setting(variant, stored, rendered);
-            let measured = Measured { render_s: Some(ms * 1e-3), ..Measured::quality(psnr + shift, Some(psnr / 40.0)) };
+            let measured =
+                ViewMetrics { render_s: Some(ms * 1e-3), ..ViewMetrics::quality(psnr + shift, Some(psnr / 40.0)) };
             views.add(scene, 3, setting, measured).unwrap();
             if variant == Variant::Clift {
                 views.add_scene_bytes(setting, 1000 * stored as u64);
             }
         }
     }
-    views.summary()
+    Summary::new(&views)
 }
 
 /// A scene of two views of 2 x 2 patches.
 fn exhibit(side: usize) -> Exhibit {
     let picture = |level| Picture::new(side, side, [level; 3]);
     let drawing = |variant, stored, rendered| {
-        let setting = if stored == 0 { Setting::baseline(variant) } else { setting(variant, stored, rendered) };
+        let setting = if stored == 0 { EvalKey::baseline(variant) } else { setting(variant, stored, rendered) };
         Drawing { setting, psnr: 17.25, picture: picture(90) }
     };
     Exhibit {
@@ -78,7 +80,7 @@ fn report() -> Report {
 }
 
 fn page(report: &Report) -> String {
-    String::from_utf8(report.to_html().unwrap()).unwrap()
+    report.to_html().unwrap()
 }
 
 #[test]
@@ -132,7 +134,14 @@ fn tags_are_closed_in_the_order_they_are_opened() {
 fn no_text_from_data_is_read_as_markup() {
     let html = page(&report());
     // Title, heading, scene, ledger and config.
-    assert_eq!(html.matches("&lt;script&gt;alert(&#39;room&#39;)&lt;/script&gt;").count(), 5);
+    assert_eq!(html.matches("&lt;script&gt;alert('room')&lt;/script&gt;").count(), 5);
+    // In an attribute too, and characters that HTML cannot express are replaced.
+    let mut quoted = report();
+    quoted.name = "a\" onload=\"b\u{7}&".into();
+    quoted.exhibits[0].drawings[0].setting.variant = Variant::System(SystemName::new("\" onload=\"b").unwrap());
+    let html = page(&quoted);
+    assert!(html.contains("<h1>a&quot; onload=&quot;b\u{fffd}&amp;</h1>") && !html.contains("onload=\""), "{html}");
+    assert!(html.contains("alt=\"The target as &quot; onload=&quot;b draws it"), "{html}");
 }
 
 #[test]
@@ -194,20 +203,20 @@ fn a_report_that_cannot_be_written_says_where() {
     assert!(message.starts_with("writing the report failed: ") && message.ends_with("report.html"), "{message}");
     let path = folder.path().join("report.html");
     report().write(&path).unwrap();
-    assert!(std::fs::read_to_string(&path).unwrap().ends_with("</html>\n"));
+    assert!(std::fs::read_to_string(&path).unwrap().ends_with("</html>"));
 }
 
 #[test]
 fn other_systems_stand_in_tables_plots_and_scenes_with_what_they_miss() {
     let name = SystemName::new("<b>MVSplat</b>").unwrap();
     let mut other = report();
-    let mut views = Accumulator::default();
-    let setting = Setting::baseline(Variant::System(name));
-    views.add("a", 3, setting, Measured::quality(17.0, Some(0.5))).unwrap();
+    let mut views = EvalResults::default();
+    let setting = EvalKey::baseline(Variant::System(name));
+    views.add("a", 3, setting, ViewMetrics::quality(17.0, Some(0.5))).unwrap();
     views.add_scene_bytes(setting, 5_000);
     views.miss(name, "b/000003.png".into());
     views.note_not_measured("lpips_vgg", "no <weights>".into());
-    let theirs = views.summary();
+    let theirs = Summary::new(&views);
     other.summary.points.extend(theirs.points);
     (other.summary.missing, other.summary.not_measured) = (theirs.missing, theirs.not_measured);
     other.exhibits[0].drawings.push(Drawing { setting, psnr: 17.0, picture: Picture::new(16, 16, [9; 3]) });

@@ -4,10 +4,9 @@ use std::fmt;
 
 use clift_model::TokenStorage;
 
-use super::{Quality, Summary};
-use crate::adaptive::Adaptive;
-use crate::measured::Variant;
-use crate::paired::Difference;
+use crate::method::Variant;
+use crate::paired::PairedDifference;
+use crate::summary::{Quality, Summary};
 
 /// Missing pictures that are named; the file names all.
 const MAX_NAMED: usize = 3;
@@ -30,7 +29,7 @@ const WIDTHS: [usize; 12] = [7, 9, 6, 8, 6, 6, 6, 10, 9, 7, 7, 9];
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { num_scenes, num_views, num_skipped, baselines, points, differences, adaptive, .. } = self;
+        let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
         writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes left out\n")?;
         let names = points.iter().map(|point| point.variant.name().chars().count());
         let width = names.chain([Variant::NearestView.name().len()]).max().unwrap_or_default();
@@ -83,21 +82,10 @@ impl fmt::Display for Summary {
         if !differences.is_empty() {
             writeln!(f, "\nPSNR of the same scenes, difference and standard error")?;
         }
-        for Difference { variant, against, num_storage_tokens, tokens, psnr, psnr_stderr, .. } in differences {
+        for PairedDifference { variant, against, num_storage_tokens, tokens, psnr, psnr_stderr, .. } in differences {
             let (error, format) = (cell(*psnr_stderr, 2), tokens.map_or("", TokenStorage::name));
             let names = format!("{} - {}", variant.name(), against.name());
             writeln!(f, "{names:<24} {num_storage_tokens:>6} tokens {format:<4} {psnr:>+7.2} +- {error} dB")?;
-        }
-        if !adaptive.is_empty() {
-            writeln!(
-                f,
-                "\n--max-error against one count for all scenes, at no more tokens on average; of what any rule could gain"
-            )?;
-        }
-        for row in adaptive {
-            let Adaptive { max_error, mean_storage_tokens: own, num_storage_tokens: fixed, .. } = row;
-            let Adaptive { difference, difference_bound: most, .. } = row;
-            writeln!(f, "{max_error:<8.4} {own:>8.1} tokens against {fixed:>6} {difference:>+7.2} dB of {most:.2}")?;
         }
         for missing in &self.missing {
             let named = missing.pictures.iter().take(MAX_NAMED).cloned().collect::<Vec<_>>().join(", ");
@@ -123,33 +111,35 @@ fn cell(value: Option<f64>, decimals: usize) -> String {
 mod tests {
     use clift_model::TokenStorage;
 
-    use crate::measured::{Accumulator, Measured, Setting, Variant};
-    use crate::predictions::SystemName;
+    use crate::eval_results::EvalResults;
+    use crate::method::{SystemName, Variant};
+    use crate::summary::Summary;
+    use crate::view_metrics::{EvalKey, ViewMetrics};
 
     #[test]
     fn the_table_lines_up() {
-        let mut views = Accumulator::default();
-        let setting = Setting {
+        let mut views = EvalResults::default();
+        let key = EvalKey {
             variant: Variant::Clift,
             num_storage_tokens: 64,
             num_render_tokens: 32,
             tokens: Some(TokenStorage::Int8),
         };
         for (scene, psnr, ms) in [("a", 20.0, 1.0), ("b", 21.0, 2.0)] {
-            let measured = Measured {
+            let measured = ViewMetrics {
                 render_s: Some(ms * 1e-3),
                 select_s: Some(0.01),
-                ..Measured::quality(psnr, Some(psnr / 100.0))
+                ..ViewMetrics::quality(psnr, Some(psnr / 100.0))
             };
-            views.add(scene, 0, setting, measured).unwrap();
+            views.add(scene, 0, key, measured).unwrap();
         }
         let system = SystemName::new("DepthSplat").unwrap();
-        let other = Setting::baseline(Variant::System(system));
-        views.add("a", 0, other, Measured { lpips_vgg: Some(0.25), ..Measured::quality(19.0, None) }).unwrap();
+        let other = EvalKey::baseline(Variant::System(system));
+        views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) }).unwrap();
         views.miss(system, "b/000000.png".into());
-        views.add("a", 0, Setting::baseline(Variant::NearestView), Measured::quality(18.0, Some(0.5))).unwrap();
-        views.add_gflops(setting, 45.23);
-        views.add_scene_bytes(setting, 99_000);
+        views.add("a", 0, EvalKey::baseline(Variant::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
+        views.add_gflops(key, 45.23);
+        views.add_scene_bytes(key, 99_000);
         views.note_not_measured("lpips_vgg", "no weights".into());
         let expected = "\
 2 views of 2 scenes, 0 scenes left out
@@ -164,6 +154,6 @@ t: no other point has this PSNR in this time per frame (median); b: in as few by
 DepthSplat: 1 of 2 pictures are missing, its means are over the rest: b/000000.png
 lpips_vgg is not measured: no weights
 ";
-        assert_eq!(views.summary().to_string(), expected);
+        assert_eq!(Summary::new(&views).to_string(), expected);
     }
 }

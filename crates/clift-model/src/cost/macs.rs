@@ -19,7 +19,8 @@ pub struct Macs {
 }
 
 /// How an amount of work is told.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "lowercase")]
 pub enum Convention {
     /// As the paper's numbers come out (render-budget table): one per multiply-accumulate of linear layers, attention
     /// left out, and five per value of `3 L + 2` layer norms. The first two are what fvcore counts where attention is
@@ -34,15 +35,11 @@ pub enum Convention {
 
 impl Convention {
     /// All conventions.
-    pub const ALL: [Self; 3] = [Self::Paper, Self::Macs, Self::Flops];
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// The name as it is typed.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Paper => "paper",
-            Self::Macs => "macs",
-            Self::Flops => "flops",
-        }
+    /// Returns the name as it is typed.
+    pub fn name(self) -> &'static str {
+        self.into()
     }
 
     /// The unit of a thousand million of it.
@@ -55,21 +52,11 @@ impl Convention {
     }
 }
 
-impl fmt::Display for Convention {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
 impl FromStr for Convention {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
-        Self::ALL.into_iter().find(|convention| convention.name() == name).ok_or_else(|| ModelError::BadConfig {
-            key: "convention",
-            value: name.into(),
-            fix: format!("write one of {}", Self::ALL.map(Self::name).join(", ")),
-        })
+        parse_value("convention", name)
     }
 }
 

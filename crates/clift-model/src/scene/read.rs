@@ -5,7 +5,8 @@ use std::path::Path;
 
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 
-use super::{FORMAT, Scene, TokenKind, TokenStorage, VERSION, WorldFrame, dtype_name};
+use super::{FORMAT, Scene, TokenStorage, VERSION, WorldFrame, dtype_name};
+use crate::names::parse;
 use crate::{ModelConfig, ModelError, ViewCamera};
 
 /// Longest header that is read; those of this version are shorter.
@@ -78,8 +79,7 @@ fn from_bytes(bytes: &[u8]) -> Result<(Scene, TokenStorage), Refusal> {
         return Err(refusal(format!("it has version {version:?}, this program reads {VERSION}"), OTHER_VERSION));
     }
     let kind = fields.get("kind")?;
-    let kind = [TokenKind::Clift, TokenKind::Kmeans].into_iter().find(|known| known.name() == kind);
-    let kind = kind.ok_or_else(|| format!("its tokens are of an unknown kind, {:?}", fields.0.get("kind")))?;
+    let kind = parse(kind).ok_or_else(|| format!("its tokens are of an unknown kind, {:?}", fields.0.get("kind")))?;
     let model: ModelConfig =
         serde_json::from_str(fields.get("model")?).map_err(|error| format!("its model cannot be read ({error})"))?;
 

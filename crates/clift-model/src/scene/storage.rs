@@ -1,21 +1,36 @@
 //! How the tokens of a scene file are rounded.
 // S stored tokens, D width
 
-use std::fmt;
 use std::str::FromStr;
 
 use half::f16;
-
 use serde::{Deserialize, Serialize};
+use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::ModelError;
+use crate::names::parse_value;
 
 /// Largest magnitude of an 8-bit value; -128 is not used, so that the range is even.
 const INT8_MAX: f32 = 127.0;
 
 /// Number format of the tokens in a scene file.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(
+    Clone,
+    Copy,
+    Debug,
+    Default,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Serialize,
+    Deserialize,
+    Display,
+    IntoStaticStr,
+    VariantArray,
+)]
 #[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
 pub enum TokenStorage {
     /// 32-bit floats: the renderer gets the tokens it would get without a file.
     F32,
@@ -28,15 +43,11 @@ pub enum TokenStorage {
 
 impl TokenStorage {
     /// All formats.
-    pub const ALL: [Self; 3] = [Self::F32, Self::F16, Self::Int8];
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// The name as it is typed.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::F32 => "f32",
-            Self::F16 => "f16",
-            Self::Int8 => "int8",
-        }
+    /// Returns the name as it is typed.
+    pub fn name(self) -> &'static str {
+        self.into()
     }
 
     /// Bytes of one value.
@@ -109,21 +120,11 @@ impl TokenStorage {
     }
 }
 
-impl fmt::Display for TokenStorage {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
 impl FromStr for TokenStorage {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
-        Self::ALL.into_iter().find(|storage| storage.name() == name).ok_or_else(|| ModelError::BadConfig {
-            key: "tokens",
-            value: name.into(),
-            fix: format!("write one of {}", Self::ALL.map(Self::name).join(", ")),
-        })
+        parse_value("tokens", name)
     }
 }
 

@@ -9,7 +9,7 @@ use clift_data::order::{item_rng, step_rng};
 use clift_data::statistics::upper_median;
 use clift_data::{ClipReader, Split, open_dataset};
 use clift_eval::lpips::Lpips;
-use clift_eval::{Accumulator, Condensed, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
+use clift_eval::{Condensed, EvalResults, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
 
 use clift_model::{Convention, ModelConfig, Parameters, Part, SceneSizes};
 use cpu_time::ProcessTime;
@@ -250,7 +250,7 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
         let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
         let sweep = Sweep { model: shallow.model.clone(), lpips, ..evaluated(config) };
         // One for all: after the first time no setting draws the view that warms it up.
-        let mut measured = Accumulator::default();
+        let mut measured = EvalResults::default();
         measuring_s =
             Timed::of(|| Ok(evaluate_scene(&networks, &clip, &sweep, false, &mut measured).map(|_| ())?))?.seconds;
     } else {

@@ -2,7 +2,9 @@
 
 use std::time::Instant;
 
-use clift_model::{ModelError, ViewCamera, Viewer};
+use crate::camera::ViewCamera;
+use crate::error::ModelError;
+use crate::viewer::Viewer;
 
 /// Parts of the stored tokens that are timed, in sixteenths; all of them are timed beside.
 const SIXTEENTHS: [usize; 5] = [1, 2, 4, 8, 12];
@@ -13,14 +15,14 @@ const ENOUGH_S: f64 = 1.0;
 
 /// Time per frame, from the choice of tokens to pixels on the host.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Calibration {
+pub struct RenderBudget {
     /// Tokens and seconds, by tokens: what was measured of frames drawn from a part of the tokens.
     pub some: Vec<(usize, f64)>,
     /// All tokens and seconds, where frames are drawn several at a time and tokens need no choosing.
     pub all: (usize, f64),
 }
 
-impl Calibration {
+impl RenderBudget {
     /// Times frames of a few counts.
     ///
     /// # Errors
@@ -104,7 +106,7 @@ mod tests {
 
     #[test]
     fn a_budget_between_two_measured_counts_buys_its_share_of_the_tokens_between() {
-        let times = Calibration { some: vec![(16, 0.010), (64, 0.022), (128, 0.030)], all: (256, 0.050) };
+        let times = RenderBudget { some: vec![(16, 0.010), (64, 0.022), (128, 0.030)], all: (256, 0.050) };
         for (budget_s, expected) in [
             (0.009, None),
             (0.010, Some(16)),
@@ -122,12 +124,12 @@ mod tests {
     #[test]
     fn a_count_that_was_slow_by_chance_hides_no_larger_one_that_fits() {
         // 64 tokens took 12 ms, so that 16 take no more, whatever the clock said then.
-        let times = Calibration { some: vec![(8, 0.010), (16, 0.020), (64, 0.012), (128, 0.030)], all: (256, 0.050) };
+        let times = RenderBudget { some: vec![(8, 0.010), (16, 0.020), (64, 0.012), (128, 0.030)], all: (256, 0.050) };
         assert_eq!(times.most_tokens(0.011), Some(12));
         assert_eq!(times.most_tokens(0.012), Some(64));
         assert_eq!(times.most_tokens(0.021), Some(96));
         // The shortest time that is named can be had, wherever it was measured.
-        let first = Calibration { some: vec![(1, 0.0019), (2, 0.0015), (4, 0.0016)], all: (16, 0.0017) };
+        let first = RenderBudget { some: vec![(1, 0.0019), (2, 0.0015), (4, 0.0016)], all: (16, 0.0017) };
         assert_eq!(first.most_tokens(first.least_s()), Some(2));
         let mut last = 0;
         for step in 0..100 {
@@ -139,10 +141,10 @@ mod tests {
 
     #[test]
     fn all_tokens_are_taken_where_drawing_several_frames_at_once_makes_them_cheaper_than_some() {
-        let times = Calibration { some: vec![(16, 0.010), (64, 0.012)], all: (256, 0.008) };
+        let times = RenderBudget { some: vec![(16, 0.010), (64, 0.012)], all: (256, 0.008) };
         assert_eq!(times.most_tokens(0.009), Some(256));
         assert_eq!(times.least_s(), 0.008);
-        let one = Calibration { some: Vec::new(), all: (1, 0.01) };
+        let one = RenderBudget { some: Vec::new(), all: (1, 0.01) };
         assert_eq!((one.most_tokens(0.02), one.most_tokens(0.001)), (Some(1), None));
     }
 }

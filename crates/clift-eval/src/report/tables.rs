@@ -1,0 +1,171 @@
+//! The tables of the page.
+
+use clift_data::Ledger;
+use clift_model::TokenStorage;
+use maud::{Markup, html};
+
+use super::axis::{grouped, milliseconds};
+use super::html::{DASH, count, head, number};
+use crate::machine;
+use crate::paired::PairedDifference;
+use crate::summary::{Point, Summary};
+
+const POINTS_HEAD: [&str; 17] = [
+    "variant",
+    "stored\ntokens",
+    "rendered\ntokens",
+    "format\n\u{a0}",
+    "PSNR\ndB",
+    "\u{b1}\ndB",
+    "SSIM\n\u{a0}",
+    "LPIPS\n\u{a0}",
+    "drawing\nms",
+    "p95\nms",
+    "frame\nms",
+    "p95\nms",
+    "GMAC\n\u{a0}",
+    "scene\nkB",
+    "memory\nMB",
+    "front:\ntime",
+    "front:\nbytes",
+];
+
+const POINTS_NOTE: &str = "Each view is drawn alone, keys and values of its tokens included; a frame is the choice of tokens and \
+                           the drawing; times are medians and 95th percentiles over views. A point is on a front if no \
+                           other has its PSNR in as little time per frame, or in as few bytes. Memory is the peak of \
+                           the whole process. GMAC are multiply-accumulates per view, attention included.";
+
+const DIFFERENCES_HEAD: [&str; 7] =
+    ["better", "worse", "stored\ntokens", "format\n\u{a0}", "scenes\n\u{a0}", "difference\ndB", "\u{b1}\ndB"];
+
+const DIFFERENCES_NOTE: &str = "PSNR of the variant that the paper finds better less that of the other, on the same \
+                                scenes: below zero where these scenes disagree.";
+
+/// Returns the table of all points, baselines first, and what is missing in it.
+pub fn points(summary: &Summary) -> Markup {
+    let Summary { baselines, points, missing, not_measured, num_views, .. } = summary;
+    html! {
+        h2 { "All points" }
+        div.scroll {
+            table.points {
+                (head(&POINTS_HEAD))
+                tbody {
+                    @for (name, quality) in [("nearest view", baselines.nearest_view), ("mean image", baselines.mean_image)] {
+                        tr {
+                            td { (name) }
+                            td {} td {} td {}
+                            td { (number(quality.psnr, 2)) }
+                            td {}
+                            td { (number(quality.ssim, 3)) }
+                            td { (number(quality.lpips_vgg, 3)) }
+                            @for _ in 8..POINTS_HEAD.len() { td {} }
+                        }
+                    }
+                    @for (i, point) in points.iter().enumerate() {
+                        @let is_first = i == 0 || points[i - 1].variant != point.variant;
+                        @let is_front = point.pareto_time || point.pareto_bytes;
+                        tr.first[is_first].front-row[is_front] {
+                            td { (point.variant.name()) }
+                            @for cell in cells(point) { td { (cell) } }
+                        }
+                    }
+                }
+            }
+        }
+        p.note { (POINTS_NOTE) }
+        @for missing in missing {
+            p.note {
+                (missing.variant.name()) ": " (missing.num_missing) " of " (num_views)
+                " pictures are missing; its means are over the rest."
+            }
+        }
+        @for missing in not_measured {
+            p.note { code { (missing.metric) } " is not measured: " (missing.reason) }
+        }
+    }
+}
+
+/// Returns the cells of a point after its name.
+fn cells(point: &Point) -> [String; 16] {
+    let tokens = |tokens: usize| if tokens == 0 { DASH.to_owned() } else { count(tokens) };
+    let ms = |seconds: Option<f64>| seconds.map_or_else(|| DASH.into(), milliseconds);
+    let dot = |is_front: bool| if is_front { "\u{25cf}".to_owned() } else { String::new() };
+    [
+        tokens(point.num_storage_tokens),
+        tokens(point.num_render_tokens),
+        point.tokens.map_or(DASH, TokenStorage::name).to_owned(),
+        number(point.psnr, 2),
+        number(point.psnr_stderr, 2),
+        number(point.ssim, 3),
+        number(point.lpips_vgg, 3),
+        ms(point.render_median_s),
+        ms(point.render_p95_s),
+        ms(point.frame_median_s),
+        ms(point.frame_p95_s),
+        number(point.gflops, if point.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }),
+        number(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
+        number(point.peak_bytes.map(|bytes| bytes as f64 / 1e6), 0),
+        dot(point.pareto_time),
+        dot(point.pareto_bytes),
+    ]
+}
+
+/// Returns the table of paired differences; nothing where there is no pair.
+pub fn differences(differences: &[PairedDifference]) -> Markup {
+    html! {
+        @if !differences.is_empty() {
+            h2 { "Scene by scene" }
+            p.note { (DIFFERENCES_NOTE) }
+            div.scroll {
+                table {
+                    (head(&DIFFERENCES_HEAD))
+                    tbody {
+                        @for row in differences {
+                            tr {
+                                td { (row.variant.name()) }
+                                td { (row.against.name()) }
+                                td { (count(row.num_storage_tokens)) }
+                                td { (row.tokens.map_or(DASH, TokenStorage::name)) }
+                                td { (count(row.num_scenes)) }
+                                td { (grouped(row.psnr, 2)) }
+                                td { (number(row.psnr_stderr, 2)) }
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Returns how many scenes were evaluated, and the reasons of the others.
+pub fn left_out(num_evaluated: usize, ledger: &Ledger) -> Markup {
+    html! {
+        h2 { "What was left out" }
+        p { (count(num_evaluated)) " of " (count(ledger.num_scenes)) " scenes were evaluated." }
+        @if ledger.skips.is_empty() {
+            p { "None was left out." }
+        } @else {
+            table.plain {
+                thead { tr { th { "scenes" } th { "reason" } } }
+                tbody {
+                    @for (reason, count) in ledger.counts() { tr { td { (count) } td { (reason) } } }
+                }
+            }
+            p.note { "Each by its name: " code { "skipped.json" } "." }
+        }
+    }
+}
+
+/// Returns the table of program, device and machine.
+pub fn machine(device: &str) -> Markup {
+    let ours = [("clift", env!("CARGO_PKG_VERSION").to_owned()), ("device", device.to_owned())];
+    html! {
+        h2 { "Machine" }
+        table.plain {
+            tbody {
+                @for (name, value) in ours.into_iter().chain(machine::rows()) { tr { td { (name) } td { (value) } } }
+            }
+        }
+    }
+}

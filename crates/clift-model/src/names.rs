@@ -1,0 +1,71 @@
+//! Enums by the names of their variants, as a config or the command line gives them.
+
+use strum::VariantArray;
+
+use crate::error::ModelError;
+
+/// An enum whose variants have names: strum derives `VariantArray` and `IntoStaticStr`.
+pub trait Named: Copy + VariantArray + Into<&'static str> {}
+
+impl<T: Copy + VariantArray + Into<&'static str>> Named for T {}
+
+/// Returns the names of all variants, joined by commas.
+pub fn names<T: Named>() -> String {
+    T::VARIANTS.iter().map(|&variant| variant.into()).collect::<Vec<&str>>().join(", ")
+}
+
+/// Finds the variant of a name.
+pub fn parse<T: Named>(name: &str) -> Option<T> {
+    T::VARIANTS.iter().copied().find(|&variant| variant.into() == name)
+}
+
+/// Finds the variant of a name that `key` was given.
+///
+/// # Errors
+/// [`ModelError::BadConfig`] with all names.
+pub fn parse_value<T: Named>(key: &'static str, name: &str) -> Result<T, ModelError> {
+    parse(name).ok_or_else(|| ModelError::BadConfig {
+        key,
+        value: name.into(),
+        fix: format!("write one of {}", names::<T>()),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fmt::{Debug, Display};
+    use std::str::FromStr;
+
+    use super::*;
+    use crate::config::Variant;
+    use crate::device::DeviceName;
+    use crate::flops::Convention;
+    use crate::precision::Precision;
+    use crate::scene::{TokenKind, TokenStorage};
+    use crate::select::Preset;
+
+    fn check<T>(expected: &str)
+    where
+        T: Named + Debug + Display + FromStr + PartialEq,
+        T::Err: Debug,
+    {
+        assert_eq!(names::<T>(), expected);
+        for &variant in T::VARIANTS {
+            assert_eq!(variant.to_string().parse::<T>().unwrap(), variant);
+        }
+        assert!("other".parse::<T>().is_err());
+    }
+
+    #[test]
+    fn every_variant_is_printed_and_parsed_by_its_name() {
+        check::<Convention>("paper, macs, flops");
+        check::<DeviceName>("flex, ndarray, wgpu");
+        check::<Precision>("f32, f16");
+        check::<Preset>("paper, global, scaled");
+        check::<TokenStorage>("f32, f16, int8");
+        check::<Variant>("paper, released-re10k, released-dl3dv");
+        assert_eq!(names::<TokenKind>(), "clift, kmeans");
+        let message = parse_value::<Convention>("convention", "flop").unwrap_err().to_string();
+        assert_eq!(message, "`convention` = flop: write one of paper, macs, flops");
+    }
+}
