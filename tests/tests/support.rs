@@ -218,8 +218,17 @@ impl Place {
         for stage in ["stage1", "stage2"] {
             assert_eq!(self.progress(run, stage), self.progress(other, stage), "{stage}");
         }
-        let summary = |run: &str| crate::pipeline::summary_but_time(self, &format!("{run}/eval/summary.json"));
-        assert_eq!(summary(run), summary(other));
+        assert_eq!(self.summary_but_time(run), self.summary_but_time(other));
+    }
+
+    /// A run's `summary.json` without what the clock decides.
+    pub fn summary_but_time(&self, run: &str) -> Value {
+        let mut summary = self.json(&format!("{run}/eval/summary.json"));
+        for point in summary["points"].as_array_mut().expect("a list") {
+            let point = point.as_object_mut().expect("an object");
+            point.retain(|key, _| !key.ends_with("_s") && key != "peak_bytes" && key != "pareto_time");
+        }
+        summary
     }
 
     /// The steps of a stage's checkpoints.
@@ -272,6 +281,18 @@ pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
         }
     }
     found
+}
+
+/// Texts of the repository's files with these endings below some folders, by their paths in it.
+pub fn sources(folders: &[&str], endings: &[&str]) -> BTreeMap<String, String> {
+    let root = repository("");
+    let all = folders.iter().flat_map(|folder| files(&repository(folder)));
+    let has_ending = |path: &Path| path.extension().is_some_and(|ending| endings.iter().any(|one| ending == *one));
+    let text = |(path, bytes): (PathBuf, Vec<u8>)| {
+        let name = path.strip_prefix(&root).expect("a file of the repository").display().to_string();
+        (name, String::from_utf8(bytes).expect("sources are UTF-8"))
+    };
+    all.filter(|(path, _)| has_ending(path)).map(text).collect()
 }
 
 /// Parameters by name.

@@ -147,26 +147,16 @@ fn a_run_writes_every_documented_file() {
     assert!(place.weights("run", "stage1").0.keys().all(|name| !name.starts_with("condenser.")));
 }
 
-/// `summary.json` without what the clock decides.
-pub fn summary_but_time(place: &Place, name: &str) -> Value {
-    let mut summary = place.json(name);
-    for point in summary["points"].as_array_mut().expect("a list") {
-        let point = point.as_object_mut().expect("an object");
-        point.retain(|key, _| !key.ends_with("_s") && key != "peak_bytes" && key != "pareto_time");
-    }
-    summary
-}
-
 #[test]
 fn a_run_can_be_moved_and_evaluated_with_other_counts() {
     let place = Place::new();
     place.train("before", &[], &[]).ok();
-    let summary = summary_but_time(&place, "before/eval/summary.json");
+    let summary = place.summary_but_time("before");
     std::fs::rename(place.at("before"), place.at("after")).unwrap();
 
     let ran = place.eval("after", &[]).ok();
     assert!(ran.stdout.trim_end().ends_with("after/eval"), "{}", ran.stdout);
-    assert_eq!(summary_but_time(&place, "after/eval/summary.json"), summary);
+    assert_eq!(place.summary_but_time("after"), summary);
     assert!(!place.at("before").exists(), "nothing is written to where the run was trained");
 
     let out = place.at("elsewhere");
@@ -176,7 +166,7 @@ fn a_run_can_be_moved_and_evaluated_with_other_counts() {
     let stored: Vec<_> = other["points"].as_array().unwrap().iter().map(|point| &point["num_storage_tokens"]).collect();
     assert_eq!(stored, [3, 4, 3, 4, 3, 4]);
     assert_eq!(
-        summary_but_time(&place, "after/eval/summary.json"),
+        place.summary_but_time("after"),
         summary,
         "--out leaves the run's own results alone"
     );
@@ -194,7 +184,7 @@ fn the_stages_one_by_one_give_the_whole_runs_weights_to_the_bit() {
     place.assert_same_result("parts", "whole");
     assert_eq!(place.metrics_but_time("parts"), place.metrics_but_time("whole"));
     place.eval("parts", &[]).ok();
-    let summary = |run: &str| summary_but_time(&place, &format!("{run}/eval/summary.json"));
+    let summary = |run: &str| place.summary_but_time(run);
     assert_eq!(summary("parts"), summary("whole"));
 }
 

@@ -110,7 +110,7 @@ fn a_finished_run_is_left_as_it_is() {
     let place = Place::new();
     place.train("run", &[], &[]).ok();
     let before = files(&place.at("run"));
-    let summary = crate::pipeline::summary_but_time(&place, "run/eval/summary.json");
+    let summary = place.summary_but_time("run");
     let ran = place.train("run", &[], &[]).ok();
     assert!(!ran.stderr.contains("stage1: 6 steps") && !ran.stderr.contains("stage2: 4 steps"), "{}", ran.stderr);
     let after = files(&place.at("run"));
@@ -121,7 +121,7 @@ fn a_finished_run_is_left_as_it_is() {
             ["summary.json", "views.csv", "report.html"].iter().any(|name| path.ends_with(format!("eval/{name}")));
         assert!(timed || *bytes == after[path], "{} changed", path.display());
     }
-    assert_eq!(crate::pipeline::summary_but_time(&place, "run/eval/summary.json"), summary);
+    assert_eq!(place.summary_but_time("run"), summary);
 }
 
 #[test]
