@@ -165,11 +165,7 @@ fn a_run_can_be_moved_and_evaluated_with_other_counts() {
     assert_eq!(other["num_scenes"], 2);
     let stored: Vec<_> = other["points"].as_array().unwrap().iter().map(|point| &point["num_storage_tokens"]).collect();
     assert_eq!(stored, [3, 4, 3, 4, 3, 4]);
-    assert_eq!(
-        place.summary_but_time("after"),
-        summary,
-        "--out leaves the run's own results alone"
-    );
+    assert_eq!(place.summary_but_time("after"), summary, "--out leaves the run's own results alone");
 }
 
 #[test]
