@@ -51,7 +51,7 @@ fn named_path(line: &str, at: usize) -> Option<&str> {
 }
 
 #[test]
-fn missing_links_and_paths_are_listed_with_their_line() {
+fn missing_paths_are_listed_with_their_line() {
     let exists = |path: &Path| ["docs/plan.md", "docs/here.md"].iter().any(|known| Path::new(known) == path);
     let text = "[a](plan.md#part) [b](gone.md) [c](https://example.org/docs/x.md)\nSee `docs/here.md`, docs/{a,b}.md.\n\
                 Run scripts/gone.py. ../docs/plan.md, my-docs/x";

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use crate::support::{Place, clift};
+use crate::support::{Place, STAGE_1, WHOLE, clift};
 
 /// Keys of a JSON object, in any order.
 fn keys(value: &Value) -> Vec<&str> {
@@ -148,9 +148,9 @@ fn a_run_writes_every_documented_file() {
 }
 
 #[test]
-fn a_run_can_be_moved_and_evaluated_with_other_counts() {
+fn moved_runs_evaluate_with_other_counts() {
     let place = Place::new();
-    place.train("before", &[], &[]).ok();
+    place.copy(&WHOLE, "before");
     let summary = place.summary_but_time("before");
     std::fs::rename(place.at("before"), place.at("after")).unwrap();
 
@@ -169,9 +169,9 @@ fn a_run_can_be_moved_and_evaluated_with_other_counts() {
 }
 
 #[test]
-fn the_stages_one_by_one_give_the_whole_runs_weights_to_the_bit() {
+fn stages_run_singly_give_equal_weights() {
     let place = Place::new();
-    place.train("whole", &[], &[]).ok();
+    place.copy(&WHOLE, "whole");
     for stage in ["stage1", "clusters", "stage2"] {
         let ran = place.train("parts", &[], &["--only", stage]).ok();
         assert!(ran.stdout.is_empty(), "a part has no evaluation to print: {}", ran.stdout);
@@ -185,7 +185,7 @@ fn the_stages_one_by_one_give_the_whole_runs_weights_to_the_bit() {
 }
 
 #[test]
-fn a_stage_before_its_turn_names_what_to_run_first() {
+fn early_stages_name_what_to_run_first() {
     let place = Place::new();
     for stage in ["stage2", "clusters"] {
         let message = place.train("run", &[], &["--only", stage]).fails(2);
@@ -194,7 +194,7 @@ fn a_stage_before_its_turn_names_what_to_run_first() {
         assert!(message.contains(&expected), "{message}");
         assert!(message.trim_end().ends_with("run/stage1/model.safetensors"), "{message}");
     }
-    place.train("run", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "run");
     let message = place.train("run", &[], &["--only", "stage2"]).fails(2);
     assert!(message.contains("error: stage2 needs the cluster cache, which is not there; run --only clusters first: "));
     // Without stage 2 there is still something to measure, and it says so.
@@ -223,7 +223,7 @@ fn overfitting_one_scene_trains_and_measures_that_scene() {
 }
 
 #[test]
-fn a_run_starts_from_another_runs_weights_and_says_so() {
+fn runs_start_from_weights_of_other_runs() {
     let place = Place::new();
     place.train("first", &["seed=7"], &["--only", "stage1"]).ok();
     let first = place.at("first").display().to_string();
