@@ -7,7 +7,7 @@ use clift_model::adapter::{adapters, max_tensor_bytes};
 use clift_model::device::DeviceName;
 
 #[test]
-fn the_used_adapter_allows_what_the_open_device_does() {
+fn adapter_limits_hold_on_the_open_device() {
     let device = match DeviceName::Wgpu.open() {
         Ok(device) => device,
         Err(error) if std::env::var_os("CLIFT_REQUIRE_WGPU").is_some() => panic!("{error}"),

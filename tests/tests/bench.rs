@@ -1,11 +1,10 @@
 //! `clift bench`: the rows it prints and the file it writes.
 
 use std::io::{BufRead, BufReader};
-use std::process::Command;
 
 use serde_json::Value;
 
-use crate::support::{Place, clift, finish, repository, spawn};
+use crate::support::{Place, clift, finish, repository, signal, spawn};
 
 const WORKS: [&str; 10] = [
     "encode",
@@ -30,7 +29,7 @@ fn args(flags: &[&str]) -> Vec<String> {
 }
 
 #[test]
-fn every_row_is_printed_and_written_with_its_time_and_its_error() {
+fn every_row_has_its_time_and_error() {
     let place = Place::new();
     let json = place.at("bench.json").display().to_string();
     let ran = clift(args(&["--repeats", "2", "--warmup", "0", "--json", &json])).ok();
@@ -60,7 +59,7 @@ fn every_row_is_printed_and_written_with_its_time_and_its_error() {
 }
 
 #[test]
-fn works_are_chosen_and_errors_left_out_on_request() {
+fn rows_are_chosen_and_errors_omitted_on_request() {
     let place = Place::new();
     let json = place.at("bench.json").display().to_string();
     let chosen = ["--work", "render,encode", "--no-error", "--repeats", "1", "--json", &json];
@@ -83,17 +82,18 @@ fn what_cannot_be_timed_is_wrong_usage() {
 }
 
 #[test]
-fn an_interrupted_benchmark_exits_130_and_writes_nothing() {
+fn an_interrupted_benchmark_writes_nothing() {
     let place = Place::new();
     let json = place.at("bench.json").display().to_string();
-    // Thousands of repetitions: the second row goes on for longer than the signal takes.
-    let mut child = spawn(args(&["--work", "encode,render", "--no-error", "--repeats", "3000", "--json", &json]));
-    let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
-    assert!(lines.any(|line| line.starts_with("encode: ")), "the first row is done");
-    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill runs");
-    assert!(sent.success());
-    let rest: Vec<String> = lines.collect();
-    assert_eq!(finish(child).code, Some(130), "{rest:?}");
-    assert!(rest.iter().any(|line| line == "error: interrupted during `render`; nothing was written"), "{rest:?}");
-    assert!(!place.at("bench.json").exists());
+    for (name, code) in [("-INT", 130), ("-TERM", 143)] {
+        // Thousands of repetitions: the second row goes on for longer than the signal takes.
+        let mut child = spawn(args(&["--work", "encode,render", "--no-error", "--repeats", "3000", "--json", &json]));
+        let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
+        assert!(lines.any(|line| line.starts_with("encode: ")), "the first row is done");
+        signal(&child, name);
+        let rest: Vec<String> = lines.collect();
+        assert_eq!(finish(child).code, Some(code), "{rest:?}");
+        assert!(rest.iter().any(|line| line == "error: interrupted during `render`; nothing was written"), "{rest:?}");
+        assert!(!place.at("bench.json").exists());
+    }
 }

@@ -1,28 +1,16 @@
 //! Whole runs through the command line: what a user types, and the files and exit codes that follow.
+//!
+//! `training` runs the stages, stops them and resumes them; `evaluation` measures, encodes and renders; `data` converts and
+//! checks data sets; `input` is wrong or damaged input. `architecture`, `links` and
+//! `old_names` read the sources instead.
 
-mod attack;
-mod bad_input;
+mod architecture;
 mod bench;
-mod checkpoints;
-mod convert;
-#[cfg(unix)]
-mod crash;
-mod data_tools;
+mod data;
 mod evaluation;
-mod exact_resume;
-mod extend;
-#[cfg(unix)]
-mod failing_disk;
-mod hyperparameters;
-mod layouts;
+mod input;
 mod licences;
-mod loss_curve;
-mod patchwise;
-mod pipeline;
-mod report;
-mod resume;
-mod scene_files;
-#[cfg(unix)]
-mod signals;
+mod links;
+mod old_names;
 mod support;
-mod wrong_inputs;
+mod training;

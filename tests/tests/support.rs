@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
@@ -108,6 +109,25 @@ pub fn finish(child: Child) -> Ran {
     Ran { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
 }
 
+/// A micro run that several tests start from: trained once for all of them.
+pub struct Shared {
+    set: &'static [&'static str],
+    flags: &'static [&'static str],
+    files: OnceLock<BTreeMap<PathBuf, Vec<u8>>>,
+}
+
+/// The whole micro run, with its evaluation.
+pub static WHOLE: Shared = Shared::new(&[], &[]);
+/// Its first stage.
+pub static STAGE_1: Shared = Shared::new(&[], &["--only", "stage1"]);
+
+impl Shared {
+    /// The micro run with changed keys and further flags.
+    pub const fn new(set: &'static [&'static str], flags: &'static [&'static str]) -> Self {
+        Self { set, flags, files: OnceLock::new() }
+    }
+}
+
 /// A temporary folder for runs.
 pub struct Place(TempDir);
 
@@ -135,6 +155,34 @@ impl Place {
     /// Trains the micro run `name` to its end.
     pub fn train(&self, name: &str, set: &[&str], flags: &[&str]) -> Ran {
         clift(self.train_args(name, set, flags))
+    }
+
+    /// Makes the run `name` of a shared one, as if it had been trained here.
+    pub fn copy(&self, shared: &Shared, name: &str) {
+        // The only file that holds the run's own path.
+        let config = Path::new("config.toml");
+        let moved = |bytes: &[u8], from: &Path, to: &Path| {
+            let text = String::from_utf8(bytes.to_vec()).expect("text");
+            text.replace(&from.display().to_string(), &to.display().to_string()).into_bytes()
+        };
+        let files = shared.files.get_or_init(|| {
+            let place = Self::new();
+            place.train("run", shared.set, shared.flags).ok();
+            let run = place.at("run");
+            let relative = |path: &Path| path.strip_prefix(&run).expect("below").to_owned();
+            let mut found: BTreeMap<_, _> =
+                files(&run).into_iter().map(|(path, bytes)| (relative(&path), bytes)).collect();
+            let text = found.get_mut(config).expect("a config");
+            *text = moved(text, &run, Path::new("RUN"));
+            found
+        });
+        for (path, bytes) in files {
+            let to = self.at(name).join(path);
+            std::fs::create_dir_all(to.parent().expect("a folder")).expect("writable");
+            let run = self.at(name);
+            let moved = (path == config).then(|| moved(bytes, Path::new("RUN"), &run));
+            std::fs::write(to, moved.as_ref().unwrap_or(bytes)).expect("writable");
+        }
     }
 
     /// Evaluates the run `name`.
@@ -218,8 +266,17 @@ impl Place {
         for stage in ["stage1", "stage2"] {
             assert_eq!(self.progress(run, stage), self.progress(other, stage), "{stage}");
         }
-        let summary = |run: &str| crate::pipeline::summary_but_time(self, &format!("{run}/eval/summary.json"));
-        assert_eq!(summary(run), summary(other));
+        assert_eq!(self.summary_but_time(run), self.summary_but_time(other));
+    }
+
+    /// A run's `summary.json` without what the clock decides.
+    pub fn summary_but_time(&self, run: &str) -> Value {
+        let mut summary = self.json(&format!("{run}/eval/summary.json"));
+        for point in summary["points"].as_array_mut().expect("a list") {
+            let point = point.as_object_mut().expect("an object");
+            point.retain(|key, _| !key.ends_with("_s") && key != "peak_bytes" && key != "pareto_time");
+        }
+        summary
     }
 
     /// The steps of a stage's checkpoints.
@@ -272,6 +329,18 @@ pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
         }
     }
     found
+}
+
+/// Texts of the repository's files with these endings below some folders, by their paths in it.
+pub fn sources(folders: &[&str], endings: &[&str]) -> BTreeMap<String, String> {
+    let root = repository("");
+    let all = folders.iter().flat_map(|folder| files(&repository(folder)));
+    let has_ending = |path: &Path| path.extension().is_some_and(|ending| endings.iter().any(|one| ending == *one));
+    let text = |(path, bytes): (PathBuf, Vec<u8>)| {
+        let name = path.strip_prefix(&root).expect("a file of the repository").display().to_string();
+        (name, String::from_utf8(bytes).expect("sources are UTF-8"))
+    };
+    all.filter(|(path, _)| has_ending(path)).map(text).collect()
 }
 
 /// Parameters by name.

@@ -40,7 +40,7 @@ fn worst(a: &[f64], b: &[f64]) -> f64 {
 
 proptest! {
     #[test]
-    fn the_18_numbers_of_a_camera_give_the_camera_and_again_the_numbers(camera in camera()) {
+    fn cameras_round_trip_through_their_18_numbers(camera in camera()) {
         let row = camera.to_re10k();
         let back = Camera::from_re10k(row).unwrap();
         prop_assert!(worst(&back.c2w.to_matrix_f64(), &camera.c2w.to_matrix_f64()) < 1e-11); // centres are up to 87 away
@@ -57,7 +57,7 @@ proptest! {
     }
 
     #[test]
-    fn the_18_numbers_survive_f32_files_to_their_precision(camera in camera()) {
+    fn cameras_survive_f32_files(camera in camera()) {
         let row = camera.to_re10k().map(|value| f64::from(value as f32));
         let back = Camera::from_re10k(row).unwrap();
         // Translations are up to 87, in steps of 2^-18.

@@ -29,7 +29,7 @@ fn numbers(camera: &Camera) -> Vec<f64> {
 }
 
 #[test]
-fn frames_come_back_equal_and_cameras_equal_to_the_precision_of_f32() {
+fn frames_round_trip_and_cameras_to_f32() {
     let root = tempfile::tempdir().unwrap();
     write(root.path());
     for split in [Split::Train, Split::Test] {
@@ -55,7 +55,7 @@ fn frames_come_back_equal_and_cameras_equal_to_the_precision_of_f32() {
 }
 
 #[test]
-fn chunks_are_split_at_the_size_asked_for_and_described_as_their_source_is() {
+fn chunks_split_by_size_and_keep_the_description() {
     let root = tempfile::tempdir().unwrap();
     write(root.path());
     assert!(root.path().join("train/000001.torch").exists());
@@ -72,7 +72,7 @@ fn chunks_are_split_at_the_size_asked_for_and_described_as_their_source_is() {
 
 #[cfg(unix)]
 #[test]
-fn written_files_have_the_permissions_of_other_files_there() {
+fn written_files_have_ordinary_permissions() {
     use std::os::unix::fs::PermissionsExt;
     let root = tempfile::tempdir().unwrap();
     write(root.path());

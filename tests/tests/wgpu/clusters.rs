@@ -5,15 +5,12 @@ use clift_model::kmeans::Fit;
 use clift_model::{KMeans, total_variance};
 
 use crate::place::{DIM, Place};
-use crate::table::{Case, Named, Values};
+use crate::table::{Case, Named, Tolerance, Values};
 
 pub const CASES: &[Case] = &[
-    Case {
-        operation: "K-means: cluster of every token, centroids",
-        forward: 0.0,
-        backward: None,
-        reason: "the nearest mean is the nearest by more than rounding",
-        run: |place| {
+    Tolerance::forward(0.0, "the nearest mean is the nearest by more than rounding").case(
+        "K-means: cluster of every token, centroids",
+        |place| {
             let mut values = scattered(place);
             if place.is_wrong() {
                 // One token moves to where another cluster is.
@@ -22,13 +19,10 @@ pub const CASES: &[Case] = &[
             }
             labels(&fit(place, values, 48, 6))
         },
-    },
-    Case {
-        operation: "K-means: inertia, variance of all tokens",
-        forward: 1e-5,
-        backward: None,
-        reason: "squared distances of 4 from sums of 60: a digit is lost",
-        run: |place| {
+    ),
+    Tolerance::forward(1e-5, "squared distances of 4 from sums of 60: a digit is lost").case(
+        "K-means: inertia, variance of all tokens",
+        |place| {
             let mut values = scattered(place);
             if place.is_wrong() {
                 values[0] += 0.3;
@@ -38,21 +32,16 @@ pub const CASES: &[Case] = &[
             let inertia = fit(place, values, 48, 6).inertia;
             named([("inertia", inertia), ("variance", variance)])
         },
-    },
-    Case {
-        operation: "K-means: ties, more clusters than different tokens",
-        forward: 0.0,
-        backward: None,
-        reason: "whole numbers, of which every sum is exact; of equally near means the first is taken",
-        run: |place| {
+    ),
+    Tolerance::forward(0.0, "whole numbers, of which every sum is exact; of equally near means the first is taken")
+        .case("K-means: ties, more clusters than different tokens", |place| {
             // Four different tokens in each scene of 16, in no order; the first is another one where it is to be wrong.
             let first = usize::from(place.is_wrong());
             let kind = |i: usize| if i == 0 { first } else { i * (i + 1) / 2 % 4 };
             let token = |i: usize| (0..DIM).map(move |d| (kind(i) * (d % 3)) as f32 - 1.0);
             let values = (0..2 * 16).flat_map(token).collect();
             labels(&fit(place, values, 16, 7))
-        },
-    },
+        }),
 ];
 
 /// Tokens of two scenes about six places each.

@@ -75,7 +75,7 @@ fn every_operation_gives_what_the_cpu_gives() -> Result<(), Failure> {
 
 /// A tolerance that a wrong input passes is none.
 #[test]
-fn every_tolerance_notices_an_input_that_is_a_little_off() {
+fn every_tolerance_detects_slightly_wrong_inputs() {
     let mut passed = Vec::new();
     for case in cases() {
         let place = Place::new(&cpu());

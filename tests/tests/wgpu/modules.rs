@@ -12,201 +12,98 @@ use clift_model::{Encoder, LiftNorm, RenderTokens, Renderer, Variant};
 use clift_train::loss::mse;
 
 use crate::place::{BATCH, DIM, NUM_TOKENS, Place, SIZE, VIEWS, network, values};
-use crate::table::{Case, Values};
+use crate::table::{Case, Tolerance, Values};
 
 /// A product of vectors of a few dozen numbers in f32: the order of the sum moves the last two bits.
 const PRODUCT: &str = "sums of 32 to 72 products in another order";
-const SOFTMAX: &str = "the same, and another `exp` (a GPU's may be off by 3 units in the last place)";
-const BLOCK: &str = "a chain of those above";
+const SOFTMAX: Tolerance =
+    Tolerance::both(5e-6, 2e-5, "the same, and another `exp` (a GPU's may be off by 3 units in the last place)");
+const BLOCK: Tolerance = Tolerance::both(1e-5, 5e-5, "a chain of those above");
+const FEED_FORWARD: Tolerance = Tolerance::both(1e-5, 2e-5, "a chain of those above");
 
 pub const CASES: &[Case] = &[
-    Case {
-        operation: "rays of every pixel",
-        forward: 1e-6,
-        backward: None,
-        reason: "a division, a root and three products: each may round another way",
-        run: |place| forward(plucker(&place.targets()).flatten(0, 4)),
-    },
-    Case {
-        operation: "pictures to patches and back",
-        forward: 0.0,
-        backward: None,
-        reason: "values are moved, not changed",
-        run: |place| {
-            let pictures = place.random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 1);
-            let patches = patchify(pictures, 8);
-            let back = unpatchify(patches.clone(), [VIEWS, SIZE[0], SIZE[1]], 8);
-            forward(Tensor::cat(vec![patches.flatten(0, 2), back.flatten(0, 4)], 0))
-        },
-    },
-    Case {
-        operation: "linear layer",
-        forward: 5e-6,
-        backward: Some(5e-6),
-        reason: PRODUCT,
-        run: |place| {
-            let layer = place.module(|init| init.linear(DIM, 48));
-            place.differentiate(&layer, [place.tokens(1)], |layer, [x]| linear(layer, x).flatten(0, 2))
-        },
-    },
-    Case {
-        operation: "linear layer of GELU",
-        forward: 1e-5,
-        backward: Some(1e-5),
-        reason: "the same, and an `erf` from a polynomial that is good to 1.5e-7",
-        run: |place| {
+    Tolerance::forward(1e-6, "a division, a root and three products: each may round another way")
+        .case("rays of every pixel", |place| forward(plucker(&place.targets()).flatten(0, 4))),
+    Tolerance::forward(0.0, "values are moved, not changed").case("pictures to patches and back", |place| {
+        let pictures = place.random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 1);
+        let patches = patchify(pictures, 8);
+        let back = unpatchify(patches.clone(), [VIEWS, SIZE[0], SIZE[1]], 8);
+        forward(Tensor::cat(vec![patches.flatten(0, 2), back.flatten(0, 4)], 0))
+    }),
+    Tolerance::both(5e-6, 5e-6, PRODUCT).case("linear layer", |place| {
+        let layer = place.module(|init| init.linear(DIM, 48));
+        place.differentiate(&layer, [place.tokens(1)], |layer, [x]| linear(layer, x).flatten(0, 2))
+    }),
+    Tolerance::both(1e-5, 1e-5, "the same, and an `erf` from a polynomial that is good to 1.5e-7").case(
+        "linear layer of GELU",
+        |place| {
             let layer = place.module(|init| init.linear(DIM, 48));
             let x = place.tokens(1).mul_scalar(3.0);
             place.differentiate(&layer, [x], |layer, [x]| linear_of_gelu(layer, x).flatten(0, 2))
         },
-    },
-    Case {
-        operation: "linear layer of a layer norm",
-        forward: 5e-6,
-        backward: Some(1e-5),
-        reason: "the same, and two means over a row",
-        run: |place| {
-            let layers = place.module(|init| (init.layer_norm(DIM), init.linear(DIM, 48)));
-            place.differentiate(&layers, [place.tokens(1)], |(norm, layer), [x]| {
-                linear_of_norm(norm, layer, x).flatten(0, 2)
-            })
-        },
-    },
-    Case {
-        operation: "feed-forward network, GELU",
-        forward: 1e-5,
-        backward: Some(2e-5),
-        reason: BLOCK,
-        run: |place| feed_forward(place, Activation::Gelu),
-    },
-    Case {
-        operation: "feed-forward network, ReLU",
-        forward: 1e-5,
-        backward: Some(2e-5),
-        reason: BLOCK,
-        run: |place| feed_forward(place, Activation::Relu),
-    },
-    Case {
-        operation: "self-attention of packed projections",
-        forward: 5e-6,
-        backward: Some(2e-5),
-        reason: SOFTMAX,
-        run: |place| {
-            let packed = place.random([BATCH, NUM_TOKENS, 3 * DIM], 1).mul_scalar(2.0);
-            place.differentiate(&none(), [packed], |_, [packed]| self_sdpa(packed, 4).flatten(0, 2))
-        },
-    },
-    Case {
-        operation: "self-attention of 130 tokens, a width of 96",
-        forward: 5e-6,
-        backward: Some(2e-5),
-        reason: "the same with larger sums: sizes at which other kernels are chosen, and no multiple of a tile",
-        run: |place| {
+    ),
+    Tolerance::both(5e-6, 1e-5, "the same, and two means over a row").case("linear layer of a layer norm", |place| {
+        let layers = place.module(|init| (init.layer_norm(DIM), init.linear(DIM, 48)));
+        place.differentiate(&layers, [place.tokens(1)], |(norm, layer), [x]| {
+            linear_of_norm(norm, layer, x).flatten(0, 2)
+        })
+    }),
+    FEED_FORWARD.case("feed-forward network, GELU", |place| feed_forward(place, Activation::Gelu)),
+    FEED_FORWARD.case("feed-forward network, ReLU", |place| feed_forward(place, Activation::Relu)),
+    SOFTMAX.case("self-attention of packed projections", |place| {
+        let packed = place.random([BATCH, NUM_TOKENS, 3 * DIM], 1).mul_scalar(2.0);
+        place.differentiate(&none(), [packed], |_, [packed]| self_sdpa(packed, 4).flatten(0, 2))
+    }),
+    SOFTMAX
+        .because("the same with larger sums: sizes at which other kernels are chosen, and no multiple of a tile")
+        .case("self-attention of 130 tokens, a width of 96", |place| {
             let packed = place.random([1, 130, 3 * 96], 1).mul_scalar(2.0);
             place.differentiate(&none(), [packed], |_, [packed]| self_sdpa(packed, 4).flatten(0, 2))
-        },
-    },
-    Case {
-        operation: "cross-attention of projections",
-        forward: 5e-6,
-        backward: Some(2e-5),
-        reason: SOFTMAX,
-        run: |place| {
-            let inputs = [place.tokens(1), place.random([BATCH, NUM_TOKENS, 2 * DIM], 2).mul_scalar(2.0)];
-            place.differentiate(&none(), inputs, |_, [query, key_value]| cross_sdpa(query, key_value, 4).flatten(0, 2))
-        },
-    },
-    Case {
-        operation: "self-attention layer",
-        forward: 1e-5,
-        backward: Some(5e-5),
-        reason: BLOCK,
-        run: |place| self_attention(place, Variant::Paper),
-    },
-    Case {
-        operation: "self-attention layer with norms of queries and keys",
-        forward: 1e-5,
-        backward: Some(5e-5),
-        reason: "the same, and a root mean square over the columns of a head",
-        run: |place| self_attention(place, Variant::ReleasedDl3dv),
-    },
-    Case {
-        operation: "layer norm behind the encoder",
-        forward: 5e-6,
-        backward: Some(1e-5),
-        reason: "two means over a row, by Burn's own kernel",
-        run: |place| {
+        }),
+    SOFTMAX.case("cross-attention of projections", |place| {
+        let inputs = [place.tokens(1), place.random([BATCH, NUM_TOKENS, 2 * DIM], 2).mul_scalar(2.0)];
+        place.differentiate(&none(), inputs, |_, [query, key_value]| cross_sdpa(query, key_value, 4).flatten(0, 2))
+    }),
+    BLOCK.case("self-attention layer", |place| self_attention(place, Variant::Paper)),
+    BLOCK
+        .because("the same, and a root mean square over the columns of a head")
+        .case("self-attention layer with norms of queries and keys", |place| {
+            self_attention(place, Variant::ReleasedDl3dv)
+        }),
+    Tolerance::both(5e-6, 1e-5, "two means over a row, by Burn's own kernel").case(
+        "layer norm behind the encoder",
+        |place| {
             let norm = place.module(|init| LiftNorm::new(&network(Variant::ReleasedDl3dv), init));
             place.differentiate(&norm, [place.tokens(1)], |norm, [x]| norm.forward(x).flatten(0, 2))
         },
-    },
-    Case {
-        operation: "encoder block",
-        forward: 1e-5,
-        backward: Some(5e-5),
-        reason: BLOCK,
-        run: |place| {
-            let block = place.module(|init| EncoderBlock::new(&network(Variant::Paper), init));
-            place.differentiate(&block, [place.tokens(1)], |block, [x]| block.forward(x).flatten(0, 2))
-        },
-    },
-    Case {
-        operation: "decoder block, two views of a scene",
-        forward: 1e-5,
-        backward: Some(5e-5),
-        reason: BLOCK,
-        run: |place| decoder_block(place, Variant::Paper),
-    },
-    Case {
-        operation: "decoder block with norms of queries and keys",
-        forward: 1e-5,
-        backward: Some(5e-5),
-        reason: BLOCK,
-        run: |place| decoder_block(place, Variant::ReleasedDl3dv),
-    },
-    Case {
-        operation: "encoder, from pictures",
-        forward: 1e-5,
-        backward: Some(5e-5),
-        reason: "sums of 576 products, rays of their own, and a block",
-        run: |place| {
-            let encoder = place.module(|init| Encoder::new(&network(Variant::Paper), init));
-            let context = place.context();
-            place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context).flatten(0, 2))
-        },
-    },
-    Case {
-        operation: "renderer, to pictures",
-        forward: 1e-5,
-        backward: Some(5e-5),
-        reason: "sums of 384 products, a block and a sigmoid",
-        run: |place| render(place, RenderTokens::from),
-    },
-    Case {
-        operation: "renderer, few tokens for each view",
-        forward: 1e-5,
-        backward: Some(5e-5),
-        reason: "the same; rows of tokens are gathered, and their gradients added",
-        run: |place| render(place, |tokens| RenderTokens::subsets(tokens, &subsets(5))),
-    },
-    Case {
-        operation: "renderer, most tokens for each view",
-        forward: 1e-5,
-        backward: Some(5e-5),
-        reason: "the same with rows of keys and values",
-        run: |place| render(place, |tokens| RenderTokens::subsets(tokens, &subsets(8))),
-    },
-    Case {
-        operation: "mean squared error",
-        forward: 1e-6,
-        backward: Some(1e-6),
-        reason: "a sum of 4,608 squares in another order",
-        run: |place| {
-            let truth = Place::new(&place.device).random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 2);
-            let rendering = place.random([BATCH, VIEWS * SIZE[0], SIZE[1] * 3], 1);
-            place.differentiate(&none(), [rendering], |_, [x]| mse(x.reshape(truth.dims()), truth.clone()))
-        },
-    },
+    ),
+    BLOCK.case("encoder block", |place| {
+        let block = place.module(|init| EncoderBlock::new(&network(Variant::Paper), init));
+        place.differentiate(&block, [place.tokens(1)], |block, [x]| block.forward(x).flatten(0, 2))
+    }),
+    BLOCK.case("decoder block, two views of a scene", |place| decoder_block(place, Variant::Paper)),
+    BLOCK.case("decoder block with norms of queries and keys", |place| decoder_block(place, Variant::ReleasedDl3dv)),
+    BLOCK.because("sums of 576 products, rays of their own, and a block").case("encoder, from pictures", |place| {
+        let encoder = place.module(|init| Encoder::new(&network(Variant::Paper), init));
+        let context = place.context();
+        place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context).flatten(0, 2))
+    }),
+    BLOCK
+        .because("sums of 384 products, a block and a sigmoid")
+        .case("renderer, to pictures", |place| render(place, RenderTokens::from)),
+    BLOCK
+        .because("the same; rows of tokens are gathered, and their gradients added")
+        .case("renderer, few tokens for each view", |place| {
+            render(place, |tokens| RenderTokens::subsets(tokens, &subsets(5)))
+        }),
+    BLOCK.because("the same with rows of keys and values").case("renderer, most tokens for each view", |place| {
+        render(place, |tokens| RenderTokens::subsets(tokens, &subsets(8)))
+    }),
+    Tolerance::both(1e-6, 1e-6, "a sum of 4,608 squares in another order").case("mean squared error", |place| {
+        let truth = Place::new(&place.device).random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 2);
+        let rendering = place.random([BATCH, VIEWS * SIZE[0], SIZE[1] * 3], 1);
+        place.differentiate(&none(), [rendering], |_, [x]| mse(x.reshape(truth.dims()), truth.clone()))
+    }),
 ];
 
 /// No module at all.

@@ -13,43 +13,26 @@ use clift_train::trained::Trained;
 
 use crate::cpu;
 use crate::place::{Place, SIZE, network};
-use crate::table::{Case, Values};
+use crate::table::{Case, Tolerance, Values};
+
+const PICTURES: Tolerance = Tolerance::forward(1e-5, "the renderer's; the same file for both devices");
 
 pub const CASES: &[Case] = &[
-    Case {
-        operation: "scene: capture to `.clift` file",
-        forward: 5e-5,
-        backward: None,
-        reason: "encoder, clusters and condenser one after the other; the chosen patches are the same",
-        run: |place| {
+    Tolerance::forward(5e-5, "encoder, clusters and condenser one after the other; the chosen patches are the same")
+        .case("scene: capture to `.clift` file", |place| {
             let folder = tempfile::tempdir().expect("a folder");
             let scene = encode(place, folder.path(), TokenStorage::F32);
             let ids = scene.token_ids.iter().copied().map(f64::from).collect();
             let tokens = scene.tokens.iter().copied().map(f64::from).collect();
             Values { forward: vec![("patches".into(), ids), ("tokens".into(), tokens)], ..Values::default() }
-        },
-    },
-    Case {
-        operation: "scene: f32 file to pictures, all tokens and some",
-        forward: 1e-5,
-        backward: None,
-        reason: "the renderer's; the same file for both devices",
-        run: |place| draw(place, TokenStorage::F32),
-    },
-    Case {
-        operation: "scene: f16 file to pictures",
-        forward: 1e-5,
-        backward: None,
-        reason: "the same: the host unpacks 16 bits",
-        run: |place| draw(place, TokenStorage::F16),
-    },
-    Case {
-        operation: "scene: int8 file to pictures",
-        forward: 1e-5,
-        backward: None,
-        reason: "the same: the host unpacks 8 bits",
-        run: |place| draw(place, TokenStorage::Int8),
-    },
+        }),
+    PICTURES.case("scene: f32 file to pictures, all tokens and some", |place| draw(place, TokenStorage::F32)),
+    PICTURES
+        .because("the same: the host unpacks 16 bits")
+        .case("scene: f16 file to pictures", |place| draw(place, TokenStorage::F16)),
+    PICTURES
+        .because("the same: the host unpacks 8 bits")
+        .case("scene: int8 file to pictures", |place| draw(place, TokenStorage::Int8)),
 ];
 
 /// So many of the room's 12 tokens are stored. A pair, of which rounding once chose, is among the clusters.

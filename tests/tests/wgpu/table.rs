@@ -8,14 +8,43 @@ use crate::place::Place;
 pub struct Case {
     /// What it is.
     pub operation: &'static str,
-    /// Most difference of results, over the largest of them.
-    pub forward: f64,
-    /// The same of gradients, each tensor over its own largest; `None` for what has none.
-    pub backward: Option<f64>,
-    /// Why there is a difference, and why no more.
-    pub reason: &'static str,
+    /// How far off it may be.
+    pub tolerance: Tolerance,
     /// Computes it on a device, always from the same numbers.
     pub run: fn(&Place) -> Values,
+}
+
+/// How far two devices may be apart.
+#[derive(Clone, Copy)]
+pub struct Tolerance {
+    /// Most difference of results, over the largest of them.
+    forward: f64,
+    /// The same of gradients, each tensor over its own largest; `None` for what has none.
+    backward: Option<f64>,
+    /// Why there is a difference, and why no more.
+    reason: &'static str,
+}
+
+impl Tolerance {
+    /// Of results that have no gradient.
+    pub const fn forward(forward: f64, reason: &'static str) -> Self {
+        Self { forward, backward: None, reason }
+    }
+
+    /// Of results and gradients.
+    pub const fn both(forward: f64, backward: f64, reason: &'static str) -> Self {
+        Self { forward, backward: Some(backward), reason }
+    }
+
+    /// For another reason.
+    pub const fn because(self, reason: &'static str) -> Self {
+        Self { reason, ..self }
+    }
+
+    /// An operation that may be off by so much.
+    pub const fn case(self, operation: &'static str, run: fn(&Place) -> Values) -> Case {
+        Case { operation, tolerance: self, run }
+    }
 }
 
 /// Named tensors on the host.
@@ -96,19 +125,22 @@ pub fn header() -> &'static str {
 impl Case {
     /// One line of the table.
     pub fn row(&self, difference: &Difference, elapsed: Duration) -> String {
-        let backward = match self.backward {
+        let Tolerance { forward, backward, reason } = self.tolerance;
+        let backward = match backward {
             Some(tolerance) => format!("{} | {tolerance:.0e}", shown(difference.backward.error)),
             None => "- | -".into(),
         };
-        let forward = format!("{} | {}", shown(difference.forward.error), shown_bound(self.forward));
+        let forward = format!("{} | {}", shown(difference.forward.error), shown_bound(forward));
         let seconds = elapsed.as_secs_f64();
-        format!("| {} | {forward} | {backward} | {seconds:.1} | {} |", self.operation, self.reason)
+        format!("| {} | {forward} | {backward} | {seconds:.1} | {reason} |", self.operation)
     }
 
     /// What is too far off.
     pub fn complaints(&self, difference: &Difference) -> Vec<String> {
-        let directions =
-            [("result", &difference.forward, Some(self.forward)), ("gradient", &difference.backward, self.backward)];
+        let directions = [
+            ("result", &difference.forward, Some(self.tolerance.forward)),
+            ("gradient", &difference.backward, self.tolerance.backward),
+        ];
         let too_far = directions.into_iter().filter_map(|(what, worst, tolerance)| {
             let tolerance = tolerance?;
             let Worst { error, name } = worst;
@@ -121,7 +153,7 @@ impl Case {
 
     /// How many tolerances there are.
     pub fn num_directions(&self) -> usize {
-        1 + usize::from(self.backward.is_some())
+        1 + usize::from(self.tolerance.backward.is_some())
     }
 }
 

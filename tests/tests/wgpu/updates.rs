@@ -12,32 +12,16 @@ use clift_train::step::Learner;
 
 use crate::modules::subsets;
 use crate::place::{Place, clusters, gradients, parameters};
-use crate::table::{Case, Named, Values};
+use crate::table::{Case, Named, Tolerance, Values};
 
-const LOSS: &str = "three sums over everything above";
+const UPDATE: Tolerance = Tolerance::both(1e-5, 1e-4, "three sums over everything above");
 
 pub const CASES: &[Case] = &[
-    Case {
-        operation: "stage 1: loss, gradient norm, update; tokens dropped",
-        forward: 1e-5,
-        backward: Some(1e-4),
-        reason: LOSS,
-        run: |place| update(place, Stage::Stage1, 1, false),
-    },
-    Case {
-        operation: "stage 1: in two parts, blocks computed again",
-        forward: 1e-5,
-        backward: Some(1e-4),
-        reason: LOSS,
-        run: |place| update(place, Stage::Stage1, 2, true),
-    },
-    Case {
-        operation: "stage 2: loss, gradient norm, update; encoder frozen",
-        forward: 1e-5,
-        backward: Some(1e-4),
-        reason: "the same through the condenser",
-        run: |place| update(place, Stage::Stage2, 1, false),
-    },
+    UPDATE.case("stage 1: loss, gradient norm, update; tokens dropped", |place| update(place, Stage::Stage1, 1, false)),
+    UPDATE.case("stage 1: in two parts, blocks computed again", |place| update(place, Stage::Stage1, 2, true)),
+    UPDATE
+        .because("the same through the condenser")
+        .case("stage 2: loss, gradient norm, update; encoder frozen", |place| update(place, Stage::Stage2, 1, false)),
 ];
 
 const LEARNING_RATE: f64 = 1e-3;

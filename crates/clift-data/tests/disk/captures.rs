@@ -59,7 +59,7 @@ fn frame(name: &str, x: f64) -> Value {
 }
 
 #[test]
-fn frames_are_in_the_order_people_count_in_and_joined_to_cameras_by_name() {
+fn frames_are_in_natural_order_with_their_cameras() {
     let frames = [frame("images/10.png", 10.0), frame("images/9.png", 9.0), frame("images/1.png", 1.0)];
     let capture =
         Capture::new(&["images/1.png", "images/10.png", "images/9.png"], &json!({"fl_x": 20, "frames": frames}));
@@ -67,7 +67,7 @@ fn frames_are_in_the_order_people_count_in_and_joined_to_cameras_by_name() {
 }
 
 #[test]
-fn angles_and_the_pictures_own_size_stand_in_for_what_is_missing() {
+fn angles_and_image_size_replace_missing_intrinsics() {
     let angle = 2.0 * (0.5_f64 / 0.8).atan();
     let capture = Capture::new(&["r_0.png"], &json!({"camera_angle_x": angle, "frames": [frame("./r_0", 0.0)]}));
     let k = capture.open().unwrap().0.cameras(0).unwrap()[0].intrinsics_norm;
@@ -78,7 +78,7 @@ fn angles_and_the_pictures_own_size_stand_in_for_what_is_missing() {
 }
 
 #[test]
-fn a_frame_overrules_what_stands_at_the_top_and_sizes_scale_with_the_pictures() {
+fn frame_intrinsics_override_and_scale_with_images() {
     let mut own = frame("images/b.png", 1.0);
     for (key, value) in [("fl_x", 30.0), ("w", 48.0), ("h", 32.0), ("cx", 12.0)] {
         own[key] = value.into();
@@ -94,23 +94,7 @@ fn a_frame_overrules_what_stands_at_the_top_and_sizes_scale_with_the_pictures() 
 }
 
 #[test]
-fn pictures_are_found_in_smaller_copies_and_by_paths_of_another_computer() {
-    let transforms = |name: &str| json!({"fl_x": 20, "frames": [frame(name, 2.0)]});
-    for (file, named) in [
-        ("images_4/a.png", "images/a.png"),
-        ("images/a.png", "/home/somebody/attic/images/a.png"),
-        ("images/a.png", "images\\a.png"),
-        ("images/a.PNG", "./images/a.jpg"),
-        ("a.png", "a.png"),
-    ] {
-        assert_eq!(Capture::new(&[file], &transforms(named)).frames(), [(0, 2.0)], "{file} for {named}");
-    }
-    let message = Capture::new(&["images/b.png"], &transforms("images/a.png")).open().err().unwrap();
-    assert!(message.contains("none of its 1 frames has a picture, the first being images/a.png"), "{message}");
-}
-
-#[test]
-fn a_picture_that_two_frames_name_is_used_once() {
+fn images_named_twice_are_used_once() {
     let frames = [frame("images/a.png", 0.0), frame("images/a", 1.0), frame("images/b.png", 2.0)];
     let capture = Capture::new(&["images/a.png", "images/b.png"], &json!({"fl_x": 20, "frames": frames}));
     assert_eq!(capture.open().unwrap().0.num_frames(0).unwrap(), 2);
@@ -137,7 +121,7 @@ fn open(root: &Path, undistort: Option<bool>) -> Arc<dyn SceneSource> {
 }
 
 #[test]
-fn every_model_of_colmap_is_read_and_its_lens_undone_unless_it_is_to_be_ignored() {
+fn colmap_lenses_are_undistorted_unless_ignored() {
     // In pixels of twice the picture: cameras scale.
     let norm = |fx: f64, fy: f64| IntrinsicsNorm { fx: fx / 64.0, fy: fy / 36.0, cx: 31.0 / 64.0, cy: 19.0 / 36.0 };
     for (line, fx, fy, radial, tangential) in [
@@ -166,7 +150,7 @@ fn every_model_of_colmap_is_read_and_its_lens_undone_unless_it_is_to_be_ignored(
 }
 
 #[test]
-fn other_models_are_noted_and_pictures_are_found_from_any_place_of_the_model() {
+fn colmap_images_are_found_from_any_model_folder() {
     let (root, picture) = colmap("PINHOLE 64 36 56 57 31 19");
     let scene = root.path().join("attic");
     copy_folder(&scene.join("sparse/0"), &scene.join("sparse/1"));

@@ -32,7 +32,7 @@ fn keys(opened: &OpenedSource) -> Vec<&str> {
 }
 
 #[test]
-fn a_benchmark_scene_that_is_there_twice_is_in_no_training_set() {
+fn duplicate_benchmark_scenes_are_in_no_training_set() {
     let root = tempfile::tempdir().unwrap();
     copy(&format!("dl3dv/1K/{HASH}"), &root.path().join("1K").join(HASH));
     copy(&format!("dl3dv/1K/{HASH}"), &root.path().join("bench").join(HASH).join("nerfstudio"));
@@ -54,7 +54,7 @@ fn a_benchmark_scene_that_is_there_twice_is_in_no_training_set() {
 }
 
 #[test]
-fn scenes_of_dl3dv_among_others_are_not_taken_for_captures() {
+fn dl3dv_scenes_among_others_are_no_captures() {
     let root = tempfile::tempdir().unwrap();
     copy("dl3dv", root.path());
     copy("colmap_bin/attic", &root.path().join("1K/stray"));
@@ -71,7 +71,7 @@ fn scenes_of_dl3dv_among_others_are_not_taken_for_captures() {
 }
 
 #[test]
-fn a_capture_named_as_a_half_hides_no_other() {
+fn captures_named_as_splits_hide_no_others() {
     let root = tempfile::tempdir().unwrap();
     copy("colmap_bin/attic", &root.path().join("train"));
     copy("colmap_bin/attic", &root.path().join("truck"));
@@ -89,7 +89,7 @@ fn a_capture_named_as_a_half_hides_no_other() {
 
 #[cfg(unix)]
 #[test]
-fn of_the_names_that_links_give_a_folder_its_own_is_used() {
+fn linked_folders_keep_their_own_names() {
     use std::os::unix::fs::symlink;
     let root = tempfile::tempdir().unwrap();
     let place = |name: &str| root.path().join(name);
@@ -106,7 +106,7 @@ fn of_the_names_that_links_give_a_folder_its_own_is_used() {
 }
 
 #[test]
-fn chunks_and_scenes_that_the_index_does_not_name_are_told() {
+fn unindexed_chunks_and_scenes_are_reported() {
     let root = tempfile::tempdir().unwrap();
     let train = root.path().join("train");
     copy_folder(&fixtures().join("re10k-mini/train"), &train);
@@ -136,7 +136,7 @@ fn chunks_and_scenes_that_the_index_does_not_name_are_told() {
 }
 
 #[test]
-fn of_a_scene_in_two_files_without_an_index_the_first_is_used() {
+fn duplicate_scenes_use_the_first_file() {
     let root = tempfile::tempdir().unwrap();
     let train = root.path().join("train");
     copy_folder(&fixtures().join("re10k-mini/train"), &train);
@@ -153,7 +153,7 @@ fn of_a_scene_in_two_files_without_an_index_the_first_is_used() {
 }
 
 #[test]
-fn data_of_other_layouts_below_a_root_is_named() {
+fn data_of_other_layouts_is_named() {
     let root = tempfile::tempdir().unwrap();
     copy("capture/attic", &root.path().join("captures/attic"));
     copy_folder(&fixtures().join("re10k-mini"), &root.path().join("re10k"));
@@ -170,7 +170,7 @@ fn data_of_other_layouts_below_a_root_is_named() {
 }
 
 #[test]
-fn cameras_in_several_files_are_named_where_none_is_called_transforms_json() {
+fn several_camera_files_are_refused_by_name() {
     let root = tempfile::tempdir().unwrap();
     fs::create_dir(root.path().join("train")).unwrap();
     for split in ["train", "test"] {

@@ -56,7 +56,7 @@ fn numbers(clip: &Clip) -> Vec<f64> {
 }
 
 #[test]
-fn all_layouts_of_a_scene_give_the_same_clip() {
+fn all_layouts_give_the_same_clip() {
     let expected = clip(open(&layouts().join("chunks"), Split::Test, SourceKind::Auto).source);
     let text_model = ("colmap_txt", Split::Test, SourceKind::Captures, "attic");
     for (name, split, layout, key) in LAYOUTS.into_iter().chain([text_model]) {
@@ -67,6 +67,10 @@ fn all_layouts_of_a_scene_give_the_same_clip() {
             assert!(source.key(0).starts_with(key), "{name}: {}", source.key(0));
             let found = if key == "attic" { key } else { KEY };
             assert_eq!((source.find(found), source.num_frames(0).unwrap()), (Some(0), 6), "{name}");
+            let info = SourceInfo::read(source.as_ref()).unwrap();
+            // atan(0.515625 / 0.875) + atan(0.484375 / 0.875), by hand
+            let fov_deg = format!("{:.1}", info.fov_deg.unwrap().max);
+            assert_eq!((info.num_scenes, info.image_size, fov_deg.as_str()), (1, Some([32, 18]), "59.5"), "{name}");
             let clip = clip(source.clone());
             assert_eq!(clip.context.images, expected.context.images, "{name}");
             assert_eq!(clip.target.images, expected.target.images, "{name}");
@@ -81,7 +85,7 @@ fn all_layouts_of_a_scene_give_the_same_clip() {
 }
 
 #[test]
-fn cameras_are_those_of_the_script_that_wrote_them() {
+fn cameras_equal_those_of_the_fixture_script() {
     // What the script says of frame 3: 1.0 + 0.2 * 3, -0.5 + 0.03 * 9, 2.0 - 0.1 * 3.
     for (name, split, ..) in LAYOUTS {
         let source = open(&layouts().join(name), split, SourceKind::Auto).source;
@@ -97,7 +101,7 @@ fn cameras_are_those_of_the_script_that_wrote_them() {
 }
 
 #[test]
-fn time_stamps_and_addresses_are_those_of_the_files() {
+fn timestamps_and_urls_come_from_the_files() {
     let times = |name: &str| open(&layouts().join(name), Split::Test, SourceKind::Auto).source.timestamps(0).unwrap();
     assert_eq!(times("re10k_txt")[..2], [1_000_000, 1_033_367]);
     assert_eq!(times("dl3dv"), [1, 2, 3, 4, 5, 6]);
@@ -107,16 +111,7 @@ fn time_stamps_and_addresses_are_those_of_the_files() {
 }
 
 #[test]
-fn a_frame_without_a_picture_is_named_and_left_out_of_a_capture() {
-    let OpenedSource { report: ledger, source, .. } = open(&layouts().join("capture"), Split::Test, SourceKind::Auto);
-    assert_eq!(source.num_frames(0).unwrap(), 6);
-    let expected = "1 of 1 scenes used; 1 frame without a picture (./images/99); no train/ and test/ folders and no \
-                    test scenes in a list: both halves are the same scenes";
-    assert_eq!(ledger.to_string(), expected);
-}
-
-#[test]
-fn a_capture_may_be_given_as_a_folder_of_folders_a_folder_or_a_file() {
+fn captures_open_as_folders_or_file() {
     let capture = layouts().join("capture");
     let expected = clip(open(&capture, Split::Test, SourceKind::Auto).source);
     for part in ["attic", "attic/transforms.json"] {
@@ -145,7 +140,7 @@ fn open_with(root: &Path, split: Split, files: FileOptions) -> (Arc<dyn SceneSou
 }
 
 #[test]
-fn a_scene_of_a_data_set_with_a_missing_picture_is_left_out_unless_it_is_asked_for() {
+fn incomplete_scenes_are_skipped_unless_asked_for() {
     let root = tempfile::tempdir().unwrap();
     let [whole, torn] = two_scenes(root.path());
     let (source, ledger) = open_with(root.path(), Split::Test, FileOptions::default());
@@ -165,7 +160,7 @@ fn a_scene_of_a_data_set_with_a_missing_picture_is_left_out_unless_it_is_asked_f
 }
 
 #[test]
-fn scenes_of_the_list_are_kept_out_of_training_and_missing_ones_are_counted() {
+fn listed_test_scenes_are_kept_out_of_training() {
     let root = tempfile::tempdir().unwrap();
     let [train, test] = two_scenes(root.path());
     let list = root.path().join("benchmark.json");
@@ -186,7 +181,7 @@ fn scenes_of_the_list_are_kept_out_of_training_and_missing_ones_are_counted() {
 }
 
 #[test]
-fn filters_and_sizes_leave_scenes_out_with_a_reason() {
+fn filters_and_sizes_skip_scenes_with_reasons() {
     let ledger = |filters: SceneFilters, min_size: [usize; 2]| {
         let options = SourceOptions { filters, min_size, ..SourceOptions::default() };
         let OpenedSource { source, report: ledger, .. } =
@@ -222,7 +217,7 @@ fn the_folder_of_pictures_may_be_chosen() {
 }
 
 #[test]
-fn frames_of_real_estate_10k_are_found_where_the_user_says() {
+fn re10k_frames_are_found_where_configured() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&layouts().join("re10k_txt/test"), &root.path().join("data/test"));
     let elsewhere = root.path().join("extracted");
@@ -235,7 +230,7 @@ fn frames_of_real_estate_10k_are_found_where_the_user_says() {
 }
 
 #[test]
-fn files_of_scenes_are_opened_without_an_index_and_chunks_that_lost_theirs_too() {
+fn scenes_and_chunks_open_without_an_index() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&layouts().join("scenes"), root.path());
     let (source, ledger) = open_with(root.path(), Split::Test, FileOptions::default());
@@ -256,7 +251,7 @@ fn files_of_scenes_are_opened_without_an_index_and_chunks_that_lost_theirs_too()
 }
 
 #[test]
-fn scenes_of_one_name_are_told_apart_by_the_way_to_them() {
+fn scenes_of_equal_name_take_distinct_keys() {
     let root = tempfile::tempdir().unwrap();
     for place in ["a/attic", "b/c/attic", "b/cellar"] {
         copy_folder(&layouts().join("capture/attic"), &root.path().join(place));
@@ -267,7 +262,7 @@ fn scenes_of_one_name_are_told_apart_by_the_way_to_them() {
 }
 
 #[test]
-fn halves_in_folders_of_their_own_are_told_from_a_shared_folder() {
+fn split_folders_differ_from_a_shared_folder() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&layouts().join("capture"), &root.path().join("train"));
     let opened = open(root.path(), Split::Train, SourceKind::Auto);
@@ -275,14 +270,4 @@ fn halves_in_folders_of_their_own_are_told_from_a_shared_folder() {
     let error = open_at(root.path(), Split::Test, &SourceOptions::default()).err().unwrap();
     assert!(error.to_string().starts_with("no scenes found: there is no folder test/ beside the other split: "));
     assert!(!open(&root.path().join("train"), Split::Test, SourceKind::Auto).has_splits);
-}
-
-#[test]
-fn any_layout_is_described() {
-    for (name, split, ..) in LAYOUTS {
-        let info = SourceInfo::read(open(&layouts().join(name), split, SourceKind::Auto).source.as_ref()).unwrap();
-        assert_eq!((info.num_scenes, info.image_size), (1, Some([32, 18])), "{name}");
-        // atan(0.515625 / 0.875) + atan(0.484375 / 0.875), by hand
-        assert_eq!(format!("{:.1}", info.fov_deg.unwrap().max), "59.5", "{name}");
-    }
 }

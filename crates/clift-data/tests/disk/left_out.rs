@@ -39,7 +39,7 @@ fn frames_left_out(ledger: &Ledger) -> Vec<(&str, &str)> {
 }
 
 #[test]
-fn a_picture_whose_end_is_missing_is_left_out_at_opening() {
+fn truncated_images_are_skipped_at_opening() {
     let (jpeg, png) = (encode_jpeg(&picture(48, 32), 90).unwrap(), encode_png(&picture(48, 32)).unwrap());
     let cut = |bytes: &[u8]| bytes[..bytes.len() * 3 / 4].to_vec();
     let padded = |bytes: &[u8]| [bytes, &[0; 900]].concat();
@@ -66,7 +66,7 @@ fn a_picture_whose_end_is_missing_is_left_out_at_opening() {
 }
 
 #[test]
-fn a_scene_without_a_usable_picture_says_what_is_wrong_with_them() {
+fn scenes_without_usable_images_report_the_reason() {
     let jpeg = encode_jpeg(&picture(48, 32), 90).unwrap();
     let turned = encode_jpeg(&picture(32, 48), 90).unwrap();
     let scenes = tempfile::tempdir().unwrap();
@@ -106,7 +106,7 @@ fn a_scene_without_a_usable_picture_says_what_is_wrong_with_them() {
 }
 
 #[test]
-fn a_picture_of_no_size_leaves_the_others_in_use() {
+fn unreadable_images_leave_other_frames_in_use() {
     let root = tempfile::tempdir().unwrap();
     write(root.path(), &[("0.png", encode_png(&picture(48, 32)).unwrap()), ("1.png", vec![9])], &["0.png", "1.png"]);
     let path = root.path().join("transforms.json");
@@ -164,7 +164,7 @@ fn a_byte_order_mark_is_passed_over() {
 }
 
 #[test]
-fn pictures_are_found_by_mixed_separators_and_by_the_end_of_a_path() {
+fn images_are_found_by_the_end_of_paths() {
     let png = || encode_png(&picture(48, 32)).unwrap();
     for (file, named, image_folder) in [
         ("images/0.png", ".\\images\\0.png", None),
@@ -176,6 +176,9 @@ fn pictures_are_found_by_mixed_separators_and_by_the_end_of_a_path() {
         ("small/left/0.png", "/home/somebody/cap/images/left/0.png", Some("small")),
         ("small/0.png", "/home/somebody/cap/images/left/0.png", Some("small")),
         ("small/left/0.png", "images\\left\\0.png", Some("small")),
+        ("images_4/0.png", "images/0.png", None),
+        ("images/0.PNG", "./images/0.jpg", None),
+        ("0.png", "0.png", None),
     ] {
         let root = tempfile::tempdir().unwrap();
         write(root.path(), &[(file, png())], &[named]);
@@ -188,11 +191,12 @@ fn pictures_are_found_by_mixed_separators_and_by_the_end_of_a_path() {
     // A relative path is not looked for where the folder it names is not.
     let root = tempfile::tempdir().unwrap();
     write(root.path(), &[("0.png", png())], &["images/0.png"]);
-    assert!(open(root.path()).is_err());
+    let message = open(root.path()).err().unwrap();
+    assert!(message.contains("none of its 1 frames has a picture, the first being images/0.png"), "{message}");
 }
 
 #[test]
-fn an_orientation_that_is_not_applied_is_told_where_the_shape_is_wrong() {
+fn exif_orientation_is_reported_for_wrong_shapes() {
     // Of phones: pixels lie as the sensor has them, and a tag says how to turn them.
     let tagged = |frame: &Frame| {
         let jpeg = encode_jpeg(frame, 90).unwrap();
@@ -213,7 +217,7 @@ fn an_orientation_that_is_not_applied_is_told_where_the_shape_is_wrong() {
 }
 
 #[test]
-fn a_listed_scene_that_the_test_half_does_not_have_is_told_as_one_that_nobody_uses() {
+fn listed_scenes_missing_from_test_are_flagged() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&fixtures().join("re10k-mini"), root.path());
     let list = root.path().join("list");

@@ -65,7 +65,7 @@ fn pictures_are_undistorted_as_by_opencv() {
 }
 
 #[test]
-fn without_distortion_nothing_moves_and_what_cannot_be_undone_is_refused() {
+fn pinhole_lenses_change_nothing_and_impossible_ones_fail() {
     let norm = IntrinsicsNorm { fx: 0.8, fy: 1.1, cx: 0.45, cy: 0.52 };
     let pinhole = Undistortion::new(norm, Lens::default()).unwrap();
     for (got, expected) in [(pinhole.intrinsics_norm().fx, 0.8), (pinhole.intrinsics_norm().fy, 1.1)] {

@@ -1,9 +1,11 @@
 //! Multiply-accumulates of the networks, and the conventions of counting them.
 
-use std::fmt;
 use std::str::FromStr;
 
+use strum::{Display, IntoStaticStr, VariantArray};
+
 use super::SceneSizes;
+use crate::names::parse_value;
 use crate::{Layer, LayerKind, ModelConfig, ModelError, Part};
 
 /// Multiply-accumulates of a forward pass of one scene. Norms, activations, softmax and the rays of pixels are not
@@ -159,14 +161,6 @@ mod tests {
         assert_eq!(giga(config.render_macs(256, 448, 7168).unwrap()), 271.4);
         assert_eq!(giga(config.encode_macs(4, 256, 256).unwrap()), 291.7);
         assert!(config.render_macs(250, 256, 1).is_err());
-    }
-
-    #[test]
-    fn a_convention_has_a_name() {
-        for convention in Convention::ALL {
-            assert_eq!(convention.to_string().parse::<Convention>().unwrap(), convention);
-        }
-        assert!("flop".parse::<Convention>().unwrap_err().to_string().contains("paper, macs, flops"));
     }
 
     #[test]

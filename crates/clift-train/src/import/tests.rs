@@ -139,7 +139,7 @@ fn network(path: &Path) -> BTreeMap<String, (Vec<u64>, Vec<u32>)> {
 }
 
 #[test]
-fn checkpoints_of_every_variant_compute_what_the_twin_computes_and_come_back_bit_for_bit() {
+fn checkpoints_compute_as_the_twin_and_round_trip() {
     for (name, variant, num_heads) in CHECKPOINTS {
         let place = tempfile::tempdir().unwrap();
         let [folder, again] = ["model", "again"].map(|name| place.path().join(name));
@@ -232,24 +232,6 @@ fn tensors_of(name: &str, rename: impl Fn(&str) -> String) -> Vec<(String, Vec<u
 }
 
 #[test]
-fn misshapen_tensors_are_named_with_both_shapes() {
-    let message = refusal(
-        |tensors| {
-            tensors.insert("transformer.squeezer.linear1.weight".into(), (vec![15, 14], vec![0.0; 210]));
-            tensors.insert("transformer.linear_target.weight".into(), (vec![15, 96, 2, 2], vec![0.0; 15 * 384]));
-        },
-        &re10k(),
-    );
-    assert_says(
-        &message,
-        &[
-            "misshapen: transformer.squeezer.linear1.weight is [15, 14], expected [15, 15]",
-            "misshapen: transformer.linear_target.weight is [15, 96, 2, 2], expected [15, 384]",
-        ],
-    );
-}
-
-#[test]
 fn another_variant_is_named_where_it_fits() {
     let place = tempfile::tempdir().unwrap();
     for (name, wrong, right) in [
@@ -291,7 +273,7 @@ fn heads_must_divide_the_width() {
 }
 
 #[test]
-fn half_precision_is_refused_with_the_way_to_widen_it() {
+fn half_precision_needs_conversion() {
     let place = tempfile::tempdir().unwrap();
     let options = options(Variant::ReleasedRe10k, Some(5));
     let message = refused(&fixture("half.ckpt"), place.path(), &options);
@@ -350,7 +332,7 @@ fn truncated_damaged_and_hostile_files_are_refused() {
 }
 
 #[test]
-fn an_export_says_its_heads_and_others_are_refused() {
+fn exports_store_heads_and_refuse_others() {
     let place = tempfile::tempdir().unwrap();
     let [folder, again] = ["model", "again"].map(|name| place.path().join(name));
     let (config, _) = import(&fixture("re10k.ckpt"), &folder, &re10k()).unwrap();
@@ -384,14 +366,4 @@ fn nothing_that_exists_is_written_over() {
     let message = import(&fixture("re10k.ckpt"), &folder, &re10k()).unwrap_err().to_string();
     assert_says(&message, &["`-o` = ", "it exists already"]);
     assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 0);
-
-    let model = place.path().join("imported");
-    let (config, _) = import(&fixture("re10k.ckpt"), &model, &re10k()).unwrap();
-    let found = ModelPath::find(&model).unwrap();
-    let before = std::fs::read(&found.weights).unwrap();
-    for format in [ExportFormat::Pytorch, ExportFormat::Safetensors] {
-        let message = export(&config, &found, format, &found.weights).unwrap_err().to_string();
-        assert_says(&message, &["`-o` = ", "nothing is written over"]);
-    }
-    assert!(std::fs::read(&found.weights).unwrap() == before);
 }

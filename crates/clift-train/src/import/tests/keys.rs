@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn missing_and_unknown_keys_are_all_listed_with_the_nearest_name() {
+fn missing_and_unknown_keys_list_nearest_names() {
     let message = refusal(
         |tensors| {
             let tensor = tensors.remove("transformer.encoder.layers.0.norm1.weight").unwrap();
@@ -60,7 +60,7 @@ fn missing_and_unknown_keys_are_all_listed_with_the_nearest_name() {
 }
 
 #[test]
-fn a_stray_key_of_a_layer_is_unknown_and_one_wrong_tensor_does_not_make_all_others_wrong() {
+fn stray_and_misshapen_tensors_are_reported_alone() {
     let message = refusal(
         |tensors| {
             tensors.insert("transformer.decoder.layers.3.norm1.weight".into(), (vec![15], vec![0.0; 15]));
@@ -75,26 +75,33 @@ fn a_stray_key_of_a_layer_is_unknown_and_one_wrong_tensor_does_not_make_all_othe
         ],
     );
     assert!(!message.contains("missing"), "{message}");
-    for (key, shape, told) in [
-        ("output_norm.weight", vec![14], "is [14], expected [15]"),
-        ("encoder.layers.0.linear1.weight", vec![15, 22], "is [15, 22], expected [22, 15]"),
-        ("linear_input.weight", vec![15, 576, 3, 3], "is [15, 576, 3, 3], expected [15, 576]"),
+    for changes in [
+        &[("output_norm.weight", &[14][..], "[14], expected [15]")][..],
+        &[("encoder.layers.0.linear1.weight", &[15, 22], "[15, 22], expected [22, 15]")],
+        &[("linear_input.weight", &[15, 576, 3, 3], "[15, 576, 3, 3], expected [15, 576]")],
+        &[
+            ("squeezer.linear1.weight", &[15, 14], "[15, 14], expected [15, 15]"),
+            ("linear_target.weight", &[15, 96, 2, 2], "[15, 96, 2, 2], expected [15, 384]"),
+        ],
     ] {
-        let key = format!("transformer.{key}");
         let message = refusal(
             |tensors| {
-                let values = vec![0.0; shape.iter().product()];
-                assert!(tensors.insert(key.clone(), (shape.clone(), values)).is_some());
+                for (key, shape, _) in changes {
+                    let tensor = (shape.to_vec(), vec![0.0; shape.iter().product()]);
+                    assert!(tensors.insert(format!("transformer.{key}"), tensor).is_some());
+                }
             },
             &re10k(),
         );
-        assert_says(&message, &[&format!("misshapen: {key} {told}")]);
-        assert_eq!(message.matches("misshapen").count(), 1, "{message}");
+        for (key, _, shapes) in changes {
+            assert_says(&message, &[&format!("misshapen: transformer.{key} is {shapes}")]);
+        }
+        assert_eq!(message.matches("misshapen").count(), changes.len(), "{message}");
     }
 }
 
 #[test]
-fn keys_beside_the_prefix_are_refused_where_they_are_the_networks_and_listed_where_not() {
+fn network_keys_outside_the_prefix_are_refused() {
     let outside = |from: &str| {
         let change = |tensors: &mut BTreeMap<String, (Vec<usize>, Vec<f32>)>| {
             let short =
@@ -138,20 +145,32 @@ fn keys_beside_the_prefix_are_refused_where_they_are_the_networks_and_listed_whe
 }
 
 #[test]
-fn what_compiled_and_distributed_models_put_into_keys_is_taken_off_wherever_it_stands() {
-    for lead in
-        ["module.transformer.", "_orig_mod.transformer.", "transformer.module.", "transformer._orig_mod.", "module."]
-    {
+fn prefixes_are_removed_and_renames_applied() {
+    let none: &[(&str, &str)] = &[];
+    let gate = &[("squeezer.gate", "squeezer.linear1")];
+    for (lead, linear1, renames) in [
+        ("module.transformer.", "linear1", none),
+        ("_orig_mod.transformer.", "linear1", none),
+        ("transformer.module.", "linear1", none),
+        ("transformer._orig_mod.", "gate", gate),
+        ("module.", "linear1", none),
+    ] {
         let place = tempfile::tempdir().unwrap();
         let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
-        write_state_dict(&file, &tensors_of("re10k.ckpt", |key| key.replace("transformer.", lead)), &[]).unwrap();
-        import(&file, &out, &re10k()).unwrap();
+        let rename =
+            |key: &str| key.replace("squeezer.linear1", &format!("squeezer.{linear1}")).replace("transformer.", lead);
+        write_state_dict(&file, &tensors_of("re10k.ckpt", rename), &[]).unwrap();
+        if !renames.is_empty() {
+            refused(&file, place.path(), &re10k());
+        }
+        let renames = renames.iter().map(|(from, to)| ((*from).to_owned(), (*to).to_owned())).collect();
+        import(&file, &out, &ImportOptions { renames, ..re10k() }).unwrap();
         assert_computes(&out, "re10k");
     }
 }
 
 #[test]
-fn renames_see_the_whole_key_and_one_of_nothing_is_an_error() {
+fn renames_apply_to_whole_keys_or_fail() {
     let place = tempfile::tempdir().unwrap();
     let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
     write_state_dict(&file, &tensors_of("re10k.ckpt", |key| key.replace("transformer.", "net.")), &[]).unwrap();
@@ -165,18 +184,4 @@ fn renames_see_the_whole_key_and_one_of_nothing_is_an_error() {
     assert_says(&message, &["unknown: net.output_norm.weight [15], renamed transformer.output.weight"]);
     renamed(&[("net.", "transformer.")]).unwrap();
     assert_computes(&out, "re10k");
-}
-
-#[test]
-fn renamed_keys_can_be_renamed_back() {
-    let place = tempfile::tempdir().unwrap();
-    let file = place.path().join("changed.ckpt");
-    let tensors = tensors_of("re10k.ckpt", |key| {
-        key.replace("squeezer.linear1", "squeezer.gate").replace("transformer.", "transformer._orig_mod.")
-    });
-    write_state_dict(&file, &tensors, &[]).unwrap();
-    refused(&file, place.path(), &re10k());
-    let renames = vec![("squeezer.gate".to_owned(), "squeezer.linear1".to_owned())];
-    import(&file, &place.path().join("model"), &ImportOptions { renames, ..re10k() }).unwrap();
-    assert_computes(&place.path().join("model"), "re10k");
 }

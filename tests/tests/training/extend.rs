@@ -1,11 +1,11 @@
 //! `--extend`: more steps than a run was started with.
 
-use crate::support::{Place, files, killed_at};
+use crate::support::{Place, WHOLE, files, killed_at};
 
 #[test]
-fn a_finished_stage_goes_on_with_the_rates_of_the_new_count() {
+fn extended_stages_follow_the_longer_schedule() {
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     let former = place.bytes("run/stage2/model.safetensors");
     let before = files(&place.at("run"));
     let more = ["stage2.steps=8"];
@@ -63,7 +63,7 @@ fn an_extended_stage_resumes_exactly() {
 #[test]
 fn what_cannot_go_on_is_refused() {
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     let before = files(&place.at("run"));
     let message = place.train("run", &["stage1.steps=9"], &["--extend"]).fails(2);
     assert!(message.contains("clusters/ was made with the encoder that stage 1 has now"), "{message}");

@@ -14,7 +14,7 @@ fn convert(from: &std::path::Path, to: &std::path::Path, words: &[&str]) -> crat
 }
 
 #[test]
-fn an_index_of_both_halves_has_the_scenes_of_both() {
+fn indices_of_both_splits_hold_all_scenes() {
     let place = Place::new();
     let out = place.at("index.json").display().to_string();
     let mini = repository(MINI).display().to_string();
@@ -27,7 +27,7 @@ fn an_index_of_both_halves_has_the_scenes_of_both() {
 }
 
 #[test]
-fn a_folder_of_another_form_or_with_other_files_is_refused_before_anything_is_written() {
+fn conversion_into_other_data_is_refused_unwritten() {
     let place = Place::new();
     let (mini, out) = (repository(MINI), place.at("out"));
     convert(&mini, &out, &["--to", "chunks"]).ok();
@@ -49,7 +49,7 @@ fn a_folder_of_another_form_or_with_other_files_is_refused_before_anything_is_wr
 }
 
 #[test]
-fn a_list_of_test_scenes_divides_what_is_converted_and_checked() {
+fn test_scene_lists_split_conversion_and_check() {
     let place = Place::new();
     std::fs::write(place.at("list.txt"), "00000000000000a2\n").unwrap();
     let list = format!("data.files.test_scenes={}", place.at("list.txt").display());
@@ -73,7 +73,7 @@ fn a_list_of_test_scenes_divides_what_is_converted_and_checked() {
 }
 
 #[test]
-fn scenes_that_opening_leaves_out_are_printed_and_listed() {
+fn scenes_skipped_at_opening_are_listed() {
     let place = Place::new();
     let data = place.at("data");
     copy_folder(&repository("data-fixtures/layouts/capture"), &data);
@@ -91,7 +91,7 @@ fn scenes_that_opening_leaves_out_are_printed_and_listed() {
 }
 
 #[test]
-fn where_no_scene_can_be_converted_or_checked_the_command_fails() {
+fn conversion_and_check_without_scenes_fail() {
     let place = Place::new();
     let source = ChunkSource::open(&repository(MINI), Split::Test, &SceneFilters::default()).unwrap();
     let mut cameras = source.cameras(0).unwrap();

@@ -1,17 +1,21 @@
 //! A run that is killed at a known step ends with the files of one that was not, bit for bit.
 
-use crate::support::{Place, killed_at};
+use crate::support::{Place, Shared, killed_at};
 
 /// Thirty steps of which seventeen are saved, in both stages.
 const THIRTY: [&str; 4] = ["stage1.steps=30", "stage2.steps=30", "eval.every=17", "checkpoint={every=17, keep=2}"];
+static UNDISTURBED: Shared = Shared::new(&THIRTY, &[]);
 
 #[test]
-fn thirty_steps_are_seventeen_a_kill_and_thirteen_with_any_number_of_loader_threads() {
+fn killed_runs_end_the_same_with_any_loader_threads() {
     let place = Place::new();
-    place.train("whole", &THIRTY, &[]).ok();
-    for threads in ["data.num_threads=0", "data.num_threads=1", "data.num_threads=3"] {
-        let name = threads.rsplit('=').next().expect("a number");
-        let set: Vec<&str> = THIRTY.iter().copied().chain([threads]).collect();
+    place.copy(&UNDISTURBED, "whole");
+    for (name, threads) in [
+        ("0", &["data.num_threads=0"][..]),
+        ("1", &["data.num_threads=1"]),
+        ("3", &["data.num_threads=3", "data.num_prefetch=3"]),
+    ] {
+        let set = [&THIRTY[..], threads].concat();
         let kill_at = |moment: &str| killed_at(moment, &place.train_args(name, &set, &[]));
         // Between the save of a step and its validation, then with eight steps that are lost.
         kill_at("saved/stage1/17");
@@ -31,7 +35,7 @@ fn thirty_steps_are_seventeen_a_kill_and_thirteen_with_any_number_of_loader_thre
 }
 
 #[test]
-fn training_with_f16_products_resumes_with_its_loss_scale() {
+fn f16_training_resumes_with_its_loss_scale() {
     let place = Place::new();
     let set: Vec<&str> = THIRTY.iter().copied().chain(["precision=\"f16\"", "eval.precision=\"f16\""]).collect();
     place.train("whole", &set, &[]).ok();
@@ -44,7 +48,7 @@ fn training_with_f16_products_resumes_with_its_loss_scale() {
     let state: serde_json::Value = serde_json::from_str(&state).expect("JSON");
     assert_eq!(state["loss_scale"], serde_json::json!({"factor": 65536.0, "good_steps": 30}));
 
-    place.train("single", &THIRTY, &[]).ok();
+    place.copy(&UNDISTURBED, "single");
     let last_loss = |run: &str| place.metrics(run).last().expect("a step")["loss"].as_f64().expect("finite");
     let apart = (last_loss("whole") / last_loss("single") - 1.0).abs();
     assert!(apart > 0.0 && apart < 0.02, "halves round, and training goes where it went: {apart}");
@@ -53,15 +57,18 @@ fn training_with_f16_products_resumes_with_its_loss_scale() {
 }
 
 #[test]
-fn a_killed_save_and_a_killed_rename_are_cleared_away() {
+fn what_killed_saves_leave_is_cleared_away() {
     let place = Place::new();
-    place.train("whole", &THIRTY, &[]).ok();
+    place.copy(&UNDISTURBED, "whole");
     killed_at("saved/stage1/17", &place.train_args("parts", &THIRTY, &[]));
     let leftovers = [
         "parts/.clift-x",
         "parts/stage1/.clift-y",
         "parts/stage1/.clift-z/.tmpAb12Cd",
         "parts/stage1/checkpoints/step-000000034.tmp/model.bpk",
+        "parts/stage2/checkpoints/step-000000002.tmp/model.bpk",
+        // It does not say what it was made from.
+        "parts/clusters.tmp/clusters.bin",
     ];
     for name in leftovers {
         std::fs::create_dir_all(place.at(name).parent().expect("a folder")).expect("writable");
@@ -82,7 +89,7 @@ const SPIKES: [&str; 5] = [
 ];
 
 #[test]
-fn spikes_are_left_out_noted_and_the_same_after_a_kill() {
+fn spikes_are_skipped_identically_after_kills() {
     let place = Place::new();
     place.train("whole", &SPIKES, &[]).ok();
     for moment in ["step/stage1/34", "step/stage1/57", "saved/stage1/70"] {
@@ -125,7 +132,7 @@ fn spikes_are_left_out_noted_and_the_same_after_a_kill() {
 }
 
 #[test]
-fn spikes_in_a_row_stop_the_run_and_name_the_last_checkpoint() {
+fn consecutive_spikes_stop_the_run() {
     let place = Place::new();
     // With a batch in three a spike, some three follow each other.
     let spikes = "stage1.optimizer={learning_rate=1e-3, warm_up_steps=2, spike_factor=1.01, max_bad_steps=3}";
@@ -146,7 +153,7 @@ fn spikes_in_a_row_stop_the_run_and_name_the_last_checkpoint() {
 }
 
 #[test]
-fn the_last_the_best_and_every_mth_checkpoint_are_kept() {
+fn last_best_and_every_mth_checkpoints_are_kept() {
     let place = Place::new();
     let set = ["stage1.steps=22", "eval.every=4", "checkpoint={every=2, keep=2, keep_every=8}"];
     place.train("run", &set, &["--only", "stage1"]).ok();

@@ -13,7 +13,7 @@ fn data(source: &str, layout: &str, more: &str) -> String {
 }
 
 #[test]
-fn a_capture_is_trained_on_encoded_and_drawn_and_its_missing_frame_is_named() {
+fn captures_train_and_render_and_name_missing_frames() {
     let place = Place::new();
     let ran = place.train("run", &[&data("auto", "capture", ""), "clusters.num_scenes=0"], &[]).ok();
     let text = format!("{}{}", ran.stdout, ran.stderr);
@@ -32,7 +32,7 @@ fn a_capture_is_trained_on_encoded_and_drawn_and_its_missing_frame_is_named() {
 }
 
 #[test]
-fn folders_of_dl3dv_are_trained_on_only_with_a_list_of_test_scenes() {
+fn dl3dv_training_requires_a_test_scene_list() {
     let place = Place::new();
     for source in ["dl3dv", "auto", "captures"] {
         let message = place.train("run", &[&data(source, "dl3dv", "")], &[]).fails(2);

@@ -48,7 +48,7 @@ fn scenes_are_checked_converted_and_checked_again() {
 }
 
 #[test]
-fn an_index_is_made_of_what_overlaps_and_never_written_over() {
+fn indices_hold_overlapping_views_and_are_not_overwritten() {
     let place = Place::new();
     let rooms = rooms(&place);
     let out = place.at("index.json").display().to_string();
@@ -77,7 +77,7 @@ fn reading_is_timed_and_the_clips_are_named() {
 }
 
 #[test]
-fn contexts_may_be_spread_clips_flipped_and_crops_exact_in_training() {
+fn training_takes_spread_contexts_flips_and_exact_crops() {
     let place = Place::new();
     for (name, inner) in [("far", "farthest_point"), ("even", "even")] {
         let views = format!(

@@ -36,7 +36,7 @@ const STAGE_2_TOLERANCE: f64 = 5e-4;
 
 /// `CLIFT_UPDATE=1 cargo test --release --workspace loss_curve` writes the curve of this machine as the reference.
 #[test]
-fn the_loss_curve_of_a_small_run_is_the_one_checked_in() {
+fn loss_curves_equal_the_reference() {
     let text = std::fs::read_to_string(repository(REFERENCE)).expect("the curve is checked in");
     let mut reference: Value = serde_json::from_str(&text).expect("JSON");
     for device in ["flex", "ndarray"] {

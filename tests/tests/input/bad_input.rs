@@ -1,10 +1,10 @@
 //! Input that is wrong, damaged or missing: what it says and what goes on.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use clift_data::{ChunkSource, SceneFilters, SceneRecord, SceneSource, Split, write_chunks};
 
-use crate::support::{Place, Ran, clift, copy_folder, files, repository};
+use crate::support::{Place, Ran, STAGE_1, WHOLE, copy_folder, files, repository};
 
 /// The pictures of two training scenes and a test scene, written by PyTorch's own `torch.save`.
 const MINI: &str = "data-fixtures/re10k-mini";
@@ -19,7 +19,7 @@ fn train_on(place: &Place, data: &Path, set: &[&str], flags: &[&str]) -> Ran {
 }
 
 /// Copies the mini data set, with its two training scenes in a chunk each.
-fn two_chunks(place: &Place) -> std::path::PathBuf {
+fn two_chunks(place: &Place) -> PathBuf {
     let data = place.at("data");
     copy_folder(&repository(MINI), &data);
     std::fs::copy(data.join("train/000000.torch"), data.join("train/000001.torch")).unwrap();
@@ -29,7 +29,7 @@ fn two_chunks(place: &Place) -> std::path::PathBuf {
 }
 
 /// Copies the mini data set with one training scene changed.
-fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> std::path::PathBuf {
+fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> PathBuf {
     let data = place.at("data");
     copy_folder(&repository(MINI).join("test"), &data.join("test"));
     let source = ChunkSource::open(&repository(MINI), Split::Train, &SceneFilters::default()).unwrap();
@@ -53,6 +53,11 @@ fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> std::path:
     data
 }
 
+/// The mini data set with the camera centres of one training scene changed.
+fn moved_cameras(place: &Place, change: impl Fn(&mut [f64; 3])) -> PathBuf {
+    changed_scene(place, |scene| scene.cameras.iter_mut().for_each(|camera| change(&mut camera.c2w.translation)))
+}
+
 /// Expects a run that left the second scene out for `reason`, said so, and trained on the first one.
 fn assert_second_is_skipped(place: &Place, ran: Ran, reason: &str) {
     let stderr = ran.ok().stderr;
@@ -73,49 +78,8 @@ fn assert_second_is_skipped(place: &Place, ran: Ran, reason: &str) {
 }
 
 #[test]
-fn an_unknown_key_is_shown_in_its_line_with_the_nearest_one() {
+fn what_the_data_refutes_is_refused_before_any_step() {
     let place = Place::new();
-    let text = std::fs::read_to_string(repository("configs/tiny.toml")).unwrap();
-    let wrong = text.replacen("learning_rate", "learnin_rate", 1);
-    assert_ne!(wrong, text);
-    std::fs::write(place.at("wrong.toml"), &wrong).unwrap();
-    let path = place.at("wrong.toml").display().to_string();
-
-    let message = clift(["train", &path]).fails(2);
-    let line = 1 + wrong[..wrong.find("learnin_rate").unwrap()].matches('\n').count();
-    assert!(message.contains("unknown key `learnin_rate` in [stage1.optimizer]\n"), "{message}");
-    assert!(message.contains(&format!("--> {path}:{line}:")), "line {line}: {message}");
-    assert!(message.contains(" ^^^^^^^^^^^^ did you mean `learning_rate`?"), "{message}");
-
-    let message = place.train("run", &["stage1.step=3"], &[]).fails(2);
-    assert!(message.contains("stage1.step=3\n |        ^^^^ did you mean `steps`?"), "{message}");
-    let message = place.train("run", &["stage1.steps=ten"], &[]).fails(2);
-    assert!(message.contains("expected a whole number of 0 or more, got the string \"ten\""), "{message}");
-    assert!(!place.at("run").exists(), "a refused config leaves nothing behind");
-}
-
-#[test]
-fn wrong_usage_is_told_from_failure_by_the_exit_code() {
-    let place = Place::new();
-    let message = clift(["train", "no/such.toml"]).fails(2);
-    assert!(message.starts_with("error: reading the configuration failed: "), "{message}");
-    assert!(message.trim_end().ends_with(": no/such.toml"), "what, where, why, the path last: {message}");
-    for (set, expected) in [
-        (vec!["data.source=chunks"], "`data.root` = missing: write the folder that holds train/ and test/"),
-        (vec!["model.num_heads=3"], "`model.num_heads` = 3: write a divisor of model.dim = 16"),
-        (vec!["data.width=20"], "`data.width` = 20: write a multiple of model.patch_size = 8"),
-        (vec!["stage1.batch_size=0"], "`stage1.batch_size` = 0: write at least 1"),
-        (vec!["stage1.accumulate=3"], "`stage1.accumulate` = 3: write 1 to 2"),
-        (vec!["device=cuda"], "unknown value of `device`"),
-        (vec!["data.views.min_context=1"], "`data.views.min_context` = 1: a stretch has two ends, so use 2 or more"),
-        (vec!["clusters.grid=[9]"], "`clusters.grid` = 9: a scene has as few as 8 tokens"),
-        (vec!["data.synthetic.fov_deg=180.0"], "`data.synthetic.fov_deg` = 180: use 10 to 100"),
-    ] {
-        let message = place.train("run", &set, &[]).fails(2);
-        assert!(message.contains(expected), "{expected}: {message}");
-        assert!(!place.at("run").exists(), "a refused config leaves nothing behind");
-    }
-    // Known once the scenes are open, and before a step is made.
     let message = place.train("run", &["eval.storage=[9]"], &[]).fails(2);
     let expected = "`eval.storage` = 9: write at most 8, the fewest tokens of an evaluated scene";
     assert!(message.contains(expected), "{message}");
@@ -129,7 +93,7 @@ fn wrong_usage_is_told_from_failure_by_the_exit_code() {
 
 #[cfg(not(feature = "wgpu"))]
 #[test]
-fn a_device_that_is_not_built_in_says_how_to_rebuild() {
+fn missing_devices_are_refused_with_the_build_command() {
     let place = Place::new();
     let message = place.train("run", &[], &["--device", "wgpu"]).fails(2);
     assert!(message.contains("cargo build --release --features wgpu"), "{message}");
@@ -138,7 +102,7 @@ fn a_device_that_is_not_built_in_says_how_to_rebuild() {
 }
 
 #[test]
-fn torch_files_train_without_skips_and_an_index_may_have_null_entries() {
+fn chunks_train_and_null_index_entries_are_unused() {
     let place = Place::new();
     let index = format!("eval.index={:?}", repository(MINI).join("evaluation_index.json"));
     let stderr = train_on(&place, &repository(MINI), &[&index], &[]).ok().stderr;
@@ -191,44 +155,53 @@ fn targets_that_are_contexts_are_measured() {
 }
 
 #[test]
-fn a_truncated_chunk_is_skipped_and_named() {
+fn unusable_scenes_are_skipped_and_named() {
+    /// Makes a data set of which the second scene cannot be used.
+    type Damage = fn(&Place) -> PathBuf;
+    let cases: [(&str, Damage); 6] = [
+        ("data/train/000001.torch", |place| {
+            let data = two_chunks(place);
+            place.truncate("data/train/000001.torch");
+            data
+        }),
+        ("which is not allowed; nothing was run", |place| {
+            let data = two_chunks(place);
+            let hostile = repository("data-fixtures/hostile/calls_system.torch");
+            std::fs::copy(hostile, data.join("train/000001.torch")).unwrap();
+            data
+        }),
+        ("of scene 00000000000000a2 cannot be decoded: its JPEG data of ", |place| {
+            changed_scene(place, |scene| scene.images.iter_mut().for_each(|image| image.truncate(image.len() / 2)))
+        }),
+        ("bad camera: ", |place| moved_cameras(place, |centre| centre[1] = f64::NAN)),
+        ("bad camera: ", |place| moved_cameras(place, |centre| centre[1] = f64::INFINITY)),
+        ("scene 00000000000000a2 has no baseline: its 2 camera centres lie within ", |place| {
+            moved_cameras(place, |centre| *centre = [1.0, 2.0, 3.0])
+        }),
+    ];
+    for (reason, damage) in cases {
+        let place = Place::new();
+        let data = damage(&place);
+        let ran = train_on(&place, &data, &[], &[]);
+        assert_second_is_skipped(&place, ran, reason);
+    }
+}
+
+#[test]
+fn without_any_usable_scene_the_run_ends() {
     let place = Place::new();
     let data = two_chunks(&place);
-    place.truncate("data/train/000001.torch");
-    let ran = train_on(&place, &data, &[], &[]);
-    let path = data.join("train/000001.torch").display().to_string();
-    assert_second_is_skipped(&place, ran, &path);
-
-    place.truncate("data/train/000000.torch");
-    let message = train_on(&place, &data, &[], &["--fresh"]).fails(1);
+    for chunk in ["000000.torch", "000001.torch"] {
+        place.truncate(&format!("data/train/{chunk}"));
+    }
+    let message = train_on(&place, &data, &[], &[]).fails(1);
     assert!(message.contains("error: no usable scene for slot 0 of step 0 in 16 tries; the last, "), "{message}");
     assert!(message.contains("bad chunk: "), "{message}");
     assert!(message.trim_end().ends_with("000000.torch") || message.trim_end().ends_with("000001.torch"), "{message}");
 }
 
 #[test]
-fn a_chunk_that_would_run_code_is_skipped_and_named() {
-    let place = Place::new();
-    let data = two_chunks(&place);
-    std::fs::copy(repository("data-fixtures/hostile/calls_system.torch"), data.join("train/000001.torch")).unwrap();
-    let ran = train_on(&place, &data, &[], &[]);
-    assert_second_is_skipped(&place, ran, "which is not allowed; nothing was run");
-}
-
-#[test]
-fn an_unreadable_picture_is_skipped_and_named() {
-    let place = Place::new();
-    let data = changed_scene(&place, |scene| {
-        for image in &mut scene.images {
-            image.truncate(image.len() / 2);
-        }
-    });
-    let ran = train_on(&place, &data, &[], &[]);
-    assert_second_is_skipped(&place, ran, "of scene 00000000000000a2 cannot be decoded: its JPEG data of ");
-}
-
-#[test]
-fn a_scene_too_short_for_any_step_is_left_out_at_the_start_and_listed() {
+fn too_short_scenes_are_skipped_at_the_start() {
     let place = Place::new();
     let data = changed_scene(&place, |scene| {
         scene.images.truncate(3);
@@ -243,33 +216,7 @@ fn a_scene_too_short_for_any_step_is_left_out_at_the_start_and_listed() {
 }
 
 #[test]
-fn poses_that_are_not_finite_are_skipped_and_named() {
-    for value in [f64::NAN, f64::INFINITY] {
-        let place = Place::new();
-        let data = changed_scene(&place, |scene| {
-            for camera in &mut scene.cameras {
-                camera.c2w.translation[1] = value;
-            }
-        });
-        let ran = train_on(&place, &data, &[], &[]);
-        assert_second_is_skipped(&place, ran, "bad camera: ");
-    }
-}
-
-#[test]
-fn scenes_without_a_baseline_are_skipped_with_the_reason() {
-    let place = Place::new();
-    let data = changed_scene(&place, |scene| {
-        for camera in &mut scene.cameras {
-            camera.c2w.translation = [1.0, 2.0, 3.0];
-        }
-    });
-    let ran = train_on(&place, &data, &[], &[]);
-    assert_second_is_skipped(&place, ran, "scene 00000000000000a2 has no baseline: its 2 camera centres lie within ");
-}
-
-#[test]
-fn pictures_smaller_than_the_configured_size_are_refused_with_the_fix() {
+fn too_small_images_are_refused_with_the_fix() {
     let place = Place::new();
     let message = train_on(&place, &repository(MINI), &["data.height=64"], &[]).fails(1);
     assert!(message.contains("cannot make a 32x64 picture from one of 64x36"), "{message}");
@@ -277,9 +224,9 @@ fn pictures_smaller_than_the_configured_size_are_refused_with_the_fix() {
 }
 
 #[test]
-fn truncated_weights_and_a_stale_cluster_cache_are_refused() {
+fn truncated_weights_and_stale_caches_are_refused() {
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     place.truncate("run/stage2/model.safetensors");
     let message = place.eval("run", &[]).fails(1);
     assert!(message.contains("reading the weights failed: "), "{message}");
@@ -306,9 +253,9 @@ fn truncated_weights_and_a_stale_cluster_cache_are_refused() {
 }
 
 #[test]
-fn a_damaged_checkpoint_is_an_error_and_never_a_silent_restart() {
+fn damaged_checkpoints_are_errors_and_change_nothing() {
     let place = Place::new();
-    place.train("whole", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "whole");
     let newest = "stage1/checkpoints/step-000000006";
     for file in ["state.json", "model.bpk", "optimizer.bpk"] {
         for missing in [false, true] {
@@ -335,7 +282,7 @@ fn a_damaged_checkpoint_is_an_error_and_never_a_silent_restart() {
 }
 
 #[test]
-fn steps_that_are_not_finite_are_left_out_and_three_in_a_row_stop_the_run() {
+fn three_steps_without_finite_loss_stop_the_run() {
     let place = Place::new();
     // One update of this size overflows every product after it.
     let set = ["stage1.optimizer={learning_rate=1e30, warm_up_steps=1}", "checkpoint.every=1", "stage1.steps=9"];
@@ -358,7 +305,7 @@ fn steps_that_are_not_finite_are_left_out_and_three_in_a_row_stop_the_run() {
 #[test]
 fn weights_of_two_trainings_are_not_evaluated_together() {
     let place = Place::new();
-    place.train("a", &[], &[]).ok();
+    place.copy(&WHOLE, "a");
     place.train("b", &["seed=1"], &["--only", "stage1"]).ok();
     std::fs::copy(place.at("b/stage1/model.safetensors"), place.at("a/stage1/model.safetensors")).expect("copies");
     let message = place.eval("a", &[]).fails(1);
@@ -374,13 +321,4 @@ fn an_empty_cluster_cache_is_not_kept() {
     let message = place.train("run", &[views, "stage1.steps=6"], &[]).fails(1);
     assert!(message.contains("none could be clustered"), "{message}");
     assert!(!place.at("run/clusters").exists());
-}
-
-#[test]
-fn fresh_is_refused_for_a_later_stage() {
-    let place = Place::new();
-    place.train("run", &[], &["--only", "stage1"]).ok();
-    let message = place.train("run", &[], &["--fresh", "--only", "clusters"]).fails(2);
-    assert!(message.contains("--fresh"), "{message}");
-    assert!(place.at("run/stage1/model.safetensors").exists(), "nothing was moved");
 }

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use crate::support::{Place, clift};
+use crate::support::{Place, STAGE_1, WHOLE, clift};
 
 /// Keys of a JSON object, in any order.
 fn keys(value: &Value) -> Vec<&str> {
@@ -146,26 +146,16 @@ fn a_run_writes_every_documented_file() {
     assert!(place.weights("run", "stage1").0.keys().all(|name| !name.starts_with("condenser.")));
 }
 
-/// `summary.json` without what the clock decides.
-pub fn summary_but_time(place: &Place, name: &str) -> Value {
-    let mut summary = place.json(name);
-    for point in summary["points"].as_array_mut().expect("a list") {
-        let point = point.as_object_mut().expect("an object");
-        point.retain(|key, _| !key.ends_with("_s") && key != "peak_bytes" && key != "pareto_time");
-    }
-    summary
-}
-
 #[test]
-fn a_run_can_be_moved_and_evaluated_with_other_counts() {
+fn moved_runs_evaluate_with_other_counts() {
     let place = Place::new();
-    place.train("before", &[], &[]).ok();
-    let summary = summary_but_time(&place, "before/eval/summary.json");
+    place.copy(&WHOLE, "before");
+    let summary = place.summary_but_time("before");
     std::fs::rename(place.at("before"), place.at("after")).unwrap();
 
     let ran = place.eval("after", &[]).ok();
     assert!(ran.stdout.trim_end().ends_with("after/eval"), "{}", ran.stdout);
-    assert_eq!(summary_but_time(&place, "after/eval/summary.json"), summary);
+    assert_eq!(place.summary_but_time("after"), summary);
     assert!(!place.at("before").exists(), "nothing is written to where the run was trained");
 
     let out = place.at("elsewhere");
@@ -174,17 +164,13 @@ fn a_run_can_be_moved_and_evaluated_with_other_counts() {
     assert_eq!(other["num_scenes"], 2);
     let stored: Vec<_> = other["points"].as_array().unwrap().iter().map(|point| &point["num_storage_tokens"]).collect();
     assert_eq!(stored, [3, 4, 3, 4, 3, 4]);
-    assert_eq!(
-        summary_but_time(&place, "after/eval/summary.json"),
-        summary,
-        "--out leaves the run's own results alone"
-    );
+    assert_eq!(place.summary_but_time("after"), summary, "--out leaves the run's own results alone");
 }
 
 #[test]
-fn the_stages_one_by_one_give_the_whole_runs_weights_to_the_bit() {
+fn stages_run_singly_give_equal_weights() {
     let place = Place::new();
-    place.train("whole", &[], &[]).ok();
+    place.copy(&WHOLE, "whole");
     for stage in ["stage1", "clusters", "stage2"] {
         let ran = place.train("parts", &[], &["--only", stage]).ok();
         assert!(ran.stdout.is_empty(), "a part has no evaluation to print: {}", ran.stdout);
@@ -193,12 +179,12 @@ fn the_stages_one_by_one_give_the_whole_runs_weights_to_the_bit() {
     place.assert_same_result("parts", "whole");
     assert_eq!(place.metrics_but_time("parts"), place.metrics_but_time("whole"));
     place.eval("parts", &[]).ok();
-    let summary = |run: &str| summary_but_time(&place, &format!("{run}/eval/summary.json"));
+    let summary = |run: &str| place.summary_but_time(run);
     assert_eq!(summary("parts"), summary("whole"));
 }
 
 #[test]
-fn a_stage_before_its_turn_names_what_to_run_first() {
+fn early_stages_name_what_to_run_first() {
     let place = Place::new();
     for stage in ["stage2", "clusters"] {
         let message = place.train("run", &[], &["--only", stage]).fails(2);
@@ -207,7 +193,7 @@ fn a_stage_before_its_turn_names_what_to_run_first() {
         assert!(message.contains(&expected), "{message}");
         assert!(message.trim_end().ends_with("run/stage1/model.safetensors"), "{message}");
     }
-    place.train("run", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "run");
     let message = place.train("run", &[], &["--only", "stage2"]).fails(2);
     assert!(message.contains("error: stage2 needs the cluster cache, which is not there; run --only clusters first: "));
     // Without stage 2 there is still something to measure, and it says so.
@@ -236,7 +222,7 @@ fn overfitting_one_scene_trains_and_measures_that_scene() {
 }
 
 #[test]
-fn a_run_starts_from_another_runs_weights_and_says_so() {
+fn runs_start_from_weights_of_other_runs() {
     let place = Place::new();
     place.train("first", &["seed=7"], &["--only", "stage1"]).ok();
     let first = place.at("first").display().to_string();

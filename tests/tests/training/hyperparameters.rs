@@ -29,7 +29,7 @@ fn stage_2_freezes_the_encoder_and_trains_the_rest() {
 }
 
 #[test]
-fn the_renderer_learns_at_its_share_of_the_rate() {
+fn the_renderer_learns_at_its_own_rate() {
     let place = Place::new();
     // One step at the full rate without decay: Adam moves each value by the rate, whatever its gradient.
     let one_step = ["stage2.steps=1", "stage2.optimizer.warm_up_steps=1", "stage2.optimizer.weight_decay=0.0"];

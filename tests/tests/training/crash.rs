@@ -16,7 +16,7 @@ fn draw(state: &mut u64) -> f64 {
 }
 
 #[test]
-fn runs_killed_at_random_moments_resume_and_end_as_if_they_had_not_been() {
+fn runs_killed_at_random_end_the_same() {
     let place = Place::new();
     let started = Instant::now();
     place.train("whole", &SAVING, &[]).ok();

@@ -18,28 +18,35 @@ fn is_hang_up_ignored() -> bool {
 }
 
 #[test]
-fn every_signal_saves_and_exits_with_its_own_code() {
+fn signals_save_and_runs_resume_to_the_same_result() {
+    // Enough steps that a stage is still going when the signal comes: a step takes milliseconds.
+    let set = ["stage1.steps=120", "stage2.steps=120", "eval.every=50", "checkpoint.every=25"];
     let place = Place::new();
-    for (name, code) in [("-INT", 130), ("-TERM", 143), ("-HUP", 129)] {
+    place.train("whole", &set, &[]).ok();
+    for (name, code, count) in [("-INT", 130, 10), ("-HUP", 129, 60), ("-TERM", 143, 130)] {
         if name == "-HUP" && is_hang_up_ignored() {
             continue;
         }
-        let run = format!("run{name}");
-        let mut child = spawn(place.train_args(&run, &LONG, &[]));
-        wait_for_steps(&place.at(&run), &mut child, 5);
+        let mut child = spawn(place.train_args("run", &set, &[]));
+        wait_for_steps(&place.at("run"), &mut child, count);
         signal(&child, name);
         let message = finish(child).fails(code);
-        let steps = place.metrics(&run).len() as u64;
-        assert!(
-            message.contains(&format!("error: interrupted at step {steps}; the same command resumes")),
-            "{message}"
-        );
-        assert_eq!(place.checkpoints(&run, "stage1"), [steps]);
+        let last = place.metrics("run").pop().expect("a step");
+        let (stage, step) = (last["stage"].as_str().expect("text"), last["step"].as_u64().expect("a number"));
+        let expected = format!("error: interrupted at step {step}; the same command resumes");
+        assert!(message.contains(&expected), "{message}");
+        let checkpoints = place.at(&format!("run/{stage}/checkpoints"));
+        assert!(message.contains(&format!("saved {}", checkpoints.display())), "{message}");
+        assert_eq!(place.checkpoints("run", stage).last(), Some(&step));
+        assert!(!place.at(&format!("run/{stage}/model.safetensors")).exists());
     }
+    let message = place.train("run", &set, &[]).ok().stderr;
+    assert!(message.contains("stage2: resumed after"), "{message}");
+    place.assert_same_run("run", "whole");
 }
 
 #[test]
-fn a_second_signal_ends_the_run_at_once_without_saving() {
+fn second_signals_end_runs_without_saving() {
     let place = Place::new();
     // The first batch takes far longer than two signals.
     let set = [&LONG[..], &["stage1.batch_size=50000"]].concat();
@@ -61,19 +68,6 @@ fn a_second_signal_ends_the_run_at_once_without_saving() {
 }
 
 #[test]
-fn a_signal_ends_other_commands_with_its_own_code_too() {
-    let place = Place::new();
-    let config = crate::support::repository("configs/tiny.toml").display().to_string();
-    let json = place.at("bench.json").display().to_string();
-    let mut child = spawn(["bench", &config, "--repeats", "100000", "--work", "select", "--json", &json]);
-    std::thread::sleep(Duration::from_secs(1));
-    assert!(child.try_wait().expect("a child").is_none(), "it ended before the signal");
-    signal(&child, "-TERM");
-    finish(child).fails(143);
-    assert!(!place.at("bench.json").exists());
-}
-
-#[test]
 fn a_run_started_by_nohup_outlives_its_terminal() {
     let place = Place::new();
     let args = place.train_args("run", &LONG, &[]);
@@ -89,7 +83,7 @@ fn a_run_started_by_nohup_outlives_its_terminal() {
 }
 
 #[test]
-fn a_second_process_is_refused_while_the_first_lives_and_not_after() {
+fn second_processes_are_refused_while_the_first_lives() {
     let place = Place::new();
     let mut first = spawn(place.train_args("run", &LONG, &[]));
     wait_for_steps(&place.at("run"), &mut first, 5);

@@ -12,7 +12,10 @@ use clift_model::{Preset, Scene, TokenKind, TokenStorage, Viewer};
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
-use crate::support::{Place, clift, repository};
+use crate::support::{Place, STAGE_1, Shared, WHOLE, clift, repository};
+
+/// A run whose variants differ by more than rounding.
+static LONGER: Shared = Shared::new(&["stage1.steps=60", "stage2.steps=20"], &[]);
 
 const KEY: &str = "synthetic-0-test-00000";
 
@@ -78,9 +81,9 @@ fn drawn(scene: &Path, weights: &Path, clip: &Clip, preset: Preset, num_render_t
 }
 
 #[test]
-fn a_scene_file_gives_the_numbers_of_the_evaluation_without_it() {
+fn scene_files_reproduce_the_evaluation() {
     let place = Place::new();
-    place.train("run", &["stage1.steps=60", "stage2.steps=20"], &[]).ok();
+    place.copy(&LONGER, "run");
     let (clip, reader) = first_clip(&place, "run");
     let weights = place.at("run/stage2/model.safetensors");
     let poses: Vec<Value> = clip
@@ -97,9 +100,8 @@ fn a_scene_file_gives_the_numbers_of_the_evaluation_without_it() {
 
     for (count, storage) in [(4, "f32"), (8, "f32"), (4, "f16"), (8, "f16"), (4, "int8"), (8, "int8")] {
         let name = format!("{count}-{storage}.clift");
-        let flags = ["--scene", KEY, "--context", "0,7", "--storage", &count.to_string(), "--tokens", storage]
-            .map(String::from);
-        let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
+        let stored = count.to_string();
+        let flags = ["--scene", KEY, "--context", "0,7", "--storage", &stored, "--tokens", storage];
         let ran = clift(encode_args(&place, "run", &name, &flags)).ok();
         assert!(ran.stdout.contains(&format!("{count} of 8 tokens (clift, {storage})")), "{}", ran.stdout);
 
@@ -149,9 +151,9 @@ fn a_scene_file_gives_the_numbers_of_the_evaluation_without_it() {
 }
 
 #[test]
-fn an_evaluation_from_chosen_tokens_has_the_numbers_of_rendering_a_file_from_them() {
+fn evaluation_of_selected_tokens_equals_rendering_the_file() {
     let place = Place::new();
-    place.train("run", &["stage1.steps=60", "stage2.steps=20"], &[]).ok();
+    place.copy(&LONGER, "run");
     let (clip, _) = first_clip(&place, "run");
     let weights = place.at("run/stage2/model.safetensors");
     let flags = ["--scene", KEY, "--context", "0,7", "--storage", "8", "--tokens", "f32"];
@@ -169,9 +171,9 @@ fn an_evaluation_from_chosen_tokens_has_the_numbers_of_rendering_a_file_from_the
 }
 
 #[test]
-fn a_path_is_drawn_as_frames_and_an_animation_from_any_number_of_tokens() {
+fn paths_render_to_frames_and_animation_by_count() {
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     clift(encode_args(&place, "run", "room.clift", &["--scene", KEY, "--storage", "1.0"])).ok();
     let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
     assert_eq!((scene.num_tokens(), storage), (8, TokenStorage::F16));
@@ -228,27 +230,27 @@ fn a_path_is_drawn_as_frames_and_an_animation_from_any_number_of_tokens() {
 #[test]
 fn what_cannot_be_drawn_says_what_to_do() {
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     place.train("other", &["seed=1"], &["--only", "stage1"]).ok();
     clift(encode_args(&place, "run", "room.clift", &["--scene", KEY])).ok();
     let render = |flags: &[&str]| clift(render_args(&place, "room.clift", "out", flags));
     let orbit = ["--path", "orbit", "--frames", "2"];
     let with = |flags: &[&str]| render(&[&orbit[..], flags].concat());
 
-    let message = with(&["--budget-ms", "0.0001"]).fails(2);
-    assert!(message.contains("no frame takes less than ") && message.contains("--budget-ms "), "{message}");
-    let message = with(&["--size", "20x16"]).fails(2);
-    assert!(message.contains("an image of 20 x 16 does not divide into patches of 8 x 8"), "{message}");
-    assert!(with(&["--render", "9"]).fails(2).contains("a scene has 2 tokens"));
     let other = place.at("other/stage1/model.safetensors").display().to_string();
-    let message = with(&["--model", &other]).fails(2);
-    assert!(message.contains("the scene was made for the renderer ") && message.contains("--model RUN"), "{message}");
-    for size in ["1000000x8", "17179869184x17179869184"] {
-        let message = with(&["--size", size]).fails(2);
-        assert!(message.contains(&format!("--size {size}: write at most 16384 pixels a side")), "{message}");
+    for (flags, expected) in [
+        (["--budget-ms", "0.0001"], "no frame takes less than "),
+        (["--size", "20x16"], "an image of 20 x 16 does not divide into patches of 8 x 8"),
+        (["--size", "1000000x8"], "--size 1000000x8: write at most 16384 pixels a side"),
+        (["--size", "17179869184x17179869184"], "--size 17179869184x17179869184: write at most 16384 pixels a side"),
+        (["--render", "9"], "a scene has 2 tokens"),
+        (["--model", &other], "the scene was made for the renderer "),
+        (["--path", "interpolated"], "--path interpolated: there is no such file; write interpolate, orbit, or"),
+    ] {
+        let path = if flags[0] == "--path" { &[][..] } else { &orbit[..] };
+        let message = render(&[path, &flags].concat()).fails(2);
+        assert!(message.contains(expected), "{expected}: {message}");
     }
-    let message = render(&["--path", "interpolated"]).fails(2);
-    assert!(message.contains("--path interpolated: there is no such file; write interpolate, orbit, or"), "{message}");
     // The second pose is no camera: nothing is drawn of the first either.
     let pose = json!({"c2w": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]});
     let far = json!({"c2w": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0]]});
@@ -283,7 +285,7 @@ fn a_path_that_is_interrupted_leaves_nothing_behind() {
     use crate::support::{finish, signal, spawn};
 
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     clift(encode_args(&place, "run", "room.clift", &["--scene", KEY])).ok();
     let flags = ["--path", "orbit", "--frames", "100000"];
     let mut child = spawn(render_args(&place, "room.clift", "out", &flags));
@@ -307,9 +309,9 @@ fn a_path_that_is_interrupted_leaves_nothing_behind() {
 }
 
 #[test]
-fn a_scene_never_takes_the_place_of_anything_else() {
+fn scene_files_overwrite_only_scene_files() {
     let place = Place::new();
-    place.train("run", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "run");
     let encode =
         |name: &str, flags: &[&str]| clift(encode_args(&place, "run", name, &[&["--scene", KEY][..], flags].concat()));
     let weights = place.bytes("run/stage1/model.safetensors");
@@ -328,9 +330,9 @@ fn a_scene_never_takes_the_place_of_anything_else() {
 }
 
 #[test]
-fn a_scene_is_chosen_by_key_and_encoded_with_what_the_run_has() {
+fn encode_chooses_scenes_by_key_context_and_count() {
     let place = Place::new();
-    place.train("run", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "run");
     let encode = |flags: &[&str]| clift(encode_args(&place, "run", "room.clift", flags));
     let message = encode(&[]).fails(2);
     assert!(message.contains("scenes; choose one with --scene: synthetic-0-test-00000, "), "{message}");

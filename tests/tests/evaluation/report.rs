@@ -1,11 +1,11 @@
 //! The report of an evaluation, and evaluations that draw from chosen tokens.
 
-use crate::support::Place;
+use crate::support::{Place, STAGE_1, WHOLE};
 
 #[test]
-fn a_run_and_an_evaluation_leave_a_report_that_needs_no_other_file() {
+fn reports_need_no_other_file() {
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     let html = place.text("run/eval/report.html");
     for part in ["<title>run", "synthetic-0-test-00000", "3 of 3 scenes were evaluated", "num_encoder_blocks = 1"] {
         assert!(html.contains(part), "{part}");
@@ -29,9 +29,9 @@ fn a_run_and_an_evaluation_leave_a_report_that_needs_no_other_file() {
 }
 
 #[test]
-fn views_drawn_from_chosen_tokens_have_rows_of_their_own_with_both_times() {
+fn selected_tokens_have_rows_with_both_times() {
     let place = Place::new();
-    place.train("run", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "run");
     for selection in ["paper", "global", "scaled", "random"] {
         let out = place.at(selection);
         let flags = ["--render", "2,1/2", "--selection", selection, "--out", out.to_str().unwrap()];
@@ -66,9 +66,9 @@ fn views_drawn_from_chosen_tokens_have_rows_of_their_own_with_both_times() {
 }
 
 #[test]
-fn a_render_count_that_no_scene_stores_more_than_is_wrong_usage() {
+fn render_counts_at_or_above_storage_are_refused() {
     let place = Place::new();
-    place.train("run", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "run");
     for count in ["8", "1.0", "400"] {
         let message = place.eval("run", &["--render", count]).fails(2);
         assert!(message.contains("`eval.render`") && message.contains("less than 8"), "{message}");

@@ -44,7 +44,7 @@ fn variants(summary: &serde_json::Value) -> Vec<&str> {
 }
 
 #[test]
-fn a_published_checkpoint_is_imported_measured_encoded_and_drawn() {
+fn published_checkpoints_import_evaluate_encode_and_render() {
     let place = Place::new();
     for (name, variant, heads) in [("re10k", "released-re10k", "3"), ("dl3dv", "released-dl3dv", "7")] {
         let model = import(&place, &checkpoint(name), variant, heads, name);
@@ -121,7 +121,7 @@ fn a_first_stage_model_adds_the_uncondensed_variants() {
 }
 
 #[test]
-fn a_checkpoint_that_does_not_fit_leaves_nothing_behind() {
+fn unfit_checkpoints_are_refused_and_leave_nothing() {
     let place = Place::new();
     let folder = place.at("model").display().to_string();
     let import = |file: &str, variant: &str, heads: &str| {
@@ -131,18 +131,12 @@ fn a_checkpoint_that_does_not_fit_leaves_nothing_behind() {
     for part in ["unknown: transformer.input_norm.weight [14]", "nothing was written", "--variant released-dl3dv"] {
         assert!(message.contains(part), "{part}\nis not in\n{message}");
     }
-    let message = import(&checkpoint("half"), "released-re10k", "5").fails(1);
-    assert!(message.contains("not in f32: transformer."), "{message}");
     import(&checkpoint("re10k"), "released-re10k", "4").fails(2);
-    let cut = place.at("cut.ckpt");
-    std::fs::write(&cut, &std::fs::read(checkpoint("re10k")).unwrap()[..5000]).unwrap();
-    import(&cut.display().to_string(), "released-re10k", "3").fails(1);
-    std::fs::remove_file(&cut).unwrap();
     assert!(files(&place.at("")).is_empty());
 }
 
 #[test]
-fn released_variants_train_in_both_stages_and_leave_as_checkpoints() {
+fn released_variants_train_and_export() {
     let place = Place::new();
     for variant in ["released-re10k", "released-dl3dv"] {
         let set = [&format!("model.variant={variant}")[..], "checkpoint.every=2", "activation_checkpointing=true"];
@@ -177,7 +171,7 @@ fn released_variants_train_in_both_stages_and_leave_as_checkpoints() {
 }
 
 #[test]
-fn a_dl3dv_model_starts_from_an_imported_re10k_model_and_lists_what_is_new() {
+fn dl3dv_starts_from_re10k_and_lists_new_parameters() {
     let place = Place::new();
     let from = import(&place, &checkpoint("re10k"), "released-re10k", "3", "re10k");
     let model = "model={variant='released-dl3dv', dim=15, num_heads=3, feed_forward_dim=22, num_encoder_blocks=1, \
@@ -217,7 +211,7 @@ fn an_export_writes_over_nothing() {
 }
 
 #[test]
-fn other_heads_than_those_of_the_weights_are_refused() {
+fn heads_unlike_the_weights_are_refused() {
     let place = Place::new();
     let model = import(&place, &checkpoint("re10k"), "released-re10k", "3", "model");
     let (data, out) = (mini(), place.at("eval").display().to_string());
@@ -237,7 +231,7 @@ fn other_heads_than_those_of_the_weights_are_refused() {
 }
 
 #[test]
-fn a_checkpoint_that_is_not_imported_is_named_with_the_command() {
+fn checkpoints_not_imported_are_refused_with_the_command() {
     let place = Place::new();
     let (file, data) = (checkpoint("re10k"), mini());
     let out = place.at("out.ckpt").display().to_string();

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::Command;
 
-use crate::support::{BINARY, Place, clift, finish, killed_at, spawn, start, wait_for_steps};
+use crate::support::{BINARY, Place, STAGE_1, clift, finish, killed_at, spawn, start, wait_for_steps};
 
 /// Twelve saved steps and as many to come.
 const HALF: [&str; 4] = ["stage1.steps=24", "stage2.steps=12", "eval.every=12", "checkpoint={every=12, keep=2}"];
@@ -17,7 +17,7 @@ fn assert_names_the_last_good_checkpoint(place: &Place, run: &str, step: u64, me
 
 /// No file may grow beyond the limit: what a full disk is to a checkpoint, without the right to mount one.
 #[test]
-fn a_save_that_does_not_fit_leaves_the_last_checkpoint_and_the_run_goes_on_later() {
+fn failed_saves_keep_the_checkpoint_and_runs_resume() {
     let place = Place::new();
     place.train("whole", &HALF, &[]).ok();
     killed_at("saved/stage1/12", &place.train_args("run", &HALF, &[]));
@@ -58,7 +58,7 @@ impl Drop for SmallDisk<'_> {
 }
 
 #[test]
-fn a_full_disk_leaves_the_last_checkpoint_and_the_run_goes_on_when_there_is_room() {
+fn full_disks_keep_the_checkpoint_and_runs_resume() {
     let place = Place::new();
     let folder = place.at("disk");
     let Some(disk) = SmallDisk::mount(&folder, 4096) else {
@@ -97,7 +97,7 @@ fn a_full_disk_leaves_the_last_checkpoint_and_the_run_goes_on_when_there_is_room
 }
 
 #[test]
-fn a_run_directory_that_cannot_be_is_an_error_before_anything_else() {
+fn impossible_run_directories_are_errors() {
     let place = Place::new();
     std::fs::write(place.at("file"), b"not a folder").expect("writable");
     let message = place.train("file/run", &[], &[]).fails(1);
@@ -106,7 +106,7 @@ fn a_run_directory_that_cannot_be_is_an_error_before_anything_else() {
         "{message}"
     );
     // A folder that turned into something else.
-    place.train("run", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "run");
     std::fs::write(place.at("run/clusters.tmp"), b"not a folder").expect("writable");
     let message = place.train("run", &[], &[]).fails(1);
     assert!(message.trim_end().ends_with("run/clusters.tmp"), "{message}");
@@ -114,7 +114,7 @@ fn a_run_directory_that_cannot_be_is_an_error_before_anything_else() {
 }
 
 #[test]
-fn data_that_vanishes_stops_the_run_after_a_save_and_it_goes_on_when_the_data_is_back() {
+fn vanished_data_stops_runs_which_resume_with_it() {
     let place = Place::new();
     let data = place.at("rooms");
     let folder = data.display().to_string();

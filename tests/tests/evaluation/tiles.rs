@@ -1,6 +1,6 @@
 //! Patch-wise grouping beside K-means, on the same stage 1.
 
-use crate::support::{Place, clift};
+use crate::support::{Place, WHOLE, clift};
 
 /// A tile for every view at least.
 const STORAGE: &str = "eval.validation_storage=0.5";
@@ -12,9 +12,9 @@ fn train_on_tiles(place: &Place, name: &str) {
 }
 
 #[test]
-fn tiles_and_clusters_are_measured_on_the_same_views_with_paired_differences() {
+fn tiles_and_clusters_have_paired_differences() {
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     train_on_tiles(&place, "tiles");
     let tiles = place.at("tiles").display().to_string();
     let out = place.at("out").display().to_string();
@@ -50,9 +50,9 @@ fn tiles_and_clusters_are_measured_on_the_same_views_with_paired_differences() {
 }
 
 #[test]
-fn a_run_on_tiles_neither_encodes_scenes_nor_stands_beside_its_own_kind() {
+fn tile_runs_encode_nothing_and_refuse_their_kind() {
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     train_on_tiles(&place, "tiles");
     let message = place.train("few", &["clusters.grouping=\"tile\""], &[]).fails(2);
     assert!(message.contains("eval.validation_storage") && message.contains("a tile for every"), "{message}");

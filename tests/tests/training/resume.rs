@@ -1,86 +1,11 @@
-//! Runs that stop and go on: the result is that of a run that never stopped.
+//! What a second command of the same run keeps, refuses and makes anew.
 
 use std::time::{Duration, Instant};
 
-use crate::support::{Place, Ran, clift, files, finish, signal as send, spawn, wait_for_steps};
-
-/// Starts a run, sends it a signal after some steps and waits for its end.
-fn stop_after(place: &Place, name: &str, set: &[&str], flags: &[&str], count: usize, signal: &str) -> Ran {
-    let mut child = spawn(place.train_args(name, set, flags));
-    wait_for_steps(&place.at(name), &mut child, count);
-    send(&child, signal);
-    finish(child)
-}
-
-/// Enough steps that a run is still going when the signal comes: a step takes milliseconds.
-const LONG: [&str; 4] = ["stage1.steps=120", "stage2.steps=120", "eval.every=50", "checkpoint.every=25"];
+use crate::support::{Place, STAGE_1, WHOLE, clift, files, finish, killed_at, signal, spawn};
 
 #[test]
-fn an_interrupted_run_saves_exits_130_and_ends_as_if_it_had_not_been() {
-    let place = Place::new();
-    place.train("whole", &LONG, &[]).ok();
-
-    let message = stop_after(&place, "parts", &LONG, &[], 10, "-INT").fails(130);
-    let step = place.metrics("parts").len();
-    assert!((10..120).contains(&step), "{step}");
-    assert!(message.contains(&format!("error: interrupted at step {step}; the same command resumes")), "{message}");
-    assert!(message.contains(&format!("saved {}", place.at("parts/stage1/checkpoints").display())), "{message}");
-    assert!(place.at(&format!("parts/stage1/checkpoints/step-{step:09}")).is_dir());
-    assert!(!place.at("parts/stage1/model.safetensors").exists());
-
-    // Again, in the middle of stage 2.
-    let ran = stop_after(&place, "parts", &LONG, &[], 130, "-INT");
-    assert!(ran.stderr.contains(&format!("stage1: resumed after {step} of 120 steps")), "{}", ran.stderr);
-    ran.fails(130);
-    let message = place.train("parts", &LONG, &[]).ok().stderr;
-    assert!(message.contains("stage2: resumed after"), "{message}");
-
-    assert_eq!(place.metrics_but_time("parts"), place.metrics_but_time("whole"));
-    place.assert_same_result("parts", "whole");
-}
-
-#[test]
-fn a_killed_run_goes_on_from_its_last_checkpoint_to_the_same_weights() {
-    let place = Place::new();
-    let only = ["--only", "stage1"];
-    place.train("whole", &LONG, &only).ok();
-    // Past the checkpoint of step 25, with steps after it that are lost.
-    assert_eq!(stop_after(&place, "parts", &LONG, &only, 35, "-KILL").code, None);
-    let done = place.metrics("parts").len();
-    let stderr = place.train("parts", &LONG, &only).ok().stderr;
-    let resumed = format!("stage1: resumed after {} of 120 steps", done / 25 * 25);
-    // A save that was not finished when the signal came leaves the checkpoint before it.
-    let or_before = format!("stage1: resumed after {} of 120 steps", (done / 25 - 1) * 25);
-    assert!(stderr.contains(&resumed) || stderr.contains(&or_before), "{resumed}: {stderr}");
-    assert_eq!(place.metrics_but_time("parts"), place.metrics_but_time("whole"), "no step is missing or doubled");
-    assert_eq!(place.weights("parts", "stage1"), place.weights("whole", "stage1"));
-}
-
-#[test]
-fn half_written_folders_that_are_no_use_are_made_anew() {
-    let place = Place::new();
-    place.train("whole", &[], &["--only", "stage1"]).ok();
-    // A folder under its temporary name that does not say what it was made from, and a save that a kill cut off.
-    std::fs::create_dir(place.at("whole/clusters.tmp")).unwrap();
-    std::fs::write(place.at("whole/clusters.tmp/clusters.bin"), b"half").unwrap();
-    std::fs::create_dir_all(place.at("whole/stage2/checkpoints/step-000000002.tmp")).unwrap();
-    place.train("whole", &[], &[]).ok();
-    assert!(!place.at("whole/clusters.tmp").exists());
-    place.train("other", &[], &[]).ok();
-    place.assert_same_result("whole", "other");
-}
-
-#[test]
-fn the_number_of_loader_threads_does_not_change_the_weights() {
-    let place = Place::new();
-    place.train("none", &["data.num_threads=0"], &[]).ok();
-    place.train("two", &["data.num_threads=2", "data.num_prefetch=3"], &[]).ok();
-    assert_eq!(place.metrics_but_time("none"), place.metrics_but_time("two"));
-    place.assert_same_result("none", "two");
-}
-
-#[test]
-fn a_batch_worked_off_in_parts_gives_the_same_update() {
+fn micro_batches_give_the_same_update() {
     let place = Place::new();
     let batches = ["stage1.batch_size=5", "stage2.batch_size=5"];
     place.train("at_once", &batches, &[]).ok();
@@ -108,9 +33,9 @@ fn a_batch_worked_off_in_parts_gives_the_same_update() {
 #[test]
 fn a_finished_run_is_left_as_it_is() {
     let place = Place::new();
-    place.train("run", &[], &[]).ok();
+    place.copy(&WHOLE, "run");
     let before = files(&place.at("run"));
-    let summary = crate::pipeline::summary_but_time(&place, "run/eval/summary.json");
+    let summary = place.summary_but_time("run");
     let ran = place.train("run", &[], &[]).ok();
     assert!(!ran.stderr.contains("stage1: 6 steps") && !ran.stderr.contains("stage2: 4 steps"), "{}", ran.stderr);
     let after = files(&place.at("run"));
@@ -121,13 +46,13 @@ fn a_finished_run_is_left_as_it_is() {
             ["summary.json", "views.csv", "report.html"].iter().any(|name| path.ends_with(format!("eval/{name}")));
         assert!(timed || *bytes == after[path], "{} changed", path.display());
     }
-    assert_eq!(crate::pipeline::summary_but_time(&place, "run/eval/summary.json"), summary);
+    assert_eq!(place.summary_but_time("run"), summary);
 }
 
 #[test]
-fn keys_that_decide_the_result_are_refused_by_name_and_others_may_change() {
+fn changed_settings_are_refused_unless_results_stay_equal() {
     let place = Place::new();
-    place.train("run", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "run");
     let before = files(&place.at("run"));
     for (change, expected) in [
         ("seed=1", "  seed: 0 -> 1"),
@@ -152,11 +77,14 @@ fn keys_that_decide_the_result_are_refused_by_name_and_others_may_change() {
 #[test]
 fn fresh_moves_the_former_run_aside() {
     let place = Place::new();
-    place.train("run", &[], &["--only", "stage1"]).ok();
-    let before: Vec<_> = files(&place.at("run")).into_values().collect();
+    place.copy(&STAGE_1, "run");
+    let before = files(&place.at("run"));
+    let message = place.train("run", &[], &["--fresh", "--only", "clusters"]).fails(2);
+    assert!(message.contains("--fresh"), "{message}");
+    assert!(files(&place.at("run")) == before, "a later stage cannot be fresh: nothing is moved");
     let ran = place.train("run", &["stage1.steps=3"], &["--only", "stage1", "--fresh"]).ok();
     assert!(ran.stderr.contains("moved the former run to "), "{}", ran.stderr);
-    assert!(files(&place.at("run.1")).into_values().eq(before), "every byte of it");
+    assert!(files(&place.at("run.1")).into_values().eq(before.into_values()), "every byte of it");
     assert_eq!(place.metrics("run").len(), 3);
     place.train("run", &[], &["--only", "stage1", "--fresh"]).ok();
     assert_eq!((place.metrics("run.2").len(), place.metrics("run").len()), (3, 6));
@@ -183,7 +111,7 @@ fn an_evaluation_can_be_interrupted() {
         assert!(started.elapsed() < Duration::from_mins(1), "no sheet within a minute");
         std::thread::sleep(Duration::from_millis(2));
     }
-    send(&child, "-INT");
+    signal(&child, "-INT");
     let message = finish(child).fails(130);
     assert!(message.contains("interrupted during the evaluation, after "), "{message}");
     assert!(message.contains(" scenes; nothing was written"), "{message}");
@@ -195,24 +123,14 @@ fn an_evaluation_can_be_interrupted() {
 }
 
 #[test]
-fn a_finished_run_needs_neither_its_clusters_nor_what_it_started_from() {
+fn resumed_runs_need_neither_initial_weights_nor_clusters() {
     let place = Place::new();
-    place.train("first", &[], &["--only", "stage1"]).ok();
+    place.copy(&STAGE_1, "first");
     let from = format!("stage1.init_from=\"{}\"", place.at("first").display());
-    place.train("second", &[&from], &[]).ok();
+    killed_at("saved/stage1/2", &place.train_args("second", &[&from], &[]));
     std::fs::remove_dir_all(place.at("first")).expect("removes");
+    place.train("second", &[&from], &[]).ok();
     std::fs::remove_dir_all(place.at("second/clusters")).expect("removes");
     place.train("second", &[&from], &[]).ok();
     assert!(!place.at("second/clusters").exists(), "nothing was clustered again");
-}
-
-#[test]
-fn a_resumed_stage_does_not_look_for_the_weights_it_started_from() {
-    let place = Place::new();
-    place.train("first", &[], &["--only", "stage1"]).ok();
-    let from = format!("stage1.init_from=\"{}\"", place.at("first").display());
-    let set: Vec<&str> = LONG.iter().copied().chain([from.as_str()]).collect();
-    stop_after(&place, "second", &set, &["--only", "stage1"], 10, "-INT").fails(130);
-    std::fs::remove_dir_all(place.at("first")).expect("removes");
-    place.train("second", &set, &["--only", "stage1"]).ok();
 }

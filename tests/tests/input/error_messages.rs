@@ -58,7 +58,7 @@ num_targets = 2
 ";
 
 /// Name, what is replaced in the config by what, and arguments behind `train CONFIG`.
-const CONFIGS: [(&str, &str, &str, &[&str]); 36] = [
+const CONFIGS: [(&str, &str, &str, &[&str]); 38] = [
     ("unknown-key", "dim = 16", "dimm = 16", &[]),
     ("unknown-section", "[clusters]", "[cluster]", &[]),
     ("key-of-another-section", "num_heads = 2", "num_heads = 2\nbatch_size = 4", &[]),
@@ -104,6 +104,8 @@ const CONFIGS: [(&str, &str, &str, &[&str]); 36] = [
     ("override-without-a-value", "", "", &["--set", "stage1.steps"]),
     ("override-of-an-unknown-key", "", "", &["--set", "stage1.step=3"]),
     ("override-below-a-value", "", "", &["--set", "stage1.steps.x=3"]),
+    ("override-of-another-type", "", "", &["--set", "stage1.steps=ten"]),
+    ("override-beyond-a-limit", "", "", &["--set", "data.synthetic.fov_deg=180.0"]),
     ("override-that-contradicts-the-file", "", "", &["--set", "model.dim=15"]),
 ];
 
@@ -118,7 +120,7 @@ const COMMANDS: [(&str, &[&str]); 6] = [
 ];
 
 #[test]
-fn every_wrong_input_says_what_is_wrong_where_and_what_would_be_right() {
+fn every_wrong_input_gives_its_message() {
     let place = Place::new();
     let dir = place.at("").display().to_string().trim_end_matches('/').to_owned();
     let right = RIGHT.replace("DIR", &dir);
@@ -174,7 +176,7 @@ fn an_instruction_set_that_is_none_is_refused() {
 }
 
 #[test]
-fn a_plan_names_a_wrong_value_as_training_does_and_needs_no_data() {
+fn plans_name_wrong_values_and_need_no_data() {
     let place = Place::new();
     let config = repository("configs/re10k.toml").display().to_string();
     let plan = |flags: &[&str]| {

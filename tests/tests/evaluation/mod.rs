@@ -1,0 +1,7 @@
+//! Evaluations and what they write, scene files, published checkpoints.
+
+mod checkpoints;
+mod eval;
+mod report;
+mod scene_files;
+mod tiles;

@@ -1,0 +1,59 @@
+//! Paths that documents, comments and messages name must exist.
+
+use std::path::Path;
+
+use crate::support::{repository, sources};
+
+/// Folders whose files are named in texts.
+const FOLDERS: [&str; 3] = ["docs/", "scripts/", "configs/"];
+
+#[test]
+fn every_link_and_named_path_exists() {
+    let mut texts = sources(&["crates", "tests", "docs", "scripts", "configs"], &["rs", "toml", "py", "sh", "md"]);
+    for name in [".ci/run", "README.md", "Cargo.toml", "deny.toml", "clippy.toml", "typos.toml"] {
+        texts.insert(name.into(), std::fs::read_to_string(repository(name)).expect(name));
+    }
+    let exists = |path: &Path| repository("").join(path).exists();
+    let missing: Vec<String> = texts
+        .iter()
+        .filter(|(path, _)| !path.ends_with("links.rs"))
+        .flat_map(|(path, text)| missing(path, text, &exists))
+        .collect();
+    assert!(missing.is_empty(), "{} paths are missing:\n{}", missing.len(), missing.join("\n"));
+}
+
+/// Paths of a text that do not exist, as `path:line: named path`.
+fn missing(path: &str, text: &str, exists: &dyn Fn(&Path) -> bool) -> Vec<String> {
+    let folder = Path::new(path).parent().expect("a file");
+    let mut found = Vec::new();
+    for (number, line) in text.lines().enumerate() {
+        if path.ends_with(".md") {
+            let links = line.split("](").skip(1).filter_map(|rest| rest.split([')', '#', ' ']).next());
+            let links = links.filter(|link| !link.is_empty() && !link.contains(':'));
+            found.extend(links.filter(|link| !exists(&folder.join(link))).map(|link| (number, link)));
+        }
+        for start in FOLDERS {
+            let named = line.match_indices(start).filter_map(|(at, _)| named_path(line, at));
+            found.extend(named.filter(|name| !exists(Path::new(name))).map(|name| (number, name)));
+        }
+    }
+    found.into_iter().map(|(number, name)| format!("{path}:{}: {name}", number + 1)).collect()
+}
+
+/// The path that begins at a place of a line; `None` inside of a longer one, and for patterns.
+fn named_path(line: &str, at: usize) -> Option<&str> {
+    let before = line[..at].trim_end_matches("../");
+    let is_inside = before.ends_with(|c: char| c.is_alphanumeric() || "_-/.".contains(c));
+    let end =
+        line[at..].find(|c: char| !c.is_ascii_alphanumeric() && !"_-./".contains(c)).map_or(line.len(), |end| at + end);
+    let is_pattern = line[end..].starts_with(['*', '{', '<', '$', '…']);
+    (!is_inside && !is_pattern).then(|| line[at..end].trim_end_matches('.'))
+}
+
+#[test]
+fn missing_paths_are_listed_with_their_line() {
+    let exists = |path: &Path| ["docs/plan.md", "docs/here.md"].iter().any(|known| Path::new(known) == path);
+    let text = "[a](plan.md#part) [b](gone.md) [c](https://example.org/docs/x.md)\nSee `docs/here.md`, docs/{a,b}.md.\n\
+                Run scripts/gone.py. ../docs/plan.md, my-docs/x";
+    assert_eq!(missing("docs/a.md", text, &exists), ["docs/a.md:1: gone.md", "docs/a.md:3: scripts/gone.py"]);
+}
