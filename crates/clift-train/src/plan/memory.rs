@@ -1,4 +1,4 @@
-//! Bytes that the parts of a run need, counted from what the hand-written operations keep (docs/plan.md).
+//! Bytes that the parts of a run need, counted from what the hand-written operations keep (docs/guide/training.md).
 // In f32 values: x = N D of a part's scenes, y = T Q D, z = tokens D
 
 use clift_eval::vgg::VggSizes;
@@ -12,7 +12,7 @@ use crate::events::Stage;
 const F32: f64 = 4.0;
 
 /// What the C library's heap holds for a byte of what a backward pass keeps: freed pieces below 32 MiB stay in it.
-/// Measured at 1.05 to 1.22 (docs/plan.md).
+/// Measured at 1.05 to 1.22 (docs/guide/training.md).
 const HEAP: f64 = 1.2;
 
 /// Above this many values K-means asks the device for every distance instead of keeping a table.
@@ -274,7 +274,7 @@ mod tests {
 
     #[test]
     fn the_papers_update_is_within_fifteen_percent_of_its_measured_peak() {
-        // docs/performance.md, full size, batch 1; a process of this program holds 26 MB besides its tensors.
+        // docs/results/performance.md, full size, batch 1; a process of this program holds 26 MB besides its tensors.
         let config = ModelConfig::default();
         for (stage, recompute, measured) in
             [(Stage::Stage1, false, 2.26e9), (Stage::Stage1, true, 1.72e9), (Stage::Stage2, false, 1.43e9)]

@@ -42,7 +42,7 @@ fn head(small: bool) -> String {
     format!(
         "# Numbers on hard scenes
 
-Made by `{command} --markdown docs/stability.md`; a small version of every case runs in `cargo test`.
+Made by `{command} --markdown docs/results/stability.md`; a small version of every case runs in `cargo test`.
 
 Each case is a real computation in f32 and the same code on the same values in f64, which takes the composed
 operations instead of the kernels. The error is the largest difference over the largest value, of an update over its

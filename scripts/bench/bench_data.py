@@ -1,8 +1,8 @@
 """Compares how fast clift and pixelSplat's way read the same clips of the same files, alternately.
 
-    python scripts/bench_data.py DIR --clift target/release/clift [--rounds 3] [--json F]
-    python scripts/bench_data.py DIR --make PATH [--mb 100 --chunks 3]     # chunks made of DIR's frames, 640 x 360
-    python scripts/bench_data.py DIR --clift EXE --big 2000                # also the memory on one chunk of 2 GB
+    python scripts/bench/bench_data.py DIR --clift target/release/clift [--rounds 3] [--json F]
+    python scripts/bench/bench_data.py DIR --make PATH [--mb 100 --chunks 3]     # chunks made of DIR's frames, 640 x 360
+    python scripts/bench/bench_data.py DIR --clift EXE --big 2000                # also the memory on one chunk of 2 GB
 
 Needs torch, Pillow and numpy. pixelSplat's way: `torch.load` of a whole chunk, Pillow for decoding and LANCZOS, floats
 in between as its code has them, and a DataLoader with two workers that share the chunks. For a single clip it has to

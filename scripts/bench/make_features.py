@@ -1,4 +1,4 @@
-"""Writes encoder tokens to cluster: `python scripts/make_features.py OUT.safetensors [options]`.
+"""Writes encoder tokens to cluster: `python scripts/bench/make_features.py OUT.safetensors [options]`.
 
 The file holds one tensor, "features" `[N, D]` in f32, of one scene with evenly spread context views. The encoder is
 the PyTorch twin's: with seeded weights, or with those of a run directory that `clift train` wrote.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import sys
 import tomllib
 from pathlib import Path
 
@@ -15,8 +16,9 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "twin"))
 import clift_torch as twin
-from torch_works import cameras, pictures
+from torch_cases import cameras, pictures
 
 
 def read_clip(chunk: Path, scene: int, views: int, side: int) -> tuple[Tensor, Tensor, Tensor]:

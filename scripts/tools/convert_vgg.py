@@ -1,7 +1,7 @@
 """Converts the weights of the perceptual networks to what clift reads. Downloads nothing.
 
-    python3 scripts/convert_vgg.py lpips vgg16-397923af.pth lpips/weights/v0.1/vgg.pth -o lpips-vgg.safetensors
-    python3 scripts/convert_vgg.py vgg19 imagenet-vgg-verydeep-19.mat -o vgg19.safetensors
+    python3 scripts/tools/convert_vgg.py lpips vgg16-397923af.pth lpips/weights/v0.1/vgg.pth -o lpips-vgg.safetensors
+    python3 scripts/tools/convert_vgg.py vgg19 imagenet-vgg-verydeep-19.mat -o vgg19.safetensors
 
 lpips: VGG-16 as torchvision publishes it, and the linear heads that come with the `lpips` package (pip install
 lpips; the file lies in its folder). For LPIPS: `eval.lpips_weights`.
@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from safetensors.numpy import save_file
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "twin"))
 import vgg_torch
 
 MEAN_TOLERANCE = 0.01

@@ -1,15 +1,15 @@
 """Compares clift with PyTorch: the same work, alternately, on a quiet Linux machine's CPU in f32.
 
-    python3 scripts/bench_pytorch.py --size smoke                          # does it run? seconds, no judgement
-    python3 scripts/bench_pytorch.py --targets --json bench.json           # the full sizes
-    python3 scripts/bench_pytorch.py --work stage1_step,render --rounds 3
+    python3 scripts/bench/bench_pytorch.py --size smoke                          # does it run? seconds, no judgement
+    python3 scripts/bench/bench_pytorch.py --targets --json bench.json           # the full sizes
+    python3 scripts/bench/bench_pytorch.py --work stage1_step,render --rounds 3
 
 Needs Python 3.11 and nothing else: it makes its own virtual environment from scripts/requirements.txt and builds
 clift, unless `--python` and `--clift` name what there is.
 
 A round starts one process of each side, in turn the other way round, with the same number of threads; a process does
 one piece of work only, and its peak memory is what the kernel says at its end. PyTorch is the twin (clift_torch.py) on
-fused attention, with the faster ways of torch_works.py; where it has several, all are timed first and the fastest
+fused attention, with the faster ways of torch_cases.py; where it has several, all are timed first and the fastest
 competes. Ours is `clift bench`. A round in which somebody else used the processor is thrown away and made again.
 
 Exit codes: 0 done, 1 something failed (or a target was missed, with --strict), 2 wrong usage, 3 the machine is not
@@ -36,9 +36,9 @@ import quiet_machine
 from bench_rows import SIZES, Row, Side, Torch, overrides, rows
 from quiet_machine import CommandFailed, Loaded
 
-SCRIPTS = Path(__file__).resolve().parent
-ROOT = SCRIPTS.parent
-REQUIREMENTS = SCRIPTS / "requirements.txt"
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+REQUIREMENTS = ROOT / "scripts" / "requirements.txt"
 # CPU builds of torch; the default ones for Linux carry gigabytes of CUDA.
 CPU_WHEELS = "https://download.pytorch.org/whl/cpu"
 # Repetitions of each way PyTorch has, before the fastest is chosen.
@@ -119,7 +119,7 @@ class Bench:
         return command
 
     def worker(self, spec: dict[str, Any]) -> list[str]:
-        return [str(self.python), str(SCRIPTS / "torch_works.py"), json.dumps({"threads": self.args.threads, **spec})]
+        return [str(self.python), str(HERE / "torch_cases.py"), json.dumps({"threads": self.args.threads, **spec})]
 
     def torch_spec(self, side: Torch, round_: int | None, variant: str | None) -> dict[str, Any]:
         spec = dict(work=side.work, variant=variant, size=SIZES[side.size or self.args.size])
@@ -133,7 +133,7 @@ class Bench:
         """What K-means clusters on both sides."""
         if self.features is None:
             path, size = self.folder / "features.safetensors", SIZES[self.args.size]
-            command = [str(self.python), str(SCRIPTS / "make_features.py"), str(path)]
+            command = [str(self.python), str(HERE / "make_features.py"), str(path)]
             for option in ("dim", "heads", "feed_forward", "contexts", "side"):
                 command += [f"--{option.replace('_', '-')}", str(size[option])]
             quiet_machine.run([*command, "--blocks", str(size["encoder_blocks"])], self.env)
@@ -375,7 +375,7 @@ def measure_all(args: argparse.Namespace, folder: Path, report: dict[str, Any]) 
         known = json.loads(quiet_machine.run(bench.worker({"work": "versions"}), bench.env).stdout)
     except CommandFailed as error:
         raise CommandFailed(f"{python} cannot do PyTorch's side; does it have {REQUIREMENTS.name}?\n{error}") from None
-    quiet_machine.run([str(python), str(SCRIPTS / "check_torch_works.py")], bench.env)
+    quiet_machine.run([str(python), str(HERE / "check_torch_cases.py")], bench.env)
     print("PyTorch's fast ways agree with the twin; its attention is fused", flush=True)
     imports = quiet_machine.run(bench.worker({"work": "import"}), bench.env)
     report["baseline_bytes"] = bench.baseline_bytes = imports.peak_bytes

@@ -2,8 +2,8 @@
 """Kills real trainings with SIGKILL at random moments and compares how they end with one that was left alone.
 
     cargo build --release
-    python3 scripts/crash_test.py                         # 50 kills, about ten minutes on two cores
-    python3 scripts/crash_test.py --kills 200 --seed 1
+    python3 scripts/check/crash_test.py                         # 50 kills, about ten minutes on two cores
+    python3 scripts/check/crash_test.py --kills 200 --seed 1
 
 Every other kill waits for a file or folder under a temporary name to appear, that is, for a save, and comes up to a few
 milliseconds after it; the others come at a moment drawn evenly over the time of a whole run. Every file of a finished run
@@ -25,7 +25,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 TIMES = {"step_s", "render_s", "select_s"}
 
 # Small, so that a run takes seconds, and saving all the time.

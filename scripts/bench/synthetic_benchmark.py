@@ -8,7 +8,7 @@ comparison: the difference of each seed over its scenes with its standard error,
 What is there is not made again, so that an interrupted benchmark goes on where it was. With --jobs, seeds are trained
 side by side, each on its share of the cores, which takes less time in all; what they print is in OUT/seed-N.log then.
 
-    python3 scripts/synthetic_benchmark.py --seeds 0,1,2 --jobs 3
+    python3 scripts/bench/synthetic_benchmark.py --seeds 0,1,2 --jobs 3
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ import math
 import os
 import statistics
 import subprocess
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 VARIANTS = "random,patch,patch_clift,kmeans,clift"
 STORAGE = "1/16,1/8,1/4,1/2,1.0"
 

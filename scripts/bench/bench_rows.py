@@ -26,7 +26,7 @@ class Ours:
 
 @dataclass(frozen=True)
 class Torch:
-    """A work of torch_works.py."""
+    """A case of torch_cases.py."""
 
     work: str
     size: str | None = None
@@ -52,7 +52,7 @@ def rows() -> list[Row]:
         return Row(work, work, Ours(work), Torch(work), targets)
 
     stage1, views, stage2 = Torch("stage1_step"), Ours("render_8_views"), Ours("stage2_step")
-    recompute = Ours("stage1_step", ("recompute=true",))
+    recompute = Ours("stage1_step", ("activation_checkpointing=true",))
     return [
         same("stage1_step", ("ratio", 1.0), ("memory_ratio", 0.7)),
         Row("stage1_step_recompute", "stage1_step", recompute, stage1, (("ratio", 1.35), ("memory_ratio", 0.5))),

@@ -10,8 +10,8 @@ released code. Modules carry the names that the checkpoints' keys have below
 Variants: `released-re10k`, `released-dl3dv` (adds `input_norm` and the q_norm, k_norm
 of every attention), and `paper`, whose condenser is clift_torch's, below `squeezer.blocks`.
 
-    python scripts/clift_released.py FILE            # loads an export strictly and says what it is
-    python scripts/clift_released.py FILE --same-as FIXTURE.ckpt   # and compares every value
+    python scripts/twin/clift_released.py FILE            # loads an export strictly and says what it is
+    python scripts/twin/clift_released.py FILE --same-as FIXTURE.ckpt   # and compares every value
 """
 
 from __future__ import annotations

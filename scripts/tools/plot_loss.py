@@ -1,4 +1,4 @@
-"""Draws the training losses of several runs over each other, as an SVG: `python scripts/plot_loss.py OUT.svg NAME=RUN..`
+"""Draws the training losses of several runs over each other, as an SVG: `python scripts/tools/plot_loss.py OUT.svg NAME=RUN..`
 
 A run is a directory that `clift train` wrote; the curve is the mean over windows of 20 steps of its `metrics.jsonl`,
 stage 2 after stage 1. Needs Python 3.11 and nothing else. Prints the means of longer windows as a Markdown table.

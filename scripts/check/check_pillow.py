@@ -1,4 +1,4 @@
-"""Compares clift's decoding, rescaling and cropping with Pillow's: `python scripts/check_pillow.py DIR [--size 256x256]`.
+"""Compares clift's decoding, rescaling and cropping with Pillow's: `python scripts/check/check_pillow.py DIR [--size 256x256]`.
 
 DIR holds JPEG or PNG files, or chunks (`*.torch`), at any depth; `--jpeg 4:2:0` stores them as JPEG of that chroma first.
 Builds and runs the example `fit_frame` of clift-data. Prints, for each chroma that the files have, the mean and the
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, JpegImagePlugin
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 # Mean absolute difference in grey levels that a file may have.
 LIMIT = 0.5
 # Chroma of JPEG files, by Pillow's numbers.

@@ -1,7 +1,7 @@
 """PyTorch's side of bench_pytorch.py and gpu_bench.py: each piece of work done as fast as plain PyTorch does it.
 
 Not run by hand: they start one process per measurement with a JSON object as its only argument, and read a JSON object
-back. check_torch_works.py compares every way with the twin. Modules and training step are the twin's
+back. check_torch_cases.py compares every way with the twin. Modules and training step are the twin's
 (clift_torch.py); what is written anew here is what the twin does slowly on purpose. Where PyTorch has more than one
 good way, each is a variant, and the driver times them all.
 
@@ -16,6 +16,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,6 +24,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "twin"))
 import clift_torch as twin
 
 NUM_VIEWS_OF_SCENE = 8

@@ -30,7 +30,7 @@ from typing import Any
 
 from bench_rows import FULL, SMOKE, overrides
 
-SCRIPTS = Path(__file__).resolve().parent
+HERE = Path(__file__).resolve().parent
 RENDER_TOKENS = (512, 1024, 2048, 4096)
 OURS = ("f32", "f16")
 
@@ -89,7 +89,7 @@ class Bench:
 
     def torch_process(self, spec: dict[str, Any]) -> dict[str, Any]:
         spec = {"threads": os.cpu_count() or 1, **spec}
-        command = [str(self.args.python), str(SCRIPTS / "torch_works.py"), json.dumps(spec)]
+        command = [str(self.args.python), str(HERE / "torch_cases.py"), json.dumps(spec)]
         return json.loads(run(command, self.args.limit))
 
     def measure_torch(self, row: Row, precision: str) -> list[float]:
@@ -113,9 +113,9 @@ class Bench:
             raise Failed(f"clift measured {written['device']} in {written['precision']}")
         return next(one["samples_s"] for one in written["rows"] if one["work"] == row.work)
 
-    def half(self) -> list[dict[str, Any]] | str:
-        """What f16 products change, from `clift bench half`."""
-        command = self.clift("bench", "half", str(self.args.config))
+    def precision(self) -> list[dict[str, Any]] | str:
+        """What f16 products change, from `clift bench precision`."""
+        command = self.clift("bench", "precision", str(self.args.config))
         command += ["--repeats", str(self.args.repeats), "--warmup", str(self.args.warmup), "--json", str(self.json)]
         try:
             run(command, self.args.limit)
@@ -174,7 +174,7 @@ def table(results: dict[str, dict[str, Any]], torch_precisions: tuple[str, ...])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def half_table(rows: list[dict[str, Any]]) -> str:
+def precision_table(rows: list[dict[str, Any]]) -> str:
     lines = [["work", "f16 / f32", "error", "loss f32, f16", "PSNR to f32"], ["---"] * 5]
     for row in rows:
         loss = ", ".join(f"{value:.6f}" for value in row["loss"]) if row.get("loss") else "-"
@@ -186,7 +186,7 @@ def half_table(rows: list[dict[str, Any]]) -> str:
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clift", type=Path, required=True, metavar="EXE", help="built with --features wgpu")
-    parser.add_argument("--config", type=Path, default=SCRIPTS.parent / "configs" / "tiny.toml", help="sizes are set over it")
+    parser.add_argument("--config", type=Path, default=HERE.parents[1] / "configs" / "tiny.toml", help="sizes are set over it")
     parser.add_argument("--device", default="wgpu", help="clift's: wgpu, or flex for a look")
     parser.add_argument("--python", type=Path, default=Path(sys.executable), metavar="EXE", help="one that has PyTorch")
     parser.add_argument("--torch-device", metavar="NAME", help="cuda, cuda:1, mps or cpu; the first there is by default")
@@ -229,7 +229,7 @@ def main() -> int:
         report["torch"] = bench.torch
         print(f"PyTorch: {bench.torch if isinstance(bench.torch, str) else ', '.join(bench.torch.values())}", flush=True)
         report["rows"] = measure(bench, rows, args.rounds)
-        report["half"] = bench.half()
+        report["half"] = bench.precision()
     for result in report["rows"].values():
         result["median_s"] = medians(result)
     if args.json:
@@ -240,7 +240,7 @@ def main() -> int:
     if isinstance(bench.torch, str):
         print(f"\nPyTorch was {bench.torch}: no ratios.")
     print("\nWhat f16 products change:\n")
-    print(half_table(report["half"]) if isinstance(report["half"], list) else f"nothing measured: {report['half']}")
+    print(precision_table(report["half"]) if isinstance(report["half"], list) else f"nothing measured: {report['half']}")
     failed = [error for result in report["rows"].values() for error in result["errors"].values()]
     return 1 if failed else 0
 

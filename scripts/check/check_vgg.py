@@ -1,7 +1,7 @@
 """Compares clift's LPIPS and perceptual loss at full width with torchvision and the `lpips` package.
 
     .venv/bin/pip install --no-deps lpips torchvision tqdm
-    .venv/bin/python scripts/check_vgg.py /tmp/check-vgg     # writes 140 MB, prints the command that compares
+    .venv/bin/python scripts/check/check_vgg.py /tmp/check-vgg     # writes 140 MB, prints the command that compares
 
 The backbones are randomly initialised, so that nothing is downloaded; the linear heads are the package's own. The
 whole way is checked: the weights go through convert_vgg.py, from files as torchvision and MatConvNet write them.
@@ -21,15 +21,16 @@ import torch
 import torchvision
 from safetensors.numpy import load_file, save_file
 
+SCRIPTS = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(SCRIPTS / "twin"), str(SCRIPTS / "fixtures")]
 import vgg_torch
 from make_vgg_fixtures import metrics_of, perceptual_of, pictures, smooth
 
-SCRIPTS = Path(__file__).resolve().parent
 TWIN_TOLERANCE = 1e-9
 
 
 def convert(*args: object) -> None:
-    subprocess.run([sys.executable, SCRIPTS / "convert_vgg.py", *map(str, args)], check=True)
+    subprocess.run([sys.executable, SCRIPTS / "tools" / "convert_vgg.py", *map(str, args)], check=True)
 
 
 def write_mat(weights: vgg_torch.Weights, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Checks that PyTorch reads chunk files and files of single scenes: `python scripts/check_chunk.py FILE.torch [..]`.
+"""Checks that PyTorch reads chunk files and files of single scenes: `python scripts/check/check_chunk.py FILE.torch [..]`.
 
 Loads each with `torch.load(weights_only=True)`, checks types and shapes, and decodes every picture if Pillow is there.
 Prints a line per chunk; exits with an error at the first thing that does not fit the format.

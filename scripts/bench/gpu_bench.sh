@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Carries clift to a GPU machine that needs no network, no compiler and no checkout, and measures it there beside PyTorch:
-#   bash scripts/gpu_bench.sh pack FOLDER            # a release binary with wgpu, and what the comparison needs
-#   bash scripts/gpu_bench.sh over USER@HOST [..]    # packs, copies it there, runs it, brings gpu.json back
-#   bash gpu_bench.sh run [arguments of gpu_bench.py]   # in the packed folder, on that machine
+#   bash scripts/bench/gpu_bench.sh pack FOLDER           # packs a release binary with wgpu and the scripts
+#   bash scripts/bench/gpu_bench.sh over USER@HOST [..]   # packs, copies, runs there, and brings gpu.json back
+#   bash bench/gpu_bench.sh run [arguments of gpu_bench.py]   # in the packed folder, on the GPU machine
 #
 # There: a Vulkan driver and loader (Linux), Python 3.11; PyTorch for the comparison (PYTHON=EXE names the Python that has
 # it). The binary is linked against this machine's C library: pack on one that is no newer than the GPU machine's.
@@ -11,17 +11,18 @@ set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 
 pack() {
-    local folder=$1 root=$here/..
-    mkdir -p "$folder"
+    local folder=$1 root=$here/../..
+    mkdir -p "$folder/bench" "$folder/twin"
     if [ -n "${CLIFT:-}" ]; then
         cp "$CLIFT" "$folder/clift"
     else
         (cd "$root" && cargo build --locked --release --features wgpu)
         cp "${CARGO_TARGET_DIR:-$root/target}/release/clift" "$folder/clift"
     fi
-    cp "$here"/gpu_bench.sh "$here"/gpu_bench.py "$here"/bench_rows.py "$here"/torch_works.py "$here"/clift_torch.py "$folder/"
+    cp "$here"/gpu_bench.sh "$here"/gpu_bench.py "$here"/bench_rows.py "$here"/torch_cases.py "$folder/bench/"
+    cp "$here/../twin/clift_torch.py" "$folder/twin/"
     cp "$root/configs/tiny.toml" "$folder/sizes.toml"
-    echo "packed $(du -sh "$folder" | cut -f1) in $folder; there: bash gpu_bench.sh run --json gpu.json"
+    echo "packed $(du -sh "$folder" | cut -f1) in $folder; there: bash bench/gpu_bench.sh run --json gpu.json"
 }
 
 over() {
@@ -32,15 +33,15 @@ over() {
     pack "$folder"
     tar -C "$folder" -czf - . | ssh "$host" 'mkdir -p clift-gpu-bench && tar -C clift-gpu-bench -xzf -'
     # shellcheck disable=SC2029  # the arguments are meant to be read there
-    ssh "$host" "cd clift-gpu-bench && PYTHON='${PYTHON:-python3}' bash gpu_bench.sh run --json gpu.json $*" ||
+    ssh "$host" "cd clift-gpu-bench && PYTHON='${PYTHON:-python3}' bash bench/gpu_bench.sh run --json gpu.json $*" ||
         echo "something failed there; gpu.json holds what was measured"
     scp "$host:clift-gpu-bench/gpu.json" gpu.json
 }
 
 run() {
-    local python=${PYTHON:-python3} config=$here/sizes.toml clift=${CLIFT:-$here/clift}
+    local python=${PYTHON:-python3} config=$here/../sizes.toml clift=${CLIFT:-$here/../clift}
     if [ ! -e "$config" ]; then # in a checkout
-        config=$here/../configs/tiny.toml
+        config=$here/../../configs/tiny.toml
     fi
     exec "$python" "$here/gpu_bench.py" --clift "$clift" --config "$config" "$@"
 }
