@@ -85,7 +85,7 @@ class Seed:
     def make(self) -> tuple[Path, Path]:
         """Trains and evaluates; the folders of the evaluations with and without residuals in the condenser."""
         self.train("kmeans")
-        self.same_stage1("tiles", 'clusters.grouping="patch"')
+        self.same_stage1("tiles", 'clusters.grouping="tile"')
         self.compare()
         self.same_stage1("literal", "model.condenser.residual=false")
         return self.compared, self.run("literal") / "eval"

@@ -1,6 +1,6 @@
 """The published networks in plain torch: the part of the PyTorch twin that stands for the released checkpoints.
 
-Written from docs/checkpoints.md, independently of the Rust code and without the
+Written from docs/guide/checkpoints.md, independently of the Rust code and without the
 released code. Modules carry the names that the checkpoints' keys have below
 `transformer.`, so that `state_dict` and a strict `load_state_dict` are the test:
 
