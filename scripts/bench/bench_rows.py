@@ -52,10 +52,10 @@ def rows() -> list[Row]:
         return Row(work, work, Ours(work), Torch(work), targets)
 
     stage1, views, stage2 = Torch("stage1_step"), Ours("render_8_views"), Ours("stage2_step")
-    recompute = Ours("stage1_step", ("activation_checkpointing=true",))
+    checkpointed = Ours("stage1_step", ("activation_checkpointing=true",))
     return [
         same("stage1_step", ("ratio", 1.0), ("memory_ratio", 0.7)),
-        Row("stage1_step_recompute", "stage1_step", recompute, stage1, (("ratio", 1.35), ("memory_ratio", 0.5))),
+        Row("stage1_step_recompute", "stage1_step", checkpointed, stage1, (("ratio", 1.35), ("memory_ratio", 0.5))),
         Row(
             "stage1_step_tiny",
             "stage1_step_tiny",
