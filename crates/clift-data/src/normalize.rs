@@ -42,7 +42,7 @@ pub struct SceneFrame {
 
 /// Largest coordinate that a camera of a clip may have in the normalised frame, whose contexts reach to 1.
 ///
-/// Farther away colours drown in the rays' moments: f32 keeps seven digits of their sum (docs/stability.md). The
+/// Farther away colours drown in the rays' moments: f32 keeps seven digits of their sum (docs/results/stability.md). The
 /// reference draws other views beyond the same number.
 pub const MAX_COORDINATE: f64 = 1e3;
 

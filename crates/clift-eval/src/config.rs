@@ -26,7 +26,7 @@ pub struct EvalConfig {
     /// those to compare.
     #[serde(deserialize_with = "one_or_more")]
     pub tokens: Vec<TokenStorage>,
-    /// Weights of LPIPS, converted by `scripts/convert_vgg.py`; without them it is not measured.
+    /// Weights of LPIPS, converted by `scripts/tools/convert_vgg.py`; without them it is not measured.
     pub lpips_weights: Option<PathBuf>,
     /// Evaluation index with the context and target frames of every scene. Without one, contexts are
     /// spread evenly over each clip and targets lie between them.

@@ -16,7 +16,7 @@ pub const LPIPS_MIN_SIZE_PX: usize = MIN_SIZE_PX;
 
 /// The command that makes the weight file.
 pub const LPIPS_COMMAND: &str =
-    "python3 scripts/convert_vgg.py lpips vgg16-397923af.pth lpips/weights/v0.1/vgg.pth -o lpips-vgg.safetensors";
+    "python3 scripts/tools/convert_vgg.py lpips vgg16-397923af.pth lpips/weights/v0.1/vgg.pth -o lpips-vgg.safetensors";
 
 const WANTED: Wanted = Wanted { what: "LPIPS", format: "clift-lpips-vgg-1", command: LPIPS_COMMAND };
 
@@ -166,9 +166,9 @@ pub(crate) mod tests {
         }
     }
 
-    /// `scripts/check_vgg.py` writes the folder: the full network, the package's own heads and numbers.
+    /// `scripts/check/check_vgg.py` writes the folder: the full network, the package's own heads and numbers.
     #[test]
-    #[ignore = "needs the files of scripts/check_vgg.py"]
+    #[ignore = "needs the files of scripts/check/check_vgg.py"]
     fn the_full_network_gives_the_lpips_packages_distances() {
         let folder = std::path::PathBuf::from(std::env::var("CLIFT_CHECK_VGG").expect("the folder of check_vgg.py"));
         let lpips = Lpips::load(&folder.join("lpips-vgg.safetensors"), &Device::flex()).unwrap();

@@ -15,7 +15,7 @@ pub const PERCEPTUAL_MIN_SIZE_PX: usize = MIN_SIZE_PX;
 
 /// The command that makes the weight file.
 pub const PERCEPTUAL_COMMAND: &str =
-    "python3 scripts/convert_vgg.py vgg19 imagenet-vgg-verydeep-19.mat -o vgg19.safetensors";
+    "python3 scripts/tools/convert_vgg.py vgg19 imagenet-vgg-verydeep-19.mat -o vgg19.safetensors";
 
 const WANTED: Wanted = Wanted { what: "the perceptual loss", format: "clift-vgg19-1", command: PERCEPTUAL_COMMAND };
 
@@ -189,9 +189,9 @@ mod tests {
         assert_eq!(tracked.0, 0);
     }
 
-    /// `scripts/check_vgg.py` writes the folder.
+    /// `scripts/check/check_vgg.py` writes the folder.
     #[test]
-    #[ignore = "needs the files of scripts/check_vgg.py"]
+    #[ignore = "needs the files of scripts/check/check_vgg.py"]
     fn the_full_network_gives_pytorchs_loss_and_gradient() {
         let folder = std::path::PathBuf::from(std::env::var("CLIFT_CHECK_VGG").expect("the folder of check_vgg.py"));
         let device = Device::flex();

@@ -1,4 +1,4 @@
-//! Weights of networks that cannot come with this program: safetensors files that `scripts/convert_vgg.py` writes.
+//! Weights of networks that cannot come with this program: safetensors files that `scripts/tools/convert_vgg.py` writes.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

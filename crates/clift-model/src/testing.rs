@@ -56,7 +56,7 @@ pub fn assert_close<const D: usize>(got: &Tensor<D>, expected: &Tensor<D>, toler
     assert!(error <= tolerance, "relative error {error:.3e} above {tolerance:.1e}");
 }
 
-/// One file of `data-fixtures/reference`, written by `scripts/make_fixtures.py`.
+/// One file of `data-fixtures/reference`, written by `scripts/fixtures/make_fixtures.py`.
 pub struct Fixture {
     bytes: Vec<u8>,
 }

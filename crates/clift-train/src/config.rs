@@ -66,7 +66,7 @@ pub struct Config {
 pub struct LossConfig {
     /// Weight of the perceptual term; the paper has 0.5. 0 trains on the mean squared error alone.
     pub perceptual_weight: f64,
-    /// Weights of its network, VGG-19 as MatConvNet publishes it, converted by `scripts/convert_vgg.py`.
+    /// Weights of its network, VGG-19 as MatConvNet publishes it, converted by `scripts/tools/convert_vgg.py`.
     pub vgg_weights: Option<PathBuf>,
 }
 

@@ -1,8 +1,8 @@
 //! `clift plan`: parameters, memory and time of a run before it starts.
 //!
 //! Parameters and multiplications are counted. Memory is counted from what the hand-written operations keep. Seconds
-//! come from a shallow network, timed on the device, and the multiplications of the whole one. `docs/plan.md` holds how
-//! far that is from what runs then take.
+//! come from a shallow network, timed on the device, and the multiplications of the whole one.
+//! `docs/results/performance.md` compares plans with measured runs.
 
 mod calibration;
 

@@ -1,7 +1,7 @@
 //! `clift doctor --stability`: hard cases on every device, each against the same code in f64.
 //!
 //! A case is a real computation, forward and, where weights learn from it, backward. Its bound stands beside it with
-//! the reason; a small version of every case runs in the tests, the full one makes `docs/stability.md`.
+//! the reason; a small version of every case runs in the tests, the full one makes `docs/results/stability.md`.
 
 mod attention;
 mod clusters;

@@ -1,4 +1,4 @@
-//! Attacks every reader with damaged files: `bash scripts/attack.sh` (docs/robustness-input.md).
+//! Attacks every reader with damaged files: `bash scripts/check/attack.sh` (docs/results/robustness.md).
 //!
 //! Starts from valid files, mutates them, and reads each. A reader may accept or refuse; it may not panic, hang, take
 //! memory beyond its bound, or refuse without a word. An execution is a function of (reader, seed, number), so that

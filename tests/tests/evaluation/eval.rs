@@ -22,7 +22,7 @@ fn views(place: &Place, folder: &str) -> Vec<(String, String)> {
     views.into_iter().collect()
 }
 
-/// A file as `scripts/convert_vgg.py` writes it, with small random weights.
+/// A file as `scripts/tools/convert_vgg.py` writes it, with small random weights.
 fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) {
     let mut state = 1_u32;
     let mut random = |count: usize, scale: f32| -> Vec<u8> {

@@ -1,4 +1,4 @@
-//! A short attack on every reader with damaged files; `scripts/attack.sh` makes long ones.
+//! A short attack on every reader with damaged files; `scripts/check/attack.sh` makes long ones.
 
 use std::process::Command;
 

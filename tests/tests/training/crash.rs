@@ -1,4 +1,4 @@
-//! The crash test in short form: SIGKILL at random moments, saving included. `scripts/crash_test.py` is the long form.
+//! The crash test in short form: SIGKILL at random moments, saving included. `scripts/check/crash_test.py` is the long form.
 
 use std::time::{Duration, Instant};
 

@@ -1,4 +1,4 @@
-//! One scene in every layout, written by `scripts/make_layout_fixtures.py`.
+//! One scene in every layout, written by `scripts/fixtures/make_layout_fixtures.py`.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! Lens distortion against COLMAP's camera models and OpenCV's undistortion (`scripts/make_layout_fixtures.py`).
+//! Lens distortion against COLMAP's camera models and OpenCV's undistortion (`scripts/fixtures/make_layout_fixtures.py`).
 
 use crate::files::fixtures;
 use clift_data::{Frame, IntrinsicsNorm, Lens, Undistortion};

@@ -19,7 +19,7 @@ pub fn available_bytes(device: DeviceName) -> Option<u64> {
     Some(group.unwrap_or(u64::MAX).min(kib * 1024))
 }
 
-/// Memory that a process of this program holds besides its tensors: its code, threads and buffers (docs/plan.md).
+/// Memory that a process of this program holds besides its tensors: its code, threads and buffers (docs/guide/training.md).
 pub fn own_bytes() -> u64 {
     20 << 20
 }

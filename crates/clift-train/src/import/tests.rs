@@ -17,7 +17,7 @@ use crate::trained::{ModelPath, Trained};
 
 mod keys;
 
-/// Name, variant and heads of every checkpoint that `scripts/make_checkpoints.py` wrote.
+/// Name, variant and heads of every checkpoint that `scripts/fixtures/make_checkpoints.py` wrote.
 const CHECKPOINTS: [(&str, Variant, Option<usize>); 5] = [
     ("re10k", Variant::ReleasedRe10k, Some(3)),
     ("re10k_first", Variant::ReleasedRe10k, Some(5)),

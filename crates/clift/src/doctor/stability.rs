@@ -42,13 +42,13 @@ fn head(small: bool) -> String {
     format!(
         "# Numbers on hard scenes
 
-Made by `{command} --markdown docs/stability.md`; a small version of every case runs in `cargo test`.
+Made by `{command} --markdown docs/results/stability.md`; a small version of every case runs in `cargo test`.
 
-Each case is a real computation in f32 and the same code on the same values in f64, which takes the composed
-operations instead of the kernels. The error is the largest difference over the largest value, of an update over its
-loss and the gradient of every parameter (of parameters whose gradient is below a thousandth of the largest one, over
-that thousandth: a gradient that is zero in exact arithmetic is noise in any other). What is **bold** is beyond its bound.
-What `refused` stands for has a message and a test of its own.
+Each case is a real computation in f32, compared with the same code on the same values in f64, which uses the composed
+operations instead of the kernels. The error is the largest difference over the largest value; of an update, over its
+loss and the gradient of every parameter. A gradient below a thousandth of the largest one is compared with that
+thousandth, because a gradient that is zero in exact arithmetic contains only rounding. **Bold** values exceed their
+bound. `refused` cases have an error message and a test of their own.
 "
     )
 }
