@@ -6,7 +6,7 @@ use clift_model::Grouping;
 
 
 use crate::TrainError;
-use crate::config::{Config, DataConfig, MAX_TOKENS, OptimizerConfig, SourceKind};
+use crate::config::{Config, MAX_TOKENS, OptimizerConfig};
 use crate::error::bad;
 use crate::events::Stage;
 

@@ -50,10 +50,10 @@ pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<
         return Ok(Some(format!("{needs}: fewer context views, or smaller ones, would fit")));
     }
     let (batch_size, _) = batch_sizes(config, part);
-    let was_recomputed = config.recompute;
-    for recompute in [config.recompute, true] {
-        let mut config = Config { recompute, ..config.clone() };
-        let also = if recompute && !was_recomputed { "recompute = true and " } else { "" };
+    let was_on = config.activation_checkpointing;
+    for activation_checkpointing in [config.activation_checkpointing, true] {
+        let mut config = Config { activation_checkpointing, ..config.clone() };
+        let also = if activation_checkpointing && !was_on { "activation_checkpointing = true and " } else { "" };
         for parts in 1..=batch_size {
             set_accumulate(&mut config, part, parts);
             if peak_bytes(&config, part)? <= available {
@@ -61,7 +61,7 @@ pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<
             }
         }
     }
-    Ok(Some(format!("{needs}: even one scene at a time with recompute = true does not fit")))
+    Ok(Some(format!("{needs}: even one scene at a time with activation_checkpointing = true does not fit")))
 }
 
 fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
@@ -82,7 +82,7 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         trained: trained_parts(stage),
         num_scenes,
         is_accumulated: num_scenes < batch_size,
-        recompute: config.recompute,
+        recompute: config.activation_checkpointing,
         scene: largest(config, stage)?,
         num_image_values,
         loss,
@@ -157,8 +157,8 @@ mod tests {
         let mut one_by_one = config.clone();
         one_by_one.stage2.accumulate = config.stage2.batch_size;
         let text = warning(peak(&one_by_one, Stage::Stage2) - 1).expect("too large");
-        assert!(text.contains("recompute = true and stage"), "{text}");
+        assert!(text.contains("activation_checkpointing = true and stage"), "{text}");
         let text = warning(1 << 20).expect("too large");
-        assert!(text.ends_with("even one scene at a time with recompute = true does not fit"), "{text}");
+        assert!(text.ends_with("even one scene at a time with activation_checkpointing = true does not fit"), "{text}");
     }
 }

@@ -106,7 +106,7 @@ pub fn macs_of(model: &ModelConfig, network: Part, scene: &SceneSizes) -> f64 {
 pub fn update_macs(config: &Config, stage: Stage, scene: &SceneSizes) -> f64 {
     let [encoder, condenser, renderer] =
         [Part::Encoder, Part::Condenser, Part::Renderer].map(|network| macs_of(&config.model, network, scene));
-    let passes = if config.recompute { 4.0 } else { 3.0 };
+    let passes = if config.activation_checkpointing { 4.0 } else { 3.0 };
     if stage == Stage::Stage2 { encoder + passes * (condenser + renderer) } else { passes * (encoder + renderer) }
 }
 
