@@ -4,7 +4,8 @@ use std::fmt;
 use std::str::FromStr;
 
 use super::SceneSizes;
-use crate::{Layer, LayerKind, ModelConfig, ModelError, Part};
+use crate::layers::{Layer, LayerKind, Rows};
+use crate::{ModelConfig, ModelError, Part};
 
 /// Multiply-accumulates of a forward pass of one scene. Norms, activations, softmax and the rays of pixels are not
 /// counted.
@@ -87,6 +88,9 @@ impl Macs {
 impl Layer {
     /// Returns the work of this layer in a forward pass of one scene.
     fn macs(&self, sizes: &SceneSizes) -> Macs {
+        if self.rows == [Rows::GatheringTokens] && sizes.num_rows(&[Rows::Members]) == 0 {
+            return Macs::default();
+        }
         let rows = sizes.num_rows(self.rows);
         let pairs = |num_pairs: u64, width: usize| Macs { attention: 2 * num_pairs * width as u64, ..Macs::default() };
         match self.kind {
