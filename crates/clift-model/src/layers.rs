@@ -18,8 +18,8 @@ pub struct Layer {
     pub kind: LayerKind,
     /// What it processes.
     pub rows: Sequence,
-    /// Whether it saves a copy of its input for the backward. A linear layer behind a norm or an activation does not:
-    /// the backward recomputes its input. Nor does a layer of memory tokens: all blocks share one copy of them.
+    /// Whether it saves its input for the backward. A linear layer behind a norm or an activation does not: its input
+    /// is recomputed. Nor does a layer that reads memory tokens: all blocks share one copy of them.
     pub saves_input: bool,
 }
 
@@ -39,15 +39,13 @@ pub enum Part {
 /// Rows of a layer's input, counted by [`SceneSizes`](crate::SceneSizes).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rows {
-    /// Patches of all context views.
+    /// Patches of all context views, and the tokens made of them.
     ContextPatches,
     /// Tokens that are no centroid.
     Members,
-    /// Tokens including centroids, as keys of the condenser.
-    AllTokens,
     /// Centroids.
     StoredTokens,
-    /// Centroids, if there are members: without members the condenser skips its cross-attention.
+    /// Centroids in cross-attention, which the condenser skips without members.
     GatheringTokens,
     /// Tokens that a view is rendered from.
     RenderTokens,
@@ -58,51 +56,21 @@ pub enum Rows {
 /// Rows that are processed as one sequence, usually of one kind.
 pub type Sequence = &'static [Rows];
 
-/// What a layer computes, with its sizes.
+/// What a layer computes, with its columns: all heads together, but for the norm of a head.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LayerKind {
     /// Matrix product.
-    Linear {
-        /// Columns of the input.
-        inputs: usize,
-        /// Columns of the output.
-        outputs: usize,
-        /// Whether a bias is added.
-        bias: bool,
-    },
+    Linear { inputs: usize, outputs: usize, bias: bool },
     /// Layer norm with scale and shift.
-    LayerNorm {
-        /// Columns.
-        width: usize,
-    },
+    LayerNorm { width: usize },
     /// RMS norm of every head of queries or keys, with one scale for all heads.
-    HeadNorm {
-        /// Columns of a head.
-        width: usize,
-        /// Number of heads.
-        heads: usize,
-    },
+    HeadNorm { width: usize, heads: usize },
     /// Softmax attention of every row to every key of its group.
-    Attention {
-        /// Columns of all heads together.
-        width: usize,
-        /// Number of heads.
-        heads: usize,
-        /// Keys and values.
-        keys: Sequence,
-    },
+    Attention { width: usize, heads: usize, keys: Sequence },
     /// Softmax attention of a centroid to the keys of its cluster: each key belongs to one centroid.
-    ClusterAttention {
-        /// Columns of all heads together.
-        width: usize,
-        /// Keys and values.
-        keys: Sequence,
-    },
+    ClusterAttention { width: usize, keys: Sequence },
     /// GELU or `ReLU` between the layers of a feed-forward network.
-    Activation {
-        /// Columns.
-        width: usize,
-    },
+    Activation { width: usize },
 }
 
 impl Layer {
@@ -128,14 +96,13 @@ impl Layer {
 impl ModelConfig {
     /// Lists every layer. Parameters stand in the order of published checkpoints: encoder, token norm, renderer,
     /// condenser; in a block of PyTorch attention, feed-forward network, norms.
-    pub fn layers(&self) -> Vec<Layer> {
+    pub(crate) fn layers(&self) -> Vec<Layer> {
         clift_layers(self)
     }
 }
 
 const CONTEXT: Sequence = &[Rows::ContextPatches];
 const MEMBERS: Sequence = &[Rows::Members];
-const ALL_TOKENS: Sequence = &[Rows::AllTokens];
 const STORED: Sequence = &[Rows::StoredTokens];
 const GATHERING: Sequence = &[Rows::GatheringTokens];
 const RENDER_TOKENS: Sequence = &[Rows::RenderTokens];
@@ -163,8 +130,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
     list.linear("ray_embed", [config.ray_patch_len(), dim], TARGETS, true);
     for i in 0..config.num_renderer_blocks {
         list.enter(Part::Renderer, Some(i), &format!("renderer.blocks.{i}"));
-        let attention = LayerKind::Attention { width: dim, heads: config.num_heads, keys: RENDER_TOKENS };
-        list.decoder_block(TARGETS, "cross_attn", attention, RENDER_TOKENS);
+        list.decoder_block(TARGETS, RENDER_TOKENS);
     }
     list.enter(Part::Renderer, None, "renderer");
     list.norm("output_norm", TARGETS);
@@ -172,8 +138,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
 
     if variant.is_released() {
         list.enter(Part::Condenser, Some(0), "condenser.released");
-        let attention = LayerKind::ClusterAttention { width: dim, keys: ALL_TOKENS };
-        list.decoder_block(STORED, "cluster_attn", attention, ALL_TOKENS);
+        list.decoder_block(STORED, CONTEXT);
         list.linear("gate", [dim, dim], STORED, true);
         return list.layers;
     }
@@ -188,8 +153,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
         // The members are the same in every block.
         list.push("norm_memory", LayerKind::LayerNorm { width: dim }, MEMBERS, false);
         list.norm("norm_ff", STORED);
-        let attention = LayerKind::ClusterAttention { width: dim, keys: MEMBERS };
-        list.cross_attention("cluster_attn", GATHERING, !residual, attention, MEMBERS);
+        list.cross_attention(GATHERING, !residual, MEMBERS);
         list.feed_forward(STORED);
         list.push("gate", LayerKind::Linear { inputs: dim, outputs: dim, bias: false }, STORED, true);
     }
@@ -231,12 +195,16 @@ impl LayerList<'_> {
         self.attention_output(name, rows, rows);
     }
 
-    /// Attention to memory tokens.
-    fn cross_attention(&mut self, name: &str, rows: Sequence, saves_query: bool, attention: LayerKind, keys: Sequence) {
-        let dim = self.config.dim;
-        self.linear(&format!("{name}.q_proj"), [dim, dim], rows, saves_query);
-        self.linear(&format!("{name}.kv_proj"), [dim, 2 * dim], keys, false);
-        self.push(name, attention, rows, true);
+    /// Attention to memory tokens: in the condenser to those of a cluster.
+    fn cross_attention(&mut self, rows: Sequence, saves_query: bool, keys: Sequence) {
+        let ModelConfig { dim: width, num_heads: heads, .. } = *self.config;
+        let (name, kind) = match self.part {
+            Part::Condenser => ("cluster_attn", LayerKind::ClusterAttention { width, keys }),
+            _ => ("cross_attn", LayerKind::Attention { width, heads, keys }),
+        };
+        self.linear(&format!("{name}.q_proj"), [width, width], rows, saves_query);
+        self.linear(&format!("{name}.kv_proj"), [width, 2 * width], keys, false);
+        self.push(name, kind, rows, true);
         self.attention_output(name, rows, keys);
     }
 
@@ -259,9 +227,9 @@ impl LayerList<'_> {
     }
 
     /// PyTorch's pre-norm decoder layer.
-    fn decoder_block(&mut self, rows: Sequence, cross: &str, attention: LayerKind, keys: Sequence) {
+    fn decoder_block(&mut self, rows: Sequence, keys: Sequence) {
         self.self_attention("self_attn", rows);
-        self.cross_attention(cross, rows, false, attention, keys);
+        self.cross_attention(rows, false, keys);
         self.feed_forward(rows);
         for name in ["norm_self", "norm_cross", "norm_ff"] {
             self.norm(name, rows);
@@ -294,16 +262,17 @@ mod tests {
             let listed: BTreeMap<_, _> = config.layers().iter().flat_map(Layer::parameters).collect();
             assert_eq!(listed, built, "{config:?}");
 
-            let counted = Parameters::of(&config);
-            let built = [
-                model.encoder.num_params(),
-                model.lift_norm.num_params(),
-                model.condenser.num_params(),
-                model.renderer.num_params(),
-                model.num_params(),
-            ];
-            let Parameters { encoder, lift_norm, condenser, renderer, total } = counted;
-            assert_eq!([encoder, lift_norm, condenser, renderer, total], built.map(|count| count as u64), "{config:?}");
+            let Parameters { encoder, lift_norm, condenser, renderer, total } = Parameters::of(&config);
+            assert_eq!(
+                [encoder, lift_norm, condenser, renderer, total].map(|count| count as usize),
+                [
+                    model.encoder.num_params(),
+                    model.lift_norm.num_params(),
+                    model.condenser.num_params(),
+                    model.renderer.num_params(),
+                    model.num_params(),
+                ]
+            );
         }
     }
 }

@@ -39,7 +39,7 @@ mod tests {
     use super::*;
     use crate::config::Variant;
     use crate::device::DeviceName;
-    use crate::flops::Convention;
+    use crate::cost::Convention;
     use crate::precision::Precision;
     use crate::scene::{TokenKind, TokenStorage};
     use crate::select::Preset;

@@ -18,21 +18,25 @@ pub fn cpu_devices() -> Vec<Device> {
     [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().expect("a CPU device")).into()
 }
 
-/// Small networks of every variant, the paper's with and without residuals, whose sizes differ from each other.
-pub fn small_configs() -> Vec<ModelConfig> {
-    let literal = CondenserConfig { residual: false, ..CondenserConfig::default() };
-    let all = Variant::ALL.map(|variant| (variant, CondenserConfig::of(variant)));
-    let config = |(variant, condenser)| ModelConfig {
+/// A small network of a variant, whose sizes differ from each other.
+pub fn small_config(variant: Variant) -> ModelConfig {
+    ModelConfig {
         variant,
-        dim: 24,
+        dim: 15,
         num_heads: 3,
-        feed_forward_dim: 40,
-        num_encoder_blocks: 3,
-        num_renderer_blocks: 2,
-        condenser,
-        ..ModelConfig::default()
-    };
-    all.into_iter().chain([(Variant::Paper, literal)]).map(config).collect()
+        feed_forward_dim: 22,
+        num_encoder_blocks: 1,
+        num_renderer_blocks: 3,
+        patch_size: 8,
+        condenser: CondenserConfig::of(variant),
+    }
+}
+
+/// Those of all variants, and the paper's without residuals.
+pub fn small_configs() -> Vec<ModelConfig> {
+    let mut literal = small_config(Variant::Paper);
+    literal.condenser.residual = false;
+    Variant::ALL.map(small_config).into_iter().chain([literal]).collect()
 }
 
 /// Values in f64, row-major.

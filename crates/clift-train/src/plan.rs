@@ -159,18 +159,8 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
     let compute_s = rates.map(|rates| {
         macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_picture
     });
-    Ok(PartPlan {
-        part: stage.name(),
-        unit: "step",
-        count: Some(steps),
-        trained_parameters,
-        gmacs: macs / 1e9,
-        peak_bytes: peak_bytes(config, stage)?,
-        compute_s,
-        busy_threads: rates.map(|rates| rates.busy),
-        loading_s: None,
-        seconds: None,
-    })
+    let part = PartPlan { trained_parameters, ..untimed(config, stage, macs)? };
+    Ok(PartPlan { unit: "step", count: Some(steps), compute_s, busy_threads: rates.map(|rates| rates.busy), ..part })
 }
 
 fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
@@ -196,18 +186,8 @@ fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
         (count, SourceKind::Synthetic) => Some(count.min(config.data.synthetic.num_scenes)),
         (count, _) => Some(count),
     };
-    Ok(PartPlan {
-        part: Stage::Clusters.name(),
-        unit: "scene",
-        count: num_scenes.map(|count| (count * config.clusters.num_passes) as u64),
-        trained_parameters: 0,
-        gmacs: macs / 1e9,
-        peak_bytes: peak_bytes(config, Stage::Clusters)?,
-        compute_s,
-        busy_threads: None,
-        loading_s: None,
-        seconds: None,
-    })
+    let count = num_scenes.map(|count| (count * config.clusters.num_passes) as u64);
+    Ok(PartPlan { count, compute_s, ..untimed(config, Stage::Clusters, macs)? })
 }
 
 fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
@@ -243,14 +223,20 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     } else {
         None
     };
+    let count = (eval.num_scenes > 0).then_some(eval.num_scenes as u64);
+    Ok(PartPlan { count, compute_s, ..untimed(config, Stage::Eval, encoder + rest)? })
+}
+
+/// What is counted of a part that works off scenes and trains nothing.
+fn untimed(config: &Config, part: Stage, macs: f64) -> Result<PartPlan, TrainError> {
     Ok(PartPlan {
-        part: Stage::Eval.name(),
+        part: part.name(),
         unit: "scene",
-        count: (eval.num_scenes > 0).then_some(eval.num_scenes as u64),
+        count: None,
         trained_parameters: 0,
-        gmacs: (encoder + rest) / 1e9,
-        peak_bytes: peak_bytes(config, Stage::Eval)?,
-        compute_s,
+        gmacs: macs / 1e9,
+        peak_bytes: peak_bytes(config, part)?,
+        compute_s: None,
         busy_threads: None,
         loading_s: None,
         seconds: None,

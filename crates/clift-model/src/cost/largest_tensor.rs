@@ -4,7 +4,8 @@
 use super::SceneSizes;
 use crate::attention::MAX_SCORES;
 use crate::kmeans::seeding::MAX_TABLE_LEN;
-use crate::{Layer, LayerKind, ModelConfig, Part, Sequence};
+use crate::layers::{Layer, LayerKind, Sequence};
+use crate::{ModelConfig, Part};
 
 /// Lists the tensors that can be the largest of one network at work on equal scenes: what each is, and its number of
 /// values.

@@ -6,7 +6,12 @@ use strum::{Display, IntoStaticStr, VariantArray};
 
 use super::SceneSizes;
 use crate::names::parse_value;
-use crate::{Layer, LayerKind, ModelConfig, ModelError, Part};
+use crate::ModelConfig;
+use crate::ModelError;
+use crate::Part;
+use crate::layers::Layer;
+use crate::layers::LayerKind;
+use crate::layers::Rows;
 
 /// Multiply-accumulates of a forward pass of one scene. Norms, activations, softmax and the rays of pixels are not
 /// counted.
@@ -76,6 +81,9 @@ impl Macs {
 impl Layer {
     /// Returns the work of this layer in a forward pass of one scene.
     fn macs(&self, sizes: &SceneSizes) -> Macs {
+        if self.rows == [Rows::GatheringTokens] && sizes.num_rows(&[Rows::Members]) == 0 {
+            return Macs::default();
+        }
         let rows = sizes.num_rows(self.rows);
         let pairs = |num_pairs: u64, width: usize| Macs { attention: 2 * num_pairs * width as u64, ..Macs::default() };
         match self.kind {

@@ -2,7 +2,8 @@
 // In f32 values: x = N D of a block's own rows
 
 use super::{Parameters, SceneSizes, kmeans_values};
-use crate::{Layer, LayerKind, ModelConfig, Part, Rows};
+use crate::layers::{Layer, LayerKind, Rows};
+use crate::{ModelConfig, Part};
 
 /// Bytes of an f32.
 const F32: f64 = 4.0;
@@ -11,7 +12,7 @@ const F32: f64 = 4.0;
 /// Measured at 1.05 to 1.22 (docs/plan.md).
 const HEAP: f64 = 1.2;
 
-/// A segment of a forward and backward pass; numbers of f32 values.
+/// A segment of a forward and backward pass of one scene; numbers of f32 values.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Segment {
     /// Kept from the forward until the segment's backward is done.
@@ -24,19 +25,20 @@ pub struct Segment {
     pub parameters: f64,
 }
 
-/// Returns the most values alive at once: the forward adds what is kept; the backward, from the end, gives it back and
-/// leaves gradients of parameters.
-fn peak(segments: &[Segment]) -> f64 {
+/// Returns the most values alive at once, of segments at work on `num_scenes` scenes: the forward adds what is kept; the
+/// backward, from the end, gives it back and leaves gradients of parameters.
+fn peak(segments: &[Segment], num_scenes: usize) -> f64 {
+    let scenes = num_scenes as f64;
     let (mut kept, mut most) = (0.0_f64, 0.0_f64);
     for segment in segments {
-        most = most.max(kept + segment.forward.max(segment.kept));
-        kept += segment.kept;
+        most = most.max(kept + scenes * segment.forward.max(segment.kept));
+        kept += scenes * segment.kept;
     }
     let mut gradients = 0.0;
     for segment in segments.iter().rev() {
         gradients += segment.parameters;
-        most = most.max(kept + segment.working + gradients);
-        kept -= segment.kept;
+        most = most.max(kept + scenes * segment.working + gradients);
+        kept -= scenes * segment.kept;
     }
     most
 }
@@ -56,7 +58,7 @@ pub struct UpdateSizes {
     pub scene: SceneSizes,
     /// Values of a scene's images, context and target.
     pub num_image_values: usize,
-    /// The network of a perceptual loss on all target views, zeros without one.
+    /// The network of a perceptual loss on a scene's target views, zeros without one.
     pub loss: Segment,
     /// The weights of that network.
     pub loss_parameters: f64,
@@ -69,7 +71,7 @@ pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
     let trained = parameters.of_parts(sizes.trained) as f64;
     let images = (sizes.num_scenes * sizes.num_image_values) as f64;
     let earlier = if sizes.is_accumulated { trained } else { 0.0 };
-    let backward = HEAP * peak(&segments(config, &layers, sizes)) + images + earlier;
+    let backward = HEAP * peak(&segments(config, &layers, sizes), sizes.num_scenes) + images + earlier;
     let matrix_len = |layer: &Layer| match layer.kind {
         LayerKind::Linear { inputs, outputs, .. } => inputs * outputs,
         _ => 0,
@@ -82,16 +84,14 @@ pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
     F32 * (standing + backward.max(optimizer))
 }
 
-/// Returns the segments of an update in the order of its forward pass.
+/// Returns the segments of a scene's share of an update, in the order of its forward pass.
 fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<Segment> {
-    let UpdateSizes { trained, num_scenes, recompute, scene, .. } = *sizes;
-    let values = |rows: &[Rows]| num_scenes as f64 * (scene.num_rows(rows) as f64) * config.dim as f64;
+    let UpdateSizes { trained, recompute, scene, .. } = *sizes;
+    let values = |rows: &[Rows]| scene.num_rows(rows) as f64 * config.dim as f64;
     let of_part = |part: Part| {
         let groups = layers.chunk_by(|a, b| (a.part, a.block) == (b.part, b.block));
-        groups.filter(move |layers| layers[0].part == part).map(move |layers| {
-            let group = LayerGroup { layers, config, scene, num_scenes: num_scenes as f64 };
-            group.segment(trained.contains(&part), recompute)
-        })
+        let groups = groups.filter(move |layers| layers[0].part == part);
+        groups.map(move |layers| segment(config, layers, &scene, trained.contains(&part), recompute))
     };
     let keep = |kept: f64| Segment { kept, ..Segment::default() };
     let mut segments: Vec<Segment> = of_part(Part::Encoder).collect();
@@ -116,125 +116,63 @@ fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<
     segments
 }
 
-/// The layers of one block, or consecutive layers outside the blocks, at work on some scenes.
-struct LayerGroup<'a> {
-    layers: &'a [Layer],
-    config: &'a ModelConfig,
-    scene: SceneSizes,
-    num_scenes: f64,
-}
-
-impl LayerGroup<'_> {
-    fn segment(&self, is_trained: bool, recompute: bool) -> Segment {
-        let first = &self.layers[0];
-        let segment = match first.block {
-            Some(_) if !is_trained => {
-                let x = self.own_values();
-                return Segment { forward: forward_values(self.config, x) + x, ..Segment::default() };
+/// Returns the segment of one block, or of consecutive layers outside the blocks. What it keeps follows from its
+/// layers; what it needs on top is a formula of its kind, compared with measured peaks.
+fn segment(config: &ModelConfig, layers: &[Layer], scene: &SceneSizes, is_trained: bool, recompute: bool) -> Segment {
+    let first = &layers[0];
+    let values = |count: u64, width: usize| (count * width as u64) as f64;
+    let x = values(scene.num_rows(first.rows), config.dim);
+    let (mut saved, mut head_norms, mut hidden) = (0.0, 0.0, 0.0);
+    // Needed for keys and values of other rows: while the backward runs, and while the forward runs.
+    let (mut cross_working, mut cross_forward) = (0.0, 0.0);
+    for layer in layers {
+        let rows = scene.num_rows(layer.rows);
+        let input = match layer.kind {
+            LayerKind::Linear { inputs: width, .. } | LayerKind::LayerNorm { width } => values(rows, width),
+            LayerKind::Activation { width } => {
+                hidden = values(rows, width);
+                hidden
             }
-            Some(_) => self.block(),
-            None if first.saves_input => self.embedding(),
-            None => self.output(),
-        };
-        match first.block {
-            _ if !is_trained => Segment { kept: 0.0, parameters: 0.0, ..segment },
-            Some(_) if recompute => {
-                Segment { kept: self.own_values(), working: segment.working + segment.kept, ..segment }
+            LayerKind::HeadNorm { width, heads } => {
+                // As measured: before and after, and beside the values of attention.
+                head_norms += 2.5 * values(rows, width * heads);
+                0.0
             }
-            _ => segment,
-        }
-    }
-
-    /// Patches are gathered from images and rays, 15 values a pixel on the way.
-    fn embedding(&self) -> Segment {
-        let (patches, values) = (self.saved(), self.own_values());
-        Segment { kept: patches, working: values, forward: patches * 2.5 + values, parameters: self.parameters() }
-    }
-
-    /// The norm's input, the sigmoid's result, the difference; images and their gradients in two orders.
-    fn output(&self) -> Segment {
-        let rgb = self.num_scenes * self.values(self.layers[0].rows, self.config.rgb_patch_len());
-        Segment {
-            kept: self.saved() + 2.0 * rgb,
-            working: 2.0 * self.own_values() + 3.0 * rgb,
-            forward: 4.0 * rgb,
-            parameters: self.parameters(),
-        }
-    }
-
-    /// A transformer block. What it saves follows from its layers; what it needs on top is a formula of its kind of
-    /// attention to memory, compared with measured peaks.
-    fn block(&self) -> Segment {
-        let (x, saved) = (self.own_values(), self.saved());
-        let hidden = self.sum(|layer| match layer.kind {
-            LayerKind::Activation { width } => self.values(layer.rows, width),
-            _ => 0.0,
-        });
-        let head_norms = self.sum(|layer| match layer.kind {
-            // As measured: before and after, and beside the values of attention.
-            LayerKind::HeadNorm { width, heads } => 2.5 * self.values(layer.rows, width * heads),
-            _ => 0.0,
-        });
-        let mut memory = (0.0, 0.0);
-        for layer in self.layers {
-            let own = |count: u64, width: usize| self.num_scenes * (count * width as u64) as f64;
-            match layer.kind {
-                LayerKind::Attention { width, keys, .. } if keys != layer.rows => {
-                    let gathered = 2.0 * own(self.scene.num_gathered(keys), width);
-                    let projected = 2.0 * own(self.scene.num_rows(keys), width);
+            LayerKind::Attention { width, keys, .. } | LayerKind::ClusterAttention { width, keys } => {
+                let gathered = 2.0 * values(scene.num_gathered(keys), width);
+                if matches!(layer.kind, LayerKind::ClusterAttention { .. }) {
+                    (cross_working, cross_forward) = (3.0 * x + 1.5 * gathered, gathered / 2.0);
+                } else if keys != layer.rows {
                     // The gradient of what the views gathered, of what was projected, and of the tokens, added up over
                     // the blocks.
-                    memory = (3.0 * x + gathered + 2.0 * projected - hidden, projected);
+                    let projected = 2.0 * values(scene.num_rows(keys), width);
+                    (cross_working, cross_forward) = (3.0 * x + gathered + 2.0 * projected, projected);
                 }
-                LayerKind::ClusterAttention { width, keys } => {
-                    let members = own(self.scene.num_rows(keys), width);
-                    memory = (3.0 * x + 3.0 * members - hidden, members);
-                }
-                _ => {}
+                values(rows, width) + gathered
             }
+        };
+        saved += if layer.saves_input { input } else { 0.0 };
+    }
+    let parameters = layers.iter().map(Layer::num_parameters).sum::<u64>() as f64;
+    let rgb = values(scene.num_rows(first.rows), config.rgb_patch_len());
+    match first.block {
+        Some(_) if !is_trained => Segment { forward: forward_values(config, x) + x, ..Segment::default() },
+        Some(_) => {
+            let kept = saved + head_norms;
+            // The gradients of the sum and of the hidden values, and the norm recomputed.
+            let working = (2.0 * x + hidden).max(cross_working - hidden);
+            let forward = saved + hidden + cross_forward;
+            let (kept, working) = if recompute { (x, working + kept) } else { (kept, working) };
+            Segment { kept, working, forward, parameters }
         }
-        // The gradients of the sum and of the hidden values, and the norm recomputed.
-        let feed_forward = 2.0 * x + hidden;
-        Segment {
-            kept: saved + head_norms,
-            working: feed_forward.max(memory.0),
-            forward: saved + hidden + memory.1,
-            parameters: self.parameters(),
+        // Patches are gathered from images and rays, 15 values a pixel on the way.
+        None if matches!(first.kind, LayerKind::Linear { .. }) => {
+            let forward = saved * 2.5 + x;
+            let (kept, parameters) = if is_trained { (saved, parameters) } else { (0.0, 0.0) };
+            Segment { kept, working: x, forward, parameters }
         }
-    }
-
-    /// Values that layers save for their backward, but for the norms of heads.
-    fn saved(&self) -> f64 {
-        self.sum(|layer| match layer.kind {
-            _ if !layer.saves_input => 0.0,
-            LayerKind::Linear { inputs: width, .. }
-            | LayerKind::LayerNorm { width }
-            | LayerKind::Activation { width } => self.values(layer.rows, width),
-            // Queries, keys and values.
-            LayerKind::Attention { width, keys, .. } | LayerKind::ClusterAttention { width, keys } => {
-                let key_values = 2 * self.scene.num_gathered(keys) * width as u64;
-                self.values(layer.rows, width) + key_values as f64
-            }
-            LayerKind::HeadNorm { .. } => 0.0,
-        })
-    }
-
-    /// Values of the rows that the first layer processes, at the width of a token.
-    fn own_values(&self) -> f64 {
-        self.num_scenes * self.values(self.layers[0].rows, self.config.dim)
-    }
-
-    fn parameters(&self) -> f64 {
-        self.layers.iter().map(Layer::num_parameters).sum::<u64>() as f64
-    }
-
-    /// Sums values of layers over all scenes.
-    fn sum(&self, of_scene: impl Fn(&Layer) -> f64) -> f64 {
-        self.num_scenes * self.layers.iter().map(of_scene).sum::<f64>()
-    }
-
-    fn values(&self, rows: &[Rows], width: usize) -> f64 {
-        (self.scene.num_rows(rows) * width as u64) as f64
+        // The norm's input, the sigmoid's result, the difference; images and their gradients in two orders.
+        None => Segment { kept: saved + 2.0 * rgb, working: 2.0 * x + 3.0 * rgb, forward: 4.0 * rgb, parameters },
     }
 }
 
@@ -362,20 +300,21 @@ mod tests {
         ] {
             let mut groups = layers.chunk_by(|a, b| (a.part, a.block) == (b.part, b.block));
             let layers = groups.find(|layers| layers[0].part == part && layers[0].block.is_some()).expect("a block");
-            let group = LayerGroup { layers, config: &config, scene, num_scenes: 1.0 };
-            assert_eq!(group.segment(true, false).kept, expected, "{part:?}");
+            assert_eq!(segment(&config, layers, &scene, true, false).kept, expected, "{part:?}");
         }
     }
 
     #[test]
     fn the_peak_is_where_the_kept_the_working_and_the_gradients_are_most() {
         let segment = |kept, working, forward, parameters| Segment { kept, working, forward, parameters };
-        assert_eq!(peak(&[]), 0.0);
+        assert_eq!(peak(&[], 1), 0.0);
         // At the start of the backward.
-        assert_eq!(peak(&[segment(5.0, 1.0, 0.0, 1.0), segment(5.0, 2.0, 0.0, 1.0)]), 13.0);
+        assert_eq!(peak(&[segment(5.0, 1.0, 0.0, 1.0), segment(5.0, 2.0, 0.0, 1.0)], 1), 13.0);
         // At its end, by the gradients.
-        assert_eq!(peak(&[segment(1.0, 1.0, 0.0, 10.0), segment(1.0, 1.0, 0.0, 10.0)]), 22.0);
+        assert_eq!(peak(&[segment(1.0, 1.0, 0.0, 10.0), segment(1.0, 1.0, 0.0, 10.0)], 1), 22.0);
+        // The same of two scenes: gradients of parameters are summed.
+        assert_eq!(peak(&[segment(1.0, 1.0, 0.0, 10.0), segment(1.0, 1.0, 0.0, 10.0)], 2), 24.0);
         // In the forward.
-        assert_eq!(peak(&[segment(1.0, 0.0, 9.0, 0.0), segment(2.0, 1.0, 0.0, 0.0)]), 9.0);
+        assert_eq!(peak(&[segment(1.0, 0.0, 9.0, 0.0), segment(2.0, 1.0, 0.0, 0.0)], 1), 9.0);
     }
 }

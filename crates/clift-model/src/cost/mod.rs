@@ -1,4 +1,4 @@
-//! The cost of a network, derived from its [`layers`](crate::ModelConfig::layers) and the sizes of a scene.
+//! The cost of a network, derived from the list of its layers and the sizes of a scene.
 //!
 //! [`SceneSizes`] counts the rows that layers process; the other files multiply them out: [`Parameters`], [`Macs`],
 //! bytes in memory, and the largest tensors.

@@ -2,7 +2,8 @@
 
 use serde::Serialize;
 
-use crate::{Layer, ModelConfig, Part};
+use crate::layers::Layer;
+use crate::{ModelConfig, Part};
 
 /// Parameters of the networks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

@@ -1,6 +1,6 @@
 //! Counts of the tokens, patches and views of a scene.
 
-use crate::{ModelConfig, Rows};
+use crate::layers::Rows;
 
 /// Sizes of one scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -34,13 +34,13 @@ impl SceneSizes {
 
     /// Tokens that keys and values are projected from: those of the scene, or the subsets of its views if those are
     /// fewer.
-    pub fn num_projected(&self) -> usize {
+    fn num_projected(&self) -> usize {
         let all = self.num_storage_tokens.unwrap_or(self.num_tokens);
         if self.is_per_view { all.min(self.num_targets * self.num_render_tokens) } else { self.num_render_tokens }
     }
 
     /// Groups of rows: attention stays inside a group. Several for views, which do not attend to each other.
-    pub fn num_groups(&self, rows: &[Rows]) -> u64 {
+    pub(super) fn num_groups(&self, rows: &[Rows]) -> u64 {
         let is_per_view = |rows: &Rows| match rows {
             Rows::TargetPatches => true,
             Rows::RenderTokens => self.is_per_view,
@@ -50,15 +50,11 @@ impl SceneSizes {
     }
 
     /// Rows of one group.
-    pub fn group_len(&self, rows: &[Rows]) -> u64 {
+    pub(super) fn group_len(&self, rows: &[Rows]) -> u64 {
         let stored = self.num_storage_tokens.unwrap_or(0);
-        let members = self.num_storage_tokens.map_or(0, |stored| self.num_tokens.saturating_sub(stored));
         let len = |rows: &Rows| match rows {
             Rows::ContextPatches => self.num_tokens,
-            Rows::AllTokens if stored == 0 => 0,
-            Rows::AllTokens => self.num_tokens,
-            Rows::Members => members,
-            Rows::GatheringTokens if members == 0 => 0,
+            Rows::Members => self.num_tokens.saturating_sub(stored),
             Rows::StoredTokens | Rows::GatheringTokens => stored,
             Rows::RenderTokens => self.num_render_tokens,
             Rows::TargetPatches => self.num_patches,
@@ -67,28 +63,12 @@ impl SceneSizes {
     }
 
     /// Rows of all groups, as attention reads them.
-    pub fn num_gathered(&self, rows: &[Rows]) -> u64 {
+    pub(super) fn num_gathered(&self, rows: &[Rows]) -> u64 {
         self.num_groups(rows) * self.group_len(rows)
     }
 
     /// Rows that a layer processes. Keys and values of render tokens are projected before views gather theirs.
-    pub fn num_rows(&self, rows: &[Rows]) -> u64 {
+    pub(super) fn num_rows(&self, rows: &[Rows]) -> u64 {
         if rows == [Rows::RenderTokens] { self.num_projected() as u64 } else { self.num_gathered(rows) }
-    }
-}
-
-impl ModelConfig {
-    /// Returns the sizes of a scene of `num_context` views of which `num_targets` are rendered from all tokens.
-    ///
-    /// # Errors
-    /// [`ModelError::NotDivisible`](crate::ModelError::NotDivisible) if a side is no positive multiple of the patch.
-    pub fn scene_sizes(
-        &self,
-        num_context: usize,
-        num_targets: usize,
-        [height, width]: [usize; 2],
-    ) -> Result<SceneSizes, crate::ModelError> {
-        let num_patches = self.num_tokens(1, height, width)?;
-        Ok(SceneSizes::new(num_context * num_patches, num_targets, num_patches))
     }
 }

@@ -137,21 +137,9 @@ pub fn sizes<'a>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::small_config;
 
     type Shapes = BTreeMap<String, Vec<u64>>;
-
-    fn config(variant: Variant) -> ModelConfig {
-        ModelConfig {
-            variant,
-            dim: 15,
-            num_heads: 3,
-            feed_forward_dim: 22,
-            num_encoder_blocks: 1,
-            num_renderer_blocks: 3,
-            patch_size: 8,
-            condenser: CondenserConfig::of(variant),
-        }
-    }
 
     fn shapes(config: &ModelConfig, has_condenser: bool) -> Shapes {
         let wide = |shape: Vec<usize>| shape.into_iter().map(|size| size as u64).collect();
@@ -167,7 +155,7 @@ mod tests {
         for variant in Variant::ALL {
             for residual in [true, false] {
                 for with_condenser in [true, false] {
-                    let mut config = config(variant);
+                    let mut config = small_config(variant);
                     config.condenser.residual = residual || variant.is_released() || !with_condenser;
                     let heads = (!variant.has_norms()).then_some(3);
                     let got = read(variant, heads, &shapes(&config, with_condenser));
@@ -198,7 +186,7 @@ mod tests {
     #[test]
     fn one_misshapen_tensor_does_not_change_the_sizes() {
         for variant in Variant::ALL {
-            let config = config(variant);
+            let config = small_config(variant);
             let all = shapes(&config, true);
             for key in all.keys() {
                 let mut changed = all.clone();
@@ -213,7 +201,7 @@ mod tests {
 
     #[test]
     fn a_stray_key_makes_no_layer_and_a_missing_layer_no_smaller_network() {
-        let config = config(Variant::ReleasedRe10k);
+        let config = small_config(Variant::ReleasedRe10k);
         let mut stray = shapes(&config, true);
         stray.insert("decoder.layers.3.norm1.weight".into(), vec![15]);
         stray.insert("encoder.layers.18446744073709551615.norm1.weight".into(), vec![15]);
@@ -226,7 +214,7 @@ mod tests {
     #[test]
     fn heads_are_known_where_norms_or_the_published_width_show_them() {
         let knows = |variant, dim| {
-            let config = ModelConfig { dim, ..config(variant) };
+            let config = ModelConfig { dim, ..small_config(variant) };
             let got = read(variant, None, &shapes(&config, true));
             (got.knows_heads, got.config.num_heads)
         };

@@ -5,7 +5,7 @@ use clift_model::adapter::max_tensor_bytes;
 use clift_model::cost::{kmeans_values, largest_tensors};
 use clift_model::{Part, SceneSizes};
 
-use super::scene_sizes::{VIEWS_PER_PASS, batch_sizes, cluster_counts, scene, set_accumulate, stored};
+use super::scene_sizes::{VIEWS_PER_PASS, batch_sizes, cluster_counts, scene, set_accumulate, stored, trained_parts};
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::Stage;
@@ -105,25 +105,32 @@ fn setting_that_fits(config: &Config, part: Stage, limit: u64) -> Result<(&'stat
 
 /// Lists the tensors that can be the largest of a part, with their numbers of values.
 fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainError> {
-    match part {
-        Stage::Stage1 | Stage::Stage2 => of_update(config, part),
-        Stage::Clusters => of_clusters(config),
-        Stage::Eval => of_evaluation(config),
-    }
-}
-
-fn of_update(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainError> {
-    let views = &config.data.views;
-    let (_, num_scenes) = batch_sizes(config, part);
-    let scene = scene(config, views.max_context, views.num_targets)?;
+    let (eval, views) = (&config.eval, &config.data.views);
+    let (num_context, num_targets) = match part {
+        Stage::Eval => (eval.num_context, eval.num_targets.clamp(1, VIEWS_PER_PASS)),
+        _ => (views.max_context, views.num_targets),
+    };
+    let scene = scene(config, num_context, num_targets)?;
+    let num_scenes = if trained_parts(part).is_empty() { 1 } else { batch_sizes(config, part).1 };
     let of = |network: Part, scene: &SceneSizes| largest_tensors(&config.model, network, scene, num_scenes);
     let mut all = of(Part::Encoder, &scene);
-    if part == Stage::Stage2 {
-        let [fewest, most] = fewest_and_most(scene, &cluster_counts(config, scene.num_tokens)?);
-        all.extend(of(Part::Condenser, &fewest));
-        all.extend(of(Part::Condenser, &most));
-        all.extend(of(Part::Renderer, &most));
-    } else {
+    let counts = match part {
+        Stage::Stage1 => Vec::new(),
+        Stage::Stage2 | Stage::Clusters => cluster_counts(config, scene.num_tokens)?,
+        // Of an index, which may have fewer contexts or more, nothing is known here.
+        Stage::Eval => {
+            eval.storage.iter().map(|count| count.of(scene.num_tokens)).collect::<Result<_, _>>().unwrap_or_default()
+        }
+    };
+    let most = counts.into_iter().max().unwrap_or(scene.num_tokens);
+    if matches!(part, Stage::Clusters | Stage::Eval) {
+        all.push(("the distances of K-means".into(), kmeans_values(scene.num_tokens, most)));
+    }
+    if matches!(part, Stage::Stage2 | Stage::Eval) {
+        all.extend(of(Part::Condenser, &stored(scene, most)));
+        all.extend(of(Part::Renderer, &stored(scene, most)));
+    }
+    if part == Stage::Stage1 {
         let [low, high] = config.stage1.keep_tokens;
         let kept = ((scene.num_tokens as f64 * high) as usize).clamp(1, scene.num_tokens);
         // Shares are drawn: with all tokens views share them, with all but one every view has a set of its own.
@@ -135,49 +142,12 @@ fn of_update(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainEr
             all.extend(of(Part::Renderer, &scene));
         }
     }
-    if config.loss.perceptual_weight > 0.0 {
-        all.push(("the first maps of the perceptual loss".into(), num_scenes as u64 * vgg_maps(config, &scene)));
+    let first_maps = (num_scenes * num_targets * config.data.width * config.data.height) as u64 * VGG_CHANNELS;
+    if !trained_parts(part).is_empty() && config.loss.perceptual_weight > 0.0 {
+        all.push(("the first maps of the perceptual loss".into(), first_maps));
     }
-    Ok(all)
-}
-
-/// The scenes with the fewest and the most stored tokens of `counts`.
-fn fewest_and_most(scene: SceneSizes, counts: &[usize]) -> [SceneSizes; 2] {
-    let all = scene.num_tokens;
-    [counts.iter().min(), counts.iter().max()].map(|count| stored(scene, count.copied().unwrap_or(all)))
-}
-
-/// Values of the first feature maps of all target views.
-fn vgg_maps(config: &Config, scene: &SceneSizes) -> u64 {
-    (scene.num_targets * config.data.width * config.data.height) as u64 * VGG_CHANNELS
-}
-
-fn kmeans(scene: &SceneSizes) -> (String, u64) {
-    ("the distances of K-means".into(), kmeans_values(scene.num_tokens, scene.num_render_tokens))
-}
-
-fn of_clusters(config: &Config) -> Result<Vec<(String, u64)>, TrainError> {
-    let scene = scene(config, config.data.views.max_context, 0)?;
-    let mut all = largest_tensors(&config.model, Part::Encoder, &scene, 1);
-    let [_, most] = fewest_and_most(scene, &cluster_counts(config, scene.num_tokens)?);
-    all.push(kmeans(&most));
-    Ok(all)
-}
-
-fn of_evaluation(config: &Config) -> Result<Vec<(String, u64)>, TrainError> {
-    let eval = &config.eval;
-    let scene = scene(config, eval.num_context, eval.num_targets.clamp(1, VIEWS_PER_PASS))?;
-    let counts = eval.storage.iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>();
-    // Of an index, which may have fewer contexts or more, nothing is known here.
-    let [fewest, most] = fewest_and_most(scene, &counts.unwrap_or_else(|_| vec![scene.num_tokens]));
-    let of = |network: Part, scene: &SceneSizes| largest_tensors(&config.model, network, scene, 1);
-    let mut all = of(Part::Encoder, &scene);
-    all.push(kmeans(&most));
-    all.extend(of(Part::Condenser, &fewest));
-    all.extend(of(Part::Condenser, &most));
-    all.extend(of(Part::Renderer, &most));
-    if eval.lpips_path().is_some() {
-        all.push(("the first maps of LPIPS".into(), vgg_maps(config, &scene)));
+    if part == Stage::Eval && eval.lpips_path().is_some() {
+        all.push(("the first maps of LPIPS".into(), first_maps));
     }
     Ok(all)
 }
