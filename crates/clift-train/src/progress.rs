@@ -153,7 +153,9 @@ mod tests {
 
     fn state(values: &[f64], psnr: f64) -> State {
         let mut recent = Recent::default();
-        values.iter().for_each(|&value| recent.push(value, -value));
+        for &value in values {
+            recent.push(value, -value);
+        }
         let progress = Progress { step: 7, best: Some(Best { step: 5, psnr }), recent, ..Progress::default() };
         State { version: VERSION, progress, files: BTreeMap::new(), model: None, loss_scale: None }
     }
