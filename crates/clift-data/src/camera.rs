@@ -5,7 +5,8 @@ use glam::DVec3;
 use crate::error::DataError;
 pub use crate::pose::Pose;
 
-/// Pinhole intrinsics in pixels of one image; the centre of the pixel in column `i` and row `j` is `(i + 0.5, j + 0.5)`.
+/// Pinhole intrinsics in pixels of one image; the pixel in column `i` and row `j` has its centre at
+/// `(i + 0.5, j + 0.5)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Intrinsics {
     /// Horizontal focal length in pixels.

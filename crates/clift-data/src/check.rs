@@ -19,8 +19,8 @@ pub use result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
 pub struct Checked {
     /// The findings.
     pub check: SceneCheck,
-    /// Two frames with epipolar lines: dots of one colour are the same corner in both and must lie on the lines of their
-    /// colour. `None` if too few corners match.
+    /// Two frames with epipolar lines: dots of one colour are the same corner in both and must lie on the lines of
+    /// their colour. `None` if too few corners match.
     pub picture: Option<Frame>,
 }
 

@@ -52,8 +52,8 @@ impl Features {
         features
     }
 
-    /// Pairs of corners that are clearly most similar to each other and agree with one epipolar geometry. Deterministic;
-    /// empty if too few agree, as for images of different places.
+    /// Pairs of corners that are clearly most similar to each other and agree with one epipolar geometry.
+    /// Deterministic; empty if too few agree, as for images of different places.
     pub fn matches(&self, other: &Self) -> Vec<Match> {
         let pairs = matching::mutual(&self.descriptors, &other.descriptors);
         let matches: Vec<Match> =

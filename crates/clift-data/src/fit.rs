@@ -35,8 +35,8 @@ impl Crop {
 /// `scaled_width - width` is odd, as in published results. With `exact_principal_point` it moves with the crop:
 /// `cx = cx_norm * scaled_width - margin / 2` with the margin halved downwards.
 ///
-// Departs from pixelSplat, which keeps cx_norm: equal for a principal point at the centre, as in RealEstate10K, and off by
-// (cx_norm - 0.5) * margin elsewhere, as in photos of phones.
+// Departs from pixelSplat, which keeps cx_norm: equal for a principal point at the centre, as in RealEstate10K, and off
+// by (cx_norm - 0.5) * margin elsewhere, as in photos of phones.
 ///
 /// # Errors
 /// [`DataError::Upscale`] if `width` or `height` is larger than the image's.

@@ -74,8 +74,8 @@ pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
     Ok([width as usize, height as usize])
 }
 
-/// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated. Reads the last bytes of most files, and all
-/// bytes of those with data after the image, as phones append it.
+/// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated. Reads the last bytes of most files, and
+/// all bytes of those with data after the image, as phones append it.
 ///
 /// # Errors
 /// [`DataError::Io`], and [`DataError::BadScene`] for a truncated file.

@@ -1,4 +1,4 @@
-//! Lens distortion in the models of `OpenCV` and COLMAP.
+//! Lens distortion in the models of OpenCV and COLMAP.
 
 use glam::{DMat2, DVec2};
 

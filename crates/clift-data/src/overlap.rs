@@ -9,8 +9,8 @@ use crate::pose::Pose;
 const SIDE: usize = 32;
 
 /// Share in `[0, 1]` of `from`'s image that `to` may see: of a grid of 32 x 32 rays, those with any point in front of
-/// `from` that projects into the image of `to`. pixelSplat's measure, which needs no depth: the epipolar line of the ray
-/// crosses the other image. An upper bound of the true overlap.
+/// `from` that projects into the image of `to`. pixelSplat's measure, which needs no depth: the epipolar line of the
+/// ray crosses the other image. An upper bound of the true overlap.
 pub fn overlap(from: &Camera, to: &Camera) -> f64 {
     let motion = to.c2w.inverse().after(from.c2w);
     let place = |index: usize| (index as f64 + 0.5) / SIDE as f64;

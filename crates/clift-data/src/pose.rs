@@ -1,6 +1,6 @@
 //! Rigid poses in f64.
 //!
-//! Camera axes are `OpenCV`'s: +x right, +y down, +z forward. The name of a pose gives its direction: `c2w` (camera to
+//! Camera axes are OpenCV's: +x right, +y down, +z forward. The name of a pose gives its direction: `c2w` (camera to
 //! world) or `w2c` (world to camera).
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
@@ -45,9 +45,9 @@ impl Pose {
         Ok(pose)
     }
 
-    /// Reads the upper three rows of a camera-to-world matrix in OpenGL/Blender axes (+x right, +y up, -z forward), as in
-    /// nerfstudio's `transforms.json`, and converts the camera's axes: `rows * diag(1, -1, -1, 1)`. World axes and camera
-    /// centre do not change.
+    /// Reads the upper three rows of a camera-to-world matrix in OpenGL/Blender axes (+x right, +y up, -z forward), as
+    /// in nerfstudio's `transforms.json`, and converts the camera's axes: `rows * diag(1, -1, -1, 1)`. World axes and
+    /// camera centre do not change.
     ///
     /// # Errors
     /// As [`Pose::from_rows`].

@@ -2,9 +2,9 @@
 
 use crate::pose::Pose;
 
-/// `num_views` frames from the first to the last, evenly along the path of the camera centres: while the camera rests or
-/// turns on the spot, one view replaces many. Evenly over the frames if all centres coincide or one is not finite. `None`
-/// for fewer frames than views, or for no views.
+/// `num_views` frames from the first to the last, evenly along the path of the camera centres: while the camera rests
+/// or turns on the spot, one view replaces many. Evenly over the frames if all centres coincide or one is not finite.
+/// `None` for fewer frames than views, or for no views.
 pub fn spread_along_path(c2w: &[Pose], num_views: usize) -> Option<Vec<usize>> {
     let num_frames = c2w.len();
     if num_views == 0 || num_frames < num_views {

@@ -1,7 +1,7 @@
 //! Synthetic scenes from seeds: textured rooms with boxes and balls, ray traced on demand.
 //!
-//! A scene is a pure function of (seed, split, index), a frame of (scene, frame): unused scenes cost nothing, and threads
-//! need no coordination. Cameras are exact.
+//! A scene is a pure function of (seed, split, index), a frame of (scene, frame): unused scenes cost nothing, and
+//! threads need no coordination. Cameras are exact.
 
 mod config;
 mod path;

@@ -12,8 +12,8 @@ const EDGE_POINTS: usize = 129;
 
 /// A pinhole camera inside the view of a distorted one, and the map between their pixels.
 ///
-/// Camera centre, principal point and image size are equal. The focal lengths are multiplied by one factor, the smallest
-/// for which every pixel lies in the distorted image: no blank corners, as `OpenCV`'s `alpha = 0`.
+/// Camera centre, principal point and image size are equal. The focal lengths are multiplied by one factor, the
+/// smallest for which every pixel lies in the distorted image: no blank corners, as OpenCV's `alpha = 0`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Undistortion {
     from: IntrinsicsNorm,
@@ -78,8 +78,8 @@ impl Undistortion {
         Frame { width, height, rgb: undistorted }
     }
 
-    /// Position of each pixel of a row in the distorted image, clamped to it: column and row from the centre of the first
-    /// pixel, in units of 1 / [`STEPS`] pixel.
+    /// Position of each pixel of a row in the distorted image, clamped to it: column and row from the centre of the
+    /// first pixel, in units of 1 / [`STEPS`] pixel.
     fn find_places(&self, row: usize, [width, height]: [usize; 2], places: &mut [[u32; 2]]) {
         let (from, to) = (self.from.to_pixels(width, height), self.to.to_pixels(width, height));
         let (step_x, y) = (1.0 / to.fx, (row as f64 + 0.5 - to.cy) / to.fy);

@@ -14,8 +14,8 @@ const DOT: f64 = 4.5;
 /// Half the width of a line in pixels.
 const LINE: f64 = 0.9;
 
-/// Draws some of the matches: in each frame a dot per corner, and in the dot's colour the epipolar line of the corner in
-/// the other frame.
+/// Draws some of the matches: in each frame a dot per corner, and in the dot's colour the epipolar line of the corner
+/// in the other frame.
 pub(super) fn draw(frames: &[Frame; 2], geometry: &DMat3, matches: &[Match]) -> Frame {
     let frames = [reduced(&frames[0]), reduced(&frames[1])];
     let height = frames[0].height.max(frames[1].height);

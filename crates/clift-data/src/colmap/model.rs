@@ -1,4 +1,4 @@
-//! Cameras and images of a COLMAP model. Poses are world to camera with `OpenCV`'s axes.
+//! Cameras and images of a COLMAP model. Poses are world to camera with OpenCV's axes.
 
 use std::collections::HashMap;
 

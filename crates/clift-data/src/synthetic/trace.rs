@@ -133,8 +133,8 @@ fn meet(object: &Object, origin: Vec3, direction: Vec3) -> Option<(f32, Vec3)> {
     }
 }
 
-/// Distances at which a line enters and leaves a box around the origin, the axis of the face it enters, and its slope along
-/// that axis.
+/// Distances at which a line enters and leaves a box around the origin, the axis of the face it enters, and its slope
+/// along that axis.
 fn slabs(origin: Vec3, direction: Vec3, half_size: Vec3) -> (f32, f32, usize, f32) {
     let (mut near, mut far, mut entered) = (f32::NEG_INFINITY, f32::INFINITY, 0);
     for axis in 0..3 {
