@@ -1,18 +1,9 @@
 //! What the readers give and the model takes: frames, views, clips.
 
-use crate::camera::{Intrinsics, Pose};
+use crate::camera::Intrinsics;
+use crate::pose::Pose;
+pub use crate::rgb_image::Frame;
 pub use crate::scene_source::SceneSource;
-
-/// One decoded picture, 8-bit RGB, row-major `[height, width, 3]`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Frame {
-    /// Columns.
-    pub width: usize,
-    /// Rows.
-    pub height: usize,
-    /// `height * width * 3` values.
-    pub rgb: Vec<u8>,
-}
 
 /// Which frames of a scene are given and which are to be rendered: list positions, not time stamps.
 #[derive(Clone, Debug, PartialEq, Eq)]
