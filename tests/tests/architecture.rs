@@ -67,7 +67,7 @@ type Modules<'a> = BTreeMap<String, Module<'a>>;
 fn violations(sources: &Sources) -> Vec<String> {
     let mut found = Vec::new();
     let mut files_of = BTreeMap::<&str, usize>::new();
-    for (folder, _) in sources.keys().filter(|path| path.ends_with(".rs")).filter_map(|path| path.rsplit_once('/')) {
+    for (folder, _) in sources.keys().filter_map(|path| path.strip_suffix(".rs")?.rsplit_once('/')) {
         *files_of.entry(folder).or_default() += 1;
     }
     for (folder, count) in files_of.into_iter().filter(|(_, count)| *count > MAX_FILES) {

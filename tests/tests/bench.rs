@@ -71,14 +71,11 @@ fn rows_are_chosen_and_errors_omitted_on_request() {
 
 #[test]
 fn what_cannot_be_timed_is_wrong_usage() {
-    let message = clift(args(&["--work", "encode,incode"])).fails(2);
-    assert!(message.contains("'incode'") && message.contains("the works are encode, kmeans, condense"), "{message}");
-    let message = clift(args(&["--storage", "17"])).fails(2);
-    assert!(message.contains("`--storage` = 17"), "{message}");
-    let message = clift(args(&["--json", "no/such/folder/bench.json"])).fails(2);
-    assert!(message.contains("no folder"), "{message}");
-    let message = clift(args(&["--set", "data.width=20"])).fails(2);
-    assert!(message.contains("`data.width` = 20: write a multiple of model.patch_size = 8"), "{message}");
+    clift(args(&["--work", "encode,incode"])).fails_with(2, &["'incode'", "the works are encode, kmeans, condense"]);
+    clift(args(&["--storage", "17"])).fails_with(2, &["`--storage` = 17"]);
+    clift(args(&["--json", "no/such/folder/bench.json"])).fails_with(2, &["no folder"]);
+    clift(args(&["--set", "data.width=20"]))
+        .fails_with(2, &["`data.width` = 20: write a multiple of model.patch_size = 8"]);
 }
 
 #[test]

@@ -27,7 +27,7 @@ fn missing(path: &str, text: &str, exists: &dyn Fn(&Path) -> bool) -> Vec<String
     let folder = Path::new(path).parent().expect("a file");
     let mut found = Vec::new();
     for (number, line) in text.lines().enumerate() {
-        if path.ends_with(".md") {
+        if path.strip_suffix(".md").is_some() {
             let links = line.split("](").skip(1).filter_map(|rest| rest.split([')', '#', ' ']).next());
             let links = links.filter(|link| !link.is_empty() && !link.contains(':'));
             found.extend(links.filter(|link| !exists(&folder.join(link))).map(|link| (number, link)));

@@ -49,10 +49,20 @@ impl Ran {
     }
 
     /// Expects this exit code and an error, no panic; gives the error stream.
+    #[track_caller]
     pub fn fails(self, code: i32) -> String {
         assert_eq!(self.code, Some(code), "stdout:\n{}\nstderr:\n{}", self.stdout, self.stderr);
         assert!(self.stderr.contains("error: ") && !self.stderr.contains("panicked"), "{}", self.stderr);
         self.stderr
+    }
+
+    /// Expects this exit code and these parts of the error.
+    #[track_caller]
+    pub fn fails_with(self, code: i32, parts: &[&str]) {
+        let message = self.fails(code);
+        for part in parts {
+            assert!(message.contains(part), "{part}\nis not in\n{message}");
+        }
     }
 }
 

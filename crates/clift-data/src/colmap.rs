@@ -9,7 +9,6 @@ use std::path::{Path, PathBuf};
 
 use crate::error::DataError;
 use crate::listing::natural_order;
-use crate::photo::MAX_FRAMES;
 use crate::photo::MissingPhoto;
 use crate::photo::Photo;
 use crate::photo::PhotoOptions;

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::clip_reader::ClipOptions;
 use crate::filters::SceneFilters;
-use crate::image::Crop;
+use crate::fit::Crop;
 use crate::kind::SourceKind;
 use crate::normalize::{PoseRotation, PoseScale};
 use crate::options::FileOptions;

@@ -16,7 +16,7 @@ use crate::error::DataError;
 use crate::image::read_size;
 use crate::lens::Lens;
 use crate::listing::natural_order;
-use crate::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoOptions, PhotoScene};
+pub(crate) use crate::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoOptions, PhotoScene};
 use crate::picture_folder::PictureFolders;
 
 /// Most bytes of one `transforms.json`.

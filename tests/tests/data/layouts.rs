@@ -35,19 +35,18 @@ fn captures_train_and_render_and_name_missing_frames() {
 fn dl3dv_training_requires_a_test_scene_list() {
     let place = Place::new();
     for source in ["dl3dv", "auto", "captures"] {
-        let message = place.train("run", &[&data(source, "dl3dv", "")], &[]).fails(2);
-        assert!(
-            message.contains("`data.files.test_scenes` = missing: the folders hold DL3DV's benchmark"),
-            "{message}"
-        );
+        place
+            .train("run", &[&data(source, "dl3dv", "")], &[])
+            .fails_with(2, &["`data.files.test_scenes` = missing: the folders hold DL3DV's benchmark"]);
     }
     std::fs::write(place.at("none.txt"), "").unwrap();
     let files = format!("files={{test_scenes='{}'}},", place.at("none.txt").display());
     let ran = place.train("run", &[&data("dl3dv", "dl3dv", &files)], &["--only", "stage1"]).ok();
     assert!(format!("{}{}", ran.stdout, ran.stderr).contains("both halves are the same scenes"));
     let files = format!("{files} filters={{min_frames=9}},");
-    let message = place.train("other", &[&data("auto", "dl3dv", &files)], &[]).fails(1);
-    assert!(message.contains("0 of 1 scenes used; 1 shorter than 9 frames"), "{message}");
+    place
+        .train("other", &[&data("auto", "dl3dv", &files)], &[])
+        .fails_with(1, &["0 of 1 scenes used; 1 shorter than 9 frames"]);
 }
 
 #[test]
@@ -66,6 +65,6 @@ fn a_folder_of_any_layout_is_described() {
         assert!(ran.stdout.starts_with(&format!("layout            {layout}\n")), "{name}: {}", ran.stdout);
         assert!(ran.stdout.contains("  picture         32x18"), "{name}: {}", ran.stdout);
     }
-    let message = clift(["data", "info", repository("configs").to_str().unwrap()]).fails(2);
-    assert!(message.contains("no scenes found: looked for index.json with chunks, "), "{message}");
+    clift(["data", "info", repository("configs").to_str().unwrap()])
+        .fails_with(2, &["no scenes found: looked for index.json with chunks, "]);
 }

@@ -133,23 +133,17 @@ fn predictions_are_scored_and_missing_images_named() {
     std::fs::create_dir_all(&small).unwrap();
     image::RgbImage::new(8, 16).save(small.join(format!("{frame:0>6}.png"))).unwrap();
     let small = place.at("small").display().to_string();
-    assert!(
-        place.eval("run", &["--predictions", &small]).fails(1).contains("it has 8 x 16 pixels, the target 16 x 16")
-    );
+    place.eval("run", &["--predictions", &small]).fails_with(1, &["it has 8 x 16 pixels, the target 16 x 16"]);
     let empty = place.at("empty");
     std::fs::create_dir_all(&empty).unwrap();
     let empty = empty.display().to_string();
-    let message = place.eval("run", &["--predictions", &empty]).fails(2);
-    assert!(
-        message.contains("empty has none of the 6 target pictures; the first would be synthetic-0-test-"),
-        "{message}"
-    );
-    assert!(
-        place.eval("run", &["--predictions", &grey, "--name", "clift"]).fails(2).contains("a variant of this program")
-    );
+    place
+        .eval("run", &["--predictions", &empty])
+        .fails_with(2, &["empty has none of the 6 target pictures; the first would be synthetic-0-test-"]);
+    place.eval("run", &["--predictions", &grey, "--name", "clift"]).fails_with(2, &["a variant of this program"]);
     let two = ["--predictions", &grey, "--name", "a", "--name", "b"];
-    assert!(place.eval("run", &two).fails(2).contains("1 --predictions but 2 --name"));
-    assert!(place.eval("run", &["--predictions", "no/such/folder"]).fails(2).contains("no/such/folder"));
+    place.eval("run", &two).fails_with(2, &["1 --predictions but 2 --name"]);
+    place.eval("run", &["--predictions", "no/such/folder"]).fails_with(2, &["no/such/folder"]);
 }
 
 #[test]
@@ -185,19 +179,18 @@ fn lpips_needs_its_weights() {
     // The wrong file, and none where one is named.
     let other = place.at("other.safetensors");
     write_vgg(&other, "clift-vgg19-1", [2, 2, 4, 4, 2], false);
-    let message = place.eval("run", &["--set", &format!("eval.lpips_weights={other:?}")]).fails(2);
-    assert!(message.contains("its format is clift-vgg19-1") && message.contains("convert_vgg.py lpips"), "{message}");
+    place
+        .eval("run", &["--set", &format!("eval.lpips_weights={other:?}")])
+        .fails_with(2, &["its format is clift-vgg19-1", "convert_vgg.py lpips"]);
     let set = ["eval.lpips_weights=\"no/such/file\""];
-    let message = place.train("new", &set, &[]).fails(2);
-    assert!(message.contains("`eval.lpips_weights` = no/such/file: there is no such file"), "{message}");
+    place.train("new", &set, &[]).fails_with(2, &["`eval.lpips_weights` = no/such/file: there is no such file"]);
 }
 
 #[test]
 fn the_perceptual_loss_trains_both_stages() {
     let place = Place::new();
     let weight = "loss.perceptual_weight=0.5";
-    let message = place.train("run", &[weight], &[]).fails(2);
-    assert!(message.contains("`loss.vgg_weights` = missing") && message.contains("convert_vgg.py vgg19"), "{message}");
+    place.train("run", &[weight], &[]).fails_with(2, &["`loss.vgg_weights` = missing", "convert_vgg.py vgg19"]);
     assert!(!place.at("run").exists(), "nothing is begun");
 
     let file = place.at("vgg19.safetensors");
@@ -257,8 +250,7 @@ fn two_evaluations_are_compared_pair_by_pair() {
     place.eval("b", &["--set", "eval.num_scenes=2", "--out", out.to_str().unwrap()]).ok();
     let ran = clift(["compare", &a, out.to_str().unwrap()]).ok();
     assert!(ran.stdout.contains("the 4 of both are compared, up to 2 of A alone and 0 of B alone"), "{}", ran.stdout);
-    let message = clift(["compare", &a, "no/such/run"]).fails(2);
-    assert!(message.contains("there is no views.csv") && message.contains("no/such/run"), "{message}");
+    clift(["compare", &a, "no/such/run"]).fails_with(2, &["there is no views.csv", "no/such/run"]);
 }
 
 #[test]
@@ -276,6 +268,6 @@ fn the_papers_counts_come_out_of_the_command() {
     let rendered: Vec<&Value> =
         counts["rows"].as_array().unwrap().iter().filter(|row| row["work"] == "render").collect();
     assert_eq!(rendered.iter().map(|row| &row["num_tokens"]).collect::<Vec<_>>(), [16, 64]);
-    assert!(clift(["flops", "--convention", "flop"]).fails(2).contains("flop"));
-    assert!(clift(["flops", "--render", "5000"]).fails(2).contains("a scene has 4096 tokens"));
+    clift(["flops", "--convention", "flop"]).fails_with(2, &["flop"]);
+    clift(["flops", "--render", "5000"]).fails_with(2, &["a scene has 4096 tokens"]);
 }

@@ -70,9 +70,7 @@ fn render_counts_at_or_above_storage_are_refused() {
     let place = Place::new();
     place.copy(&STAGE_1, "run");
     for count in ["8", "1.0", "400"] {
-        let message = place.eval("run", &["--render", count]).fails(2);
-        assert!(message.contains("`eval.render`") && message.contains("less than 8"), "{message}");
+        place.eval("run", &["--render", count]).fails_with(2, &["`eval.render`", "less than 8"]);
     }
-    let message = place.eval("run", &["--set", "eval.selection=\"nearest\""]).fails(2);
-    assert!(message.contains("paper, global, scaled, random"), "{message}");
+    place.eval("run", &["--set", "eval.selection=\"nearest\""]).fails_with(2, &["paper, global, scaled, random"]);
 }

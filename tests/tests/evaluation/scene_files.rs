@@ -248,35 +248,33 @@ fn what_cannot_be_drawn_says_what_to_do() {
         (["--path", "interpolated"], "--path interpolated: there is no such file; write interpolate, orbit, or"),
     ] {
         let path = if flags[0] == "--path" { &[][..] } else { &orbit[..] };
-        let message = render(&[path, &flags].concat()).fails(2);
-        assert!(message.contains(expected), "{expected}: {message}");
+        render(&[path, &flags].concat()).fails_with(2, &[expected]);
     }
     // The second pose is no camera: nothing is drawn of the first either.
     let pose = json!({"c2w": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]});
     let far = json!({"c2w": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0]]});
     std::fs::write(place.at("poses.json"), json!({"poses": [pose, far]}).to_string()).unwrap();
     let poses = place.at("poses.json").display().to_string();
-    assert!(render(&["--path", &poses]).fails(1).contains("pose 1: bad camera: it stands "));
-    assert!(render(&["--path", &poses, "--frames", "3"]).fails(2).contains("has its own number of frames"));
+    render(&["--path", &poses]).fails_with(1, &["pose 1: bad camera: it stands "]);
+    render(&["--path", &poses, "--frames", "3"]).fails_with(2, &["has its own number of frames"]);
     assert!(!place.at("out").exists(), "nothing is left of what was refused");
 
     std::fs::create_dir(place.at("out")).unwrap();
     std::fs::write(place.at("out/notes.txt"), "").unwrap();
-    assert!(with(&[]).fails(2).contains("is not empty, and nothing is written over"));
+    with(&[]).fails_with(2, &["is not empty, and nothing is written over"]);
     std::fs::remove_file(place.at("out/notes.txt")).unwrap();
 
     std::fs::rename(place.at("run"), place.at("moved")).unwrap();
-    let message = with(&[]).fails(2);
-    assert!(message.contains("which is not there; give the run with --model RUN"), "{message}");
+    with(&[]).fails_with(2, &["which is not there; give the run with --model RUN"]);
     let moved = place.at("moved").display().to_string();
     with(&["--model", &moved]).ok();
 
     place.truncate("room.clift");
-    let message = clift(render_args(&place, "room.clift", "again", &orbit)).fails(1);
-    assert!(message.contains("cannot use the scene: it is cut off") && message.contains("copy it again"), "{message}");
+    clift(render_args(&place, "room.clift", "again", &orbit))
+        .fails_with(1, &["cannot use the scene: it is cut off", "copy it again"]);
     let weights = place.at("moved/stage2/model.safetensors").display().to_string();
-    let message = clift(["render", weights.as_str(), "--path", "orbit", "--out", "again"]).fails(1);
-    assert!(message.contains("its header does not say that it is a scene"), "{message}");
+    clift(["render", weights.as_str(), "--path", "orbit", "--out", "again"])
+        .fails_with(1, &["its header does not say that it is a scene"]);
 }
 
 #[cfg(unix)]
@@ -300,11 +298,7 @@ fn a_path_that_is_interrupted_leaves_nothing_behind() {
         std::thread::sleep(std::time::Duration::from_millis(2));
     }
     signal(&child, "-INT");
-    let message = finish(child).fails(130);
-    assert!(
-        message.contains("error: interrupted during frame ") && message.contains("nothing was written"),
-        "{message}"
-    );
+    finish(child).fails_with(130, &["error: interrupted during frame ", "nothing was written"]);
     assert!(!place.at("out").exists());
 }
 
@@ -315,17 +309,17 @@ fn scene_files_overwrite_only_scene_files() {
     let encode =
         |name: &str, flags: &[&str]| clift(encode_args(&place, "run", name, &[&["--scene", KEY][..], flags].concat()));
     let weights = place.bytes("run/stage1/model.safetensors");
-    let message = encode("run/stage1/model.safetensors", &[]).fails(2);
-    assert!(message.contains("the file there is no scene, and only scenes are written over"), "{message}");
+    encode("run/stage1/model.safetensors", &[])
+        .fails_with(2, &["the file there is no scene, and only scenes are written over"]);
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
-    assert!(encode("no/room.clift", &[]).fails(2).contains("there is no folder "));
+    encode("no/room.clift", &[]).fails_with(2, &["there is no folder "]);
     encode("room.clift", &[]).ok();
     encode("room.clift", &["--storage", "8"]).ok();
     assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);
     // Other heads fit the same weights, and draw another picture.
     for change in ["model.num_heads=1", "model={num_heads=1}"] {
-        let message = encode("heads.clift", &["--set", change]).fails(2);
-        assert!(message.contains("--set model: the network is what the weights were trained with"), "{message}");
+        encode("heads.clift", &["--set", change])
+            .fails_with(2, &["--set model: the network is what the weights were trained with"]);
     }
 }
 
@@ -334,12 +328,11 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     let place = Place::new();
     place.copy(&STAGE_1, "run");
     let encode = |flags: &[&str]| clift(encode_args(&place, "run", "room.clift", flags));
-    let message = encode(&[]).fails(2);
-    assert!(message.contains("scenes; choose one with --scene: synthetic-0-test-00000, "), "{message}");
-    assert!(encode(&["--scene", "attic"]).fails(2).contains("there is no scene attic; the "));
-    let message = encode(&["--scene", KEY, "--context", "0,8"]).fails(2);
-    assert!(message.contains("`--context` = 0,8: there is no frame 8; the scene has frames 0 to 7"), "{message}");
-    assert!(encode(&["--scene", KEY, "--storage", "9"]).fails(2).contains("a scene has 8 tokens"));
+    encode(&[]).fails_with(2, &["scenes; choose one with --scene: synthetic-0-test-00000, "]);
+    encode(&["--scene", "attic"]).fails_with(2, &["there is no scene attic; the "]);
+    encode(&["--scene", KEY, "--context", "0,8"])
+        .fails_with(2, &["`--context` = 0,8: there is no frame 8; the scene has frames 0 to 7"]);
+    encode(&["--scene", KEY, "--storage", "9"]).fails_with(2, &["a scene has 8 tokens"]);
 
     // Without stage 2, tokens are those nearest to the cluster centres; all of them leave no variance within clusters.
     let ran = encode(&["--scene", KEY, "--storage", "8"]).ok();
@@ -356,7 +349,7 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     assert!(on(&mini.join("test"), &[]).ok().stdout.contains("scene 00000000000000b1"));
     let train = ["--split", "train", "--scene", "00000000000000a2"];
     assert!(on(&mini, &train).ok().stdout.contains("scene 00000000000000a2"));
-    assert!(on(&place.at("run"), &[]).fails(2).contains("no scenes found: looked for index.json with chunks, "));
+    on(&place.at("run"), &[]).fails_with(2, &["no scenes found: looked for index.json with chunks, "]);
 
     let file = place.at("run/stage1/model.safetensors").display().to_string();
     let out = place.at("from-file.clift").display().to_string();
@@ -366,6 +359,6 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     clift(["encode", &stage, mini.to_str().unwrap(), "-o", &out]).ok();
     std::fs::copy(&file, place.at("alone.safetensors")).unwrap();
     let alone = place.at("alone.safetensors").display().to_string();
-    let message = clift(["encode", &alone, mini.to_str().unwrap(), "-o", &out]).fails(2);
-    assert!(message.contains("no config.toml beside it or above it"), "{message}");
+    clift(["encode", &alone, mini.to_str().unwrap(), "-o", &out])
+        .fails_with(2, &["no config.toml beside it or above it"]);
 }

@@ -58,7 +58,7 @@ num_targets = 2
 ";
 
 /// Name, what is replaced in the config by what, and arguments behind `train CONFIG`.
-const CONFIGS: [(&str, &str, &str, &[&str]); 38] = [
+const CONFIGS: [(&str, &str, &str, &[&str]); 40] = [
     ("unknown-key", "dim = 16", "dimm = 16", &[]),
     ("unknown-section", "[clusters]", "[cluster]", &[]),
     ("key-of-another-section", "num_heads = 2", "num_heads = 2\nbatch_size = 4", &[]),
@@ -106,6 +106,8 @@ const CONFIGS: [(&str, &str, &str, &[&str]); 38] = [
     ("override-below-a-value", "", "", &["--set", "stage1.steps.x=3"]),
     ("override-of-another-type", "", "", &["--set", "stage1.steps=ten"]),
     ("override-beyond-a-limit", "", "", &["--set", "data.synthetic.fov_deg=180.0"]),
+    ("override-that-is-not-toml", "", "", &["--set", "device=a b"]),
+    ("override-with-another-type-in-a-list", "", "", &["--set", "clusters.grid=[0.5, true]"]),
     ("override-that-contradicts-the-file", "", "", &["--set", "model.dim=15"]),
 ];
 
@@ -183,8 +185,8 @@ fn plans_name_wrong_values_and_need_no_data() {
         let fixed = ["plan", &config, "--no-time", "--device", "flex", "--set", "loss.perceptual_weight=0.0"];
         clift(fixed.iter().chain(flags))
     };
-    let message = plan(&["--set", "model.num_heads=7"]).fails(2);
-    assert!(message.contains("`model.num_heads` = 7: write a divisor of model.dim = 768, such as 6 or 8"), "{message}");
+    plan(&["--set", "model.num_heads=7"])
+        .fails_with(2, &["`model.num_heads` = 7: write a divisor of model.dim = 768, such as 6 or 8"]);
     let json = place.at("plan.json").display().to_string();
     plan(&["--json", &json]).ok();
     let plan = place.json("plan.json");

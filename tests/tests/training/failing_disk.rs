@@ -3,10 +3,11 @@
 use std::path::Path;
 use std::process::Command;
 
-use crate::support::{BINARY, Place, STAGE_1, clift, finish, killed_at, spawn, start, wait_for_steps};
+use crate::support::{BINARY, Place, STAGE_1, Shared, clift, finish, killed_at, spawn, start, wait_for_steps};
 
 /// Twelve saved steps and as many to come.
 const HALF: [&str; 4] = ["stage1.steps=24", "stage2.steps=12", "eval.every=12", "checkpoint={every=12, keep=2}"];
+static UNDISTURBED: Shared = Shared::new(&HALF, &[]);
 
 /// Expects a message with what failed, where the stage stands and what there is to go on from.
 fn assert_names_the_last_good_checkpoint(place: &Place, run: &str, step: u64, message: &str) {
@@ -19,7 +20,7 @@ fn assert_names_the_last_good_checkpoint(place: &Place, run: &str, step: u64, me
 #[test]
 fn failed_saves_keep_the_checkpoint_and_runs_resume() {
     let place = Place::new();
-    place.train("whole", &HALF, &[]).ok();
+    place.copy(&UNDISTURBED, "whole");
     killed_at("saved/stage1/12", &place.train_args("run", &HALF, &[]));
     let largest = |path: &Path| std::fs::metadata(path).expect("there").len();
     let model = largest(&place.at("run/stage1/checkpoints/step-000000012/model.bpk"));
@@ -65,7 +66,7 @@ fn full_disks_keep_the_checkpoint_and_runs_resume() {
         println!("passed by: no right to mount a tmpfs");
         return;
     };
-    place.train("whole", &HALF, &[]).ok();
+    place.copy(&UNDISTURBED, "whole");
     let run = "disk/run";
     killed_at("saved/stage1/12", &place.train_args(run, &HALF, &[]));
     // Fills the disk up to less than a checkpoint takes.
@@ -85,8 +86,7 @@ fn full_disks_keep_the_checkpoint_and_runs_resume() {
     // Not even a line of metrics fits: the run stops before the next save, and with no gap in its metrics.
     let rest = vec![1; free() as usize];
     let _ = std::fs::write(folder.join("more-ballast"), rest);
-    let message = finish(spawn(place.train_args(run, &HALF, &[]))).fails(1);
-    assert!(message.contains("No space left on device"), "{message}");
+    finish(spawn(place.train_args(run, &HALF, &[]))).fails_with(1, &["No space left on device"]);
 
     for name in ["ballast", "more-ballast"] {
         std::fs::remove_file(folder.join(name)).expect("removes");
@@ -149,7 +149,7 @@ fn vanished_data_stops_runs_which_resume_with_it() {
     assert!(message.contains(&format!("\nstage1 stopped after step {steps}; ")), "{message}");
     assert_names_the_last_good_checkpoint(&place, "run", steps, &message);
 
-    assert!(place.train("run", &set, &[]).fails(1).contains(&folder));
+    place.train("run", &set, &[]).fails_with(1, &[&folder]);
     std::fs::rename(place.at("gone"), &data).expect("renames");
     place.train("run", &set, &[]).ok();
     place.assert_same_run("run", "whole");

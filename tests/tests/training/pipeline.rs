@@ -194,8 +194,9 @@ fn early_stages_name_what_to_run_first() {
         assert!(message.trim_end().ends_with("run/stage1/model.safetensors"), "{message}");
     }
     place.copy(&STAGE_1, "run");
-    let message = place.train("run", &[], &["--only", "stage2"]).fails(2);
-    assert!(message.contains("error: stage2 needs the cluster cache, which is not there; run --only clusters first: "));
+    place
+        .train("run", &[], &["--only", "stage2"])
+        .fails_with(2, &["error: stage2 needs the cluster cache, which is not there; run --only clusters first: "]);
     // Without stage 2 there is still something to measure, and it says so.
     let ran = place.eval("run", &[]).ok();
     assert!(ran.stderr.contains("stage 2 has not run"), "{}", ran.stderr);
@@ -239,8 +240,8 @@ fn runs_start_from_weights_of_other_runs() {
     }
 
     let set = [&format!("stage1.init_from={first:?}"), "model.dim=8"];
-    let message = place.train("third", &set, &["--only", "stage1"]).fails(1);
-    assert!(message.contains(&file), "weights of another width: {message}");
-    let message = place.train("fourth", &["stage1.init_from=no/such/run.safetensors"], &[]).fails(1);
-    assert!(message.contains("no/such/run.safetensors"), "{message}");
+    place.train("third", &set, &["--only", "stage1"]).fails_with(1, &[&file]);
+    place
+        .train("fourth", &["stage1.init_from=no/such/run.safetensors"], &[])
+        .fails_with(1, &["no/such/run.safetensors"]);
 }

@@ -79,8 +79,7 @@ fn fresh_moves_the_former_run_aside() {
     let place = Place::new();
     place.copy(&STAGE_1, "run");
     let before = files(&place.at("run"));
-    let message = place.train("run", &[], &["--fresh", "--only", "clusters"]).fails(2);
-    assert!(message.contains("--fresh"), "{message}");
+    place.train("run", &[], &["--fresh", "--only", "clusters"]).fails_with(2, &["--fresh"]);
     assert!(files(&place.at("run")) == before, "a later stage cannot be fresh: nothing is moved");
     let ran = place.train("run", &["stage1.steps=3"], &["--only", "stage1", "--fresh"]).ok();
     assert!(ran.stderr.contains("moved the former run to "), "{}", ran.stderr);
@@ -112,9 +111,7 @@ fn an_evaluation_can_be_interrupted() {
         std::thread::sleep(Duration::from_millis(2));
     }
     signal(&child, "-INT");
-    let message = finish(child).fails(130);
-    assert!(message.contains("interrupted during the evaluation, after "), "{message}");
-    assert!(message.contains(" scenes; nothing was written"), "{message}");
+    finish(child).fails_with(130, &["interrupted during the evaluation, after ", " scenes; nothing was written"]);
     assert_eq!((names(), place.bytes("run/eval/summary.json")), (before, summary));
     // A shorter evaluation leaves no sheet of a longer one, and whatever else is there.
     std::fs::write(sheets.join("mine.png"), b"").expect("writable");
