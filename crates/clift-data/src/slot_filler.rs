@@ -91,15 +91,4 @@ mod tests {
         assert_eq!(attempts(filler, |_| 7), [0, 1, 2]);
         assert_eq!(attempts(SlotFiller { min_scenes: 0, ..filler }, |attempt| attempt as usize), [0, 1, 2]);
     }
-
-    #[test]
-    fn the_first_usable_scene_ends_the_attempts() {
-        let filler = SlotFiller { min_attempts: 16, min_scenes: 0, max_attempts: 16 };
-        let mut skipped = Vec::new();
-        let read = |scene: usize, attempt: u32| {
-            if attempt < 2 { Err(Skip { key: scene.to_string(), reason: "torn".into() }) } else { Ok((scene, attempt)) }
-        };
-        assert_eq!(filler.fill(|attempt| 10 - attempt as usize, read, &mut skipped), Ok((8, 2)));
-        assert_eq!(skipped.iter().map(|skip| skip.key.as_str()).collect::<Vec<_>>(), ["10", "9"]);
-    }
 }
