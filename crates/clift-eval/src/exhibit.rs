@@ -9,9 +9,10 @@ use crate::EvalError;
 use crate::measured::{Setting, Variant};
 use crate::picture::{Picture, error_map};
 use crate::predictions::Scored;
-use crate::rendered::{Rendered, truth};
-use crate::selection::Chosen;
+use crate::rendered::ScoredViews;
 use crate::sheet::{Cell, Row, sheet};
+use crate::token_choice::SelectedTokens;
+use crate::view_scorer::target_image;
 
 /// Most rows of a sheet; more targets are thinned evenly.
 const MAX_ROWS: usize = 6;
@@ -77,11 +78,11 @@ pub struct Choice {
 #[derive(Default)]
 pub(crate) struct Material {
     /// Every setting, baselines first.
-    pub renderings: Vec<Rendered>,
+    pub renderings: Vec<ScoredViews>,
     /// By storage count.
     pub clusters: Vec<SceneClusters>,
     /// The patches that stored tokens stand on, and what was chosen of them for every target.
-    pub choices: Vec<(Setting, Vec<u32>, Vec<Chosen>)>,
+    pub choices: Vec<(Setting, Vec<u32>, Vec<SelectedTokens>)>,
     /// Other systems' pictures.
     pub others: Vec<Scored>,
 }
@@ -112,7 +113,7 @@ impl Exhibit {
         }
         drawings.sort_by_key(|drawing| drawing.setting);
         drawings.dedup_by_key(|drawing| drawing.setting);
-        let choice = |(setting, stored, chosen): &(Setting, Vec<u32>, Vec<Chosen>)| {
+        let choice = |(setting, stored, chosen): &(Setting, Vec<u32>, Vec<SelectedTokens>)| {
             let chosen = chosen[view].tokens.iter().map(|&token| stored[token as usize]).collect();
             Choice { setting: *setting, stored: stored.clone(), chosen }
         };
@@ -127,7 +128,7 @@ impl Exhibit {
             grid: [height / patch_size, width / patch_size],
             context: context.collect::<Result<_, EvalError>>()?,
             context_frames: clip.context.frame_index.clone(),
-            target: small(Picture::from_unit(&truth(&clip.target, view), height, width)?),
+            target: small(Picture::from_unit(&target_image(&clip.target, view), height, width)?),
             target_frame: clip.target.frame_index[view],
             drawings,
             clusters,
@@ -164,11 +165,11 @@ pub(crate) fn spread(count: usize, most: usize) -> Vec<usize> {
 
 /// Columns: contexts, target, nearest view, then the fewest and the most tokens of the best variant
 /// there is, and the error of the last.
-fn scene_sheet(clip: &Clip, renderings: &[Rendered], shown_views: &[usize]) -> Result<Picture, EvalError> {
+fn scene_sheet(clip: &Clip, renderings: &[ScoredViews], shown_views: &[usize]) -> Result<Picture, EvalError> {
     let best = best_variant(renderings.iter().map(|rendering| rendering.setting));
     let whole = |setting: Setting| setting.num_render_tokens == setting.num_storage_tokens;
     let shown = renderings.iter().filter(|r| Some(r.setting.variant) == best && whole(r.setting));
-    let mut shown: Vec<&Rendered> = shown.collect();
+    let mut shown: Vec<&ScoredViews> = shown.collect();
     shown.sort_by_key(|r| r.setting.num_storage_tokens);
     shown.dedup_by_key(|r| r.setting.num_storage_tokens);
     if shown.len() > 2 {
@@ -193,7 +194,7 @@ fn scene_sheet(clip: &Clip, renderings: &[Rendered], shown_views: &[usize]) -> R
 
     let mut rows = Vec::new();
     for &view in shown_views {
-        let truth = truth(&clip.target, view);
+        let truth = target_image(&clip.target, view);
         let cell = |picture: Picture, caption: String| Cell { pictures: vec![picture], caption };
         let mut cells = vec![
             Cell { pictures: contexts.clone(), caption: String::new() },

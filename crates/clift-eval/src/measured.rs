@@ -9,7 +9,7 @@ use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
-use crate::predictions::SystemName;
+use crate::method::SystemName;
 use crate::selection::Selection;
 
 /// How a view was made.

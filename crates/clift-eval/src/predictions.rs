@@ -3,64 +3,16 @@
 //! They lie in `FOLDER/<scene>/<target frame>.png`, the frame in six digits, or in a folder `color` of the scene's, as
 //! pixelSplat writes them.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 
 use clift_data::Clip;
 use image::{DynamicImage, ImageReader, Limits};
-use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::EvalError;
 use crate::measured::{Accumulator, Measured, Setting, Variant};
-use crate::rendered::Judge;
-
-/// Most characters of a name.
-const MAX_NAME: usize = 40;
-
-/// Names of our own variants, and of the baselines.
-const TAKEN: [&str; 7] = ["clift", "kmeans", "patch", "patch_clift", "random", "nearest_view", "mean_image"];
-
-/// Name of a system, kept for the life of the process: there are a handful.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(transparent)]
-pub struct SystemName(&'static str);
-
-impl SystemName {
-    /// Takes a name of at most 40 characters that is not one of our own variants'.
-    ///
-    /// # Errors
-    /// [`EvalError::BadSystemName`].
-    pub fn new(name: &str) -> Result<Self, EvalError> {
-        static NAMES: Mutex<BTreeSet<&'static str>> = Mutex::new(BTreeSet::new());
-        let bad = |reason: &str| EvalError::BadSystemName { name: name.into(), reason: reason.into() };
-        if name.trim().is_empty() || name.chars().count() > MAX_NAME || name.chars().any(char::is_control) {
-            return Err(bad("write 1 to 40 printable characters"));
-        }
-        if TAKEN.contains(&name) {
-            return Err(bad("a variant of this program has that name"));
-        }
-        let mut names = NAMES.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        if let Some(known) = names.get(name) {
-            return Ok(Self(known));
-        }
-        let kept: &'static str = Box::leak(name.to_owned().into_boxed_str());
-        names.insert(kept);
-        Ok(Self(kept))
-    }
-
-    /// The name.
-    pub const fn as_str(self) -> &'static str {
-        self.0
-    }
-}
-
-// By hand: the derived form would only read what lives for ever.
-impl<'de> Deserialize<'de> for SystemName {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        Self::new(&String::deserialize(deserializer)?).map_err(serde::de::Error::custom)
-    }
-}
+use crate::method::SystemName;
+use crate::view_scorer::ViewScorer;
 
 /// Another system with its pictures.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -92,7 +44,7 @@ impl System {
     pub(crate) fn score(
         &self,
         clip: &Clip,
-        judge: &Judge,
+        scorer: &ViewScorer,
         rows: &[usize],
         into: &mut Accumulator,
     ) -> Result<Scored, EvalError> {
@@ -105,7 +57,7 @@ impl System {
                 continue;
             };
             let pixels = read_picture(&path, clip.target.height, clip.target.width)?;
-            scored.measured.insert(view, judge.measure(&pixels, view)?);
+            scored.measured.insert(view, scorer.measure(&pixels, view)?);
             if rows.contains(&view) {
                 scored.shown.insert(view, pixels);
             }
@@ -195,8 +147,8 @@ mod tests {
         write(folder.path(), "a_room/000003.png", 100, (24, 16));
         write(folder.path(), "a_room/color/000040.png", 151, (24, 16));
         let (clip, mut into) = (clip(), Accumulator::default());
-        let judge = Judge::new(&clip.target, None);
-        let scored = system(folder.path()).score(&clip, &judge, &[2], &mut into).unwrap();
+        let scorer = ViewScorer::new(&clip.target, None);
+        let scored = system(folder.path()).score(&clip, &scorer, &[2], &mut into).unwrap();
         assert_eq!(scored.measured.keys().copied().collect::<Vec<_>>(), [0, 2]);
         assert_eq!(scored.measured[&0].psnr, f64::INFINITY);
         // 51 of 255 levels: a fifth.
@@ -210,26 +162,16 @@ mod tests {
     fn a_picture_of_another_size_or_that_is_none_is_an_error_with_its_path() {
         let folder = tempfile::tempdir().unwrap();
         let (clip, mut into) = (clip(), Accumulator::default());
-        let judge = Judge::new(&clip.target, None);
+        let scorer = ViewScorer::new(&clip.target, None);
         write(folder.path(), "a_room/000003.png", 1, (16, 24));
         let message = |into: &mut Accumulator| {
-            let Err(error) = system(folder.path()).score(&clip, &judge, &[], into) else { panic!("accepted") };
+            let Err(error) = system(folder.path()).score(&clip, &scorer, &[], into) else { panic!("accepted") };
             error.to_string()
         };
         let text = message(&mut into);
         assert!(text.contains("it has 16 x 24 pixels, the target 24 x 16") && text.ends_with("000003.png"), "{text}");
         std::fs::write(folder.path().join("a_room/000003.png"), "no picture").unwrap();
         assert!(message(&mut into).ends_with("000003.png"));
-    }
-
-    #[test]
-    fn names_are_printable_and_not_our_own() {
-        for name in ["", " ", "clift", "kmeans", "a\nb", &"x".repeat(41)] {
-            assert!(SystemName::new(name).is_err(), "{name:?}");
-        }
-        let name = SystemName::new("LVSM (2 views)").unwrap();
-        assert_eq!(name, SystemName::new(&String::from("LVSM (2 views)")).unwrap());
-        assert_eq!(name.as_str(), "LVSM (2 views)");
     }
 
     #[test]

@@ -2,12 +2,11 @@
 
 use std::str::FromStr;
 
-use clift_model::{ModelError, Preset};
+use clift_model::{ModelError, Preset, TokenCount};
 
 use crate::config::EvalConfig;
 use crate::measured::Variant;
 use crate::selection::Selection;
-use crate::token_count::TokenCount;
 
 /// An experiment of the paper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -18,9 +18,9 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use clift_eval::{TokenCount, memory, statistics};
-use clift_model::Precision;
+use clift_eval::{memory, statistics};
 use clift_model::device::DeviceName;
+use clift_model::{Precision, TokenCount};
 use serde::Serialize;
 
 use crate::TrainError;

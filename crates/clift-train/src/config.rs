@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use clift_data::{
     BoundedSampler, ClipOptions, Crop, FileOptions, Layout, PoseRotation, PoseScale, SceneFilters, SyntheticConfig,
 };
+use clift_eval::EvalConfig;
 use clift_eval::perceptual::PERCEPTUAL_COMMAND;
-use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
-use clift_model::{Grouping, KMeans, ModelConfig, Precision};
+use clift_model::{Grouping, KMeans, ModelConfig, Precision, TokenCount};
 use serde::{Deserialize, Serialize};
 
 use self::checks::bad;

@@ -1,13 +1,10 @@
-//! The scenes of a run: the sources a config names, and the clips that are evaluated.
+//! The scenes of a run: the sources a config names.
 
 use std::sync::Arc;
 
-use clift_data::export::spread_views;
 use clift_data::{
-    ClipReader, EvaluationIndex, EvaluationItem, Layout, LayoutOptions, Ledger, Opened, SceneSource, Split,
-    SyntheticConfig, SyntheticSource, is_dl3dv_key,
+    Layout, LayoutOptions, Ledger, Opened, SceneSource, Split, SyntheticConfig, SyntheticSource, is_dl3dv_key,
 };
-use clift_eval::EvalConfig;
 
 use crate::TrainError;
 use crate::config::DataConfig;
@@ -73,41 +70,6 @@ pub fn open_to_train(data: &DataConfig) -> Result<(Arc<dyn SceneSource>, Ledger)
         return Err(TrainError::NoScenes { reason: format!("{}: {ledger}", Split::Train) });
     }
     Ok((Arc::new(SceneSubset::new(source, long)), ledger))
-}
-
-/// Chooses the scenes and views of an evaluation: those of its index, or views spread evenly.
-///
-/// At most `num_scenes` (0: all) are taken, in the order of the index or the source. Scenes that cannot
-/// be used are in the ledger.
-///
-/// # Errors
-/// Whatever reading the index gives, and [`TrainError::NoScenes`] when none is left.
-pub fn evaluation_items(
-    eval: &EvalConfig,
-    reader: &ClipReader,
-    num_scenes: usize,
-) -> Result<(Vec<EvaluationItem>, Ledger), TrainError> {
-    let source = &reader.source;
-    let (items, ledger) = if let Some(index) = &eval.index {
-        EvaluationIndex::read(index)?.select(source.as_ref(), num_scenes)
-    } else {
-        let limit = if num_scenes == 0 { usize::MAX } else { num_scenes };
-        let count = source.num_scenes().min(limit);
-        let mut ledger = Ledger::new(count);
-        let mut items = Vec::with_capacity(count);
-        for scene in 0..count {
-            match source.num_frames(scene).map(|count| spread_views(count, eval.num_context, eval.num_targets)) {
-                Ok(Some(views)) => items.push(EvaluationItem { scene, views }),
-                Ok(None) => ledger.skip(source.key(scene), "too few frames for its views"),
-                Err(error) => ledger.skip(source.key(scene), error.to_string()),
-            }
-        }
-        (items, ledger)
-    };
-    if items.is_empty() {
-        return Err(TrainError::NoScenes { reason: format!("evaluation: {ledger}") });
-    }
-    Ok((items, ledger))
 }
 
 #[cfg(test)]

@@ -16,13 +16,13 @@ use crate::TrainError;
 use crate::checkpoint::Checkpoints;
 use crate::config::{Config, OptimizerConfig};
 use crate::events::{Event, Sink, Stage};
-use crate::held_out::HeldOut;
 use crate::loss::Loss;
 use crate::loss_scale::LossScale;
 use crate::optim::adamw;
 use crate::sinks::RunLog;
 use crate::step::{Learner, StageBatch};
 use crate::training::Training;
+use crate::validation::Validation;
 
 /// Makes the batch of a step, in any thread.
 pub type MakeBatch = dyn Fn(u64) -> Result<StageBatch, TrainError> + Send + Sync;
@@ -59,7 +59,7 @@ impl StagePlan<'_> {
     pub fn train(
         &self,
         start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
-        held_out: &HeldOut,
+        validation: &Validation,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Clift, TrainError> {
@@ -81,7 +81,7 @@ impl StagePlan<'_> {
         let mut log = RunLog::open(run_dir, self.stage, progress.step, sink)?;
         log.event(&Event::StageStarted { stage: self.stage, done: progress.step, num_steps: self.num_steps });
 
-        let mut training = Training::new(self, checkpoints, progress, held_out, stop, log);
+        let mut training = Training::new(self, checkpoints, progress, validation, stop, log);
         let model = training.run(learner).map_err(|error| training.name_checkpoint(error))?;
         training.log.event(&Event::StageFinished { stage: self.stage, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(model)

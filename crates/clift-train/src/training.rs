@@ -9,12 +9,12 @@ use crate::TrainError;
 use crate::bad_steps::{BadScene, BadStep, Fault};
 use crate::checkpoint::{Best, Checkpoints, Progress};
 use crate::events::{Event, Sink, StepEvent};
-use crate::held_out::HeldOut;
 use crate::loss::psnr_of;
 use crate::schedule::warm_up_cosine;
 use crate::sinks::RunLog;
 use crate::step::{Learner, StageBatch, Update};
 use crate::trainer::StagePlan;
+use crate::validation::Validation;
 
 /// A stage while it trains.
 pub(crate) struct Training<'a> {
@@ -23,7 +23,7 @@ pub(crate) struct Training<'a> {
     progress: Progress,
     /// Step of the newest checkpoint; 0 for none.
     saved: u64,
-    held_out: &'a HeldOut<'a>,
+    validation: &'a Validation<'a>,
     stop: &'a AtomicBool,
     /// What happens goes here.
     pub(crate) log: RunLog<'a>,
@@ -35,11 +35,11 @@ impl<'a> Training<'a> {
         plan: &'a StagePlan,
         checkpoints: Checkpoints,
         progress: Progress,
-        held_out: &'a HeldOut,
+        validation: &'a Validation,
         stop: &'a AtomicBool,
         log: RunLog<'a>,
     ) -> Self {
-        Self { plan, checkpoints, saved: progress.step, progress, held_out, stop, log }
+        Self { plan, checkpoints, saved: progress.step, progress, validation, stop, log }
     }
 
     /// Makes the steps that are left and returns the trained model.
@@ -171,7 +171,7 @@ impl<'a> Training<'a> {
         }
         let (stage, samples) = (self.plan.stage, self.plan.folder.join("samples"));
         let model = learner.inference_model();
-        let psnr = self.held_out.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
+        let psnr = self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
         if psnr.is_none() && self.stop.load(Ordering::Relaxed) {
             if self.saved < step {
                 self.save(learner)?;

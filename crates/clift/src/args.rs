@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
 use clift_eval::compare::Side;
-use clift_eval::{Experiment, Selection, TokenCount};
+use clift_eval::{Experiment, Selection};
 use clift_model::device::DeviceName;
-use clift_model::{Convention, TokenStorage};
+use clift_model::{Convention, TokenCount, TokenStorage};
 use clift_train::Stage;
 use clift_train::bench::Work;
 
@@ -69,7 +69,7 @@ Examples:
   clift encode runs/tiny --scene synthetic-0-test-00000 -o room.clift
   clift encode runs/re10k captures/attic -o attic.clift
   clift encode runs/re10k /data/re10k --scene 5aca87f95a9412c6 --storage 1/8 -o room.clift
-  clift encode runs/re10k /data/re10k/test --max-error 0.02 --tokens int8 -o room.clift")]
+  clift encode runs/re10k /data/re10k/test --tokens int8 -o room.clift")]
     Encode(EncodeArgs),
     /// Draw a scene file along a camera path
     ///

@@ -5,12 +5,10 @@ use std::sync::Arc;
 
 use clift_data::layout::SAME_SCENES;
 use clift_data::{ClipReader, FileOptions, LayoutOptions, SceneSource, Split, open_layout};
-use clift_eval::TokenCount;
+use clift_eval::encode::{EncodeOptions, Encoded, encode};
 use clift_model::device::DeviceName;
-use clift_model::{TokenStorage, check_destination};
+use clift_model::{ModelPath, TokenCount, TokenStorage, TrainedModel, check_destination};
 use clift_train::config::SourceKind;
-use clift_train::encode::{Budget, EncodeOptions, Encoded};
-use clift_train::trained::{ModelPath, Trained};
 use clift_train::{Config, Override, read_config, scenes};
 
 use crate::WrongUsage;
@@ -42,12 +40,9 @@ pub struct EncodeArgs {
     /// Frames the encoder sees, as 0,5,9; by default as many as in training, spread along the path
     #[arg(long, value_name = "FRAMES", value_delimiter = ',')]
     pub context: Vec<usize>,
-    /// Tokens to keep, a number or a share [default: 1/4]
-    #[arg(long, value_name = "COUNT", conflicts_with = "max_error")]
-    pub storage: Option<TokenCount>,
-    /// Keep the fewest tokens of the run's clusters.grid that leave at most this share of the tokens' variance unexplained
-    #[arg(long, value_name = "E", value_parser = parse_error_share)]
-    pub max_error: Option<f64>,
+    /// Tokens to keep, a number or a share
+    #[arg(long, value_name = "COUNT", default_value = "1/4")]
+    pub storage: TokenCount,
     /// Number format of the tokens in the file: f32, f16 or int8
     #[arg(long, value_name = "FORMAT", default_value_t)]
     pub tokens: TokenStorage,
@@ -63,9 +58,9 @@ pub struct EncodeArgs {
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_destination(&args.out).map_err(|error| WrongUsage(error.to_string()))?;
     let model = ModelPath::find(&args.model)?;
-    let (mut config, overrides) = read_config::<Config>(&model.run.join("config.toml"), &args.set)?;
+    let (mut config, overrides) = read_config::<Config>(&model.dir.join("config.toml"), &args.set)?;
     // No shape shows heads: another number would be encoded, and drawn, without a word.
-    if config.model != read_config::<Config>(&model.run.join("config.toml"), &[])?.0.model {
+    if config.model != model.config()? {
         return Err(
             WrongUsage("--set model: the network is what the weights were trained with: leave it out".into()).into()
         );
@@ -86,28 +81,28 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     };
     let scene = choose(source.as_ref(), args.scene.as_deref())?;
     let reader = ClipReader { source, options: config.data.clip_options() };
-    let budget = match args.max_error {
-        Some(error) => Budget::MaxError(error),
-        None => Budget::Tokens(args.storage.unwrap_or(TokenCount::Share(0.25))),
-    };
     let options = EncodeOptions {
         context: (!args.context.is_empty()).then(|| args.context.clone()),
-        budget,
+        num_context: config.data.views.max_context,
+        storage: args.storage,
+        grouping: config.clusters.grouping,
+        kmeans: config.clusters.kmeans.clone(),
+        seed: config.seed,
         model_path: args.model.to_string_lossy().into_owned(),
     };
-    let encoded = Trained::load(&config, &model.weights)?.encode(&config, &reader, scene, &options)?;
+    let model = TrainedModel::open(&model, &config.model, &config.device.open()?)?;
+    let encoded = encode(&model, &reader, scene, &options)?;
     encoded.scene.write(&args.out, args.tokens)?;
     terminal::print_result(&told(&encoded, args.tokens, &args.out))
 }
 
 /// What was written, for people.
 fn told(encoded: &Encoded, storage: TokenStorage, path: &Path) -> String {
-    let Encoded { scene, num_lift_tokens, tried } = encoded;
+    let Encoded { scene, num_lift_tokens, cluster_error } = encoded;
     let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-    let errors: Vec<String> = tried.iter().map(|(count, error)| format!("{count:>6}  {error:.4}")).collect();
     format!(
         "{}: {} of {num_lift_tokens} tokens ({}, {storage}), {}\nscene {}, {} of {} x {}: frames {frames}\n\
-         tokens  variance left within clusters\n{}",
+         variance left within clusters: {cluster_error:.4}",
         path.display(),
         scene.num_tokens(),
         scene.kind,
@@ -116,7 +111,6 @@ fn told(encoded: &Encoded, storage: TokenStorage, path: &Path) -> String {
         count(scene.context.len(), "view"),
         scene.width,
         scene.height,
-        errors.join("\n"),
     )
 }
 
@@ -160,9 +154,4 @@ fn choose(source: &dyn SceneSource, key: Option<&str>) -> anyhow::Result<usize> 
 fn parse_split(text: &str) -> Result<Split, String> {
     let splits = [Split::Train, Split::Test];
     splits.into_iter().find(|split| split.to_string() == text).ok_or_else(|| "write train or test".into())
-}
-
-fn parse_error_share(text: &str) -> Result<f64, String> {
-    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
-    share.ok_or_else(|| "write a share of the variance, 0 to 1".into())
 }

@@ -12,10 +12,9 @@ use clift_eval::Calibration;
 use clift_model::device::DeviceName;
 use clift_model::scene::MAX_SIDE_PX;
 use clift_model::viewer::{frames_per_call, load_renderer};
-use clift_model::{ModelError, Scene, ViewCamera, Viewer};
+use clift_model::{ModelError, ModelPath, Scene, ViewCamera, Viewer};
 use clift_train::plan::drawing_bytes;
 use clift_train::plan::machine::available_bytes;
-use clift_train::trained::renderer_weights;
 use serde::Serialize;
 
 use args::CameraPath;
@@ -60,7 +59,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     film::refuse_existing(&args.out)?;
     let views = path(&scene, args, height, width)?;
     let model = args.model.clone().unwrap_or_else(|| scene.model_path.clone().into());
-    let weights = renderer_weights(&model, scene.kind);
+    let weights = ModelPath::for_tokens(&model, scene.kind);
     if args.model.is_none() && !weights.exists() {
         // The path is out of a file from anywhere: no control character of it reaches the terminal.
         let path = weights.display().to_string();

@@ -4,12 +4,10 @@ use std::path::Path;
 
 use burn::module::Module;
 use clift_data::{BoundedSampler, ClipReader, Split, SyntheticConfig};
-use clift_eval::TokenCount;
+use clift_eval::encode::{EncodeOptions, encode};
 use clift_model::viewer::load_renderer;
-use clift_model::{Clift, Preset, Scene, TokenStorage, Variant, ViewCamera, Viewer, weights};
+use clift_model::{Preset, Scene, TokenCount, TokenStorage, TrainedModel, Variant, ViewCamera, Viewer, weights};
 use clift_train::config::DataConfig;
-use clift_train::encode::{Budget, EncodeOptions};
-use clift_train::trained::Trained;
 use clift_train::{Config, scenes};
 
 use crate::cpu;
@@ -24,7 +22,7 @@ pub const CASES: &[Case] = &[
         reason: "encoder, clusters and condenser one after the other; the chosen patches are the same",
         run: |place| {
             let folder = tempfile::tempdir().expect("a folder");
-            let scene = encode(place, folder.path(), TokenStorage::F32);
+            let scene = encode_room(place, folder.path(), TokenStorage::F32);
             let ids = scene.token_ids.iter().copied().map(f64::from).collect();
             let tokens = scene.tokens.iter().copied().map(f64::from).collect();
             Values { forward: vec![("patches".into(), ids), ("tokens".into(), tokens)], ..Values::default() }
@@ -57,7 +55,7 @@ pub const CASES: &[Case] = &[
 const STORED: usize = 7;
 
 /// Encodes a synthetic room on the place's device, writes it and reads it back.
-fn encode(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
+fn encode_room(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
     let [height, width] = SIZE;
     let synthetic = SyntheticConfig {
         num_scenes: 2,
@@ -73,11 +71,17 @@ fn encode(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
     let (source, _) = scenes::open(&config.data, Split::Test).expect("rooms are made");
     let reader = ClipReader { source, options: config.data.clip_options() };
 
-    let Clift { encoder, lift_norm, condenser, renderer } = place.model().valid();
-    let trained = Trained { encoder, lift_norm, condenser: Some(condenser), renderer, device: place.plain() };
-    let options =
-        EncodeOptions { context: None, budget: Budget::Tokens(TokenCount::Count(STORED)), model_path: "suite".into() };
-    let encoded = trained.encode(&config, &reader, 0, &options).expect("a room is encoded");
+    let trained = TrainedModel::snapshot(&place.model().valid(), &config.model, true);
+    let options = EncodeOptions {
+        context: None,
+        num_context: config.data.views.max_context,
+        storage: TokenCount::Count(STORED),
+        grouping: config.clusters.grouping,
+        kmeans: config.clusters.kmeans.clone(),
+        seed: config.seed,
+        model_path: "suite".into(),
+    };
+    let encoded = encode(&trained, &reader, 0, &options).expect("a room is encoded");
     let path = folder.join("room.clift");
     encoded.scene.write(&path, storage).expect("the folder takes a file");
     Scene::read(&path).expect("what was written is read").0
@@ -88,7 +92,7 @@ fn draw(place: &Place, storage: TokenStorage) -> Values {
     let folder = tempfile::tempdir().expect("a folder");
     let maker = Place::new(&cpu());
     let maker = if place.is_wrong() { maker.wrong() } else { maker };
-    let scene = encode(&maker, folder.path(), storage);
+    let scene = encode_room(&maker, folder.path(), storage);
     let weights_file = folder.path().join("model.safetensors");
     weights::save(&maker.model().valid(), &weights_file).expect("the folder takes a file");
     let renderer = load_renderer(&scene, &weights_file, &place.plain()).expect("the scene's renderer");

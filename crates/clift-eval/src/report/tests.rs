@@ -3,8 +3,8 @@ use clift_model::{SceneClusters, TokenStorage};
 use super::*;
 use crate::exhibit::{Choice, Drawing};
 use crate::measured::{Accumulator, Measured, Setting, Variant};
+use crate::method::SystemName;
 use crate::picture::Picture;
-use crate::predictions::SystemName;
 
 const HOSTILE: &str = "<script>alert('room')</script>";
 

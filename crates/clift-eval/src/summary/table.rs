@@ -124,7 +124,7 @@ mod tests {
     use clift_model::TokenStorage;
 
     use crate::measured::{Accumulator, Measured, Setting, Variant};
-    use crate::predictions::SystemName;
+    use crate::method::SystemName;
 
     #[test]
     fn the_table_lines_up() {

@@ -6,9 +6,9 @@ use std::path::PathBuf;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use clift_data::{BoundedSampler, Clip, SyntheticConfig};
-use clift_eval::{TokenCount, upload_views};
+use clift_eval::upload_views;
 use clift_model::device::DeviceName;
-use clift_model::{Clift, ModelConfig};
+use clift_model::{Clift, ModelConfig, SceneModel, TokenCount};
 
 use super::inputs::{Shape, clip, model};
 use super::{BenchOptions, MAX_CHECKED_TOKENS};
@@ -151,7 +151,7 @@ impl BenchContext {
             return Ok(lift.clone());
         }
         let views = upload_views(&[&self.clip(1).context], &self.device)?;
-        let lift = self.model().valid().lift(&views);
+        let lift = self.model().valid().encode(&views);
         Ok(self.lift.get_or_init(|| lift).clone())
     }
 

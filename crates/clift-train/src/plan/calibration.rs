@@ -8,9 +8,9 @@ use burn::tensor::Tensor;
 use clift_data::order::{item_rng, step_rng};
 use clift_data::{ClipReader, Split};
 use clift_eval::lpips::Lpips;
-use clift_eval::{Accumulator, Condensed, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
+use clift_eval::{Accumulator, EvalModels, Sweep, evaluate_scene, upload_cameras, upload_views};
 
-use clift_model::ModelConfig;
+use clift_model::{ModelConfig, SceneModel, TokenCount, TrainedModel};
 use cpu_time::ProcessTime;
 use rand::RngExt;
 use rand::seq::index::sample;
@@ -226,27 +226,21 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
         num_patches: patches as f64,
     };
     let macs = Macs::of(&shallow.model, &scene);
-    let encode_s = Timed::of(|| read(model.lift(&views)))?.seconds;
-    let lift = model.lift(&views);
+    let encode_s = Timed::of(|| read(model.encode(&views)))?.seconds;
+    let lift = model.encode(&views);
     let render_s = Timed::of(|| read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?.seconds;
     let mut kmeans = Vec::new();
     let mut measuring_s = 0.0;
     if is_measured {
-        let networks = Networks {
-            encoder: model.encoder.clone(),
-            lift_norm: model.lift_norm.clone(),
-            renderer: model.renderer.clone(),
-            condensed: Some(Condensed::of(&model)),
-            patch_condensed: None,
-            device: context.device.clone(),
-        };
+        let stage2 = TrainedModel::snapshot(&model, &shallow.model, true);
+        let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
         let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
         let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
         let sweep = Sweep { model: shallow.model.clone(), lpips, ..evaluated(config) };
         // One for all: after the first time no setting draws the view that warms it up.
         let mut measured = Accumulator::default();
         measuring_s =
-            Timed::of(|| Ok(evaluate_scene(&networks, &clip, &sweep, false, &mut measured).map(|_| ())?))?.seconds;
+            Timed::of(|| Ok(evaluate_scene(&models, &clip, &sweep, false, &mut measured).map(|_| ())?))?.seconds;
     } else {
         for &count in counts {
             // One seed takes a few iterations more, another fewer.

@@ -262,7 +262,7 @@ fn of_evaluation(config: &Config) -> Result<Vec<(&'static str, u64)>, TrainError
 
 #[cfg(test)]
 mod tests {
-    use clift_eval::TokenCount;
+    use clift_model::TokenCount;
 
     use super::*;
 

@@ -7,7 +7,7 @@ use super::counts::{Macs, SceneSizes};
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::Stage;
-use crate::held_out::sweep;
+use crate::sweep::sweep;
 
 /// Points along the range of shares of tokens that are averaged over.
 const NUM_SHARES: usize = 9;
