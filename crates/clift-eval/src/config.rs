@@ -2,12 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_model::{Precision, TokenStorage};
+use clift_model::{Precision, TokenCount, TokenStorage};
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::method::Variant;
 use crate::selection::Selection;
-use crate::token_count::TokenCount;
 
 /// Which scenes and views are rendered, with how many tokens.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

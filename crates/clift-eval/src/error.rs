@@ -1,6 +1,6 @@
 //! What can go wrong between a rendering and a report, one documented variant per failure.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// A failure of this crate. A message says what, where, expected and got, with the path last.
 #[derive(Debug, thiserror::Error)]
@@ -107,26 +107,29 @@ pub enum EvalError {
         /// Scene, frame, variant and token counts.
         view: String,
     },
-    /// A count or share of tokens that cannot be had.
-    #[error("`{text}` tokens: {reason}")]
-    BadTokenCount {
-        /// What was written.
-        text: String,
-        /// Why it cannot be had, and what can.
+    /// A method was asked for without weights that render it.
+    #[error("there are no weights that render the variant `{variant}`")]
+    NoModel {
+        /// The name of the method.
+        variant: &'static str,
+    },
+    /// No scene can be evaluated.
+    #[error("no usable scene: {reason}")]
+    NoScenes {
+        /// Why every scene was skipped.
         reason: String,
     },
-    /// A condensed variant was asked for without a condenser that was trained on its groups.
-    #[error("the variant `{variant}` needs the weights of a stage 2 that was trained on its groups of tokens")]
-    NoCondenser {
-        /// Its name.
-        variant: &'static str,
+    /// The evaluation was asked to stop.
+    #[error("interrupted during the evaluation, after {done} of {total} scenes; nothing was written")]
+    Interrupted {
+        /// Scenes done.
+        done: usize,
+        /// Scenes in all.
+        total: usize,
     },
-    /// A sweep was asked for a variant that is not made from tokens here.
-    #[error("the variant `{variant}` is not rendered in a sweep")]
-    NotRendered {
-        /// Its name.
-        variant: &'static str,
-    },
+    /// Scenes could not be read.
+    #[error(transparent)]
+    Data(#[from] clift_data::DataError),
     /// The model refused its input or its weights.
     #[error(transparent)]
     Model(#[from] clift_model::ModelError),
@@ -139,6 +142,11 @@ pub enum EvalError {
 }
 
 impl EvalError {
+    /// Wraps an operating-system error; for `map_err`.
+    pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        move |source| Self::Io { action, source, path: path.to_path_buf() }
+    }
+
     /// Wraps a device's error; for `map_err`.
     pub(crate) fn tensor(reason: impl std::fmt::Debug) -> Self {
         Self::Tensor { reason: format!("{reason:?}") }

@@ -6,8 +6,8 @@ use clift_model::SceneClusters;
 use crate::error::EvalError;
 use crate::method::Variant;
 use crate::picture::{Picture, error_map};
-use crate::rendered::{Rendered, truth};
 use crate::scene_results::SceneResults;
+use crate::rendered::ScoredViews;
 use crate::sheet::{Cell, Row, sheet};
 use crate::token_choice::SelectedTokens;
 use crate::view_metrics::{EvalKey, best_variant};
@@ -114,7 +114,7 @@ impl Exhibit {
             grid: [height / patch_size, width / patch_size],
             context: context.collect::<Result<_, EvalError>>()?,
             context_frames: clip.context.frame_index.clone(),
-            target: small(Picture::from_unit(&truth(&clip.target, view), height, width)?),
+            target: small(Picture::from_unit(&target_image(&clip.target, view), height, width)?),
             target_frame: clip.target.frame_index[view],
             drawings,
             clusters,
@@ -130,7 +130,7 @@ fn small(picture: Picture) -> Picture {
 
 /// Columns: contexts, target, nearest view, then the fewest and the most tokens of the best variant
 /// there is, and the error of the last.
-fn scene_sheet(clip: &Clip, renderings: &[Rendered], shown_views: &[usize]) -> Result<Picture, EvalError> {
+fn scene_sheet(clip: &Clip, renderings: &[ScoredViews], shown_views: &[usize]) -> Result<Picture, EvalError> {
     let best = best_variant(renderings.iter().map(|rendering| rendering.setting));
     let shown = renderings.iter().filter(|r| Some(r.setting.variant) == best && r.setting.is_whole());
     let mut shown: Vec<&Rendered> = shown.collect();
@@ -158,7 +158,7 @@ fn scene_sheet(clip: &Clip, renderings: &[Rendered], shown_views: &[usize]) -> R
 
     let mut rows = Vec::new();
     for &view in shown_views {
-        let truth = truth(&clip.target, view);
+        let truth = target_image(&clip.target, view);
         let cell = |picture: Picture, caption: String| Cell { pictures: vec![picture], caption };
         let mut cells = vec![
             Cell { pictures: contexts.clone(), caption: String::new() },

@@ -11,9 +11,17 @@ use image::{DynamicImage, ImageReader, Limits};
 
 use crate::error::EvalError;
 use crate::eval_results::EvalResults;
-use crate::method::{SystemName, Variant};
+use crate::method::SystemName;
+use crate::method::Variant;
 use crate::rendered::Judge;
-use crate::view_metrics::{EvalKey, ViewMetrics};
+use crate::view_metrics::EvalKey;
+use crate::view_metrics::ViewMetrics;
+use crate::EvalError;
+use crate::eval_results::EvalResults;
+use crate::measured::Measured;
+use crate::measured::Setting;
+use crate::method::Variant;
+use crate::view_scorer::ViewScorer;
 
 /// Another system with its pictures.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -45,7 +53,7 @@ impl System {
     pub(crate) fn score(
         &self,
         clip: &Clip,
-        judge: &Judge,
+        scorer: &ViewScorer,
         rows: &[usize],
         into: &mut EvalResults,
     ) -> Result<Scored, EvalError> {
@@ -58,7 +66,7 @@ impl System {
                 continue;
             };
             let pixels = read_picture(&path, clip.target.height, clip.target.width)?;
-            scored.measured.insert(view, judge.measure(&pixels, view)?);
+            scored.measured.insert(view, scorer.measure(&pixels, view)?);
             if rows.contains(&view) {
                 scored.shown.insert(view, pixels);
             }
@@ -148,8 +156,8 @@ mod tests {
         write(folder.path(), "a_room/000003.png", 100, (24, 16));
         write(folder.path(), "a_room/color/000040.png", 151, (24, 16));
         let (clip, mut into) = (clip(), EvalResults::default());
-        let judge = Judge::new(&clip.target, None);
-        let scored = system(folder.path()).score(&clip, &judge, &[2], &mut into).unwrap();
+        let scorer = ViewScorer::new(&clip.target, None);
+        let scored = system(folder.path()).score(&clip, &scorer, &[2], &mut into).unwrap();
         assert_eq!(scored.measured.keys().copied().collect::<Vec<_>>(), [0, 2]);
         assert_eq!(scored.measured[&0].psnr, f64::INFINITY);
         // 51 of 255 levels: a fifth.
@@ -163,10 +171,10 @@ mod tests {
     fn a_picture_of_another_size_or_that_is_none_is_an_error_with_its_path() {
         let folder = tempfile::tempdir().unwrap();
         let (clip, mut into) = (clip(), EvalResults::default());
-        let judge = Judge::new(&clip.target, None);
+        let scorer = ViewScorer::new(&clip.target, None);
         write(folder.path(), "a_room/000003.png", 1, (16, 24));
         let message = |into: &mut EvalResults| {
-            let Err(error) = system(folder.path()).score(&clip, &judge, &[], into) else { panic!("accepted") };
+            let Err(error) = system(folder.path()).score(&clip, &scorer, &[], into) else { panic!("accepted") };
             error.to_string()
         };
         let text = message(&mut into);

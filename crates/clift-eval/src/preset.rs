@@ -3,13 +3,15 @@
 use std::str::FromStr;
 
 use clift_model::names::parse_value;
-use clift_model::{ModelError, Preset};
-use strum::{IntoStaticStr, VariantArray};
+use clift_model::ModelError;
+use clift_model::Preset;
+use strum::IntoStaticStr;
+use strum::VariantArray;
+use clift_model::TokenCount;
 
 use crate::config::EvalConfig;
 use crate::method::Variant;
 use crate::selection::Selection;
-use crate::token_count::TokenCount;
 
 /// An experiment of the paper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, IntoStaticStr, VariantArray)]

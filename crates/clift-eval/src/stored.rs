@@ -1,114 +1,54 @@
-//! The tokens a scene is stored with, by variant, and the renderer that draws them.
+//! The tokens a scene is stored with, by variant, and the model that renders them.
 // N encoder tokens, S stored tokens, R rendered tokens, D width
-
-use std::cell::OnceCell;
 
 use burn::tensor::{Int, Tensor, TensorData};
 use clift_data::order::item_rng;
-use clift_model::kmeans::Fit;
-use clift_model::{Clusters, KMeans, Renderer, SceneClusters, TokenStorage, tile_clusters};
+use clift_model::{SceneModel, TokenStorage, TrainedModel};
 use rand::seq::SliceRandom;
 
 use crate::EvalError;
-use crate::evaluate::Networks;
 use crate::method::Variant;
+use crate::eval_models::EvalModels;
+use crate::lazy_clusters::LazyClusters;
 
 /// Stored tokens of one scene.
-pub(crate) struct Stored<'a> {
+pub(crate) struct CompressedTokens<'a> {
     /// `[1, S, D]`
     pub tokens: Tensor<3>,
     /// The patch of the context views each stands on, `[S]`.
     pub ids: Vec<u32>,
-    /// What draws them.
-    pub renderer: &'a Renderer,
+    /// Renders them.
+    pub model: &'a TrainedModel,
 }
 
-impl<'a> Stored<'a> {
+impl<'a> CompressedTokens<'a> {
     /// Makes a variant's tokens, rounded as a scene file would round them; random subsets have no file.
     pub fn new(
         variant: Variant,
-        networks: &'a Networks,
+        models: &'a EvalModels,
         lift: &Tensor<3>,
-        index: &GroupsOnce,
+        index: &LazyClusters,
         storage: TokenStorage,
     ) -> Result<Self, EvalError> {
-        let device = &networks.device;
+        let model = models.for_method(variant).ok_or(EvalError::NoModel { variant: variant.name() })?;
         if variant == Variant::Random {
             let ids = random_subset(lift.dims()[1], index.num_clusters, index.seed);
-            return Ok(Self { tokens: rows_of(lift, &ids), ids, renderer: &networks.renderer });
+            return Ok(Self { tokens: select_tokens(lift, &ids), ids, model });
         }
-        let clusters = match variant {
-            Variant::Kmeans | Variant::Clift => index.clusters()?,
-            Variant::Patch | Variant::PatchClift => index.tiles()?,
-            _ => return Err(EvalError::NotRendered { variant: variant.name() }),
-        };
-        let uploaded = clusters.upload(device);
-        let (tokens, renderer) = match variant {
-            Variant::Clift | Variant::PatchClift => {
-                let condensed = networks.condensed_of(variant);
-                let condensed = condensed.ok_or(EvalError::NoCondenser { variant: variant.name() })?;
-                (condensed.condenser.forward(lift.clone(), &uploaded), &condensed.renderer)
-            }
-            _ => (uploaded.gather_centroids(lift.clone()), &networks.renderer),
+        let is_tiled = matches!(variant, Variant::Patch | Variant::PatchClift);
+        let clusters = if is_tiled { index.tiles()? } else { index.clusters()? };
+        let uploaded = clusters.upload(&model.device);
+        let tokens = match variant {
+            Variant::Clift | Variant::PatchClift => model.network.compress(lift.clone(), &uploaded),
+            _ => uploaded.gather_centroids(lift.clone()),
         };
         let ids = clusters.scenes()[0].centroid_index().to_vec();
-        Ok(Self { tokens: rounded(tokens, storage)?, ids, renderer })
-    }
-}
-
-/// Groups of one count, made when the first variant asks.
-pub(crate) struct GroupsOnce<'a> {
-    pub kmeans: &'a KMeans,
-    pub lift: &'a Tensor<3>,
-    pub num_clusters: usize,
-    pub seed: u64,
-    /// Context views, and rows and columns of tokens of each.
-    pub views: (usize, [usize; 2]),
-    fit: OnceCell<Fit>,
-    tiles: OnceCell<Clusters>,
-}
-
-impl<'a> GroupsOnce<'a> {
-    pub fn new(
-        kmeans: &'a KMeans,
-        lift: &'a Tensor<3>,
-        views: (usize, [usize; 2]),
-        num_clusters: usize,
-        seed: u64,
-    ) -> Self {
-        Self { kmeans, lift, num_clusters, seed, views, fit: OnceCell::new(), tiles: OnceCell::new() }
-    }
-
-    /// Tiles of the context views, [`tile_clusters`].
-    pub fn tiles(&self) -> Result<&Clusters, EvalError> {
-        if let Some(tiles) = self.tiles.get() {
-            return Ok(tiles);
-        }
-        let (num_views, grid) = self.views;
-        let tiles = Clusters::new(vec![tile_clusters(num_views, grid, self.num_clusters)?])?;
-        Ok(self.tiles.get_or_init(|| tiles))
-    }
-
-    pub fn clusters(&self) -> Result<&Clusters, EvalError> {
-        Ok(&self.fit()?.clusters)
-    }
-
-    fn fit(&self) -> Result<&Fit, EvalError> {
-        if let Some(fit) = self.fit.get() {
-            return Ok(fit);
-        }
-        let fit = self.kmeans.fit(self.lift.clone(), self.num_clusters, &[self.seed])?;
-        Ok(self.fit.get_or_init(|| fit))
-    }
-
-    /// Those of the one scene there is.
-    pub fn scene_clusters(&self) -> Result<&SceneClusters, EvalError> {
-        Ok(&self.clusters()?.scenes()[0])
+        Ok(Self { tokens: rounded(tokens, storage)?, ids, model })
     }
 }
 
 /// Some tokens of one scene, `[1, N, D]` to `[1, R, D]`.
-pub(crate) fn rows_of(tokens: &Tensor<3>, ids: &[u32]) -> Tensor<3> {
+pub(crate) fn select_tokens(tokens: &Tensor<3>, ids: &[u32]) -> Tensor<3> {
     let index: Vec<i64> = ids.iter().map(|&id| i64::from(id)).collect();
     let index = Tensor::<1, Int>::from_data(TensorData::new(index, [ids.len()]), &tokens.device());
     tokens.clone().select(1, index)
@@ -151,7 +91,7 @@ mod tests {
     #[test]
     fn rows_are_taken_by_id() {
         let tokens = Tensor::<1, Int>::arange(0..6, &Device::flex()).float().reshape([1, 3, 2]);
-        let rows: Vec<f32> = rows_of(&tokens, &[0, 2]).into_data().try_to_vec().expect("f32");
+        let rows: Vec<f32> = select_tokens(&tokens, &[0, 2]).into_data().try_to_vec().expect("f32");
         assert_eq!(rows, [0.0, 1.0, 4.0, 5.0]);
     }
 }

@@ -108,4 +108,46 @@ pub enum ModelError {
         /// The file.
         path: PathBuf,
     },
+    /// No weights are found where a trained model is expected.
+    #[error("no trained model at {path}; run `clift train` first", path = path.display())]
+    NoModel {
+        /// The weight file that was looked for.
+        path: PathBuf,
+    },
+    /// A weight file lies away from the run that made it.
+    #[error(
+        "there is no config.toml beside it or above it, which says what model it holds; give the run directory, or \
+         RUN/stage2/model.safetensors: {path}",
+        path = path.display()
+    )]
+    NoConfig {
+        /// The weight file.
+        path: PathBuf,
+    },
+    /// The config beside a weight file could not be read.
+    #[error("reading the configuration failed: {reason}: {path}", path = path.display())]
+    BadConfigFile {
+        /// The reason.
+        reason: String,
+        /// The config.
+        path: PathBuf,
+    },
+    /// A PyTorch checkpoint was given where a model of this program is expected.
+    #[error(
+        "a checkpoint of PyTorch must be imported first: run `clift import {path} --variant released-re10k -o DIR` (or \
+         another variant) and give DIR instead: {path}",
+        path = path.display()
+    )]
+    NotImported {
+        /// The checkpoint.
+        path: PathBuf,
+    },
+    /// A scene does not have that number or share of tokens.
+    #[error("`{text}` tokens: {reason}")]
+    BadTokenCount {
+        /// The value found.
+        text: String,
+        /// Why the scene does not have it, and what it has.
+        reason: String,
+    },
 }

@@ -1,9 +1,12 @@
 //! The three networks of a model together.
 
 use burn::module::Module;
+use burn::store::PathFilter;
 use burn::tensor::{Device, Tensor};
 
-use crate::{Condenser, Encoder, Init, LiftNorm, ModelConfig, Renderer, Views};
+use crate::{
+    Cameras, ClusterIndex, Condenser, Encoder, Init, LiftNorm, ModelConfig, RenderTokens, Renderer, SceneModel, Views,
+};
 
 /// Encoder, condenser and renderer. Stage 1 trains the first and the last, stage 2 the last two.
 #[derive(Module, Debug)]
@@ -14,17 +17,6 @@ pub struct Clift {
     pub lift_norm: LiftNorm,
     /// Light-field tokens to compressed ones.
     pub condenser: Condenser,
-    /// Tokens and a camera to a picture.
-    pub renderer: Renderer,
-}
-
-/// What stage 1 trains.
-#[derive(Module, Debug)]
-pub struct Stage1 {
-    /// Posed pictures to light-field tokens.
-    pub encoder: Encoder,
-    /// A norm of those, in the variant that has one.
-    pub lift_norm: LiftNorm,
     /// Tokens and a camera to a picture.
     pub renderer: Renderer,
 }
@@ -41,30 +33,46 @@ impl Clift {
         Self { encoder, lift_norm, condenser, renderer }
     }
 
-    /// The tokens of context views that condenser and renderer read.
-    ///
-    /// # Shapes
-    /// - returns `[batch, num_tokens, dim]`
-    pub fn lift(&self, context: &Views) -> Tensor<3> {
-        self.lift_norm.forward(self.encoder.forward(context))
+    /// The parameters that stage 1 trains and saves: those of every network but the condenser.
+    pub fn stage1_part() -> PathFilter {
+        PathFilter::from_predicate(|path, _| !is_condenser(path))
+    }
+}
+
+/// Whether the parameter at `path` belongs to the condenser.
+pub(crate) fn is_condenser(path: &str) -> bool {
+    path.starts_with("condenser.")
+}
+
+impl SceneModel for Clift {
+    fn features(&self, context: &Views) -> Tensor<3> {
+        self.encoder.forward(context)
     }
 
-    /// The networks of stage 1, sharing this model's parameters.
-    pub fn stage1(&self) -> Stage1 {
-        Stage1 { encoder: self.encoder.clone(), lift_norm: self.lift_norm.clone(), renderer: self.renderer.clone() }
+    fn has_token_norm(&self) -> bool {
+        self.lift_norm.is_norm()
     }
 
-    /// Takes the networks of stage 1 from elsewhere.
-    pub fn set_stage1(&mut self, stage1: Stage1) {
-        let Stage1 { encoder, lift_norm, renderer } = stage1;
-        (self.encoder, self.lift_norm, self.renderer) = (encoder, lift_norm, renderer);
+    fn normalize(&self, features: Tensor<3>) -> Tensor<3> {
+        self.lift_norm.forward(features)
+    }
+
+    fn compress(&self, tokens: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
+        self.condenser.forward(tokens, clusters)
+    }
+
+    fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
+        self.renderer.forward(tokens, targets)
+    }
+
+    fn supports_selection(&self) -> bool {
+        true
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Cameras;
     use crate::testing::{Fixture, assert_close, devices, load_weights, weight_gradients};
 
     #[test]
@@ -80,7 +88,9 @@ mod tests {
         };
         for device in devices() {
             let device = device.autodiff();
-            let model = load_weights(Clift::new(&config, 0, &device).stage1(), &fixture, "weight.");
+            let Clift { encoder, renderer, .. } = Clift::new(&config, 0, &device);
+            let encoder = load_weights(encoder, &fixture, "weight.encoder.");
+            let renderer = load_weights(renderer, &fixture, "weight.renderer.");
             let cameras = |kind: &str| Cameras {
                 height: 16,
                 width: 24,
@@ -89,16 +99,18 @@ mod tests {
             };
             let context =
                 Views { images: fixture.tensor("input.context_images", &device), cameras: cameras("context") };
-            let lift = model.encoder.forward(&context);
+            let lift = encoder.forward(&context);
             assert_close(&lift.clone().inner(), &fixture.tensor::<3>("output.lift", &device).inner(), 1e-5);
-            let rendering = model.renderer.forward(lift, &cameras("target"));
+            let rendering = renderer.forward(lift, &cameras("target"));
             let expected = fixture.tensor::<5>("output.rendering", &device);
             assert_close(&rendering.clone().inner(), &expected.inner(), 1e-5);
             let target: Tensor<5> = fixture.tensor("input.target_images", &device);
             let loss = (rendering - target).square().mean();
             let expected = fixture.tensor::<1>("output.loss", &device);
             assert_close(&loss.clone().inner(), &expected.inner(), 1e-6);
-            weight_gradients(&model, &loss.backward(), &fixture, "grad.weight.", 5e-5);
+            let grads = loss.backward();
+            weight_gradients(&encoder, &grads, &fixture, "grad.weight.encoder.", 5e-5);
+            weight_gradients(&renderer, &grads, &fixture, "grad.weight.renderer.", 5e-5);
         }
     }
 

@@ -5,12 +5,11 @@
 use std::path::Path;
 use std::time::Instant;
 
-use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 
-use crate::{
-    Cameras, Init, ModelConfig, ModelError, Renderer, Rules, Scene, SceneMemory, Selector, ViewCamera, weights,
-};
+use crate::trained_model::open_renderer;
+use crate::weights::renderer_hash;
+use crate::{Cameras, ModelError, Renderer, Rules, Scene, SceneMemory, Selector, ViewCamera};
 
 /// Most frames that are drawn by one call where all tokens are used: they share keys and values.
 const FRAMES_PER_CALL: usize = 8;
@@ -23,47 +22,18 @@ pub fn frames_per_call(num_patches: usize) -> usize {
     (PATCHES_PER_CALL / num_patches.max(1)).clamp(1, FRAMES_PER_CALL)
 }
 
-/// A renderer alone, under the name it has in weight files.
-#[derive(Module, Debug)]
-struct RendererOnly {
-    renderer: Renderer,
-}
-
 /// Reads the renderer that a scene was made for out of a weight file.
 ///
 /// # Errors
 /// [`ModelError::Weights`] for a file that cannot be read or holds no such renderer, [`ModelError::OtherRenderer`] for
 /// other weights.
 pub fn load_renderer(scene: &Scene, weights: &Path, device: &Device) -> Result<Renderer, ModelError> {
-    let refuse = |reason: String| ModelError::Weights { action: "reading", reason, path: weights.into() };
-    let size = std::fs::metadata(weights).map_err(|error| refuse(error.to_string()))?.len();
-    // A scene file names the sizes of its network; nothing is allocated for what the weights cannot hold.
-    let needed = least_bytes(&scene.model);
-    if needed > size {
-        return Err(refuse(format!("the scene's renderer takes {needed} bytes at least, the file has {size}")));
-    }
-    let renderer = Renderer::new(&scene.model, &mut Init::new(0, device));
-    let mut module = RendererOnly { renderer };
-    let loaded = weights::load(&mut module, weights)?;
-    if let Some(name) = loaded.missing.first() {
-        return Err(refuse(format!(
-            "{} parameters of the scene's renderer are missing ({name})",
-            loaded.missing.len()
-        )));
-    }
-    let got = weights::renderer_hash(&module.renderer, &scene.model);
+    let renderer = open_renderer(&scene.model, weights, device)?;
+    let got = renderer_hash(&renderer, &scene.model);
     if got != scene.renderer_hash {
         return Err(ModelError::OtherRenderer { expected: scene.renderer_hash.clone(), got, path: weights.into() });
     }
-    Ok(module.renderer)
-}
-
-/// Bytes of the matrices of a renderer's blocks.
-fn least_bytes(config: &ModelConfig) -> u64 {
-    let [dim, hidden, blocks] = [config.dim, config.feed_forward_dim, config.num_renderer_blocks].map(|n| n as u64);
-    // Four matrices each for self- and cross-attention, two for the feed-forward network, in f32. The largest sizes that
-    // a config may have do not overflow.
-    4 * blocks * (8 * dim * dim + 2 * dim * hidden)
+    Ok(renderer)
 }
 
 /// One drawn frame.
@@ -181,7 +151,7 @@ impl Viewer {
 mod tests {
     use super::*;
     use crate::testing::devices;
-    use crate::{Clift, Preset, TokenKind, WorldFrame};
+    use crate::{Clift, ModelConfig, Preset, TokenKind, WorldFrame, weights};
 
     const MODEL: ModelConfig = ModelConfig {
         variant: crate::Variant::Paper,

@@ -1,16 +1,20 @@
-//! Weight files: safetensors in PyTorch's layout, and the hash that names a set of weights.
+//! Weight files: safetensors in PyTorch's layout.
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{Cursor, ErrorKind, Read, Seek, SeekFrom, Write};
+use std::io::{Cursor, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
-use burn::module::{Module, ModuleVisitor, Param};
-use burn::store::{ApplyError, BurnToPyTorchAdapter, ModuleSnapshot, PyTorchToBurnAdapter, SafetensorsStore};
-use burn::tensor::{DType, Tensor, TensorData};
-use sha2::{Digest, Sha256};
+use burn::module::Module;
+use burn::store::{
+    ApplyError, BurnToPyTorchAdapter, ModuleSnapshot, PathFilter, PyTorchToBurnAdapter, SafetensorsStore,
+};
+use burn::tensor::DType;
 
-use crate::{ModelConfig, ModelError, Renderer};
+use crate::ModelError;
+use crate::files::{TEMPORARY, folder_of, publish};
+use crate::hash::visit;
+pub use crate::hash::{hash, renderer_hash};
 
 /// Which parameters of a file went into a module.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -50,6 +54,14 @@ impl Loaded {
 /// # Errors
 /// [`ModelError::Weights`].
 pub fn save<M: Module>(module: &M, path: &Path) -> Result<(), ModelError> {
+    save_part(module, &PathFilter::all(), path)
+}
+
+/// Does [`save`] for the parameters whose paths match `part`. The file equals that of a module without the others.
+///
+/// # Errors
+/// As [`save`].
+pub fn save_part<M: Module>(module: &M, part: &PathFilter, path: &Path) -> Result<(), ModelError> {
     let error = |reason: String| ModelError::Weights { action: "writing", reason, path: path.into() };
     // The store and the crate below it have temporary names of their own, which a kill leaves behind: in a folder whose
     // name is known. On an error it goes, as on a full disk it must.
@@ -58,29 +70,12 @@ pub fn save<M: Module>(module: &M, path: &Path) -> Result<(), ModelError> {
     let temporary = folder.path().join("model.safetensors");
     let mut store = SafetensorsStore::from_file(&temporary)
         .with_to_adapter(BurnToPyTorchAdapter)
+        .filter(part.clone())
         .overwrite(true)
         .metadata("format", "clift-1");
     module.save_into(&mut store).map_err(|e| error(e.to_string()))?;
-    publish(&temporary, path).map_err(|e| error(e.to_string()))
-}
-
-/// Start of every temporary name: what a kill leaves behind can be told from everything else.
-pub(crate) const TEMPORARY: &str = ".clift-";
-
-pub(crate) fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
-}
-
-/// Gives a finished file its name, with its header in order.
-fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
-    let mut file = File::options().read(true).write(true).open(temporary)?;
-    sort_header(&mut file)?;
-    // What the store writes is for its owner alone; the umask decides who may read a file that is kept.
-    let usual = File::create(temporary.with_extension("usual"))?.metadata()?.permissions();
-    file.set_permissions(usual)?;
-    file.sync_all()?;
-    std::fs::rename(temporary, path)?;
-    sync_folder(path)
+    let sorted = File::options().read(true).write(true).open(&temporary).and_then(|mut file| sort_header(&mut file));
+    sorted.and_then(|()| publish(&temporary, path)).map_err(|e| error(e.to_string()))
 }
 
 /// Writes a safetensors header anew with its keys sorted: Burn's store orders them at random, file by file. The
@@ -110,29 +105,43 @@ pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Makes the name of a file survive a power cut, where the system lets a folder be synced.
-pub(crate) fn sync_folder(path: &Path) -> std::io::Result<()> {
-    if cfg!(windows) {
-        return Ok(()); // it opens no folders
-    }
-    match File::open(folder_of(path))?.sync_all() {
-        Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),
-        synced => synced,
-    }
-}
-
 /// Reads parameters written by [`save`] into a module and says which.
 ///
 /// # Errors
 /// [`ModelError::Weights`] when the file cannot be read, a shape differs, or a value is not finite or no 32-bit
 /// float.
 pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError> {
+    load_part(module, &PathFilter::all(), path)
+}
+
+/// Does [`load`] for the parameters whose paths match `part`. Tensors of the file that do not match are unused.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> Result<Loaded, ModelError> {
+    read(module, SafetensorsStore::from_file(path).filter(part.clone()), part, path)
+}
+
+/// Reads the module `name` of a larger one, such as the `renderer` of a whole model, without the others.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_module<M: Module>(module: &mut M, name: &str, path: &Path) -> Result<Loaded, ModelError> {
+    let store = SafetensorsStore::from_file(path).with_key_remapping(format!("^{name}\\."), "");
+    read(module, store, &PathFilter::all(), path)
+}
+
+fn read<M: Module>(
+    module: &mut M,
+    store: SafetensorsStore,
+    part: &PathFilter,
+    path: &Path,
+) -> Result<Loaded, ModelError> {
     let error = |reason: String| ModelError::Weights { action: "reading", reason, path: path.into() };
     if !path.is_file() {
         return Err(error("there is no such file".into()));
     }
-    let mut store =
-        SafetensorsStore::from_file(path).with_from_adapter(PyTorchToBurnAdapter).validate(false).allow_partial(true);
+    let mut store = store.with_from_adapter(PyTorchToBurnAdapter).validate(false).allow_partial(true);
     let result = module.load_from(&mut store).map_err(|e| error(e.to_string()))?;
     if let Some(first) = result.errors.first() {
         return Err(error(told(first)));
@@ -143,8 +152,13 @@ pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError
     if let Some(name) = first_non_finite(module) {
         return Err(error(format!("{name} is not finite")));
     }
-    let missing = result.missing.iter().map(|(name, _)| name_in_file(name)).collect();
-    Ok(Loaded { applied: result.applied, missing, unused: result.unused })
+    // Burn counts an absent parameter as missing whether it matches or not.
+    let missing = result.missing.iter().filter(|(name, _)| part.matches(name));
+    let missing = missing.map(|(name, _)| name_in_file(name)).collect();
+    let mut unused = result.unused;
+    unused.extend(result.skipped.iter().map(|name| name_in_file(name)));
+    unused.sort();
+    Ok(Loaded { applied: result.applied, missing, unused })
 }
 
 /// The name that a parameter of a module has in a file: Burn calls those of norms otherwise.
@@ -169,26 +183,6 @@ fn told(error: &ApplyError) -> String {
     format!("{} is {found:?}, expected {expected:?}", name_in_file(path))
 }
 
-/// Hash of all parameters of a module: their paths, shapes and values, as 64 hexadecimal digits.
-/// Equal weights have equal hashes on every device.
-pub fn hash<M: Module>(module: &M) -> String {
-    let mut sha = Sha256::new();
-    visit(module, |name, shape, data| {
-        sha.update(name.as_bytes());
-        sha.update(format!("{shape:?}"));
-        for value in data.iter::<f32>() {
-            sha.update(value.to_le_bytes());
-        }
-    });
-    hex::encode(sha.finalize())
-}
-
-/// [`hash`] of a renderer's weights together with what they do not show and drawing depends on: variant and heads.
-pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
-    let ModelConfig { variant, num_heads, .. } = config;
-    hex::encode(Sha256::digest(format!("{variant} {num_heads} {}", hash(renderer))))
-}
-
 /// Path of the first parameter with a NaN or an infinity.
 pub fn first_non_finite<M: Module>(module: &M) -> Option<String> {
     let mut found = None;
@@ -209,26 +203,6 @@ pub fn first_not_f32<M: Module>(module: &M) -> Option<(String, DType)> {
         }
     });
     found
-}
-
-/// Calls `f` with path, shape and values of every parameter, in the module's order.
-fn visit<M: Module>(module: &M, f: impl FnMut(&str, &[usize], &TensorData)) {
-    struct Visitor<F> {
-        path: Vec<String>,
-        f: F,
-    }
-    impl<F: FnMut(&str, &[usize], &TensorData)> ModuleVisitor for Visitor<F> {
-        fn enter_module(&mut self, name: &str, _container: &str) {
-            self.path.push(name.into());
-        }
-        fn exit_module(&mut self, _name: &str, _container: &str) {
-            self.path.pop();
-        }
-        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            (self.f)(&self.path.join("."), &param.val().dims(), &param.val().into_data());
-        }
-    }
-    module.visit(&mut Visitor { path: Vec::new(), f });
 }
 
 #[cfg(test)]

@@ -18,10 +18,11 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use clift_data::statistics::{median, p95};
-use clift_eval::{TokenCount, memory};
-use clift_model::Precision;
+use clift_data::statistics::median;
+use clift_data::statistics::p95;
+use clift_eval::memory;
 use clift_model::device::DeviceName;
+use clift_model::{Precision, TokenCount};
 use serde::Serialize;
 
 use crate::TrainError;

@@ -5,10 +5,10 @@ mod checks;
 use std::path::{Path, PathBuf};
 
 use clift_data::DataConfig;
+use clift_eval::EvalConfig;
 use clift_eval::perceptual::PERCEPTUAL_COMMAND;
-use clift_eval::{EvalConfig, TokenCount};
 use clift_model::device::DeviceName;
-use clift_model::{Grouping, KMeans, ModelConfig, Precision};
+use clift_model::{Grouping, KMeans, ModelConfig, Precision, TokenCount};
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;

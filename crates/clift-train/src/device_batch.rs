@@ -3,7 +3,7 @@
 
 use burn::tensor::{Device, Tensor};
 use clift_eval::{upload_cameras, upload_pictures, upload_views};
-use clift_model::{Cameras, Clift, Views};
+use clift_model::{Cameras, Clift, SceneModel, Views};
 
 use crate::TrainError;
 use crate::batch::{StageBatch, TokenChoice};
@@ -39,8 +39,8 @@ pub(crate) fn loss_of(
     choice: &TokenChoice,
     loss: &Loss,
 ) -> Result<LossParts, TrainError> {
-    let lift = model.lift(&shown.context); // [B, N, D]
+    let lift = model.encode(&shown.context); // [B, N, D]
     let tokens = choice.apply(&model.condenser, lift)?;
-    let rendering = model.renderer.forward(tokens, &shown.targets);
+    let rendering = model.render(tokens, &shown.targets);
     Ok(loss.of(rendering, shown.pictures.clone()))
 }

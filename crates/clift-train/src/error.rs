@@ -80,26 +80,6 @@ pub enum TrainError {
         /// Where it was looked for.
         path: PathBuf,
     },
-    /// A weight file lies away from the run that made it.
-    #[error(
-        "there is no config.toml beside it or above it, which says what model it holds; give the run directory, or \
-         RUN/stage2/model.safetensors: {path}",
-        path = path.display()
-    )]
-    NoConfig {
-        /// The weight file.
-        path: PathBuf,
-    },
-    /// A checkpoint of PyTorch stands where a model of this program is expected.
-    #[error(
-        "a checkpoint of PyTorch must be imported first: run `clift import {path} --variant released-re10k -o DIR` (or \
-         another variant) and give DIR instead: {path}",
-        path = path.display()
-    )]
-    NotImported {
-        /// The checkpoint.
-        path: PathBuf,
-    },
     /// A tensor could not be read back from its device.
     #[error("reading tokens from their device failed: {reason}")]
     Tensor {

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use clift_data::files::replace;
 use clift_data::write_state_dict;
-use clift_model::ModelConfig;
 use clift_model::interchange::{self, CONVOLUTIONS, PREFIX};
+use clift_model::{ModelConfig, ModelPath};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
@@ -14,7 +14,6 @@ use crate::TrainError;
 use crate::config::Config;
 use crate::import_record::Imported;
 use crate::model_dir::{Parameter, refuse_existing, to_safetensors};
-use crate::trained::ModelPath;
 
 /// What kind of file is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,7 +43,7 @@ pub struct Exported {
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
     refuse_existing(out)?;
     config.model.validate()?;
-    let convolutions = match Imported::read(&model.run)? {
+    let convolutions = match Imported::read(&model.dir)? {
         Some(imported) => imported.convolutions,
         None => CONVOLUTIONS.map(String::from).into(),
     };

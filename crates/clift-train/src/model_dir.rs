@@ -8,19 +8,23 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::files::{TEMPORARY, publish, replace};
-use clift_data::{ClipReader, OpenedSource, PoseRotation, PoseScale, SourceKind, Split, open_dataset};
-use clift_eval::{Condensed, Networks, Summary, System, Variant as Tokens};
-use clift_model::{ModelConfig, Variant, weights};
+use clift_data::OpenedSource;
+use clift_data::PoseRotation;
+use clift_data::PoseScale;
+use clift_data::SourceKind;
+use clift_data::open_dataset;
+use clift_model::ModelConfig;
+use clift_model::Variant;
+use clift_model::weights;
+use clift_model::ModelPath;
+use clift_model::TrainedModel;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 
 use crate::TrainError;
 use crate::config::Config;
-use crate::events::{Event, Sink};
-use crate::held_out::HeldOut;
 use crate::import_record::Imported;
 use crate::import_record::go_on;
-use crate::trained::{ModelPath, Trained, check_heads};
 
 /// A parameter on the host, in PyTorch's layout.
 #[derive(Clone, Debug, PartialEq)]
@@ -115,7 +119,8 @@ pub(crate) fn write(
     let text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", &import_path))?;
     replace(&import_path, &text).map_err(TrainError::io(writing, &import_path))?;
 
-    Trained::load(config, &weights_path)?;
+    let written = ModelPath { dir: temporary.path().into(), weights: weights_path };
+    TrainedModel::open(&written, &config.model, &config.device.open()?)?;
     go_on(stop)?;
     refuse_existing(folder)?;
     publish(temporary.path(), folder).map_err(TrainError::io(writing, folder))?;
@@ -141,64 +146,4 @@ pub(crate) fn to_safetensors(
     let file = safetensors::serialize(views.map_err(bad)?, Some(metadata)).map_err(bad)?;
     // Equal weights are equal files.
     weights::sorted_header(file).map_err(TrainError::bad_file("weight file", path))
-}
-
-/// Evaluates the model of a directory, with the data and settings of `config`, and writes the results to `folder`.
-///
-/// A model with a condenser is measured on condensed tokens alone unless `stage1` is given, the model it was trained
-/// from: that draws the other variants. `systems` are measured beside it.
-///
-/// # Errors
-/// [`TrainError::BadFile`] when `stage1` has another encoder, [`TrainError::BadConfig`] for variants that there are no
-/// weights for and heads that are not the model's, and whatever data, models or evaluation give.
-pub fn evaluate(
-    mut config: Config,
-    model: &ModelPath,
-    stage1: Option<&ModelPath>,
-    systems: &[System],
-    folder: &Path,
-    stop: &AtomicBool,
-    sink: &mut dyn Sink,
-) -> Result<Summary, TrainError> {
-    config.validate()?;
-    check_heads(&config.model, &model.run)?;
-    let last = Trained::load(&config, &model.weights)?;
-    let first = stage1.map(|path| Trained::load(&config, &path.weights)).transpose()?;
-    if let Some(path) = stage1 {
-        check_heads(&config.model, &path.run)?;
-    }
-    if let (Some(first), Some(path)) = (&first, stage1)
-        && weights::hash(&first.encoder) != weights::hash(&last.encoder)
-    {
-        let reason = format!("its encoder is not that of {}", model.weights.display());
-        return Err(TrainError::bad_file("stage-1 model", &path.weights)(reason));
-    }
-    if last.condenser.is_some() && first.is_none() {
-        // Its renderer was trained on condensed tokens: what it makes of others is no baseline.
-        let asked = &mut config.eval.variants;
-        if asked.is_empty() {
-            asked.push(Tokens::Clift);
-        }
-        if let Some(variant) = asked.iter().find(|variant| **variant != Tokens::Clift) {
-            let fix = "give the first-stage model that draws it with --stage1".to_owned();
-            return Err(TrainError::BadConfig { key: "eval.variants".into(), value: variant.name().into(), fix });
-        }
-    }
-    let OpenedSource { source, report: ledger, .. } = open_dataset(&config.data, Split::Test)?;
-    sink.event(&Event::Message(format!("{}: {ledger}", Split::Test)));
-    let reader = ClipReader { source, options: config.data.clip_options() };
-    let held_out = HeldOut::new(&config, &config.eval, reader, &last.device)?;
-    if !held_out.ledger().skips.is_empty() {
-        sink.event(&Event::Message(format!("evaluation: {}", held_out.ledger())));
-    }
-    std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
-    let Trained { encoder, lift_norm, condenser, renderer, device } = last;
-    let condensed =
-        condenser.map(|condenser| Condensed { lift_norm: lift_norm.clone(), condenser, renderer: renderer.clone() });
-    let (lift_norm, renderer) = first.map_or((lift_norm, renderer), |first| (first.lift_norm, first.renderer));
-    let mut networks = Networks { encoder, lift_norm, renderer, condensed: None, patch_condensed: None, device };
-    if let Some(condensed) = condensed {
-        networks.set_condensed(config.clusters.grouping, condensed);
-    }
-    held_out.evaluate(&networks, systems, folder, stop, sink)
 }

@@ -266,7 +266,7 @@ fn kmeans_s(rates: &InferenceRates, count: usize) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use clift_eval::TokenCount;
+    use clift_model::TokenCount;
 
     use super::*;
 

@@ -7,10 +7,18 @@ use std::sync::atomic::AtomicBool;
 use burn::module::Module;
 use burn::tensor::Device;
 use clift_data::files::{make_folder, remove_leftovers};
-use clift_data::{ClipReader, OpenedSource, SceneSource, SceneSubset, Split, open_dataset, open_training_dataset};
+use clift_data::ClipReader;
+use clift_data::OpenedSource;
+use clift_data::SceneSource;
+use clift_data::SceneSubset;
+use clift_data::Split;
+use clift_data::open_dataset;
+use clift_data::open_training_dataset;
+use clift_eval::evaluator::write_ledger;
 use clift_eval::lpips::LPIPS_COMMAND;
-use clift_eval::{Condensed, Networks, Summary, System};
-use clift_model::{Clift, Encoder, ModelConfig, weights};
+use clift_eval::{EvalModels, Summary, System};
+use clift_model::model_path::check_heads;
+use clift_model::{Clift, ModelError, ModelPath, TrainedModel, weights};
 
 use crate::TrainError;
 use crate::cluster_builder::ClusterJob;
@@ -20,13 +28,13 @@ use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::footprint::scene_sizes::PARTS;
-use crate::held_out::{HeldOut, write_ledger};
+use crate::init_from::init_from;
 use crate::lock::RunLock;
 use crate::run_settings::{RunFile, compare, write_config};
 use crate::stage1::Stage1Batches;
 use crate::stage2::Stage2Batches;
-use crate::trained::{ModelPath, check_heads, refuse_checkpoint};
 use crate::trainer::{MakeBatch, StagePlan};
+use crate::validation::Validation;
 
 /// What the command line adds to a config.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -130,10 +138,10 @@ impl Run {
     ) -> Result<Option<Summary>, TrainError> {
         let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
         let reader = self.reader(Split::Train, sink)?;
-        let held_out = self.held_out(sink)?;
+        let validation = self.validation(sink)?;
 
         let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
-            self.train_stage1(&reader, &held_out, stop, sink)?
+            self.train_stage1(&reader, &validation, stop, sink)?
         } else {
             self.load_stage1(only)?
         };
@@ -141,13 +149,13 @@ impl Run {
         if only == Some(Stage::Clusters) || train_stage2 {
             let cache = self.clusters(only, &reader, &stage1, stop, sink)?;
             if train_stage2 {
-                self.train_stage2(&reader, cache, &held_out, stage1, stop, sink)?;
+                self.train_stage2(&reader, cache, &validation, stage1, stop, sink)?;
             }
         }
         if only.is_some() {
             return Ok(None);
         }
-        held_out.evaluate(&self.networks(sink)?, &[], &self.folder("eval"), stop, sink).map(Some)
+        validation.evaluate(&self.models(sink)?, &[], &self.folder("eval"), stop, sink).map(Some)
     }
 
     /// Evaluates the run's weights, and other systems' pictures beside them, and writes the results to `folder`;
@@ -169,7 +177,7 @@ impl Run {
         let is_inside = self.lock.is_none() && folder.starts_with(&self.config.run_dir);
         let _lock = is_inside.then(|| RunLock::take(&self.config.run_dir, sink)).transpose()?;
         std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
-        let mut networks = self.networks(sink)?;
+        let mut models = self.models(sink)?;
         if let Some(other) = beside {
             if other.clusters.grouping == self.config.clusters.grouping {
                 let value = other.run_dir.display().to_string();
@@ -177,61 +185,55 @@ impl Run {
                            clusters.grouping";
                 return Err(TrainError::BadConfig { key: "--with".into(), value, fix: fix.into() });
             }
-            let condensed = self.load_stage2(other, &networks.encoder)?;
-            networks.set_condensed(other.clusters.grouping, condensed);
+            models.set_stage2(other.clusters.grouping, self.open_stage2(other, &models.stage1)?);
         }
-        self.held_out(sink)?.evaluate(&networks, systems, folder, stop, sink)
+        self.validation(sink)?.evaluate(&models, systems, folder, stop, sink)
     }
 
-    /// The trained networks: of both stages, or of stage 1 alone.
-    fn networks(&self, sink: &mut dyn Sink) -> Result<Networks, TrainError> {
-        let stage1 = self.load_stage1(Some(Stage::Eval))?;
-        let Clift { encoder, lift_norm, renderer, .. } = stage1.valid();
-        let device = self.device.clone();
-        let mut networks = Networks { encoder, lift_norm, renderer, condensed: None, patch_condensed: None, device };
+    /// The trained models: of both stages, or of stage 1 alone.
+    fn models(&self, sink: &mut dyn Sink) -> Result<EvalModels, TrainError> {
+        let weights = self.require_stage1(Stage::Eval)?;
+        let path = ModelPath { dir: self.config.run_dir.clone(), weights };
+        let mut models = EvalModels::new(TrainedModel::open(&path, &self.config.model, &self.device)?);
         if self.weights(Stage::Stage2).exists() {
-            let condensed = self.load_stage2(&self.config, &networks.encoder)?;
-            networks.set_condensed(self.config.clusters.grouping, condensed);
+            models.set_stage2(self.config.clusters.grouping, self.open_stage2(&self.config, &models.stage1)?);
         } else {
             sink.event(&Event::Message("stage 2 has not run: evaluating the stage-1 weights alone".into()));
         }
-        Ok(networks)
+        Ok(models)
     }
 
-    /// What the stage 2 of `config`'s run trained, which must have been on this encoder.
-    fn load_stage2(&self, config: &Config, encoder: &Encoder) -> Result<Condensed, TrainError> {
+    /// The model of stage 2 of `config`'s run, which must have been trained on the encoder of `stage1`.
+    fn open_stage2(&self, config: &Config, stage1: &TrainedModel) -> Result<TrainedModel, TrainError> {
         let path = config.run_dir.join(Stage::Stage2.name()).join("model.safetensors");
         if !path.exists() {
             let what = "the weights of stage 2";
             return Err(TrainError::Missing { stage: "evaluation", what, first: "clift train", path });
         }
-        let mut model = Clift::new(&config.model, config.seed, &self.device);
-        weights::load(&mut model, &path)?.require_all(&path)?;
-        if weights::hash(&model.encoder) != weights::hash(encoder) {
-            return Err(TrainError::OtherEncoder { path });
+        let found = ModelPath { dir: config.run_dir.clone(), weights: path.clone() };
+        let model = TrainedModel::open(&found, &config.model, &self.device)?;
+        if !model.has_condenser {
+            let reason = "the file holds no condenser".into();
+            return Err(ModelError::Weights { action: "reading", reason, path }.into());
         }
-        Ok(Condensed::of(&model))
+        if model.has_encoder_of(stage1) { Ok(model) } else { Err(TrainError::OtherEncoder { path }) }
     }
 
     /// The views that are measured, during training and after it.
-    fn held_out(&self, sink: &mut dyn Sink) -> Result<HeldOut<'_>, TrainError> {
+    fn validation(&self, sink: &mut dyn Sink) -> Result<Validation<'_>, TrainError> {
         let mut eval = self.config.eval.clone();
         if self.overfit.is_some() && eval.index.take().is_some() {
             sink.event(&Event::Message("--overfit measures the scenes it trains on: eval.index is not used".into()));
         }
         // The test split, or the training scenes themselves under --overfit.
         let reader = self.reader(if self.overfit.is_some() { Split::Train } else { Split::Test }, sink)?;
-        let held_out = HeldOut::new(&self.config, &eval, reader, &self.device)?;
-        if !held_out.ledger().skips.is_empty() {
-            sink.event(&Event::Message(format!("evaluation: {}", held_out.ledger())));
-        }
-        Ok(held_out)
+        Validation::new(&self.config, eval, reader, &self.device, sink)
     }
 
     fn train_stage1(
         &self,
         reader: &ClipReader,
-        held_out: &HeldOut,
+        validation: &Validation,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Clift, TrainError> {
@@ -244,8 +246,8 @@ impl Run {
             }
             Ok(model)
         };
-        let model = self.plan(Stage::Stage1, batches).train(start, held_out, stop, sink)?;
-        weights::save(&model.stage1(), &self.weights(Stage::Stage1))?;
+        let model = self.plan(Stage::Stage1, batches).train(start, validation, stop, sink)?;
+        weights::save_part(&model, &Clift::stage1_part(), &self.weights(Stage::Stage1))?;
         Ok(model)
     }
 
@@ -253,19 +255,16 @@ impl Run {
         &self,
         reader: &ClipReader,
         cache: ClusterCache,
-        held_out: &HeldOut,
+        validation: &Validation,
         stage1: Clift,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<(), TrainError> {
         let batches = Stage2Batches::new(&self.config, reader, Arc::new(cache))?;
         let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
-        let start = |_: &mut dyn Sink| {
-            let mut model = self.new_model();
-            model.set_stage1(stage1.stage1());
-            Ok(model)
-        };
-        let model = self.plan(Stage::Stage2, batches).train(start, held_out, stop, sink)?;
+        // The condenser of stage 1 takes no gradient.
+        let start = |_: &mut dyn Sink| Ok(Clift { condenser: self.new_model().condenser, ..stage1 });
+        let model = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?;
         Ok(weights::save(&model, &self.weights(Stage::Stage2))?)
     }
 
@@ -312,17 +311,20 @@ impl Run {
     }
 
     fn load_stage1(&self, only: Option<Stage>) -> Result<Clift, TrainError> {
-        let path = self.weights(Stage::Stage1);
-        if !path.exists() {
-            let stage = only.map_or("stage2", Stage::name);
-            let what = "the weights of stage 1";
-            return Err(TrainError::Missing { stage, what, first: "--only stage1", path });
-        }
+        let path = self.require_stage1(only.unwrap_or(Stage::Stage2))?;
         let mut model = self.new_model();
-        let mut stage1 = model.stage1();
-        weights::load(&mut stage1, &path)?.require_all(&path)?;
-        model.set_stage1(stage1);
+        weights::load_part(&mut model, &Clift::stage1_part(), &path)?.require_all(&path)?;
         Ok(model)
+    }
+
+    /// The weights of stage 1, which `stage` needs.
+    fn require_stage1(&self, stage: Stage) -> Result<PathBuf, TrainError> {
+        let path = self.weights(Stage::Stage1);
+        if path.exists() {
+            return Ok(path);
+        }
+        let what = "the weights of stage 1";
+        Err(TrainError::Missing { stage: stage.name(), what, first: "--only stage1", path })
     }
 
     fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
@@ -350,35 +352,6 @@ impl Run {
     fn weights(&self, stage: Stage) -> PathBuf {
         self.folder(stage.name()).join("model.safetensors")
     }
-}
-
-/// Starts from another run or a weight file, and says what was and was not loaded.
-fn init_from(model: &mut Clift, config: &ModelConfig, from: &Path, sink: &mut dyn Sink) -> Result<(), TrainError> {
-    // A run, a model directory or a weight file.
-    let in_folder = ["stage1/model.safetensors", "model.safetensors"].map(|file| from.join(file));
-    let [run, _] = &in_folder;
-    let path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
-    refuse_checkpoint(path)?;
-    // A weight file on its own does not say its heads.
-    if let Ok(found) = ModelPath::find(path) {
-        check_heads(config, &found.run)?;
-    }
-    let mut stage1 = model.stage1();
-    let loaded = weights::load(&mut stage1, path)?;
-    if loaded.applied.is_empty() {
-        let reason = "none of its tensors has a place in this model".to_owned();
-        return Err(TrainError::bad_file("weight file for stage1.init_from", path)(reason));
-    }
-    model.set_stage1(stage1);
-    let list = |names: &[String]| if names.is_empty() { "none".into() } else { names.join(", ") };
-    sink.event(&Event::Message(format!(
-        "loaded {} parameters from {}; new, not in the file: {}; unused in the file: {}",
-        loaded.applied.len(),
-        path.display(),
-        list(&loaded.missing),
-        list(&loaded.unused)
-    )));
-    Ok(())
 }
 
 /// `runs/tiny` becomes `runs/tiny.1`, or the first number that is free.

@@ -4,7 +4,9 @@ use burn::module::Module;
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::{GradientsAccumulator, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor};
-use clift_model::{Clift, Precision};
+use clift_model::Clift;
+use clift_model::Precision;
+use clift_model::SceneModel;
 
 use crate::TrainError;
 use crate::batch::StageBatch;

@@ -14,7 +14,9 @@ use crate::batch::StageBatch;
 use crate::checkpoint::Checkpoints;
 use crate::config::Config;
 use crate::events::Stage;
-use crate::stage_settings::{Part, StageSettings};
+use crate::stage_settings::Part;
+use crate::stage_settings::StageSettings;
+use crate::validation::Validation;
 
 /// Makes the batch of a step, in any thread.
 pub type MakeBatch = dyn Fn(u64) -> Result<StageBatch, TrainError> + Send + Sync;

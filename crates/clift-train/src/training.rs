@@ -10,7 +10,6 @@ use crate::bad_steps::{BadScene, BadStep, Fault};
 use crate::batch::StageBatch;
 use crate::checkpoint::Checkpoints;
 use crate::events::{Event, Sink, StepEvent};
-use crate::held_out::HeldOut;
 use crate::loss::psnr_of;
 use crate::progress::{Best, Progress};
 use crate::schedule::warm_up_cosine;
@@ -18,6 +17,7 @@ use crate::sinks::RunLog;
 use crate::stage_settings::StageSettings;
 use crate::step::{Learner, Update};
 use crate::trainer::StagePlan;
+use crate::validation::Validation;
 
 /// A stage while it trains.
 pub(crate) struct Training<'a> {
@@ -26,7 +26,7 @@ pub(crate) struct Training<'a> {
     progress: Progress,
     /// Step of the newest checkpoint; 0 for none.
     saved: u64,
-    held_out: &'a HeldOut<'a>,
+    validation: &'a Validation<'a>,
     stop: &'a AtomicBool,
     /// What happens goes here.
     pub(crate) log: RunLog<'a>,
@@ -38,11 +38,11 @@ impl<'a> Training<'a> {
         plan: &'a StagePlan,
         checkpoints: Checkpoints,
         progress: Progress,
-        held_out: &'a HeldOut,
+        validation: &'a Validation,
         stop: &'a AtomicBool,
         log: RunLog<'a>,
     ) -> Self {
-        Self { plan, checkpoints, saved: progress.step, progress, held_out, stop, log }
+        Self { plan, checkpoints, saved: progress.step, progress, validation, stop, log }
     }
 
     /// Makes the steps that are left and returns the trained model.
@@ -174,7 +174,7 @@ impl<'a> Training<'a> {
         }
         let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
         let model = learner.inference_model();
-        let psnr = self.held_out.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
+        let psnr = self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
         if psnr.is_none() && self.stop.load(Ordering::Relaxed) {
             if self.saved < step {
                 self.save(learner)?;

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
 use clift_eval::compare::Side;
-use clift_eval::{Experiment, Selection, TokenCount};
+use clift_eval::{Experiment, Selection};
 use clift_model::device::DeviceName;
-use clift_model::{Convention, TokenStorage};
+use clift_model::{Convention, TokenCount, TokenStorage};
 use clift_train::Stage;
 use clift_train::bench::Work;
 

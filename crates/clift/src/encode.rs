@@ -4,17 +4,28 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::layout::SAME_SCENES;
-use clift_data::{
-    ClipReader, DatasetRoot, FileOptions, OpenedSource, SceneSource, SourceKind, SourceOptions, Split, open_dataset,
-    open_source,
-};
-use clift_eval::TokenCount;
+use clift_data::ClipReader;
+use clift_data::DatasetRoot;
+use clift_data::FileOptions;
+use clift_data::OpenedSource;
+use clift_data::SceneSource;
+use clift_data::SourceKind;
+use clift_data::SourceOptions;
+use clift_data::Split;
+use clift_data::open_dataset;
+use clift_data::open_source;
+use clift_eval::encode::EncodeOptions;
+use clift_eval::encode::Encoded;
+use clift_eval::encode::encode;
 use clift_model::device::DeviceName;
-use clift_model::{TokenStorage, check_destination};
-use clift_train::encode::EncodeOptions;
-use clift_train::encode::Encoded;
-use clift_train::trained::{ModelPath, Trained};
-use clift_train::{Config, Override, read_config};
+use clift_model::TokenStorage;
+use clift_model::check_destination;
+use clift_train::Config;
+use clift_train::Override;
+use clift_train::read_config;
+use clift_model::ModelPath;
+use clift_model::TokenCount;
+use clift_model::TrainedModel;
 
 use crate::WrongUsage;
 use crate::data::text::{bytes, count};
@@ -63,9 +74,9 @@ pub struct EncodeArgs {
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_destination(&args.out).map_err(|error| WrongUsage(error.to_string()))?;
     let model = ModelPath::find(&args.model)?;
-    let (mut config, overrides) = read_config::<Config>(&model.run.join("config.toml"), &args.set)?;
+    let (mut config, overrides) = read_config::<Config>(&model.dir.join("config.toml"), &args.set)?;
     // No shape shows heads: another number would be encoded, and drawn, without a word.
-    if config.model != read_config::<Config>(&model.run.join("config.toml"), &[])?.0.model {
+    if config.model != model.config()? {
         return Err(
             WrongUsage("--set model: the network is what the weights were trained with: leave it out".into()).into()
         );
@@ -88,10 +99,15 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let reader = ClipReader { source, options: config.data.clip_options() };
     let options = EncodeOptions {
         context: (!args.context.is_empty()).then(|| args.context.clone()),
+        num_context: config.data.views.max_context,
         storage: args.storage,
+        grouping: config.clusters.grouping,
+        kmeans: config.clusters.kmeans.clone(),
+        seed: config.seed,
         model_path: args.model.to_string_lossy().into_owned(),
     };
-    let encoded = Trained::load(&config, &model.weights)?.encode(&config, &reader, scene, &options)?;
+    let model = TrainedModel::open(&model, &config.model, &config.device.open()?)?;
+    let encoded = encode(&model, &reader, scene, &options)?;
     encoded.scene.write(&args.out, args.tokens)?;
     terminal::print_result(&told(&encoded, args.tokens, &args.out))
 }

@@ -4,8 +4,11 @@ use std::path::{Path, PathBuf};
 
 use clift_data::SourceKind;
 use clift_eval::{System, SystemName};
-use clift_train::trained::ModelPath;
-use clift_train::{Config, Run, model_dir, read_config};
+use clift_train::Config;
+use clift_train::Run;
+use clift_train::read_config;
+use clift_model::ModelPath;
+use clift_train::evaluate_model::evaluate_model;
 
 use crate::args::EvalArgs;
 use crate::{WrongUsage, terminal};
@@ -15,7 +18,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let systems = systems(args)?;
     let model = args.checkpoint.as_deref().map(ModelPath::find).transpose()?;
     let folder = match (&model, &args.run) {
-        (Some(model), _) => &model.run,
+        (Some(model), _) => &model.dir,
         (None, Some(run)) => run,
         (None, None) => unreachable!("the command line asks for one of the two"),
     };
@@ -39,7 +42,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
         None => Run::reopen(config)?.evaluate(&systems, &out, beside.as_ref(), &stop, sink.as_mut())?,
         Some(model) => {
             let stage1 = args.stage1.as_deref().map(ModelPath::find).transpose()?;
-            model_dir::evaluate(config, model, stage1.as_ref(), &systems, &out, &stop, sink.as_mut())?
+            evaluate_model(config, model, stage1.as_ref(), &systems, &out, &stop, sink.as_mut())?
         }
     };
     drop(sink);

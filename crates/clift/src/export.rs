@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 
 use clap::ValueEnum;
+use clift_model::ModelPath;
 use clift_train::export::{ExportFormat, export};
 use clift_train::model_dir::refuse_existing;
-use clift_train::trained::ModelPath;
 use clift_train::{Config, read_config};
 
 use crate::terminal;
@@ -37,7 +37,7 @@ pub enum Format {
 pub fn run(args: &ExportArgs) -> anyhow::Result<()> {
     refuse_existing(&args.out)?;
     let model = ModelPath::find(&args.model)?;
-    let (config, _) = read_config::<Config>(&model.run.join("config.toml"), &[])?;
+    let (config, _) = read_config::<Config>(&model.dir.join("config.toml"), &[])?;
     let format = match args.format {
         Format::Pytorch => ExportFormat::Pytorch,
         Format::Safetensors => ExportFormat::Safetensors,

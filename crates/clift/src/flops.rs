@@ -1,7 +1,6 @@
 //! `clift flops`.
 
-use clift_eval::TokenCount;
-use clift_model::{Convention, Macs, ModelConfig};
+use clift_model::{Convention, Macs, ModelConfig, TokenCount};
 use clift_train::{Config, read_config};
 use serde::Serialize;
 

@@ -106,11 +106,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
 fn train_exit_code(error: &TrainError) -> u8 {
     match error {
         TrainError::Interrupted { .. } | TrainError::Abandoned { .. } => interrupt::exit_code(),
-        TrainError::BadConfig { .. }
-        | TrainError::OtherRun { .. }
-        | TrainError::Missing { .. }
-        | TrainError::NoConfig { .. }
-        | TrainError::NotImported { .. } => WRONG_USAGE,
+        TrainError::BadConfig { .. } | TrainError::OtherRun { .. } | TrainError::Missing { .. } => WRONG_USAGE,
         TrainError::Eval(error) => eval_exit_code(error),
         TrainError::Data(error) => data_exit_code(error),
         TrainError::Model(error) => model_exit_code(error),
@@ -125,24 +121,30 @@ fn data_exit_code(error: &clift_data::DataError) -> u8 {
 }
 
 fn eval_exit_code(error: &EvalError) -> u8 {
-    use EvalError::{BadSystemName, BadTokenCount, BadWeights, NoPredictions, NotComparable};
+    use EvalError::{BadSystemName, BadWeights, Interrupted, NoPredictions, NotComparable};
     match error {
-        BadTokenCount { .. }
-        | BadSystemName { .. }
-        | BadWeights { .. }
-        | NoPredictions { .. }
-        | NotComparable { .. } => WRONG_USAGE,
+        Interrupted { .. } => interrupt::exit_code(),
+        BadSystemName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => WRONG_USAGE,
+        EvalError::Data(error) => data_exit_code(error),
         EvalError::Model(error) => model_exit_code(error),
         _ => FAILED,
     }
 }
 
 fn model_exit_code(error: &clift_model::ModelError) -> u8 {
-    use clift_model::ModelError::{BadConfig, NoDevice, NotDivisible, OtherRenderer};
-    if matches!(error, BadConfig { .. } | NoDevice { .. } | NotDivisible { .. } | OtherRenderer { .. }) {
-        WRONG_USAGE
-    } else {
-        FAILED
+    use clift_model::ModelError::{
+        BadConfig, BadTokenCount, NoConfig, NoDevice, NoModel, NotDivisible, NotImported, OtherRenderer,
+    };
+    match error {
+        BadConfig { .. }
+        | BadTokenCount { .. }
+        | NoConfig { .. }
+        | NoDevice { .. }
+        | NoModel { .. }
+        | NotDivisible { .. }
+        | NotImported { .. }
+        | OtherRenderer { .. } => WRONG_USAGE,
+        _ => FAILED,
     }
 }
 

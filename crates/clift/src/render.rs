@@ -18,7 +18,7 @@ use clift_model::ViewCamera;
 use clift_model::Viewer;
 use clift_train::footprint::machine::available_bytes;
 use clift_model::RenderBudget;
-use clift_train::trained::renderer_weights;
+use clift_model::ModelPath;
 use serde::Serialize;
 
 use args::CameraPath;
@@ -63,7 +63,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     film::refuse_existing(&args.out)?;
     let views = path(&scene, args, height, width)?;
     let model = args.model.clone().unwrap_or_else(|| scene.model_path.clone().into());
-    let weights = renderer_weights(&model, scene.kind);
+    let weights = ModelPath::for_tokens(&model, scene.kind);
     if args.model.is_none() && !weights.exists() {
         // The path is out of a file from anywhere: no control character of it reaches the terminal.
         let path = weights.display().to_string();

@@ -5,7 +5,7 @@ use std::path::Path;
 use burn::tensor::Device;
 use clift_data::pickle::Pickle;
 use clift_data::{ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, image};
-use clift_model::{Scene, weights};
+use clift_model::{Clift, Scene, weights};
 use clift_train::checkpoint::Checkpoints;
 use clift_train::clusters::ClusterCache;
 use clift_train::config::{CheckpointConfig, OptimizerConfig};
@@ -387,8 +387,7 @@ fn config(setup: &Setup) -> Read {
 fn model_weights(setup: &Setup) -> Read {
     let model = setup.model();
     file(setup, "model.safetensors", move |path| {
-        let mut stage1 = model.stage1();
-        let loaded = weights::load(&mut stage1, path).map_err(words_of)?;
+        let loaded = weights::load_part(&mut model.clone(), &Clift::stage1_part(), path).map_err(words_of)?;
         loaded.require_all(path).map_err(words_of)
     })
 }

@@ -3,13 +3,25 @@
 use std::path::Path;
 
 use burn::module::Module;
-use clift_data::{BoundedSampler, ClipReader, DataConfig, Split, SyntheticConfig, open_dataset};
-use clift_eval::TokenCount;
+use clift_data::BoundedSampler;
+use clift_data::ClipReader;
+use clift_data::DataConfig;
+use clift_data::Split;
+use clift_data::SyntheticConfig;
+use clift_data::open_dataset;
+use clift_eval::encode::EncodeOptions;
+use clift_eval::encode::encode;
 use clift_model::viewer::load_renderer;
-use clift_model::{Clift, Preset, Scene, TokenStorage, Variant, ViewCamera, Viewer, weights};
+use clift_model::Preset;
+use clift_model::Scene;
+use clift_model::TokenStorage;
+use clift_model::Variant;
+use clift_model::ViewCamera;
+use clift_model::Viewer;
+use clift_model::weights;
 use clift_train::Config;
-use clift_train::encode::EncodeOptions;
-use clift_train::trained::Trained;
+use clift_model::TokenCount;
+use clift_model::TrainedModel;
 
 use crate::cpu;
 use crate::place::{Place, SIZE, network};
@@ -21,7 +33,7 @@ pub const CASES: &[Case] = &[
     Tolerance::forward(5e-5, "encoder, clusters and condenser one after the other; the chosen patches are the same")
         .case("scene: capture to `.clift` file", |place| {
             let folder = tempfile::tempdir().expect("a folder");
-            let scene = encode(place, folder.path(), TokenStorage::F32);
+            let scene = encode_room(place, folder.path(), TokenStorage::F32);
             let ids = scene.token_ids.iter().copied().map(f64::from).collect();
             let tokens = scene.tokens.iter().copied().map(f64::from).collect();
             Values { forward: vec![("patches".into(), ids), ("tokens".into(), tokens)], ..Values::default() }
@@ -39,7 +51,7 @@ pub const CASES: &[Case] = &[
 const STORED: usize = 7;
 
 /// Encodes a synthetic room on the place's device, writes it and reads it back.
-fn encode(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
+fn encode_room(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
     let [height, width] = SIZE;
     let synthetic = SyntheticConfig {
         num_scenes: 2,
@@ -55,10 +67,17 @@ fn encode(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
     let source = open_dataset(&config.data, Split::Test).expect("rooms are made").source;
     let reader = ClipReader { source, options: config.data.clip_options() };
 
-    let Clift { encoder, lift_norm, condenser, renderer } = place.model().valid();
-    let trained = Trained { encoder, lift_norm, condenser: Some(condenser), renderer, device: place.plain() };
-    let options = EncodeOptions { context: None, storage: TokenCount::Count(STORED), model_path: "suite".into() };
-    let encoded = trained.encode(&config, &reader, 0, &options).expect("a room is encoded");
+    let trained = TrainedModel::snapshot(&place.model().valid(), &config.model, true);
+    let options = EncodeOptions {
+        context: None,
+        num_context: config.data.views.max_context,
+        storage: TokenCount::Count(STORED),
+        grouping: config.clusters.grouping,
+        kmeans: config.clusters.kmeans.clone(),
+        seed: config.seed,
+        model_path: "suite".into(),
+    };
+    let encoded = encode(&trained, &reader, 0, &options).expect("a room is encoded");
     let path = folder.join("room.clift");
     encoded.scene.write(&path, storage).expect("the folder takes a file");
     Scene::read(&path).expect("what was written is read").0
@@ -69,7 +88,7 @@ fn draw(place: &Place, storage: TokenStorage) -> Values {
     let folder = tempfile::tempdir().expect("a folder");
     let maker = Place::new(&cpu());
     let maker = if place.is_wrong() { maker.wrong() } else { maker };
-    let scene = encode(&maker, folder.path(), storage);
+    let scene = encode_room(&maker, folder.path(), storage);
     let weights_file = folder.path().join("model.safetensors");
     weights::save(&maker.model().valid(), &weights_file).expect("the folder takes a file");
     let renderer = load_renderer(&scene, &weights_file, &place.plain()).expect("the scene's renderer");

@@ -2,7 +2,7 @@
 
 use burn::module::Module;
 use clift_eval::upload_pictures;
-use clift_model::{Clift, Clusters, RenderTokens};
+use clift_model::{Clift, Clusters, RenderTokens, SceneModel};
 use clift_train::Stage;
 use clift_train::batch::{StageBatch, TokenChoice};
 use clift_train::config::OptimizerConfig;
@@ -75,7 +75,7 @@ fn update(place: &Place, stage: Stage, parts: usize, activation_checkpointing: b
 
 /// The gradient of every parameter, by hand.
 fn gradient(place: &Place, model: &Clift, batch: &StageBatch) -> Named {
-    let lift = model.lift(&place.context());
+    let lift = model.encode(&place.context());
     let tokens: RenderTokens = match &batch.tokens {
         TokenChoice::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
         TokenChoice::Clusters(clusters) => {

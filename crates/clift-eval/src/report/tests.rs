@@ -3,9 +3,11 @@ use clift_model::{SceneClusters, TokenStorage};
 use super::*;
 use crate::eval_results::EvalResults;
 use crate::exhibit::{Choice, Drawing};
-use crate::method::{SystemName, Variant};
+use crate::method::SystemName;
+use crate::method::Variant;
 use crate::picture::Picture;
-use crate::view_metrics::{EvalKey, ViewMetrics};
+use crate::view_metrics::EvalKey;
+use crate::view_metrics::ViewMetrics;
 
 const HOSTILE: &str = "<script>alert('room')</script>";
 

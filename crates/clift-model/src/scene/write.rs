@@ -2,12 +2,12 @@
 
 use std::fmt::Write as _;
 use std::fs::File;
-use std::io::{ErrorKind, Read as _, Write as _};
+use std::io::{ErrorKind, Read as _};
 use std::path::Path;
 
 use super::{FORMAT, HEADER_BYTES, Scene, TokenStorage, VERSION, dtype_name};
 use crate::ModelError;
-use crate::weights::{TEMPORARY, folder_of, sync_folder};
+use crate::files::{folder_of, replace};
 
 /// Where nothing is lost by writing a scene: a folder that exists, and in it nothing of the name or a scene.
 ///
@@ -50,18 +50,7 @@ impl Scene {
     pub fn write(&self, path: &Path, storage: TokenStorage) -> Result<(), ModelError> {
         let bytes = self.to_bytes(path, storage)?;
         check_destination(path)?;
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(TEMPORARY);
-        // The umask decides who may read it, as for any file that is kept.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        let written = builder.tempfile_in(folder_of(path)).and_then(|mut file| {
-            file.write_all(&bytes)?;
-            file.as_file().sync_all()?;
-            file.persist(path)?;
-            sync_folder(path)
-        });
-        written.map_err(|error| ModelError::SceneFile {
+        replace(path, &bytes).map_err(|error| ModelError::SceneFile {
             action: "write",
             reason: error.to_string(),
             fix: WRITABLE_FOLDER,

@@ -5,10 +5,14 @@ use std::path::PathBuf;
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use clift_data::{BoundedSampler, Clip, DataConfig, SourceKind, SyntheticConfig};
-use clift_eval::{TokenCount, upload_views};
+use clift_data::BoundedSampler;
+use clift_data::Clip;
+use clift_data::DataConfig;
+use clift_data::SourceKind;
+use clift_data::SyntheticConfig;
+use clift_eval::upload_views;
 use clift_model::device::DeviceName;
-use clift_model::{Clift, ModelConfig};
+use clift_model::{Clift, ModelConfig, SceneModel, TokenCount};
 
 use super::inputs::{Shape, clip, model};
 use super::{BenchOptions, MAX_CHECKED_TOKENS};
@@ -151,7 +155,7 @@ impl BenchContext {
             return Ok(lift.clone());
         }
         let views = upload_views(&[&self.clip(1).context], &self.device)?;
-        let lift = self.model().valid().lift(&views);
+        let lift = self.model().valid().encode(&views);
         Ok(self.lift.get_or_init(|| lift).clone())
     }
 

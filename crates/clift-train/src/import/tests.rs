@@ -6,14 +6,20 @@ use burn::tensor::{Device, Tensor, TensorData};
 use clift_data::write_state_dict;
 use clift_model::device::DeviceName;
 use clift_model::interchange::PREFIX;
-use clift_model::{Cameras, Clusters, SceneClusters, Variant, Views};
+use clift_model::Cameras;
+use clift_model::Clusters;
+use clift_model::SceneClusters;
+use clift_model::Variant;
+use clift_model::Views;
+use clift_model::ModelPath;
+use clift_model::SceneModel;
+use clift_model::TrainedModel;
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
 use super::*;
 use crate::export::{ExportFormat, export};
 use crate::read_config;
-use crate::trained::{ModelPath, Trained};
 
 mod keys;
 
@@ -106,22 +112,23 @@ fn assert_computes(folder: &Path, name: &str) {
     for device in [DeviceName::Flex, DeviceName::Ndarray] {
         config.device = device;
         let path = ModelPath::find(folder).unwrap();
-        let trained = Trained::load(&config, &path.weights).unwrap();
-        let device = &trained.device;
+        assert_eq!(path.config().unwrap(), config.model);
+        let trained = TrainedModel::open(&path, &config.model, &config.device.open().unwrap()).unwrap();
+        let (network, device) = (&trained.network, &trained.device);
         let images = reference.tensor("input.context_images", device);
-        let features = trained.encoder.forward(&Views { images, cameras: reference.cameras("context", device) });
+        let features = network.features(&Views { images, cameras: reference.cameras("context", device) });
         reference.assert_close("output.features", &features);
-        let mut tokens = trained.lift_norm.forward(features);
-        if let Some(condenser) = &trained.condenser {
+        let mut tokens = network.normalize(features);
+        if trained.has_condenser {
             let [assignment, centroid_index] = ["assignment", "centroid_index"];
             let counts = |name: &str| reference.counts(&format!("input.{name}"));
             let scene = SceneClusters::new(counts(assignment), counts(centroid_index)).unwrap();
-            tokens = condenser.forward(tokens, &Clusters::new(vec![scene]).unwrap().upload(device));
+            tokens = network.compress(tokens, &Clusters::new(vec![scene]).unwrap().upload(device));
             reference.assert_close("output.clift", &tokens);
         } else {
             assert!(reference.values("output.clift").is_none(), "{name} has lost its condenser");
         }
-        let rendering = trained.renderer.forward(tokens, &reference.cameras("target", device));
+        let rendering = network.render(tokens, &reference.cameras("target", device));
         reference.assert_close("output.rendering", &rendering);
     }
 }

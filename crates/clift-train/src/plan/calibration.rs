@@ -9,9 +9,21 @@ use clift_data::order::{item_rng, step_rng};
 use clift_data::statistics::upper_median;
 use clift_data::{ClipReader, Split, open_dataset};
 use clift_eval::lpips::Lpips;
-use clift_eval::{Condensed, EvalResults, Networks, Sweep, TokenCount, evaluate_scene, upload_cameras, upload_views};
+use clift_eval::EvalResults;
+use clift_eval::Sweep;
+use clift_eval::evaluate_scene;
+use clift_eval::upload_cameras;
+use clift_eval::upload_views;
+use clift_eval::EvalModels;
 
-use clift_model::{Convention, ModelConfig, Parameters, Part, SceneSizes};
+use clift_model::Convention;
+use clift_model::ModelConfig;
+use clift_model::Parameters;
+use clift_model::Part;
+use clift_model::SceneSizes;
+use clift_model::SceneModel;
+use clift_model::TokenCount;
+use clift_model::TrainedModel;
 use cpu_time::ProcessTime;
 use rand::RngExt;
 use rand::seq::index::sample;
@@ -238,21 +250,15 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
     let mut kmeans = Vec::new();
     let mut measuring_s = 0.0;
     if is_measured {
-        let networks = Networks {
-            encoder: model.encoder.clone(),
-            lift_norm: model.lift_norm.clone(),
-            renderer: model.renderer.clone(),
-            condensed: Some(Condensed::of(&model)),
-            patch_condensed: None,
-            device: context.device.clone(),
-        };
+        let stage2 = TrainedModel::snapshot(&model, &shallow.model, true);
+        let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
         let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
         let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
         let sweep = Sweep { model: shallow.model.clone(), lpips, ..evaluated(config) };
         // One for all: after the first time no setting draws the view that warms it up.
         let mut measured = EvalResults::default();
         measuring_s =
-            Timed::of(|| Ok(evaluate_scene(&networks, &clip, &sweep, false, &mut measured).map(|_| ())?))?.seconds;
+            Timed::of(|| Ok(evaluate_scene(&models, &clip, &sweep, false, &mut measured).map(|_| ())?))?.seconds;
     } else {
         for &count in counts {
             // One seed takes a few iterations more, another fewer.

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clift_eval::TokenCount;
+use clift_model::TokenCount;
 use clift_model::device::DeviceName;
 use clift_train::bench::half::{HalfReport, HalfRow, WORKS, compare};
 use clift_train::bench::{BenchOptions, Work};

@@ -6,9 +6,8 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::builder::RangedU64ValueParser;
-use clift_eval::TokenCount;
 use clift_model::device::DeviceName;
-use clift_model::{Precision, Preset};
+use clift_model::{Precision, Preset, TokenCount};
 
 use crate::data::args::parse_size;
 

@@ -1,28 +1,24 @@
-//! The clips that are evaluated.
+//! The scenes and views that are evaluated.
 
-use clift_data::index::spread_views;
+use clift_data::export::spread_views;
 use clift_data::{ClipReader, EvaluationIndex, EvaluationItem, Ledger};
-use clift_eval::EvalConfig;
 
-use crate::TrainError;
+use crate::EvalError;
+use crate::config::EvalConfig;
 
 /// Chooses the scenes and views of an evaluation: those of its index, or views spread evenly.
 ///
-/// At most `num_scenes` (0: all) are taken, in the order of the index or the source. Scenes that cannot
+/// At most `eval.num_scenes` (0: all) are taken, in the order of the index or the source. Scenes that cannot
 /// be used are in the ledger.
 ///
 /// # Errors
-/// Whatever reading the index gives, and [`TrainError::NoScenes`] when none is left.
-pub fn evaluation_items(
-    eval: &EvalConfig,
-    reader: &ClipReader,
-    num_scenes: usize,
-) -> Result<(Vec<EvaluationItem>, Ledger), TrainError> {
+/// [`EvalError::Data`] for an index that cannot be read, and [`EvalError::NoScenes`] when no scene is left.
+pub fn evaluation_items(eval: &EvalConfig, reader: &ClipReader) -> Result<(Vec<EvaluationItem>, Ledger), EvalError> {
     let source = &reader.source;
     let (items, ledger) = if let Some(index) = &eval.index {
-        EvaluationIndex::read(index)?.select(source.as_ref(), num_scenes)
+        EvaluationIndex::read(index)?.select(source.as_ref(), eval.num_scenes)
     } else {
-        let limit = if num_scenes == 0 { usize::MAX } else { num_scenes };
+        let limit = if eval.num_scenes == 0 { usize::MAX } else { eval.num_scenes };
         let count = source.num_scenes().min(limit);
         let mut ledger = Ledger::new(count);
         let mut items = Vec::with_capacity(count);
@@ -36,7 +32,7 @@ pub fn evaluation_items(
         (items, ledger)
     };
     if items.is_empty() {
-        return Err(TrainError::NoScenes { reason: format!("evaluation: {ledger}") });
+        return Err(EvalError::NoScenes { reason: format!("evaluation: {ledger}") });
     }
     Ok((items, ledger))
 }

@@ -6,6 +6,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::error::EvalError;
+use crate::ModelError;
 
 /// A count of tokens (`256`) or a share of all of them (`"1/16"`, `0.0625`), as a config and the
 /// command line give it.
@@ -21,17 +22,17 @@ impl TokenCount {
     /// The number of tokens of a scene that has `num_tokens`.
     ///
     /// # Errors
-    /// [`EvalError::BadTokenCount`] when a scene does not have that many.
-    pub fn of(self, num_tokens: usize) -> Result<usize, EvalError> {
+    /// [`ModelError::BadTokenCount`] when a scene does not have that many.
+    pub fn of(self, num_tokens: usize) -> Result<usize, ModelError> {
         match self {
-            _ if num_tokens == 0 => Err(EvalError::BadTokenCount {
+            _ if num_tokens == 0 => Err(ModelError::BadTokenCount {
                 text: self.to_string(),
                 reason: "a scene without views has no tokens".into(),
             }),
             Self::Count(count) if (1..=num_tokens).contains(&count) => Ok(count),
             // The small excess keeps 3 of 48 from becoming 2 through 0.0625 * 48 = 2.9999...
             Self::Share(share) => Ok(((num_tokens as f64 * share + 1e-9) as usize).clamp(1, num_tokens)),
-            Self::Count(count) => Err(EvalError::BadTokenCount {
+            Self::Count(count) => Err(ModelError::BadTokenCount {
                 text: count.to_string(),
                 reason: format!("a scene has {num_tokens} tokens"),
             }),
@@ -40,10 +41,10 @@ impl TokenCount {
 }
 
 impl FromStr for TokenCount {
-    type Err = EvalError;
+    type Err = ModelError;
 
-    fn from_str(text: &str) -> Result<Self, EvalError> {
-        let bad = |reason: &str| EvalError::BadTokenCount { text: text.into(), reason: reason.into() };
+    fn from_str(text: &str) -> Result<Self, ModelError> {
+        let bad = |reason: &str| ModelError::BadTokenCount { text: text.into(), reason: reason.into() };
         let share = |share: f64| {
             if share > 0.0 && share <= 1.0 { Ok(Self::Share(share)) } else { Err(bad("a share lies in (0, 1]")) }
         };

@@ -1,0 +1,180 @@
+//! A capture to a scene: contexts, tokens, clusters, condenser.
+// N encoder tokens, S stored tokens, D width
+
+use burn::tensor::Tensor;
+use clift_data::order::derive_seed;
+use clift_data::{ClipReader, Pose, SceneFrame, ViewIndices, spread_along_path};
+use clift_model::{
+    Clusters, Grouping, KMeans, ModelError, Scene, SceneModel, TokenCount, TokenKind, TrainedModel, WorldFrame,
+    total_variance,
+};
+
+use crate::EvalError;
+use crate::upload::{upload_views, view_cameras};
+
+/// How a scene is encoded.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EncodeOptions {
+    /// Frames the encoder sees; `None`: `num_context` frames, spread along the path.
+    pub context: Option<Vec<usize>>,
+    /// Context views in training, at most.
+    pub num_context: usize,
+    /// How many tokens are stored.
+    pub storage: TokenCount,
+    /// Groups of tokens that the model was trained on.
+    pub grouping: Grouping,
+    /// Latent K-means.
+    pub kmeans: KMeans,
+    /// Seed of the run.
+    pub seed: u64,
+    /// The model as the user typed it: noted in the scene.
+    pub model_path: String,
+}
+
+/// An encoded scene.
+#[derive(Clone, Debug)]
+pub struct Encoded {
+    /// The scene.
+    pub scene: Scene,
+    /// Tokens before clustering.
+    pub num_lift_tokens: usize,
+    /// Share of the tokens' variance that is left within clusters.
+    pub cluster_error: f64,
+}
+
+/// Encodes a scene of `reader`. Clusters are those of `clift eval` for the same contexts and count.
+///
+/// # Errors
+/// [`ModelError::BadConfig`] for contexts that the scene does not have, [`ModelError::BadTokenCount`] for a count that it
+/// does not have, and whatever reading the capture gives.
+pub fn encode(
+    model: &TrainedModel,
+    reader: &ClipReader,
+    scene: usize,
+    options: &EncodeOptions,
+) -> Result<Encoded, EvalError> {
+    if options.grouping != Grouping::Kmeans {
+        let fix = "scenes are of K-means tokens: encode with a run whose clusters.grouping is \"kmeans\"".into();
+        return Err(bad_config("clusters.grouping", "\"patch\"".into(), fix));
+    }
+    let key = reader.source.key(scene);
+    let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();
+    let frames = context_frames(&poses, options.context.as_deref(), options.num_context)?;
+    let context_poses: Vec<Pose> = frames.iter().map(|&frame| poses[frame]).collect();
+    let views = ViewIndices { context: frames, target: Vec::new() };
+    let clip = reader.read(scene, &views)?;
+    let data = &reader.options;
+    let frame = SceneFrame::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)?;
+
+    let lift = model.network.encode(&upload_views(&[&clip.context], &model.device)?); // [1, N, D]
+    let [_, num_lift_tokens, dim] = lift.dims();
+    let seed = derive_seed(derive_seed(options.seed, "eval"), key);
+    let (clusters, cluster_error) = cluster(&options.kmeans, &lift, options.storage, seed)?;
+    let index = clusters.upload(&model.device);
+    let (kind, tokens) = if model.has_condenser {
+        (TokenKind::Clift, model.network.compress(lift, &index))
+    } else {
+        (TokenKind::Kmeans, index.gather_centroids(lift))
+    };
+    let tokens = tokens.into_data().convert::<f32>().try_to_vec::<f32>().map_err(EvalError::tensor)?;
+    let token_ids = clusters.scenes()[0].centroid_index().to_vec();
+    debug_assert_eq!(tokens.len(), token_ids.len() * dim, "a row per centroid");
+    let scene = Scene {
+        key: key.into(),
+        kind,
+        model: model.config.clone(),
+        renderer_hash: model.renderer_hash(),
+        model_path: options.model_path.clone(),
+        height: data.height,
+        width: data.width,
+        context: view_cameras(&clip.context),
+        context_frames: views.context.iter().map(|&frame| frame as u32).collect(),
+        world: WorldFrame { mean_c2w: frame.mean_c2w.to_matrix_f64(), scale: frame.scale },
+        token_ids,
+        tokens,
+    };
+    Ok(Encoded { scene, num_lift_tokens, cluster_error })
+}
+
+/// The frames asked for, or as many as in training, spread along the path.
+fn context_frames(poses: &[Pose], asked: Option<&[usize]>, num_views: usize) -> Result<Vec<usize>, EvalError> {
+    let num_frames = poses.len();
+    let bad = |value: String, fix: String| bad_config("--context", value, fix);
+    let Some(asked) = asked else {
+        return spread_along_path(poses, num_views.min(num_frames)).ok_or_else(|| {
+            bad(num_views.to_string(), format!("the scene has {num_frames} frames; name frames to use"))
+        });
+    };
+    let list = asked.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
+    let mut sorted = asked.to_vec();
+    sorted.sort_unstable();
+    sorted.dedup();
+    if asked.len() < 2 || sorted.len() < asked.len() {
+        return Err(bad(list, "write at least two frames, each once".into()));
+    }
+    if let Some(frame) = asked.iter().find(|frame| **frame >= num_frames) {
+        let last = num_frames.saturating_sub(1);
+        return Err(bad(list, format!("there is no frame {frame}; the scene has frames 0 to {last}")));
+    }
+    Ok(asked.to_vec())
+}
+
+fn bad_config(key: &'static str, value: String, fix: String) -> EvalError {
+    ModelError::BadConfig { key, value, fix }.into()
+}
+
+/// Clusters, and the share of the tokens' variance that is left within them.
+fn cluster(kmeans: &KMeans, lift: &Tensor<3>, storage: TokenCount, seed: u64) -> Result<(Clusters, f64), EvalError> {
+    let [_, num_tokens, _] = lift.dims();
+    let fit = kmeans.fit(lift.clone(), storage.of(num_tokens)?, &[seed])?;
+    let error = fit.error(0, total_variance(lift)?[0]);
+    Ok((fit.clusters, error))
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{Device, TensorData};
+
+    use super::*;
+
+    /// Tokens of two values: `num_kinds` places, far apart, with a little noise.
+    fn tokens(num_tokens: usize, num_kinds: usize) -> Tensor<3> {
+        let value = |i: usize| [(i % num_kinds) as f32 * 10.0, ((i * 7919) % 101) as f32 * 1e-3];
+        let values: Vec<f32> = (0..num_tokens).flat_map(value).collect();
+        Tensor::from_data(TensorData::new(values, [1, num_tokens, 2]), &Device::flex())
+    }
+
+    #[test]
+    fn the_error_is_the_variance_within_clusters_over_the_total() {
+        let lift = tokens(64, 2);
+        let values: Vec<f32> = lift.to_data().try_to_vec().unwrap();
+        let rows: Vec<[f64; 2]> = values.chunks(2).map(|row| [f64::from(row[0]), f64::from(row[1])]).collect();
+        let spread = |rows: &[[f64; 2]]| {
+            let mean = [0, 1].map(|i| rows.iter().map(|row| row[i]).sum::<f64>() / rows.len() as f64);
+            rows.iter().flat_map(|row| [row[0] - mean[0], row[1] - mean[1]]).map(|d| d * d).sum::<f64>()
+        };
+        let (even, odd): (Vec<_>, Vec<_>) = rows.iter().partition(|row| row[0] == 0.0);
+        let expected = (spread(&even) + spread(&odd)) / spread(&rows);
+        let (_, error) = cluster(&KMeans::default(), &lift, TokenCount::Count(2), 1).unwrap();
+        assert!((error / expected - 1.0).abs() < 1e-3, "{error} against {expected}"); // f32
+    }
+
+    #[test]
+    fn a_scene_of_equal_tokens_has_no_error() {
+        let lift = Tensor::<3>::ones([1, 8, 2], &Device::flex());
+        assert_eq!(cluster(&KMeans::default(), &lift, TokenCount::Count(2), 1).unwrap().1, 0.0);
+    }
+
+    #[test]
+    fn contexts_are_those_asked_for_or_spread_and_wrong_ones_are_named() {
+        let at = |x: f64| Pose { translation: [x, 0.0, 0.0], ..Pose::IDENTITY };
+        let poses: Vec<Pose> = (0..10).map(f64::from).map(at).collect();
+        assert_eq!(context_frames(&poses, None, 4).unwrap(), [0, 3, 6, 9]);
+        assert_eq!(context_frames(&poses[..3], None, 4).unwrap(), [0, 1, 2]);
+        assert_eq!(context_frames(&poses, Some(&[7, 2]), 4).unwrap(), [7, 2]);
+        let message = |asked: &[usize]| context_frames(&poses, Some(asked), 4).unwrap_err().to_string();
+        assert_eq!(message(&[0, 10]), "`--context` = 0,10: there is no frame 10; the scene has frames 0 to 9");
+        assert_eq!(message(&[3, 3]), "`--context` = 3,3: write at least two frames, each once");
+        assert_eq!(message(&[3]), "`--context` = 3: write at least two frames, each once");
+    }
+}
