@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use clift_data::{ClipReader, DataError, EvaluationIndex, Ledger, Opened, SceneSource, SourceInfo, Split, has_halves};
+use clift_eval::items::evaluation_items;
 use clift_train::config::SourceKind;
 use clift_train::scene_subset::SceneSubset;
 use clift_train::scenes;
@@ -146,7 +147,7 @@ fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
 
 fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport {
     let reader = ClipReader { source, options: config.data.clip_options() };
-    match scenes::evaluation_items(&config.eval, &reader, config.eval.num_scenes) {
+    match evaluation_items(&config.eval, &reader) {
         Ok((items, ledger)) => EvaluationReport {
             error: None,
             num_scenes: items.len(),
