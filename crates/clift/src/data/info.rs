@@ -6,10 +6,20 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context;
-use clift_data::{
-    ClipReader, DataError, DatasetRoot, EvaluationIndex, Ledger, OpenedSource, SceneSource, SceneSubset, SourceInfo,
-    SourceKind, Split, open_dataset, open_source,
-};
+use clift_data::ClipReader;
+use clift_data::DataError;
+use clift_data::DatasetRoot;
+use clift_data::EvaluationIndex;
+use clift_data::Ledger;
+use clift_data::OpenedSource;
+use clift_data::SceneSource;
+use clift_data::SceneSubset;
+use clift_data::SourceInfo;
+use clift_data::SourceKind;
+use clift_data::Split;
+use clift_data::open_dataset;
+use clift_data::open_source;
+use clift_eval::items::evaluation_items;
 use clift_train::scenes;
 use clift_train::{Config, read_config};
 
@@ -147,7 +157,7 @@ fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
 
 fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport {
     let reader = ClipReader { source, options: config.data.clip_options() };
-    match scenes::evaluation_items(&config.eval, &reader, config.eval.num_scenes) {
+    match evaluation_items(&config.eval, &reader) {
         Ok((items, ledger)) => EvaluationReport {
             error: None,
             num_scenes: items.len(),
