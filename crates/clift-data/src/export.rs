@@ -11,7 +11,7 @@ use crate::clip::{Frame, ViewIndices};
 use crate::error::DataError;
 use crate::files::replace;
 use crate::image::{encode_jpeg, encode_png};
-use crate::index::spread_views;
+pub(crate) use crate::index::spread_views;
 use crate::scene_source::SceneSource;
 
 /// How frames are stored.

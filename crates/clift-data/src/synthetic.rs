@@ -15,8 +15,8 @@ use crate::camera::Camera;
 use crate::clip::SceneSource;
 use crate::error::DataError;
 use crate::order::step_rng;
-use crate::scene_source::Split;
 use crate::rgb_image::Frame;
+use crate::scene_source::Split;
 pub use config::SyntheticConfig;
 use scene::Scene;
 

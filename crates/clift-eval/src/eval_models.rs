@@ -26,7 +26,7 @@ impl EvalModels {
         model.share_encoder(&self.stage1);
         match grouping {
             Grouping::Kmeans => self.stage2 = Some(model),
-            Grouping::Patch => self.stage2_tiles = Some(model),
+            Grouping::Tile => self.stage2_tiles = Some(model),
         }
     }
 
@@ -53,6 +53,6 @@ impl EvalModels {
 pub const fn stage2_method(grouping: Grouping) -> Variant {
     match grouping {
         Grouping::Kmeans => Variant::Clift,
-        Grouping::Patch => Variant::PatchClift,
+        Grouping::Tile => Variant::PatchClift,
     }
 }

@@ -1,30 +1,31 @@
 //! The sweep: every scene encoded once, rendered with every variant at every token count.
 
+use crate::SceneResults;
+use crate::EvalKey;
 use std::time::Instant;
 
 use burn::tensor::Tensor;
 use clift_data::Clip;
 use clift_data::order::derive_seed;
-use clift_model::scene::file_bytes;
 use clift_model::Cameras;
 use clift_model::Convention;
 use clift_model::SceneModel;
+use clift_model::scene::file_bytes;
 
 use crate::error::EvalError;
-use crate::eval_results::EvalResults;
 use crate::eval_models::EvalModels;
+use crate::eval_results::EvalResults;
 use crate::lazy_clusters::LazyClusters;
 use crate::memory;
 use crate::method::Variant;
-use crate::rendered::baselines;
-use crate::scene_results::SceneResults;
-use crate::scene_results::sheet_rows;
-use crate::token_choice::SelectedTokens;
-use crate::token_choice::choose;
 use crate::rendered::ScoredViews;
+use crate::rendered::baselines;
+use crate::scene_results::sheet_rows;
 use crate::stored::CompressedTokens;
 use crate::stored::select_tokens;
 use crate::sweep::Sweep;
+use crate::token_choice::SelectedTokens;
+use crate::token_choice::choose;
 use crate::upload::{upload_cameras, upload_views};
 use crate::view_scorer::ViewScorer;
 
@@ -41,7 +42,7 @@ pub fn evaluate_scene(
     sweep: &Sweep,
     is_shown: bool,
     into: &mut EvalResults,
-) -> Result<Option<Shown>, EvalError> {
+) -> Result<Option<SceneResults>, EvalError> {
     let (stage1, device) = (&models.stage1.network, &models.stage1.device);
     let features = stage1.features(&upload_views(&[&clip.context], device)?);
     // Where stage 2 has trained a norm of the tokens, condensed ones are of that norm, and of its clusters.
@@ -60,7 +61,7 @@ pub fn evaluate_scene(
     let is_shown = !rows.is_empty();
     let scorer = ViewScorer::new(&clip.target, sweep.lpips.as_ref());
     let drawing = Drawing { clip, scorer: &scorer, cameras: upload_cameras(&[&clip.target], device)?, sweep };
-    let mut material = Material { renderings: baselines(clip, &scorer, &rows)?, ..Material::default() };
+    let mut material = SceneResults::new(baselines(clip, &scorer, &rows)?, rows.clone());
     for rendering in &material.renderings {
         record(clip, rendering, into)?;
     }

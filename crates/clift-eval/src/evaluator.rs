@@ -10,11 +10,12 @@ use clift_model::ModelError;
 use crate::EvalError;
 use crate::config::EvalConfig;
 use crate::eval_models::EvalModels;
+use crate::eval_results::EvalResults;
 use crate::evaluate::evaluate_scene;
 use crate::exhibit::Shown;
+use crate::summary::scenes::write_scenes;
 use crate::items::evaluation_items;
 use crate::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
-use crate::eval_results::EvalResults;
 use crate::method::Variant;
 
 use crate::predictions::{System, picture_name};
@@ -110,7 +111,7 @@ impl Evaluator {
             Ok(lpips) => measured.set_lpips_weights(lpips.sha256()),
             Err(reason) => measured.note_not_measured("lpips_vgg", reason.clone()),
         }
-        let summary = measured.summary();
+        let summary = Summary::new(&measured);
         if summary.num_views == 0 {
             return Err(EvalError::NoScenes { reason: "every scene of the evaluation failed".into() });
         }
@@ -119,7 +120,7 @@ impl Evaluator {
         }
         sheets.keep()?;
         summary.write(&folder.join("summary.json"))?;
-        measured.write_scenes(&folder.join("scenes.csv"))?;
+        write_scenes(&measured, &folder.join("scenes.csv"))?;
         measured.write_views(&folder.join("views.csv"))?;
         write_ledger(&ledger, &folder.join("skipped.json"))?;
         let Description { name, config, device } = self.description.clone();
@@ -155,8 +156,8 @@ impl Evaluator {
             match self.reader.read(item.scene, &item.views) {
                 Ok(clip) => {
                     let is_shown = i < limits.num_shown;
-                    if let Some(shown) = evaluate_scene(models, &clip, sweep, is_shown, &mut measured)? {
-                        show(key, shown)?;
+                    if let Some(results) = evaluate_scene(models, &clip, sweep, is_shown, &mut measured)? {
+                        show(key, Shown::new(&clip, &results, sweep.model.patch_size)?)?;
                     }
                 }
                 Err(error) => {
@@ -212,7 +213,7 @@ impl Evaluator {
         let fix = match method {
             Variant::Clift => "stage 2 was not trained on clusters of K-means: leave it out",
             Variant::PatchClift => {
-                "stage 2 was not trained on tiles: train a run with clusters.grouping = \"patch\" and \
+                "stage 2 was not trained on tiles: train a run with clusters.grouping = \"tile\" and \
                  stage1.init_from this one, and evaluate it with --with"
             }
             _ => "baselines are always measured: leave it out",

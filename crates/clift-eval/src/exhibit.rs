@@ -1,13 +1,14 @@
 //! What is shown of a scene: a contact sheet, and small pictures for the report.
 
+use crate::view_scorer::target_image;
 use clift_data::Clip;
 use clift_model::SceneClusters;
 
 use crate::error::EvalError;
 use crate::method::Variant;
 use crate::picture::{Picture, error_map};
-use crate::scene_results::SceneResults;
 use crate::rendered::ScoredViews;
+use crate::scene_results::SceneResults;
 use crate::sheet::{Cell, Row, sheet};
 use crate::token_choice::SelectedTokens;
 use crate::view_metrics::{EvalKey, best_variant};
@@ -133,7 +134,7 @@ fn small(picture: Picture) -> Picture {
 fn scene_sheet(clip: &Clip, renderings: &[ScoredViews], shown_views: &[usize]) -> Result<Picture, EvalError> {
     let best = best_variant(renderings.iter().map(|rendering| rendering.setting));
     let shown = renderings.iter().filter(|r| Some(r.setting.variant) == best && r.setting.is_whole());
-    let mut shown: Vec<&Rendered> = shown.collect();
+    let mut shown: Vec<&ScoredViews> = shown.collect();
     shown.sort_by_key(|r| r.setting.num_storage_tokens);
     shown.dedup_by_key(|r| r.setting.num_storage_tokens);
     if shown.len() > 2 {

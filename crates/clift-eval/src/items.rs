@@ -1,6 +1,6 @@
 //! The scenes and views that are evaluated.
 
-use clift_data::export::spread_views;
+use clift_data::index::spread_views;
 use clift_data::{ClipReader, EvaluationIndex, EvaluationItem, Ledger};
 
 use crate::EvalError;

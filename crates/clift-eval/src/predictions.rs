@@ -13,14 +13,8 @@ use crate::error::EvalError;
 use crate::eval_results::EvalResults;
 use crate::method::SystemName;
 use crate::method::Variant;
-use crate::rendered::Judge;
 use crate::view_metrics::EvalKey;
 use crate::view_metrics::ViewMetrics;
-use crate::EvalError;
-use crate::eval_results::EvalResults;
-use crate::measured::Measured;
-use crate::measured::Setting;
-use crate::method::Variant;
 use crate::view_scorer::ViewScorer;
 
 /// Another system with its pictures.

@@ -2,12 +2,12 @@
 
 use std::str::FromStr;
 
-use clift_model::names::parse_value;
 use clift_model::ModelError;
 use clift_model::Preset;
+use clift_model::TokenCount;
+use clift_model::names::parse_value;
 use strum::IntoStaticStr;
 use strum::VariantArray;
-use clift_model::TokenCount;
 
 use crate::config::EvalConfig;
 use crate::method::Variant;

@@ -6,9 +6,9 @@ use clift_data::Clip;
 
 use crate::EvalError;
 use crate::baseline::{mean_image, nearest_image};
-use crate::view_metrics::ViewMetrics;
-use crate::view_metrics::EvalKey;
 use crate::method::Variant;
+use crate::view_metrics::EvalKey;
+use crate::view_metrics::ViewMetrics;
 
 use crate::view_scorer::ViewScorer;
 

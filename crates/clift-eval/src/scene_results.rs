@@ -3,7 +3,7 @@
 use clift_model::SceneClusters;
 
 use crate::predictions::Scored;
-use crate::rendered::Rendered;
+use crate::rendered::ScoredViews;
 use crate::token_choice::SelectedTokens;
 use crate::view_metrics::EvalKey;
 
@@ -13,7 +13,7 @@ const MAX_ROWS: usize = 6;
 /// Images, clusters and selected tokens of one scene.
 pub struct SceneResults {
     /// The renderings of every key, baselines first.
-    pub(crate) renderings: Vec<Rendered>,
+    pub(crate) renderings: Vec<ScoredViews>,
     /// The clusters of every storage count.
     pub(crate) clusters: Vec<SceneClusters>,
     /// The patches of the stored tokens, and the tokens selected for every target.
@@ -26,7 +26,7 @@ pub struct SceneResults {
 
 impl SceneResults {
     /// Starts with the baselines, of which the images of `rows` are kept.
-    pub(crate) fn new(baselines: Vec<Rendered>, rows: Vec<usize>) -> Self {
+    pub(crate) fn new(baselines: Vec<ScoredViews>, rows: Vec<usize>) -> Self {
         Self { renderings: baselines, clusters: Vec::new(), choices: Vec::new(), others: Vec::new(), rows }
     }
 }

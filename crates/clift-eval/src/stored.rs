@@ -7,9 +7,9 @@ use clift_model::{SceneModel, TokenStorage, TrainedModel};
 use rand::seq::SliceRandom;
 
 use crate::EvalError;
-use crate::method::Variant;
 use crate::eval_models::EvalModels;
 use crate::lazy_clusters::LazyClusters;
+use crate::method::Variant;
 
 /// Stored tokens of one scene.
 pub(crate) struct CompressedTokens<'a> {

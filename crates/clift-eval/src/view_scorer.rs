@@ -7,7 +7,7 @@ use clift_data::Views as HostViews;
 
 use crate::EvalError;
 use crate::lpips::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures};
-use crate::measured::Measured;
+use crate::view_metrics::ViewMetrics;
 use crate::metrics::{SSIM_MIN_SIZE_PX, psnr, ssim};
 
 /// Memory for what LPIPS sees in the targets of a scene, which every setting is compared with: 31 pictures of

@@ -1,7 +1,7 @@
 //! The shape of the network, as the `[model]` section of a config holds it.
 
 use serde::{Deserialize, Serialize};
-use strum::{Display, IntoStaticStr, VariantArray};
+use strum::VariantArray;
 
 use crate::{ModelError, Variant};
 

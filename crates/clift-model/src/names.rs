@@ -38,8 +38,8 @@ mod tests {
 
     use super::*;
     use crate::config::Variant;
-    use crate::device::DeviceName;
     use crate::cost::Convention;
+    use crate::device::DeviceName;
     use crate::precision::Precision;
     use crate::scene::{TokenKind, TokenStorage};
     use crate::select::Preset;

@@ -5,7 +5,6 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use crate::error::EvalError;
 use crate::ModelError;
 
 /// A count of tokens (`256`) or a share of all of them (`"1/16"`, `0.0625`), as a config and the

@@ -38,7 +38,6 @@ pub mod progress;
 mod recompute;
 pub mod run;
 mod run_settings;
-pub mod scenes;
 pub mod schedule;
 pub mod sinks;
 pub mod stability;

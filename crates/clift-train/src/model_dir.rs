@@ -8,11 +8,9 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::files::{TEMPORARY, publish, replace};
-use clift_data::OpenedSource;
 use clift_data::PoseRotation;
 use clift_data::PoseScale;
 use clift_data::SourceKind;
-use clift_data::open_dataset;
 use clift_model::ModelConfig;
 use clift_model::Variant;
 use clift_model::weights;

@@ -8,7 +8,7 @@ use clift_model::Clift;
 
 use crate::TrainError;
 use crate::events::{Event, Sink};
-use crate::held_out::HeldOut;
+use crate::validation::Validation;
 use crate::loss::Loss;
 use crate::loss_scale::LossScale;
 use crate::optim::adamw;
@@ -28,7 +28,7 @@ impl StagePlan<'_> {
     pub fn train(
         &self,
         start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
-        held_out: &HeldOut,
+        validation: &Validation,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Clift, TrainError> {
@@ -55,7 +55,7 @@ impl StagePlan<'_> {
         let mut log = RunLog::open(run_dir, stage, progress.step, sink)?;
         log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
 
-        let mut training = Training::new(self, checkpoints, progress, held_out, stop, log);
+        let mut training = Training::new(self, checkpoints, progress, validation, stop, log);
         let model = training.run(learner).map_err(|error| training.name_checkpoint(error))?;
         training.log.event(&Event::StageFinished { stage, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(model)

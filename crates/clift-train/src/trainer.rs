@@ -16,7 +16,6 @@ use crate::config::Config;
 use crate::events::Stage;
 use crate::stage_settings::Part;
 use crate::stage_settings::StageSettings;
-use crate::validation::Validation;
 
 /// Makes the batch of a step, in any thread.
 pub type MakeBatch = dyn Fn(u64) -> Result<StageBatch, TrainError> + Send + Sync;

@@ -14,7 +14,7 @@ use clift_model::{Clift, TokenCount, TrainedModel};
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::{Event, Sink, Stage};
-use crate::plan::largest_tensor;
+use crate::footprint::largest_tensor;
 use crate::sweep::sweep;
 
 /// The validation and test views of a run.
@@ -94,7 +94,7 @@ impl<'a> Validation<'a> {
             Err(EvalError::Interrupted { .. }) => return Ok(None),
             measured => measured?.0,
         };
-        let summary = measured.summary();
+        let summary = Summary::new(&measured);
         let Some(point) = summary.points.first() else { return Ok(None) };
         let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
         sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });

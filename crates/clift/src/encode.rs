@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use clift_data::layout::SAME_SCENES;
 use clift_data::ClipReader;
 use clift_data::DatasetRoot;
 use clift_data::FileOptions;
@@ -12,20 +11,21 @@ use clift_data::SceneSource;
 use clift_data::SourceKind;
 use clift_data::SourceOptions;
 use clift_data::Split;
+use clift_data::layout::SAME_SCENES;
 use clift_data::open_dataset;
 use clift_data::open_source;
 use clift_eval::encode::EncodeOptions;
 use clift_eval::encode::Encoded;
 use clift_eval::encode::encode;
-use clift_model::device::DeviceName;
+use clift_model::ModelPath;
+use clift_model::TokenCount;
 use clift_model::TokenStorage;
+use clift_model::TrainedModel;
 use clift_model::check_destination;
+use clift_model::device::DeviceName;
 use clift_train::Config;
 use clift_train::Override;
 use clift_train::read_config;
-use clift_model::ModelPath;
-use clift_model::TokenCount;
-use clift_model::TrainedModel;
 
 use crate::WrongUsage;
 use crate::data::text::{bytes, count};

@@ -4,11 +4,11 @@ use std::path::{Path, PathBuf};
 
 use clift_data::SourceKind;
 use clift_eval::{System, SystemName};
+use clift_model::ModelPath;
 use clift_train::Config;
 use clift_train::Run;
-use clift_train::read_config;
-use clift_model::ModelPath;
 use clift_train::evaluate_model::evaluate_model;
+use clift_train::read_config;
 
 use crate::args::EvalArgs;
 use crate::{WrongUsage, terminal};

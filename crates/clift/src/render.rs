@@ -8,17 +8,17 @@ use clift_data::camera_path::{PathView, interpolate, mean_intrinsics, orbit, rea
 use clift_data::files::replace;
 use clift_data::unfinished::Unfinished;
 use clift_data::{Intrinsics, Pose, SceneFrame};
+use clift_model::ModelError;
+use clift_model::ModelPath;
+use clift_model::RenderBudget;
+use clift_model::Scene;
+use clift_model::ViewCamera;
+use clift_model::Viewer;
 use clift_model::cost::render_bytes;
 use clift_model::device::DeviceName;
 use clift_model::scene::MAX_SIDE_PX;
 use clift_model::viewer::{frames_per_call, load_renderer};
-use clift_model::ModelError;
-use clift_model::Scene;
-use clift_model::ViewCamera;
-use clift_model::Viewer;
 use clift_train::footprint::machine::available_bytes;
-use clift_model::RenderBudget;
-use clift_model::ModelPath;
 use serde::Serialize;
 
 use args::CameraPath;

@@ -111,12 +111,12 @@ fn cell(value: Option<f64>, decimals: usize) -> String {
 mod tests {
     use clift_model::TokenStorage;
 
-use crate::eval_results::EvalResults;
-use crate::method::SystemName;
-use crate::method::Variant;
-use crate::summary::Summary;
-use crate::view_metrics::EvalKey;
-use crate::view_metrics::ViewMetrics;
+    use crate::eval_results::EvalResults;
+    use crate::method::SystemName;
+    use crate::method::Variant;
+    use crate::summary::Summary;
+    use crate::view_metrics::EvalKey;
+    use crate::view_metrics::ViewMetrics;
 
     #[test]
     fn the_table_lines_up() {

@@ -5,13 +5,13 @@ use std::str::FromStr;
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use super::SceneSizes;
-use crate::names::parse_value;
 use crate::ModelConfig;
 use crate::ModelError;
 use crate::Part;
 use crate::layers::Layer;
 use crate::layers::LayerKind;
 use crate::layers::Rows;
+use crate::names::parse_value;
 
 /// Multiply-accumulates of a forward pass of one scene. Norms, activations, softmax and the rays of pixels are not
 /// counted.

@@ -7,7 +7,7 @@ use clift_model::{Part, SceneSizes};
 use crate::TrainError;
 use crate::config::Config;
 use crate::events::Stage;
-use crate::held_out::sweep;
+use crate::sweep::sweep;
 
 /// The parts of a run, in their order.
 pub const PARTS: [Stage; 4] = [Stage::Stage1, Stage::Clusters, Stage::Stage2, Stage::Eval];

@@ -1,5 +1,6 @@
 //! Seconds of a shallow copy of the network on this device, from which those of the whole one are counted.
 
+use clift_model::SceneModel;
 use std::time::Instant;
 
 use burn::module::Module;
@@ -21,7 +22,6 @@ use clift_model::ModelConfig;
 use clift_model::Parameters;
 use clift_model::Part;
 use clift_model::SceneSizes;
-use clift_model::SceneModel;
 use clift_model::TokenCount;
 use clift_model::TrainedModel;
 use cpu_time::ProcessTime;
@@ -244,8 +244,8 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
     let scene = scene(config, num_context, num_targets)?;
     let [encode_macs, render_macs] =
         [Part::Encoder, Part::Renderer].map(|network| macs_of(&shallow.model, network, &scene));
-    let encode_s = Timed::of(|| read(model.lift(&views)))?.seconds;
-    let lift = model.lift(&views);
+    let encode_s = Timed::of(|| read(model.encode(&views)))?.seconds;
+    let lift = model.encode(&views);
     let render_s = Timed::of(|| read(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?.seconds;
     let mut kmeans = Vec::new();
     let mut measuring_s = 0.0;
