@@ -261,7 +261,7 @@ fn scenes_without_a_baseline_are_skipped_with_the_reason() {
     let place = Place::new();
     let data = changed_scene(&place, |scene| {
         for camera in &mut scene.cameras {
-            camera.c2w.translation = [1.0, 2.0, 3.0];
+            camera.c2w.translation = [1.0, 2.0, 3.0].into();
         }
     });
     let ran = train_on(&place, &data, &[], &[]);

@@ -4,8 +4,8 @@
 
 use std::error::Error;
 
-use clift_data::IntrinsicsNorm;
-use clift_data::image::{decode, encode_png, fit};
+use clift_data::image::{decode, encode_png};
+use clift_data::{IntrinsicsNorm, fit};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut words = std::env::args().skip(1);

@@ -192,7 +192,7 @@ mod tests {
                 width: 0,
                 height: 0,
                 images: Vec::new(),
-                c2w: vec![Pose { translation: [1.0, 0.0, 0.0], ..Pose::IDENTITY }; frame_index.len()],
+                c2w: vec![Pose { translation: [1.0, 0.0, 0.0].into(), ..Pose::IDENTITY }; frame_index.len()],
                 intrinsics: Vec::new(),
                 frame_index: frame_index.to_vec(),
             };

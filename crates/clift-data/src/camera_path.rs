@@ -1,25 +1,27 @@
-//! Camera paths to render: through the context views, around what they look at, or from a file.
+//! Camera paths to render: through the context views, around their common focus, or from a file.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
 
+use glam::{DMat3, DVec3};
 use serde::Deserialize;
 
-use crate::camera::{Intrinsics, IntrinsicsNorm, Pose, cross, dot};
+use crate::camera::{Intrinsics, IntrinsicsNorm};
 use crate::error::DataError;
-use crate::normalize::{SceneFrame, check_near, from_quaternion, quaternion};
+use crate::normalize::{SceneFrame, check_near};
+use crate::pose::Pose;
 
-/// Share of the contexts' extent that an orbit goes around: outside it nothing was seen.
+/// Radius of an orbit over the contexts' extent; farther out the contexts show little.
 const ORBIT_SHARE: f64 = 0.7;
 
-/// Smallest radius of an orbit, where contexts lie on a line; the normalised contexts reach to 1.
+/// Smallest radius of an orbit, for contexts on a line; the normalised contexts reach to 1.
 const MIN_ORBIT_RADIUS: f64 = 0.1;
 
-/// Distance of what an orbit looks at, where contexts look parallel, and its bounds otherwise.
+/// Distance of an orbit's focus if the contexts look parallel, and its bounds otherwise.
 const FOCUS: f64 = 2.0;
 const FOCUS_RANGE: [f64; 2] = [0.5, 8.0];
 
-/// Most poses that are read from a file.
+/// Most poses of a file.
 const MAX_POSES: usize = 100_000;
 
 /// One view to render, in the scene's normalised frame.
@@ -27,13 +29,13 @@ const MAX_POSES: usize = 100_000;
 pub struct PathView {
     /// Camera to world.
     pub c2w: Pose,
-    /// In pixels of the picture to render.
+    /// In pixels of the rendered image.
     pub intrinsics: Intrinsics,
 }
 
-/// Through all context views in their order, smoothly: the first frame is the first view, the last frame the last.
+/// A smooth path through all context views in their order: the first frame is the first view, the last frame the last.
 ///
-/// Centres follow a Catmull-Rom spline, orientations the shortest turn, intrinsics a straight line.
+/// Centres follow a Catmull-Rom spline; orientations are interpolated spherically, intrinsics linearly.
 pub fn interpolate(context: &[PathView], num_frames: usize) -> Vec<PathView> {
     let Some(last) = context.len().checked_sub(1) else { return Vec::new() };
     let place = |frame: usize| last as f64 * frame as f64 / num_frames.saturating_sub(1).max(1) as f64;
@@ -47,46 +49,25 @@ fn between(context: &[PathView], place: f64) -> PathView {
     let t = place - first as f64;
     let [before, from, to, after] =
         [first.saturating_sub(1), first, (first + 1).min(last), (first + 2).min(last)].map(|view| &context[view]);
-    let translation = [0, 1, 2].map(|i| {
-        let [a, b, c, d] = [before, from, to, after].map(|view| view.c2w.translation[i]);
-        b + 0.5 * t * (c - a + t * (2.0 * a - 5.0 * b + 4.0 * c - d + t * (3.0 * (b - c) + d - a)))
-    });
-    let rotation = turn(&from.c2w, &to.c2w, t);
+    let [a, b, c, d] = [before, from, to, after].map(|view| view.c2w.translation);
+    let translation = b + 0.5 * t * (c - a + t * (2.0 * a - 5.0 * b + 4.0 * c - d + t * (3.0 * (b - c) + d - a)));
+    let rotation = DMat3::from_quat(from.c2w.quaternion().slerp(to.c2w.quaternion(), t).normalize());
     let mix = |a: f64, b: f64| a + t * (b - a);
     let (a, b) = (from.intrinsics, to.intrinsics);
     let intrinsics = Intrinsics { fx: mix(a.fx, b.fx), fy: mix(a.fy, b.fy), cx: mix(a.cx, b.cx), cy: mix(a.cy, b.cy) };
     PathView { c2w: Pose { rotation, translation }, intrinsics }
 }
 
-/// Spherical interpolation of two orientations.
-fn turn(from: &Pose, to: &Pose, t: f64) -> [[f64; 3]; 3] {
-    let (a, mut b) = (quaternion(&from.rotation), quaternion(&to.rotation));
-    let mut cosine: f64 = a.iter().zip(b).map(|(a, b)| a * b).sum();
-    if cosine < 0.0 {
-        (b, cosine) = (b.map(|value| -value), -cosine);
-    }
-    let angle = cosine.min(1.0).acos();
-    // Below a thousandth of a degree the sines cancel, and a straight line is as good.
-    let [u, v] =
-        if angle < 1e-5 { [1.0 - t, t] } else { [(1.0 - t) * angle, t * angle].map(|x| x.sin() / angle.sin()) };
-    let sum = [0, 1, 2, 3].map(|i| u * a[i] + v * b[i]);
-    let norm = sum.iter().map(|value| value * value).sum::<f64>().sqrt();
-    from_quaternion(sum.map(|value| value / norm))
-}
-
-/// Once around the mean view, looking at what the context views look at: an ellipse as wide and as high as most of
-/// their centres are apart. The frame after the last would be the first.
+/// A closed ellipse around the mean view, facing the focus of the context views; its radii are 0.7 of the extent of
+/// their centres. The frame after the last would equal the first.
 pub fn orbit(context: &[PathView], num_frames: usize) -> Vec<PathView> {
     let Some(intrinsics) = mean_intrinsics(context) else { return Vec::new() };
-    let focus = [0.0, 0.0, focus_distance(context)];
-    let radius = |axis: usize| {
-        let extent = context.iter().map(|view| view.c2w.translation[axis].abs()).fold(0.0, f64::max);
-        (ORBIT_SHARE * extent).max(MIN_ORBIT_RADIUS)
-    };
-    let [x, y] = [0, 1].map(radius);
+    let focus = focus_distance(context) * DVec3::Z;
+    let extent = context.iter().fold(DVec3::ZERO, |extent, view| extent.max(view.c2w.translation.abs()));
+    let radius = (ORBIT_SHARE * extent).max(DVec3::splat(MIN_ORBIT_RADIUS));
     let view = |frame: usize| {
         let (sin, cos) = (std::f64::consts::TAU * frame as f64 / num_frames as f64).sin_cos();
-        PathView { c2w: look_at([x * cos, y * sin, 0.0], focus), intrinsics }
+        PathView { c2w: look_at(radius * DVec3::new(cos, sin, 0.0), focus), intrinsics }
     };
     (0..num_frames).map(view).collect()
 }
@@ -103,14 +84,14 @@ pub fn mean_intrinsics(context: &[PathView]) -> Option<Intrinsics> {
     })
 }
 
-/// The point of the mean view's axis that is nearest to the axes of all views (least squares), as a distance.
+/// Distance along the mean view's axis of the point nearest to the axes of all views (least squares).
 fn focus_distance(context: &[PathView]) -> f64 {
     let (mut above, mut below) = (0.0, 0.0);
     for view in context {
-        let axis = view.c2w.rotate([0.0, 0.0, 1.0]);
+        let axis = view.c2w.rotation.z_axis;
         // With A = I - d d^T: z = sum(e^T A o) / sum(e^T A e).
-        above += view.c2w.translation[2] - axis[2] * dot(axis, view.c2w.translation);
-        below += 1.0 - axis[2] * axis[2];
+        above += view.c2w.translation.z - axis.z * axis.dot(view.c2w.translation);
+        below += 1.0 - axis.z * axis.z;
     }
     let distance = above / below;
     // Parallel axes meet nowhere, diverging ones behind the cameras.
@@ -118,18 +99,16 @@ fn focus_distance(context: &[PathView]) -> f64 {
 }
 
 /// A camera at `centre` that looks at `point`, upright in the frame of the mean view.
-fn look_at(centre: [f64; 3], point: [f64; 3]) -> Pose {
-    let unit = |v: [f64; 3]| v.map(|value| value / dot(v, v).sqrt());
-    let forward = unit([0, 1, 2].map(|i| point[i] - centre[i]));
-    let right = unit(cross([0.0, 1.0, 0.0], forward));
-    let down = cross(forward, right);
-    Pose { rotation: [0, 1, 2].map(|row| [right[row], down[row], forward[row]]), translation: centre }
+fn look_at(centre: DVec3, point: DVec3) -> Pose {
+    let forward = (point - centre).normalize();
+    let right = DVec3::Y.cross(forward).normalize();
+    Pose { rotation: DMat3::from_cols(right, forward.cross(right), forward), translation: centre }
 }
 
-/// Focal lengths of a file over width and height, and how far from 0 centres may be: beyond any camera.
+/// Accepted focal lengths of a file over width and height; its end bounds the principal point's distance from 0.
 const INTRINSICS: RangeInclusive<f64> = 1e-3..=1e3;
 
-/// What a file of poses holds.
+/// A file of poses.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct PoseFile {
@@ -142,16 +121,17 @@ struct PoseFile {
 struct FilePose {
     /// Camera to world in the capture's world, OpenCV axes; three or four rows.
     c2w: Vec<[f64; 4]>,
-    /// `fx, fy, cx, cy` over width and height; those of the context views if it is missing.
+    /// `fx, fy, cx, cy` over width and height; the mean of the context views if missing.
     #[serde(default)]
     intrinsics_norm: Option<[f64; 4]>,
 }
 
-/// Reads `{"poses": [{"c2w": [[..4], [..4], [..4]], "intrinsics_norm": [fx, fy, cx, cy]}, ..]}`: poses in the world of
-/// the capture, as its own files give them (camera to world, OpenCV axes), for pictures of `width` by `height`.
+/// Reads `{"poses": [{"c2w": [[..4], [..4], [..4]], "intrinsics_norm": [fx, fy, cx, cy]}, ..]}`: camera-to-world poses
+/// in the world of the capture's own files (OpenCV axes), for images of `width` by `height` pixels, and moves them into
+/// `frame`. A pose without intrinsics gets `default`.
 ///
 /// # Errors
-/// [`DataError::Io`], and [`DataError::BadPoses`] for another form or a pose that is none, with its position.
+/// [`DataError::Io`], and [`DataError::BadPoses`] for another form or an invalid pose, with its position.
 pub fn read_poses(
     path: &Path,
     frame: &SceneFrame,
@@ -205,9 +185,7 @@ mod tests {
 
     /// A camera at `centre`, turned by `angle` about the y axis.
     fn view(centre: [f64; 3], angle: f64) -> PathView {
-        let (sin, cos) = angle.sin_cos();
-        let rotation = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
-        PathView { c2w: Pose { rotation, translation: centre }, intrinsics: K }
+        PathView { c2w: Pose { rotation: DMat3::from_rotation_y(angle), translation: centre.into() }, intrinsics: K }
     }
 
     fn assert_close(a: &PathView, b: &PathView, tolerance: f64) {
@@ -236,10 +214,7 @@ mod tests {
             assert!(view.c2w.orthonormality_defect() < 1e-12);
         }
         // No frame goes farther than a few times the mean step.
-        let step = |pair: &[PathView]| {
-            let [a, b] = [pair[0], pair[1]].map(|view| view.c2w.translation);
-            a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
-        };
+        let step = |pair: &[PathView]| pair[0].c2w.translation.distance(pair[1].c2w.translation);
         assert!(path.windows(2).all(|pair| step(pair) < 0.2), "2 units in 30 steps");
     }
 
@@ -273,14 +248,13 @@ mod tests {
         let path = orbit(&context, 12);
         assert_eq!(path.len(), 12);
         for view in &path {
-            let to_focus = [0, 1, 2].map(|i| [0.0, 0.0, 3.0][i] - view.c2w.translation[i]);
-            let forward = view.c2w.rotate([0.0, 0.0, 1.0]);
-            assert!((dot(to_focus, forward) / dot(to_focus, to_focus).sqrt() - 1.0).abs() < 1e-12);
+            let to_focus = 3.0 * DVec3::Z - view.c2w.translation;
+            assert!((view.c2w.rotation.z_axis.dot(to_focus.normalize()) - 1.0).abs() < 1e-12);
             assert!(view.c2w.orthonormality_defect() < 1e-12);
-            assert!(view.c2w.rotation[1][1] > 0.9, "upright");
+            assert!(view.c2w.rotation.y_axis.y > 0.9, "upright");
         }
-        assert!((path[0].c2w.translation[0] - 0.7).abs() < 1e-12);
-        assert!((path[3].c2w.translation[1] - 0.1).abs() < 1e-12, "contexts on a line: a small way up and down");
+        assert!((path[0].c2w.translation.x - 0.7).abs() < 1e-12);
+        assert!((path[3].c2w.translation.y - 0.1).abs() < 1e-12, "contexts on a line: a small way up and down");
         let parallel = [view([-1.0, 0.0, 0.0], 0.0), view([1.0, 0.0, 0.0], 0.0)];
         assert_eq!(focus_distance(&parallel), FOCUS);
         assert!(orbit(&[], 3).is_empty());

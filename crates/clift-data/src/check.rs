@@ -1,61 +1,32 @@
-//! Whether scenes can be believed: readable pictures, plausible cameras, and poses that agree with the pictures.
+//! Checks of a scene: readable images, plausible cameras, and poses that agree with the images.
 
 mod cameras;
 mod epipolar;
 mod frames;
 mod picture;
+mod result;
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
-
-use crate::clip::{Frame, SceneSource};
+use crate::clip::SceneSource;
 use crate::ledger::Ledger;
+use crate::rgb_image::Frame;
 use crate::test_scenes::KEPT_FOR_TESTING;
-pub use epipolar::PairCheck;
+pub use result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
 
-/// Median symmetric epipolar distance above which a scene is flagged, in pixels of a picture 640 wide.
-pub const MAX_EPIPOLAR_PX: f64 = 1.0;
-
-/// What was found about one scene.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct SceneCheck {
-    /// Key of the scene.
-    pub key: String,
-    /// Whether there is no reason against it.
-    pub ok: bool,
-    /// What is wrong with it.
-    pub reasons: Vec<String>,
-    /// Frames it has.
-    pub num_frames: usize,
-    /// Median symmetric epipolar distance of matched corners, in pixels of a picture 640 wide; `None` where too few
-    /// corners match.
-    pub epipolar_px: Option<f64>,
-    /// What is worth knowing but not wrong.
-    pub notes: Vec<String>,
-    /// Columns and rows of most frames.
-    pub image_size: Option<[usize; 2]>,
-    /// Widest field of view of any frame, in degrees.
-    pub fov_deg: Option<f64>,
-    /// Largest absolute entry of `R^T R - I` of any frame.
-    pub rotation_defect: Option<f64>,
-    /// Frames whose corners were matched, in pairs.
-    pub pairs: Vec<PairCheck>,
-}
-
-/// One scene's check, with a picture to look at.
+/// Findings of one scene, with an image for inspection.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checked {
-    /// What was found.
+    /// The findings.
     pub check: SceneCheck,
-    /// Two frames with epipolar lines: a dot of one colour is the same corner in both, and must lie on the line of its
-    /// colour. `None` where too few corners match.
+    /// Two frames with epipolar lines: dots of one colour are the same corner in both and must lie on the lines of
+    /// their colour. `None` if too few corners match.
     pub picture: Option<Frame>,
 }
 
-/// Checks one scene of `source`. What fails is a reason in the result and never an error.
+/// Checks one scene of `source`. Failures are reasons in the result, never errors.
 ///
-/// All frames are decoded, on all cores, and about nine pairs of them compared.
+/// Decodes all frames, on all cores, and compares about nine pairs of them.
 pub fn check_scene(source: &dyn SceneSource, scene: usize) -> Checked {
     let mut check = SceneCheck { key: source.key(scene).to_owned(), ..SceneCheck::default() };
     let cameras = match source.cameras(scene) {
@@ -73,7 +44,7 @@ pub fn check_scene(source: &dyn SceneSource, scene: usize) -> Checked {
     Checked { check, picture }
 }
 
-/// The scenes that opening a source left out, as flagged ones; without those that belong to the test half.
+/// Findings for the scenes skipped when the source was opened, except those reserved for testing.
 pub fn left_out(ledger: &Ledger) -> Vec<SceneCheck> {
     let skips = ledger.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING);
     let flagged = skips.map(|skip| {
@@ -85,7 +56,7 @@ pub fn left_out(ledger: &Ledger) -> Vec<SceneCheck> {
     flagged.collect()
 }
 
-/// Names every frame that opening the source left out of a scene.
+/// Adds a note for the frames of a scene skipped when the source was opened.
 pub fn note_frames(ledger: &Ledger, check: &mut SceneCheck) {
     let mut by_reason: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for skip in ledger.frames.iter().filter(|skip| skip.key == check.key) {

@@ -1,18 +1,9 @@
 //! What the readers give and the model takes: frames, views, clips.
 
-use crate::camera::{Camera, Intrinsics, Pose};
+use crate::camera::{Camera, Intrinsics};
 use crate::error::DataError;
-
-/// One decoded picture, 8-bit RGB, row-major `[height, width, 3]`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Frame {
-    /// Columns.
-    pub width: usize,
-    /// Rows.
-    pub height: usize,
-    /// `height * width * 3` values.
-    pub rgb: Vec<u8>,
-}
+use crate::pose::Pose;
+pub use crate::rgb_image::Frame;
 
 /// Which frames of a scene are given and which are to be rendered: list positions, not time stamps.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::camera::{Camera, Intrinsics};
 use crate::clip::{Clip, Frame, SceneSource, ViewIndices, Views};
 use crate::error::DataError;
-use crate::image::fit;
+use crate::fit::fit;
 use crate::normalize::{PoseRotation, PoseScale, SceneFrame, check_near};
 
 /// How frames and poses are prepared.
@@ -172,9 +172,7 @@ mod tests {
         let (reader, _) = reader(None, OPTIONS);
         let clip = reader.read(0, &views(&[0, 7], &[3])).unwrap();
         let [first, last] = [0, 1].map(|view| clip.context.c2w[view].translation);
-        for (a, b) in first.iter().zip(last) {
-            assert!((a + b).abs() < 1e-6, "{first:?} {last:?}"); // f32 files
-        }
+        assert!((first + last).abs().max_element() < 1e-6, "{first} {last}"); // f32 files
         assert!((first[0].abs() - 1.0).abs() < 1e-12, "{first:?}"); // the camera slides along x
         let between = clip.target.c2w[0].translation;
         // Centres are 0.1 * frame along a line: frame 3 of 0..7 is at -1 + 2 * 3 / 7.
@@ -183,7 +181,7 @@ mod tests {
 
     #[test]
     fn a_pose_that_is_not_finite_names_scene_and_frame() {
-        let broken = Pose { translation: [0.0, f64::NAN, 0.0], ..Pose::IDENTITY };
+        let broken = Pose { translation: [0.0, f64::NAN, 0.0].into(), ..Pose::IDENTITY };
         let (reader, _) = reader(Some(broken), OPTIONS);
         let message = reader.read(0, &views(&[0, 7], &[3, 4])).unwrap_err().to_string();
         assert_eq!(message, "frame 4 of scene 00000000000000b1: bad camera: the pose holds NaN");

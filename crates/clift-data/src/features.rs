@@ -1,45 +1,37 @@
-//! Corners of pictures and which of them show the same point: what poses are checked against.
+//! Corners of images, matched between images without their cameras: the reference for checking poses.
 //!
-//! Nothing here looks at cameras. Corners are found in two sizes of a picture, described by the gradients around them,
-//! matched both ways, and kept where one fundamental matrix, whichever it is, explains them.
+//! Corners are found in two sizes of an image, described by the gradients around them, matched both ways, and kept if
+//! they agree with one fundamental matrix.
 
 mod corners;
+mod correspondence;
 mod descriptor;
 mod fundamental;
 mod grey;
 mod matching;
 
-use crate::clip::Frame;
 use crate::lanczos::resize_lanczos;
+use crate::rgb_image::Frame;
+pub use correspondence::{Match, WIDTH};
 use descriptor::Descriptor;
-pub use fundamental::{Matrix3, epipolar_distance, line, line_back, of_cameras};
+pub use fundamental::{epipolar_distance, line, line_back, of_cameras};
 use grey::Grey;
 
-/// Columns to which wider pictures are reduced; distances are in pixels of this width.
-pub const WIDTH: usize = 640;
-/// Most corners of the two sizes of a picture.
+/// Most corners of the two sizes of an image.
 const MAX_CORNERS: [usize; 2] = [900, 500];
-/// Size of the smaller picture: corners of a surface seen from nearer match those of the larger.
+/// Size of the smaller image over the larger: its corners match those of a surface that the other image shows from
+/// farther away.
 const SMALLER: f64 = 0.6;
 
-/// Corners of a picture, in pixels of the picture `WIDTH` wide, with what is around them.
+/// Corners of an image, in pixels of the image [`WIDTH`] columns wide, and their descriptors.
 #[derive(Clone, Debug, Default)]
 pub struct Features {
     points: Vec<[f64; 2]>,
     descriptors: Vec<Descriptor>,
 }
 
-/// Two corners that show the same point.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Match {
-    /// Column and row in the first picture.
-    pub first: [f64; 2],
-    /// Column and row in the second picture.
-    pub second: [f64; 2],
-}
-
 impl Features {
-    /// Finds the corners of a picture.
+    /// Finds the corners of an image.
     pub fn find(frame: &Frame) -> Self {
         let shown = reduced(frame);
         let unit = WIDTH as f64 / shown.width as f64;
@@ -60,8 +52,8 @@ impl Features {
         features
     }
 
-    /// Pairs of corners that are each other's most similar, clearly so, and that some epipolar geometry explains.
-    /// The same for the same pictures; fewer than a handful mean that the pictures do not show the same.
+    /// Pairs of corners that are clearly most similar to each other and agree with one epipolar geometry.
+    /// Deterministic; empty if too few agree, as for images of different places.
     pub fn matches(&self, other: &Self) -> Vec<Match> {
         let pairs = matching::mutual(&self.descriptors, &other.descriptors);
         let matches: Vec<Match> =
@@ -70,7 +62,7 @@ impl Features {
     }
 }
 
-/// The picture at most `WIDTH` wide.
+/// Reduces an image to at most [`WIDTH`] columns.
 pub fn reduced(frame: &Frame) -> Frame {
     if frame.width <= WIDTH {
         return frame.clone();

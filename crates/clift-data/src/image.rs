@@ -1,4 +1,4 @@
-//! Pictures: decoding and encoding files, and fitting a frame with its intrinsics to the model's size.
+//! JPEG and PNG files: decoding with limits, encoding, checks for truncation.
 
 use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
@@ -7,50 +7,27 @@ use std::path::Path;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
-use serde::{Deserialize, Serialize};
 
-use crate::camera::{Intrinsics, IntrinsicsNorm};
-use crate::clip::Frame;
 use crate::error::DataError;
 use crate::files::read_bounded;
-use crate::lanczos::{Window, resize_lanczos_window};
+use crate::rgb_image::Frame;
 
-/// Most columns or rows of a picture that is decoded.
+/// Most columns or rows of a decoded image.
 pub const MAX_SIDE: u32 = 16_384;
-/// Most memory that decoding one picture may take: 8,192 x 8,192 RGB and the decoder's own copy.
+/// Most memory for decoding one image: 8,192 x 8,192 RGB and the decoder's own copy.
 const MAX_DECODE_BYTES: u64 = 512 << 20;
-/// Bytes at the end of a file that its end marker is looked for in before all of it is read.
+/// Bytes at the end of a file in which its end marker is searched before the whole file is read.
 const TAIL_BYTES: u64 = 512;
-/// What a JPEG ends in.
+/// End marker of a JPEG.
 const JPEG_END: &[u8] = &[0xff, 0xd9];
-/// What a PNG ends in: the type of its last chunk, and the checksum.
+/// End of a PNG: the type of the last chunk, and its checksum.
 const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 
-/// Where the principal point goes when a picture is cropped.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Crop {
-    /// It keeps its place relative to the width and height, as published numbers have it: half a pixel off where the
-    /// rescaled picture has an odd margin, and more where it is not in the middle.
-    #[default]
-    Protocol,
-    /// It moves with the pixels.
-    Exact,
-}
-
-impl Crop {
-    /// By default the key is not written: what runs from before it existed have on disk stays as it is.
-    #[allow(clippy::trivially_copy_pass_by_ref)] // serde's signature
-    pub fn is_default(&self) -> bool {
-        *self == Self::default()
-    }
-}
-
-/// Decodes a JPEG or PNG file to 8-bit RGB; grey becomes RGB, an alpha channel is dropped.
+/// Decodes a JPEG or PNG file to 8-bit RGB; gray becomes RGB, an alpha channel is dropped.
 ///
 /// # Errors
-/// [`DataError::BadImage`], which names `key` and `frame`: another format, broken or truncated data, or more than
-/// [`MAX_SIDE`] on a side.
+/// [`DataError::BadImage`] with `key` and `frame`: another format, broken or truncated data, or a side above
+/// [`MAX_SIDE`].
 pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<Frame, DataError> {
     let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
     let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {
@@ -73,10 +50,10 @@ pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<Frame, DataError>
     Ok(Frame { width: width as usize, height: height as usize, rgb: picture.into_raw() })
 }
 
-/// Reads the columns and rows of a JPEG or PNG file from its head.
+/// Reads the columns and rows of a JPEG or PNG file from its header.
 ///
 /// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] for what is no picture.
+/// [`DataError::Io`], and [`DataError::BadScene`] for a file of another format.
 pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let metadata = std::fs::metadata(path).map_err(DataError::io("opening a picture", path))?;
@@ -97,8 +74,8 @@ pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
     Ok([width as usize, height as usize])
 }
 
-/// Checks that the end of a JPEG or PNG file of at most `limit` bytes is there. Of most files the last bytes are read; of
-/// those with something behind the picture, as phones append it, everything.
+/// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated. Reads the last bytes of most files, and
+/// all bytes of those with data after the image, as phones append it.
 ///
 /// # Errors
 /// [`DataError::Io`], and [`DataError::BadScene`] for a truncated file.
@@ -125,20 +102,20 @@ pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
     Err(DataError::BadScene { what, path: path.to_owned() })
 }
 
-/// The EXIF orientation of a picture file, 2 to 8, if it says that the picture is to be turned or mirrored.
+/// The EXIF orientation of an image file, 2 to 8; `None` for 1 (upright), and for a file without one.
 pub(crate) fn exif_orientation(path: &Path) -> Option<u8> {
     let mut decoder = ImageReader::open(path).ok()?.with_guessed_format().ok()?.into_decoder().ok()?;
     decoder.orientation().ok().map(image::metadata::Orientation::to_exif).filter(|orientation| *orientation != 1)
 }
 
-/// Whether the picture ends before the file does; the decoder fills what is missing of a truncated JPEG with grey.
+/// Whether the image ends before the file; the decoder would fill the missing part of a truncated JPEG with gray.
 fn has_jpeg_end(bytes: &[u8]) -> bool {
     let padding = bytes.iter().rev().take_while(|byte| **byte == 0).count();
     bytes[..bytes.len() - padding].ends_with(JPEG_END) || ends_after_a_scan(bytes).unwrap_or_default()
 }
 
-/// Walks the segments of a JPEG up to the first end marker behind a scan: what is appended to it, such as a phone's film,
-/// may look like anything. `None` where the data stops within a segment.
+/// Walks the segments of a JPEG up to the first end marker after a scan; appended data, such as a phone's film, may
+/// contain any bytes. `None` if the data ends within a segment.
 fn ends_after_a_scan(bytes: &[u8]) -> Option<bool> {
     let mut rest = bytes;
     let mut has_scan = false;
@@ -160,14 +137,20 @@ fn ends_after_a_scan(bytes: &[u8]) -> Option<bool> {
     }
 }
 
-/// Encodes a frame as JPEG of `quality` in `1..=100`.
+/// Encodes an image as JPEG of `quality` in `1..=100`.
+///
+/// # Errors
+/// [`DataError::Encode`] for an image whose `rgb` does not match its size, or beyond the format's limits.
 pub fn encode_jpeg(frame: &Frame, quality: u8) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
     encode(JpegEncoder::new_with_quality(&mut bytes, quality), frame)?;
     Ok(bytes)
 }
 
-/// Encodes a frame as PNG, without loss.
+/// Encodes an image as PNG, without loss.
+///
+/// # Errors
+/// As [`encode_jpeg`].
 pub fn encode_png(frame: &Frame) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
     encode(PngEncoder::new(&mut bytes), frame)?;
@@ -185,48 +168,6 @@ fn encode(encoder: impl ImageEncoder, frame: &Frame) -> Result<(), DataError> {
         .map_err(|error| bad(error.to_string()))
 }
 
-/// Rescales a frame until it just covers `width` by `height`, crops the centre, and moves its intrinsics along
-/// (pixelSplat's protocol). Focal lengths and the way from the centre to the principal point follow the rescaled picture.
-/// The centre stays the centre, which is what the published numbers use and is half a pixel off where the rescaled
-/// picture has an odd margin; `exact_principal_point` moves it with the crop instead.
-///
-// Departs from the protocol, which keeps the normalised position: the same for a principal point in the centre, as
-// RealEstate10K has it, and half a pixel wrong for a phone picture cropped to a square.
-///
-/// # Errors
-/// [`DataError::Upscale`] when the target is larger than the frame.
-pub fn fit(
-    frame: &Frame,
-    intrinsics_norm: IntrinsicsNorm,
-    width: usize,
-    height: usize,
-    exact_principal_point: bool,
-) -> Result<(Frame, Intrinsics), DataError> {
-    if width > frame.width || height > frame.height {
-        return Err(DataError::Upscale { width, height, from_width: frame.width, from_height: frame.height });
-    }
-    let (scaled_width, scaled_height) = covering_size((frame.width, frame.height), (width, height));
-    let (column, row) = ((scaled_width - width) / 2, (scaled_height - height) / 2);
-    let window = Window { column, row, width, height };
-    let cropped = resize_lanczos_window(frame, scaled_width, scaled_height, window);
-    let in_scaled = intrinsics_norm.to_pixels(scaled_width, scaled_height);
-    let (cx, cy) = if exact_principal_point {
-        (in_scaled.cx - column as f64, in_scaled.cy - row as f64)
-    } else {
-        let from_centre = |at: f64, scaled: usize| (at - 0.5) * scaled as f64;
-        let x = width as f64 / 2.0 + from_centre(intrinsics_norm.cx, scaled_width);
-        (x, height as f64 / 2.0 + from_centre(intrinsics_norm.cy, scaled_height))
-    };
-    Ok((cropped, Intrinsics { fx: in_scaled.fx, fy: in_scaled.fy, cx, cy }))
-}
-
-/// The smallest size with the aspect ratio of `from` that covers `to`; both as (width, height).
-fn covering_size(from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
-    let scale = (to.1 as f64 / from.1 as f64).max(to.0 as f64 / from.0 as f64);
-    let side = |from: usize| (from as f64 * scale).round_ties_even() as usize;
-    (side(from.0), side(from.1))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -234,63 +175,6 @@ mod tests {
     fn ramp(width: usize, height: usize) -> Frame {
         let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 77])).collect();
         Frame { width, height, rgb }
-    }
-
-    #[test]
-    fn fitted_sizes_crops_and_focal_factors_equal_the_protocols_table() {
-        // (source) -> (target): rescaled size, crop offset, factor of fx, exact principal point, all as width first.
-        let table = [
-            ((640, 360), (256, 256), (455, 256), (99, 0), 1.777_34, 128.5),
-            ((480, 270), (448, 256), (455, 256), (3, 0), 1.015_625, 224.5),
-            ((960, 540), (448, 256), (455, 256), (3, 0), 1.015_625, 224.5),
-            ((640, 360), (448, 256), (455, 256), (3, 0), 1.015_625, 224.5),
-        ];
-        for (from, to, scaled, offset, factor, exact) in table {
-            assert_eq!(covering_size(from, to), scaled);
-            assert_eq!(((scaled.0 - to.0) / 2, (scaled.1 - to.1) / 2), offset);
-            let norm = IntrinsicsNorm { fx: 0.9, fy: 1.6, cx: 0.5, cy: 0.5 };
-            let frame = Frame { width: from.0, height: from.1, rgb: vec![9; from.0 * from.1 * 3] };
-            let (fitted, protocol) = fit(&frame, norm, to.0, to.1, false).unwrap();
-            assert_eq!((fitted.width, fitted.height, fitted.rgb.len()), (to.0, to.1, to.0 * to.1 * 3));
-            assert!((protocol.fx / to.0 as f64 / norm.fx - factor).abs() < 1e-5, "{protocol:?}"); // printed to 5 digits
-            assert_eq!((protocol.fy, protocol.cx, protocol.cy), (1.6 * 256.0, to.0 as f64 / 2.0, 128.0));
-            let (_, moved) = fit(&frame, norm, to.0, to.1, true).unwrap();
-            assert_eq!((moved.fx, moved.cx, moved.cy), (protocol.fx, exact, 128.0));
-        }
-    }
-
-    #[test]
-    fn a_crop_without_rescaling_takes_the_centre_pixels() {
-        let frame = ramp(9, 4);
-        let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.6, cy: 0.5 };
-        let (fitted, intrinsics) = fit(&frame, norm, 4, 4, true).unwrap();
-        for y in 0..4 {
-            for x in 0..4 {
-                let (got, expected) = ((y * 4 + x) * 3, (y * 9 + x + 2) * 3);
-                assert_eq!(fitted.rgb[got..got + 3], frame.rgb[expected..expected + 3]);
-            }
-        }
-        assert!((intrinsics.cx - 3.4).abs() < 1e-12, "{intrinsics:?}"); // 0.6 * 9 - 2
-    }
-
-    #[test]
-    fn a_principal_point_off_the_centre_is_half_a_pixel_from_the_exact_one_at_most() {
-        let frame = ramp(108, 192);
-        let norm = IntrinsicsNorm { fx: 1.27, fy: 0.72, cx: 0.6, cy: 0.55 };
-        let [protocol, exact] = [false, true].map(|exact| fit(&frame, norm, 64, 64, exact).unwrap().1);
-        // 64 x 114, 25 rows cut off above and below: 0.55 * 114 - 25 = 37.7.
-        assert!((exact.cx - 38.4).abs() < 1e-12 && (exact.cy - 37.7).abs() < 1e-12, "{exact:?}");
-        assert!((protocol.cx - exact.cx).abs() < 1e-12 && (protocol.cy - exact.cy).abs() < 1e-12, "{protocol:?}");
-        let odd = fit(&ramp(108, 193), norm, 64, 63, false).unwrap().1;
-        let exact = fit(&ramp(108, 193), norm, 64, 63, true).unwrap().1;
-        assert!((odd.cy - exact.cy).abs() <= 0.5 + 1e-12, "{odd:?} {exact:?}");
-    }
-
-    #[test]
-    fn upscaling_is_refused_with_both_sizes() {
-        let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
-        let message = fit(&ramp(64, 36), norm, 32, 48, false).unwrap_err().to_string();
-        assert!(message.contains("32x48") && message.contains("64x36"), "{message}");
     }
 
     #[test]
@@ -361,26 +245,5 @@ mod tests {
         png[29..33].copy_from_slice(&checksum);
         let message = decode(&png, "k", 0).unwrap_err().to_string();
         assert!(message.contains("limit") || message.contains("exceeds"), "{message}");
-    }
-
-    #[test]
-    fn a_jpeg_is_decoded_rescaled_and_cropped_as_pillow_does_it_to_a_fraction_of_a_level() {
-        let bytes = include_bytes!("../../../data-fixtures/reference/fitted.safetensors");
-        let tensors = safetensors::SafeTensors::deserialize(bytes).unwrap();
-        let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
-        for number in 0..3 {
-            let expected = tensors.tensor(&format!("{number}.output")).unwrap();
-            let &[height, width, 3] = expected.shape() else { panic!("{:?}", expected.shape()) };
-            let file = tensors.tensor(&format!("{number}.jpeg")).unwrap().data();
-            // The frame header's sampling of the luma: 2 x 2, so that decoders have to enlarge the chroma (4:2:0).
-            let header = file.windows(2).position(|marker| marker == [0xff, 0xc0]).unwrap();
-            assert_eq!(file[header + 11], 0x22);
-            let frame = decode(file, "k", 0).unwrap();
-            let (fitted, _) = fit(&frame, norm, width, height, false).unwrap();
-            let differences = fitted.rgb.iter().zip(expected.data()).map(|(a, b)| a.abs_diff(*b));
-            let mean = differences.clone().map(f64::from).sum::<f64>() / fitted.rgb.len() as f64;
-            // Decoders enlarge the chroma differently; of real photos the mean is 0.07 to 0.28 (docs/data-tools.md).
-            assert!(mean < 0.5 && differences.max() <= Some(8), "{number}: {mean}");
-        }
     }
 }

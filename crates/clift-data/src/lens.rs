@@ -1,14 +1,16 @@
-//! Lens distortion as OpenCV and COLMAP model it: where a real lens puts what a pinhole would put elsewhere.
+//! Lens distortion in the models of OpenCV and COLMAP.
+
+use glam::{DMat2, DVec2};
 
 use crate::error::DataError;
 
-/// Steps of Newton's method; three to five do for real lenses.
+/// Most steps of Newton's method; real lenses need three to five.
 const MAX_STEPS: usize = 50;
-/// Points between the axis and a solution at which the model must not fold over.
+/// Points between the axis and a solution at which the distortion must not fold over.
 const NUM_FOLD_CHECKS: usize = 16;
 
-/// Radial (`k1 k2 k3`) and tangential (`p1 p2`) distortion of rays `(x, y, 1)`: OpenCV's five parameters, of which
-/// COLMAP's `SIMPLE_RADIAL`, `RADIAL` and `OPENCV` are the first one, two and four.
+/// Radial (`k1 k2 k3`) and tangential (`p1 p2`) distortion of rays `(x, y, 1)`: OpenCV's five parameters. COLMAP's
+/// `SIMPLE_RADIAL`, `RADIAL` and `OPENCV` have the first one, two and four of `k1 k2 p1 p2`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Lens {
     /// Radial coefficients of r^2, r^4 and r^6.
@@ -23,10 +25,10 @@ impl Lens {
         *self == Self::default()
     }
 
-    /// Checks that every coefficient is a number.
+    /// Checks that every coefficient is finite.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] that names the coefficient.
+    /// [`DataError::BadCamera`] with the first coefficient that is not.
     pub fn validate(&self) -> Result<(), DataError> {
         let [k1, k2, k3] = self.radial;
         let [p1, p2] = self.tangential;
@@ -38,7 +40,7 @@ impl Lens {
         Ok(())
     }
 
-    /// Where the lens puts the ray `(x, y, 1)`.
+    /// Maps the ray `(x, y, 1)` of the scene to the ray at which the lens images it.
     pub fn distort(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         let [k1, k2, k3] = self.radial;
         let [p1, p2] = self.tangential;
@@ -51,44 +53,37 @@ impl Lens {
         ]
     }
 
-    /// Derivatives of [`Lens::distort`], row-major.
-    fn jacobian(&self, [x, y]: [f64; 2]) -> [[f64; 2]; 2] {
+    /// Derivatives of [`Lens::distort`]; the matrix is symmetric.
+    fn jacobian(&self, DVec2 { x, y }: DVec2) -> DMat2 {
         let [k1, k2, k3] = self.radial;
         let [p1, p2] = self.tangential;
         let r2 = x * x + y * y;
         let scale = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
         let slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)); // of the scale, over x or y
         let mixed = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y;
-        [
+        DMat2::from_cols_array_2d(&[
             [scale + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x, mixed],
             [mixed, scale + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x],
-        ]
+        ])
     }
 
-    fn is_folded(&self, point: [f64; 2]) -> bool {
-        let [[a, b], [c, d]] = self.jacobian(point);
-        let determinant = a * d - b * c;
+    fn is_folded(&self, ray: DVec2) -> bool {
+        let determinant = self.jacobian(ray).determinant();
         determinant.is_nan() || determinant <= 0.0
     }
 
-    /// The ray that the lens puts at `point`; `None` where the model has none: beyond the radius at which it folds
-    /// over, or with coefficients that describe no lens.
+    /// Inverts [`Lens::distort`] by Newton's method; `None` if the model has no such ray: beyond the radius at which it
+    /// folds over, or with coefficients that describe no lens.
     pub fn undistort(&self, point: [f64; 2]) -> Option<[f64; 2]> {
-        let mut ray = point;
+        let mut ray = DVec2::from(point);
         for _ in 0..MAX_STEPS {
-            let at = self.distort(ray);
-            let error = [at[0] - point[0], at[1] - point[1]];
-            if error[0].abs().max(error[1].abs()) < 1e-13 {
-                let folds = (1..=NUM_FOLD_CHECKS).any(|step| {
-                    let share = step as f64 / NUM_FOLD_CHECKS as f64;
-                    self.is_folded([ray[0] * share, ray[1] * share])
-                });
-                return (!folds).then_some(ray);
+            let error = DVec2::from(self.distort(ray.into())) - DVec2::from(point);
+            if error.abs().max_element() < 1e-13 {
+                let folds =
+                    (1..=NUM_FOLD_CHECKS).any(|step| self.is_folded(ray * (step as f64 / NUM_FOLD_CHECKS as f64)));
+                return (!folds).then_some(ray.into());
             }
-            let [[a, b], [c, d]] = self.jacobian(ray);
-            let determinant = a * d - b * c;
-            ray[0] -= (d * error[0] - b * error[1]) / determinant;
-            ray[1] -= (a * error[1] - c * error[0]) / determinant;
+            ray -= self.jacobian(ray).inverse() * error;
         }
         None
     }
@@ -102,20 +97,10 @@ mod tests {
     const PHONE: Lens = Lens { radial: [0.058, -0.081, 0.0], tangential: [-0.000_98, 0.000_16] };
 
     #[test]
-    fn a_ray_is_put_where_the_formula_computed_by_hand_says() {
-        let lens = Lens { radial: [0.1, 0.01, 0.0], tangential: [0.02, 0.03] };
-        // r^2 = 0.25 + 1 = 1.25; scale = 1 + 0.125 + 0.015625; 2xy = 1.
-        let [x, y] = lens.distort([0.5, 1.0]);
-        assert!((x - (0.5 * 1.140_625 + 0.02 + 0.03 * 1.75)).abs() < 1e-15, "{x}");
-        assert!((y - (1.140_625 + 0.02 * 3.25 + 0.03)).abs() < 1e-15, "{y}");
-        assert_eq!(Lens::default().distort([0.3, -0.2]), [0.3, -0.2]);
-    }
-
-    #[test]
     fn the_jacobian_is_the_slope_of_the_distortion() {
         let (point, step) = ([0.31, -0.47], 1e-6);
         let lens = Lens { radial: [-0.3, 0.12, -0.02], ..PHONE };
-        let jacobian = lens.jacobian(point);
+        let jacobian = lens.jacobian(point.into()).to_cols_array_2d();
         for axis in 0..2 {
             let moved = |sign: f64| {
                 let mut point = point;

@@ -1,32 +1,35 @@
-//! How much of one camera's picture another camera may see, from poses alone.
+//! View overlap of two cameras from poses alone.
 
-use crate::camera::{Camera, Pose};
+use glam::DVec3;
 
-/// Rays along a side of the picture.
+use crate::camera::Camera;
+use crate::pose::Pose;
+
+/// Rays along a side of the image.
 const SIDE: usize = 32;
 
-/// Share of `from`'s picture that `to` sees at some depth or other: of a grid of 32 x 32 rays, those of which any
-/// point in front of `from` falls into the picture of `to`. This is pixelSplat's measure, which needs no depth: where a
-/// ray's epipolar line crosses the other picture. It is an upper bound of what both see.
+/// Share in `[0, 1]` of `from`'s image that `to` may see: of a grid of 32 x 32 rays, those with any point in front of
+/// `from` that projects into the image of `to`. pixelSplat's measure, which needs no depth: the epipolar line of the
+/// ray crosses the other image. An upper bound of the true overlap.
 pub fn overlap(from: &Camera, to: &Camera) -> f64 {
     let motion = to.c2w.inverse().after(from.c2w);
     let place = |index: usize| (index as f64 + 0.5) / SIDE as f64;
     let rays = (0..SIDE * SIDE).map(|ray| [place(ray % SIDE), place(ray / SIDE)]);
     let seen = rays.filter(|[u, v]| {
         let k = from.intrinsics_norm;
-        is_seen(motion, [(u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0], to)
+        is_seen(motion, DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0), to)
     });
     seen.count() as f64 / (SIDE * SIDE) as f64
 }
 
-/// Whether any point at `t > 0` of the ray that starts at the origin, moved by `motion`, lies in the camera's view: four
-/// planes through the camera's centre, each a linear condition on `t`.
-fn is_seen(motion: Pose, direction: [f64; 3], to: &Camera) -> bool {
+/// Whether any point at `t > 0` of the ray from the origin, moved by `motion`, lies in the camera's view: four planes
+/// through the camera's centre, each a linear condition on `t`.
+fn is_seen(motion: Pose, direction: DVec3, to: &Camera) -> bool {
     let k = to.intrinsics_norm;
-    let inside = |[x, y, z]: [f64; 3]| {
+    let inside = |DVec3 { x, y, z }: DVec3| {
         [k.fx * x + k.cx * z, (1.0 - k.cx) * z - k.fx * x, k.fy * y + k.cy * z, (1.0 - k.cy) * z - k.fy * y]
     };
-    let (start, slope) = (inside(motion.translation), inside(motion.rotate(direction)));
+    let (start, slope) = (inside(motion.translation), inside(motion.rotation * direction));
     let (mut low, mut high) = (0.0_f64, f64::INFINITY);
     for (a, b) in start.into_iter().zip(slope) {
         if b > 0.0 {
@@ -45,12 +48,12 @@ mod tests {
     use super::*;
     use crate::camera::IntrinsicsNorm;
     use crate::order::{step_rng, unit};
+    use glam::DMat3;
 
     fn camera(turn_deg: f64, centre: [f64; 3]) -> Camera {
-        let (sin, cos) = turn_deg.to_radians().sin_cos();
-        let rotation = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
+        let rotation = DMat3::from_rotation_y(turn_deg.to_radians());
         let intrinsics_norm = IntrinsicsNorm { fx: 0.5, fy: 0.5, cx: 0.5, cy: 0.5 }; // 90 degrees
-        Camera { intrinsics_norm, c2w: Pose { rotation, translation: centre } }
+        Camera { intrinsics_norm, c2w: Pose { rotation, translation: centre.into() } }
     }
 
     #[test]
@@ -82,10 +85,10 @@ mod tests {
             let mut rng = step_rng(3, i, "test");
             let mut around = |size: f64| (2.0 * unit(&mut rng) - 1.0) * size;
             let to = camera(around(90.0), [around(2.0), around(2.0), around(2.0)]);
-            let direction = [around(1.0), around(1.0), 1.0];
+            let direction = DVec3::new(around(1.0), around(1.0), 1.0);
             let motion = to.c2w.inverse();
             let tried = (0..4000).map(|step| 1e-3 * 1.005_f64.powi(step)).any(|t| {
-                let [x, y, z] = motion.apply(direction.map(|value| value * t));
+                let [x, y, z] = motion.apply(direction * t).to_array();
                 z > 0.0 && (0.5 * x / z).abs() < 0.5 && (0.5 * y / z).abs() < 0.5
             });
             let seen = is_seen(motion, direction, &to);

@@ -231,9 +231,8 @@ mod tests {
         // 75 degrees wide, three degrees per frame: half of the view is left after some 12 frames, nothing after 25.
         let intrinsics_norm = crate::IntrinsicsNorm { fx: 0.65, fy: 0.65, cx: 0.5, cy: 0.5 };
         let camera = |frame: usize| {
-            let (sin, cos) = (3.0 * frame as f64).to_radians().sin_cos();
-            let rotation = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
-            Camera { intrinsics_norm, c2w: crate::Pose { rotation, translation: [0.0; 3] } }
+            let rotation = crate::DMat3::from_rotation_y((3.0 * frame as f64).to_radians());
+            Camera { intrinsics_norm, c2w: crate::Pose { rotation, ..crate::Pose::IDENTITY } }
         };
         let cameras: Vec<Camera> = (0..60).map(camera).collect();
         let options = |near, far| OverlapOptions { distance: [near, far], ..OverlapOptions::default() };

@@ -155,7 +155,7 @@ impl BoundedSampler {
         if !self.inner.needs_centres() {
             return self.sample(source.num_frames(scene)?, &[], step, num_context, rng);
         }
-        let centres: Vec<_> = source.cameras(scene)?.iter().map(|camera| camera.c2w.translation).collect();
+        let centres: Vec<_> = source.cameras(scene)?.iter().map(|camera| camera.c2w.translation.to_array()).collect();
         self.sample(centres.len(), &centres, step, num_context, rng)
     }
 

@@ -1,23 +1,19 @@
 //! Context views spread over a camera path.
 
-use crate::camera::Pose;
+use crate::pose::Pose;
 
-/// Frames from the first to the last, evenly along the way the camera goes: where it rests or turns on the spot, one
-/// view shows what many would. Without any way to go, evenly over the frames. `None` for fewer frames than views, or
-/// for no views.
+/// `num_views` frames from the first to the last, evenly along the path of the camera centres: while the camera rests
+/// or turns on the spot, one view replaces many. Evenly over the frames if all centres coincide or one is not finite.
+/// `None` for fewer frames than views, or for no views.
 pub fn spread_along_path(c2w: &[Pose], num_views: usize) -> Option<Vec<usize>> {
     let num_frames = c2w.len();
     if num_views == 0 || num_frames < num_views {
         return None;
     }
-    let step = |pair: &[Pose]| {
-        let between = pair[0].translation.iter().zip(pair[1].translation).map(|(a, b)| (a - b).powi(2));
-        between.sum::<f64>().sqrt()
-    };
-    // How far the camera has gone at every frame.
+    // Distance travelled up to every frame.
     let mut gone = vec![0.0];
     for pair in c2w.windows(2) {
-        gone.push(gone[gone.len() - 1] + step(pair));
+        gone.push(gone[gone.len() - 1] + pair[0].translation.distance(pair[1].translation));
     }
     let length = gone[num_frames - 1];
     if !(length > 0.0 && length.is_finite()) {
@@ -39,10 +35,11 @@ pub fn spread_along_path(c2w: &[Pose], num_views: usize) -> Option<Vec<usize>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::DVec3;
     use proptest::prelude::*;
 
     fn at(places: &[f64]) -> Vec<Pose> {
-        places.iter().map(|&x| Pose { translation: [x, 0.0, 0.0], ..Pose::IDENTITY }).collect()
+        places.iter().map(|&x| Pose { translation: x * DVec3::X, ..Pose::IDENTITY }).collect()
     }
 
     #[test]

@@ -1,29 +1,29 @@
-//! Scenes from seeds: textured rooms with boxes and balls, ray traced on demand.
+//! Synthetic scenes from seeds: textured rooms with boxes and balls, ray traced on demand.
 //!
-//! Every scene is a pure function of (seed, split, index) and every frame of (scene, frame), so a million scenes
-//! cost nothing until they are looked at and threads need no coordination. Cameras are exact.
+//! A scene is a pure function of (seed, split, index), a frame of (scene, frame): unused scenes cost nothing, and
+//! threads need no coordination. Cameras are exact.
 
 mod config;
 mod path;
 mod scene;
 mod texture;
 mod trace;
-mod vector;
 
 use std::sync::OnceLock;
 
 use crate::camera::Camera;
-use crate::clip::{Frame, SceneSource};
+use crate::clip::SceneSource;
 use crate::error::DataError;
 use crate::order::step_rng;
+use crate::rgb_image::Frame;
 use crate::split::Split;
 pub use config::SyntheticConfig;
 use scene::Scene;
 
-/// Keys are written in blocks of this many, when the first of a block is asked for.
+/// Keys of a block, which are formatted together on first use.
 const KEYS_PER_BLOCK: usize = 1024;
 
-/// Synthetic scenes, made when asked for. Keys are `synthetic-<seed>-<split>-<index>`.
+/// Synthetic scenes, traced on demand. Keys are `synthetic-<seed>-<split>-<index>`.
 #[derive(Debug)]
 pub struct SyntheticSource {
     config: SyntheticConfig,
@@ -31,7 +31,7 @@ pub struct SyntheticSource {
 }
 
 impl SyntheticSource {
-    /// Makes a source; no scene is made yet.
+    /// Makes a source without tracing anything.
     ///
     /// # Errors
     /// Those of [`SyntheticConfig::validate`].
@@ -41,7 +41,7 @@ impl SyntheticSource {
         Ok(Self { config, key_blocks: (0..num_blocks).map(|_| OnceLock::new()).collect() })
     }
 
-    /// What the scenes look like.
+    /// The options of the scenes.
     pub fn config(&self) -> &SyntheticConfig {
         &self.config
     }
@@ -144,7 +144,7 @@ mod tests {
                 source.frame(scene, frame).unwrap().rgb.into_iter().map(f64::from).collect()
             };
             let truth = pixels(target);
-            let away = |frame: usize| (0..3).map(|i| (center[frame][i] - center[target][i]).powi(2)).sum::<f64>();
+            let away = |frame: usize| center[frame].distance_squared(center[target]);
             let nearest = views.context.iter().copied().min_by(|&a, &b| away(a).total_cmp(&away(b))).unwrap();
             let contexts: Vec<Vec<f64>> = views.context.iter().map(|&frame| pixels(frame)).collect();
             let mean: Vec<f64> =
@@ -172,22 +172,6 @@ mod tests {
         for other in [source(|_| ()).frame(7, 4), source(|_| ()).frame(8, 3), source(|c| c.seed = 1).frame(7, 3)] {
             assert_ne!(first, other.unwrap());
         }
-    }
-
-    #[test]
-    fn threads_see_the_same_frames() {
-        let source = source(|_| ());
-        let frames: Vec<Frame> = (0..8).map(|i| source.frame(i, i).unwrap()).collect();
-        std::thread::scope(|scope| {
-            for thread in 0..4 {
-                let (source, frames) = (&source, &frames);
-                scope.spawn(move || {
-                    for i in (0..8).map(|i| (i + 2 * thread) % 8) {
-                        assert_eq!(source.frame(i, i).unwrap(), frames[i]);
-                    }
-                });
-            }
-        });
     }
 
     #[test]
@@ -247,15 +231,12 @@ mod tests {
             assert_eq!(cameras.len(), 200);
             for camera in &cameras {
                 assert!(camera.c2w.orthonormality_defect() < 1e-12);
-                let [[right_y, down_y, _]] = [camera.c2w.rotation[1]];
-                assert!(right_y.abs() < 1e-12 && down_y > 0.1, "rolled or upside down: {right_y}, {down_y}");
+                let [right, down] = [camera.c2w.rotation.x_axis, camera.c2w.rotation.y_axis];
+                assert!(right.y.abs() < 1e-12 && down.y > 0.1, "rolled or upside down: {right}, {down}");
                 let pixels = camera.intrinsics_norm.to_pixels(64, 32);
                 assert!((pixels.fx - pixels.fy).abs() < 1e-9, "pixels are square");
             }
-            let step = |pair: &[Camera]| {
-                let [a, b] = [pair[0].c2w.translation, pair[1].c2w.translation];
-                (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt()
-            };
+            let step = |pair: &[Camera]| pair[0].c2w.translation.distance(pair[1].c2w.translation);
             let length: f64 = cameras.windows(2).map(step).sum();
             let wanted = source.config().path_length;
             assert!((0.9 * wanted..1.3 * wanted).contains(&length), "scene {scene}: {length}");
@@ -265,7 +246,7 @@ mod tests {
     #[test]
     fn a_single_frame_is_a_scene_too() {
         let source = source(|c| c.num_frames = 1);
-        assert!(source.cameras(0).unwrap()[0].c2w.translation.iter().all(|x| x.is_finite()));
+        assert!(source.cameras(0).unwrap()[0].c2w.translation.is_finite());
         source.frame(0, 0).unwrap();
     }
 

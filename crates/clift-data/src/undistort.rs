@@ -1,19 +1,19 @@
-//! Undoing lens distortion: a picture as a pinhole camera would have taken it.
+//! Resampling of distorted images to pinhole images.
 
 use rayon::prelude::*;
 
 use crate::camera::IntrinsicsNorm;
-use crate::clip::Frame;
 use crate::error::DataError;
 use crate::lens::Lens;
+use crate::rgb_image::Frame;
 
-/// Points of each edge of a picture that are followed through the lens.
+/// Points of each image edge at which the lens is inverted.
 const EDGE_POINTS: usize = 129;
 
-/// A pinhole camera that sees part of what a distorted one does, and the way between their pixels.
+/// A pinhole camera inside the view of a distorted one, and the map between their pixels.
 ///
-/// Centre of projection, principal point and size stay. The focal lengths grow or shrink by one factor, the smallest
-/// with which every pixel has one in the distorted picture: no blank corners, as OpenCV's `alpha = 0`.
+/// Camera centre, principal point and image size are equal. The focal lengths are multiplied by one factor, the
+/// smallest for which every pixel lies in the distorted image: no blank corners, as OpenCV's `alpha = 0`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Undistortion {
     from: IntrinsicsNorm,
@@ -22,16 +22,16 @@ pub struct Undistortion {
 }
 
 impl Undistortion {
-    /// Finds the pinhole camera for pictures taken with `intrinsics_norm` through `lens`.
+    /// Finds the pinhole camera for images taken with `intrinsics_norm` through `lens`.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] for a lens that cannot be undone at the edge of the picture, and for a principal point
-    /// outside of the picture.
+    /// [`DataError::BadCamera`] for a lens that cannot be inverted at the image edge, and for a principal point outside
+    /// of the image.
     pub fn new(intrinsics_norm: IntrinsicsNorm, lens: Lens) -> Result<Self, DataError> {
         lens.validate()?;
         let IntrinsicsNorm { fx, fy, cx, cy } = intrinsics_norm;
         let bad = |what: String| DataError::BadCamera { what };
-        // Of the rays of each edge, the one nearest to the axis bounds the rectangle that is all picture.
+        // The ray of each edge nearest to the axis bounds the rectangle without blank pixels.
         let [mut left, mut right, mut top, mut bottom] = [f64::INFINITY; 4];
         for step in 0..EDGE_POINTS {
             let share = step as f64 / (EDGE_POINTS - 1) as f64;
@@ -60,12 +60,12 @@ impl Undistortion {
         self.to
     }
 
-    /// Resamples a picture, bilinearly, into one of the same size. What rounding puts beyond the edge is the edge.
+    /// Resamples an image bilinearly to the same size; positions that round beyond the edge are clamped to it.
     pub fn apply(&self, frame: &Frame) -> Frame {
         let &Frame { width, height, ref rgb } = frame;
         let mut undistorted = vec![0; rgb.len()];
         let rows = undistorted.par_chunks_exact_mut(width * 3).enumerate();
-        // Places first, colours second: a loop of arithmetic alone is one the compiler makes vectors of.
+        // Positions first, colours second: the compiler vectorises a loop of arithmetic only.
         rows.for_each_init(
             || vec![[0; 2]; width],
             |places, (row, pixels)| {
@@ -78,8 +78,8 @@ impl Undistortion {
         Frame { width, height, rgb: undistorted }
     }
 
-    /// Where each pixel of a row lies in the distorted picture: columns and rows from the centre of the first pixel, in
-    /// [`STEPS`] per pixel, within the picture.
+    /// Position of each pixel of a row in the distorted image, clamped to it: column and row from the centre of the
+    /// first pixel, in units of 1 / [`STEPS`] pixel.
     fn find_places(&self, row: usize, [width, height]: [usize; 2], places: &mut [[u32; 2]]) {
         let (from, to) = (self.from.to_pixels(width, height), self.to.to_pixels(width, height));
         let (step_x, y) = (1.0 / to.fx, (row as f64 + 0.5 - to.cy) / to.fy);
@@ -94,10 +94,10 @@ impl Undistortion {
     }
 }
 
-/// Parts of a pixel that places are rounded to: the product of two and a colour fits into 32 bits.
+/// Steps per pixel of a position: the product of two and a colour fits into 32 bits.
 const STEPS: usize = 2048;
 
-/// Colour at a place given in [`STEPS`].
+/// Bilinear colour at a position in units of 1 / [`STEPS`] pixel.
 fn bilinear(frame: &Frame, place: [u32; 2]) -> [u8; 3] {
     let steps = STEPS as u32;
     let [column, row] = place.map(|at| (at / steps) as usize);

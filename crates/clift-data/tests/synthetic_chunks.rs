@@ -24,8 +24,7 @@ fn write(root: &Path) {
 
 fn numbers(camera: &Camera) -> Vec<f64> {
     let k = camera.intrinsics_norm;
-    let pose = camera.c2w;
-    [k.fx, k.fy, k.cx, k.cy].into_iter().chain(pose.rotation.into_iter().flatten()).chain(pose.translation).collect()
+    [k.fx, k.fy, k.cx, k.cy].into_iter().chain(camera.c2w.to_matrix_f64()).collect()
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! What a method must beat: the nearest context view, and the mean of all of them.
 
-use clift_data::{Pose, Views};
+use clift_data::{DVec3, Pose, Views};
 
 use crate::error::EvalError;
 
@@ -15,7 +15,7 @@ const TIE: f64 = 1e-9;
 /// # Errors
 /// [`EvalError::NoContext`] when `context_c2w` is empty.
 pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, EvalError> {
-    let distances: Vec<f64> = context_c2w.iter().map(|c2w| distance(*c2w, target_c2w)).collect();
+    let distances: Vec<f64> = context_c2w.iter().map(|c2w| c2w.translation.distance(target_c2w.translation)).collect();
     let nearest = distances.iter().copied().reduce(f64::min).ok_or(EvalError::NoContext)?;
     let tie = TIE * distances.iter().copied().fold(0.0, f64::max);
     let near: Vec<usize> = (0..distances.len()).filter(|&i| distances[i] <= nearest + tie).collect();
@@ -54,27 +54,21 @@ pub fn mean_image(context: &Views) -> Result<Vec<f32>, EvalError> {
     Ok(sums.into_iter().map(|sum| (f64::from(sum) / scale) as f32).collect())
 }
 
-fn distance(a: Pose, b: Pose) -> f64 {
-    a.translation.iter().zip(b.translation).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
-}
-
 /// Angle of the rotation between two poses, from its sine and cosine so that small angles are exact too.
 fn rotation_angle_rad(a: Pose, b: Pose) -> f64 {
-    let r = a.inverse().after(b).rotation;
-    let axis = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]];
-    let twice_sine = axis.iter().map(|value| value * value).sum::<f64>().sqrt();
-    twice_sine.atan2(r[0][0] + r[1][1] + r[2][2] - 1.0)
+    let r = a.rotation.transpose() * b.rotation;
+    let axis = DVec3::new(r.y_axis.z - r.z_axis.y, r.z_axis.x - r.x_axis.z, r.x_axis.y - r.y_axis.x);
+    axis.length().atan2(r.diagonal().element_sum() - 1.0)
 }
 
 #[cfg(test)]
 mod tests {
-    use clift_data::Intrinsics;
+    use clift_data::{DMat3, Intrinsics};
 
     use super::*;
 
     fn pose(x: f64, yaw_deg: f64) -> Pose {
-        let (sin, cos) = yaw_deg.to_radians().sin_cos();
-        Pose { rotation: [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]], translation: [x, 0.0, 0.0] }
+        Pose { rotation: DMat3::from_rotation_y(yaw_deg.to_radians()), translation: x * DVec3::X }
     }
 
     fn views(poses: &[Pose], images: Vec<u8>) -> Views {

@@ -3,8 +3,7 @@
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
-use clift_data::camera::{Intrinsics, Pose};
-use clift_data::{Clip, Views};
+use clift_data::{Clip, DMat3, DVec3, Intrinsics, Pose, Views};
 use clift_eval::{upload_cameras, upload_views};
 use clift_model::{
     Cameras, Clift, Condenser, CondenserConfig, Encoder, Init, LiftNorm, ModelConfig, Renderer, SceneClusters, Variant,
@@ -153,9 +152,8 @@ impl Place {
 
 /// A pose on an arc, turned towards its middle.
 fn pose(place: f64) -> Pose {
-    let (sin, cos) = (-0.5 * place).sin_cos();
-    let rotation = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
-    Pose { rotation, translation: [place, 0.1 * place, 0.25 * place * place] }
+    let rotation = DMat3::from_rotation_y(-0.5 * place);
+    Pose { rotation, translation: DVec3::new(place, 0.1 * place, 0.25 * place * place) }
 }
 
 /// The network of the cases.

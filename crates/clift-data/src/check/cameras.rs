@@ -1,26 +1,27 @@
-//! Whether cameras are plausible, without a look at the pictures' content.
+//! Plausible intrinsics and poses, whatever the images show.
 
-use super::SceneCheck;
 use super::frames::{Sizes, named};
-use crate::camera::{Camera, Pose};
+use super::result::SceneCheck;
+use crate::camera::Camera;
 use crate::normalize::{PoseRotation, PoseScale, SceneFrame};
+use crate::pose::Pose;
 
-/// Fields of view that a camera for scenes has, in degrees.
+/// Plausible fields of view, in degrees.
 const FOV_DEG: [f64; 2] = [5.0, 120.0];
-/// Field of view above which published configs leave a scene out, in degrees.
+/// Field of view above which published configs skip a scene, in degrees.
 const FILTERED_FOV_DEG: f64 = 100.0;
-/// Where the principal point lies, over width and height.
+/// Plausible principal points, over width and height.
 const PRINCIPAL_POINT: [f64; 2] = [0.25, 0.75];
-/// How much wider than high a pixel is before it is noted, ..
+/// Aspect ratio of a pixel, or its inverse, above which a note is made.
 const NOTED_ASPECT: f64 = 1.02;
-/// .. and before it is taken for a mistake.
+/// Aspect ratio of a pixel, or its inverse, above which a scene is flagged.
 const MOST_ASPECT: f64 = 1.5;
-/// `R^T R - I` of files with four digits, above which a rotation is flagged.
+/// Entry of `R^T R - I` above which a rotation is flagged; files with four digits stay below.
 const MOST_DEFECT: f64 = 1e-3;
-/// `R^T R - I` that f32 files do not reach.
+/// Entry of `R^T R - I` above which a note is made; f32 files stay below.
 const NOTED_DEFECT: f64 = 1e-4;
 
-/// Looks at intrinsics, rotations and centres.
+/// Checks intrinsics, rotations and centres.
 pub(super) fn look(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     if cameras.is_empty() {
         check.reasons.push("it has no frames".into());

@@ -1,48 +1,37 @@
-//! Whether poses agree with the pictures: matched corners must lie on each other's epipolar lines.
+//! Poses against the images: matched corners must lie on each other's epipolar lines.
 
 use std::sync::OnceLock;
 
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use super::frames::Sizes;
 use super::picture::draw;
-use super::{MAX_EPIPOLAR_PX, SceneCheck};
+use super::result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
 use crate::camera::Camera;
-use crate::clip::{Frame, SceneSource};
+use crate::clip::SceneSource;
 use crate::features::{Features, Match, epipolar_distance, of_cameras};
+use crate::rgb_image::Frame;
 
-/// Pairs of frames that are looked for.
+/// Pairs of frames of a scene.
 const NUM_PAIRS: usize = 9;
-/// Parts of a scene that the partners of a pair are apart, the most that is tried first: the wider the stretch, the
-/// more a wrong pose shows, and the fewer corners match.
+/// Numbers of frames of a scene over those between the two of a pair, tried in this order: at larger distances a wrong
+/// pose shows more, and fewer corners match.
 const PARTS: [usize; 4] = [6, 10, 16, 24];
-/// Matches of one pair that count, so that no pair outweighs the others.
+/// Most matches of one pair in the scene's median, so that no pair dominates.
 const MAX_MATCHES: usize = 150;
-/// Fewest matches of a scene that say something.
+/// Fewest matches of a scene for a median.
 const MIN_MATCHES: usize = 40;
-/// A pair above this is named even where the scene as a whole passes.
+/// Epipolar distance in pixels above which a pair is noted in a scene that passes.
 const NOTED_PX: f64 = 3.0;
 
-/// Two frames whose corners were matched.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct PairCheck {
-    /// The frames.
-    pub frames: [usize; 2],
-    /// Corners that match.
-    pub num_matches: usize,
-    /// Median of their symmetric epipolar distances, in pixels of a picture 640 wide.
-    pub epipolar_px: f64,
-}
-
-/// A pair with what is needed to draw it.
+/// A pair with its matches, to draw it.
 struct Pair {
     check: PairCheck,
     matches: Vec<Match>,
     distances: Vec<f64>,
 }
 
-/// Measures the epipolar distance of a scene, and draws the pair that shows it best.
+/// Measures the epipolar distance of a scene, and draws the pair nearest to it.
 pub(super) fn look(
     source: &dyn SceneSource,
     scene: usize,
@@ -96,15 +85,15 @@ struct SceneViews<'a> {
 }
 
 impl SceneViews<'_> {
-    /// Frames that a partner is looked for, spread over the scene.
+    /// First frames of the pairs, spread over the scene.
     fn anchors(&self) -> Vec<usize> {
         let count = self.cameras.len().saturating_sub(1);
         let num_pairs = NUM_PAIRS.min(count);
         (0..num_pairs).map(|place| place * count / num_pairs).collect()
     }
 
-    /// The first partner whose corners match, from far to near in the order of the frames, then the one whose camera
-    /// is said to be nearest: photos need not be in an order.
+    /// The first partner whose corners match, from far to near in the order of the frames, then the frame of the most
+    /// similar camera: photos need not be in order.
     fn pair_from(&self, anchor: usize) -> Option<Pair> {
         let num_frames = self.cameras.len();
         let mut gaps: Vec<usize> = PARTS.iter().map(|parts| num_frames / parts).chain([2, 1]).collect();
@@ -124,7 +113,7 @@ impl SceneViews<'_> {
 
     fn pair(&self, frames: [usize; 2]) -> Option<Pair> {
         let [a, b] = frames.map(|frame| &self.cameras[frame]);
-        // One place has no epipolar lines.
+        // Equal centres have no epipolar lines.
         if a.c2w.translation == b.c2w.translation {
             return None;
         }
@@ -137,7 +126,7 @@ impl SceneViews<'_> {
         Some(Pair { check: PairCheck { frames, num_matches: matches.len(), epipolar_px }, matches, distances })
     }
 
-    /// Found once, whoever asks first.
+    /// Features of a frame, computed on first use; `None` for an unreadable frame.
     fn features(&self, frame: usize) -> Option<&Features> {
         let find = || Some(Features::find(&self.source.frame(self.scene, frame).ok()?));
         self.features[frame].get_or_init(find).as_ref()
@@ -152,14 +141,13 @@ impl SceneViews<'_> {
     }
 }
 
-/// How differently two cameras look: the distance of their centres and that of their forward directions.
+/// Dissimilarity of two cameras: the distance of their centres and three times that of their forward directions.
 fn unlike(a: &Camera, b: &Camera) -> f64 {
-    let centre = (0..3).map(|i| (a.c2w.translation[i] - b.c2w.translation[i]).powi(2)).sum::<f64>().sqrt();
-    let forward = (0..3).map(|i| (a.c2w.rotation[i][2] - b.c2w.rotation[i][2]).powi(2)).sum::<f64>().sqrt();
-    centre + 3.0 * forward
+    let forward = a.c2w.rotation.z_axis.distance(b.c2w.rotation.z_axis);
+    a.c2w.translation.distance(b.c2w.translation) + 3.0 * forward
 }
 
-/// At most `count` of the values, at even places.
+/// At most `count` of the values, evenly spaced.
 fn evenly(values: &[f64], count: usize) -> impl Iterator<Item = f64> {
     let kept = values.len().min(count);
     (0..kept).map(move |place| values[place * values.len() / kept])

@@ -1,25 +1,26 @@
-//! Whether the pictures can be read, have one size and differ from each other.
+//! Readable, equal-sized, distinct images.
 
 use std::collections::{BTreeMap, HashMap};
 use std::hash::{DefaultHasher, Hash, Hasher};
 
 use rayon::prelude::*;
 
-use super::SceneCheck;
+use super::result::SceneCheck;
 use crate::camera::Camera;
 use crate::clip::SceneSource;
+use crate::error::DataError;
 
 /// Most frames named in a sentence.
 const MAX_NAMED: usize = 5;
-/// Equal pictures contradict cameras that differ by more than this share of the path's extent, ..
+/// Distance of two cameras, over the extent of all centres, above which equal images contradict them.
 const MOST_MOVE: f64 = 0.02;
-/// .. or by more than this, in degrees.
+/// Angle between two cameras, in degrees, above which equal images contradict them.
 const MOST_TURN_DEG: f64 = 1.0;
 
-/// Columns and rows of every frame; `None` for one that cannot be read.
+/// Columns and rows of every frame; `None` for an unreadable one.
 pub(super) type Sizes = Vec<Option<[usize; 2]>>;
 
-/// Decodes every frame.
+/// Decodes every frame, on all cores.
 pub(super) fn look(source: &dyn SceneSource, scene: usize, cameras: &[Camera], check: &mut SceneCheck) -> Sizes {
     let read = (0..cameras.len()).into_par_iter().map(|frame| {
         let picture = source.frame(scene, frame)?;
@@ -27,7 +28,7 @@ pub(super) fn look(source: &dyn SceneSource, scene: usize, cameras: &[Camera], c
         picture.rgb.hash(&mut hasher);
         Ok(([picture.width, picture.height], hasher.finish()))
     });
-    let read: Vec<Result<([usize; 2], u64), crate::DataError>> = read.collect();
+    let read: Vec<Result<([usize; 2], u64), DataError>> = read.collect();
     let failures: Vec<(usize, String)> =
         read.iter().enumerate().filter_map(|(frame, read)| Some((frame, read.as_ref().err()?.to_string()))).collect();
     if let Some((_, first)) = failures.first() {
@@ -48,7 +49,7 @@ pub(super) fn look(source: &dyn SceneSource, scene: usize, cameras: &[Camera], c
     sizes
 }
 
-/// Looks for equal pictures, and whether their cameras are.
+/// Compares the cameras of equal images.
 fn compare(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
     let extent = extent(cameras);
     let mut seen: HashMap<u64, usize> = HashMap::new();
@@ -74,9 +75,9 @@ fn compare(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
 
 /// Distance of the centres, and the angle between the orientations in degrees.
 fn apart(a: &Camera, b: &Camera) -> (f64, f64) {
-    let move_ = (0..3).map(|i| (a.c2w.translation[i] - b.c2w.translation[i]).powi(2)).sum::<f64>().sqrt();
-    let trace: f64 = (0..3).map(|i| (0..3).map(|j| a.c2w.rotation[i][j] * b.c2w.rotation[i][j]).sum::<f64>()).sum();
-    (move_, ((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees())
+    let trace = (a.c2w.rotation.transpose() * b.c2w.rotation).diagonal().element_sum();
+    let turn_deg = ((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees();
+    (a.c2w.translation.distance(b.c2w.translation), turn_deg)
 }
 
 /// Largest distance of a camera centre from the first.

@@ -1,9 +1,11 @@
-//! Two frames beside each other with matched corners and their epipolar lines.
+//! An image of two frames side by side with matched corners and their epipolar lines.
 
-use crate::clip::Frame;
-use crate::features::{Match, Matrix3, WIDTH, line, line_back, reduced};
+use glam::DMat3;
 
-/// Corners that are drawn.
+use crate::features::{Match, WIDTH, line, line_back, reduced};
+use crate::rgb_image::Frame;
+
+/// Corners to draw.
 const NUM_SHOWN: usize = 12;
 /// Columns between the frames.
 const GAP: usize = 12;
@@ -12,9 +14,9 @@ const DOT: f64 = 4.5;
 /// Half the width of a line in pixels.
 const LINE: f64 = 0.9;
 
-/// Draws some of the matches: in each frame a dot per corner, and in the colour of the dot the line on which the other
-/// frame's camera says that it lies.
-pub(super) fn draw(frames: &[Frame; 2], geometry: &Matrix3, matches: &[Match]) -> Frame {
+/// Draws some of the matches: in each frame a dot per corner, and in the dot's colour the epipolar line of the corner
+/// in the other frame.
+pub(super) fn draw(frames: &[Frame; 2], geometry: &DMat3, matches: &[Match]) -> Frame {
     let frames = [reduced(&frames[0]), reduced(&frames[1])];
     let height = frames[0].height.max(frames[1].height);
     let width = frames[0].width + GAP + frames[1].width;
@@ -45,8 +47,8 @@ pub(super) fn draw(frames: &[Frame; 2], geometry: &Matrix3, matches: &[Match]) -
                     }
                 }
             };
-            if let Some([a, b, c]) = line {
-                let away = |x: f64, y: f64| (a * x + b * y + c * unit).abs();
+            if let Some(line) = line {
+                let away = |x: f64, y: f64| (line.x * x + line.y * y + line.z * unit).abs();
                 paint(&|x, y| away(x, y) - LINE - 0.8, [0; 3]);
                 paint(&|x, y| away(x, y) - LINE, colour);
             }
@@ -58,7 +60,7 @@ pub(super) fn draw(frames: &[Frame; 2], geometry: &Matrix3, matches: &[Match]) -
     canvas
 }
 
-/// Matches that lie far from each other in the first picture.
+/// Matches that lie far from each other in the first image (farthest point sampling).
 fn spread(matches: &[Match]) -> Vec<Match> {
     let mut shown: Vec<Match> = Vec::new();
     let squared = |a: &Match, b: &Match| (0..2).map(|i| (a.first[i] - b.first[i]).powi(2)).sum::<f64>();
@@ -73,7 +75,7 @@ fn spread(matches: &[Match]) -> Vec<Match> {
     shown
 }
 
-/// Colours around the wheel, neighbours far apart.
+/// Colours of the hue wheel, neighbours far apart.
 fn colour(place: usize, count: usize) -> [u8; 3] {
     let hue = (place * 5 % count.max(1)) as f64 / count.max(1) as f64 * 6.0;
     [5.0, 3.0, 1.0].map(|offset| {
@@ -95,7 +97,7 @@ mod tests {
     #[test]
     fn the_line_of_a_corner_goes_through_its_dot_in_the_other_frame() {
         // A sideways move: lines are rows.
-        let geometry = [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]];
+        let geometry = DMat3::from_rows_array(&[0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]);
         let frames = [(); 2].map(|()| Frame { width: 160, height: 90, rgb: vec![128; 160 * 90 * 3] });
         let pair = Match { first: [200.0, 102.0], second: [400.0, 102.0] };
         let canvas = draw(&frames, &geometry, &[pair]);

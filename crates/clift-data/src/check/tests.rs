@@ -2,10 +2,12 @@
 
 use std::sync::OnceLock;
 
+use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 use super::*;
-use crate::camera::{Camera, Pose};
+use crate::camera::Camera;
+use crate::pose::Pose;
 use crate::{DataError, SyntheticConfig, SyntheticSource};
 
 /// A room whose frames are traced once.
@@ -77,9 +79,7 @@ fn check(cameras: impl Fn(usize, &mut Camera) + Send + Sync) -> SceneCheck {
 
 /// Up or down: the camera goes sideways, and a turn to the side would move points along their epipolar lines.
 fn turned(c2w: Pose, angle_deg: f64) -> Pose {
-    let (sin, cos) = angle_deg.to_radians().sin_cos();
-    let turn = [[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]];
-    c2w.after(Pose { rotation: turn, translation: [0.0; 3] })
+    c2w.after(Pose { rotation: DMat3::from_rotation_x(angle_deg.to_radians()), ..Pose::IDENTITY })
 }
 
 #[test]
@@ -112,9 +112,7 @@ fn cameras_that_do_not_fit_the_pictures_are_flagged() {
     flagged(
         "OpenGL axes",
         check(|_, camera| {
-            for row in &mut camera.c2w.rotation {
-                (row[1], row[2]) = (-row[1], -row[2]);
-            }
+            camera.c2w.rotation *= DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
         }),
     );
     flagged("world to camera", check(|_, camera| camera.c2w = camera.c2w.inverse()));
@@ -142,9 +140,9 @@ fn implausible_cameras_are_flagged_with_what_is_implausible() {
     assert!(text.contains("degrees in 1 frame (3), expected 5 to 120"), "{text}");
     let text = reasons(check(|_, camera| camera.intrinsics_norm.fy *= 2.0));
     assert!(text.contains("fx / fy = 0.500: are they for another picture size?"), "{text}");
-    let text = reasons(check(|frame, camera| camera.c2w.rotation[0][0] += 0.004 * f64::from(frame == 5)));
+    let text = reasons(check(|frame, camera| camera.c2w.rotation.x_axis.x += 0.004 * f64::from(frame == 5)));
     assert!(text.contains("off orthonormal ones by up to"), "{text}");
-    let text = reasons(check(|_, camera| camera.c2w.translation = [1.0, 2.0, 3.0]));
+    let text = reasons(check(|_, camera| camera.c2w.translation = DVec3::new(1.0, 2.0, 3.0)));
     assert!(text.contains("has no baseline"), "{text}");
 }
 

@@ -1,14 +1,14 @@
-//! COLMAP's binary files, little-endian.
+//! COLMAP binary files, little-endian.
 
 use std::collections::HashMap;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
-use super::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, MODELS, Model, add_camera, add_image};
+use super::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, MODELS, Model, add_camera, add_image};
 use crate::error::DataError;
 
-/// Bytes of a point of an image: two coordinates and the number of its 3D point.
+/// Bytes of a point of an image: two coordinates and the id of its 3D point.
 const POINT_BYTES: u64 = 24;
 
 /// Reads `cameras.bin` and `images.bin`.
@@ -40,22 +40,20 @@ fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
     let mut images = Vec::new();
     for _ in 0..count {
         let _id: [u8; 4] = file.take()?;
-        let mut pose = [0.0; 7];
-        for value in &mut pose {
+        let mut w2c = [0.0; 7];
+        for value in &mut w2c {
             *value = f64::from_le_bytes(file.take()?);
         }
         let camera_id = u32::from_le_bytes(file.take()?);
         let name = file.take_name()?;
         let num_points = u64::from_le_bytes(file.take()?);
         file.skip(num_points.checked_mul(POINT_BYTES))?;
-        let [w, x, y, z, tx, ty, tz] = pose;
-        let image = ColmapImage { name, camera_id, rotation: [w, x, y, z], translation: [tx, ty, tz] };
-        add_image(&mut images, image).map_err(|what| file.bad(what))?;
+        add_image(&mut images, ColmapImage { name, camera_id, w2c }).map_err(|what| file.bad(what))?;
     }
     Ok(images)
 }
 
-/// Fields of a file, one after the other. Nothing is reserved for counts that the file does not bear out.
+/// Sequential fields of a file. Counts of the file reserve no memory.
 struct Fields<'a> {
     path: &'a Path,
     reader: BufReader<File>,
@@ -74,7 +72,7 @@ impl<'a> Fields<'a> {
         DataError::BadScene { what, path: self.path.to_owned() }
     }
 
-    /// Checks that so many bytes are left, and goes past them.
+    /// Moves past `count` bytes; refuses to pass the end of the file.
     fn advance(&mut self, count: Option<u64>) -> Result<(), DataError> {
         let end = count.and_then(|count| self.at.checked_add(count)).filter(|end| *end <= self.num_bytes);
         self.at = end.ok_or_else(|| {

@@ -1,4 +1,4 @@
-//! COLMAP's text files, line by line.
+//! COLMAP text files, line by line.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -6,10 +6,10 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::str::FromStr;
 
-use super::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera, add_image};
+use super::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera, add_image};
 use crate::error::DataError;
 
-/// Most bytes of a line that is read; points of an image, which may have any number, are passed over.
+/// Most bytes of a line in memory; the rest of a line of points, which may have any length, is skipped.
 const MAX_LINE_BYTES: usize = MAX_NAME_BYTES + 1024;
 
 /// Reads `cameras.txt` and `images.txt`.
@@ -40,7 +40,7 @@ fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
     while let Some(line) = lines.next_entry()? {
         let image = parse_image(&line).and_then(|image| add_image(&mut images, image));
         image.map_err(|what| lines.bad(&what))?;
-        // The line of points may be empty, so that only what it begins with tells whether it was left out.
+        // The line of points may be empty: its first words show whether it is missing.
         if lines.next_line()? && !lines.is_of_points() {
             return Err(
                 lines.bad("expected the points of the image above: two lines per image, the second may be empty")
@@ -58,16 +58,15 @@ fn parse_image(line: &str) -> Result<ColmapImage, String> {
         if first.is_empty() { Err(format!("no {what}")) } else { Ok(first.to_owned()) }
     };
     let _: u32 = number(Some(&word("IMAGE_ID")?), "IMAGE_ID")?;
-    let mut pose = [0.0; 7];
-    for (value, name) in pose.iter_mut().zip(["QW", "QX", "QY", "QZ", "TX", "TY", "TZ"]) {
+    let mut w2c = [0.0; 7];
+    for (value, name) in w2c.iter_mut().zip(["QW", "QX", "QY", "QZ", "TX", "TY", "TZ"]) {
         *value = number(Some(&word(name)?), name)?;
     }
     let camera_id = number(Some(&word("CAMERA_ID")?), "CAMERA_ID")?;
     if rest.is_empty() || rest.len() > MAX_NAME_BYTES {
         return Err(format!("the NAME has {} bytes", rest.len()));
     }
-    let [w, x, y, z, tx, ty, tz] = pose;
-    Ok(ColmapImage { name: rest.into(), camera_id, rotation: [w, x, y, z], translation: [tx, ty, tz] })
+    Ok(ColmapImage { name: rest.into(), camera_id, w2c })
 }
 
 fn number<T: FromStr>(word: Option<&str>, name: &str) -> Result<T, String> {
@@ -75,7 +74,7 @@ fn number<T: FromStr>(word: Option<&str>, name: &str) -> Result<T, String> {
     word.parse().map_err(|_| format!("{name} is {word:?}, expected a number"))
 }
 
-/// Lines of a file; of long ones, the beginning.
+/// Lines of a file, truncated to [`MAX_LINE_BYTES`].
 struct Lines<'a> {
     path: &'a Path,
     reader: BufReader<File>,
@@ -93,7 +92,7 @@ impl<'a> Lines<'a> {
         DataError::BadScene { what: format!("line {}: {what}", self.number), path: self.path.to_owned() }
     }
 
-    /// Goes to the next line; false at the end of the file.
+    /// Reads the next line; false at the end of the file.
     fn next_line(&mut self) -> Result<bool, DataError> {
         let io = DataError::io("reading a COLMAP model", self.path);
         self.line.clear();
@@ -125,7 +124,7 @@ impl<'a> Lines<'a> {
         Ok(None)
     }
 
-    /// Whether the line begins as a list of points does, or is empty. An image has its name in the tenth place.
+    /// Whether the first ten words are numbers, as in a list of points; the tenth word of an image is its name.
     fn is_of_points(&self) -> bool {
         let words = self.line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
         let is_number = |word: &[u8]| std::str::from_utf8(word).is_ok_and(|word| word.parse::<f64>().is_ok());

@@ -1,19 +1,19 @@
-//! Corners: places where the picture changes in every direction (Shi and Tomasi's measure).
+//! Shi-Tomasi corners: places where the image changes in every direction.
 
 use super::grey::Grey;
 
-/// Half the side of the square whose gradients are looked at.
+/// Half the side of the square of summed gradients, in pixels.
 const REACH: usize = 2;
-/// Least distance between corners.
+/// Smallest distance between corners, in pixels.
 const APART: usize = 4;
-/// Corners nearer to the edge have no descriptor.
+/// Smallest distance from the edge, in pixels: corners nearer to it have no descriptor.
 const MARGIN: usize = 12;
 /// Smallest measure of a corner, in squared grey levels per pixel: above the noise of a JPEG.
 const LEAST: f32 = 4.0;
-/// Pictures are divided into about this many cells that share the corners evenly, so that they cover it.
+/// Cells of an image, about; they share the corners evenly, so that corners cover the image.
 const CELLS: usize = 96;
 
-/// At most about `count` corners as column and row, the centre of the first pixel at (0.5, 0.5).
+/// At most `count` corners as column and row; the centre of the first pixel is at (0.5, 0.5).
 pub(super) fn find(grey: &Grey, count: usize) -> Vec<[f64; 2]> {
     let (width, height) = (grey.width, grey.height);
     if width.min(height) <= 2 * MARGIN {
@@ -58,7 +58,7 @@ pub(super) fn find(grey: &Grey, count: usize) -> Vec<[f64; 2]> {
     kept.take(count).map(peak).collect()
 }
 
-/// Where the parabola through three neighbouring values has its top, relative to the middle one.
+/// Position of the maximum of the parabola through three neighbouring values, relative to the middle one.
 fn top(before: f32, middle: f32, after: f32) -> f64 {
     let curvature = before - 2.0 * middle + after;
     if curvature >= 0.0 { 0.0 } else { f64::from((before - after) / (2.0 * curvature)).clamp(-0.5, 0.5) }
@@ -104,7 +104,7 @@ fn measure(grey: &Grey) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clip::Frame;
+    use crate::rgb_image::Frame;
 
     #[test]
     fn the_corners_of_a_square_are_found_and_its_edges_are_not() {

@@ -1,4 +1,4 @@
-//! What is around a corner: histograms of gradient directions in 4 x 4 cells, upright, as SIFT's.
+//! Descriptors of corners: upright histograms of gradient directions in 4 x 4 cells, as SIFT's.
 
 use super::grey::Grey;
 
@@ -6,14 +6,14 @@ use super::grey::Grey;
 const CELLS: usize = 4;
 /// Directions per cell.
 const DIRECTIONS: usize = 8;
-/// Pixels along a cell.
+/// Side of a cell in pixels.
 const CELL_PX: f32 = 5.0;
-/// A component above this share of the length is cut: one strong edge shall not outweigh the rest.
+/// Largest component over the length; larger ones are clipped, so that one strong edge does not dominate.
 const MOST: f32 = 0.2;
-/// Length of a descriptor: components are whole numbers.
+/// Length of a descriptor; components are integers.
 const LENGTH: f32 = 1024.0;
 
-/// A vector of about the same length for every corner.
+/// A vector of length 1,024, up to rounding.
 #[derive(Clone, Debug)]
 pub(super) struct Descriptor {
     values: [i16; CELLS * CELLS * DIRECTIONS],
@@ -22,7 +22,7 @@ pub(super) struct Descriptor {
 }
 
 impl Descriptor {
-    /// Describes the place (x, y); `None` where the picture ends or has no gradient.
+    /// Describes the surroundings of (x, y), in pixels; `None` near the edge and for a constant surrounding.
     pub fn at(grey: &Grey, x: f64, y: f64) -> Option<Self> {
         let half = (CELLS as f32 * CELL_PX / 2.0) as i64 + 1;
         let (column, row) = (x.floor() as i64, y.floor() as i64);
@@ -62,7 +62,7 @@ impl Descriptor {
     }
 }
 
-/// Shares a gradient among the cells and directions next to it, by nearness.
+/// Distributes a gradient over the neighbouring cells and directions, linearly by distance.
 fn add(sums: &mut [f32], [across, down, turn]: [f32; 3], strength: f32) {
     let parts = |place: f32| {
         let low = place.floor();
@@ -84,7 +84,7 @@ fn add(sums: &mut [f32], [across, down, turn]: [f32; 3], strength: f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clip::Frame;
+    use crate::rgb_image::Frame;
 
     fn waves(shift: f64, contrast: f64) -> Grey {
         let (width, height) = (64, 64);

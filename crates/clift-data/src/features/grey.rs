@@ -1,6 +1,6 @@
-//! Grey pictures in f32.
+//! Gray images in f32.
 
-use crate::clip::Frame;
+use crate::rgb_image::Frame;
 
 /// Brightness in `[0, 255]`, row-major.
 pub(super) struct Grey {
@@ -10,7 +10,7 @@ pub(super) struct Grey {
 }
 
 impl Grey {
-    /// The mean of the channels, green twice: close to how bright a colour looks.
+    /// The mean of the channels, green twice: near the perceived brightness.
     pub fn of(frame: &Frame) -> Self {
         let values = frame.rgb.as_chunks::<3>().0.iter().map(|[r, g, b]| {
             let sum = u16::from(*r) + 2 * u16::from(*g) + u16::from(*b);
@@ -19,7 +19,7 @@ impl Grey {
         Self { width: frame.width, height: frame.height, values: values.collect() }
     }
 
-    /// Smoothed by a Gaussian of about one pixel (1 4 6 4 1).
+    /// Smooths by a binomial filter (1 4 6 4 1): a Gaussian of one pixel.
     pub fn blurred(&self) -> Self {
         let Self { width, height, values } = self;
         let (width, height) = (*width, *height);

@@ -1,12 +1,11 @@
-//! Which descriptors belong together.
+//! Mutual nearest descriptors.
 
 use super::descriptor::Descriptor;
 
-/// The nearest must be at most this share as far as the second nearest, as Lowe has it.
+/// Largest distance of the nearest descriptor over that of the second nearest (Lowe's ratio test).
 const RATIO: f64 = 0.8;
 
-/// Pairs that are each other's nearest, and clearly nearer than the second in both directions, in the order of the
-/// first list.
+/// Pairs that are each other's nearest and pass the ratio test in both directions, in the order of the first list.
 pub(super) fn mutual(first: &[Descriptor], second: &[Descriptor]) -> Vec<(usize, usize)> {
     let mut there = vec![Nearest::default(); first.len()];
     let mut back = vec![Nearest::default(); second.len()];
@@ -25,7 +24,7 @@ pub(super) fn mutual(first: &[Descriptor], second: &[Descriptor]) -> Vec<(usize,
     there.iter().enumerate().filter_map(pair).collect()
 }
 
-/// The nearest of those seen, and how far the second is.
+/// The nearest descriptor so far, and the distance of the second nearest.
 #[derive(Clone, Copy)]
 struct Nearest {
     place: usize,

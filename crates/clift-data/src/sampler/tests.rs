@@ -163,7 +163,7 @@ fn stage_two_contexts_beyond_the_scene_are_refused() {
 fn scenes_give_their_centres_where_farthest_points_are_asked_for() {
     let config = crate::SyntheticConfig { num_scenes: 1, num_frames: 40, ..Default::default() };
     let source = crate::SyntheticSource::new(config).unwrap();
-    let centres: Vec<_> = source.cameras(0).unwrap().iter().map(|camera| camera.c2w.translation).collect();
+    let centres: Vec<_> = source.cameras(0).unwrap().iter().map(|camera| camera.c2w.translation.to_array()).collect();
     for inner in [InnerViews::Random, InnerViews::FarthestPoint, InnerViews::Even] {
         let sampler = BoundedSampler { inner, ..sampler() };
         let drawn = sampler.draw(&source, 0, 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap();

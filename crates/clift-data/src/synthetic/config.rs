@@ -1,4 +1,4 @@
-//! What synthetic scenes look like, and what of it cannot be.
+//! Options of synthetic scenes, and their valid ranges.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,18 +8,18 @@ use crate::split::Split;
 /// Most scenes of one source: the table of key blocks is then below 1 MiB.
 pub(super) const MAX_SCENES: usize = 32_000_000;
 
-/// Which way the camera looks on its path.
+/// Viewing direction of the camera on its path.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Looks {
-    /// From near the walls to the middle: all views show the same things.
+    /// From near the walls to the middle: all views show the same objects.
     #[default]
     In,
     /// From near the middle to the walls, turning: views far apart on the path show nothing in common.
     Out,
 }
 
-/// What synthetic scenes look like. Lengths are in the scene's own unit; a room is 3 to 4 units wide.
+/// Options of synthetic scenes. Lengths are in the scene's own unit; a room is 3 to 4 units wide.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SyntheticConfig {
@@ -44,13 +44,13 @@ pub struct SyntheticConfig {
     /// Which way the camera looks, `"in"` or `"out"`.
     pub looks: Looks,
     /// Length of the camera path from the first to the last frame, before small swings. Longer is harder. A camera that
-    /// looks out turns by the angle that it would go around by if it looked in.
+    /// looks out rotates by the arc's angle of a camera that looks in.
     pub path_length: f64,
     /// Cycles of the wall patterns per unit of length; patterns on objects are twice as fine. Finer is harder.
     pub texture_frequency: f64,
-    /// Share of the rooms that are empty and of one colour a wall, so that scenes differ in how much they hold.
+    /// Share of rooms that are empty and have one colour per wall, so that scenes differ in complexity.
     pub plain_share: f64,
-    /// Strength of highlights and reflections, which change with the view: 0 is matt, 1 is polished.
+    /// Strength of highlights and reflections, which depend on the view: 0 is matt, 1 is polished.
     pub specular: f64,
     /// Rays per pixel, a square number.
     pub samples_per_pixel: usize,
@@ -82,7 +82,7 @@ impl SyntheticConfig {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] naming the first field that cannot hold.
+    /// [`DataError::BadConfig`] with the first field out of range.
     pub fn validate(&self) -> Result<(), DataError> {
         let fail = |key: &str, problem: String| Err(DataError::bad_config(key, problem));
         for (key, count, most) in [

@@ -1,15 +1,15 @@
-//! What is in a scene: a box-shaped room, boxes and balls on its floor, a lamp and a camera path.
+//! A synthetic scene: a box-shaped room, boxes and balls on its floor, a lamp and a camera path.
 
+use glam::{DVec3, Vec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::SyntheticConfig;
+use super::config::SyntheticConfig;
 use super::path::{CLEARANCE, CameraPath};
 use super::texture::Texture;
-use super::vector::Vector;
 use crate::order::{between, unit};
 
-/// How often an object is drawn again, a little smaller, before the room counts as full.
+/// Attempts to place an object, each a little smaller, before the room counts as full.
 const MAX_PLACEMENTS: u32 = 60;
 
 /// Geometry of an object.
@@ -20,16 +20,16 @@ pub(super) enum Shape {
     },
     /// Half edge lengths, and the turn about the vertical as (cosine, sine).
     Block {
-        half_size: Vector,
+        half_size: Vec3,
         turn: [f32; 2],
     },
 }
 
-/// A thing in the room.
+/// An object in the room.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Object {
     pub shape: Shape,
-    pub center: Vector,
+    pub center: Vec3,
     pub texture: Texture,
     /// 0 is matt, 1 is polished.
     pub gloss: f32,
@@ -40,7 +40,7 @@ impl Object {
     pub fn reach(&self) -> f32 {
         match self.shape {
             Shape::Ball { radius } => radius,
-            Shape::Block { half_size, .. } => half_size.0[0].hypot(half_size.0[2]),
+            Shape::Block { half_size, .. } => half_size.x.hypot(half_size.z),
         }
     }
 }
@@ -48,26 +48,26 @@ impl Object {
 /// A scene: the room is centred on the origin, x right, y down, z forward.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Scene {
-    pub half_size: Vector,
+    pub half_size: Vec3,
     /// Textures at -x, +x, -y (ceiling), +y (floor), -z, +z.
     pub walls: [Texture; 6],
     pub objects: Vec<Object>,
-    pub lamp: Vector,
+    pub lamp: Vec3,
     pub path: CameraPath,
 }
 
 impl Scene {
-    /// Draws a scene; a config that validates always gives one.
+    /// Samples a scene of a valid `config`.
     pub fn draw(rng: &mut ChaCha8Rng, config: &SyntheticConfig) -> Self {
         let [small, large] = config.room_half_size;
         let mut half = || small + (large - small) * unit(rng);
         let (wide, deep) = (half(), half());
         let tall = small * (0.6 + 0.15 * unit(rng));
-        let half_size = [wide, tall, deep];
+        let half_size = DVec3::new(wide, tall, deep);
         let path = CameraPath::draw(rng, half_size, config.path_length, config.looks);
-        let lamp = [wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35)];
+        let lamp = DVec3::new(wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35));
 
-        // No draw where no room is plain: those rooms stay what they are.
+        // No random number if no room is plain: such rooms stay as they were before the option.
         let is_plain = config.plain_share > 0.0 && unit(rng) < config.plain_share;
         let hue = unit(rng);
         let frequency = if is_plain { 0.0 } else { config.texture_frequency };
@@ -85,13 +85,7 @@ impl Scene {
             Texture::draw(rng, hue, saturation, value, frequency)
         });
 
-        let mut scene = Self {
-            half_size: Vector::from_f64(half_size),
-            walls,
-            objects: Vec::new(),
-            lamp: Vector::from_f64(lamp),
-            path,
-        };
+        let mut scene = Self { half_size: half_size.as_vec3(), walls, objects: Vec::new(), lamp: lamp.as_vec3(), path };
         let [fewest, most] = if is_plain { [0, 0] } else { config.num_objects };
         for _ in 0..between(rng, fewest, most) {
             let object = (0..MAX_PLACEMENTS).find_map(|attempt| scene.try_object(rng, config, attempt));
@@ -100,7 +94,7 @@ impl Scene {
         scene
     }
 
-    /// Draws an object on the floor, or gives none where it would touch the path, a wall or another object.
+    /// Samples an object on the floor; `None` if it would touch the path, a wall or another object.
     fn try_object(&self, rng: &mut impl Rng, config: &SyntheticConfig, attempt: u32) -> Option<Object> {
         let scale = config.room_half_size[0] * 0.96_f64.powi(attempt as i32);
         let mut size = |low: f64, high: f64| (scale * (low + (high - low) * unit(rng))) as f32;
@@ -110,11 +104,11 @@ impl Scene {
         let (shape, height) = if is_ball {
             (Shape::Ball { radius }, radius)
         } else {
-            (Shape::Block { half_size: Vector(edges), turn: [cos, sin] }, edges[1])
+            (Shape::Block { half_size: edges.into(), turn: [cos, sin] }, edges[1])
         };
 
-        let [wide, floor, deep] = self.half_size.0;
-        let center = Vector([wide * swing(rng, 1.0) as f32, floor - height, deep * swing(rng, 1.0) as f32]);
+        let Vec3 { x: wide, y: floor, z: deep } = self.half_size;
+        let center = Vec3::new(wide * swing(rng, 1.0) as f32, floor - height, deep * swing(rng, 1.0) as f32);
         let hue = unit(rng);
         let texture = Texture::draw(rng, hue, 0.75, 0.95, 2.0 * config.texture_frequency);
         let object = Object { shape, center, texture, gloss: unit(rng) as f32 };
@@ -122,21 +116,26 @@ impl Scene {
     }
 
     fn has_room_for(&self, object: &Object) -> bool {
-        let (x, z, reach) = (object.center.0[0], object.center.0[2], object.reach());
+        let (Vec3 { x, z, .. }, reach) = (object.center, object.reach());
         let from_axis = x.hypot(z);
         let [nearest, farthest] = self.path.radius_bounds().map(|radius| radius as f32);
         let clearance = CLEARANCE as f32;
         let off_path = from_axis + reach + clearance < nearest || from_axis - reach - clearance > farthest;
-        let inside = x.abs() + reach < self.half_size.0[0] && z.abs() + reach < self.half_size.0[2];
+        let inside = x.abs() + reach < self.half_size.x && z.abs() + reach < self.half_size.z;
         let apart = self
             .objects
             .iter()
-            .all(|other| (x - other.center.0[0]).hypot(z - other.center.0[2]) > reach + other.reach() + 0.02);
+            .all(|other| (x - other.center.x).hypot(z - other.center.z) > reach + other.reach() + 0.02);
         off_path && inside && apart
     }
 }
 
-/// Draws uniformly from `[-size, size)`.
+/// Rotates about the vertical axis; `turn` is (cosine, sine).
+pub(super) fn turned(v: Vec3, [cos, sin]: [f32; 2]) -> Vec3 {
+    Vec3::new(cos * v.x + sin * v.z, v.y, cos * v.z - sin * v.x)
+}
+
+/// Samples uniformly from `[-size, size)`.
 fn swing(rng: &mut impl Rng, size: f64) -> f64 {
     size * (2.0 * unit(rng) - 1.0)
 }
@@ -148,14 +147,11 @@ mod tests {
     use crate::synthetic::config::Looks;
 
     /// Distance from a point to an object's surface, 0 inside.
-    fn distance(object: &Object, point: Vector) -> f32 {
+    fn distance(object: &Object, point: Vec3) -> f32 {
         let from_center = point - object.center;
         match object.shape {
             Shape::Ball { radius } => (from_center.length() - radius).max(0.0),
-            Shape::Block { half_size, turn } => {
-                let local = from_center.turned(turn).0;
-                Vector([0, 1, 2].map(|i| (local[i].abs() - half_size.0[i]).max(0.0))).length()
-            }
+            Shape::Block { half_size, turn } => (turned(from_center, turn).abs() - half_size).max(Vec3::ZERO).length(),
         }
     }
 
@@ -177,11 +173,9 @@ mod tests {
         for config in [SyntheticConfig::default(), crowded, turning] {
             for scene in scenes(&config) {
                 for time in 0..=500 {
-                    let position = Vector::from_f64(scene.path.position(f64::from(time) / 500.0));
-                    for axis in 0..3 {
-                        let to_wall = scene.half_size.0[axis] - position.0[axis].abs();
-                        assert!(to_wall > least, "{to_wall} from a wall, {position:?} in {:?}", scene.half_size);
-                    }
+                    let position = scene.path.position(f64::from(time) / 500.0).as_vec3();
+                    let to_walls = scene.half_size - position.abs();
+                    assert!(to_walls.min_element() > least, "{position} in {}", scene.half_size);
                     for object in &scene.objects {
                         let apart = distance(object, position);
                         assert!(apart > least, "{apart} from {object:?}");
@@ -197,14 +191,12 @@ mod tests {
             for (i, object) in scene.objects.iter().enumerate() {
                 let height = match object.shape {
                     Shape::Ball { radius } => radius,
-                    Shape::Block { half_size, .. } => half_size.0[1],
+                    Shape::Block { half_size, .. } => half_size.y,
                 };
-                assert!((object.center.0[1] + height - scene.half_size.0[1]).abs() < 1e-5);
-                assert!(
-                    [0, 2].iter().all(|&axis| object.center.0[axis].abs() + object.reach() < scene.half_size.0[axis])
-                );
+                assert!((object.center.y + height - scene.half_size.y).abs() < 1e-5);
+                assert!([0, 2].iter().all(|&axis| object.center[axis].abs() + object.reach() < scene.half_size[axis]));
                 for other in &scene.objects[i + 1..] {
-                    let [x, _, z] = (object.center - other.center).0;
+                    let Vec3 { x, z, .. } = object.center - other.center;
                     assert!(x.hypot(z) > object.reach() + other.reach());
                 }
             }
@@ -217,9 +209,9 @@ mod tests {
             for scene in scenes(&SyntheticConfig { looks, ..Default::default() }) {
                 for time in [0.0, 0.3, 1.0] {
                     let camera = scene.path.camera(time, 75.0, 1.0).c2w;
-                    let forward = camera.rotation.map(|row| row[2]);
-                    let away = forward[0] * camera.translation[0] + forward[2] * camera.translation[2];
-                    assert_eq!(away > 0.0, looks == Looks::Out, "{forward:?} at {:?}", camera.translation);
+                    let (forward, centre) = (camera.rotation.z_axis, camera.translation);
+                    let away = forward.x * centre.x + forward.z * centre.z;
+                    assert_eq!(away > 0.0, looks == Looks::Out, "{forward} at {centre}");
                 }
             }
         }

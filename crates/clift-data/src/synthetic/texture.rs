@@ -1,10 +1,10 @@
-//! Procedural surface colours: two colours and the pattern that mixes them.
+//! Procedural surface colours: two colours and a pattern that mixes them.
 
 use std::f32::consts::TAU;
 
+use glam::Vec3;
 use rand::Rng;
 
-use super::vector::Vector;
 use crate::order::{below, unit};
 
 /// How the two colours alternate.
@@ -20,7 +20,7 @@ enum Pattern {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Texture {
     pattern: Pattern,
-    colors: [Vector; 2],
+    colors: [Vec3; 2],
     /// Unit direction of the pattern's first axis along the surface.
     axis: [f32; 2],
     /// Radians per unit of length.
@@ -29,7 +29,7 @@ pub(super) struct Texture {
 }
 
 impl Texture {
-    /// Draws a texture around `hue` (in turns), with patterns of about `frequency` cycles per unit of length.
+    /// Samples a texture around `hue` (in turns), with patterns of about `frequency` cycles per unit of length.
     ///
     /// `saturation` and `value` are those of the brighter colour.
     pub fn draw(rng: &mut impl Rng, hue: f64, saturation: f64, value: f64, frequency: f64) -> Self {
@@ -48,12 +48,12 @@ impl Texture {
 
     /// One colour all over.
     #[cfg(test)]
-    pub fn plain(color: Vector) -> Self {
+    pub fn plain(color: Vec3) -> Self {
         Self { pattern: Pattern::Gradient, colors: [color; 2], axis: [1.0, 0.0], rate: 0.0, phase: 0.0 }
     }
 
     /// Linear colour at the surface coordinates `u`, `v`.
-    pub fn color(&self, u: f32, v: f32) -> Vector {
+    pub fn color(&self, u: f32, v: f32) -> Vec3 {
         let along = (u * self.axis[0] + v * self.axis[1]) * self.rate + self.phase;
         let across = (v * self.axis[0] - u * self.axis[1]) * self.rate;
         let share = match self.pattern {
@@ -62,23 +62,24 @@ impl Texture {
             Pattern::Checkers => soft_edge(2.0 * (0.7 * along).sin() * (0.7 * across).sin()),
             Pattern::Waves => 0.5 + 0.25 * (along.sin() + (across + along.cos()).sin()),
         };
-        self.colors[0].mix(self.colors[1], share)
+        self.colors[0].lerp_monotonic(self.colors[1], share)
     }
 }
 
-/// Turns a wave in `[-1, 1]` into plateaus at 0 and 1 with edges that stay wider than a pixel.
+/// Maps a wave in `[-1, 1]` to plateaus at 0 and 1 with edges wider than a pixel.
 fn soft_edge(wave: f32) -> f32 {
     let x = (0.5 + 1.2 * wave).clamp(0.0, 1.0);
     x * x * (3.0 - 2.0 * x)
 }
 
 /// Linear colour of a hue in turns, saturation and value (the display's gamma is taken as 2).
-fn linear_color(hue: f64, saturation: f64, value: f64) -> Vector {
-    Vector([0.0, 2.0 / 3.0, 1.0 / 3.0].map(|offset: f64| {
+fn linear_color(hue: f64, saturation: f64, value: f64) -> Vec3 {
+    let channels = [0.0, 2.0 / 3.0, 1.0 / 3.0].map(|offset: f64| {
         let distance = ((hue + offset).rem_euclid(1.0) * 6.0 - 3.0).abs() - 1.0;
         let shade = value * (1.0 - saturation * (1.0 - distance.clamp(0.0, 1.0)));
         (shade * shade) as f32
-    }))
+    });
+    channels.into()
 }
 
 #[cfg(test)]
@@ -87,9 +88,9 @@ mod tests {
 
     #[test]
     fn hues_a_third_apart_are_red_green_and_blue() {
-        assert_eq!(linear_color(0.0, 1.0, 1.0), Vector([1.0, 0.0, 0.0]));
-        assert_eq!(linear_color(1.0 / 3.0, 1.0, 1.0), Vector([0.0, 1.0, 0.0]));
-        assert_eq!(linear_color(-1.0 / 3.0, 1.0, 0.5), Vector([0.0, 0.0, 0.25]));
-        assert_eq!(linear_color(0.4, 0.0, 1.0), Vector::ONE);
+        assert_eq!(linear_color(0.0, 1.0, 1.0), Vec3::new(1.0, 0.0, 0.0));
+        assert_eq!(linear_color(1.0 / 3.0, 1.0, 1.0), Vec3::new(0.0, 1.0, 0.0));
+        assert_eq!(linear_color(-1.0 / 3.0, 1.0, 0.5), Vec3::new(0.0, 0.0, 0.25));
+        assert_eq!(linear_color(0.4, 0.0, 1.0), Vec3::ONE);
     }
 }

@@ -87,7 +87,7 @@ fn cameras_are_those_of_the_script_that_wrote_them() {
         let camera = source.cameras(0).unwrap()[3];
         let k = camera.intrinsics_norm;
         let expected = [1.6, -0.23, 1.7, 0.875, 1.5625, 0.515_625, 0.468_75];
-        let got = camera.c2w.translation.into_iter().chain([k.fx, k.fy, k.cx, k.cy]);
+        let got = camera.c2w.translation.to_array().into_iter().chain([k.fx, k.fy, k.cx, k.cy]);
         for (got, expected) in got.zip(expected) {
             assert!((got - expected).abs() < 1e-6, "{name}: {got} against {expected}"); // f32
         }

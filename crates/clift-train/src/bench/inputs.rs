@@ -2,9 +2,8 @@
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
-use clift_data::camera::{Intrinsics, Pose};
 use clift_data::order::{below, item_rng, step_rng};
-use clift_data::{Clip, Views};
+use clift_data::{Clip, DMat3, DVec3, Intrinsics, Pose, Views};
 use clift_model::{Clift, ModelConfig, SceneClusters};
 use rand::{Rng, RngExt};
 
@@ -63,9 +62,8 @@ fn views(places: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -> V
 
 /// The camera at a place of the arc, turned towards its middle.
 fn pose(place: f64) -> Pose {
-    let (sin, cos) = (-0.5 * place).sin_cos();
-    let rotation = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
-    Pose { rotation, translation: [place, 0.0, 0.25 * place * place] }
+    let rotation = DMat3::from_rotation_y(-0.5 * place);
+    Pose { rotation, translation: DVec3::new(place, 0.0, 0.25 * place * place) }
 }
 
 /// Clusters drawn at random: every cluster has its own token, every other token any cluster.

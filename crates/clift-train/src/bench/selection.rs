@@ -1,6 +1,7 @@
 //! The row of token selection: work of the host, on whole tokens.
 
 use burn::tensor::Device;
+use clift_data::DVec3;
 use clift_data::order::step_rng;
 use clift_model::{Preset, Selector, TokenRay, ViewCamera};
 use rand::RngExt;
@@ -27,7 +28,8 @@ impl Selection {
             .map(|token| {
                 let pose = clip.context.c2w[token % clip.context.num_views()];
                 let [x, y] = [0, 1].map(|_| rng.random_range(-0.5..0.5));
-                TokenRay { origin: pose.apply([0.0; 3]), direction: pose.rotate([x, y, 1.0]) }
+                let direction = pose.rotation * DVec3::new(x, y, 1.0);
+                TokenRay { origin: pose.translation.into(), direction: direction.into() }
             })
             .collect();
         let lens = clip.target.intrinsics[0];

@@ -50,9 +50,9 @@ pub(super) const CASES: &[Case] = &[
 fn normalised(distance: f64, baseline: f64, in_f32: bool) -> Result<Outcome, TrainError> {
     let clip = clip(Shape { num_context: 4, num_targets: 1, size: [8, 8] }, 0, 0);
     // Coordinates that no binary number holds: the scene's own happen to survive.
-    let grown = |pose: &Pose| Pose { translation: pose.translation.map(|value| value * 1.1), ..*pose };
+    let grown = |pose: &Pose| Pose { translation: pose.translation * 1.1, ..*pose };
     let moved = |pose: &Pose| {
-        let translation = pose.translation.map(|value| baseline * value + distance);
+        let translation = baseline * pose.translation + distance;
         let round = |value: f64| if in_f32 { f64::from(value as f32) } else { value };
         Pose { translation: translation.map(round), ..*pose }
     };
@@ -71,8 +71,8 @@ fn normalised(distance: f64, baseline: f64, in_f32: bool) -> Result<Outcome, Tra
     };
     let pairs = here?.into_iter().zip(away);
     let differences = pairs.flat_map(|(a, b)| {
-        let rotation = (0..9).map(move |i| a.rotation[i / 3][i % 3] - b.rotation[i / 3][i % 3]);
-        rotation.chain((0..3).map(move |i| a.translation[i] - b.translation[i]))
+        let [a, b] = [a, b].map(Pose::to_matrix_f64);
+        (0..16).map(move |i| a[i] - b[i])
     });
     Ok(Outcome::Error(most(differences)))
 }

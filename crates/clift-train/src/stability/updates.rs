@@ -51,7 +51,7 @@ pub(super) const CASES: &[Case] = &[
         run: |place| {
             changed(place, 4, |clip| {
                 for pose in clip.context.c2w.iter_mut().chain(&mut clip.target.c2w) {
-                    pose.translation = pose.translation.map(|x| x + MAX_COORDINATE);
+                    pose.translation += MAX_COORDINATE;
                 }
             })
         },
