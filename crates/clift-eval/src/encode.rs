@@ -167,7 +167,7 @@ mod tests {
 
     #[test]
     fn contexts_are_those_asked_for_or_spread_and_wrong_ones_are_named() {
-        let at = |x: f64| Pose { translation: [x, 0.0, 0.0], ..Pose::IDENTITY };
+        let at = |x: f64| Pose { translation: [x, 0.0, 0.0].into(), ..Pose::IDENTITY };
         let poses: Vec<Pose> = (0..10).map(f64::from).map(at).collect();
         assert_eq!(context_frames(&poses, None, 4).unwrap(), [0, 3, 6, 9]);
         assert_eq!(context_frames(&poses[..3], None, 4).unwrap(), [0, 1, 2]);

@@ -1,7 +1,7 @@
 //! The sweep: every scene encoded once, rendered with every variant at every token count.
 
-use crate::SceneResults;
 use crate::EvalKey;
+use crate::SceneResults;
 use std::time::Instant;
 
 use burn::tensor::Tensor;

@@ -13,10 +13,10 @@ use crate::eval_models::EvalModels;
 use crate::eval_results::EvalResults;
 use crate::evaluate::evaluate_scene;
 use crate::exhibit::Shown;
-use crate::summary::scenes::write_scenes;
 use crate::items::evaluation_items;
 use crate::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
 use crate::method::Variant;
+use crate::summary::scenes::write_scenes;
 
 use crate::predictions::{System, picture_name};
 use crate::progress::Progress;

@@ -76,7 +76,7 @@ mod tests {
             width: 16,
             height: 16,
             images: vec![0; places.len() * 16 * 16 * 3],
-            c2w: places.iter().map(|&x| Pose { translation: [x, 0.0, 0.0], ..Pose::IDENTITY }).collect(),
+            c2w: places.iter().map(|&x| Pose { translation: [x, 0.0, 0.0].into(), ..Pose::IDENTITY }).collect(),
             intrinsics: vec![Intrinsics { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0 }; places.len()],
             frame_index: frame_index.to_vec(),
         }

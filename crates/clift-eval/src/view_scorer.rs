@@ -7,8 +7,8 @@ use clift_data::Views as HostViews;
 
 use crate::EvalError;
 use crate::lpips::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures};
-use crate::view_metrics::ViewMetrics;
 use crate::metrics::{SSIM_MIN_SIZE_PX, psnr, ssim};
+use crate::view_metrics::ViewMetrics;
 
 /// Memory for what LPIPS sees in the targets of a scene, which every setting is compared with: 31 pictures of
 /// 256 x 256. What it sees in further ones is computed each time.

@@ -1,9 +1,8 @@
 //! The shape of the network, as the `[model]` section of a config holds it.
 
 use serde::{Deserialize, Serialize};
-use strum::VariantArray;
 
-use crate::{ModelError, Variant};
+pub(crate) use crate::{ModelError, Variant};
 
 /// Sizes of the encoder, the condenser and the renderer. The defaults are the paper's.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -7,15 +7,15 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use clift_data::files::{TEMPORARY, publish, replace};
 use clift_data::PoseRotation;
 use clift_data::PoseScale;
 use clift_data::SourceKind;
+use clift_data::files::{TEMPORARY, publish, replace};
 use clift_model::ModelConfig;
-use clift_model::Variant;
-use clift_model::weights;
 use clift_model::ModelPath;
 use clift_model::TrainedModel;
+use clift_model::Variant;
+use clift_model::weights;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 

@@ -6,12 +6,12 @@ use std::sync::atomic::AtomicBool;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use clift_data::files::{make_folder, remove_leftovers};
 use clift_data::ClipReader;
 use clift_data::OpenedSource;
 use clift_data::SceneSource;
 use clift_data::SceneSubset;
 use clift_data::Split;
+use clift_data::files::{make_folder, remove_leftovers};
 use clift_data::open_dataset;
 use clift_data::open_training_dataset;
 use clift_eval::evaluator::write_ledger;

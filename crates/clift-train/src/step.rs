@@ -6,7 +6,6 @@ use burn::optim::{GradientsAccumulator, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor};
 use clift_model::Clift;
 use clift_model::Precision;
-use clift_model::SceneModel;
 
 use crate::TrainError;
 use crate::batch::StageBatch;

@@ -8,7 +8,6 @@ use clift_model::Clift;
 
 use crate::TrainError;
 use crate::events::{Event, Sink};
-use crate::validation::Validation;
 use crate::loss::Loss;
 use crate::loss_scale::LossScale;
 use crate::optim::adamw;
@@ -17,6 +16,7 @@ use crate::stage_settings::StageSettings;
 use crate::step::Learner;
 use crate::trainer::{StagePlan, freeze};
 use crate::training::Training;
+use crate::validation::Validation;
 
 impl StagePlan<'_> {
     /// Trains from where the stage stands and returns the model when all steps are done. `start` gives

@@ -54,7 +54,7 @@ fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> PathBuf {
 }
 
 /// The mini data set with the camera centres of one training scene changed.
-fn moved_cameras(place: &Place, change: impl Fn(&mut DVec3)) -> PathBuf {
+fn moved_cameras(place: &Place, change: impl Fn(&mut clift_data::DVec3)) -> PathBuf {
     changed_scene(place, |scene| scene.cameras.iter_mut().for_each(|camera| change(&mut camera.c2w.translation)))
 }
 
@@ -176,7 +176,7 @@ fn unusable_scenes_are_skipped_and_named() {
         ("bad camera: ", |place| moved_cameras(place, |centre| centre[1] = f64::NAN)),
         ("bad camera: ", |place| moved_cameras(place, |centre| centre[1] = f64::INFINITY)),
         ("scene 00000000000000a2 has no baseline: its 2 camera centres lie within ", |place| {
-            moved_cameras(place, |centre| *centre = [1.0, 2.0, 3.0])
+            moved_cameras(place, |centre| *centre = [1.0, 2.0, 3.0].into())
         }),
     ];
     for (reason, damage) in cases {

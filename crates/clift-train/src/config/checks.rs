@@ -4,7 +4,6 @@ use clift_data::{DataConfig, DataError, SourceKind, Split};
 use clift_eval::perceptual::PERCEPTUAL_MIN_SIZE_PX;
 use clift_model::Grouping;
 
-
 use crate::TrainError;
 use crate::config::{Config, MAX_TOKENS, OptimizerConfig};
 use crate::error::bad;

@@ -154,8 +154,8 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
 
 #[cfg(test)]
 mod tests {
-use clift_model::attention::MAX_SCORES;
-use clift_model::TokenCount;
+    use clift_model::TokenCount;
+    use clift_model::attention::MAX_SCORES;
 
     use super::*;
     use crate::footprint::scene_sizes::PARTS;

@@ -4,16 +4,16 @@ use std::sync::atomic::AtomicBool;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_data::write_state_dict;
-use clift_model::device::DeviceName;
-use clift_model::interchange::PREFIX;
 use clift_model::Cameras;
 use clift_model::Clusters;
-use clift_model::SceneClusters;
-use clift_model::Variant;
-use clift_model::Views;
 use clift_model::ModelPath;
+use clift_model::SceneClusters;
 use clift_model::SceneModel;
 use clift_model::TrainedModel;
+use clift_model::Variant;
+use clift_model::Views;
+use clift_model::device::DeviceName;
+use clift_model::interchange::PREFIX;
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 

@@ -9,13 +9,13 @@ use burn::tensor::Tensor;
 use clift_data::order::{item_rng, step_rng};
 use clift_data::statistics::upper_median;
 use clift_data::{ClipReader, Split, open_dataset};
-use clift_eval::lpips::Lpips;
+use clift_eval::EvalModels;
 use clift_eval::EvalResults;
 use clift_eval::Sweep;
 use clift_eval::evaluate_scene;
+use clift_eval::lpips::Lpips;
 use clift_eval::upload_cameras;
 use clift_eval::upload_views;
-use clift_eval::EvalModels;
 
 use clift_model::Convention;
 use clift_model::ModelConfig;

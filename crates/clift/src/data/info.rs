@@ -20,7 +20,6 @@ use clift_data::Split;
 use clift_data::open_dataset;
 use clift_data::open_source;
 use clift_eval::items::evaluation_items;
-use clift_train::scenes;
 use clift_train::{Config, read_config};
 
 use super::args::{InfoArgs, Splits};
