@@ -76,8 +76,9 @@ pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
         LayerKind::Linear { inputs, outputs, .. } => inputs * outputs,
         _ => 0,
     };
-    let largest_matrix = layers.iter().map(matrix_len).max().unwrap_or_default() as f64;
-    // Gradients, and a few copies of the largest matrix on the way to its update.
+    let in_blocks = layers.iter().filter(|layer| layer.block.is_some());
+    let largest_matrix = in_blocks.map(matrix_len).max().unwrap_or_default() as f64;
+    // Gradients, and a few copies of the largest matrix of a block on the way to its update.
     let optimizer = trained + 5.0 * largest_matrix;
     // Weights, and two moments of those that train.
     let standing = parameters.total as f64 + sizes.loss_parameters + 2.0 * trained;

@@ -71,7 +71,7 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         (config.loss.perceptual_weight > 0.0).then(|| VggShape::VGG19.sizes(config.data.height, config.data.width));
     // Layers are kept before and behind their ReLU; what the targets are in the network is there until the differences
     // are; a convolution orders its input anew.
-    let images = (num_scenes * config.data.views.num_targets) as f64;
+    let images = config.data.views.num_targets as f64;
     let loss = vgg.map_or_else(Segment::default, |vgg| Segment {
         kept: images * (2.0 * vgg.outputs + vgg.features),
         working: images * 3.0 * vgg.widest,
