@@ -46,11 +46,6 @@ impl<'a> LazyClusters<'a> {
         Ok(&self.fit()?.clusters)
     }
 
-    /// Share of `total_variance` that is left within clusters, where K-means was asked for.
-    pub fn cluster_error(&self, total_variance: f64) -> Option<f64> {
-        self.fit.get().map(|fit| fit.error(0, total_variance))
-    }
-
     fn fit(&self) -> Result<&Fit, EvalError> {
         if let Some(fit) = self.fit.get() {
             return Ok(fit);
