@@ -2,9 +2,7 @@
 //! instances that come and go on several threads.
 
 use burn::tensor::{DType, Tensor};
-use clift_model::Precision;
-use clift_model::adapter::{adapters, max_tensor_bytes};
-use clift_model::device::DeviceName;
+use clift_model::{DeviceName, Precision, adapters, max_tensor_bytes};
 
 #[test]
 fn adapter_limits_hold_on_the_open_device() {

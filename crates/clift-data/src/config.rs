@@ -4,14 +4,14 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::clip_reader::ClipOptions;
-use crate::filters::SceneFilters;
-use crate::fit::Crop;
-use crate::kind::SourceKind;
-use crate::normalize::{PoseRotation, PoseScale};
-use crate::options::FileOptions;
-use crate::sampler::BoundedSampler;
-use crate::synthetic::SyntheticConfig;
+use crate::geometry::normalization::{PoseRotation, PoseScale};
+use crate::image::fit::Crop;
+use crate::sampling::clip_reader::ClipOptions;
+use crate::sampling::view_sampler::BoundedSampler;
+use crate::sources::filters::SceneFilters;
+use crate::sources::kind::SourceKind;
+use crate::sources::options::FileOptions;
+use crate::synthetic::config::SyntheticConfig;
 
 /// Scenes and how views are drawn from them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -4,15 +4,16 @@ use std::sync::Arc;
 
 use crate::config::DataConfig;
 use crate::error::DataError;
-use crate::keys::is_dl3dv_key;
-use crate::kind::SourceKind;
-use crate::layout::{OpenedSource, open_source};
-use crate::ledger::Ledger;
-use crate::options::SourceOptions;
-use crate::place::DatasetRoot;
 use crate::scene_source::{SceneSource, Split};
-use crate::subset::SceneSubset;
-use crate::synthetic::{SyntheticConfig, SyntheticSource};
+use crate::skip_report::Ledger;
+use crate::sources::dataset_root::DatasetRoot;
+use crate::sources::keys::is_dl3dv_key;
+use crate::sources::kind::SourceKind;
+use crate::sources::open::{OpenedSource, open_source};
+use crate::sources::options::SourceOptions;
+use crate::sources::subset::SceneSubset;
+use crate::synthetic::config::SyntheticConfig;
+use crate::synthetic::source::SyntheticSource;
 
 /// Opens one split of the data set of a config.
 ///
@@ -82,7 +83,9 @@ pub fn open_training_dataset(config: &DataConfig) -> Result<OpenedSource, DataEr
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{BoundedSampler, SceneRecord, SyntheticConfig, write_chunks};
+    use crate::sampling::view_sampler::BoundedSampler;
+    use crate::sources::chunks::writer::{SceneRecord, write_chunks};
+    use crate::synthetic::config::SyntheticConfig;
 
     #[test]
     fn training_skips_scenes_too_short_for_any_step() {

@@ -226,7 +226,7 @@ pub struct WorkerPanic {
 
 impl DataError {
     /// A [`DataError::BadConfig`] about `key`.
-    pub(crate) fn bad_config(key: impl Into<String>, problem: impl Into<String>) -> Self {
+    pub fn bad_config(key: impl Into<String>, problem: impl Into<String>) -> Self {
         Self::BadConfig { key: key.into(), problem: problem.into() }
     }
 

@@ -46,7 +46,7 @@ pub(crate) fn unit(rng: &mut impl Rng) -> f64 {
 }
 
 /// Draws `count` distinct values of `0..range` uniformly, in increasing order (Floyd's algorithm).
-pub(crate) fn distinct(rng: &mut impl Rng, range: usize, count: usize) -> Vec<usize> {
+pub fn distinct(rng: &mut impl Rng, range: usize, count: usize) -> Vec<usize> {
     let mut drawn = Vec::with_capacity(count);
     for last in range - count..range {
         let value = below(rng, last + 1);
@@ -90,9 +90,11 @@ pub(crate) fn mix(value: u64) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use proptest::prelude::*;
     use std::collections::BTreeSet;
+
+    use proptest::prelude::*;
+
+    use super::*;
 
     // The expected values come from an implementation of ChaCha8 and of this file in Python.
     #[test]

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use crate::camera::Camera;
-use crate::clip::Frame;
 use crate::error::DataError;
+use crate::geometry::camera::Camera;
+use crate::image::rgb_image::Frame;
 use crate::scene_source::SceneSource;
 
 type ChangeCameras = dyn Fn(usize, Vec<Camera>) -> Result<Vec<Camera>, DataError> + Send + Sync;

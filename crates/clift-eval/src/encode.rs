@@ -2,14 +2,13 @@
 // N encoder tokens, S stored tokens, D width
 
 use burn::tensor::Tensor;
-use clift_data::order::derive_seed;
-use clift_data::{ClipReader, Pose, SceneFrame, ViewIndices, spread_along_path};
+use clift_data::{ClipReader, Pose, SceneFrame, ViewIndices, derive_seed, spread_along_path};
 use clift_model::{
     Clusters, Grouping, KMeans, ModelError, Scene, SceneModel, TokenCount, TokenKind, TrainedModel, WorldFrame,
     total_variance,
 };
 
-use crate::EvalError;
+use crate::error::EvalError;
 use crate::upload::{upload_views, view_cameras};
 
 /// How a scene is encoded.

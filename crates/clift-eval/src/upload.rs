@@ -2,10 +2,9 @@
 
 use burn::tensor::{Device, Tensor};
 use clift_data::Views as HostViews;
-use clift_model::ViewCamera;
-use clift_model::views::{Cameras, Views, upload_images};
+use clift_model::{Cameras, ViewCamera, Views, upload_images};
 
-use crate::EvalError;
+use crate::error::EvalError;
 
 /// Puts one set of views per scene together on a device.
 ///

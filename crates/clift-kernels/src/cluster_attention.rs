@@ -3,10 +3,9 @@
 
 use rayon::prelude::*;
 
-use crate::InstructionSet;
-use crate::disjoint::Disjoint;
-use crate::instruction_set::Kernel;
-use crate::simd::Simd;
+use crate::primitives::shared_slice::Disjoint;
+use crate::simd::dispatch::{InstructionSet, Kernel};
+use crate::simd::vector::Simd;
 
 /// Sizes, and which member belongs where.
 #[derive(Clone, Debug)]

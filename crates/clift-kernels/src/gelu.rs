@@ -1,8 +1,8 @@
 //! GELU of the normal distribution function (erf, not the tanh approximation) and its slope.
 
-use crate::InstructionSet;
-use crate::elementwise::{Combine, Map, combine, map};
-use crate::simd::Simd;
+use crate::primitives::elementwise::{Combine, Map, combine, map};
+use crate::simd::dispatch::InstructionSet;
+use crate::simd::vector::Simd;
 
 /// `output = x * Phi(x)` with the normal distribution function `Phi`.
 pub fn forward(set: InstructionSet, x: &[f32], output: &mut [f32]) {

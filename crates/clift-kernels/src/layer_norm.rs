@@ -3,10 +3,9 @@
 
 use rayon::prelude::*;
 
-use crate::InstructionSet;
-use crate::disjoint::Disjoint;
-use crate::instruction_set::Kernel;
-use crate::simd::Simd;
+use crate::primitives::shared_slice::Disjoint;
+use crate::simd::dispatch::{InstructionSet, Kernel};
+use crate::simd::vector::Simd;
 
 /// `output = (x - mean) / sqrt(variance + epsilon) * gamma + beta`, row by row; `statistics`, if
 /// wanted, receives every row's mean and the inverse of its root, which [`backward`] needs.
@@ -66,7 +65,7 @@ pub fn backward(
 const MAX_PARTS: usize = 64;
 
 fn rows_of_a_piece(dim: usize) -> usize {
-    crate::elementwise::PIECE.div_ceil(dim)
+    crate::primitives::elementwise::PIECE.div_ceil(dim)
 }
 
 struct Forward<'a> {

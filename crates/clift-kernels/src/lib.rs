@@ -8,18 +8,21 @@
 
 #![expect(clippy::inline_always, reason = "only what is inlined into a kernel is compiled with its instructions")]
 
-pub mod attention;
-pub mod cluster_attention;
-mod disjoint;
-mod elementwise;
-pub mod gelu;
-mod instruction_set;
-pub mod layer_norm;
-pub mod linear;
-mod matmul;
-mod scratch;
+mod attention;
+mod cluster_attention;
+mod gelu;
+mod layer_norm;
+mod linear;
+mod primitives;
 mod simd;
 #[cfg(test)]
 mod testing;
 
-pub use instruction_set::{BadInstructionSet, InstructionSet};
+pub use attention::backward::{Saved, backward as attention_backward};
+pub use attention::forward::forward as attention_forward;
+pub use attention::shapes::{Gradients, Rows, Sizes};
+pub use cluster_attention::{Segments, backward as cluster_attention_backward, forward as cluster_attention_forward};
+pub use gelu::{backward as gelu_backward, forward as gelu_forward};
+pub use layer_norm::{backward as layer_norm_backward, forward as layer_norm_forward, sum_rows};
+pub use linear::forward as linear_forward;
+pub use simd::dispatch::{BadInstructionSet, InstructionSet};

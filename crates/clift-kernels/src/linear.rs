@@ -4,7 +4,7 @@
 use gemm::Parallelism;
 use rayon::prelude::*;
 
-use crate::elementwise::PIECE;
+use crate::primitives::elementwise::PIECE;
 
 /// Below so many products threads cost more than they bring.
 const PARALLEL: usize = 1 << 20;

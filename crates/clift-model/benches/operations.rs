@@ -6,10 +6,7 @@ use std::time::Duration;
 
 use burn::module::Module;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use clift_model::attention::self_sdpa;
-use clift_model::cluster_attention::cluster_attention;
-use clift_model::linear::{linear, linear_of_gelu, linear_of_norm};
-use clift_model::{Init, KMeans};
+use clift_model::{Init, KMeans, cluster_attention, linear, linear_of_gelu, linear_of_norm, self_sdpa};
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
 use rand::{RngExt, SeedableRng};

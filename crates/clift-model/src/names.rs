@@ -37,12 +37,13 @@ mod tests {
     use std::str::FromStr;
 
     use super::*;
-    use crate::config::Variant;
-    use crate::cost::Convention;
-    use crate::device::DeviceName;
-    use crate::precision::Precision;
-    use crate::scene::{TokenKind, TokenStorage};
-    use crate::select::Preset;
+    use crate::cost::macs::Convention;
+    use crate::device::name::DeviceName;
+    use crate::network::architecture::Variant;
+    use crate::ops::precision::Precision;
+    use crate::scene::token_format::TokenStorage;
+    use crate::tokens::kind::TokenKind;
+    use crate::tokens::selection::rules::Preset;
 
     fn check<T>(expected: &str)
     where

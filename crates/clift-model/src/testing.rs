@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
 
-use crate::device::DeviceName;
-use crate::{CondenserConfig, ModelConfig, Variant};
+use crate::device::name::DeviceName;
+use crate::network::architecture::Variant;
+use crate::network::config::{CondenserConfig, ModelConfig};
 
 /// Every device of this build that opens: flex, ndarray, and wgpu where an adapter is found.
 pub fn devices() -> Vec<Device> {

@@ -174,12 +174,12 @@ impl From<clift_data::WorkerPanic> for TrainError {
 
 impl TrainError {
     /// Wraps an operating-system error; for `map_err`.
-    pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+    pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, source, path: path.to_path_buf() }
     }
 
     /// A [`TrainError::BadFile`]; for `map_err`.
-    pub(crate) fn bad_file<E: std::fmt::Display>(what: &'static str, path: &Path) -> impl FnOnce(E) -> Self {
+    pub fn bad_file<E: std::fmt::Display>(what: &'static str, path: &Path) -> impl FnOnce(E) -> Self {
         move |reason| Self::BadFile { what, reason: reason.to_string(), path: path.to_path_buf() }
     }
 }

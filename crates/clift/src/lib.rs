@@ -1,38 +1,21 @@
 //! The command line of clift: arguments and printing, nothing else.
 
-mod args;
-mod bench;
-mod compare;
-mod data;
-mod doctor;
-mod encode;
-mod eval;
-mod export;
-mod flops;
-mod import;
+mod cli;
+mod commands;
+mod exit_code;
 mod interrupt;
-mod json;
-mod plan;
-mod render;
-mod table;
-pub mod terminal;
-mod train;
-mod units;
+mod output;
 
 use std::process::ExitCode;
 
 use clap::Parser;
-use clift_eval::EvalError;
-use clift_train::TrainError;
 
-use args::{Args, BenchArgs, BenchCommand, Command, DataCommand};
-
-/// Done.
-const DONE: u8 = 0;
-/// Something failed.
-const FAILED: u8 = 1;
-/// The command line or the config is wrong.
-const WRONG_USAGE: u8 = 2;
+use crate::cli::{Args, Command};
+use crate::commands::bench::cases::{BenchArgs, BenchCommand};
+use crate::commands::data::command::DataCommand;
+use crate::commands::{bench, compare, data, doctor, encode, eval, export, flops, import, plan, render, train};
+use crate::exit_code::{DONE, exit_code, message};
+use crate::output::stdout;
 
 /// Runs the command line of this process and returns its exit code: 0 done, 1 failed, 2 wrong usage
 /// or config, 130 (Ctrl-C), 143 (SIGTERM) or 129 (a closed terminal) interrupted after saving.
@@ -43,134 +26,25 @@ pub fn main() -> ExitCode {
         Command::Compare(args) => compare::run(&args),
         Command::Flops(args) => flops::run(&args),
         Command::Encode(args) => encode::run(&args),
-        Command::Render(args) => render::run(&args),
+        Command::Render(args) => render::run::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
         Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
         Command::Data { command: DataCommand::Check(args) } => data::check::run(&args),
         Command::Data { command: DataCommand::Index(args) } => data::index::run(&args),
         Command::Data { command: DataCommand::Convert(args) } => data::convert::run(&args),
         Command::Plan(args) => plan::run(&args),
-        Command::Doctor(args) => doctor::run(&args),
-        Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => data::bench::run(&args),
-        Command::Bench(BenchArgs { command: Some(BenchCommand::Half(args)), .. }) => bench::half::run(&args),
-        Command::Bench(args) => bench::run(&args),
+        Command::Doctor(args) => doctor::run::run(&args),
+        Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => bench::data::run(&args),
+        Command::Bench(BenchArgs { command: Some(BenchCommand::Half(args)), .. }) => bench::precision::run(&args),
+        Command::Bench(args) => bench::cases::run(&args),
         Command::Import(args) => import::run(&args),
         Command::Export(args) => export::run(&args),
     };
     match result {
         Ok(()) => ExitCode::from(DONE),
         Err(error) => {
-            terminal::print_note(&format!("error: {}", message(&error)));
+            stdout::print_note(&format!("error: {}", message(&error)));
             ExitCode::from(exit_code(&error))
         }
-    }
-}
-
-/// The error with its causes, without those that a message quotes already.
-fn message(error: &anyhow::Error) -> String {
-    error
-        .chain()
-        .skip(1)
-        .map(ToString::to_string)
-        .fold(error.to_string(), |text, cause| if text.contains(&cause) { text } else { format!("{text}: {cause}") })
-}
-
-/// The command line asks for something that cannot be done.
-#[derive(Debug)]
-struct WrongUsage(String);
-
-impl std::fmt::Display for WrongUsage {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for WrongUsage {}
-
-fn exit_code(error: &anyhow::Error) -> u8 {
-    if error.is::<WrongUsage>() || error.is::<clift_train::ConfigError>() {
-        return WRONG_USAGE;
-    }
-    if let Some(error) = error.downcast_ref::<clift_data::DataError>() {
-        return data_exit_code(error);
-    }
-    if let Some(error) = error.downcast_ref::<clift_model::ModelError>() {
-        return model_exit_code(error);
-    }
-    if let Some(error) = error.downcast_ref::<EvalError>() {
-        return eval_exit_code(error);
-    }
-    error.downcast_ref::<TrainError>().map_or(FAILED, train_exit_code)
-}
-
-fn train_exit_code(error: &TrainError) -> u8 {
-    match error {
-        TrainError::Interrupted { .. } | TrainError::Abandoned { .. } => interrupt::exit_code(),
-        TrainError::BadConfig { .. } | TrainError::OtherRun { .. } | TrainError::Missing { .. } => WRONG_USAGE,
-        TrainError::Eval(error) => eval_exit_code(error),
-        TrainError::Data(error) => data_exit_code(error),
-        TrainError::Model(error) => model_exit_code(error),
-        TrainError::Stopped { source, .. } | TrainError::Damaged { source, .. } => train_exit_code(source),
-        _ => FAILED,
-    }
-}
-
-fn data_exit_code(error: &clift_data::DataError) -> u8 {
-    use clift_data::DataError::{BadConfig, UnknownLayout};
-    if matches!(error, BadConfig { .. } | UnknownLayout { .. }) { WRONG_USAGE } else { FAILED }
-}
-
-fn eval_exit_code(error: &EvalError) -> u8 {
-    use EvalError::{BadSystemName, BadWeights, Interrupted, NoPredictions, NotComparable};
-    match error {
-        Interrupted { .. } => interrupt::exit_code(),
-        BadSystemName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => WRONG_USAGE,
-        EvalError::Data(error) => data_exit_code(error),
-        EvalError::Model(error) => model_exit_code(error),
-        _ => FAILED,
-    }
-}
-
-fn model_exit_code(error: &clift_model::ModelError) -> u8 {
-    use clift_model::ModelError::{
-        BadConfig, BadTokenCount, NoConfig, NoDevice, NoModel, NotDivisible, NotImported, OtherRenderer,
-    };
-    match error {
-        BadConfig { .. }
-        | BadTokenCount { .. }
-        | NoConfig { .. }
-        | NoDevice { .. }
-        | NoModel { .. }
-        | NotDivisible { .. }
-        | NotImported { .. }
-        | OtherRenderer { .. } => WRONG_USAGE,
-        _ => FAILED,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_cause_is_shown_once() {
-        let missing = clift_train::read_config::<clift_train::Config>("no.toml".as_ref(), &[]).unwrap_err();
-        let text = message(&anyhow::Error::from(missing).context("starting"));
-        assert!(text.starts_with("starting: reading the configuration failed: "), "{text}");
-        assert_eq!(text.matches("os error").count(), 1, "{text}");
-    }
-
-    #[test]
-    fn what_the_user_can_change_is_wrong_usage_and_the_rest_has_failed() {
-        let bad_config = || clift_data::SyntheticConfig { num_frames: 0, ..Default::default() }.validate();
-        assert_eq!(exit_code(&WrongUsage("no".into()).into()), WRONG_USAGE);
-        assert_eq!(exit_code(&bad_config().unwrap_err().into()), WRONG_USAGE);
-        assert_eq!(exit_code(&TrainError::from(bad_config().unwrap_err()).into()), WRONG_USAGE);
-        let stopped = |source| TrainError::Stopped { source, stage: "stage1", step: 3, checkpoint: "none".into() };
-        assert_eq!(exit_code(&stopped(Box::new(bad_config().unwrap_err().into())).into()), WRONG_USAGE);
-        assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), 130);
-        assert_eq!(exit_code(&TrainError::Abandoned { work: "`encode`".into() }.into()), 130);
-        assert_eq!(exit_code(&clift_data::DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
-        assert_eq!(exit_code(&anyhow::anyhow!("anything else")), FAILED);
     }
 }

@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 
 use clift_data::{DatasetRoot, SourceOptions, Split, TestScenes, open_source};
 use clift_model::Variant;
-use clift_train::import::{ImportOptions, import};
+use clift_train::{ImportOptions, import};
 
 use crate::setup::{Setup, fixture};
 use crate::targets::{JSON_WORDS, PICKLE_WORDS, PLAIN, Read, Target, words_of};

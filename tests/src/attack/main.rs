@@ -19,7 +19,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-
 use layouts::LAYOUT_TARGETS;
 use mutate::Mutator;
 use report::Attacked;

@@ -3,16 +3,14 @@
 use std::path::Path;
 
 use burn::tensor::Device;
-use clift_data::pickle::Pickle;
-use clift_data::{ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, image};
-use clift_model::{Clift, Scene, weights};
-use clift_train::checkpoint::Checkpoints;
-use clift_train::clusters::ClusterCache;
-use clift_train::config::{CheckpointConfig, OptimizerConfig};
-use clift_train::loss::Loss;
-use clift_train::optim::adamw;
-use clift_train::step::Learner;
-use clift_train::{Config, Run, read_checked_config};
+use clift_data::{
+    ChunkSource, EvaluationIndex, Pickle, SceneFilters, SceneSource, Split, decode_image, encode_jpeg, encode_png,
+};
+use clift_model::{Clift, Scene, load_part};
+use clift_train::{
+    CheckpointConfig, Checkpoints, ClusterCache, Config, Learner, Loss, OptimizerConfig, Run, adamw,
+    read_checked_config,
+};
 
 use crate::setup::{Setup, fixture, member, with_pickle};
 
@@ -349,15 +347,15 @@ fn frame() -> clift_data::Frame {
 }
 
 fn pngs(_: &Setup) -> Vec<Vec<u8>> {
-    vec![image::encode_png(&frame()).expect("it can be encoded")]
+    vec![encode_png(&frame()).expect("it can be encoded")]
 }
 
 fn jpegs(_: &Setup) -> Vec<Vec<u8>> {
-    [90, 10].map(|quality| image::encode_jpeg(&frame(), quality).expect("it can be encoded")).into()
+    [90, 10].map(|quality| encode_jpeg(&frame(), quality).expect("it can be encoded")).into()
 }
 
 fn picture(_: &Setup) -> Read {
-    Box::new(|bytes| image::decode(bytes, "attack", 0).map(drop).map_err(words_of))
+    Box::new(|bytes| decode_image(bytes, "attack", 0).map(drop).map_err(words_of))
 }
 
 /// Gives every block of a PNG the checksum it should have, as far as its blocks can be followed.
@@ -387,7 +385,7 @@ fn config(setup: &Setup) -> Read {
 fn model_weights(setup: &Setup) -> Read {
     let model = setup.model();
     file(setup, "model.safetensors", move |path| {
-        let loaded = weights::load_part(&mut model.clone(), &Clift::stage1_part(), path).map_err(words_of)?;
+        let loaded = load_part(&mut model.clone(), &Clift::stage1_part(), path).map_err(words_of)?;
         loaded.require_all(path).map_err(words_of)
     })
 }

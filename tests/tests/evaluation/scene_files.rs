@@ -2,13 +2,9 @@
 
 use std::path::Path;
 
-use clift_data::index::spread_views;
-use clift_data::{Clip, ClipReader, Split, open_dataset};
-use clift_eval::metrics::{psnr, ssim};
-use clift_eval::picture::Picture;
-use clift_eval::view_cameras;
-use clift_model::viewer::load_renderer;
-use clift_model::{Preset, Scene, TokenKind, TokenStorage, Viewer};
+use clift_data::{Clip, ClipReader, Split, open_dataset, spread_views};
+use clift_eval::{Picture, psnr, ssim, view_cameras};
+use clift_model::{Preset, Scene, TokenKind, TokenStorage, Viewer, load_renderer};
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 

@@ -1,8 +1,7 @@
 //! Latent K-means.
 
 use burn::tensor::Tensor;
-use clift_model::kmeans::Fit;
-use clift_model::{KMeans, total_variance};
+use clift_model::{Fit, KMeans, total_variance};
 
 use crate::place::{DIM, Place};
 use crate::table::{Case, Named, Tolerance, Values};

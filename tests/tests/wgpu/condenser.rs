@@ -1,8 +1,7 @@
 //! The condenser in all its forms, and the attention inside clusters that it is made of.
 
 use burn::tensor::{Int, Tensor};
-use clift_model::cluster_attention::cluster_attention;
-use clift_model::{Clusters, Condenser, CondenserConfig, ModelConfig, SceneClusters, Variant};
+use clift_model::{Clusters, Condenser, CondenserConfig, ModelConfig, SceneClusters, Variant, cluster_attention};
 
 use crate::place::{BATCH, DIM, NUM_TOKENS, Place, clusters, network};
 use crate::table::{Case, Tolerance, Values};

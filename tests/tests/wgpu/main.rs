@@ -17,8 +17,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use burn::tensor::Device;
-use clift_model::device::DeviceName;
-
+use clift_model::DeviceName;
 use place::Place;
 use table::{Case, Difference};
 

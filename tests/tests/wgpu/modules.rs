@@ -2,14 +2,11 @@
 
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
-use clift_model::attention::{SelfAttention, cross_sdpa, self_sdpa};
-use clift_model::block::{DecoderBlock, EncoderBlock};
-use clift_model::feed_forward::{Activation, FeedForward};
-use clift_model::linear::{linear, linear_of_gelu, linear_of_norm};
-use clift_model::patch::{patchify, unpatchify};
-use clift_model::rays::plucker;
-use clift_model::{Encoder, LiftNorm, RenderTokens, Renderer, Variant};
-use clift_train::loss::mse;
+use clift_model::{
+    Activation, DecoderBlock, Encoder, EncoderBlock, FeedForward, LiftNorm, RenderTokens, Renderer, SelfAttention,
+    Variant, cross_sdpa, linear, linear_of_gelu, linear_of_norm, patchify, plucker, self_sdpa, unpatchify,
+};
+use clift_train::mse;
 
 use crate::place::{BATCH, DIM, NUM_TOKENS, Place, SIZE, VIEWS, network, values};
 use crate::table::{Case, Tolerance, Values};

@@ -3,24 +3,11 @@
 use std::path::Path;
 
 use burn::module::Module;
-use clift_data::BoundedSampler;
-use clift_data::ClipReader;
-use clift_data::DataConfig;
-use clift_data::Split;
-use clift_data::SyntheticConfig;
-use clift_data::open_dataset;
-use clift_eval::encode::EncodeOptions;
-use clift_eval::encode::encode;
-use clift_model::Preset;
-use clift_model::Scene;
-use clift_model::TokenCount;
-use clift_model::TokenStorage;
-use clift_model::TrainedModel;
-use clift_model::Variant;
-use clift_model::ViewCamera;
-use clift_model::Viewer;
-use clift_model::viewer::load_renderer;
-use clift_model::weights;
+use clift_data::{BoundedSampler, ClipReader, DataConfig, Split, SyntheticConfig, open_dataset};
+use clift_eval::{EncodeOptions, encode};
+use clift_model::{
+    Preset, Scene, TokenCount, TokenStorage, TrainedModel, Variant, ViewCamera, Viewer, load_renderer, save_weights,
+};
 use clift_train::Config;
 
 use crate::cpu;
@@ -90,7 +77,7 @@ fn draw(place: &Place, storage: TokenStorage) -> Values {
     let maker = if place.is_wrong() { maker.wrong() } else { maker };
     let scene = encode_room(&maker, folder.path(), storage);
     let weights_file = folder.path().join("model.safetensors");
-    weights::save(&maker.model().valid(), &weights_file).expect("the folder takes a file");
+    save_weights(&maker.model().valid(), &weights_file).expect("the folder takes a file");
     let renderer = load_renderer(&scene, &weights_file, &place.plain()).expect("the scene's renderer");
     let mut viewer = Viewer::new(&scene, renderer, Preset::Scaled.rules(), &place.plain()).expect("finite rays");
     let between = |share: f64| {

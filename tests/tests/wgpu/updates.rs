@@ -3,12 +3,7 @@
 use burn::module::Module;
 use clift_eval::upload_pictures;
 use clift_model::{Clift, Clusters, RenderTokens, SceneModel};
-use clift_train::Stage;
-use clift_train::batch::{StageBatch, TokenChoice};
-use clift_train::config::OptimizerConfig;
-use clift_train::loss::Loss;
-use clift_train::optim::adamw;
-use clift_train::step::Learner;
+use clift_train::{Learner, Loss, OptimizerConfig, Stage, StageBatch, TokenChoice, adamw};
 
 use crate::modules::subsets;
 use crate::place::{Place, clusters, gradients, parameters};
@@ -54,7 +49,7 @@ pub fn batch(place: &Place, stage: Stage) -> StageBatch {
 }
 
 /// Makes an update.
-pub fn step(learner: Learner, batch: &StageBatch, parts: usize) -> (Learner, clift_train::step::Update) {
+pub fn step(learner: Learner, batch: &StageBatch, parts: usize) -> (Learner, clift_train::Update) {
     let (learner, update) = learner.step(batch, parts, LEARNING_RATE.into(), 1.0).expect("the model takes the batch");
     assert!(update.applied, "{update:?}");
     (learner, update)

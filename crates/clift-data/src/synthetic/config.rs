@@ -6,7 +6,7 @@ use crate::error::DataError;
 use crate::scene_source::Split;
 
 /// Most scenes of one source: the table of key blocks is then below 1 MiB.
-pub(super) const MAX_SCENES: usize = 32_000_000;
+pub(crate) const MAX_SCENES: usize = 32_000_000;
 
 /// Viewing direction of the camera on its path.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -5,7 +5,7 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 use rand::Rng;
 
-use crate::order::{below, unit};
+use crate::random::{below, unit};
 
 /// How the two colours alternate.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -18,7 +18,7 @@ enum Pattern {
 
 /// Colour of a surface as a function of two coordinates along it.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Texture {
+pub(crate) struct Texture {
     pattern: Pattern,
     colors: [Vec3; 2],
     /// Unit direction of the pattern's first axis along the surface.

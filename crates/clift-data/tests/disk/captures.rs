@@ -4,8 +4,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use clift_data::image::{decode, encode_png};
-use clift_data::{FileOptions, Frame, IntrinsicsNorm, Ledger, Lens, SceneSource, SourceOptions, Split, Undistortion};
+use clift_data::{
+    FileOptions, Frame, IntrinsicsNorm, Ledger, Lens, SceneSource, SourceOptions, Split, Undistortion, decode_image,
+    encode_png,
+};
 use serde_json::{Value, json};
 
 use crate::files::{copy_folder, fixtures};
@@ -112,7 +114,7 @@ fn colmap(model: &str) -> (tempfile::TempDir, Frame) {
     let line = text.lines().find(|line| line.starts_with('7')).unwrap();
     fs::write(&path, text.replace(line, &format!("7 {model}"))).unwrap();
     let file = fs::read(root.path().join("attic/images/left/frame 8.png")).unwrap();
-    (root, decode(&file, "", 0).unwrap())
+    (root, decode_image(&file, "", 0).unwrap())
 }
 
 fn open(root: &Path, undistort: Option<bool>) -> Arc<dyn SceneSource> {

@@ -3,10 +3,11 @@
 use std::fs;
 use std::path::Path;
 
-use crate::files::{copy_folder, fixtures};
-use crate::open_at;
 use clift_data::{OpenedSource, SourceOptions, Split};
 use proptest::prelude::*;
+
+use crate::files::{copy_folder, fixtures};
+use crate::open_at;
 
 /// Opens a scene and reads all of it; the first error as text.
 fn read(root: &Path) -> Result<usize, String> {
@@ -101,7 +102,7 @@ fn turned_images_are_skipped_for_their_shape() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&fixtures().join("layouts/capture"), root.path());
     let picture = clift_data::Frame { width: 18, height: 32, rgb: vec![9; 18 * 32 * 3] };
-    let png = clift_data::image::encode_png(&picture).unwrap();
+    let png = clift_data::encode_png(&picture).unwrap();
     fs::write(root.path().join("attic/images/10.png"), &png).unwrap();
     fs::write(root.path().join("attic/images/11.png"), "no picture").unwrap();
     let OpenedSource { source, report: ledger, .. } =

@@ -3,13 +3,13 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use clift_data::{
+    Clip, ClipOptions, ClipReader, FileOptions, Ledger, OpenedSource, PoseRotation, PoseScale, SceneFilters,
+    SceneSource, SourceInfo, SourceKind, SourceOptions, Split, ViewIndices,
+};
+
 use crate::files::{copy_folder, fixtures};
 use crate::open_at;
-use clift_data::normalize::{PoseRotation, PoseScale};
-use clift_data::{
-    Clip, ClipOptions, ClipReader, FileOptions, Ledger, OpenedSource, SceneFilters, SceneSource, SourceInfo,
-    SourceKind, SourceOptions, Split, ViewIndices,
-};
 
 const KEY: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 
@@ -79,7 +79,7 @@ fn all_layouts_give_the_same_clip() {
                 assert!((got - expected).abs() < 1e-5, "{name}: {got} against {expected}");
             }
             let file = source.encoded_frame(0, 3).unwrap().expect("the file of a frame");
-            assert_eq!(clift_data::image::decode(&file, "", 3).unwrap(), source.frame(0, 3).unwrap(), "{name}");
+            assert_eq!(clift_data::decode_image(&file, "", 3).unwrap(), source.frame(0, 3).unwrap(), "{name}");
         }
     }
 }

@@ -3,8 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use clift_data::image::{encode_jpeg, encode_png};
-use clift_data::{FileOptions, Frame, Ledger, OpenedSource, SourceKind, SourceOptions, Split};
+use clift_data::{FileOptions, Frame, Ledger, OpenedSource, SourceKind, SourceOptions, Split, encode_jpeg, encode_png};
 use serde_json::{Value, json};
 
 use crate::files::{copy_folder, fixtures};
@@ -227,7 +226,7 @@ fn listed_scenes_missing_from_test_are_flagged() {
         let options = SourceOptions { kind: layout, files, ..SourceOptions::default() };
         let opened = open_at(root.path(), Split::Train, &options).unwrap();
         assert_eq!((opened.source.num_scenes(), opened.report.skips.len()), (1, 1));
-        let flagged = clift_data::check::left_out(&opened.report).into_iter();
+        let flagged = clift_data::left_out(&opened.report).into_iter();
         flagged.map(|check| (check.key, check.reasons.concat())).collect::<Vec<_>>()
     };
     let reason = "kept for testing by the list of test scenes, but not in test/".to_owned();

@@ -1,8 +1,9 @@
 //! Lens distortion against COLMAP's camera models and OpenCV's undistortion (`scripts/fixtures/make_layout_fixtures.py`).
 
-use crate::files::fixtures;
 use clift_data::{Frame, IntrinsicsNorm, Lens, Undistortion};
 use safetensors::SafeTensors;
+
+use crate::files::fixtures;
 
 const MODELS: [&str; 3] = ["SIMPLE_RADIAL", "RADIAL", "OPENCV"];
 

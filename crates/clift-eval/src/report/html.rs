@@ -5,8 +5,8 @@ use std::io;
 use base64::prelude::{BASE64_STANDARD, Engine};
 use maud::{Markup, html};
 
-use super::axis::grouped;
-use crate::picture::Picture;
+use crate::figures::canvas::Picture;
+use crate::report::axis::grouped;
 
 /// Shown where a value was not measured.
 pub const DASH: &str = "\u{2013}";

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use maud::{Markup, html};
 
-use super::axis::{Axis, Scale};
+use crate::report::axis::{Axis, Scale};
 
 // Small enough that the text can still be read where the plot is shrunk to the width of a phone.
 const WIDTH: f64 = 460.0;

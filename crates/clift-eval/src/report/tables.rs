@@ -4,11 +4,11 @@ use clift_data::Ledger;
 use clift_model::TokenStorage;
 use maud::{Markup, html};
 
-use super::axis::{grouped, milliseconds};
-use super::html::{DASH, count, head, number};
-use crate::machine;
-use crate::paired::PairedDifference;
-use crate::summary::{Point, Summary};
+use crate::report::axis::{grouped, milliseconds};
+use crate::report::html::{DASH, count, head, number};
+use crate::statistics::paired::PairedDifference;
+use crate::statistics::summary::{Point, Summary};
+use crate::system::machine;
 
 const POINTS_HEAD: [&str; 17] = [
     "variant",

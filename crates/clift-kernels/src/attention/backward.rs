@@ -4,18 +4,17 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::{Gradients, Heads, QUERY_BLOCK, ROW_PADDING, Rows, Sizes, copy_padded, copy_transposed};
-use crate::InstructionSet;
-use crate::disjoint::Disjoint;
-use crate::instruction_set::Kernel;
-use crate::matmul::{Left, Right, multiply, padded, panel_width};
-use crate::scratch::{Scratch, cut};
-use crate::simd::Simd;
+use crate::attention::shapes::{Gradients, Heads, QUERY_BLOCK, ROW_PADDING, Rows, Sizes, copy_padded, copy_transposed};
+use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
+use crate::primitives::scratch::{Scratch, cut};
+use crate::primitives::shared_slice::Disjoint;
+use crate::simd::dispatch::{InstructionSet, Kernel};
+use crate::simd::vector::Simd;
 
 /// Keys in a block: there are two blocks of scores and two of gradients.
 const BACKWARD_KEYS: usize = 256;
 
-/// What [`backward`] reads: the inputs and the results of [`forward`](super::forward), and the output's gradient.
+/// What [`backward`] reads: the inputs and the results of [`forward`](crate::attention::forward::forward), and the output's gradient.
 #[derive(Clone, Copy, Debug)]
 pub struct Saved<'a> {
     /// Queries.

@@ -4,13 +4,12 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::{Heads, QUERY_BLOCK, ROW_PADDING, Rows, Sizes, copy_padded, copy_transposed};
-use crate::InstructionSet;
-use crate::disjoint::Disjoint;
-use crate::instruction_set::Kernel;
-use crate::matmul::{Left, Right, multiply, padded, panel_width};
-use crate::scratch::{Scratch, cut};
-use crate::simd::Simd;
+use crate::attention::shapes::{Heads, QUERY_BLOCK, ROW_PADDING, Rows, Sizes, copy_padded, copy_transposed};
+use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
+use crate::primitives::scratch::{Scratch, cut};
+use crate::primitives::shared_slice::Disjoint;
+use crate::simd::dispatch::{InstructionSet, Kernel};
+use crate::simd::vector::Simd;
 
 /// Keys in a block: scores of a block take 200 KB.
 const FORWARD_KEYS: usize = 512;
@@ -18,7 +17,7 @@ const FORWARD_KEYS: usize = 512;
 /// Computes `softmax(q k^T / sqrt(head width)) v` per head.
 ///
 /// `output` is `[batch, num_queries, dim]`; `log_sum`, if wanted, is `[batch, num_heads, num_queries]` and
-/// receives each row's `log2(sum(2^(score * log2(e))))`, which [`backward`](super::backward) needs.
+/// receives each row's `log2(sum(2^(score * log2(e))))`, which [`backward`](crate::attention::backward::backward) needs.
 pub fn forward(
     set: InstructionSet,
     sizes: Sizes,

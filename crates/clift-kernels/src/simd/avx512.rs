@@ -1,10 +1,9 @@
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx512` proves that the processor has AVX-512")]
 
+use crate::simd::vector::{Simd, Tile};
+
 #[allow(clippy::wildcard_imports, reason = "intrinsics carry their own prefix; tests are let off")]
 use std::arch::x86_64::*;
-
-use super::Simd;
-use crate::matmul::Tile;
 
 /// AVX-512: 16 lanes, 32 registers.
 #[derive(Clone, Copy, Debug)]

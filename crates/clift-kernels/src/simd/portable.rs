@@ -1,5 +1,4 @@
-use super::Simd;
-use crate::matmul::Tile;
+use crate::simd::vector::{Simd, Tile};
 
 /// Plain Rust in arrays of eight, for the compiler to vectorise with what every processor has.
 #[derive(Clone, Copy, Debug)]

@@ -1,11 +1,11 @@
 //! The largest tensors of a network. A GPU has a limit for one beside that of its memory: a tensor is one buffer, and a
 //! shader sees at most `max_storage_buffer_binding_size` of it (below 2 GiB on Vulkan and Direct3D 12).
 
-use super::SceneSizes;
-use crate::attention::MAX_SCORES;
-use crate::kmeans::seeding::MAX_TABLE_LEN;
-use crate::layers::{Layer, LayerKind, Sequence};
-use crate::{ModelConfig, Part};
+use crate::cost::scene_sizes::SceneSizes;
+use crate::network::config::ModelConfig;
+use crate::network::layers::{Layer, LayerKind, Part, Sequence};
+use crate::ops::attention::composed::MAX_SCORES;
+use crate::tokens::kmeans::seeding::MAX_TABLE_LEN;
 
 /// Lists the tensors that can be the largest of one network at work on equal scenes: what each is, and its number of
 /// values.

@@ -4,14 +4,11 @@ use std::str::FromStr;
 
 use strum::{Display, IntoStaticStr, VariantArray};
 
-use super::SceneSizes;
-use crate::ModelConfig;
-use crate::ModelError;
-use crate::Part;
-use crate::layers::Layer;
-use crate::layers::LayerKind;
-use crate::layers::Rows;
+use crate::cost::scene_sizes::SceneSizes;
+use crate::error::ModelError;
 use crate::names::parse_value;
+use crate::network::config::ModelConfig;
+use crate::network::layers::{Layer, LayerKind, Part, Rows};
 
 /// Multiply-accumulates of a forward pass of one scene. Norms, activations, softmax and the rays of pixels are not
 /// counted.
@@ -143,8 +140,11 @@ mod tests {
     use burn::tensor::{DType, Device, Tensor};
 
     use super::*;
+    use crate::network::clift::Clift;
+    use crate::ops::mac_counter;
     use crate::testing::{random, small_configs};
-    use crate::{Cameras, Clift, Clusters, SceneClusters, Views, mac_counter};
+    use crate::tokens::clusters::{Clusters, SceneClusters};
+    use crate::views::upload::{Cameras, Views};
 
     #[test]
     fn the_papers_numbers_come_out_to_the_printed_digits() {

@@ -1,9 +1,11 @@
 //! Bytes of tensors that the networks need, counted from what the hand-written operations save (docs/plan.md).
 // In f32 values: x = N D of a block's own rows
 
-use super::{Parameters, SceneSizes, kmeans_values};
-use crate::layers::{Layer, LayerKind, Rows};
-use crate::{ModelConfig, Part};
+use crate::cost::largest_tensor::kmeans_values;
+use crate::cost::parameters::Parameters;
+use crate::cost::scene_sizes::SceneSizes;
+use crate::network::config::ModelConfig;
+use crate::network::layers::{Layer, LayerKind, Part, Rows};
 
 /// Bytes of an f32.
 const F32: f64 = 4.0;

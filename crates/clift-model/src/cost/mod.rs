@@ -1,16 +1,13 @@
-//! The cost of a network, derived from the list of its layers and the sizes of a scene.
+//! Cost of a network, derived from `network/layers`.
 //!
-//! [`SceneSizes`] counts the rows that layers process; the other files multiply them out: [`Parameters`], [`Macs`],
-//! bytes in memory, and the largest tensors.
+//! - `scene_sizes`: counts of tokens, views, patches
+//! - `parameters`: parameters per network
+//! - `macs`: multiply-accumulates and conventions
+//! - `memory`: saved activations and peak bytes
+//! - `largest_tensor`: largest tensor of each network
 
-mod largest_tensor;
-mod macs;
-mod memory;
-mod parameters;
-mod scene_sizes;
-
-pub use largest_tensor::{kmeans_values, largest_tensors};
-pub use macs::{Convention, Macs};
-pub use memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, render_bytes, update_bytes};
-pub use parameters::Parameters;
-pub use scene_sizes::SceneSizes;
+pub(crate) mod largest_tensor;
+pub(crate) mod macs;
+pub(crate) mod memory;
+pub(crate) mod parameters;
+pub(crate) mod scene_sizes;

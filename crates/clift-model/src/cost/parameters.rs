@@ -2,8 +2,8 @@
 
 use serde::Serialize;
 
-use crate::layers::Layer;
-use crate::{ModelConfig, Part};
+use crate::network::config::ModelConfig;
+use crate::network::layers::{Layer, Part};
 
 /// Parameters of the networks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

@@ -1,6 +1,6 @@
 //! Counts of the tokens, patches and views of a scene.
 
-use crate::layers::Rows;
+use crate::network::layers::Rows;
 
 /// Sizes of one scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,7 +40,7 @@ impl SceneSizes {
     }
 
     /// Groups of rows: attention stays inside a group. Several for views, which do not attend to each other.
-    pub(super) fn num_groups(&self, rows: &[Rows]) -> u64 {
+    pub(crate) fn num_groups(&self, rows: &[Rows]) -> u64 {
         let is_per_view = |rows: &Rows| match rows {
             Rows::TargetPatches => true,
             Rows::RenderTokens => self.is_per_view,
@@ -50,7 +50,7 @@ impl SceneSizes {
     }
 
     /// Rows of one group.
-    pub(super) fn group_len(&self, rows: &[Rows]) -> u64 {
+    pub(crate) fn group_len(&self, rows: &[Rows]) -> u64 {
         let stored = self.num_storage_tokens.unwrap_or(0);
         let len = |rows: &Rows| match rows {
             Rows::ContextPatches => self.num_tokens,
@@ -63,12 +63,12 @@ impl SceneSizes {
     }
 
     /// Rows of all groups, as attention reads them.
-    pub(super) fn num_gathered(&self, rows: &[Rows]) -> u64 {
+    pub(crate) fn num_gathered(&self, rows: &[Rows]) -> u64 {
         self.num_groups(rows) * self.group_len(rows)
     }
 
     /// Rows that a layer processes. Keys and values of render tokens are projected before views gather theirs.
-    pub(super) fn num_rows(&self, rows: &[Rows]) -> u64 {
+    pub(crate) fn num_rows(&self, rows: &[Rows]) -> u64 {
         if rows == [Rows::RenderTokens] { self.num_projected() as u64 } else { self.num_gathered(rows) }
     }
 }

@@ -1,7 +1,7 @@
 //! What a scene must be before it is written or drawn. Files come from anywhere: nothing is taken on trust.
 
-use super::{HEADER_BYTES, Scene};
-use crate::ViewCamera;
+use crate::scene::scene::{HEADER_BYTES, Scene};
+use crate::views::camera::ViewCamera;
 
 /// Most context views of a scene.
 const MAX_VIEWS: usize = 1024;
@@ -20,7 +20,7 @@ const MAX_ROTATION_ERROR: f64 = 1e-2;
 
 impl Scene {
     /// Says what is wrong with the scene, if anything.
-    pub(super) fn check(&self) -> Result<(), String> {
+    pub(crate) fn check(&self) -> Result<(), String> {
         self.model.validate().map_err(|error| error.to_string())?;
         let views = self.context.len();
         if !(1..=MAX_VIEWS).contains(&views) || self.context_frames.len() != views {

@@ -5,9 +5,12 @@ use std::path::Path;
 
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 
-use super::{FORMAT, Scene, TokenStorage, VERSION, WorldFrame, dtype_name};
+use crate::error::ModelError;
 use crate::names::parse;
-use crate::{ModelConfig, ModelError, ViewCamera};
+use crate::network::config::ModelConfig;
+use crate::scene::scene::{FORMAT, Scene, VERSION, WorldFrame, dtype_name};
+use crate::scene::token_format::TokenStorage;
+use crate::views::camera::ViewCamera;
 
 /// Longest header that is read; those of this version are shorter.
 const MAX_HEADER_BYTES: u64 = 1 << 16;

@@ -5,9 +5,10 @@ use std::fs::File;
 use std::io::{ErrorKind, Read as _};
 use std::path::Path;
 
-use super::{FORMAT, HEADER_BYTES, Scene, TokenStorage, VERSION, dtype_name};
-use crate::ModelError;
+use crate::error::ModelError;
 use crate::files::{folder_of, replace};
+use crate::scene::scene::{FORMAT, HEADER_BYTES, Scene, VERSION, dtype_name};
+use crate::scene::token_format::TokenStorage;
 
 /// Where nothing is lost by writing a scene: a folder that exists, and in it nothing of the name or a scene.
 ///

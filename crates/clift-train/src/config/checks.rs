@@ -1,12 +1,11 @@
 //! What no type can check of a config: ranges, and values that have to fit each other.
 
 use clift_data::{DataConfig, DataError, SourceKind, Split};
-use clift_eval::perceptual::PERCEPTUAL_MIN_SIZE_PX;
+use clift_eval::PERCEPTUAL_MIN_SIZE_PX;
 use clift_model::Grouping;
 
-use crate::TrainError;
-use crate::config::{Config, MAX_TOKENS, OptimizerConfig};
-use crate::error::bad;
+use crate::config::config::{Config, MAX_TOKENS, OptimizerConfig};
+use crate::error::{TrainError, bad};
 use crate::events::Stage;
 
 impl Config {

@@ -1,14 +1,14 @@
 //! The largest tensor of every part of a run, and the refusal of those that a device cannot hold.
 
 use burn::tensor::Device;
-use clift_model::adapter::max_tensor_bytes;
-use clift_model::cost::{kmeans_values, largest_tensors};
-use clift_model::{Part, SceneSizes};
+use clift_model::{Part, SceneSizes, kmeans_values, largest_tensors, max_tensor_bytes};
 
-use super::scene_sizes::{VIEWS_PER_PASS, batch_sizes, cluster_counts, scene, set_accumulate, stored, trained_parts};
-use crate::TrainError;
-use crate::config::Config;
+use crate::config::config::Config;
+use crate::error::TrainError;
 use crate::events::Stage;
+use crate::footprint::scene_sizes::{
+    VIEWS_PER_PASS, batch_sizes, cluster_counts, scene, set_accumulate, stored, trained_parts,
+};
 
 /// Bytes of an f32; f16 operands are smaller copies of what is there in f32.
 const F32: u64 = 4;
@@ -154,8 +154,7 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenCount;
-    use clift_model::attention::MAX_SCORES;
+    use clift_model::{MAX_SCORES, TokenCount};
 
     use super::*;
     use crate::footprint::scene_sizes::PARTS;

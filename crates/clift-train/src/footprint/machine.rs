@@ -1,6 +1,6 @@
 //! The memory there is.
 
-use clift_model::device::DeviceName;
+use clift_model::DeviceName;
 
 /// Memory that a device has for a run to fill, as far as the system tells: of a CPU device what is free for use, and
 /// what the process's control group leaves.

@@ -1,17 +1,16 @@
 //! Peak memory of every part of a run, and a warning where the device has less.
 
-use clift_eval::vgg::VggShape;
-use clift_model::Parameters;
-use clift_model::cost::{InferenceSizes, Segment, UpdateSizes, inference_bytes, update_bytes};
+use clift_eval::VggShape;
+use clift_model::{InferenceSizes, Parameters, Segment, UpdateSizes, inference_bytes, update_bytes};
 
-use super::machine::own_bytes;
-use super::scene_sizes::{
+use crate::config::config::Config;
+use crate::error::TrainError;
+use crate::events::Stage;
+use crate::footprint::machine::own_bytes;
+use crate::footprint::scene_sizes::{
     PARTS, VIEWS_PER_PASS, batch_sizes, cluster_counts, evaluated, image_values, largest, measures_lpips, num_tokens,
     set_accumulate, trained_parts,
 };
-use crate::TrainError;
-use crate::config::Config;
-use crate::events::Stage;
 
 /// Returns the most memory of the process during a part of a run.
 ///

@@ -1,9 +1,10 @@
-//! Memory that a run needs, checked before it starts.
+//! Memory requirements, checked before a run.
 //!
-//! [`largest_tensor`] refuses tensors that the device cannot hold; [`memory`] estimates the peak of every part of a run
-//! and warns where the device has less. Both count from the [`scene_sizes`] that a config can give.
+//! - `scene_sizes`: possible sizes of a step
+//! - `memory`: memory of each part, warning
+//! - `largest_tensor`: refuse tensors a device cannot hold
 
-pub mod largest_tensor;
-pub mod machine;
-pub mod memory;
-pub mod scene_sizes;
+pub(crate) mod largest_tensor;
+pub(crate) mod machine;
+pub(crate) mod memory;
+pub(crate) mod scene_sizes;

@@ -1,13 +1,12 @@
 //! Sizes that the steps of a run can have: all, the typical ones, the largest.
 
-use clift_eval::lpips::LPIPS_MIN_SIZE_PX;
-use clift_eval::{Sweep, Variant};
+use clift_eval::{LPIPS_MIN_SIZE_PX, Sweep, Variant};
 use clift_model::{Part, SceneSizes};
 
-use crate::TrainError;
-use crate::config::Config;
+use crate::config::config::Config;
+use crate::config::sweep::sweep;
+use crate::error::TrainError;
 use crate::events::Stage;
-use crate::sweep::sweep;
 
 /// The parts of a run, in their order.
 pub const PARTS: [Stage; 4] = [Stage::Stage1, Stage::Clusters, Stage::Stage2, Stage::Eval];

@@ -1,0 +1,164 @@
+//! Sizes, device and shared inputs of the rows.
+
+use std::cell::OnceCell;
+use std::path::PathBuf;
+
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use clift_data::{BoundedSampler, Clip, DataConfig, SourceKind, SyntheticConfig};
+use clift_eval::upload_views;
+use clift_model::{Clift, DeviceName, ModelConfig, SceneModel, TokenCount};
+use clift_train::{Config, Stage1Config, TrainError};
+
+use crate::cases::inputs::{Shape, clip, model};
+use crate::cases::options::{BenchOptions, MAX_CHECKED_TOKENS};
+
+/// The sizes and the device that all rows share.
+pub struct BenchContext {
+    /// Sizes, seed and optimisers.
+    pub config: Config,
+    /// Where tensors live, without autodiff.
+    pub device: Device,
+    /// Whether the device works in this process's memory.
+    pub is_cpu: bool,
+    storage: TokenCount,
+    render: Option<TokenCount>,
+    /// The file that K-means clusters.
+    pub features: Option<PathBuf>,
+    /// Tokens of one scene, made once.
+    lift: OnceCell<Tensor<3>>,
+}
+
+impl BenchContext {
+    pub fn new(config: &Config, options: &BenchOptions) -> Result<Self, TrainError> {
+        let mut config = config.clone();
+        // Pictures are made up, so that it does not matter where the config has its own, or whether they are there.
+        let DataConfig { width, height, .. } = config.data;
+        let synthetic = SyntheticConfig { width, height, ..SyntheticConfig::default() };
+        (config.data.source, config.data.synthetic) = (SourceKind::Synthetic, synthetic);
+        config.validate()?;
+        let device = config.device.open()?;
+        config.precision.check("precision", &device)?;
+        let context = Self {
+            device,
+            is_cpu: matches!(config.device, DeviceName::Flex | DeviceName::Ndarray),
+            storage: options.storage,
+            render: options.render,
+            features: options.features.clone(),
+            lift: OnceCell::new(),
+            config,
+        };
+        context.num_storage_tokens()?;
+        context.num_render_tokens()?;
+        Ok(context)
+    }
+
+    /// The same with other sizes.
+    fn with(&self, config: Config) -> Self {
+        let (device, is_cpu, storage) = (self.device.clone(), self.is_cpu, self.storage);
+        Self { config, device, is_cpu, storage, render: None, features: None, lift: OnceCell::new() }
+    }
+
+    /// The small network of `stage1_step_tiny`, whatever the config is: 256 tokens, 64 queries, batch 8.
+    pub fn tiny(&self) -> Self {
+        let model = ModelConfig {
+            dim: 128,
+            num_heads: 8,
+            feed_forward_dim: 341,
+            num_encoder_blocks: 3,
+            num_renderer_blocks: 3,
+            ..ModelConfig::default()
+        };
+        let views = BoundedSampler { min_context: 4, num_targets: 1, ..BoundedSampler::default() };
+        let data = DataConfig { width: 64, height: 64, views, ..DataConfig::default() };
+        let stage1 = Stage1Config { batch_size: 8, accumulate: 1, ..Stage1Config::default() };
+        let Config { seed, device, precision, .. } = self.config;
+        self.with(Config { seed, device, precision, data, model, stage1, ..Config::default() })
+    }
+
+    /// The same network on at most [`MAX_CHECKED_TOKENS`] tokens: smaller pictures, then fewer scenes and views.
+    pub fn reduced(&self) -> Result<Self, TrainError> {
+        let mut config = self.config.clone();
+        let patch = config.model.patch_size;
+        let Config { data, stage1, stage2, .. } = &mut config;
+        let tokens = |data: &DataConfig| data.views.min_context * (data.width / patch) * (data.height / patch);
+        while tokens(data) > MAX_CHECKED_TOKENS && data.width.max(data.height) > patch {
+            (data.width, data.height) =
+                ((data.width / patch).div_ceil(2) * patch, (data.height / patch).div_ceil(2) * patch);
+        }
+        data.views.min_context = data.views.min_context.min(MAX_CHECKED_TOKENS);
+        data.views.num_targets = data.views.num_targets.min(2);
+        let num_scenes = (MAX_CHECKED_TOKENS / tokens(data)).max(1);
+        stage1.batch_size = stage1.batch_size.min(num_scenes);
+        stage2.batch_size = stage2.batch_size.min(num_scenes);
+        let mut reduced = self.with(config);
+        if let TokenCount::Count(count) = self.storage {
+            reduced.storage = TokenCount::Share(count as f64 / self.num_tokens()? as f64);
+        }
+        Ok(reduced)
+    }
+
+    pub fn seed(&self) -> u64 {
+        self.config.seed
+    }
+
+    /// Tokens of one scene.
+    pub fn num_tokens(&self) -> Result<usize, TrainError> {
+        let DataConfig { width, height, views, .. } = &self.config.data;
+        Ok(self.config.model.num_tokens(views.min_context, *height, *width)?)
+    }
+
+    pub fn num_storage_tokens(&self) -> Result<usize, TrainError> {
+        self.stored_of(self.num_tokens()?)
+    }
+
+    /// Tokens that a view is drawn from.
+    pub fn num_render_tokens(&self) -> Result<usize, TrainError> {
+        let all = self.num_tokens()?;
+        let Some(count) = self.render else { return Ok(all) };
+        let bad = |fix: String| TrainError::BadConfig { key: "--render".into(), value: count.to_string(), fix };
+        count.of(all).map_err(|error| bad(error.to_string()))
+    }
+
+    pub fn stored_of(&self, num_tokens: usize) -> Result<usize, TrainError> {
+        self.storage.of(num_tokens).map_err(|error| self.bad_storage(&error.to_string()))
+    }
+
+    pub fn bad_storage(&self, fix: &str) -> TrainError {
+        TrainError::BadConfig { key: "--storage".into(), value: self.storage.to_string(), fix: fix.into() }
+    }
+
+    pub fn shape(&self) -> Shape {
+        let DataConfig { width, height, views, .. } = &self.config.data;
+        Shape { num_context: views.min_context, num_targets: views.num_targets, size: [*height, *width] }
+    }
+
+    /// A scene with so many targets.
+    pub fn clip(&self, num_targets: usize) -> Clip {
+        clip(Shape { num_targets, ..self.shape() }, self.seed(), 0)
+    }
+
+    /// A model to train, with the seed's weights.
+    pub fn model(&self) -> Clift {
+        model(&self.config.model, self.seed(), &self.device)
+    }
+
+    /// The seeded encoder's tokens of one scene.
+    pub fn lift(&self) -> Result<Tensor<3>, TrainError> {
+        if let Some(lift) = self.lift.get() {
+            return Ok(lift.clone());
+        }
+        let views = upload_views(&[&self.clip(1).context], &self.device)?;
+        let lift = self.model().valid().encode(&views);
+        Ok(self.lift.get_or_init(|| lift).clone())
+    }
+
+    /// Where the f64 reference runs: GPUs have no f64 that can be relied on.
+    pub fn reference(&self) -> Result<Device, TrainError> {
+        if self.is_cpu { Ok(self.device.clone()) } else { Ok(DeviceName::Flex.open()?) }
+    }
+
+    pub fn sync(&self) -> Result<(), TrainError> {
+        self.device.sync().map_err(|error| TrainError::Device { reason: error.to_string() })
+    }
+}

@@ -1,0 +1,23 @@
+//! The rows of `clift bench`.
+//!
+//! - `case`: BenchCase, names of the rows
+//! - `options`: timing options
+//! - `inputs`: seeded clips, clusters, weights
+//! - `reference`: the same computation in f64
+//! - `task`: BenchTask and Forward traits
+//! - `context`: device and sizes of all rows
+//! - `forward`: rows without gradient
+//! - `step`: rows of whole updates
+//! - `clustering`: the K-means row
+//! - `selection`: the token-selection row
+
+pub(crate) mod case;
+pub(crate) mod clustering;
+pub(crate) mod context;
+pub(crate) mod forward;
+pub(crate) mod inputs;
+pub(crate) mod options;
+pub(crate) mod reference;
+pub(crate) mod selection;
+pub(crate) mod step;
+pub(crate) mod task;

@@ -1,0 +1,97 @@
+//! The same computation in f64: weights and inputs cast, and how far a result is from it.
+
+use burn::module::{Module, ModuleMapper, Param};
+use burn::tensor::{DType, Device, Tensor};
+use clift_model::{Cameras, Views};
+
+/// Something of which the f64 reference makes a copy.
+pub trait InF64 {
+    /// The same values in f64 on the reference device.
+    #[must_use]
+    fn in_f64(&self, reference: &Device) -> Self;
+}
+
+impl<const D: usize> InF64 for Tensor<D> {
+    fn in_f64(&self, reference: &Device) -> Self {
+        self.clone().to_device(reference).cast(DType::F64)
+    }
+}
+
+impl InF64 for Cameras {
+    fn in_f64(&self, reference: &Device) -> Self {
+        Self { c2w: self.c2w.in_f64(reference), intrinsics: self.intrinsics.in_f64(reference), ..*self }
+    }
+}
+
+impl InF64 for Views {
+    fn in_f64(&self, reference: &Device) -> Self {
+        Self { images: self.images.in_f64(reference), cameras: self.cameras.in_f64(reference) }
+    }
+}
+
+/// A module without autodiff, with every parameter in f64; parameters keep their ids and whether they train.
+pub fn module_in_f64<M: Module>(module: &M, reference: &Device) -> M {
+    struct Cast<'a>(&'a Device);
+    impl ModuleMapper for Cast<'_> {
+        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            param.map(|tensor| tensor.in_f64(self.0))
+        }
+    }
+    module.valid().map(&mut Cast(reference))
+}
+
+/// Largest difference over the largest absolute value of `reference`: 0 for two tensors of zeros, NaN or infinite
+/// where a value is not finite.
+pub fn relative_error<const D: usize>(result: Tensor<D>, reference: Tensor<D>) -> f64 {
+    let (result, reference) = (values(result), values(reference));
+    assert_eq!(result.len(), reference.len(), "a result and its reference");
+    let largest = |values: &mut dyn Iterator<Item = f64>| {
+        // `f64::max` would pass over NaN.
+        values.map(f64::abs).fold(0.0_f64, |most, value| if value > most || value.is_nan() { value } else { most })
+    };
+    let difference = largest(&mut result.iter().zip(&reference).map(|(a, b)| a - b));
+    if difference == 0.0 { 0.0 } else { difference / largest(&mut reference.iter().copied()) }
+}
+
+/// Values in f64, row-major.
+pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f64> {
+    tensor.into_data().convert::<f64>().try_to_vec::<f64>().expect("f64 after conversion")
+}
+
+#[cfg(test)]
+mod tests {
+    use clift_model::{Init, ModelConfig, Renderer};
+
+    use super::*;
+
+    #[test]
+    fn the_error_is_relative_to_the_largest_value_and_nan_does_not_pass() {
+        let error = |a: [f32; 3], b: [f32; 3]| {
+            let device = Device::flex();
+            relative_error(Tensor::<1>::from_floats(a, &device), Tensor::<1>::from_floats(b, &device))
+        };
+        assert_eq!(error([1.0, -4.0, 0.0], [1.0, -4.0, 1.0]), 0.25);
+        assert_eq!(error([0.0; 3], [0.0; 3]), 0.0);
+        assert_eq!(error([1.0, 0.0, 0.0], [0.0; 3]), f64::INFINITY);
+        assert!(error([1.0, f32::NAN, 2.0], [1.0; 3]).is_nan());
+    }
+
+    #[test]
+    fn a_module_in_f64_has_the_same_parameters() {
+        struct IsF64(usize);
+        impl burn::module::ModuleVisitor for IsF64 {
+            fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+                assert_eq!(param.val().dtype(), DType::F64);
+                self.0 += 1;
+            }
+        }
+        let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
+        let device = Device::flex();
+        let module = Renderer::new(&config, &mut Init::new(0, &device.clone().autodiff()));
+        let copy = module_in_f64(&module, &device);
+        assert_eq!(clift_model::weights_hash(&copy), clift_model::weights_hash(&module));
+        let mut visitor = IsF64(0);
+        copy.visit(&mut visitor);
+        assert!(visitor.0 > 0);
+    }
+}

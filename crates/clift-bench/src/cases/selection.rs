@@ -1,0 +1,57 @@
+//! The row of token selection: work of the host, on whole tokens.
+
+use burn::tensor::Device;
+use clift_data::{DVec3, step_rng};
+use clift_model::{Preset, Selector, TokenRay, ViewCamera};
+use clift_train::TrainError;
+use rand::RngExt;
+
+use crate::cases::context::BenchContext;
+use crate::cases::task::Task;
+
+/// Half of a scene's stored tokens for one view, by the paper's rules.
+pub struct Selection {
+    selector: Selector,
+    camera: ViewCamera,
+    size: [usize; 2],
+    num_render_tokens: usize,
+}
+
+impl Selection {
+    pub fn new(context: &BenchContext) -> Result<Self, TrainError> {
+        let count = context.num_storage_tokens()?;
+        let clip = context.clip(1);
+        let mut rng = step_rng(context.seed(), 0, "bench rays");
+        // Through every picture, somewhere.
+        let rays: Vec<TokenRay> = (0..count)
+            .map(|token| {
+                let pose = clip.context.c2w[token % clip.context.num_views()];
+                let [x, y] = [0, 1].map(|_| rng.random_range(-0.5..0.5));
+                let direction = pose.rotation * DVec3::new(x, y, 1.0);
+                TokenRay { origin: pose.translation.into(), direction: direction.into() }
+            })
+            .collect();
+        let lens = clip.target.intrinsics[0];
+        let camera =
+            ViewCamera { c2w: clip.target.c2w[0].to_matrix_f64(), intrinsics: [lens.fx, lens.fy, lens.cx, lens.cy] };
+        Ok(Self {
+            selector: Selector::new(Preset::Paper.rules(), &rays)?,
+            camera,
+            size: context.shape().size,
+            num_render_tokens: count.div_ceil(2),
+        })
+    }
+}
+
+impl Task for Selection {
+    fn run(&mut self) -> Result<(), TrainError> {
+        let [height, width] = self.size;
+        self.selector.select(&self.camera, height, width, self.num_render_tokens)?;
+        Ok(())
+    }
+
+    /// Ids have none; that they are the right ones is tested against brute force in f64.
+    fn error(self: Box<Self>, _reference: &Device) -> Result<Option<f64>, TrainError> {
+        Ok(None)
+    }
+}

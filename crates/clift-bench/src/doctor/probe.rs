@@ -1,0 +1,173 @@
+//! One forward and backward pass of a small model on a device.
+
+use std::panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::tensor::{DType, Device, Gradients, Tensor};
+use clift_data::{Clip, ClipOptions, ClipReader, SyntheticConfig, SyntheticSource, ViewIndices};
+use clift_eval::{upload_cameras, upload_pictures, upload_views};
+use clift_model::{Clift, Clusters, DeviceName, KMeans, ModelConfig, Precision, SceneClusters};
+use clift_train::mse;
+
+/// What a device that works can do.
+#[derive(Clone, Debug)]
+pub struct Probe {
+    /// What the device calls itself.
+    pub adapter: String,
+    /// Floats it has.
+    pub dtypes: Vec<&'static str>,
+    /// What the model gives on it.
+    pub gradient: Gradient,
+    /// Seconds of the second pass: the first compiles kernels.
+    pub seconds: f64,
+}
+
+/// The gradient of all weights of the small model.
+#[derive(Clone, Debug)]
+pub struct Gradient {
+    /// The loss.
+    pub loss: f64,
+    /// One number per weight.
+    pub values: Vec<f64>,
+}
+
+impl Gradient {
+    /// Largest difference, of loss or gradient, over the largest entry of `reference`; NaN for another number of
+    /// weights.
+    pub fn difference(&self, reference: &Self) -> f64 {
+        if self.values.len() != reference.values.len() {
+            return f64::NAN;
+        }
+        let pairs = self.values.iter().zip(&reference.values);
+        let worst = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let scale = reference.values.iter().fold(f64::MIN_POSITIVE, |scale, value| scale.max(value.abs()));
+        let loss = (self.loss - reference.loss).abs() / reference.loss.abs().max(f64::MIN_POSITIVE);
+        (worst / scale).max(loss)
+    }
+}
+
+/// Opens a device and trains a small model on it for one step; a panic becomes its message.
+pub fn probe(name: DeviceName, precision: Precision) -> Result<Probe, String> {
+    caught(|| probe_device(name, precision)).unwrap_or_else(|panic| Err(format!("panicked: {panic}")))
+}
+
+fn probe_device(name: DeviceName, precision: Precision) -> Result<Probe, String> {
+    let device = name.open().map_err(|error| error.to_string())?;
+    precision.check("precision", &device).map_err(|error| error.to_string())?;
+    let _scope = precision.scope();
+    let floats = [("f32", DType::F32), ("f16", DType::F16), ("bf16", DType::BF16), ("f64", DType::F64)];
+    let dtypes = floats.into_iter().filter(|(_, dtype)| device.supports_dtype(*dtype)).map(|(name, _)| name).collect();
+    gradient(&device).map_err(|error| format!("{error:#}"))?;
+    let started = Instant::now();
+    let gradient = gradient(&device).map_err(|error| format!("{error:#}"))?;
+    let seconds = started.elapsed().as_secs_f64();
+    Ok(Probe { adapter: adapter(name, &device), dtypes, gradient, seconds })
+}
+
+#[cfg(feature = "wgpu")]
+fn adapter(name: DeviceName, device: &Device) -> String {
+    match name {
+        DeviceName::Wgpu => device.identity().map_or_else(|| "unnamed".into(), |identity| identity.name),
+        DeviceName::Flex | DeviceName::Ndarray => "CPU".into(),
+    }
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn adapter(_name: DeviceName, _device: &Device) -> String {
+    "CPU".into()
+}
+
+/// Encodes, clusters, condenses and renders one synthetic clip, and goes back through all three networks.
+fn gradient(device: &Device) -> anyhow::Result<Gradient> {
+    let clip = clip()?;
+    let device = device.clone().autodiff();
+    let config = ModelConfig {
+        dim: 32,
+        num_heads: 2,
+        feed_forward_dim: 64,
+        num_encoder_blocks: 1,
+        num_renderer_blocks: 1,
+        ..ModelConfig::default()
+    };
+    let model = Clift::new(&config, 0, &device);
+    let lift = model.encoder.forward(&upload_views(&[&clip.context], &device)?);
+    let num_tokens = lift.dims()[1];
+    // K-means must run, but not decide: which token is nearest may hang on the last bit of a distance.
+    let num_clusters = num_tokens / 4;
+    KMeans::default().fit(lift.clone().inner(), num_clusters, &[0])?;
+    let assignment = (0..num_tokens).map(|token| (token % num_clusters) as u32).collect();
+    let scene = SceneClusters::new(assignment, (0..num_clusters as u32).collect())?;
+    let index = Clusters::new(vec![scene])?.upload(&device);
+    let tokens = model.condenser.forward(lift, &index);
+    let rendering = model.renderer.forward(tokens, &upload_cameras(&[&clip.target], &device)?);
+    let loss = mse(rendering, upload_pictures(&[&clip.target], &device)?);
+    let grads = loss.backward();
+    let mut collect = Collect { grads: &grads, values: Vec::new() };
+    model.visit(&mut collect);
+    Ok(Gradient { loss: loss.into_scalar::<f64>(), values: collect.values })
+}
+
+struct Collect<'a> {
+    grads: &'a Gradients,
+    values: Vec<f64>,
+}
+
+impl ModuleVisitor for Collect<'_> {
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        if let Some(grad) = param.val().grad(self.grads) {
+            // Without values the count differs from the reference's, which is reported.
+            self.values.extend(grad.into_data().convert::<f64>().try_to_vec::<f64>().unwrap_or_default());
+        }
+    }
+}
+
+fn clip() -> anyhow::Result<Clip> {
+    let config = SyntheticConfig { num_scenes: 1, num_frames: 3, width: 16, height: 16, ..Default::default() };
+    let (pose_rotation, pose_scale) = Default::default();
+    let options = ClipOptions { width: 16, height: 16, pose_rotation, pose_scale, exact_principal_point: false };
+    let reader = ClipReader { source: Arc::new(SyntheticSource::new(config)?), options };
+    Ok(reader.read(0, &ViewIndices { context: vec![0, 2], target: vec![1] })?)
+}
+
+type Hook = Box<dyn Fn(&PanicHookInfo<'_>) + Sync + Send>;
+
+/// Runs `work`; a panic in it, or the first one of a thread it waits for, is returned as one line and not printed.
+pub fn caught<T>(work: impl FnOnce() -> T) -> Result<T, String> {
+    // The hook is one for the whole process.
+    static HOOK: Mutex<()> = Mutex::new(());
+    let _only_one = HOOK.lock().unwrap_or_else(PoisonError::into_inner);
+    let message = Arc::new(Mutex::new(None));
+    let noted = Arc::clone(&message);
+    let former: Hook = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |info| {
+        let text = info.payload_as_str().unwrap_or("no message").lines().next().unwrap_or_default().to_owned();
+        noted.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(text);
+    }));
+    // What `work` leaves half done is dropped with it.
+    let result = catch_unwind(AssertUnwindSafe(work));
+    std::panic::set_hook(former);
+    let message = message.lock().unwrap_or_else(PoisonError::into_inner).take();
+    result.map_err(|_| message.unwrap_or_else(|| "no message".into()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panic_becomes_its_first_line_and_the_next_work_goes_on() {
+        assert_eq!(caught(|| -> u8 { panic!("no adapter\nin sight") }), Err("no adapter".into()));
+        assert_eq!(caught(|| 3), Ok(3));
+    }
+
+    #[test]
+    fn the_difference_is_relative_to_the_largest_entry_and_counts_the_loss() {
+        let gradient = |loss, values: &[f64]| Gradient { loss, values: values.to_vec() };
+        let reference = gradient(2.0, &[4.0, 0.0]);
+        assert_eq!(gradient(2.0, &[4.0, 1.0]).difference(&reference), 0.25);
+        assert_eq!(gradient(3.0, &[4.0, 0.0]).difference(&reference), 0.5);
+        assert!(gradient(2.0, &[4.0]).difference(&reference).is_nan());
+    }
+}

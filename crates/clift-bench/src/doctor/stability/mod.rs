@@ -1,0 +1,21 @@
+//! Hard cases against f64.
+//!
+//! - `case`: a hard case and its bound
+//! - `compare`: an update against f64
+//! - `attention`: long and extreme attention
+//! - `updates`: updates on hard views
+//! - `clusters`: degenerate clusters
+//! - `poses`: far and close cameras
+//! - `tokens`: rounded tokens
+//! - `training`: ten times the learning rate
+//! - `suite`: all cases, table
+
+pub(crate) mod attention;
+pub(crate) mod case;
+pub(crate) mod clusters;
+pub(crate) mod compare;
+pub(crate) mod poses;
+pub(crate) mod suite;
+pub(crate) mod tokens;
+pub(crate) mod training;
+pub(crate) mod updates;

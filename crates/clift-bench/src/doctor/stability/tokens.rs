@@ -1,0 +1,79 @@
+//! Tokens that are stored in 16 and 8 bits.
+
+use burn::module::Module;
+use burn::tensor::{Tensor, TensorData};
+use clift_eval::{upload_cameras, upload_views};
+use clift_model::{ModelError, TokenStorage};
+use clift_train::TrainError;
+
+use crate::cases::inputs::{clip, model};
+use crate::cases::reference::{InF64, module_in_f64, values};
+use crate::doctor::stability::case::{Bound, Case, Outcome, Place};
+use crate::doctor::stability::compare::most;
+use crate::doctor::stability::updates::{network, shape};
+
+pub(crate) const CASES: &[Case] = &[
+    Case {
+        name: "tokens in f32",
+        breaks: "the way to a file and back",
+        bound: Bound::Most(1e-5),
+        reason: "nothing is rounded; of pictures, whose values are below 1",
+        run: |place| drawn(place, TokenStorage::F32),
+    },
+    Case {
+        name: "tokens in f16",
+        breaks: "colours of a renderer that was not trained with them",
+        bound: Bound::Most(2e-3),
+        reason: "values are rounded by 5e-4, and half a grey level is 2e-3",
+        run: |place| drawn(place, TokenStorage::F16),
+    },
+    Case {
+        name: "tokens in int8",
+        breaks: "the same",
+        bound: Bound::Most(2e-2),
+        reason: "values are rounded by 1/254 of a token's largest",
+        run: |place| drawn(place, TokenStorage::Int8),
+    },
+    Case {
+        name: "tokens beyond 65,504 in f16",
+        breaks: "infinities in a file",
+        bound: Bound::Refused("beyond 65504"),
+        reason: "f16 ends there",
+        run: |_| match TokenStorage::F16.round(&[1.0, 7e4], 2) {
+            Err(error @ ModelError::BadConfig { .. }) => Ok(Outcome::Refused(error.to_string())),
+            Err(other) => Err(other.into()),
+            Ok(_) => Ok(Outcome::Error(0.0)),
+        },
+    },
+    Case {
+        name: "tokens of 1e-30 and 1e30 in int8",
+        breaks: "the scale's inverse",
+        bound: Bound::Most(4e-3),
+        reason: "1/254 of each token's largest value",
+        run: |_| {
+            let tokens = [1e-30, -5e-31, 1e30, 3e29];
+            let rounded = TokenStorage::Int8.round(&tokens, 2)?;
+            let largest = [1e-30_f64, 1e-30, 1e30, 1e30];
+            let errors = rounded.iter().zip(tokens).zip(largest);
+            Ok(Outcome::Error(most(errors.map(|((a, b), largest)| (f64::from(*a) - f64::from(b)) / largest))))
+        },
+    },
+];
+
+/// The largest difference of a picture drawn from rounded tokens from one drawn in f64 from those that are not.
+fn drawn(place: &Place, storage: TokenStorage) -> Result<Outcome, TrainError> {
+    let config = network(place);
+    let networks = model(&config, 0, &place.device).valid();
+    let clip = clip(shape(place, 4), 0, 0);
+    let lift = networks.encoder.forward(&upload_views(&[&clip.context], &place.device)?);
+    let shape = lift.dims();
+    let tokens: Vec<f32> = values(lift.clone()).into_iter().map(|value| value as f32).collect();
+    let rounded = TensorData::new(storage.round(&tokens, config.dim)?, shape);
+    let rounded: Tensor<3> = Tensor::from_data(rounded, &place.device);
+    let cameras = upload_cameras(&[&clip.target], &place.device)?;
+    let ours = networks.renderer.forward(rounded, &cameras);
+    let renderer = module_in_f64(&networks.renderer, &place.reference);
+    let theirs = renderer.forward(lift.in_f64(&place.reference), &cameras.in_f64(&place.reference));
+    let pairs = values(ours).into_iter().zip(values(theirs));
+    Ok(Outcome::Error(most(pairs.map(|(a, b)| a - b))))
+}

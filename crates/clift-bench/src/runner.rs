@@ -1,0 +1,238 @@
+//! `clift bench`: how long the parts of the method take on a device, and how far each result is from f64.
+//!
+//! Inputs are drawn from the config's seed; no data is read. Speed stands beside error, so that a kernel that is
+//! fast because it is wrong shows.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use clift_data::{median, p95};
+use clift_eval::{peak_bytes, start_peak};
+use clift_model::{DeviceName, Precision};
+use clift_train::{Config, TrainError};
+use serde::Serialize;
+
+use crate::cases::case::Work;
+use crate::cases::context::BenchContext;
+use crate::cases::options::BenchOptions;
+
+/// What was measured.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Report {
+    /// Where tensors were.
+    pub device: DeviceName,
+    /// What the operands of matrix products were.
+    pub precision: Precision,
+    /// Threads of the CPU devices.
+    pub threads: usize,
+    /// One per work.
+    pub rows: Vec<Row>,
+}
+
+/// What was measured of one work.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Row {
+    /// Which work.
+    pub work: Work,
+    /// Middle of the samples.
+    pub median_s: f64,
+    /// 95th percentile of the samples, nearest rank.
+    pub p95_s: f64,
+    /// Most memory of the whole process during the samples; `None` on a GPU, whose memory the system does not
+    /// tell, and where the system has no such count.
+    pub peak_bytes: Option<u64>,
+    /// Largest difference from f64 over the largest value; `None` where it was not asked for. Of an update: the
+    /// largest over its loss and the gradient of each parameter, with at most [`MAX_CHECKED_TOKENS`] tokens. Of
+    /// K-means: the relative difference of the inertia, whose f64 clustering may take another turn.
+    pub max_rel_error: Option<f64>,
+    /// Seconds of every repetition that counts; of `render_8_views` an eighth of them.
+    pub samples_s: Vec<f64>,
+    /// Of K-means: sum of squared distances to the cluster means.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub inertia: Option<f64>,
+}
+
+/// What a benchmark tells while it runs.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum BenchEvent<'a> {
+    /// So many repetitions of all are done; the comparison with f64 counts as one.
+    Progress {
+        /// Repetitions so far.
+        done: usize,
+        /// Repetitions in all.
+        total: usize,
+    },
+    /// A row is complete.
+    Finished(&'a Row),
+}
+
+/// Times every work that `options` names on the device of `config`.
+///
+/// # Errors
+/// [`TrainError::BadConfig`] for sizes that cannot be, [`TrainError::Abandoned`] between two repetitions
+/// after `stop` was set, and what the device or a file of features gives.
+pub fn run(
+    config: &Config,
+    options: &BenchOptions,
+    stop: &AtomicBool,
+    tell: &mut dyn FnMut(BenchEvent),
+) -> Result<Report, TrainError> {
+    let context = BenchContext::new(config, options)?;
+    let works: Vec<Work> = Work::ALL.into_iter().filter(|work| options.work.contains(work)).collect();
+    let total = works.len() * (options.warmup + options.repeats + usize::from(options.error));
+    let mut done = 0;
+    let mut rows = Vec::with_capacity(works.len());
+    for work in works {
+        let mut advance = |count| {
+            done += count;
+            tell(BenchEvent::Progress { done, total });
+            // Between repetitions, so that no time is of half a repetition.
+            if stop.load(Ordering::Relaxed) {
+                Err(TrainError::Abandoned { work: format!("`{}`", work.name()) })
+            } else {
+                Ok(())
+            }
+        };
+        let row = measure(work, &context, options, &mut advance)?;
+        tell(BenchEvent::Finished(&row));
+        rows.push(row);
+    }
+    Ok(Report { device: config.device, precision: config.precision, threads: rayon::current_num_threads(), rows })
+}
+
+fn measure(
+    work: Work,
+    context: &BenchContext,
+    options: &BenchOptions,
+    advance: &mut dyn FnMut(usize) -> Result<(), TrainError>,
+) -> Result<Row, TrainError> {
+    let _precision = context.config.precision.scope();
+    let mut task = work.prepare(context)?;
+    context.sync()?;
+    advance(0)?;
+    for _ in 0..options.warmup {
+        task.run()?;
+        context.sync()?;
+        advance(1)?;
+    }
+    let has_peak = context.is_cpu && start_peak().is_some();
+    let mut samples_s = Vec::with_capacity(options.repeats);
+    for _ in 0..options.repeats {
+        let started = Instant::now();
+        task.run()?;
+        // A device that queues its work has only accepted it.
+        context.sync()?;
+        samples_s.push(started.elapsed().as_secs_f64() / task.num_views() as f64);
+        advance(1)?;
+    }
+    let peak_bytes = if has_peak { peak_bytes() } else { None };
+    let inertia = task.inertia();
+    let max_rel_error = if options.error {
+        let error = task.error(&context.reference()?)?;
+        advance(1)?;
+        error
+    } else {
+        None
+    };
+    let (median_s, p95_s) = (median(&samples_s), p95(&samples_s));
+    Ok(Row { work, median_s, p95_s, peak_bytes, max_rel_error, samples_s, inertia })
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use clift_data::BoundedSampler;
+    use clift_model::ModelConfig;
+
+    use super::*;
+
+    /// Sixteen tokens of width 16, four views of 16 x 16.
+    pub fn config(device: DeviceName) -> Config {
+        let model = ModelConfig {
+            dim: 16,
+            num_heads: 2,
+            feed_forward_dim: 24,
+            num_encoder_blocks: 1,
+            num_renderer_blocks: 1,
+            ..ModelConfig::default()
+        };
+        let mut config = Config { run_dir: "run".into(), device, model, ..Config::default() };
+        (config.data.width, config.data.height) = (16, 16);
+        config.data.views = BoundedSampler { num_targets: 1, ..BoundedSampler::default() };
+        (config.stage1.batch_size, config.stage2.batch_size) = (2, 2);
+        config
+    }
+
+    pub fn options(work: &[Work]) -> BenchOptions {
+        let storage = TokenCount::Share(0.25);
+        BenchOptions { work: work.into(), repeats: 2, warmup: 0, error: true, storage, render: None, features: None }
+    }
+
+    #[test]
+    fn every_row_runs_on_every_cpu_device_and_is_close_to_f64() {
+        for device in [DeviceName::Flex, DeviceName::Ndarray] {
+            let mut events = Vec::new();
+            let mut note = |event: BenchEvent| match event {
+                BenchEvent::Progress { done, total } => events.push((done, total)),
+                BenchEvent::Finished(_) => {}
+            };
+            let options = options(&Work::ALL);
+            let report = run(&config(device), &options, &AtomicBool::new(false), &mut note).expect("runs");
+            assert_eq!(report.rows.iter().map(|row| row.work).collect::<Vec<_>>(), Work::ALL);
+            for row in &report.rows {
+                // Blocks of f32 as in the tests of the model: outputs to 1e-5, gradients to 5e-5.
+                let close = row.max_rel_error.map(|error| error < 1e-4);
+                assert_eq!(close, (row.work != Work::Select).then_some(true), "{device}: {row:?}");
+                assert_eq!(row.samples_s.len(), 2);
+                assert!(row.samples_s.iter().all(|sample| (0.0..=row.p95_s).contains(sample)));
+                assert_eq!(row.inertia.is_some(), row.work == Work::Kmeans);
+            }
+            // An f32 result that was compared with itself would be exact.
+            let exact = |row: &&Row| row.work != Work::Kmeans && row.max_rel_error == Some(0.0);
+            assert_eq!(report.rows.iter().find(exact), None);
+            let total = Work::ALL.len() * 3;
+            assert_eq!(events.last(), Some(&(total, total)));
+        }
+    }
+
+    #[test]
+    fn a_stop_ends_it_before_the_first_repetition() {
+        let mut events = Vec::new();
+        let mut note = |event: BenchEvent| events.push(matches!(event, BenchEvent::Progress { done: 0, .. }));
+        let options = options(&[Work::Render, Work::Encode]);
+        let stopped = run(&config(DeviceName::Flex), &options, &AtomicBool::new(true), &mut note).unwrap_err();
+        assert_eq!(stopped.to_string(), "interrupted during `encode`; nothing was written");
+        assert_eq!(events, [true]);
+    }
+
+    #[test]
+    fn the_scenes_of_a_config_need_not_be_there_but_its_sizes_must_fit() {
+        let mut config = config(DeviceName::Flex);
+        config.data.source = clift_data::SourceKind::Chunks;
+        let prepared = |config: &Config, storage: &str| {
+            let storage = storage.parse().expect("a count");
+            BenchContext::new(config, &BenchOptions { storage, ..options(&[]) }).map(|context| context.num_tokens())
+        };
+        assert_eq!(prepared(&config, "16").expect("valid").expect("whole patches"), 16);
+        let message = prepared(&config, "17").err().map(|error| error.to_string());
+        assert_eq!(message.as_deref(), Some("`--storage` = 17: `17` tokens: a scene has 16 tokens"));
+        config.model.num_heads = 3;
+        assert!(prepared(&config, "1/4").is_err());
+    }
+
+    #[test]
+    fn an_update_is_compared_with_few_tokens_in_the_shape_it_has() {
+        let mut config = config(DeviceName::Flex);
+        (config.data.width, config.data.height) = (448, 256);
+        config.stage1.batch_size = 64;
+        let options = BenchOptions { storage: TokenCount::Count(448), ..options(&[]) };
+        let context = BenchContext::new(&config, &options).expect("valid");
+        assert_eq!(context.num_tokens().expect("whole patches"), 7168);
+        let reduced = context.reduced().expect("valid");
+        // 28 x 16 patches are halved once to 14 x 8.
+        assert_eq!((reduced.config.data.width, reduced.config.data.height), (112, 64));
+        assert_eq!((reduced.num_tokens().unwrap(), reduced.num_storage_tokens().unwrap()), (448, 28));
+        assert_eq!(reduced.config.stage1.batch_size, 2);
+        let tiny = context.tiny().reduced().expect("valid");
+        assert_eq!((tiny.num_tokens().unwrap(), tiny.config.stage1.batch_size), (256, 4));
+    }
+}

@@ -1,0 +1,174 @@
+//! Pinhole intrinsics and posed cameras in f64.
+
+use glam::DVec3;
+
+use crate::error::DataError;
+use crate::geometry::pose::Pose;
+
+/// Pinhole intrinsics in pixels of one image; the pixel in column `i` and row `j` has its centre at
+/// `(i + 0.5, j + 0.5)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Intrinsics {
+    /// Horizontal focal length in pixels.
+    pub fx: f64,
+    /// Vertical focal length in pixels.
+    pub fy: f64,
+    /// Column of the principal point in pixels.
+    pub cx: f64,
+    /// Row of the principal point in pixels.
+    pub cy: f64,
+}
+
+/// Pinhole intrinsics divided by the image's width (`fx`, `cx`) and height (`fy`, `cy`), as in files.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct IntrinsicsNorm {
+    /// Horizontal focal length over the width.
+    pub fx: f64,
+    /// Vertical focal length over the height.
+    pub fy: f64,
+    /// Column of the principal point over the width.
+    pub cx: f64,
+    /// Row of the principal point over the height.
+    pub cy: f64,
+}
+
+impl IntrinsicsNorm {
+    /// Checks that focal lengths are positive and all numbers finite.
+    ///
+    /// # Errors
+    /// [`DataError::BadCamera`] with the first number that is not.
+    pub fn validate(self) -> Result<(), DataError> {
+        let Self { fx, fy, cx, cy } = self;
+        for (name, focal) in [("fx", fx), ("fy", fy)] {
+            if !(focal.is_finite() && focal > 0.0) {
+                return Err(DataError::BadCamera { what: format!("{name} is {focal}, expected a positive number") });
+            }
+        }
+        for (name, centre) in [("cx", cx), ("cy", cy)] {
+            if !centre.is_finite() {
+                return Err(DataError::BadCamera { what: format!("{name} is {centre}, expected a finite number") });
+            }
+        }
+        Ok(())
+    }
+
+    /// Divides `intrinsics` in pixels by the size of their image, in pixels.
+    pub fn of_pixels(intrinsics: Intrinsics, width: f64, height: f64) -> Self {
+        let Intrinsics { fx, fy, cx, cy } = intrinsics;
+        Self { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height }
+    }
+
+    /// Intrinsics in pixels of an image of `width` by `height` pixels.
+    pub fn to_pixels(self, width: usize, height: usize) -> Intrinsics {
+        let (width, height) = (width as f64, height as f64);
+        Intrinsics { fx: self.fx * width, fy: self.fy * height, cx: self.cx * width, cy: self.cy * height }
+    }
+}
+
+/// A camera as files give it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Camera {
+    /// Intrinsics over width and height.
+    pub intrinsics_norm: IntrinsicsNorm,
+    /// Camera to world.
+    pub c2w: Pose,
+}
+
+impl Camera {
+    /// Reads the 18 numbers of a frame of RealEstate10K and its chunks: `fx fy cx cy` over width and height, two
+    /// placeholders (ignored), then `w2c` as 3 x 4, row-major, OpenCV axes. `c2w` is its matrix inverse.
+    ///
+    /// # Errors
+    /// [`DataError::BadCamera`] for intrinsics that fail [`IntrinsicsNorm::validate`] and as [`Pose::from_rows`].
+    pub fn from_re10k(row: [f64; 18]) -> Result<Self, DataError> {
+        let [fx, fy, cx, cy, ..] = row;
+        let intrinsics_norm = IntrinsicsNorm { fx, fy, cx, cy };
+        intrinsics_norm.validate()?;
+        let w2c = Pose::from_rows(&[0, 1, 2].map(|r| [0, 1, 2, 3].map(|c| row[6 + 4 * r + c])))?;
+        Ok(Self { intrinsics_norm, c2w: w2c.matrix_inverse() })
+    }
+
+    /// The 18 numbers that [`Camera::from_re10k`] reads, with zeros for the placeholders.
+    pub fn to_re10k(&self) -> [f64; 18] {
+        let IntrinsicsNorm { fx, fy, cx, cy } = self.intrinsics_norm;
+        let mut row = [0.0; 18];
+        row[..4].copy_from_slice(&[fx, fy, cx, cy]);
+        row[6..].copy_from_slice(&self.c2w.matrix_inverse().to_matrix_f64()[..12]);
+        row
+    }
+
+    /// Horizontal and vertical field of view in degrees: the angles between the rays through the midpoints of opposite
+    /// image edges, as in pixelSplat's limit of 100 degrees.
+    pub fn fov_deg(&self) -> (f64, f64) {
+        let IntrinsicsNorm { fx, fy, cx, cy } = self.intrinsics_norm;
+        let ray = |u: f64, v: f64| DVec3::new((u - cx) / fx, (v - cy) / fy, 1.0);
+        (angle_deg(ray(0.0, 0.5), ray(1.0, 0.5)), angle_deg(ray(0.5, 0.0), ray(0.5, 1.0)))
+    }
+}
+
+/// Angle between two directions in degrees; `atan2` is exact where `acos` loses half the digits.
+fn angle_deg(a: DVec3, b: DVec3) -> f64 {
+    a.cross(b).length().atan2(a.dot(b)).to_degrees()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Row of a camera at (1, 2, 3) that looks along world +x: its right is world -z, its down is world +y.
+    /// By hand: w2c rotation has rows right, down, forward; w2c translation is -R (1, 2, 3) = (3, -2, -1).
+    const LOOKS_ALONG_X: [f64; 18] = [
+        0.9, 1.6, 0.5, 0.25, 0.0, 0.0, // fx fy cx cy and the placeholders
+        0.0, 0.0, -1.0, 3.0, // right
+        0.0, 1.0, 0.0, -2.0, // down
+        1.0, 0.0, 0.0, -1.0, // forward
+    ];
+
+    #[test]
+    fn a_re10k_row_becomes_the_camera_computed_by_hand() {
+        let camera = Camera::from_re10k(LOOKS_ALONG_X).unwrap();
+        assert_eq!(camera.intrinsics_norm, IntrinsicsNorm { fx: 0.9, fy: 1.6, cx: 0.5, cy: 0.25 });
+        assert_eq!(camera.c2w.translation, DVec3::new(1.0, 2.0, 3.0));
+        assert_eq!(camera.c2w.rotation.z_axis, DVec3::X);
+        assert_eq!(camera.c2w.rotation.x_axis, -DVec3::Z);
+        assert_eq!(
+            camera.intrinsics_norm.to_pixels(640, 360),
+            Intrinsics { fx: 576.0, fy: 576.0, cx: 320.0, cy: 90.0 }
+        );
+    }
+
+    #[test]
+    fn a_re10k_row_survives_the_way_there_and_back() {
+        // A rotation rounded to three decimals: its transpose is not its inverse.
+        let mut row = LOOKS_ALONG_X;
+        row[6..18].copy_from_slice(&[0.866, -0.5, 0.0, 10.0, 0.5, 0.866, 0.0, -20.0, 0.0, 0.0, 1.0, 30.0]);
+        let back = Camera::from_re10k(row).unwrap().to_re10k();
+        for (got, expected) in back.iter().zip(&row) {
+            assert!((got - expected).abs() < 1e-13, "{got} against {expected}"); // a few roundings of 30
+        }
+    }
+
+    #[test]
+    fn field_of_view_of_half_a_width_of_focal_length_is_90_degrees() {
+        let mut row = LOOKS_ALONG_X;
+        row[..4].copy_from_slice(&[0.5, 1.0, 0.5, 0.5]);
+        let (x, y) = Camera::from_re10k(row).unwrap().fov_deg();
+        assert!((x - 90.0).abs() < 1e-12, "{x}");
+        assert!((y - 53.130_102_354_155_98).abs() < 1e-12, "{y}"); // 2 atan(1/2)
+    }
+
+    #[test]
+    fn a_bad_row_says_which_number_is_bad() {
+        let message = |index: usize, value: f64| {
+            let mut row = LOOKS_ALONG_X;
+            row[index] = value;
+            Camera::from_re10k(row).unwrap_err().to_string()
+        };
+        assert_eq!(message(0, f64::NAN), "bad camera: fx is NaN, expected a positive number");
+        assert_eq!(message(1, -0.5), "bad camera: fy is -0.5, expected a positive number");
+        assert_eq!(message(3, f64::INFINITY), "bad camera: cy is inf, expected a finite number");
+        assert_eq!(message(9, f64::NEG_INFINITY), "bad camera: the pose holds -inf");
+        assert!(message(11, -1.0).contains("mirrors"), "{}", message(11, -1.0));
+        assert!(message(11, 2.0).contains("off an orthonormal one by 3.000e0"), "{}", message(11, 2.0));
+    }
+}

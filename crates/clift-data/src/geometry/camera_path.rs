@@ -1,0 +1,311 @@
+//! Camera paths to render: through the context views, around their common focus, or from a file.
+
+use std::ops::RangeInclusive;
+use std::path::Path;
+
+use glam::{DMat3, DVec3};
+use serde::Deserialize;
+
+use crate::error::DataError;
+use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
+use crate::geometry::normalization::{SceneFrame, check_near};
+use crate::geometry::pose::Pose;
+
+/// Radius of an orbit over the contexts' extent; farther out the contexts show little.
+const ORBIT_SHARE: f64 = 0.7;
+
+/// Smallest radius of an orbit, for contexts on a line; the normalised contexts reach to 1.
+const MIN_ORBIT_RADIUS: f64 = 0.1;
+
+/// Distance of an orbit's focus if the contexts look parallel, and its bounds otherwise.
+const FOCUS: f64 = 2.0;
+const FOCUS_RANGE: [f64; 2] = [0.5, 8.0];
+
+/// Most poses of a file.
+const MAX_POSES: usize = 100_000;
+
+/// One view to render, in the scene's normalised frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PathView {
+    /// Camera to world.
+    pub c2w: Pose,
+    /// In pixels of the rendered image.
+    pub intrinsics: Intrinsics,
+}
+
+/// A smooth path through all context views in their order: the first frame is the first view, the last frame the last.
+///
+/// Centres follow a Catmull-Rom spline; orientations are interpolated spherically, intrinsics linearly.
+pub fn interpolate(context: &[PathView], num_frames: usize) -> Vec<PathView> {
+    let Some(last) = context.len().checked_sub(1) else { return Vec::new() };
+    let place = |frame: usize| last as f64 * frame as f64 / num_frames.saturating_sub(1).max(1) as f64;
+    (0..num_frames).map(|frame| between(context, place(frame))).collect()
+}
+
+/// The view at `place` in `0..=context.len() - 1`.
+fn between(context: &[PathView], place: f64) -> PathView {
+    let last = context.len() - 1;
+    let first = (place as usize).min(last.saturating_sub(1));
+    let t = place - first as f64;
+    let [before, from, to, after] =
+        [first.saturating_sub(1), first, (first + 1).min(last), (first + 2).min(last)].map(|view| &context[view]);
+    let [a, b, c, d] = [before, from, to, after].map(|view| view.c2w.translation);
+    let translation = b + 0.5 * t * (c - a + t * (2.0 * a - 5.0 * b + 4.0 * c - d + t * (3.0 * (b - c) + d - a)));
+    let rotation = DMat3::from_quat(from.c2w.quaternion().slerp(to.c2w.quaternion(), t).normalize());
+    let mix = |a: f64, b: f64| a + t * (b - a);
+    let (a, b) = (from.intrinsics, to.intrinsics);
+    let intrinsics = Intrinsics { fx: mix(a.fx, b.fx), fy: mix(a.fy, b.fy), cx: mix(a.cx, b.cx), cy: mix(a.cy, b.cy) };
+    PathView { c2w: Pose { rotation, translation }, intrinsics }
+}
+
+/// A closed ellipse around the mean view, facing the focus of the context views; its radii are 0.7 of the extent of
+/// their centres. The frame after the last would equal the first.
+pub fn orbit(context: &[PathView], num_frames: usize) -> Vec<PathView> {
+    let Some(intrinsics) = mean_intrinsics(context) else { return Vec::new() };
+    let focus = focus_distance(context) * DVec3::Z;
+    let extent = context.iter().fold(DVec3::ZERO, |extent, view| extent.max(view.c2w.translation.abs()));
+    let radius = (ORBIT_SHARE * extent).max(DVec3::splat(MIN_ORBIT_RADIUS));
+    let view = |frame: usize| {
+        let (sin, cos) = (std::f64::consts::TAU * frame as f64 / num_frames as f64).sin_cos();
+        PathView { c2w: look_at(radius * DVec3::new(cos, sin, 0.0), focus), intrinsics }
+    };
+    (0..num_frames).map(view).collect()
+}
+
+/// Mean intrinsics of the context views; `None` without any.
+pub fn mean_intrinsics(context: &[PathView]) -> Option<Intrinsics> {
+    let count = context.len() as f64;
+    let mean = |value: fn(&Intrinsics) -> f64| context.iter().map(|view| value(&view.intrinsics) / count).sum();
+    (!context.is_empty()).then(|| Intrinsics {
+        fx: mean(|k| k.fx),
+        fy: mean(|k| k.fy),
+        cx: mean(|k| k.cx),
+        cy: mean(|k| k.cy),
+    })
+}
+
+/// Distance along the mean view's axis of the point nearest to the axes of all views (least squares).
+fn focus_distance(context: &[PathView]) -> f64 {
+    let (mut above, mut below) = (0.0, 0.0);
+    for view in context {
+        let axis = view.c2w.rotation.z_axis;
+        // With A = I - d d^T: z = sum(e^T A o) / sum(e^T A e).
+        above += view.c2w.translation.z - axis.z * axis.dot(view.c2w.translation);
+        below += 1.0 - axis.z * axis.z;
+    }
+    let distance = above / below;
+    // Parallel axes meet nowhere, diverging ones behind the cameras.
+    if below > 1e-6 && distance > 0.0 { distance.clamp(FOCUS_RANGE[0], FOCUS_RANGE[1]) } else { FOCUS }
+}
+
+/// A camera at `centre` that looks at `point`, upright in the frame of the mean view.
+fn look_at(centre: DVec3, point: DVec3) -> Pose {
+    let forward = (point - centre).normalize();
+    let right = DVec3::Y.cross(forward).normalize();
+    Pose { rotation: DMat3::from_cols(right, forward.cross(right), forward), translation: centre }
+}
+
+/// Accepted focal lengths of a file over width and height; its end bounds the principal point's distance from 0.
+const INTRINSICS: RangeInclusive<f64> = 1e-3..=1e3;
+
+/// A file of poses.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct PoseFile {
+    poses: Vec<FilePose>,
+}
+
+/// One pose of a file.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FilePose {
+    /// Camera to world in the capture's world, OpenCV axes; three or four rows.
+    c2w: Vec<[f64; 4]>,
+    /// `fx, fy, cx, cy` over width and height; the mean of the context views if missing.
+    #[serde(default)]
+    intrinsics_norm: Option<[f64; 4]>,
+}
+
+/// Reads `{"poses": [{"c2w": [[..4], [..4], [..4]], "intrinsics_norm": [fx, fy, cx, cy]}, ..]}`: camera-to-world poses
+/// in the world of the capture's own files (OpenCV axes), for images of `width` by `height` pixels, and moves them into
+/// `frame`. A pose without intrinsics gets `default`.
+///
+/// # Errors
+/// [`DataError::Io`], and [`DataError::BadPoses`] for another form or an invalid pose, with its position.
+pub fn read_poses(
+    path: &Path,
+    frame: &SceneFrame,
+    default: Intrinsics,
+    width: usize,
+    height: usize,
+) -> Result<Vec<PathView>, DataError> {
+    let text = std::fs::read(path).map_err(DataError::io("reading the poses", path))?;
+    let bad = |what: String| DataError::BadPoses { what, path: path.to_path_buf() };
+    let file: PoseFile = serde_json::from_slice(&text)
+        .map_err(|error| bad(format!("expected {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}")))?;
+    if !(1..=MAX_POSES).contains(&file.poses.len()) {
+        return Err(bad(format!("{} poses, expected 1 to {MAX_POSES}", file.poses.len())));
+    }
+    let is_near = |cx: f64, cy: f64| [cx, cy].iter().all(|centre| centre.abs() <= *INTRINSICS.end());
+    let view = |(position, pose): (usize, FilePose)| {
+        let bad = |what: String| bad(format!("pose {position}: {what}"));
+        let (rows, last) = match pose.c2w[..] {
+            [a, b, c] => ([a, b, c], [0.0, 0.0, 0.0, 1.0]),
+            [a, b, c, last] => ([a, b, c], last),
+            _ => return Err(bad(format!("{} rows, expected 3 or 4", pose.c2w.len()))),
+        };
+        if last != [0.0, 0.0, 0.0, 1.0] {
+            return Err(bad(format!("its last row is {last:?}, expected [0, 0, 0, 1]")));
+        }
+        let c2w = frame.normalize(Pose::from_rows(&rows).map_err(|error| bad(error.to_string()))?);
+        check_near(&c2w).map_err(|error| bad(error.to_string()))?;
+        let intrinsics = match pose.intrinsics_norm {
+            None => default,
+            Some([fx, fy, cx, cy]) if INTRINSICS.contains(&fx) && INTRINSICS.contains(&fy) && is_near(cx, cy) => {
+                IntrinsicsNorm { fx, fy, cx, cy }.to_pixels(width, height)
+            }
+            Some(other) => {
+                let most = INTRINSICS.end();
+                return Err(bad(format!(
+                    "its intrinsics are {other:?}; expected fx and fy from {} to {most}, cx and cy within {most} of 0",
+                    INTRINSICS.start()
+                )));
+            }
+        };
+        Ok(PathView { c2w, intrinsics })
+    };
+    file.poses.into_iter().enumerate().map(view).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const K: Intrinsics = Intrinsics { fx: 40.0, fy: 41.0, cx: 16.0, cy: 12.0 };
+
+    /// A camera at `centre`, turned by `angle` about the y axis.
+    fn view(centre: [f64; 3], angle: f64) -> PathView {
+        PathView { c2w: Pose { rotation: DMat3::from_rotation_y(angle), translation: centre.into() }, intrinsics: K }
+    }
+
+    fn assert_close(a: &PathView, b: &PathView, tolerance: f64) {
+        let (a, b) = (a.c2w.to_matrix_f64(), b.c2w.to_matrix_f64());
+        assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < tolerance), "{a:?} {b:?}");
+    }
+
+    fn walk() -> Vec<PathView> {
+        vec![
+            view([-1.0, 0.0, 0.0], 0.4),
+            view([-0.2, 0.1, 0.3], 0.1),
+            view([0.3, -0.1, 0.0], 0.0),
+            view([1.0, 0.0, 0.1], -0.5),
+        ]
+    }
+
+    #[test]
+    fn an_interpolated_path_goes_through_every_context_view() {
+        let context = walk();
+        let path = interpolate(&context, 31);
+        assert_eq!(path.len(), 31);
+        for (i, view) in context.iter().enumerate() {
+            assert_close(&path[10 * i], view, 1e-12);
+        }
+        for view in &path {
+            assert!(view.c2w.orthonormality_defect() < 1e-12);
+        }
+        // No frame goes farther than a few times the mean step.
+        let step = |pair: &[PathView]| pair[0].c2w.translation.distance(pair[1].c2w.translation);
+        assert!(path.windows(2).all(|pair| step(pair) < 0.2), "2 units in 30 steps");
+    }
+
+    #[test]
+    fn half_way_between_two_views_is_half_the_turn_and_the_mean_of_the_rest() {
+        let mut context = vec![view([0.0; 3], 0.2), view([1.0, 2.0, 0.0], 0.8)];
+        context[1].intrinsics.fx = 60.0;
+        let middle = interpolate(&context, 3)[1];
+        assert_close(&middle, &view([0.5, 1.0, 0.0], 0.5), 1e-12);
+        assert!((middle.intrinsics.fx - 50.0).abs() < 1e-12);
+        assert_eq!(interpolate(&context, 1).len(), 1);
+        assert_close(&interpolate(&context, 1)[0], &context[0], 1e-12);
+        assert_close(&interpolate(&context[..1], 5)[3], &context[0], 1e-12);
+        assert!(interpolate(&[], 5).is_empty());
+    }
+
+    #[test]
+    fn opposite_signs_of_a_quaternion_do_not_take_the_long_way() {
+        // Three quarters of a half turn to either side of 170 degrees.
+        let context = [view([0.0; 3], 2.9), view([1.0, 0.0, 0.0], -2.9)];
+        let middle = interpolate(&context, 3)[1];
+        assert_close(&middle, &view([0.5, 0.0, 0.0], std::f64::consts::PI), 1e-9);
+    }
+
+    #[test]
+    fn an_orbit_looks_at_what_the_views_look_at_and_ends_where_it_starts() {
+        // Two cameras that look at (0, 0, 3) from either side.
+        let turn = 1.0_f64.atan2(3.0);
+        let context = [view([-1.0, 0.0, 0.0], turn), view([1.0, 0.0, 0.0], -turn)];
+        assert!((focus_distance(&context) - 3.0).abs() < 1e-9);
+        let path = orbit(&context, 12);
+        assert_eq!(path.len(), 12);
+        for view in &path {
+            let to_focus = 3.0 * DVec3::Z - view.c2w.translation;
+            assert!((view.c2w.rotation.z_axis.dot(to_focus.normalize()) - 1.0).abs() < 1e-12);
+            assert!(view.c2w.orthonormality_defect() < 1e-12);
+            assert!(view.c2w.rotation.y_axis.y > 0.9, "upright");
+        }
+        assert!((path[0].c2w.translation.x - 0.7).abs() < 1e-12);
+        assert!((path[3].c2w.translation.y - 0.1).abs() < 1e-12, "contexts on a line: a small way up and down");
+        let parallel = [view([-1.0, 0.0, 0.0], 0.0), view([1.0, 0.0, 0.0], 0.0)];
+        assert_eq!(focus_distance(&parallel), FOCUS);
+        assert!(orbit(&[], 3).is_empty());
+    }
+
+    fn read(json: &str) -> Result<Vec<PathView>, DataError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("poses.json");
+        std::fs::write(&path, json).unwrap();
+        let frame = SceneFrame { mean_c2w: view([1.0, 0.0, 0.0], 0.0).c2w, scale: 2.0 };
+        read_poses(&path, &frame, K, 64, 32)
+    }
+
+    #[test]
+    fn poses_of_a_file_are_moved_into_the_frame_of_the_scene() {
+        let views = read(
+            r#"{"poses": [{"c2w": [[1,0,0,3],[0,1,0,0],[0,0,1,0.5]]},
+                {"c2w": [[1,0,0,1],[0,1,0,0],[0,0,1,0],[0,0,0,1]], "intrinsics_norm": [0.5, 1.0, 0.5, 0.25]}]}"#,
+        )
+        .unwrap();
+        assert_close(&views[0], &view([4.0, 0.0, 1.0], 0.0), 1e-12);
+        assert_eq!(views[0].intrinsics, K);
+        assert_close(&views[1], &view([0.0; 3], 0.0), 1e-12);
+        assert_eq!(views[1].intrinsics, Intrinsics { fx: 32.0, fy: 32.0, cx: 32.0, cy: 8.0 });
+    }
+
+    #[test]
+    fn a_file_that_holds_no_poses_says_what_is_expected_and_where_it_goes_wrong() {
+        for (json, part) in [
+            ("[]", "expected {\"poses\": "),
+            (r#"{"poses": []}"#, "0 poses, expected 1 to 100000"),
+            (r#"{"poses": [{"c2w": [[1,0,0,0]]}]}"#, "pose 0: 1 rows, expected 3 or 4"),
+            (r#"{"poses": [{"c2w": [[2,0,0,0],[0,1,0,0],[0,0,1,0]]}]}"#, "pose 0: bad camera: the rotation is off"),
+            (r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,2]]}]}"#, "its last row is"),
+            (
+                r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "intrinsics_norm": [0,1,0,0]}]}"#,
+                "pose 0: its intrinsics are [0.0, 1.0",
+            ),
+            (
+                r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "intrinsics_norm": [1,1,1e39,0.5]}]}"#,
+                "pose 0: its intrinsics are [1.0, 1.0, 1e39",
+            ),
+            (
+                r#"{"poses": [{"c2w": [[1,0,0,1e6],[0,1,0,0],[0,0,1,0]]}]}"#,
+                "pose 0: bad camera: it stands 1999998 times",
+            ),
+            (r#"{"poses": [{"c2w": [[1,0,0,1e300],[0,1,0,0],[0,0,1,0]]}]}"#, "pose 0: bad camera: it stands 2"),
+            (r#"{"poses": [], "frames": []}"#, "unknown field `frames`"),
+        ] {
+            let message = read(json).unwrap_err().to_string();
+            assert!(message.contains(part) && message.ends_with("poses.json"), "{message}");
+        }
+    }
+}

@@ -1,0 +1,17 @@
+//! Cameras and poses in f64.
+//!
+//! - `pose`: rigid poses on glam, conventions
+//! - `camera`: intrinsics and cameras
+//! - `lens`: OpenCV and COLMAP lens distortion
+//! - `normalization`: normalised frame of a scene
+//! - `overlap`: view overlap of two cameras
+//! - `camera_path`: interpolated, orbit and file paths
+//! - `path_spread`: context frames spread along a path
+
+pub(crate) mod camera;
+pub(crate) mod camera_path;
+pub(crate) mod lens;
+pub(crate) mod normalization;
+pub(crate) mod overlap;
+pub(crate) mod path_spread;
+pub(crate) mod pose;

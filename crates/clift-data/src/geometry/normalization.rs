@@ -1,0 +1,292 @@
+//! Pose normalisation of a scene: the mean context camera becomes the origin, and the largest coordinate one.
+
+use glam::{DMat3, DQuat, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::error::DataError;
+use crate::geometry::pose::{Pose, unit_quaternion};
+
+/// How the mean orientation of the context cameras is computed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PoseRotation {
+    /// Mean of unit quaternions: the reference's choice for RealEstate10K.
+    ///
+    // Departs from the reference: quaternions are aligned to the first camera's instead of to w >= 0, because near
+    // half a turn from the world's axes the latter cancel. Elsewhere both are equal.
+    #[default]
+    Quaternion,
+    /// Mean viewing direction, and the mean down direction made perpendicular to it: the reference's choice for DL3DV.
+    Axes,
+}
+
+/// Which cameras determine the scale.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PoseScale {
+    /// Context cameras only, so that tokens do not depend on the targets.
+    #[default]
+    Context,
+    /// Context and target cameras: the reference's choice for RealEstate10K.
+    All,
+}
+
+/// The normalised frame of a scene: maps world poses to poses around the origin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SceneFrame {
+    /// Mean context camera, camera to world.
+    pub mean_c2w: Pose,
+    /// Normalised units per world unit.
+    pub scale: f64,
+}
+
+/// Largest coordinate of a clip's camera in the normalised frame, in which contexts reach to 1.
+///
+/// Beyond it the rays' moments outweigh the colours in f32 sums of seven digits (docs/results/stability.md). The reference
+/// samples other views beyond the same number.
+pub const MAX_COORDINATE: f64 = 1e3;
+
+impl SceneFrame {
+    /// Finds the frame of `context`, camera-to-world poses; `target` matters for [`PoseScale::All`] only.
+    ///
+    /// # Errors
+    /// [`DataError::InFrame`] around [`DataError::BadCamera`] for a pose that is not finite (the frame is the position
+    /// in `context`, then `target`), [`DataError::BadCamera`] for no context or opposite viewing directions, and
+    /// [`DataError::ZeroBaseline`] if the centres that determine the scale coincide: within 4 f32 epsilons of their
+    /// largest coordinate, the precision of files.
+    pub fn find(
+        key: &str,
+        context: &[Pose],
+        target: &[Pose],
+        rotation: PoseRotation,
+        scale: PoseScale,
+    ) -> Result<Self, DataError> {
+        for (frame, pose) in context.iter().chain(target).enumerate() {
+            pose.check_finite().map_err(|source| DataError::InFrame {
+                key: key.to_owned(),
+                frame,
+                source: Box::new(source),
+            })?;
+        }
+        if context.is_empty() {
+            return Err(DataError::BadCamera { what: format!("scene {key} has no context views to normalise by") });
+        }
+        let rotation = match rotation {
+            PoseRotation::Quaternion => mean_quaternion(context),
+            PoseRotation::Axes => mean_axes(context).ok_or_else(|| DataError::BadCamera {
+                what: format!("the context views of scene {key} look in opposite directions, so they have no mean"),
+            })?,
+        };
+        let translation = context.iter().map(|pose| pose.translation / context.len() as f64).sum();
+        let unscaled = Self { mean_c2w: Pose { rotation, translation }, scale: 1.0 };
+        let counted: Vec<&Pose> = match scale {
+            PoseScale::Context => context.iter().collect(),
+            PoseScale::All => context.iter().chain(target).collect(),
+        };
+        let extent = largest(counted.iter().map(|pose| unscaled.normalize(**pose).translation));
+        let threshold = 4.0 * f64::from(f32::EPSILON) * largest(counted.iter().map(|pose| pose.translation));
+        if extent <= threshold {
+            return Err(DataError::ZeroBaseline { key: key.to_owned(), num_views: counted.len(), extent, threshold });
+        }
+        Ok(Self { scale: 1.0 / extent, ..unscaled })
+    }
+
+    /// Moves a camera-to-world pose from the world into this frame.
+    pub fn normalize(&self, c2w: Pose) -> Pose {
+        // The difference of centres first: at a million units from the origin `R^T c - R^T mean` would lose digits.
+        let offset = c2w.translation - self.mean_c2w.translation;
+        let to_mean = self.mean_c2w.rotation.transpose();
+        Pose { rotation: to_mean * c2w.rotation, translation: to_mean * offset * self.scale }
+    }
+}
+
+/// Refuses a normalised pose beyond [`MAX_COORDINATE`].
+pub(crate) fn check_near(pose: &Pose) -> Result<(), DataError> {
+    let coordinate = pose.translation.abs().max_element();
+    if coordinate <= MAX_COORDINATE {
+        return Ok(());
+    }
+    let what = format!(
+        "it stands {coordinate:.0} times the contexts' extent away; expected at most {MAX_COORDINATE}, beyond which f32 \
+         loses the colours beside the rays"
+    );
+    Err(DataError::BadCamera { what })
+}
+
+/// Largest absolute coordinate.
+fn largest(points: impl Iterator<Item = DVec3>) -> f64 {
+    points.fold(0.0, |largest, point| point.abs().max_element().max(largest))
+}
+
+/// Mean of unit quaternions as a rotation. Each is aligned to the first, so the sum is never zero.
+fn mean_quaternion(poses: &[Pose]) -> DMat3 {
+    let first = poses[0].quaternion();
+    let aligned = |q: DQuat| q * 1.0_f64.copysign(q.dot(first));
+    let sum: DQuat = poses.iter().map(|pose| aligned(pose.quaternion())).sum();
+    DMat3::from_quat(unit_quaternion(sum))
+}
+
+/// Mean viewing direction and the perpendicular part of the mean down direction; `None` if directions cancel.
+fn mean_axes(poses: &[Pose]) -> Option<DMat3> {
+    let sum = |axis: usize| poses.iter().map(|pose| pose.rotation.col(axis)).sum::<DVec3>();
+    let forward = unit(sum(2), poses.len())?;
+    let right = unit(sum(1).cross(forward), poses.len())?;
+    Some(DMat3::from_cols(right, forward.cross(right), forward))
+}
+
+/// Direction of a sum of `count` unit vectors, unless the sum is rounding.
+fn unit(sum: DVec3, count: usize) -> Option<DVec3> {
+    let length = sum.length();
+    (length > 1e-6 * count as f64).then(|| sum / length)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use safetensors::SafeTensors;
+
+    use super::*;
+
+    #[test]
+    fn a_camera_is_near_up_to_the_edge() {
+        let at = |x: f64| Pose { translation: x * DVec3::Y, ..Pose::IDENTITY };
+        assert!(check_near(&at(-MAX_COORDINATE)).is_ok());
+        let message = check_near(&at(-1.01 * MAX_COORDINATE)).unwrap_err().to_string();
+        assert!(message.contains("it stands 1010 times the contexts' extent away; expected at most 1000"), "{message}");
+    }
+
+    /// A pose turned by `angles` about the world's x, y and z axes.
+    fn pose([x, y, z]: [f64; 3], translation: [f64; 3]) -> Pose {
+        let rotation = DMat3::from_rotation_z(z) * DMat3::from_rotation_y(y) * DMat3::from_rotation_x(x);
+        Pose { rotation, translation: translation.into() }
+    }
+
+    fn walk() -> Vec<Pose> {
+        (0..5)
+            .map(|i| f64::from(i) * 0.3)
+            .map(|t| pose([0.1 * t, 0.4 * t, -0.05], [t, 0.1 * t * t, 0.5 * t.sin()]))
+            .collect()
+    }
+
+    fn normalized(poses: &[Pose], rotation: PoseRotation, scale: PoseScale) -> Vec<Pose> {
+        let (context, target) = poses.split_at(poses.len() - 2);
+        let frame = SceneFrame::find("k", context, target, rotation, scale).unwrap();
+        poses.iter().map(|pose| frame.normalize(*pose)).collect()
+    }
+
+    fn worst(a: &[Pose], b: &[Pose]) -> f64 {
+        assert_eq!(a.len(), b.len());
+        let values = |poses: &[Pose]| poses.iter().flat_map(|pose| pose.to_matrix_f64()).collect::<Vec<_>>();
+        values(a).iter().zip(values(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    }
+
+    const CHOICES: [(PoseRotation, PoseScale, &str); 4] = [
+        (PoseRotation::Quaternion, PoseScale::Context, "quaternion.context"),
+        (PoseRotation::Quaternion, PoseScale::All, "quaternion.all"),
+        (PoseRotation::Axes, PoseScale::Context, "axes.context"),
+        (PoseRotation::Axes, PoseScale::All, "axes.all"),
+    ];
+
+    #[test]
+    fn normalised_poses_equal_numpy_and_scipy() {
+        let bytes = include_bytes!("../../../data-fixtures/reference/poses.safetensors");
+        let tensors = SafeTensors::deserialize(bytes).unwrap();
+        let poses = |name: &str| {
+            let data = tensors.tensor(name).unwrap().data();
+            let numbers: Vec<f64> = data.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect();
+            numbers.as_chunks().0.iter().map(|matrix| Pose::from_matrix(matrix).unwrap()).collect::<Vec<_>>()
+        };
+        for case in ["benign", "turned"] {
+            let (context, target) = (poses(&format!("{case}.context")), poses(&format!("{case}.target")));
+            for (rotation, scale, name) in CHOICES {
+                let frame = SceneFrame::find("k", &context, &target, rotation, scale).unwrap();
+                let got: Vec<Pose> = context.iter().chain(&target).map(|pose| frame.normalize(*pose)).collect();
+                // Coordinates of 30 in f64, a matrix inverse on the other side.
+                assert!(worst(&got, &poses(&format!("{case}.{name}"))) < 1e-12, "{case}.{name}");
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn moving_and_scaling_the_world_changes_nothing(
+            angles in prop::array::uniform3(-3.2_f64..3.2),
+            shift in prop::array::uniform3(-100.0_f64..100.0),
+            scale in 0.01_f64..100.0,
+        ) {
+            let world = pose(angles, shift);
+            let poses = walk();
+            let moved: Vec<Pose> = poses
+                .iter()
+                .map(|pose| world.after(Pose { translation: pose.translation * scale, ..*pose }))
+                .collect();
+            for (rotation, scale, name) in CHOICES {
+                let difference = worst(&normalized(&poses, rotation, scale), &normalized(&moved, rotation, scale));
+                // Centres of up to 200 lose 200 * 2^-52 of an extent of 0.01 * 0.3.
+                prop_assert!(difference < 1e-10, "{}: {}", name, difference);
+            }
+        }
+    }
+
+    #[test]
+    fn cameras_a_million_units_away_keep_nine_digits() {
+        let poses = walk();
+        let far: Vec<Pose> =
+            poses.iter().map(|pose| Pose { translation: 10.0 * pose.translation + 1e6, ..*pose }).collect();
+        for (rotation, scale, name) in CHOICES {
+            // 1e6 * 2^-52 over an extent of a few units.
+            assert!(worst(&normalized(&poses, rotation, scale), &normalized(&far, rotation, scale)) < 1e-9, "{name}");
+        }
+    }
+
+    #[test]
+    fn cameras_on_both_sides_of_half_a_turn_have_their_mean_between_them() {
+        // 179 and 181 degrees about y. With w >= 0 their quaternions nearly cancel and the mean turns about nothing.
+        let context = [179.0_f64, 181.0].map(|angle| pose([0.0, angle.to_radians(), 0.0], [angle, 0.0, 0.0]));
+        let frame = SceneFrame::find("k", &context, &[], PoseRotation::Quaternion, PoseScale::Context).unwrap();
+        let expected = pose([0.0, std::f64::consts::PI, 0.0], [180.0, 0.0, 0.0]);
+        assert!(worst(&[frame.mean_c2w], &[expected]) < 1e-14, "{frame:?}");
+    }
+
+    #[test]
+    fn identical_centres_are_an_error_that_says_so() {
+        let turned = [0.0, 0.1, 0.2].map(|angle| pose([0.0, angle, 0.0], [1e6, 2.0, 3.0]));
+        let find = |context: &[Pose]| {
+            SceneFrame::find("00ff", context, &[], PoseRotation::Quaternion, PoseScale::Context)
+                .map(|frame| frame.scale)
+        };
+        let message = find(&turned).unwrap_err().to_string();
+        assert!(message.starts_with("scene 00ff has no baseline: its 3 camera centres"), "{message}");
+        // Beside the threshold of 4 f32 steps at a million, 0.477: apart by less is rounding, by more is a baseline.
+        let apart = |extent: f64| {
+            let mut poses = turned;
+            poses[1].translation[1] += 3.0 * extent / 2.0; // the mean moves by a third of it
+            poses
+        };
+        assert!(find(&apart(0.45)).is_err());
+        assert!(find(&apart(0.55)).is_ok());
+        assert!(find(&turned.map(|pose| Pose { translation: DVec3::ZERO, ..pose })).is_err());
+        // With f64 centres near the origin a tiny baseline is a baseline.
+        assert!(
+            find(&walk().iter().map(|p| Pose { translation: p.translation * 1e-9, ..*p }).collect::<Vec<_>>()).is_ok()
+        );
+    }
+
+    #[test]
+    fn a_pose_that_is_not_finite_names_its_frame() {
+        let mut poses = walk();
+        poses[3].translation[1] = f64::NAN;
+        let (context, target) = poses.split_at(2);
+        let message =
+            SceneFrame::find("00ff", context, target, PoseRotation::Axes, PoseScale::All).unwrap_err().to_string();
+        assert_eq!(message, "frame 3 of scene 00ff: bad camera: the pose holds NaN");
+    }
+
+    #[test]
+    fn opposite_viewing_directions_have_no_mean_axes() {
+        let context = [0.0, std::f64::consts::PI].map(|angle| pose([0.0, angle, 0.0], [angle, 0.0, 0.0]));
+        let message =
+            SceneFrame::find("00ff", &context, &[], PoseRotation::Axes, PoseScale::Context).unwrap_err().to_string();
+        assert!(message.contains("opposite directions"), "{message}");
+    }
+}

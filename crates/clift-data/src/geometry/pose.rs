@@ -1,0 +1,155 @@
+//! Rigid poses in f64.
+//!
+//! Camera axes are OpenCV's: +x right, +y down, +z forward. The name of a pose gives its direction: `c2w` (camera to
+//! world) or `w2c` (world to camera).
+
+use glam::{DMat3, DMat4, DQuat, DVec3, DVec4};
+
+use crate::error::DataError;
+
+/// Largest entry of `R^T R - I` of an accepted rotation; published poses reach about 4e-4.
+const MAX_DEFECT: f64 = 1e-2;
+
+/// A rigid motion `x' = rotation * x + translation`; the variable's name gives its direction, `c2w` or `w2c`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pose {
+    /// Rotation matrix.
+    pub rotation: DMat3,
+    /// Translation in world units; of a `c2w` pose, the camera centre.
+    pub translation: DVec3,
+}
+
+impl Pose {
+    /// The identity.
+    pub const IDENTITY: Self = Self { rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
+
+    /// Reads the upper three rows of a 4 x 4 matrix.
+    ///
+    /// # Errors
+    /// [`DataError::BadCamera`] for a value that is not finite, and for a rotation that is not orthonormal to 1e-2 with
+    /// determinant +1.
+    pub fn from_rows(rows: &[[f64; 4]; 3]) -> Result<Self, DataError> {
+        let [x, y, z] = rows.map(|[a, b, c, _]| DVec3::new(a, b, c));
+        let pose = Self { rotation: DMat3::from_rows(x, y, z), translation: rows.map(|row| row[3]).into() };
+        pose.check_finite()?;
+        let defect = pose.orthonormality_defect();
+        if defect > MAX_DEFECT {
+            return Err(DataError::BadCamera {
+                what: format!("the rotation is off an orthonormal one by {defect:.3e}, more than {MAX_DEFECT:.0e}"),
+            });
+        }
+        let determinant = pose.rotation.determinant();
+        if determinant < 0.0 {
+            return Err(DataError::BadCamera { what: format!("the rotation mirrors (determinant {determinant:.3})") });
+        }
+        Ok(pose)
+    }
+
+    /// Reads the upper three rows of a camera-to-world matrix in OpenGL/Blender axes (+x right, +y up, -z forward), as
+    /// in nerfstudio's `transforms.json`, and converts the camera's axes: `rows * diag(1, -1, -1, 1)`. World axes and
+    /// camera centre do not change.
+    ///
+    /// # Errors
+    /// As [`Pose::from_rows`].
+    pub fn from_opengl(rows: &[[f64; 4]; 3]) -> Result<Self, DataError> {
+        let Self { rotation, translation } = Self::from_rows(rows)?;
+        Ok(Self { rotation: DMat3::from_cols(rotation.x_axis, -rotation.y_axis, -rotation.z_axis), translation })
+    }
+
+    /// Row-major 4 x 4 matrix in f32, as tensors hold it.
+    pub fn to_matrix(self) -> [f32; 16] {
+        self.to_matrix_f64().map(|value| value as f32)
+    }
+
+    /// Row-major 4 x 4 matrix.
+    pub fn to_matrix_f64(self) -> [f64; 16] {
+        DMat4::from_mat3_translation(self.rotation, self.translation).to_rows_array()
+    }
+
+    /// Reads a row-major 4 x 4 matrix, whose last row is ignored.
+    ///
+    /// # Errors
+    /// As [`Pose::from_rows`].
+    pub fn from_matrix(matrix: &[f64; 16]) -> Result<Self, DataError> {
+        Self::from_rows(&[0, 1, 2].map(|row| [0, 1, 2, 3].map(|column| matrix[row * 4 + column])))
+    }
+
+    /// Inverse of an orthonormal rotation and its translation: `[R^T | -R^T t]`.
+    #[must_use]
+    pub fn inverse(self) -> Self {
+        let rotation = self.rotation.transpose();
+        Self { rotation, translation: -(rotation * self.translation) }
+    }
+
+    /// Inverse of the matrix. The readers of the chunk format invert `w2c` as a matrix, and the inverse of a rotation
+    /// rounded to f32 or to nine decimals differs from its transpose.
+    pub(crate) fn matrix_inverse(self) -> Self {
+        // By way of the transpose, glam rounds as files written before have it.
+        let rotation = self.rotation.transpose().inverse().transpose();
+        Self { rotation, translation: -(rotation * self.translation) }
+    }
+
+    /// The motion `x -> self(first(x))`.
+    #[must_use]
+    pub fn after(self, first: Self) -> Self {
+        Self { rotation: self.rotation * first.rotation, translation: self.apply(first.translation) }
+    }
+
+    /// Moves a point.
+    pub fn apply(self, point: DVec3) -> DVec3 {
+        self.rotation * point + self.translation
+    }
+
+    /// Largest absolute entry of `R^T R - I`.
+    pub fn orthonormality_defect(self) -> f64 {
+        let difference = self.rotation.transpose() * self.rotation - DMat3::IDENTITY;
+        difference.to_cols_array().into_iter().fold(0.0, |largest: f64, value| largest.max(value.abs()))
+    }
+
+    /// Refuses values that are not finite.
+    pub(crate) fn check_finite(self) -> Result<(), DataError> {
+        let mut values = self.rotation.to_rows_array().into_iter().chain(self.translation.to_array());
+        match values.find(|value| !value.is_finite()) {
+            Some(value) => Err(DataError::BadCamera { what: format!("the pose holds {value}") }),
+            None => Ok(()),
+        }
+    }
+
+    /// Unit quaternion of the rotation, from the largest of its four squared components.
+    ///
+    // Not `DQuat::from_mat3`: of a rotation rounded to four digits its result differs from that of scipy's
+    // `Rotation.from_matrix`, with which published poses are normalised, by more than rounding.
+    pub(crate) fn quaternion(self) -> DQuat {
+        let [[xx, yx, zx], [xy, yy, zy], [xz, yz, zz]] = self.rotation.to_cols_array_2d();
+        let squares = [1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz];
+        let [wx, wy, wz] = [zy - yz, xz - zx, yx - xy];
+        let [xy, xz, yz] = [xy + yx, xz + zx, yz + zy];
+        let largest = (0..4).fold(0, |best, i| if squares[i] > squares[best] { i } else { best });
+        // Four times the products of the largest component with x, y, z and w.
+        let [x, y, z, w] = match largest {
+            0 => [wx, wy, wz, squares[0]],
+            1 => [squares[1], xy, xz, wx],
+            2 => [xy, squares[2], yz, wy],
+            _ => [xz, yz, squares[3], wz],
+        };
+        unit_quaternion(DQuat::from_xyzw(x, y, z, w))
+    }
+}
+
+/// Normalises with the rounding of poses in files written before: glam sums `w` last and multiplies by a reciprocal.
+pub(crate) fn unit_quaternion(q: DQuat) -> DQuat {
+    q / DVec4::new(q.w, q.x, q.y, q.z).length()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn opengl_identity_becomes_diag_1_minus_1_minus_1() {
+        let rows = [[1.0, 0.0, 0.0, 4.0], [0.0, 1.0, 0.0, 5.0], [0.0, 0.0, 1.0, 6.0]];
+        let c2w = Pose::from_opengl(&rows).unwrap();
+        assert_eq!(c2w.rotation, DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
+        assert_eq!(c2w.translation, DVec3::new(4.0, 5.0, 6.0));
+    }
+}

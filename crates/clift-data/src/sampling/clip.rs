@@ -1,0 +1,48 @@
+//! What the readers give and the model takes: frames, views, clips.
+
+use crate::geometry::camera::Intrinsics;
+use crate::geometry::pose::Pose;
+
+/// Which frames of a scene are given and which are to be rendered: list positions, not time stamps.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ViewIndices {
+    /// Frames the encoder sees.
+    pub context: Vec<usize>,
+    /// Frames to render.
+    pub target: Vec<usize>,
+}
+
+/// Posed views of one scene at the model's resolution, in the scene's normalised frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Views {
+    /// Columns of every view.
+    pub width: usize,
+    /// Rows of every view.
+    pub height: usize,
+    /// `[num_views, height, width, 3]`, 8-bit RGB.
+    pub images: Vec<u8>,
+    /// Normalised camera-to-world poses, one per view.
+    pub c2w: Vec<Pose>,
+    /// Intrinsics in pixels, one per view.
+    pub intrinsics: Vec<Intrinsics>,
+    /// Frame of the scene each view is.
+    pub frame_index: Vec<usize>,
+}
+
+impl Views {
+    /// How many views there are.
+    pub fn num_views(&self) -> usize {
+        self.c2w.len()
+    }
+}
+
+/// One training or evaluation item: context and target views of one scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Clip {
+    /// Key of the scene.
+    pub key: String,
+    /// Given views.
+    pub context: Views,
+    /// Views to render, with their ground truth.
+    pub target: Views,
+}

@@ -1,0 +1,192 @@
+//! From a scene and a list of frames to a clip at the model's size, in the scene's normalised frame.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use crate::error::DataError;
+use crate::geometry::camera::{Camera, Intrinsics};
+use crate::geometry::normalization::{PoseRotation, PoseScale, SceneFrame, check_near};
+use crate::image::fit::fit;
+use crate::image::rgb_image::Frame;
+use crate::sampling::clip::{Clip, ViewIndices, Views};
+use crate::scene_source::SceneSource;
+
+/// How frames and poses are prepared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ClipOptions {
+    /// Columns of every view.
+    pub width: usize,
+    /// Rows of every view.
+    pub height: usize,
+    /// How the mean orientation of the contexts is taken.
+    pub pose_rotation: PoseRotation,
+    /// Which cameras set the scale.
+    pub pose_scale: PoseScale,
+    /// Whether the principal point follows the crop exactly; published numbers are made without.
+    pub exact_principal_point: bool,
+}
+
+/// Reads clips from a source.
+#[derive(Clone)]
+pub struct ClipReader {
+    /// Where scenes come from.
+    pub source: Arc<dyn SceneSource>,
+    /// How views are prepared.
+    pub options: ClipOptions,
+}
+
+impl ClipReader {
+    /// Reads the frames of `views` (each distinct one once), fits them to the configured size and normalises the
+    /// poses by the contexts.
+    ///
+    /// # Errors
+    /// [`DataError::NoSuchFrame`] for a position the scene does not have; whatever reading cameras or frames, fitting
+    /// ([`DataError::Upscale`]) or normalising ([`DataError::ZeroBaseline`]) gives; [`DataError::InFrame`] around
+    /// [`DataError::BadCamera`] for a camera that is too far from the contexts.
+    pub fn read(&self, scene: usize, views: &ViewIndices) -> Result<Clip, DataError> {
+        let key = self.source.key(scene);
+        let cameras = self.source.cameras(scene)?;
+        let wanted = views.context.iter().chain(&views.target);
+        if let Some(&frame) = wanted.clone().find(|frame| **frame >= cameras.len()) {
+            return Err(DataError::NoSuchFrame { key: key.to_owned(), frame, num_frames: cameras.len() });
+        }
+        let poses = |frames: &[usize]| frames.iter().map(|frame| cameras[*frame].c2w).collect::<Vec<_>>();
+        let (context, target) = (poses(&views.context), poses(&views.target));
+        let ClipOptions { pose_rotation, pose_scale, .. } = self.options;
+        let scene_frame = SceneFrame::find(key, &context, &target, pose_rotation, pose_scale).map_err(|error| {
+            // The normaliser counts through the views it was given; say which frame of the scene that is.
+            match error {
+                DataError::InFrame { key, frame, source } => {
+                    let frame = wanted.clone().nth(frame).copied().unwrap_or(frame);
+                    DataError::InFrame { key, frame, source }
+                }
+                other => other,
+            }
+        })?;
+        for &frame in wanted.clone() {
+            check_near(&scene_frame.normalize(cameras[frame].c2w)).map_err(|source| DataError::InFrame {
+                key: key.to_owned(),
+                frame,
+                source: Box::new(source),
+            })?;
+        }
+        let mut fitted = HashMap::new();
+        for &frame in wanted {
+            if let std::collections::hash_map::Entry::Vacant(entry) = fitted.entry(frame) {
+                entry.insert(self.fitted(scene, frame, &cameras[frame])?);
+            }
+        }
+        let gather = |frames: &[usize]| Views {
+            width: self.options.width,
+            height: self.options.height,
+            images: frames.iter().flat_map(|frame| &fitted[frame].0.rgb).copied().collect(),
+            c2w: frames.iter().map(|frame| scene_frame.normalize(cameras[*frame].c2w)).collect(),
+            intrinsics: frames.iter().map(|frame| fitted[frame].1).collect(),
+            frame_index: frames.to_vec(),
+        };
+        Ok(Clip { key: key.to_owned(), context: gather(&views.context), target: gather(&views.target) })
+    }
+
+    fn fitted(&self, scene: usize, frame: usize, camera: &Camera) -> Result<(Frame, Intrinsics), DataError> {
+        let ClipOptions { width, height, exact_principal_point, .. } = self.options;
+        let picture = self.source.frame(scene, frame)?;
+        fit(&picture, camera.intrinsics_norm, width, height, exact_principal_point).map_err(|source| {
+            DataError::InFrame { key: self.source.key(scene).to_owned(), frame, source: Box::new(source) }
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+    use crate::geometry::pose::Pose;
+    use crate::scene_source::Split;
+    use crate::sources::chunks::chunk_source::ChunkSource;
+    use crate::sources::filters::SceneFilters;
+    use crate::testing::TestSource;
+
+    const OPTIONS: ClipOptions = ClipOptions {
+        width: 32,
+        height: 32,
+        pose_rotation: PoseRotation::Quaternion,
+        pose_scale: PoseScale::Context,
+        exact_principal_point: false,
+    };
+
+    /// Reads the fixture's test scene, with the pose of frame 4 replaced and the decoded frames counted.
+    fn reader(frame_4: Option<Pose>, options: ClipOptions) -> (ClipReader, Arc<AtomicUsize>) {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
+        let chunks = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
+        let num_decoded = Arc::new(AtomicUsize::new(0));
+        let counter = num_decoded.clone();
+        let source = TestSource::new(chunks)
+            .with_cameras(move |_, mut cameras| {
+                cameras[4].c2w = frame_4.unwrap_or(cameras[4].c2w);
+                Ok(cameras)
+            })
+            .with_frames(move |_, _, frame| {
+                counter.fetch_add(1, Ordering::Relaxed);
+                Ok(frame)
+            });
+        (ClipReader { source: Arc::new(source), options }, num_decoded)
+    }
+
+    fn views(context: &[usize], target: &[usize]) -> ViewIndices {
+        ViewIndices { context: context.to_vec(), target: target.to_vec() }
+    }
+
+    #[test]
+    fn a_clip_holds_its_views_in_the_order_asked_for_and_decodes_each_frame_once() {
+        let (reader, num_decoded) = reader(None, OPTIONS);
+        let clip = reader.read(0, &views(&[7, 0, 2], &[2, 2, 5])).unwrap();
+        assert_eq!(num_decoded.load(Ordering::Relaxed), 4);
+        assert_eq!((clip.key.as_str(), clip.context.num_views()), ("00000000000000b1", 3));
+        assert_eq!((&clip.context.frame_index[..], &clip.target.frame_index[..]), (&[7, 0, 2][..], &[2, 2, 5][..]));
+        let bytes = 32 * 32 * 3;
+        assert_eq!((clip.context.images.len(), clip.target.images.len()), (3 * bytes, 3 * bytes));
+        assert_eq!(clip.context.images[2 * bytes..], clip.target.images[..bytes]);
+        assert_eq!(clip.target.images[..bytes], clip.target.images[bytes..2 * bytes]);
+        assert_ne!(clip.target.images[bytes..2 * bytes], clip.target.images[2 * bytes..]);
+        assert_eq!(clip.context.c2w[2], clip.target.c2w[0]);
+        // 64x36 to 57x32, cropped to 32: fx = 0.9 * 57, fy = 1.6 * 32, as f32 files hold them.
+        let intrinsics = clip.target.intrinsics[0];
+        assert!((intrinsics.fx - 51.3).abs() < 1e-5 && (intrinsics.fy - 51.2).abs() < 1e-5, "{intrinsics:?}");
+        assert_eq!((intrinsics.cx, intrinsics.cy), (16.0, 16.0));
+    }
+
+    #[test]
+    fn context_centres_span_one_and_targets_follow_their_frame() {
+        let (reader, _) = reader(None, OPTIONS);
+        let clip = reader.read(0, &views(&[0, 7], &[3])).unwrap();
+        let [first, last] = [0, 1].map(|view| clip.context.c2w[view].translation);
+        assert!((first + last).abs().max_element() < 1e-6, "{first} {last}"); // f32 files
+        assert!((first[0].abs() - 1.0).abs() < 1e-12, "{first:?}"); // the camera slides along x
+        let between = clip.target.c2w[0].translation;
+        // Centres are 0.1 * frame along a line: frame 3 of 0..7 is at -1 + 2 * 3 / 7.
+        assert!((between[0] - (6.0 / 7.0 - 1.0)).abs() < 1e-5, "{between:?}");
+    }
+
+    #[test]
+    fn a_pose_that_is_not_finite_names_scene_and_frame() {
+        let broken = Pose { translation: [0.0, f64::NAN, 0.0].into(), ..Pose::IDENTITY };
+        let (reader, _) = reader(Some(broken), OPTIONS);
+        let message = reader.read(0, &views(&[0, 7], &[3, 4])).unwrap_err().to_string();
+        assert_eq!(message, "frame 4 of scene 00000000000000b1: bad camera: the pose holds NaN");
+        assert!(reader.read(0, &views(&[0, 7], &[3])).is_ok());
+    }
+
+    #[test]
+    fn a_clip_of_one_place_a_missing_frame_and_a_large_size_are_errors() {
+        let message = |context: &[usize], width: usize| {
+            let (reader, _) = reader(None, ClipOptions { width, ..OPTIONS });
+            reader.read(0, &views(context, &[1])).unwrap_err().to_string()
+        };
+        assert!(message(&[2, 2], 32).starts_with("scene 00000000000000b1 has no baseline"), "{}", message(&[2, 2], 32));
+        let missing = "scene 00000000000000b1 has 8 frames, so there is no frame 8 (counted from 0)";
+        assert_eq!(message(&[0, 8], 32), missing);
+        assert!(message(&[0, 7], 65).contains("cannot make a 65x32 picture from one of 64x36"));
+    }
+}

@@ -1,0 +1,284 @@
+//! Evaluation indices: which frames of which scenes are given and which are measured.
+
+use std::collections::HashMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use serde::de::{Deserializer, MapAccess, Visitor};
+
+use crate::error::DataError;
+use crate::sampling::clip::ViewIndices;
+use crate::scene_source::SceneSource;
+use crate::skip_report::Ledger;
+
+/// An index as published: `{key: {"context": [..], "target": [..]} | null | {}}`, in the order of the file.
+#[derive(Clone, Debug)]
+pub struct EvaluationIndex {
+    path: PathBuf,
+    /// Every key with its views; `None` for null and empty entries.
+    entries: Vec<(String, Option<ViewIndices>)>,
+    positions: HashMap<String, usize>,
+}
+
+/// One scene to evaluate.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct EvaluationItem {
+    /// Position in the source.
+    pub scene: usize,
+    /// Frames, checked against the scene.
+    pub views: ViewIndices,
+}
+
+impl EvaluationIndex {
+    /// Reads an index file.
+    ///
+    /// # Errors
+    /// [`DataError::Io`], or [`DataError::BadIndex`] for another form, a doubled key, or an entry with contexts but no
+    /// targets or the reverse.
+    pub fn read(path: &Path) -> Result<Self, DataError> {
+        let text = std::fs::read(path).map_err(DataError::io("reading the evaluation index", path))?;
+        let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
+        let file: IndexFile = serde_json::from_slice(&text).map_err(|error| {
+            bad(format!("expected {{key: {{\"context\": [..], \"target\": [..]}} or null}}, got {error}"))
+        })?;
+        let mut positions = HashMap::with_capacity(file.0.len());
+        let mut entries = Vec::with_capacity(file.0.len());
+        for (key, entry) in file.0 {
+            let views = match entry.map(|Entry { context, target }| (context, target)) {
+                None => None,
+                Some((context, target)) if context.is_empty() && target.is_empty() => None,
+                Some((context, target)) if context.is_empty() || target.is_empty() => {
+                    let (contexts, targets) = (context.len(), target.len());
+                    return Err(bad(format!("scene {key} has {contexts} context and {targets} target frames")));
+                }
+                Some((context, target)) => Some(ViewIndices { context, target }),
+            };
+            if positions.insert(key.clone(), entries.len()).is_some() {
+                return Err(bad(format!("scene {key} comes twice")));
+            }
+            entries.push((key, views));
+        }
+        Ok(Self { path: path.to_path_buf(), entries, positions })
+    }
+
+    /// How many keys there are, null and empty entries included.
+    pub fn num_keys(&self) -> usize {
+        self.entries.len()
+    }
+
+    /// The entries that have views, in the order of the file.
+    pub fn usable(&self) -> impl Iterator<Item = (&str, &ViewIndices)> {
+        self.entries.iter().filter_map(|(key, views)| Some((key.as_str(), views.as_ref()?)))
+    }
+
+    /// What is evaluated of `key`, a scene of `num_frames` frames; `None` for a null or empty entry.
+    ///
+    /// # Errors
+    /// [`DataError::MissingIndexKey`] if the index does not have the key, [`DataError::BadIndex`] if it asks for a
+    /// frame that the scene does not have.
+    pub fn views(&self, key: &str, num_frames: usize) -> Result<Option<&ViewIndices>, DataError> {
+        let position = self.positions.get(key);
+        let position =
+            position.ok_or_else(|| DataError::MissingIndexKey { key: key.to_owned(), path: self.path.clone() })?;
+        let Some(views) = &self.entries[*position].1 else { return Ok(None) };
+        self.check_frames(key, views, num_frames)?;
+        Ok(Some(views))
+    }
+
+    /// The first `limit` scenes of `source` to evaluate (0: all), in the order of the file, and what is left out on
+    /// the way: null entries, empty entries, keys that the source does not have, scenes whose cameras cannot be read
+    /// and those that lack a frame. The ledger counts the entries that were looked at.
+    pub fn select(&self, source: &dyn SceneSource, limit: usize) -> (Vec<EvaluationItem>, Ledger) {
+        let mut ledger = Ledger::default();
+        let mut items = Vec::new();
+        for (key, views) in &self.entries {
+            if limit > 0 && items.len() == limit {
+                break;
+            }
+            ledger.num_scenes += 1;
+            let Some(views) = views else {
+                ledger.skip(key, "without views in the evaluation index");
+                continue;
+            };
+            let Some(scene) = source.find(key) else {
+                ledger.skip(key, "not in the data");
+                continue;
+            };
+            match source.cameras(scene).and_then(|cameras| self.check_frames(key, views, cameras.len())) {
+                Ok(()) => items.push(EvaluationItem { scene, views: views.clone() }),
+                Err(error) => ledger.skip(key, error.to_string()),
+            }
+        }
+        (items, ledger)
+    }
+
+    fn check_frames(&self, key: &str, views: &ViewIndices, num_frames: usize) -> Result<(), DataError> {
+        match views.context.iter().chain(&views.target).find(|frame| **frame >= num_frames) {
+            Some(frame) => Err(DataError::BadIndex {
+                what: format!("it asks for frame {frame} of scene {key}, which has {num_frames} frames"),
+                path: self.path.clone(),
+            }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// A JSON map in the order of the file.
+struct IndexFile(Vec<(String, Option<Entry>)>);
+
+/// Frames of one scene; published indices carry further fields, which are ignored.
+#[derive(Deserialize)]
+struct Entry {
+    #[serde(default)]
+    context: Vec<usize>,
+    #[serde(default)]
+    target: Vec<usize>,
+}
+
+impl<'de> Deserialize<'de> for IndexFile {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct InOrder;
+        impl<'de> Visitor<'de> for InOrder {
+            type Value = IndexFile;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a map from scene keys")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<IndexFile, A::Error> {
+                let mut entries = Vec::new();
+                while let Some(entry) = map.next_entry()? {
+                    entries.push(entry);
+                }
+                Ok(IndexFile(entries))
+            }
+        }
+        deserializer.deserialize_map(InOrder)
+    }
+}
+
+/// Contexts from the first to the last of `num_frames` frames, and targets spread over the frames between them;
+/// `None` for fewer frames than views, or fewer than 2 contexts.
+pub fn spread_views(num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
+    let num_views = num_context.checked_add(num_targets)?;
+    if num_context < 2 || num_frames < num_views {
+        return None;
+    }
+    let spread = |place: usize, count: usize, of: usize| (place * (of - 1) + (count - 1) / 2) / (count - 1);
+    let context: Vec<usize> = (0..num_context).map(|place| spread(place, num_context, num_frames)).collect();
+    let rest: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();
+    // With two to spare the ends are left out, which lie next to a context.
+    let has_spare = rest.len() >= num_targets + 2;
+    let place = |target: usize| if has_spare { spread(target + 1, num_targets + 2, rest.len()) } else { target };
+    let target = (0..num_targets).map(|target| rest[place(target)]).collect();
+    Some(ViewIndices { context, target })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene_source::Split;
+    use crate::sources::chunks::chunk_source::ChunkSource;
+    use crate::sources::filters::SceneFilters;
+    use crate::synthetic::config::SyntheticConfig;
+    use crate::synthetic::source::SyntheticSource;
+    use crate::testing::TestSource;
+
+    fn index(json: &str) -> Result<EvaluationIndex, DataError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("index.json");
+        std::fs::write(&path, json).unwrap();
+        EvaluationIndex::read(&path)
+    }
+
+    #[test]
+    fn views_run_from_the_first_to_the_last_frame_and_targets_are_no_contexts() {
+        for num_frames in 7..200 {
+            let ViewIndices { context, target } = spread_views(num_frames, 4, 3).unwrap();
+            assert_eq!((context[0], context[3]), (0, num_frames - 1));
+            assert_eq!((context.len(), target.len()), (4, 3));
+            assert!(context.is_sorted_by(|a, b| a < b) && target.is_sorted_by(|a, b| a < b), "{context:?} {target:?}");
+            assert!(target.iter().all(|frame| !context.contains(frame) && *frame < num_frames));
+        }
+        assert_eq!(spread_views(16, 4, 3).unwrap().context, [0, 5, 10, 15]);
+        assert!([spread_views(6, 4, 3), spread_views(9, 1, 3), spread_views(0, 0, 0)].iter().all(Option::is_none));
+        assert!([spread_views(9, 2, usize::MAX), spread_views(9, usize::MAX, 2)].iter().all(Option::is_none));
+    }
+
+    #[test]
+    fn null_and_empty_entries_are_kept_apart_from_usable_ones_in_file_order() {
+        let index = index(
+            r#"{"c": {"context": [5, 1], "target": [2, 2], "overlap": 0.5}, "b": null, "d": {}, "a": {"context": [0], "target": [0]}}"#,
+        )
+        .unwrap();
+        assert_eq!(index.num_keys(), 4);
+        assert_eq!(index.usable().map(|(key, _)| key).collect::<Vec<_>>(), ["c", "a"]);
+        let views = ViewIndices { context: vec![5, 1], target: vec![2, 2] };
+        assert_eq!(index.views("c", 6).unwrap(), Some(&views));
+        assert_eq!(index.views("b", 6).unwrap(), None);
+        assert_eq!(index.views("d", 6).unwrap(), None);
+    }
+
+    #[test]
+    fn a_key_that_is_missing_is_an_error_that_names_key_and_file() {
+        let message = index(r#"{"a": null}"#).unwrap().views("00ff", 9).unwrap_err().to_string();
+        assert!(message.starts_with("scene 00ff is not in the evaluation index: "), "{message}");
+        assert!(message.ends_with("index.json"), "{message}");
+    }
+
+    #[test]
+    fn a_frame_that_the_scene_does_not_have_is_an_error() {
+        let index = index(r#"{"a": {"context": [0, 5], "target": [1]}}"#).unwrap();
+        let message = index.views("a", 5).unwrap_err().to_string();
+        assert!(message.contains("it asks for frame 5 of scene a, which has 5 frames"), "{message}");
+    }
+
+    #[test]
+    fn other_forms_are_refused_with_the_reason() {
+        let message = |json: &str| index(json).unwrap_err().to_string();
+        assert!(message("[]").contains("expected {key:"), "{}", message("[]"));
+        assert!(message(r#"{"a": {"context": [-1], "target": [1]}}"#).contains("-1"));
+        assert!(message(r#"{"a": {"context": [1]}}"#).contains("scene a has 1 context and 0 target frames"));
+        assert!(message(r#"{"a": null, "a": null}"#).contains("scene a comes twice"));
+    }
+
+    #[test]
+    fn selecting_counts_what_is_left_out() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
+        let source = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
+        let (items, ledger) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&source, 0);
+        let views = ViewIndices { context: vec![0, 2, 5, 7], target: vec![1, 3, 4, 6] };
+        assert_eq!(items, [EvaluationItem { scene: 0, views }]);
+        assert_eq!(ledger.to_string(), "1 of 3 scenes used; 2 without views in the evaluation index");
+
+        let train = ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap();
+        let (items, ledger) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&train, 0);
+        assert!(items.is_empty());
+        assert_eq!(ledger.counts()["not in the data"], 1);
+    }
+
+    #[test]
+    fn an_entry_that_cannot_be_used_does_not_stop_the_rest_and_a_limit_ends_the_search() {
+        let config = SyntheticConfig { num_scenes: 5, num_frames: 8, ..Default::default() };
+        let broken = || DataError::BadCamera { what: "the pose holds NaN".into() };
+        let source = TestSource::new(SyntheticSource::new(config).unwrap())
+            .with_cameras(move |scene, cameras| if scene == 1 { Err(broken()) } else { Ok(cameras) });
+        let last_frames = [8, 7, 7, 7, 7]; // the first scene has no frame 8
+        let entries: Vec<String> = (0..5)
+            .map(|scene| {
+                format!(r#""{}": {{"context": [0, {}], "target": [3]}}"#, source.key(scene), last_frames[scene])
+            })
+            .collect();
+        let index = index(&format!("{{{}}}", entries.join(","))).unwrap();
+        let scenes = |items: &[EvaluationItem]| items.iter().map(|item| item.scene).collect::<Vec<_>>();
+
+        let (items, ledger) = index.select(&source, 0);
+        assert_eq!((scenes(&items), ledger.num_scenes), (vec![2, 3, 4], 5));
+        assert!(ledger.skips[0].reason.contains("asks for frame 8 of scene"), "{ledger}");
+        assert_eq!(ledger.skips[1].reason, "bad camera: the pose holds NaN");
+
+        let (items, ledger) = index.select(&source, 2);
+        assert_eq!((scenes(&items), ledger.num_scenes, ledger.num_used()), (vec![2, 3], 4, 2));
+    }
+}

@@ -1,0 +1,172 @@
+//! Mirrored clips: left and right exchanged in images, cameras and rays.
+
+use glam::{DMat3, DVec3};
+
+use crate::geometry::camera::Intrinsics;
+use crate::geometry::pose::Pose;
+use crate::sampling::clip::{Clip, Views};
+
+impl Clip {
+    /// Exchanges left and right in all views and in the world: image columns are reversed, poses become `S c2w S` with
+    /// `S = diag(-1, 1, 1)`, principal points move from `cx` to `width - cx`.
+    ///
+    /// A point at `x` of a view is then at `width - x`, a ray `[moment, direction]` becomes `[-S moment, S direction]`,
+    /// and the clip of mirrored frames, normalised, is the mirrored normalised clip.
+    ///
+    // Departs from pixelSplat, which flips before it rescales and crops: with an odd margin its crop then shows another
+    // column of pixels. Its intrinsics do not change, which is right for a principal point at the centre only.
+    #[must_use]
+    pub fn flipped(&self) -> Self {
+        Self { key: self.key.clone(), context: self.context.flipped(), target: self.target.flipped() }
+    }
+}
+
+impl Views {
+    fn flipped(&self) -> Self {
+        let row_bytes = self.width * 3;
+        let images = if row_bytes == 0 {
+            Vec::new()
+        } else {
+            let rows = self.images.chunks_exact(row_bytes);
+            rows.flat_map(|row| row.as_chunks::<3>().0.iter().rev()).flatten().copied().collect()
+        };
+        let mirrored = |k: &Intrinsics| Intrinsics { cx: self.width as f64 - k.cx, ..*k };
+        Self {
+            images,
+            c2w: self.c2w.iter().map(|pose| mirrored_pose(*pose)).collect(),
+            intrinsics: self.intrinsics.iter().map(mirrored).collect(),
+            frame_index: self.frame_index.clone(),
+            ..*self
+        }
+    }
+}
+
+/// `S pose S` with `S = diag(-1, 1, 1)`.
+fn mirrored_pose(Pose { rotation, translation }: Pose) -> Pose {
+    let mirror = DVec3::new(-1.0, 1.0, 1.0);
+    let [x, y, z] = [rotation.x_axis, rotation.y_axis, rotation.z_axis];
+    Pose { rotation: DMat3::from_cols(x * -mirror, y * mirror, z * mirror), translation: translation * mirror }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::error::DataError;
+    use crate::geometry::camera::Camera;
+    use crate::geometry::normalization::{PoseRotation, PoseScale};
+    use crate::image::rgb_image::Frame;
+    use crate::sampling::clip::ViewIndices;
+    use crate::sampling::clip_reader::{ClipOptions, ClipReader};
+    use crate::scene_source::SceneSource;
+    use crate::synthetic::config::SyntheticConfig;
+    use crate::synthetic::source::SyntheticSource;
+
+    /// A source in a mirror: flipped frames, and the cameras that took them.
+    struct Mirrored(SyntheticSource);
+
+    impl SceneSource for Mirrored {
+        fn num_scenes(&self) -> usize {
+            self.0.num_scenes()
+        }
+        fn key(&self, scene: usize) -> &str {
+            self.0.key(scene)
+        }
+        fn find(&self, key: &str) -> Option<usize> {
+            self.0.find(key)
+        }
+        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+            let mut cameras = self.0.cameras(scene)?;
+            for camera in &mut cameras {
+                camera.c2w = mirrored_pose(camera.c2w);
+                camera.intrinsics_norm.cx = 1.0 - camera.intrinsics_norm.cx;
+            }
+            Ok(cameras)
+        }
+        fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+            let Frame { width, height, rgb } = self.0.frame(scene, frame)?;
+            let rows = rgb.chunks_exact(width * 3);
+            let rgb = rows.flat_map(|row| row.as_chunks::<3>().0.iter().rev()).flatten().copied().collect();
+            Ok(Frame { width, height, rgb })
+        }
+    }
+
+    /// A room of 40 x 24 pixels whose principal points are off the middle.
+    fn room() -> SyntheticSource {
+        let config = SyntheticConfig { num_scenes: 1, num_frames: 9, width: 40, height: 24, ..Default::default() };
+        SyntheticSource::new(config).unwrap()
+    }
+
+    fn read(source: Arc<dyn SceneSource>, size: [usize; 2], rotation: PoseRotation) -> Clip {
+        let options = ClipOptions {
+            width: size[0],
+            height: size[1],
+            pose_rotation: rotation,
+            pose_scale: PoseScale::Context,
+            exact_principal_point: true,
+        };
+        let views = ViewIndices { context: vec![0, 3, 8], target: vec![5, 5] };
+        ClipReader { source, options }.read(0, &views).unwrap()
+    }
+
+    /// Plücker ray through a point of a view, in pixels: moment and direction.
+    fn ray(views: &Views, view: usize, x: f64, y: f64) -> [DVec3; 2] {
+        let (pose, Intrinsics { fx, fy, cx, cy }) = (views.c2w[view], views.intrinsics[view]);
+        let direction = pose.rotation * DVec3::new((x - cx) / fx, (y - cy) / fy, 1.0).normalize();
+        [pose.translation.cross(direction), direction]
+    }
+
+    #[test]
+    fn the_rays_of_a_flipped_clip_mirror_and_so_do_its_pixels() {
+        let mut clip = read(Arc::new(room()), [40, 16], PoseRotation::Quaternion);
+        for views in [&mut clip.context, &mut clip.target] {
+            for k in &mut views.intrinsics {
+                k.cx += 1.7;
+            }
+        }
+        let flipped = clip.flipped();
+        for (views, mirrored) in [(&clip.context, &flipped.context), (&clip.target, &flipped.target)] {
+            assert_eq!((mirrored.width, mirrored.height, &mirrored.frame_index), (40, 16, &views.frame_index));
+            for view in 0..views.num_views() {
+                for row in 0..16 {
+                    for column in 0..40 {
+                        let pixel = |views: &Views, column: usize| {
+                            let at = ((view * 16 + row) * 40 + column) * 3;
+                            views.images[at..at + 3].to_vec()
+                        };
+                        assert_eq!(pixel(views, column), pixel(mirrored, 39 - column));
+                        let (x, y) = (column as f64 + 0.5, row as f64 + 0.5);
+                        let [moment, direction] = ray(views, view, x, y);
+                        let got = ray(mirrored, view, 40.0 - x, y);
+                        let mirror = DVec3::new(-1.0, 1.0, 1.0);
+                        for (got, expected) in got.into_iter().zip([-mirror * moment, mirror * direction]) {
+                            assert!(got.abs_diff_eq(expected, 1e-12), "{got} against {expected}");
+                        }
+                    }
+                }
+            }
+        }
+        assert_eq!(flipped.flipped(), clip);
+        assert_ne!(flipped, clip);
+    }
+
+    #[test]
+    fn mirrored_frames_and_cameras_give_the_mirrored_clip() {
+        for rotation in [PoseRotation::Quaternion, PoseRotation::Axes] {
+            // 40 x 24 to 24 x 24 leaves 8 columns on either side.
+            let expected = read(Arc::new(Mirrored(room())), [24, 24], rotation);
+            let got = read(Arc::new(room()), [24, 24], rotation).flipped();
+            for (got, expected) in [(&got.context, &expected.context), (&got.target, &expected.target)] {
+                assert_eq!(got.images, expected.images);
+                let numbers = |views: &Views| -> Vec<f64> {
+                    let poses = views.c2w.iter().flat_map(|pose| pose.to_matrix_f64());
+                    poses.chain(views.intrinsics.iter().flat_map(|k| [k.fx, k.fy, k.cx, k.cy])).collect()
+                };
+                for (got, expected) in numbers(got).iter().zip(numbers(expected)) {
+                    assert!((got - expected).abs() < 1e-9, "{got} against {expected}");
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! Context views between the two ends of a stretch: drawn, spread in space, or spread in time.
+
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::random::distinct;
+
+/// How the contexts between the ends of a stretch are chosen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum InnerViews {
+    /// Uniformly, all different: what the paper trains with.
+    #[default]
+    Random,
+    /// The frame whose camera centre is farthest from those chosen, again and again, starting from both ends.
+    ///
+    /// Departs from `DepthSplat`, whose ends are what its search picks first and last, so that targets may lie outside.
+    FarthestPoint,
+    /// Evenly over the frames.
+    Even,
+}
+
+impl InnerViews {
+    /// Whether the choice looks at the camera centres.
+    pub fn needs_centres(self) -> bool {
+        self == Self::FarthestPoint
+    }
+
+    /// By default the key is not written: what runs from before it existed have on disk stays as it is.
+    #[allow(clippy::trivially_copy_pass_by_ref)] // serde's signature
+    pub(crate) fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Chooses `count` different frames between `left` and `right`, in increasing order. `centres` are the camera
+    /// centres of all frames of the scene; they are looked at only where [`InnerViews::needs_centres`] says so.
+    ///
+    /// Expects `count < right - left`, as [`BoundedSampler::sample`](crate::sampling::view_sampler::BoundedSampler::sample) makes sure.
+    pub(crate) fn choose(
+        self,
+        rng: &mut impl Rng,
+        left: usize,
+        right: usize,
+        count: usize,
+        centres: &[[f64; 3]],
+    ) -> Vec<usize> {
+        let gap = right - left;
+        match self {
+            Self::Random => distinct(rng, gap - 1, count).into_iter().map(|offset| left + 1 + offset).collect(),
+            // Rounded half up. Steps are of one frame or more, so no frame comes twice.
+            Self::Even => (1..=count).map(|place| left + (2 * place * gap + count + 1) / (2 * (count + 1))).collect(),
+            Self::FarthestPoint => farthest_points(left, right, count, centres),
+        }
+    }
+}
+
+/// Of equally far frames the first is taken.
+fn farthest_points(left: usize, right: usize, count: usize, centres: &[[f64; 3]]) -> Vec<usize> {
+    let squared = |a: usize, b: usize| (0..3).map(|i| (centres[a][i] - centres[b][i]).powi(2)).sum::<f64>();
+    let mut chosen = Vec::with_capacity(count);
+    // Squared distance of every inner frame to the nearest one chosen.
+    let mut nearest: Vec<(usize, f64)> =
+        (left + 1..right).map(|frame| (frame, squared(frame, left).min(squared(frame, right)))).collect();
+    for _ in 0..count {
+        let Some(place) = (0..nearest.len()).reduce(|a, b| if nearest[b].1 > nearest[a].1 { b } else { a }) else {
+            break;
+        };
+        let (frame, _) = nearest.remove(place);
+        chosen.push(frame);
+        for (other, distance) in &mut nearest {
+            *distance = distance.min(squared(*other, frame));
+        }
+    }
+    chosen.sort_unstable();
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::step_rng;
+
+    fn choose(inner: InnerViews, left: usize, right: usize, count: usize, centres: &[[f64; 3]]) -> Vec<usize> {
+        inner.choose(&mut step_rng(1, 2, "test"), left, right, count, centres)
+    }
+
+    #[test]
+    fn even_views_have_equal_gaps_to_half_a_frame() {
+        assert_eq!(choose(InnerViews::Even, 10, 19, 2, &[]), [13, 16]);
+        assert_eq!(choose(InnerViews::Even, 0, 7, 6, &[]), [1, 2, 3, 4, 5, 6]);
+        assert_eq!(choose(InnerViews::Even, 0, 5, 1, &[]), [3]); // 2.5, rounded up
+        assert!(choose(InnerViews::Even, 3, 9, 0, &[]).is_empty());
+        for gap in 1..60 {
+            for count in 0..gap {
+                let inner = choose(InnerViews::Even, 5, 5 + gap, count, &[]);
+                for (place, frame) in inner.iter().enumerate() {
+                    let ideal = 5.0 + (place + 1) as f64 * gap as f64 / (count + 1) as f64;
+                    assert!((*frame as f64 - ideal).abs() <= 0.5, "{inner:?} in a gap of {gap}");
+                }
+                let all: Vec<usize> = [5].into_iter().chain(inner).chain([5 + gap]).collect();
+                assert!(all.is_sorted_by(|a, b| a < b), "{all:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn farthest_points_are_where_the_camera_goes_and_not_where_it_rests() {
+        // Frames 0..6 rest at 0, then the camera goes to 4 in steps of one, then sideways.
+        let places = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0];
+        let centres: Vec<[f64; 3]> = places.iter().map(|&x| [x, 0.0, 0.0]).collect();
+        assert_eq!(choose(InnerViews::FarthestPoint, 0, 9, 1, &centres), [7]);
+        assert_eq!(choose(InnerViews::FarthestPoint, 0, 9, 3, &centres), [6, 7, 8]);
+        // A detour to the side beats the middle of the way.
+        let mut detour = centres;
+        detour[3] = [0.0, 9.0, 0.0];
+        assert_eq!(choose(InnerViews::FarthestPoint, 0, 9, 1, &detour), [3]);
+    }
+
+    #[test]
+    fn a_camera_that_stands_still_gives_different_frames_all_the_same() {
+        assert_eq!(choose(InnerViews::FarthestPoint, 4, 9, 4, &[[1.0; 3]; 10]), [5, 6, 7, 8]);
+        assert_eq!(choose(InnerViews::FarthestPoint, 4, 9, 2, &[[f64::NAN; 3]; 10]).len(), 2);
+    }
+
+    #[test]
+    fn names_in_a_config_are_in_snake_case() {
+        let parse = |text: &str| serde_json::from_str::<InnerViews>(text);
+        assert_eq!(parse(r#""farthest_point""#).unwrap(), InnerViews::FarthestPoint);
+        assert_eq!(parse(r#""even""#).unwrap(), InnerViews::Even);
+        assert!(parse(r#""equal""#).unwrap_err().to_string().contains("farthest_point"));
+    }
+}

@@ -1,0 +1,135 @@
+//! The scene of every batch slot: a function of (seed, step, slot), never of threads.
+
+use crate::derive_seed;
+use crate::random::mix;
+use crate::error::DataError;
+
+/// Rounds of the Feistel network behind [`SceneOrder`]; four suffice in theory, small rooms for error cost nothing.
+const FEISTEL_ROUNDS: u64 = 8;
+
+/// Which scene each slot of each batch takes: a new seeded permutation of all scenes per epoch, read in order.
+///
+/// Position `step * batch_size + slot` of the endless sequence lies in epoch `position / num_scenes`. The
+/// permutation is computed point by point (a Feistel network with cycle walking), so a million scenes cost no
+/// memory and any step is reached at once.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SceneOrder {
+    seed: u64,
+    num_scenes: u64,
+    batch_size: u64,
+    half_bits: u32,
+}
+
+impl SceneOrder {
+    /// Makes the order of `num_scenes` scenes in batches of `batch_size`.
+    ///
+    /// # Errors
+    /// [`DataError::BadConfig`] when there are no scenes or a batch has no slots.
+    pub fn new(seed: u64, num_scenes: usize, batch_size: usize) -> Result<Self, DataError> {
+        for (key, value) in [("num_scenes", num_scenes), ("batch_size", batch_size)] {
+            if value == 0 {
+                return Err(DataError::bad_config(key, "is 0; at least 1 is needed"));
+            }
+        }
+        let num_scenes = num_scenes as u64;
+        let bits = (u64::BITS - (num_scenes - 1).leading_zeros()).max(2);
+        let seed = derive_seed(seed, "scene order");
+        Ok(Self { seed, num_scenes, batch_size: batch_size as u64, half_bits: bits.div_ceil(2) })
+    }
+
+    /// Scene, in `0..num_scenes`, of batch slot `slot` at `step`.
+    pub fn scene(&self, step: u64, slot: usize) -> usize {
+        let position = self.position(step, slot);
+        self.permuted((position / u128::from(self.num_scenes)) as u64, (position % u128::from(self.num_scenes)) as u64)
+            as usize
+    }
+
+    /// Slots per batch.
+    pub fn batch_size(&self) -> usize {
+        self.batch_size as usize
+    }
+
+    fn position(&self, step: u64, slot: usize) -> u128 {
+        u128::from(step) * u128::from(self.batch_size) + slot as u128
+    }
+
+    fn permuted(&self, epoch: u64, place: u64) -> u64 {
+        let key = mix(self.seed ^ mix(epoch));
+        let mut value = place;
+        // The network permutes 0..4^half_bits, at most 8 times too many values: walk on until one fits.
+        loop {
+            value = self.feistel(key, value);
+            if value < self.num_scenes {
+                return value;
+            }
+        }
+    }
+
+    fn feistel(&self, key: u64, value: u64) -> u64 {
+        let mask = (1_u64 << self.half_bits) - 1;
+        let (mut left, mut right) = (value >> self.half_bits, value & mask);
+        for round in 0..FEISTEL_ROUNDS {
+            let next = left ^ (mix(mix(key.wrapping_add(round)) ^ right) & mask);
+            (left, right) = (right, next);
+        }
+        (left << self.half_bits) | right
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn the_scene_order_is_the_same_on_every_platform_and_in_every_release() {
+        let order = SceneOrder::new(7, 10, 5).unwrap();
+        let epochs: Vec<usize> = (0..4)
+            .flat_map(|step| (0..5).map(move |slot| (step, slot)))
+            .map(|(step, slot)| order.scene(step, slot))
+            .collect();
+        assert_eq!(epochs, [0, 4, 5, 6, 2, 3, 9, 1, 7, 8, 2, 1, 4, 9, 7, 8, 3, 6, 0, 5]);
+        assert_eq!(SceneOrder::new(7, 67_477, 8).unwrap().scene(30_000, 5), 34_403);
+    }
+
+    #[test]
+    fn every_scene_comes_to_every_place_equally_often_over_many_epochs() {
+        // 5,000 epochs of 5 scenes: each of the 25 counts is binomial with mean 1,000 and deviation 28.
+        let order = SceneOrder::new(3, 5, 5).unwrap();
+        let mut counts = [[0_i32; 5]; 5];
+        for epoch in 0..5_000 {
+            for (place, row) in counts.iter_mut().enumerate() {
+                row[order.scene(epoch, place)] += 1;
+            }
+        }
+        assert!(counts.iter().flatten().all(|count| (count - 1_000).abs() < 140), "{counts:?}");
+    }
+
+    #[test]
+    fn epochs_are_ordered_differently() {
+        let order = SceneOrder::new(3, 1_000, 1_000).unwrap();
+        let same = (0..1_000).filter(|&slot| order.scene(0, slot) == order.scene(1, slot)).count();
+        assert!(same < 10, "{same} of 1000 scenes kept their place");
+    }
+
+    #[test]
+    fn an_order_without_scenes_or_slots_is_refused() {
+        assert!(SceneOrder::new(0, 0, 1).unwrap_err().to_string().contains("num_scenes"));
+        assert!(SceneOrder::new(0, 1, 0).unwrap_err().to_string().contains("batch_size"));
+    }
+
+    proptest! {
+        #[test]
+        fn an_epoch_takes_every_scene_once_whatever_the_batch_size(seed: u64, num_scenes in 1_usize..400, batch in 1_usize..9, epoch in 0_u64..1_000) {
+            let order = SceneOrder::new(seed, num_scenes, batch).unwrap();
+            let first = epoch * num_scenes as u64;
+            let scenes: BTreeSet<usize> = (first..first + num_scenes as u64)
+                .map(|position| order.scene(position / batch as u64, (position % batch as u64) as usize))
+                .collect();
+            prop_assert_eq!(scenes, (0..num_scenes).collect());
+        }
+    }
+}

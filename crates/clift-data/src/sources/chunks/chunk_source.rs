@@ -1,0 +1,251 @@
+//! Scenes in the chunk layout of pixelSplat: `<root>/{train,test}/NNNNNN.torch` with an `index.json`.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use rayon::prelude::*;
+
+use crate::error::DataError;
+use crate::geometry::camera::Camera;
+use crate::image::codec::decode;
+use crate::image::rgb_image::Frame;
+use crate::scene_source::{SceneSource, Split};
+use crate::skip_report::{Ledger, counted, some_of};
+use crate::sources::chunks::index::read_index;
+use crate::sources::chunks::table::{ChunkTable, SceneTable};
+use crate::sources::filters::SceneFilters;
+use crate::sources::keys::{DL3DV_PREFIX, find_by_name};
+
+/// One chunk file; its table is read when a scene of it is first needed.
+struct Chunk {
+    path: PathBuf,
+    table: OnceLock<ChunkTable>,
+}
+
+impl Chunk {
+    /// Checks that the file is there.
+    fn find(&self) -> Result<(), DataError> {
+        let metadata = std::fs::metadata(&self.path)
+            .map_err(DataError::io("opening a chunk that index.json lists", &self.path))?;
+        if metadata.is_dir() {
+            let what = "index.json lists it as a chunk, but it is a folder".into();
+            return Err(DataError::BadChunk { what, path: self.path.clone() });
+        }
+        Ok(())
+    }
+
+    fn table(&self) -> Result<&ChunkTable, DataError> {
+        if let Some(table) = self.table.get() {
+            return Ok(table);
+        }
+        // Two threads may read the same chunk at once; the first to finish is kept.
+        let read = ChunkTable::read(&self.path)?;
+        Ok(self.table.get_or_init(|| read))
+    }
+}
+
+/// A scene's key and its chunk.
+struct Entry {
+    key: String,
+    chunk: usize,
+}
+
+/// Scenes of one split of a chunked data set, sorted by key, with random access to single frames.
+///
+/// Chunks are never read whole: a table of 24 bytes per frame is kept once a chunk has been used (about 0.2 GiB for
+/// all of RealEstate10K), and a frame or a scene's cameras are one read each.
+pub struct ChunkSource {
+    chunks: Vec<Chunk>,
+    scenes: Vec<Entry>,
+    positions: HashMap<String, usize>,
+    ledger: Ledger,
+}
+
+impl ChunkSource {
+    /// Opens `<root>/<split>`. Without filters this reads `index.json` alone; with filters, every chunk's table.
+    ///
+    /// Scenes whose chunk is missing, and with filters those that cannot be read, go into the ledger with the error
+    /// as the reason: a data set with a gap can be used.
+    ///
+    /// # Errors
+    /// [`DataError::Io`] for a missing `index.json`, [`DataError::BadIndex`] for one that is no map from keys to files
+    /// beside it, [`DataError::BadConfig`] for wrong filters, and the first chunk's error when every chunk fails.
+    pub fn open(root: &Path, split: Split, filters: &SceneFilters) -> Result<Self, DataError> {
+        let folder = root.join(split.to_string());
+        let index = read_index(&folder.join("index.json"))?;
+        let mut source = Self::of_index(&folder, &index, |_| true, filters, false)?;
+        source.tell_unlisted(&folder, &index);
+        Ok(source)
+    }
+
+    /// Opens the scenes of `index`, from keys to files in `folder`, that are `kept`. With `reads_all`, every chunk's
+    /// table is read even without filters.
+    pub(crate) fn of_index(
+        folder: &Path,
+        index: &BTreeMap<String, String>,
+        kept: impl Fn(&str) -> bool,
+        filters: &SceneFilters,
+        reads_all: bool,
+    ) -> Result<Self, DataError> {
+        filters.validate()?;
+        let mut chunk_ids = BTreeMap::new();
+        let mut chunks = Vec::new();
+        let mut scenes = Vec::with_capacity(index.len());
+        for (key, file) in index.iter().filter(|(key, _)| kept(key)) {
+            let chunk = *chunk_ids.entry(file).or_insert_with_key(|file| {
+                chunks.push(Chunk { path: folder.join(file), table: OnceLock::new() });
+                chunks.len() - 1
+            });
+            scenes.push(Entry { key: key.clone(), chunk });
+        }
+        let mut source = Self { chunks, ledger: Ledger::new(scenes.len()), scenes, positions: HashMap::new() };
+        source.leave_out(filters, reads_all || filters.is_any_set())?;
+        source.positions = source.scenes.iter().enumerate().map(|(i, entry)| (entry.key.clone(), i)).collect();
+        Ok(source)
+    }
+
+    /// What the filters left out, and what could not be read.
+    pub fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    /// Reads the file of one frame, JPEG or PNG, as it is in the chunk.
+    fn read_encoded(&self, scene: usize, frame: usize) -> Result<Vec<u8>, DataError> {
+        let (path, table) = self.table(scene)?;
+        let span = table.images.get(frame).ok_or_else(|| DataError::NoSuchFrame {
+            key: table.key.clone(),
+            frame,
+            num_frames: table.images.len(),
+        })?;
+        span.read(path)
+    }
+
+    /// Moves scenes into the ledger: those of chunks that fail, and those that the filters do not let through.
+    fn leave_out(&mut self, filters: &SceneFilters, reads_tables: bool) -> Result<(), DataError> {
+        let open = |chunk: &Chunk| {
+            chunk.find()?;
+            if reads_tables { chunk.table().map(|_| ()) } else { Ok(()) }
+        };
+        let opened: Vec<Result<(), DataError>> = self.chunks.par_iter().map(open).collect();
+        let failures: Vec<_> = opened.iter().map(|opened| opened.as_ref().err().map(ToString::to_string)).collect();
+        if failures.iter().all(Option::is_some) {
+            opened.into_iter().next().transpose()?;
+        }
+        let verdict = |scene: usize| {
+            let failure = failures[self.scenes[scene].chunk].clone();
+            let look = || {
+                if reads_tables {
+                    self.table(scene)?;
+                }
+                self.reason_to_skip(scene, filters)
+            };
+            failure.or_else(|| look().unwrap_or_else(|error| Some(error.to_string())))
+        };
+        let verdicts: Vec<Option<String>> = (0..self.scenes.len()).into_par_iter().map(verdict).collect();
+        let scenes = std::mem::take(&mut self.scenes);
+        for (entry, reason) in scenes.into_iter().zip(verdicts) {
+            match reason {
+                Some(reason) => self.ledger.skip(entry.key, reason),
+                None => self.scenes.push(entry),
+            }
+        }
+        Ok(())
+    }
+
+    /// Puts the scenes of chunks that `index` does not name into the ledger. Only tables that have been read are looked
+    /// at.
+    pub(crate) fn tell_unlisted(&mut self, folder: &Path, index: &BTreeMap<String, String>) {
+        let (mut unlisted, mut elsewhere) = (BTreeSet::new(), BTreeSet::new());
+        for chunk in &self.chunks {
+            for key in chunk.table.get().iter().flat_map(|table| table.scenes.keys()) {
+                match index.get(key) {
+                    None => {
+                        unlisted.insert(key.clone());
+                    }
+                    Some(file) if folder.join(file) != chunk.path => {
+                        elsewhere.insert(key.clone());
+                    }
+                    Some(_) => {}
+                }
+            }
+        }
+        self.ledger.num_scenes += unlisted.len();
+        for key in unlisted {
+            self.ledger.skip(key, "in a chunk but not in its index.json");
+        }
+        if !elsewhere.is_empty() {
+            let names: Vec<String> = elsewhere.into_iter().collect();
+            let note = format!(
+                "{} also in chunks other than those that index.json names, which are not used ({})",
+                counted(names.len(), "scene"),
+                some_of(&names)
+            );
+            self.ledger.notes.push(note);
+        }
+    }
+
+    fn reason_to_skip(&self, scene: usize, filters: &SceneFilters) -> Result<Option<String>, DataError> {
+        let num_frames = if filters.min_frames > 0 { self.num_frames(scene)? } else { 0 };
+        filters.reason_to_skip(num_frames, || self.cameras(scene))
+    }
+
+    /// The table of a scene, with the path of its chunk.
+    fn table(&self, scene: usize) -> Result<(&Path, &SceneTable), DataError> {
+        let num_scenes = self.scenes.len();
+        let Entry { key, chunk } = self.scenes.get(scene).ok_or(DataError::NoSuchScene { scene, num_scenes })?;
+        let chunk = &self.chunks[*chunk];
+        let table = chunk.table()?;
+        let scene = table.scenes.get(key).ok_or_else(|| DataError::BadChunk {
+            what: format!("scene {key} is expected in it, but it holds {} other scenes", table.scenes.len()),
+            path: chunk.path.clone(),
+        })?;
+        Ok((&chunk.path, scene))
+    }
+}
+
+impl SceneSource for ChunkSource {
+    fn num_scenes(&self) -> usize {
+        self.scenes.len()
+    }
+
+    fn key(&self, scene: usize) -> &str {
+        &self.scenes[scene].key
+    }
+
+    fn find(&self, key: &str) -> Option<usize> {
+        // DepthSplat's training chunks prefix the keys that its indices give without.
+        let prefixed = || self.positions.get(&format!("{DL3DV_PREFIX}{key}"));
+        let by_name = || find_by_name(self.scenes.iter().map(|entry| entry.key.as_str()), key);
+        self.positions.get(key).or_else(prefixed).copied().or_else(by_name)
+    }
+
+    fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
+        Ok(self.table(scene)?.1.images.len())
+    }
+
+    fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
+        let (path, table) = self.table(scene)?;
+        table.read_timestamps(path)
+    }
+
+    fn url(&self, scene: usize) -> Result<String, DataError> {
+        Ok(self.table(scene)?.1.url.clone())
+    }
+
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+        let (path, table) = self.table(scene)?;
+        table.read_cameras(path)
+    }
+
+    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+        decode(&self.read_encoded(scene, frame)?, self.key(scene), frame)
+    }
+
+    fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
+        self.read_encoded(scene, frame).map(Some)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,286 @@
+use proptest::prelude::*;
+use safetensors::SafeTensors;
+
+use super::*;
+
+const ALL: SceneFilters = SceneFilters { min_frames: 0, max_fov_deg: None };
+
+fn fixtures() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures")
+}
+
+/// A data set whose only training chunk has the given bytes and whose index lists the given scenes.
+fn with_chunk(bytes: &[u8], keys: &[&str]) -> (tempfile::TempDir, ChunkSource) {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::create_dir(folder.path().join("train")).unwrap();
+    std::fs::write(folder.path().join("train/000000.torch"), bytes).unwrap();
+    let index: BTreeMap<_, _> = keys.iter().map(|key| (*key, "000000.torch")).collect();
+    std::fs::write(folder.path().join("train/index.json"), serde_json::to_vec(&index).unwrap()).unwrap();
+    let source = ChunkSource::open(folder.path(), Split::Train, &ALL).unwrap();
+    (folder, source)
+}
+
+fn mini_chunk() -> Vec<u8> {
+    std::fs::read(fixtures().join("re10k-mini/train/000000.torch")).unwrap()
+}
+
+#[test]
+fn a_chunk_written_by_torch_save_is_read_frame_by_frame() {
+    let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &ALL).unwrap();
+    assert_eq!(source.num_scenes(), 2);
+    assert_eq!(source.ledger().to_string(), "2 of 2 scenes used");
+    let scene = source.find("00000000000000a2").unwrap();
+    assert_eq!(source.key(scene), "00000000000000a2");
+    assert_eq!(source.url(scene).unwrap(), "https://example.org/00000000000000a2");
+    let times: Vec<i64> = (0..8).map(|frame| 1_000_000 + 33_367 * frame).collect();
+    assert_eq!(source.timestamps(scene).unwrap(), times);
+
+    let bytes = std::fs::read(fixtures().join("reference/re10k_mini.safetensors")).unwrap();
+    let tensors = SafeTensors::deserialize(&bytes).unwrap();
+    let frame = source.frame(scene, 3).unwrap();
+    let expected = tensors.tensor("frame").unwrap();
+    assert_eq!(expected.shape(), [frame.height, frame.width, 3]);
+    let worst = frame.rgb.iter().zip(expected.data()).map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(worst <= Some(4), "{worst:?}"); // JPEG decoders round differently, chroma most
+    let expected: Vec<f64> =
+        tensors.tensor("c2w").unwrap().data().as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect();
+    let c2w = source.cameras(scene).unwrap()[3].c2w.to_matrix();
+    for (got, expected) in c2w.iter().zip(&expected) {
+        assert!((f64::from(*got) - expected).abs() < 1e-6, "{got} against {expected}"); // f32 file, f32 matrix
+    }
+}
+
+#[test]
+fn filters_leave_scenes_out_into_the_ledger() {
+    let open = |min_frames, max_fov_deg| {
+        let filters = SceneFilters { min_frames, max_fov_deg };
+        ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &filters).unwrap()
+    };
+    assert_eq!(open(8, Some(60.0)).num_scenes(), 2);
+    let short = open(9, None);
+    assert_eq!((short.num_scenes(), short.find("00000000000000a1")), (0, None));
+    assert_eq!(short.ledger().to_string(), "0 of 2 scenes used; 2 shorter than 9 frames");
+    // fx = 0.9 of the width: 58.1 degrees.
+    let wide = open(8, Some(58.0));
+    assert_eq!(wide.ledger().to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
+}
+
+#[test]
+fn sources_are_shared_between_threads() {
+    let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &ALL).unwrap();
+    let one_by_one: Vec<Frame> = (0..16).map(|i| source.frame(i / 8, i % 8).unwrap()).collect();
+    let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &ALL).unwrap();
+    let at_once: Vec<Frame> = (0..16).into_par_iter().map(|i| source.frame(i / 8, i % 8).unwrap()).collect();
+    assert_eq!(at_once, one_by_one);
+}
+
+#[test]
+fn truncated_chunks_are_errors_that_name_the_file() {
+    let bytes = mini_chunk();
+    for length in [0, 10, bytes.len() / 2, bytes.len() - 10] {
+        let (_folder, source) = with_chunk(&bytes[..length], &["00000000000000a1"]);
+        let message = source.frame(0, 0).unwrap_err().to_string();
+        assert!(message.starts_with("bad chunk: ") && message.ends_with("000000.torch"), "{length}: {message}");
+        assert!(message.contains("truncated"), "{length}: {message}");
+    }
+}
+
+#[test]
+fn a_chunk_whose_pickle_calls_os_system_is_refused() {
+    let bytes = std::fs::read(fixtures().join("hostile/calls_system.torch")).unwrap();
+    let (_folder, source) = with_chunk(&bytes, &["a"]);
+    let message = source.cameras(0).unwrap_err().to_string();
+    assert!(message.contains("`os.system`") && message.ends_with("000000.torch"), "{message}");
+}
+
+#[test]
+fn a_frame_with_a_flipped_bit_is_found_by_its_checksum() {
+    let mut bytes = mini_chunk();
+    let start = bytes.windows(4).position(|window| window == b"\xff\xd8\xff\xe0").unwrap();
+    bytes[start + 700] ^= 1;
+    let (_folder, source) = with_chunk(&bytes, &["00000000000000a1"]);
+    let message = source.frame(0, 0).unwrap_err().to_string();
+    assert!(message.contains("has another checksum") && message.ends_with("000000.torch"), "{message}");
+    assert!(source.frame(0, 1).is_ok());
+}
+
+proptest! {
+    #[test]
+    fn a_chunk_with_bytes_changed_never_panics(
+        changes in proptest::collection::vec((0.0..1.0, any::<bool>(), any::<u8>()), 1..8),
+    ) {
+        let mut bytes = mini_chunk();
+        // Half of the changes hit the pickle and the first headers, half anywhere, the directory included.
+        for (at, near_start, byte) in changes {
+            let range = if near_start { 3000 } else { bytes.len() };
+            bytes[(at * range as f64) as usize] = byte;
+        }
+        let (_folder, source) = with_chunk(&bytes, &["00000000000000a1"]);
+        let _ = (source.cameras(0), source.timestamps(0), source.frame(0, 0));
+    }
+}
+
+#[test]
+fn a_key_that_the_chunk_does_not_hold_is_an_error() {
+    let (_folder, source) = with_chunk(&mini_chunk(), &["00ff"]);
+    let message = source.cameras(0).unwrap_err().to_string();
+    assert!(message.contains("scene 00ff is expected in it, but it holds 2 other scenes"), "{message}");
+}
+
+#[test]
+fn a_frame_or_scene_that_does_not_exist_is_an_error() {
+    let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Test, &ALL).unwrap();
+    let message = source.frame(0, 8).unwrap_err().to_string();
+    assert_eq!(message, "scene 00000000000000b1 has 8 frames, so there is no frame 8 (counted from 0)");
+    let message = source.frame(1, 0).unwrap_err().to_string();
+    assert_eq!(message, "there are 1 scenes, so there is no scene 1 (counted from 0)");
+}
+
+#[test]
+fn bad_indices_and_missing_chunks_are_errors_that_name_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let open = || ChunkSource::open(folder.path(), Split::Test, &ALL).err().map(|error| error.to_string()).unwrap();
+    assert!(open().starts_with("reading the scene index failed: "), "{}", open());
+    std::fs::create_dir(folder.path().join("test")).unwrap();
+    let index = folder.path().join("test/index.json");
+    std::fs::write(&index, "[1, 2]").unwrap();
+    assert!(open().contains("expected a map from scene keys to chunk files"), "{}", open());
+    std::fs::write(&index, r#"{"a": "../../secret.torch"}"#).unwrap();
+    assert!(open().contains("expected a file beside the index"), "{}", open());
+    std::fs::write(&index, r#"{"a": ""}"#).unwrap();
+    assert!(open().contains(r#"scene a is in "", expected a file beside the index"#), "{}", open());
+    std::fs::write(&index, r#"{"a": "000000.torch"}"#).unwrap();
+    assert!(open().starts_with("opening a chunk that index.json lists failed"), "{}", open());
+    assert!(open().ends_with("000000.torch"), "{}", open());
+    std::fs::create_dir(folder.path().join("test/000000.torch")).unwrap();
+    let expected = "bad chunk: index.json lists it as a chunk, but it is a folder: ";
+    assert!(open().starts_with(expected) && open().ends_with("000000.torch"), "{}", open());
+}
+
+/// A data set of the mini chunk under three names, the last of which is changed, with a scene of each.
+fn three_chunks(change: impl FnOnce(&Path)) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let train = folder.path().join("train");
+    std::fs::create_dir(&train).unwrap();
+    for name in ["0.torch", "1.torch", "2.torch"] {
+        std::fs::write(train.join(name), mini_chunk()).unwrap();
+    }
+    let index = r#"{"00000000000000a1": "0.torch", "00000000000000a2": "2.torch"}"#;
+    std::fs::write(train.join("index.json"), index).unwrap();
+    change(&train.join("2.torch"));
+    folder
+}
+
+#[test]
+fn scenes_of_a_chunk_that_fails_are_left_out_with_its_error() {
+    let lists = SceneFilters { min_frames: 8, max_fov_deg: None };
+    let truncate = |path: &Path| std::fs::write(path, &mini_chunk()[..3000]).unwrap();
+    let remove = |path: &Path| std::fs::remove_file(path).unwrap();
+    for (folder, filters, reason) in [
+        (three_chunks(truncate), &lists, "1 bad chunk: "),
+        (three_chunks(remove), &lists, "1 opening a chunk that index.json lists failed: "),
+        (three_chunks(remove), &ALL, "1 opening a chunk that index.json lists failed: "),
+    ] {
+        let source = ChunkSource::open(folder.path(), Split::Train, filters).unwrap();
+        assert_eq!((source.num_scenes(), source.key(0)), (1, "00000000000000a1"));
+        assert!(source.find("00000000000000a2").is_none() && source.frame(0, 0).is_ok());
+        let ledger = source.ledger().to_string();
+        assert!(ledger.starts_with(&format!("1 of 2 scenes used; {reason}")), "{ledger}");
+        assert!(ledger.contains("2.torch"), "{ledger}");
+    }
+}
+
+#[test]
+fn scenes_whose_cameras_cannot_be_read_are_left_out_by_the_field_of_view() {
+    let folder = tempfile::tempdir().unwrap();
+    let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &ALL).unwrap();
+    let records = (0..2).map(|scene| {
+        let mut cameras = source.cameras(scene).unwrap();
+        if scene == 0 {
+            cameras[3].c2w.translation[1] = f64::NAN;
+        }
+        let images = (0..8).map(|frame| source.encoded_frame(scene, frame).unwrap().unwrap()).collect();
+        let (key, timestamps) = (source.key(scene).into(), source.timestamps(scene).unwrap());
+        Ok(crate::sources::chunks::writer::SceneRecord { key, url: String::new(), timestamps, cameras, images })
+    });
+    crate::sources::chunks::writer::write_chunks(&folder.path().join("train"), records, u64::MAX).unwrap();
+    let filters = SceneFilters { min_frames: 0, max_fov_deg: Some(100.0) };
+    let source = ChunkSource::open(folder.path(), Split::Train, &filters).unwrap();
+    assert_eq!((source.num_scenes(), source.key(0)), (1, "00000000000000a2"));
+    let skip = &source.ledger().skips[0];
+    assert!(skip.key == "00000000000000a1" && skip.reason.contains("frame 3: bad camera: "), "{skip:?}");
+}
+
+#[test]
+fn a_field_of_view_that_is_no_positive_number_is_refused() {
+    for limit in [f64::NAN, f64::INFINITY, 0.0, -1.0] {
+        let filters = SceneFilters { min_frames: 0, max_fov_deg: Some(limit) };
+        let message = filters.validate().unwrap_err().to_string();
+        assert_eq!(message, format!("max_fov_deg is {limit}; use a positive number such as 100"));
+        assert!(ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &filters).is_err());
+    }
+    assert!(ALL.validate().is_ok());
+}
+
+/// An archive whose pickle is a list of `scenes`, after a tensor in memo slot 1 and a list of 10,000 references
+/// to it in slot 2.
+fn sharing_chunk(scenes: &[u8]) -> Vec<u8> {
+    let mut pickle = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((X\x07\0\0\0storagectorch\nByteStorage\n\
+        X\x01\0\0\x000X\x03\0\0\0cpuK\0tQK\0K\0\x85K\x01\x85\x89ccollections\nOrderedDict\n)RtRq\x01"
+        .to_vec();
+    pickle.extend(b"](");
+    pickle.extend(b"h\x01".repeat(10_000));
+    pickle.extend(b"eq\x02](");
+    pickle.extend(scenes);
+    pickle.extend(b"e.");
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    // 10,000 rows of cameras, and as many time stamps.
+    for (name, bytes) in [("data.pkl", pickle), ("data/0", Vec::new()), ("data/1", vec![0; 720_000])] {
+        zip.start_file(format!("bomb/{name}"), options).unwrap();
+        std::io::Write::write_all(&mut zip, &bytes).unwrap();
+    }
+    zip.finish().unwrap().into_inner()
+}
+
+/// A scene with the 10,000 shared images and opcodes that give its address; the memo's slot 3 receives it.
+fn sharing_scene(key: &str, url: &[u8]) -> Vec<u8> {
+    let mut scene = b"}(X\x06\0\0\0imagesh\x02X\x03\0\0\0keyX".to_vec();
+    scene.extend((key.len() as u32).to_le_bytes());
+    scene.extend(key.as_bytes());
+    scene.extend(b"X\x03\0\0\0url");
+    scene.extend(url);
+    for (name, storage, shape) in [
+        ("cameras", "FloatStorage", &b"M\x10\x27K\x12\x86K\x12K\x01\x86"[..]),
+        ("timestamps", "LongStorage", b"M\x10\x27\x85K\x01\x85"),
+    ] {
+        scene.push(b'X');
+        scene.extend((name.len() as u32).to_le_bytes());
+        scene.extend(format!("{name}ctorch._utils\n_rebuild_tensor_v2\n((").as_bytes());
+        scene.extend(format!("X\x07\0\0\0storagectorch\n{storage}\nX\x01\0\0\x001X\x03\0\0\0cpuK\0tQK\0").as_bytes());
+        scene.extend(shape);
+        scene.extend(b"\x89ccollections\nOrderedDict\n)RtR");
+    }
+    scene.extend(b"uq\x03");
+    scene
+}
+
+#[test]
+fn scenes_that_share_what_they_refer_to_cannot_fill_the_memory() {
+    let message = |scenes: &[u8]| {
+        let (_folder, source) = with_chunk(&sharing_chunk(scenes), &["a"]);
+        source.num_frames(0).map_err(|error| error.to_string())
+    };
+    let empty = b"X\0\0\0\0";
+    assert_eq!(message(&sharing_scene("a", empty)), Ok(10_000), "the file is one that can be read");
+    // 2,000 million frames of 24 bytes, from 400 kB.
+    let repeated = [sharing_scene("a", empty), b"h\x03".repeat(200_000)].concat();
+    assert!(message(&repeated).unwrap_err().contains("scene 1: key \"a\": it comes twice"));
+    let scenes: Vec<u8> = (0..1000).flat_map(|number| sharing_scene(&format!("{number}"), empty)).collect();
+    assert!(message(&scenes).unwrap_err().contains("more than the limit of 131072 frames"));
+    let long = [b"X\0\0\x40\0", vec![b'u'; 0x40_0000].as_slice(), b"q\x04"].concat();
+    let scenes: Vec<u8> = (0..9)
+        .flat_map(|number| sharing_scene(&format!("{number}"), if number == 0 { &long } else { b"h\x04" }))
+        .collect();
+    assert!(message(&scenes).unwrap_err().contains("more than the limit of 16777216 bytes"));
+}

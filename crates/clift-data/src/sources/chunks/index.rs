@@ -1,0 +1,125 @@
+//! Which scene is in which file of a folder of chunks, by `index.json` or by looking.
+
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
+use std::path::{Component, Path};
+
+use rayon::prelude::*;
+
+use crate::error::DataError;
+use crate::files::listing::{file_names, has_ending};
+use crate::skip_report::{Ledger, counted, some_of};
+use crate::sources::chunks::table::ChunkTable;
+use crate::sources::test_scenes::TestScenes;
+
+/// What the reference's tool writes beside scenes in files of their own: keys of those whose pictures have another size.
+const INVALID_KEYS: &str = "invalid_keys.txt";
+
+/// Reads `index.json`: scene key to file name, sorted by key.
+pub(crate) fn read_index(path: &Path) -> Result<BTreeMap<String, String>, DataError> {
+    let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
+    let text = std::fs::read(path).map_err(DataError::io("reading the scene index", path))?;
+    let index: BTreeMap<String, String> = serde_json::from_slice(&text)
+        .map_err(|error| bad(format!("expected a map from scene keys to chunk files, got {error}")))?;
+    for (key, file) in &index {
+        if file.is_empty() || !Path::new(file).components().all(|part| matches!(part, Component::Normal(_))) {
+            return Err(bad(format!("scene {key} is in {file:?}, expected a file beside the index")));
+        }
+    }
+    Ok(index)
+}
+
+/// A note on chunks in `folder` that `index` does not name, if there are any.
+pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> Result<Option<String>, DataError> {
+    let mut files = torch_files(folder)?;
+    let mut named: Vec<&String> = index.values().collect();
+    named.sort_unstable();
+    files.retain(|file| named.binary_search(&file).is_err());
+    let note = || {
+        let counted = counted(files.len(), ".torch file");
+        format!("not in index.json and so not opened: {counted} ({})", some_of(&files))
+    };
+    Ok((!files.is_empty()).then(note))
+}
+
+/// Scenes in files of their own, by the names of these. Chunks whose index is missing are looked into.
+///
+/// # Errors
+/// [`DataError::Io`] for a folder that cannot be listed, and what reading `invalid_keys.txt` gives.
+pub(crate) fn index_of_files(folder: &Path, ledger: &mut Ledger) -> Result<BTreeMap<String, String>, DataError> {
+    let files = torch_files(folder)?;
+    let stem = |file: &str| file.strip_suffix(".torch").unwrap_or(file).to_owned();
+    let first = files.iter().take(8).find_map(|file| Some((file, ChunkTable::read(&folder.join(file)).ok()?)));
+    if first.is_some_and(|(file, table)| table.scenes.len() != 1 || !table.scenes.contains_key(&stem(file))) {
+        return Ok(index_of_chunks(folder, &files, ledger));
+    }
+    let mut index: BTreeMap<String, String> = files.iter().map(|file| (stem(file), file.clone())).collect();
+    let invalid = folder.join(INVALID_KEYS);
+    if invalid.is_file() {
+        let invalid = TestScenes::read(&invalid)?;
+        for key in index.keys().filter(|key| invalid.contains(key)) {
+            ledger.num_scenes += 1;
+            ledger.skip(key, format!("in {INVALID_KEYS}"));
+        }
+        index.retain(|key, _| !invalid.contains(key));
+    }
+    Ok(index)
+}
+
+fn index_of_chunks(folder: &Path, files: &[String], ledger: &mut Ledger) -> BTreeMap<String, String> {
+    let tables: Vec<_> = files.par_iter().map(|file| (file, ChunkTable::read(&folder.join(file)))).collect();
+    let mut index = BTreeMap::new();
+    let mut again = Vec::new();
+    for (file, table) in tables {
+        match table {
+            Ok(table) => {
+                for key in table.scenes.into_keys() {
+                    match index.entry(key) {
+                        Entry::Vacant(place) => {
+                            place.insert(file.clone());
+                        }
+                        Entry::Occupied(first) => again.push(format!("{} in {} and {file}", first.key(), first.get())),
+                    }
+                }
+            }
+            Err(error) => {
+                ledger.num_scenes += 1;
+                ledger.skip(file, error.to_string());
+            }
+        }
+    }
+    if !again.is_empty() {
+        again.sort_unstable();
+        let counted = counted(again.len(), "scene");
+        let note = format!("{counted} in more than one file, of which the first is used ({})", some_of(&again));
+        ledger.notes.push(note);
+    }
+    ledger.notes.push(format!("there is no index.json: the scenes of {} files were looked up", files.len()));
+    index
+}
+
+fn torch_files(folder: &Path) -> Result<Vec<String>, DataError> {
+    let mut files = file_names(folder)?;
+    files.retain(|name| has_ending(name, "torch"));
+    files.sort_unstable();
+    Ok(files)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sources::chunks::writer::{SceneRecord, scene_file_bytes};
+
+    #[test]
+    fn a_key_may_end_as_a_file_does() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.torch.torch");
+        let (key, url) = ("a.torch".to_owned(), String::new());
+        let scene = SceneRecord { key, url, timestamps: Vec::new(), cameras: Vec::new(), images: Vec::new() };
+        std::fs::write(&path, scene_file_bytes(&path, &scene).unwrap()).unwrap();
+        let mut ledger = Ledger::default();
+        let index = index_of_files(folder.path(), &mut ledger).unwrap();
+        assert_eq!(index, BTreeMap::from([("a.torch".to_owned(), "a.torch.torch".to_owned())]));
+        assert!(ledger.notes.is_empty(), "it is no chunk: {ledger}");
+    }
+}

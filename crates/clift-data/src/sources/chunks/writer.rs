@@ -1,0 +1,285 @@
+//! Writes scenes in the chunk layout: files that `torch.load` and [`crate::sources::chunks::chunk_source::ChunkSource`] read.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use crate::error::DataError;
+use crate::files::atomic::replace;
+use crate::geometry::camera::Camera;
+use crate::torch::pickle_writer::PickleWriter;
+use crate::torch::values::{MAX_BYTES, MAX_VALUES};
+
+/// Size at which a chunk is closed, in bytes of pictures: 100 MB, as in the published RealEstate10K chunks.
+pub const DEFAULT_CHUNK_BYTES: u64 = 100_000_000;
+/// Frames at which a chunk is closed whatever their size: a reader takes 1,048,576 values, some 19 per frame.
+const MAX_CHUNK_FRAMES: usize = 50_000;
+
+/// One scene to write.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SceneRecord {
+    /// Unique key.
+    pub key: String,
+    /// Where it comes from; may be empty.
+    pub url: String,
+    /// One per frame: microseconds for RealEstate10K, frame numbers for DL3DV.
+    pub timestamps: Vec<i64>,
+    /// One per frame.
+    pub cameras: Vec<Camera>,
+    /// One JPEG or PNG file per frame.
+    pub images: Vec<Vec<u8>>,
+}
+
+impl SceneRecord {
+    /// Says which lists differ in length, and whether it is more than a reader takes.
+    pub(crate) fn check(&self) -> Result<(), String> {
+        let Self { key, timestamps, cameras, images, .. } = self;
+        let (timestamps, cameras, images) = (timestamps.len(), cameras.len(), images.len());
+        if timestamps != images || cameras != images {
+            return Err(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps"));
+        }
+        if Fill::default().has_room(self) {
+            return Ok(());
+        }
+        Err(format!("scene {key} has {images} frames, more than a file holds (about 50,000)"))
+    }
+}
+
+/// How full a file is.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Fill {
+    /// Bytes of pictures.
+    image_bytes: u64,
+    num_frames: usize,
+    /// Values and bytes of the pickle, or a few more.
+    num_values: usize,
+    pickle_bytes: usize,
+}
+
+impl Fill {
+    fn with(self, scene: &SceneRecord) -> Self {
+        let num_frames = scene.images.len();
+        // A tensor has 19 values and 170 bytes at most; beside a frame's there are two of the scene and the five names.
+        Self {
+            image_bytes: self.image_bytes + scene.images.iter().map(|image| image.len() as u64).sum::<u64>(),
+            num_frames: self.num_frames + num_frames,
+            num_values: self.num_values + 20 * num_frames + 60,
+            pickle_bytes: self.pickle_bytes + 180 * num_frames + 600 + scene.url.len() + scene.key.len(),
+        }
+    }
+
+    /// Takes up a scene.
+    pub fn add(&mut self, scene: &SceneRecord) {
+        *self = self.with(scene);
+    }
+
+    /// Whether readers take the file with one scene more.
+    pub fn has_room(self, scene: &SceneRecord) -> bool {
+        let Self { num_values, pickle_bytes, .. } = self.with(scene);
+        num_values < MAX_VALUES && pickle_bytes < MAX_BYTES
+    }
+
+    /// Whether the file has the size that was asked for.
+    pub fn is_full(self, target_bytes: u64) -> bool {
+        self.image_bytes >= target_bytes || self.num_frames >= MAX_CHUNK_FRAMES
+    }
+}
+
+/// Writes `000000.torch, 000001.torch, ..` and, when all are written, `index.json` into `folder`; returns how many
+/// scenes there are. A chunk is closed once its pictures have `target_bytes` or more. Every file appears under its
+/// name only when it is complete, and an existing `index.json` is not overwritten.
+///
+/// # Errors
+/// Whatever an item carries, [`DataError::Io`] from writing, [`DataError::BadIndex`] for an existing index, two scenes
+/// of one key, or a scene whose lists differ in length.
+pub fn write_chunks(
+    folder: &Path,
+    scenes: impl IntoIterator<Item = Result<SceneRecord, DataError>>,
+    target_bytes: u64,
+) -> Result<usize, DataError> {
+    std::fs::create_dir_all(folder).map_err(DataError::io("making the folder", folder))?;
+    let index_path = folder.join("index.json");
+    let bad = |what: String| DataError::BadIndex { what, path: index_path.clone() };
+    if index_path.exists() {
+        return Err(bad("it exists already; choose an empty folder".into()));
+    }
+    let mut index = BTreeMap::new();
+    let mut num_chunks = 0;
+    let mut pending = Vec::new();
+    let mut fill = Fill::default();
+    for scene in scenes {
+        let scene = scene?;
+        scene.check().map_err(&bad)?;
+        if !fill.has_room(&scene) {
+            write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
+            num_chunks += 1;
+            pending.clear();
+            fill = Fill::default();
+        }
+        if index.insert(scene.key.clone(), chunk_name(num_chunks)).is_some() {
+            return Err(bad(format!("scene {} comes twice", scene.key)));
+        }
+        fill.add(&scene);
+        pending.push(scene);
+        if fill.is_full(target_bytes) {
+            write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
+            num_chunks += 1;
+            pending.clear();
+            fill = Fill::default();
+        }
+    }
+    if !pending.is_empty() {
+        write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
+    }
+    let text = serde_json::to_vec_pretty(&index).map_err(|error| bad(error.to_string()))?;
+    replace(&index_path, &text).map_err(DataError::io("writing the index", &index_path))?;
+    Ok(index.len())
+}
+
+pub(crate) fn chunk_name(number: usize) -> String {
+    format!("{number:06}.torch")
+}
+
+/// Writes a list of scenes.
+fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
+    replace(path, &chunk_bytes(path, scenes)?).map_err(DataError::io("writing a chunk", path))
+}
+
+/// The file at `path` of a list of scenes.
+pub(crate) fn chunk_bytes(path: &Path, scenes: &[SceneRecord]) -> Result<Vec<u8>, DataError> {
+    let mut pickle = PickleWriter::new();
+    pickle.raw(b"](");
+    for scene in scenes {
+        write_scene(scene, &mut pickle);
+    }
+    pickle.raw(b"e.");
+    pack(path, pickle)
+}
+
+/// The file at `path` of a scene by itself, as the reference's tool writes it.
+pub(crate) fn scene_file_bytes(path: &Path, scene: &SceneRecord) -> Result<Vec<u8>, DataError> {
+    let mut pickle = PickleWriter::new();
+    write_scene(scene, &mut pickle);
+    pickle.raw(b".");
+    pack(path, pickle)
+}
+
+fn pack(path: &Path, pickle: PickleWriter) -> Result<Vec<u8>, DataError> {
+    let prefix = path.file_stem().unwrap_or_default().to_string_lossy();
+    pickle.pack(&prefix).map_err(|error| DataError::io("packing a chunk", path)(error.into()))
+}
+
+/// Time stamps as a file has them.
+pub(crate) fn timestamp_bytes(timestamps: &[i64]) -> Vec<u8> {
+    timestamps.iter().flat_map(|time| time.to_le_bytes()).collect()
+}
+
+/// Cameras as a file has them: rows of 18 f32.
+pub(crate) fn camera_bytes(cameras: &[Camera]) -> Vec<u8> {
+    let rows = cameras.iter().flat_map(Camera::to_re10k);
+    rows.flat_map(|number| (number as f32).to_le_bytes()).collect()
+}
+
+fn write_scene(scene: &SceneRecord, pickle: &mut PickleWriter) {
+    let num_frames = scene.images.len();
+    pickle.raw(b"}(");
+    pickle.string("url");
+    pickle.string(&scene.url);
+    pickle.string("timestamps");
+    pickle.tensor("LongStorage", timestamp_bytes(&scene.timestamps), &[num_frames]);
+    pickle.string("cameras");
+    pickle.tensor("FloatStorage", camera_bytes(&scene.cameras), &[num_frames, 18]);
+    pickle.string("images");
+    pickle.raw(b"](");
+    for image in &scene.images {
+        pickle.tensor("ByteStorage", image.clone(), &[image.len()]);
+    }
+    pickle.raw(b"e");
+    pickle.string("key");
+    pickle.string(&scene.key);
+    pickle.raw(b"u");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene_source::{SceneSource, Split};
+    use crate::sources::chunks::chunk_source::ChunkSource;
+    use crate::sources::filters::SceneFilters;
+
+    fn record(key: &str, num_frames: usize) -> SceneRecord {
+        let camera = |frame: usize| {
+            let mut row = [0.0; 18];
+            row[..4].copy_from_slice(&[0.9, 1.6, 0.5, 0.5]);
+            (row[6], row[11], row[16]) = (1.0, 1.0, 1.0);
+            row[9] = frame as f64;
+            Camera::from_re10k(row).unwrap()
+        };
+        SceneRecord {
+            key: key.into(),
+            url: format!("https://example.org/{key}"),
+            timestamps: (0..num_frames as i64).map(|frame| frame * 33_367 + (1 << 33)).collect(),
+            cameras: (0..num_frames).map(camera).collect(),
+            images: (0..num_frames).map(|frame| vec![frame as u8; 100 + frame % 50]).collect(),
+        }
+    }
+
+    #[test]
+    fn written_scenes_are_read_back_equal() {
+        let folder = tempfile::tempdir().unwrap();
+        let records = [record("b", 3), record("a", 5), record("c", 1)];
+        // 303, 510 and 100 bytes of pictures: the second scene closes the first chunk.
+        let written = write_chunks(&folder.path().join("test"), records.clone().map(Ok), 400).unwrap();
+        assert_eq!(written, 3);
+        let index = std::fs::read_to_string(folder.path().join("test/index.json")).unwrap();
+        let index: BTreeMap<String, String> = serde_json::from_str(&index).unwrap();
+        let expected = [("a", "000000.torch"), ("b", "000000.torch"), ("c", "000001.torch")];
+        assert_eq!(index, expected.map(|(key, file)| (key.to_owned(), file.to_owned())).into());
+
+        let source = ChunkSource::open(folder.path(), Split::Test, &SceneFilters::default()).unwrap();
+        assert_eq!(source.num_scenes(), 3);
+        for record in &records {
+            let scene = source.find(&record.key).unwrap();
+            assert_eq!(source.url(scene).unwrap(), record.url);
+            assert_eq!(source.timestamps(scene).unwrap(), record.timestamps);
+            assert_eq!(source.num_frames(scene).unwrap(), record.images.len());
+            for (frame, image) in record.images.iter().enumerate() {
+                assert_eq!(source.encoded_frame(scene, frame).unwrap().as_ref(), Some(image));
+            }
+            for (got, expected) in source.cameras(scene).unwrap().iter().zip(&record.cameras) {
+                assert_eq!(got.c2w, expected.c2w); // whole numbers, so f32 loses nothing
+                assert!((got.intrinsics_norm.fx - 0.9).abs() < 1e-7); // f32
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_never_more_than_a_reader_takes() {
+        // As many scenes of one frame as would fill two files by their pictures' size, and one scene that fills one.
+        let most = (MAX_VALUES - 61) / 20;
+        let small = (0..20_000).map(|number| record(&format!("{number:05}"), 1));
+        let folder = tempfile::tempdir().unwrap();
+        write_chunks(&folder.path().join("test"), small.chain([record("long", most)]).map(Ok), u64::MAX).unwrap();
+        let source =
+            ChunkSource::open(folder.path(), Split::Test, &SceneFilters { min_frames: 1, ..Default::default() });
+        let source = source.unwrap();
+        assert_eq!(source.ledger().to_string(), "20001 of 20001 scenes used");
+        assert_eq!(source.num_frames(source.find("long").unwrap()).unwrap(), most);
+        let message = write_chunks(&folder.path().join("train"), [Ok(record("a", most + 1))], 1).unwrap_err();
+        assert!(message.to_string().contains(" frames, more than a file holds (about 50,000)"), "{message}");
+    }
+
+    #[test]
+    fn uneven_lists_doubled_keys_and_an_existing_index_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut uneven = record("a", 3);
+        uneven.timestamps.pop();
+        let message = write_chunks(folder.path(), [Ok(uneven)], 1).unwrap_err().to_string();
+        assert!(message.contains("scene a has 3 images, 3 cameras, 2 time stamps"), "{message}");
+        let message =
+            write_chunks(folder.path(), [Ok(record("a", 1)), Ok(record("a", 1))], 1000).unwrap_err().to_string();
+        assert!(message.contains("scene a comes twice"), "{message}");
+        write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap();
+        let message = write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap_err().to_string();
+        assert!(message.contains("it exists already"), "{message}");
+    }
+}

@@ -1,0 +1,193 @@
+//! The root of a data set: its split folders, and the kind of their scenes.
+
+use std::path::{Path, PathBuf};
+
+use crate::error::DataError;
+use crate::files::listing::{file_names, has_ending};
+use crate::scene_source::Split;
+use crate::skip_report::{Ledger, some_of};
+use crate::sources::kind::SourceKind;
+use crate::sources::photos::re10k_text::looks_like_re10k;
+use crate::sources::photos::scene_folder::{
+    FoundScenes, SceneFiles, SceneFolder, find_scenes, scene_in, transforms_in,
+};
+
+/// The folder, or the file of a single scene, that a data set is opened from.
+pub struct DatasetRoot {
+    path: PathBuf,
+    has_splits: bool,
+}
+
+impl DatasetRoot {
+    /// Finds a data set and its split folders.
+    ///
+    /// # Errors
+    /// [`DataError::Io`] for a path that does not exist.
+    pub fn find(path: &Path) -> Result<Self, DataError> {
+        std::fs::metadata(path).map_err(DataError::io("opening the data", path))?;
+        Ok(Self { path: path.to_owned(), has_splits: has_splits(path) })
+    }
+
+    /// Path of the root.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Returns whether training and test scenes lie in folders of their own, `train/` and `test/`.
+    ///
+    /// A capture may have such a name too, as `train` of Tanks and Temples has: it is a split only if the other split is
+    /// a capture as well and no third capture is beside them.
+    pub fn has_splits(&self) -> bool {
+        self.has_splits
+    }
+}
+
+fn has_splits(root: &Path) -> bool {
+    let halves = [Split::Train, Split::Test].map(|split| split.to_string());
+    let there: Vec<&String> = halves.iter().filter(|half| root.join(half).is_dir()).collect();
+    if there.is_empty() || scene_in(root).is_some() {
+        return false;
+    }
+    let is_capture = |name: &String| {
+        matches!(scene_in(&root.join(name)), Some(SceneFiles::Transforms(_) | SceneFiles::Colmap { .. }))
+    };
+    if !there.iter().any(|half| is_capture(half)) {
+        return true;
+    }
+    let names = file_names(root).unwrap_or_default();
+    there.len() == halves.len() && !names.iter().any(|name| !halves.contains(name) && is_capture(name))
+}
+
+/// The scenes detected in a folder; of photos, with the skipped ones.
+pub(crate) enum DetectedSource {
+    Torch(SourceKind),
+    Photos(SourceKind, Vec<SceneFolder>, Ledger),
+}
+
+/// The folder of one split: the root itself where it has no split folders.
+pub(crate) struct SplitFolder<'a> {
+    pub root: &'a DatasetRoot,
+    pub base: PathBuf,
+    pub split: Split,
+}
+
+impl<'a> SplitFolder<'a> {
+    /// Finds the folder of a split.
+    ///
+    /// # Errors
+    /// [`DataError::UnknownLayout`] for a split without a folder beside the other split's.
+    pub fn find(root: &'a DatasetRoot, split: Split) -> Result<Self, DataError> {
+        let base = if root.has_splits { root.path.join(split.to_string()) } else { root.path.clone() };
+        let folder = Self { root, base, split };
+        if folder.base.exists() {
+            return Ok(folder);
+        }
+        Err(folder.nothing(&format!("there is no folder {split}/ beside the other split"), &[]))
+    }
+
+    /// Finds the scenes of the kind asked for, or of the first that is recognised.
+    ///
+    /// # Errors
+    /// [`DataError::UnknownLayout`] for a folder without scenes, and for one with scenes of DL3DV among others.
+    pub fn detect(&self, asked: SourceKind) -> Result<DetectedSource, DataError> {
+        let base = &self.base;
+        if base.is_file() {
+            let kind = if asked == SourceKind::Auto { SourceKind::Captures } else { asked };
+            return Ok(DetectedSource::Photos(kind, vec![SceneFolder::of_file(base)], Ledger::default()));
+        }
+        let names = file_names(base)?;
+        let has_torch = names.iter().any(|name| has_ending(name, "torch"));
+        match asked {
+            SourceKind::Chunks => return Ok(DetectedSource::Torch(SourceKind::Chunks)),
+            SourceKind::Scenes if has_torch => return Ok(DetectedSource::Torch(SourceKind::Scenes)),
+            SourceKind::Scenes => return Err(self.nothing("expected .torch files", &[])),
+            SourceKind::Auto if names.iter().any(|name| name == "index.json") => {
+                return Ok(DetectedSource::Torch(SourceKind::Chunks));
+            }
+            SourceKind::Auto if has_torch => return Ok(DetectedSource::Torch(SourceKind::Scenes)),
+            _ => {}
+        }
+        if matches!(asked, SourceKind::Auto | SourceKind::Re10kTxt) {
+            let texts: Vec<&String> = names.iter().filter(|name| has_ending(name, "txt")).collect();
+            let is_scene = scene_in(base).is_some();
+            if !is_scene && texts.iter().take(8).any(|name| looks_like_re10k(&base.join(name))) {
+                return Ok(DetectedSource::Photos(SourceKind::Re10kTxt, Vec::new(), Ledger::default()));
+            }
+        }
+        let FoundScenes { mut scenes, others, notes } = find_scenes(base)?;
+        let kind = if asked == SourceKind::Auto { self.recognise(&scenes)? } else { asked };
+        let mut ledger = Ledger { notes, ..Ledger::default() };
+        scenes.retain(|scene| {
+            let is_of_layout = match kind {
+                SourceKind::Re10kTxt => matches!(scene.files, SceneFiles::Re10kText { .. }),
+                SourceKind::Dl3dv => matches!(scene.files, SceneFiles::Transforms(_)),
+                _ => true,
+            };
+            if !is_of_layout {
+                ledger.num_scenes += 1;
+                ledger.skip(&scene.key, format!("with cameras in another form than {kind} has"));
+            }
+            is_of_layout
+        });
+        if scenes.is_empty() {
+            let what = match asked {
+                SourceKind::Auto => {
+                    "looked for index.json with chunks, .torch files, RealEstate10K's .txt files, and for folders with \
+                     a transforms.json or a COLMAP model, three levels down"
+                }
+                SourceKind::Re10kTxt => "expected RealEstate10K's .txt files",
+                SourceKind::Dl3dv => "expected folders with a transforms.json",
+                _ => "expected folders with a transforms.json or a COLMAP model",
+            };
+            return Err(self.nothing(what, &others));
+        }
+        if !others.is_empty() {
+            ledger.notes.push(format!("not opened, each being data of its own: {}", some_of(&others)));
+        }
+        Ok(DetectedSource::Photos(kind, scenes, ledger))
+    }
+
+    /// The kind that all of these scenes have.
+    fn recognise(&self, scenes: &[SceneFolder]) -> Result<SourceKind, DataError> {
+        if scenes.iter().all(|scene| matches!(scene.files, SceneFiles::Re10kText { .. })) {
+            return Ok(SourceKind::Re10kTxt);
+        }
+        // Lenses, incomplete scenes and scenes kept for testing are treated in another way, so that one stray folder
+        // must not decide over all the others.
+        match scenes.iter().find(|scene| !scene.is_dl3dv()) {
+            None => Ok(SourceKind::Dl3dv),
+            Some(other) if scenes.iter().any(SceneFolder::is_dl3dv) => {
+                let num_dl3dv = scenes.iter().filter(|scene| scene.is_dl3dv()).count();
+                let what = format!(
+                    "{num_dl3dv} of {} scenes are DL3DV's by their names and transforms.json, and others, such as {}, \
+                     are not: say with data.source whether all are to be read as \"dl3dv\" or as \"captures\", or keep \
+                     them in folders of their own",
+                    scenes.len(),
+                    other.key
+                );
+                Err(DataError::UnknownLayout { what, path: self.base.clone() })
+            }
+            Some(_) => Ok(SourceKind::Captures),
+        }
+    }
+
+    /// The error for a folder without scenes, with what is there instead.
+    fn nothing(&self, what: &str, others: &[String]) -> DataError {
+        let mut parts = vec![what.to_owned()];
+        let folders = [self.base.as_path(), self.root.path()];
+        let files = folders.into_iter().map(transforms_in).find(|files| !files.is_empty());
+        parts.extend(files.map(|files| {
+            format!(
+                "there is no transforms.json, but {}: open one by its path, or write the frames of all into a \
+                 transforms.json",
+                some_of(&files)
+            )
+        }));
+        if !others.is_empty() {
+            parts.push(format!("below it there is other data, to be opened by itself: {}", some_of(others)));
+        }
+        let what = parts.join("; ");
+        let path = if self.base.exists() { self.base.clone() } else { self.root.path.clone() };
+        DataError::UnknownLayout { what, path }
+    }
+}

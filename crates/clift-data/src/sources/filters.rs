@@ -1,0 +1,53 @@
+//! Which scenes of a data set are used.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::DataError;
+use crate::geometry::camera::Camera;
+
+/// Which scenes of a data set are used. What they leave out is in the source's [`Ledger`](crate::skip_report::Ledger).
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SceneFilters {
+    /// Fewest frames of a usable scene; 0 keeps all. The paper's training set keeps scenes of 46 and more.
+    pub min_frames: usize,
+    /// Largest field of view of any frame, in degrees; pixelSplat leaves out scenes above 100.
+    pub max_fov_deg: Option<f64>,
+}
+
+impl SceneFilters {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`DataError::BadConfig`] naming the field that cannot hold.
+    pub fn validate(&self) -> Result<(), DataError> {
+        match self.max_fov_deg {
+            Some(limit) if !(limit.is_finite() && limit > 0.0) => {
+                Err(DataError::bad_config("max_fov_deg", format!("is {limit}; use a positive number such as 100")))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether a scene has to be read to know whether it is used.
+    pub(crate) fn is_any_set(&self) -> bool {
+        *self != Self::default()
+    }
+
+    /// Why a scene is left out, in words that equal cases share. Its cameras are read only where they matter.
+    pub(crate) fn reason_to_skip(
+        &self,
+        num_frames: usize,
+        cameras: impl FnOnce() -> Result<Vec<Camera>, DataError>,
+    ) -> Result<Option<String>, DataError> {
+        if num_frames < self.min_frames {
+            return Ok(Some(format!("shorter than {} frames", self.min_frames)));
+        }
+        let Some(limit) = self.max_fov_deg else { return Ok(None) };
+        let is_wide = cameras()?.iter().any(|camera| {
+            let (x, y) = camera.fov_deg();
+            x.max(y) > limit
+        });
+        Ok(is_wide.then(|| format!("with a field of view above {limit} degrees")))
+    }
+}

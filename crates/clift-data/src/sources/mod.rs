@@ -1,0 +1,23 @@
+//! Data sets: kinds, detection, opening.
+//!
+//! - `kind`: ONE SourceKind
+//! - `options`: paths of a data set's parts
+//! - `filters`: scene filters
+//! - `keys`: scene keys: DL3DV hashes, look-up
+//! - `test_scenes`: scenes reserved for testing
+//! - `subset`: some scenes of a source
+//! - `dataset_root`: find split folders, detect the layout
+//! - `open`: open any layout as a source
+//! - `chunks`: pixelSplat chunks
+//! - `photos`: one image file per frame
+
+pub(crate) mod chunks;
+pub(crate) mod dataset_root;
+pub(crate) mod filters;
+pub(crate) mod keys;
+pub(crate) mod kind;
+pub(crate) mod open;
+pub(crate) mod options;
+pub(crate) mod photos;
+pub(crate) mod subset;
+pub(crate) mod test_scenes;

@@ -1,0 +1,191 @@
+//! Opening of data sets on disk in any layout.
+
+use std::collections::HashSet;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use crate::error::DataError;
+use crate::files::listing::file_names;
+use crate::scene_source::{SceneSource, Split};
+use crate::skip_report::Ledger;
+use crate::sources::chunks::chunk_source::ChunkSource;
+use crate::sources::chunks::index::{index_of_files, note_unlisted, read_index};
+use crate::sources::dataset_root::{DatasetRoot, DetectedSource, SplitFolder};
+use crate::sources::kind::SourceKind;
+use crate::sources::options::SourceOptions;
+use crate::sources::photos::photo::PhotoOptions;
+use crate::sources::photos::photo_source::{PhotoSource, PhotoSourceOptions};
+use crate::sources::photos::scene_folder::{SceneFiles, SceneFolder};
+use crate::sources::test_scenes::{KEPT_AND_ABSENT, TestScenes};
+
+/// Folders that DL3DV's pictures are in, in the order they are preferred: 480 x 270, then larger.
+const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
+
+/// Note on a data set that is not divided: of no interest where a single split is asked for.
+pub const SAME_SCENES: &str =
+    "no train/ and test/ folders and no test scenes in a list: both halves are the same scenes";
+
+/// An open data set.
+pub struct OpenedSource {
+    /// Scenes of the data set.
+    pub source: Arc<dyn SceneSource>,
+    /// Layout that was detected, or [`SourceKind::Synthetic`].
+    pub kind: SourceKind,
+    /// Whether training and test scenes are apart without a list: in folders `train/` and `test/`, or synthetic.
+    pub has_splits: bool,
+    /// Skipped scenes and frames.
+    pub report: Ledger,
+}
+
+/// Opens one split of a data set on disk: `root/train` or `root/test`, or `root` itself where it has neither. `root`
+/// may be a data set, a single scene, or a `transforms.json` of any name.
+///
+/// Without folders of their own both splits are the same scenes (the report has a note), unless
+/// [`FileOptions::test_scenes`](crate::sources::options::FileOptions::test_scenes) divides them.
+///
+/// # Errors
+/// [`DataError::UnknownLayout`] for a folder without scenes, [`DataError::BadConfig`] for [`SourceKind::Synthetic`],
+/// and the errors of the layout's reader.
+pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) -> Result<OpenedSource, DataError> {
+    if options.kind == SourceKind::Synthetic {
+        return Err(DataError::bad_config("source", "is synthetic; write the layout of the folder, or auto"));
+    }
+    let list = options.files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
+    // An empty list names no test scenes: both splits are then the same.
+    let list = list.filter(|list| list.num_scenes() > 0);
+    let folder = SplitFolder::find(root, split)?;
+    let mut opened = match folder.detect(options.kind)? {
+        DetectedSource::Torch(kind) => folder.open_torch(kind, options, list.as_ref())?,
+        DetectedSource::Photos(kind, scenes, report) => {
+            folder.open_photos(kind, scenes, report, options, list.as_ref())?
+        }
+    };
+    if !opened.has_splits && list.is_none() {
+        opened.report.notes.push(SAME_SCENES.into());
+    }
+    Ok(opened)
+}
+
+impl SplitFolder<'_> {
+    fn open_torch(
+        &self,
+        kind: SourceKind,
+        options: &SourceOptions,
+        list: Option<&TestScenes>,
+    ) -> Result<OpenedSource, DataError> {
+        let mut ledger = Ledger::default();
+        let index = if kind == SourceKind::Chunks {
+            let index = read_index(&self.base.join("index.json"))?;
+            ledger.notes.extend(note_unlisted(&self.base, &index)?);
+            index
+        } else {
+            index_of_files(&self.base, &mut ledger)?
+        };
+        let keys: Vec<String> = index.keys().cloned().collect();
+        let kept = self.divide(list, &keys, options, &mut ledger);
+        let kept: HashSet<&str> =
+            keys.iter().zip(kept).filter(|(_, kept)| *kept).map(|(key, _)| key.as_str()).collect();
+        let is_kept = |key: &str| kept.contains(key);
+        let mut source = ChunkSource::of_index(&self.base, &index, is_kept, &options.filters, options.reads_chunks)?;
+        if kind == SourceKind::Chunks {
+            source.tell_unlisted(&self.base, &index);
+        }
+        append(&mut ledger, source.ledger());
+        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits(), report: ledger })
+    }
+
+    fn open_photos(
+        &self,
+        kind: SourceKind,
+        scenes: Vec<SceneFolder>,
+        mut ledger: Ledger,
+        options: &SourceOptions,
+        list: Option<&TestScenes>,
+    ) -> Result<OpenedSource, DataError> {
+        let is_text = kind == SourceKind::Re10kTxt;
+        let mut scenes = if scenes.is_empty() { self.re10k_clips(options)? } else { scenes };
+        let keys: Vec<String> = scenes.iter().map(|scene| scene.key.clone()).collect();
+        let mut kept = self.divide(list, &keys, options, &mut ledger).into_iter();
+        scenes.retain(|_| kept.next().unwrap_or_default());
+        let is_dl3dv = kind == SourceKind::Dl3dv;
+        let files = &options.files;
+        let source_options = PhotoSourceOptions {
+            photos: PhotoOptions {
+                image_folder: files.image_folder.clone(),
+                first_folders: if is_dl3dv { DL3DV_FOLDERS } else { &[] },
+                undistort: files.undistort.unwrap_or(kind == SourceKind::Captures),
+            },
+            filters: options.filters.clone(),
+            whole_scenes: (is_dl3dv || is_text) && !files.keep_incomplete,
+            min_size: options.min_size,
+        };
+        let source = PhotoSource::open(scenes, &source_options)?;
+        append(&mut ledger, source.ledger());
+        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits(), report: ledger })
+    }
+
+    /// Clips of RealEstate10K as text files, and where their frames are.
+    fn re10k_clips(&self, options: &SourceOptions) -> Result<Vec<SceneFolder>, DataError> {
+        let mut names = file_names(&self.base)?;
+        names.sort_unstable();
+        let split = self.split.to_string();
+        let folders: Vec<PathBuf> = if let Some(frames) = &options.files.frames {
+            vec![frames.clone(), frames.join(&split)]
+        } else {
+            let above = self.base.parent().unwrap_or(&self.base);
+            let frames = [self.root.path().join("frames"), above.join("frames")];
+            let frames = frames.iter().flat_map(|frames| [frames.clone(), frames.join(&split)]);
+            std::iter::once(self.base.clone()).chain(frames).collect()
+        };
+        let clip = |name: &String| {
+            let key = name.strip_suffix(".txt")?;
+            let mut places = folders.iter().map(|folder| folder.join(key));
+            let frames =
+                places.find(|frames| frames.is_dir()).unwrap_or_else(|| self.root.path().join("frames").join(key));
+            let files = SceneFiles::Re10kText { cameras: self.base.join(name), frames };
+            Some(SceneFolder { key: key.into(), files })
+        };
+        Ok(names.iter().filter_map(clip).collect())
+    }
+
+    /// Which of the keys belong to the split; the rest goes into the ledger.
+    fn divide(
+        &self,
+        list: Option<&TestScenes>,
+        keys: &[String],
+        options: &SourceOptions,
+        ledger: &mut Ledger,
+    ) -> Vec<bool> {
+        let Some(list) = list else { return vec![true; keys.len()] };
+        let (kept, mut divided) = list.divide(keys, self.split, !self.root.has_splits());
+        if self.root.has_splits() && self.split == Split::Train && !divided.skips.is_empty() {
+            let there = TestScenes::of_keys(&self.test_keys(options).unwrap_or_default());
+            let absent = divided.skips.iter_mut().filter(|skip| !there.contains(&skip.key));
+            absent.for_each(|skip| skip.reason = KEPT_AND_ABSENT.into());
+        }
+        append(ledger, &divided);
+        kept
+    }
+
+    /// Keys of the scenes in `test/`.
+    fn test_keys(&self, options: &SourceOptions) -> Result<Vec<String>, DataError> {
+        let place = SplitFolder::find(self.root, Split::Test)?;
+        Ok(match place.detect(options.kind)? {
+            DetectedSource::Torch(SourceKind::Chunks) => {
+                read_index(&place.base.join("index.json"))?.into_keys().collect()
+            }
+            DetectedSource::Torch(_) => index_of_files(&place.base, &mut Ledger::default())?.into_keys().collect(),
+            DetectedSource::Photos(_, scenes, _) => {
+                let scenes = if scenes.is_empty() { place.re10k_clips(options)? } else { scenes };
+                scenes.into_iter().map(|scene| scene.key).collect()
+            }
+        })
+    }
+}
+
+fn append(ledger: &mut Ledger, more: &Ledger) {
+    ledger.num_scenes += more.num_scenes;
+    ledger.skips.extend_from_slice(&more.skips);
+    ledger.frames.extend_from_slice(&more.frames);
+    ledger.notes.extend_from_slice(&more.notes);
+}

@@ -1,0 +1,133 @@
+//! COLMAP text files, line by line.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
+use std::str::FromStr;
+
+use crate::error::DataError;
+use crate::sources::photos::colmap::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera, add_image};
+
+/// Most bytes of a line in memory; the rest of a line of points, which may have any length, is skipped.
+const MAX_LINE_BYTES: usize = MAX_NAME_BYTES + 1024;
+
+/// Reads `cameras.txt` and `images.txt`.
+pub(crate) fn read(cameras: &Path, images: &Path) -> Result<Model, DataError> {
+    Ok(Model { cameras: read_cameras(cameras)?, images: read_images(images)? })
+}
+
+fn read_cameras(path: &Path) -> Result<HashMap<u32, ColmapCamera>, DataError> {
+    let mut cameras = HashMap::new();
+    let mut lines = Lines::open(path)?;
+    while let Some(line) = lines.next_entry()? {
+        let mut words = line.split_ascii_whitespace();
+        let camera = (|| {
+            let id = number(words.next(), "CAMERA_ID")?;
+            let model = words.next().ok_or("no MODEL")?.to_owned();
+            let (width, height) = (number(words.next(), "WIDTH")?, number(words.next(), "HEIGHT")?);
+            let params = words.map(|word| number(Some(word), "PARAMS")).collect::<Result<_, _>>()?;
+            add_camera(&mut cameras, id, ColmapCamera { model, width, height, params })
+        })();
+        camera.map_err(|what: String| lines.bad(&what))?;
+    }
+    Ok(cameras)
+}
+
+fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
+    let mut images = Vec::new();
+    let mut lines = Lines::open(path)?;
+    while let Some(line) = lines.next_entry()? {
+        let image = parse_image(&line).and_then(|image| add_image(&mut images, image));
+        image.map_err(|what| lines.bad(&what))?;
+        // The line of points may be empty: its first words show whether it is missing.
+        if lines.next_line()? && !lines.is_of_points() {
+            return Err(
+                lines.bad("expected the points of the image above: two lines per image, the second may be empty")
+            );
+        }
+    }
+    Ok(images)
+}
+
+fn parse_image(line: &str) -> Result<ColmapImage, String> {
+    let mut rest = line.trim();
+    let mut word = |what: &str| {
+        let (first, after) = rest.split_once(|c: char| c.is_ascii_whitespace()).unwrap_or((rest, ""));
+        rest = after.trim_start();
+        if first.is_empty() { Err(format!("no {what}")) } else { Ok(first.to_owned()) }
+    };
+    let _: u32 = number(Some(&word("IMAGE_ID")?), "IMAGE_ID")?;
+    let mut w2c = [0.0; 7];
+    for (value, name) in w2c.iter_mut().zip(["QW", "QX", "QY", "QZ", "TX", "TY", "TZ"]) {
+        *value = number(Some(&word(name)?), name)?;
+    }
+    let camera_id = number(Some(&word("CAMERA_ID")?), "CAMERA_ID")?;
+    if rest.is_empty() || rest.len() > MAX_NAME_BYTES {
+        return Err(format!("the NAME has {} bytes", rest.len()));
+    }
+    Ok(ColmapImage { name: rest.into(), camera_id, w2c })
+}
+
+fn number<T: FromStr>(word: Option<&str>, name: &str) -> Result<T, String> {
+    let word = word.ok_or_else(|| format!("no {name}"))?;
+    word.parse().map_err(|_| format!("{name} is {word:?}, expected a number"))
+}
+
+/// Lines of a file, truncated to [`MAX_LINE_BYTES`].
+struct Lines<'a> {
+    path: &'a Path,
+    reader: BufReader<File>,
+    line: Vec<u8>,
+    number: usize,
+}
+
+impl<'a> Lines<'a> {
+    fn open(path: &'a Path) -> Result<Self, DataError> {
+        let file = File::open(path).map_err(DataError::io("opening a COLMAP model", path))?;
+        Ok(Self { path, reader: BufReader::new(file), line: Vec::new(), number: 0 })
+    }
+
+    fn bad(&self, what: &str) -> DataError {
+        DataError::BadScene { what: format!("line {}: {what}", self.number), path: self.path.to_owned() }
+    }
+
+    /// Reads the next line; false at the end of the file.
+    fn next_line(&mut self) -> Result<bool, DataError> {
+        let io = DataError::io("reading a COLMAP model", self.path);
+        self.line.clear();
+        self.number += 1;
+        let mut limited = (&mut self.reader).take(MAX_LINE_BYTES as u64);
+        let length = match limited.read_until(b'\n', &mut self.line) {
+            Ok(length) => length,
+            Err(error) => return Err(io(error)),
+        };
+        if length == MAX_LINE_BYTES && self.line.last() != Some(&b'\n') {
+            self.reader.skip_until(b'\n').map_err(io)?;
+        }
+        Ok(length > 0)
+    }
+
+    /// The next line that is neither empty nor a comment.
+    fn next_entry(&mut self) -> Result<Option<String>, DataError> {
+        while self.next_line()? {
+            let line = self.line.trim_ascii();
+            if line.is_empty() || line.starts_with(b"#") {
+                continue;
+            }
+            if self.line.len() == MAX_LINE_BYTES {
+                return Err(self.bad("the line is too long"));
+            }
+            let text = std::str::from_utf8(line).map_err(|_| self.bad("the line is not UTF-8"))?;
+            return Ok(Some(text.to_owned()));
+        }
+        Ok(None)
+    }
+
+    /// Whether the first ten words are numbers, as in a list of points; the tenth word of an image is its name.
+    fn is_of_points(&self) -> bool {
+        let words = self.line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        let is_number = |word: &[u8]| std::str::from_utf8(word).is_ok_and(|word| word.parse::<f64>().is_ok());
+        words.take(10).all(is_number)
+    }
+}

@@ -1,0 +1,345 @@
+//! Own captures and DL3DV as `transforms.json`, in the form that nerfstudio and instant-ngp write.
+//!
+//! Poses are camera to world with OpenGL's axes (+x right, +y up, -z forward) and become OpenCV's.
+
+use std::collections::HashSet;
+use std::fmt;
+use std::marker::PhantomData;
+use std::path::{Component, Path, PathBuf};
+
+use serde::de::{Error, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
+
+use crate::error::DataError;
+use crate::files::bounded::read_bounded;
+use crate::files::listing::natural_order;
+use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
+use crate::geometry::lens::Lens;
+use crate::geometry::pose::Pose;
+use crate::image::codec::read_size;
+use crate::sources::photos::image_folder::PictureFolders;
+use crate::sources::photos::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoOptions, PhotoScene};
+
+/// Most bytes of one `transforms.json`.
+const MAX_BYTES: u64 = 128 << 20;
+/// Longest name of a picture: what operating systems take as a path.
+const MAX_NAME_BYTES: usize = 4096;
+/// Folders above a picture that are looked for in the scene's own, its name included.
+const MAX_WAYS: usize = 32;
+
+/// Defines a struct with the keys of a camera, which may stand at the top or in a frame.
+macro_rules! with_optics {
+    ($name:ident { $($field:ident: $type:ty,)* }) => {
+        #[derive(Deserialize)]
+        struct $name {
+            $($field: $type,)*
+            camera_model: Option<String>,
+            is_fisheye: Option<bool>,
+            w: Option<f64>,
+            h: Option<f64>,
+            fl_x: Option<f64>,
+            fl_y: Option<f64>,
+            cx: Option<f64>,
+            cy: Option<f64>,
+            camera_angle_x: Option<f64>,
+            camera_angle_y: Option<f64>,
+            k1: Option<f64>,
+            k2: Option<f64>,
+            k3: Option<f64>,
+            k4: Option<f64>,
+            p1: Option<f64>,
+            p2: Option<f64>,
+        }
+
+        impl $name {
+            fn optics(&self) -> Optics<'_> {
+                Optics {
+                    camera_model: self.camera_model.as_deref(),
+                    is_fisheye: self.is_fisheye,
+                    size: [self.w, self.h],
+                    focal: [self.fl_x, self.fl_y],
+                    centre: [self.cx, self.cy],
+                    angle: [self.camera_angle_x, self.camera_angle_y],
+                    radial: [self.k1, self.k2, self.k3, self.k4],
+                    tangential: [self.p1, self.p2],
+                }
+            }
+        }
+    };
+}
+
+with_optics!(Document { frames: Bounded<Entry, MAX_FRAMES>, });
+with_optics!(Entry { file_path: String, transform_matrix: Bounded<[f64; 4], 4>, });
+
+impl Entry {
+    /// The upper three rows of the matrix; the fourth may be left out.
+    fn c2w_rows(&self) -> Result<[[f64; 4]; 3], String> {
+        let rows = &self.transform_matrix.0;
+        if let Some(last) = rows.get(3) {
+            let error = last.iter().zip([0.0, 0.0, 0.0, 1.0]).map(|(got, expected)| (got - expected).abs());
+            if error.fold(0.0, f64::max) > 1e-6 {
+                return Err(format!("transform_matrix ends in {last:?}, expected 0 0 0 1"));
+            }
+        }
+        match rows.as_slice() {
+            [a, b, c, ..] => Ok([*a, *b, *c]),
+            rows => Err(format!("transform_matrix has {} rows, expected 4", rows.len())),
+        }
+    }
+}
+
+/// What is said of a camera. Lengths are in pixels, angles in radians.
+struct Optics<'a> {
+    camera_model: Option<&'a str>,
+    is_fisheye: Option<bool>,
+    size: [Option<f64>; 2],
+    focal: [Option<f64>; 2],
+    centre: [Option<f64>; 2],
+    angle: [Option<f64>; 2],
+    radial: [Option<f64>; 4],
+    tangential: [Option<f64>; 2],
+}
+
+impl<'a> Optics<'a> {
+    /// What a frame says, and where it says nothing, what stands at the top. A focal length of its own overrules an
+    /// angle at the top.
+    fn or(self, top: &Optics<'a>) -> Self {
+        let either = |own: [Option<f64>; 2], top: [Option<f64>; 2]| [own[0].or(top[0]), own[1].or(top[1])];
+        let has_focal = self.focal.iter().chain(&self.angle).any(Option::is_some);
+        Self {
+            camera_model: self.camera_model.or(top.camera_model),
+            is_fisheye: self.is_fisheye.or(top.is_fisheye),
+            size: either(self.size, top.size),
+            focal: if has_focal { self.focal } else { top.focal },
+            angle: if has_focal { self.angle } else { top.angle },
+            centre: either(self.centre, top.centre),
+            radial: [0, 1, 2, 3].map(|i| self.radial[i].or(top.radial[i])),
+            tangential: either(self.tangential, top.tangential),
+        }
+    }
+
+    /// The lens, if it is one that can be undone.
+    fn lens(&self) -> Result<Lens, String> {
+        let model = self.camera_model.unwrap_or("OPENCV");
+        let known = ["PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "perspective"];
+        if !known.contains(&model) || self.is_fisheye == Some(true) {
+            let model = if self.is_fisheye == Some(true) { "OPENCV_FISHEYE" } else { model };
+            return Err(format!("camera_model is {model}, expected one of {}", known.join(", ")));
+        }
+        let [k1, k2, k3, k4] = self.radial.map(Option::unwrap_or_default);
+        if k4 != 0.0 {
+            return Err(format!("k4 is {k4}: only lenses of k1, k2, k3, p1 and p2 can be undone"));
+        }
+        let lens = Lens { radial: [k1, k2, k3], tangential: self.tangential.map(Option::unwrap_or_default) };
+        lens.validate().map(|()| lens).map_err(|error| error.to_string())
+    }
+
+    /// Columns and rows of the pictures that the intrinsics were given for.
+    fn size(&self) -> Result<Option<[f64; 2]>, String> {
+        let [Some(width), Some(height)] = self.size else { return Ok(None) };
+        for (name, side) in [("w", width), ("h", height)] {
+            if !(side.is_finite() && side >= 1.0) {
+                return Err(format!("{name} is {side}, expected a number of pixels"));
+            }
+        }
+        Ok(Some([width, height]))
+    }
+
+    fn intrinsics_norm(&self, [width, height]: [f64; 2]) -> Result<IntrinsicsNorm, String> {
+        let of_angle = |axis: usize, side: f64| self.angle[axis].map(|angle| 0.5 * side / (0.5 * angle).tan());
+        let [x, y] = [self.focal[0].or_else(|| of_angle(0, width)), self.focal[1].or_else(|| of_angle(1, height))];
+        let (Some(fx), Some(fy)) = (x.or(y), y.or(x)) else {
+            return Err("neither fl_x nor camera_angle_x is given".into());
+        };
+        let [cx, cy] = self.centre;
+        let intrinsics = Intrinsics { fx, fy, cx: cx.unwrap_or(width / 2.0), cy: cy.unwrap_or(height / 2.0) };
+        let intrinsics_norm = IntrinsicsNorm::of_pixels(intrinsics, width, height);
+        intrinsics_norm.validate().map(|()| intrinsics_norm).map_err(|error| error.to_string())
+    }
+}
+
+/// Reads a `transforms.json` and finds its pictures. Frames are in the natural order of their names.
+///
+/// # Errors
+/// [`DataError::Io`], and [`DataError::BadScene`] for a file of another form, a camera that cannot be used and two
+/// frames of one name.
+pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
+    let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
+    let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
+    // Editors on Windows put a byte order mark in front.
+    let json = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&text);
+    let document: Document = serde_json::from_slice(json).map_err(|error| bad(explain(&error, json)))?;
+    drop(text);
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
+    if let Some(Entry { file_path: name, .. }) = entries.iter().find(|entry| entry.file_path.len() > MAX_NAME_BYTES) {
+        let start: String = name.chars().take(40).collect();
+        return Err(bad(format!("frame {start}..: its name has {} bytes, more than {MAX_NAME_BYTES}", name.len())));
+    }
+    entries.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
+    let mut pictures = Pictures { folder, options, folders: PictureFolders::default() };
+    let (top, mut scene) = (document.optics(), PhotoScene::default());
+    let mut taken = HashSet::new();
+    for entry in entries {
+        let name = &entry.file_path;
+        let in_frame = |what: String| bad(format!("frame {name}: {what}"));
+        let picture = match pictures.find(name) {
+            Ok(picture) if taken.insert(picture.clone()) => picture,
+            found => {
+                let reason = found.map_or_else(|reason| reason, |_| "whose picture another frame has".into());
+                scene.missing.push(MissingPhoto { name: name.clone(), reason });
+                continue;
+            }
+        };
+        let optics = entry.optics().or(&top);
+        let lens = optics.lens().map_err(in_frame)?;
+        let given = optics.size().map_err(in_frame)?;
+        let size = given.map_or_else(|| read_size(&picture).map(|size| size.map(|side| side as f64)), Ok);
+        let Ok(size) = size else {
+            let reason = "whose picture cannot be read".into();
+            scene.missing.push(MissingPhoto { name: name.clone(), reason });
+            continue;
+        };
+        let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;
+        let rows = entry.c2w_rows().map_err(in_frame)?;
+        let photo = Pose::from_opengl(&rows)
+            .and_then(|c2w| Photo::new(picture, c2w, intrinsics_norm, lens, options.undistort))
+            .map_err(PhotoScene::in_frame(path, name))?;
+        scene.photos.push(Photo { shape: given.map(|[width, height]| width / height), ..photo });
+    }
+    scene.num_without_camera = pictures.folders.num_unasked();
+    Ok(scene)
+}
+
+/// The reason of the parser, and what it does not say of numbers that Python writes and JSON does not have.
+fn explain(error: &serde_json::Error, text: &[u8]) -> String {
+    let line = text.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
+    let column = error.column().min(line.len());
+    let near = String::from_utf8_lossy(&line[column.saturating_sub(9)..line.len().min(column + 9)]);
+    let hint = if near.contains("NaN") || near.contains("Infinity") { " (a number is NaN or infinite)" } else { "" };
+    format!("expected the form that nerfstudio writes, got {error}{hint}")
+}
+
+/// Where the pictures of one scene are looked for.
+struct Pictures<'a> {
+    folder: &'a Path,
+    options: &'a PhotoOptions,
+    folders: PictureFolders,
+}
+
+impl Pictures<'_> {
+    fn find(&mut self, file_path: &str) -> Result<PathBuf, String> {
+        let found = self.find_at(Path::new(file_path));
+        if found.is_ok() || !file_path.contains('\\') {
+            return found;
+        }
+        // Windows separates folders so, and some tools write both.
+        self.find_at(Path::new(&file_path.replace('\\', "/")))
+    }
+
+    fn find_at(&mut self, named: &Path) -> Result<PathBuf, String> {
+        if let Some(folder) = self.chosen_folder() {
+            let below =
+                if is_of_another_computer(named) { self.longest_way(&folder, named) } else { below_first(named) };
+            return self.folders.find(&folder.join(below));
+        }
+        let given = self.folder.join(named);
+        let (Some(parent), Some(name)) = (given.parent(), given.file_name()) else {
+            return Err("without a picture".into());
+        };
+        if self.folders.has(parent) {
+            return self.folders.find(&given);
+        }
+        // Pictures scaled down alone, or a path from another folder or computer.
+        let ways = ways_to(named).map(|way| self.folder.join(way));
+        for place in std::iter::once(given.clone()).chain(ways) {
+            let Some(parent) = place.parent().filter(|parent| *parent != self.folder) else { continue };
+            let last = parent.file_name().unwrap_or_default().to_string_lossy();
+            let scaled = ["", "_2", "_4", "_8"].map(|suffix| parent.with_file_name(format!("{last}{suffix}")));
+            if let Some(folder) = scaled.into_iter().find(|folder| self.folders.has(folder)) {
+                return self.folders.find(&folder.join(name));
+            }
+        }
+        if is_of_another_computer(named) {
+            return self.folders.find(&self.folder.join(name));
+        }
+        Err("without a picture".into())
+    }
+
+    /// The folder asked for, or the first of those looked for that is there.
+    fn chosen_folder(&mut self) -> Option<PathBuf> {
+        if let Some(folder) = &self.options.image_folder {
+            return Some(self.folder.join(folder));
+        }
+        let mut folders = self.options.first_folders.iter().map(|folder| self.folder.join(folder));
+        folders.find(|folder| self.folders.has(folder))
+    }
+
+    /// As many of the last parts of a path as have their folder in `folder`.
+    fn longest_way(&mut self, folder: &Path, named: &Path) -> PathBuf {
+        let mut ways = ways_to(named);
+        let found = ways.find(|way| way.parent().is_some_and(|parent| self.folders.has(&folder.join(parent))));
+        found.unwrap_or_else(|| named.file_name().unwrap_or_default().into())
+    }
+}
+
+/// The last parts of a path, from all of them, or as many as are looked at, to the name alone.
+fn ways_to(path: &Path) -> impl Iterator<Item = PathBuf> {
+    let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
+    (parts.len().saturating_sub(MAX_WAYS)..parts.len()).map(move |start| parts[start..].iter().collect())
+}
+
+/// Whether a path is absolute, on Windows or elsewhere.
+fn is_of_another_computer(path: &Path) -> bool {
+    let first = path.components().next().map(|part| part.as_os_str().to_string_lossy());
+    path.has_root() || first.is_some_and(|first| first.len() == 2 && first.ends_with(':'))
+}
+
+/// A path without its first folder: `images/left/1.png` is `left/1.png` in `images_8`.
+fn below_first(path: &Path) -> PathBuf {
+    let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
+    parts[parts.len().min(2).saturating_sub(1)..].iter().collect()
+}
+
+/// A list of at most `MAX` items: what a few bytes of JSON become takes a hundred times their memory.
+struct Bounded<T, const MAX: usize>(Vec<T>);
+
+impl<'de, T: Deserialize<'de>, const MAX: usize> Deserialize<'de> for Bounded<T, MAX> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_seq(BoundedVisitor(PhantomData))
+    }
+}
+
+struct BoundedVisitor<T, const MAX: usize>(PhantomData<T>);
+
+impl<'de, T: Deserialize<'de>, const MAX: usize> Visitor<'de> for BoundedVisitor<T, MAX> {
+    type Value = Bounded<T, MAX>;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "a list of at most {MAX}")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Self::Value, A::Error> {
+        let mut list = Vec::new();
+        while let Some(item) = items.next_element()? {
+            if list.len() == MAX {
+                return Err(A::Error::custom(format!("a list of more than {MAX} items")));
+            }
+            list.push(item);
+        }
+        Ok(Bounded(list))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_a_path_of_many_folders_the_last_are_looked_at() {
+        let ways = |path: &str| ways_to(Path::new(path)).collect::<Vec<_>>();
+        assert_eq!(ways("/a/./b/c.png"), ["a/b/c.png", "b/c.png", "c.png"].map(PathBuf::from));
+        let deep = ways(&"a/".repeat(2000));
+        assert_eq!((deep.len(), deep[0].components().count()), (MAX_WAYS, MAX_WAYS));
+    }
+}

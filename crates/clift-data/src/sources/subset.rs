@@ -1,0 +1,70 @@
+//! Some of the scenes of a source.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use crate::error::DataError;
+use crate::geometry::camera::Camera;
+use crate::image::rgb_image::Frame;
+use crate::scene_source::SceneSource;
+
+/// The chosen scenes of a source, in the order they were chosen in.
+pub struct SceneSubset {
+    source: Arc<dyn SceneSource>,
+    /// Positions in `source`.
+    scenes: Vec<usize>,
+    /// Positions here, by those there.
+    places: HashMap<usize, usize>,
+}
+
+impl SceneSubset {
+    /// Keeps the scenes at these positions, which the source must have.
+    pub fn new(source: Arc<dyn SceneSource>, scenes: Vec<usize>) -> Self {
+        let places = scenes.iter().enumerate().map(|(place, scene)| (*scene, place)).collect();
+        Self { source, scenes, places }
+    }
+
+    /// Keeps at most the first `num_scenes`, for `--overfit`.
+    pub fn first(source: Arc<dyn SceneSource>, num_scenes: usize) -> Self {
+        let scenes = (0..num_scenes.min(source.num_scenes())).collect();
+        Self::new(source, scenes)
+    }
+}
+
+impl SceneSource for SceneSubset {
+    fn num_scenes(&self) -> usize {
+        self.scenes.len()
+    }
+
+    fn key(&self, scene: usize) -> &str {
+        self.source.key(self.scenes[scene])
+    }
+
+    fn find(&self, key: &str) -> Option<usize> {
+        self.places.get(&self.source.find(key)?).copied()
+    }
+
+    fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
+        self.source.num_frames(self.scenes[scene])
+    }
+
+    fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
+        self.source.cameras(self.scenes[scene])
+    }
+
+    fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
+        self.source.timestamps(self.scenes[scene])
+    }
+
+    fn url(&self, scene: usize) -> Result<String, DataError> {
+        self.source.url(self.scenes[scene])
+    }
+
+    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+        self.source.frame(self.scenes[scene], frame)
+    }
+
+    fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
+        self.source.encoded_frame(self.scenes[scene], frame)
+    }
+}

@@ -1,0 +1,145 @@
+//! The scenes that are kept for testing: of DL3DV the 140 of its benchmark, which its folders hold beside all others.
+
+use std::collections::{BTreeSet, HashMap};
+use std::path::Path;
+
+use serde::de::IgnoredAny;
+
+use crate::error::DataError;
+use crate::files::bounded::read_bounded;
+use crate::scene_source::Split;
+use crate::skip_report::Ledger;
+use crate::sources::keys::{last_name, plain_key};
+
+/// Most bytes of a list.
+const MAX_BYTES: u64 = 256 << 20;
+/// Why a training half goes without a scene that the test half has: nothing is wrong with it.
+pub const KEPT_FOR_TESTING: &str = "kept for testing";
+/// Why neither half has a scene that the list keeps for testing and that lies in `train/` alone. Starts with
+/// [`KEPT_FOR_TESTING`].
+pub(crate) const KEPT_AND_ABSENT: &str = "kept for testing by the list of test scenes, but not in test/";
+
+/// Keys of the scenes kept for testing, without DepthSplat's prefix, and of DL3DV's without the way to them.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct TestScenes {
+    keys: BTreeSet<String>,
+}
+
+impl TestScenes {
+    /// Reads an evaluation index (its keys count), a JSON list of keys, or a text file with a key per line.
+    ///
+    /// # Errors
+    /// [`DataError::Io`], and [`DataError::BadIndex`] for a file of another form.
+    pub fn read(path: &Path) -> Result<Self, DataError> {
+        let bad = |what: String| DataError::BadIndex { what, path: path.to_owned() };
+        let bytes = read_bounded(path, MAX_BYTES, "reading the list of test scenes")?;
+        let text = String::from_utf8(bytes).map_err(|_| bad("the list of test scenes is not UTF-8".into()))?;
+        let text = text.trim_start_matches('\u{feff}');
+        let json = |error: serde_json::Error| bad(format!("expected an index, a list or a key per line, got {error}"));
+        let keys: Vec<String> = match text.trim_start().chars().next() {
+            Some('{') => {
+                // What the keys stand for is passed over, whatever it is.
+                let index: HashMap<String, Option<IgnoredAny>> = serde_json::from_str(text).map_err(json)?;
+                index.into_keys().collect()
+            }
+            Some('[') => serde_json::from_str(text).map_err(json)?,
+            _ => text.lines().map(|line| line.trim().to_owned()).filter(|line| !line.is_empty()).collect(),
+        };
+        Ok(Self::of_keys(&keys))
+    }
+
+    pub(crate) fn of_keys(keys: &[String]) -> Self {
+        Self { keys: keys.iter().map(|key| plain_key(key).to_owned()).collect() }
+    }
+
+    /// Whether a scene is one of them, with or without DepthSplat's prefix. Of a key that is the way to a scene, as those
+    /// of several folders of one name are, the last part counts as well.
+    pub fn contains(&self, key: &str) -> bool {
+        self.keys.contains(plain_key(key)) || self.keys.contains(last_name(key))
+    }
+
+    /// How many there are.
+    pub fn num_scenes(&self) -> usize {
+        self.keys.len()
+    }
+
+    /// Which of `keys` belong to a split, and a ledger of the others: for training, those in the list; for testing
+    /// where both splits share a folder, those in the list that are not there.
+    pub(crate) fn divide(&self, keys: &[String], split: Split, is_shared: bool) -> (Vec<bool>, Ledger) {
+        let mut ledger = Ledger::default();
+        let kept: Vec<bool> = keys
+            .iter()
+            .map(|key| match split {
+                Split::Train => !self.contains(key),
+                Split::Test => !is_shared || self.contains(key),
+            })
+            .collect();
+        if split == Split::Train {
+            keys.iter().zip(&kept).filter(|(_, kept)| !**kept).for_each(|(key, _)| ledger.skip(key, KEPT_FOR_TESTING));
+        } else if is_shared {
+            let there: BTreeSet<&str> = keys.iter().flat_map(|key| [plain_key(key), last_name(key)]).collect();
+            let absent = self.keys.iter().filter(|key| !there.contains(key.as_str()));
+            absent.for_each(|key| ledger.skip(key, "in the list of test scenes, but not there"));
+        }
+        ledger.num_scenes = ledger.skips.len();
+        (kept, ledger)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> Result<TestScenes, String> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("list");
+        std::fs::write(&path, text).unwrap();
+        TestScenes::read(&path).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn an_index_a_list_and_lines_name_the_same_scenes() {
+        let index = read(r#"{"a": {"context": [0], "target": [1]}, "dl3dv_b": null}"#).unwrap();
+        assert_eq!(index, read(r#" ["b", "a"]"#).unwrap());
+        assert_eq!(index, read("a\r\n\n  b\n").unwrap());
+        assert!(index.contains("dl3dv_a") && index.contains("b") && !index.contains("c"));
+        assert_eq!((index.num_scenes(), read("").unwrap().num_scenes()), (2, 0));
+        assert!(read("[1, 2]").unwrap_err().contains("expected an index, a list or a key per line, got"));
+        assert!(read("{\"a\": ").unwrap_err().starts_with("bad index: "));
+    }
+
+    #[test]
+    fn a_scene_is_kept_out_of_training_wherever_its_copies_lie() {
+        let hash = "a".repeat(64);
+        let keys = [format!("1K/{hash}"), format!("bench/{hash}"), "1K/attic".into(), "bench/attic".into()];
+        for listed in [hash.clone(), format!("11K/{hash}"), format!("dl3dv_{hash}")] {
+            let list = read(&listed).unwrap();
+            assert_eq!(list.divide(&keys, Split::Train, true).0, [false, false, true, true], "{listed}");
+            let (kept, ledger) = list.divide(&keys, Split::Test, true);
+            assert_eq!((kept, ledger.skips.len()), (vec![true, true, false, false], 0), "{listed}");
+        }
+        // Other captures of one name are not the same scene: the way tells them apart, the name alone means both.
+        let kept = |listed: &str| read(listed).unwrap().divide(&keys, Split::Train, true).0;
+        assert_eq!(kept("1K/attic"), [true, true, false, true]);
+        assert_eq!(kept("attic"), [true, true, false, false]);
+        assert!(read("\u{feff}attic").unwrap().contains("attic"), "as an editor on Windows writes it");
+    }
+
+    #[test]
+    fn training_goes_without_them_and_testing_has_them_alone() {
+        let list = read("b c").unwrap();
+        assert!(list.contains("b c"), "a line is a key");
+        let list = read("b\nc").unwrap();
+        let keys = ["a", "dl3dv_b", "d"].map(String::from);
+        let divided = |split, is_shared| {
+            let (kept, ledger) = list.divide(&keys, split, is_shared);
+            (kept, ledger.to_string())
+        };
+        let train = (vec![true, false, true], "0 of 1 scenes used; 1 kept for testing".to_owned());
+        assert_eq!(divided(Split::Train, true), train);
+        assert_eq!(divided(Split::Train, false), train);
+        let absent = "0 of 1 scenes used; 1 in the list of test scenes, but not there".to_owned();
+        assert_eq!(divided(Split::Test, true), (vec![false, true, false], absent));
+        assert_eq!(divided(Split::Test, false), (vec![true; 3], "0 of 0 scenes used".to_owned()));
+    }
+}

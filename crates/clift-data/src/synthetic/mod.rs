@@ -1,0 +1,15 @@
+//! Ray-traced rooms from a seed.
+//!
+//! - `config`: options of synthetic scenes
+//! - `room`: a room, its objects and lamp
+//! - `camera_path`: the camera's arc through a room
+//! - `texture`: procedural surface colours
+//! - `ray_tracer`: small deterministic ray tracer
+//! - `source`: scenes from seeds as a source
+
+pub(crate) mod camera_path;
+pub(crate) mod config;
+pub(crate) mod ray_tracer;
+pub(crate) mod room;
+pub(crate) mod source;
+pub(crate) mod texture;

@@ -1,0 +1,352 @@
+//! A small ray tracer: nearest surface, soft shadows and occlusion in closed form, one mirrored bounce.
+//!
+//! Soft shadows follow from the distance at which the ray to the lamp passes an object, not from samples of the lamp:
+//! images have no noise, and a frame is a pure function of scene and camera.
+
+use glam::{DVec3, Vec3};
+
+use crate::geometry::camera::Camera;
+use crate::image::rgb_image::Frame;
+use crate::synthetic::room::{Object, Scene, Shape, turned};
+
+/// Smallest slope of a slab test, which keeps the test finite for rays along an axis.
+const LEAST_SLOPE: f32 = 1e-6;
+/// Smallest weight of a mirrored ray; below it the ray hardly changes an 8-bit value.
+const LEAST_MIRROR: f32 = 0.02;
+/// Ambient light over the lamp's.
+const AMBIENT: f32 = 0.6;
+/// Brightness of the lamp.
+const LAMP: f32 = 2.2;
+/// Distance over which the lamp's light halves, in units of length.
+const LAMP_REACH: f32 = 2.5;
+/// Inverse angular size of the lamp: larger gives sharper shadows.
+const SHARPNESS: f32 = 5.0;
+
+/// The point where a ray ends, and its surface.
+struct Hit {
+    point: Vec3,
+    normal: Vec3,
+    albedo: Vec3,
+    gloss: f32,
+    /// Position of the object in the scene's list; `None` for the room.
+    object: Option<usize>,
+}
+
+/// Renders `scene` with `side * side` rays per pixel.
+///
+/// `specular` in `[0, 1]` scales all light that depends on the viewing direction.
+pub(crate) fn render(scene: &Scene, camera: &Camera, width: usize, height: usize, side: usize, specular: f32) -> Frame {
+    let intrinsics = camera.intrinsics_norm.to_pixels(width, height);
+    let origin = camera.c2w.translation.as_vec3();
+    let mut rgb = Vec::with_capacity(width * height * 3);
+    for row in 0..height {
+        for column in 0..width {
+            let mut sum = Vec3::ZERO;
+            for sample in 0..side * side {
+                let offset = |index: usize| (index as f64 + 0.5) / side as f64;
+                let x = (column as f64 + offset(sample % side) - intrinsics.cx) / intrinsics.fx;
+                let y = (row as f64 + offset(sample / side) - intrinsics.cy) / intrinsics.fy;
+                let direction = (camera.c2w.rotation * DVec3::new(x, y, 1.0)).as_vec3().normalize();
+                sum += display(trace(scene, origin, direction, specular, true));
+            }
+            let scale = 255.0 / (side * side) as f32;
+            rgb.extend(sum.to_array().map(|value| (value * scale + 0.5) as u8));
+        }
+    }
+    Frame { width, height, rgb }
+}
+
+/// Linear light to display values in `[0, 1]`: a soft shoulder, then gamma 2.
+fn display(light: Vec3) -> Vec3 {
+    light.map(|x| (x * (1.0 + x * 0.1) / (1.0 + x * 0.45)).clamp(0.0, 1.0).sqrt())
+}
+
+/// Linear light along a ray.
+fn trace(scene: &Scene, origin: Vec3, direction: Vec3, specular: f32, may_mirror: bool) -> Vec3 {
+    let hit = nearest(scene, origin, direction);
+    let to_lamp = scene.lamp - hit.point;
+    let distance = to_lamp.length().max(1e-3);
+    let to_lamp = to_lamp * (1.0 / distance);
+    let facing = hit.normal.dot(to_lamp).max(0.0);
+    let reaching = if facing > 0.0 { LAMP * shadow(scene, &hit, to_lamp) } else { 0.0 };
+    let falloff = 1.0 / (1.0 + (distance / LAMP_REACH).powi(2));
+
+    let diffuse = AMBIENT * openness(scene, &hit) + reaching * facing * falloff;
+    let mut light = hit.albedo * diffuse + lamp_glow(scene, &hit);
+    let shine = specular * hit.gloss;
+    if shine > 0.0 {
+        let mirrored = direction.reflect(hit.normal);
+        let glint = mirrored.dot(to_lamp).max(0.0);
+        let glint = glint.powi(8 + (hit.gloss * 40.0) as i32);
+        light += Vec3::splat(shine * reaching * glint);
+        // Schlick's approximation of Fresnel's law.
+        let grazing = 1.0 + direction.dot(hit.normal).min(0.0);
+        let weight = shine * (0.12 + 0.88 * grazing.powi(5));
+        if may_mirror && weight > LEAST_MIRROR {
+            let start = hit.point + hit.normal * 1e-3;
+            light = light.lerp_monotonic(trace(scene, start, mirrored, specular, false), weight);
+        }
+    }
+    light
+}
+
+fn nearest(scene: &Scene, origin: Vec3, direction: Vec3) -> Hit {
+    let mut best = (f32::INFINITY, Vec3::ZERO, None);
+    for (index, object) in scene.objects.iter().enumerate() {
+        if let Some((distance, normal)) = meet(object, origin, direction)
+            && distance < best.0
+        {
+            best = (distance, normal, Some(index));
+        }
+    }
+    let (distance, normal, object) = best;
+    if let Some(index) = object {
+        let (point, object) = (origin + direction * distance, &scene.objects[index]);
+        let [u, v] = surface(object, point, normal);
+        return Hit { point, normal, albedo: object.texture.color(u, v), gloss: object.gloss, object: Some(index) };
+    }
+    meet_room(scene, origin, direction)
+}
+
+/// Distance and normal where a ray from outside meets an object.
+fn meet(object: &Object, origin: Vec3, direction: Vec3) -> Option<(f32, Vec3)> {
+    let from_center = origin - object.center;
+    match object.shape {
+        Shape::Ball { radius } => {
+            let along = from_center.dot(direction);
+            let inside = along * along - from_center.dot(from_center) + radius * radius;
+            if inside < 0.0 {
+                return None;
+            }
+            let distance = -along - inside.sqrt();
+            (distance > 0.0).then(|| (distance, (from_center + direction * distance) * (1.0 / radius)))
+        }
+        Shape::Block { half_size, turn } => {
+            let (near, far, axis, slope) = slabs(turned(from_center, turn), turned(direction, turn), half_size);
+            if near > far || near <= 0.0 {
+                return None;
+            }
+            let mut normal = Vec3::ZERO;
+            normal[axis] = -slope.signum();
+            Some((near, turned(normal, [turn[0], -turn[1]])))
+        }
+    }
+}
+
+/// Distances at which a line enters and leaves a box around the origin, the axis of the face it enters, and its slope
+/// along that axis.
+fn slabs(origin: Vec3, direction: Vec3, half_size: Vec3) -> (f32, f32, usize, f32) {
+    let (mut near, mut far, mut entered) = (f32::NEG_INFINITY, f32::INFINITY, 0);
+    for axis in 0..3 {
+        let inverse = 1.0 / steep(direction[axis]);
+        let (middle, reach) = (-origin[axis] * inverse, half_size[axis] * inverse.abs());
+        if middle - reach > near {
+            (near, entered) = (middle - reach, axis);
+        }
+        far = far.min(middle + reach);
+    }
+    (near, far, entered, direction[entered])
+}
+
+/// Moves a slope off zero.
+fn steep(slope: f32) -> f32 {
+    if slope.abs() < LEAST_SLOPE { LEAST_SLOPE.copysign(slope) } else { slope }
+}
+
+/// Texture coordinates of a point on an object: the coordinates of the object's own frame along the face.
+fn surface(object: &Object, point: Vec3, normal: Vec3) -> [f32; 2] {
+    let local = point - object.center;
+    let Shape::Block { turn, .. } = object.shape else { return [local.x + local.z, local.y] };
+    let (Vec3 { x, y, z }, facing) = (turned(local, turn), turned(normal, turn));
+    if facing.y.abs() > 0.5 {
+        [x, z]
+    } else if facing.x.abs() > 0.5 {
+        [z, y]
+    } else {
+        [x, y]
+    }
+}
+
+/// Intersection of a ray from inside the room with a wall.
+fn meet_room(scene: &Scene, origin: Vec3, direction: Vec3) -> Hit {
+    let (mut distance, mut axis) = (f32::INFINITY, 0);
+    for candidate in 0..3 {
+        let slope = steep(direction[candidate]);
+        let reached = (scene.half_size[candidate].copysign(slope) - origin[candidate]) / slope;
+        if reached < distance {
+            (distance, axis) = (reached, candidate);
+        }
+    }
+    let point = origin + direction * distance;
+    let forward = direction[axis] > 0.0;
+    let mut normal = Vec3::ZERO;
+    normal[axis] = if forward { -1.0 } else { 1.0 };
+    let [x, y, z] = point.to_array();
+    let [u, v] = [[z, y], [x, z], [x, y]][axis];
+    let albedo = scene.walls[axis * 2 + usize::from(forward)].color(u, v);
+    let is_floor = axis == 1 && forward;
+    Hit { point, normal, albedo, gloss: if is_floor { 0.35 } else { 0.0 }, object: None }
+}
+
+/// Visible share of the lamp: 1 without shadow, 0 in full shadow.
+fn shadow(scene: &Scene, hit: &Hit, to_lamp: Vec3) -> f32 {
+    let mut share = 1.0;
+    for (index, object) in scene.objects.iter().enumerate() {
+        if hit.object == Some(index) {
+            continue; // a convex object shades itself where its normal points away from the lamp
+        }
+        let from_center = hit.point - object.center;
+        share *= match object.shape {
+            Shape::Ball { radius } => {
+                let along = from_center.dot(to_lamp);
+                let inside = along * along - from_center.dot(from_center) + radius * radius;
+                let reached = -along - inside.max(0.0).sqrt();
+                let missed_by = (radius * radius - inside).max(0.0).sqrt() - radius;
+                if reached <= 0.0 { 1.0 } else { smooth(SHARPNESS * missed_by / reached) }
+            }
+            Shape::Block { half_size, turn } => {
+                let (near, far, ..) = slabs(turned(from_center, turn), turned(to_lamp, turn), half_size);
+                if far < 0.0 { 1.0 } else { smooth(1.0 + SHARPNESS * (near - far)) }
+            }
+        };
+    }
+    share
+}
+
+/// Share of ambient light that reaches a point: less in corners and beside objects.
+fn openness(scene: &Scene, hit: &Hit) -> f32 {
+    let mut share = 1.0;
+    for axis in 0..3 {
+        let to_wall = scene.half_size[axis] - hit.point[axis].abs();
+        if hit.normal[axis].abs() < 0.9 {
+            share *= 1.0 - 0.4 / (1.0 + (5.0 * to_wall).powi(2));
+        }
+    }
+    for (index, object) in scene.objects.iter().enumerate() {
+        if hit.object == Some(index) {
+            continue;
+        }
+        let size = match object.shape {
+            Shape::Ball { radius } => radius * radius,
+            Shape::Block { half_size, .. } => half_size.dot(half_size) * 0.5,
+        };
+        let towards = object.center - hit.point;
+        let squared = towards.dot(towards).max(size);
+        let covered = hit.normal.dot(towards).max(0.0) * size / (squared * squared.sqrt());
+        share *= 1.0 - 0.7 * covered.min(1.0);
+    }
+    share
+}
+
+/// The lamp itself, a soft disc on the ceiling.
+fn lamp_glow(scene: &Scene, hit: &Hit) -> Vec3 {
+    if hit.object.is_some() || hit.normal.y < 0.5 {
+        return Vec3::ZERO;
+    }
+    let across = hit.point - scene.lamp;
+    let squared = across.x.powi(2) + across.z.powi(2);
+    Vec3::new(1.0, 0.95, 0.85) * (2.0 * smooth(1.5 - 12.0 * squared))
+}
+
+/// Hermite step from 0 to 1.
+fn smooth(x: f32) -> f32 {
+    let x = x.clamp(0.0, 1.0);
+    x * x * (3.0 - 2.0 * x)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::step_rng;
+    use crate::synthetic::config::SyntheticConfig;
+    use crate::synthetic::texture::Texture;
+
+    const RED: Vec3 = Vec3::new(1.0, 0.0, 0.0);
+
+    /// A room of one colour with one ball in it, and the default camera path.
+    fn scene(room: Vec3, ball: Vec3, gloss: f32) -> Scene {
+        let config = SyntheticConfig { num_objects: [0, 0], ..Default::default() };
+        let mut scene = Scene::draw(&mut step_rng(5, 0, "test"), &config);
+        scene.walls = [(); 6].map(|()| Texture::plain(room));
+        let shape = Shape::Ball { radius: 0.2 };
+        let center = Vec3::new(0.1, 0.2, -0.1);
+        scene.objects.push(Object { shape, center, texture: Texture::plain(ball), gloss });
+        scene
+    }
+
+    #[test]
+    fn a_ball_appears_where_the_camera_projects_its_centre() {
+        let scene = scene(Vec3::ZERO, RED, 0.0);
+        for time in [0.0, 0.2, 0.4, 0.6, 0.8, 1.0] {
+            let camera = scene.path.camera(time, 75.0, 1.5);
+            let frame = render(&scene, &camera, 192, 128, 1, 0.0);
+            let (mut sum, mut count) = ([0.0; 2], 0.0);
+            for (index, pixel) in frame.rgb.chunks_exact(3).enumerate() {
+                if pixel[0] > 30 && pixel[2] == 0 {
+                    sum[0] += (index % 192) as f64 + 0.5;
+                    sum[1] += (index / 192) as f64 + 0.5;
+                    count += 1.0;
+                }
+            }
+            let [x, y, depth] = camera.c2w.inverse().apply(scene.objects[0].center.as_dvec3()).to_array();
+            let pixels = camera.intrinsics_norm.to_pixels(192, 128);
+            let center = [pixels.fx * x / depth + pixels.cx, pixels.fy * y / depth + pixels.cy];
+            // A ball off the axis looks like an ellipse whose middle lies outwards of the projected centre, by
+            // less than (radius / depth)^2 of the distance from the axis.
+            for (axis, middle) in [pixels.cx, pixels.cy].into_iter().enumerate() {
+                let off_axis = (center[axis] - middle).abs();
+                let tolerance = 0.3 + off_axis * (0.2 / depth).powi(2);
+                let got = sum[axis] / count;
+                assert!((got - center[axis]).abs() < tolerance, "axis {axis} at {time}: {got}, not {}", center[axis]);
+            }
+            let radius = pixels.fx * 0.2 / depth;
+            let area = std::f64::consts::PI * radius * radius;
+            assert!((0.95..1.35).contains(&(count / area)), "{count} pixels for a disc of {area}");
+        }
+    }
+
+    #[test]
+    fn the_floor_below_a_ball_is_in_shadow() {
+        let mut scene = scene(Vec3::ONE, RED, 0.0);
+        let floor = scene.half_size.y;
+        scene.lamp = Vec3::new(0.1, -floor + 0.1, -0.1);
+        let light =
+            |scene: &Scene, x: f32| trace(scene, Vec3::new(x, floor - 0.05, -0.1), Vec3::new(0.0, 1.0, 0.0), 0.0, true);
+        let (below, beside) = (light(&scene, 0.1), light(&scene, 0.9));
+        assert!(below.y < 0.5 * beside.y, "{below:?} {beside:?}");
+        scene.objects.clear();
+        let (below, beside) = (light(&scene, 0.1), light(&scene, 0.9));
+        assert!(below.y > beside.y, "without the ball it is brightest below the lamp");
+    }
+
+    #[test]
+    fn only_specular_surfaces_change_with_the_view() {
+        let scene = scene(Vec3::new(0.2, 0.4, 0.8), RED, 1.0);
+        let ball = &scene.objects[0];
+        let top = ball.center + Vec3::new(0.0, -0.2, 0.0);
+        let seen_from = |origin: Vec3, specular: f32| trace(&scene, origin, (top - origin).normalize(), specular, true);
+        let (left, right) = (Vec3::new(-1.0, -0.6, 0.3), Vec3::new(0.9, -0.3, 0.2));
+        let difference = |specular: f32| (seen_from(left, specular) - seen_from(right, specular)).length();
+        assert!(difference(0.0) < 1e-4, "{}", difference(0.0));
+        assert!(difference(1.0) > 0.02, "{}", difference(1.0));
+    }
+
+    #[test]
+    fn a_turned_block_is_met_at_its_faces() {
+        let turn = [0.6, 0.8];
+        let half_size = Vec3::new(0.3, 0.2, 0.1);
+        let shape = Shape::Block { half_size, turn };
+        let object = Object { shape, center: Vec3::new(1.0, 0.0, 2.0), texture: Texture::plain(RED), gloss: 0.0 };
+        for axis in 0..3 {
+            let mut local = Vec3::ZERO;
+            local[axis] = 1.0;
+            let outwards = turned(local, [turn[0], -turn[1]]);
+            let (distance, normal) = meet(&object, object.center + outwards * 5.0, -outwards).unwrap();
+            assert!((distance - (5.0 - half_size[axis])).abs() < 1e-5, "axis {axis}: {distance}");
+            assert!((normal - outwards).length() < 1e-5, "axis {axis}: {normal:?}");
+        }
+        assert!(meet(&object, Vec3::new(0.0, 0.5, 0.0), Vec3::new(0.0, 0.0, 1.0)).is_none());
+        let behind = meet(&object, Vec3::new(1.0, 0.0, 4.0), Vec3::new(0.0, 0.0, 1.0));
+        assert!(behind.is_none(), "what is behind the origin is not met");
+    }
+}

@@ -1,0 +1,97 @@
+//! Plausible intrinsics and poses, whatever the images show.
+
+use crate::geometry::camera::Camera;
+use crate::geometry::normalization::{PoseRotation, PoseScale, SceneFrame};
+use crate::geometry::pose::Pose;
+use crate::tools::check::images::{Sizes, named};
+use crate::tools::check::result::SceneCheck;
+
+/// Plausible fields of view, in degrees.
+const FOV_DEG: [f64; 2] = [5.0, 120.0];
+/// Field of view above which published configs skip a scene, in degrees.
+const FILTERED_FOV_DEG: f64 = 100.0;
+/// Plausible principal points, over width and height.
+const PRINCIPAL_POINT: [f64; 2] = [0.25, 0.75];
+/// Aspect ratio of a pixel, or its inverse, above which a note is made.
+const NOTED_ASPECT: f64 = 1.02;
+/// Aspect ratio of a pixel, or its inverse, above which a scene is flagged.
+const MOST_ASPECT: f64 = 1.5;
+/// Entry of `R^T R - I` above which a rotation is flagged; files with four digits stay below.
+const MOST_DEFECT: f64 = 1e-3;
+/// Entry of `R^T R - I` above which a note is made; f32 files stay below.
+const NOTED_DEFECT: f64 = 1e-4;
+
+/// Checks intrinsics, rotations and centres.
+pub(crate) fn look(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
+    if cameras.is_empty() {
+        check.reasons.push("it has no frames".into());
+        return;
+    }
+    intrinsics(cameras, sizes, check);
+    let defects = cameras.iter().map(|camera| camera.c2w.orthonormality_defect());
+    let worst = defects.fold(0.0, f64::max);
+    check.rotation_defect = Some(worst);
+    let sentence = format!("rotations are off orthonormal ones by up to {worst:.1e}");
+    if worst > MOST_DEFECT {
+        check.reasons.push(format!("{sentence}, more than {MOST_DEFECT:.0e}"));
+    } else if worst > NOTED_DEFECT {
+        check.notes.push(sentence);
+    }
+    let poses: Vec<Pose> = cameras.iter().map(|camera| camera.c2w).collect();
+    let found = SceneFrame::find(&check.key, &poses, &[], PoseRotation::Quaternion, PoseScale::Context);
+    if let Err(error) = found {
+        check.reasons.push(error.to_string());
+    }
+}
+
+fn intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
+    let frames_where = |test: &dyn Fn(&Camera) -> bool| -> Vec<usize> {
+        cameras.iter().enumerate().filter(|(_, camera)| test(camera)).map(|(frame, _)| frame).collect()
+    };
+    let fields = |camera: &Camera| {
+        let (x, y) = camera.fov_deg();
+        [x.min(y), x.max(y)]
+    };
+    let widest = cameras.iter().map(|camera| fields(camera)[1]).fold(0.0, f64::max);
+    check.fov_deg = Some(widest);
+    let [low, high] = FOV_DEG;
+    let implausible = frames_where(&|camera| {
+        let [narrow, wide] = fields(camera);
+        !(narrow >= low && wide <= high)
+    });
+    if let Some(&first) = implausible.first() {
+        let [narrow, wide] = fields(&cameras[first]);
+        let frames = named(&implausible);
+        check
+            .reasons
+            .push(format!("fields of view of {narrow:.1} and {wide:.1} degrees in {frames}, expected {low} to {high}"));
+    } else if widest > FILTERED_FOV_DEG {
+        check.notes.push(format!("a field of view of {widest:.1} degrees; filters often leave out above 100"));
+    }
+    let [low, high] = PRINCIPAL_POINT;
+    let middle = low..=high;
+    let outside = frames_where(&|camera| {
+        let k = camera.intrinsics_norm;
+        !middle.contains(&k.cx) || !middle.contains(&k.cy)
+    });
+    if let Some(&first) = outside.first() {
+        let k = cameras[first].intrinsics_norm;
+        let frames = named(&outside);
+        check.reasons.push(format!(
+            "principal point at ({:.3}, {:.3}) of the picture in {frames}, expected {low} to {high}",
+            k.cx, k.cy
+        ));
+    }
+    let aspects = cameras.iter().zip(sizes).filter_map(|(camera, size)| {
+        let k = camera.intrinsics_norm;
+        size.map(|[width, height]| (k.fx * width as f64) / (k.fy * height as f64))
+    });
+    let off = |aspect: f64| aspect.max(1.0 / aspect);
+    let Some(worst) = aspects.reduce(|a, b| if off(b) > off(a) { b } else { a }) else { return };
+    let sentence = format!("focal lengths in pixels have the ratio fx / fy = {worst:.3}");
+    if off(worst) > MOST_ASPECT {
+        check.reasons.push(format!("{sentence}: are they for another picture size?"));
+    } else if off(worst) > NOTED_ASPECT {
+        check.notes.push(format!("{sentence}: pixels are not square"));
+    }
+}

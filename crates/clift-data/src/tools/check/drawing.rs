@@ -1,0 +1,125 @@
+//! An image of two frames side by side with matched corners and their epipolar lines.
+
+use glam::DMat3;
+
+use crate::image::rgb_image::Frame;
+use crate::tools::features::correspondence::{Match, WIDTH};
+use crate::tools::features::epipolar::{line, line_back};
+use crate::tools::features::features::reduced;
+
+/// Corners to draw.
+const NUM_SHOWN: usize = 12;
+/// Columns between the frames.
+const GAP: usize = 12;
+/// Radius of a dot in pixels.
+const DOT: f64 = 4.5;
+/// Half the width of a line in pixels.
+const LINE: f64 = 0.9;
+
+/// Draws some of the matches: in each frame a dot per corner, and in the dot's colour the epipolar line of the corner
+/// in the other frame.
+pub(crate) fn draw(frames: &[Frame; 2], geometry: &DMat3, matches: &[Match]) -> Frame {
+    let frames = [reduced(&frames[0]), reduced(&frames[1])];
+    let height = frames[0].height.max(frames[1].height);
+    let width = frames[0].width + GAP + frames[1].width;
+    let mut canvas = Frame { width, height, rgb: vec![255; width * height * 3] };
+    let left = [0, frames[0].width + GAP];
+    for (frame, left) in frames.iter().zip(left) {
+        for (row, pixels) in frame.rgb.chunks_exact(frame.width * 3).enumerate() {
+            let at = (row * width + left) * 3;
+            canvas.rgb[at..at + pixels.len()].copy_from_slice(pixels);
+        }
+    }
+    let shown = spread(matches);
+    for (i, pair) in shown.iter().enumerate() {
+        let colour = colour(i, shown.len());
+        let sides = [(pair.first, line_back(geometry, pair.second)), (pair.second, line(geometry, pair.first))];
+        for ((point, line), (frame, left)) in sides.into_iter().zip(frames.iter().zip(left)) {
+            // Matches are in pixels of a picture WIDTH wide.
+            let unit = frame.width as f64 / WIDTH as f64;
+            let mut paint = |distance: &dyn Fn(f64, f64) -> f64, colour: [u8; 3]| {
+                for y in 0..frame.height {
+                    for x in 0..frame.width {
+                        let away = distance(x as f64 + 0.5, y as f64 + 0.5);
+                        let share = (0.5 - away).clamp(0.0, 1.0);
+                        if share > 0.0 {
+                            let at = (y * width + left + x) * 3;
+                            blend(&mut canvas.rgb[at..at + 3], colour, share);
+                        }
+                    }
+                }
+            };
+            if let Some(line) = line {
+                let away = |x: f64, y: f64| (line.x * x + line.y * y + line.z * unit).abs();
+                paint(&|x, y| away(x, y) - LINE - 0.8, [0; 3]);
+                paint(&|x, y| away(x, y) - LINE, colour);
+            }
+            let [u, v] = point.map(|value| value * unit);
+            paint(&|x, y| (x - u).hypot(y - v) - DOT - 1.5, [255; 3]);
+            paint(&|x, y| (x - u).hypot(y - v) - DOT, colour);
+        }
+    }
+    canvas
+}
+
+/// Matches that lie far from each other in the first image (farthest point sampling).
+fn spread(matches: &[Match]) -> Vec<Match> {
+    let mut shown: Vec<Match> = Vec::new();
+    let squared = |a: &Match, b: &Match| (0..2).map(|i| (a.first[i] - b.first[i]).powi(2)).sum::<f64>();
+    let mut nearest = vec![f64::INFINITY; matches.len()];
+    while shown.len() < NUM_SHOWN.min(matches.len()) {
+        let place = (0..matches.len()).reduce(|a, b| if nearest[b] > nearest[a] { b } else { a }).unwrap_or(0);
+        shown.push(matches[place]);
+        for (nearest, other) in nearest.iter_mut().zip(matches) {
+            *nearest = nearest.min(squared(&matches[place], other));
+        }
+    }
+    shown
+}
+
+/// Colours of the hue wheel, neighbours far apart.
+fn colour(place: usize, count: usize) -> [u8; 3] {
+    let hue = (place * 5 % count.max(1)) as f64 / count.max(1) as f64 * 6.0;
+    [5.0, 3.0, 1.0].map(|offset| {
+        let k = (offset + hue) % 6.0;
+        (255.0 * (1.0 - k.min(4.0 - k).clamp(0.0, 1.0))) as u8
+    })
+}
+
+fn blend(pixel: &mut [u8], colour: [u8; 3], share: f64) {
+    for (value, wanted) in pixel.iter_mut().zip(colour) {
+        *value = (f64::from(*value) * (1.0 - share) + f64::from(wanted) * share).round() as u8;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_line_of_a_corner_goes_through_its_dot_in_the_other_frame() {
+        // A sideways move: lines are rows.
+        let geometry = DMat3::from_rows_array(&[0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]);
+        let frames = [(); 2].map(|()| Frame { width: 160, height: 90, rgb: vec![128; 160 * 90 * 3] });
+        let pair = Match { first: [200.0, 102.0], second: [400.0, 102.0] };
+        let canvas = draw(&frames, &geometry, &[pair]);
+        assert_eq!((canvas.width, canvas.height), (160 + GAP + 160, 90));
+        let pixel = |x: usize, y: usize| &canvas.rgb[(y * canvas.width + x) * 3..][..3];
+        let colour = colour(0, 1);
+        // Row 102 of 640 columns is the middle of row 25 of 160; the dots are at columns 50 and 100.
+        for x in [5, 50, 155, 160 + GAP + 5, 160 + GAP + 100] {
+            assert_eq!(pixel(x, 25), colour, "{x}");
+        }
+        assert_eq!(pixel(5, 40), [128; 3]);
+        assert_eq!(pixel(165, 25), [255; 3]);
+        assert_ne!(pixel(50, 28), [128; 3], "the dot is thicker than the line");
+    }
+
+    #[test]
+    fn colours_are_bright_and_differ() {
+        let colours: Vec<_> = (0..12).map(|place| colour(place, 12)).collect();
+        for (i, colour) in colours.iter().enumerate() {
+            assert!(colour.iter().max() == Some(&255) && !colours[i + 1..].contains(colour), "{colours:?}");
+        }
+    }
+}

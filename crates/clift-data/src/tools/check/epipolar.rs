@@ -1,0 +1,160 @@
+//! Poses against the images: matched corners must lie on each other's epipolar lines.
+
+use std::sync::OnceLock;
+
+use rayon::prelude::*;
+
+use crate::geometry::camera::Camera;
+use crate::image::rgb_image::Frame;
+use crate::scene_source::SceneSource;
+use crate::tools::check::drawing::draw;
+use crate::tools::check::images::Sizes;
+use crate::tools::check::result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
+use crate::tools::features::correspondence::Match;
+use crate::tools::features::epipolar::{epipolar_distance, of_cameras};
+use crate::tools::features::features::Features;
+
+/// Pairs of frames of a scene.
+const NUM_PAIRS: usize = 9;
+/// Numbers of frames of a scene over those between the two of a pair, tried in this order: at larger distances a wrong
+/// pose shows more, and fewer corners match.
+const PARTS: [usize; 4] = [6, 10, 16, 24];
+/// Most matches of one pair in the scene's median, so that no pair dominates.
+const MAX_MATCHES: usize = 150;
+/// Fewest matches of a scene for a median.
+const MIN_MATCHES: usize = 40;
+/// Epipolar distance in pixels above which a pair is noted in a scene that passes.
+const NOTED_PX: f64 = 3.0;
+
+/// A pair with its matches, to draw it.
+struct Pair {
+    check: PairCheck,
+    matches: Vec<Match>,
+    distances: Vec<f64>,
+}
+
+/// Measures the epipolar distance of a scene, and draws the pair nearest to it.
+pub(crate) fn look(
+    source: &dyn SceneSource,
+    scene: usize,
+    cameras: &[Camera],
+    sizes: &Sizes,
+    check: &mut SceneCheck,
+) -> Option<Frame> {
+    let features: Vec<OnceLock<Option<Features>>> = (0..cameras.len()).map(|_| OnceLock::new()).collect();
+    let view = SceneViews { source, scene, cameras, sizes, features };
+    let mut pairs: Vec<Pair> = view.anchors().into_par_iter().filter_map(|anchor| view.pair_from(anchor)).collect();
+    // At the end of a scene two frames may have chosen each other.
+    pairs.sort_by_key(|pair| pair.check.frames);
+    pairs.dedup_by_key(|pair| pair.check.frames);
+    check.pairs = pairs.iter().map(|pair| pair.check.clone()).collect();
+    let pooled: Vec<f64> = pairs.iter().flat_map(|pair| evenly(&pair.distances, MAX_MATCHES)).collect();
+    if pooled.len() < MIN_MATCHES {
+        check.notes.push(format!(
+            "poses were not compared with the pictures: {} matching corners in {} pairs of frames",
+            pooled.len(),
+            pairs.len()
+        ));
+        return None;
+    }
+    let scene_px = median(pooled)?;
+    check.epipolar_px = Some(scene_px);
+    if scene_px > MAX_EPIPOLAR_PX {
+        check.reasons.push(format!(
+            "corners lie {scene_px:.2} px from their epipolar lines (median at 640 columns), more than \
+             {MAX_EPIPOLAR_PX}: poses or intrinsics do not fit the pictures"
+        ));
+    } else {
+        for PairCheck { frames: [a, b], epipolar_px, .. } in &check.pairs {
+            if *epipolar_px > NOTED_PX {
+                check.notes.push(format!(
+                    "frames {a} and {b} alone: {epipolar_px:.1} px; their poses, or a pattern that repeats"
+                ));
+            }
+        }
+    }
+    let off = |pair: &Pair| (pair.check.epipolar_px - scene_px).abs();
+    let shown = pairs.iter().min_by(|a, b| off(a).total_cmp(&off(b)))?;
+    view.draw(shown)
+}
+
+struct SceneViews<'a> {
+    source: &'a dyn SceneSource,
+    scene: usize,
+    cameras: &'a [Camera],
+    sizes: &'a Sizes,
+    features: Vec<OnceLock<Option<Features>>>,
+}
+
+impl SceneViews<'_> {
+    /// First frames of the pairs, spread over the scene.
+    fn anchors(&self) -> Vec<usize> {
+        let count = self.cameras.len().saturating_sub(1);
+        let num_pairs = NUM_PAIRS.min(count);
+        (0..num_pairs).map(|place| place * count / num_pairs).collect()
+    }
+
+    /// The first partner whose corners match, from far to near in the order of the frames, then the frame of the most
+    /// similar camera: photos need not be in order.
+    fn pair_from(&self, anchor: usize) -> Option<Pair> {
+        let num_frames = self.cameras.len();
+        let mut gaps: Vec<usize> = PARTS.iter().map(|parts| num_frames / parts).chain([2, 1]).collect();
+        gaps.retain(|gap| *gap > 0);
+        gaps.sort_unstable_by(|a, b| b.cmp(a));
+        gaps.dedup();
+        let in_order = gaps.into_iter().filter_map(|gap| {
+            let after = anchor + gap;
+            if after < num_frames { Some(after) } else { anchor.checked_sub(gap) }
+        });
+        let nearest = (0..num_frames).filter(|frame| *frame != anchor).min_by(|&a, &b| {
+            let unlike = |frame: usize| unlike(&self.cameras[anchor], &self.cameras[frame]);
+            unlike(a).total_cmp(&unlike(b))
+        });
+        in_order.chain(nearest).find_map(|partner| self.pair([anchor.min(partner), anchor.max(partner)]))
+    }
+
+    fn pair(&self, frames: [usize; 2]) -> Option<Pair> {
+        let [a, b] = frames.map(|frame| &self.cameras[frame]);
+        // Equal centres have no epipolar lines.
+        if a.c2w.translation == b.c2w.translation {
+            return None;
+        }
+        let [first, second] = frames;
+        let sizes = [self.sizes[first]?, self.sizes[second]?];
+        let matches = self.features(first)?.matches(self.features(second)?);
+        let geometry = of_cameras([a, b], sizes);
+        let distances: Vec<f64> = matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect();
+        let epipolar_px = median(distances.clone())?;
+        Some(Pair { check: PairCheck { frames, num_matches: matches.len(), epipolar_px }, matches, distances })
+    }
+
+    /// Features of a frame, computed on first use; `None` for an unreadable frame.
+    fn features(&self, frame: usize) -> Option<&Features> {
+        let find = || Some(Features::find(&self.source.frame(self.scene, frame).ok()?));
+        self.features[frame].get_or_init(find).as_ref()
+    }
+
+    fn draw(&self, pair: &Pair) -> Option<Frame> {
+        let [first, second] = pair.check.frames;
+        let frames = [self.source.frame(self.scene, first).ok()?, self.source.frame(self.scene, second).ok()?];
+        let sizes = [self.sizes[first]?, self.sizes[second]?];
+        let geometry = of_cameras([&self.cameras[first], &self.cameras[second]], sizes);
+        Some(draw(&frames, &geometry, &pair.matches))
+    }
+}
+
+/// Dissimilarity of two cameras: the distance of their centres and three times that of their forward directions.
+fn unlike(a: &Camera, b: &Camera) -> f64 {
+    let forward = a.c2w.rotation.z_axis.distance(b.c2w.rotation.z_axis);
+    a.c2w.translation.distance(b.c2w.translation) + 3.0 * forward
+}
+
+/// At most `count` of the values, evenly spaced.
+fn evenly(values: &[f64], count: usize) -> impl Iterator<Item = f64> {
+    let kept = values.len().min(count);
+    (0..kept).map(move |place| values[place * values.len() / kept])
+}
+
+fn median(values: Vec<f64>) -> Option<f64> {
+    (!values.is_empty()).then(|| crate::statistics::upper_median(&values))
+}

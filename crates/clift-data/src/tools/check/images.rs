@@ -1,0 +1,94 @@
+//! Readable, equal-sized, distinct images.
+
+use std::collections::{BTreeMap, HashMap};
+use std::hash::{DefaultHasher, Hash, Hasher};
+
+use rayon::prelude::*;
+
+use crate::error::DataError;
+use crate::geometry::camera::Camera;
+use crate::scene_source::SceneSource;
+use crate::tools::check::result::SceneCheck;
+
+/// Most frames named in a sentence.
+const MAX_NAMED: usize = 5;
+/// Distance of two cameras, over the extent of all centres, above which equal images contradict them.
+const MOST_MOVE: f64 = 0.02;
+/// Angle between two cameras, in degrees, above which equal images contradict them.
+const MOST_TURN_DEG: f64 = 1.0;
+
+/// Columns and rows of every frame; `None` for an unreadable one.
+pub(crate) type Sizes = Vec<Option<[usize; 2]>>;
+
+/// Decodes every frame, on all cores.
+pub(crate) fn look(source: &dyn SceneSource, scene: usize, cameras: &[Camera], check: &mut SceneCheck) -> Sizes {
+    let read = (0..cameras.len()).into_par_iter().map(|frame| {
+        let picture = source.frame(scene, frame)?;
+        let mut hasher = DefaultHasher::new();
+        picture.rgb.hash(&mut hasher);
+        Ok(([picture.width, picture.height], hasher.finish()))
+    });
+    let read: Vec<Result<([usize; 2], u64), DataError>> = read.collect();
+    let failures: Vec<(usize, String)> =
+        read.iter().enumerate().filter_map(|(frame, read)| Some((frame, read.as_ref().err()?.to_string()))).collect();
+    if let Some((_, first)) = failures.first() {
+        let frames: Vec<usize> = failures.iter().map(|(frame, _)| *frame).collect();
+        check.reasons.push(format!("{} cannot be read; the first: {first}", named(&frames)));
+    }
+    let sizes: Sizes = read.iter().map(|read| Some(read.as_ref().ok()?.0)).collect();
+    let mut counts: BTreeMap<[usize; 2], usize> = BTreeMap::new();
+    sizes.iter().flatten().for_each(|size| *counts.entry(*size).or_default() += 1);
+    check.image_size = counts.iter().max_by_key(|(_, count)| **count).map(|(size, _)| *size);
+    if counts.len() > 1 {
+        let list: Vec<String> =
+            counts.iter().map(|([width, height], count)| format!("{width}x{height} ({count})")).collect();
+        check.notes.push(format!("frames have {} sizes: {}", counts.len(), list.join(", ")));
+    }
+    let hashes: Vec<Option<u64>> = read.iter().map(|read| Some(read.as_ref().ok()?.1)).collect();
+    compare(&hashes, cameras, check);
+    sizes
+}
+
+/// Compares the cameras of equal images.
+fn compare(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
+    let extent = extent(cameras);
+    let mut seen: HashMap<u64, usize> = HashMap::new();
+    let (mut equal, mut contradictions) = (Vec::new(), Vec::new());
+    for (frame, hash) in hashes.iter().enumerate() {
+        let Some(hash) = hash else { continue };
+        let Some(&first) = seen.get(hash) else {
+            seen.insert(*hash, frame);
+            continue;
+        };
+        let (distance, turn_deg) = apart(&cameras[first], &cameras[frame]);
+        let is_moved = distance > MOST_MOVE * extent || turn_deg > MOST_TURN_DEG;
+        (if is_moved { &mut contradictions } else { &mut equal }).push(frame);
+    }
+    if !contradictions.is_empty() {
+        let frames = named(&contradictions);
+        check.reasons.push(format!("{frames} repeat the picture of an earlier frame that has another camera"));
+    }
+    if !equal.is_empty() {
+        check.notes.push(format!("{} repeat the picture and the camera of an earlier frame", named(&equal)));
+    }
+}
+
+/// Distance of the centres, and the angle between the orientations in degrees.
+fn apart(a: &Camera, b: &Camera) -> (f64, f64) {
+    let trace = (a.c2w.rotation.transpose() * b.c2w.rotation).diagonal().element_sum();
+    let turn_deg = ((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees();
+    (a.c2w.translation.distance(b.c2w.translation), turn_deg)
+}
+
+/// Largest distance of a camera centre from the first.
+fn extent(cameras: &[Camera]) -> f64 {
+    cameras.iter().map(|camera| apart(&cameras[0], camera).0).fold(0.0, f64::max)
+}
+
+/// `3 frames (1, 4, 7)`, with dots beyond a handful.
+pub(crate) fn named(frames: &[usize]) -> String {
+    let list: Vec<String> = frames.iter().take(MAX_NAMED).map(ToString::to_string).collect();
+    let more = if frames.len() > MAX_NAMED { ", .." } else { "" };
+    let noun = if frames.len() == 1 { "frame" } else { "frames" };
+    format!("{} {noun} ({}{more})", frames.len(), list.join(", "))
+}

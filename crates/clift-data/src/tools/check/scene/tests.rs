@@ -1,0 +1,190 @@
+//! Right cameras pass, wrong ones are flagged.
+
+use crate::tools::check::result::MAX_EPIPOLAR_PX;
+use std::sync::OnceLock;
+
+use glam::{DMat3, DVec3};
+use rayon::prelude::*;
+
+use super::*;
+use crate::error::DataError;
+use crate::geometry::camera::Camera;
+use crate::geometry::pose::Pose;
+use crate::synthetic::config::SyntheticConfig;
+use crate::synthetic::source::SyntheticSource;
+
+/// A room whose frames are traced once.
+struct Traced {
+    cameras: Vec<Camera>,
+    frames: Vec<Frame>,
+}
+
+/// Two rooms with patterns fine enough to find corners in, seen from nearby as in a video.
+fn rooms() -> &'static [Traced] {
+    static ROOMS: OnceLock<Vec<Traced>> = OnceLock::new();
+    ROOMS.get_or_init(|| {
+        let config = SyntheticConfig {
+            num_scenes: 2,
+            num_frames: 12,
+            width: 320,
+            height: 240,
+            path_length: 1.2,
+            texture_frequency: 3.0,
+            specular: 0.1,
+            ..Default::default()
+        };
+        let source = SyntheticSource::new(config).unwrap();
+        let traced = |scene: usize| Traced {
+            cameras: source.cameras(scene).unwrap(),
+            frames: (0..12).into_par_iter().map(|frame| source.frame(scene, frame).unwrap()).collect(),
+        };
+        (0..2).map(traced).collect()
+    })
+}
+
+/// A room with its cameras, or its frames, changed.
+struct Changed<C, F> {
+    room: &'static Traced,
+    cameras: C,
+    frame: F,
+}
+
+impl<C, F> SceneSource for Changed<C, F>
+where
+    C: Fn(usize, &mut Camera) + Send + Sync,
+    F: Fn(usize) -> usize + Send + Sync,
+{
+    fn num_scenes(&self) -> usize {
+        1
+    }
+    fn key(&self, _scene: usize) -> &'static str {
+        "room"
+    }
+    fn find(&self, _key: &str) -> Option<usize> {
+        None
+    }
+    fn cameras(&self, _scene: usize) -> Result<Vec<Camera>, DataError> {
+        let mut cameras = self.room.cameras.clone();
+        cameras.iter_mut().enumerate().for_each(|(frame, camera)| (self.cameras)(frame, camera));
+        Ok(cameras)
+    }
+    fn frame(&self, _scene: usize, frame: usize) -> Result<Frame, DataError> {
+        match (self.frame)(frame) {
+            usize::MAX => Err(DataError::BadImage { key: "k".into(), frame, what: "it is torn".into() }),
+            shown => Ok(self.room.frames[shown].clone()),
+        }
+    }
+}
+
+fn check(cameras: impl Fn(usize, &mut Camera) + Send + Sync) -> SceneCheck {
+    check_scene(&Changed { room: &rooms()[0], cameras, frame: |frame| frame }, 0).check
+}
+
+/// Up or down: the camera goes sideways, and a turn to the side would move points along their epipolar lines.
+fn turned(c2w: Pose, angle_deg: f64) -> Pose {
+    c2w.after(Pose { rotation: DMat3::from_rotation_x(angle_deg.to_radians()), ..Pose::IDENTITY })
+}
+
+#[test]
+fn rooms_with_right_cameras_pass() {
+    for room in rooms() {
+        let source = Changed { room, cameras: |_, _: &mut _| (), frame: |frame| frame };
+        let Checked { check, picture } = check_scene(&source, 0);
+        assert!(check.ok && check.reasons.is_empty(), "{check:?}");
+        assert_eq!((check.num_frames, check.image_size), (12, Some([320, 240])));
+        assert!(check.epipolar_px.is_some_and(|px| px < 0.7), "{check:?}");
+        assert!(check.pairs.len() >= 5, "{check:?}");
+        assert_eq!(picture.unwrap().height, 240);
+    }
+}
+
+#[test]
+fn cameras_that_do_not_fit_the_pictures_are_flagged() {
+    let flagged = |name: &str, check: SceneCheck| {
+        assert!(!check.ok, "{name}: {check:?}");
+        assert!(check.epipolar_px.is_some_and(|px| px > MAX_EPIPOLAR_PX), "{name}: {check:?}");
+        assert!(check.reasons[0].contains("from their epipolar lines"), "{name}: {check:?}");
+    };
+    // A degree of a focal length of 417 pixels, at 640 columns, is 7 pixels.
+    flagged(
+        "random turns",
+        check(|frame, camera| {
+            camera.c2w = turned(camera.c2w, 0.8 * ((frame * 7919 % 13) as f64 / 6.0 - 1.0));
+        }),
+    );
+    flagged(
+        "OpenGL axes",
+        check(|_, camera| {
+            camera.c2w.rotation *= DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+        }),
+    );
+    flagged("world to camera", check(|_, camera| camera.c2w = camera.c2w.inverse()));
+    flagged("focal length of another camera", check(|_, camera| camera.intrinsics_norm.fx *= 1.25));
+    let shuffled = Changed { room: &rooms()[0], cameras: |_, _: &mut _| (), frame: |frame| (frame * 5 + 2) % 12 };
+    flagged("frames of other cameras", check_scene(&shuffled, 0).check);
+}
+
+#[test]
+fn implausible_cameras_are_flagged_with_what_is_implausible() {
+    let reasons = |check: SceneCheck| {
+        assert!(!check.ok);
+        check.reasons.join("; ")
+    };
+    let text = reasons(check(|_, camera| camera.intrinsics_norm.cx = 0.9));
+    assert!(
+        text.contains("principal point at (0.900, 0.500) of the picture in 12 frames (0, 1, 2, 3, 4, ..)"),
+        "{text}"
+    );
+    let text = reasons(check(|frame, camera| {
+        if frame == 3 {
+            camera.intrinsics_norm.fx = 0.2;
+        }
+    }));
+    assert!(text.contains("degrees in 1 frame (3), expected 5 to 120"), "{text}");
+    let text = reasons(check(|_, camera| camera.intrinsics_norm.fy *= 2.0));
+    assert!(text.contains("fx / fy = 0.500: are they for another picture size?"), "{text}");
+    let text = reasons(check(|frame, camera| camera.c2w.rotation.x_axis.x += 0.004 * f64::from(frame == 5)));
+    assert!(text.contains("off orthonormal ones by up to"), "{text}");
+    let text = reasons(check(|_, camera| camera.c2w.translation = DVec3::new(1.0, 2.0, 3.0)));
+    assert!(text.contains("has no baseline"), "{text}");
+}
+
+#[test]
+fn frames_that_repeat_or_cannot_be_read_are_told() {
+    let config = SyntheticConfig { num_scenes: 1, num_frames: 8, width: 48, height: 32, ..Default::default() };
+    let source = SyntheticSource::new(config).unwrap();
+    let frames = (0..8).map(|frame| source.frame(0, frame).unwrap()).collect();
+    let room: &'static Traced = Box::leak(Box::new(Traced { cameras: source.cameras(0).unwrap(), frames }));
+    let of = |frame: fn(usize) -> usize, cameras: fn(usize, &mut Camera)| {
+        check_scene(&Changed { room, cameras, frame }, 0).check
+    };
+    let stuck = of(|frame| frame.min(5), |_, _| ());
+    assert!(!stuck.ok);
+    assert_eq!(stuck.reasons, ["2 frames (6, 7) repeat the picture of an earlier frame that has another camera"]);
+    let torn = of(|frame| if frame == 2 { usize::MAX } else { frame }, |_, _| ());
+    assert!(
+        torn.reasons[0].starts_with("1 frame (2) cannot be read; the first: frame 2 of scene k cannot"),
+        "{torn:?}"
+    );
+    // Too small for corners: said, and not held against the scene.
+    let small = of(|frame| frame, |_, _| ());
+    assert!(small.ok && small.epipolar_px.is_none(), "{small:?}");
+    assert!(small.notes[0].starts_with("poses were not compared with the pictures: 0 matching corners"), "{small:?}");
+}
+
+#[test]
+fn scenes_that_were_left_out_are_flagged_with_the_reason() {
+    let mut ledger = Ledger::new(3);
+    ledger.skip("a", "not a scene");
+    for name in ["0005.jpg", "0010.jpg"] {
+        ledger.skip_frame("b", name, "no such file");
+    }
+    let checks = left_out(&ledger);
+    assert_eq!(checks.len(), 1);
+    assert!(!checks[0].ok && checks[0].key == "a" && checks[0].reasons == ["not a scene"]);
+    assert!(checks[0].notes.is_empty());
+    let mut check = SceneCheck { key: "b".into(), ok: true, ..SceneCheck::default() };
+    note_frames(&ledger, &mut check);
+    assert!(check.ok);
+    assert_eq!(check.notes, ["2 frames left out, no such file: 0005.jpg, 0010.jpg"]);
+}

@@ -1,0 +1,306 @@
+//! Converted scenes are the same scenes.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use super::*;
+use crate::scene_source::Split;
+use crate::skip_report::Skip;
+use crate::sources::chunks::chunk_source::ChunkSource;
+use crate::sources::dataset_root::DatasetRoot;
+use crate::sources::filters::SceneFilters;
+use crate::sources::open::{OpenedSource, open_source};
+use crate::sources::options::SourceOptions;
+use crate::synthetic::config::SyntheticConfig;
+use crate::synthetic::source::SyntheticSource;
+use crate::testing::TestSource;
+
+const CHUNKS: ConvertOptions = options(ConvertTo::Chunks { target_bytes: 1 });
+const SCENES: ConvertOptions = options(ConvertTo::Scenes);
+
+const fn options(to: ConvertTo) -> ConvertOptions {
+    ConvertOptions { to, encoding: Encoding::Png, opened_with: String::new() }
+}
+
+/// Converts a source of which opening has left nothing out.
+fn convert_all(
+    source: &dyn SceneSource,
+    folder: &Path,
+    options: &ConvertOptions,
+    done: impl FnMut(usize),
+) -> Result<Converted, DataError> {
+    convert(source, &Ledger::new(source.num_scenes()), folder, options, done)
+}
+
+fn open(root: &Path, split: Split) -> OpenedSource {
+    open_source(&DatasetRoot::find(root).unwrap(), split, &SourceOptions::default()).unwrap()
+}
+
+fn rooms(num_scenes: usize) -> SyntheticSource {
+    let config = SyntheticConfig { num_scenes, num_frames: 3, width: 16, height: 8, ..Default::default() };
+    SyntheticSource::new(config).unwrap()
+}
+
+fn mini() -> ChunkSource {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
+    ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap()
+}
+
+fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap());
+    entries.map(|entry| (entry.file_name().into_string().unwrap(), std::fs::read(entry.path()).unwrap())).collect()
+}
+
+fn same(a: &dyn SceneSource, b: &dyn SceneSource) {
+    assert_eq!(a.num_scenes(), b.num_scenes());
+    for scene in 0..a.num_scenes() {
+        let other = b.find(a.key(scene)).unwrap();
+        assert_eq!(a.timestamps(scene).unwrap(), b.timestamps(other).unwrap());
+        assert_eq!(a.url(scene).unwrap(), b.url(other).unwrap());
+        let (cameras, others) = (a.cameras(scene).unwrap(), b.cameras(other).unwrap());
+        assert_eq!(cameras.len(), others.len());
+        for (frame, (camera, other_camera)) in cameras.iter().zip(&others).enumerate() {
+            assert_eq!(a.frame(scene, frame).unwrap(), b.frame(other, frame).unwrap());
+            for (x, y) in camera.to_re10k().iter().zip(other_camera.to_re10k()) {
+                assert!((x - y).abs() < 1e-6 * (1.0 + x.abs()), "{x} {y}"); // f32 files
+            }
+        }
+    }
+}
+
+#[test]
+fn chunks_and_scenes_hold_the_same_and_keep_the_files_of_the_pictures() {
+    for options in [CHUNKS, SCENES] {
+        let folder = tempfile::tempdir().unwrap();
+        let source = mini();
+        let mut seen = Vec::new();
+        let converted = convert_all(&source, &folder.path().join("train"), &options, |done| seen.push(done)).unwrap();
+        assert_eq!((converted.num_scenes, converted.num_found, converted.num_frames), (2, 0, 16));
+        assert_eq!((converted.num_encoded, converted.left_out.skips.len()), (0, 0));
+        assert_eq!(seen, [1, 2]);
+        let OpenedSource { source: back, report, .. } = open(folder.path(), Split::Train);
+        assert_eq!(report.num_used(), 2);
+        same(&source, back.as_ref());
+        for scene in 0..2 {
+            let other = back.find(source.key(scene)).unwrap();
+            for frame in 0..8 {
+                assert_eq!(source.encoded_frame(scene, frame).unwrap(), back.encoded_frame(other, frame).unwrap());
+            }
+        }
+    }
+}
+
+#[test]
+fn every_layout_is_converted_to_the_same_scene() {
+    let layouts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/layouts");
+    let open = |root: &Path| open(root, Split::Test).source;
+    for name in ["re10k_txt", "re10k_folders", "dl3dv_flat", "capture", "colmap_bin", "scenes"] {
+        let source = open(&layouts.join(name));
+        for options in [CHUNKS, SCENES] {
+            let folder = tempfile::tempdir().unwrap();
+            let converted = convert_all(source.as_ref(), &folder.path().join("test"), &options, |_| ()).unwrap();
+            assert_eq!((converted.num_scenes, &converted.left_out.skips[..]), (source.num_scenes(), &[][..]), "{name}");
+            same(source.as_ref(), open(folder.path()).as_ref());
+        }
+        if name.starts_with("re10k") {
+            let times: Vec<i64> = (0..6).map(|frame| 1_000_000 + 33_367 * frame).collect();
+            assert_eq!(source.timestamps(0).unwrap(), times, "{name}");
+        }
+    }
+}
+
+#[test]
+fn pictures_without_a_file_are_encoded() {
+    let folder = tempfile::tempdir().unwrap();
+    let converted = convert_all(&rooms(3), &folder.path().join("test"), &CHUNKS, |_| ()).unwrap();
+    assert_eq!((converted.num_frames, converted.num_encoded), (9, 9));
+    same(&rooms(3), open(folder.path(), Split::Test).source.as_ref());
+}
+
+/// Rooms of which so many frames can be read, three per scene: as when a process is killed.
+fn interrupted(num_scenes: usize, num_frames: usize) -> TestSource {
+    let left = AtomicUsize::new(num_frames);
+    TestSource::new(rooms(num_scenes)).with_frames(move |_, _, frame| {
+        let may = |left: usize| left.checked_sub(1);
+        assert!(left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, may).is_ok(), "killed");
+        Ok(frame)
+    })
+}
+
+#[test]
+fn an_interrupted_conversion_goes_on_and_ends_with_the_same_files() {
+    for options in [CHUNKS, SCENES] {
+        let whole = tempfile::tempdir().unwrap();
+        convert_all(&rooms(6), whole.path(), &options, |_| ()).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let killed = interrupted(6, 9);
+        let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &options, |_| ()));
+        assert!(std::panic::catch_unwind(run).is_err());
+        assert!(!folder.path().join("index.json").exists());
+        // One of the three files is damaged meanwhile: it is made again.
+        let damaged = files(folder.path()).into_keys().find(|name| name.contains(".torch")).unwrap();
+        std::fs::write(folder.path().join(&damaged), [&files(folder.path())[&damaged][..], b"x"].concat()).unwrap();
+        let converted = convert_all(&rooms(6), folder.path(), &options, |_| ()).unwrap();
+        assert_eq!((converted.num_scenes, converted.num_found, converted.num_frames), (6, 2, 12));
+        let (got, expected) = (files(folder.path()), files(whole.path()));
+        assert_eq!(got.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
+        for name in got.keys().filter(|name| *name != "SHA256SUMS") {
+            assert!(got[name] == expected[name], "{name}");
+        }
+        // Finished: no picture is read again.
+        let again = interrupted(6, 0);
+        let converted = convert_all(&again, folder.path(), &options, |_| ()).unwrap();
+        assert_eq!((converted.num_found, converted.num_frames), (6, 0));
+        assert_eq!(files(folder.path()).len(), expected.len());
+    }
+}
+
+/// Three rooms of which the second cannot be read.
+fn second_is_torn() -> TestSource {
+    TestSource::new(rooms(3)).with_torn_frames(|scene| scene == 1)
+}
+
+#[test]
+fn a_scene_that_cannot_be_read_is_named_and_made_later() {
+    let folder = tempfile::tempdir().unwrap();
+    let converted = convert_all(&second_is_torn(), folder.path(), &SCENES, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (2, 1));
+    assert!(
+        converted.left_out.skips[0].key.ends_with("00001") && converted.left_out.skips[0].reason.contains("it is torn")
+    );
+    assert!(files(folder.path()).contains_key("skipped.json"));
+    let converted = convert_all(&rooms(3), folder.path(), &SCENES, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.num_found, converted.left_out.skips.len()), (3, 2, 0));
+    assert!(!files(folder.path()).contains_key("skipped.json"));
+}
+
+#[test]
+fn a_folder_of_other_scenes_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    convert_all(&rooms(3), folder.path(), &SCENES, |_| ()).unwrap();
+    let message = convert_all(&mini(), folder.path(), &SCENES, |_| ()).unwrap_err().to_string();
+    assert!(message.contains("which is not to be converted; choose another folder"), "{message}");
+    assert!(!is_file_name("a/b") && !is_file_name("..") && is_file_name("1K-ab.c"));
+    assert!(!"*?\"<>|".chars().any(|no| is_file_name(&format!("a{no}"))), "not on Windows");
+    assert!(is_file_name(&"k".repeat(200)) && !is_file_name(&"k".repeat(201)));
+}
+
+#[test]
+fn a_scene_that_can_no_longer_be_opened_stays_as_it_was_converted() {
+    for options in [CHUNKS, SCENES] {
+        let folder = tempfile::tempdir().unwrap();
+        convert_all(&rooms(3), folder.path(), &options, |_| ()).unwrap();
+        let before = files(folder.path());
+        let again = |reason: &str| {
+            let mut left_out = Ledger::new(3);
+            left_out.skip(rooms(3).key(2), reason);
+            convert(&rooms(2), &left_out, folder.path(), &options, |_| ())
+        };
+        let converted = again("its cameras cannot be read").unwrap();
+        assert_eq!((converted.num_scenes, converted.num_found, converted.left_out.num_used()), (3, 3, 3));
+        assert!(converted.left_out.notes[0].starts_with("1 scene could not be read again, kept as converted before ("));
+        assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), before.keys().collect::<Vec<_>>());
+        // Those of the test half have no place among the others, wherever else they are.
+        for reason in [KEPT_FOR_TESTING, crate::sources::test_scenes::KEPT_AND_ABSENT] {
+            let message = again(reason).unwrap_err().to_string();
+            assert!(message.contains("which is not to be converted; choose another folder"), "{message}");
+        }
+    }
+}
+
+#[test]
+fn an_index_of_files_that_are_gone_goes_before_they_are_made_again() {
+    let folder = tempfile::tempdir().unwrap();
+    convert_all(&rooms(3), folder.path(), &CHUNKS, |_| ()).unwrap();
+    std::fs::remove_file(folder.path().join("000001.torch")).unwrap();
+    let killed = interrupted(3, 0);
+    let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &CHUNKS, |_| ()));
+    assert!(std::panic::catch_unwind(run).is_err());
+    assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), ["000000.torch", "000002.torch", "SHA256SUMS"]);
+}
+
+#[test]
+fn chunks_have_no_more_frames_than_can_be_read_and_scenes_of_more_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let one = options(ConvertTo::Chunks { target_bytes: u64::MAX });
+    let num_frames = |scene| if scene == 1 { 60_000 } else { 30_000 };
+    let long = TestSource::new(rooms(3))
+        .with_cameras(move |scene, cameras| Ok(vec![cameras[0]; num_frames(scene)]))
+        .with_encoded_frames(|_, frame| Some(vec![frame as u8]));
+    let converted = convert_all(&long, folder.path(), &one, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (2, 1));
+    let reason = &converted.left_out.skips[0].reason;
+    assert!(reason.contains("has 60000 frames, more than a file holds"), "{reason}");
+    for name in ["000000.torch", "000001.torch"] {
+        let table = ChunkTable::read(&folder.path().join(name)).unwrap();
+        assert_eq!(table.scenes.into_values().map(|scene| scene.images.len()).collect::<Vec<_>>(), [30_000]);
+    }
+}
+
+#[test]
+fn a_folder_that_was_made_with_other_options_is_refused_and_stays_as_it_is() {
+    let folder = tempfile::tempdir().unwrap();
+    convert_all(&rooms(2), folder.path(), &CHUNKS, |_| ()).unwrap();
+    let before = files(folder.path());
+    let others = [
+        SCENES,
+        options(ConvertTo::Chunks { target_bytes: 2 }),
+        ConvertOptions { encoding: Encoding::Jpeg(90), ..CHUNKS },
+        ConvertOptions { opened_with: "data.files.undistort=false".into(), ..CHUNKS },
+    ];
+    for other in others {
+        let message = convert_all(&rooms(2), folder.path(), &other, |_| ()).unwrap_err().to_string();
+        assert!(message.contains("its files were made as: chunks of 1 bytes, PNG; asked for are: "), "{message}");
+        assert!(message.contains("give the same options or choose another folder"), "{message}");
+        assert!(files(folder.path()) == before);
+    }
+}
+
+#[test]
+fn scenes_that_have_changed_since_are_written_anew() {
+    for (num_frames, shift) in [(2, 0.0), (3, 0.001)] {
+        // All in one chunk; a chunk and a file for each.
+        let one = options(ConvertTo::Chunks { target_bytes: u64::MAX });
+        for (options, num_found) in [(one, 0), (CHUNKS, 2), (SCENES, 2)] {
+            let (folder, whole) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+            let before = TestSource::new(rooms(3)).with_cameras(move |scene, mut cameras| {
+                if scene == 1 {
+                    cameras.truncate(num_frames);
+                    cameras[0].c2w.translation[0] += shift;
+                }
+                Ok(cameras)
+            });
+            convert_all(&before, folder.path(), &options, |_| ()).unwrap();
+            let converted = convert_all(&rooms(3), folder.path(), &options, |_| ()).unwrap();
+            assert_eq!((converted.num_scenes, converted.num_found, converted.num_changed), (3, num_found, 1));
+            convert_all(&rooms(3), whole.path(), &options, |_| ()).unwrap();
+            let (mut got, mut expected) = (files(folder.path()), files(whole.path()));
+            for files in [&mut got, &mut expected] {
+                files.remove("SHA256SUMS"); // in the order of writing
+            }
+            assert!(got == expected, "{:?}", got.keys());
+        }
+    }
+}
+
+#[test]
+fn what_opening_left_out_is_in_the_list_of_what_was_skipped() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut left_out = Ledger::new(4);
+    left_out.skip("far", "without any picture");
+    left_out.skip_frame("near", "7.jpg", "without a picture");
+    let converted = convert(&second_is_torn(), &left_out, folder.path(), &SCENES, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.left_out.num_scenes, converted.left_out.num_used()), (2, 4, 2));
+    let text = std::fs::read(folder.path().join("skipped.json")).unwrap();
+    let saved: Ledger = serde_json::from_slice(&text).unwrap();
+    assert_eq!((&saved, saved.skips.len(), saved.frames.len()), (&converted.left_out, 2, 1));
+    assert_eq!(saved.skips[0], Skip { key: "far".into(), reason: "without any picture".into() });
+}
+
+#[test]
+fn no_index_is_written_where_no_scene_can_be_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let converted =
+        convert_all(&TestSource::new(rooms(1)).with_torn_frames(|_| true), folder.path(), &CHUNKS, |_| ()).unwrap();
+    assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (0, 1));
+    assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), ["SHA256SUMS", "skipped.json"]);
+}

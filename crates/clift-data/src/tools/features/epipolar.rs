@@ -1,0 +1,195 @@
+//! Fundamental matrices of two cameras, and of matches by RANSAC.
+
+use glam::{DMat3, DVec3};
+
+use crate::geometry::camera::Camera;
+use crate::geometry::pose::Pose;
+use crate::random::{below, step_rng};
+use crate::tools::features::correspondence::{Match, WIDTH};
+
+/// Largest distance of an inlier from its epipolar lines, in pixels.
+const MOST_PX: f64 = 1.5;
+/// Most samples of eight matches.
+const MAX_TRIES: u64 = 3000;
+/// Probability of no sample of eight inliers at which the search ends.
+const LEAST_DOUBT: f64 = 1e-4;
+/// Fewest inliers: eight fit any geometry, and a few more by chance.
+const FEWEST: usize = 20;
+/// Smallest share of inliers; of wrong matches about one in fifty lies on its line.
+const LEAST_SHARE: f64 = 0.25;
+
+/// The fundamental matrix of two cameras whose images have the given columns and rows, in the units of [`Match`]:
+/// `second^T F first = 0` for a point seen at `first` and `second`.
+pub fn of_cameras(cameras: [&Camera; 2], sizes: [[usize; 2]; 2]) -> DMat3 {
+    // Both images are WIDTH wide; their height keeps the shape of the pixels.
+    let inverse_intrinsics = |i: usize| {
+        let [columns, rows] = sizes[i].map(|side| side as f64);
+        let k = cameras[i].intrinsics_norm;
+        let (width, height) = (WIDTH as f64, WIDTH as f64 * rows / columns);
+        let (fx, fy, cx, cy) = (k.fx * width, k.fy * height, k.cx * width, k.cy * height);
+        DMat3::from_rows_array(&[1.0 / fx, 0.0, -cx / fx, 0.0, 1.0 / fy, -cy / fy, 0.0, 0.0, 1.0])
+    };
+    let Pose { rotation, translation: t } = cameras[1].c2w.inverse().after(cameras[0].c2w);
+    // E = [t]x R, column by column.
+    let essential = DMat3::from_cols(t.cross(rotation.x_axis), t.cross(rotation.y_axis), t.cross(rotation.z_axis));
+    inverse_intrinsics(1).transpose() * essential * inverse_intrinsics(0)
+}
+
+/// The epipolar line `a x + b y + c = 0` in the second image of a point in the first, as `(a, b, c)` with unit normal
+/// `(a, b)`; `None` for a point at the epipole.
+pub fn line(geometry: &DMat3, point: [f64; 2]) -> Option<DVec3> {
+    let line = *geometry * DVec3::new(point[0], point[1], 1.0);
+    let length = line.x.hypot(line.y);
+    (length > 0.0 && length.is_finite()).then(|| line / length)
+}
+
+/// The epipolar line in the first image of a point in the second.
+pub fn line_back(geometry: &DMat3, point: [f64; 2]) -> Option<DVec3> {
+    line(&geometry.transpose(), point)
+}
+
+/// Symmetric epipolar distance in pixels: the mean of the distances of both points to the line of the other.
+pub fn epipolar_distance(geometry: &DMat3, pair: &Match) -> f64 {
+    let away = |line: Option<DVec3>, [x, y]: [f64; 2]| line.map_or(0.0, |line| line.dot(DVec3::new(x, y, 1.0)).abs());
+    let there = away(line(geometry, pair.first), pair.second);
+    let back = away(line_back(geometry, pair.second), pair.first);
+    f64::midpoint(there, back)
+}
+
+/// The largest set of matches that agree with one fundamental matrix, by RANSAC with samples of eight; empty if too few
+/// agree. Independent of cameras, so that cameras can be checked against the result.
+pub(crate) fn consistent(matches: &[Match]) -> Vec<Match> {
+    if matches.len() < FEWEST {
+        return Vec::new();
+    }
+    let mut rng = step_rng(0, matches.len() as u64, "epipolar geometry");
+    let mut best: Vec<Match> = Vec::new();
+    let mut tries = 0;
+    let mut enough = MAX_TRIES;
+    while tries < enough {
+        tries += 1;
+        let sample: [Match; 8] = std::array::from_fn(|_| matches[below(&mut rng, matches.len())]);
+        let geometry = eight_point(&sample);
+        let agrees = |pair: &&Match| epipolar_distance(&geometry, pair) < MOST_PX;
+        let num_agreeing = matches.iter().filter(agrees).count();
+        if num_agreeing > best.len() {
+            let share = num_agreeing as f64 / matches.len() as f64;
+            let doubt = (1.0 - share.powi(8)).max(f64::MIN_POSITIVE).ln();
+            enough = if doubt < 0.0 { MAX_TRIES.min((LEAST_DOUBT.ln() / doubt).ceil() as u64) } else { MAX_TRIES };
+            best = matches.iter().filter(agrees).copied().collect();
+        }
+    }
+    let least = FEWEST.max((LEAST_SHARE * matches.len() as f64).ceil() as usize);
+    if best.len() < least { Vec::new() } else { best }
+}
+
+/// A matrix that eight matches satisfy. Its rank may be three, which rejects wrong matches as well as rank two.
+fn eight_point(sample: &[Match; 8]) -> DMat3 {
+    // Coordinates around zero and of about one keep the elimination accurate.
+    let scale = WIDTH as f64 / 2.0;
+    let unit = |[x, y]: [f64; 2]| [x / scale - 1.0, y / scale - 1.0];
+    let rows = sample.map(|pair| {
+        let ([x, y], [u, v]) = (unit(pair.first), unit(pair.second));
+        [u * x, u * y, u, v * x, v * y, v, x, y, 1.0]
+    });
+    let inner = DMat3::from_rows_array(&null_vector(rows));
+    let to_unit = DMat3::from_rows_array(&[1.0 / scale, 0.0, -1.0, 0.0, 1.0 / scale, -1.0, 0.0, 0.0, 1.0]);
+    to_unit.transpose() * inner * to_unit
+}
+
+/// A null vector of an 8 x 9 matrix, by elimination with full pivoting; one of many for points of a plane.
+fn null_vector(mut rows: [[f64; 9]; 8]) -> [f64; 9] {
+    let mut order: [usize; 9] = std::array::from_fn(|i| i);
+    let mut rank = 0;
+    while rank < 8 {
+        let places = (rank..8).flat_map(|row| (rank..9).map(move |column| (row, column)));
+        let largest = places.max_by(|a, b| rows[a.0][a.1].abs().total_cmp(&rows[b.0][b.1].abs()));
+        let Some((row, column)) = largest.filter(|(row, column)| rows[*row][*column].abs() > 1e-9) else { break };
+        rows.swap(rank, row);
+        for row in &mut rows {
+            row.swap(rank, column);
+        }
+        order.swap(rank, column);
+        let pivot = rows[rank];
+        for row in &mut rows[rank + 1..] {
+            let factor = row[rank] / pivot[rank];
+            (rank..9).for_each(|i| row[i] -= factor * pivot[i]);
+        }
+        rank += 1;
+    }
+    let mut solution = [0.0; 9];
+    solution[8] = 1.0;
+    for row in (0..rank).rev() {
+        let sum: f64 = (row + 1..9).map(|i| rows[row][i] * solution[i]).sum();
+        solution[row] = -sum / rows[row][row];
+    }
+    let mut vector = [0.0; 9];
+    order.iter().zip(solution).for_each(|(place, value)| vector[*place] = value);
+    vector
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::camera::IntrinsicsNorm;
+    use crate::random::unit;
+
+    /// Two cameras that look at about the same, and points that both see.
+    fn scene(num_points: u64) -> ([Camera; 2], Vec<Match>) {
+        let intrinsics_norm = IntrinsicsNorm { fx: 0.9, fy: 1.2, cx: 0.5, cy: 0.48 };
+        let second = Pose { rotation: DMat3::from_rotation_y(0.2), translation: DVec3::new(-0.7, 0.2, 0.1) };
+        let cameras = [Pose::IDENTITY, second].map(|c2w| Camera { intrinsics_norm, c2w });
+        let seen = |camera: &Camera, point: DVec3| {
+            let [x, y, z] = camera.c2w.inverse().apply(point).to_array();
+            let k = camera.intrinsics_norm.to_pixels(640, 480);
+            [k.fx * x / z + k.cx, k.fy * y / z + k.cy]
+        };
+        let matches = (0..num_points).map(|i| {
+            let mut rng = step_rng(5, i, "test");
+            let point = DVec3::new(2.0 * unit(&mut rng) - 1.0, 1.5 * unit(&mut rng) - 0.7, 3.0 + 2.0 * unit(&mut rng));
+            Match { first: seen(&cameras[0], point), second: seen(&cameras[1], point) }
+        });
+        let matches = matches.collect();
+        (cameras, matches)
+    }
+
+    #[test]
+    fn points_seen_by_both_cameras_lie_on_each_others_lines() {
+        let (cameras, matches) = scene(50);
+        let geometry = of_cameras([&cameras[0], &cameras[1]], [[320, 240], [1280, 960]]);
+        for pair in &matches {
+            assert!(epipolar_distance(&geometry, pair) < 1e-9, "{pair:?}");
+            let line = line(&geometry, pair.first).unwrap();
+            let beside = DVec3::new(pair.second[0] + 3.0 * line.x, pair.second[1] + 3.0 * line.y, 1.0);
+            assert!((line.dot(beside) - 3.0).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn eight_matches_give_the_geometry_of_the_cameras() {
+        let (_, matches) = scene(60);
+        let geometry = eight_point(&std::array::from_fn(|i| matches[i]));
+        for pair in &matches {
+            assert!(epipolar_distance(&geometry, pair) < 1e-6, "{}", epipolar_distance(&geometry, pair));
+        }
+    }
+
+    #[test]
+    fn wrong_matches_are_sorted_out_and_pictures_of_other_places_have_none() {
+        let (_, mut matches) = scene(120);
+        for (i, pair) in matches.iter_mut().enumerate().filter(|(i, _)| i % 3 == 0) {
+            let mut rng = step_rng(6, i as u64, "test");
+            pair.second = [640.0 * unit(&mut rng), 480.0 * unit(&mut rng)];
+        }
+        let kept = consistent(&matches);
+        let right = matches.iter().enumerate().filter(|(i, _)| i % 3 != 0).map(|(_, pair)| *pair);
+        assert!(right.clone().all(|pair| kept.contains(&pair)));
+        assert!(kept.len() < 80 + 8, "{}", kept.len());
+        for (i, pair) in matches.iter_mut().enumerate() {
+            let mut rng = step_rng(7, i as u64, "test");
+            pair.second = [640.0 * unit(&mut rng), 480.0 * unit(&mut rng)];
+        }
+        assert!(consistent(&matches).is_empty());
+        assert!(consistent(&matches[..19]).is_empty());
+    }
+}

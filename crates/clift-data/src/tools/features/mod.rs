@@ -1,0 +1,17 @@
+//! Corners and epipolar geometry.
+//!
+//! - `correspondence`: two corners, one point
+//! - `gray_image`: gray levels, blur, gradients
+//! - `corners`: Shi-Tomasi corners
+//! - `descriptor`: gradient histograms
+//! - `matching`: mutual nearest descriptors
+//! - `epipolar`: fundamental matrices, RANSAC
+//! - `features`: corners of an image, matched
+
+pub(crate) mod corners;
+pub(crate) mod correspondence;
+pub(crate) mod descriptor;
+pub(crate) mod epipolar;
+pub(crate) mod features;
+pub(crate) mod gray_image;
+pub(crate) mod matching;

@@ -1,0 +1,19 @@
+//! `clift data`: info, index, convert.
+//!
+//! - `info`: counts and sizes of a source
+//! - `index_census`: statistics of an evaluation index
+//! - `overlap_index`: make an evaluation index
+//! - `export`: write a source as chunks
+//! - `convert`: convert any layout, resumable
+//! - `checksums`: SHA256SUMS of a folder in progress
+//! - `features`: corners and epipolar geometry
+//! - `check`: `clift data check`
+
+pub(crate) mod check;
+pub(crate) mod checksums;
+pub(crate) mod convert;
+pub(crate) mod export;
+pub(crate) mod features;
+pub(crate) mod index_census;
+pub(crate) mod info;
+pub(crate) mod overlap_index;

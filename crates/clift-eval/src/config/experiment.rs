@@ -1,0 +1,89 @@
+//! The paper's experiments as settings of an evaluation.
+
+use std::str::FromStr;
+
+use clift_model::{ModelError, Preset, TokenCount, parse_value};
+use strum::{IntoStaticStr, VariantArray};
+
+use crate::config::eval_config::EvalConfig;
+use crate::config::method::Variant;
+use crate::config::token_selection::Selection;
+
+/// An experiment of the paper.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "lowercase")]
+pub enum Experiment {
+    /// Quality against data size (section 4.2).
+    Main,
+    /// Random tokens, K-means, K-means and condenser (section 4.3, "`CLiFT` Construction").
+    Ablation,
+    /// Tiles of the views against K-means, each with and without condenser (section 4.3).
+    Patchwise,
+    /// Quality and cost against rendered tokens, half of all stored (section 4.3, "`CLiFT` Rendering").
+    Budget,
+}
+
+impl Experiment {
+    /// Sets variants, token counts and selection; scenes and views stay.
+    ///
+    /// Counts are shares, so that other sizes than the paper's 4,096 tokens are served: its patch-wise table has 256
+    /// and 1,024 of 4,096, its table of render budgets 4,096 of 8,192 stored and 4,096 to 512 rendered.
+    pub fn apply(self, eval: &mut EvalConfig) {
+        let (storage, render, variants): (&[f64], &[f64], &[Variant]) = match self {
+            Self::Main => (&[1.0 / 16.0, 0.125, 0.25, 0.5, 0.75, 1.0], &[], &[Variant::Clift]),
+            Self::Ablation => {
+                (&[1.0 / 32.0, 1.0 / 16.0, 0.125, 0.25, 0.5], &[], &[Variant::Random, Variant::Kmeans, Variant::Clift])
+            }
+            Self::Patchwise => (
+                &[1.0 / 16.0, 0.125, 0.25],
+                &[],
+                &[Variant::Patch, Variant::PatchClift, Variant::Kmeans, Variant::Clift],
+            ),
+            Self::Budget => (&[0.5], &[0.75, 0.5, 0.25, 0.125], &[Variant::Clift]),
+        };
+        let shares = |shares: &[f64]| shares.iter().map(|&share| TokenCount::Share(share)).collect();
+        (eval.storage, eval.render, eval.variants) = (shares(storage), shares(render), variants.into());
+        if self == Self::Budget {
+            // What the published table was made with: no momentum, no count per cell.
+            eval.selection = Selection::Preset(Preset::Global);
+        }
+    }
+}
+
+impl FromStr for Experiment {
+    type Err = ModelError;
+
+    fn from_str(name: &str) -> Result<Self, ModelError> {
+        parse_value("preset", name)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_counts_are_the_papers_at_its_sizes() {
+        let counts = |experiment: Experiment, num_tokens: usize| {
+            let mut eval = EvalConfig::default();
+            experiment.apply(&mut eval);
+            let of = |counts: &[TokenCount], total| counts.iter().map(|c| c.of(total).unwrap()).collect::<Vec<_>>();
+            let storage = of(&eval.storage, num_tokens);
+            let render = of(&eval.render, storage[0]);
+            (storage, render)
+        };
+        assert_eq!(counts(Experiment::Main, 4096).0, [256, 512, 1024, 2048, 3072, 4096]);
+        assert_eq!(counts(Experiment::Ablation, 4096).0, [128, 256, 512, 1024, 2048]);
+        assert!(
+            counts(Experiment::Patchwise, 4096).0.ends_with(&[1024]) && counts(Experiment::Patchwise, 4096).0[0] == 256
+        );
+        assert_eq!(counts(Experiment::Budget, 8192), (vec![4096], vec![3072, 2048, 1024, 512]));
+    }
+
+    #[test]
+    fn an_unknown_experiment_lists_the_known() {
+        assert_eq!("budget".parse::<Experiment>().unwrap(), Experiment::Budget);
+        let message = "table1".parse::<Experiment>().unwrap_err().to_string();
+        assert!(message.contains("main, ablation, patchwise, budget"), "{message}");
+    }
+}

@@ -1,0 +1,57 @@
+//! The contact sheets of an evaluation on disk.
+
+use std::ffi::OsStr;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use clift_data::Unfinished;
+
+use crate::error::EvalError;
+use crate::figures::canvas::Picture;
+use crate::sweep::predictions::file_name;
+
+/// The contact sheets of an evaluation. They replace those of an earlier one in the same folder.
+pub(crate) struct Sheets {
+    folder: PathBuf,
+    files: Unfinished,
+    /// File names of the earlier evaluation's sheets.
+    former: Vec<String>,
+}
+
+impl Sheets {
+    /// Starts the sheets of the evaluation in the folder `evaluation`.
+    pub fn new(evaluation: &Path) -> Result<Self, EvalError> {
+        let folder = evaluation.join("sheets");
+        let files = Unfinished::new(&folder).map_err(EvalError::io("making a folder", &folder))?;
+        // The table of the earlier evaluation names its scenes. Other files in the folder are the user's.
+        let table = std::fs::read_to_string(evaluation.join("scenes.csv")).unwrap_or_default();
+        let mut keys: Vec<&str> = table.lines().skip(1).filter_map(|line| line.split(',').next()).collect();
+        keys.dedup();
+        Ok(Self { folder, files, former: keys.into_iter().map(sheet_name).collect() })
+    }
+
+    /// Writes the sheet of a scene to a temporary folder.
+    pub fn add(&self, sheet: &Picture, key: &str) -> Result<(), EvalError> {
+        sheet.write_png(&self.files.path().join(sheet_name(key)))
+    }
+
+    /// Gives all sheets their final names and removes those of the earlier evaluation.
+    pub fn keep(self) -> Result<(), EvalError> {
+        let Self { folder, files, former } = self;
+        let replace = || {
+            let kept = files.keep()?;
+            for name in former.iter().filter(|name| !kept.contains(OsStr::new(name))) {
+                match std::fs::remove_file(folder.join(name)) {
+                    Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+                    _ => {}
+                }
+            }
+            Ok(())
+        };
+        replace().map_err(EvalError::io("writing the sheets", &folder))
+    }
+}
+
+fn sheet_name(key: &str) -> String {
+    format!("{}.png", file_name(key))
+}

@@ -1,0 +1,110 @@
+//! Pictures that move: animated PNG, which browsers play and other programs show as the first frame.
+
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use crate::error::EvalError;
+use crate::figures::canvas::Picture;
+
+/// An animation that is being written, frame by frame: the file is half done until [`Animation::finish`].
+pub struct Animation {
+    path: PathBuf,
+    writer: png::Writer<BufWriter<File>>,
+    /// Frames that are still to come: the encoder itself would write a file that lacks some.
+    missing: usize,
+}
+
+impl Animation {
+    /// Starts an endless animation of `num_frames` pictures of `width` by `height`, `fps` of them per second.
+    ///
+    /// # Errors
+    /// [`EvalError::Io`] for no frames or no picture.
+    pub fn new(path: &Path, width: usize, height: usize, num_frames: usize, fps: u16) -> Result<Self, EvalError> {
+        let writing = |source| EvalError::Io { action: "writing the animation", source, path: path.to_owned() };
+        let file = BufWriter::new(File::create(path).map_err(writing)?);
+        let mut encoder = png::Encoder::new(file, width as u32, height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        let started = encoder
+            .set_animated(num_frames as u32, 0)
+            .and_then(|()| encoder.set_frame_delay(1, fps))
+            .and_then(|()| encoder.write_header());
+        let writer = started.map_err(|error| failed(path, error))?;
+        Ok(Self { path: path.into(), writer, missing: num_frames })
+    }
+
+    /// Adds the next frame.
+    ///
+    /// # Errors
+    /// [`EvalError::Io`] for a picture of another size, or one too many.
+    pub fn add(&mut self, picture: &Picture) -> Result<(), EvalError> {
+        let Some(missing) = self.missing.checked_sub(1) else {
+            return Err(failed(&self.path, "more frames than announced"));
+        };
+        self.writer.write_image_data(picture.as_rgb8()).map_err(|error| failed(&self.path, error))?;
+        self.missing = missing;
+        Ok(())
+    }
+
+    /// Ends the file.
+    ///
+    /// # Errors
+    /// [`EvalError::Io`] when frames are missing or the file cannot be written.
+    pub fn finish(self) -> Result<(), EvalError> {
+        let Self { path, writer, missing } = self;
+        if missing > 0 {
+            return Err(failed(&path, format!("{missing} frames fewer than announced")));
+        }
+        writer.finish().map_err(|error| failed(&path, error))
+    }
+}
+
+fn failed(path: &Path, error: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> EvalError {
+    EvalError::Io { action: "encoding the animation", source: std::io::Error::other(error), path: path.to_owned() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_frame_comes_back_at_its_time_and_the_first_is_what_a_still_viewer_shows() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("a.png");
+        let colours = [[255, 0, 0], [0, 255, 0], [10, 20, 30]];
+        let mut animation = Animation::new(&path, 5, 3, 3, 12).unwrap();
+        for colour in colours {
+            animation.add(&Picture::new(5, 3, colour)).unwrap();
+        }
+        animation.finish().unwrap();
+
+        let file = std::io::BufReader::new(std::fs::File::open(&path).unwrap());
+        let mut reader = png::Decoder::new(file).read_info().unwrap();
+        let control = *reader.info().animation_control().unwrap();
+        assert_eq!((control.num_frames, control.num_plays), (3, 0));
+        for colour in colours {
+            let mut pixels = vec![0; 5 * 3 * 3];
+            reader.next_frame(&mut pixels).unwrap();
+            assert!(pixels.chunks(3).all(|pixel| pixel == colour), "{pixels:?}");
+            let frame = reader.info().frame_control().unwrap();
+            assert_eq!((frame.delay_num, frame.delay_den), (1, 12));
+        }
+        assert_eq!(image::open(&path).unwrap().into_rgb8().get_pixel(4, 2).0, colours[0]);
+    }
+
+    #[test]
+    fn frames_of_another_size_or_missing_ones_are_errors() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("a.png");
+        let mut animation = Animation::new(&path, 5, 3, 2, 12).unwrap();
+        animation.add(&Picture::new(5, 3, [0; 3])).unwrap();
+        assert!(animation.add(&Picture::new(4, 3, [0; 3])).is_err());
+        assert!(animation.finish().is_err(), "one frame of two");
+        let mut animation = Animation::new(&path, 5, 3, 1, 12).unwrap();
+        animation.add(&Picture::new(5, 3, [0; 3])).unwrap();
+        assert!(animation.add(&Picture::new(5, 3, [0; 3])).is_err(), "two frames of one");
+        assert!(Animation::new(&path, 5, 3, 0, 12).is_err());
+        assert!(Animation::new(&place.path().join("no/a.png"), 5, 3, 1, 12).is_err());
+    }
+}

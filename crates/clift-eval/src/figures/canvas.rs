@@ -1,0 +1,278 @@
+//! 8-bit RGB pictures: what a report shows, and how it reaches the disk.
+
+use std::path::Path;
+
+use clift_data::replace_file;
+use embedded_graphics::mono_font::{MonoFont, MonoTextStyle, iso_8859_1};
+use embedded_graphics::pixelcolor::{Rgb888, RgbColor};
+use embedded_graphics::prelude::{DrawTarget, Drawable, OriginDimensions, Pixel, Point, Size};
+use embedded_graphics::text::{Baseline, Text};
+use image::{ImageEncoder, RgbImage};
+
+use crate::error::EvalError;
+use crate::metrics::image_metrics::check;
+
+/// Mean absolute error over red, green and blue that [`error_map`] shows as its brightest colour.
+pub const ERROR_FULL_SCALE: f32 = 0.25;
+
+/// Size of a line of text.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TextSize {
+    /// 7 x 13 pixels a character.
+    Small,
+    /// 9 x 18 pixels a character, bold.
+    Large,
+}
+
+impl TextSize {
+    fn font(self) -> &'static MonoFont<'static> {
+        match self {
+            Self::Small => &iso_8859_1::FONT_7X13,
+            Self::Large => &iso_8859_1::FONT_9X18_BOLD,
+        }
+    }
+
+    /// Columns and rows of one character.
+    pub fn glyph_px(self) -> (usize, usize) {
+        let size = self.font().character_size;
+        (size.width as usize, size.height as usize)
+    }
+}
+
+/// An 8-bit RGB picture to paint on.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Picture {
+    rgb: RgbImage,
+}
+
+impl Picture {
+    /// Makes a picture of one colour.
+    pub fn new(width: usize, height: usize, colour: [u8; 3]) -> Self {
+        Self { rgb: RgbImage::from_pixel(width as u32, height as u32, image::Rgb(colour)) }
+    }
+
+    /// Takes an 8-bit `[height, width, 3]` array.
+    ///
+    /// # Errors
+    /// [`EvalError::SizeMismatch`] when there are not `height * width * 3` values.
+    pub fn from_rgb8(rgb: &[u8], height: usize, width: usize) -> Result<Self, EvalError> {
+        let mismatch = EvalError::SizeMismatch { expected: height * width * 3, got: rgb.len() };
+        if rgb.len() != height * width * 3 {
+            return Err(mismatch);
+        }
+        RgbImage::from_raw(width as u32, height as u32, rgb.to_vec()).map(|rgb| Self { rgb }).ok_or(mismatch)
+    }
+
+    /// Rounds a `[height, width, 3]` array in [0, 1] to 8 bits; values outside are clamped.
+    ///
+    /// # Errors
+    /// [`EvalError::SizeMismatch`] when there are not `height * width * 3` values.
+    pub fn from_unit(values: &[f32], height: usize, width: usize) -> Result<Self, EvalError> {
+        let rgb: Vec<u8> = values.iter().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+        Self::from_rgb8(&rgb, height, width)
+    }
+
+    /// The pixels, `[height, width, 3]`.
+    pub fn as_rgb8(&self) -> &[u8] {
+        self.rgb.as_raw()
+    }
+
+    /// Columns.
+    pub fn width(&self) -> usize {
+        self.rgb.width() as usize
+    }
+
+    /// Rows.
+    pub fn height(&self) -> usize {
+        self.rgb.height() as usize
+    }
+
+    /// Colour of the pixel in column `x` and row `y`.
+    pub fn pixel(&self, x: usize, y: usize) -> [u8; 3] {
+        self.rgb.get_pixel(x as u32, y as u32).0
+    }
+
+    /// Repeats every pixel `factor` times along both axes, so that each stays visible as it is.
+    #[must_use]
+    pub fn magnified(&self, factor: usize) -> Self {
+        let factor = factor.max(1) as u32;
+        let (width, height) = (self.rgb.width() * factor, self.rgb.height() * factor);
+        Self { rgb: RgbImage::from_fn(width, height, |x, y| *self.rgb.get_pixel(x / factor, y / factor)) }
+    }
+
+    /// Scales to fill `width` by `height` as far as its proportions allow. Whole factors repeat pixels;
+    /// between them the next larger one is shrunk, which keeps the edges of small pictures sharp.
+    #[must_use]
+    pub fn fitted(&self, width: usize, height: usize) -> Self {
+        let scale = (width as f64 / self.width() as f64).min(height as f64 / self.height() as f64);
+        let magnified = self.magnified(scale.ceil() as usize);
+        let scaled = |size: usize| ((size as f64 * scale).round() as u32).max(1);
+        let (width, height) = (scaled(self.width()), scaled(self.height()));
+        if (width, height) == magnified.rgb.dimensions() {
+            return magnified;
+        }
+        Self { rgb: image::imageops::resize(&magnified.rgb, width, height, image::imageops::FilterType::Triangle) }
+    }
+
+    /// Paints `other` with its top left corner at column `x` and row `y`; what does not fit is cut off.
+    pub fn paste(&mut self, other: &Self, x: usize, y: usize) {
+        image::imageops::replace(&mut self.rgb, &other.rgb, x as i64, y as i64);
+    }
+
+    /// Writes one line of text whose top left corner is at column `x` and row `y`.
+    /// Characters beyond Latin-1 are drawn as `?`.
+    pub fn write_text(&mut self, text: &str, x: usize, y: usize, size: TextSize, colour: [u8; 3]) {
+        let style = MonoTextStyle::new(size.font(), Rgb888::new(colour[0], colour[1], colour[2]));
+        let Ok(_) = Text::with_baseline(text, Point::new(x as i32, y as i32), style, Baseline::Top).draw(self);
+    }
+
+    /// The bytes of a PNG file.
+    ///
+    /// # Errors
+    /// For a picture without pixels.
+    pub fn png(&self) -> std::io::Result<Vec<u8>> {
+        let mut png = Vec::new();
+        image::codecs::png::PngEncoder::new(&mut png)
+            .write_image(&self.rgb, self.rgb.width(), self.rgb.height(), image::ExtendedColorType::Rgb8)
+            .map_err(std::io::Error::other)?;
+        Ok(png)
+    }
+
+    /// Writes the picture as PNG, under a temporary name first, so that no reader sees half a file.
+    ///
+    /// # Errors
+    /// [`EvalError::Io`] when the folder cannot be written.
+    pub fn write_png(&self, path: &Path) -> Result<(), EvalError> {
+        self.png().and_then(|png| replace_file(path, &png)).map_err(|source| EvalError::Io {
+            action: "writing the picture",
+            source,
+            path: path.to_owned(),
+        })
+    }
+}
+
+impl OriginDimensions for Picture {
+    fn size(&self) -> Size {
+        Size::new(self.rgb.width(), self.rgb.height())
+    }
+}
+
+impl DrawTarget for Picture {
+    type Color = Rgb888;
+    type Error = std::convert::Infallible;
+
+    fn draw_iter<I: IntoIterator<Item = Pixel<Rgb888>>>(&mut self, pixels: I) -> Result<(), Self::Error> {
+        for Pixel(point, colour) in pixels {
+            let (x, y) = (point.x as u32, point.y as u32); // a negative one wraps to beyond the picture
+            if let Some(pixel) = self.rgb.get_pixel_mut_checked(x, y) {
+                *pixel = image::Rgb([colour.r(), colour.g(), colour.b()]);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Paints where a rendering is wrong: the mean absolute error over red, green and blue, through
+/// [`error_colour`], black at 0 and brightest from [`ERROR_FULL_SCALE`] on.
+///
+/// # Errors
+/// [`EvalError::SizeMismatch`] when either picture does not hold `height * width * 3` values, and
+/// [`EvalError::NotFinite`], which would otherwise be painted as no error.
+pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<Picture, EvalError> {
+    check(pred, target, height * width * 3)?;
+    let colours: Vec<u8> = pred
+        .as_chunks::<3>()
+        .0
+        .iter()
+        .zip(target.as_chunks::<3>().0)
+        .map(|(p, t)| p.iter().zip(t).map(|(p, t)| (p.clamp(0.0, 1.0) - t.clamp(0.0, 1.0)).abs()).sum::<f32>() / 3.0)
+        .flat_map(|error| error_colour(error / ERROR_FULL_SCALE))
+        .collect();
+    Picture::from_rgb8(&colours, height, width)
+}
+
+/// Colours a share of the full scale, from black over purple and orange to pale yellow.
+///
+/// Matplotlib's `inferno`, whose lightness grows evenly, as a polynomial of degree 6.
+pub fn error_colour(share: f32) -> [u8; 3] {
+    const COEFFICIENTS: [[f64; 3]; 7] = [
+        [0.000_219, 0.001_651, -0.019_481],
+        [0.106_513, 0.563_956, 3.932_712],
+        [11.602_493, -3.972_854, -15.942_394],
+        [-41.703_996, 17.436_399, 44.354_145],
+        [77.162_936, -33.402_36, -81.807_31],
+        [-71.319_43, 32.626_064, 73.209_52],
+        [25.131_126, -12.242_669, -23.070_325],
+    ];
+    let share = f64::from(share.clamp(0.0, 1.0));
+    [0, 1, 2].map(|channel| {
+        let value = COEFFICIENTS.iter().rev().fold(0.0, |sum, coefficients| sum * share + coefficients[channel]);
+        (value.clamp(0.0, 1.0) * 255.0).round() as u8
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn lightness([r, g, b]: [u8; 3]) -> f32 {
+        0.2126 * f32::from(r) + 0.7152 * f32::from(g) + 0.0722 * f32::from(b)
+    }
+
+    #[test]
+    fn no_error_is_black_and_more_error_is_never_darker() {
+        assert_eq!(error_colour(0.0), [0, 0, 0]);
+        let shades: Vec<f32> = (0..=64).map(|i| lightness(error_colour(i as f32 / 64.0))).collect();
+        assert!(shades.is_sorted(), "{shades:?}");
+        assert!(shades[64] > 240.0);
+    }
+
+    #[test]
+    fn the_error_map_saturates_at_its_full_scale() {
+        let map = error_map(&[0.5, 0.5, 0.5, 0.75, 0.75, 0.75, 1.0, 1.0, 1.0], &[0.5; 9], 1, 3).unwrap();
+        assert_eq!([0, 1, 2].map(|x| map.pixel(x, 0)), [[0, 0, 0], error_colour(1.0), error_colour(1.0)]);
+        assert!(error_map(&[0.5; 9], &[0.5; 12], 1, 3).is_err());
+        assert!(error_map(&[0.5; 9], &[0.5; 9], 2, 3).is_err());
+        assert!(error_map(&[f32::NAN; 9], &[0.5; 9], 1, 3).is_err());
+    }
+
+    #[test]
+    fn unit_values_round_to_the_nearest_level() {
+        let picture = Picture::from_unit(&[-1.0, 0.4999, 2.0], 1, 1).unwrap();
+        assert_eq!(picture.pixel(0, 0), [0, 127, 255]);
+    }
+
+    #[test]
+    fn a_picture_fills_the_place_it_is_given_without_distortion() {
+        for (place, expected) in [((64, 64), (64, 40)), ((200, 200), (200, 125)), ((16, 99), (16, 10))] {
+            let fitted = Picture::new(32, 20, [9, 9, 9]).fitted(place.0, place.1);
+            assert_eq!((fitted.width(), fitted.height()), expected);
+            assert_eq!(fitted.pixel(expected.0 / 2, expected.1 / 2), [9, 9, 9]);
+        }
+    }
+
+    #[test]
+    fn a_whole_factor_repeats_pixels() {
+        let picture = Picture::from_rgb8(&[0, 0, 0, 255, 255, 255], 1, 2).unwrap().fitted(6, 6);
+        assert_eq!([0, 2, 3, 5].map(|x| picture.pixel(x, 2)[0]), [0, 0, 255, 255]);
+    }
+
+    #[test]
+    fn a_png_reads_back_as_it_was_written_and_leaves_no_temporary_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut picture = Picture::new(40, 20, [1, 2, 3]);
+        picture.write_text("Hi", 2, 2, TextSize::Small, [255, 255, 255]);
+        picture.write_png(&folder.path().join("a.png")).unwrap();
+        let read = image::open(folder.path().join("a.png")).unwrap().to_rgb8();
+        assert_eq!(read, picture.rgb);
+        assert!(read.pixels().any(|pixel| pixel.0 == [255, 255, 255]));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_folder_that_is_missing_is_named() {
+        let error = Picture::new(1, 1, [0; 3]).write_png(Path::new("no/such/folder/a.png")).unwrap_err().to_string();
+        assert!(error.starts_with("writing the picture failed: "), "{error}");
+        assert!(error.ends_with(": no/such/folder/a.png"), "{error}");
+    }
+}

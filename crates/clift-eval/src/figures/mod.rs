@@ -1,0 +1,11 @@
+//! Result images.
+//!
+//! - `canvas`: an RGB image to draw on
+//! - `contact_sheet`: rows of views, columns of methods
+//! - `animation`: animated PNG, streamed
+//! - `scene_figure`: images of one scene for a report
+
+pub(crate) mod animation;
+pub(crate) mod canvas;
+pub(crate) mod contact_sheet;
+pub(crate) mod scene_figure;

@@ -1,0 +1,182 @@
+//! PSNR and SSIM of one picture, in f64, as the papers of this field compute them.
+//!
+//! Pictures are row-major `[height, width, 3]` slices with values in [0, 1].
+
+use crate::error::EvalError;
+
+/// Smallest height and width that hold one SSIM window.
+pub const SSIM_MIN_SIZE_PX: usize = 2 * SSIM_RADIUS + 1;
+
+const SSIM_RADIUS: usize = 5;
+const SSIM_SIGMA_PX: f64 = 1.5;
+const SSIM_C1: f64 = 0.01 * 0.01;
+const SSIM_C2: f64 = 0.03 * 0.03;
+/// scikit-image's `use_sample_covariance`: n / (n - 1) with n = 11 x 11.
+const SAMPLE_COVARIANCE: f64 = 121.0 / 120.0;
+
+/// Measures the peak signal-to-noise ratio in dB, after clamping both pictures to [0, 1].
+///
+/// The mean squared error is over all values. Identical pictures have no error and give `+inf`;
+/// [`crate::statistics::scene_means::PSNR_CAP_DB`] is what a mean takes for it.
+///
+/// # Errors
+/// [`EvalError::SizeMismatch`], and [`EvalError::NotFinite`] where clamping would hide a NaN or an infinity.
+pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, EvalError> {
+    check(pred, target, target.len())?;
+    let squared_error: f64 = pred
+        .iter()
+        .zip(target)
+        .map(|(p, t)| (f64::from(p.clamp(0.0, 1.0)) - f64::from(t.clamp(0.0, 1.0))).powi(2))
+        .sum();
+    Ok(-10.0 * (squared_error / target.len() as f64).log10())
+}
+
+/// Measures the structural similarity of two `[height, width, 3]` pictures; 1 for identical ones.
+///
+/// This is scikit-image's `structural_similarity(win_size=11, gaussian_weights=True, data_range=1)`:
+/// Gaussian window of sigma 1.5 and 11 taps, sample covariance, only windows wholly inside the
+/// picture, mean over positions and then channels. The pictures are not clamped.
+///
+/// # Errors
+/// [`EvalError::ImageTooSmall`] below 11 x 11 pixels, [`EvalError::SizeMismatch`], [`EvalError::NotFinite`].
+pub fn ssim(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, EvalError> {
+    check(pred, target, height * width * 3)?;
+    if height < SSIM_MIN_SIZE_PX || width < SSIM_MIN_SIZE_PX {
+        return Err(EvalError::ImageTooSmall { metric: "SSIM", min: SSIM_MIN_SIZE_PX, width, height });
+    }
+    // One thread: a 256 x 256 picture takes 13 ms, and callers have many pictures to spread over cores.
+    let per_channel = [0, 1, 2].map(|channel| {
+        let plane = |image: &[f32]| image.iter().skip(channel).step_by(3).map(|&v| f64::from(v)).collect();
+        ssim_of_planes(plane(pred), plane(target), width)
+    });
+    Ok(per_channel.iter().sum::<f64>() / 3.0)
+}
+
+fn ssim_of_planes(pred: Vec<f64>, target: Vec<f64>, width: usize) -> f64 {
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
+    let taps = gaussian_taps();
+    let squared_pred = blur(&product(&pred, &pred), width, &taps);
+    let squared_target = blur(&product(&target, &target), width, &taps);
+    let cross = blur(&product(&pred, &target), width, &taps);
+    let (mean_pred, mean_target) = (blur(&pred, width, &taps), blur(&target, width, &taps));
+
+    let mut sum = 0.0;
+    for (i, (&p, &t)) in mean_pred.iter().zip(&mean_target).enumerate() {
+        let variance_pred = SAMPLE_COVARIANCE * (squared_pred[i] - p * p);
+        let variance_target = SAMPLE_COVARIANCE * (squared_target[i] - t * t);
+        let covariance = SAMPLE_COVARIANCE * (cross[i] - p * t);
+        let luminance = (2.0 * p * t + SSIM_C1) / (p * p + t * t + SSIM_C1);
+        sum += luminance * (2.0 * covariance + SSIM_C2) / (variance_pred + variance_target + SSIM_C2);
+    }
+    sum / mean_pred.len() as f64
+}
+
+fn gaussian_taps() -> [f64; SSIM_MIN_SIZE_PX] {
+    let mut taps = [0.0; SSIM_MIN_SIZE_PX];
+    for (i, tap) in taps.iter_mut().enumerate() {
+        let distance_px = i as f64 - SSIM_RADIUS as f64;
+        *tap = (-0.5 * (distance_px / SSIM_SIGMA_PX).powi(2)).exp();
+    }
+    let sum: f64 = taps.iter().sum();
+    taps.map(|tap| tap / sum)
+}
+
+/// Filters with `taps` along both axes and keeps the positions whose window lies inside the plane.
+fn blur(plane: &[f64], width: usize, taps: &[f64; SSIM_MIN_SIZE_PX]) -> Vec<f64> {
+    let height = plane.len() / width;
+    let mut blurred = Vec::with_capacity(plane.len());
+    let mut row = vec![0.0; width];
+    for y in 0..=height - taps.len() {
+        row.fill(0.0);
+        for (tap, above) in taps.iter().zip(plane[y * width..].chunks_exact(width)) {
+            for (sum, value) in row.iter_mut().zip(above) {
+                *sum += tap * value;
+            }
+        }
+        blurred.extend(row.windows(taps.len()).map(|w| w.iter().zip(taps).map(|(v, tap)| v * tap).sum::<f64>()));
+    }
+    blurred
+}
+
+/// Refuses pictures of the wrong size and values that no metric can judge.
+pub(crate) fn check(pred: &[f32], target: &[f32], expected: usize) -> Result<(), EvalError> {
+    for (image, name) in [(target, "target"), (pred, "prediction")] {
+        if image.len() != expected || image.is_empty() {
+            return Err(EvalError::SizeMismatch { expected, got: image.len() });
+        }
+        if let Some(index) = image.iter().position(|value| !value.is_finite()) {
+            return Err(EvalError::NotFinite { image: name, index, value: image[index] });
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::Reference;
+
+    #[test]
+    fn psnr_and_ssim_equal_torch_and_scikit_image() {
+        let fixture = Reference::open("metrics");
+        let [count, height, width, 3] = fixture.shape("input.prediction")[..] else { panic!() };
+        let [pred, target] = ["input.prediction", "input.target"].map(|name| fixture.f32s(name));
+        let (expected_psnr, expected_ssim) = (fixture.f64s("output.psnr"), fixture.f64s("output.ssim"));
+
+        let size = height * width * 3;
+        for i in 0..count {
+            let (pred, target) = (&pred[i * size..][..size], &target[i * size..][..size]);
+            let (psnr, ssim) = (psnr(pred, target).unwrap(), ssim(pred, target, height, width).unwrap());
+            // Both sides clamp and sum in f64, in another order: 1e-9 dB is far above the 1e-13 of that.
+            assert!(psnr == expected_psnr[i] || (psnr - expected_psnr[i]).abs() < 1e-9, "pair {i}: {psnr} dB");
+            // The variances are differences of numbers near 1, divided by at least C2 = 9e-4:
+            // 1e-16 / 9e-4 = 1e-13 per pixel, so 1e-10 leaves room and still tells f32 filters (1e-6) apart.
+            assert!((ssim - expected_ssim[i]).abs() < 1e-10, "pair {i}: {ssim} is not {}", expected_ssim[i]);
+        }
+    }
+
+    #[test]
+    fn psnr_of_a_constant_offset_is_its_logarithm() {
+        // 0.75 - 0.25 is exact in f32, so the mean squared error is exactly 1/4.
+        assert_eq!(psnr(&[0.75; 12], &[0.25; 12]).unwrap(), -10.0 * 0.25_f64.log10());
+    }
+
+    #[test]
+    fn psnr_of_identical_pictures_is_infinite() {
+        assert_eq!(psnr(&[0.5; 12], &[0.5; 12]).unwrap(), f64::INFINITY);
+    }
+
+    #[test]
+    fn values_beyond_the_range_are_clamped_for_psnr() {
+        assert_eq!(psnr(&[1.5, -0.25, 1.0], &[1.0, 0.0, 1.0]).unwrap(), f64::INFINITY);
+    }
+
+    #[test]
+    fn a_prediction_that_is_not_finite_is_an_error() {
+        for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            let mut pred = vec![0.5; 11 * 11 * 3];
+            pred[7] = value;
+            let target = vec![0.5; 11 * 11 * 3];
+            let messages = [psnr(&pred, &target), ssim(&pred, &target, 11, 11)].map(|r| r.unwrap_err().to_string());
+            for message in messages {
+                assert_eq!(message, format!("the prediction is not finite: value 7 is {value}"));
+            }
+        }
+    }
+
+    #[test]
+    fn ssim_needs_one_whole_window() {
+        let image = vec![0.5; 11 * 11 * 3];
+        assert!((ssim(&image, &image, 11, 11).unwrap() - 1.0).abs() < 1e-15);
+        let message = ssim(&image[..10 * 11 * 3], &image[..10 * 11 * 3], 10, 11).unwrap_err().to_string();
+        assert_eq!(message, "SSIM needs at least 11 x 11 pixels, got 11 x 10");
+    }
+
+    #[test]
+    fn pictures_of_two_sizes_are_an_error() {
+        let message = psnr(&[0.5; 9], &[0.5; 12]).unwrap_err().to_string();
+        assert_eq!(message, "the images differ in size: expected 12 values like the target, got 9 in the prediction");
+        assert!(psnr(&[], &[]).is_err());
+        assert!(ssim(&[0.5; 12], &[0.5; 12], 11, 11).is_err());
+    }
+}

@@ -1,0 +1,181 @@
+//! VGG networks up to their last convolution: 3 x 3 convolutions in five stages with poolings between them.
+// B pictures, C channels, H rows, W columns
+
+use burn::module::{Module, Param};
+use burn::nn::PaddingConfig2d;
+use burn::nn::conv::{Conv2d, Conv2dConfig};
+use burn::tensor::activation::relu;
+use burn::tensor::module::{avg_pool2d, max_pool2d};
+use burn::tensor::ops::{AvgPoolOptions, MaxPoolOptions};
+use burn::tensor::{DType, Device, Tensor};
+
+use crate::error::EvalError;
+use crate::metrics::network_file::WeightFile;
+
+/// Number of stages; pictures are halved between them.
+pub const NUM_STAGES: usize = 5;
+
+/// Smallest side of a picture that every stage still has a value of.
+pub const MIN_SIZE_PX: usize = 1 << (NUM_STAGES - 1);
+
+/// How pictures are halved: over 2 x 2 values, an odd last row or column left out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pooling {
+    /// The largest.
+    Max,
+    /// Their mean.
+    Average,
+}
+
+/// Sizes of a network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct VggShape {
+    /// Channels of each stage.
+    pub widths: [usize; NUM_STAGES],
+    /// Convolutions of each stage; those of the last that no feature needs are left out.
+    pub convs: [usize; NUM_STAGES],
+    /// Convolutions of each stage up to the one whose output is a feature, 1 or more.
+    pub taps: [usize; NUM_STAGES],
+    /// Between the stages.
+    pub pooling: Pooling,
+}
+
+impl VggShape {
+    /// VGG-16 with the features `relu1_2`, `relu2_2`, `relu3_3`, `relu4_3` and `relu5_3`.
+    pub const VGG16: Self =
+        Self { widths: [64, 128, 256, 512, 512], convs: [2, 2, 3, 3, 3], taps: [2, 2, 3, 3, 3], pooling: Pooling::Max };
+    /// VGG-19 with average pooling and the features `relu1_2`, `relu2_2`, `relu3_2`, `relu4_2` and
+    /// `relu5_2`.
+    pub const VGG19: Self = Self {
+        widths: [64, 128, 256, 512, 512],
+        convs: [2, 2, 4, 4, 2],
+        taps: [2, 2, 2, 2, 2],
+        pooling: Pooling::Average,
+    };
+}
+
+/// What a network takes on one picture, in f32 values and multiplications.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VggSizes {
+    /// Weights.
+    pub parameters: f64,
+    /// Multiply-accumulates of a forward pass.
+    pub macs: f64,
+    /// Values of all convolutions and poolings together.
+    pub outputs: f64,
+    /// Values of the features.
+    pub features: f64,
+    /// Values of the largest layer.
+    pub widest: f64,
+}
+
+impl VggShape {
+    /// Counts what a picture of so many pixels takes.
+    pub fn sizes(&self, height: usize, width: usize) -> VggSizes {
+        let mut sizes = VggSizes { parameters: 0.0, macs: 0.0, outputs: 0.0, features: 0.0, widest: 0.0 };
+        let mut inputs = 3.0;
+        for (stage, (&count, &channels)) in self.convs.iter().zip(&self.widths).enumerate() {
+            let pixels = ((height >> stage) * (width >> stage)) as f64;
+            let values = channels as f64 * pixels;
+            if stage > 0 {
+                sizes.outputs += inputs * pixels;
+            }
+            for _ in 0..count {
+                sizes.parameters += 9.0 * inputs * channels as f64 + channels as f64;
+                sizes.macs += 9.0 * inputs * values;
+                sizes.outputs += values;
+                inputs = channels as f64;
+            }
+            sizes.features += values;
+            sizes.widest = sizes.widest.max(values);
+        }
+        sizes
+    }
+}
+
+/// A frozen network.
+#[derive(Module, Debug)]
+pub struct Vgg {
+    stages: Vec<Vec<Conv2d>>,
+    #[module(skip)]
+    shape: VggShape,
+}
+
+impl Vgg {
+    /// Takes the network's tensors, `convS_I.weight` `[out, in, 3, 3]` and `convS_I.bias`, out of a file.
+    ///
+    /// # Errors
+    /// As [`WeightFile::take`].
+    pub fn take(file: &mut WeightFile, shape: VggShape, place: (&Device, DType)) -> Result<Self, EvalError> {
+        let mut inputs = 3;
+        let mut stages = Vec::new();
+        for (stage, (&count, &outputs)) in shape.convs.iter().zip(&shape.widths).enumerate() {
+            let mut convs = Vec::new();
+            for i in 1..=count {
+                let name = format!("conv{}_{i}", stage + 1);
+                let mut conv = Conv2dConfig::new([inputs, outputs], [3, 3])
+                    .with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1))
+                    .init(place.0);
+                conv.weight = frozen(file.take(&format!("{name}.weight"), [outputs, inputs, 3, 3], place)?);
+                conv.bias = Some(frozen(file.take(&format!("{name}.bias"), [outputs], place)?));
+                convs.push(conv);
+                inputs = outputs;
+            }
+            stages.push(convs);
+        }
+        Ok(Self { stages, shape })
+    }
+
+    /// The features of every stage.
+    ///
+    /// # Shapes
+    /// - `pictures`: `[batch, 3, height, width]`, both sides at least [`MIN_SIZE_PX`]
+    /// - returns `[batch, channels, height / 2^s, width / 2^s]` for the stages s = 0 to 4
+    pub fn features(&self, pictures: Tensor<4>) -> Vec<Tensor<4>> {
+        let mut x = pictures;
+        let mut features = Vec::new();
+        for (stage, convs) in self.stages.iter().enumerate() {
+            if stage > 0 {
+                x = self.shape.pooling.halved(x); // [B, C, H, W] -> [B, C, H/2, W/2]
+            }
+            for (i, conv) in convs.iter().enumerate() {
+                x = relu(conv.forward(x));
+                if i + 1 == self.shape.taps[stage] {
+                    features.push(x.clone());
+                }
+            }
+        }
+        features
+    }
+}
+
+impl Pooling {
+    fn halved(self, x: Tensor<4>) -> Tensor<4> {
+        match self {
+            Self::Max => max_pool2d(x, MaxPoolOptions::new([2, 2])),
+            Self::Average => avg_pool2d(x, AvgPoolOptions::new([2, 2])),
+        }
+    }
+}
+
+/// A parameter that gets no gradient.
+fn frozen<const D: usize>(tensor: Tensor<D>) -> Param<Tensor<D>> {
+    Param::from_tensor(tensor).set_require_grad(false)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_whole_networks_have_their_published_sizes() {
+        // Convolutions of VGG-16 without the classifier: 14,714,688 weights and 15.35e9 multiplications at 224 pixels.
+        let sizes = VggShape::VGG16.sizes(224, 224);
+        assert_eq!(sizes.parameters, 14_714_688.0);
+        assert!((sizes.macs / 15.35e9 - 1.0).abs() < 1e-3, "{}", sizes.macs);
+        // 122 values a pixel.
+        assert_eq!((sizes.features, sizes.widest), (122.0 * 224.0 * 224.0, 64.0 * 224.0 * 224.0));
+        // An odd last row is left out on the way down.
+        assert_eq!(VggShape::VGG16.sizes(17, 17).features, (64 * 17 * 17 + 128 * 64 + 256 * 16 + 512 * 4 + 512) as f64);
+    }
+}

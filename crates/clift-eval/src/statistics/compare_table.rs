@@ -1,0 +1,73 @@
+//! The table that a terminal shows of a comparison.
+
+use std::fmt;
+
+use crate::statistics::compare::{Comparison, Difference, Made, Pair};
+
+impl fmt::Display for Made {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { variant, num_storage_tokens: stored, num_render_tokens: rendered, tokens } = self;
+        f.write_str(variant)?;
+        match (stored, stored == rendered) {
+            (0, _) => {}
+            (_, true) => write!(f, " {stored}")?,
+            (_, false) => write!(f, " {rendered} of {stored}")?,
+        }
+        if tokens.is_empty() { Ok(()) } else { write!(f, " {tokens}") }
+    }
+}
+
+impl fmt::Display for Comparison {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "A: {}\nB: {}\n", self.a.display(), self.b.display())?;
+        let names: Vec<String> = self.pairs.iter().map(name).collect();
+        let width = names.iter().map(|name| name.chars().count()).max().unwrap_or_default();
+        writeln!(
+            f,
+            "{:<width$}  scenes  PSNR of A  B - A, dB (95 %)          B - A, SSIM (95 %)            B - A, LPIPS (95 %)",
+            "setting"
+        )?;
+        for (pair, name) in self.pairs.iter().zip(&names) {
+            let psnr = pair.psnr.map_or_else(|| "-".into(), |difference| format!("{:.2}", difference.a));
+            let line = format!(
+                "{name:<width$}  {:>6}  {psnr:>9}  {:<28}  {:<28}  {}",
+                pair.num_scenes,
+                interval(pair.psnr, 3),
+                interval(pair.ssim, 4),
+                interval(pair.lpips_vgg, 4)
+            );
+            writeln!(f, "{}", line.trim_end())?;
+        }
+        writeln!(
+            f,
+            "\nMeans of the paired differences of scenes with 95 % intervals of Student's t; *: zero lies outside. Of LPIPS \
+             less is better."
+        )?;
+        let left_out = |count: fn(&Pair) -> usize| self.pairs.iter().map(count).max().unwrap_or_default();
+        let (only_a, only_b) = (left_out(|pair| pair.num_only_a), left_out(|pair| pair.num_only_b));
+        if only_a + only_b > 0 {
+            let common = self.pairs.iter().map(|pair| pair.num_views).max().unwrap_or_default();
+            writeln!(
+                f,
+                "The evaluations are of other target views: the {common} of both are compared, up to {only_a} of A alone and \
+                 {only_b} of B alone are left out."
+            )?;
+        }
+        Ok(())
+    }
+}
+
+fn name(pair: &Pair) -> String {
+    if pair.a == pair.b { pair.a.to_string() } else { format!("{} -> {}", pair.a, pair.b) }
+}
+
+fn interval(difference: Option<Difference>, decimals: usize) -> String {
+    let Some(difference) = difference else { return "-".into() };
+    let mark = if difference.is_clear() { " *" } else { "" };
+    match difference.interval {
+        Some([low, high]) => {
+            format!("{:+.decimals$} [{low:+.decimals$}, {high:+.decimals$}]{mark}", difference.mean)
+        }
+        None => format!("{:+.decimals$}", difference.mean),
+    }
+}

@@ -1,0 +1,25 @@
+//! Results, their summaries and comparisons.
+//!
+//! - `view_metrics`: EvalKey, ViewMetrics, Cost
+//! - `eval_results`: all measured views, one owner
+//! - `scene_means`: mean per scene, then over scenes
+//! - `student_t`: Student's t quantile
+//! - `pareto`: Pareto front
+//! - `paired`: paired differences of methods
+//! - `summary`: summary.json
+//! - `scenes_csv`: scenes.csv
+//! - `table`: the terminal table
+//! - `compare`: two evaluations, view by view
+//! - `compare_table`: its terminal table
+
+pub(crate) mod compare;
+pub(crate) mod compare_table;
+pub(crate) mod eval_results;
+pub(crate) mod paired;
+pub(crate) mod pareto;
+pub(crate) mod scene_means;
+pub(crate) mod scenes_csv;
+pub(crate) mod student_t;
+pub(crate) mod summary;
+pub(crate) mod table;
+pub(crate) mod view_metrics;

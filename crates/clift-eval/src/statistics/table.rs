@@ -1,0 +1,159 @@
+//! The table that a terminal shows: quality, tokens and cost of each setting; `-` is what was not measured.
+
+use std::fmt;
+
+use clift_model::TokenStorage;
+
+use crate::config::method::Variant;
+use crate::statistics::paired::PairedDifference;
+use crate::statistics::summary::{Quality, Summary};
+
+/// Missing pictures that are named; the file names all.
+const MAX_NAMED: usize = 3;
+
+const HEADERS: [&str; 12] = [
+    "stored",
+    "rendered",
+    "format",
+    "PSNR dB",
+    "+- dB",
+    "SSIM",
+    "LPIPS",
+    "render ms",
+    "frame ms",
+    "p95 ms",
+    "GMAC",
+    "scene kB",
+];
+const WIDTHS: [usize; 12] = [7, 9, 6, 8, 6, 6, 6, 10, 9, 7, 7, 9];
+
+impl fmt::Display for Summary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
+        writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes left out\n")?;
+        let names = points.iter().map(|point| point.variant.name().chars().count());
+        let width = names.chain([Variant::NearestView.name().len()]).max().unwrap_or_default();
+        let mut row = |name: &str, cells: [String; 12], mark: &str| {
+            write!(f, "{name:<width$}")?;
+            for (cell, width) in cells.iter().zip(WIDTHS) {
+                write!(f, " {cell:>width$}")?;
+            }
+            writeln!(f, "{mark}")
+        };
+        row("variant", HEADERS.map(str::to_owned), "")?;
+        for (variant, Quality { psnr, ssim, lpips_vgg }) in
+            [(Variant::NearestView, baselines.nearest_view), (Variant::MeanImage, baselines.mean_image)]
+        {
+            let mut cells = std::array::from_fn(|_| cell(None, 0));
+            (cells[3], cells[5], cells[6]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3));
+            row(variant.name(), cells, "")?;
+        }
+        for point in points {
+            let count = |count: usize| if count == 0 { cell(None, 0) } else { count.to_string() };
+            let ms = |seconds: Option<f64>| cell(seconds.map(|seconds| seconds * 1e3), 1);
+            let cells = [
+                count(point.num_storage_tokens),
+                count(point.num_render_tokens),
+                point.tokens.map_or("-", TokenStorage::name).to_owned(),
+                cell(point.psnr, 2),
+                cell(point.psnr_stderr, 2),
+                cell(point.ssim, 3),
+                cell(point.lpips_vgg, 3),
+                ms(point.render_median_s),
+                ms(point.frame_median_s),
+                ms(point.frame_p95_s),
+                cell(point.gflops, if point.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }),
+                cell(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
+            ];
+            let mark = match (point.pareto_time, point.pareto_bytes) {
+                (true, true) => " tb",
+                (true, false) => " t",
+                (false, true) => "  b",
+                (false, false) => "",
+            };
+            row(point.variant.name(), cells, mark)?;
+        }
+        if points.iter().any(|point| point.pareto_time || point.pareto_bytes) {
+            writeln!(f, "\nt: no other point has this PSNR in this time per frame (median); b: in as few bytes")?;
+        }
+        if let Some(selection) = self.selection {
+            writeln!(f, "\nrendered tokens were chosen by {selection}")?;
+        }
+        if !differences.is_empty() {
+            writeln!(f, "\nPSNR of the same scenes, difference and standard error")?;
+        }
+        for PairedDifference { variant, against, num_storage_tokens, tokens, psnr, psnr_stderr, .. } in differences {
+            let (error, format) = (cell(*psnr_stderr, 2), tokens.map_or("", TokenStorage::name));
+            let names = format!("{} - {}", variant.name(), against.name());
+            writeln!(f, "{names:<24} {num_storage_tokens:>6} tokens {format:<4} {psnr:>+7.2} +- {error} dB")?;
+        }
+        for missing in &self.missing {
+            let named = missing.pictures.iter().take(MAX_NAMED).cloned().collect::<Vec<_>>().join(", ");
+            let more = if missing.pictures.len() > MAX_NAMED { ", .." } else { "" };
+            let (name, count) = (missing.variant.name(), missing.num_missing);
+            writeln!(
+                f,
+                "{name}: {count} of {num_views} pictures are missing, its means are over the rest: {named}{more}"
+            )?;
+        }
+        for missing in &self.not_measured {
+            writeln!(f, "{} is not measured: {}", missing.metric, missing.reason)?;
+        }
+        Ok(())
+    }
+}
+
+fn cell(value: Option<f64>, decimals: usize) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.decimals$}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use clift_model::TokenStorage;
+
+    use crate::config::method::{SystemName, Variant};
+    use crate::statistics::eval_results::EvalResults;
+    use crate::statistics::summary::Summary;
+    use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
+
+    #[test]
+    fn the_table_lines_up() {
+        let mut views = EvalResults::default();
+        let key = EvalKey {
+            variant: Variant::Clift,
+            num_storage_tokens: 64,
+            num_render_tokens: 32,
+            tokens: Some(TokenStorage::Int8),
+        };
+        for (scene, psnr, ms) in [("a", 20.0, 1.0), ("b", 21.0, 2.0)] {
+            let measured = ViewMetrics {
+                render_s: Some(ms * 1e-3),
+                select_s: Some(0.01),
+                ..ViewMetrics::quality(psnr, Some(psnr / 100.0))
+            };
+            views.add(scene, 0, key, measured).unwrap();
+        }
+        let system = SystemName::new("DepthSplat").unwrap();
+        let other = EvalKey::baseline(Variant::System(system));
+        views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) }).unwrap();
+        views.miss(system, "b/000000.png".into());
+        views.add("a", 0, EvalKey::baseline(Variant::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
+        views.add_gflops(key, 45.23);
+        views.add_scene_bytes(key, 99_000);
+        views.note_not_measured("lpips_vgg", "no weights".into());
+        let expected = "\
+2 views of 2 scenes, 0 scenes left out
+
+variant       stored  rendered format  PSNR dB  +- dB   SSIM  LPIPS  render ms  frame ms  p95 ms    GMAC  scene kB
+nearest_view       -         -      -    18.00      -  0.500      -          -         -       -       -         -
+mean_image         -         -      -        -      -      -      -          -         -       -       -         -
+clift             64        32   int8    20.50   0.50  0.205      -        1.5      11.5    12.0    45.2      99.0 tb
+DepthSplat         -         -      -    19.00      -      -  0.250          -         -       -       -         -
+
+t: no other point has this PSNR in this time per frame (median); b: in as few bytes
+DepthSplat: 1 of 2 pictures are missing, its means are over the rest: b/000000.png
+lpips_vgg is not measured: no weights
+";
+        assert_eq!(Summary::new(&views).to_string(), expected);
+    }
+}

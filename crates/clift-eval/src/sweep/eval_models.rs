@@ -1,0 +1,58 @@
+//! The trained models of an evaluation, one per rendering method.
+
+use clift_model::{Grouping, TrainedModel};
+
+use crate::config::method::Variant;
+
+/// The models of both stages. They have one encoder.
+#[derive(Clone, Debug)]
+pub struct EvalModels {
+    /// Renders random subsets and the centroids of clusters.
+    pub stage1: TrainedModel,
+    /// Renders tokens that its condenser makes of K-means clusters.
+    pub stage2: Option<TrainedModel>,
+    /// Renders tokens that its condenser makes of tiles.
+    pub stage2_tiles: Option<TrainedModel>,
+}
+
+impl EvalModels {
+    /// Takes the model of stage 1.
+    pub fn new(stage1: TrainedModel) -> Self {
+        Self { stage1, stage2: None, stage2_tiles: None }
+    }
+
+    /// Takes a model of stage 2, trained on such groups of tokens and on the encoder of stage 1.
+    pub fn set_stage2(&mut self, grouping: Grouping, mut model: TrainedModel) {
+        model.share_encoder(&self.stage1);
+        match grouping {
+            Grouping::Kmeans => self.stage2 = Some(model),
+            Grouping::Tile => self.stage2_tiles = Some(model),
+        }
+    }
+
+    /// Returns the model that renders a method; `None` without one and for baselines.
+    pub fn for_method(&self, method: Variant) -> Option<&TrainedModel> {
+        match method {
+            Variant::Random | Variant::Patch | Variant::Kmeans => Some(&self.stage1),
+            Variant::Clift => self.stage2.as_ref(),
+            Variant::PatchClift => self.stage2_tiles.as_ref(),
+            Variant::NearestView | Variant::MeanImage | Variant::System(_) => None,
+        }
+    }
+
+    /// Returns the methods of an evaluation that names none: all with a model, and tiles without condenser only beside
+    /// tiles with one.
+    pub fn methods(&self) -> Vec<Variant> {
+        let all = [Variant::Random, Variant::Patch, Variant::PatchClift, Variant::Kmeans, Variant::Clift];
+        let is_wanted = |method: &Variant| *method != Variant::Patch || self.stage2_tiles.is_some();
+        all.into_iter().filter(|method| self.for_method(*method).is_some()).filter(is_wanted).collect()
+    }
+}
+
+/// Returns the method that stage 2 is trained for, on such groups of tokens.
+pub const fn stage2_method(grouping: Grouping) -> Variant {
+    match grouping {
+        Grouping::Kmeans => Variant::Clift,
+        Grouping::Tile => Variant::PatchClift,
+    }
+}

@@ -1,0 +1,25 @@
+//! One scene with every method and count.
+//!
+//! - `eval_models`: trained models per method
+//! - `sweep`: settings of a sweep
+//! - `lazy_clusters`: K-means or tiles, computed once
+//! - `compressed_tokens`: stored tokens of a method
+//! - `token_choice`: tokens selected for each view
+//! - `baselines`: nearest view and mean image
+//! - `view_scorer`: score renderings of a scene
+//! - `rendered_views`: scored views of one EvalKey
+//! - `predictions`: images of another method, scored
+//! - `scene_results`: results of one scene
+//! - `evaluate_scene`: encode once, render every key
+
+pub(crate) mod baselines;
+pub(crate) mod compressed_tokens;
+pub(crate) mod eval_models;
+pub(crate) mod evaluate_scene;
+pub(crate) mod lazy_clusters;
+pub(crate) mod predictions;
+pub(crate) mod rendered_views;
+pub(crate) mod scene_results;
+pub(crate) mod sweep;
+pub(crate) mod token_choice;
+pub(crate) mod view_scorer;

@@ -1,0 +1,112 @@
+//! Products of small matrices that stay in the cache, which attention is made of.
+// M rows, K inner, N columns
+
+use crate::simd::vector::{Simd, Tile};
+
+/// A matrix inside a slice. Columns need not be neighbours.
+#[derive(Clone, Copy)]
+pub(crate) struct Left<'a> {
+    pub values: &'a [f32],
+    pub row: usize,
+    pub step: usize,
+}
+
+/// The right factor, cut into panels of columns that the register tile reads row by row. In a panel
+/// the columns are neighbours.
+#[derive(Clone, Copy)]
+pub(crate) struct Right<'a> {
+    pub values: &'a [f32],
+    /// Distance of two rows inside a panel.
+    pub step: usize,
+    /// Distance of two panels.
+    pub panel: usize,
+}
+
+/// Columns of a full panel.
+#[inline(always)]
+pub(crate) fn panel_width<S: Simd>() -> usize {
+    S::LANES * S::TILE_VECTORS
+}
+
+/// `columns` rounded up to whole vectors.
+#[inline(always)]
+pub(crate) fn padded<S: Simd>(columns: usize) -> usize {
+    columns.next_multiple_of(S::LANES)
+}
+
+/// `C[rows, columns] = A[rows, inner] B[inner, columns]`, or added to C. Whole vectors of columns are
+/// computed: B must have and C must have room for [`padded`] columns.
+#[inline(always)]
+pub(crate) fn multiply<S: Simd>(
+    simd: S,
+    [rows, inner, columns]: [usize; 3],
+    a: Left<'_>,
+    b: Right<'_>,
+    (c, c_row): (&mut [f32], usize),
+    accumulate: bool,
+) {
+    if rows == 0 || columns == 0 || inner == 0 {
+        assert!(accumulate || rows == 0 || columns == 0, "an empty sum would have to be written");
+        return;
+    }
+    let (columns, width) = (padded::<S>(columns), panel_width::<S>());
+    let last_panel = (columns - 1) / width;
+    let last_columns = columns - last_panel * width;
+    assert!(a.values.len() > (rows - 1) * a.row + (inner - 1) * a.step, "A has its rows");
+    assert!(b.values.len() >= last_panel * b.panel + (inner - 1) * b.step + last_columns, "B has its panels");
+    assert!(c.len() >= (rows - 1) * c_row + columns, "C has its rows");
+    for panel in 0..=last_panel {
+        let vectors = if panel == last_panel { last_columns / S::LANES } else { S::TILE_VECTORS };
+        let mut row = 0;
+        while row < rows {
+            // SAFETY: the three assertions above cover rows `row..row + ..` of A and C and the panel of B.
+            unsafe {
+                let tile = Tile {
+                    inner,
+                    a: a.values.as_ptr().add(row * a.row),
+                    a_row: a.row,
+                    a_step: a.step,
+                    b: b.values.as_ptr().add(panel * b.panel),
+                    b_step: b.step,
+                    c: c.as_mut_ptr().add(row * c_row + panel * width),
+                    c_row,
+                    accumulate,
+                };
+                row += run_tile(simd, tile, rows - row, vectors);
+            }
+        }
+    }
+}
+
+/// Runs the largest tile that fits into `rows` rows and is `vectors` wide; returns its rows.
+///
+/// # Safety
+/// As [`Tile::run`].
+#[inline(always)]
+unsafe fn run_tile<S: Simd>(simd: S, tile: Tile, rows: usize, vectors: usize) -> usize {
+    // SAFETY: the caller's.
+    unsafe {
+        if vectors == S::TILE_VECTORS {
+            if rows >= S::TILE_ROWS {
+                simd.full_tile(tile);
+                return S::TILE_ROWS;
+            }
+            if rows >= 4 {
+                tile.run_vectors::<S, 4>(simd);
+                return 4;
+            }
+            tile.run_vectors::<S, 1>(simd);
+            return 1;
+        }
+        if rows >= 8 {
+            tile.run::<S, 8, 1>(simd);
+            return 8;
+        }
+        if rows >= 4 {
+            tile.run::<S, 4, 1>(simd);
+            return 4;
+        }
+        tile.run::<S, 1, 1>(simd);
+        1
+    }
+}

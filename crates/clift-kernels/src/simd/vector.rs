@@ -1,0 +1,182 @@
+//! Vectors of f32 of one instruction set, behind one trait.
+//!
+//! A value of a type that implements [`Simd`] is the proof that the processor has its instructions,
+//! which makes the arithmetic safe to call. Everything that is generic over [`Simd`] must be
+//! `#[inline(always)]`: only code inlined into `InstructionSet::run` is compiled with the instructions.
+
+/// Arithmetic on vectors of [`Simd::LANES`] values.
+pub trait Simd: Copy + Send + Sync + 'static {
+    /// Values in a vector.
+    const LANES: usize;
+    /// Rows of the register tile of a matrix product.
+    const TILE_ROWS: usize;
+    /// Vectors side by side in the register tile of a matrix product.
+    const TILE_VECTORS: usize;
+    /// A vector.
+    type V: Copy;
+
+    /// The same value in every lane.
+    fn splat(self, value: f32) -> Self::V;
+    /// Reads [`Simd::LANES`] values.
+    ///
+    /// # Safety
+    /// They must be readable at `from`.
+    unsafe fn load(self, from: *const f32) -> Self::V;
+    /// Writes [`Simd::LANES`] values.
+    ///
+    /// # Safety
+    /// They must be writable at `to`.
+    unsafe fn store(self, to: *mut f32, value: Self::V);
+    /// `a + b`
+    fn add(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `a - b`
+    fn sub(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `a * b`
+    fn mul(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `a / b`
+    fn div(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `a * b + c`, in one rounding where the processor can.
+    fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// The larger value; `b` where one of the two is NaN.
+    fn max(self, a: Self::V, b: Self::V) -> Self::V;
+    /// The smaller value; `b` where one of the two is NaN.
+    fn min(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `yes` where `condition` is less than zero, `no` elsewhere.
+    fn select_negative(self, condition: Self::V, yes: Self::V, no: Self::V) -> Self::V;
+    /// The nearest integer, ties to even.
+    fn round(self, a: Self::V) -> Self::V;
+    /// `a * 2^n` for integers `n` in `-126..=127`; zero or as it should be for -127.
+    fn scale_by_power(self, a: Self::V, n: Self::V) -> Self::V;
+    /// The sum of all lanes.
+    fn sum(self, a: Self::V) -> f32;
+    /// The largest lane.
+    fn largest(self, a: Self::V) -> f32;
+    /// The full register tile of a matrix product: [`Simd::TILE_ROWS`] rows of
+    /// [`Simd::TILE_VECTORS`] vectors.
+    ///
+    /// # Safety
+    /// As [`Tile::run`].
+    unsafe fn full_tile(self, tile: Tile);
+
+    /// Reads a full vector from the front of a slice, or what there is and zeros.
+    #[inline(always)]
+    fn read(self, from: &[f32]) -> Self::V {
+        if from.len() >= Self::LANES {
+            // SAFETY: the slice is long enough.
+            return unsafe { self.load(from.as_ptr()) };
+        }
+        let mut padded = [0.0; MAX_LANES];
+        padded[..from.len()].copy_from_slice(from);
+        // SAFETY: no vector is longer than the array.
+        unsafe { self.load(padded.as_ptr()) }
+    }
+
+    /// Writes a full vector to the front of a slice, or as much of it as fits.
+    #[inline(always)]
+    fn write(self, to: &mut [f32], value: Self::V) {
+        if to.len() >= Self::LANES {
+            // SAFETY: the slice is long enough.
+            return unsafe { self.store(to.as_mut_ptr(), value) };
+        }
+        let mut padded = [0.0; MAX_LANES];
+        // SAFETY: no vector is longer than the array.
+        unsafe { self.store(padded.as_mut_ptr(), value) };
+        let count = to.len();
+        to.copy_from_slice(&padded[..count]);
+    }
+
+    /// `2^a`, to 2e-7. Below `2^-126` it is no more than that, and not always zero; at most `2^127`. NaN stays NaN.
+    #[inline(always)]
+    fn exp2(self, a: Self::V) -> Self::V {
+        // Coefficients of Cephes' exp2f.
+        const COEFFICIENTS: [f32; 6] =
+            [1.535_336_2e-4, 1.339_887_5e-3, 9.618_437e-3, 5.550_332_5e-2, 2.402_264_8e-1, std::f32::consts::LN_2];
+        let bounded = self.min(self.splat(127.0), self.max(self.splat(-127.0), a));
+        let whole = self.round(bounded);
+        let rest = self.sub(bounded, whole);
+        let mut power = self.splat(COEFFICIENTS[0]);
+        for coefficient in &COEFFICIENTS[1..] {
+            power = self.mul_add(power, rest, self.splat(*coefficient));
+        }
+        power = self.mul_add(power, rest, self.splat(1.0));
+        self.scale_by_power(power, whole)
+    }
+}
+
+/// The longest vector of any instruction set.
+pub(crate) const MAX_LANES: usize = 16;
+
+/// One register tile: `C[M, N] = A[M, K] B[K, N]`, with `C` added to if `accumulate`.
+#[derive(Clone, Copy, Debug)]
+pub struct Tile {
+    /// Inner size.
+    pub inner: usize,
+    /// First value of A.
+    pub a: *const f32,
+    /// Distance of two rows of A.
+    pub a_row: usize,
+    /// Distance of two columns of A.
+    pub a_step: usize,
+    /// First value of B; its columns are neighbours.
+    pub b: *const f32,
+    /// Distance of two rows of B.
+    pub b_step: usize,
+    /// First value of C; its columns are neighbours.
+    pub c: *mut f32,
+    /// Distance of two rows of C.
+    pub c_row: usize,
+    /// Whether to add to C.
+    pub accumulate: bool,
+}
+
+impl Tile {
+    /// Computes `ROWS` rows of `VECTORS` vectors, all in registers.
+    ///
+    /// # Safety
+    /// All values of A, B and C that the sizes name must be readable, C's writable.
+    #[inline(always)]
+    #[expect(clippy::needless_range_loop, reason = "both loops unroll over constants")]
+    pub unsafe fn run<S: Simd, const ROWS: usize, const VECTORS: usize>(self, simd: S) {
+        let Self { inner, a, a_row, a_step, b, b_step, c, c_row, accumulate } = self;
+        // SAFETY: the caller's promise covers every address below.
+        unsafe {
+            let mut sum = [[simd.splat(0.0); VECTORS]; ROWS];
+            for k in 0..inner {
+                let mut row_of_b = [simd.splat(0.0); VECTORS];
+                for v in 0..VECTORS {
+                    row_of_b[v] = simd.load(b.add(k * b_step + v * S::LANES));
+                }
+                for r in 0..ROWS {
+                    let value = simd.splat(*a.add(r * a_row + k * a_step));
+                    for v in 0..VECTORS {
+                        sum[r][v] = simd.mul_add(value, row_of_b[v], sum[r][v]);
+                    }
+                }
+            }
+            for r in 0..ROWS {
+                for v in 0..VECTORS {
+                    let place = c.add(r * c_row + v * S::LANES);
+                    let value = if accumulate { simd.add(simd.load(place), sum[r][v]) } else { sum[r][v] };
+                    simd.store(place, value);
+                }
+            }
+        }
+    }
+}
+
+impl Tile {
+    /// `ROWS` rows of [`Simd::TILE_VECTORS`] vectors.
+    ///
+    /// # Safety
+    /// As [`Tile::run`].
+    #[inline(always)]
+    pub(crate) unsafe fn run_vectors<S: Simd, const ROWS: usize>(self, simd: S) {
+        // SAFETY: the caller's.
+        unsafe {
+            match S::TILE_VECTORS {
+                1 => self.run::<S, ROWS, 1>(simd),
+                _ => self.run::<S, ROWS, 2>(simd),
+            }
+        }
+    }
+}

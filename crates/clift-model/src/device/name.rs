@@ -1,0 +1,129 @@
+//! Every device this project runs on, by the name a config or a command line gives it.
+
+use burn::tensor::Device;
+use clift_kernels::{BadInstructionSet, InstructionSet};
+use serde::{Deserialize, Serialize};
+use strum::{Display, IntoStaticStr, VariantArray};
+
+use crate::error::ModelError;
+use crate::names::{names, parse};
+
+/// A device by name.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
+pub enum DeviceName {
+    /// Burn's CPU backend, the default.
+    #[default]
+    Flex,
+    /// The older CPU backend: a second opinion for numerical tests.
+    Ndarray,
+    /// Any GPU through WebGPU (Vulkan, Metal, DX12); needs the cargo feature `wgpu`.
+    Wgpu,
+}
+
+impl DeviceName {
+    /// All names, in the order they are listed to a user.
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
+
+    /// Returns the name as it is typed.
+    pub fn as_str(self) -> &'static str {
+        self.into()
+    }
+
+    /// Whether this build contains the device.
+    pub fn is_built(self) -> bool {
+        match self {
+            Self::Flex | Self::Ndarray => true,
+            Self::Wgpu => cfg!(feature = "wgpu"),
+        }
+    }
+
+    /// Opens the device, without autodiff.
+    ///
+    /// # Errors
+    /// [`ModelError::NoDevice`] when this build does not contain it (the message says how to build
+    /// one that does) or no adapter is found; [`ModelError::BadConfig`] when the environment asks `flex` for an
+    /// instruction set that the processor does not have.
+    pub fn open(self) -> Result<Device, ModelError> {
+        match self {
+            Self::Flex => {
+                let bad = |bad: BadInstructionSet| ModelError::BadConfig {
+                    key: InstructionSet::VARIABLE,
+                    fix: bad.to_string(),
+                    value: bad.text,
+                };
+                InstructionSet::forced().map_err(bad)?;
+                Ok(Device::flex())
+            }
+            // Upstream retires this backend in favour of flex; it stays as an independent check.
+            #[allow(deprecated)]
+            Self::Ndarray => Ok(Device::ndarray()),
+            Self::Wgpu => open_wgpu(),
+        }
+    }
+}
+
+impl std::str::FromStr for DeviceName {
+    type Err = ModelError;
+
+    fn from_str(name: &str) -> Result<Self, ModelError> {
+        parse(name).ok_or_else(|| ModelError::NoDevice {
+            name: name.into(),
+            reason: format!("unknown; the names are {}", names::<Self>()),
+        })
+    }
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn open_wgpu() -> Result<Device, ModelError> {
+    Err(ModelError::NoDevice {
+        name: "wgpu".into(),
+        reason: "this build has no GPU support; rebuild with `cargo build --release --features wgpu`, \
+                 or choose `flex` (`--device flex`)"
+            .into(),
+    })
+}
+
+#[cfg(feature = "wgpu")]
+fn open_wgpu() -> Result<Device, ModelError> {
+    use burn::tensor::{DeviceKind, DeviceType};
+
+    use crate::device::adapter::{ADAPTER_VARIABLE, adapters};
+    // Asking wgpu for a device where there is no adapter panics, so look first.
+    let num_adapters = std::panic::catch_unwind(|| Device::enumerate(DeviceType::Wgpu).into_vec().len()).unwrap_or(0);
+    if num_adapters == 0 {
+        return Err(ModelError::NoDevice {
+            name: "wgpu".into(),
+            reason: "no adapter was found; install a Vulkan driver (for software rendering: Mesa's lavapipe)".into(),
+        });
+    }
+    // It panics as well where the environment names an adapter that is not there.
+    if let Ok(chosen) = std::env::var(ADAPTER_VARIABLE) {
+        let adapters = std::panic::catch_unwind(adapters).unwrap_or_default();
+        if !adapters.iter().any(|adapter| adapter.is_used) {
+            let known: Vec<_> = adapters.iter().map(|adapter| adapter.selector.as_str()).collect();
+            let reason = format!("{ADAPTER_VARIABLE} is `{chosen}`; the adapters here are {}", known.join(", "));
+            return Err(ModelError::NoDevice { name: "wgpu".into(), reason });
+        }
+    }
+    Ok(Device::wgpu(DeviceKind::DefaultDevice))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unknown_name_lists_the_known() {
+        let message = "cuda".parse::<DeviceName>().unwrap_err().to_string();
+        assert_eq!(message, "device `cuda`: unknown; the names are flex, ndarray, wgpu");
+    }
+
+    #[cfg(not(feature = "wgpu"))]
+    #[test]
+    fn a_build_without_wgpu_says_how_to_get_it() {
+        let message = DeviceName::Wgpu.open().unwrap_err().to_string();
+        assert!(message.contains("--features wgpu"), "{message}");
+    }
+}

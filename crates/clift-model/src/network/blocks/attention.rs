@@ -1,0 +1,106 @@
+//! Attention with its projections.
+
+use burn::module::Module;
+use burn::nn::{LayerNorm, Linear};
+use burn::tensor::Tensor;
+
+use crate::network::blocks::norms::QkNorm;
+use crate::network::config::ModelConfig;
+use crate::network::init::Init;
+use crate::ops::attention::sdpa::self_sdpa;
+use crate::ops::linear::{linear, linear_of_norm};
+
+/// Self-attention with a packed projection (paper section 3.1: eight heads).
+#[derive(Module, Debug)]
+pub struct SelfAttention {
+    in_proj: Linear,
+    out_proj: Linear,
+    qk_norm: Option<QkNorm>,
+    #[module(skip)]
+    num_heads: usize,
+}
+
+impl SelfAttention {
+    /// Makes the layer with PyTorch's initialisation of multi-head attention.
+    pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        let ModelConfig { dim, num_heads, .. } = *config;
+        Self {
+            in_proj: init.attention_in(dim, 3),
+            out_proj: init.attention_out(dim),
+            qk_norm: QkNorm::of(config, init),
+            num_heads,
+        }
+    }
+
+    /// Mixes the normalised tokens of the same scene.
+    ///
+    /// # Shapes
+    /// - `x` and the result: `[batch, count, dim]`
+    pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
+        let packed = linear_of_norm(norm, &self.in_proj, x);
+        let packed = match &self.qk_norm {
+            Some(qk_norm) => qk_norm.packed(packed),
+            None => packed,
+        };
+        linear(&self.out_proj, self_sdpa(packed, self.num_heads))
+    }
+}
+
+/// Attention from one set of tokens to another.
+#[derive(Module, Debug)]
+pub struct CrossAttention {
+    q_proj: Linear,
+    kv_proj: Linear,
+    out_proj: Linear,
+    qk_norm: Option<QkNorm>,
+    #[module(skip)]
+    num_heads: usize,
+}
+
+impl CrossAttention {
+    /// Makes the layer with PyTorch's initialisation of multi-head attention.
+    pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        let ModelConfig { dim, num_heads, .. } = *config;
+        Self {
+            q_proj: init.attention_in(dim, 1),
+            kv_proj: init.attention_in(dim, 2),
+            out_proj: init.attention_out(dim),
+            qk_norm: QkNorm::of(config, init),
+            num_heads,
+        }
+    }
+
+    /// Queries, `[batch, num_queries, dim]`.
+    pub(crate) fn project_query(&self, norm: Option<&LayerNorm>, x: Tensor<3>) -> Tensor<3> {
+        let query = project(norm, &self.q_proj, x);
+        match &self.qk_norm {
+            Some(qk_norm) => qk_norm.queries(query),
+            None => query,
+        }
+    }
+
+    /// Keys and values side by side, `[batch, num_keys, 2 dim]`. They depend on the tokens alone.
+    pub(crate) fn project_memory(&self, norm: Option<&LayerNorm>, memory: Tensor<3>) -> Tensor<3> {
+        let key_value = project(norm, &self.kv_proj, memory);
+        match &self.qk_norm {
+            Some(qk_norm) => qk_norm.keys_beside_values(key_value),
+            None => key_value,
+        }
+    }
+
+    /// The projection after the heads.
+    pub(crate) fn project_out(&self, x: Tensor<3>) -> Tensor<3> {
+        linear(&self.out_proj, x)
+    }
+
+    pub(crate) fn num_heads(&self) -> usize {
+        self.num_heads
+    }
+}
+
+fn project(norm: Option<&LayerNorm>, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    match norm {
+        Some(norm) => linear_of_norm(norm, layer, x),
+        None => linear(layer, x),
+    }
+}

@@ -1,0 +1,130 @@
+//! The three networks of a model together.
+
+use burn::module::Module;
+use burn::store::PathFilter;
+use burn::tensor::{Device, Tensor};
+
+use crate::network::blocks::norms::LiftNorm;
+use crate::network::condenser::Condenser;
+use crate::network::config::ModelConfig;
+use crate::network::encoder::Encoder;
+use crate::network::init::Init;
+use crate::network::render_tokens::RenderTokens;
+use crate::network::renderer::Renderer;
+use crate::network::scene_model::SceneModel;
+use crate::tokens::clusters::ClusterIndex;
+use crate::views::upload::{Cameras, Views};
+
+/// Encoder, condenser and renderer. Stage 1 trains the first and the last, stage 2 the last two.
+#[derive(Module, Debug)]
+pub struct Clift {
+    /// Posed pictures to light-field tokens.
+    pub encoder: Encoder,
+    /// A norm of those, in the variant that has one. Both stages train it.
+    pub lift_norm: LiftNorm,
+    /// Light-field tokens to compressed ones.
+    pub condenser: Condenser,
+    /// Tokens and a camera to a picture.
+    pub renderer: Renderer,
+}
+
+impl Clift {
+    /// Makes a model with random weights, the same for a seed on every device.
+    pub fn new(config: &ModelConfig, seed: u64, device: &Device) -> Self {
+        let mut init = Init::new(seed, device);
+        let encoder = Encoder::new(config, &mut init);
+        let renderer = Renderer::new(config, &mut init);
+        // Last, so that stage 1 does not depend on the condenser's settings.
+        let condenser = Condenser::new(config, &mut init);
+        let lift_norm = LiftNorm::new(config, &mut init);
+        Self { encoder, lift_norm, condenser, renderer }
+    }
+
+    /// The parameters that stage 1 trains and saves: those of every network but the condenser.
+    pub fn stage1_part() -> PathFilter {
+        PathFilter::from_predicate(|path, _| !is_condenser(path))
+    }
+}
+
+/// Whether the parameter at `path` belongs to the condenser.
+pub(crate) fn is_condenser(path: &str) -> bool {
+    path.starts_with("condenser.")
+}
+
+impl SceneModel for Clift {
+    fn features(&self, context: &Views) -> Tensor<3> {
+        self.encoder.forward(context)
+    }
+
+    fn has_token_norm(&self) -> bool {
+        self.lift_norm.is_norm()
+    }
+
+    fn normalize(&self, features: Tensor<3>) -> Tensor<3> {
+        self.lift_norm.forward(features)
+    }
+
+    fn compress(&self, tokens: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
+        self.condenser.forward(tokens, clusters)
+    }
+
+    fn render(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
+        self.renderer.forward(tokens, targets)
+    }
+
+    fn supports_selection(&self) -> bool {
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{Fixture, assert_close, devices, load_weights, weight_gradients};
+
+    #[test]
+    fn encoder_and_renderer_equal_pytorchs_with_the_gradients_of_the_loss() {
+        let fixture = Fixture::open("model");
+        let config = ModelConfig {
+            dim: 16,
+            num_heads: 4,
+            feed_forward_dim: 24,
+            num_encoder_blocks: 2,
+            num_renderer_blocks: 2,
+            ..ModelConfig::default()
+        };
+        for device in devices() {
+            let device = device.autodiff();
+            let Clift { encoder, renderer, .. } = Clift::new(&config, 0, &device);
+            let encoder = load_weights(encoder, &fixture, "weight.encoder.");
+            let renderer = load_weights(renderer, &fixture, "weight.renderer.");
+            let cameras = |kind: &str| Cameras {
+                height: 16,
+                width: 24,
+                c2w: fixture.tensor(&format!("input.{kind}_c2w"), &device),
+                intrinsics: fixture.tensor(&format!("input.{kind}_intrinsics"), &device),
+            };
+            let context =
+                Views { images: fixture.tensor("input.context_images", &device), cameras: cameras("context") };
+            let lift = encoder.forward(&context);
+            assert_close(&lift.clone().inner(), &fixture.tensor::<3>("output.lift", &device).inner(), 1e-5);
+            let rendering = renderer.forward(lift, &cameras("target"));
+            let expected = fixture.tensor::<5>("output.rendering", &device);
+            assert_close(&rendering.clone().inner(), &expected.inner(), 1e-5);
+            let target: Tensor<5> = fixture.tensor("input.target_images", &device);
+            let loss = (rendering - target).square().mean();
+            let expected = fixture.tensor::<1>("output.loss", &device);
+            assert_close(&loss.clone().inner(), &expected.inner(), 1e-6);
+            let grads = loss.backward();
+            weight_gradients(&encoder, &grads, &fixture, "grad.weight.encoder.", 5e-5);
+            weight_gradients(&renderer, &grads, &fixture, "grad.weight.renderer.", 5e-5);
+        }
+    }
+
+    #[test]
+    fn the_papers_model_has_81_million_parameters_in_stage_1() {
+        let model = Clift::new(&ModelConfig::default(), 0, &Device::flex());
+        let stage1 = model.encoder.num_params() + model.renderer.num_params();
+        assert_eq!(stage1, 81_239_232);
+    }
+}

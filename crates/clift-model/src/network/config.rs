@@ -1,0 +1,276 @@
+//! The shape of the network, as the `[model]` section of a config holds it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::ModelError;
+use crate::network::architecture::Variant;
+
+/// Sizes of the encoder, the condenser and the renderer. The defaults are the paper's.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "ModelSection")]
+pub struct ModelConfig {
+    /// Which published network the blocks follow.
+    pub variant: Variant,
+    /// Width of a token.
+    pub dim: usize,
+    /// Attention heads in every block; divides `dim`.
+    pub num_heads: usize,
+    /// Hidden width of the feed-forward networks.
+    pub feed_forward_dim: usize,
+    /// Self-attention blocks of the encoder.
+    pub num_encoder_blocks: usize,
+    /// Decoder blocks of the renderer.
+    pub num_renderer_blocks: usize,
+    /// Side of a square patch in pixels: one token per patch.
+    pub patch_size: usize,
+    /// The condenser of stage 2.
+    pub condenser: CondenserConfig,
+}
+
+/// The neural condenser (paper section 3.2, equations 1-4).
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct CondenserConfig {
+    /// Condenser blocks; the paper has two, the released networks one.
+    pub num_blocks: usize,
+    /// Whether each step inside a block adds to its input ("Add & `LayerNorm`" of the paper's text),
+    /// or replaces it, as equations 1-3 print it.
+    pub residual: bool,
+}
+
+impl Default for ModelConfig {
+    fn default() -> Self {
+        Self {
+            variant: Variant::Paper,
+            dim: 768,
+            num_heads: 8,
+            feed_forward_dim: 2048,
+            num_encoder_blocks: 6,
+            num_renderer_blocks: 6,
+            patch_size: 8,
+            condenser: CondenserConfig::default(),
+        }
+    }
+}
+
+impl Default for CondenserConfig {
+    fn default() -> Self {
+        Self::of(Variant::Paper)
+    }
+}
+
+impl CondenserConfig {
+    /// That of a variant.
+    pub fn of(variant: Variant) -> Self {
+        Self { num_blocks: if variant.is_released() { 1 } else { 2 }, residual: true }
+    }
+}
+
+/// [`ModelConfig`] as a file holds it: what the file leaves out of the condenser depends on the variant.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct ModelSection {
+    variant: Variant,
+    dim: usize,
+    num_heads: usize,
+    feed_forward_dim: usize,
+    num_encoder_blocks: usize,
+    num_renderer_blocks: usize,
+    patch_size: usize,
+    condenser: CondenserSection,
+}
+
+/// [`CondenserConfig`] as a file holds it.
+#[derive(Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct CondenserSection {
+    num_blocks: Option<usize>,
+    residual: Option<bool>,
+}
+
+impl Default for ModelSection {
+    fn default() -> Self {
+        let ModelConfig {
+            variant,
+            dim,
+            num_heads,
+            feed_forward_dim,
+            num_encoder_blocks,
+            num_renderer_blocks,
+            patch_size,
+            condenser: _,
+        } = ModelConfig::default();
+        Self {
+            variant,
+            dim,
+            num_heads,
+            feed_forward_dim,
+            num_encoder_blocks,
+            num_renderer_blocks,
+            patch_size,
+            condenser: CondenserSection::default(),
+        }
+    }
+}
+
+impl From<ModelSection> for ModelConfig {
+    fn from(section: ModelSection) -> Self {
+        let usual = CondenserConfig::of(section.variant);
+        Self {
+            variant: section.variant,
+            dim: section.dim,
+            num_heads: section.num_heads,
+            feed_forward_dim: section.feed_forward_dim,
+            num_encoder_blocks: section.num_encoder_blocks,
+            num_renderer_blocks: section.num_renderer_blocks,
+            patch_size: section.patch_size,
+            condenser: CondenserConfig {
+                num_blocks: section.condenser.num_blocks.unwrap_or(usual.num_blocks),
+                residual: section.condenser.residual.unwrap_or(usual.residual),
+            },
+        }
+    }
+}
+
+impl ModelConfig {
+    /// Values of one context patch: RGB and six ray coordinates per pixel (576 for 8 x 8).
+    pub fn context_patch_len(&self) -> usize {
+        self.patch_size * self.patch_size * 9
+    }
+
+    /// Values of one target patch: six ray coordinates per pixel (384 for 8 x 8).
+    pub fn ray_patch_len(&self) -> usize {
+        self.patch_size * self.patch_size * 6
+    }
+
+    /// Values of one rendered patch: RGB per pixel (192 for 8 x 8).
+    pub fn rgb_patch_len(&self) -> usize {
+        self.patch_size * self.patch_size * 3
+    }
+
+    /// How many tokens `num_views` views of `width` by `height` pixels give.
+    ///
+    /// # Errors
+    /// [`ModelError::NotDivisible`] when a side is not a positive multiple of the patch.
+    pub fn num_tokens(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
+        let patch_size = self.patch_size;
+        if height == 0 || width == 0 || !height.is_multiple_of(patch_size) || !width.is_multiple_of(patch_size) {
+            return Err(ModelError::NotDivisible { width, height, patch_size });
+        }
+        Ok(num_views * (height / patch_size) * (width / patch_size))
+    }
+
+    /// Checks every value against its range.
+    ///
+    /// # Errors
+    /// [`ModelError::BadConfig`] naming the key, the value and the fix.
+    pub fn validate(&self) -> Result<(), ModelError> {
+        let positive = [
+            ("model.dim", self.dim),
+            ("model.num_heads", self.num_heads),
+            ("model.feed_forward_dim", self.feed_forward_dim),
+            ("model.num_encoder_blocks", self.num_encoder_blocks),
+            ("model.num_renderer_blocks", self.num_renderer_blocks),
+            ("model.patch_size", self.patch_size),
+            ("model.condenser.num_blocks", self.condenser.num_blocks),
+        ];
+        for (key, value) in positive {
+            if value == 0 {
+                return Err(ModelError::BadConfig { key, value: value.to_string(), fix: "write at least 1".into() });
+            }
+        }
+        for ((key, value), most) in positive.into_iter().zip([1 << 16, 1 << 10, 1 << 18, 1 << 10, 1 << 10, 256, 64]) {
+            if value > most {
+                let fix = format!("write at most {most}");
+                return Err(ModelError::BadConfig { key, value: value.to_string(), fix });
+            }
+        }
+        if !self.dim.is_multiple_of(self.num_heads) {
+            return Err(ModelError::BadConfig {
+                key: "model.num_heads",
+                value: self.num_heads.to_string(),
+                fix: format!(
+                    "write a divisor of model.dim = {}, such as {}",
+                    self.dim,
+                    near_divisors(self.dim, self.num_heads)
+                ),
+            });
+        }
+        let CondenserConfig { num_blocks, residual } = self.condenser;
+        if self.variant.is_released() && num_blocks != 1 {
+            let fix = format!("model.variant = \"{}\" has one: leave the key out", self.variant);
+            return Err(ModelError::BadConfig {
+                key: "model.condenser.num_blocks",
+                value: num_blocks.to_string(),
+                fix,
+            });
+        }
+        if self.variant.is_released() && !residual {
+            let fix = format!("the block of model.variant = \"{}\" has residuals: leave the key out", self.variant);
+            return Err(ModelError::BadConfig { key: "model.condenser.residual", value: residual.to_string(), fix });
+        }
+        Ok(())
+    }
+}
+
+/// The divisors of `number` next to `wrong`, in words.
+fn near_divisors(number: usize, wrong: usize) -> String {
+    let divides = |candidate: &usize| number.is_multiple_of(*candidate);
+    let below = (1..wrong.min(number + 1)).rev().find(divides);
+    let above = (wrong + 1..=number).find(divides);
+    let near: Vec<String> = below.into_iter().chain(above).map(|divisor| divisor.to_string()).collect();
+    near.join(" or ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_default_is_the_papers_network() {
+        let config = ModelConfig::default();
+        config.validate().expect("the default is valid");
+        assert_eq!([config.context_patch_len(), config.ray_patch_len(), config.rgb_patch_len()], [576, 384, 192]);
+        assert_eq!(config.num_tokens(4, 256, 256).expect("divides"), 4096);
+        assert_eq!(config.num_tokens(4, 256, 448).expect("divides"), 7168);
+    }
+
+    #[test]
+    fn one_key_chooses_a_released_network_and_contradictions_are_refused() {
+        let parse = |text: &str| serde_json::from_str::<ModelConfig>(text).expect("a model section");
+        for variant in Variant::ALL {
+            let config = parse(&format!("{{\"variant\": \"{variant}\"}}"));
+            assert_eq!(
+                (config.variant, config.condenser.num_blocks),
+                (variant, if variant.is_released() { 1 } else { 2 })
+            );
+            config.validate().expect("one key is enough");
+            assert_eq!(parse(&serde_json::to_string(&config).expect("JSON")), config);
+        }
+        assert_eq!(parse("{}"), ModelConfig::default());
+        let message = |text: &str| parse(text).validate().unwrap_err().to_string();
+        let two = message(r#"{"variant": "released-re10k", "condenser": {"num_blocks": 2}}"#);
+        assert!(
+            two.starts_with("`model.condenser.num_blocks` = 2: model.variant = \"released-re10k\" has one"),
+            "{two}"
+        );
+        let plain = message(r#"{"variant": "released-dl3dv", "condenser": {"residual": false}}"#);
+        assert!(plain.starts_with("`model.condenser.residual` = false"), "{plain}");
+        assert!(serde_json::from_str::<ModelConfig>(r#"{"depth": 1}"#).is_err());
+        assert!(serde_json::from_str::<ModelConfig>(r#"{"condenser": {"depth": 1}}"#).is_err());
+    }
+
+    #[test]
+    fn heads_that_do_not_divide_the_width_are_refused_by_name() {
+        let message = ModelConfig { num_heads: 7, ..ModelConfig::default() }.validate().unwrap_err().to_string();
+        assert_eq!(message, "`model.num_heads` = 7: write a divisor of model.dim = 768, such as 6 or 8");
+        let message = ModelConfig { num_heads: 800, ..ModelConfig::default() }.validate().unwrap_err().to_string();
+        assert!(message.ends_with("such as 768"), "{message}");
+    }
+
+    #[test]
+    fn an_image_that_is_not_whole_patches_is_refused() {
+        let error = ModelConfig::default().num_tokens(1, 250, 256).unwrap_err();
+        assert_eq!(error.to_string(), "an image of 256 x 250 does not divide into patches of 8 x 8");
+        assert!(ModelConfig::default().num_tokens(1, 0, 256).is_err());
+    }
+}

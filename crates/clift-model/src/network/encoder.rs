@@ -1,0 +1,54 @@
+//! The multi-view encoder: posed pictures to light-field tokens (paper section 3.1).
+// B scenes, V views, N tokens, D width
+
+use burn::module::Module;
+use burn::nn::Linear;
+use burn::tensor::Tensor;
+
+use crate::network::blocks::block::EncoderBlock;
+use crate::network::config::ModelConfig;
+use crate::network::init::Init;
+use crate::ops::linear::linear_in_f32;
+use crate::views::patch::patchify;
+use crate::views::rays::plucker;
+use crate::views::upload::Views;
+
+/// Patch embedding and self-attention over all tokens of all views. The result is not normalised: K-means, condenser
+/// and renderer all work on the raw residual stream, but for the variant with a [`LiftNorm`](crate::network::blocks::norms::LiftNorm).
+#[derive(Module, Debug)]
+pub struct Encoder {
+    patch_embed: Linear,
+    blocks: Vec<EncoderBlock>,
+    #[module(skip)]
+    patch_size: usize,
+}
+
+impl Encoder {
+    /// Makes an encoder of the sizes of `config`.
+    pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        Self {
+            patch_embed: init.linear(config.context_patch_len(), config.dim),
+            blocks: (0..config.num_encoder_blocks).map(|_| EncoderBlock::new(config, init)).collect(),
+            patch_size: config.patch_size,
+        }
+    }
+
+    /// Encodes context views into light-field tokens, one per patch.
+    ///
+    /// # Shapes
+    /// - returns `[batch, views * (height / patch) * (width / patch), dim]`, ordered by view, row, column
+    pub fn forward(&self, context: &Views) -> Tensor<3> {
+        self.blocks.iter().fold(self.embed(context), |tokens, block| block.forward(tokens))
+    }
+
+    /// What the first block starts from: the embedded patches, in the result's shape.
+    pub fn embed(&self, context: &Views) -> Tensor<3> {
+        let pixels = Tensor::cat(vec![context.images.clone(), plucker(&context.cameras)], 4); // [B, V, H, W, 9]
+        linear_in_f32(&self.patch_embed, patchify(pixels, self.patch_size))
+    }
+
+    /// The blocks after [`embed`](Self::embed).
+    pub fn blocks(&self) -> &[EncoderBlock] {
+        &self.blocks
+    }
+}

@@ -1,0 +1,280 @@
+//! ONE description of the networks: every layer with its path, sizes and the rows it processes.
+//!
+//! Derived from it: parameter names and counts, multiply-accumulates, memory, largest tensors, published names. A new
+//! network is one function that lists its layers.
+
+use crate::network::config::ModelConfig;
+
+/// A layer of a network.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Layer {
+    /// Path of its module, such as `encoder.blocks.0.attn.in_proj`.
+    pub path: String,
+    /// The network it belongs to.
+    pub part: Part,
+    /// Index of its transformer block; `None` outside the blocks.
+    pub block: Option<usize>,
+    /// What it computes.
+    pub kind: LayerKind,
+    /// What it processes.
+    pub rows: Sequence,
+    /// Whether it saves its input for the backward. A linear layer behind a norm or an activation does not: its input
+    /// is recomputed. Nor does a layer that reads memory tokens: all blocks share one copy of them.
+    pub saves_input: bool,
+}
+
+/// A network with weights of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Context views to light-field tokens.
+    Encoder,
+    /// The norm between the encoder and the readers of its tokens.
+    TokenNorm,
+    /// All tokens to stored ones.
+    Condenser,
+    /// Tokens and a camera to an image.
+    Renderer,
+}
+
+/// Rows of a layer's input, counted by [`SceneSizes`](crate::cost::scene_sizes::SceneSizes).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Rows {
+    /// Patches of all context views, and the tokens made of them.
+    ContextPatches,
+    /// Tokens that are no centroid.
+    Members,
+    /// Centroids.
+    StoredTokens,
+    /// Centroids in cross-attention, which the condenser skips without members.
+    GatheringTokens,
+    /// Tokens that a view is rendered from.
+    RenderTokens,
+    /// Patches of the target views.
+    TargetPatches,
+}
+
+/// Rows that are processed as one sequence, usually of one kind.
+pub type Sequence = &'static [Rows];
+
+/// What a layer computes, with its columns: all heads together, but for the norm of a head.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LayerKind {
+    /// Matrix product.
+    Linear { inputs: usize, outputs: usize, bias: bool },
+    /// Layer norm with scale and shift.
+    LayerNorm { width: usize },
+    /// RMS norm of every head of queries or keys, with one scale for all heads.
+    HeadNorm { width: usize, heads: usize },
+    /// Softmax attention of every row to every key of its group.
+    Attention { width: usize, heads: usize, keys: Sequence },
+    /// Softmax attention of a centroid to the keys of its cluster: each key belongs to one centroid.
+    ClusterAttention { width: usize, keys: Sequence },
+    /// GELU or `ReLU` between the layers of a feed-forward network.
+    Activation { width: usize },
+}
+
+impl Layer {
+    /// Parameters in a weight file: path and shape, linear weights `[outputs, inputs]`.
+    pub fn parameters(&self) -> Vec<(String, Vec<usize>)> {
+        let shapes = match self.kind {
+            LayerKind::Linear { inputs, outputs, bias: true } => vec![vec![outputs, inputs], vec![outputs]],
+            LayerKind::Linear { inputs, outputs, bias: false } => vec![vec![outputs, inputs]],
+            LayerKind::LayerNorm { width } => vec![vec![width], vec![width]],
+            LayerKind::HeadNorm { width, .. } => vec![vec![width]],
+            LayerKind::Attention { .. } | LayerKind::ClusterAttention { .. } | LayerKind::Activation { .. } => vec![],
+        };
+        let paths = ["weight", "bias"].map(|name| format!("{}.{name}", self.path));
+        paths.into_iter().zip(shapes).collect()
+    }
+
+    /// Number of parameters.
+    pub fn num_parameters(&self) -> u64 {
+        self.parameters().iter().map(|(_, shape)| shape.iter().product::<usize>() as u64).sum()
+    }
+}
+
+impl ModelConfig {
+    /// Lists every layer. Parameters stand in the order of published checkpoints: encoder, token norm, renderer,
+    /// condenser; in a block of PyTorch attention, feed-forward network, norms.
+    pub(crate) fn layers(&self) -> Vec<Layer> {
+        clift_layers(self)
+    }
+}
+
+const CONTEXT: Sequence = &[Rows::ContextPatches];
+const MEMBERS: Sequence = &[Rows::Members];
+const STORED: Sequence = &[Rows::StoredTokens];
+const GATHERING: Sequence = &[Rows::GatheringTokens];
+const RENDER_TOKENS: Sequence = &[Rows::RenderTokens];
+const TARGETS: Sequence = &[Rows::TargetPatches];
+
+fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
+    let ModelConfig { dim, variant, .. } = *config;
+    let mut list = LayerList { config, path: String::new(), part: Part::Encoder, block: None, layers: Vec::new() };
+
+    list.enter(Part::Encoder, None, "encoder");
+    list.linear("patch_embed", [config.context_patch_len(), dim], CONTEXT, true);
+    for i in 0..config.num_encoder_blocks {
+        list.enter(Part::Encoder, Some(i), &format!("encoder.blocks.{i}"));
+        list.self_attention("attn", CONTEXT);
+        list.feed_forward(CONTEXT);
+        list.norm("norm_attn", CONTEXT);
+        list.norm("norm_ff", CONTEXT);
+    }
+    if variant.has_norms() {
+        list.enter(Part::TokenNorm, None, "lift_norm");
+        list.norm("norm", CONTEXT);
+    }
+
+    list.enter(Part::Renderer, None, "renderer");
+    list.linear("ray_embed", [config.ray_patch_len(), dim], TARGETS, true);
+    for i in 0..config.num_renderer_blocks {
+        list.enter(Part::Renderer, Some(i), &format!("renderer.blocks.{i}"));
+        list.decoder_block(TARGETS, RENDER_TOKENS);
+    }
+    list.enter(Part::Renderer, None, "renderer");
+    list.norm("output_norm", TARGETS);
+    list.linear("to_pixels", [dim, config.rgb_patch_len()], TARGETS, false);
+
+    if variant.is_released() {
+        list.enter(Part::Condenser, Some(0), "condenser.released");
+        list.decoder_block(STORED, CONTEXT);
+        list.linear("gate", [dim, dim], STORED, true);
+        return list.layers;
+    }
+    let residual = config.condenser.residual;
+    for i in 0..config.condenser.num_blocks {
+        list.enter(Part::Condenser, Some(i), &format!("condenser.blocks.{i}"));
+        list.self_attention("self_attn", STORED);
+        list.norm("norm_self", STORED);
+        if residual {
+            list.norm("norm_cross", GATHERING);
+        }
+        // The members are the same in every block.
+        list.push("norm_memory", LayerKind::LayerNorm { width: dim }, MEMBERS, false);
+        list.norm("norm_ff", STORED);
+        list.cross_attention(GATHERING, !residual, MEMBERS);
+        list.feed_forward(STORED);
+        list.push("gate", LayerKind::Linear { inputs: dim, outputs: dim, bias: false }, STORED, true);
+    }
+    list.layers
+}
+
+/// Layers so far, and where the next ones belong.
+struct LayerList<'a> {
+    config: &'a ModelConfig,
+    path: String,
+    part: Part,
+    block: Option<usize>,
+    layers: Vec<Layer>,
+}
+
+impl LayerList<'_> {
+    fn enter(&mut self, part: Part, block: Option<usize>, path: &str) {
+        (self.part, self.block, self.path) = (part, block, path.to_owned());
+    }
+
+    fn push(&mut self, name: &str, kind: LayerKind, rows: Sequence, saves_input: bool) {
+        let path = format!("{}.{name}", self.path);
+        self.layers.push(Layer { path, part: self.part, block: self.block, kind, rows, saves_input });
+    }
+
+    fn linear(&mut self, name: &str, [inputs, outputs]: [usize; 2], rows: Sequence, saves_input: bool) {
+        self.push(name, LayerKind::Linear { inputs, outputs, bias: true }, rows, saves_input);
+    }
+
+    fn norm(&mut self, name: &str, rows: Sequence) {
+        self.push(name, LayerKind::LayerNorm { width: self.config.dim }, rows, true);
+    }
+
+    /// Attention behind a norm, with one packed projection.
+    fn self_attention(&mut self, name: &str, rows: Sequence) {
+        let ModelConfig { dim, num_heads, .. } = *self.config;
+        self.linear(&format!("{name}.in_proj"), [dim, 3 * dim], rows, false);
+        self.push(name, LayerKind::Attention { width: dim, heads: num_heads, keys: rows }, rows, true);
+        self.attention_output(name, rows, rows);
+    }
+
+    /// Attention to memory tokens: in the condenser to those of a cluster.
+    fn cross_attention(&mut self, rows: Sequence, saves_query: bool, keys: Sequence) {
+        let ModelConfig { dim: width, num_heads: heads, .. } = *self.config;
+        let (name, kind) = match self.part {
+            Part::Condenser => ("cluster_attn", LayerKind::ClusterAttention { width, keys }),
+            _ => ("cross_attn", LayerKind::Attention { width, heads, keys }),
+        };
+        self.linear(&format!("{name}.q_proj"), [width, width], rows, saves_query);
+        self.linear(&format!("{name}.kv_proj"), [width, 2 * width], keys, false);
+        self.push(name, kind, rows, true);
+        self.attention_output(name, rows, keys);
+    }
+
+    fn attention_output(&mut self, name: &str, rows: Sequence, keys: Sequence) {
+        let ModelConfig { dim, num_heads: heads, variant, .. } = *self.config;
+        self.linear(&format!("{name}.out_proj"), [dim, dim], rows, true);
+        if variant.has_norms() {
+            let norm = LayerKind::HeadNorm { width: dim / heads, heads };
+            self.push(&format!("{name}.qk_norm.query"), norm, rows, true);
+            self.push(&format!("{name}.qk_norm.key"), norm, keys, true);
+        }
+    }
+
+    /// Two layers behind a norm.
+    fn feed_forward(&mut self, rows: Sequence) {
+        let ModelConfig { dim, feed_forward_dim: hidden, .. } = *self.config;
+        self.linear("feed_forward.up", [dim, hidden], rows, false);
+        self.push("feed_forward", LayerKind::Activation { width: hidden }, rows, true);
+        self.linear("feed_forward.down", [hidden, dim], rows, false);
+    }
+
+    /// PyTorch's pre-norm decoder layer.
+    fn decoder_block(&mut self, rows: Sequence, keys: Sequence) {
+        self.self_attention("self_attn", rows);
+        self.cross_attention(rows, false, keys);
+        self.feed_forward(rows);
+        for name in ["norm_self", "norm_cross", "norm_ff"] {
+            self.norm(name, rows);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use burn::module::Module;
+    use burn::tensor::Device;
+
+    use super::*;
+    use crate::cost::parameters::Parameters;
+    use crate::network::clift::Clift;
+    use crate::testing::small_configs;
+    use crate::weights::file;
+
+    #[test]
+    fn layers_are_those_of_the_built_module() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("model.safetensors");
+        for config in small_configs() {
+            let model = Clift::new(&config, 0, &Device::flex());
+            file::save(&model, &path).expect("writes");
+            let bytes = std::fs::read(&path).expect("reads");
+            let file = safetensors::SafeTensors::deserialize(&bytes).expect("valid");
+            let built: BTreeMap<String, Vec<usize>> =
+                file.tensors().into_iter().map(|(name, view)| (name, view.shape().to_vec())).collect();
+            let listed: BTreeMap<_, _> = config.layers().iter().flat_map(Layer::parameters).collect();
+            assert_eq!(listed, built, "{config:?}");
+
+            let Parameters { encoder, lift_norm, condenser, renderer, total } = Parameters::of(&config);
+            assert_eq!(
+                [encoder, lift_norm, condenser, renderer, total].map(|count| count as usize),
+                [
+                    model.encoder.num_params(),
+                    model.lift_norm.num_params(),
+                    model.condenser.num_params(),
+                    model.renderer.num_params(),
+                    model.num_params(),
+                ]
+            );
+        }
+    }
+}

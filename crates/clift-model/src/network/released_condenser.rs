@@ -1,0 +1,68 @@
+//! The condenser of the released networks.
+// B scenes, N tokens, S centroids, D width
+
+use burn::module::Module;
+use burn::nn::{LayerNorm, Linear};
+use burn::tensor::Tensor;
+
+use crate::network::blocks::attention::{CrossAttention, SelfAttention};
+use crate::network::blocks::feed_forward::{Activation, FeedForward};
+use crate::network::config::ModelConfig;
+use crate::network::init::Init;
+use crate::ops::cluster_attention::operation::cluster_attention;
+use crate::ops::linear::linear;
+use crate::tokens::clusters::ClusterIndex;
+
+/// One pre-norm decoder layer from the centroids to the tokens, each to those of its own cluster alone, and a gate.
+///
+/// Departs from the paper as the published weights do: one block; residuals around all three parts; keys and values
+/// are the tokens as they are, the centroid among them, so that a cluster of one attends to itself; `ReLU`; the gate
+/// has a bias.
+#[derive(Module, Debug)]
+pub(crate) struct ReleasedCondenser {
+    norm_self: LayerNorm,
+    self_attn: SelfAttention,
+    norm_cross: LayerNorm,
+    cluster_attn: CrossAttention,
+    norm_ff: LayerNorm,
+    feed_forward: FeedForward,
+    /// `W_z` and `b_z`, zero at the start.
+    gate: Linear,
+}
+
+impl ReleasedCondenser {
+    pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        let dim = config.dim;
+        Self {
+            norm_self: init.layer_norm(dim),
+            self_attn: SelfAttention::new(config, init),
+            norm_cross: init.layer_norm(dim),
+            cluster_attn: CrossAttention::new(config, init),
+            norm_ff: init.layer_norm(dim),
+            feed_forward: FeedForward::with(Activation::Relu, dim, config.feed_forward_dim, init),
+            gate: init.zero_linear_with_bias(dim, dim),
+        }
+    }
+
+    /// Opens the gate, so that the rest does something.
+    #[cfg(test)]
+    pub fn open(&mut self, init: &mut Init) {
+        let dim = self.gate.weight.dims()[0];
+        self.gate = init.linear(dim, dim);
+    }
+
+    /// # Shapes
+    /// - `centroids` and the result: `[batch, num_storage_tokens, dim]`
+    /// - `lift`: `[batch, num_tokens, dim]`
+    pub fn forward(&self, centroids: Tensor<3>, lift: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
+        let x = centroids.clone() + self.self_attn.forward(&self.norm_self, centroids.clone());
+
+        let key_value = self.cluster_attn.project_memory(None, lift);
+        let query = self.cluster_attn.project_query(Some(&self.norm_cross), x.clone());
+        let found = cluster_attention(query, key_value, clusters.segment.clone(), self.cluster_attn.num_heads());
+        let x = x + self.cluster_attn.project_out(found);
+
+        let x = x.clone() + self.feed_forward.forward(&self.norm_ff, x);
+        centroids + linear(&self.gate, x)
+    }
+}

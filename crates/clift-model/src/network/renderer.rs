@@ -1,0 +1,163 @@
+//! The neural renderer: tokens and a camera to a picture (paper section 3.3).
+// B scenes, T target views, G sets of tokens, Q patches of a view, R render tokens, D width
+
+use burn::module::Module;
+use burn::nn::{LayerNorm, Linear};
+use burn::tensor::activation::sigmoid;
+use burn::tensor::Tensor;
+
+use crate::network::blocks::block::DecoderBlock;
+use crate::network::config::ModelConfig;
+use crate::network::init::Init;
+use crate::network::render_tokens::{RenderTokens, SceneMemory};
+use crate::ops::linear::{linear_in_f32, linear_of_norm};
+use crate::views::patch::{patchify, unpatchify};
+use crate::views::rays::plucker;
+use crate::views::upload::Cameras;
+
+/// A transformer decoder whose queries are the target's ray patches.
+#[derive(Module, Debug)]
+pub struct Renderer {
+    ray_embed: Linear,
+    blocks: Vec<DecoderBlock>,
+    output_norm: LayerNorm,
+    to_pixels: Linear,
+    #[module(skip)]
+    patch_size: usize,
+}
+
+impl Renderer {
+    /// Side of a patch in pixels.
+    pub const fn patch_size(&self) -> usize {
+        self.patch_size
+    }
+
+    /// Makes a renderer of the sizes of `config`.
+    pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        Self {
+            ray_embed: init.linear(config.ray_patch_len(), config.dim),
+            blocks: (0..config.num_renderer_blocks).map(|_| DecoderBlock::new(config, init)).collect(),
+            output_norm: init.layer_norm(config.dim),
+            to_pixels: init.linear(config.dim, config.rgb_patch_len()),
+            patch_size: config.patch_size,
+        }
+    }
+
+    /// Draws target views from tokens. Views are independent of each other.
+    ///
+    /// # Shapes
+    /// - `tokens`: one set per scene, shared by all its target views, or one set per target view
+    /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
+    pub fn forward(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
+        let tokens = tokens.into();
+        let x = self.embed(targets);
+        let x = self.blocks.iter().fold(x, |x, block| block.forward(x, tokens.memory(block)));
+        self.picture(x, targets)
+    }
+
+    /// Keys and values of a scene's tokens in every block, for drawing it many times.
+    ///
+    /// # Shapes
+    /// - `tokens`: `[batch, num_render_tokens, dim]`
+    pub fn memory(&self, tokens: &Tensor<3>) -> SceneMemory {
+        let blocks = self.blocks.iter().map(|block| block.memory(tokens.clone())).collect();
+        SceneMemory { blocks, num_render_tokens: tokens.dims()[1] }
+    }
+
+    /// Draws target views as [`forward`](Self::forward) does, from what [`memory`](Self::memory) prepared.
+    ///
+    /// # Shapes
+    /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
+    pub fn draw(&self, memory: &SceneMemory, targets: &Cameras) -> Tensor<5> {
+        let x = self.embed(targets);
+        let x = self.blocks.iter().zip(&memory.blocks).fold(x, |x, (block, memory)| block.forward(x, memory.clone()));
+        self.picture(x, targets)
+    }
+
+    /// What the first block starts from: the embedded rays of every patch, `[batch * views, num_queries, dim]`.
+    pub fn embed(&self, targets: &Cameras) -> Tensor<3> {
+        let [batch, views] = targets.dims();
+        let rays = linear_in_f32(&self.ray_embed, patchify(plucker(targets), self.patch_size)); // [B, TQ, D]
+        let [_, queries, dim] = rays.dims();
+        rays.reshape([batch * views, queries / views, dim])
+    }
+
+    /// The blocks between [`embed`](Self::embed) and [`picture`](Self::picture).
+    pub fn blocks(&self) -> &[DecoderBlock] {
+        &self.blocks
+    }
+
+    /// The picture in what the last block gives.
+    ///
+    /// # Shapes
+    /// - `x`: `[batch * views, num_queries, dim]`
+    /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
+    pub fn picture(&self, x: Tensor<3>, targets: &Cameras) -> Tensor<5> {
+        let [batch, views] = targets.dims();
+        let patches = sigmoid(linear_of_norm(&self.output_norm, &self.to_pixels, x));
+        let [_, num_queries, values] = patches.dims();
+        let patches = patches.reshape([batch, views * num_queries, values]);
+        unpatchify(patches, [views, targets.height, targets.width], self.patch_size)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{DType, Device};
+
+    use super::*;
+    use crate::testing::{assert_close, devices, random};
+
+    fn setting(device: &Device) -> (Renderer, Tensor<3>, Cameras) {
+        let config = ModelConfig { dim: 16, num_heads: 4, feed_forward_dim: 24, ..ModelConfig::default() };
+        let renderer = Renderer::new(&config, &mut Init::new(0, device));
+        let tokens = random([2, 10, 16], 1, device).cast(DType::F32);
+        let c2w = Tensor::<2>::eye(4, device).reshape([1, 1, 4, 4]).expand([2, 3, 4, 4]);
+        let shift = random([2, 3, 4], 2, device).cast(DType::F32).reshape([2, 3, 4, 1]);
+        let column = Tensor::<1>::from_floats([0.0, 0.0, 0.0, 0.3], device).reshape([1, 1, 1, 4]);
+        let intrinsics = Tensor::<1>::from_floats([16.0, 16.0, 8.0, 8.0], device).reshape([1, 1, 4]).expand([2, 3, 4]);
+        (renderer, tokens, Cameras { height: 16, width: 16, c2w: c2w + shift * column, intrinsics })
+    }
+
+    #[test]
+    fn a_prepared_scene_is_drawn_as_an_unprepared_one() {
+        for device in devices() {
+            let (renderer, tokens, cameras) = setting(&device);
+            let drawn = renderer.draw(&renderer.memory(&tokens), &cameras);
+            assert_close(&drawn, &renderer.forward(tokens, &cameras), 0.0);
+        }
+    }
+
+    #[test]
+    fn subsets_per_view_are_drawn_as_their_tokens_alone_with_the_same_gradients() {
+        // Few tokens of each view: gathered before the projection. Many: after it.
+        for count in [2, 7] {
+            let subsets: Vec<Vec<Vec<u32>>> = (0..2)
+                .map(|scene| (0..3).map(|view| (0..count).map(|i| (3 * i + view + scene) % 10).collect()).collect())
+                .collect();
+            let ids: Vec<i32> = subsets.iter().flatten().flatten().map(|&id| id as i32).collect();
+            for device in devices() {
+                let device = device.autodiff();
+                let (renderer, tokens, cameras) = setting(&device);
+                let results = |alone: bool| {
+                    let tokens = tokens.clone().detach().require_grad();
+                    let images = if alone {
+                        let each = |i: usize| {
+                            let scene = tokens.clone().narrow(0, i / 3, 1);
+                            let ids = &ids[i * count as usize..(i + 1) * count as usize];
+                            scene.select(1, Tensor::from_ints(ids, &device))
+                        };
+                        renderer.forward(Tensor::cat((0..6).map(each).collect(), 0), &cameras)
+                    } else {
+                        renderer.forward(RenderTokens::subsets(tokens.clone(), &subsets), &cameras)
+                    };
+                    let grads = images.clone().square().mean().backward();
+                    (images.inner(), tokens.grad(&grads).expect("tracked"))
+                };
+                let ((images, gradient), (expected_images, expected_gradient)) = (results(false), results(true));
+                assert_close(&images, &expected_images, 1e-6);
+                assert_close(&gradient, &expected_gradient, 1e-5);
+            }
+        }
+    }
+}

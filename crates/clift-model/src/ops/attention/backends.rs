@@ -1,0 +1,131 @@
+//! Attention on Burn's CPU backend: f32 by the kernels of `clift-kernels`, straight from the packed
+//! projections and into packed gradients.
+#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+
+use burn::backend::flex::FlexTensor;
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{Flex, NdArray, TensorMetadata};
+use clift_kernels::{Gradients, InstructionSet, Rows, Saved, Sizes, attention_backward, attention_forward};
+
+use crate::ops::attention::composed::{Attended, Heads, Projected, composed_backward, forward, split};
+use crate::ops::flex::{contiguous, is_native, tensor, values};
+use crate::ops::precision::{MatmulKernels, Precision};
+
+impl AttentionKernels for Flex {
+    fn attend(inputs: &Projected<FloatTensor<Self>>, heads: Heads) -> Attended<FloatTensor<Self>> {
+        if !inputs.is_native() || heads.precision != Precision::F32 {
+            return Attended { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None };
+        }
+        let Heads { num_heads, .. } = heads;
+        let inputs = inputs.clone().contiguous();
+        let sizes = inputs.sizes(num_heads);
+        let Sizes { batch, num_queries, head_width, .. } = sizes;
+        let dim = num_heads * head_width;
+        let mut output = vec![0.0; batch * num_queries * dim];
+        let mut log_sum = vec![0.0; batch * num_heads * num_queries];
+        attention_forward(InstructionSet::detected(), sizes, inputs.rows(dim), &mut output, Some(&mut log_sum));
+        let log_sum = tensor(log_sum, [batch, num_heads, num_queries]);
+        Attended { output: tensor(output, [batch, num_queries, dim]), log_sum: Some(log_sum) }
+    }
+
+    fn attend_backward(
+        inputs: Projected<FloatTensor<Self>>,
+        attended: Attended<FloatTensor<Self>>,
+        heads: Heads,
+        grad_output: FloatTensor<Self>,
+    ) -> Projected<FloatTensor<Self>> {
+        let Some(log_sum) = attended.log_sum else {
+            return composed_backward::<Self>(inputs, attended.output, heads, grad_output);
+        };
+        let Heads { num_heads, .. } = heads;
+        let inputs = inputs.contiguous();
+        let sizes = inputs.sizes(num_heads);
+        let Sizes { batch, num_queries, num_keys, head_width, .. } = sizes;
+        let dim = num_heads * head_width;
+        let [output, grad_output] = [attended.output, grad_output].map(contiguous);
+        let [query, key, value] = inputs.rows(dim);
+        let [output, grad_output] = [&output, &grad_output].map(|x| columns(x, 0));
+        let saved = Saved { query, key, value, output, log_sum: values(&log_sum), grad_output };
+        let set = InstructionSet::detected();
+        match inputs {
+            Projected::Packed(_) => {
+                let mut grad = vec![0.0; batch * num_queries * 3 * dim];
+                attention_backward(set, sizes, saved, Gradients::Packed(&mut grad));
+                Projected::Packed(tensor(grad, [batch, num_queries, 3 * dim]))
+            }
+            Projected::Separate { .. } => {
+                let mut query = vec![0.0; batch * num_queries * dim];
+                let mut key_value = vec![0.0; batch * num_keys * 2 * dim];
+                let to = Gradients::Separate { query: &mut query, key_value: &mut key_value };
+                attention_backward(set, sizes, saved, to);
+                let query = tensor(query, [batch, num_queries, dim]);
+                Projected::Separate { query, key_value: tensor(key_value, [batch, num_keys, 2 * dim]) }
+            }
+        }
+    }
+}
+
+impl Projected<FlexTensor> {
+    fn is_native(&self) -> bool {
+        match self {
+            Self::Packed(packed) => is_native(packed),
+            Self::Separate { query, key_value } => is_native(query) && is_native(key_value),
+        }
+    }
+
+    fn contiguous(self) -> Self {
+        match self {
+            Self::Packed(packed) => Self::Packed(contiguous(packed)),
+            Self::Separate { query, key_value } => {
+                Self::Separate { query: contiguous(query), key_value: contiguous(key_value) }
+            }
+        }
+    }
+
+    fn sizes(&self, num_heads: usize) -> Sizes {
+        let (query, key_value, parts) = match self {
+            Self::Packed(packed) => (packed, packed, 3),
+            Self::Separate { query, key_value } => (query, key_value, 1),
+        };
+        let [batch, num_queries, width] = query.shape().dims();
+        let [_, num_keys, _] = key_value.shape().dims();
+        Sizes { batch, num_queries, num_keys, num_heads, head_width: width / parts / num_heads }
+    }
+
+    /// Rows of queries, keys and values.
+    fn rows(&self, dim: usize) -> [Rows<'_>; 3] {
+        match self {
+            Self::Packed(packed) => [0, 1, 2].map(|part| columns(packed, part * dim)),
+            Self::Separate { query, key_value } => [columns(query, 0), columns(key_value, 0), columns(key_value, dim)],
+        }
+    }
+}
+
+/// Rows of a contiguous tensor from a column on.
+fn columns(x: &FlexTensor, first: usize) -> Rows<'_> {
+    let [_, count, width] = x.shape().dims();
+    Rows { values: values(x).get(first..).unwrap_or_default(), batch_stride: count * width, row_stride: width }
+}
+
+/// Both directions of attention on a device. The bodies here run on every one of them.
+pub trait AttentionKernels: MatmulKernels {
+    /// The output, and what the backward can use besides it.
+    fn attend(inputs: &Projected<FloatTensor<Self>>, heads: Heads) -> Attended<FloatTensor<Self>> {
+        Attended { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None }
+    }
+
+    /// The gradients of the inputs from that of the output.
+    fn attend_backward(
+        inputs: Projected<FloatTensor<Self>>,
+        attended: Attended<FloatTensor<Self>>,
+        heads: Heads,
+        grad_output: FloatTensor<Self>,
+    ) -> Projected<FloatTensor<Self>> {
+        composed_backward::<Self>(inputs, attended.output, heads, grad_output)
+    }
+}
+
+impl AttentionKernels for NdArray {}
+
+#[cfg(feature = "wgpu")]
+impl AttentionKernels for burn::backend::Cube {}

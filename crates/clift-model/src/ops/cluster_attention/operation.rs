@@ -1,0 +1,316 @@
+//! Attention of every centroid to the tokens of its own cluster, linear in the number of tokens.
+//!
+//! A token is a key for one centroid only, so the scores are one number per token and head and the
+//! softmax runs over segments: never a `[centroids, tokens]` mask.
+#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+// B scenes, S centroids, M members, D width, H heads, E = D/H width of a head
+
+use burn::backend::autodiff::checkpoint::base::Checkpointer;
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::tensor::{FloatTensor, IndexingUpdateOp, IntTensor};
+use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::tensor::{FloatDType, Int, Shape, Slice, Tensor, assert_shape};
+
+use crate::ops::autodiff::register;
+use crate::ops::mac_counter;
+
+/// Attention from every centroid to its members: `o_s = sum_i softmax_i(q_s k_i / sqrt(head width)) v_i`
+/// over the `i` whose segment is `s`. A centroid without members gets zeros.
+///
+/// Its gradient is exact and first order. Scores are shifted by their segment's maximum.
+///
+/// # Shapes
+/// - `query`: `[batch, num_segments, dim]`
+/// - `key_value`: `[batch, num_members, 2 dim]`, the two side by side
+/// - `segment`: `[batch * num_members]`, `scene * num_segments + cluster` of every member
+/// - returns `[batch, num_segments, dim]`
+pub fn cluster_attention(
+    query: Tensor<3>,
+    key_value: Tensor<3>,
+    segment: Tensor<1, Int>,
+    num_heads: usize,
+) -> Tensor<3> {
+    let [batch, _num_segments, dim] = query.dims();
+    let [_, num_members, _] = key_value.dims();
+    assert_shape!(key_value, [batch, num_members, 2 * dim]);
+    assert_shape!(segment, [batch * num_members]);
+    assert!(dim.is_multiple_of(num_heads), "{num_heads} heads do not divide a width of {dim}");
+    mac_counter::add_attention(batch * num_members, dim);
+    Tensor::from_dispatch(<Dispatch as ClusterAttentionOps>::cluster_attention(
+        query.into_dispatch(),
+        key_value.into_dispatch(),
+        segment.into_dispatch(),
+        num_heads,
+    ))
+}
+
+/// The operation behind [`cluster_attention`] on a device.
+#[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
+pub trait ClusterAttentionOps: Backend {
+    /// See [`cluster_attention`].
+    fn cluster_attention(
+        query: FloatTensor<Self>,
+        key_value: FloatTensor<Self>,
+        segment: IntTensor<Self>,
+        num_heads: usize,
+    ) -> FloatTensor<Self>;
+}
+
+/// Both directions of the operation on a device. The bodies here run on every one of them.
+pub trait ClusterAttentionKernels: Backend {
+    /// Output `[B, S, D]` and weights `[BM, H, 1]`.
+    fn attend_clusters(inputs: &ClusterInputs<Self>) -> [FloatTensor<Self>; 2] {
+        forward::<Self>(inputs)
+    }
+
+    /// The gradients of queries and of keys and values from the weights and the output's gradient.
+    fn attend_clusters_backward(
+        inputs: ClusterInputs<Self>,
+        results: [FloatTensor<Self>; 2],
+        grad_output: FloatTensor<Self>,
+    ) -> [FloatTensor<Self>; 2] {
+        backward::<Self>(inputs, results, grad_output)
+    }
+}
+
+/// What [`cluster_attention`] is given.
+#[derive(Clone, Debug)]
+pub struct ClusterInputs<B: Backend> {
+    pub(crate) query: FloatTensor<B>,
+    pub(crate) key_value: FloatTensor<B>,
+    pub(crate) segment: IntTensor<B>,
+    pub(crate) num_heads: usize,
+}
+
+macro_rules! cluster_attention_ops {
+    ($backend:ty) => {
+        impl ClusterAttentionOps for $backend {
+            fn cluster_attention(
+                query: FloatTensor<Self>,
+                key_value: FloatTensor<Self>,
+                segment: IntTensor<Self>,
+                num_heads: usize,
+            ) -> FloatTensor<Self> {
+                let [output, _] = Self::attend_clusters(&ClusterInputs { query, key_value, segment, num_heads });
+                output
+            }
+        }
+    };
+}
+cluster_attention_ops!(Flex);
+cluster_attention_ops!(NdArray);
+#[cfg(feature = "wgpu")]
+cluster_attention_ops!(burn::backend::Cube);
+
+impl ClusterAttentionKernels for NdArray {}
+#[cfg(feature = "wgpu")]
+impl ClusterAttentionKernels for burn::backend::Cube {}
+
+impl<B: ClusterAttentionOps + ClusterAttentionKernels, C: CheckpointStrategy> ClusterAttentionOps for Autodiff<B, C> {
+    fn cluster_attention(
+        query: FloatTensor<Self>,
+        key_value: FloatTensor<Self>,
+        segment: IntTensor<Self>,
+        num_heads: usize,
+    ) -> FloatTensor<Self> {
+        let ((query, query_node), (key_value, key_value_node)) = (query.into_parts(), key_value.into_parts());
+        match ClusterBackward.prepare::<C>([query_node, key_value_node]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let inputs = ClusterInputs::<B> { query, key_value, segment, num_heads };
+                let results = B::attend_clusters(&inputs);
+                let output = results[0].clone();
+                prep.finish((inputs, results), output)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::cluster_attention(query, key_value, segment, num_heads)),
+        }
+    }
+}
+
+#[derive(Debug)]
+struct ClusterBackward;
+
+impl<B: ClusterAttentionKernels> Backward<B, 2> for ClusterBackward {
+    type State = (ClusterInputs<B>, [FloatTensor<B>; 2]);
+
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        register::<B, _, 2>(ops, grads, |(inputs, results), grad_output, _| {
+            B::attend_clusters_backward(inputs, results, grad_output).map(Some)
+        });
+    }
+}
+
+/// Keys and values, each `[BM, H, E]`.
+fn split<B: Backend>(key_value: FloatTensor<B>, num_heads: usize) -> [FloatTensor<B>; 2] {
+    let [batch, count, width] = key_value.shape().dims();
+    let dim = width / 2;
+    [0..dim, dim..width].map(|columns| {
+        let part = B::float_slice(key_value.clone(), &[0..batch, 0..count, columns].map(Slice::from));
+        flatten::<B>(part, num_heads)
+    })
+}
+
+pub(crate) fn forward<B: Backend>(inputs: &ClusterInputs<B>) -> [FloatTensor<B>; 2] {
+    let ClusterInputs { query, key_value, segment, num_heads } = inputs.clone();
+    let [batch, num_segments, dim] = query.shape().dims();
+    let segments = batch * num_segments;
+    let head_width = dim / num_heads;
+    let scale = 1.0 / (head_width as f64).sqrt();
+
+    let query = flatten::<B>(B::float_mul_scalar(query, scale.into()), num_heads); // [BS, H, E]
+    let [key, value] = split::<B>(key_value, num_heads); // [BM, H, E]
+    let scores = dot::<B>(B::float_select(query, 0, segment.clone()), key); // [BM, H, 1]
+
+    // Every segment's maximum. The lowest finite value stands in for segments without members.
+    let (device, dtype) = (scores.device(), FloatDType::from(scores.dtype()));
+    let per_segment = Shape::new([segments, num_heads, 1]);
+    let lowest = B::float_full(per_segment.clone(), f64::from(f32::MIN).into(), &device, dtype);
+    let maximum = B::float_select_assign(lowest, 0, segment.clone(), scores.clone(), IndexingUpdateOp::Max);
+    let shifted = B::float_sub(scores, B::float_select(maximum, 0, segment.clone()));
+    let exponential = B::float_exp(shifted);
+    let zeros = B::float_zeros(per_segment, &device, dtype);
+    let total = B::float_select_assign(zeros, 0, segment.clone(), exponential.clone(), IndexingUpdateOp::Add);
+    // Every total that is read has a member at its maximum, so it is at least one.
+    let weights = B::float_div(exponential, B::float_select(total, 0, segment.clone()));
+
+    let weighted = B::float_mul(value, weights.clone());
+    let zeros = B::float_zeros(Shape::new([segments, num_heads, head_width]), &device, dtype);
+    let output = B::float_select_assign(zeros, 0, segment, weighted, IndexingUpdateOp::Add);
+    [B::float_reshape(output, Shape::new([batch, num_segments, dim])), weights]
+}
+
+/// With `g_i = dO[segment i]`: `dV_i = p_i g_i`, `dS_i = p_i (g_i v_i - rowsum(dO * O)[segment i])`,
+/// `dK_i = s dS_i q[segment i]`, `dQ_s = s sum_i dS_i k_i`.
+pub(crate) fn backward<B: Backend>(
+    inputs: ClusterInputs<B>,
+    [output, weights]: [FloatTensor<B>; 2],
+    grad_output: FloatTensor<B>,
+) -> [FloatTensor<B>; 2] {
+    let ClusterInputs { query, key_value, segment, num_heads } = inputs;
+    let query_shape = query.shape();
+    let [_, num_members, _]: [usize; 3] = key_value.shape().dims();
+    let [batch, num_segments, dim]: [usize; 3] = query_shape.dims();
+    let head_width = dim / num_heads;
+    let scale = 1.0 / (head_width as f64).sqrt();
+
+    let grad_output = flatten::<B>(grad_output, num_heads); // [BS, H, E]
+    let delta = dot::<B>(grad_output.clone(), flatten::<B>(output, num_heads)); // [BS, H, 1]
+    let query = flatten::<B>(B::float_mul_scalar(query, scale.into()), num_heads);
+    let [key, value] = split::<B>(key_value, num_heads);
+
+    let gathered = B::float_select(grad_output, 0, segment.clone()); // [BM, H, E]
+    let grad_value = B::float_mul(gathered.clone(), weights.clone());
+    let grad_weights = B::float_sub(dot::<B>(gathered, value), B::float_select(delta, 0, segment.clone()));
+    let grad_scores = B::float_mul(weights, grad_weights); // [BM, H, 1]
+    let grad_key = B::float_mul(B::float_select(query, 0, segment.clone()), grad_scores.clone());
+    let (device, dtype) = (key.device(), FloatDType::from(key.dtype()));
+    let zeros = B::float_zeros(Shape::new([batch * num_segments, num_heads, head_width]), &device, dtype);
+    let grad_query = B::float_select_assign(zeros, 0, segment, B::float_mul(key, grad_scores), IndexingUpdateOp::Add);
+    let grad_query = B::float_mul_scalar(grad_query, scale.into());
+    let members = [grad_key, grad_value].map(|x| B::float_reshape(x, Shape::new([batch, num_members, dim])));
+    [B::float_reshape(grad_query, query_shape), B::float_cat(members.into(), 2)]
+}
+
+/// `[B, N, D] -> [BN, H, E]`
+fn flatten<B: Backend>(x: FloatTensor<B>, num_heads: usize) -> FloatTensor<B> {
+    let [batch, count, dim] = x.shape().dims();
+    B::float_reshape(x, Shape::new([batch * count, num_heads, dim / num_heads]))
+}
+
+/// Dot product per head: `[N, H, E] -> [N, H, 1]`
+fn dot<B: Backend>(a: FloatTensor<B>, b: FloatTensor<B>) -> FloatTensor<B> {
+    B::float_sum_dim(B::float_mul(a, b), 2)
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::Device;
+
+    use super::*;
+    use crate::testing::{assert_close, check_gradients, cpu_devices, devices, random, to_vec};
+
+    fn cluster_attention(
+        query: Tensor<3>,
+        key: Tensor<3>,
+        value: Tensor<3>,
+        segment: Tensor<1, Int>,
+        num_heads: usize,
+    ) -> Tensor<3> {
+        super::cluster_attention(query, Tensor::cat(vec![key, value], 2), segment, num_heads)
+    }
+
+    /// Seven members, four segments in each of two scenes: uneven, a singleton, an empty one.
+    const SEGMENTS: [i64; 14] = [0, 0, 2, 0, 1, 2, 0, 5, 7, 7, 5, 4, 5, 4];
+
+    fn segments(device: &Device) -> Tensor<1, Int> {
+        Tensor::from_ints(SEGMENTS, device)
+    }
+
+    /// The same attention, written as a loop over centroids.
+    fn reference(q: &Tensor<3>, k: &Tensor<3>, v: &Tensor<3>, num_heads: usize) -> Vec<f64> {
+        let [batch, num_segments, dim] = q.dims();
+        let (q, k, v) = (to_vec(q.clone()), to_vec(k.clone()), to_vec(v.clone()));
+        let width = dim / num_heads;
+        let mut output = vec![0.0; batch * num_segments * dim];
+        for segment in 0..batch * num_segments {
+            let members: Vec<usize> = (0..SEGMENTS.len()).filter(|&i| SEGMENTS[i] == segment as i64).collect();
+            for head in 0..num_heads {
+                let columns = head * width..(head + 1) * width;
+                let scores: Vec<f64> = members
+                    .iter()
+                    .map(|i| columns.clone().map(|c| q[segment * dim + c] * k[i * dim + c]).sum::<f64>())
+                    .map(|dot| dot / (width as f64).sqrt())
+                    .collect();
+                let maximum = scores.iter().copied().fold(f64::MIN, f64::max);
+                let total: f64 = scores.iter().map(|score| (score - maximum).exp()).sum();
+                for (i, score) in members.iter().zip(&scores) {
+                    let weight = (score - maximum).exp() / total;
+                    columns.clone().for_each(|c| output[segment * dim + c] += weight * v[i * dim + c]);
+                }
+            }
+        }
+        output
+    }
+
+    #[test]
+    fn output_equals_a_loop_over_centroids_and_empty_clusters_give_zeros() {
+        for device in devices() {
+            let [q, k, v] = [(4, 1), (7, 2), (7, 3)].map(|(count, seed)| random([2, count, 8], seed, &device));
+            let f32_device = q.clone().cast(burn::tensor::DType::F32);
+            let [k, v] = [k, v].map(|x| x.cast(burn::tensor::DType::F32));
+            let output = to_vec(cluster_attention(f32_device.clone(), k.clone(), v.clone(), segments(&device), 2));
+            for (got, expected) in output.iter().zip(reference(&f32_device, &k, &v, 2)) {
+                assert!((got - expected).abs() < 1e-6, "{got} against {expected}");
+            }
+            assert!(output[3 * 8..4 * 8].iter().all(|&value| value == 0.0), "segment 3 has no members");
+        }
+    }
+
+    #[test]
+    fn gradients_equal_central_differences_in_f64() {
+        for device in cpu_devices() {
+            let inputs = [random([2, 4, 8], 1, &device), random([2, 7, 8], 2, &device), random([2, 7, 8], 3, &device)];
+            let segments = segments(&device);
+            check_gradients(
+                inputs,
+                |[q, k, v]| {
+                    let segments = if q.is_autodiff() { segments.clone().autodiff() } else { segments.clone() };
+                    cluster_attention(q, k, v, segments, 2)
+                },
+                1e-6,
+            );
+        }
+    }
+
+    #[test]
+    fn extreme_logits_in_one_cluster_do_not_touch_another() {
+        for device in devices() {
+            let q = Tensor::<3>::from_floats([[[1e4, 0.0], [1e-3, 0.0]]], &device);
+            let k = Tensor::<3>::from_floats([[[1.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [1.0, 0.0]]], &device);
+            let v = Tensor::<3>::from_floats([[[1.0, 2.0], [9.0, 9.0], [3.0, 4.0], [5.0, 6.0]]], &device);
+            let output = cluster_attention(q, k, v, Tensor::from_ints([0, 0, 1, 1], &device), 1);
+            assert_close(&output, &Tensor::from_floats([[[1.0, 2.0], [4.0, 5.0]]], &device), 1e-6);
+        }
+    }
+}

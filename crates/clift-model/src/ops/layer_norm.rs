@@ -1,0 +1,193 @@
+//! Layer normalisation on a device, in both directions. Every norm of the model stands before a linear
+//! layer: [`linear_of_norm`](crate::ops::linear::linear_of_norm) is the operation.
+#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+// B scenes, N tokens, D width
+
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
+use burn::tensor::Shape;
+use clift_kernels::{InstructionSet, layer_norm_backward, layer_norm_forward};
+
+use crate::ops::flex::{contiguous, is_native, tensor, values};
+
+/// Added to the variance, as in PyTorch.
+pub const EPSILON: f64 = 1e-5;
+
+/// `(x - mean) / sqrt(variance + 1e-5) * gamma + beta` over the last dimension, and its gradient. The
+/// bodies here run on every device.
+pub trait LayerNormKernels: Backend {
+    /// The result, and what [`LayerNormKernels::norm_backward`] can use besides the inputs.
+    fn norm_output(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+    ) -> (FloatTensor<Self>, Option<FloatTensor<Self>>) {
+        (output::<Self>(x, gamma, beta), None)
+    }
+
+    /// The gradients of `x`, `gamma` and `beta`.
+    fn norm_backward(state: NormState<FloatTensor<Self>>, grad: FloatTensor<Self>) -> [FloatTensor<Self>; 3] {
+        backward::<Self>(state, grad)
+    }
+}
+
+/// What the backward needs.
+#[derive(Clone, Debug)]
+pub struct NormState<T> {
+    /// `[B, N, D]`
+    pub x: T,
+    /// `[D]`
+    pub gamma: T,
+    /// Mean and inverse deviation of every row, `[BN, 2]`, where the device saved them.
+    pub statistics: Option<T>,
+}
+
+/// `(x - mean) / deviation` and `1 / deviation`.
+fn normal<B: Backend>(x: FloatTensor<B>) -> (FloatTensor<B>, FloatTensor<B>) {
+    let centred = B::float_sub(x.clone(), mean::<B>(x));
+    let variance = mean::<B>(B::float_mul(centred.clone(), centred.clone()));
+    let inverse = B::float_recip(B::float_sqrt(B::float_add_scalar(variance, EPSILON.into())));
+    (B::float_mul(centred, inverse.clone()), inverse)
+}
+
+/// `[B, N, D] -> [B, N, 1]`
+fn mean<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
+    let [_, _, dim] = x.shape().dims();
+    B::float_mul_scalar(B::float_sum_dim(x, 2), (1.0 / dim as f64).into())
+}
+
+/// `[D] -> [1, 1, D]`
+fn row<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
+    let [dim] = x.shape().dims();
+    B::float_reshape(x, Shape::new([1, 1, dim]))
+}
+
+fn output<B: Backend>(x: FloatTensor<B>, gamma: FloatTensor<B>, beta: FloatTensor<B>) -> FloatTensor<B> {
+    B::float_add(B::float_mul(normal::<B>(x).0, row::<B>(gamma)), row::<B>(beta))
+}
+
+/// With `y` the normalised rows and `g = dO gamma`: `dx = (g - mean(g) - y mean(g y)) / deviation`,
+/// `dgamma = sum(dO y)`, `dbeta = sum(dO)`.
+fn backward<B: Backend>(state: NormState<FloatTensor<B>>, grad: FloatTensor<B>) -> [FloatTensor<B>; 3] {
+    let NormState { x, gamma, .. } = state;
+    let [batch, count, dim] = x.shape().dims();
+    let (normal, inverse) = normal::<B>(x);
+    let product = B::float_mul(grad.clone(), normal.clone());
+    let over_rows = |x: FloatTensor<B>| {
+        let sum = B::float_sum_dim(B::float_reshape(x, Shape::new([batch * count, dim])), 0);
+        B::float_reshape(sum, Shape::new([dim]))
+    };
+    let (grad_gamma, grad_beta) = (over_rows(product), over_rows(grad.clone()));
+    let slope = B::float_mul(grad, row::<B>(gamma));
+    let along = B::float_mul(normal.clone(), mean::<B>(B::float_mul(slope.clone(), normal)));
+    let grad_x = B::float_mul(B::float_sub(B::float_sub(slope.clone(), mean::<B>(slope)), along), inverse);
+    [grad_x, grad_gamma, grad_beta]
+}
+
+impl LayerNormKernels for Flex {
+    fn norm_output(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+    ) -> (FloatTensor<Self>, Option<FloatTensor<Self>>) {
+        if !is_native(&x) {
+            return (output::<Self>(x, gamma, beta), None);
+        }
+        let [batch, count, dim] = x.shape().dims();
+        let [x, gamma, beta] = [x, gamma, beta].map(contiguous);
+        let mut output = vec![0.0; batch * count * dim];
+        let mut statistics = vec![0.0; batch * count * 2];
+        let inputs = [values(&x), values(&gamma), values(&beta)];
+        let (pairs, _) = statistics.as_chunks_mut();
+        layer_norm_forward(InstructionSet::detected(), EPSILON as f32, inputs, &mut output, pairs);
+        (tensor(output, [batch, count, dim]), Some(tensor(statistics, [batch * count, 2])))
+    }
+
+    fn norm_backward(state: NormState<FloatTensor<Self>>, grad: FloatTensor<Self>) -> [FloatTensor<Self>; 3] {
+        let Some(statistics) = &state.statistics else {
+            return backward::<Self>(state, grad);
+        };
+        let [batch, count, dim] = state.x.shape().dims();
+        let [x, gamma, grad] = [state.x, state.gamma, grad].map(contiguous);
+        let mut grads = [batch * count * dim, dim, dim].map(|len| vec![0.0; len]);
+        let inputs = [values(&x), values(&gamma), values(&grad)];
+        let (pairs, _) = values(statistics).as_chunks();
+        layer_norm_backward(InstructionSet::detected(), inputs, pairs, grads.each_mut().map(|grad| &mut grad[..]));
+        let [grad_x, grad_gamma, grad_beta] = grads;
+        [tensor(grad_x, [batch, count, dim]), tensor(grad_gamma, [dim]), tensor(grad_beta, [dim])]
+    }
+}
+impl LayerNormKernels for NdArray {}
+#[cfg(feature = "wgpu")]
+impl LayerNormKernels for burn::backend::Cube {}
+
+#[cfg(test)]
+mod tests {
+    use burn::module::Param;
+    use burn::nn::{LayerNormConfig, Linear};
+    use burn::tensor::{DType, Device, Tensor};
+
+    use crate::ops::linear::norm_then_linear;
+    use crate::testing::{assert_close, check_gradients, cpu_devices, devices, random};
+
+    /// The norm on its own, before a layer that changes nothing; gamma and beta as `[1, 1, D]`.
+    fn norm(x: Tensor<3>, gamma: Tensor<3>, beta: Tensor<3>) -> Tensor<3> {
+        let [_, _, dim] = x.dims();
+        let (device, dtype) = (x.device(), x.dtype());
+        let identity = Linear {
+            weight: Param::from_tensor(Tensor::<2>::eye(dim, &device).cast(dtype)),
+            bias: Some(Param::from_tensor(Tensor::<1>::zeros([dim], &device).cast(dtype))),
+        };
+        norm_then_linear(x, gamma.reshape([dim]), beta.reshape([dim]), &identity)
+    }
+
+    #[test]
+    fn equals_burns_own_layer() {
+        for device in devices() {
+            let [gamma, beta] = [1, 2].map(|seed| random([1, 1, 12], seed, &device).cast(DType::F32));
+            let mut layer = LayerNormConfig::new(12).init(&device);
+            layer.gamma = Param::from_tensor(gamma.clone().reshape([12]));
+            layer.beta = Some(Param::from_tensor(beta.clone().reshape([12])));
+            let x = random([2, 5, 12], 3, &device).cast(DType::F32);
+            assert_close(&norm(x.clone(), gamma, beta), &layer.forward(x), 2e-6);
+        }
+    }
+
+    #[test]
+    fn gradients_equal_central_differences_in_f64() {
+        for device in cpu_devices() {
+            let inputs = [random([2, 5, 8], 1, &device), random([1, 1, 8], 2, &device), random([1, 1, 8], 3, &device)];
+            check_gradients(inputs, |[x, gamma, beta]| norm(x, gamma, beta), 1e-6);
+        }
+    }
+
+    #[test]
+    fn gradients_of_the_native_kernel_equal_f64() {
+        let device = Device::flex().autodiff();
+        let gradients = |dtype: DType| {
+            let make =
+                |shape: [usize; 3], seed| random(shape, seed, &device).cast(DType::F32).cast(dtype).require_grad();
+            let inputs = [make([3, 7, 37], 1), make([1, 1, 37], 2), make([1, 1, 37], 3)];
+            let cotangent = random([3, 7, 37], 4, &device).cast(DType::F32).cast(dtype);
+            let [x, gamma, beta] = inputs.clone();
+            let grads = (norm(x, gamma, beta) * cotangent).sum().backward();
+            inputs.map(|input| input.grad(&grads).expect("tracked").cast(DType::F64))
+        };
+        for (native, reference) in gradients(DType::F32).iter().zip(&gradients(DType::F64)) {
+            assert_close(native, reference, 1e-5);
+        }
+    }
+
+    #[test]
+    fn a_constant_row_gives_beta_and_finite_gradients() {
+        for device in devices() {
+            let device = device.autodiff();
+            let [gamma, beta] = [1, 2].map(|seed| random([1, 1, 12], seed, &device).cast(DType::F32));
+            let x = (Tensor::<3>::ones([1, 2, 12], &device) * 3.0).require_grad();
+            let output = norm(x.clone(), gamma, beta.clone());
+            assert_close(&output.clone().inner(), &beta.inner().expand([1, 2, 12]), 1e-4);
+            let gradient = x.grad(&output.square().sum().backward()).expect("tracked");
+            assert!(gradient.is_finite().all().into_scalar::<bool>());
+        }
+    }
+}

@@ -1,0 +1,378 @@
+//! Linear layers as one operation: on their own, behind a GELU, or behind a layer norm.
+//!
+//! What stands before the layer is not kept for the backward but computed again from its input, one
+//! pass: a GELU's result is the widest activation of a transformer block, and every block has two or
+//! three norms.
+#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+// B scenes, N rows of a scene, I inputs, O outputs
+
+use burn::backend::autodiff::checkpoint::base::Checkpointer;
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::nn::{LayerNorm, Linear};
+use burn::tensor::{Shape, Tensor, assert_shape};
+use clift_kernels::{InstructionSet, linear_forward, sum_rows};
+
+use crate::ops::autodiff::register;
+use crate::ops::flex::{contiguous, is_native, tensor, values};
+use crate::ops::gelu::GeluKernels;
+use crate::ops::layer_norm::{LayerNormKernels, NormState};
+use crate::ops::mac_counter;
+use crate::ops::precision::{MatmulKernels, Precision};
+
+/// `x W + b` of a layer with a bias.
+///
+/// # Shapes
+/// - `x`: `[batch, count, inputs]`
+/// - returns `[batch, count, outputs]`
+///
+/// # Panics
+/// When the layer has no bias.
+pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    apply(layer, x, Before { gelu: false, precision: Precision::current() })
+}
+
+/// [`linear`] in f32 whatever the precision of this thread: for layers that take rays.
+///
+/// # Shapes
+/// - `x`: `[batch, count, inputs]`
+/// - returns `[batch, count, outputs]`
+///
+/// # Panics
+/// When the layer has no bias.
+pub fn linear_in_f32(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    apply(layer, x, Before { gelu: false, precision: Precision::F32 })
+}
+
+/// `gelu(x) W + b` with `gelu(x) = x Phi(x)` and the normal distribution function `Phi`.
+///
+/// # Shapes
+/// - `x`: `[batch, count, inputs]`
+/// - returns `[batch, count, outputs]`
+///
+/// # Panics
+/// When the layer has no bias.
+pub fn linear_of_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    apply(layer, x, Before { gelu: true, precision: Precision::current() })
+}
+
+/// `norm(x) W + b` with `norm(x) = (x - mean) / sqrt(variance + 1e-5) * gamma + beta` over a row.
+///
+/// # Shapes
+/// - `x`: `[batch, count, inputs]`
+/// - returns `[batch, count, outputs]`
+///
+/// # Panics
+/// When the norm or the layer has no bias.
+pub fn linear_of_norm(norm: &LayerNorm, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    norm_then_linear(x, norm.gamma.val(), norm.beta.as_ref().expect("the norm has a bias").val(), layer)
+}
+
+/// What is done before a layer's bias is added.
+#[derive(Clone, Copy, Debug)]
+pub struct Before {
+    /// Whether the input goes through a GELU.
+    gelu: bool,
+    /// What the product is computed in.
+    precision: Precision,
+}
+
+fn apply(layer: &Linear, x: Tensor<3>, before: Before) -> Tensor<3> {
+    let (weight, bias) = parameters(layer, &x);
+    let [x, weight, bias] = [x.into_dispatch(), weight.into_dispatch(), bias.into_dispatch()];
+    Tensor::from_dispatch(<Dispatch as LinearOps>::linear_layer(x, weight, bias, before))
+}
+
+/// [`linear_of_norm`] with the norm's parameters as tensors.
+pub(crate) fn norm_then_linear(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>, layer: &Linear) -> Tensor<3> {
+    let (weight, bias) = parameters(layer, &x);
+    let [inputs, _outputs] = weight.dims();
+    assert_shape!(gamma, [inputs]);
+    assert_shape!(beta, [inputs]);
+    Tensor::from_dispatch(<Dispatch as LinearOps>::norm_then_linear(
+        x.into_dispatch(),
+        gamma.into_dispatch(),
+        beta.into_dispatch(),
+        weight.into_dispatch(),
+        bias.into_dispatch(),
+        Precision::current(),
+    ))
+}
+
+/// Weight and bias of a layer that takes `x`.
+fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
+    let weight = layer.weight.val();
+    let bias = layer.bias.as_ref().expect("the layer has a bias").val();
+    let ([inputs, outputs], [batch, count, _]) = (weight.dims(), x.dims());
+    assert_shape!(x, [.., inputs]);
+    mac_counter::add_linear(batch * count, inputs, outputs);
+    (weight, bias)
+}
+
+/// The operations behind [`linear`], [`linear_of_gelu`] and [`linear_of_norm`] on a device.
+#[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
+pub trait LinearOps: Backend {
+    /// See [`linear`] and [`linear_of_gelu`].
+    fn linear_layer(
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        before: Before,
+    ) -> FloatTensor<Self>;
+
+    /// See [`linear_of_norm`].
+    fn norm_then_linear(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        precision: Precision,
+    ) -> FloatTensor<Self>;
+}
+
+/// The parts of the operation on a device. The bodies here run on every one of them.
+pub trait LinearKernels: GeluKernels + LayerNormKernels + MatmulKernels {
+    /// `x W + b`: `[B, N, I] -> [B, N, O]`
+    fn linear_output(
+        precision: Precision,
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+    ) -> FloatTensor<Self> {
+        output::<Self>(precision, x, weight, bias)
+    }
+
+    /// Sum over rows: `[B, N, O] -> [O]`
+    fn sum_rows(x: FloatTensor<Self>) -> FloatTensor<Self> {
+        sum::<Self>(x)
+    }
+}
+
+fn output<B: MatmulKernels>(
+    precision: Precision,
+    x: FloatTensor<B>,
+    weight: FloatTensor<B>,
+    bias: FloatTensor<B>,
+) -> FloatTensor<B> {
+    let [batch, count, _] = x.shape().dims();
+    let [_, outputs] = weight.shape().dims();
+    let product = B::product(precision, rows::<B>(x), weight); // [BN, O]
+    let bias = B::float_expand(B::float_reshape(bias, Shape::new([1, outputs])), product.shape());
+    B::float_reshape(B::float_add(product, bias), Shape::new([batch, count, outputs]))
+}
+
+fn sum<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
+    let x = rows::<B>(x);
+    let [_, outputs] = x.shape().dims();
+    B::float_reshape(B::float_sum_dim(x, 0), Shape::new([outputs]))
+}
+
+/// `[B, N, D] -> [BN, D]`
+fn rows<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
+    let [batch, count, dim] = x.shape().dims();
+    B::float_reshape(x, Shape::new([batch * count, dim]))
+}
+
+impl LinearKernels for Flex {
+    fn linear_output(
+        precision: Precision,
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+    ) -> FloatTensor<Self> {
+        if !is_native(&x) || precision != Precision::F32 {
+            return output::<Self>(precision, x, weight, bias);
+        }
+        let [batch, count, inputs] = x.shape().dims();
+        let [_, outputs] = weight.shape().dims();
+        let [x, weight, bias] = [x, weight, bias].map(contiguous);
+        let mut output = vec![0.0; batch * count * outputs];
+        let sizes = [batch * count, inputs, outputs];
+        linear_forward(sizes, [values(&x), values(&weight), values(&bias)], &mut output);
+        tensor(output, [batch, count, outputs])
+    }
+
+    fn sum_rows(x: FloatTensor<Self>) -> FloatTensor<Self> {
+        if !is_native(&x) {
+            return sum::<Self>(x);
+        }
+        let [_, _, outputs] = x.shape().dims();
+        let mut sum = vec![0.0; outputs];
+        sum_rows(InstructionSet::detected(), values(&contiguous(x)), &mut sum);
+        tensor(sum, [outputs])
+    }
+}
+
+impl LinearKernels for NdArray {}
+#[cfg(feature = "wgpu")]
+impl LinearKernels for burn::backend::Cube {}
+
+fn forward<B: LinearKernels>(
+    x: FloatTensor<B>,
+    weight: FloatTensor<B>,
+    bias: FloatTensor<B>,
+    before: Before,
+) -> FloatTensor<B> {
+    B::linear_output(before.precision, if before.gelu { B::gelu_output(x) } else { x }, weight, bias)
+}
+
+macro_rules! linear_ops {
+    ($backend:ty) => {
+        impl LinearOps for $backend {
+            fn linear_layer(
+                x: FloatTensor<Self>,
+                weight: FloatTensor<Self>,
+                bias: FloatTensor<Self>,
+                before: Before,
+            ) -> FloatTensor<Self> {
+                forward::<Self>(x, weight, bias, before)
+            }
+
+            fn norm_then_linear(
+                x: FloatTensor<Self>,
+                gamma: FloatTensor<Self>,
+                beta: FloatTensor<Self>,
+                weight: FloatTensor<Self>,
+                bias: FloatTensor<Self>,
+                precision: Precision,
+            ) -> FloatTensor<Self> {
+                let (normal, _statistics) = Self::norm_output(x, gamma, beta);
+                Self::linear_output(precision, normal, weight, bias)
+            }
+        }
+    };
+}
+linear_ops!(Flex);
+linear_ops!(NdArray);
+#[cfg(feature = "wgpu")]
+linear_ops!(burn::backend::Cube);
+
+impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff<B, C> {
+    fn linear_layer(
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        before: Before,
+    ) -> FloatTensor<Self> {
+        let ((x, x_node), (weight, weight_node), (bias, bias_node)) =
+            (x.into_parts(), weight.into_parts(), bias.into_parts());
+        match LinearBackward.prepare::<C>([x_node, weight_node, bias_node]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let output = forward::<B>(x.clone(), weight.clone(), bias, before);
+                prep.finish(LinearState { x, weight, before }, output)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(forward::<B>(x, weight, bias, before)),
+        }
+    }
+
+    fn norm_then_linear(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        precision: Precision,
+    ) -> FloatTensor<Self> {
+        let ((x, x_node), (gamma, gamma_node), (beta, beta_node)) =
+            (x.into_parts(), gamma.into_parts(), beta.into_parts());
+        let ((weight, weight_node), (bias, bias_node)) = (weight.into_parts(), bias.into_parts());
+        let nodes = [x_node, gamma_node, beta_node, weight_node, bias_node];
+        match NormLinearBackward.prepare::<C>(nodes).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let (normal, statistics) = B::norm_output(x.clone(), gamma.clone(), beta.clone());
+                let output = B::linear_output(precision, normal, weight.clone(), bias);
+                prep.finish(
+                    NormLinearState { norm: NormState { x, gamma, statistics }, beta, weight, precision },
+                    output,
+                )
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::norm_then_linear(x, gamma, beta, weight, bias, precision)),
+        }
+    }
+}
+
+#[derive(Debug)]
+struct LinearBackward;
+
+#[derive(Clone, Debug)]
+struct LinearState<T> {
+    x: T,
+    weight: T,
+    before: Before,
+}
+
+impl<B: LinearKernels> Backward<B, 3> for LinearBackward {
+    type State = LinearState<FloatTensor<B>>;
+
+    /// With `a = x` or `gelu(x)`: `dW = a^T dO`, `db = sum dO`, `da = dO W^T`.
+    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        register::<B, _, 3>(ops, grads, |LinearState { x, weight, before }, grad, wanted| {
+            let Before { gelu, precision } = before;
+            let [of_x, of_weight, of_bias] = wanted;
+            let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
+            let grad_weight = of_weight.then(|| {
+                let activation = if gelu { B::gelu_output(x.clone()) } else { x.clone() };
+                grad_of_weight::<B>(precision, activation, grad.clone())
+            });
+            let grad_x = of_x.then(|| {
+                let grad = grad_of_input::<B>(precision, grad, weight);
+                if gelu { B::gelu_grad(x, grad) } else { grad }
+            });
+            [grad_x, grad_weight, grad_bias]
+        });
+    }
+}
+
+#[derive(Debug)]
+struct NormLinearBackward;
+
+#[derive(Clone, Debug)]
+struct NormLinearState<T> {
+    norm: NormState<T>,
+    beta: T,
+    weight: T,
+    precision: Precision,
+}
+
+impl<B: LinearKernels> Backward<B, 5> for NormLinearBackward {
+    type State = NormLinearState<FloatTensor<B>>;
+
+    /// As for [`LinearBackward`] with `a = norm(x)`, and `da` handed on through the norm.
+    fn backward(self, ops: Ops<Self::State, 5>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        register::<B, _, 5>(ops, grads, |NormLinearState { norm, beta, weight, precision }, grad, wanted| {
+            let [of_x, of_gamma, of_beta, of_weight, of_bias] = wanted;
+            let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
+            let grad_weight = of_weight.then(|| {
+                let (normal, _statistics) = B::norm_output(norm.x.clone(), norm.gamma.clone(), beta);
+                grad_of_weight::<B>(precision, normal, grad.clone())
+            });
+            let [grad_x, grad_gamma, grad_beta] = if of_x || of_gamma || of_beta {
+                B::norm_backward(norm, grad_of_input::<B>(precision, grad, weight)).map(Some)
+            } else {
+                [None, None, None]
+            };
+            [grad_x, grad_gamma, grad_beta, grad_weight, grad_bias]
+        });
+    }
+}
+
+/// `x^T grad`: `[I, O]`
+fn grad_of_weight<B: MatmulKernels>(precision: Precision, x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
+    B::product(precision, B::float_swap_dims(rows::<B>(x), 0, 1), rows::<B>(grad))
+}
+
+/// `grad W^T`: `[B, N, O] -> [B, N, I]`
+fn grad_of_input<B: MatmulKernels>(
+    precision: Precision,
+    grad: FloatTensor<B>,
+    weight: FloatTensor<B>,
+) -> FloatTensor<B> {
+    let [batch, count, _] = grad.shape().dims();
+    let [inputs, _] = weight.shape().dims();
+    let product = B::product(precision, rows::<B>(grad), B::float_swap_dims(weight, 0, 1));
+    B::float_reshape(product, Shape::new([batch, count, inputs]))
+}

@@ -1,0 +1,179 @@
+//! How the tokens of a scene file are rounded.
+// S stored tokens, D width
+
+use std::str::FromStr;
+
+use half::f16;
+use serde::{Deserialize, Serialize};
+use strum::{Display, IntoStaticStr, VariantArray};
+
+use crate::error::ModelError;
+use crate::names::parse_value;
+
+/// Largest magnitude of an 8-bit value; -128 is not used, so that the range is even.
+const INT8_MAX: f32 = 127.0;
+
+/// Number format of the tokens in a scene file.
+#[derive(
+    Clone,
+    Copy,
+    Debug,
+    Default,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Serialize,
+    Deserialize,
+    Display,
+    IntoStaticStr,
+    VariantArray,
+)]
+#[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
+pub enum TokenStorage {
+    /// 32-bit floats: the renderer gets the tokens it would get without a file.
+    F32,
+    /// 16-bit floats, a relative error of 5e-4.
+    #[default]
+    F16,
+    /// 8-bit integers with a 32-bit scale per token: errors of 1/254 of its largest value.
+    Int8,
+}
+
+impl TokenStorage {
+    /// All formats.
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
+
+    /// Returns the name as it is typed.
+    pub fn name(self) -> &'static str {
+        self.into()
+    }
+
+    /// Bytes of one value.
+    pub const fn bytes_per_value(self) -> usize {
+        match self {
+            Self::F32 => 4,
+            Self::F16 => 2,
+            Self::Int8 => 1,
+        }
+    }
+
+    /// Bytes of one token's values, with its scale if it has one.
+    pub const fn bytes_per_token(self, dim: usize) -> usize {
+        let scale = match self {
+            Self::Int8 => 4,
+            _ => 0,
+        };
+        dim * self.bytes_per_value() + scale
+    }
+
+    /// Tokens `[S, D]` as they come back from a file.
+    ///
+    /// # Errors
+    /// [`ModelError::BadConfig`] for values beyond the range of 16-bit floats.
+    pub fn round(self, tokens: &[f32], dim: usize) -> Result<Vec<f32>, ModelError> {
+        let (bytes, scales) = self.encode(tokens, dim)?;
+        Ok(self.decode(&bytes, &scales.unwrap_or_default(), dim))
+    }
+
+    /// Rounds tokens `[S, D]` to bytes, little-endian, with a scale per token for 8 bits.
+    ///
+    /// # Errors
+    /// [`ModelError::BadConfig`] for values beyond the range of 16-bit floats.
+    pub(crate) fn encode(self, tokens: &[f32], dim: usize) -> Result<(Vec<u8>, Option<Vec<f32>>), ModelError> {
+        match self {
+            Self::F32 => Ok((tokens.iter().flat_map(|value| value.to_le_bytes()).collect(), None)),
+            Self::F16 => {
+                let rounded: Vec<f16> = tokens.iter().map(|&value| f16::from_f32(value)).collect();
+                if let Some(position) = rounded.iter().position(|value| !value.is_finite()) {
+                    let fix = format!("a token holds {}, beyond 65504; write f32 or int8", tokens[position]);
+                    return Err(ModelError::BadConfig { key: "tokens", value: "f16".into(), fix });
+                }
+                Ok((rounded.iter().flat_map(|value| value.to_le_bytes()).collect(), None))
+            }
+            Self::Int8 => {
+                let (mut bytes, mut scales) = (Vec::with_capacity(tokens.len()), Vec::new());
+                for token in tokens.chunks_exact(dim) {
+                    let scale = token.iter().fold(0.0_f32, |most, value| most.max(value.abs())) / INT8_MAX;
+                    scales.push(scale);
+                    // A token of nothing but zeros, or of values too small to be told from them.
+                    let inverse = if scale.is_normal() { scale.recip() } else { 0.0 };
+                    let rounded = token.iter().map(|value| (value * inverse).round().clamp(-INT8_MAX, INT8_MAX) as i8);
+                    bytes.extend(rounded.map(|value| value as u8));
+                }
+                Ok((bytes, Some(scales)))
+            }
+        }
+    }
+
+    /// The tokens that [`TokenStorage::encode`] wrote, after rounding.
+    pub(crate) fn decode(self, bytes: &[u8], scales: &[f32], dim: usize) -> Vec<f32> {
+        match self {
+            Self::F32 => bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect(),
+            Self::F16 => bytes.as_chunks::<2>().0.iter().map(|bytes| f16::from_le_bytes(*bytes).to_f32()).collect(),
+            Self::Int8 => {
+                let tokens = bytes.chunks_exact(dim).zip(scales);
+                tokens.flat_map(|(token, scale)| token.iter().map(move |&byte| f32::from(byte as i8) * scale)).collect()
+            }
+        }
+    }
+}
+
+impl FromStr for TokenStorage {
+    type Err = ModelError;
+
+    fn from_str(name: &str) -> Result<Self, ModelError> {
+        parse_value("tokens", name)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DIM: usize = 4;
+
+    fn round_trip(storage: TokenStorage, tokens: &[f32]) -> Vec<f32> {
+        let (bytes, scales) = storage.encode(tokens, DIM).unwrap();
+        let with_scales = bytes.len() + 4 * scales.as_ref().map_or(0, Vec::len);
+        assert_eq!(with_scales, tokens.len() / DIM * storage.bytes_per_token(DIM));
+        storage.decode(&bytes, &scales.unwrap_or_default(), DIM)
+    }
+
+    #[test]
+    fn each_format_is_as_exact_as_it_says() {
+        let tokens: Vec<f32> = (0..400).map(|i| ((i * 7919 % 1000) as f32 - 500.0) * 0.013).collect();
+        assert_eq!(round_trip(TokenStorage::F32, &tokens), tokens);
+        for (got, value) in round_trip(TokenStorage::F16, &tokens).iter().zip(&tokens) {
+            assert!((got - value).abs() <= value.abs() / 2048.0, "{got} against {value}");
+        }
+        for (got, token) in round_trip(TokenStorage::Int8, &tokens).chunks(DIM).zip(tokens.chunks(DIM)) {
+            let largest = token.iter().fold(0.0_f32, |most, value| most.max(value.abs()));
+            for (got, value) in got.iter().zip(token) {
+                assert!((got - value).abs() <= largest / 253.9, "{got} against {value} of {token:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn tokens_of_zeros_and_of_tiny_values_stay_finite() {
+        for storage in TokenStorage::ALL {
+            assert_eq!(round_trip(storage, &[0.0; DIM]), [0.0; DIM]);
+            let tiny = round_trip(storage, &[1e-42, -1e-42, 0.0, 1e-45]);
+            assert!(tiny.iter().all(|value| value.is_finite() && value.abs() < 1e-41), "{tiny:?}");
+        }
+        assert_eq!(round_trip(TokenStorage::Int8, &[-3.0, 3.0, 0.0, 1.5])[..2], [-3.0, 3.0]);
+    }
+
+    #[test]
+    fn values_beyond_16_bits_are_refused_with_what_holds_them() {
+        let message = TokenStorage::F16.encode(&[1.0, 7e4, 0.0, 0.0], DIM).unwrap_err().to_string();
+        assert_eq!(message, "`tokens` = f16: a token holds 70000, beyond 65504; write f32 or int8");
+        assert!((round_trip(TokenStorage::Int8, &[1.0, 7e4, 0.0, 0.0])[1] - 7e4).abs() < 0.1);
+        assert_eq!(
+            "bf16".parse::<TokenStorage>().unwrap_err().to_string(),
+            "`tokens` = bf16: write one of f32, f16, int8"
+        );
+    }
+}

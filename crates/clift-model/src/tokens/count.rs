@@ -1,0 +1,141 @@
+//! How many tokens: a number, or a share of what a scene has.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+use crate::error::ModelError;
+
+/// A count of tokens (`256`) or a share of all of them (`"1/16"`, `0.0625`), as a config and the
+/// command line give it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum TokenCount {
+    /// So many.
+    Count(usize),
+    /// A part in `(0, 1]` of all, rounded down but at least one.
+    Share(f64),
+}
+
+impl TokenCount {
+    /// The number of tokens of a scene that has `num_tokens`.
+    ///
+    /// # Errors
+    /// [`ModelError::BadTokenCount`] when a scene does not have that many.
+    pub fn of(self, num_tokens: usize) -> Result<usize, ModelError> {
+        match self {
+            _ if num_tokens == 0 => Err(ModelError::BadTokenCount {
+                text: self.to_string(),
+                reason: "a scene without views has no tokens".into(),
+            }),
+            Self::Count(count) if (1..=num_tokens).contains(&count) => Ok(count),
+            // The small excess keeps 3 of 48 from becoming 2 through 0.0625 * 48 = 2.9999...
+            Self::Share(share) => Ok(((num_tokens as f64 * share + 1e-9) as usize).clamp(1, num_tokens)),
+            Self::Count(count) => Err(ModelError::BadTokenCount {
+                text: count.to_string(),
+                reason: format!("a scene has {num_tokens} tokens"),
+            }),
+        }
+    }
+}
+
+impl FromStr for TokenCount {
+    type Err = ModelError;
+
+    fn from_str(text: &str) -> Result<Self, ModelError> {
+        let bad = |reason: &str| ModelError::BadTokenCount { text: text.into(), reason: reason.into() };
+        let share = |share: f64| {
+            if share > 0.0 && share <= 1.0 { Ok(Self::Share(share)) } else { Err(bad("a share lies in (0, 1]")) }
+        };
+        let text = text.trim();
+        if let Some((over, under)) = text.split_once('/') {
+            let number = |part: &str| part.trim().parse::<f64>().map_err(|_| bad("write a fraction as 1/16"));
+            return share(number(over)? / number(under)?);
+        }
+        match text.parse::<usize>() {
+            Ok(0) => Err(bad("at least one token is needed")),
+            Ok(count) => Ok(Self::Count(count)),
+            Err(_) => share(text.parse().map_err(|_| bad("write a count (256) or a share (1/16, 0.0625)"))?),
+        }
+    }
+}
+
+impl fmt::Display for TokenCount {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Count(count) => write!(f, "{count}"),
+            Self::Share(share) => {
+                let under = (1.0 / share).round();
+                if (under * share - 1.0).abs() < 1e-12 { write!(f, "1/{under}") } else { write!(f, "{share}") }
+            }
+        }
+    }
+}
+
+impl Serialize for TokenCount {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match *self {
+            Self::Count(count) => serializer.serialize_u64(count as u64),
+            Self::Share(_) => serializer.collect_str(self),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for TokenCount {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(untagged, expecting = "a count (256) or a share (\"1/16\", 0.0625)")]
+        enum Written {
+            Count(u64),
+            Share(f64),
+            Text(String),
+        }
+        match Written::deserialize(deserializer)? {
+            // A float is a share even where it is whole: 1.0 is all tokens, not one.
+            Written::Share(share) if share > 0.0 && share <= 1.0 => return Ok(Self::Share(share)),
+            Written::Share(share) => share.to_string().parse(),
+            Written::Count(count) => count.to_string().parse(),
+            Written::Text(text) => text.parse(),
+        }
+        .map_err(serde::de::Error::custom)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> TokenCount {
+        text.parse().expect("valid")
+    }
+
+    #[test]
+    fn counts_and_shares_resolve_against_a_scene() {
+        assert_eq!(parse("256").of(4096).expect("fits"), 256);
+        assert_eq!(parse("1/16").of(4096).expect("fits"), 256);
+        assert_eq!(parse("0.0625").of(48).expect("fits"), 3);
+        assert_eq!(parse("1/3").of(48).expect("fits"), 16);
+        assert_eq!(parse("1/1000").of(48).expect("at least one"), 1);
+        assert_eq!(parse("1.0").of(48).expect("all"), 48);
+    }
+
+    #[test]
+    fn what_is_no_count_says_what_is() {
+        for (text, part) in [("0", "at least one"), ("3/2", "(0, 1]"), ("x", "write a count"), ("1/x", "as 1/16")] {
+            let message = text.parse::<TokenCount>().unwrap_err().to_string();
+            assert!(message.contains(part), "{message}");
+        }
+        assert!(parse("1/2").of(0).is_err());
+        assert!(serde_json::from_str::<TokenCount>("-1").unwrap_err().to_string().contains("`-1` tokens"));
+        assert!(parse("300").of(256).unwrap_err().to_string().contains("a scene has 256 tokens"));
+    }
+
+    #[test]
+    fn json_round_trips_and_one_point_zero_is_everything() {
+        let list: Vec<TokenCount> = serde_json::from_str(r#"[16, "1/4", 0.5, 1.0, 1]"#).expect("valid");
+        assert_eq!(list[3].of(64).expect("all"), 64);
+        assert_eq!(list[4].of(64).expect("one"), 1);
+        let text = serde_json::to_string(&list).expect("serialises");
+        assert_eq!(serde_json::from_str::<Vec<TokenCount>>(&text).expect("valid"), list);
+    }
+}

@@ -1,0 +1,96 @@
+//! The tokens of one scene, and what K-means asks the device about them.
+
+use burn::tensor::{DType, Device, IndexingUpdateOp, Int, Tensor, TensorData, Transaction};
+use rayon::prelude::*;
+
+use crate::tokens::kmeans::labels::Labels;
+
+/// Distances computed at once for the table on the host: 4 MiB in f32, which stay in a cache on the way.
+const BLOCK_LEN: usize = 1 << 20;
+
+/// The tokens of one scene with their squared lengths.
+pub(crate) struct Samples {
+    /// `[N, D]`, about their mean.
+    tokens: Tensor<2>,
+    /// Squared lengths, `[N]`.
+    squares: Vec<f64>,
+}
+
+impl Samples {
+    /// Takes the tokens of a scene, `[N, D]`; `None` when a squared length is not finite in f32.
+    pub fn new(tokens: Tensor<2>) -> Option<Self> {
+        // Distances are differences of squares: taken about the mean they lose the fewest digits.
+        let tokens = tokens.clone() - tokens.mean_dim(0);
+        let squares = floats(tokens.clone().square().sum_dim(1).into_data());
+        squares.iter().all(|&square| (square as f32).is_finite()).then_some(Self { tokens, squares })
+    }
+
+    pub fn len(&self) -> usize {
+        self.squares.len()
+    }
+
+    fn device(&self) -> Device {
+        self.tokens.device()
+    }
+
+    /// These tokens, `[ids.len(), D]`.
+    pub fn select(&self, ids: &[usize]) -> Tensor<2> {
+        let ids: Vec<i64> = ids.iter().map(|&id| id as i64).collect();
+        self.tokens.clone().select(0, self.index(ids))
+    }
+
+    fn index(&self, ids: Vec<i64>) -> Tensor<1, Int> {
+        let count = ids.len();
+        Tensor::from_data(TensorData::new(ids, [count]), &self.device())
+    }
+
+    /// Squared distances `|x|^2 - 2 x y + |y|^2` of these tokens to all, on the host: `[ids.len(), N]`.
+    pub fn distances(&self, ids: &[usize]) -> Vec<f32> {
+        let squares: Vec<f32> = self.squares.iter().map(|&square| square as f32).collect();
+        let (count, rows) = (self.len(), (BLOCK_LEN / self.len()).max(1));
+        let mut distances = vec![0.0; ids.len() * count];
+        for (ids, distances) in ids.chunks(rows).zip(distances.chunks_mut(rows * count)) {
+            let products = self.select(ids).matmul(self.tokens.clone().transpose());
+            let products = products.cast(DType::F32).into_data();
+            let products = products.as_slice::<f32>().expect("cast to f32");
+            let lines = distances.par_chunks_mut(count).zip(products.par_chunks(count)).zip(ids);
+            lines.for_each(|((distances, products), &id)| {
+                let own = squares[id];
+                for ((distance, product), square) in distances.iter_mut().zip(products).zip(&squares) {
+                    *distance = ((own + square) - 2.0 * product).max(0.0);
+                }
+                distances[id] = 0.0;
+            });
+        }
+        distances
+    }
+
+    /// The nearest mean of every token; the lower one on ties. The host waits for the device once.
+    pub fn assign(&self, means: Tensor<2>) -> Labels {
+        let squares = means.clone().square().sum_dim(1).transpose(); // [1, S]
+        // The token's own square is the same for all means, so the smallest is found without it.
+        let scores = self.tokens.clone().matmul(means.mul_scalar(-2.0).transpose()) + squares; // [N, S]
+        let (score, cluster) = scores.min_dim_with_indices(1);
+        let mut read = Transaction::default().register(score).register(cluster).execute().into_iter();
+        let mut next = || read.next().expect("two were registered");
+        let distance =
+            floats(next()).iter().zip(&self.squares).map(|(score, square)| (score + square).max(0.0)).collect();
+        let assignment = next().try_into_vec_as::<u32>().expect("an index is not negative");
+        Labels { assignment, distance }
+    }
+
+    /// Mean of the tokens of every cluster, `[S, D]`; none is empty.
+    pub fn means(&self, labels: &Labels, num_clusters: usize) -> Tensor<2> {
+        let mut counts = vec![0.0_f64; num_clusters];
+        labels.assignment.iter().for_each(|&cluster| counts[cluster as usize] += 1.0);
+        let like = (&self.device(), self.tokens.dtype());
+        let counts = Tensor::<2>::from_data(TensorData::new(counts, [num_clusters, 1]), like);
+        let rows = self.index(labels.assignment.iter().map(|&cluster| i64::from(cluster)).collect());
+        let sums = Tensor::<2>::zeros([num_clusters, self.tokens.dims()[1]], like);
+        sums.select_assign(0, rows, self.tokens.clone(), IndexingUpdateOp::Add) / counts
+    }
+}
+
+fn floats(data: TensorData) -> Vec<f64> {
+    data.try_into_vec_as().expect("converts to f64")
+}

@@ -1,0 +1,295 @@
+//! Token selection: which stored tokens a target view is drawn from (paper section 3.3, Algorithm 1).
+//!
+//! Plain arrays on the host, no tensors. Where the printed algorithm leaves a choice open: the second step
+//! fills up with tokens that the first did not take, a first step that takes too many keeps the nearest, the
+//! bonus for the previous frame belongs to a token and not to its view, and of equally near tokens the one
+//! with the lower id comes first.
+// S stored tokens, R rendered tokens, Q cells of the target's grid
+
+
+use rayon::prelude::*;
+
+use crate::error::ModelError;
+use crate::tokens::selection::rules::Rules;
+use crate::tokens::selection::token_ray::TokenRay;
+use crate::views::camera::ViewCamera;
+
+/// Distances are worked out for this many cells by one task at least.
+const CELLS_PER_TASK: usize = 16;
+
+/// Distances of a row that are looked over at once for one small enough.
+const GROUP: usize = 32;
+
+/// Selects the tokens of one frame after the other, and remembers what the next frame needs of the last.
+#[derive(Clone, Debug)]
+pub struct Selector {
+    rules: Rules,
+    origins: Vec<[f64; 3]>,
+    directions: Directions,
+    /// Rows and columns of the previous frame's grid.
+    grid: [usize; 2],
+    /// Smoothed distances of the previous frame, `[Q][S]`; rows are empty without momentum.
+    field: Vec<Vec<f32>>,
+    /// Whether the previous frame was drawn from a token; empty before the first frame.
+    previous: Vec<bool>,
+    /// The way the previous frame's camera looked.
+    forward: Option<[f64; 3]>,
+}
+
+/// Unit directions by coordinate, so that a row of distances is made several at a time.
+#[derive(Clone, Debug)]
+pub(crate) struct Directions {
+    x: Vec<f32>,
+    y: Vec<f32>,
+    z: Vec<f32>,
+}
+
+/// What the cells of a task found.
+struct Nearest {
+    /// Smallest distance of every token to a cell.
+    distance: Vec<f32>,
+    /// Whether a token is among the nearest of a cell.
+    taken: Vec<bool>,
+    /// The row of a cell, where it is not kept.
+    row: Vec<f32>,
+    candidates: Vec<(f32, u32)>,
+}
+
+impl Selector {
+    /// Prepares the tokens of a scene.
+    ///
+    /// # Errors
+    /// [`ModelError::BadRay`] for a ray that is not finite or has no direction.
+    pub fn new(rules: Rules, rays: &[TokenRay]) -> Result<Self, ModelError> {
+        let mut directions = Directions { x: Vec::new(), y: Vec::new(), z: Vec::new() };
+        for (token, ray) in rays.iter().enumerate() {
+            let length = ray.direction.iter().map(|v| v * v).sum::<f64>().sqrt();
+            if !(length > 0.0 && length.is_finite() && ray.origin.iter().all(|v| v.is_finite())) {
+                return Err(ModelError::BadRay { token, origin: ray.origin, direction: ray.direction });
+            }
+            let [x, y, z] = ray.direction.map(|v| (v / length) as f32);
+            directions.x.push(x);
+            directions.y.push(y);
+            directions.z.push(z);
+        }
+        let origins = rays.iter().map(|ray| ray.origin).collect();
+        Ok(Self { rules, origins, directions, grid: [0; 2], field: Vec::new(), previous: Vec::new(), forward: None })
+    }
+
+    /// Forgets the previous frame.
+    pub fn reset(&mut self) {
+        self.grid = [0; 2];
+        self.field.clear();
+        self.previous.clear();
+        self.forward = None;
+    }
+
+    /// Chooses exactly `min(num_render_tokens, num_storage_tokens)` tokens for the next frame, a view of `height` by
+    /// `width` pixels. A frame of another size than the one before starts without momentum.
+    ///
+    /// Returns ids in ascending order.
+    ///
+    /// # Errors
+    /// [`ModelError::BadConfig`] for no tokens, [`ModelError::NotFinite`] for a camera that is not finite.
+    pub fn select(
+        &mut self,
+        camera: &ViewCamera,
+        height: usize,
+        width: usize,
+        num_render_tokens: usize,
+    ) -> Result<Vec<u32>, ModelError> {
+        if num_render_tokens == 0 {
+            let fix = "write at least 1".into();
+            return Err(ModelError::BadConfig { key: "num_render_tokens", value: "0".into(), fix });
+        }
+        let cells = self.rules.cell_directions(camera, height, width);
+        let mut values = cells.iter().flatten().chain(camera.c2w.iter()).enumerate();
+        if let Some((position, &value)) = values.find(|(_, value)| !value.is_finite()) {
+            return Err(ModelError::NotFinite { what: "the target's camera", value: value as f32, position });
+        }
+        self.notice_cut(&cells, self.rules.grid(height, width));
+        let num_storage_tokens = self.origins.len();
+        let num_render_tokens = num_render_tokens.min(num_storage_tokens);
+        let per_cell = if self.rules.per_cell { num_render_tokens / cells.len() } else { 0 };
+        let nearest = self.measure(&cells, self.rules.grid(height, width), camera.origin(), per_cell);
+        let chosen = nearest.choose(num_render_tokens);
+        self.previous = vec![false; num_storage_tokens];
+        for &token in &chosen {
+            self.previous[token as usize] = true;
+        }
+        Ok(chosen)
+    }
+
+    /// Forgets the previous frame where the camera has turned by more than the cell in the middle spans.
+    fn notice_cut(&mut self, cells: &[[f64; 3]], [rows, columns]: [usize; 2]) {
+        let middle = rows / 2 * columns + columns / 2;
+        let forward = cells[middle];
+        let angle = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>().clamp(-1.0, 1.0).acos();
+        if self.rules.cuts && self.forward.is_some_and(|last| angle(last, forward) > angle(forward, cells[middle - 1]))
+        {
+            self.reset();
+        }
+        self.forward = Some(forward);
+    }
+
+    /// Distances of all tokens to all cells, the nearest of each cell, and the smoothed field for the next frame.
+    fn measure(&mut self, cells: &[[f64; 3]], grid: [usize; 2], target: [f64; 3], per_cell: usize) -> Nearest {
+        let num_tokens = self.origins.len();
+        let Rules { angle_weight, momentum, .. } = self.rules;
+        let offsets = self.offsets(target);
+        let keeps_field = momentum > 0.0;
+        let momentum = if self.grid == grid { momentum } else { 0.0 };
+        if self.grid != grid {
+            self.grid = grid;
+            let row = if keeps_field { vec![0.0; num_tokens] } else { Vec::new() };
+            self.field = vec![row; cells.len()];
+        }
+        let directions = &self.directions;
+        let weigh = |mut found: Nearest, (cell, kept): (&[f64; 3], &mut Vec<f32>)| {
+            let mut scratch = std::mem::take(&mut found.row);
+            let row = if keeps_field { kept } else { &mut scratch };
+            directions.add_distances(cell.map(|v| v as f32), angle_weight, &offsets, momentum, row);
+            for (nearest, &distance) in found.distance.iter_mut().zip(row.iter()) {
+                *nearest = if distance < *nearest { distance } else { *nearest };
+            }
+            found.take_smallest(row, per_cell);
+            found.row = scratch;
+            found
+        };
+        let none = || Nearest::none(num_tokens, keeps_field);
+        let cells = cells.par_iter().zip(self.field.par_iter_mut()).with_min_len(CELLS_PER_TASK);
+        cells.fold(none, weigh).reduce(none, Nearest::merge)
+    }
+
+    /// The part of a token's distance that is the same for all cells.
+    fn offsets(&self, target: [f64; 3]) -> Vec<f32> {
+        let Rules { distance_weight, previous_bonus, .. } = self.rules;
+        let offset = |(token, origin): (usize, &[f64; 3])| {
+            let between = origin.iter().zip(target).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+            let bonus = if self.previous.get(token) == Some(&true) { previous_bonus } else { 0.0 };
+            distance_weight * between as f32 - bonus
+        };
+        self.origins.iter().enumerate().map(offset).collect()
+    }
+}
+
+impl Directions {
+    /// Replaces a row by `(1 - momentum) * (angle_weight * angle + offset) + momentum * row`.
+    fn add_distances(&self, cell: [f32; 3], angle_weight: f32, offsets: &[f32], momentum: f32, row: &mut [f32]) {
+        let Self { x, y, z } = self;
+        let (count, keep) = (row.len(), 1.0 - momentum);
+        // Equal lengths that the compiler can see, so that it leaves out the checks and works on several at once.
+        let (x, y, z, offsets) = (&x[..count], &y[..count], &z[..count], &offsets[..count]);
+        for i in 0..count {
+            let (dx, dy, dz) = (x[i] - cell[0], y[i] - cell[1], z[i] - cell[2]);
+            let distance = angle_weight * angle(dx * dx + dy * dy + dz * dz) + offsets[i];
+            row[i] = keep * distance + momentum * row[i];
+        }
+    }
+}
+
+/// Angle in radians between two unit vectors whose difference has this squared length. From the difference rather
+/// than from the inner product, whose rounding alone turns equal directions by 3e-4.
+///
+/// Abramowitz and Stegun 4.4.46 with `x = 1 - u / 2`, and its mirror image beyond a right angle: good to 1e-6, a
+/// thousandth of a pixel's angle, and made of operations that processors do on several numbers at once.
+#[inline]
+pub(crate) fn angle(squared_chord: f32) -> f32 {
+    let is_acute = squared_chord <= 2.0;
+    let u = if is_acute { squared_chord } else { (4.0 - squared_chord).max(0.0) };
+    let x = 1.0 - 0.5 * u;
+    let mut sum = -0.001_262_491_1_f32;
+    for coefficient in [0.006_670_09, -0.017_088_126, 0.030_891_88, -0.050_174_303, 0.088_978_99, -0.214_598_8] {
+        sum = sum * x + coefficient;
+    }
+    // Half of pi rather than the printed 1.5707963050, 2e-8 less: both branches meet at a right angle.
+    sum = sum * x + std::f32::consts::FRAC_PI_2;
+    let angle = (0.5 * u).sqrt() * sum;
+    if is_acute { angle } else { std::f32::consts::PI - angle }
+}
+
+/// By distance, then by id.
+fn nearer((a, first): (f32, u32), (b, second): (f32, u32)) -> std::cmp::Ordering {
+    a.total_cmp(&b).then(first.cmp(&second))
+}
+
+/// Keeps the `count` nearest, in any order.
+fn keep_nearest(candidates: &mut Vec<(f32, u32)>, count: usize) {
+    if count < candidates.len() && count > 0 {
+        candidates.select_nth_unstable_by(count - 1, |a, b| nearer(*a, *b));
+    }
+    candidates.truncate(count);
+}
+
+impl Nearest {
+    fn none(num_tokens: usize, keeps_field: bool) -> Self {
+        Self {
+            distance: vec![f32::INFINITY; num_tokens],
+            taken: vec![false; num_tokens],
+            row: if keeps_field { Vec::new() } else { vec![0.0; num_tokens] },
+            candidates: Vec::new(),
+        }
+    }
+
+    fn merge(mut self, other: Self) -> Self {
+        for (a, b) in self.distance.iter_mut().zip(&other.distance) {
+            *a = if *b < *a { *b } else { *a };
+        }
+        for (a, b) in self.taken.iter_mut().zip(&other.taken) {
+            *a |= *b;
+        }
+        self
+    }
+
+    /// Takes the `count` tokens nearest to a cell (Algorithm 1, the patch step).
+    fn take_smallest(&mut self, row: &[f32], count: usize) {
+        if count == 0 {
+            return;
+        }
+        let candidates = &mut self.candidates;
+        candidates.clear();
+        // Tokens farther than `count` others that were seen already need no look, and most groups hold no other.
+        let mut limit = f32::INFINITY;
+        for (group, distances) in row.chunks(GROUP).enumerate() {
+            let nearest = distances.iter().fold(f32::INFINITY, |least, &d| if d < least { d } else { least });
+            if nearest >= limit {
+                continue;
+            }
+            for (i, &distance) in distances.iter().enumerate() {
+                if distance < limit {
+                    candidates.push((distance, (group * GROUP + i) as u32));
+                }
+            }
+            if candidates.len() >= 4 * count {
+                keep_nearest(candidates, count);
+                limit = candidates[count - 1].0;
+            }
+        }
+        keep_nearest(candidates, count);
+        for &(_, token) in candidates.iter() {
+            self.taken[token as usize] = true;
+        }
+    }
+
+    /// Exactly `count` tokens: of those taken by cells the nearest, or all and then the nearest others.
+    fn choose(&self, count: usize) -> Vec<u32> {
+        let listed = |taken: bool| {
+            let tokens = (0..self.distance.len()).filter(move |&token| self.taken[token] == taken);
+            tokens.map(|token| (self.distance[token], token as u32)).collect::<Vec<_>>()
+        };
+        let mut chosen = listed(true);
+        if chosen.len() >= count {
+            keep_nearest(&mut chosen, count);
+        } else {
+            let mut rest = listed(false);
+            keep_nearest(&mut rest, count - chosen.len());
+            chosen.append(&mut rest);
+        }
+        let mut ids: Vec<u32> = chosen.into_iter().map(|(_, token)| token).collect();
+        ids.sort_unstable();
+        ids
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,49 @@
+//! SHA-256 of a set of weights.
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::tensor::{Tensor, TensorData};
+use sha2::{Digest, Sha256};
+
+use crate::network::config::ModelConfig;
+use crate::network::renderer::Renderer;
+
+/// Hash of all parameters of a module: their paths, shapes and values, as 64 hexadecimal digits.
+/// Equal weights have equal hashes on every device.
+pub fn hash<M: Module>(module: &M) -> String {
+    let mut sha = Sha256::new();
+    visit(module, |name, shape, data| {
+        sha.update(name.as_bytes());
+        sha.update(format!("{shape:?}"));
+        for value in data.iter::<f32>() {
+            sha.update(value.to_le_bytes());
+        }
+    });
+    hex::encode(sha.finalize())
+}
+
+/// [`hash`] of a renderer's weights together with the settings that rendering depends on and no shape shows: variant
+/// and heads.
+pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
+    let ModelConfig { variant, num_heads, .. } = config;
+    hex::encode(Sha256::digest(format!("{variant} {num_heads} {}", hash(renderer))))
+}
+
+/// Calls `f` with path, shape and values of every parameter, in the module's order.
+pub(crate) fn visit<M: Module>(module: &M, f: impl FnMut(&str, &[usize], &TensorData)) {
+    struct Visitor<F> {
+        path: Vec<String>,
+        f: F,
+    }
+    impl<F: FnMut(&str, &[usize], &TensorData)> ModuleVisitor for Visitor<F> {
+        fn enter_module(&mut self, name: &str, _container: &str) {
+            self.path.push(name.into());
+        }
+        fn exit_module(&mut self, _name: &str, _container: &str) {
+            self.path.pop();
+        }
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            (self.f)(&self.path.join("."), &param.val().dims(), &param.val().into_data());
+        }
+    }
+    module.visit(&mut Visitor { path: Vec::new(), f });
+}

@@ -1,0 +1,190 @@
+//! Where a trained model is: the weights of a run or of a model directory, and the config beside them.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use crate::error::ModelError;
+use crate::network::config::ModelConfig;
+use crate::tokens::kind::TokenKind;
+
+/// A run or model directory, and one of its weight files.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ModelPath {
+    /// The directory with `config.toml`.
+    pub dir: PathBuf,
+    /// The weights: those of the last finished stage, unless a file was given.
+    pub weights: PathBuf,
+}
+
+impl ModelPath {
+    /// Finds the weights of a run directory, a stage folder (`RUN/stage2`), a model directory, or a weight file in one
+    /// of these.
+    ///
+    /// # Errors
+    /// [`ModelError::NoModel`] where no weights are found, [`ModelError::NoConfig`] for a weight file without a config,
+    /// [`ModelError::NotImported`] for a PyTorch checkpoint.
+    pub fn find(path: &Path) -> Result<Self, ModelError> {
+        let inside = path.join(WEIGHTS);
+        if path.is_dir() && inside.is_file() {
+            // The folder of a stage has no config of its own.
+            let has_config = path.join("config.toml").is_file();
+            return if has_config { Ok(Self { dir: path.into(), weights: inside }) } else { Self::find(&inside) };
+        }
+        if path.is_dir() {
+            let stages = [TokenKind::Clift, TokenKind::Kmeans].map(|kind| weights_of(path, kind));
+            let found = stages.iter().find(|file| file.exists()).cloned();
+            let weights = found.ok_or_else(|| ModelError::NoModel { path: stages[1].clone() })?;
+            return Ok(Self { dir: path.into(), weights });
+        }
+        if !path.exists() {
+            return Err(ModelError::NoModel { path: path.into() });
+        }
+        refuse_checkpoint(path)?;
+        let above = path.ancestors().skip(1).take(2);
+        let mut above = above.map(|dir| if dir.as_os_str().is_empty() { Path::new(".") } else { dir });
+        let dir = above.find(|dir| dir.join("config.toml").is_file());
+        let dir = dir.ok_or_else(|| ModelError::NoConfig { path: path.into() })?;
+        Ok(Self { dir: dir.into(), weights: path.into() })
+    }
+
+    /// Returns the weight file that renders tokens of a kind: of stage 1 or 2 of a run directory, the only one of a model
+    /// directory, or `path` itself if it is no directory. The file need not exist.
+    pub fn for_tokens(path: &Path, kind: TokenKind) -> PathBuf {
+        let inside = path.join(WEIGHTS);
+        match (path.is_dir(), inside.is_file()) {
+            (true, true) => inside,
+            (true, false) => weights_of(path, kind),
+            (false, _) => path.into(),
+        }
+    }
+
+    /// Reads `[model]` of `config.toml`; the other sections are ignored.
+    ///
+    /// # Errors
+    /// [`ModelError::NoConfig`] without a config, [`ModelError::BadConfigFile`] for a config that cannot be read.
+    pub fn config(&self) -> Result<ModelConfig, ModelError> {
+        read_config(&self.dir)?.ok_or_else(|| ModelError::NoConfig { path: self.weights.clone() })
+    }
+}
+
+const WEIGHTS: &str = "model.safetensors";
+
+/// The weights of a run's stage that makes tokens of a kind.
+fn weights_of(run: &Path, kind: TokenKind) -> PathBuf {
+    let stage = match kind {
+        TokenKind::Clift => "stage2",
+        TokenKind::Kmeans => "stage1",
+    };
+    run.join(stage).join(WEIGHTS)
+}
+
+/// Refuses a PyTorch file, recognised by its extension or as a ZIP archive, where a weight file is expected.
+///
+/// # Errors
+/// [`ModelError::NotImported`].
+pub fn refuse_checkpoint(path: &Path) -> Result<(), ModelError> {
+    if !path.is_file() {
+        return Ok(());
+    }
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    let mut start = [0; 4];
+    let is_archive =
+        File::open(path).is_ok_and(|mut file| file.read_exact(&mut start).is_ok() && start == *b"PK\x03\x04");
+    if is_archive || matches!(&*extension, "ckpt" | "pt" | "pth") {
+        return Err(ModelError::NotImported { path: path.into() });
+    }
+    Ok(())
+}
+
+/// Refuses weights of a run or model directory for a network with another number of heads, if the directory has a config.
+/// Tensor shapes do not determine the number of heads; a wrong number would silently change the output.
+///
+/// # Errors
+/// [`ModelError::BadConfig`] for other heads, [`ModelError::BadConfigFile`] for a config that cannot be read.
+pub fn check_heads(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
+    let Some(ModelConfig { num_heads, .. }) = read_config(dir)? else { return Ok(()) };
+    if model.num_heads != num_heads {
+        let path = dir.join("config.toml");
+        let fix = format!("the weights are those of a network with {num_heads} heads: write that: {}", path.display());
+        return Err(ModelError::BadConfig { key: "model.num_heads", value: model.num_heads.to_string(), fix });
+    }
+    Ok(())
+}
+
+fn read_config(dir: &Path) -> Result<Option<ModelConfig>, ModelError> {
+    #[derive(serde::Deserialize)]
+    struct Sections {
+        #[serde(default)]
+        model: ModelConfig,
+    }
+    let path = dir.join("config.toml");
+    if !path.exists() {
+        return Ok(None);
+    }
+    let bad = |reason: String| ModelError::BadConfigFile { reason, path: path.clone() };
+    let text = std::fs::read_to_string(&path).map_err(|error| bad(error.to_string()))?;
+    let sections: Sections = toml::from_str(&text).map_err(|error| bad(error.to_string()))?;
+    Ok(Some(sections.model))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_gives_its_last_stage_and_a_file_its_run() {
+        let place = tempfile::tempdir().unwrap();
+        let run = place.path().join("run");
+        let touch = |name: &str| {
+            std::fs::create_dir_all(run.join(name).parent().unwrap()).unwrap();
+            std::fs::write(run.join(name), "").unwrap();
+            run.join(name)
+        };
+        touch("config.toml");
+        let message = ModelPath::find(&run).unwrap_err().to_string();
+        assert!(
+            message.starts_with("no trained model at ") && message.contains("run `clift train` first"),
+            "{message}"
+        );
+        let stage1 = touch("stage1/model.safetensors");
+        let found = ModelPath::find(&run).unwrap();
+        assert_eq!(found, ModelPath { dir: run.clone(), weights: stage1.clone() });
+        assert_eq!(found.config().unwrap(), ModelConfig::default());
+        let stage2 = touch("stage2/model.safetensors");
+        assert_eq!(ModelPath::find(&run).unwrap().weights, stage2);
+        assert_eq!(ModelPath::find(&stage1).unwrap(), ModelPath { dir: run.clone(), weights: stage1.clone() });
+        assert_eq!(ModelPath::find(&run.join("stage1")).unwrap(), ModelPath::find(&stage1).unwrap());
+        assert_eq!(ModelPath::for_tokens(&run, TokenKind::Kmeans), stage1);
+        assert_eq!(ModelPath::for_tokens(&stage2, TokenKind::Clift), stage2);
+
+        let alone = place.path().join("alone.safetensors");
+        let message = ModelPath::find(&alone).unwrap_err().to_string();
+        assert!(message.starts_with("no trained model at "), "{message}");
+        std::fs::write(&alone, "").unwrap();
+        let message = ModelPath::find(&alone).unwrap_err().to_string();
+        assert!(message.contains("no config.toml beside it or above it") && !message.contains("  "), "{message}");
+        // A checkpoint, by its name or by its start.
+        for (name, bytes) in [("run/stage1/last.ckpt", "damaged"), ("alone.bin", "PK\u{3}\u{4}")] {
+            let path = place.path().join(name);
+            std::fs::write(&path, bytes).unwrap();
+            let message = ModelPath::find(&path).unwrap_err().to_string();
+            assert!(message.contains(&format!("run `clift import {}", path.display())), "{message}");
+        }
+    }
+
+    #[test]
+    fn other_heads_than_a_directory_says_are_refused() {
+        let place = tempfile::tempdir().unwrap();
+        let check = |text: &str, num_heads| {
+            std::fs::write(place.path().join("config.toml"), text).unwrap();
+            let model = ModelConfig { num_heads, ..ModelConfig::default() };
+            check_heads(&model, place.path()).map_err(|error| error.to_string())
+        };
+        assert_eq!(check("[model]\nnum_heads = 4\n[data]\nof_a_later_version = 1", 4), Ok(()));
+        assert_eq!(check("seed = 3", 8), Ok(()), "the default");
+        check_heads(&ModelConfig::default(), &place.path().join("none")).unwrap();
+        let message = check("[model]\nnum_heads = 4", 8).unwrap_err();
+        assert!(message.contains("`model.num_heads` = 8: ") && message.contains("with 4 heads"), "{message}");
+    }
+}

@@ -1,0 +1,228 @@
+//! `state.json` of a checkpoint: where training goes on, and the checksums of the other files.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use clift_data::replace_file;
+use clift_model::ModelConfig;
+use serde::{Deserialize, Deserializer, Serialize};
+use serde_json::Value;
+
+use crate::error::TrainError;
+use crate::step::loss_scale::LossScale;
+use crate::step::step_guard::Recent;
+
+/// The version that is written.
+pub(crate) const VERSION: u32 = 3;
+/// Has the numbers of [`Progress`] as strings.
+const STRING_VERSION: u32 = 2;
+
+/// Content of `state.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct State {
+    pub version: u32,
+    pub progress: Progress,
+    /// The other files, by name.
+    pub files: BTreeMap<String, Fingerprint>,
+    /// Which network it is; absent in the oldest files.
+    #[serde(default)]
+    pub model: Option<ModelConfig>,
+    /// In training with f16 products.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub loss_scale: Option<LossScale>,
+}
+
+/// Size and checksum of a file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Fingerprint {
+    pub num_bytes: u64,
+    crc32: u32,
+}
+
+/// Position in training. With the weights and the optimiser state it determines the rest of the run: batches, schedules
+/// and random draws are functions of the seed and the step.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Progress {
+    /// Updates made, including the skipped ones.
+    pub step: u64,
+    /// Consecutive updates that were skipped just before.
+    pub bad_steps: u32,
+    /// All skipped updates.
+    pub num_bad_steps: u64,
+    /// The last step with a finished validation; 0 for none.
+    pub validated: u64,
+    /// The best validation so far of a step with a checkpoint.
+    pub best: Option<Best>,
+    /// Loss and gradient norm of the last good steps, with which the next step is compared.
+    pub recent: Recent,
+}
+
+/// The best validation of a stage.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Best {
+    /// Its step.
+    pub step: u64,
+    /// Mean PSNR of the held-out views, in dB.
+    #[serde(deserialize_with = "null_as_nan")]
+    pub psnr: f64,
+}
+
+/// JSON has no NaN: `serde_json` writes `null`.
+fn null_as_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN))
+}
+
+impl State {
+    /// Reads `state.json` of a checkpoint, also of version 2.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`] and [`TrainError::BadFile`].
+    pub fn read(folder: &Path) -> Result<Self, TrainError> {
+        let path = folder.join("state.json");
+        let text = std::fs::read(&path).map_err(TrainError::io("reading a checkpoint", &path))?;
+        Self::parse(&text).map_err(TrainError::bad_file("checkpoint", &path))
+    }
+
+    fn parse(text: &[u8]) -> Result<Self, String> {
+        let mut value: Value = serde_json::from_slice(text).map_err(|error| error.to_string())?;
+        let version = &value["version"];
+        if *version == STRING_VERSION {
+            parse_numbers(&mut value["progress"]);
+        } else if *version != VERSION {
+            return Err(format!("it has version {version}, this program reads {STRING_VERSION} and {VERSION}"));
+        }
+        let state: Self = serde_json::from_value(value).map_err(|error| error.to_string())?;
+        Ok(Self { version: VERSION, ..state })
+    }
+
+    /// Writes `state.json` of a checkpoint.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`].
+    pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
+        let path = folder.join("state.json");
+        let text = serde_json::to_vec(self).map_err(TrainError::bad_file("checkpoint", &path))?;
+        replace_file(&path, &text).map_err(TrainError::io("writing a checkpoint", &path))
+    }
+}
+
+/// Replaces every string that is a number by the number, as of version 3.
+fn parse_numbers(value: &mut Value) {
+    match value {
+        Value::String(text) => {
+            if let Ok(number) = text.parse::<f64>() {
+                *value = number.into();
+            }
+        }
+        Value::Array(items) => items.iter_mut().for_each(parse_numbers),
+        Value::Object(entries) => entries.values_mut().for_each(parse_numbers),
+        Value::Null | Value::Bool(_) | Value::Number(_) => {}
+    }
+}
+
+impl Fingerprint {
+    /// Computes size and checksum of a file.
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn of(path: &Path) -> std::io::Result<Self> {
+        let mut file = File::open(path)?;
+        let mut hasher = crc32fast::Hasher::new();
+        let (mut num_bytes, mut buffer) = (0, vec![0; 1 << 20]);
+        loop {
+            match file.read(&mut buffer)? {
+                0 => return Ok(Self { num_bytes, crc32: hasher.finalize() }),
+                count => {
+                    hasher.update(&buffer[..count]);
+                    num_bytes += count as u64;
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn state(values: &[f64], psnr: f64) -> State {
+        let mut recent = Recent::default();
+        for &value in values {
+            recent.push(value, -value);
+        }
+        let progress = Progress { step: 7, best: Some(Best { step: 5, psnr }), recent, ..Progress::default() };
+        State { version: VERSION, progress, files: BTreeMap::new(), model: None, loss_scale: None }
+    }
+
+    /// Finite numbers of every sign and exponent, and the extreme ones.
+    fn numbers() -> Vec<f64> {
+        let mut bits = 0x1234_5678_9abc_def0_u64;
+        let any = std::iter::repeat_with(|| {
+            bits = bits.wrapping_mul(0x5851_f42d_4c95_7f2d).wrapping_add(0x1405_7b7e_f767_814f);
+            f64::from_bits(bits)
+        });
+        let extreme = [0.0, -0.0, f64::MAX, f64::MIN_POSITIVE, f64::from_bits(1), 1e23, 9_007_199_254_740_993.0];
+        let decimal = (1..1000).map(|i| f64::from(i) / 1000.0);
+        any.take(200_000).filter(|number| number.is_finite()).chain(extreme).chain(decimal).collect()
+    }
+
+    #[test]
+    fn every_bit_of_a_number_comes_back() {
+        for values in numbers().chunks(101) {
+            let state = state(values, values[0]);
+            let text = serde_json::to_vec(&state).unwrap();
+            let read = State::parse(&text).unwrap();
+            assert_eq!(read, state);
+            // The same bytes again, so also the sign of zero.
+            assert_eq!(serde_json::to_vec(&read).unwrap(), text);
+            assert_eq!(read.progress.best.unwrap().psnr.to_bits(), values[0].to_bits());
+        }
+    }
+
+    #[test]
+    fn a_psnr_that_is_nan_can_be_read() {
+        let text = serde_json::to_vec(&state(&[], f64::NAN)).unwrap();
+        assert!(State::parse(&text).unwrap().progress.best.unwrap().psnr.is_nan());
+    }
+
+    #[test]
+    fn version_2_with_numbers_as_strings_is_read() {
+        let values = [0.1, 1.0 / 3.0, 5e-324];
+        let version_2 = |psnr: &str| {
+            let lists = ["losses", "grad_norms"].map(|name| {
+                let sign = if name == "losses" { 1.0 } else { -1.0 };
+                format!("\"{name}\":[{}]", values.map(|value| format!("\"{}\"", sign * value)).join(","))
+            });
+            format!(
+                "{{\"version\":2,\"progress\":{{\"step\":7,\"bad_steps\":0,\"num_bad_steps\":0,\"validated\":0,\
+                 \"best\":{{\"step\":5,\"psnr\":\"{psnr}\"}},\"recent\":{{{}}}}},\"files\":{{}},\"model\":null}}",
+                lists.join(",")
+            )
+        };
+        let read = State::parse(version_2("24.309").as_bytes()).unwrap();
+        assert_eq!(read, state(&values, 24.309));
+        assert!(State::parse(version_2("NaN").as_bytes()).unwrap().progress.best.unwrap().psnr.is_nan());
+        assert!(State::parse(version_2("one").as_bytes()).is_err());
+        let message = State::parse(br#"{"version":4}"#).unwrap_err();
+        assert_eq!(message, "it has version 4, this program reads 2 and 3");
+    }
+
+    #[test]
+    fn a_fingerprint_sees_every_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.bpk");
+        let mut bytes = vec![7; 3_000_000];
+        std::fs::write(&path, &bytes).unwrap();
+        let whole = Fingerprint::of(&path).unwrap();
+        assert_eq!(whole.num_bytes, 3_000_000);
+        bytes[2_000_001] ^= 1;
+        std::fs::write(&path, &bytes).unwrap();
+        assert_ne!(Fingerprint::of(&path).unwrap(), whole);
+    }
+}

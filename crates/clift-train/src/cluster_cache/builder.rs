@@ -1,0 +1,103 @@
+//! Clusters every training scene, once, with the frozen encoder: latent K-means, or tiles.
+//!
+//! While a cache is made, a log keeps the finished entries, from which an interrupted build resumes.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use burn::tensor::Device;
+use clift_data::{ClipReader, DataError, ViewIndices, derive_seed, item_rng, uniform_below};
+use clift_eval::upload_views;
+use clift_model::{Encoder, Grouping, SceneClusters, tile_clusters};
+
+use crate::cluster_cache::cache::ClusterCache;
+use crate::cluster_cache::entry::{VERSION, settings};
+use crate::cluster_cache::resume_log::{Journal, Origin};
+use crate::config::config::{ClustersConfig, Config};
+use crate::error::TrainError;
+use crate::events::{Event, Sink, Stage};
+
+/// What the cache of a run is made from.
+pub struct ClusterJob<'a> {
+    /// Settings of the run.
+    pub config: &'a Config,
+    /// Training scenes.
+    pub reader: &'a ClipReader,
+    /// The trained encoder, without autodiff.
+    pub encoder: &'a Encoder,
+    /// Its hash.
+    pub encoder_hash: &'a str,
+    /// Where it lives.
+    pub device: &'a Device,
+}
+
+impl ClusterJob<'_> {
+    /// Clusters every training scene `num_passes` times, each time with one context set and one count
+    /// of the grid, and opens the result. What an interrupted call with the same encoder and settings has done is taken
+    /// over; the result is the same, byte for byte. Written to a temporary folder that is then renamed.
+    ///
+    /// # Errors
+    /// Whatever the disk or the model gives, [`TrainError::NoScenes`] when no scene could be clustered, and
+    /// [`TrainError::Interrupted`]. A scene that does not fit its views is skipped and noted.
+    pub fn make(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
+        let Self { config, reader, encoder_hash, .. } = *self;
+        let origin = Origin { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };
+        let mut journal = Journal::open(&folder.with_extension("tmp"), origin)?;
+
+        let total = reader.source.num_scenes();
+        let num_scenes = if config.clusters.num_scenes == 0 { total } else { config.clusters.num_scenes.min(total) };
+        let total_sets = (config.clusters.num_passes * num_scenes) as u64;
+        let started = std::time::Instant::now();
+        let done = journal.num_sets();
+        sink.event(&Event::StageStarted { stage: Stage::Clusters, done, num_steps: total_sets });
+        for set in done..total_sets {
+            let (pass, scene) = (set / num_scenes as u64, set as usize % num_scenes);
+            let key = reader.source.key(scene);
+            match self.cluster_scene(pass, scene) {
+                Ok((context, clusters)) => journal.add(key, context, &clusters)?,
+                // A scene that does not fit its views is left out; a disk that fails is not a scene.
+                Err(TrainError::Data(error)) if !matches!(error, DataError::Io { .. }) => {
+                    let reason = error.to_string();
+                    sink.event(&Event::Skipped { key: key.into(), reason: reason.clone() });
+                    journal.skip(key, &reason)?;
+                }
+                Err(other) => return Err(other),
+            }
+            sink.event(&Event::Progress { stage: Stage::Clusters, done: set + 1, total: total_sets });
+            if stop.load(Ordering::Relaxed) {
+                return Err(TrainError::Interrupted { step: set + 1 });
+            }
+        }
+        sink.event(&Event::StageFinished { stage: Stage::Clusters, elapsed_s: started.elapsed().as_secs_f64() });
+        journal.publish(folder, num_scenes)?;
+        ClusterCache::open(folder, config, encoder_hash)
+    }
+
+    fn cluster_scene(&self, pass: u64, scene: usize) -> Result<(Vec<usize>, SceneClusters), TrainError> {
+        let Self { config, reader, encoder, device, .. } = *self;
+        let seed = derive_seed(config.seed, "clusters");
+        let views = &config.data.views;
+        let mut rng = item_rng(seed, pass, scene as u32, 0, "context and count");
+        let num_context = views.min_context + uniform_below(&mut rng, views.max_context - views.min_context + 1);
+        // The gaps that stage 1 ends with.
+        let last_step = config.stage1.steps.min(views.warm_up_steps);
+        let context = views.draw(reader.source.as_ref(), scene, last_step, num_context, &mut rng)?.context;
+        let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
+        let ClustersConfig { grouping, grid, kmeans, .. } = &config.clusters;
+        let num_tokens = config.model.num_tokens(num_context, clip.context.height, clip.context.width)?;
+        let count = grid[uniform_below(&mut rng, grid.len())].of(num_tokens)?;
+        let clusters = match grouping {
+            Grouping::Kmeans => {
+                // Before any norm of the tokens, as in the reference: stage 2 trains that norm, and the clusters stay.
+                let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
+                let fit = kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
+                fit.clusters.scenes()[0].clone()
+            }
+            Grouping::Tile => {
+                let grid = [clip.context.height, clip.context.width].map(|side| side / config.model.patch_size);
+                tile_clusters(num_context, grid, count)?
+            }
+        };
+        Ok((context, clusters))
+    }
+}

@@ -1,0 +1,122 @@
+//! The finished cluster cache of a run.
+//!
+//! A folder with `index.json` (what was clustered with which encoder) and `clusters.bin` (per entry the
+//! cluster of every token and the token of every cluster, little-endian u16).
+
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use clift_data::Ledger;
+use clift_model::SceneClusters;
+
+use crate::cluster_cache::entry::{Entry, Index, VERSION, settings};
+use crate::config::config::Config;
+use crate::error::TrainError;
+
+/// An open cluster cache.
+#[derive(Debug)]
+pub struct ClusterCache {
+    folder: PathBuf,
+    index: Index,
+}
+
+impl ClusterCache {
+    /// Opens the cache of a run.
+    ///
+    /// # Errors
+    /// [`TrainError::StaleClusters`] when it was made with another encoder or other settings,
+    /// [`TrainError::BadFile`] when it is damaged.
+    pub fn open(folder: &Path, config: &Config, encoder: &str) -> Result<Self, TrainError> {
+        let path = folder.join("index.json");
+        let text = std::fs::read(&path).map_err(TrainError::io("reading the cluster cache", &path))?;
+        let index: Index = serde_json::from_slice(&text).map_err(TrainError::bad_file("cluster cache", &path))?;
+        let stale = |reason: String| TrainError::StaleClusters { reason, path: folder.into() };
+        if index.version != VERSION {
+            return Err(stale(format!("it has version {}, this program writes {VERSION}", index.version)));
+        }
+        if index.encoder != encoder {
+            let short = |hash: &str| hash.chars().take(12).collect::<String>();
+            let reason =
+                format!("its tokens are of encoder {}, the run's is {}", short(&index.encoder), short(encoder));
+            return Err(stale(reason));
+        }
+        if index.settings != settings(config) {
+            return Err(stale("its data, sampler or K-means settings are not this run's".into()));
+        }
+        if let Some(entry) = index.entries.iter().find(|entry| !entry.is_possible()) {
+            let Entry { key, num_tokens, num_storage_tokens, .. } = entry;
+            let reason = format!("scene {key} has {num_storage_tokens} clusters of {num_tokens} tokens");
+            return Err(TrainError::BadFile { what: "cluster cache", reason, path });
+        }
+        let data = folder.join("clusters.bin");
+        let found = std::fs::metadata(&data).map_err(TrainError::io("opening the cluster cache", &data))?.len();
+        let expected: u64 = index.entries.iter().map(Entry::num_bytes).sum();
+        if found != expected {
+            let reason = format!("{found} bytes, {expected} expected");
+            return Err(TrainError::BadFile { what: "cluster cache", reason, path: data });
+        }
+        Ok(Self { folder: folder.into(), index })
+    }
+
+    /// What was clustered.
+    pub fn entries(&self) -> &[Entry] {
+        &self.index.entries
+    }
+
+    /// Scenes that could not be clustered.
+    pub fn skipped(&self) -> &Ledger {
+        &self.index.skipped
+    }
+
+    /// Reads the clusters of one entry.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`], and [`clift_model::ModelError::BadClusters`] for indices that contradict each other.
+    pub fn read(&self, entry: &Entry) -> Result<SceneClusters, TrainError> {
+        let path = self.folder.join("clusters.bin");
+        let mut bytes = vec![0; entry.num_bytes() as usize];
+        File::open(&path)
+            .and_then(|mut file| {
+                file.seek(SeekFrom::Start(entry.offset_bytes))?;
+                file.read_exact(&mut bytes)
+            })
+            .map_err(TrainError::io("reading the cluster cache", &path))?;
+        let mut values: Vec<u32> =
+            bytes.as_chunks::<2>().0.iter().map(|bytes| u32::from(u16::from_le_bytes(*bytes))).collect();
+        let centroids = values.split_off(entry.num_tokens);
+        Ok(SceneClusters::new(values, centroids)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What a cache says whose only entry has such counts.
+    fn opened(num_tokens: usize, num_storage_tokens: usize) -> String {
+        let config = Config::default();
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let entry = Entry { key: "a".into(), context: vec![0], num_tokens, num_storage_tokens, offset_bytes: 0 };
+        let index = Index {
+            version: VERSION,
+            encoder: "e".into(),
+            settings: settings(&config),
+            skipped: Ledger::new(1),
+            entries: vec![entry],
+        };
+        std::fs::write(folder.path().join("index.json"), serde_json::to_vec(&index).expect("JSON")).expect("writable");
+        std::fs::write(folder.path().join("clusters.bin"), [0, 0, 0, 0]).expect("writable");
+        ClusterCache::open(folder.path(), &config, "e").map_or_else(|error| error.to_string(), |_| "opened".into())
+    }
+
+    #[test]
+    fn counts_that_no_scene_has_are_refused_before_they_are_added_or_allocated() {
+        assert_eq!(opened(1, 1), "opened");
+        for (num_tokens, num_storage_tokens) in [(usize::MAX, 3), (1 << 62, 1 << 62), (0, 0), (1, 2), (2, 0)] {
+            let message = opened(num_tokens, num_storage_tokens);
+            let expected = format!("scene a has {num_storage_tokens} clusters of {num_tokens} tokens");
+            assert!(message.contains(&expected), "{message}");
+        }
+    }
+}

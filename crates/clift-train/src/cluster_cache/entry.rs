@@ -1,0 +1,73 @@
+//! Entries of a cluster cache and their index.
+
+use clift_data::Ledger;
+use clift_model::Grouping;
+use serde::{Deserialize, Serialize};
+
+use crate::config::config::{Config, MAX_TOKENS};
+
+pub(crate) const VERSION: u32 = 1;
+
+/// One clustered context set of a scene.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Entry {
+    /// Key of the scene.
+    pub key: String,
+    /// Frames of the contexts.
+    pub context: Vec<usize>,
+    /// Tokens of the scene.
+    pub num_tokens: usize,
+    /// Clusters.
+    pub num_storage_tokens: usize,
+    /// Where the entry starts in `clusters.bin`.
+    pub offset_bytes: u64,
+}
+
+/// What `index.json` holds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Index {
+    pub version: u32,
+    /// Hash of the encoder's weights.
+    pub encoder: String,
+    /// The settings that decide the clusters, as JSON in a string, compared as text.
+    pub settings: String,
+    pub skipped: Ledger,
+    pub entries: Vec<Entry>,
+}
+
+impl Entry {
+    /// Whether a scene can have so many tokens and clusters. No number is allocated or added up before.
+    pub(crate) fn is_possible(&self) -> bool {
+        (1..=MAX_TOKENS).contains(&self.num_tokens) && (1..=self.num_tokens).contains(&self.num_storage_tokens)
+    }
+
+    pub(crate) fn num_bytes(&self) -> u64 {
+        (self.num_tokens as u64).saturating_add(self.num_storage_tokens as u64).saturating_mul(2)
+    }
+}
+
+/// The settings that decide which clusters come out.
+pub(crate) fn settings(config: &Config) -> String {
+    let data = &config.data;
+    let mut clusters = serde_json::json!(config.clusters);
+    if config.clusters.grouping == Grouping::Tile {
+        // The former name: with the present one, existing caches would be stale.
+        clusters["grouping"] = "patch".into();
+    }
+    serde_json::json!({
+        "seed": config.seed,
+        "source": data.source,
+        "root": data.root,
+        "files": data.files,
+        "synthetic": data.synthetic,
+        "size": [data.width, data.height],
+        "poses": [serde_json::json!(data.pose_rotation), serde_json::json!(data.pose_scale)],
+        "exact_principal_point": data.clip_options().exact_principal_point,
+        "filters": data.filters,
+        "views": data.views,
+        "clusters": clusters,
+    })
+    .to_string()
+}

@@ -1,0 +1,25 @@
+//! A config as settings of an evaluation.
+
+use clift_data::derive_seed;
+use clift_eval::{Sweep, Variant};
+use clift_model::{DeviceName, TokenCount};
+
+use crate::config::config::Config;
+
+/// What an evaluation of a run does with every scene, without LPIPS and other systems.
+pub(crate) fn sweep(config: &Config, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
+    let Config { seed, eval, clusters, model, device, .. } = config;
+    Sweep {
+        storage,
+        render: eval.render.clone(),
+        selection: eval.selection,
+        tokens: eval.tokens.clone(),
+        variants,
+        kmeans: clusters.kmeans.clone(),
+        model: model.clone(),
+        lpips: None,
+        systems: Vec::new(),
+        is_cpu: matches!(device, DeviceName::Flex | DeviceName::Ndarray),
+        seed: derive_seed(*seed, "eval"),
+    }
+}

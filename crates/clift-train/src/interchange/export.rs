@@ -1,0 +1,116 @@
+//! A model to a file under the names of published checkpoints, for PyTorch.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
+
+use clift_data::{replace_file, write_state_dict};
+use clift_model::{CONVOLUTIONS, ModelConfig, ModelPath, PREFIX, published_tensors};
+use safetensors::SafeTensors;
+use safetensors::tensor::Dtype;
+
+use crate::config::config::Config;
+use crate::error::TrainError;
+use crate::interchange::model_dir::{Parameter, refuse_existing, to_safetensors};
+use crate::interchange::record::Imported;
+
+/// What kind of file is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ExportFormat {
+    /// `{"state_dict": {..}, "clift": sizes}`, which `torch.load(path, weights_only=True)` reads.
+    Pytorch,
+    /// The same keys in a safetensors file, the sizes in its metadata.
+    Safetensors,
+}
+
+/// What was written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Exported {
+    /// Tensors of the file.
+    pub num_tensors: usize,
+    /// Values of all of them.
+    pub num_values: usize,
+    /// Whether the condenser is among them.
+    pub has_condenser: bool,
+}
+
+/// Writes a model's weights under the keys of a published checkpoint, `transformer.` before each.
+///
+/// # Errors
+/// [`TrainError::BadConfig`] where `out` exists, [`TrainError::BadFile`] for a weight file that is not the config's model,
+/// and whatever reading and writing give.
+pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
+    refuse_existing(out)?;
+    config.model.validate()?;
+    let convolutions = match Imported::read(&model.dir)? {
+        Some(imported) => imported.convolutions,
+        None => CONVOLUTIONS.map(String::from).into(),
+    };
+    let mut ours = read_parameters(&model.weights)?;
+    let bad = |reason: String| TrainError::bad_file("weight file", &model.weights)(reason);
+    let has_condenser = ours.keys().any(|path| path.starts_with("condenser."));
+    let mut tensors = Vec::new();
+    for tensor in published_tensors(&config.model, has_condenser) {
+        let mut values = Vec::new();
+        for (path, rows) in &tensor.parts {
+            let mut shape = tensor.shape.clone();
+            shape[0] = rows.len();
+            let part = ours.remove(path).ok_or_else(|| bad(format!("{path} {shape:?} is missing")))?;
+            if part.shape != shape {
+                return Err(bad(format!("{path} is {:?}, expected {shape:?}", part.shape)));
+            }
+            values.extend(part.values);
+        }
+        let mut shape = tensor.shape;
+        if tensor.key.strip_suffix(".weight").is_some_and(|layer| convolutions.iter().any(|name| name == layer)) {
+            shape.extend([1, 1]);
+        }
+        tensors.push((format!("{PREFIX}{}", tensor.key), shape, values));
+    }
+    if let Some(path) = ours.keys().next() {
+        return Err(bad(format!("{path} has no place in a {} network", config.model.variant)));
+    }
+    let exported = Exported {
+        num_tensors: tensors.len(),
+        num_values: tensors.iter().map(|(_, _, values)| values.len()).sum(),
+        has_condenser,
+    };
+    match format {
+        ExportFormat::Pytorch => write_state_dict(out, &tensors, &sizes(&config.model))?,
+        ExportFormat::Safetensors => {
+            let parameters: Vec<Parameter> =
+                tensors.into_iter().map(|(path, shape, values)| Parameter { path, shape, values }).collect();
+            let said = sizes(&config.model).map(|(name, size)| (name.to_owned(), size.to_string()));
+            let bytes = to_safetensors(&parameters, HashMap::from(said), out)?;
+            replace_file(out, &bytes).map_err(TrainError::io("writing the weights", out))?;
+        }
+    }
+    Ok(exported)
+}
+
+/// What is said beside the tensors: no shape shows the heads.
+fn sizes(model: &ModelConfig) -> [(&'static str, usize); 6] {
+    [
+        ("dim", model.dim),
+        ("num_heads", model.num_heads),
+        ("feed_forward_dim", model.feed_forward_dim),
+        ("num_encoder_blocks", model.num_encoder_blocks),
+        ("num_renderer_blocks", model.num_renderer_blocks),
+        ("patch_size", model.patch_size),
+    ]
+}
+
+/// The parameters of a weight file by path.
+fn read_parameters(path: &Path) -> Result<BTreeMap<String, Parameter>, TrainError> {
+    let bytes = std::fs::read(path).map_err(TrainError::io("reading the weights", path))?;
+    let file = SafeTensors::deserialize(&bytes).map_err(TrainError::bad_file("weight file", path))?;
+    let mut found = BTreeMap::new();
+    for (name, view) in file.tensors() {
+        if view.dtype() != Dtype::F32 {
+            let reason = format!("{name} is {:?}, expected F32", view.dtype());
+            return Err(TrainError::bad_file("weight file", path)(reason));
+        }
+        let values = view.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        found.insert(name.clone(), Parameter { path: name, shape: view.shape().to_vec(), values });
+    }
+    Ok(found)
+}

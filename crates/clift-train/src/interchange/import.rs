@@ -1,0 +1,124 @@
+//! A published checkpoint to a model directory: weights, config, and what came from where.
+
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use clift_data::{ElementType, StateDict};
+use clift_model::{CheckpointTensor, Sizes, published_tensors};
+
+use crate::config::config::Config;
+use crate::error::TrainError;
+use crate::interchange::keys::{Keys, shown};
+use crate::interchange::model_dir::{self, Parameter};
+use crate::interchange::problems;
+use crate::interchange::record::{ImportOptions, Imported, go_on};
+
+/// Reads a checkpoint and writes a model directory: all of it or nothing.
+///
+/// # Errors
+/// [`TrainError::BadFile`] where keys, shapes or number formats are not the network's, with all of them;
+/// [`TrainError::BadConfig`] for heads that cannot be and renames of nothing; [`TrainError::Abandoned`] once `stop`
+/// is set; whatever reading the file or writing the directory gives.
+pub fn import(
+    file: &Path,
+    out: &Path,
+    options: &ImportOptions,
+    stop: &AtomicBool,
+) -> Result<(Config, Imported), TrainError> {
+    model_dir::refuse_existing(out)?;
+    let state = StateDict::open(file)?;
+    let keys = Keys::of(&state, options)?;
+    let options = &ImportOptions { num_heads: num_heads(&state, options)?, ..options.clone() };
+    let sizes = keys.sizes(&state, options.variant, options.num_heads);
+    check_sizes(&sizes, &keys, &state)?;
+    let Sizes { config: model, has_condenser, .. } = sizes;
+    let expected = published_tensors(&model, has_condenser);
+    let problems = problems::problems(&keys, &state, &expected, options);
+    if !problems.is_empty() {
+        let told = problems::told(&keys, &state, &problems, &model, options);
+        return Err(TrainError::bad_file("checkpoint", file)(told));
+    }
+
+    let num_bytes: u64 = expected.iter().map(|tensor| 4 * tensor.shape.iter().product::<usize>() as u64).sum();
+    // Keys may share a storage, which a network's parameters do not.
+    if num_bytes > state.num_bytes().saturating_mul(2) {
+        let reason = format!("its parameters take {num_bytes} bytes, more than twice the {} it has", state.num_bytes());
+        return Err(TrainError::bad_file("checkpoint", file)(reason));
+    }
+    let (mut parameters, mut mapping, mut convolutions, mut num_converted) = (vec![], vec![], vec![], 0);
+    for tensor in &expected {
+        go_on(stop)?;
+        let key = &keys.network[&tensor.key];
+        let values = state.read(key)?;
+        let (element_type, shape) = state.tensor(key).unwrap_or((ElementType::F32, &[]));
+        num_converted += usize::from(element_type != ElementType::F32);
+        if shape.len() == 4 {
+            convolutions.push(tensor.key.trim_end_matches(".weight").to_owned());
+        }
+        parameters.extend(parts(tensor, &values));
+        mapping.push((key.clone(), tensor.parts.iter().map(|(path, _)| path.clone()).collect()));
+    }
+    let imported = Imported {
+        version: 1,
+        file: file.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        sha256: model_dir::sha256(file)?,
+        variant: options.variant,
+        has_condenser,
+        convolutions,
+        num_converted,
+        parameters: mapping,
+        ignored: keys.ignored,
+        outside: keys.outside,
+        passed_over: state.passed_over().clone(),
+    };
+    let config = model_dir::evaluation_config(model, out);
+    model_dir::write(out, &config, &parameters, &imported, stop)?;
+    Ok((config, imported))
+}
+
+/// The heads that are given, or those that an export of this program says it has.
+fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>, TrainError> {
+    let said = state.size("num_heads").and_then(|size| usize::try_from(size).ok());
+    match (options.num_heads, said) {
+        (Some(given), Some(said)) if given != said => {
+            let fix = format!("the checkpoint says it has {said}: leave the option out: {}", state.path().display());
+            Err(TrainError::BadConfig { key: "--num-heads".into(), value: given.to_string(), fix })
+        }
+        (given, said) => Ok(given.or(said)),
+    }
+}
+
+/// What no shape shows must be right before anything else can be said.
+fn check_sizes(sizes: &Sizes, keys: &Keys, state: &StateDict) -> Result<(), TrainError> {
+    let Sizes { config: model, knows_heads, width_key, .. } = sizes;
+    let file = state.path();
+    let num_heads = model.num_heads;
+    if !knows_heads || num_heads == 0 || !model.dim.is_multiple_of(num_heads) {
+        let key = width_key.as_ref().map(|key| &keys.network[key]);
+        let from = key.and_then(|key| state.tensor(key).map(|(_, shape)| format!(" ({} is {shape:?})", shown(key))));
+        let (dim, from, file) = (model.dim, from.unwrap_or_default(), file.display());
+        let (value, why) = if *knows_heads {
+            (num_heads.to_string(), "")
+        } else {
+            ("not given".into(), "no shape shows them, and width 768 alone is published, with 8: ")
+        };
+        let fix = format!("{why}give the heads of this network, a divisor of its width {dim}{from}: {file}");
+        return Err(TrainError::BadConfig { key: "--num-heads".into(), value, fix });
+    }
+    let bad_sizes = |error: clift_model::ModelError| TrainError::bad_file("checkpoint", file)(error);
+    model.validate().map_err(bad_sizes)
+}
+
+/// The rows of a tensor that are parameters here.
+fn parts<'a>(tensor: &'a CheckpointTensor, values: &'a [f32]) -> impl Iterator<Item = Parameter> + 'a {
+    let row_len: usize = tensor.shape[1..].iter().product();
+    tensor.parts.iter().map(move |(path, rows)| {
+        let mut shape = tensor.shape.clone();
+        shape[0] = rows.len();
+        let values = values[rows.start * row_len..rows.end * row_len].to_vec();
+        Parameter { path: path.clone(), shape, values }
+    })
+}
+
+#[cfg(test)]
+mod tests;

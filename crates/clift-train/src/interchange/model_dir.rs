@@ -1,0 +1,139 @@
+//! A model directory: `model.safetensors` with `config.toml`, which says what network it is and how it is evaluated.
+//! That of an imported model has `import.json` too.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use clift_data::{PoseRotation, PoseScale, SourceKind, TEMPORARY, publish_file, replace_file};
+use clift_model::{ModelConfig, ModelPath, TrainedModel, Variant, sorted_header};
+use safetensors::tensor::{Dtype, TensorView};
+use sha2::{Digest, Sha256};
+
+use crate::config::config::Config;
+use crate::error::TrainError;
+use crate::interchange::record::{Imported, go_on};
+
+/// A parameter on the host, in PyTorch's layout.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Parameter {
+    /// Its path in weight files.
+    pub path: String,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Its values, row-major.
+    pub values: Vec<f32>,
+}
+
+/// The settings under which the reference evaluates a published network.
+pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
+    // Where `clift train` would write, given this config; evaluating sets its own.
+    let run_dir = Path::new("runs").join(folder.file_name().unwrap_or("imported".as_ref()));
+    let mut config = Config { run_dir, ..Config::default() };
+    let data = &mut config.data;
+    data.source = SourceKind::Auto;
+    (data.views.min_context, data.views.max_context) = (4, 4);
+    match model.variant {
+        Variant::Paper => {}
+        Variant::ReleasedRe10k => (data.pose_rotation, data.pose_scale) = (PoseRotation::Quaternion, PoseScale::All),
+        Variant::ReleasedDl3dv => {
+            (data.width, data.height) = (448, 256);
+            (data.pose_rotation, data.pose_scale) = (PoseRotation::Axes, PoseScale::Context);
+            data.views.max_context = 6;
+        }
+    }
+    config.model = model;
+    config
+}
+
+/// Nothing that exists is written over, be it a link to nowhere.
+///
+/// # Errors
+/// [`TrainError::BadConfig`].
+pub fn refuse_existing(path: &Path) -> Result<(), TrainError> {
+    if path.symlink_metadata().is_err() {
+        return Ok(());
+    }
+    let fix = "it exists already, and nothing is written over; write a name that is free".to_owned();
+    Err(TrainError::BadConfig { key: "-o".into(), value: path.display().to_string(), fix })
+}
+
+/// SHA-256 of a file, as 64 hexadecimal digits.
+pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
+    let reading = "reading the checkpoint";
+    let mut file = File::open(path).map_err(TrainError::io(reading, path))?;
+    let (mut sha, mut buffer) = (Sha256::new(), vec![0; 1 << 20]);
+    loop {
+        match file.read(&mut buffer).map_err(TrainError::io(reading, path))? {
+            0 => break,
+            count => sha.update(&buffer[..count]),
+        }
+    }
+    Ok(hex::encode(sha.finalize()))
+}
+
+/// Writes a model directory under a temporary name, reads the model back as every command does, and renames it, unless
+/// `stop` is set before: then nothing is left.
+pub(crate) fn write(
+    folder: &Path,
+    config: &Config,
+    parameters: &[Parameter],
+    imported: &Imported,
+    stop: &AtomicBool,
+) -> Result<(), TrainError> {
+    if folder.file_name().is_none() {
+        let fix = "write the name of a directory".to_owned();
+        return Err(TrainError::BadConfig { key: "-o".into(), value: folder.display().to_string(), fix });
+    }
+    let above = folder.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let writing = "writing the model directory";
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(TEMPORARY);
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
+    // Dropped before it is renamed, it leaves nothing behind.
+    let temporary = std::fs::create_dir_all(above).and_then(|()| builder.tempdir_in(above));
+    let temporary = temporary.map_err(TrainError::io(writing, above))?;
+    let weights_path = temporary.path().join("model.safetensors");
+    let bytes = to_safetensors(parameters, HashMap::new(), &weights_path)?;
+    go_on(stop)?;
+    replace_file(&weights_path, &bytes).map_err(TrainError::io(writing, &weights_path))?;
+    drop(bytes);
+    go_on(stop)?;
+    let config_path = temporary.path().join("config.toml");
+    let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &config_path))?;
+    replace_file(&config_path, text.as_bytes()).map_err(TrainError::io(writing, &config_path))?;
+    let import_path = temporary.path().join("import.json");
+    let text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", &import_path))?;
+    replace_file(&import_path, &text).map_err(TrainError::io(writing, &import_path))?;
+
+    let written = ModelPath { dir: temporary.path().into(), weights: weights_path };
+    TrainedModel::open(&written, &config.model, &config.device.open()?)?;
+    go_on(stop)?;
+    refuse_existing(folder)?;
+    publish_file(temporary.path(), folder).map_err(TrainError::io(writing, folder))?;
+    let _ = temporary.keep(); // it has another name now
+    Ok(())
+}
+
+/// The bytes of a safetensors file, with what is said about it beside the format.
+pub(crate) fn to_safetensors(
+    parameters: &[Parameter],
+    mut metadata: HashMap<String, String>,
+    path: &Path,
+) -> Result<Vec<u8>, TrainError> {
+    let bad = |error: safetensors::SafeTensorError| TrainError::bad_file("weight file", path)(error);
+    let bytes: Vec<Vec<u8>> =
+        parameters.iter().map(|p| p.values.iter().flat_map(|value| value.to_le_bytes()).collect()).collect();
+    let views: Result<Vec<(&str, TensorView)>, _> = parameters
+        .iter()
+        .zip(&bytes)
+        .map(|(p, bytes)| Ok((p.path.as_str(), TensorView::new(Dtype::F32, p.shape.clone(), bytes)?)))
+        .collect();
+    metadata.insert("format".into(), "clift-1".into());
+    let file = safetensors::serialize(views.map_err(bad)?, Some(metadata)).map_err(bad)?;
+    // Equal weights are equal files.
+    sorted_header(file).map_err(TrainError::bad_file("weight file", path))
+}

@@ -1,0 +1,232 @@
+//! What is wrong with the keys of a checkpoint, and how it is told: one line for all layers, each with the nearest name.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+
+use clift_data::{ElementType, StateDict};
+use clift_model::{CheckpointTensor, ModelConfig, PREFIX, Variant, plain_key, published_tensors};
+
+use crate::interchange::keys::{Keys, MAX_SHOWN, is_number, pattern, shown};
+use crate::interchange::record::ImportOptions;
+
+/// Lines of one kind; a network has about sixty patterns of keys.
+const MAX_LISTED: usize = 200;
+/// Numbers of layers in one line.
+const MAX_NUMBERS: usize = 64;
+
+/// What is wrong with one key.
+pub(crate) struct Problem {
+    kind: Kind,
+    /// The key as the file has it, or would.
+    key: String,
+    /// The same as `interchange` writes it.
+    name: String,
+    /// Shapes and formats.
+    detail: String,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, strum::Display)]
+#[strum(serialize_all = "lowercase")]
+enum Kind {
+    Misshapen,
+    #[strum(to_string = "not in f32")]
+    NotF32,
+    #[strum(to_string = "no tensor")]
+    NoTensor,
+    Missing,
+    Unknown,
+    #[strum(to_string = "beside transformer.")]
+    Stray,
+}
+
+/// Compares a checkpoint with the tensors that a network has.
+pub(crate) fn problems(
+    keys: &Keys,
+    state: &StateDict,
+    expected: &[CheckpointTensor],
+    options: &ImportOptions,
+) -> Vec<Problem> {
+    let mut problems = Vec::new();
+    let known: BTreeSet<&str> = expected.iter().map(|tensor| tensor.key.as_str()).collect();
+    for tensor in expected {
+        let (name, expected) = (tensor.key.clone(), &tensor.shape);
+        let Some(key) = keys.network.get(&name) else {
+            let key = format!("{}{name}", keys.prefix);
+            problems.push(Problem { kind: Kind::Missing, key, name, detail: format!(" {expected:?}") });
+            continue;
+        };
+        let key = key.clone();
+        let Some((got, shape)) = state.tensor(&key) else {
+            let detail = format!(", expected {expected:?}");
+            problems.push(Problem { kind: Kind::NoTensor, key, name, detail });
+            continue;
+        };
+        let is_convertible = matches!(got, ElementType::F16 | ElementType::BF16 | ElementType::F64);
+        if !tensor.fits(shape) {
+            let detail = format!(" is {shape:?}, expected {expected:?}");
+            problems.push(Problem { kind: Kind::Misshapen, key, name, detail });
+        } else if got != ElementType::F32 && !(options.convert && is_convertible) {
+            let fix = if is_convertible { "; --convert converts it to f32" } else { "" };
+            problems.push(Problem { kind: Kind::NotF32, key, name, detail: format!(" {shape:?} is {got:?}{fix}") });
+        }
+    }
+    let unknown = keys.network.iter().filter(|(name, _)| !known.contains(name.as_str()));
+    let unknown = unknown.map(|(name, key)| (Kind::Unknown, keys.prefix, name, key));
+    let strays = keys.strays.iter().map(|(name, key)| (Kind::Stray, "", name, key));
+    for (kind, prefix, name, key) in unknown.chain(strays) {
+        let mut detail = state.tensor(key).map_or_else(String::new, |(_, shape)| format!(" {shape:?}"));
+        let full = format!("{prefix}{name}");
+        if plain_key(key) != full {
+            let _ = write!(detail, ", renamed {}", shown(&pattern(&full)));
+        }
+        problems.push(Problem { kind, key: key.clone(), name: name.clone(), detail });
+    }
+    problems
+}
+
+/// Names by their pattern.
+struct Names<'a>(BTreeMap<String, BTreeSet<&'a str>>);
+
+impl<'a> Names<'a> {
+    fn of(names: impl Iterator<Item = &'a str>) -> Self {
+        let mut patterns: BTreeMap<_, BTreeSet<_>> = BTreeMap::new();
+        for name in names {
+            patterns.entry(pattern(name)).or_default().insert(name);
+        }
+        Self(patterns)
+    }
+
+    /// The pattern with the fewest typing slips, if those are at most so many.
+    fn nearest(&self, name: &str, most: usize) -> Option<&str> {
+        let short = |text: &str| text.chars().take(MAX_SHOWN).collect::<String>();
+        let word = short(&pattern(name));
+        let slips = |candidate: &str| strsim::damerau_levenshtein(&word, &short(candidate));
+        let all = self.0.keys().take(MAX_LISTED).map(|candidate| (slips(candidate), candidate.as_str()));
+        all.filter(|(slips, _)| *slips <= most).min_by_key(|(slips, _)| *slips).map(|(_, candidate)| candidate)
+    }
+
+    /// The name of a pattern that has these numbers, the only one there is, or the pattern for many.
+    fn told(&self, found: &str, numbers: Option<&[&str]>) -> String {
+        let mut numbers = numbers.unwrap_or_default().iter();
+        let part = |part| if part == "N" { numbers.next().copied().unwrap_or(part) } else { part };
+        let filled = found.split('.').map(part).collect::<Vec<_>>().join(".");
+        let names = &self.0[found];
+        match names.first() {
+            _ if names.contains(filled.as_str()) => filled,
+            Some(first) if names.len() == 1 => (*first).to_owned(),
+            _ => found.to_owned(),
+        }
+    }
+}
+
+/// All that is wrong, for people.
+pub(crate) fn told(
+    keys: &Keys,
+    state: &StateDict,
+    problems: &[Problem],
+    model: &ModelConfig,
+    options: &ImportOptions,
+) -> String {
+    let ModelConfig { variant, dim, num_heads, num_encoder_blocks, num_renderer_blocks, .. } = model;
+    let mut text = format!(
+        "it does not hold a {variant} network (width {dim}, {num_heads} heads, {num_encoder_blocks} + \
+         {num_renderer_blocks} layers); nothing was written"
+    );
+    let of_kinds = |kinds: &[Kind]| {
+        let found = problems.iter().filter(|problem| kinds.contains(&problem.kind));
+        Names::of(found.map(|problem| problem.name.as_str()))
+    };
+    let (missing, unknown, strays) = (of_kinds(&[Kind::Missing]), of_kinds(&[Kind::Unknown]), of_kinds(&[Kind::Stray]));
+    let expected = published_tensors(model, true);
+    let expected = Names::of(expected.iter().map(|tensor| tensor.key.as_str()));
+    let mut lines: BTreeMap<(Kind, String, &str), Vec<&Problem>> = BTreeMap::new();
+    for problem in problems {
+        lines.entry((problem.kind, pattern(&problem.key), &problem.detail)).or_default().push(problem);
+    }
+    let mut counts = BTreeMap::new();
+    for ((kind, pattern, detail), found) in lines {
+        let count = counts.entry(kind).or_insert(0_usize);
+        *count += 1;
+        if *count > MAX_LISTED {
+            continue;
+        }
+        let first = found[0];
+        let (key, numbers) = match found.len() {
+            1 => (&first.key, String::new()),
+            _ => (&pattern, format!(" (N = {})", layer_numbers(&found))),
+        };
+        let _ = write!(text, "\n  {kind}: {}{detail}{numbers}", shown(key));
+        let (own, most) = (numbers_of(&first.name), first.name.len() / 2);
+        let prefixed = |name: String| format!("{}{name}", keys.prefix);
+        let own = (found.len() == 1).then_some(&own[..]);
+        let near = match kind {
+            // So near that it may be this one under another name; strays lack the prefix.
+            Kind::Missing => {
+                let near = |names: &Names| names.nearest(&first.name, most).map(|found| names.told(found, own));
+                near(&strays).or_else(|| near(&unknown).map(prefixed))
+            }
+            Kind::Unknown | Kind::Stray => {
+                let missing = missing.nearest(&first.name, most).map(|found| missing.told(found, own));
+                let near = missing
+                    .or_else(|| expected.nearest(&first.name, usize::MAX).map(|found| expected.told(found, own)));
+                near.map(prefixed)
+            }
+            _ => None,
+        };
+        if let Some(near) = near {
+            let _ = write!(text, "; nearest name: {}", shown(&near));
+        }
+    }
+    for (kind, count) in counts.iter().filter(|(_, count)| **count > MAX_LISTED) {
+        let _ = write!(text, "\n  {kind}: {} more", count - MAX_LISTED);
+    }
+    text.push_str(&way_on(keys, state, options, !unknown.0.is_empty() || !strays.0.is_empty()));
+    text.push_str("\n ");
+    text
+}
+
+/// What may be done about it.
+fn way_on(keys: &Keys, state: &StateDict, options: &ImportOptions, has_unknown: bool) -> String {
+    let fitting = Variant::ALL.into_iter().filter(|other| *other != options.variant).find(|other| {
+        let sizes = keys.sizes(state, *other, options.num_heads);
+        let options = ImportOptions { convert: true, ..options.clone() };
+        sizes.config.validate().is_ok()
+            && problems(keys, state, &published_tensors(&sizes.config, sizes.has_condenser), &options).is_empty()
+    });
+    if let Some(other) = fitting {
+        return format!("\n  its keys and shapes are those of --variant {other}");
+    }
+    // Renaming replaces wherever the text stands: only where no other key has it.
+    let first = keys.strays.keys().next().and_then(|name| name.split('.').next());
+    if let Some(first) = first.filter(|first| !keys.network.values().any(|key| key.contains(first))) {
+        let first = shown(first);
+        return format!(
+            "\n  --rename {first}=transformer.{first} makes such keys the network's, --rename {first}=other.{first} \
+             passes over them"
+        );
+    }
+    let lead = keys.network.values().find_map(|key| key.split_once(&format!(".{PREFIX}")).map(|(lead, _)| lead));
+    if let Some(lead) = lead.filter(|_| keys.prefix.is_empty()).map(shown) {
+        return format!("\n  --rename {lead}.{PREFIX}={PREFIX} makes of its keys those that are expected");
+    }
+    if has_unknown {
+        return "\n  --rename FROM=TO replaces a part of its keys, as they stand here".into();
+    }
+    String::new()
+}
+
+/// The first number in each key.
+fn layer_numbers(found: &[&Problem]) -> String {
+    let first =
+        |problem: &&Problem| numbers_of(&problem.key).first().map(|number| (number.len(), (*number).to_owned()));
+    let numbers: BTreeSet<(usize, String)> = found.iter().filter_map(first).collect(); // shorter are smaller
+    let mut listed: Vec<&str> = numbers.iter().take(MAX_NUMBERS).map(|(_, number)| number.as_str()).collect();
+    if numbers.len() > MAX_NUMBERS {
+        listed.push("..");
+    }
+    listed.join(", ")
+}
+
+fn numbers_of(key: &str) -> Vec<&str> {
+    key.split('.').filter(|part| is_number(part)).collect()
+}

@@ -1,0 +1,63 @@
+//! Evaluation of a model that is no run: an imported model, or a single weight file.
+
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use clift_data::{ClipReader, OpenedSource, Split, open_dataset};
+use clift_eval::{EvalModels, Summary, System, Variant};
+use clift_model::{ModelPath, TrainedModel};
+
+use crate::config::config::Config;
+use crate::error::TrainError;
+use crate::events::{Event, Sink};
+use crate::run::validation::Validation;
+
+/// Evaluates a model with the data and settings of `config`, and writes the results to `folder`.
+///
+/// A model with a condenser is measured on condensed tokens alone unless `stage1` is given, the model it was trained
+/// from, which renders the other methods. `systems` are measured beside it.
+///
+/// # Errors
+/// [`TrainError::BadFile`] when `stage1` has another encoder, [`TrainError::BadConfig`] for methods without
+/// weights, [`TrainError::Model`] for heads that are not the model's, and whatever data, models or evaluation give.
+pub fn evaluate_model(
+    mut config: Config,
+    model: &ModelPath,
+    stage1: Option<&ModelPath>,
+    systems: &[System],
+    folder: &Path,
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<Summary, TrainError> {
+    config.validate()?;
+    let device = config.device.open()?;
+    let last = TrainedModel::open(model, &config.model, &device)?;
+    let mut models = EvalModels::new(match stage1 {
+        Some(path) => TrainedModel::open(path, &config.model, &device)?,
+        None => last.clone(),
+    });
+    if let Some(path) = stage1.filter(|_| !models.stage1.has_encoder_of(&last)) {
+        let reason = format!("its encoder is not that of {}", model.weights.display());
+        return Err(TrainError::bad_file("stage-1 model", &path.weights)(reason));
+    }
+    if last.has_condenser && stage1.is_none() {
+        // Its renderer was trained on condensed tokens: what it makes of others is no baseline.
+        let asked = &mut config.eval.variants;
+        if asked.is_empty() {
+            asked.push(Variant::Clift);
+        }
+        if let Some(variant) = asked.iter().find(|variant| **variant != Variant::Clift) {
+            let fix = "give the first-stage model that draws it with --stage1".to_owned();
+            return Err(TrainError::BadConfig { key: "eval.variants".into(), value: variant.name().into(), fix });
+        }
+    }
+    if last.has_condenser {
+        models.set_stage2(config.clusters.grouping, last);
+    }
+    let OpenedSource { source, report: ledger, .. } = open_dataset(&config.data, Split::Test)?;
+    sink.event(&Event::Message(format!("{}: {ledger}", Split::Test)));
+    let reader = ClipReader { source, options: config.data.clip_options() };
+    let validation = Validation::new(&config, config.eval.clone(), reader, &device, sink)?;
+    std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
+    validation.evaluate(&models, systems, folder, stop, sink)
+}

@@ -1,0 +1,363 @@
+//! A run: its directory, what it resumes, and the order of its stages.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use burn::module::Module;
+use burn::tensor::Device;
+use clift_data::{
+    ClipReader, OpenedSource, SceneSource, SceneSubset, Split, make_folder, open_dataset, open_training_dataset,
+    remove_leftovers,
+};
+use clift_eval::{EvalModels, LPIPS_COMMAND, Summary, System, write_ledger};
+use clift_model::{
+    Clift, ModelError, ModelPath, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
+};
+
+use crate::cluster_cache::builder::ClusterJob;
+use crate::cluster_cache::cache::ClusterCache;
+use crate::cluster_cache::resume_log::remove_journal;
+use crate::config::config::Config;
+use crate::error::TrainError;
+use crate::events::{Event, Sink, Stage};
+use crate::footprint::largest_tensor;
+use crate::footprint::scene_sizes::PARTS;
+use crate::run::init_from::init_from;
+use crate::run::lock::RunLock;
+use crate::run::run_file::{RunFile, compare, write_config};
+use crate::run::stage_plan::{MakeBatch, StagePlan};
+use crate::run::validation::Validation;
+use crate::stage::stage1_batches::Stage1Batches;
+use crate::stage::stage2_batches::Stage2Batches;
+
+/// What the command line adds to a config.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RunOptions {
+    /// Do this stage alone.
+    pub only: Option<Stage>,
+    /// Train and evaluate on the first scenes of the training data.
+    pub overfit: Option<usize>,
+    /// Start over: an existing run directory is moved aside.
+    pub fresh: bool,
+    /// Take larger step counts than the run was started with.
+    pub extend: bool,
+}
+
+const STAGES: [Stage; 3] = [Stage::Stage1, Stage::Clusters, Stage::Stage2];
+
+/// An open run.
+pub struct Run {
+    config: Config,
+    overfit: Option<usize>,
+    device: Device,
+    /// Of a run that is written to.
+    lock: Option<RunLock>,
+}
+
+impl Run {
+    /// Opens the run directory of a config, new or to be resumed, and writes the resolved config to it. No other process
+    /// can open it until the run is dropped.
+    ///
+    /// # Errors
+    /// [`TrainError::OtherRun`] when the directory holds a run with other settings, [`TrainError::Locked`] when another
+    /// process works in it.
+    pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+        config.validate()?;
+        let device = config.device.open()?;
+        config.precision.check("precision", &device)?;
+        config.eval.precision.check("eval.precision", &device)?;
+        largest_tensor::check(&config, &device, &PARTS)?;
+        // Missing weights are found now, not after days of training.
+        config.loss.weights()?;
+        if let Some(path) = config.eval.lpips_path().filter(|path| !path.is_file()) {
+            let fix = format!("there is no such file; `{LPIPS_COMMAND}` makes it, \"\" leaves LPIPS out");
+            let value = path.display().to_string();
+            return Err(TrainError::BadConfig { key: "eval.lpips_weights".into(), value, fix });
+        }
+        let folder = &config.run_dir;
+        if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
+            let fix = "it starts a run over, which begins with stage 1: leave out one of the two";
+            return Err(TrainError::BadConfig { key: "--fresh".into(), value: "with --only".into(), fix: fix.into() });
+        }
+        if options.fresh && folder.exists() {
+            // Not from under a process that trains in it. Let go of before the move, which Windows refuses otherwise.
+            drop(RunLock::take(folder, sink)?);
+            let moved = free_name(folder);
+            std::fs::rename(folder, &moved).map_err(TrainError::io("moving the former run aside", folder))?;
+            sink.event(&Event::Message(format!("moved the former run to {}", moved.display())));
+        }
+        make_folder(folder).map_err(TrainError::io("making the run directory", folder))?;
+        let lock = RunLock::take(folder, sink)?;
+        remove_leftovers(folder).map_err(TrainError::io("removing what a killed process left", folder))?;
+        // A run that failed before its first step, on a wrong path perhaps, has nothing that settings could contradict.
+        let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
+        let mut file = RunFile::new(options.overfit);
+        if folder.join("config.toml").exists() && has_begun {
+            let found = RunFile::read(folder)?;
+            let extensions = compare(folder, &found, &config, options.overfit, options.extend)?;
+            file.extended = found.extended;
+            for extension in extensions {
+                file.extended.push(extension.apply(folder, sink)?);
+            }
+        }
+        file.write(folder)?;
+        write_config(&config)?;
+        Ok(Self { config, overfit: options.overfit, device, lock: Some(lock) })
+    }
+
+    /// Opens a run that exists, to evaluate it.
+    ///
+    /// # Errors
+    /// [`TrainError::BadFile`] for a damaged `run.json`, [`TrainError::BadConfig`] for other heads than those of the run,
+    /// and what the device gives.
+    pub fn reopen(config: Config) -> Result<Self, TrainError> {
+        config.validate()?;
+        check_heads(&config.model, &config.run_dir)?;
+        let run = RunFile::read(&config.run_dir)?;
+        let device = config.device.open()?;
+        Ok(Self { config, overfit: run.overfit, device, lock: None })
+    }
+
+    /// Does what is left of the run, or of one stage, and evaluates it. Returns the evaluation of a
+    /// whole run.
+    ///
+    /// # Errors
+    /// [`TrainError::Missing`] when `only` names a stage whose predecessor has not run, and whatever
+    /// the stages give.
+    pub fn train(
+        &self,
+        only: Option<Stage>,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Option<Summary>, TrainError> {
+        let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
+        let reader = self.reader(Split::Train, sink)?;
+        let validation = self.validation(sink)?;
+
+        let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
+            self.train_stage1(&reader, &validation, stop, sink)?
+        } else {
+            self.load_stage1(only)?
+        };
+        let train_stage2 = wanted(Stage::Stage2) && !self.weights(Stage::Stage2).exists();
+        if only == Some(Stage::Clusters) || train_stage2 {
+            let cache = self.clusters(only, &reader, &stage1, stop, sink)?;
+            if train_stage2 {
+                self.train_stage2(&reader, cache, &validation, stage1, stop, sink)?;
+            }
+        }
+        if only.is_some() {
+            return Ok(None);
+        }
+        validation.evaluate(&self.models(sink)?, &[], &self.folder("eval"), stop, sink).map(Some)
+    }
+
+    /// Evaluates the run's weights, and other systems' pictures beside them, and writes the results to `folder`;
+    /// `beside` is another run of the same stage 1 whose stage 2 was trained on other groups of tokens, to be measured
+    /// on the same views.
+    ///
+    /// # Errors
+    /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] when those of
+    /// stage 2 do not belong to them, [`TrainError::Locked`] when `folder` lies in a run that another process works in, and
+    /// whatever the evaluation gives.
+    pub fn evaluate(
+        &self,
+        systems: &[System],
+        folder: &Path,
+        beside: Option<&Config>,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Summary, TrainError> {
+        let is_inside = self.lock.is_none() && folder.starts_with(&self.config.run_dir);
+        let _lock = is_inside.then(|| RunLock::take(&self.config.run_dir, sink)).transpose()?;
+        std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
+        let mut models = self.models(sink)?;
+        if let Some(other) = beside {
+            if other.clusters.grouping == self.config.clusters.grouping {
+                let value = other.run_dir.display().to_string();
+                let fix = "its stage 2 was trained on the same groups of tokens: name a run with another \
+                           clusters.grouping";
+                return Err(TrainError::BadConfig { key: "--with".into(), value, fix: fix.into() });
+            }
+            models.set_stage2(other.clusters.grouping, self.open_stage2(other, &models.stage1)?);
+        }
+        self.validation(sink)?.evaluate(&models, systems, folder, stop, sink)
+    }
+
+    /// The trained models: of both stages, or of stage 1 alone.
+    fn models(&self, sink: &mut dyn Sink) -> Result<EvalModels, TrainError> {
+        let weights = self.require_stage1(Stage::Eval)?;
+        let path = ModelPath { dir: self.config.run_dir.clone(), weights };
+        let mut models = EvalModels::new(TrainedModel::open(&path, &self.config.model, &self.device)?);
+        if self.weights(Stage::Stage2).exists() {
+            models.set_stage2(self.config.clusters.grouping, self.open_stage2(&self.config, &models.stage1)?);
+        } else {
+            sink.event(&Event::Message("stage 2 has not run: evaluating the stage-1 weights alone".into()));
+        }
+        Ok(models)
+    }
+
+    /// The model of stage 2 of `config`'s run, which must have been trained on the encoder of `stage1`.
+    fn open_stage2(&self, config: &Config, stage1: &TrainedModel) -> Result<TrainedModel, TrainError> {
+        let path = config.run_dir.join(Stage::Stage2.name()).join("model.safetensors");
+        if !path.exists() {
+            let what = "the weights of stage 2";
+            return Err(TrainError::Missing { stage: "evaluation", what, first: "clift train", path });
+        }
+        let found = ModelPath { dir: config.run_dir.clone(), weights: path.clone() };
+        let model = TrainedModel::open(&found, &config.model, &self.device)?;
+        if !model.has_condenser {
+            let reason = "the file holds no condenser".into();
+            return Err(ModelError::Weights { action: "reading", reason, path }.into());
+        }
+        if model.has_encoder_of(stage1) { Ok(model) } else { Err(TrainError::OtherEncoder { path }) }
+    }
+
+    /// The views that are measured, during training and after it.
+    fn validation(&self, sink: &mut dyn Sink) -> Result<Validation<'_>, TrainError> {
+        let mut eval = self.config.eval.clone();
+        if self.overfit.is_some() && eval.index.take().is_some() {
+            sink.event(&Event::Message("--overfit measures the scenes it trains on: eval.index is not used".into()));
+        }
+        // The test split, or the training scenes themselves under --overfit.
+        let reader = self.reader(if self.overfit.is_some() { Split::Train } else { Split::Test }, sink)?;
+        Validation::new(&self.config, eval, reader, &self.device, sink)
+    }
+
+    fn train_stage1(
+        &self,
+        reader: &ClipReader,
+        validation: &Validation,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Clift, TrainError> {
+        let batches = Stage1Batches::new(&self.config, reader)?;
+        let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
+        let start = |sink: &mut dyn Sink| {
+            let mut model = self.new_model();
+            if let Some(from) = &self.config.stage1.init_from {
+                init_from(&mut model, &self.config.model, from, sink)?;
+            }
+            Ok(model)
+        };
+        let model = self.plan(Stage::Stage1, batches).train(start, validation, stop, sink)?;
+        save_part(&model, &Clift::stage1_part(), &self.weights(Stage::Stage1))?;
+        Ok(model)
+    }
+
+    fn train_stage2(
+        &self,
+        reader: &ClipReader,
+        cache: ClusterCache,
+        validation: &Validation,
+        stage1: Clift,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<(), TrainError> {
+        let batches = Stage2Batches::new(&self.config, reader, Arc::new(cache))?;
+        let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
+        // The condenser of stage 1 takes no gradient.
+        let start = |_: &mut dyn Sink| Ok(Clift { condenser: self.new_model().condenser, ..stage1 });
+        let model = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?;
+        Ok(save_weights(&model, &self.weights(Stage::Stage2))?)
+    }
+
+    fn plan(&self, stage: Stage, batches: Arc<MakeBatch>) -> StagePlan<'_> {
+        StagePlan {
+            settings: self.config.stage(stage),
+            batches,
+            config: &self.config,
+            folder: self.folder(stage.name()),
+            device: self.device.clone().autodiff(),
+        }
+    }
+
+    fn clusters(
+        &self,
+        only: Option<Stage>,
+        reader: &ClipReader,
+        model: &Clift,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<ClusterCache, TrainError> {
+        let folder = self.folder("clusters");
+        let encoder_hash = &weights_hash(&model.encoder);
+        if folder.exists() {
+            remove_journal(&folder)?;
+            return ClusterCache::open(&folder, &self.config, encoder_hash);
+        }
+        if only == Some(Stage::Stage2) {
+            return Err(TrainError::Missing {
+                stage: "stage2",
+                what: "the cluster cache",
+                first: "--only clusters",
+                path: folder,
+            });
+        }
+        let encoder = model.encoder.valid();
+        ClusterJob { config: &self.config, reader, encoder: &encoder, encoder_hash, device: &self.device }
+            .make(&folder, stop, sink)
+    }
+
+    /// The run's training weights on the autodiff device.
+    fn new_model(&self) -> Clift {
+        Clift::new(&self.config.model, self.config.seed, &self.device.clone().autodiff())
+    }
+
+    fn load_stage1(&self, only: Option<Stage>) -> Result<Clift, TrainError> {
+        let path = self.require_stage1(only.unwrap_or(Stage::Stage2))?;
+        let mut model = self.new_model();
+        load_part(&mut model, &Clift::stage1_part(), &path)?.require_all(&path)?;
+        Ok(model)
+    }
+
+    /// The weights of stage 1, which `stage` needs.
+    fn require_stage1(&self, stage: Stage) -> Result<PathBuf, TrainError> {
+        let path = self.weights(Stage::Stage1);
+        if path.exists() {
+            return Ok(path);
+        }
+        let what = "the weights of stage 1";
+        Err(TrainError::Missing { stage: stage.name(), what, first: "--only stage1", path })
+    }
+
+    fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
+        let data = &self.config.data;
+        // Under --overfit the training scenes are measured: the same ones.
+        let OpenedSource { source, report: ledger, .. } = match split {
+            Split::Train => open_training_dataset(data)?,
+            Split::Test => open_dataset(data, split)?,
+        };
+        sink.event(&Event::Message(format!("{split}: {ledger}")));
+        if ledger.has_gaps() && self.config.run_dir.is_dir() {
+            write_ledger(&ledger, &self.folder(&format!("skipped-{split}.json")))?;
+        }
+        let source: Arc<dyn SceneSource> = match self.overfit {
+            Some(count) => Arc::new(SceneSubset::first(source, count)),
+            None => source,
+        };
+        Ok(ClipReader { source, options: self.config.data.clip_options() })
+    }
+
+    fn folder(&self, name: &str) -> PathBuf {
+        self.config.run_dir.join(name)
+    }
+
+    fn weights(&self, stage: Stage) -> PathBuf {
+        self.folder(stage.name()).join("model.safetensors")
+    }
+}
+
+/// `runs/tiny` becomes `runs/tiny.1`, or the first number that is free.
+fn free_name(folder: &Path) -> PathBuf {
+    let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let mut number = 1;
+    loop {
+        let moved = folder.with_file_name(format!("{name}.{number}"));
+        if !moved.exists() {
+            return moved;
+        }
+        number += 1;
+    }
+}

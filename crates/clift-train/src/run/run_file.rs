@@ -1,0 +1,198 @@
+//! What a run was started with, and whether a command that resumes it asks for the same.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use clift_data::replace_file;
+use serde::{Deserialize, Serialize};
+
+use crate::config::config::Config;
+use crate::config::parse::parse_config;
+use crate::error::TrainError;
+use crate::events::Stage;
+use crate::run::extend::{Extended, Extension};
+
+const VERSION: u32 = 1;
+
+/// Keys that may change between the start of a run and its resumption.
+const FREE_KEYS: [&str; 7] =
+    ["run_dir", "device", "activation_checkpointing", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
+
+/// Keys that `--extend` may raise.
+const STEP_COUNTS: [(&str, Stage); 2] = [("stage1.steps", Stage::Stage1), ("stage2.steps", Stage::Stage2)];
+
+/// What `run.json` holds.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct RunFile {
+    version: u32,
+    /// How many scenes `--overfit` kept.
+    pub overfit: Option<usize>,
+    /// What `--extend` did, in order.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub extended: Vec<Extended>,
+}
+
+impl RunFile {
+    /// That of a new run.
+    pub fn new(overfit: Option<usize>) -> Self {
+        Self { version: VERSION, overfit, extended: Vec::new() }
+    }
+
+    /// Reads that of a run directory.
+    pub fn read(folder: &Path) -> Result<Self, TrainError> {
+        let path = folder.join("run.json");
+        let text = std::fs::read(&path).map_err(TrainError::io("reading the run file", &path))?;
+        let run: Self = serde_json::from_slice(&text).map_err(TrainError::bad_file("run file", &path))?;
+        if run.version != VERSION {
+            let reason = format!("it has version {}, this program reads {VERSION}", run.version);
+            return Err(TrainError::bad_file("run file", &path)(reason));
+        }
+        Ok(run)
+    }
+
+    /// Writes it to a run directory.
+    pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
+        let path = folder.join("run.json");
+        let json = serde_json::to_vec_pretty(self).map_err(TrainError::bad_file("run file", &path))?;
+        replace_file(&path, &json).map_err(TrainError::io("writing the run file", &path))
+    }
+}
+
+/// Writes every key of a config to its run directory.
+pub(crate) fn write_config(config: &Config) -> Result<(), TrainError> {
+    let path = config.run_dir.join("config.toml");
+    let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &path))?;
+    replace_file(&path, text.as_bytes()).map_err(TrainError::io("writing the config", &path))
+}
+
+/// Compares a config with that of the run in `folder`. Returns the step counts that `extend` lets grow.
+///
+/// # Errors
+/// [`TrainError::OtherRun`] for any other difference in what shapes the result.
+pub(crate) fn compare(
+    folder: &Path,
+    found: &RunFile,
+    config: &Config,
+    overfit: Option<usize>,
+    extend: bool,
+) -> Result<Vec<Extension>, TrainError> {
+    let path = folder.join("config.toml");
+    let text = std::fs::read_to_string(&path).map_err(TrainError::io("reading the run's config", &path))?;
+    let bad = || TrainError::bad_file("config", &path);
+    // A key that an older version did not have yet has its default; one that this version does not have is a difference.
+    let old = match parse_config::<Config>(&path, &text, &[]) {
+        Ok((old, _)) => toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?,
+        Err(_) => text.parse().map_err(|error: toml::de::Error| bad()(error.message().to_owned()))?,
+    };
+    let new = toml::Table::try_from(config).map_err(|error| bad()(error.to_string()))?;
+    let (mut old, mut new) = (flatten(old), flatten(new));
+    let flag = |overfit: Option<usize>| overfit.map_or("off".into(), |count| count.to_string());
+    old.insert("--overfit".into(), flag(found.overfit));
+    new.insert("--overfit".into(), flag(overfit));
+
+    let (mut differences, mut extensions) = (Vec::new(), Vec::new());
+    let keys: std::collections::BTreeSet<_> = old.keys().chain(new.keys()).collect();
+    let free = |key: &str| FREE_KEYS.iter().any(|free| key == *free || (free.ends_with('.') && key.starts_with(free)));
+    for key in keys {
+        let (from, to) = (old.get(key), new.get(key));
+        if free(key) || from == to {
+            continue;
+        }
+        let extension = extension(key, from, to);
+        if !extend || extension.is_none() {
+            let show = |value: Option<&String>| value.cloned().unwrap_or_else(|| "not set".into());
+            differences.push(format!("  {key}: {} -> {}", show(from), show(to)));
+        }
+        extensions.extend(extension);
+    }
+    if differences.is_empty() {
+        return Ok(extensions);
+    }
+    let is_all = !extend && differences.len() == extensions.len();
+    let or = if is_all { "train on with --extend (which changes the learning rates to come), " } else { "" };
+    Err(TrainError::OtherRun { differences: differences.join("\n"), or, path: config.run_dir.clone() })
+}
+
+/// The difference in a key as one that `--extend` allows: a larger step count.
+fn extension(key: &str, from: Option<&String>, to: Option<&String>) -> Option<Extension> {
+    let (_, stage) = *STEP_COUNTS.iter().find(|(name, _)| *name == key)?;
+    let (from, to) = (from?.parse().ok()?, to?.parse().ok()?);
+    (from < to).then_some(Extension { stage, from, to })
+}
+
+/// Dotted keys and their values as text.
+fn flatten(table: toml::Table) -> BTreeMap<String, String> {
+    let mut flat = BTreeMap::new();
+    let mut pending: Vec<(String, toml::Value)> = table.into_iter().collect();
+    while let Some((key, value)) = pending.pop() {
+        match value {
+            toml::Value::Table(inner) => pending.extend(inner.into_iter().map(|(k, v)| (format!("{key}.{k}"), v))),
+            other => {
+                flat.insert(key, other.to_string());
+            }
+        }
+    }
+    flat
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Compares `config` with a run that was started with another.
+    fn differ(old: &str, config: &Config, extend: bool) -> Result<Vec<Extension>, TrainError> {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("config.toml"), old).unwrap();
+        compare(folder.path(), &RunFile::new(None), config, None, extend)
+    }
+
+    fn old() -> Config {
+        Config { run_dir: "run".into(), ..Config::default() }
+    }
+
+    #[test]
+    fn a_key_that_an_older_version_did_not_write_has_its_default() {
+        let text = toml::to_string_pretty(&old()).unwrap();
+        let shorter: String =
+            text.lines().filter(|line| !line.starts_with("spike_factor")).collect::<Vec<_>>().join("\n");
+        assert!(shorter.len() < text.len());
+        assert!(differ(&shorter, &old(), false).unwrap().is_empty());
+        let mut other = old();
+        other.stage2.optimizer.spike_factor = 7.0;
+        let message = differ(&shorter, &other, false).unwrap_err().to_string();
+        assert!(message.contains("  stage2.optimizer.spike_factor: 100.0 -> 7.0\n"), "{message}");
+    }
+
+    #[test]
+    fn a_run_with_former_names_is_resumed() {
+        let mut tiles = old();
+        tiles.clusters.grouping = clift_model::Grouping::Tile;
+        let text = toml::to_string_pretty(&tiles).unwrap();
+        let former = text.replace("activation_checkpointing", "recompute").replace("\"tile\"", "\"patch\"");
+        assert!(former.contains("recompute = false") && former.contains("grouping = \"patch\""));
+        assert!(differ(&former, &tiles, false).unwrap().is_empty());
+    }
+
+    #[test]
+    fn a_key_that_this_version_does_not_have_is_a_difference() {
+        let text = format!("wings = 2\n{}", toml::to_string_pretty(&old()).unwrap());
+        let message = differ(&text, &old(), false).unwrap_err().to_string();
+        assert!(message.contains("  wings: 2 -> not set\n"), "{message}");
+    }
+
+    #[test]
+    fn step_counts_grow_when_asked_for_and_never_shrink() {
+        let text = toml::to_string_pretty(&old()).unwrap();
+        let mut longer = old();
+        longer.stage2.steps += 10;
+        let message = differ(&text, &longer, false).unwrap_err().to_string();
+        assert!(message.contains("  stage2.steps: 50000 -> 50010\n") && message.contains("--extend"), "{message}");
+        let expected = Extension { stage: Stage::Stage2, from: 50_000, to: 50_010 };
+        assert_eq!(differ(&text, &longer, true).unwrap(), [expected]);
+        longer.stage1.steps -= 1;
+        let message = differ(&text, &longer, true).unwrap_err().to_string();
+        assert!(message.contains("settings:\n  stage1.steps: 90000 -> 89999\nresume"), "{message}");
+        assert!(!message.contains("--extend"), "{message}");
+    }
+}

@@ -1,0 +1,63 @@
+//! One stage, resumed or started, trained to its last step.
+
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+use clift_data::make_folder;
+use clift_model::Clift;
+
+use crate::error::TrainError;
+use crate::events::{Event, Sink};
+use crate::run::logs::RunLog;
+use crate::run::stage_plan::{StagePlan, freeze};
+use crate::run::train_loop::Training;
+use crate::run::validation::Validation;
+use crate::stage::settings::StageSettings;
+use crate::step::loss::Loss;
+use crate::step::loss_scale::LossScale;
+use crate::step::optimizer::adamw;
+use crate::step::train_state::Learner;
+
+impl StagePlan<'_> {
+    /// Trains from where the stage stands and returns the model when all steps are done. `start` gives
+    /// the model to start from, and is called only where there is no checkpoint.
+    ///
+    /// # Errors
+    /// [`TrainError::Interrupted`] after `stop` was set and the state saved, [`TrainError::Diverged`]
+    /// after too many bad steps, [`TrainError::Stopped`] with whatever data, model or disk give.
+    pub fn train(
+        &self,
+        start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
+        validation: &Validation,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Clift, TrainError> {
+        let started = Instant::now();
+        let StageSettings { stage, steps: num_steps, optimizer, .. } = self.settings;
+        let checkpoints = self.checkpoints();
+        let model = if checkpoints.newest()?.is_some() { self.blank_model() } else { start(sink)? };
+        let loss = Loss::load(&self.config.loss, &self.device)?;
+        for term in loss.describe() {
+            sink.event(&Event::Message(term));
+        }
+        let mut learner = Learner {
+            model,
+            optimizer: adamw(optimizer),
+            device: self.device.clone(),
+            loss,
+            activation_checkpointing: self.config.activation_checkpointing,
+            loss_scale: LossScale::of(self.config.precision),
+        };
+        let progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
+        learner.model = freeze(stage, learner.model);
+        make_folder(&self.folder).map_err(TrainError::io("making a folder", &self.folder))?;
+        let run_dir = self.folder.parent().unwrap_or(&self.folder);
+        let mut log = RunLog::open(run_dir, stage, progress.step, sink)?;
+        log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
+
+        let mut training = Training::new(self, checkpoints, progress, validation, stop, log);
+        let model = training.run(learner).map_err(|error| training.name_checkpoint(error))?;
+        training.log.event(&Event::StageFinished { stage, elapsed_s: started.elapsed().as_secs_f64() });
+        Ok(model)
+    }
+}

@@ -1,0 +1,154 @@
+//! The evaluator of a run: validation during training, and the evaluation at its end.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use burn::tensor::Device;
+use clift_data::ClipReader;
+use clift_eval::{
+    Description, EvalConfig, EvalError, EvalModels, Evaluator, Limits, Progress, Shown, Summary, Sweep, System,
+    Variant, stage2_method,
+};
+use clift_model::{Clift, TokenCount, TrainedModel};
+
+use crate::config::config::Config;
+use crate::config::sweep::sweep;
+use crate::error::TrainError;
+use crate::events::{Event, Sink, Stage};
+use crate::footprint::largest_tensor;
+
+/// The validation and test views of a run.
+pub struct Validation<'a> {
+    config: &'a Config,
+    evaluator: Evaluator,
+}
+
+impl<'a> Validation<'a> {
+    /// Chooses the scenes of `reader` and their views that `eval` names, to be measured on `device`.
+    ///
+    /// # Errors
+    /// As [`Evaluator::new`], and what the device cannot hold.
+    pub fn new(
+        config: &'a Config,
+        eval: EvalConfig,
+        reader: ClipReader,
+        device: &Device,
+        sink: &mut dyn Sink,
+    ) -> Result<Self, TrainError> {
+        largest_tensor::check(config, device, &[Stage::Eval])?;
+        let run_dir = &config.run_dir;
+        let description = Description {
+            name: run_dir.file_name().unwrap_or(run_dir.as_os_str()).to_string_lossy().into_owned(),
+            config: toml::to_string_pretty(config).map_err(TrainError::bad_file("config", run_dir))?,
+            device: config.device.to_string(),
+        };
+        let sweep = sweep(config, eval.storage.clone(), Vec::new());
+        let evaluator = Evaluator::new(eval, sweep, description, reader, device)?;
+        if !evaluator.ledger().skips.is_empty() {
+            sink.event(&Event::Message(format!("evaluation: {}", evaluator.ledger())));
+        }
+        Ok(Self { config, evaluator })
+    }
+
+    /// Measures a model without autodiff during training: all tokens in stage 1, one count of condensed ones in stage 2.
+    /// Writes the first sheet to `folder`. Returns the mean PSNR; none where nothing could be measured, and once `stop` is
+    /// set.
+    ///
+    /// # Errors
+    /// As [`Evaluator::measure`]; a scene that cannot be read is skipped.
+    pub fn validate(
+        &self,
+        model: &Clift,
+        stage: Stage,
+        step: u64,
+        folder: &Path,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Option<f64>, TrainError> {
+        let Config { eval, clusters, model: sizes, .. } = self.config;
+        let is_stage2 = stage == Stage::Stage2;
+        let model = TrainedModel::snapshot(model, sizes, is_stage2);
+        let mut models = EvalModels::new(model.clone());
+        let (storage, method) = if is_stage2 {
+            models.set_stage2(clusters.grouping, model);
+            (eval.validation_storage, stage2_method(clusters.grouping))
+        } else {
+            (TokenCount::Share(1.0), Variant::Kmeans)
+        };
+        let all = self.evaluator.sweep();
+        let sweep = Sweep {
+            storage: vec![storage],
+            render: Vec::new(),
+            tokens: all.tokens[..1].to_vec(),
+            variants: vec![method],
+            ..all.clone()
+        };
+        let mut write_sheet = |_: &str, shown: Shown| {
+            let making = |source| EvalError::Io { action: "making a folder", source, path: folder.into() };
+            std::fs::create_dir_all(folder).map_err(making)?;
+            shown.sheet.write_png(&folder.join(format!("step-{step:09}.png")))
+        };
+        let limits = Limits { num_scenes: eval.num_validation_scenes, num_shown: 1 };
+        let mut progress = EvalEvents { stop, sink, is_stage: false };
+        let measured = match self.evaluator.measure(&models, &sweep, limits, &mut write_sheet, &mut progress) {
+            Err(EvalError::Interrupted { .. }) => return Ok(None),
+            measured => measured?.0,
+        };
+        let summary = Summary::new(&measured);
+        let Some(point) = summary.points.first() else { return Ok(None) };
+        let (psnr, ssim) = (point.psnr.unwrap_or(f64::NAN), point.ssim);
+        sink.event(&Event::Evaluated { stage, step, psnr, ssim, num_views: summary.num_views });
+        Ok(point.psnr.filter(|psnr| psnr.is_finite()))
+    }
+
+    /// Does [`Evaluator::evaluate`] as a stage of the run.
+    ///
+    /// # Errors
+    /// As [`Evaluator::evaluate`].
+    pub fn evaluate(
+        &self,
+        models: &EvalModels,
+        systems: &[System],
+        folder: &Path,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Summary, TrainError> {
+        let started = Instant::now();
+        let mut progress = EvalEvents { stop, sink, is_stage: true };
+        let summary = self.evaluator.evaluate(models, systems, folder, &mut progress)?;
+        sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
+        Ok(summary)
+    }
+}
+
+/// The progress of an evaluation as events of a run.
+struct EvalEvents<'a> {
+    stop: &'a AtomicBool,
+    sink: &'a mut dyn Sink,
+    /// Whether the evaluation is a stage of its own; a validation is none, and its scenes are not counted.
+    is_stage: bool,
+}
+
+impl Progress for EvalEvents<'_> {
+    fn done(&mut self, scenes: usize, total: usize) {
+        let (stage, done, total) = (Stage::Eval, scenes as u64, total as u64);
+        match (self.is_stage, done) {
+            (false, _) => {}
+            (true, 0) => self.sink.event(&Event::StageStarted { stage, done, num_steps: total }),
+            (true, _) => self.sink.event(&Event::Progress { stage, done, total }),
+        }
+    }
+
+    fn note(&mut self, text: &str) {
+        self.sink.event(&Event::Message(text.into()));
+    }
+
+    fn skipped(&mut self, key: &str, reason: &str) {
+        self.sink.event(&Event::Skipped { key: key.into(), reason: reason.into() });
+    }
+
+    fn is_interrupted(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+}

@@ -1,0 +1,9 @@
+//! Stage-specific settings and batches.
+//!
+//! - `settings`: steps, batch, optimiser per stage
+//! - `stage1_batches`: random token subsets
+//! - `stage2_batches`: cached clusters
+
+pub(crate) mod settings;
+pub(crate) mod stage1_batches;
+pub(crate) mod stage2_batches;

@@ -1,0 +1,66 @@
+//! Stage 1: encoder and renderer together, on random subsets of the tokens.
+
+use std::sync::Arc;
+
+use clift_data::{ClipReader, TrainingClips, derive_seed, item_rng, step_rng};
+use rand::RngExt;
+use rand::seq::index::sample;
+
+use crate::config::config::Config;
+use crate::error::TrainError;
+use crate::step::batch::{StageBatch, TokenChoice};
+
+/// Makes the batches of stage 1: a pure function of (seed, step).
+pub struct Stage1Batches {
+    clips: TrainingClips,
+    keep_tokens: [f64; 2],
+    tokens_per_view: usize,
+    seed: u64,
+}
+
+impl Stage1Batches {
+    /// Prepares the batches of a run.
+    ///
+    /// # Errors
+    /// Whatever the sampler or the size of the pictures refuses.
+    pub fn new(config: &Config, reader: &ClipReader) -> Result<Self, TrainError> {
+        let seed = derive_seed(config.seed, "stage1");
+        let read = reader.clone();
+        let clips = TrainingClips::new(
+            reader.source.clone(),
+            Arc::new(move |scene, views: &_| read.read(scene, views)),
+            config.data.views.clone(),
+            config.stage1.batch_size,
+            seed,
+        )?;
+        let clips = clips.with_flip(config.data.flip);
+        let tokens_per_view = config.model.num_tokens(1, config.data.height, config.data.width)?;
+        Ok(Self { clips, keep_tokens: config.stage1.keep_tokens, tokens_per_view, seed })
+    }
+
+    /// Makes the batch of `step`, counted from 0.
+    ///
+    /// The share of tokens is drawn once per step; every target view gets its own random subset.
+    ///
+    /// # Errors
+    /// As [`TrainingClips::batch`].
+    pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
+        let batch = self.clips.batch(step)?;
+        let num_context = batch.clips.first().map_or(0, |clip| clip.context.num_views());
+        let num_tokens = num_context * self.tokens_per_view;
+        let [low, high] = self.keep_tokens;
+        let share = low + (high - low) * step_rng(self.seed, step, "kept share").random::<f64>();
+        let count = ((num_tokens as f64 * share) as usize).clamp(1, num_tokens.max(1));
+        let tokens = if count == num_tokens {
+            TokenChoice::All
+        } else {
+            let subsets = batch.clips.iter().enumerate().map(|(slot, clip)| {
+                let mut rng = item_rng(self.seed, step, slot as u32, 0, "kept tokens");
+                let subset = |_| sample(&mut rng, num_tokens, count).into_iter().map(|token| token as u32).collect();
+                (0..clip.target.num_views()).map(subset).collect()
+            });
+            TokenChoice::Subsets(subsets.collect())
+        };
+        Ok(StageBatch { clips: batch.clips, tokens, skipped: batch.skipped })
+    }
+}

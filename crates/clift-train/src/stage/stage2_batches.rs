@@ -1,0 +1,116 @@
+//! Stage 2: the condenser on cached clusters, with the encoder frozen and the renderer at a smaller rate.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use clift_data::{
+    Clip, ClipReader, NoUsableScene, Skip, SlotFiller, ViewIndices, derive_seed, item_rng, step_rng, targets_excluding,
+    uniform_below,
+};
+use clift_model::SceneClusters;
+
+use crate::cluster_cache::cache::ClusterCache;
+use crate::cluster_cache::entry::Entry;
+use crate::config::config::Config;
+use crate::error::TrainError;
+use crate::step::batch::{StageBatch, TokenChoice};
+
+/// Attempts of one slot, repeated entries included, before the batch fails.
+const FILLER: SlotFiller = SlotFiller { min_attempts: 16, min_scenes: 0, max_attempts: 16 };
+
+/// Makes the batches of stage 2: a pure function of (seed, step) and the cluster cache.
+pub struct Stage2Batches {
+    reader: ClipReader,
+    cache: Arc<ClusterCache>,
+    /// Entries with equal numbers of tokens and of clusters: what one batch can hold.
+    groups: Vec<Vec<usize>>,
+    batch_size: usize,
+    num_targets: usize,
+    seed: u64,
+}
+
+impl Stage2Batches {
+    /// Prepares the batches of a run.
+    ///
+    /// # Errors
+    /// [`TrainError::NoScenes`] for an empty cache.
+    pub fn new(config: &Config, reader: &ClipReader, cache: Arc<ClusterCache>) -> Result<Self, TrainError> {
+        let mut groups: BTreeMap<_, Vec<usize>> = BTreeMap::new();
+        for (i, entry) in cache.entries().iter().enumerate() {
+            groups.entry((entry.num_tokens, entry.num_storage_tokens)).or_default().push(i);
+        }
+        if groups.is_empty() {
+            return Err(TrainError::NoScenes { reason: "the cluster cache is empty".into() });
+        }
+        Ok(Self {
+            reader: reader.clone(),
+            cache,
+            groups: groups.into_values().collect(),
+            batch_size: config.stage2.batch_size,
+            num_targets: config.data.views.num_targets,
+            seed: derive_seed(config.seed, "stage2"),
+        })
+    }
+
+    /// Makes the batch of `step`, counted from 0: one token count for all, then scenes that have it.
+    ///
+    /// # Errors
+    /// [`TrainError::NoScenes`] when the entries tried for a slot all fail.
+    pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
+        let group = &self.groups[self.draw_group(step)];
+        let (mut clips, mut clusters, mut skipped) = (Vec::new(), Vec::new(), Vec::new());
+        for slot in 0..self.batch_size {
+            let (clip, scene) = self.fill_slot(step, slot, group, &mut skipped)?;
+            clips.push(clip);
+            clusters.push(scene);
+        }
+        Ok(StageBatch { clips, tokens: TokenChoice::Clusters(clusters), skipped })
+    }
+
+    /// A group in proportion to its entries, so that every entry is equally likely.
+    fn draw_group(&self, step: u64) -> usize {
+        let total = self.groups.iter().map(Vec::len).sum();
+        let mut place = uniform_below(&mut step_rng(self.seed, step, "token count"), total);
+        for (i, group) in self.groups.iter().enumerate() {
+            if place < group.len() {
+                return i;
+            }
+            place -= group.len();
+        }
+        0
+    }
+
+    fn fill_slot(
+        &self,
+        step: u64,
+        slot: usize,
+        group: &[usize],
+        skipped: &mut Vec<Skip>,
+    ) -> Result<(Clip, SceneClusters), TrainError> {
+        // The entry is the first value of its attempt's stream, the targets are the following ones.
+        let draw = |attempt| {
+            let mut rng = item_rng(self.seed, step, slot as u32, attempt, "entry and targets");
+            (group[uniform_below(&mut rng, group.len())], rng)
+        };
+        let read = |entry: usize, attempt| {
+            let entry = &self.cache.entries()[entry];
+            let skip = |error: TrainError| Skip { key: entry.key.clone(), reason: error.to_string() };
+            self.read(entry, &mut draw(attempt).1).map_err(skip)
+        };
+        FILLER.fill(|attempt| draw(attempt).0, read, skipped).map_err(|NoUsableScene { attempts, last }| {
+            let Skip { key, reason } = last;
+            TrainError::NoScenes { reason: format!("slot {slot} of step {step}, {attempts} tries; {key}: {reason}") }
+        })
+    }
+
+    fn read(&self, entry: &Entry, rng: &mut impl rand::Rng) -> Result<(Clip, SceneClusters), TrainError> {
+        let source = &self.reader.source;
+        let scene = source
+            .find(&entry.key)
+            .ok_or_else(|| TrainError::NoScenes { reason: "the data does not have it any more".into() })?;
+        let num_frames = source.num_frames(scene)?;
+        let target = targets_excluding(&entry.context, num_frames, self.num_targets, rng)?;
+        let clip = self.reader.read(scene, &ViewIndices { context: entry.context.clone(), target })?;
+        Ok((clip, self.cache.read(entry)?))
+    }
+}

@@ -1,0 +1,220 @@
+//! Activation checkpointing: the backward of a step that stores only the input of every block and computes the rest again.
+//!
+//! Memory grows by one input per block instead of everything inside it, for one more forward. The
+//! gradients are those of the plain backward: the same operations on the same numbers.
+// B scenes, N tokens, T target views, Q patches of a view, D width
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::optim::{GradientsAccumulator, GradientsParams};
+use burn::tensor::{Gradients, Tensor};
+use clift_model::{Cameras, Clift, EncoderBlock, Views};
+
+use crate::error::TrainError;
+use crate::step::batch::TokenChoice;
+use crate::step::device_batch::Shown;
+use crate::step::loss::{Loss, LossParts};
+
+/// Adds the gradients of `share` times the loss of what is shown, and returns the loss.
+pub(crate) fn backward(
+    model: &Clift,
+    shown: &Shown,
+    choice: &TokenChoice,
+    loss: &Loss,
+    share: f64,
+    accumulator: &mut GradientsAccumulator<Clift>,
+) -> Result<LossParts, TrainError> {
+    let mut add = |grads: Gradients| accumulator.accumulate(model, GradientsParams::from_grads(grads, model));
+    let plain = model.valid();
+
+    // Forward without a tape: what every block starts from.
+    let context = Views { images: shown.context.images.clone().inner(), cameras: untracked(&shown.context.cameras) };
+    let targets = untracked(&shown.targets);
+    let (encoder_inputs, lift) = inputs(plain.encoder.embed(&context), plain.encoder.blocks(), EncoderBlock::forward);
+    let tokens = choice.apply(&plain.condenser, plain.lift_norm.forward(lift.clone()))?;
+    let (renderer_inputs, x) = inputs(plain.renderer.embed(&targets), plain.renderer.blocks(), |block, x| {
+        block.forward(x, tokens.memory(block))
+    });
+
+    // Backward, one tape after the other.
+    let x = leaf(x);
+    let parts = loss.of(model.renderer.picture(x.clone(), &shown.targets), shown.pictures.clone());
+    let mut grads = parts.total.clone().mul_scalar(share).backward();
+    let parts = LossParts { total: parts.total.inner(), mse: parts.mse.inner() };
+    let mut grad_x = take(&x, &mut grads);
+    add(grads);
+
+    let mut grad_tokens: Option<Tensor<3>> = None;
+    for (block, input) in model.renderer.blocks().iter().zip(renderer_inputs).rev() {
+        let (x, given) = (leaf(input), leaf(tokens.tokens().clone()));
+        let output = block.forward(x.clone(), tokens.with_tokens(given.clone()).memory(block));
+        let mut grads = pull(output, grad_x);
+        grad_x = take(&x, &mut grads);
+        let grad = take(&given, &mut grads);
+        grad_tokens = Some(match grad_tokens {
+            Some(sum) => sum + grad,
+            None => grad,
+        });
+        add(grads);
+    }
+    add(pull(model.renderer.embed(&shown.targets), grad_x));
+    let Some(grad_tokens) = grad_tokens else {
+        return Ok(parts); // a renderer without blocks looks at no token
+    };
+
+    let lift = leaf(lift);
+    let output = choice.apply(&model.condenser, model.lift_norm.forward(lift.clone()))?.tokens().clone();
+    let mut grads = pull(output, grad_tokens);
+    let mut grad_x = take(&lift, &mut grads);
+    add(grads);
+    if !trains(&model.encoder) {
+        return Ok(parts);
+    }
+    for (block, input) in model.encoder.blocks().iter().zip(encoder_inputs).rev() {
+        let x = leaf(input);
+        let mut grads = pull(block.forward(x.clone()), grad_x);
+        grad_x = take(&x, &mut grads);
+        add(grads);
+    }
+    add(pull(model.encoder.embed(&shown.context), grad_x));
+    Ok(parts)
+}
+
+fn untracked(cameras: &Cameras) -> Cameras {
+    Cameras { c2w: cameras.c2w.clone().inner(), intrinsics: cameras.intrinsics.clone().inner(), ..*cameras }
+}
+
+/// What every block starts from, and the result of the last.
+fn inputs<B>(
+    first: Tensor<3>,
+    blocks: &[B],
+    forward: impl Fn(&B, Tensor<3>) -> Tensor<3>,
+) -> (Vec<Tensor<3>>, Tensor<3>) {
+    let mut inputs = vec![first];
+    for block in blocks {
+        let x = inputs[inputs.len() - 1].clone();
+        inputs.push(forward(block, x));
+    }
+    let last = inputs.pop().expect("the first is there");
+    (inputs, last)
+}
+
+/// The start of a tape.
+fn leaf(x: Tensor<3>) -> Tensor<3> {
+    x.autodiff().require_grad()
+}
+
+/// Gradients of everything behind `output` whose own gradient is `grad`.
+fn pull(output: Tensor<3>, grad: Tensor<3>) -> Gradients {
+    (output * grad.autodiff()).sum().backward()
+}
+
+/// The gradient of a leaf; zero where nothing came from it.
+fn take(leaf: &Tensor<3>, grads: &mut Gradients) -> Tensor<3> {
+    leaf.grad_remove(grads).unwrap_or_else(|| leaf.clone().inner().zeros_like())
+}
+
+/// Whether any parameter is to get a gradient.
+fn trains<M: Module>(module: &M) -> bool {
+    struct Any(bool);
+    impl ModuleVisitor for Any {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            self.0 |= param.is_require_grad();
+        }
+    }
+    let mut any = Any(false);
+    module.visit(&mut any);
+    any.0
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::Device;
+    use clift_bench::{Shape, batch, model};
+    use clift_model::{CondenserConfig, ModelConfig, Variant};
+
+    use super::*;
+    use crate::events::Stage;
+    use crate::run::stage_plan::freeze;
+    use crate::step::batch::StageBatch;
+    use crate::step::device_batch::loss_of;
+
+    const SHAPE: Shape = Shape { num_context: 2, num_targets: 3, size: [16, 24] };
+    /// 2 views of 2 x 3 patches.
+    const NUM_TOKENS: usize = 12;
+
+    /// Every parameter's gradient from both ways.
+    fn both(
+        variant: Variant,
+        stage: Stage,
+        batch: &StageBatch,
+        loss: &Loss,
+        device: &Device,
+    ) -> Vec<(Vec<f32>, Vec<f32>)> {
+        struct Pairs<'a> {
+            grads: [&'a GradientsParams; 2],
+            pairs: Vec<(Vec<f32>, Vec<f32>)>,
+        }
+        impl ModuleVisitor for Pairs<'_> {
+            fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+                let [a, b] = self.grads.map(|grads| {
+                    grads.get::<D>(param.id).map(|grad| grad.into_data().try_to_vec::<f32>().expect("f32"))
+                });
+                assert_eq!(a.is_some(), b.is_some(), "the same parameters get a gradient");
+                self.pairs.extend(a.zip(b));
+            }
+        }
+        let config = ModelConfig {
+            variant,
+            condenser: CondenserConfig::of(variant),
+            dim: 16,
+            num_heads: 4,
+            feed_forward_dim: 24,
+            num_encoder_blocks: 2,
+            num_renderer_blocks: 2,
+            ..ModelConfig::default()
+        };
+        let model = freeze(stage, model(&config, 3, device));
+        let shown = Shown::upload(batch, &device.clone().autodiff()).expect("valid");
+        let plain_loss = loss_of(&model, &shown, &batch.tokens, loss).expect("valid").total;
+        let plain = GradientsParams::from_grads(plain_loss.clone().mul_scalar(0.5).backward(), &model);
+        let mut accumulator = GradientsAccumulator::new();
+        let parts = backward(&model, &shown, &batch.tokens, loss, 0.5, &mut accumulator).expect("valid");
+        assert!((parts.total.into_scalar::<f64>() - plain_loss.into_scalar::<f64>()).abs() < 1e-7);
+        let again = accumulator.grads();
+        let mut pairs = Pairs { grads: [&plain, &again], pairs: Vec::new() };
+        model.visit(&mut pairs);
+        assert!(pairs.pairs.len() > 20, "most parameters are trained");
+        assert!(pairs.pairs.iter().any(|(grad, _)| grad.iter().any(|&value| value != 0.0)));
+        pairs.pairs
+    }
+
+    fn subsets(count: u32) -> TokenChoice {
+        let subset = |scene: u32, view: u32| (0..count).map(|i| (5 * i + view + 2 * scene) % 12).collect();
+        TokenChoice::Subsets((0..2).map(|scene| (0..3).map(|view| subset(scene, view)).collect()).collect())
+    }
+
+    #[test]
+    fn gradients_equal_those_of_the_plain_backward() {
+        let all = batch(SHAPE, 2, NUM_TOKENS, None, 1).expect("valid");
+        let stored = batch(SHAPE, 2, NUM_TOKENS, Some(5), 1).expect("valid");
+        let few = StageBatch { tokens: subsets(2), ..all.clone() };
+        let many = StageBatch { tokens: subsets(7), ..all.clone() };
+        let cases = [(Stage::Stage1, all), (Stage::Stage1, few), (Stage::Stage1, many), (Stage::Stage2, stored)];
+        for variant in Variant::ALL {
+            for (stage, batch) in &cases {
+                let pairs = both(variant, *stage, batch, &Loss::default(), &Device::flex());
+                let largest = |values: &[f32]| values.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
+                let scale = pairs.iter().map(|(plain, _)| largest(plain)).fold(0.0, f32::max);
+                for (plain, again) in pairs {
+                    if !variant.has_norms() {
+                        assert_eq!(plain, again, "bit for bit");
+                    }
+                    // Burn adds the gradients of a norm composed of its operations in the order of the whole tape. The
+                    // floor is for biases whose gradient is all but zero.
+                    let error = plain.iter().zip(&again).fold(0.0_f32, |error, (a, b)| error.max((a - b).abs()));
+                    assert!(error <= 1e-5 * largest(&plain) + 1e-7 * scale, "{variant}: {error:e} of {scale:e}");
+                }
+            }
+        }
+    }
+}

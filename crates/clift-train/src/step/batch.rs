@@ -1,0 +1,60 @@
+//! The host batch of one update.
+// N tokens, K kept tokens, D width
+
+use burn::tensor::Tensor;
+use clift_data::{Clip, Skip};
+use clift_model::{Clusters, Condenser, RenderTokens, SceneClusters};
+
+use crate::error::TrainError;
+
+/// What one update sees: clips with equal numbers of views, and which tokens the renderer is given.
+#[derive(Clone, Debug)]
+pub struct StageBatch {
+    /// One clip per slot.
+    pub clips: Vec<Clip>,
+    /// The tokens, slot by slot.
+    pub tokens: TokenChoice,
+    /// Scenes left out on the way.
+    pub skipped: Vec<Skip>,
+}
+
+/// Which tokens the renderer is given.
+#[derive(Clone, Debug, PartialEq)]
+pub enum TokenChoice {
+    /// Stage 1: a subset of the scene's tokens for every target view, `[slots][views][K]`.
+    Subsets(Vec<Vec<Vec<u32>>>),
+    /// Stage 1: every token.
+    All,
+    /// Stage 2: the condensed centroids of every scene.
+    Clusters(Vec<SceneClusters>),
+}
+
+impl StageBatch {
+    /// Cuts the batch into `count` parts of nearly equal size.
+    pub(crate) fn parts(&self, count: usize) -> impl Iterator<Item = Self> + '_ {
+        let batch_size = self.clips.len();
+        (0..count).map(move |part| {
+            let range = part * batch_size / count..(part + 1) * batch_size / count;
+            let tokens = match &self.tokens {
+                TokenChoice::Subsets(subsets) => TokenChoice::Subsets(subsets[range.clone()].to_vec()),
+                TokenChoice::All => TokenChoice::All,
+                TokenChoice::Clusters(clusters) => TokenChoice::Clusters(clusters[range.clone()].to_vec()),
+            };
+            Self { clips: self.clips[range].to_vec(), tokens, skipped: Vec::new() }
+        })
+    }
+}
+
+impl TokenChoice {
+    /// What the renderer is given of a scene's tokens.
+    pub(crate) fn apply(&self, condenser: &Condenser, lift: Tensor<3>) -> Result<RenderTokens, TrainError> {
+        Ok(match self {
+            Self::All => lift.into(),
+            Self::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
+            Self::Clusters(clusters) => {
+                let index = Clusters::new(clusters.clone())?.upload(&lift.device());
+                condenser.forward(lift, &index).into()
+            }
+        })
+    }
+}

@@ -1,0 +1,21 @@
+//! One optimizer step.
+//!
+//! - `batch`: host batch of one update
+//! - `device_batch`: a batch on a device; its loss
+//! - `loss`: MSE and perceptual term
+//! - `loss_scale`: loss scaling for f16
+//! - `optimizer`: AdamW, gradient norm and clipping
+//! - `schedule`: warm-up and cosine
+//! - `activation_checkpointing`: backward from stored block inputs
+//! - `train_state`: model, optimiser, one update
+//! - `step_guard`: skip anomalous steps
+
+pub(crate) mod activation_checkpointing;
+pub(crate) mod batch;
+pub(crate) mod device_batch;
+pub(crate) mod loss;
+pub(crate) mod loss_scale;
+pub(crate) mod optimizer;
+pub(crate) mod schedule;
+pub(crate) mod step_guard;
+pub(crate) mod train_state;

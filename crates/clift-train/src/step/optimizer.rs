@@ -1,0 +1,162 @@
+//! AdamW, the global gradient norm, and what is done with gradients before an update.
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
+use burn::tensor::Tensor;
+
+use crate::config::config::OptimizerConfig;
+
+/// AdamW with the reference's moments (0.9, 0.95) and epsilon 1e-8, decaying every parameter.
+pub fn adamw(config: &OptimizerConfig) -> ModuleOptimizer {
+    AdamWConfig::new()
+        .with_beta_1(0.9)
+        .with_beta_2(0.95)
+        .with_epsilon(1e-8)
+        .with_weight_decay(config.weight_decay as f32)
+        .init()
+}
+
+/// Norm of all gradients of a module together, on the host.
+pub fn global_norm<M: Module>(module: &M, grads: &GradientsParams) -> f64 {
+    norm_on_device(module, grads).map_or(0.0, Tensor::into_scalar::<f64>)
+}
+
+/// Norm of all gradients of a module together, `[1]`, on their device; `None` where there is none.
+pub fn norm_on_device<M: Module>(module: &M, grads: &GradientsParams) -> Option<Tensor<1>> {
+    struct Squares<'a> {
+        grads: &'a GradientsParams,
+        sums: Vec<Tensor<1>>,
+    }
+    impl ModuleVisitor for Squares<'_> {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            if let Some(grad) = self.grads.get::<D>(param.id) {
+                self.sums.push(grad.square().sum());
+            }
+        }
+    }
+    let mut squares = Squares { grads, sums: Vec::new() };
+    module.visit(&mut squares);
+    (!squares.sums.is_empty()).then(|| Tensor::cat(squares.sums, 0).sum().sqrt())
+}
+
+/// Scales all gradients of a module by `max_norm / norm` where `norm` is larger.
+pub fn clip_global_norm<M: Module>(module: &M, grads: GradientsParams, norm: f64, max_norm: f64) -> GradientsParams {
+    scale(module, grads, clip_factor(norm, max_norm))
+}
+
+/// What gradients of a global norm are multiplied by to be within `max_norm`.
+pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
+    // PyTorch's guard against a norm of zero.
+    (max_norm / (norm + 1e-6)).min(1.0)
+}
+
+/// Multiplies all gradients of a module by a factor.
+pub fn scale<M: Module>(module: &M, grads: GradientsParams, factor: f64) -> GradientsParams {
+    struct Scale {
+        grads: GradientsParams,
+        factor: f64,
+    }
+    impl ModuleVisitor for Scale {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            if let Some(grad) = self.grads.remove::<D>(param.id) {
+                self.grads.register::<D>(param.id, grad.mul_scalar(self.factor));
+            }
+        }
+    }
+    if factor == 1.0 {
+        return grads;
+    }
+    let mut scale = Scale { grads, factor };
+    module.visit(&mut scale);
+    scale.grads
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{Device, TensorData};
+    use safetensors::SafeTensors;
+
+    use super::*;
+
+    #[derive(Module, Debug)]
+    struct Toy {
+        a: Param<Tensor<2>>,
+        b: Param<Tensor<1>>,
+    }
+
+    struct Fixture(Vec<u8>);
+
+    impl Fixture {
+        fn open() -> Self {
+            let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data-fixtures/reference/adamw.safetensors");
+            Self(std::fs::read(path).expect("the fixture is checked in"))
+        }
+
+        fn tensor<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
+            let file = SafeTensors::deserialize(&self.0).expect("valid");
+            let view = file.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}"));
+            let values: Vec<f32> = match view.dtype() {
+                safetensors::Dtype::F32 => {
+                    view.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect()
+                }
+                _ => view.data().as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes) as f32).collect(),
+            };
+            Tensor::from_data(TensorData::new(values, view.shape().to_vec()), device)
+        }
+    }
+
+    fn assert_close<const D: usize>(got: Tensor<D>, expected: Tensor<D>, tolerance: f32) {
+        let difference = (got - expected).abs().max().into_scalar::<f32>();
+        assert!(difference <= tolerance, "{difference:e}");
+    }
+
+    fn toy(fixture: &Fixture, device: &Device) -> Toy {
+        Toy {
+            a: Param::from_tensor(fixture.tensor("input.param_a", device)),
+            b: Param::from_tensor(fixture.tensor("input.param_b", device)),
+        }
+    }
+
+    #[test]
+    fn five_updates_equal_pytorchs() {
+        let fixture = Fixture::open();
+        let device = Device::flex();
+        // Parameters that train live with autodiff, their gradients without.
+        let mut model = toy(&fixture, &device.clone().autodiff());
+        let mut optimizer = adamw(&OptimizerConfig::default());
+        let grads_a: Tensor<3> = fixture.tensor("input.grad_a", &device);
+        let grads_b: Tensor<2> = fixture.tensor("input.grad_b", &device);
+        let rates = fixture.tensor::<1>("output.lr", &device).into_data().try_to_vec::<f32>().expect("f32");
+        for (step, rate) in rates.into_iter().take(5).enumerate() {
+            let mut grads = GradientsParams::new();
+            grads.register(model.a.id, grads_a.clone().narrow(0, step, 1).squeeze_dim::<2>(0));
+            grads.register(model.b.id, grads_b.clone().narrow(0, step, 1).squeeze_dim::<1>(0));
+            model = optimizer.step(f64::from(rate), model, grads);
+            // f32 against f64 for parameters of about one.
+            let expected = fixture.tensor::<3>("output.param_a", &device).narrow(0, step, 1);
+            assert_close(model.a.val().inner(), expected.squeeze_dim::<2>(0), 1e-6);
+            let expected = fixture.tensor::<2>("output.param_b", &device).narrow(0, step, 1);
+            assert_close(model.b.val().inner(), expected.squeeze_dim::<1>(0), 1e-6);
+        }
+    }
+
+    #[test]
+    fn clipping_equals_pytorchs_above_and_below_the_limit() {
+        let fixture = Fixture::open();
+        let device = Device::flex();
+        let model = toy(&fixture, &device);
+        for case in ["large", "small"] {
+            let mut grads = GradientsParams::new();
+            grads.register(model.a.id, fixture.tensor::<2>(&format!("input.clip_{case}_a"), &device));
+            grads.register(model.b.id, fixture.tensor::<1>(&format!("input.clip_{case}_b"), &device));
+            let norm = global_norm(&model, &grads);
+            let expected = fixture.tensor::<1>(&format!("output.clip_{case}_norm"), &device).into_scalar::<f64>();
+            assert!((norm / expected - 1.0).abs() < 1e-6, "{norm} against {expected}");
+            let clipped = clip_global_norm(&model, grads, norm, 1.0);
+            let got = clipped.get::<2>(model.a.id).expect("kept");
+            assert_close(got, fixture.tensor(&format!("output.clip_{case}_a"), &device), 1e-6);
+            let got = clipped.get::<1>(model.b.id).expect("kept");
+            assert_close(got, fixture.tensor(&format!("output.clip_{case}_b"), &device), 1e-6);
+        }
+    }
+}

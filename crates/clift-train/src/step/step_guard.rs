@@ -1,0 +1,167 @@
+//! Steps that are left out: what makes a step bad, and the file that names them.
+
+use std::collections::VecDeque;
+
+use clift_data::upper_median;
+use serde::{Deserialize, Serialize};
+
+use crate::config::config::OptimizerConfig;
+use crate::events::Stage;
+use crate::step::batch::StageBatch;
+
+/// Steps whose loss and gradient norm a new one is compared with.
+const WINDOW: usize = 101;
+/// Fewer than these have no median worth the name: the first steps of a run are wild.
+const MIN_STEPS: usize = 20;
+
+/// Why a step was left out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, strum::Display)]
+#[serde(rename_all = "snake_case")]
+pub enum Fault {
+    /// Loss or gradient norm was a NaN or an infinity.
+    #[strum(to_string = "loss or gradient is not finite")]
+    NotFinite,
+    /// The loss was more than `spike_factor` times its running median.
+    #[strum(to_string = "the loss is a spike")]
+    LossSpike,
+    /// The gradient norm was more than `spike_factor` times its running median.
+    #[strum(to_string = "the gradient norm is a spike")]
+    GradNormSpike,
+}
+
+/// Loss and gradient norm of the last good steps. Part of a checkpoint, so that a resumed run judges as it would have.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recent {
+    losses: VecDeque<f64>,
+    grad_norms: VecDeque<f64>,
+}
+
+impl Recent {
+    /// What is wrong with a step, before its update.
+    pub fn fault(&self, loss: f64, grad_norm: f64, optimizer: &OptimizerConfig) -> Option<Fault> {
+        if !(loss.is_finite() && grad_norm.is_finite()) {
+            return Some(Fault::NotFinite);
+        }
+        let factor = optimizer.spike_factor;
+        let is_spike = |value: f64, median: Option<f64>| factor > 0.0 && median.is_some_and(|m| value > factor * m);
+        if is_spike(loss, self.median_loss()) {
+            return Some(Fault::LossSpike);
+        }
+        is_spike(grad_norm, self.median_grad_norm()).then_some(Fault::GradNormSpike)
+    }
+
+    /// Takes a good step into account; bad ones must not raise the bar for those after them.
+    pub fn push(&mut self, loss: f64, grad_norm: f64) {
+        for (window, value) in [(&mut self.losses, loss), (&mut self.grad_norms, grad_norm)] {
+            if window.len() == WINDOW {
+                window.pop_front();
+            }
+            window.push_back(value);
+        }
+    }
+
+    /// Median loss of the window, once there are enough steps.
+    pub fn median_loss(&self) -> Option<f64> {
+        median(&self.losses)
+    }
+
+    /// Median gradient norm of the window, once there are enough steps.
+    pub fn median_grad_norm(&self) -> Option<f64> {
+        median(&self.grad_norms)
+    }
+}
+
+/// The upper median, which is one of the values: no rounding.
+fn median(window: &VecDeque<f64>) -> Option<f64> {
+    (window.len() >= MIN_STEPS).then(|| upper_median(&window.iter().copied().collect::<Vec<_>>()))
+}
+
+/// A line of `bad_steps.jsonl`. JSON holds no NaN and no infinity: such a number is `null`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct BadStep {
+    /// The step that was left out, from 1.
+    pub step: u64,
+    /// Which stage.
+    pub stage: Stage,
+    /// Why.
+    pub reason: Fault,
+    /// Loss of the batch.
+    pub loss: Option<f64>,
+    /// Global norm of the gradient before clipping.
+    pub grad_norm: Option<f64>,
+    /// Median loss of the good steps before; `null` for fewer than 20.
+    pub median_loss: Option<f64>,
+    /// Median gradient norm of the good steps before.
+    pub median_grad_norm: Option<f64>,
+    /// How many steps in a row were left out, this one included.
+    pub in_a_row: u32,
+    /// What the batch was made of.
+    pub scenes: Vec<BadScene>,
+}
+
+/// One clip of a batch that was left out.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BadScene {
+    /// Key of the scene.
+    pub key: String,
+    /// Frames of the contexts.
+    pub context: Vec<usize>,
+    /// Frames of the targets.
+    pub target: Vec<usize>,
+}
+
+impl BadScene {
+    /// The clips of a batch.
+    pub fn all(batch: &StageBatch) -> Vec<Self> {
+        let scene = |clip: &clift_data::Clip| Self {
+            key: clip.key.clone(),
+            context: clip.context.frame_index.clone(),
+            target: clip.target.frame_index.clone(),
+        };
+        batch.clips.iter().map(scene).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn with_factor(spike_factor: f64) -> OptimizerConfig {
+        OptimizerConfig { spike_factor, ..OptimizerConfig::default() }
+    }
+
+    fn after(steps: impl IntoIterator<Item = (f64, f64)>) -> Recent {
+        let mut recent = Recent::default();
+        steps.into_iter().for_each(|(loss, norm)| recent.push(loss, norm));
+        recent
+    }
+
+    #[test]
+    fn what_is_not_finite_is_bad_from_the_first_step_on() {
+        let recent = Recent::default();
+        for (loss, norm) in [(f64::NAN, 1.0), (1.0, f64::INFINITY), (f64::NEG_INFINITY, f64::NAN)] {
+            assert_eq!(recent.fault(loss, norm, &with_factor(0.0)), Some(Fault::NotFinite));
+        }
+        assert_eq!(recent.fault(1e300, 1e300, &with_factor(2.0)), None, "there is nothing to compare with");
+    }
+
+    #[test]
+    fn a_spike_is_more_than_the_factor_times_the_median() {
+        let recent = after((1..=21).map(|i| (f64::from(i), 2.0 * f64::from(i))));
+        let fault = |loss, norm, factor| recent.fault(loss, norm, &with_factor(factor));
+        assert_eq!((recent.median_loss(), recent.median_grad_norm()), (Some(11.0), Some(22.0)));
+        assert_eq!(fault(33.0, 66.0, 3.0), None, "exactly the factor");
+        assert_eq!(fault(33.1, 66.0, 3.0), Some(Fault::LossSpike));
+        assert_eq!(fault(33.0, 66.1, 3.0), Some(Fault::GradNormSpike));
+        assert_eq!(fault(1e30, 1e30, 0.0), None, "0 looks for none");
+    }
+
+    #[test]
+    fn nineteen_steps_have_no_median_and_old_ones_are_forgotten() {
+        assert_eq!(after(vec![(1.0, 1.0); 19]).median_loss(), None);
+        assert_eq!(after(vec![(1.0, 1.0); 20]).median_loss(), Some(1.0));
+        let steps = (0..202).map(|i| if i < 101 { (1.0, 1.0) } else { (7.0, 8.0) });
+        assert_eq!(after(steps).median_grad_norm(), Some(8.0));
+    }
+}

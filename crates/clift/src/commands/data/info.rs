@@ -1,0 +1,271 @@
+//! `clift data info`.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::Context;
+use clift_data::{
+    ClipReader, DataError, DatasetRoot, EvaluationIndex, Ledger, OpenedSource, SceneSource, SceneSubset, SourceInfo,
+    SourceKind, Split, open_dataset, open_source,
+};
+use clift_eval::evaluation_items;
+use clift_train::{Config, read_config};
+
+use crate::commands::data::info_report::{EvaluationReport, Report, SplitReport};
+use crate::commands::splits::{Splits, halves_there, options};
+use crate::exit_code::WrongUsage;
+use crate::output::stdout::{print_note, print_result};
+
+/// Synthetic scenes that are looked at: there may be millions, and they are all alike.
+const MAX_SYNTHETIC: usize = 1000;
+
+/// Prints what a folder or a config holds.
+pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
+    let is_json = args.path.extension().is_some_and(|extension| extension == "json");
+    // A scene may be given by its cameras, of which there may be several files: transforms_train.json.
+    let name = args.path.file_name().unwrap_or_default().to_string_lossy();
+    let is_scene = is_json && name.starts_with("transforms");
+    if is_json && !is_scene {
+        return of_index(args);
+    }
+    let report = if args.path.is_dir() || is_scene {
+        if !args.set.is_empty() {
+            return Err(WrongUsage(format!("--set changes a config, but {} is none", args.path.display())).into());
+        }
+        of_folder(&args.path)?
+    } else {
+        let (config, overrides) = read_config::<Config>(&args.path, &args.set)?;
+        for change in overrides {
+            print_note(&change.to_string());
+        }
+        config.validate()?;
+        of_config(&args.path, &config)?
+    };
+    print_result(&report.to_string())?;
+    if let Some(path) = &args.json {
+        let text = serde_json::to_vec_pretty(&report).context("writing the report as JSON")?;
+        std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
+    }
+    let failed = report.splits.values().filter_map(|split| split.error.as_ref());
+    let failed = failed.chain(report.evaluation.as_ref().and_then(|evaluation| evaluation.error.as_ref()));
+    anyhow::ensure!(failed.count() == 0, "not all of it can be used; the reason stands above");
+    Ok(())
+}
+
+/// Prints what an evaluation index asks for.
+fn of_index(args: &InfoArgs) -> anyhow::Result<()> {
+    let census = EvaluationIndex::read(&args.path)?.census();
+    print_result(&format!("{census}\n"))?;
+    if let Some(path) = &args.json {
+        let text = serde_json::to_vec_pretty(&census).context("writing the counts as JSON")?;
+        std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
+    }
+    Ok(())
+}
+
+fn of_folder(root: &Path) -> anyhow::Result<Report> {
+    let mut report = Report { path: root.to_owned(), ..Report::default() };
+    let root = DatasetRoot::find(root)?;
+    for split in halves_there(&root, Splits::Both) {
+        let name = if root.has_splits() { split.to_string() } else { "all".into() };
+        let described = match open_source(&root, split, &options()) {
+            Ok(opened) => {
+                report.layout = Some(opened.kind);
+                describe(opened.source.as_ref(), &opened.report)
+            }
+            Err(error @ DataError::UnknownLayout { .. }) => return Err(error.into()),
+            Err(error) => Err(error),
+        };
+        report.splits.insert(name, or_error(described));
+    }
+    Ok(report)
+}
+
+fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
+    let data = &config.data;
+    let mut report = Report { path: path.to_owned(), ..Report::default() };
+    for split in [Split::Train, Split::Test] {
+        let described = open_dataset(data, split).and_then(|OpenedSource { source, report: ledger, .. }| {
+            if split == Split::Test {
+                report.evaluation = Some(evaluation(config, source.clone()));
+            }
+            let source: Arc<dyn SceneSource> = match data.source {
+                SourceKind::Synthetic => Arc::new(SceneSubset::first(source, MAX_SYNTHETIC)),
+                _ => source,
+            };
+            let mut described = describe(source.as_ref(), &ledger)?;
+            if split == Split::Train {
+                described.views = Some(long_enough(config, source.as_ref()));
+            }
+            Ok(described)
+        });
+        report.splits.insert(split.to_string(), or_error(described));
+    }
+    let tokens = |num_views| config.model.num_tokens(num_views, data.height, data.width);
+    report.num_tokens = Some([tokens(data.views.min_context)?, tokens(data.views.max_context)?]);
+    Ok(report)
+}
+
+fn describe(source: &dyn SceneSource, ledger: &Ledger) -> Result<SplitReport, clift_data::DataError> {
+    Ok(SplitReport {
+        error: None,
+        num_scenes: ledger.num_scenes,
+        num_used: ledger.num_used(),
+        skipped: counts(ledger),
+        left_out: ledger.skips.clone(),
+        frames: ledger.frames.clone(),
+        notes: ledger.notes.clone(),
+        num_described: source.num_scenes(),
+        info: Some(SourceInfo::read(source)?),
+        views: None,
+    })
+}
+
+fn counts(ledger: &Ledger) -> BTreeMap<String, usize> {
+    ledger.counts().into_iter().map(|(reason, count)| (reason.to_owned(), count)).collect()
+}
+
+fn or_error<E: fmt::Display>(described: Result<SplitReport, E>) -> SplitReport {
+    described.unwrap_or_else(|error| SplitReport { error: Some(error.to_string()), ..Default::default() })
+}
+
+/// Frames that the longest of the shortest stretches has, and how many scenes have as many.
+fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
+    let views = &config.data.views;
+    let gaps = (views.min_context..=views.max_context).map(|num_context| views.gap_bounds(u64::MAX, num_context)[0]);
+    let needed = gaps.max().unwrap_or(0) + 1;
+    let mut num_long = 0;
+    for scene in 0..source.num_scenes() {
+        // A scene that cannot be read is named where the scenes are described.
+        num_long += usize::from(source.num_frames(scene).is_ok_and(|count| count >= needed));
+    }
+    [needed, num_long]
+}
+
+fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport {
+    let reader = ClipReader { source, options: config.data.clip_options() };
+    match evaluation_items(&config.eval, &reader) {
+        Ok((items, ledger)) => EvaluationReport {
+            error: None,
+            num_scenes: items.len(),
+            num_views: items.iter().map(|item| item.views.target.len()).sum(),
+            skipped: counts(&ledger),
+        },
+        Err(error) => EvaluationReport { error: Some(error.to_string()), ..Default::default() },
+    }
+}
+
+/// Arguments of `clift data info`.
+#[derive(Debug, clap::Args)]
+pub struct InfoArgs {
+    /// A folder of scenes, one scene, a config (TOML) or an evaluation index (JSON)
+    #[arg(value_name = "DIR|CONFIG|INDEX")]
+    pub path: PathBuf,
+    /// Change a key of the config: `--set data.filters.min_frames=60`
+    #[arg(long, value_name = "KEY=TOML")]
+    pub set: Vec<String>,
+    /// Also write it to a JSON file
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+
+    fn fixtures() -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini")
+    }
+
+    #[test]
+    fn a_folder_is_described_split_by_split() {
+        let text = of_folder(&fixtures()).unwrap().to_string();
+        let expected = "layout            chunks
+train             2 scenes
+  frames          8 / 8 / 8 (smallest / median / largest)
+  picture         64x36
+  field of view   58.1 / 58.1 / 58.1 deg
+  path extent     0.350 / 0.350 / 0.350
+test              1 scene
+";
+        assert!(text.starts_with(expected), "{text}");
+    }
+
+    #[test]
+    fn a_config_is_described_with_what_its_filters_views_and_evaluation_leave() {
+        let mut config = Config::default();
+        (config.data.source, config.data.root) = (SourceKind::Chunks, Some(fixtures()));
+        (config.data.width, config.data.height) = (48, 32);
+        config.data.filters.min_frames = 8;
+        config.eval.index = Some(fixtures().join("evaluation_index.json"));
+        let text = of_config(Path::new("a.toml"), &config).unwrap().to_string();
+        assert!(text.contains("  long enough     0 of 2: data.views needs 46 frames"), "{text}");
+        assert!(text.contains("evaluation        4 views of 1 scene\n  left out        2 without views"), "{text}");
+        assert!(text.ends_with("tokens per scene  96 to 144"), "{text}");
+
+        config.data.filters.min_frames = 9;
+        let report = of_config(Path::new("a.toml"), &config).unwrap();
+        let error = report.splits["train"].error.as_deref().unwrap();
+        assert!(error.contains("0 of 2 scenes used; 2 shorter than 9 frames"), "{error}");
+        assert!(report.evaluation.is_none());
+    }
+
+    #[test]
+    fn a_folder_without_scenes_says_what_was_looked_for_and_one_inside_a_split_is_described() {
+        let error = of_folder(Path::new(env!("CARGO_MANIFEST_DIR"))).unwrap_err();
+        assert!(error.to_string().starts_with("no scenes found: looked for index.json with chunks, "), "{error}");
+        assert_eq!(crate::exit_code::exit_code(&error), crate::exit_code::WRONG_USAGE);
+        let text = of_folder(&fixtures().join("train")).unwrap().to_string();
+        assert!(text.starts_with("layout            chunks\nall               2 scenes\n"), "{text}");
+    }
+
+    #[test]
+    fn scenes_left_out_are_named_with_their_reason_and_one_bad_scene_hides_no_other() {
+        let root = tempfile::tempdir().unwrap();
+        let train = root.path().join("train");
+        std::fs::create_dir(&train).unwrap();
+        std::fs::copy(fixtures().join("train/000000.torch"), train.join("000000.torch")).unwrap();
+        std::fs::write(train.join("000001.torch"), "cut").unwrap();
+        let index = r#"{"00000000000000a1": "000000.torch", "elsewhere": "000000.torch", "cut": "000001.torch"}"#;
+        std::fs::write(train.join("index.json"), index).unwrap();
+        let report = of_folder(root.path()).unwrap();
+        let split = &report.splits["train"];
+        assert!(split.error.is_none() && split.info.is_some());
+        let keys: Vec<&str> = split.left_out.iter().map(|skip| skip.key.as_str()).collect();
+        assert!(keys.contains(&"cut") && keys.contains(&"elsewhere"), "{keys:?}");
+        let text = report.to_string();
+        assert!(text.contains("train             1 of "), "{text}");
+        for expected in ["  left out        cut: bad chunk: ", "  left out        elsewhere: bad chunk: "] {
+            assert!(text.contains(expected), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_single_capture_that_cannot_be_used_is_no_half() {
+        let root = tempfile::tempdir().unwrap();
+        std::fs::write(root.path().join("transforms.json"), r#"{"fl_x": 20, "frames": []}"#).unwrap();
+        let text = of_folder(root.path()).unwrap().to_string();
+        assert!(text.starts_with("all               bad scene: it lists no frames: "), "{text}");
+    }
+
+    #[test]
+    fn frames_without_a_picture_are_listed_scene_by_scene() {
+        let mut split = SplitReport { num_scenes: 1, num_used: 1, num_described: 1, ..SplitReport::default() };
+        let mut ledger = Ledger::new(1);
+        for name in ["0005.jpg", "0016.jpg"] {
+            ledger.skip_frame("fox", name, "without a picture");
+        }
+        (split.frames, split.notes) = (ledger.frames, vec!["both halves are the same scenes".into()]);
+        let splits = BTreeMap::from([("all".into(), split)]);
+        let text = Report { layout: Some(SourceKind::Captures), splits, ..Report::default() }.to_string();
+        let expected = "layout            captures
+all               1 scene
+  left out        of fox 2 frames without a picture: 0005.jpg, 0016.jpg
+  note            both halves are the same scenes";
+        assert_eq!(text, expected);
+    }
+}

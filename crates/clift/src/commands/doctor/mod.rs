@@ -1,0 +1,11 @@
+//! `clift doctor`.
+//!
+//! - `args`: arguments of `clift doctor`
+//! - `adapters`: the adapter table
+//! - `stability`: `clift doctor --stability`
+//! - `run`: `clift doctor`
+
+pub(crate) mod adapters;
+pub(crate) mod args;
+pub(crate) mod run;
+pub(crate) mod stability;

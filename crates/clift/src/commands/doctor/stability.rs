@@ -1,0 +1,54 @@
+//! `clift doctor --stability`: the hard cases.
+
+use anyhow::Context;
+use clift_bench::{Size, StabilityRow, run_stability, stability_markdown, stability_text};
+use clift_data::replace_file;
+use clift_model::DeviceName;
+
+use crate::commands::doctor::args::DoctorArgs;
+use crate::output::stdout::{print_note, print_result};
+
+/// Runs every case on every device of the build, and fails if one is beyond its bound.
+pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
+    let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
+    let size = if args.small { Size::Small } else { Size::Full };
+    let rows = run_stability(&devices, size, &mut |row| print_note(&line(&devices, row)))?;
+    if let Some(path) = &args.markdown {
+        let text = format!("{}\n{}\n", head(args.small), stability_markdown(&devices, &rows));
+        replace_file(path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
+        print_result(&format!("table: {}", path.display()))?;
+    }
+    let broken = rows.iter().filter(|row| !row.holds()).count();
+    print_result(&format!("{} of {} cases hold on {}", rows.len() - broken, rows.len(), names(&devices)))?;
+    if broken > 0 {
+        return Err(anyhow::anyhow!("{broken} cases do not hold"));
+    }
+    Ok(())
+}
+
+fn names(devices: &[DeviceName]) -> String {
+    devices.iter().map(ToString::to_string).collect::<Vec<_>>().join(" and ")
+}
+
+fn line(devices: &[DeviceName], row: &StabilityRow) -> String {
+    let outcomes = devices.iter().zip(&row.outcomes);
+    let outcomes = outcomes.map(|(device, outcome)| format!("{device} {}", stability_text(row, outcome)));
+    format!("{}: {}", row.case.name, outcomes.collect::<Vec<_>>().join(", "))
+}
+
+/// What stands above the table.
+fn head(small: bool) -> String {
+    let command = if small { "clift doctor --stability --small" } else { "clift doctor --stability" };
+    format!(
+        "# Numbers on hard scenes
+
+Made by `{command} --markdown docs/results/stability.md`; a small version of every case runs in `cargo test`.
+
+Each case is a real computation in f32, compared with the same code on the same values in f64, which uses the composed
+operations instead of the kernels. The error is the largest difference over the largest value; of an update, over its
+loss and the gradient of every parameter. A gradient below a thousandth of the largest one is compared with that
+thousandth, because a gradient that is zero in exact arithmetic contains only rounding. **Bold** values exceed their
+bound. `refused` cases have an error message and a test of their own.
+"
+    )
+}

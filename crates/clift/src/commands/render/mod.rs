@@ -1,0 +1,9 @@
+//! `clift render`.
+//!
+//! - `args`: arguments of `clift render`
+//! - `frames`: render and write every frame
+//! - `run`: `clift render`
+
+pub(crate) mod args;
+pub(crate) mod frames;
+pub(crate) mod run;

@@ -1,0 +1,124 @@
+//! Errors to exit codes.
+
+use clift_eval::EvalError;
+use clift_train::TrainError;
+
+use crate::interrupt;
+
+/// Done.
+pub(crate) const DONE: u8 = 0;
+
+/// Something failed.
+pub(crate) const FAILED: u8 = 1;
+
+/// The command line or the config is wrong.
+pub(crate) const WRONG_USAGE: u8 = 2;
+
+/// The error with its causes, without those that a message quotes already.
+pub(crate) fn message(error: &anyhow::Error) -> String {
+    error
+        .chain()
+        .skip(1)
+        .map(ToString::to_string)
+        .fold(error.to_string(), |text, cause| if text.contains(&cause) { text } else { format!("{text}: {cause}") })
+}
+
+/// The command line asks for something that cannot be done.
+#[derive(Debug)]
+pub(crate) struct WrongUsage(pub(crate) String);
+
+impl std::fmt::Display for WrongUsage {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for WrongUsage {}
+
+pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
+    if error.is::<WrongUsage>() || error.is::<clift_train::ConfigError>() {
+        return WRONG_USAGE;
+    }
+    if let Some(error) = error.downcast_ref::<clift_data::DataError>() {
+        return data_exit_code(error);
+    }
+    if let Some(error) = error.downcast_ref::<clift_model::ModelError>() {
+        return model_exit_code(error);
+    }
+    if let Some(error) = error.downcast_ref::<EvalError>() {
+        return eval_exit_code(error);
+    }
+    error.downcast_ref::<TrainError>().map_or(FAILED, train_exit_code)
+}
+
+pub(crate) fn train_exit_code(error: &TrainError) -> u8 {
+    match error {
+        TrainError::Interrupted { .. } | TrainError::Abandoned { .. } => interrupt::exit_code(),
+        TrainError::BadConfig { .. } | TrainError::OtherRun { .. } | TrainError::Missing { .. } => WRONG_USAGE,
+        TrainError::Eval(error) => eval_exit_code(error),
+        TrainError::Data(error) => data_exit_code(error),
+        TrainError::Model(error) => model_exit_code(error),
+        TrainError::Stopped { source, .. } | TrainError::Damaged { source, .. } => train_exit_code(source),
+        _ => FAILED,
+    }
+}
+
+pub(crate) fn data_exit_code(error: &clift_data::DataError) -> u8 {
+    use clift_data::DataError::{BadConfig, UnknownLayout};
+    if matches!(error, BadConfig { .. } | UnknownLayout { .. }) { WRONG_USAGE } else { FAILED }
+}
+
+pub(crate) fn eval_exit_code(error: &EvalError) -> u8 {
+    use EvalError::{BadSystemName, BadWeights, Interrupted, NoPredictions, NotComparable};
+    match error {
+        Interrupted { .. } => interrupt::exit_code(),
+        BadSystemName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => WRONG_USAGE,
+        EvalError::Data(error) => data_exit_code(error),
+        EvalError::Model(error) => model_exit_code(error),
+        _ => FAILED,
+    }
+}
+
+pub(crate) fn model_exit_code(error: &clift_model::ModelError) -> u8 {
+    use clift_model::ModelError::{
+        BadConfig, BadTokenCount, NoConfig, NoDevice, NoModel, NotDivisible, NotImported, OtherRenderer,
+    };
+    match error {
+        BadConfig { .. }
+        | BadTokenCount { .. }
+        | NoConfig { .. }
+        | NoDevice { .. }
+        | NoModel { .. }
+        | NotDivisible { .. }
+        | NotImported { .. }
+        | OtherRenderer { .. } => WRONG_USAGE,
+        _ => FAILED,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_is_shown_once() {
+        let missing = clift_train::read_config::<clift_train::Config>("no.toml".as_ref(), &[]).unwrap_err();
+        let text = message(&anyhow::Error::from(missing).context("starting"));
+        assert!(text.starts_with("starting: reading the configuration failed: "), "{text}");
+        assert_eq!(text.matches("os error").count(), 1, "{text}");
+    }
+
+    #[test]
+    fn what_the_user_can_change_is_wrong_usage_and_the_rest_has_failed() {
+        let bad_config = || clift_data::SyntheticConfig { num_frames: 0, ..Default::default() }.validate();
+        assert_eq!(exit_code(&WrongUsage("no".into()).into()), WRONG_USAGE);
+        assert_eq!(exit_code(&bad_config().unwrap_err().into()), WRONG_USAGE);
+        assert_eq!(exit_code(&TrainError::from(bad_config().unwrap_err()).into()), WRONG_USAGE);
+        let stopped = |source| TrainError::Stopped { source, stage: "stage1", step: 3, checkpoint: "none".into() };
+        assert_eq!(exit_code(&stopped(Box::new(bad_config().unwrap_err().into())).into()), WRONG_USAGE);
+        assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), 130);
+        assert_eq!(exit_code(&TrainError::Abandoned { work: "`encode`".into() }.into()), 130);
+        assert_eq!(exit_code(&clift_data::DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
+        assert_eq!(exit_code(&anyhow::anyhow!("anything else")), FAILED);
+    }
+}

@@ -1,0 +1,77 @@
+//! Progress of work that is no training: so many of so many things.
+
+use std::io::IsTerminal;
+use std::time::Instant;
+
+use indicatif::ProgressBar;
+
+use crate::output::bar::progress_bar;
+use crate::output::event_line::{duration, rate};
+use crate::output::stdout::print_note;
+
+/// Seconds between two plain lines.
+const INTERVAL_S: f64 = 10.0;
+
+/// Counts things that get done: a bar on a terminal, a line every ten seconds elsewhere.
+pub struct Counter {
+    name: String,
+    total: u64,
+    bar: Option<ProgressBar>,
+    started: Instant,
+    shown: Instant,
+}
+
+impl Counter {
+    /// Starts counting to `total`.
+    pub fn new(name: &str, total: u64) -> Self {
+        let bar = std::io::stderr().is_terminal().then(|| progress_bar(name, 0, total));
+        let now = Instant::now();
+        Self { name: name.into(), total, bar, started: now, shown: now }
+    }
+
+    /// Shows that `done` are done.
+    pub fn set(&mut self, done: u64) {
+        match &self.bar {
+            Some(bar) => bar.set_position(done),
+            None if self.shown.elapsed().as_secs_f64() >= INTERVAL_S => {
+                self.shown = Instant::now();
+                let line = line(&self.name, done, self.total, self.started.elapsed().as_secs_f64());
+                print_note(&line);
+            }
+            None => {}
+        }
+    }
+
+    /// Writes a line, above the bar where there is one.
+    pub fn note(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.println(line),
+            None => print_note(line),
+        }
+    }
+}
+
+impl Drop for Counter {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+fn line(name: &str, done: u64, total: u64, elapsed_s: f64) -> String {
+    let per_s = done.max(1) as f64 / elapsed_s.max(1e-9);
+    let left_s = total.saturating_sub(done) as f64 / per_s;
+    format!("{name} {done}/{total}  {}, {} left", rate(per_s), duration(left_s))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_has_the_mean_rate_and_the_time_left() {
+        assert_eq!(line("train", 40, 100, 10.0), "train 40/100  4.0/s, 15 s left");
+        assert_eq!(line("train", 0, 100, 0.0), line("train", 0, 100, 1e-9));
+    }
+}

@@ -1,0 +1,21 @@
+//! Tables, JSON, progress.
+//!
+//! - `units`: seconds, bytes, counts
+//! - `table`: aligned columns
+//! - `json`: results as JSON files
+//! - `stdout`: results to stdout, notes to stderr
+//! - `event_line`: an event as one line
+//! - `bar`: progress bar
+//! - `plain`: progress lines for log files
+//! - `counter`: progress of counted work
+//! - `progress`: choose bar or lines
+
+pub(crate) mod bar;
+pub(crate) mod counter;
+pub(crate) mod event_line;
+pub(crate) mod json;
+pub(crate) mod plain;
+pub(crate) mod progress;
+pub(crate) mod stdout;
+pub(crate) mod table;
+pub(crate) mod units;
