@@ -8,7 +8,6 @@ mod precision;
 mod runner;
 
 pub use cases::case::Work;
-pub use cases::inputs::{Shape, batch, model};
 pub use cases::options::{BenchOptions, MAX_CHECKED_TOKENS};
 pub use cases::reference::module_in_f64;
 pub use data_reading::{Throughput, ThroughputOptions, measure as measure_reading};

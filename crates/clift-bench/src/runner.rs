@@ -140,6 +140,8 @@ fn measure(
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use clift_model::TokenCount;
+
     use clift_data::BoundedSampler;
     use clift_model::ModelConfig;
 

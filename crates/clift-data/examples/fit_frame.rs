@@ -4,7 +4,7 @@
 
 use std::error::Error;
 
-use clift_data::{IntrinsicsNorm, decode_image, encode_png};
+use clift_data::{IntrinsicsNorm, decode_image, encode_png, fit_image};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut words = std::env::args().skip(1);
@@ -14,7 +14,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let middle = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
     while let (Some(from), Some(to)) = (words.next(), words.next()) {
         let frame = decode_image(&std::fs::read(&from)?, &from, 0)?;
-        let (fitted, _) = fit(&frame, middle, width, height, false)?;
+        let (fitted, _) = fit_image(&frame, middle, width, height, false)?;
         std::fs::write(to, encode_png(&fitted)?)?;
     }
     Ok(())

@@ -1,6 +1,5 @@
 //! What a user types.
 
-
 use clap::{Parser, Subcommand};
 
 use crate::commands::bench::cases::BenchArgs;

@@ -8,9 +8,8 @@ use burn::tensor::{Device, Tensor};
 use clift_data::{BoundedSampler, Clip, DataConfig, SourceKind, SyntheticConfig};
 use clift_eval::upload_views;
 use clift_model::{Clift, DeviceName, ModelConfig, SceneModel, TokenCount};
-use clift_train::{Config, Stage1Config, TrainError};
+use clift_train::{Config, Shape, Stage1Config, TrainError, seeded_clip, seeded_model};
 
-use crate::cases::inputs::{Shape, clip, model};
 use crate::cases::options::{BenchOptions, MAX_CHECKED_TOKENS};
 
 /// The sizes and the device that all rows share.
@@ -135,12 +134,12 @@ impl BenchContext {
 
     /// A scene with so many targets.
     pub fn clip(&self, num_targets: usize) -> Clip {
-        clip(Shape { num_targets, ..self.shape() }, self.seed(), 0)
+        seeded_clip(Shape { num_targets, ..self.shape() }, self.seed(), 0)
     }
 
     /// A model to train, with the seed's weights.
     pub fn model(&self) -> Clift {
-        model(&self.config.model, self.seed(), &self.device)
+        seeded_model(&self.config.model, self.seed(), &self.device)
     }
 
     /// The seeded encoder's tokens of one scene.

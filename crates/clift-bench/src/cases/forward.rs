@@ -6,10 +6,9 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use clift_data::{step_rng, uniform_below};
 use clift_eval::{upload_cameras, upload_views};
 use clift_model::{Cameras, ClusterIndex, Clusters, Condenser, Encoder, Renderer, Views, cluster_attention};
-use clift_train::TrainError;
+use clift_train::{TrainError, seeded_clusters, seeded_uniform};
 
 use crate::cases::context::BenchContext;
-use crate::cases::inputs::{clusters, uniform};
 use crate::cases::reference::{InF64, module_in_f64};
 use crate::cases::task::Forward;
 
@@ -49,7 +48,7 @@ impl Condense {
     pub fn new(context: &BenchContext) -> Result<Self, TrainError> {
         let lift = context.lift()?;
         let count = context.num_storage_tokens()?;
-        let clusters = Clusters::new(vec![clusters(lift.dims()[1], count, context.seed(), 0)?])?;
+        let clusters = Clusters::new(vec![seeded_clusters(lift.dims()[1], count, context.seed(), 0)?])?;
         let index = clusters.upload(&context.device);
         Ok(Self { condenser: context.model().condenser.valid(), lift, clusters, index })
     }
@@ -85,7 +84,7 @@ impl ClusterAttend {
         }
         // Logits with a deviation of about one: sqrt(3) makes uniform values of unit variance.
         let drawn = |rows: usize, columns: usize, purpose: &str| {
-            uniform([1, rows, columns], context.seed(), purpose, &context.device).mul_scalar(3.0_f64.sqrt())
+            seeded_uniform([1, rows, columns], context.seed(), purpose, &context.device).mul_scalar(3.0_f64.sqrt())
         };
         let mut rng = step_rng(context.seed(), 0, "bench segments");
         let segment: Vec<i64> = (0..num_members).map(|_| uniform_below(&mut rng, count) as i64).collect();

@@ -2,7 +2,6 @@
 //!
 //! - `case`: BenchCase, names of the rows
 //! - `options`: timing options
-//! - `inputs`: seeded clips, clusters, weights
 //! - `reference`: the same computation in f64
 //! - `task`: BenchTask and Forward traits
 //! - `context`: device and sizes of all rows
@@ -15,7 +14,6 @@ pub(crate) mod case;
 pub(crate) mod clustering;
 pub(crate) mod context;
 pub(crate) mod forward;
-pub(crate) mod inputs;
 pub(crate) mod options;
 pub(crate) mod reference;
 pub(crate) mod selection;

@@ -6,11 +6,10 @@ use burn::tensor::{Device, Tensor};
 use clift_model::{Clift, Precision};
 use clift_train::{
     Fault, Learner, Loss, LossScale, Shown, Stage, StageBatch, StageSettings, TrainError, adamw, freeze, loss_of,
-    warm_up_cosine,
+    seeded_batch, warm_up_cosine,
 };
 
 use crate::cases::context::BenchContext;
-use crate::cases::inputs::batch;
 use crate::cases::reference::{InF64, module_in_f64, relative_error, values};
 use crate::cases::task::Task;
 
@@ -60,7 +59,7 @@ pub(crate) fn micro_batch(context: &BenchContext, stage: Stage) -> Result<StageB
 /// A batch that keeps every token (stage 1) or the stored ones (stage 2).
 fn stage_batch(context: &BenchContext, stage: Stage, batch_size: usize) -> Result<StageBatch, TrainError> {
     let stored = if stage == Stage::Stage2 { Some(context.num_storage_tokens()?) } else { None };
-    batch(context.shape(), batch_size, context.num_tokens()?, stored, context.seed())
+    seeded_batch(context.shape(), batch_size, context.num_tokens()?, stored, context.seed())
 }
 
 impl Task for StepTask {

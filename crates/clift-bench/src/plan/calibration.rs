@@ -9,15 +9,15 @@ use clift_data::{ClipReader, Split, item_rng, open_dataset, step_rng, upper_medi
 use clift_eval::{EvalModels, EvalResults, Lpips, Sweep, evaluate_scene, upload_cameras, upload_views};
 use clift_model::{Convention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
-    Config, Learner, Loss, LossScale, Middle, Shown, Stage, StageBatch, TokenChoice, TrainError, adamw,
-    clip_global_norm, evaluated, freeze, global_norm, loss_of, measures_lpips, scene, trained_parts,
+    Config, Learner, Loss, LossScale, Middle, Shape, Shown, Stage, StageBatch, TokenChoice, TrainError, adamw,
+    clip_global_norm, evaluated, freeze, global_norm, loss_of, measures_lpips, scene, seeded_batch, seeded_clip,
+    trained_parts,
 };
 use cpu_time::ProcessTime;
 use rand::RngExt;
 use rand::seq::index::sample;
 
 use crate::cases::context::BenchContext;
-use crate::cases::inputs::{Shape, batch, clip};
 use crate::cases::options::BenchOptions;
 
 /// Multiplications of a calibrated update: a second of a laptop.
@@ -196,7 +196,7 @@ fn perceptual_s(config: &Config, context: &BenchContext) -> Result<f64, TrainErr
 fn drawn(context: &BenchContext, stage: Stage, middle: &Middle, num_scenes: usize) -> Result<StageBatch, TrainError> {
     let (num_tokens, kept) = (context.num_tokens()?, middle.scene.num_render_tokens);
     let stored = (stage == Stage::Stage2).then_some(kept);
-    let mut batch = batch(context.shape(), num_scenes, num_tokens, stored, context.seed())?;
+    let mut batch = seeded_batch(context.shape(), num_scenes, num_tokens, stored, context.seed())?;
     if stage != Stage::Stage2 && kept < num_tokens {
         let subsets = batch.clips.iter().enumerate().map(|(slot, clip)| {
             let mut rng = item_rng(context.seed(), 0, slot as u32, 0, "plan tokens");
@@ -215,7 +215,7 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
     let context = context(&shallow, num_context)?;
     let model = context.model().valid();
     let shape = Shape { num_context, num_targets, ..context.shape() };
-    let clip = clip(shape, context.seed(), 0);
+    let clip = seeded_clip(shape, context.seed(), 0);
     let views = upload_views(&[&clip.context], &context.device)?;
     let cameras = upload_cameras(&[&clip.target], &context.device)?;
     let scene = scene(config, num_context, num_targets)?;

@@ -189,7 +189,7 @@ mod tests {
 
     #[test]
     fn normalised_poses_equal_numpy_and_scipy() {
-        let bytes = include_bytes!("../../../data-fixtures/reference/poses.safetensors");
+        let bytes = include_bytes!("../../../../data-fixtures/reference/poses.safetensors");
         let tensors = SafeTensors::deserialize(bytes).unwrap();
         let poses = |name: &str| {
             let data = tensors.tensor(name).unwrap().data();

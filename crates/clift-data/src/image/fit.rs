@@ -141,7 +141,7 @@ mod tests {
 
     #[test]
     fn a_jpeg_is_decoded_rescaled_and_cropped_as_pillow_does_it_to_a_fraction_of_a_level() {
-        let bytes = include_bytes!("../../../data-fixtures/reference/fitted.safetensors");
+        let bytes = include_bytes!("../../../../data-fixtures/reference/fitted.safetensors");
         let tensors = safetensors::SafeTensors::deserialize(bytes).unwrap();
         let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
         for number in 0..3 {

@@ -180,7 +180,7 @@ mod tests {
 
     #[test]
     fn resized_pictures_equal_pillows_bit_for_bit() {
-        let bytes = include_bytes!("../../../data-fixtures/reference/lanczos.safetensors");
+        let bytes = include_bytes!("../../../../data-fixtures/reference/lanczos.safetensors");
         let tensors = SafeTensors::deserialize(bytes).unwrap();
         let frame = |name: &str| {
             let tensor = tensors.tensor(name).unwrap();

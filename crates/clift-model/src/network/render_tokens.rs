@@ -1,6 +1,5 @@
 //! Tokens per view; cached keys and values.
 
-use burn::module::Module;
 use burn::tensor::{Int, Tensor, TensorData};
 
 use crate::network::blocks::block::DecoderBlock;

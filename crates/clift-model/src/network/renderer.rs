@@ -3,8 +3,8 @@
 
 use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
-use burn::tensor::activation::sigmoid;
 use burn::tensor::Tensor;
+use burn::tensor::activation::sigmoid;
 
 use crate::network::blocks::block::DecoderBlock;
 use crate::network::config::ModelConfig;

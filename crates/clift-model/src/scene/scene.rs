@@ -21,7 +21,6 @@
 //! `model_path` (where those were), `height` and `width` of the context views.
 // S stored tokens, V context views, D width
 
-
 use crate::network::config::ModelConfig;
 use crate::scene::token_format::TokenStorage;
 use crate::tokens::kind::TokenKind;

@@ -164,6 +164,7 @@ mod tests {
     use crate::tokens::kind::TokenKind;
     use crate::tokens::selection::rules::Preset;
     use crate::weights::file;
+    use crate::weights::hash;
 
     const MODEL: ModelConfig = ModelConfig {
         variant: crate::network::architecture::Variant::Paper,

@@ -206,6 +206,7 @@ pub fn first_not_f32<M: Module>(module: &M) -> Option<(String, DType)> {
 
 #[cfg(test)]
 mod tests {
+    use crate::weights::hash::hash;
     use burn::tensor::Device;
 
     use super::*;

@@ -233,6 +233,9 @@ fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) ->
 
 #[cfg(test)]
 mod tests {
+    use burn::module::{ModuleMapper, Param};
+    use burn::tensor::{DType, Tensor};
+
     use super::*;
 
     /// A learner and its first checkpoint below `root`.
@@ -293,7 +296,13 @@ mod tests {
         let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
         assert!(message.contains("tensors of another type than float"), "{message}");
 
-        let wide = clift_bench::module_in_f64(&learner.model, &burn::tensor::Device::flex());
+        struct InF64;
+        impl ModuleMapper for InF64 {
+            fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+                param.map(|tensor| tensor.cast(DType::F64))
+            }
+        }
+        let wide = learner.model.valid().map(&mut InF64);
         wide.into_record().save(&path).expect("it can be written");
         sign(&step, MODEL);
         let message = checkpoints.resume(&mut learner).unwrap_err().to_string();

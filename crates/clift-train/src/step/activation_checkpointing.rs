@@ -129,7 +129,6 @@ fn trains<M: Module>(module: &M) -> bool {
 #[cfg(test)]
 mod tests {
     use burn::tensor::Device;
-    use clift_bench::{Shape, batch, model};
     use clift_model::{CondenserConfig, ModelConfig, Variant};
 
     use super::*;
@@ -137,6 +136,7 @@ mod tests {
     use crate::run::stage_plan::freeze;
     use crate::step::batch::StageBatch;
     use crate::step::device_batch::loss_of;
+    use crate::step::seeded_inputs::{Shape, seeded_batch, seeded_model};
 
     const SHAPE: Shape = Shape { num_context: 2, num_targets: 3, size: [16, 24] };
     /// 2 views of 2 x 3 patches.
@@ -173,7 +173,7 @@ mod tests {
             num_renderer_blocks: 2,
             ..ModelConfig::default()
         };
-        let model = freeze(stage, model(&config, 3, device));
+        let model = freeze(stage, seeded_model(&config, 3, device));
         let shown = Shown::upload(batch, &device.clone().autodiff()).expect("valid");
         let plain_loss = loss_of(&model, &shown, &batch.tokens, loss).expect("valid").total;
         let plain = GradientsParams::from_grads(plain_loss.clone().mul_scalar(0.5).backward(), &model);
@@ -195,8 +195,8 @@ mod tests {
 
     #[test]
     fn gradients_equal_those_of_the_plain_backward() {
-        let all = batch(SHAPE, 2, NUM_TOKENS, None, 1).expect("valid");
-        let stored = batch(SHAPE, 2, NUM_TOKENS, Some(5), 1).expect("valid");
+        let all = seeded_batch(SHAPE, 2, NUM_TOKENS, None, 1).expect("valid");
+        let stored = seeded_batch(SHAPE, 2, NUM_TOKENS, Some(5), 1).expect("valid");
         let few = StageBatch { tokens: subsets(2), ..all.clone() };
         let many = StageBatch { tokens: subsets(7), ..all.clone() };
         let cases = [(Stage::Stage1, all), (Stage::Stage1, few), (Stage::Stage1, many), (Stage::Stage2, stored)];

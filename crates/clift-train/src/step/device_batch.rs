@@ -33,12 +33,7 @@ impl Shown {
 }
 
 /// Renders the targets and compares, on the tape.
-pub fn loss_of(
-    model: &Clift,
-    shown: &Shown,
-    choice: &TokenChoice,
-    loss: &Loss,
-) -> Result<LossParts, TrainError> {
+pub fn loss_of(model: &Clift, shown: &Shown, choice: &TokenChoice, loss: &Loss) -> Result<LossParts, TrainError> {
     let lift = model.encode(&shown.context); // [B, N, D]
     let tokens = choice.apply(&model.condenser, lift)?;
     let rendering = model.render(tokens, &shown.targets);

@@ -104,9 +104,8 @@ mod tests {
 
     #[test]
     fn overflows_change_the_factor_alone_until_the_gradient_is_that_of_f32() {
-        use clift_bench::{Shape, batch, model};
-
         use crate::config::config::OptimizerConfig;
+        use crate::step::seeded_inputs::{Shape, seeded_batch, seeded_model};
         use crate::step::train_state::Learner;
 
         let device = burn::tensor::Device::flex();
@@ -118,10 +117,10 @@ mod tests {
             num_renderer_blocks: 1,
             ..clift_model::ModelConfig::default()
         };
-        let batch = batch(Shape { num_context: 2, num_targets: 2, size: [16, 16] }, 2, 8, None, 1).unwrap();
+        let batch = seeded_batch(Shape { num_context: 2, num_targets: 2, size: [16, 16] }, 2, 8, None, 1).unwrap();
         for activation_checkpointing in [false, true] {
             let learner = |loss_scale| Learner {
-                model: crate::run::stage_plan::freeze(crate::events::Stage::Stage1, model(&sizes, 3, &device)),
+                model: crate::run::stage_plan::freeze(crate::events::Stage::Stage1, seeded_model(&sizes, 3, &device)),
                 optimizer: crate::step::optimizer::adamw(&OptimizerConfig::default()),
                 device: device.clone().autodiff(),
                 loss: crate::step::loss::Loss::default(),

@@ -6,6 +6,7 @@
 //! - `loss_scale`: loss scaling for f16
 //! - `optimizer`: AdamW, gradient norm and clipping
 //! - `schedule`: warm-up and cosine
+//! - `seeded_inputs`: batches and weights from a seed, for tests and benchmarks
 //! - `activation_checkpointing`: backward from stored block inputs
 //! - `train_state`: model, optimiser, one update
 //! - `step_guard`: skip anomalous steps
@@ -17,5 +18,6 @@ pub(crate) mod loss;
 pub(crate) mod loss_scale;
 pub(crate) mod optimizer;
 pub(crate) mod schedule;
+pub(crate) mod seeded_inputs;
 pub(crate) mod step_guard;
 pub(crate) mod train_state;

@@ -1,7 +1,5 @@
 //! Shared argument parsers.
 
-
-use clap::Parser;
 use clift_eval::Side;
 use clift_train::Stage;
 

@@ -2,9 +2,7 @@
 //!
 //! Both write to the standard error stream; the standard output is for results.
 
-
 use clift_train::{Event, Stage, StepEvent};
-
 
 pub(crate) fn numbers(step: &StepEvent) -> String {
     format!("loss {:.4}  {:.2} dB  lr {:.2e}", step.loss, step.psnr, step.lr)

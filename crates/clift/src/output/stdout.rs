@@ -6,7 +6,6 @@ use std::path::Path;
 use anyhow::Context;
 use clift_eval::Summary;
 
-
 /// Writes a line or more to the standard output, at once.
 ///
 /// # Errors

@@ -3,9 +3,8 @@
 
 use burn::tensor::{Int, Tensor, TensorData};
 use clift_model::{cluster_attention, cross_sdpa};
-use clift_train::TrainError;
+use clift_train::{TrainError, seeded_uniform};
 
-use crate::cases::inputs::uniform;
 use crate::cases::reference::{InF64, relative_error};
 use crate::doctor::stability::case::{Bound, Case, Outcome, Place};
 
@@ -60,8 +59,8 @@ fn worst(errors: impl IntoIterator<Item = f64>) -> Outcome {
 fn many(place: &Place) -> Result<Outcome, TrainError> {
     const DIM: usize = 32;
     let (keys, queries) = (place.size.pick(2048, 1 << 16), place.size.pick(16, 1024));
-    let query = uniform([1, queries, DIM], 0, "stability query", &place.device);
-    let key_value = uniform([1, keys, 2 * DIM], 0, "stability key", &place.device);
+    let query = seeded_uniform([1, queries, DIM], 0, "stability query", &place.device);
+    let key_value = seeded_uniform([1, keys, 2 * DIM], 0, "stability key", &place.device);
     compared(place, [query, key_value], |[query, key_value]| cross_sdpa(query, key_value, 2))
 }
 
@@ -78,7 +77,8 @@ fn attended(place: &Place, largest: f64) -> Result<Outcome, TrainError> {
 
 /// Queries and keys whose largest score is `largest`, and values.
 fn scores_up_to(place: &Place, largest: f64, [queries, keys]: [usize; 2], dim: usize) -> (Tensor<3>, Tensor<3>) {
-    let drawn = |count: usize, width: usize, purpose: &str| uniform([1, count, width], 0, purpose, &place.device);
+    let drawn =
+        |count: usize, width: usize, purpose: &str| seeded_uniform([1, count, width], 0, purpose, &place.device);
     let query: Tensor<3> = drawn(queries, dim, "stability query");
     let [key, value] = ["stability key", "stability value"].map(|purpose| drawn(keys, dim, purpose));
     // Two heads of half the width: no score is larger than that of a query and a key of ones.
@@ -96,7 +96,8 @@ fn scores_up_to(place: &Place, largest: f64, [queries, keys]: [usize; 2], dim: u
 fn level_scores(place: &Place, level: f64, [queries, keys]: [usize; 2]) -> [Tensor<3>; 2] {
     const DIM: usize = 32;
     let head_width = DIM / 2;
-    let drawn = |count: usize, width: usize, purpose: &str| uniform([1, count, width], 0, purpose, &place.device);
+    let drawn =
+        |count: usize, width: usize, purpose: &str| seeded_uniform([1, count, width], 0, purpose, &place.device);
     // The first column of a head carries the level, the others what differs.
     let columns = (0..DIM).map(|column| if column % head_width == 0 { 0.0 } else { 1.0 }).collect::<Vec<f64>>();
     let is_other = Tensor::<1>::from_data(TensorData::new(columns, [DIM]), &place.device).reshape([1, 1, DIM]);

@@ -2,9 +2,10 @@
 
 use burn::tensor::Tensor;
 use clift_model::{KMeans, ModelError, SceneClusters};
-use clift_train::{Stage, TokenChoice, TrainError, freeze};
+use clift_train::{
+    Stage, TokenChoice, TrainError, freeze, seeded_batch, seeded_clusters, seeded_model, seeded_uniform,
+};
 
-use crate::cases::inputs::{batch, clusters, model, uniform};
 use crate::cases::reference::{InF64, values};
 use crate::doctor::stability::case::{Bound, Case, Outcome, Place};
 use crate::doctor::stability::compare::{most, update_error};
@@ -33,7 +34,7 @@ pub(crate) const CASES: &[Case] = &[
         breaks: "a condenser of one centroid: its softmax has one score",
         bound: GRADIENT,
         reason: GRADIENT_REASON,
-        run: |place| condensed(place, |count| clusters(count, 1, 0, 0)),
+        run: |place| condensed(place, |count| seeded_clusters(count, 1, 0, 0)),
     },
     Case {
         name: "N_s = N",
@@ -48,7 +49,7 @@ pub(crate) const CASES: &[Case] = &[
         bound: Bound::Refused("clusters of"),
         reason: "there is no such clustering",
         run: |place| {
-            let tokens = uniform([1, 8, 4], 0, "stability tokens", &place.device);
+            let tokens = seeded_uniform([1, 8, 4], 0, "stability tokens", &place.device);
             match KMeans::default().fit(tokens, 9, &[0]) {
                 Err(error @ ModelError::BadClusters { .. }) => Ok(Outcome::Refused(error.to_string())),
                 Err(other) => Err(other.into()),
@@ -81,7 +82,7 @@ pub(crate) const CASES: &[Case] = &[
 /// The difference of the inertia of clusters of `distinct` tokens, each many times over, from f64.
 fn inertia_of(place: &Place, distinct: usize, num_clusters: usize) -> Result<Outcome, TrainError> {
     let (dim, times) = (place.size.pick(8, 64), place.size.pick(8, 256));
-    let few: Tensor<3> = uniform([1, distinct, dim], 0, "stability tokens", &place.device);
+    let few: Tensor<3> = seeded_uniform([1, distinct, dim], 0, "stability tokens", &place.device);
     let tokens = Tensor::cat(vec![few; times], 1);
     let fit = |tokens: Tensor<3>| KMeans::default().fit(tokens, num_clusters, &[0]);
     let ours = fit(tokens.clone())?;
@@ -93,8 +94,8 @@ fn inertia_of(place: &Place, distinct: usize, num_clusters: usize) -> Result<Out
 /// The error of an update of stage 2 with these clusters.
 fn condensed(place: &Place, scene: impl Fn(usize) -> Result<SceneClusters, TrainError>) -> Result<Outcome, TrainError> {
     let num_tokens = num_tokens(place, 4);
-    let mut batch = batch(shape(place, 4), 2, num_tokens, None, 0)?;
+    let mut batch = seeded_batch(shape(place, 4), 2, num_tokens, None, 0)?;
     batch.tokens = TokenChoice::Clusters(vec![scene(num_tokens)?; 2]);
-    let model = freeze(Stage::Stage2, model(&network(place), 0, &place.device));
+    let model = freeze(Stage::Stage2, seeded_model(&network(place), 0, &place.device));
     Ok(Outcome::Error(update_error(place, &model, &batch)?))
 }

@@ -4,9 +4,8 @@ use burn::module::Module;
 use burn::tensor::{Tensor, TensorData};
 use clift_eval::{upload_cameras, upload_views};
 use clift_model::{ModelError, TokenStorage};
-use clift_train::TrainError;
+use clift_train::{TrainError, seeded_clip, seeded_model};
 
-use crate::cases::inputs::{clip, model};
 use crate::cases::reference::{InF64, module_in_f64, values};
 use crate::doctor::stability::case::{Bound, Case, Outcome, Place};
 use crate::doctor::stability::compare::most;
@@ -63,8 +62,8 @@ pub(crate) const CASES: &[Case] = &[
 /// The largest difference of a picture drawn from rounded tokens from one drawn in f64 from those that are not.
 fn drawn(place: &Place, storage: TokenStorage) -> Result<Outcome, TrainError> {
     let config = network(place);
-    let networks = model(&config, 0, &place.device).valid();
-    let clip = clip(shape(place, 4), 0, 0);
+    let networks = seeded_model(&config, 0, &place.device).valid();
+    let clip = seeded_clip(shape(place, 4), 0, 0);
     let lift = networks.encoder.forward(&upload_views(&[&clip.context], &place.device)?);
     let shape = lift.dims();
     let tokens: Vec<f32> = values(lift.clone()).into_iter().map(|value| value as f32).collect();

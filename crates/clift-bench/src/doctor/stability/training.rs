@@ -6,9 +6,9 @@ use burn::tensor::Device;
 use clift_model::Clift;
 use clift_train::{
     Loss, OptimizerConfig, Shown, Stage, StageBatch, TrainError, adamw, clip_global_norm, freeze, global_norm, loss_of,
+    seeded_batch, seeded_model,
 };
 
-use crate::cases::inputs::{batch, model};
 use crate::cases::reference::{InF64, module_in_f64, values};
 use crate::doctor::stability::case::{Bound, Case, Outcome};
 use crate::doctor::stability::updates::{network, num_tokens, shape};
@@ -19,8 +19,8 @@ pub(crate) const CASES: &[Case] = &[Case {
     bound: Bound::Most(5e-2),
     reason: "loss after 20 updates against a run in f64: rounding grows with every update, and the loss must have fallen",
     run: |place| {
-        let batch = batch(shape(place, 2), 2, num_tokens(place, 2), None, 0)?;
-        let model = freeze(Stage::Stage1, model(&network(place), 0, &place.device));
+        let batch = seeded_batch(shape(place, 2), 2, num_tokens(place, 2), None, 0)?;
+        let model = freeze(Stage::Stage1, seeded_model(&network(place), 0, &place.device));
         let copy = module_in_f64(&model, &place.reference).train();
         let ours = losses(model, &batch, &place.device, false)?;
         let theirs = losses(copy, &batch, &place.reference, true)?;

@@ -2,9 +2,8 @@
 
 use clift_data::{Clip, MAX_COORDINATE, Views};
 use clift_model::ModelConfig;
-use clift_train::{StageBatch, TrainError};
+use clift_train::{Shape, StageBatch, TrainError, seeded_batch, seeded_model};
 
-use crate::cases::inputs::{Shape, batch, model};
 use crate::doctor::stability::case::{Bound, Case, Outcome, Place};
 use crate::doctor::stability::compare::update_error;
 
@@ -161,9 +160,9 @@ pub(crate) fn num_tokens(place: &Place, num_context: usize) -> usize {
 
 /// The error of an update of stage 1 on a scene that is changed.
 fn changed(place: &Place, num_context: usize, change: impl Fn(&mut Clip)) -> Result<Outcome, TrainError> {
-    let mut batch: StageBatch = batch(shape(place, num_context), 1, num_tokens(place, num_context), None, 0)?;
+    let mut batch: StageBatch = seeded_batch(shape(place, num_context), 1, num_tokens(place, num_context), None, 0)?;
     batch.clips.iter_mut().for_each(change);
-    let model = clift_train::freeze(clift_train::Stage::Stage1, model(&network(place), 0, &place.device));
+    let model = clift_train::freeze(clift_train::Stage::Stage1, seeded_model(&network(place), 0, &place.device));
     Ok(Outcome::Error(update_error(place, &model, &batch)?))
 }
 

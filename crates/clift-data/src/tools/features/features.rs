@@ -3,6 +3,8 @@
 //! Corners are found in two sizes of an image, described by the gradients around them, matched both ways, and kept if
 //! they agree with one fundamental matrix.
 
+use crate::tools::features::epipolar::epipolar_distance;
+use crate::tools::features::epipolar::of_cameras;
 use crate::image::lanczos::resize_lanczos;
 use crate::image::rgb_image::Frame;
 use crate::tools::features::correspondence::{Match, WIDTH};

@@ -1,5 +1,4 @@
 //! The feed-forward network of every block, and GELU with an exact gradient on every device.
-#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
 
 use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
@@ -56,7 +55,7 @@ mod tests {
     use burn::tensor::Device;
 
     use super::*;
-    
+
     use crate::testing::{Fixture, assert_close, check_gradients, cpu_devices, devices, random};
 
     /// GELU on its own: behind it a layer that changes nothing.

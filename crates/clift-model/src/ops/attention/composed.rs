@@ -1,5 +1,4 @@
 //! Attention in query chunks, any backend.
-#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
 
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, TensorMetadata};

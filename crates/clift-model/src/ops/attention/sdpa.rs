@@ -108,7 +108,7 @@ impl<B: AttentionOps + AttentionKernels, C: CheckpointStrategy> AttentionOps for
 struct SdpaBackward;
 
 #[derive(Clone, Debug)]
-struct SdpaState<T> {
+pub(crate) struct SdpaState<T> {
     inputs: Projected<T>,
     attended: Attended<T>,
     heads: Heads,
@@ -121,7 +121,10 @@ impl<T> SdpaState<T> {
     }
 }
 
-pub(crate) fn attend<B: AttentionKernels>(inputs: Projected<FloatTensor<B>>, heads: Heads) -> SdpaState<FloatTensor<B>> {
+pub(crate) fn attend<B: AttentionKernels>(
+    inputs: Projected<FloatTensor<B>>,
+    heads: Heads,
+) -> SdpaState<FloatTensor<B>> {
     SdpaState { attended: B::attend(&inputs, heads), inputs, heads }
 }
 

@@ -2,7 +2,6 @@
 
 use std::str::FromStr;
 
-use rayon::prelude::*;
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::error::ModelError;

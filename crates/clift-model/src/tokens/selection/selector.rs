@@ -6,7 +6,6 @@
 //! with the lower id comes first.
 // S stored tokens, R rendered tokens, Q cells of the target's grid
 
-
 use rayon::prelude::*;
 
 use crate::error::ModelError;

@@ -1,8 +1,5 @@
 //! Ray of a stored token.
 
-
-use rayon::prelude::*;
-
 use crate::views::camera::ViewCamera;
 
 /// The ray through the centre of a token's patch.

@@ -1,6 +1,5 @@
 //! `clift data`: make scenes, tell what there is, check it, index it, convert it.
 
-
 use clap::Subcommand;
 
 use crate::commands::data::check::CheckArgs;

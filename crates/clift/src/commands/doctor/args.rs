@@ -2,8 +2,6 @@
 
 use std::path::PathBuf;
 
-
-
 /// Arguments of `clift doctor`.
 #[derive(Debug, clap::Args)]
 pub struct DoctorArgs {

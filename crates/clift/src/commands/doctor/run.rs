@@ -144,7 +144,6 @@ fn table(rows: &[[String; 6]]) -> String {
 
 #[cfg(test)]
 mod tests {
-    
 
     use super::*;
 

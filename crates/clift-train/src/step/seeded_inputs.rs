@@ -4,8 +4,10 @@ use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_data::{Clip, DMat3, DVec3, Intrinsics, Pose, Views, item_rng, step_rng, uniform_below};
 use clift_model::{Clift, ModelConfig, SceneClusters};
-use clift_train::{StageBatch, TokenChoice, TrainError};
 use rand::{Rng, RngExt};
+
+use crate::error::TrainError;
+use crate::step::batch::{StageBatch, TokenChoice};
 
 /// How many pictures of which size an item has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -19,7 +21,7 @@ pub struct Shape {
 }
 
 /// One scene: waves of colour with noise, seen by cameras along an arc.
-pub fn clip(shape: Shape, seed: u64, slot: usize) -> Clip {
+pub fn seeded_clip(shape: Shape, seed: u64, slot: usize) -> Clip {
     let mut rng = item_rng(seed, 0, slot as u32, 0, "bench pictures");
     let Shape { num_context, num_targets, size } = shape;
     // Targets lie between the contexts.
@@ -64,7 +66,12 @@ fn pose(place: f64) -> Pose {
 }
 
 /// Clusters drawn at random: every cluster has its own token, every other token any cluster.
-pub fn clusters(num_tokens: usize, num_clusters: usize, seed: u64, slot: usize) -> Result<SceneClusters, TrainError> {
+pub fn seeded_clusters(
+    num_tokens: usize,
+    num_clusters: usize,
+    seed: u64,
+    slot: usize,
+) -> Result<SceneClusters, TrainError> {
     let mut rng = item_rng(seed, 0, slot as u32, 0, "bench clusters");
     let centroid_index: Vec<u32> = (0..num_clusters).map(|c| (c * num_tokens / num_clusters) as u32).collect();
     let mut assignment: Vec<u32> = (0..num_tokens).map(|_| uniform_below(&mut rng, num_clusters) as u32).collect();
@@ -75,7 +82,7 @@ pub fn clusters(num_tokens: usize, num_clusters: usize, seed: u64, slot: usize) 
 }
 
 /// A batch of stage 1 that keeps every token, or of stage 2 where there is a number of stored tokens.
-pub fn batch(
+pub fn seeded_batch(
     shape: Shape,
     batch_size: usize,
     num_tokens: usize,
@@ -85,16 +92,16 @@ pub fn batch(
     let tokens = match num_storage_tokens {
         None => TokenChoice::All,
         Some(count) => {
-            let scenes = (0..batch_size).map(|slot| clusters(num_tokens, count, seed, slot));
+            let scenes = (0..batch_size).map(|slot| seeded_clusters(num_tokens, count, seed, slot));
             TokenChoice::Clusters(scenes.collect::<Result<_, _>>()?)
         }
     };
-    let clips = (0..batch_size).map(|slot| clip(shape, seed, slot)).collect();
+    let clips = (0..batch_size).map(|slot| seeded_clip(shape, seed, slot)).collect();
     Ok(StageBatch { clips, tokens, skipped: Vec::new() })
 }
 
 /// Uniform values in `[-1, 1)`.
-pub fn uniform<const D: usize>(shape: [usize; D], seed: u64, purpose: &str, device: &Device) -> Tensor<D> {
+pub fn seeded_uniform<const D: usize>(shape: [usize; D], seed: u64, purpose: &str, device: &Device) -> Tensor<D> {
     let mut rng = step_rng(seed, 0, purpose);
     let values: Vec<f32> = (0..shape.iter().product()).map(|_| rng.random_range(-1.0..1.0)).collect();
     Tensor::from_data(TensorData::new(values, shape), device)
@@ -102,7 +109,7 @@ pub fn uniform<const D: usize>(shape: [usize; D], seed: u64, purpose: &str, devi
 
 /// A model on an autodiff device with the seed's initial weights, except that the condenser's gates are open:
 /// they start at zero, and behind a closed gate every result and every gradient is zero, in any arithmetic.
-pub fn model(config: &ModelConfig, seed: u64, device: &Device) -> Clift {
+pub fn seeded_model(config: &ModelConfig, seed: u64, device: &Device) -> Clift {
     struct OpenGates {
         seed: u64,
         path: Vec<String>,
@@ -121,7 +128,7 @@ pub fn model(config: &ModelConfig, seed: u64, device: &Device) -> Clift {
             let purpose = self.path.join(".");
             param.map(|weight| {
                 let bound = 1.0 / (weight.dims()[0] as f64).sqrt();
-                let opened = uniform(weight.dims(), self.seed, &purpose, &weight.device()).mul_scalar(bound);
+                let opened = seeded_uniform(weight.dims(), self.seed, &purpose, &weight.device()).mul_scalar(bound);
                 // A leaf again, as parameters are.
                 opened.detach().require_grad()
             })
@@ -140,22 +147,22 @@ mod tests {
     #[test]
     fn a_clip_has_its_views_rigid_poses_and_the_same_bytes_for_a_seed() {
         let shape = Shape { num_context: 3, num_targets: 2, size: [8, 16] };
-        let clip = clip(shape, 5, 1);
+        let clip = seeded_clip(shape, 5, 1);
         assert_eq!((clip.context.num_views(), clip.target.num_views()), (3, 2));
         assert_eq!(clip.context.images.len(), 3 * 8 * 16 * 3);
         assert!(clip.context.c2w.iter().all(|pose| pose.orthonormality_defect() < 1e-12));
         assert!(clip.context.c2w.windows(2).all(|pair| pair[0] != pair[1]), "views differ");
-        assert_eq!(clip, super::clip(shape, 5, 1));
-        assert_ne!(clip.context.images, super::clip(shape, 6, 1).context.images);
+        assert_eq!(clip, super::seeded_clip(shape, 5, 1));
+        assert_ne!(clip.context.images, super::seeded_clip(shape, 6, 1).context.images);
     }
 
     #[test]
     fn drawn_clusters_are_valid_at_every_count() {
         for count in [1, 2, 7, 12] {
-            let scene = clusters(12, count, 0, 0).expect("valid");
+            let scene = seeded_clusters(12, count, 0, 0).expect("valid");
             assert_eq!(scene.centroid_index().len(), count);
         }
-        assert_eq!(clusters(12, 12, 0, 0).expect("valid"), SceneClusters::identity(12));
+        assert_eq!(seeded_clusters(12, 12, 0, 0).expect("valid"), SceneClusters::identity(12));
     }
 
     #[test]
@@ -170,7 +177,7 @@ mod tests {
         }
         let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
         let mut visitor = NotZero(0);
-        model(&config, 0, &Device::flex()).visit(&mut visitor);
+        seeded_model(&config, 0, &Device::flex()).visit(&mut visitor);
         assert!(visitor.0 > 0);
     }
 }
