@@ -8,34 +8,34 @@ use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::median;
 use clift_model::{DeviceName, Precision};
-use clift_train::{Config, Shown, Stage, TrainError, freeze, psnr_of};
+use clift_train::{Config, DeviceBatch, Stage, TrainError, freeze, psnr_of};
 use serde::Serialize;
 
-use crate::cases::case::Work;
+use crate::cases::case::BenchCase;
 use crate::cases::context::BenchContext;
 use crate::cases::forward::{Encode, Render};
 use crate::cases::options::BenchOptions;
 use crate::cases::reference::values;
 use crate::cases::step::{gradients, loss_factor, micro_batch};
-use crate::cases::task::{Forward, Task};
+use crate::cases::task::{BenchTask, Forward};
 
 /// The works that are compared.
-pub const WORKS: [Work; 4] = [Work::Encode, Work::Render, Work::Stage1Step, Work::Stage2Step];
+pub const WORKS: [BenchCase; 4] = [BenchCase::Encode, BenchCase::Render, BenchCase::Stage1Step, BenchCase::Stage2Step];
 
 /// What was measured.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct HalfReport {
+pub struct PrecisionReport {
     /// Where tensors were.
     pub device: DeviceName,
     /// One per work.
-    pub rows: Vec<HalfRow>,
+    pub rows: Vec<PrecisionRow>,
 }
 
 /// One work in both precisions.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct HalfRow {
+pub struct PrecisionRow {
     /// Which work.
-    pub work: Work,
+    pub work: BenchCase,
     /// Median seconds with f32 products.
     pub f32_s: f64,
     /// Median seconds with f16 products, in turn with the others.
@@ -52,7 +52,7 @@ pub struct HalfRow {
     pub psnr_to_f32: Option<f64>,
 }
 
-impl HalfRow {
+impl PrecisionRow {
     /// PSNR of an update's pictures against its targets, in f32 and in f16.
     pub fn psnr(&self) -> Option<[f64; 2]> {
         self.loss.map(|loss| loss.map(psnr_of))
@@ -64,9 +64,9 @@ impl HalfRow {
 /// # Errors
 /// [`TrainError::BadConfig`] for sizes that cannot be, [`clift_model::ModelError::BadConfig`] on a device without f16,
 /// [`TrainError::Abandoned`] after `stop` was set.
-pub fn compare(config: &Config, options: &BenchOptions, stop: &AtomicBool) -> Result<HalfReport, TrainError> {
+pub fn compare(config: &Config, options: &BenchOptions, stop: &AtomicBool) -> Result<PrecisionReport, TrainError> {
     if let Some(other) = options.work.iter().find(|work| !WORKS.contains(work)) {
-        let fix = format!("write some of {}", WORKS.map(Work::name).join(", "));
+        let fix = format!("write some of {}", WORKS.map(BenchCase::name).join(", "));
         return Err(TrainError::BadConfig { key: "--work".into(), value: other.name().into(), fix });
     }
     let [single, half] = [Precision::F32, Precision::F16]
@@ -76,19 +76,19 @@ pub fn compare(config: &Config, options: &BenchOptions, stop: &AtomicBool) -> Re
     for work in WORKS.into_iter().filter(|work| options.work.contains(work)) {
         let [f32_s, f16_s] = times(work, &contexts, options, stop)?;
         let Compared { error, loss, psnr_to_f32 } = compared(work, &contexts[0])?;
-        rows.push(HalfRow { work, f32_s, f16_s, ratio: f16_s / f32_s, error, loss, psnr_to_f32 });
+        rows.push(PrecisionRow { work, f32_s, f16_s, ratio: f16_s / f32_s, error, loss, psnr_to_f32 });
     }
-    Ok(HalfReport { device: config.device, rows })
+    Ok(PrecisionReport { device: config.device, rows })
 }
 
 fn times(
-    work: Work,
+    work: BenchCase,
     contexts: &[BenchContext; 2],
     options: &BenchOptions,
     stop: &AtomicBool,
 ) -> Result<[f64; 2], TrainError> {
     let scoped = |context: &BenchContext| context.config.precision.scope();
-    let mut tasks: Vec<Box<dyn Task>> = Vec::new();
+    let mut tasks: Vec<Box<dyn BenchTask>> = Vec::new();
     for context in contexts {
         let _scope = scoped(context);
         tasks.push(work.prepare(context)?);
@@ -118,7 +118,7 @@ struct Compared {
     psnr_to_f32: Option<f64>,
 }
 
-fn compared(work: Work, context: &BenchContext) -> Result<Compared, TrainError> {
+fn compared(work: BenchCase, context: &BenchContext) -> Result<Compared, TrainError> {
     let both = |forward: &dyn Fn() -> Tensor<1>| {
         [Precision::F32, Precision::F16].map(|precision| {
             let _scope = precision.scope();
@@ -126,19 +126,19 @@ fn compared(work: Work, context: &BenchContext) -> Result<Compared, TrainError> 
         })
     };
     let stage = match work {
-        Work::Encode => {
+        BenchCase::Encode => {
             let encode = Encode::new(context)?;
             let [single, half] = both(&|| encode.forward());
             return Ok(Compared { error: distance(&half, &single), loss: None, psnr_to_f32: None });
         }
-        Work::Render => {
+        BenchCase::Render => {
             let render = Render::new(context, 1)?;
             let [single, half] = both(&|| render.forward());
             let squares = half.iter().zip(&single).map(|(a, b)| (a - b).powi(2));
             let mse = squares.sum::<f64>() / single.len() as f64;
             return Ok(Compared { error: distance(&half, &single), loss: None, psnr_to_f32: Some(psnr_of(mse)) });
         }
-        Work::Stage2Step => Stage::Stage2,
+        BenchCase::Stage2Step => Stage::Stage2,
         _ => Stage::Stage1,
     };
     let model = freeze(stage, context.model());
@@ -146,7 +146,7 @@ fn compared(work: Work, context: &BenchContext) -> Result<Compared, TrainError> 
     let mut results = Vec::new();
     for precision in [Precision::F32, Precision::F16] {
         let _scope = precision.scope();
-        let shown = Shown::upload(&batch, &context.device.clone().autodiff())?;
+        let shown = DeviceBatch::upload(&batch, &context.device.clone().autodiff())?;
         let (loss, grads) = gradients(&model, &batch, shown)?;
         results.push((loss, flat(&model, &grads, loss_factor())));
     }
@@ -189,8 +189,8 @@ mod tests {
         for row in &report.rows {
             // Operands of 11 bits, through two blocks and back.
             assert!(row.error > 1e-6 && row.error < 1e-2, "{row:?}");
-            let is_step = matches!(row.work, Work::Stage1Step | Work::Stage2Step);
-            assert_eq!((row.loss.is_some(), row.psnr_to_f32.is_some()), (is_step, row.work == Work::Render));
+            let is_step = matches!(row.work, BenchCase::Stage1Step | BenchCase::Stage2Step);
+            assert_eq!((row.loss.is_some(), row.psnr_to_f32.is_some()), (is_step, row.work == BenchCase::Render));
             if let Some([single, half]) = row.psnr() {
                 assert!((single - half).abs() < 0.01, "{row:?}");
             }

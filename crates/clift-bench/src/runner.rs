@@ -12,7 +12,7 @@ use clift_model::{DeviceName, Precision};
 use clift_train::{Config, TrainError};
 use serde::Serialize;
 
-use crate::cases::case::Work;
+use crate::cases::case::BenchCase;
 use crate::cases::context::BenchContext;
 use crate::cases::options::BenchOptions;
 
@@ -33,7 +33,7 @@ pub struct Report {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Row {
     /// Which work.
-    pub work: Work,
+    pub work: BenchCase,
     /// Middle of the samples.
     pub median_s: f64,
     /// 95th percentile of the samples, nearest rank.
@@ -78,7 +78,7 @@ pub fn run(
     tell: &mut dyn FnMut(BenchEvent),
 ) -> Result<Report, TrainError> {
     let context = BenchContext::new(config, options)?;
-    let works: Vec<Work> = Work::ALL.into_iter().filter(|work| options.work.contains(work)).collect();
+    let works: Vec<BenchCase> = BenchCase::ALL.into_iter().filter(|work| options.work.contains(work)).collect();
     let total = works.len() * (options.warmup + options.repeats + usize::from(options.error));
     let mut done = 0;
     let mut rows = Vec::with_capacity(works.len());
@@ -101,7 +101,7 @@ pub fn run(
 }
 
 fn measure(
-    work: Work,
+    work: BenchCase,
     context: &BenchContext,
     options: &BenchOptions,
     advance: &mut dyn FnMut(usize) -> Result<(), TrainError>,
@@ -142,7 +142,7 @@ fn measure(
 pub(crate) mod tests {
     use clift_model::TokenCount;
 
-    use clift_data::BoundedSampler;
+    use clift_data::ViewSampler;
     use clift_model::ModelConfig;
 
     use super::*;
@@ -159,12 +159,12 @@ pub(crate) mod tests {
         };
         let mut config = Config { run_dir: "run".into(), device, model, ..Config::default() };
         (config.data.width, config.data.height) = (16, 16);
-        config.data.views = BoundedSampler { num_targets: 1, ..BoundedSampler::default() };
+        config.data.views = ViewSampler { num_targets: 1, ..ViewSampler::default() };
         (config.stage1.batch_size, config.stage2.batch_size) = (2, 2);
         config
     }
 
-    pub fn options(work: &[Work]) -> BenchOptions {
+    pub fn options(work: &[BenchCase]) -> BenchOptions {
         let storage = TokenCount::Share(0.25);
         BenchOptions { work: work.into(), repeats: 2, warmup: 0, error: true, storage, render: None, features: None }
     }
@@ -177,21 +177,21 @@ pub(crate) mod tests {
                 BenchEvent::Progress { done, total } => events.push((done, total)),
                 BenchEvent::Finished(_) => {}
             };
-            let options = options(&Work::ALL);
+            let options = options(&BenchCase::ALL);
             let report = run(&config(device), &options, &AtomicBool::new(false), &mut note).expect("runs");
-            assert_eq!(report.rows.iter().map(|row| row.work).collect::<Vec<_>>(), Work::ALL);
+            assert_eq!(report.rows.iter().map(|row| row.work).collect::<Vec<_>>(), BenchCase::ALL);
             for row in &report.rows {
                 // Blocks of f32 as in the tests of the model: outputs to 1e-5, gradients to 5e-5.
                 let close = row.max_rel_error.map(|error| error < 1e-4);
-                assert_eq!(close, (row.work != Work::Select).then_some(true), "{device}: {row:?}");
+                assert_eq!(close, (row.work != BenchCase::Select).then_some(true), "{device}: {row:?}");
                 assert_eq!(row.samples_s.len(), 2);
                 assert!(row.samples_s.iter().all(|sample| (0.0..=row.p95_s).contains(sample)));
-                assert_eq!(row.inertia.is_some(), row.work == Work::Kmeans);
+                assert_eq!(row.inertia.is_some(), row.work == BenchCase::Kmeans);
             }
             // An f32 result that was compared with itself would be exact.
-            let exact = |row: &&Row| row.work != Work::Kmeans && row.max_rel_error == Some(0.0);
+            let exact = |row: &&Row| row.work != BenchCase::Kmeans && row.max_rel_error == Some(0.0);
             assert_eq!(report.rows.iter().find(exact), None);
-            let total = Work::ALL.len() * 3;
+            let total = BenchCase::ALL.len() * 3;
             assert_eq!(events.last(), Some(&(total, total)));
         }
     }
@@ -200,7 +200,7 @@ pub(crate) mod tests {
     fn a_stop_ends_it_before_the_first_repetition() {
         let mut events = Vec::new();
         let mut note = |event: BenchEvent| events.push(matches!(event, BenchEvent::Progress { done: 0, .. }));
-        let options = options(&[Work::Render, Work::Encode]);
+        let options = options(&[BenchCase::Render, BenchCase::Encode]);
         let stopped = run(&config(DeviceName::Flex), &options, &AtomicBool::new(true), &mut note).unwrap_err();
         assert_eq!(stopped.to_string(), "interrupted during `encode`; nothing was written");
         assert_eq!(events, [true]);

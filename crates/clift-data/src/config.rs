@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::normalization::{PoseRotation, PoseScale};
 use crate::image::fit::Crop;
 use crate::sampling::clip_reader::ClipOptions;
-use crate::sampling::view_sampler::BoundedSampler;
+use crate::sampling::view_sampler::ViewSampler;
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
 use crate::sources::options::FileOptions;
@@ -44,7 +44,7 @@ pub struct DataConfig {
     /// The synthetic scenes.
     pub synthetic: SyntheticConfig,
     /// How context and target frames are drawn for training.
-    pub views: BoundedSampler,
+    pub views: ViewSampler,
     /// Threads that prepare batches; 0 prepares them between the steps.
     pub num_threads: usize,
     /// Batches prepared ahead.
@@ -66,7 +66,7 @@ impl Default for DataConfig {
             flip: false,
             filters: SceneFilters::default(),
             synthetic: SyntheticConfig::default(),
-            views: BoundedSampler::default(),
+            views: ViewSampler::default(),
             num_threads: 1,
             num_prefetch: 4,
         }

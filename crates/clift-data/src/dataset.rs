@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::config::DataConfig;
 use crate::error::DataError;
 use crate::scene_source::{SceneSource, Split};
-use crate::skip_report::Ledger;
+use crate::skip_report::SkipReport;
 use crate::sources::dataset_root::DatasetRoot;
 use crate::sources::keys::is_dl3dv_key;
 use crate::sources::kind::SourceKind;
@@ -24,7 +24,7 @@ pub fn open_dataset(config: &DataConfig, split: Split) -> Result<OpenedSource, D
     let opened = match config.source {
         SourceKind::Synthetic => {
             let source = SyntheticSource::new(SyntheticConfig { split, ..config.synthetic.clone() })?;
-            let report = Ledger::new(source.num_scenes());
+            let report = SkipReport::new(source.num_scenes());
             OpenedSource { source: Arc::new(source), kind: config.source, has_splits: true, report }
         }
         kind => open_files(config, kind, split)?,
@@ -83,7 +83,7 @@ pub fn open_training_dataset(config: &DataConfig) -> Result<OpenedSource, DataEr
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sampling::view_sampler::BoundedSampler;
+    use crate::sampling::view_sampler::ViewSampler;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
     use crate::synthetic::config::SyntheticConfig;
 
@@ -107,7 +107,7 @@ mod tests {
         }
         // Two contexts may lie 4 apart, three 8.
         let views =
-            BoundedSampler { min_context: 2, max_context: 4, min_gap: [8, 9], max_gap: [8, 9], ..Default::default() };
+            ViewSampler { min_context: 2, max_context: 4, min_gap: [8, 9], max_gap: [8, 9], ..Default::default() };
         let mut data = DataConfig { views, source: SourceKind::Chunks, ..DataConfig::default() };
         data.root = Some(folder.path().to_owned());
         let OpenedSource { source, report, .. } = open_training_dataset(&data).unwrap();
@@ -116,7 +116,7 @@ mod tests {
         assert_eq!(report.to_string(), expected);
         assert_eq!(report.skips[0].key, "of-4");
         assert_eq!(open_dataset(&data, Split::Train).unwrap().source.num_scenes(), 3);
-        data.views = BoundedSampler { min_gap: [9, 9], max_gap: [9, 9], ..Default::default() };
+        data.views = ViewSampler { min_gap: [9, 9], max_gap: [9, 9], ..Default::default() };
         let message = open_training_dataset(&data).err().unwrap().to_string();
         assert!(message.contains("train: 0 of 3 scenes used; 3 shorter than the 10 frames"), "{message}");
     }

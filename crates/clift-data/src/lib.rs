@@ -2,7 +2,7 @@
 //! loader.
 //!
 //! This crate does not depend on Burn: its clips and batches are plain host arrays, and
-//! `clift_model::Views::upload` is the one place where they meet a device.
+//! `clift_model::ClipViews::upload` is the one place where they meet a device.
 
 mod config;
 mod dataset;
@@ -28,32 +28,32 @@ pub use error::{DataError, WorkerPanic};
 pub use files::atomic::{
     TEMPORARY, make_folder, publish as publish_file, remove_folder, remove_leftovers, replace as replace_file,
 };
-pub use files::staged_dir::{Unfinished, is_empty as is_empty_folder};
+pub use files::staged_dir::{StagedDir, is_empty as is_empty_folder};
 pub use geometry::camera::{Camera, Intrinsics, IntrinsicsNorm};
 pub use geometry::camera_path::{
     PathView, interpolate as interpolate_path, mean_intrinsics, orbit as orbit_path, read_poses,
 };
 pub use geometry::lens::Lens;
-pub use geometry::normalization::{MAX_COORDINATE, PoseRotation, PoseScale, SceneFrame};
+pub use geometry::normalization::{MAX_COORDINATE, PoseNormalization, PoseRotation, PoseScale};
 pub use geometry::overlap::overlap;
-pub use geometry::path_spread::spread_along_path;
+pub use geometry::path_spread::contexts_along_path;
 pub use geometry::pose::Pose;
 pub use image::codec::{decode as decode_image, encode_jpeg, encode_png};
 pub use image::fit::{Crop, fit as fit_image};
-pub use image::rgb_image::Frame;
+pub use image::rgb_image::RgbImage;
 pub use image::undistort::Undistortion;
-pub use random::{below as uniform_below, derive_seed, distinct as sample_distinct, item_rng, step_rng};
-pub use sampling::clip::{Clip, ViewIndices, Views};
+pub use random::{derive_seed, item_rng, sample_distinct, step_rng, uniform_below};
+pub use sampling::clip::{Clip, ClipViews, ViewIndices};
 pub use sampling::clip_reader::{ClipOptions, ClipReader};
-pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, spread_views};
+pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views};
 pub use sampling::inner_views::InnerViews;
 pub use sampling::prefetcher::Prefetcher;
 pub use sampling::scene_order::SceneOrder;
 pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
 pub use sampling::training_clips::{ClipBatch, TrainingClips};
-pub use sampling::view_sampler::{BoundedSampler, targets_excluding};
+pub use sampling::view_sampler::{ViewSampler, sample_targets};
 pub use scene_source::{SceneSource, Split};
-pub use skip_report::{FrameSkip, Ledger, Skip};
+pub use skip_report::{SkipReport, SkippedFrame, SkippedScene};
 pub use sources::chunks::chunk_source::ChunkSource;
 pub use sources::chunks::writer::{SceneRecord, write_chunks};
 pub use sources::dataset_root::DatasetRoot;
@@ -68,9 +68,9 @@ pub use statistics::{MinMedianMax, median, p95, upper_median};
 pub use synthetic::config::SyntheticConfig;
 pub use synthetic::source::SyntheticSource;
 pub use tools::check::result::SceneCheck;
-pub use tools::check::scene::{Checked, check_scene, left_out, note_frames};
-pub use tools::convert::{Conversion, ConvertOptions, ConvertTo, Converted, convert};
-pub use tools::export::{Encoding, write_evaluation_index, write_source};
+pub use tools::check::scene::{CheckedScene, check_scene, left_out, note_frames};
+pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter, convert};
+pub use tools::export::{ImageEncoding, write_evaluation_index, write_source};
 pub use tools::index_census::IndexCensus;
 pub use tools::info::SourceInfo;
 pub use tools::overlap_index::{OverlapOptions, write_overlap_index};

@@ -30,14 +30,14 @@ pub fn step_rng(seed: u64, step: u64, purpose: &str) -> ChaCha8Rng {
 ///
 /// Written out (high half of a 64 x 64 bit product) instead of taken from `rand`, whose ranges may draw
 /// differently in a later release. The bias is below `count / 2^64`.
-pub fn below(rng: &mut impl Rng, count: usize) -> usize {
+pub fn uniform_below(rng: &mut impl Rng, count: usize) -> usize {
     debug_assert!(count > 0, "nothing to draw from");
     ((u128::from(rng.next_u64()) * count as u128) >> 64) as usize
 }
 
 /// Draws uniformly from `low..=high`.
 pub(crate) fn between(rng: &mut impl Rng, low: usize, high: usize) -> usize {
-    low + below(rng, high - low + 1)
+    low + uniform_below(rng, high - low + 1)
 }
 
 /// Draws uniformly from `[0, 1)`, in steps of `2^-53`.
@@ -46,10 +46,10 @@ pub(crate) fn unit(rng: &mut impl Rng) -> f64 {
 }
 
 /// Draws `count` distinct values of `0..range` uniformly, in increasing order (Floyd's algorithm).
-pub fn distinct(rng: &mut impl Rng, range: usize, count: usize) -> Vec<usize> {
+pub fn sample_distinct(rng: &mut impl Rng, range: usize, count: usize) -> Vec<usize> {
     let mut drawn = Vec::with_capacity(count);
     for last in range - count..range {
-        let value = below(rng, last + 1);
+        let value = uniform_below(rng, last + 1);
         drawn.push(if drawn.contains(&value) { last } else { value });
     }
     drawn.sort_unstable();
@@ -57,7 +57,7 @@ pub fn distinct(rng: &mut impl Rng, range: usize, count: usize) -> Vec<usize> {
 }
 
 /// Draws `count` of `values` without replacement, in random order.
-pub(crate) fn draw_from(rng: &mut impl Rng, mut values: Vec<usize>, count: usize) -> Vec<usize> {
+pub(crate) fn sample_from(rng: &mut impl Rng, mut values: Vec<usize>, count: usize) -> Vec<usize> {
     for i in 0..count {
         let j = between(rng, i, values.len() - 1);
         values.swap(i, j);
@@ -103,7 +103,7 @@ mod tests {
         assert_eq!(step_rng(7, 1500, "views").next_u64(), 5_891_222_139_913_767_078);
         assert_eq!(derive_seed(7, "stage1"), 15_274_277_896_134_325_637);
         let mut rng = step_rng(1, 2, "draws");
-        assert_eq!([(); 6].map(|()| below(&mut rng, 1000)), [152, 127, 472, 593, 99, 357]);
+        assert_eq!([(); 6].map(|()| uniform_below(&mut rng, 1000)), [152, 127, 472, 593, 99, 357]);
     }
 
     #[test]
@@ -129,7 +129,7 @@ mod tests {
         #[test]
         fn distinct_values_are_distinct_sorted_and_in_range(seed: u64, range in 0_usize..50, share in 0.0_f64..=1.0) {
             let count = (range as f64 * share) as usize;
-            let drawn = distinct(&mut step_rng(seed, 0, "test"), range, count);
+            let drawn = sample_distinct(&mut step_rng(seed, 0, "test"), range, count);
             prop_assert_eq!(drawn.len(), count);
             prop_assert!(drawn.windows(2).all(|pair| pair[0] < pair[1]));
             prop_assert!(drawn.iter().all(|&value| value < range));
@@ -137,7 +137,7 @@ mod tests {
 
         #[test]
         fn draws_stay_below_their_count(seed: u64, count in 1_usize..=usize::MAX) {
-            prop_assert!(below(&mut step_rng(seed, 0, "test"), count) < count);
+            prop_assert!(uniform_below(&mut step_rng(seed, 0, "test"), count) < count);
         }
     }
 }

@@ -5,7 +5,7 @@ use strum::Display;
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 
 /// One of the two splits of a data set. Prints as `train` or `test`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display)]
@@ -42,7 +42,7 @@ pub trait SceneSource: Send + Sync {
         Ok(String::new())
     }
     /// Decodes one frame.
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError>;
+    fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError>;
     /// The JPEG or PNG file that [`SceneSource::frame`] decodes, byte by byte; `None` where there is none: the picture
     /// is computed, or resampled on load.
     fn encoded_frame(&self, _scene: usize, _frame: usize) -> Result<Option<Vec<u8>>, DataError> {

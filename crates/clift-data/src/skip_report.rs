@@ -13,7 +13,7 @@ const MAX_REASONS_SHOWN: usize = 8;
 
 /// One scene that was left out.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Skip {
+pub struct SkippedScene {
     /// Key of the scene.
     pub key: String,
     /// Why, in words that equal cases share, so that they can be counted.
@@ -22,7 +22,7 @@ pub struct Skip {
 
 /// One frame that was left out.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct FrameSkip {
+pub struct SkippedFrame {
     /// Key of its scene.
     pub key: String,
     /// What its file calls it: the name of a picture, or a time stamp.
@@ -33,20 +33,20 @@ pub struct FrameSkip {
 
 /// How many scenes there were and what was left out. Prints as `2 of 3 scenes used; 1 shorter than 46 frames`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Ledger {
+pub struct SkipReport {
     /// Scenes looked at, used or not.
     pub num_scenes: usize,
     /// Scenes left out, in the order they were met.
-    pub skips: Vec<Skip>,
+    pub skips: Vec<SkippedScene>,
     /// Frames left out of scenes: those that are used without them, and those that are left out because of them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub frames: Vec<FrameSkip>,
+    pub frames: Vec<SkippedFrame>,
     /// What else is to be known about the scenes, in whole sentences without a stop.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<String>,
 }
 
-impl Ledger {
+impl SkipReport {
     /// A ledger of `num_scenes` scenes of which none is left out yet.
     pub fn new(num_scenes: usize) -> Self {
         Self { num_scenes, ..Self::default() }
@@ -54,12 +54,12 @@ impl Ledger {
 
     /// Notes that a scene is left out.
     pub fn skip(&mut self, key: impl Into<String>, reason: impl Into<String>) {
-        self.skips.push(Skip { key: key.into(), reason: reason.into() });
+        self.skips.push(SkippedScene { key: key.into(), reason: reason.into() });
     }
 
     /// Notes that a frame is left out.
     pub fn skip_frame(&mut self, key: impl Into<String>, frame: impl Into<String>, reason: impl Into<String>) {
-        self.frames.push(FrameSkip { key: key.into(), frame: frame.into(), reason: reason.into() });
+        self.frames.push(SkippedFrame { key: key.into(), frame: frame.into(), reason: reason.into() });
     }
 
     /// Whether anything was left out.
@@ -96,7 +96,7 @@ impl Ledger {
     }
 }
 
-impl fmt::Display for Ledger {
+impl fmt::Display for SkipReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} of {} scenes used", self.num_used(), self.num_scenes)?;
         let counts = self.counts();
@@ -107,14 +107,14 @@ impl fmt::Display for Ledger {
             write!(f, "; {} for other reasons", counts.values().skip(MAX_REASONS_SHOWN).sum::<usize>())?;
         }
         for (reason, names) in self.frame_names() {
-            write!(f, "; {} {reason} ({})", counted(names.len(), "frame"), some_of(&names))?;
+            write!(f, "; {} {reason} ({})", plural(names.len(), "frame"), first_few(&names))?;
         }
         self.notes.iter().try_for_each(|note| write!(f, "; {note}"))
     }
 }
 
 /// The first few names, and dots for the others.
-pub(crate) fn some_of<S: AsRef<str>>(names: &[S]) -> String {
+pub(crate) fn first_few<S: AsRef<str>>(names: &[S]) -> String {
     let mut shown: Vec<&str> = names.iter().take(MAX_NAMES_SHOWN).map(AsRef::as_ref).collect();
     if names.len() > shown.len() {
         shown.push("..");
@@ -123,7 +123,7 @@ pub(crate) fn some_of<S: AsRef<str>>(names: &[S]) -> String {
 }
 
 /// A count with its noun: `1 scene`, `2 scenes`.
-pub(crate) fn counted(count: usize, noun: &str) -> String {
+pub(crate) fn plural(count: usize, noun: &str) -> String {
     format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
 
@@ -133,7 +133,7 @@ mod tests {
 
     #[test]
     fn a_ledger_prints_used_and_total_and_counts_each_reason() {
-        let mut ledger = Ledger::new(5);
+        let mut ledger = SkipReport::new(5);
         assert_eq!(ledger.to_string(), "5 of 5 scenes used");
         ledger.skip("a", "shorter than 46 frames");
         ledger.skip("b", "null in the evaluation index");
@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn frames_left_out_are_named_and_counted_and_notes_follow() {
-        let mut ledger = Ledger::new(1);
+        let mut ledger = SkipReport::new(1);
         assert!(!ledger.has_gaps());
         for frame in ["1.jpg", "5.jpg", "6.jpg", "7.jpg"] {
             ledger.skip_frame("fox", frame, "without a picture");
@@ -160,19 +160,19 @@ mod tests {
 
     #[test]
     fn a_note_alone_is_news_and_no_gap() {
-        let mut ledger = Ledger::new(1);
+        let mut ledger = SkipReport::new(1);
         assert!(!ledger.has_news());
         ledger.notes.push("only model 0 is used".into());
         assert!(ledger.has_news() && !ledger.has_gaps());
-        ledger = Ledger::new(1);
+        ledger = SkipReport::new(1);
         ledger.skip("a", "shorter than 46 frames");
         assert!(ledger.has_news());
     }
 
     #[test]
     fn a_ledger_without_frames_is_written_as_before_and_older_files_are_read() {
-        let text = serde_json::to_string(&Ledger::new(2)).unwrap();
+        let text = serde_json::to_string(&SkipReport::new(2)).unwrap();
         assert_eq!(text, r#"{"num_scenes":2,"skips":[]}"#);
-        assert_eq!(serde_json::from_str::<Ledger>(&text).unwrap(), Ledger::new(2));
+        assert_eq!(serde_json::from_str::<SkipReport>(&text).unwrap(), SkipReport::new(2));
     }
 }

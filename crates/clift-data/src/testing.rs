@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 
 type ChangeCameras = dyn Fn(usize, Vec<Camera>) -> Result<Vec<Camera>, DataError> + Send + Sync;
-type ChangeFrame = dyn Fn(usize, usize, Frame) -> Result<Frame, DataError> + Send + Sync;
+type ChangeFrame = dyn Fn(usize, usize, RgbImage) -> Result<RgbImage, DataError> + Send + Sync;
 type EncodedFrame = dyn Fn(usize, usize) -> Option<Vec<u8>> + Send + Sync;
 
 /// A source whose cameras and frames pass through a test's functions; without any they are those of another source.
@@ -41,7 +41,7 @@ impl TestSource {
     /// Changes a frame of a scene.
     pub fn with_frames(
         self,
-        change: impl Fn(usize, usize, Frame) -> Result<Frame, DataError> + Send + Sync + 'static,
+        change: impl Fn(usize, usize, RgbImage) -> Result<RgbImage, DataError> + Send + Sync + 'static,
     ) -> Self {
         Self { frame: Box::new(change), ..self }
     }
@@ -76,7 +76,7 @@ impl SceneSource for TestSource {
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         (self.cameras)(scene, self.base.cameras(scene)?)
     }
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+    fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         (self.frame)(scene, frame, self.base.frame(scene, frame)?)
     }
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
@@ -113,7 +113,7 @@ impl SceneSource for Lengths {
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.lengths[scene])
     }
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+    fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         Err(DataError::NoSuchFrame { key: self.keys[scene].clone(), frame, num_frames: self.lengths[scene] })
     }
 }

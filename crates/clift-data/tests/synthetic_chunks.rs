@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use clift_data::{
-    Camera, ChunkSource, Encoding, SceneFilters, SceneSource, SourceInfo, Split, SyntheticConfig, SyntheticSource,
+    Camera, ChunkSource, ImageEncoding, SceneFilters, SceneSource, SourceInfo, Split, SyntheticConfig, SyntheticSource,
     write_source,
 };
 
@@ -17,7 +17,7 @@ fn synthetic(split: Split) -> SyntheticSource {
 fn write(root: &Path) {
     for split in [Split::Train, Split::Test] {
         let folder = root.join(split.to_string());
-        let written = write_source(&synthetic(split), &folder, Encoding::Png, 25_000, |_| ()).unwrap();
+        let written = write_source(&synthetic(split), &folder, ImageEncoding::Png, 25_000, |_| ()).unwrap();
         assert_eq!((written.num_scenes, written.num_frames), (5, 30));
     }
 }

@@ -2,9 +2,9 @@
 // N encoder tokens, S stored tokens, D width
 
 use burn::tensor::Tensor;
-use clift_data::{ClipReader, Pose, SceneFrame, ViewIndices, derive_seed, spread_along_path};
+use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices, contexts_along_path, derive_seed};
 use clift_model::{
-    Clusters, Grouping, KMeans, ModelError, Scene, SceneModel, TokenCount, TokenKind, TrainedModel, WorldFrame,
+    Clusters, Grouping, KMeans, ModelError, Scene, SceneModel, SceneNormalization, TokenCount, TokenKind, TrainedModel,
     total_variance,
 };
 
@@ -63,7 +63,7 @@ pub fn encode(
     let views = ViewIndices { context: frames, target: Vec::new() };
     let clip = reader.read(scene, &views)?;
     let data = &reader.options;
-    let frame = SceneFrame::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)?;
+    let frame = PoseNormalization::find(key, &context_poses, &[], data.pose_rotation, data.pose_scale)?;
 
     let lift = model.network.encode(&upload_views(&[&clip.context], &model.device)?); // [1, N, D]
     let [_, num_lift_tokens, dim] = lift.dims();
@@ -88,7 +88,7 @@ pub fn encode(
         width: data.width,
         context: view_cameras(&clip.context),
         context_frames: views.context.iter().map(|&frame| frame as u32).collect(),
-        world: WorldFrame { mean_c2w: frame.mean_c2w.to_matrix_f64(), scale: frame.scale },
+        world: SceneNormalization { mean_c2w: frame.mean_c2w.to_matrix_f64(), scale: frame.scale },
         token_ids,
         tokens,
     };
@@ -100,7 +100,7 @@ fn context_frames(poses: &[Pose], asked: Option<&[usize]>, num_views: usize) -> 
     let num_frames = poses.len();
     let bad = |value: String, fix: String| bad_config("--context", value, fix);
     let Some(asked) = asked else {
-        return spread_along_path(poses, num_views.min(num_frames)).ok_or_else(|| {
+        return contexts_along_path(poses, num_views.min(num_frames)).ok_or_else(|| {
             bad(num_views.to_string(), format!("the scene has {num_frames} frames; name frames to use"))
         });
     };

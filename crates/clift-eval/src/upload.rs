@@ -1,8 +1,8 @@
 //! Clips of the data crate as tensors of the model crate.
 
 use burn::tensor::{Device, Tensor};
-use clift_data::Views as HostViews;
-use clift_model::{Cameras, ViewCamera, Views, upload_images};
+use clift_data::ClipViews;
+use clift_model::{Cameras, ViewCamera, Views};
 
 use crate::error::EvalError;
 
@@ -14,33 +14,33 @@ use crate::error::EvalError;
 ///
 /// # Errors
 /// [`EvalError::Model`] when the sets differ in number or size, or a camera is not finite.
-pub fn upload_views(scenes: &[&HostViews], device: &Device) -> Result<Views, EvalError> {
+pub fn upload_views(scenes: &[&ClipViews], device: &Device) -> Result<Views, EvalError> {
     let (c2w, intrinsics) = camera_values(scenes);
     Ok(Views::upload(&pixel_values(scenes), &c2w, &intrinsics, shape(scenes), device)?)
 }
 
 /// The pictures alone, RGB in `[0, 1]`, `[batch, views, height, width, 3]`. See [`upload_views`].
-pub fn upload_pictures(scenes: &[&HostViews], device: &Device) -> Result<Tensor<5>, EvalError> {
-    Ok(upload_images(&pixel_values(scenes), shape(scenes), device)?)
+pub fn upload_images(scenes: &[&ClipViews], device: &Device) -> Result<Tensor<5>, EvalError> {
+    Ok(clift_model::upload_images(&pixel_values(scenes), shape(scenes), device)?)
 }
 
 /// The cameras alone. See [`upload_views`].
-pub fn upload_cameras(scenes: &[&HostViews], device: &Device) -> Result<Cameras, EvalError> {
+pub fn upload_cameras(scenes: &[&ClipViews], device: &Device) -> Result<Cameras, EvalError> {
     let (c2w, intrinsics) = camera_values(scenes);
     Ok(Cameras::upload(&c2w, &intrinsics, shape(scenes), device)?)
 }
 
 /// The cameras of one scene on the host, as token selection takes them.
-pub fn view_cameras(views: &HostViews) -> Vec<ViewCamera> {
+pub fn view_cameras(views: &ClipViews) -> Vec<ViewCamera> {
     let cameras = views.c2w.iter().zip(&views.intrinsics);
     cameras.map(|(pose, k)| ViewCamera { c2w: pose.to_matrix_f64(), intrinsics: [k.fx, k.fy, k.cx, k.cy] }).collect()
 }
 
-fn pixel_values(scenes: &[&HostViews]) -> Vec<u8> {
+fn pixel_values(scenes: &[&ClipViews]) -> Vec<u8> {
     scenes.iter().flat_map(|views| &views.images).copied().collect()
 }
 
-fn camera_values(scenes: &[&HostViews]) -> (Vec<f32>, Vec<f32>) {
+fn camera_values(scenes: &[&ClipViews]) -> (Vec<f32>, Vec<f32>) {
     let c2w = scenes.iter().flat_map(|views| &views.c2w).flat_map(|pose| pose.to_matrix()).collect();
     let intrinsics = scenes.iter().flat_map(|views| &views.intrinsics);
     let intrinsics = intrinsics.flat_map(|k| [k.fx, k.fy, k.cx, k.cy].map(|value| value as f32)).collect();
@@ -48,6 +48,6 @@ fn camera_values(scenes: &[&HostViews]) -> (Vec<f32>, Vec<f32>) {
 }
 
 /// `[batch, views, height, width]` of the first scene; the uploads check the others against it.
-fn shape(scenes: &[&HostViews]) -> [usize; 4] {
+fn shape(scenes: &[&ClipViews]) -> [usize; 4] {
     scenes.first().map_or([0; 4], |first| [scenes.len(), first.num_views(), first.height, first.width])
 }

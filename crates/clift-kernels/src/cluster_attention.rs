@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use crate::primitives::shared_slice::Disjoint;
+use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
@@ -79,7 +79,7 @@ pub fn forward(
     let (dim, members) = (segments.dim(), segments.order.len());
     assert!(query.len() == segments.len() * dim && output.len() == query.len(), "rows of all segments");
     assert!(key_value.len() == members * 2 * dim && weights.len() == members * segments.num_heads, "rows of members");
-    let weights = Disjoint::new(weights);
+    let weights = SharedSlice::new(weights);
     output.par_chunks_mut(SEGMENTS_OF_A_TASK * dim).enumerate().for_each(|(task, output)| {
         set.run(Forward { segments, query, key_value, first: task * SEGMENTS_OF_A_TASK, output, weights: &weights });
     });
@@ -91,7 +91,7 @@ struct Forward<'a> {
     key_value: &'a [f32],
     first: usize,
     output: &'a mut [f32],
-    weights: &'a Disjoint<'a>,
+    weights: &'a SharedSlice<'a>,
 }
 
 impl Kernel for Forward<'_> {
@@ -156,7 +156,7 @@ pub fn backward(
     assert!(query.len() == segments.len() * dim && grad.len() == query.len() && grad_query.len() == query.len());
     assert!(key_value.len() == members * 2 * dim && weights.len() == members * segments.num_heads);
     assert_eq!(grad_key_value.len(), key_value.len(), "rows of members");
-    let grad_key_value = Disjoint::new(grad_key_value);
+    let grad_key_value = SharedSlice::new(grad_key_value);
     grad_query.par_chunks_mut(SEGMENTS_OF_A_TASK * dim).enumerate().for_each(|(task, grad_query)| {
         set.run(Backward {
             segments,
@@ -179,7 +179,7 @@ struct Backward<'a> {
     grad: &'a [f32],
     first: usize,
     grad_query: &'a mut [f32],
-    grad_key_value: &'a Disjoint<'a>,
+    grad_key_value: &'a SharedSlice<'a>,
 }
 
 impl Kernel for Backward<'_> {

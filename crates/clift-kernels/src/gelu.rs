@@ -12,7 +12,7 @@ pub fn forward(set: InstructionSet, x: &[f32], output: &mut [f32]) {
 /// `grad *= Phi(x) + x * phi(x)` with the normal density `phi`: the gradient of the output in, that
 /// of `x` out.
 pub fn backward(set: InstructionSet, x: &[f32], grad: &mut [f32]) {
-    combine(set, GeluSlope, x, grad);
+    combine(set, GeluGrad, x, grad);
 }
 
 #[derive(Clone, Copy)]
@@ -26,9 +26,9 @@ impl Map for Gelu {
 }
 
 #[derive(Clone, Copy)]
-struct GeluSlope;
+struct GeluGrad;
 
-impl Combine for GeluSlope {
+impl Combine for GeluGrad {
     #[inline(always)]
     fn apply<S: Simd>(self, simd: S, x: S::V, grad: S::V) -> S::V {
         let (distribution, bell) = distribution(simd, x);

@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use crate::primitives::shared_slice::Disjoint;
+use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
@@ -178,7 +178,7 @@ pub fn sum_rows(set: InstructionSet, x: &[f32], to: &mut [f32]) {
     assert!(dim > 0 && x.len() == count * dim, "whole rows");
     let rows = count.div_ceil(MAX_PARTS).max(rows_of_a_piece(dim));
     let mut sums = vec![0.0; count.div_ceil(rows) * dim];
-    let parts = Disjoint::new(&mut sums);
+    let parts = SharedSlice::new(&mut sums);
     x.par_chunks(rows * dim).enumerate().for_each(|(part, x)| {
         // SAFETY: every part has its own.
         let to = unsafe { parts.part(part * dim, dim) };

@@ -18,11 +18,11 @@ mod simd;
 #[cfg(test)]
 mod testing;
 
-pub use attention::backward::{Saved, backward as attention_backward};
+pub use attention::backward::{BackwardInputs, backward as attention_backward};
 pub use attention::forward::forward as attention_forward;
-pub use attention::shapes::{Gradients, Rows, Sizes};
+pub use attention::shapes::{Gradients, Sizes, StridedRows};
 pub use cluster_attention::{Segments, backward as cluster_attention_backward, forward as cluster_attention_forward};
 pub use gelu::{backward as gelu_backward, forward as gelu_forward};
 pub use layer_norm::{backward as layer_norm_backward, forward as layer_norm_forward, sum_rows};
 pub use linear::forward as linear_forward;
-pub use simd::dispatch::{BadInstructionSet, InstructionSet};
+pub use simd::dispatch::{InstructionSet, InstructionSetError};

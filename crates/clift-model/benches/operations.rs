@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use burn::module::Module;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use clift_model::{Init, KMeans, cluster_attention, linear, linear_of_gelu, linear_of_norm, self_sdpa};
+use clift_model::{Init, KMeans, cluster_attention, gelu_linear, linear, norm_linear, self_sdpa};
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
 use rand::{RngExt, SeedableRng};
@@ -110,10 +110,10 @@ fn layers(criterion: &mut Criterion) {
             linear(if plain(&x) { &up_plain } else { &up }, x)
         });
         both(&mut group, &format!("linear_of_gelu/{name}"), [hidden], |[x]| {
-            linear_of_gelu(if plain(&x) { &down_plain } else { &down }, x)
+            gelu_linear(if plain(&x) { &down_plain } else { &down }, x)
         });
         both(&mut group, &format!("linear_of_norm/{name}"), [x], |[x]| {
-            if plain(&x) { linear_of_norm(&norm_plain, &up_plain, x) } else { linear_of_norm(&norm, &up, x) }
+            if plain(&x) { norm_linear(&norm_plain, &up_plain, x) } else { norm_linear(&norm, &up, x) }
         });
     }
 }

@@ -22,7 +22,7 @@ mod weights;
 
 pub use clift_kernels::InstructionSet;
 pub use cost::largest_tensor::{kmeans_values, largest_tensors};
-pub use cost::macs::{Convention, Macs};
+pub use cost::macs::{FlopConvention, Macs};
 pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, render_bytes, update_bytes};
 pub use cost::parameters::Parameters;
 pub use cost::scene_sizes::SceneSizes;
@@ -30,7 +30,7 @@ pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tenso
 pub use device::name::DeviceName;
 pub use error::ModelError;
 pub use names::parse_value;
-pub use network::architecture::Variant;
+pub use network::architecture::CliftVariant;
 pub use network::blocks::attention::SelfAttention;
 pub use network::blocks::block::{DecoderBlock, EncoderBlock};
 pub use network::blocks::feed_forward::{Activation, FeedForward};
@@ -41,25 +41,25 @@ pub use network::config::{CondenserConfig, ModelConfig};
 pub use network::encoder::Encoder;
 pub use network::init::Init;
 pub use network::layers::Part;
-pub use network::render_tokens::{RenderTokens, SceneMemory};
+pub use network::render_tokens::{KeyValueCache, RenderTokens};
 pub use network::renderer::Renderer;
 pub use network::scene_model::SceneModel;
 pub use ops::attention::composed::MAX_SCORES;
 pub use ops::attention::sdpa::{cross_sdpa, self_sdpa};
 pub use ops::cluster_attention::operation::cluster_attention;
-pub use ops::linear::{linear, linear_of_gelu, linear_of_norm};
+pub use ops::linear::{gelu_linear, linear, norm_linear};
 pub use ops::precision::Precision;
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::render_budget::RenderBudget;
-pub use scene::scene::{Scene, WorldFrame, file_bytes as scene_file_bytes};
-pub use scene::scene_renderer::{Drawn, Viewer, frames_per_call, load_renderer};
-pub use scene::token_format::TokenStorage;
-pub use scene::write::check_destination;
+pub use scene::scene::{Scene, SceneNormalization, file_bytes as scene_file_bytes};
+pub use scene::scene_renderer::{RenderedViews, SceneRenderer, frames_per_call, load_renderer};
+pub use scene::token_format::TokenFormat;
+pub use scene::write::check_output_path;
 pub use tokens::clusters::{ClusterIndex, Clusters, SceneClusters};
 pub use tokens::count::TokenCount;
 pub use tokens::kind::TokenKind;
-pub use tokens::kmeans::fit::{Fit, KMeans, total_variance};
-pub use tokens::selection::rules::{Preset, Rules};
+pub use tokens::kmeans::fit::{KMeans, KMeansFit, total_variance};
+pub use tokens::selection::rules::{SelectionPreset, SelectionRules};
 pub use tokens::selection::selector::Selector;
 pub use tokens::selection::token_ray::TokenRay;
 pub use tokens::tiles::{Grouping, tile_clusters};
@@ -71,7 +71,7 @@ pub use weights::file::{first_not_f32, load_part, save as save_weights, save_par
 pub use weights::hash::hash as weights_hash;
 pub use weights::model_path::{ModelPath, check_heads, refuse_checkpoint};
 pub use weights::published_keys::{
-    CONVOLUTIONS, CheckpointTensor, PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, plain_key, tensors as published_tensors,
+    CONVOLUTIONS, PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };
-pub use weights::published_sizes::{Sizes, sizes as infer_config};
+pub use weights::published_sizes::{InferredConfig, infer_config};
 pub use weights::trained_model::TrainedModel;

@@ -37,13 +37,13 @@ mod tests {
     use std::str::FromStr;
 
     use super::*;
-    use crate::cost::macs::Convention;
+    use crate::cost::macs::FlopConvention;
     use crate::device::name::DeviceName;
-    use crate::network::architecture::Variant;
+    use crate::network::architecture::CliftVariant;
     use crate::ops::precision::Precision;
-    use crate::scene::token_format::TokenStorage;
+    use crate::scene::token_format::TokenFormat;
     use crate::tokens::kind::TokenKind;
-    use crate::tokens::selection::rules::Preset;
+    use crate::tokens::selection::rules::SelectionPreset;
 
     fn check<T>(expected: &str)
     where
@@ -59,14 +59,14 @@ mod tests {
 
     #[test]
     fn every_variant_is_printed_and_parsed_by_its_name() {
-        check::<Convention>("paper, macs, flops");
+        check::<FlopConvention>("paper, macs, flops");
         check::<DeviceName>("flex, ndarray, wgpu");
         check::<Precision>("f32, f16");
-        check::<Preset>("paper, global, scaled");
-        check::<TokenStorage>("f32, f16, int8");
-        check::<Variant>("paper, released-re10k, released-dl3dv");
+        check::<SelectionPreset>("paper, global, scaled");
+        check::<TokenFormat>("f32, f16, int8");
+        check::<CliftVariant>("paper, released-re10k, released-dl3dv");
         assert_eq!(names::<TokenKind>(), "clift, kmeans");
-        let message = parse_value::<Convention>("convention", "flop").unwrap_err().to_string();
+        let message = parse_value::<FlopConvention>("convention", "flop").unwrap_err().to_string();
         assert_eq!(message, "`convention` = flop: write one of paper, macs, flops");
     }
 }

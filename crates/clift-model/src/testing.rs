@@ -6,7 +6,7 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
 
 use crate::device::name::DeviceName;
-use crate::network::architecture::Variant;
+use crate::network::architecture::CliftVariant;
 use crate::network::config::{CondenserConfig, ModelConfig};
 
 /// Every device of this build that opens: flex, ndarray, and wgpu where an adapter is found.
@@ -20,7 +20,7 @@ pub fn cpu_devices() -> Vec<Device> {
 }
 
 /// A small network of a variant, whose sizes differ from each other.
-pub fn small_config(variant: Variant) -> ModelConfig {
+pub fn small_config(variant: CliftVariant) -> ModelConfig {
     ModelConfig {
         variant,
         dim: 15,
@@ -35,9 +35,9 @@ pub fn small_config(variant: Variant) -> ModelConfig {
 
 /// Those of all variants, and the paper's without residuals.
 pub fn small_configs() -> Vec<ModelConfig> {
-    let mut literal = small_config(Variant::Paper);
+    let mut literal = small_config(CliftVariant::Paper);
     literal.condenser.residual = false;
-    Variant::ALL.map(small_config).into_iter().chain([literal]).collect()
+    CliftVariant::ALL.map(small_config).into_iter().chain([literal]).collect()
 }
 
 /// Values in f64, row-major.

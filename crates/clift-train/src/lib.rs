@@ -25,23 +25,23 @@ pub use footprint::largest_tensor::{LargestTensor, largest_tensor};
 pub use footprint::machine::available_bytes;
 pub use footprint::memory::{memory_warning, peak_bytes};
 pub use footprint::scene_sizes::{
-    Middle, PARTS, batch_sizes, cluster_counts, drawn, evaluated, measures_lpips, middle, num_tokens, scene, stored,
-    trained_parts,
+    PARTS, TypicalStep, batch_sizes, cluster_counts, eval_sizes, measures_lpips, num_tokens, possible_sizes, scene,
+    stored, trained_parts, typical_sizes,
 };
 pub use interchange::export::{ExportFormat, export};
 pub use interchange::import::import;
-pub use interchange::model_dir::refuse_existing;
-pub use interchange::record::{ImportOptions, Imported};
+pub use interchange::model_dir::require_absent;
+pub use interchange::record::{ImportOptions, ImportRecord};
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::{Run, RunOptions};
 pub use run::stage_plan::freeze;
 pub use stage::settings::StageSettings;
-pub use step::batch::{StageBatch, TokenChoice};
-pub use step::device_batch::{Shown, loss_of};
+pub use step::batch::{StageBatch, TokenSelection};
+pub use step::device_batch::{DeviceBatch, render_loss};
 pub use step::loss::{Loss, mse, psnr_of};
 pub use step::loss_scale::LossScale;
 pub use step::optimizer::{adamw, clip_global_norm, global_norm};
 pub use step::schedule::warm_up_cosine;
 pub use step::seeded_inputs::{Shape, seeded_batch, seeded_clip, seeded_clusters, seeded_model, seeded_uniform};
-pub use step::step_guard::Fault;
-pub use step::train_state::{Learner, Update};
+pub use step::step_guard::StepAnomaly;
+pub use step::train_state::{TrainState, Update};

@@ -134,6 +134,9 @@ Examples:
 
 #[cfg(test)]
 mod tests {
+    use clift_bench::BenchCase;
+    use clift_model::TokenCount;
+
     use clap::CommandFactory;
 
     use super::*;
@@ -186,7 +189,7 @@ mod tests {
         let Ok(Args { command: Command::Bench(args) }) = parse(&["--work", "encode,stage1_step_tiny"]) else {
             panic!("valid arguments");
         };
-        assert_eq!(args.work, [Work::Encode, Work::Stage1StepTiny]);
+        assert_eq!(args.work, [BenchCase::Encode, BenchCase::Stage1StepTiny]);
         assert_eq!((args.repeats, args.warmup, args.storage), (5, 1, TokenCount::Share(0.25)));
         let message = parse(&["--work", "incode"]).unwrap_err().to_string();
         assert!(message.contains("'incode'") && message.contains("the works are encode, kmeans"), "{message}");

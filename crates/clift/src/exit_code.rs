@@ -25,18 +25,18 @@ pub(crate) fn message(error: &anyhow::Error) -> String {
 
 /// The command line asks for something that cannot be done.
 #[derive(Debug)]
-pub(crate) struct WrongUsage(pub(crate) String);
+pub(crate) struct UsageError(pub(crate) String);
 
-impl std::fmt::Display for WrongUsage {
+impl std::fmt::Display for UsageError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(&self.0)
     }
 }
 
-impl std::error::Error for WrongUsage {}
+impl std::error::Error for UsageError {}
 
 pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
-    if error.is::<WrongUsage>() || error.is::<clift_train::ConfigError>() {
+    if error.is::<UsageError>() || error.is::<clift_train::ConfigError>() {
         return WRONG_USAGE;
     }
     if let Some(error) = error.downcast_ref::<clift_data::DataError>() {
@@ -111,7 +111,7 @@ mod tests {
     #[test]
     fn what_the_user_can_change_is_wrong_usage_and_the_rest_has_failed() {
         let bad_config = || clift_data::SyntheticConfig { num_frames: 0, ..Default::default() }.validate();
-        assert_eq!(exit_code(&WrongUsage("no".into()).into()), WRONG_USAGE);
+        assert_eq!(exit_code(&UsageError("no".into()).into()), WRONG_USAGE);
         assert_eq!(exit_code(&bad_config().unwrap_err().into()), WRONG_USAGE);
         assert_eq!(exit_code(&TrainError::from(bad_config().unwrap_err()).into()), WRONG_USAGE);
         let stopped = |source| TrainError::Stopped { source, stage: "stage1", step: 3, checkpoint: "none".into() };

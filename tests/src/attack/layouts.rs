@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::{DatasetRoot, SourceOptions, Split, TestScenes, open_source};
-use clift_model::Variant;
+use clift_model::CliftVariant;
 use clift_train::{ImportOptions, import};
 
 use crate::setup::{Setup, fixture};
@@ -166,7 +166,7 @@ fn published_checkpoint(setup: &Setup) -> Read {
     let folder = setup.fresh("published-checkpoint");
     let (file, out) = (folder.join("last.ckpt"), folder.join("model"));
     let options =
-        ImportOptions { variant: Variant::ReleasedRe10k, num_heads: Some(3), convert: true, renames: Vec::new() };
+        ImportOptions { variant: CliftVariant::ReleasedRe10k, num_heads: Some(3), convert: true, renames: Vec::new() };
     Box::new(move |bytes| {
         std::fs::write(&file, bytes).expect("a temporary folder is writable");
         let imported = import(&file, &out, &options, &AtomicBool::new(false)).map(drop).map_err(words_of);

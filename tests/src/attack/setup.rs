@@ -4,7 +4,7 @@ use std::io::{Cursor, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use clift_model::{Clift, TokenStorage};
+use clift_model::{Clift, TokenFormat};
 use clift_train::{Config, read_config};
 use tempfile::TempDir;
 use zip::write::SimpleFileOptions;
@@ -63,7 +63,7 @@ impl Setup {
         std::fs::write(place("run.toml"), format!("run_dir = {:?}\n{RUN}", run.display().to_string()))
             .map_err(|error| error.to_string())?;
         clift(&["train", &text(&place("run.toml"))])?;
-        for storage in TokenStorage::ALL {
+        for storage in TokenFormat::ALL {
             let out = text(&place(&format!("room-{storage}.clift")));
             let scene = ["--scene", "synthetic-0-test-00000", "--tokens", storage.name(), "-o", &out];
             clift(&[&["encode", &text(&run)], &scene[..]].concat())?;

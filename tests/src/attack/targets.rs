@@ -8,7 +8,7 @@ use clift_data::{
 };
 use clift_model::{Clift, Scene, load_part};
 use clift_train::{
-    CheckpointConfig, Checkpoints, ClusterCache, Config, Learner, Loss, OptimizerConfig, Run, adamw,
+    CheckpointConfig, Checkpoints, ClusterCache, Config, Loss, OptimizerConfig, Run, TrainState, adamw,
     read_checked_config,
 };
 
@@ -341,9 +341,9 @@ fn chunk_index(setup: &Setup) -> Read {
 }
 
 /// Frames of 40 x 24 pixels with something in them.
-fn frame() -> clift_data::Frame {
+fn frame() -> clift_data::RgbImage {
     let rgb = (0..40 * 24 * 3).map(|i: usize| (i * 7 % 251) as u8).collect();
-    clift_data::Frame { width: 40, height: 24, rgb }
+    clift_data::RgbImage { width: 40, height: 24, rgb }
 }
 
 fn pngs(_: &Setup) -> Vec<Vec<u8>> {
@@ -408,7 +408,7 @@ fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             state["files"][name] = serde_json::json!({"num_bytes": bytes.len(), "crc32": crc32fast::hash(bytes)});
             std::fs::write(step.join("state.json"), state.to_string()).expect("a temporary folder is writable");
         }
-        let mut learner = Learner {
+        let mut learner = TrainState {
             model: model.clone(),
             optimizer: adamw(&OptimizerConfig::default()),
             device: Device::flex().autodiff(),

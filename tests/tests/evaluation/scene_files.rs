@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use clift_data::{Clip, ClipReader, Split, open_dataset, spread_views};
-use clift_eval::{Picture, psnr, ssim, view_cameras};
-use clift_model::{Preset, Scene, TokenKind, TokenStorage, Viewer, load_renderer};
+use clift_data::{Clip, ClipReader, Split, even_views, open_dataset};
+use clift_eval::{Canvas, psnr, ssim, view_cameras};
+use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenFormat, TokenKind, load_renderer};
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
@@ -38,7 +38,7 @@ fn first_clip(place: &Place, run: &str) -> (Clip, ClipReader) {
     let config = config(place, run);
     let source = open_dataset(&config.data, Split::Test).expect("the run's rooms").source;
     let reader = ClipReader { source, options: config.data.clip_options() };
-    let views = spread_views(8, config.eval.num_context, config.eval.num_targets).expect("enough frames");
+    let views = even_views(8, config.eval.num_context, config.eval.num_targets).expect("enough frames");
     assert_eq!(views.context, [0, 7]);
     (reader.read(0, &views).expect("readable"), reader)
 }
@@ -66,11 +66,17 @@ fn evaluated(place: &Place, eval: &str, num_tokens: usize, num_render_tokens: us
 }
 
 /// Draws a clip's targets from a scene file, each from so many of its tokens.
-fn drawn(scene: &Path, weights: &Path, clip: &Clip, preset: Preset, num_render_tokens: usize) -> Vec<Vec<f32>> {
+fn drawn(
+    scene: &Path,
+    weights: &Path,
+    clip: &Clip,
+    preset: SelectionPreset,
+    num_render_tokens: usize,
+) -> Vec<Vec<f32>> {
     let (scene, _) = Scene::read(scene).expect("a scene");
     let device = burn::tensor::Device::flex();
     let renderer = load_renderer(&scene, weights, &device).expect("its renderer");
-    let mut viewer = Viewer::new(&scene, renderer, preset.rules(), &device).expect("its tokens");
+    let mut viewer = SceneRenderer::new(&scene, renderer, preset.rules(), &device).expect("its tokens");
     let views = view_cameras(&clip.target);
     let frames = viewer.draw(&views, clip.target.height, clip.target.width, num_render_tokens).expect("draws");
     frames.into_iter().map(|frame| frame.pixels).collect()
@@ -102,7 +108,7 @@ fn scene_files_reproduce_the_evaluation() {
         assert!(ran.stdout.contains(&format!("{count} of 8 tokens (clift, {storage})")), "{}", ran.stdout);
 
         // The file's size is that of the formula, and of the evaluation's summary.
-        let format: TokenStorage = storage.parse().unwrap();
+        let format: TokenFormat = storage.parse().unwrap();
         let (scene, found) = Scene::read(&place.at(&name)).unwrap();
         assert_eq!((scene.num_tokens(), scene.kind, found), (count, TokenKind::Clift, format));
         assert_eq!(scene.context_frames, [0, 7]);
@@ -118,13 +124,13 @@ fn scene_files_reproduce_the_evaluation() {
         assert_eq!(point.unwrap()["scene_bytes"], bytes);
 
         // Rounded or not, the file gives what the evaluation has in memory, to the last digit.
-        let from_file = measure(&clip, &drawn(&place.at(&name), &weights, &clip, Preset::Paper, count));
+        let from_file = measure(&clip, &drawn(&place.at(&name), &weights, &clip, SelectionPreset::Paper, count));
         assert_eq!(from_file, evaluated(&place, storage, count, count), "{name}");
         let exact = evaluated(&place, "run/eval", count, count);
         let loss_db = match format {
-            TokenStorage::F32 => 0.0,
-            TokenStorage::F16 => 0.005,
-            TokenStorage::Int8 => 0.05,
+            TokenFormat::F32 => 0.0,
+            TokenFormat::F16 => 0.005,
+            TokenFormat::Int8 => 0.05,
         };
         for ((psnr, _), (exact, _)) in from_file.iter().zip(&exact) {
             assert!((psnr - exact).abs() <= loss_db, "{name}: {psnr} dB against {exact}");
@@ -154,7 +160,7 @@ fn evaluation_of_selected_tokens_equals_rendering_the_file() {
     let weights = place.at("run/stage2/model.safetensors");
     let flags = ["--scene", KEY, "--context", "0,7", "--storage", "8", "--tokens", "f32"];
     clift(encode_args(&place, "run", "room.clift", &flags)).ok();
-    for preset in Preset::ALL {
+    for preset in SelectionPreset::ALL {
         let out = place.at(preset.name());
         let ran =
             place.eval("run", &["--render", "3,1/4", "--selection", preset.name(), "--out", out.to_str().unwrap()]);
@@ -172,7 +178,7 @@ fn paths_render_to_frames_and_animation_by_count() {
     place.copy(&WHOLE, "run");
     clift(encode_args(&place, "run", "room.clift", &["--scene", KEY, "--storage", "1.0"])).ok();
     let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
-    assert_eq!((scene.num_tokens(), storage), (8, TokenStorage::F16));
+    assert_eq!((scene.num_tokens(), storage), (8, TokenFormat::F16));
     assert_eq!(scene.context_frames.len(), 2, "as many contexts as in training");
 
     let names = |out: &str| {
@@ -213,9 +219,9 @@ fn paths_render_to_frames_and_animation_by_count() {
     // The first frame through the contexts is the first context's.
     let device = burn::tensor::Device::flex();
     let renderer = load_renderer(&scene, &place.at("run/stage2/model.safetensors"), &device).unwrap();
-    let mut viewer = Viewer::new(&scene, renderer, Preset::Paper.rules(), &device).unwrap();
+    let mut viewer = SceneRenderer::new(&scene, renderer, SelectionPreset::Paper.rules(), &device).unwrap();
     let first = viewer.draw(&scene.context[..1], 16, 16, 8).unwrap().remove(0);
-    let first = Picture::from_unit(&first.pixels, 16, 16).unwrap();
+    let first = Canvas::from_unit(&first.pixels, 16, 16).unwrap();
     let written = image::open(place.at("all/frame-00000.png")).unwrap().into_rgb8();
     let difference = first.as_rgb8().iter().zip(written.as_raw()).map(|(a, b)| a.abs_diff(*b)).max();
     assert!(difference <= Some(1), "rounding alone differs: {difference:?}");

@@ -1,7 +1,7 @@
 //! Latent K-means.
 
 use burn::tensor::Tensor;
-use clift_model::{Fit, KMeans, total_variance};
+use clift_model::{KMeans, KMeansFit, total_variance};
 
 use crate::place::{DIM, Place};
 use crate::table::{Case, Named, Tolerance, Values};
@@ -50,13 +50,13 @@ fn scattered(place: &Place) -> Vec<f32> {
     noise.iter().enumerate().map(|(i, noise)| 2.0 * centre(i).sin() + 0.3 * *noise as f32).collect()
 }
 
-fn fit(place: &Place, values: Vec<f32>, num_tokens: usize, num_clusters: usize) -> Fit {
+fn fit(place: &Place, values: Vec<f32>, num_tokens: usize, num_clusters: usize) -> KMeansFit {
     let tokens: Tensor<3> =
         Tensor::from_data(burn::tensor::TensorData::new(values, [2, num_tokens, DIM]), &place.plain());
     KMeans::default().fit(tokens, num_clusters, &[11, 12]).expect("finite tokens")
 }
 
-fn labels(fit: &Fit) -> Values {
+fn labels(fit: &KMeansFit) -> Values {
     let scenes = fit.clusters.scenes();
     let numbers = |ids: &[u32]| ids.iter().copied().map(f64::from).collect::<Vec<_>>();
     let assignment = scenes.iter().flat_map(|scene| numbers(scene.assignment())).collect();

@@ -1,7 +1,7 @@
 //! The condenser in all its forms, and the attention inside clusters that it is made of.
 
 use burn::tensor::{Int, Tensor};
-use clift_model::{Clusters, Condenser, CondenserConfig, ModelConfig, SceneClusters, Variant, cluster_attention};
+use clift_model::{CliftVariant, Clusters, Condenser, CondenserConfig, ModelConfig, SceneClusters, cluster_attention};
 
 use crate::place::{BATCH, DIM, NUM_TOKENS, Place, clusters, network};
 use crate::table::{Case, Tolerance, Values};
@@ -33,10 +33,10 @@ pub const CASES: &[Case] = &[
     BLOCKS.case("condenser, with residuals", |place| condense(place, &paper(true), place.tokens(1), clusters())),
     BLOCKS.case("condenser, equations as printed", |place| condense(place, &paper(false), place.tokens(1), clusters())),
     BLOCKS.because("the same parts once, with ReLU").case("condenser of `released-re10k`", |place| {
-        condense(place, &network(Variant::ReleasedRe10k), place.tokens(1), clusters())
+        condense(place, &network(CliftVariant::ReleasedRe10k), place.tokens(1), clusters())
     }),
     BLOCKS.because("the same with norms of queries and keys").case("condenser of `released-dl3dv`", |place| {
-        condense(place, &network(Variant::ReleasedDl3dv), place.tokens(1), clusters())
+        condense(place, &network(CliftVariant::ReleasedDl3dv), place.tokens(1), clusters())
     }),
     BLOCKS.case("condenser, tokens that are equal", |place| {
         let some = place.tokens(1).narrow(1, 0, NUM_TOKENS / 3);
@@ -52,7 +52,7 @@ pub const CASES: &[Case] = &[
 ];
 
 fn paper(residual: bool) -> ModelConfig {
-    ModelConfig { condenser: CondenserConfig { num_blocks: 2, residual }, ..network(Variant::Paper) }
+    ModelConfig { condenser: CondenserConfig { num_blocks: 2, residual }, ..network(CliftVariant::Paper) }
 }
 
 fn condense(place: &Place, config: &ModelConfig, lift: Tensor<3>, scenes: Vec<SceneClusters>) -> Values {

@@ -3,8 +3,8 @@
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 use clift_model::{
-    Activation, DecoderBlock, Encoder, EncoderBlock, FeedForward, LiftNorm, RenderTokens, Renderer, SelfAttention,
-    Variant, cross_sdpa, linear, linear_of_gelu, linear_of_norm, patchify, plucker, self_sdpa, unpatchify,
+    Activation, CliftVariant, DecoderBlock, Encoder, EncoderBlock, FeedForward, LiftNorm, RenderTokens, Renderer,
+    SelfAttention, cross_sdpa, gelu_linear, linear, norm_linear, patchify, plucker, self_sdpa, unpatchify,
 };
 use clift_train::mse;
 
@@ -36,14 +36,12 @@ pub const CASES: &[Case] = &[
         |place| {
             let layer = place.module(|init| init.linear(DIM, 48));
             let x = place.tokens(1).mul_scalar(3.0);
-            place.differentiate(&layer, [x], |layer, [x]| linear_of_gelu(layer, x).flatten(0, 2))
+            place.differentiate(&layer, [x], |layer, [x]| gelu_linear(layer, x).flatten(0, 2))
         },
     ),
     Tolerance::both(5e-6, 1e-5, "the same, and two means over a row").case("linear layer of a layer norm", |place| {
         let layers = place.module(|init| (init.layer_norm(DIM), init.linear(DIM, 48)));
-        place.differentiate(&layers, [place.tokens(1)], |(norm, layer), [x]| {
-            linear_of_norm(norm, layer, x).flatten(0, 2)
-        })
+        place.differentiate(&layers, [place.tokens(1)], |(norm, layer), [x]| norm_linear(norm, layer, x).flatten(0, 2))
     }),
     FEED_FORWARD.case("feed-forward network, GELU", |place| feed_forward(place, Activation::Gelu)),
     FEED_FORWARD.case("feed-forward network, ReLU", |place| feed_forward(place, Activation::Relu)),
@@ -61,27 +59,29 @@ pub const CASES: &[Case] = &[
         let inputs = [place.tokens(1), place.random([BATCH, NUM_TOKENS, 2 * DIM], 2).mul_scalar(2.0)];
         place.differentiate(&none(), inputs, |_, [query, key_value]| cross_sdpa(query, key_value, 4).flatten(0, 2))
     }),
-    BLOCK.case("self-attention layer", |place| self_attention(place, Variant::Paper)),
+    BLOCK.case("self-attention layer", |place| self_attention(place, CliftVariant::Paper)),
     BLOCK
         .because("the same, and a root mean square over the columns of a head")
         .case("self-attention layer with norms of queries and keys", |place| {
-            self_attention(place, Variant::ReleasedDl3dv)
+            self_attention(place, CliftVariant::ReleasedDl3dv)
         }),
     Tolerance::both(5e-6, 1e-5, "two means over a row, by Burn's own kernel").case(
         "layer norm behind the encoder",
         |place| {
-            let norm = place.module(|init| LiftNorm::new(&network(Variant::ReleasedDl3dv), init));
+            let norm = place.module(|init| LiftNorm::new(&network(CliftVariant::ReleasedDl3dv), init));
             place.differentiate(&norm, [place.tokens(1)], |norm, [x]| norm.forward(x).flatten(0, 2))
         },
     ),
     BLOCK.case("encoder block", |place| {
-        let block = place.module(|init| EncoderBlock::new(&network(Variant::Paper), init));
+        let block = place.module(|init| EncoderBlock::new(&network(CliftVariant::Paper), init));
         place.differentiate(&block, [place.tokens(1)], |block, [x]| block.forward(x).flatten(0, 2))
     }),
-    BLOCK.case("decoder block, two views of a scene", |place| decoder_block(place, Variant::Paper)),
-    BLOCK.case("decoder block with norms of queries and keys", |place| decoder_block(place, Variant::ReleasedDl3dv)),
+    BLOCK.case("decoder block, two views of a scene", |place| decoder_block(place, CliftVariant::Paper)),
+    BLOCK.case("decoder block with norms of queries and keys", |place| {
+        decoder_block(place, CliftVariant::ReleasedDl3dv)
+    }),
     BLOCK.because("sums of 576 products, rays of their own, and a block").case("encoder, from pictures", |place| {
-        let encoder = place.module(|init| Encoder::new(&network(Variant::Paper), init));
+        let encoder = place.module(|init| Encoder::new(&network(CliftVariant::Paper), init));
         let context = place.context();
         place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context).flatten(0, 2))
     }),
@@ -121,19 +121,19 @@ fn feed_forward(place: &Place, activation: Activation) -> Values {
     })
 }
 
-fn self_attention(place: &Place, variant: Variant) -> Values {
+fn self_attention(place: &Place, variant: CliftVariant) -> Values {
     let layers = place.module(|init| (init.layer_norm(DIM), SelfAttention::new(&network(variant), init)));
     place.differentiate(&layers, [place.tokens(1)], |(norm, attention), [x]| attention.forward(norm, x).flatten(0, 2))
 }
 
-fn decoder_block(place: &Place, variant: Variant) -> Values {
+fn decoder_block(place: &Place, variant: CliftVariant) -> Values {
     let block = place.module(|init| DecoderBlock::new(&network(variant), init));
     let inputs = [place.random([BATCH * VIEWS, 6, DIM], 1), place.tokens(2)];
     place.differentiate(&block, inputs, |block, [x, tokens]| block.forward(x, block.memory(tokens)).flatten(0, 2))
 }
 
 fn render(place: &Place, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {
-    let renderer = place.module(|init| Renderer::new(&network(Variant::Paper), init));
+    let renderer = place.module(|init| Renderer::new(&network(CliftVariant::Paper), init));
     let targets = place.targets();
     place.differentiate(&renderer, [place.tokens(1)], |renderer, [tokens]| {
         renderer.forward(choose(tokens), &targets).flatten(0, 4)

@@ -3,10 +3,11 @@
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
-use clift_data::{Clip, DMat3, DVec3, Intrinsics, Pose, Views};
+use clift_data::{Clip, ClipViews, DMat3, DVec3, Intrinsics, Pose};
 use clift_eval::{upload_cameras, upload_views};
 use clift_model::{
-    Cameras, Clift, Condenser, CondenserConfig, Encoder, Init, LiftNorm, ModelConfig, Renderer, SceneClusters, Variant,
+    Cameras, Clift, CliftVariant, Condenser, CondenserConfig, Encoder, Init, LiftNorm, ModelConfig, Renderer,
+    SceneClusters,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -78,7 +79,7 @@ impl Place {
 
     /// All networks.
     pub fn model(&self) -> Clift {
-        let config = network(Variant::Paper);
+        let config = network(CliftVariant::Paper);
         self.module(|init| Clift {
             encoder: Encoder::new(&config, init),
             renderer: Renderer::new(&config, init),
@@ -99,7 +100,7 @@ impl Place {
                 images[0] ^= 32;
             }
             let c2w = places.map(|place| pose(place + 0.1 * scene as f64 + f64::from(self.is_wrong) * 0.02));
-            Views {
+            ClipViews {
                 width,
                 height,
                 images,
@@ -117,7 +118,7 @@ impl Place {
     }
 
     /// The given views of a batch.
-    pub fn context(&self) -> clift_model::Views {
+    pub fn context(&self) -> clift_model::ClipViews {
         let clips = self.clips();
         upload_views(&clips.iter().map(|clip| &clip.context).collect::<Vec<_>>(), &self.device).expect("equal sizes")
     }
@@ -157,7 +158,7 @@ fn pose(place: f64) -> Pose {
 }
 
 /// The network of the cases.
-pub fn network(variant: Variant) -> ModelConfig {
+pub fn network(variant: CliftVariant) -> ModelConfig {
     ModelConfig {
         variant,
         dim: DIM,

@@ -3,10 +3,11 @@
 use std::path::Path;
 
 use burn::module::Module;
-use clift_data::{BoundedSampler, ClipReader, DataConfig, Split, SyntheticConfig, open_dataset};
+use clift_data::{ClipReader, DataConfig, Split, SyntheticConfig, ViewSampler, open_dataset};
 use clift_eval::{EncodeOptions, encode};
 use clift_model::{
-    Preset, Scene, TokenCount, TokenStorage, TrainedModel, Variant, ViewCamera, Viewer, load_renderer, save_weights,
+    CliftVariant, Scene, SceneRenderer, SelectionPreset, TokenCount, TokenFormat, TrainedModel, ViewCamera,
+    load_renderer, save_weights,
 };
 use clift_train::Config;
 
@@ -20,25 +21,25 @@ pub const CASES: &[Case] = &[
     Tolerance::forward(5e-5, "encoder, clusters and condenser one after the other; the chosen patches are the same")
         .case("scene: capture to `.clift` file", |place| {
             let folder = tempfile::tempdir().expect("a folder");
-            let scene = encode_room(place, folder.path(), TokenStorage::F32);
+            let scene = encode_room(place, folder.path(), TokenFormat::F32);
             let ids = scene.token_ids.iter().copied().map(f64::from).collect();
             let tokens = scene.tokens.iter().copied().map(f64::from).collect();
             Values { forward: vec![("patches".into(), ids), ("tokens".into(), tokens)], ..Values::default() }
         }),
-    PICTURES.case("scene: f32 file to pictures, all tokens and some", |place| draw(place, TokenStorage::F32)),
+    PICTURES.case("scene: f32 file to pictures, all tokens and some", |place| draw(place, TokenFormat::F32)),
     PICTURES
         .because("the same: the host unpacks 16 bits")
-        .case("scene: f16 file to pictures", |place| draw(place, TokenStorage::F16)),
+        .case("scene: f16 file to pictures", |place| draw(place, TokenFormat::F16)),
     PICTURES
         .because("the same: the host unpacks 8 bits")
-        .case("scene: int8 file to pictures", |place| draw(place, TokenStorage::Int8)),
+        .case("scene: int8 file to pictures", |place| draw(place, TokenFormat::Int8)),
 ];
 
 /// So many of the room's 12 tokens are stored. A pair, of which rounding once chose, is among the clusters.
 const STORED: usize = 7;
 
 /// Encodes a synthetic room on the place's device, writes it and reads it back.
-fn encode_room(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
+fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
     let [height, width] = SIZE;
     let synthetic = SyntheticConfig {
         num_scenes: 2,
@@ -48,9 +49,9 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
         seed: u64::from(place.is_wrong()),
         ..SyntheticConfig::default()
     };
-    let views = BoundedSampler { min_context: 2, max_context: 2, ..BoundedSampler::default() };
+    let views = ViewSampler { min_context: 2, max_context: 2, ..ViewSampler::default() };
     let data = DataConfig { height, width, synthetic, views, ..DataConfig::default() };
-    let config = Config { data, model: network(Variant::Paper), ..Config::default() };
+    let config = Config { data, model: network(CliftVariant::Paper), ..Config::default() };
     let source = open_dataset(&config.data, Split::Test).expect("rooms are made").source;
     let reader = ClipReader { source, options: config.data.clip_options() };
 
@@ -71,7 +72,7 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenStorage) -> Scene {
 }
 
 /// Draws a file that the CPU made from three cameras: from all tokens, and from those that selection chooses.
-fn draw(place: &Place, storage: TokenStorage) -> Values {
+fn draw(place: &Place, storage: TokenFormat) -> Values {
     let folder = tempfile::tempdir().expect("a folder");
     let maker = Place::new(&cpu());
     let maker = if place.is_wrong() { maker.wrong() } else { maker };
@@ -79,7 +80,8 @@ fn draw(place: &Place, storage: TokenStorage) -> Values {
     let weights_file = folder.path().join("model.safetensors");
     save_weights(&maker.model().valid(), &weights_file).expect("the folder takes a file");
     let renderer = load_renderer(&scene, &weights_file, &place.plain()).expect("the scene's renderer");
-    let mut viewer = Viewer::new(&scene, renderer, Preset::Scaled.rules(), &place.plain()).expect("finite rays");
+    let mut viewer =
+        SceneRenderer::new(&scene, renderer, SelectionPreset::Scaled.rules(), &place.plain()).expect("finite rays");
     let between = |share: f64| {
         let [a, b] = [scene.context[0], scene.context[1]];
         let c2w =

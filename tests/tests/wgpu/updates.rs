@@ -1,9 +1,9 @@
 //! Whole updates by the same code that trains: loss, gradient, AdamW.
 
 use burn::module::Module;
-use clift_eval::upload_pictures;
+use clift_eval::upload_images;
 use clift_model::{Clift, Clusters, RenderTokens, SceneModel};
-use clift_train::{Learner, Loss, OptimizerConfig, Stage, StageBatch, TokenChoice, adamw};
+use clift_train::{Loss, OptimizerConfig, Stage, StageBatch, TokenSelection, TrainState, adamw};
 
 use crate::modules::subsets;
 use crate::place::{Place, clusters, gradients, parameters};
@@ -22,14 +22,14 @@ pub const CASES: &[Case] = &[
 const LEARNING_RATE: f64 = 1e-3;
 
 /// A model of a stage with its optimiser.
-pub fn learner(place: &Place, stage: Stage, activation_checkpointing: bool) -> Learner {
+pub fn learner(place: &Place, stage: Stage, activation_checkpointing: bool) -> TrainState {
     let mut model = place.model();
     match stage {
         Stage::Stage2 => model.encoder = model.encoder.no_grad(),
         _ => model.condenser = model.condenser.no_grad(),
     }
     let optimizer = adamw(&OptimizerConfig::default());
-    Learner {
+    TrainState {
         model,
         optimizer,
         device: place.device.clone(),
@@ -42,14 +42,14 @@ pub fn learner(place: &Place, stage: Stage, activation_checkpointing: bool) -> L
 /// What the stage sees.
 pub fn batch(place: &Place, stage: Stage) -> StageBatch {
     let tokens = match stage {
-        Stage::Stage2 => TokenChoice::Clusters(clusters()),
-        _ => TokenChoice::Subsets(subsets(5)),
+        Stage::Stage2 => TokenSelection::Clusters(clusters()),
+        _ => TokenSelection::Subsets(subsets(5)),
     };
     StageBatch { clips: place.clips(), tokens, skipped: Vec::new() }
 }
 
 /// Makes an update.
-pub fn step(learner: Learner, batch: &StageBatch, parts: usize) -> (Learner, clift_train::Update) {
+pub fn step(learner: TrainState, batch: &StageBatch, parts: usize) -> (TrainState, clift_train::Update) {
     let (learner, update) = learner.step(batch, parts, LEARNING_RATE.into(), 1.0).expect("the model takes the batch");
     assert!(update.applied, "{update:?}");
     (learner, update)
@@ -72,15 +72,15 @@ fn update(place: &Place, stage: Stage, parts: usize, activation_checkpointing: b
 fn gradient(place: &Place, model: &Clift, batch: &StageBatch) -> Named {
     let lift = model.encode(&place.context());
     let tokens: RenderTokens = match &batch.tokens {
-        TokenChoice::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
-        TokenChoice::Clusters(clusters) => {
+        TokenSelection::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
+        TokenSelection::Clusters(clusters) => {
             let index = Clusters::new(clusters.clone()).expect("equal counts").upload(&place.device);
             model.condenser.forward(lift, &index).into()
         }
-        TokenChoice::All => lift.into(),
+        TokenSelection::All => lift.into(),
     };
     let targets: Vec<_> = batch.clips.iter().map(|clip| &clip.target).collect();
-    let pictures = upload_pictures(&targets, &place.device).expect("equal sizes");
+    let pictures = upload_images(&targets, &place.device).expect("equal sizes");
     let loss = Loss::default().of(model.renderer.forward(tokens, &place.targets()), pictures).total;
     gradients(model, &loss.backward())
 }

@@ -8,11 +8,11 @@ use crate::cases::context::BenchContext;
 use crate::cases::forward::{ClusterAttend, Condense, Encode, Render};
 use crate::cases::selection::Selection;
 use crate::cases::step::StepTask;
-use crate::cases::task::Task;
+use crate::cases::task::BenchTask;
 
 /// One row of the table. Names are the same here, in the JSON and in the PyTorch comparison.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Work {
+pub enum BenchCase {
     /// Context views of one scene to its tokens.
     Encode,
     /// Latent K-means of one scene's tokens.
@@ -35,7 +35,7 @@ pub enum Work {
     Stage2Step,
 }
 
-impl Work {
+impl BenchCase {
     /// All works, in the order they run.
     pub const ALL: [Self; 10] = [
         Self::Encode,
@@ -72,7 +72,7 @@ impl Work {
     }
 
     /// Makes everything the work needs, so that only the work itself is left to be timed.
-    pub(crate) fn prepare(self, context: &BenchContext) -> Result<Box<dyn Task>, TrainError> {
+    pub(crate) fn prepare(self, context: &BenchContext) -> Result<Box<dyn BenchTask>, TrainError> {
         Ok(match self {
             Self::Encode => Box::new(Encode::new(context)?),
             Self::Kmeans => Box::new(Clustering::new(context)?),
@@ -88,13 +88,13 @@ impl Work {
     }
 }
 
-impl std::fmt::Display for Work {
+impl std::fmt::Display for BenchCase {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.pad(self.name())
     }
 }
 
-impl std::str::FromStr for Work {
+impl std::str::FromStr for BenchCase {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
@@ -103,7 +103,7 @@ impl std::str::FromStr for Work {
     }
 }
 
-impl Serialize for Work {
+impl Serialize for BenchCase {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.serialize_str(self.name())
     }
@@ -115,10 +115,10 @@ mod tests {
 
     #[test]
     fn names_round_trip_and_an_unknown_one_lists_the_known() {
-        for work in Work::ALL {
+        for work in BenchCase::ALL {
             assert_eq!(work.name().parse(), Ok(work));
         }
-        let message = "incode".parse::<Work>().unwrap_err();
+        let message = "incode".parse::<BenchCase>().unwrap_err();
         assert!(
             message.starts_with("unknown; the works are encode, kmeans, condense, cluster_attention, select, render, ")
         );

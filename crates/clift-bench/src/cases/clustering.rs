@@ -4,13 +4,13 @@
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use clift_model::{Fit, KMeans, ModelError};
+use clift_model::{KMeans, KMeansFit, ModelError};
 use clift_train::TrainError;
 use safetensors::{Dtype, SafeTensors};
 
 use crate::cases::context::BenchContext;
-use crate::cases::reference::{InF64, values};
-use crate::cases::task::Task;
+use crate::cases::reference::{ToF64, values};
+use crate::cases::task::BenchTask;
 
 /// Name of the tensor in a file of features.
 const FEATURES: &str = "features";
@@ -21,7 +21,7 @@ pub struct Clustering {
     tokens: Tensor<3>,
     num_clusters: usize,
     seed: u64,
-    fit: Option<Fit>,
+    fit: Option<KMeansFit>,
 }
 
 impl Clustering {
@@ -35,12 +35,12 @@ impl Clustering {
         Ok(Self { kmeans, tokens, num_clusters, seed: context.seed(), fit: None })
     }
 
-    fn fit(&self, tokens: Tensor<3>) -> Result<Fit, ModelError> {
+    fn fit(&self, tokens: Tensor<3>) -> Result<KMeansFit, ModelError> {
         self.kmeans.fit(tokens, self.num_clusters, &[self.seed])
     }
 }
 
-impl Task for Clustering {
+impl BenchTask for Clustering {
     fn run(&mut self) -> Result<(), TrainError> {
         self.fit = Some(self.fit(self.tokens.clone())?);
         Ok(())
@@ -64,7 +64,7 @@ impl Task for Clustering {
 
 /// Sum of squared distances of the tokens to the mean of their cluster, in f64: what scikit-learn calls
 /// `inertia_`. K-means itself tells the distances to the means of the iteration before, in the device's floats.
-fn inertia(tokens: &Tensor<3>, fit: &Fit) -> f64 {
+fn inertia(tokens: &Tensor<3>, fit: &KMeansFit) -> f64 {
     let dim = tokens.dims()[2];
     let tokens = values(tokens.clone());
     let scene = &fit.clusters.scenes()[0];
@@ -110,7 +110,7 @@ mod tests {
     fn the_inertia_is_about_the_means_and_not_about_the_kept_samples() {
         let tokens = Tensor::<3>::from_floats([[[0.0, 0.0], [2.0, 0.0], [10.0, 1.0], [10.0, 4.0]]], &Device::flex());
         let scene = SceneClusters::new(vec![0, 0, 1, 1], vec![0, 2]).expect("valid");
-        let fit = Fit { clusters: Clusters::new(vec![scene]).expect("one"), inertia: vec![0.0], iterations: 0 };
+        let fit = KMeansFit { clusters: Clusters::new(vec![scene]).expect("one"), inertia: vec![0.0], iterations: 0 };
         assert_eq!(inertia(&tokens, &fit), 1.0 + 1.0 + 2.25 + 2.25);
     }
 

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use clift_data::{BoundedSampler, Clip, DataConfig, SourceKind, SyntheticConfig};
+use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
 use clift_eval::upload_views;
 use clift_model::{Clift, DeviceName, ModelConfig, SceneModel, TokenCount};
 use clift_train::{Config, Shape, Stage1Config, TrainError, seeded_clip, seeded_model};
@@ -68,7 +68,7 @@ impl BenchContext {
             num_renderer_blocks: 3,
             ..ModelConfig::default()
         };
-        let views = BoundedSampler { min_context: 4, num_targets: 1, ..BoundedSampler::default() };
+        let views = ViewSampler { min_context: 4, num_targets: 1, ..ViewSampler::default() };
         let data = DataConfig { width: 64, height: 64, views, ..DataConfig::default() };
         let stage1 = Stage1Config { batch_size: 8, accumulate: 1, ..Stage1Config::default() };
         let Config { seed, device, precision, .. } = self.config;

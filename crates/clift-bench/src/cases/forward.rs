@@ -9,7 +9,7 @@ use clift_model::{Cameras, ClusterIndex, Clusters, Condenser, Encoder, Renderer,
 use clift_train::{TrainError, seeded_clusters, seeded_uniform};
 
 use crate::cases::context::BenchContext;
-use crate::cases::reference::{InF64, module_in_f64};
+use crate::cases::reference::{ToF64, module_in_f64};
 use crate::cases::task::Forward;
 
 /// Context views to tokens.

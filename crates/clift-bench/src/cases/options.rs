@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clift_model::TokenCount;
 
-use crate::cases::case::Work;
+use crate::cases::case::BenchCase;
 
 /// Most tokens, over all scenes of a batch, of the smaller update whose gradient is compared with f64.
 ///
@@ -14,8 +14,8 @@ pub const MAX_CHECKED_TOKENS: usize = 1024;
 /// What is timed, and how.
 #[derive(Clone, Debug)]
 pub struct BenchOptions {
-    /// The rows; [`Work::ALL`] gives them their order.
-    pub work: Vec<Work>,
+    /// The rows; [`BenchCase::ALL`] gives them their order.
+    pub work: Vec<BenchCase>,
     /// Repetitions that count, at least 1.
     pub repeats: usize,
     /// Repetitions before them that do not.

@@ -5,25 +5,25 @@ use burn::tensor::{DType, Device, Tensor};
 use clift_model::{Cameras, Views};
 
 /// Something of which the f64 reference makes a copy.
-pub trait InF64 {
+pub trait ToF64 {
     /// The same values in f64 on the reference device.
     #[must_use]
     fn in_f64(&self, reference: &Device) -> Self;
 }
 
-impl<const D: usize> InF64 for Tensor<D> {
+impl<const D: usize> ToF64 for Tensor<D> {
     fn in_f64(&self, reference: &Device) -> Self {
         self.clone().to_device(reference).cast(DType::F64)
     }
 }
 
-impl InF64 for Cameras {
+impl ToF64 for Cameras {
     fn in_f64(&self, reference: &Device) -> Self {
         Self { c2w: self.c2w.in_f64(reference), intrinsics: self.intrinsics.in_f64(reference), ..*self }
     }
 }
 
-impl InF64 for Views {
+impl ToF64 for Views {
     fn in_f64(&self, reference: &Device) -> Self {
         Self { images: self.images.in_f64(reference), cameras: self.cameras.in_f64(reference) }
     }

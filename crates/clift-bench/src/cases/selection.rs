@@ -2,12 +2,12 @@
 
 use burn::tensor::Device;
 use clift_data::{DVec3, step_rng};
-use clift_model::{Preset, Selector, TokenRay, ViewCamera};
+use clift_model::{SelectionPreset, Selector, TokenRay, ViewCamera};
 use clift_train::TrainError;
 use rand::RngExt;
 
 use crate::cases::context::BenchContext;
-use crate::cases::task::Task;
+use crate::cases::task::BenchTask;
 
 /// Half of a scene's stored tokens for one view, by the paper's rules.
 pub struct Selection {
@@ -35,7 +35,7 @@ impl Selection {
         let camera =
             ViewCamera { c2w: clip.target.c2w[0].to_matrix_f64(), intrinsics: [lens.fx, lens.fy, lens.cx, lens.cy] };
         Ok(Self {
-            selector: Selector::new(Preset::Paper.rules(), &rays)?,
+            selector: Selector::new(SelectionPreset::Paper.rules(), &rays)?,
             camera,
             size: context.shape().size,
             num_render_tokens: count.div_ceil(2),
@@ -43,7 +43,7 @@ impl Selection {
     }
 }
 
-impl Task for Selection {
+impl BenchTask for Selection {
     fn run(&mut self) -> Result<(), TrainError> {
         let [height, width] = self.size;
         self.selector.select(&self.camera, height, width, self.num_render_tokens)?;

@@ -1,23 +1,23 @@
-//! The rows of whole optimiser updates, by the same [`Learner`] that trains.
+//! The rows of whole optimiser updates, by the same [`TrainState`] that trains.
 
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
 use clift_model::{Clift, Precision};
 use clift_train::{
-    Fault, Learner, Loss, LossScale, Shown, Stage, StageBatch, StageSettings, TrainError, adamw, freeze, loss_of,
-    seeded_batch, warm_up_cosine,
+    DeviceBatch, Loss, LossScale, Stage, StageBatch, StageSettings, StepAnomaly, TrainError, TrainState, adamw, freeze,
+    render_loss, seeded_batch, warm_up_cosine,
 };
 
 use crate::cases::context::BenchContext;
-use crate::cases::reference::{InF64, module_in_f64, relative_error, values};
-use crate::cases::task::Task;
+use crate::cases::reference::{ToF64, module_in_f64, relative_error, values};
+use crate::cases::task::BenchTask;
 
 /// Updates of one batch: forward, loss, backward, clipping, `AdamW`.
 pub struct StepTask {
     stage: Stage,
     /// Taken while it makes a step, and gone after one that failed.
-    learner: Option<Learner>,
+    learner: Option<TrainState>,
     batch: StageBatch,
     accumulate: usize,
     rate: f64,
@@ -29,7 +29,7 @@ pub struct StepTask {
 impl StepTask {
     pub fn new(context: &BenchContext, stage: Stage) -> Result<Self, TrainError> {
         let StageSettings { steps, batch_size, accumulate, optimizer, .. } = context.config.stage(stage);
-        let learner = Learner {
+        let learner = TrainState {
             model: freeze(stage, context.model()),
             optimizer: adamw(optimizer),
             device: context.device.clone().autodiff(),
@@ -62,7 +62,7 @@ fn stage_batch(context: &BenchContext, stage: Stage, batch_size: usize) -> Resul
     seeded_batch(context.shape(), batch_size, context.num_tokens()?, stored, context.seed())
 }
 
-impl Task for StepTask {
+impl BenchTask for StepTask {
     fn run(&mut self) -> Result<(), TrainError> {
         let learner = self.learner.take().expect("no step failed before");
         let (mut learner, update) = learner.step(&self.batch, self.accumulate, self.rate.into(), self.max_grad_norm)?;
@@ -72,7 +72,7 @@ impl Task for StepTask {
         if update.applied || is_overflow {
             return Ok(());
         }
-        let (reason, keys, checkpoint) = (Fault::NotFinite.to_string(), "made up".into(), "none".into());
+        let (reason, keys, checkpoint) = (StepAnomaly::NotFinite.to_string(), "made up".into(), "none".into());
         Err(TrainError::Diverged { count: 1, step: 1, reason, keys, checkpoint })
     }
 
@@ -81,15 +81,15 @@ impl Task for StepTask {
         let batch_size = reduced.config.stage(stage).batch_size;
         let batch = stage_batch(&reduced, stage, batch_size)?;
         let model = freeze(stage, reduced.model());
-        let ours = gradients(&model, &batch, Shown::upload(&batch, &reduced.device.clone().autodiff())?)?;
+        let ours = gradients(&model, &batch, DeviceBatch::upload(&batch, &reduced.device.clone().autodiff())?)?;
         let copy = module_in_f64(&model, reference).train();
-        let shown = Shown::upload(&batch, &reference.clone().autodiff())?.in_f64(&reference.clone().autodiff());
+        let shown = DeviceBatch::upload(&batch, &reference.clone().autodiff())?.in_f64(&reference.clone().autodiff());
         let theirs = gradients(&copy, &batch, shown)?;
         Ok(Some(largest_error(&model, &ours, &theirs)))
     }
 }
 
-impl InF64 for Shown {
+impl ToF64 for DeviceBatch {
     fn in_f64(&self, reference: &Device) -> Self {
         Self {
             context: self.context.in_f64(reference),
@@ -100,8 +100,12 @@ impl InF64 for Shown {
 }
 
 /// Loss of a batch and the gradient of every parameter, times [`loss_factor`].
-pub(crate) fn gradients(model: &Clift, batch: &StageBatch, shown: Shown) -> Result<(f64, GradientsParams), TrainError> {
-    let loss = loss_of(model, &shown, &batch.tokens, &Loss::default())?.total;
+pub(crate) fn gradients(
+    model: &Clift,
+    batch: &StageBatch,
+    shown: DeviceBatch,
+) -> Result<(f64, GradientsParams), TrainError> {
+    let loss = render_loss(model, &shown, &batch.tokens, &Loss::default())?.total;
     let grads = GradientsParams::from_grads(loss.clone().mul_scalar(loss_factor()).backward(), model);
     Ok((values(loss.inner())[0], grads))
 }

@@ -6,7 +6,7 @@ use clift_train::TrainError;
 use crate::cases::reference::relative_error;
 
 /// One row's work with everything it needs.
-pub trait Task {
+pub trait BenchTask {
     /// Does the work once; what is queued on the device may go on.
     fn run(&mut self) -> Result<(), TrainError>;
 
@@ -35,13 +35,13 @@ pub trait Forward {
     #[must_use]
     fn in_f64(&self, reference: &Device) -> Self;
 
-    /// See [`Task::num_views`].
+    /// See [`BenchTask::num_views`].
     fn num_views(&self) -> usize {
         1
     }
 }
 
-impl<T: Forward> Task for T {
+impl<T: Forward> BenchTask for T {
     fn run(&mut self) -> Result<(), TrainError> {
         self.forward();
         Ok(())

@@ -7,13 +7,13 @@ use std::time::Instant;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{DType, Device, Gradients, Tensor};
 use clift_data::{Clip, ClipOptions, ClipReader, SyntheticConfig, SyntheticSource, ViewIndices};
-use clift_eval::{upload_cameras, upload_pictures, upload_views};
+use clift_eval::{upload_cameras, upload_images, upload_views};
 use clift_model::{Clift, Clusters, DeviceName, KMeans, ModelConfig, Precision, SceneClusters};
 use clift_train::mse;
 
 /// What a device that works can do.
 #[derive(Clone, Debug)]
-pub struct Probe {
+pub struct DeviceCheck {
     /// What the device calls itself.
     pub adapter: String,
     /// Floats it has.
@@ -49,11 +49,11 @@ impl Gradient {
 }
 
 /// Opens a device and trains a small model on it for one step; a panic becomes its message.
-pub fn probe(name: DeviceName, precision: Precision) -> Result<Probe, String> {
+pub fn probe(name: DeviceName, precision: Precision) -> Result<DeviceCheck, String> {
     caught(|| probe_device(name, precision)).unwrap_or_else(|panic| Err(format!("panicked: {panic}")))
 }
 
-fn probe_device(name: DeviceName, precision: Precision) -> Result<Probe, String> {
+fn probe_device(name: DeviceName, precision: Precision) -> Result<DeviceCheck, String> {
     let device = name.open().map_err(|error| error.to_string())?;
     precision.check("precision", &device).map_err(|error| error.to_string())?;
     let _scope = precision.scope();
@@ -63,7 +63,7 @@ fn probe_device(name: DeviceName, precision: Precision) -> Result<Probe, String>
     let started = Instant::now();
     let gradient = gradient(&device).map_err(|error| format!("{error:#}"))?;
     let seconds = started.elapsed().as_secs_f64();
-    Ok(Probe { adapter: adapter(name, &device), dtypes, gradient, seconds })
+    Ok(DeviceCheck { adapter: adapter(name, &device), dtypes, gradient, seconds })
 }
 
 #[cfg(feature = "wgpu")]
@@ -102,7 +102,7 @@ fn gradient(device: &Device) -> anyhow::Result<Gradient> {
     let index = Clusters::new(vec![scene])?.upload(&device);
     let tokens = model.condenser.forward(lift, &index);
     let rendering = model.renderer.forward(tokens, &upload_cameras(&[&clip.target], &device)?);
-    let loss = mse(rendering, upload_pictures(&[&clip.target], &device)?);
+    let loss = mse(rendering, upload_images(&[&clip.target], &device)?);
     let grads = loss.backward();
     let mut collect = Collect { grads: &grads, values: Vec::new() };
     model.visit(&mut collect);

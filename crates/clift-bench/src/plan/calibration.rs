@@ -7,11 +7,11 @@ use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::{ClipReader, Split, item_rng, open_dataset, step_rng, upper_median};
 use clift_eval::{EvalModels, EvalResults, Lpips, Sweep, evaluate_scene, upload_cameras, upload_views};
-use clift_model::{Convention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
+use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
-    Config, Learner, Loss, LossScale, Middle, Shape, Shown, Stage, StageBatch, TokenChoice, TrainError, adamw,
-    clip_global_norm, evaluated, freeze, global_norm, loss_of, measures_lpips, scene, seeded_batch, seeded_clip,
-    trained_parts,
+    Config, DeviceBatch, Loss, LossScale, Shape, Stage, StageBatch, TokenSelection, TrainError, TrainState,
+    TypicalStep, adamw, clip_global_norm, eval_sizes, freeze, global_norm, measures_lpips, render_loss, scene,
+    seeded_batch, seeded_clip, trained_parts,
 };
 use cpu_time::ProcessTime;
 use rand::RngExt;
@@ -87,7 +87,7 @@ pub struct InferenceRates {
 
 /// Multiplications of one network on a scene.
 pub fn macs_of(model: &ModelConfig, network: Part, scene: &SceneSizes) -> f64 {
-    model.macs(network, scene).count(Convention::Macs) as f64
+    model.macs(network, scene).count(FlopConvention::Macs) as f64
 }
 
 /// Multiplications of a scene's share of an update: a forward and a backward pass of twice its multiplications, which
@@ -130,14 +130,14 @@ fn context(config: &Config, num_context: usize) -> Result<BenchContext, TrainErr
 }
 
 /// Times an update of a shallow network at the middle of a stage's sizes.
-pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Rates, TrainError> {
+pub fn update_rates(config: &Config, stage: Stage, middle: &TypicalStep) -> Result<Rates, TrainError> {
     let shallow = shallow(config);
     let context = context(&shallow, middle.num_context)?;
     let macs_of_scene = update_macs(&shallow, stage, &middle.scene);
     let num_scenes = ((ENOUGH_MACS / macs_of_scene) as usize).clamp(1, middle.num_scenes);
     let batch = drawn(&context, stage, middle, num_scenes)?;
     let optimizer = if stage == Stage::Stage2 { &config.stage2.optimizer } else { &config.stage1.optimizer };
-    let learner = Learner {
+    let learner = TrainState {
         model: freeze(stage, context.model()),
         optimizer: adamw(optimizer),
         device: context.device.clone().autodiff(),
@@ -152,10 +152,10 @@ pub fn update_rates(config: &Config, stage: Stage, middle: &Middle) -> Result<Ra
         context.sync()?;
         Ok(learner)
     })?;
-    let shown = Shown::upload(&batch, &learner.device)?;
+    let shown = DeviceBatch::upload(&batch, &learner.device)?;
     let mut optimizer_s = f64::INFINITY;
     for _ in 0..REPEATS[0] {
-        let loss = loss_of(&learner.model, &shown, &batch.tokens, &learner.loss)?.total;
+        let loss = render_loss(&learner.model, &shown, &batch.tokens, &learner.loss)?.total;
         let grads = GradientsParams::from_grads(loss.backward(), &learner.model);
         context.sync()?;
         let started = Instant::now();
@@ -193,7 +193,12 @@ fn perceptual_s(config: &Config, context: &BenchContext) -> Result<f64, TrainErr
 }
 
 /// A batch of made-up scenes with the middle's numbers of tokens.
-fn drawn(context: &BenchContext, stage: Stage, middle: &Middle, num_scenes: usize) -> Result<StageBatch, TrainError> {
+fn drawn(
+    context: &BenchContext,
+    stage: Stage,
+    middle: &TypicalStep,
+    num_scenes: usize,
+) -> Result<StageBatch, TrainError> {
     let (num_tokens, kept) = (context.num_tokens()?, middle.scene.num_render_tokens);
     let stored = (stage == Stage::Stage2).then_some(kept);
     let mut batch = seeded_batch(context.shape(), num_scenes, num_tokens, stored, context.seed())?;
@@ -203,7 +208,7 @@ fn drawn(context: &BenchContext, stage: Stage, middle: &Middle, num_scenes: usiz
             let subset = |_| sample(&mut rng, num_tokens, kept).into_iter().map(|token| token as u32).collect();
             (0..clip.target.num_views()).map(subset).collect()
         });
-        batch.tokens = TokenChoice::Subsets(subsets.collect());
+        batch.tokens = TokenSelection::Subsets(subsets.collect());
     }
     Ok(batch)
 }
@@ -231,7 +236,7 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
         let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
         let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
         let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
-        let sweep = Sweep { model: shallow.model.clone(), lpips, ..evaluated(config) };
+        let sweep = Sweep { model: shallow.model.clone(), lpips, ..eval_sizes(config) };
         // One for all: after the first time no setting draws the view that warms it up.
         let mut measured = EvalResults::default();
         measuring_s =

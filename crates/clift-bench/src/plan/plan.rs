@@ -7,8 +7,8 @@
 use clift_data::SourceKind;
 use clift_model::{DeviceName, ModelConfig, Parameters, Part, SceneSizes};
 use clift_train::{
-    Config, Stage, TrainError, available_bytes, batch_sizes, cluster_counts, drawn, evaluated, middle, num_tokens,
-    peak_bytes, scene, stored, trained_parts,
+    Config, Stage, TrainError, available_bytes, batch_sizes, cluster_counts, eval_sizes, num_tokens, peak_bytes,
+    possible_sizes, scene, stored, trained_parts, typical_sizes,
 };
 use serde::Serialize;
 
@@ -145,11 +145,11 @@ pub fn check(config: &Config) -> Result<(), TrainError> {
 fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool) -> Result<PartPlan, TrainError> {
     let (batch_size, _) = batch_sizes(config, stage);
     let steps = if stage == Stage::Stage2 { config.stage2.steps } else { config.stage1.steps };
-    let all = drawn(config, stage)?;
+    let all = possible_sizes(config, stage)?;
     let macs_of_scene = all.iter().map(|scene| update_macs(config, stage, scene)).sum::<f64>() / all.len() as f64;
     let macs = batch_size as f64 * macs_of_scene;
     let trained_parameters = parameters.of_parts(trained_parts(stage));
-    let rates = is_timed.then(|| update_rates(config, stage, &middle(config, stage)?)).transpose()?;
+    let rates = is_timed.then(|| update_rates(config, stage, &typical_sizes(config, stage)?)).transpose()?;
     let images = (batch_size * config.data.views.num_targets) as f64;
     let compute_s = rates.map(|rates| {
         macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_picture
@@ -190,7 +190,7 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let num_targets = eval.num_targets;
     let scene = scene(config, eval.num_context, num_targets)?;
     let counts = eval.storage.iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>()?;
-    let sweep = evaluated(config);
+    let sweep = eval_sizes(config);
     // Multiplications of the encoder, and of all that is done with its tokens.
     let encode_and_rest = |model: &ModelConfig| {
         let mut rest = 0.0;

@@ -67,7 +67,7 @@ pub fn remove_folder(path: &Path) -> std::io::Result<()> {
     std::fs::remove_dir_all(&doomed)
 }
 
-/// Removes what kills in the middle of [`replace`], of saving weights or of [`crate::files::staged_dir::Unfinished`] have left in
+/// Removes what kills in the middle of [`replace`], of saving weights or of [`crate::files::staged_dir::StagedDir`] have left in
 /// a folder and in those below it. Nobody may be writing there.
 ///
 /// # Errors

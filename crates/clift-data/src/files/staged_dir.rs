@@ -15,14 +15,14 @@ const PREFIX: &str = ".clift-unfinished-";
 
 /// A folder inside the one that its files are for. Dropped, it leaves nothing behind.
 #[derive(Debug)]
-pub struct Unfinished {
+pub struct StagedDir {
     out: PathBuf,
     /// Whether `out` was made for it.
     is_new: bool,
     files: Option<TempDir>,
 }
 
-impl Unfinished {
+impl StagedDir {
     /// Makes `out` if it is not there, and removes what kills have left in it. Nobody else may be writing there.
     ///
     /// # Errors
@@ -61,7 +61,7 @@ impl Unfinished {
     }
 }
 
-impl Drop for Unfinished {
+impl Drop for StagedDir {
     fn drop(&mut self) {
         drop(self.files.take());
         if self.is_new {
@@ -109,7 +109,7 @@ mod tests {
     fn files_appear_together_and_over_others() {
         let place = tempfile::tempdir().unwrap();
         let out = place.path().join("a/b");
-        let work = Unfinished::new(&out).unwrap();
+        let work = StagedDir::new(&out).unwrap();
         std::fs::write(work.path().join("one"), "new").unwrap();
         std::fs::write(work.path().join("two"), "new").unwrap();
         std::fs::write(out.join("one"), "old").unwrap();
@@ -124,7 +124,7 @@ mod tests {
     fn nothing_stays_of_what_was_not_kept_and_of_what_was_killed() {
         let place = tempfile::tempdir().unwrap();
         let out = place.path().join("out");
-        let work = Unfinished::new(&out).unwrap();
+        let work = StagedDir::new(&out).unwrap();
         std::fs::write(work.path().join("one"), "").unwrap();
         drop(work);
         assert!(!out.exists(), "was made for it");
@@ -132,7 +132,7 @@ mod tests {
         std::fs::create_dir_all(out.join(".clift-unfinished-x")).unwrap();
         std::fs::write(out.join(".clift-unfinished-x/one"), "").unwrap();
         assert!(is_empty(&out).unwrap());
-        drop(Unfinished::new(&out).unwrap());
+        drop(StagedDir::new(&out).unwrap());
         assert_eq!(names(&out), [""; 0], "was there, and stays");
         std::fs::write(out.join("mine"), "").unwrap();
         assert!(!is_empty(&out).unwrap());

@@ -8,7 +8,7 @@ use serde::Deserialize;
 
 use crate::error::DataError;
 use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
-use crate::geometry::normalization::{SceneFrame, check_near};
+use crate::geometry::normalization::{PoseNormalization, check_near};
 use crate::geometry::pose::Pose;
 
 /// Radius of an orbit over the contexts' extent; farther out the contexts show little.
@@ -134,7 +134,7 @@ struct FilePose {
 /// [`DataError::Io`], and [`DataError::BadPoses`] for another form or an invalid pose, with its position.
 pub fn read_poses(
     path: &Path,
-    frame: &SceneFrame,
+    frame: &PoseNormalization,
     default: Intrinsics,
     width: usize,
     height: usize,
@@ -264,7 +264,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("poses.json");
         std::fs::write(&path, json).unwrap();
-        let frame = SceneFrame { mean_c2w: view([1.0, 0.0, 0.0], 0.0).c2w, scale: 2.0 };
+        let frame = PoseNormalization { mean_c2w: view([1.0, 0.0, 0.0], 0.0).c2w, scale: 2.0 };
         read_poses(&path, &frame, K, 64, 32)
     }
 

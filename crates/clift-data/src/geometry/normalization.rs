@@ -33,7 +33,7 @@ pub enum PoseScale {
 
 /// The normalised frame of a scene: maps world poses to poses around the origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SceneFrame {
+pub struct PoseNormalization {
     /// Mean context camera, camera to world.
     pub mean_c2w: Pose,
     /// Normalised units per world unit.
@@ -46,7 +46,7 @@ pub struct SceneFrame {
 /// samples other views beyond the same number.
 pub const MAX_COORDINATE: f64 = 1e3;
 
-impl SceneFrame {
+impl PoseNormalization {
     /// Finds the frame of `context`, camera-to-world poses; `target` matters for [`PoseScale::All`] only.
     ///
     /// # Errors
@@ -170,7 +170,7 @@ mod tests {
 
     fn normalized(poses: &[Pose], rotation: PoseRotation, scale: PoseScale) -> Vec<Pose> {
         let (context, target) = poses.split_at(poses.len() - 2);
-        let frame = SceneFrame::find("k", context, target, rotation, scale).unwrap();
+        let frame = PoseNormalization::find("k", context, target, rotation, scale).unwrap();
         poses.iter().map(|pose| frame.normalize(*pose)).collect()
     }
 
@@ -199,7 +199,7 @@ mod tests {
         for case in ["benign", "turned"] {
             let (context, target) = (poses(&format!("{case}.context")), poses(&format!("{case}.target")));
             for (rotation, scale, name) in CHOICES {
-                let frame = SceneFrame::find("k", &context, &target, rotation, scale).unwrap();
+                let frame = PoseNormalization::find("k", &context, &target, rotation, scale).unwrap();
                 let got: Vec<Pose> = context.iter().chain(&target).map(|pose| frame.normalize(*pose)).collect();
                 // Coordinates of 30 in f64, a matrix inverse on the other side.
                 assert!(worst(&got, &poses(&format!("{case}.{name}"))) < 1e-12, "{case}.{name}");
@@ -243,7 +243,7 @@ mod tests {
     fn cameras_on_both_sides_of_half_a_turn_have_their_mean_between_them() {
         // 179 and 181 degrees about y. With w >= 0 their quaternions nearly cancel and the mean turns about nothing.
         let context = [179.0_f64, 181.0].map(|angle| pose([0.0, angle.to_radians(), 0.0], [angle, 0.0, 0.0]));
-        let frame = SceneFrame::find("k", &context, &[], PoseRotation::Quaternion, PoseScale::Context).unwrap();
+        let frame = PoseNormalization::find("k", &context, &[], PoseRotation::Quaternion, PoseScale::Context).unwrap();
         let expected = pose([0.0, std::f64::consts::PI, 0.0], [180.0, 0.0, 0.0]);
         assert!(worst(&[frame.mean_c2w], &[expected]) < 1e-14, "{frame:?}");
     }
@@ -252,7 +252,7 @@ mod tests {
     fn identical_centres_are_an_error_that_says_so() {
         let turned = [0.0, 0.1, 0.2].map(|angle| pose([0.0, angle, 0.0], [1e6, 2.0, 3.0]));
         let find = |context: &[Pose]| {
-            SceneFrame::find("00ff", context, &[], PoseRotation::Quaternion, PoseScale::Context)
+            PoseNormalization::find("00ff", context, &[], PoseRotation::Quaternion, PoseScale::Context)
                 .map(|frame| frame.scale)
         };
         let message = find(&turned).unwrap_err().to_string();
@@ -277,16 +277,18 @@ mod tests {
         let mut poses = walk();
         poses[3].translation[1] = f64::NAN;
         let (context, target) = poses.split_at(2);
-        let message =
-            SceneFrame::find("00ff", context, target, PoseRotation::Axes, PoseScale::All).unwrap_err().to_string();
+        let message = PoseNormalization::find("00ff", context, target, PoseRotation::Axes, PoseScale::All)
+            .unwrap_err()
+            .to_string();
         assert_eq!(message, "frame 3 of scene 00ff: bad camera: the pose holds NaN");
     }
 
     #[test]
     fn opposite_viewing_directions_have_no_mean_axes() {
         let context = [0.0, std::f64::consts::PI].map(|angle| pose([0.0, angle, 0.0], [angle, 0.0, 0.0]));
-        let message =
-            SceneFrame::find("00ff", &context, &[], PoseRotation::Axes, PoseScale::Context).unwrap_err().to_string();
+        let message = PoseNormalization::find("00ff", &context, &[], PoseRotation::Axes, PoseScale::Context)
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("opposite directions"), "{message}");
     }
 }

@@ -5,7 +5,7 @@ use crate::geometry::pose::Pose;
 /// `num_views` frames from the first to the last, evenly along the path of the camera centres: while the camera rests
 /// or turns on the spot, one view replaces many. Evenly over the frames if all centres coincide or one is not finite.
 /// `None` for fewer frames than views, or for no views.
-pub fn spread_along_path(c2w: &[Pose], num_views: usize) -> Option<Vec<usize>> {
+pub fn contexts_along_path(c2w: &[Pose], num_views: usize) -> Option<Vec<usize>> {
     let num_frames = c2w.len();
     if num_views == 0 || num_frames < num_views {
         return None;
@@ -46,22 +46,22 @@ mod tests {
     #[test]
     fn views_are_spread_over_the_way_and_not_over_the_time() {
         let steady: Vec<f64> = (0..10).map(f64::from).collect();
-        assert_eq!(spread_along_path(&at(&steady), 4), Some(vec![0, 3, 6, 9]));
-        assert_eq!(spread_along_path(&at(&steady), 1), Some(vec![4]));
+        assert_eq!(contexts_along_path(&at(&steady), 4), Some(vec![0, 3, 6, 9]));
+        assert_eq!(contexts_along_path(&at(&steady), 1), Some(vec![4]));
         // The camera rests for six frames, then goes fast.
         let rests = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 3.0];
-        assert_eq!(spread_along_path(&at(&rests), 4), Some(vec![0, 6, 7, 8]));
+        assert_eq!(contexts_along_path(&at(&rests), 4), Some(vec![0, 6, 7, 8]));
         // There and back counts as a way.
-        assert_eq!(spread_along_path(&at(&[0.0, 1.0, 2.0, 1.0, 0.0]), 3), Some(vec![0, 2, 4]));
+        assert_eq!(contexts_along_path(&at(&[0.0, 1.0, 2.0, 1.0, 0.0]), 3), Some(vec![0, 2, 4]));
     }
 
     #[test]
     fn a_camera_that_stands_still_gives_frames_evenly_and_too_few_frames_none() {
-        assert_eq!(spread_along_path(&at(&[2.0; 7]), 3), Some(vec![0, 3, 6]));
-        assert_eq!(spread_along_path(&at(&[0.0, 1.0]), 3), None);
-        assert_eq!(spread_along_path(&at(&[0.0]), 0), None);
-        assert_eq!(spread_along_path(&[], 1), None);
-        assert_eq!(spread_along_path(&at(&[0.0, f64::NAN, 1.0]), 2), Some(vec![0, 2]));
+        assert_eq!(contexts_along_path(&at(&[2.0; 7]), 3), Some(vec![0, 3, 6]));
+        assert_eq!(contexts_along_path(&at(&[0.0, 1.0]), 3), None);
+        assert_eq!(contexts_along_path(&at(&[0.0]), 0), None);
+        assert_eq!(contexts_along_path(&[], 1), None);
+        assert_eq!(contexts_along_path(&at(&[0.0, f64::NAN, 1.0]), 2), Some(vec![0, 2]));
     }
 
     proptest! {
@@ -69,7 +69,7 @@ mod tests {
         fn views_are_as_many_as_asked_for_and_in_order(
             places in prop::collection::vec(-3.0_f64..3.0, 1..40), num_views in 1_usize..40,
         ) {
-            let frames = spread_along_path(&at(&places), num_views);
+            let frames = contexts_along_path(&at(&places), num_views);
             prop_assert_eq!(frames.is_some(), num_views <= places.len());
             let frames = frames.unwrap_or_default();
             prop_assert!(frames.windows(2).all(|pair| pair[0] < pair[1]));

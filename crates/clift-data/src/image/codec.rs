@@ -10,7 +10,7 @@ use image::{ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageRea
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 
 /// Most columns or rows of a decoded image.
 pub const MAX_SIDE: u32 = 16_384;
@@ -28,7 +28,7 @@ const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 /// # Errors
 /// [`DataError::BadImage`] with `key` and `frame`: another format, broken or truncated data, or a side above
 /// [`MAX_SIDE`].
-pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<Frame, DataError> {
+pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
     let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
     let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {
         return Err(bad(format!("its {} bytes are neither JPEG nor PNG", bytes.len())));
@@ -47,7 +47,7 @@ pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<Frame, DataError>
     if width == 0 || height == 0 {
         return Err(bad(format!("it is {width}x{height}")));
     }
-    Ok(Frame { width: width as usize, height: height as usize, rgb: picture.into_raw() })
+    Ok(RgbImage { width: width as usize, height: height as usize, rgb: picture.into_raw() })
 }
 
 /// Reads the columns and rows of a JPEG or PNG file from its header.
@@ -141,7 +141,7 @@ fn ends_after_a_scan(bytes: &[u8]) -> Option<bool> {
 ///
 /// # Errors
 /// [`DataError::Encode`] for an image whose `rgb` does not match its size, or beyond the format's limits.
-pub fn encode_jpeg(frame: &Frame, quality: u8) -> Result<Vec<u8>, DataError> {
+pub fn encode_jpeg(frame: &RgbImage, quality: u8) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
     encode(JpegEncoder::new_with_quality(&mut bytes, quality), frame)?;
     Ok(bytes)
@@ -151,14 +151,14 @@ pub fn encode_jpeg(frame: &Frame, quality: u8) -> Result<Vec<u8>, DataError> {
 ///
 /// # Errors
 /// As [`encode_jpeg`].
-pub fn encode_png(frame: &Frame) -> Result<Vec<u8>, DataError> {
+pub fn encode_png(frame: &RgbImage) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
     encode(PngEncoder::new(&mut bytes), frame)?;
     Ok(bytes)
 }
 
-fn encode(encoder: impl ImageEncoder, frame: &Frame) -> Result<(), DataError> {
-    let &Frame { width, height, ref rgb } = frame;
+fn encode(encoder: impl ImageEncoder, frame: &RgbImage) -> Result<(), DataError> {
+    let &RgbImage { width, height, ref rgb } = frame;
     let bad = |what: String| DataError::Encode { width, height, what };
     if rgb.len() != width * height * 3 {
         return Err(bad(format!("it has {} values, expected {}", rgb.len(), width * height * 3)));
@@ -172,9 +172,9 @@ fn encode(encoder: impl ImageEncoder, frame: &Frame) -> Result<(), DataError> {
 mod tests {
     use super::*;
 
-    fn ramp(width: usize, height: usize) -> Frame {
+    fn ramp(width: usize, height: usize) -> RgbImage {
         let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 77])).collect();
-        Frame { width, height, rgb }
+        RgbImage { width, height, rgb }
     }
 
     #[test]

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::DataError;
 use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::image::lanczos::{Window, resize_lanczos_window};
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 
 /// Position of the principal point in a cropped image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -41,12 +41,12 @@ impl Crop {
 /// # Errors
 /// [`DataError::Upscale`] if `width` or `height` is larger than the image's.
 pub fn fit(
-    frame: &Frame,
+    frame: &RgbImage,
     intrinsics_norm: IntrinsicsNorm,
     width: usize,
     height: usize,
     exact_principal_point: bool,
-) -> Result<(Frame, Intrinsics), DataError> {
+) -> Result<(RgbImage, Intrinsics), DataError> {
     if width > frame.width || height > frame.height {
         return Err(DataError::Upscale { width, height, from_width: frame.width, from_height: frame.height });
     }
@@ -77,9 +77,9 @@ mod tests {
     use super::*;
     use crate::image::codec::decode;
 
-    fn ramp(width: usize, height: usize) -> Frame {
+    fn ramp(width: usize, height: usize) -> RgbImage {
         let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 77])).collect();
-        Frame { width, height, rgb }
+        RgbImage { width, height, rgb }
     }
 
     #[test]
@@ -95,7 +95,7 @@ mod tests {
             assert_eq!(covering_size(from, to), scaled);
             assert_eq!(((scaled.0 - to.0) / 2, (scaled.1 - to.1) / 2), offset);
             let norm = IntrinsicsNorm { fx: 0.9, fy: 1.6, cx: 0.5, cy: 0.5 };
-            let frame = Frame { width: from.0, height: from.1, rgb: vec![9; from.0 * from.1 * 3] };
+            let frame = RgbImage { width: from.0, height: from.1, rgb: vec![9; from.0 * from.1 * 3] };
             let (fitted, protocol) = fit(&frame, norm, to.0, to.1, false).unwrap();
             assert_eq!((fitted.width, fitted.height, fitted.rgb.len()), (to.0, to.1, to.0 * to.1 * 3));
             assert!((protocol.fx / to.0 as f64 / norm.fx - factor).abs() < 1e-5, "{protocol:?}"); // printed to 5 digits

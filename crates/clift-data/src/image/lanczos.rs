@@ -7,7 +7,7 @@
 use std::f64::consts::PI;
 use std::ops::Range;
 
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 
 /// Fraction bits of a weight: 32, minus 8 for the pixel, minus 2 for the overshoot of a sum.
 const PRECISION_BITS: u32 = 32 - 8 - 2;
@@ -31,7 +31,7 @@ pub struct Window {
 ///
 /// # Panics
 /// When a size is zero or `frame.rgb` does not have `height * width * 3` values.
-pub fn resize_lanczos(frame: &Frame, width: usize, height: usize) -> Frame {
+pub fn resize_lanczos(frame: &RgbImage, width: usize, height: usize) -> RgbImage {
     resize_lanczos_window(frame, width, height, Window { column: 0, row: 0, width, height })
 }
 
@@ -40,7 +40,7 @@ pub fn resize_lanczos(frame: &Frame, width: usize, height: usize) -> Frame {
 ///
 /// # Panics
 /// As [`resize_lanczos`], and when the window is not inside `width` by `height`.
-pub fn resize_lanczos_window(frame: &Frame, width: usize, height: usize, window: Window) -> Frame {
+pub fn resize_lanczos_window(frame: &RgbImage, width: usize, height: usize, window: Window) -> RgbImage {
     assert_eq!(frame.rgb.len(), frame.height * frame.width * 3, "a frame of {}x{}", frame.width, frame.height);
     assert!(frame.width * frame.height * window.width * window.height > 0, "a picture without pixels");
     let [column_end, row_end] = [window.column + window.width, window.row + window.height];
@@ -64,7 +64,7 @@ pub fn resize_lanczos_window(frame: &Frame, width: usize, height: usize, window:
         Some(taps) => resize_rows(&narrowed, window.width * 3, top, taps),
         None => narrowed,
     };
-    Frame { width: window.width, height: window.height, rgb }
+    RgbImage { width: window.width, height: window.height, rgb }
 }
 
 /// Weights of one output pixel, and the first input pixel that they apply to.
@@ -185,7 +185,7 @@ mod tests {
         let frame = |name: &str| {
             let tensor = tensors.tensor(name).unwrap();
             let &[height, width, 3] = tensor.shape() else { panic!("{name} has shape {:?}", tensor.shape()) };
-            Frame { width, height, rgb: tensor.data().to_vec() }
+            RgbImage { width, height, rgb: tensor.data().to_vec() }
         };
         let mut num_cases = 0;
         while tensors.tensor(&format!("{num_cases}.input")).is_ok() {
@@ -200,7 +200,7 @@ mod tests {
     #[test]
     fn a_window_is_the_same_part_of_the_whole() {
         let rgb = (0..61 * 47 * 3).map(|i| (i * 7919 % 251) as u8).collect();
-        let frame = Frame { width: 61, height: 47, rgb };
+        let frame = RgbImage { width: 61, height: 47, rgb };
         for (width, height) in [(23, 11), (61, 20), (30, 47), (61, 47), (61, 1)] {
             let whole = resize_lanczos(&frame, width, height);
             for (column, row, columns, rows) in

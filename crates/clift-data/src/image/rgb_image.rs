@@ -2,7 +2,7 @@
 
 /// An 8-bit RGB image, row-major `[height, width, 3]`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Frame {
+pub struct RgbImage {
     /// Columns.
     pub width: usize,
     /// Rows.

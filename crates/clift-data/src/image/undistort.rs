@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::geometry::camera::IntrinsicsNorm;
 use crate::geometry::lens::Lens;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 
 /// Points of each image edge at which the lens is inverted.
 const EDGE_POINTS: usize = 129;
@@ -61,8 +61,8 @@ impl Undistortion {
     }
 
     /// Resamples an image bilinearly to the same size; positions that round beyond the edge are clamped to it.
-    pub fn apply(&self, frame: &Frame) -> Frame {
-        let &Frame { width, height, ref rgb } = frame;
+    pub fn apply(&self, frame: &RgbImage) -> RgbImage {
+        let &RgbImage { width, height, ref rgb } = frame;
         let mut undistorted = vec![0; rgb.len()];
         let rows = undistorted.par_chunks_exact_mut(width * 3).enumerate();
         // Positions first, colours second: the compiler vectorises a loop of arithmetic only.
@@ -75,7 +75,7 @@ impl Undistortion {
                 }
             },
         );
-        Frame { width, height, rgb: undistorted }
+        RgbImage { width, height, rgb: undistorted }
     }
 
     /// Position of each pixel of a row in the distorted image, clamped to it: column and row from the centre of the
@@ -98,7 +98,7 @@ impl Undistortion {
 const STEPS: usize = 2048;
 
 /// Bilinear colour at a position in units of 1 / [`STEPS`] pixel.
-fn bilinear(frame: &Frame, place: [u32; 2]) -> [u8; 3] {
+fn bilinear(frame: &RgbImage, place: [u32; 2]) -> [u8; 3] {
     let steps = STEPS as u32;
     let [column, row] = place.map(|at| (at / steps) as usize);
     let [x, y] = place.map(|at| at % steps);

@@ -14,7 +14,7 @@ pub struct ViewIndices {
 
 /// Posed views of one scene at the model's resolution, in the scene's normalised frame.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Views {
+pub struct ClipViews {
     /// Columns of every view.
     pub width: usize,
     /// Rows of every view.
@@ -29,7 +29,7 @@ pub struct Views {
     pub frame_index: Vec<usize>,
 }
 
-impl Views {
+impl ClipViews {
     /// How many views there are.
     pub fn num_views(&self) -> usize {
         self.c2w.len()
@@ -42,7 +42,7 @@ pub struct Clip {
     /// Key of the scene.
     pub key: String,
     /// Given views.
-    pub context: Views,
+    pub context: ClipViews,
     /// Views to render, with their ground truth.
-    pub target: Views,
+    pub target: ClipViews,
 }

@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use crate::error::DataError;
 use crate::geometry::camera::{Camera, Intrinsics};
-use crate::geometry::normalization::{PoseRotation, PoseScale, SceneFrame, check_near};
+use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale, check_near};
 use crate::image::fit::fit;
-use crate::image::rgb_image::Frame;
-use crate::sampling::clip::{Clip, ViewIndices, Views};
+use crate::image::rgb_image::RgbImage;
+use crate::sampling::clip::{Clip, ClipViews, ViewIndices};
 use crate::scene_source::SceneSource;
 
 /// How frames and poses are prepared.
@@ -53,16 +53,17 @@ impl ClipReader {
         let poses = |frames: &[usize]| frames.iter().map(|frame| cameras[*frame].c2w).collect::<Vec<_>>();
         let (context, target) = (poses(&views.context), poses(&views.target));
         let ClipOptions { pose_rotation, pose_scale, .. } = self.options;
-        let scene_frame = SceneFrame::find(key, &context, &target, pose_rotation, pose_scale).map_err(|error| {
-            // The normaliser counts through the views it was given; say which frame of the scene that is.
-            match error {
-                DataError::InFrame { key, frame, source } => {
-                    let frame = wanted.clone().nth(frame).copied().unwrap_or(frame);
-                    DataError::InFrame { key, frame, source }
+        let scene_frame =
+            PoseNormalization::find(key, &context, &target, pose_rotation, pose_scale).map_err(|error| {
+                // The normaliser counts through the views it was given; say which frame of the scene that is.
+                match error {
+                    DataError::InFrame { key, frame, source } => {
+                        let frame = wanted.clone().nth(frame).copied().unwrap_or(frame);
+                        DataError::InFrame { key, frame, source }
+                    }
+                    other => other,
                 }
-                other => other,
-            }
-        })?;
+            })?;
         for &frame in wanted.clone() {
             check_near(&scene_frame.normalize(cameras[frame].c2w)).map_err(|source| DataError::InFrame {
                 key: key.to_owned(),
@@ -76,7 +77,7 @@ impl ClipReader {
                 entry.insert(self.fitted(scene, frame, &cameras[frame])?);
             }
         }
-        let gather = |frames: &[usize]| Views {
+        let gather = |frames: &[usize]| ClipViews {
             width: self.options.width,
             height: self.options.height,
             images: frames.iter().flat_map(|frame| &fitted[frame].0.rgb).copied().collect(),
@@ -87,7 +88,7 @@ impl ClipReader {
         Ok(Clip { key: key.to_owned(), context: gather(&views.context), target: gather(&views.target) })
     }
 
-    fn fitted(&self, scene: usize, frame: usize, camera: &Camera) -> Result<(Frame, Intrinsics), DataError> {
+    fn fitted(&self, scene: usize, frame: usize, camera: &Camera) -> Result<(RgbImage, Intrinsics), DataError> {
         let ClipOptions { width, height, exact_principal_point, .. } = self.options;
         let picture = self.source.frame(scene, frame)?;
         fit(&picture, camera.intrinsics_norm, width, height, exact_principal_point).map_err(|source| {

@@ -10,7 +10,7 @@ use serde::de::{Deserializer, MapAccess, Visitor};
 use crate::error::DataError;
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
-use crate::skip_report::Ledger;
+use crate::skip_report::SkipReport;
 
 /// An index as published: `{key: {"context": [..], "target": [..]} | null | {}}`, in the order of the file.
 #[derive(Clone, Debug)]
@@ -89,8 +89,8 @@ impl EvaluationIndex {
     /// The first `limit` scenes of `source` to evaluate (0: all), in the order of the file, and what is left out on
     /// the way: null entries, empty entries, keys that the source does not have, scenes whose cameras cannot be read
     /// and those that lack a frame. The ledger counts the entries that were looked at.
-    pub fn select(&self, source: &dyn SceneSource, limit: usize) -> (Vec<EvaluationItem>, Ledger) {
-        let mut ledger = Ledger::default();
+    pub fn select(&self, source: &dyn SceneSource, limit: usize) -> (Vec<EvaluationItem>, SkipReport) {
+        let mut ledger = SkipReport::default();
         let mut items = Vec::new();
         for (key, views) in &self.entries {
             if limit > 0 && items.len() == limit {
@@ -160,7 +160,7 @@ impl<'de> Deserialize<'de> for IndexFile {
 
 /// Contexts from the first to the last of `num_frames` frames, and targets spread over the frames between them;
 /// `None` for fewer frames than views, or fewer than 2 contexts.
-pub fn spread_views(num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
+pub fn even_views(num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
     let num_views = num_context.checked_add(num_targets)?;
     if num_context < 2 || num_frames < num_views {
         return None;
@@ -195,15 +195,15 @@ mod tests {
     #[test]
     fn views_run_from_the_first_to_the_last_frame_and_targets_are_no_contexts() {
         for num_frames in 7..200 {
-            let ViewIndices { context, target } = spread_views(num_frames, 4, 3).unwrap();
+            let ViewIndices { context, target } = even_views(num_frames, 4, 3).unwrap();
             assert_eq!((context[0], context[3]), (0, num_frames - 1));
             assert_eq!((context.len(), target.len()), (4, 3));
             assert!(context.is_sorted_by(|a, b| a < b) && target.is_sorted_by(|a, b| a < b), "{context:?} {target:?}");
             assert!(target.iter().all(|frame| !context.contains(frame) && *frame < num_frames));
         }
-        assert_eq!(spread_views(16, 4, 3).unwrap().context, [0, 5, 10, 15]);
-        assert!([spread_views(6, 4, 3), spread_views(9, 1, 3), spread_views(0, 0, 0)].iter().all(Option::is_none));
-        assert!([spread_views(9, 2, usize::MAX), spread_views(9, usize::MAX, 2)].iter().all(Option::is_none));
+        assert_eq!(even_views(16, 4, 3).unwrap().context, [0, 5, 10, 15]);
+        assert!([even_views(6, 4, 3), even_views(9, 1, 3), even_views(0, 0, 0)].iter().all(Option::is_none));
+        assert!([even_views(9, 2, usize::MAX), even_views(9, usize::MAX, 2)].iter().all(Option::is_none));
     }
 
     #[test]

@@ -4,7 +4,7 @@ use glam::{DMat3, DVec3};
 
 use crate::geometry::camera::Intrinsics;
 use crate::geometry::pose::Pose;
-use crate::sampling::clip::{Clip, Views};
+use crate::sampling::clip::{Clip, ClipViews};
 
 impl Clip {
     /// Exchanges left and right in all views and in the world: image columns are reversed, poses become `S c2w S` with
@@ -21,7 +21,7 @@ impl Clip {
     }
 }
 
-impl Views {
+impl ClipViews {
     fn flipped(&self) -> Self {
         let row_bytes = self.width * 3;
         let images = if row_bytes == 0 {
@@ -56,7 +56,7 @@ mod tests {
     use crate::error::DataError;
     use crate::geometry::camera::Camera;
     use crate::geometry::normalization::{PoseRotation, PoseScale};
-    use crate::image::rgb_image::Frame;
+    use crate::image::rgb_image::RgbImage;
     use crate::sampling::clip::ViewIndices;
     use crate::sampling::clip_reader::{ClipOptions, ClipReader};
     use crate::scene_source::SceneSource;
@@ -84,11 +84,11 @@ mod tests {
             }
             Ok(cameras)
         }
-        fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
-            let Frame { width, height, rgb } = self.0.frame(scene, frame)?;
+        fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
+            let RgbImage { width, height, rgb } = self.0.frame(scene, frame)?;
             let rows = rgb.chunks_exact(width * 3);
             let rgb = rows.flat_map(|row| row.as_chunks::<3>().0.iter().rev()).flatten().copied().collect();
-            Ok(Frame { width, height, rgb })
+            Ok(RgbImage { width, height, rgb })
         }
     }
 
@@ -111,7 +111,7 @@ mod tests {
     }
 
     /// Plücker ray through a point of a view, in pixels: moment and direction.
-    fn ray(views: &Views, view: usize, x: f64, y: f64) -> [DVec3; 2] {
+    fn ray(views: &ClipViews, view: usize, x: f64, y: f64) -> [DVec3; 2] {
         let (pose, Intrinsics { fx, fy, cx, cy }) = (views.c2w[view], views.intrinsics[view]);
         let direction = pose.rotation * DVec3::new((x - cx) / fx, (y - cy) / fy, 1.0).normalize();
         [pose.translation.cross(direction), direction]
@@ -131,7 +131,7 @@ mod tests {
             for view in 0..views.num_views() {
                 for row in 0..16 {
                     for column in 0..40 {
-                        let pixel = |views: &Views, column: usize| {
+                        let pixel = |views: &ClipViews, column: usize| {
                             let at = ((view * 16 + row) * 40 + column) * 3;
                             views.images[at..at + 3].to_vec()
                         };
@@ -159,7 +159,7 @@ mod tests {
             let got = read(Arc::new(room()), [24, 24], rotation).flipped();
             for (got, expected) in [(&got.context, &expected.context), (&got.target, &expected.target)] {
                 assert_eq!(got.images, expected.images);
-                let numbers = |views: &Views| -> Vec<f64> {
+                let numbers = |views: &ClipViews| -> Vec<f64> {
                     let poses = views.c2w.iter().flat_map(|pose| pose.to_matrix_f64());
                     poses.chain(views.intrinsics.iter().flat_map(|k| [k.fx, k.fy, k.cx, k.cy])).collect()
                 };

@@ -3,7 +3,7 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::random::distinct;
+use crate::random::sample_distinct;
 
 /// How the contexts between the ends of a stretch are chosen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -35,7 +35,7 @@ impl InnerViews {
     /// Chooses `count` different frames between `left` and `right`, in increasing order. `centres` are the camera
     /// centres of all frames of the scene; they are looked at only where [`InnerViews::needs_centres`] says so.
     ///
-    /// Expects `count < right - left`, as [`BoundedSampler::sample`](crate::sampling::view_sampler::BoundedSampler::sample) makes sure.
+    /// Expects `count < right - left`, as [`BoundedSampler::sample`](crate::sampling::view_sampler::ViewSampler::sample) makes sure.
     pub(crate) fn choose(
         self,
         rng: &mut impl Rng,
@@ -46,7 +46,7 @@ impl InnerViews {
     ) -> Vec<usize> {
         let gap = right - left;
         match self {
-            Self::Random => distinct(rng, gap - 1, count).into_iter().map(|offset| left + 1 + offset).collect(),
+            Self::Random => sample_distinct(rng, gap - 1, count).into_iter().map(|offset| left + 1 + offset).collect(),
             // Rounded half up. Steps are of one frame or more, so no frame comes twice.
             Self::Even => (1..=count).map(|place| left + (2 * place * gap + count + 1) / (2 * (count + 1))).collect(),
             Self::FarthestPoint => farthest_points(left, right, count, centres),

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use crate::skip_report::Skip;
+use crate::skip_report::SkippedScene;
 
 /// Tries scenes for a batch slot until one can be read.
 ///
@@ -25,7 +25,7 @@ pub struct NoUsableScene {
     /// Scenes tried, repeated ones included.
     pub attempts: u32,
     /// The last of them.
-    pub last: Skip,
+    pub last: SkippedScene,
 }
 
 impl SlotFiller {
@@ -39,11 +39,12 @@ impl SlotFiller {
     pub fn fill<T>(
         &self,
         scene: impl Fn(u32) -> usize,
-        mut read: impl FnMut(usize, u32) -> Result<T, Skip>,
-        skipped: &mut Vec<Skip>,
+        mut read: impl FnMut(usize, u32) -> Result<T, SkippedScene>,
+        skipped: &mut Vec<SkippedScene>,
     ) -> Result<T, NoUsableScene> {
         let mut tried = BTreeSet::new();
-        let mut failed = NoUsableScene { attempts: 0, last: Skip { key: String::new(), reason: String::new() } };
+        let mut failed =
+            NoUsableScene { attempts: 0, last: SkippedScene { key: String::new(), reason: String::new() } };
         for attempt in 0..self.max_attempts {
             if failed.attempts >= self.min_attempts && tried.len() >= self.min_scenes {
                 break;
@@ -72,7 +73,7 @@ mod tests {
     /// The attempts at which scenes are read when none can be used.
     fn attempts(filler: SlotFiller, scene: impl Fn(u32) -> usize) -> Vec<u32> {
         let (mut read, mut skipped) = (Vec::new(), Vec::new());
-        let skip = |scene: usize| Skip { key: scene.to_string(), reason: "torn".into() };
+        let skip = |scene: usize| SkippedScene { key: scene.to_string(), reason: "torn".into() };
         let refuse = |scene: usize, attempt: u32| {
             read.push(attempt);
             Err::<(), _>(skip(scene))

@@ -8,9 +8,9 @@ use crate::random::{item_rng, unit};
 use crate::sampling::clip::{Clip, ViewIndices};
 use crate::sampling::scene_order::SceneOrder;
 use crate::sampling::slot_filler::{NoUsableScene, SlotFiller};
-use crate::sampling::view_sampler::BoundedSampler;
+use crate::sampling::view_sampler::ViewSampler;
 use crate::scene_source::SceneSource;
-use crate::skip_report::Skip;
+use crate::skip_report::SkippedScene;
 
 /// Tries of one slot, a scene that comes up again included, before the batch may fail.
 const MIN_ATTEMPTS: u32 = 16;
@@ -30,7 +30,7 @@ pub struct ClipBatch {
     /// One clip per slot.
     pub clips: Vec<Clip>,
     /// Scenes left out on the way, with the reason.
-    pub skipped: Vec<Skip>,
+    pub skipped: Vec<SkippedScene>,
 }
 
 /// Makes the batch of any step, as a pure function of (seed, step): scene order, views and replacements for scenes
@@ -38,7 +38,7 @@ pub struct ClipBatch {
 pub struct TrainingClips {
     source: Arc<dyn SceneSource>,
     read: Arc<ReadClip>,
-    sampler: BoundedSampler,
+    sampler: ViewSampler,
     order: SceneOrder,
     seed: u64,
     flip: bool,
@@ -55,7 +55,7 @@ impl TrainingClips {
     pub fn new(
         source: Arc<dyn SceneSource>,
         read: Arc<ReadClip>,
-        sampler: BoundedSampler,
+        sampler: ViewSampler,
         batch_size: usize,
         seed: u64,
     ) -> Result<Self, DataError> {
@@ -93,7 +93,7 @@ impl TrainingClips {
         step: u64,
         slot: usize,
         num_context: usize,
-        skipped: &mut Vec<Skip>,
+        skipped: &mut Vec<SkippedScene>,
     ) -> Result<Clip, DataError> {
         let filler = SlotFiller {
             min_attempts: MIN_ATTEMPTS,
@@ -102,10 +102,11 @@ impl TrainingClips {
         };
         let scene = |ahead: u32| self.order.scene(step.saturating_add(u64::from(ahead)), slot);
         let read = |scene: usize, ahead: u32| {
-            let skip = |error: DataError| Skip { key: self.source.key(scene).into(), reason: error.to_string() };
+            let skip =
+                |error: DataError| SkippedScene { key: self.source.key(scene).into(), reason: error.to_string() };
             self.read_scene(scene, step, slot, ahead, num_context).map_err(skip)
         };
-        filler.fill(scene, read, skipped).map_err(|NoUsableScene { attempts, last: Skip { key, reason } }| {
+        filler.fill(scene, read, skipped).map_err(|NoUsableScene { attempts, last: SkippedScene { key, reason } }| {
             DataError::NoUsableScene { step, slot, attempts, key, reason }
         })
     }
@@ -143,7 +144,7 @@ mod tests {
 
     use super::*;
     use crate::geometry::pose::Pose;
-    use crate::sampling::clip::Views;
+    use crate::sampling::clip::ClipViews;
     use crate::sampling::prefetcher::Prefetcher;
     use crate::testing::Lengths;
 
@@ -151,7 +152,7 @@ mod tests {
         let source = Arc::new(Lengths::new(lengths));
         let keys = source.keys.clone();
         let read = move |scene: usize, views: &ViewIndices| {
-            let only = |frame_index: &[usize]| Views {
+            let only = |frame_index: &[usize]| ClipViews {
                 width: 0,
                 height: 0,
                 images: Vec::new(),
@@ -161,7 +162,7 @@ mod tests {
             };
             Ok(Clip { key: keys[scene].clone(), context: only(&views.context), target: only(&views.target) })
         };
-        TrainingClips::new(source, Arc::new(read), BoundedSampler::default(), batch_size, seed).unwrap()
+        TrainingClips::new(source, Arc::new(read), ViewSampler::default(), batch_size, seed).unwrap()
     }
 
     fn mixed() -> TrainingClips {
@@ -283,7 +284,7 @@ mod tests {
 
     #[test]
     fn a_sampler_that_cannot_hold_is_refused_at_the_start() {
-        let sampler = BoundedSampler { num_targets: 0, ..Default::default() };
+        let sampler = ViewSampler { num_targets: 0, ..Default::default() };
         let read = |_: usize, _: &ViewIndices| unreachable!("nothing is read");
         let made = TrainingClips::new(Arc::new(Lengths::new(vec![9])), Arc::new(read), sampler, 1, 0);
         assert!(made.unwrap_err().to_string().starts_with("num_targets is 0"));

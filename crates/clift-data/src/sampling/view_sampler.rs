@@ -4,7 +4,7 @@ use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
-use crate::random::{below, between, draw_from, step_rng};
+use crate::random::{between, sample_from, step_rng, uniform_below};
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::inner_views::InnerViews;
 use crate::scene_source::SceneSource;
@@ -16,7 +16,7 @@ const MAX_VIEWS: usize = 10_000;
 /// `min(init + trunc((last - init) * step / warm_up_steps), last)`.
 ///
 /// Expects `init <= last`; without warm-up steps the value is `last` from the start.
-pub fn schedule(init: usize, last: usize, warm_up_steps: u64, step: u64) -> usize {
+pub fn linear_warm_up(init: usize, last: usize, warm_up_steps: u64, step: u64) -> usize {
     if warm_up_steps == 0 || step >= warm_up_steps {
         return last;
     }
@@ -27,11 +27,11 @@ pub fn schedule(init: usize, last: usize, warm_up_steps: u64, step: u64) -> usiz
 /// Draws a stretch of a scene, whose two ends and some inner frames are the context, and targets from inside it.
 ///
 /// The stretch grows during training: its gap (last minus first frame) is uniform in `[min_gap, max_gap]`, both on
-/// the [`schedule`] of `warm_up_steps`. This is the `bounded_v2` sampler of DepthSplat, which the paper trains with;
+/// the [`linear_warm_up`] of `warm_up_steps`. This is the `bounded_v2` sampler of DepthSplat, which the paper trains with;
 /// the default is its RealEstate10K setting with the paper's 4 to 6 contexts (paper, appendix).
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct BoundedSampler {
+pub struct ViewSampler {
     /// Fewest context views of an item; at least 2.
     pub min_context: usize,
     /// Most context views of an item. One number is drawn for each batch.
@@ -52,7 +52,7 @@ pub struct BoundedSampler {
     pub inner: InnerViews,
 }
 
-impl Default for BoundedSampler {
+impl Default for ViewSampler {
     fn default() -> Self {
         Self {
             min_context: 4,
@@ -67,7 +67,7 @@ impl Default for BoundedSampler {
     }
 }
 
-impl BoundedSampler {
+impl ViewSampler {
     /// Checks that every draw the fields allow is possible in a scene that is long enough.
     ///
     /// # Errors
@@ -131,7 +131,7 @@ impl BoundedSampler {
     /// Batches with at most half of `max_context` contexts take proportionally shorter stretches.
     pub fn gap_bounds(&self, step: u64, num_context: usize) -> [usize; 2] {
         [self.min_gap, self.max_gap]
-            .map(|[init, last]| schedule(init, last, self.warm_up_steps, step) / self.gap_divisor(num_context))
+            .map(|[init, last]| linear_warm_up(init, last, self.warm_up_steps, step) / self.gap_divisor(num_context))
     }
 
     /// Frames of the shortest stretch of any step: no item can be drawn from a scene of fewer.
@@ -144,7 +144,7 @@ impl BoundedSampler {
     /// looks at them.
     ///
     /// # Errors
-    /// As [`BoundedSampler::sample`], and whatever reading the scene gives.
+    /// As [`ViewSampler::sample`], and whatever reading the scene gives.
     pub fn draw(
         &self,
         source: &dyn SceneSource,
@@ -193,13 +193,13 @@ impl BoundedSampler {
             return Err(DataError::NotEnoughFrames { needed: min_gap + 1, got: num_frames });
         }
         let gap = between(rng, min_gap, max_gap.min(num_frames - 1));
-        let left = below(rng, num_frames - gap);
+        let left = uniform_below(rng, num_frames - gap);
         let right = left + gap;
 
         let target = if self.with_replacement {
             (0..self.num_targets).map(|_| between(rng, left, right)).collect()
         } else {
-            draw_from(rng, (left..=right).collect(), self.num_targets)
+            sample_from(rng, (left..=right).collect(), self.num_targets)
         };
 
         let inner = self.inner.choose(rng, left, right, num_context - 2, centres);
@@ -220,7 +220,7 @@ impl BoundedSampler {
 /// # Errors
 /// [`DataError::NotEnoughFrames`] when a context is not a frame of the scene; [`DataError::BadConfig`] when there are
 /// no contexts.
-pub fn targets_excluding(
+pub fn sample_targets(
     context: &[usize],
     num_frames: usize,
     num_targets: usize,
@@ -234,12 +234,12 @@ pub fn targets_excluding(
     }
     let mut candidates: Vec<usize> = (first..=last).filter(|frame| !context.contains(frame)).collect();
     if candidates.len() >= num_targets {
-        return Ok(draw_from(rng, candidates, num_targets));
+        return Ok(sample_from(rng, candidates, num_targets));
     }
     if candidates.is_empty() {
         candidates = context.to_vec();
     }
-    Ok((0..num_targets).map(|_| candidates[below(rng, candidates.len())]).collect())
+    Ok((0..num_targets).map(|_| candidates[uniform_below(rng, candidates.len())]).collect())
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::error::DataError;
 use crate::files::listing::{file_names, has_ending};
 use crate::scene_source::Split;
-use crate::skip_report::{Ledger, some_of};
+use crate::skip_report::{SkipReport, first_few};
 use crate::sources::kind::SourceKind;
 use crate::sources::photos::re10k_text::looks_like_re10k;
 use crate::sources::photos::scene_folder::{
@@ -61,7 +61,7 @@ fn has_splits(root: &Path) -> bool {
 /// The scenes detected in a folder; of photos, with the skipped ones.
 pub(crate) enum DetectedSource {
     Torch(SourceKind),
-    Photos(SourceKind, Vec<SceneFolder>, Ledger),
+    Photos(SourceKind, Vec<SceneFolder>, SkipReport),
 }
 
 /// The folder of one split: the root itself where it has no split folders.
@@ -93,7 +93,7 @@ impl<'a> SplitFolder<'a> {
         let base = &self.base;
         if base.is_file() {
             let kind = if asked == SourceKind::Auto { SourceKind::Captures } else { asked };
-            return Ok(DetectedSource::Photos(kind, vec![SceneFolder::of_file(base)], Ledger::default()));
+            return Ok(DetectedSource::Photos(kind, vec![SceneFolder::of_file(base)], SkipReport::default()));
         }
         let names = file_names(base)?;
         let has_torch = names.iter().any(|name| has_ending(name, "torch"));
@@ -111,12 +111,12 @@ impl<'a> SplitFolder<'a> {
             let texts: Vec<&String> = names.iter().filter(|name| has_ending(name, "txt")).collect();
             let is_scene = scene_in(base).is_some();
             if !is_scene && texts.iter().take(8).any(|name| looks_like_re10k(&base.join(name))) {
-                return Ok(DetectedSource::Photos(SourceKind::Re10kTxt, Vec::new(), Ledger::default()));
+                return Ok(DetectedSource::Photos(SourceKind::Re10kTxt, Vec::new(), SkipReport::default()));
             }
         }
         let FoundScenes { mut scenes, others, notes } = find_scenes(base)?;
         let kind = if asked == SourceKind::Auto { self.recognise(&scenes)? } else { asked };
-        let mut ledger = Ledger { notes, ..Ledger::default() };
+        let mut ledger = SkipReport { notes, ..SkipReport::default() };
         scenes.retain(|scene| {
             let is_of_layout = match kind {
                 SourceKind::Re10kTxt => matches!(scene.files, SceneFiles::Re10kText { .. }),
@@ -142,7 +142,7 @@ impl<'a> SplitFolder<'a> {
             return Err(self.nothing(what, &others));
         }
         if !others.is_empty() {
-            ledger.notes.push(format!("not opened, each being data of its own: {}", some_of(&others)));
+            ledger.notes.push(format!("not opened, each being data of its own: {}", first_few(&others)));
         }
         Ok(DetectedSource::Photos(kind, scenes, ledger))
     }
@@ -180,11 +180,11 @@ impl<'a> SplitFolder<'a> {
             format!(
                 "there is no transforms.json, but {}: open one by its path, or write the frames of all into a \
                  transforms.json",
-                some_of(&files)
+                first_few(&files)
             )
         }));
         if !others.is_empty() {
-            parts.push(format!("below it there is other data, to be opened by itself: {}", some_of(others)));
+            parts.push(format!("below it there is other data, to be opened by itself: {}", first_few(others)));
         }
         let what = parts.join("; ");
         let path = if self.base.exists() { self.base.clone() } else { self.root.path.clone() };

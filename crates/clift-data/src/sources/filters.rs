@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 
-/// Which scenes of a data set are used. What they leave out is in the source's [`Ledger`](crate::skip_report::Ledger).
+/// Which scenes of a data set are used. What they leave out is in the source's [`Ledger`](crate::skip_report::SkipReport).
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SceneFilters {

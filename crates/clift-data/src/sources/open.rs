@@ -7,7 +7,7 @@ use std::sync::Arc;
 use crate::error::DataError;
 use crate::files::listing::file_names;
 use crate::scene_source::{SceneSource, Split};
-use crate::skip_report::Ledger;
+use crate::skip_report::SkipReport;
 use crate::sources::chunks::chunk_source::ChunkSource;
 use crate::sources::chunks::index::{index_of_files, note_unlisted, read_index};
 use crate::sources::dataset_root::{DatasetRoot, DetectedSource, SplitFolder};
@@ -34,7 +34,7 @@ pub struct OpenedSource {
     /// Whether training and test scenes are apart without a list: in folders `train/` and `test/`, or synthetic.
     pub has_splits: bool,
     /// Skipped scenes and frames.
-    pub report: Ledger,
+    pub report: SkipReport,
 }
 
 /// Opens one split of a data set on disk: `root/train` or `root/test`, or `root` itself where it has neither. `root`
@@ -73,7 +73,7 @@ impl SplitFolder<'_> {
         options: &SourceOptions,
         list: Option<&TestScenes>,
     ) -> Result<OpenedSource, DataError> {
-        let mut ledger = Ledger::default();
+        let mut ledger = SkipReport::default();
         let index = if kind == SourceKind::Chunks {
             let index = read_index(&self.base.join("index.json"))?;
             ledger.notes.extend(note_unlisted(&self.base, &index)?);
@@ -98,7 +98,7 @@ impl SplitFolder<'_> {
         &self,
         kind: SourceKind,
         scenes: Vec<SceneFolder>,
-        mut ledger: Ledger,
+        mut ledger: SkipReport,
         options: &SourceOptions,
         list: Option<&TestScenes>,
     ) -> Result<OpenedSource, DataError> {
@@ -154,7 +154,7 @@ impl SplitFolder<'_> {
         list: Option<&TestScenes>,
         keys: &[String],
         options: &SourceOptions,
-        ledger: &mut Ledger,
+        ledger: &mut SkipReport,
     ) -> Vec<bool> {
         let Some(list) = list else { return vec![true; keys.len()] };
         let (kept, mut divided) = list.divide(keys, self.split, !self.root.has_splits());
@@ -174,7 +174,7 @@ impl SplitFolder<'_> {
             DetectedSource::Torch(SourceKind::Chunks) => {
                 read_index(&place.base.join("index.json"))?.into_keys().collect()
             }
-            DetectedSource::Torch(_) => index_of_files(&place.base, &mut Ledger::default())?.into_keys().collect(),
+            DetectedSource::Torch(_) => index_of_files(&place.base, &mut SkipReport::default())?.into_keys().collect(),
             DetectedSource::Photos(_, scenes, _) => {
                 let scenes = if scenes.is_empty() { place.re10k_clips(options)? } else { scenes };
                 scenes.into_iter().map(|scene| scene.key).collect()
@@ -183,7 +183,7 @@ impl SplitFolder<'_> {
     }
 }
 
-fn append(ledger: &mut Ledger, more: &Ledger) {
+fn append(ledger: &mut SkipReport, more: &SkipReport) {
     ledger.num_scenes += more.num_scenes;
     ledger.skips.extend_from_slice(&more.skips);
     ledger.frames.extend_from_slice(&more.frames);

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 
 /// The chosen scenes of a source, in the order they were chosen in.
@@ -60,7 +60,7 @@ impl SceneSource for SceneSubset {
         self.source.url(self.scenes[scene])
     }
 
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+    fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         self.source.frame(self.scenes[scene], frame)
     }
 

@@ -8,7 +8,7 @@ use serde::de::IgnoredAny;
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
 use crate::scene_source::Split;
-use crate::skip_report::Ledger;
+use crate::skip_report::SkipReport;
 use crate::sources::keys::{last_name, plain_key};
 
 /// Most bytes of a list.
@@ -65,8 +65,8 @@ impl TestScenes {
 
     /// Which of `keys` belong to a split, and a ledger of the others: for training, those in the list; for testing
     /// where both splits share a folder, those in the list that are not there.
-    pub(crate) fn divide(&self, keys: &[String], split: Split, is_shared: bool) -> (Vec<bool>, Ledger) {
-        let mut ledger = Ledger::default();
+    pub(crate) fn divide(&self, keys: &[String], split: Split, is_shared: bool) -> (Vec<bool>, SkipReport) {
+        let mut ledger = SkipReport::default();
         let kept: Vec<bool> = keys
             .iter()
             .map(|key| match split {

@@ -8,7 +8,7 @@ use rand::Rng;
 use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::pose::Pose;
 use crate::random::unit;
-use crate::synthetic::config::Looks;
+use crate::synthetic::config::LookDirection;
 
 /// Smallest distance between the camera and any surface, in the scene's units of length.
 pub(crate) const CLEARANCE: f64 = 0.25;
@@ -24,7 +24,7 @@ pub(crate) struct CameraPath {
     /// The fixated point and how far it swings.
     target: [DVec3; 2],
     phase: f64,
-    looks: Looks,
+    looks: LookDirection,
 }
 
 /// Radius of the path of a camera that looks out, as a share of one that looks in.
@@ -35,7 +35,7 @@ const RADIUS_SWING: f64 = 0.06;
 
 impl CameraPath {
     /// Samples a path about `length` long in a room of `half_size` (y is down).
-    pub fn draw(rng: &mut impl Rng, half_size: DVec3, length: f64, looks: Looks) -> Self {
+    pub fn draw(rng: &mut impl Rng, half_size: DVec3, length: f64, looks: LookDirection) -> Self {
         let widest = half_size.x.min(half_size.z) - CLEARANCE;
         let radius = widest * (0.86 + 0.08 * unit(rng));
         let side = if unit(rng) < 0.5 { -1.0 } else { 1.0 };
@@ -48,7 +48,7 @@ impl CameraPath {
         let pan = radius * (0.35 + around(0.1));
         let drift = DVec3::new(pan * cos, around(0.3 * tall), pan * sin);
         Self {
-            radius: if looks == Looks::Out { INNER_RADIUS * radius } else { radius },
+            radius: if looks == LookDirection::Out { INNER_RADIUS * radius } else { radius },
             looks,
             start: unit(rng) * TAU,
             sweep: side * length / radius,
@@ -78,9 +78,9 @@ impl CameraPath {
         let [target, drift] = self.target;
         let inwards = target + swing * drift - position;
         let forward = match self.looks {
-            Looks::In => inwards,
+            LookDirection::In => inwards,
             // Away from the axis of the room, as far up or down as inwards.
-            Looks::Out => {
+            LookDirection::Out => {
                 let away = self.radius / INNER_RADIUS / position.x.hypot(position.z);
                 DVec3::new(away * position.x, inwards.y, away * position.z)
             }

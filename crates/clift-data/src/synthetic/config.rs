@@ -11,7 +11,7 @@ pub(crate) const MAX_SCENES: usize = 32_000_000;
 /// Viewing direction of the camera on its path.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Looks {
+pub enum LookDirection {
     /// From near the walls to the middle: all views show the same objects.
     #[default]
     In,
@@ -42,7 +42,7 @@ pub struct SyntheticConfig {
     /// Fewest and most boxes and balls in a room; a crowded room may hold fewer.
     pub num_objects: [usize; 2],
     /// Which way the camera looks, `"in"` or `"out"`.
-    pub looks: Looks,
+    pub looks: LookDirection,
     /// Length of the camera path from the first to the last frame, before small swings. Longer is harder. A camera that
     /// looks out rotates by the arc's angle of a camera that looks in.
     pub path_length: f64,
@@ -68,7 +68,7 @@ impl Default for SyntheticConfig {
             fov_deg: 75.0,
             room_half_size: [1.5, 2.0],
             num_objects: [3, 5],
-            looks: Looks::In,
+            looks: LookDirection::In,
             path_length: 4.0,
             texture_frequency: 0.4,
             plain_share: 0.0,

@@ -6,7 +6,7 @@
 use glam::{DVec3, Vec3};
 
 use crate::geometry::camera::Camera;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::synthetic::room::{Object, Scene, Shape, turned};
 
 /// Smallest slope of a slab test, which keeps the test finite for rays along an axis.
@@ -35,7 +35,14 @@ struct Hit {
 /// Renders `scene` with `side * side` rays per pixel.
 ///
 /// `specular` in `[0, 1]` scales all light that depends on the viewing direction.
-pub(crate) fn render(scene: &Scene, camera: &Camera, width: usize, height: usize, side: usize, specular: f32) -> Frame {
+pub(crate) fn render(
+    scene: &Scene,
+    camera: &Camera,
+    width: usize,
+    height: usize,
+    side: usize,
+    specular: f32,
+) -> RgbImage {
     let intrinsics = camera.intrinsics_norm.to_pixels(width, height);
     let origin = camera.c2w.translation.as_vec3();
     let mut rgb = Vec::with_capacity(width * height * 3);
@@ -53,7 +60,7 @@ pub(crate) fn render(scene: &Scene, camera: &Camera, width: usize, height: usize
             rgb.extend(sum.to_array().map(|value| (value * scale + 0.5) as u8));
         }
     }
-    Frame { width, height, rgb }
+    RgbImage { width, height, rgb }
 }
 
 /// Linear light to display values in `[0, 1]`: a soft shoulder, then gamma 2.

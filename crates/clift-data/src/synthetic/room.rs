@@ -144,7 +144,7 @@ fn swing(rng: &mut impl Rng, size: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::random::step_rng;
-    use crate::synthetic::config::Looks;
+    use crate::synthetic::config::LookDirection;
 
     /// Distance from a point to an object's surface, 0 inside.
     fn distance(object: &Object, point: Vec3) -> f32 {
@@ -169,7 +169,7 @@ mod tests {
             path_length: 20.0,
             ..Default::default()
         };
-        let turning = SyntheticConfig { looks: Looks::Out, ..crowded.clone() };
+        let turning = SyntheticConfig { looks: LookDirection::Out, ..crowded.clone() };
         for config in [SyntheticConfig::default(), crowded, turning] {
             for scene in scenes(&config) {
                 for time in 0..=500 {
@@ -205,13 +205,13 @@ mod tests {
 
     #[test]
     fn a_camera_that_looks_out_turns_its_back_on_the_middle() {
-        for looks in [Looks::In, Looks::Out] {
+        for looks in [LookDirection::In, LookDirection::Out] {
             for scene in scenes(&SyntheticConfig { looks, ..Default::default() }) {
                 for time in [0.0, 0.3, 1.0] {
                     let camera = scene.path.camera(time, 75.0, 1.0).c2w;
                     let (forward, centre) = (camera.rotation.z_axis, camera.translation);
                     let away = forward.x * centre.x + forward.z * centre.z;
-                    assert_eq!(away > 0.0, looks == Looks::Out, "{forward} at {centre}");
+                    assert_eq!(away > 0.0, looks == LookDirection::Out, "{forward} at {centre}");
                 }
             }
         }

@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::random::step_rng;
 use crate::scene_source::{SceneSource, Split};
 use crate::synthetic::config::SyntheticConfig;
@@ -92,7 +92,7 @@ impl SceneSource for SyntheticSource {
         Ok((0..self.config.num_frames).map(|frame| self.camera(&scene, frame)).collect())
     }
 
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+    fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         let position = scene;
         let scene = self.scene(position)?;
         let SyntheticConfig { num_frames, width, height, samples_per_pixel, specular, .. } = self.config;
@@ -110,7 +110,7 @@ mod tests {
 
     use super::*;
     use crate::random::item_rng;
-    use crate::sampling::view_sampler::{BoundedSampler, targets_excluding};
+    use crate::sampling::view_sampler::{ViewSampler, sample_targets};
     use crate::synthetic::config::MAX_SCENES;
 
     fn source(change: impl FnOnce(&mut SyntheticConfig)) -> SyntheticSource {
@@ -126,14 +126,14 @@ mod tests {
 
     /// Mean PSNR over held-out scenes of copying the nearest context, and of the mean of the contexts.
     fn baselines(source: &SyntheticSource, gaps: [usize; 2]) -> [f64; 2] {
-        let sampler = BoundedSampler { min_gap: [gaps[0]; 2], max_gap: [gaps[1]; 2], ..Default::default() };
+        let sampler = ViewSampler { min_gap: [gaps[0]; 2], max_gap: [gaps[1]; 2], ..Default::default() };
         let num_scenes = 200;
         let mut sums = [0.0; 2];
         for scene in 0..num_scenes {
             let mut rng = item_rng(1, 0, scene as u32, 0, "test");
             let num_frames = source.config().num_frames;
             let views = sampler.sample(num_frames, &[], 0, 4, &mut rng).unwrap();
-            let target = targets_excluding(&views.context, num_frames, 1, &mut rng).unwrap()[0];
+            let target = sample_targets(&views.context, num_frames, 1, &mut rng).unwrap()[0];
             let center = source.cameras(scene).unwrap().into_iter().map(|c| c.c2w.translation).collect::<Vec<_>>();
             let pixels = |frame: usize| -> Vec<f64> {
                 source.frame(scene, frame).unwrap().rgb.into_iter().map(f64::from).collect()

@@ -5,7 +5,7 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 use rand::Rng;
 
-use crate::random::{below, unit};
+use crate::random::{uniform_below, unit};
 
 /// How the two colours alternate.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,7 +33,7 @@ impl Texture {
     ///
     /// `saturation` and `value` are those of the brighter colour.
     pub fn draw(rng: &mut impl Rng, hue: f64, saturation: f64, value: f64, frequency: f64) -> Self {
-        let pattern = [Pattern::Gradient, Pattern::Stripes, Pattern::Checkers, Pattern::Waves][below(rng, 4)];
+        let pattern = [Pattern::Gradient, Pattern::Stripes, Pattern::Checkers, Pattern::Waves][uniform_below(rng, 4)];
         let turn = unit(rng) * std::f64::consts::TAU;
         let shift = 0.12 + 0.3 * unit(rng);
         let darker = value * (0.25 + 0.15 * unit(rng));

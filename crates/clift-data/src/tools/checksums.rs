@@ -17,7 +17,7 @@ const FILE_NAME: &str = "SHA256SUMS";
 const MADE_AS: &str = "# made as: ";
 /// Scenes of chunks, by key: the file of each.
 pub(crate) const INDEX: &str = "index.json";
-/// The [`Ledger`](crate::skip_report::Ledger) of what is not in the folder.
+/// The [`Ledger`](crate::skip_report::SkipReport) of what is not in the folder.
 pub(crate) const SKIPPED: &str = "skipped.json";
 /// What is written beside scenes.
 const LISTS: [&str; 2] = [INDEX, SKIPPED];
@@ -26,7 +26,7 @@ const LISTS: [&str; 2] = [INDEX, SKIPPED];
 ///
 /// A file's line is on the disk before the file has its name: what is in the folder without a line is someone else's.
 #[derive(Debug)]
-pub(crate) struct Journal {
+pub(crate) struct Checksums {
     folder: PathBuf,
     /// How the files are made, on one line.
     made_as: String,
@@ -35,7 +35,7 @@ pub(crate) struct Journal {
     damaged: BTreeSet<String>,
 }
 
-impl Journal {
+impl Checksums {
     /// Looks at a folder, new or empty or one that was started, and changes nothing in it. Lines of files that are missing
     /// or hold something else are dropped: they will be written again.
     ///
@@ -210,7 +210,7 @@ mod tests {
         let path = folder.path().join("a");
         std::fs::write(&path, b"abc").unwrap();
         assert_eq!(hash_file(&path).unwrap(), "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
-        let mut journal = Journal::open(&folder.path().join("out"), "chunks").unwrap();
+        let mut journal = Checksums::open(&folder.path().join("out"), "chunks").unwrap();
         journal.begin().unwrap();
         journal.write("a", b"abc").unwrap();
         assert_eq!(journal.sums["a"], hash_file(&path).unwrap());
@@ -218,7 +218,7 @@ mod tests {
 
     /// A folder with the files `a.torch`, `b.torch` and `c.torch`.
     fn three(folder: &Path) {
-        let mut journal = Journal::open(folder, "chunks").unwrap();
+        let mut journal = Checksums::open(folder, "chunks").unwrap();
         journal.begin().unwrap();
         for name in ["a.torch", "b.torch", "c.torch"] {
             journal.write(name, name.as_bytes()).unwrap();
@@ -233,7 +233,7 @@ mod tests {
         std::fs::write(at("a.torch"), "changed").unwrap();
         let text = std::fs::read_to_string(at(FILE_NAME)).unwrap();
         std::fs::write(at(FILE_NAME), format!("{text}18ac3e7343f01689")).unwrap();
-        let mut journal = Journal::open(folder.path(), "chunks").unwrap();
+        let mut journal = Checksums::open(folder.path(), "chunks").unwrap();
         assert_eq!(journal.names().collect::<Vec<_>>(), ["b.torch", "c.torch"]);
         assert!(at("a.torch").exists(), "looking changes nothing");
         journal.begin().unwrap();
@@ -250,7 +250,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let refused = |name: &str| {
             std::fs::write(folder.path().join(name), "").unwrap();
-            let message = Journal::open(folder.path(), "chunks").unwrap_err().to_string();
+            let message = Checksums::open(folder.path(), "chunks").unwrap_err().to_string();
             std::fs::remove_file(folder.path().join(name)).unwrap();
             assert!(message.contains(&format!("it holds {name}, which is in no line of SHA256SUMS")), "{message}");
         };
@@ -259,14 +259,14 @@ mod tests {
         three(folder.path());
         refused("thesis.txt");
         refused("000007.torch");
-        Journal::open(folder.path(), "chunks").unwrap();
+        Checksums::open(folder.path(), "chunks").unwrap();
     }
 
     #[test]
     fn files_that_were_made_in_another_way_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         three(folder.path());
-        let message = |made_as: &str| Journal::open(folder.path(), made_as).unwrap_err().to_string();
+        let message = |made_as: &str| Checksums::open(folder.path(), made_as).unwrap_err().to_string();
         let expected = "its files were made as: chunks; asked for are: scenes; give the same options or choose another";
         assert!(message("scenes").contains(expected), "{}", message("scenes"));
         let path = folder.path().join(FILE_NAME);
@@ -278,10 +278,10 @@ mod tests {
     #[test]
     fn a_folder_without_scenes_may_be_made_in_another_way() {
         let folder = tempfile::tempdir().unwrap();
-        let mut journal = Journal::open(folder.path(), "chunks").unwrap();
+        let mut journal = Checksums::open(folder.path(), "chunks").unwrap();
         journal.begin().unwrap();
         journal.write("skipped.json", b"all of them").unwrap();
-        Journal::open(folder.path(), "scenes").unwrap().begin().unwrap();
+        Checksums::open(folder.path(), "scenes").unwrap().begin().unwrap();
         assert!(std::fs::read_to_string(folder.path().join(FILE_NAME)).unwrap().starts_with("# made as: scenes\n"));
     }
 
@@ -297,7 +297,7 @@ mod tests {
         let path = folder.path().join(FILE_NAME);
         let text = std::fs::read_to_string(&path).unwrap();
         std::fs::write(&path, format!("{text}{}  d\n", hex::encode(Sha256::digest(b"d")))).unwrap();
-        let mut journal = Journal::open(folder.path(), "chunks").unwrap();
+        let mut journal = Checksums::open(folder.path(), "chunks").unwrap();
         assert_eq!(journal.names().collect::<Vec<_>>(), ["a.torch", "b.torch", "c.torch"]);
         journal.begin().unwrap();
         assert!(!leftover.exists());
@@ -311,7 +311,7 @@ mod tests {
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
             std::fs::write(path, "x").unwrap();
         }
-        let message = Journal::open(folder.path(), "chunks").unwrap_err().to_string();
+        let message = Checksums::open(folder.path(), "chunks").unwrap_err().to_string();
         assert!(message.contains("it holds mine, which is in no line"), "{message}");
         assert!(mine.iter().all(|path| path.exists()));
         std::fs::rename(folder.path().join("mine"), folder.path().join(".clift-w4")).unwrap();
@@ -330,7 +330,7 @@ mod tests {
             (format!("{MADE_AS}chunks\n{sums}"), "its notes.txt is not what SHA256SUMS says"),
         ] {
             std::fs::write(at(FILE_NAME), &text).unwrap();
-            let message = Journal::open(folder.path(), "chunks").and_then(|mut journal| journal.begin()).unwrap_err();
+            let message = Checksums::open(folder.path(), "chunks").and_then(|mut journal| journal.begin()).unwrap_err();
             assert!(message.to_string().contains(expected), "{message}");
             assert_eq!(std::fs::read_to_string(at("notes.txt")).unwrap(), "second");
             assert_eq!(std::fs::read_to_string(at(FILE_NAME)).unwrap(), text);

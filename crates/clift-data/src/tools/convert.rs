@@ -8,13 +8,13 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::files::listing::has_ending;
 use crate::scene_source::SceneSource;
-use crate::skip_report::{Ledger, Skip, counted, some_of};
+use crate::skip_report::{SkipReport, SkippedScene, first_few, plural};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
-use crate::sources::chunks::writer::{Fill, SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
+use crate::sources::chunks::writer::{ChunkFill, SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
 use crate::sources::test_scenes::KEPT_FOR_TESTING;
-use crate::tools::checksums::{INDEX, Journal, SKIPPED};
-use crate::tools::export::Encoding;
+use crate::tools::checksums::{Checksums, INDEX, SKIPPED};
+use crate::tools::export::ImageEncoding;
 
 /// Longest key that names a file: file systems take 255 bytes, the ending included.
 const MAX_NAME_BYTES: usize = 200;
@@ -38,7 +38,7 @@ pub struct ConvertOptions {
     pub to: ConvertTo,
     /// How a frame is stored that has no file of its own: computed ones, and those whose lens distortion was undone.
     /// Others keep theirs, byte by byte.
-    pub encoding: Encoding,
+    pub encoding: ImageEncoding,
     /// What the source was opened with, on one line; empty for the defaults.
     pub opened_with: String,
 }
@@ -51,8 +51,8 @@ impl ConvertOptions {
             ConvertTo::Scenes => "a file per scene".into(),
         };
         let pictures = match self.encoding {
-            Encoding::Png => "PNG".into(),
-            Encoding::Jpeg(quality) => format!("JPEG of quality {quality}"),
+            ImageEncoding::Png => "PNG".into(),
+            ImageEncoding::Jpeg(quality) => format!("JPEG of quality {quality}"),
         };
         let with = if self.opened_with.is_empty() { "" } else { ", with " };
         format!("{form}, {pictures}{with}{}", self.opened_with)
@@ -61,7 +61,7 @@ impl ConvertOptions {
 
 /// What was written.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Converted {
+pub struct ConversionReport {
     /// Scenes in the folder.
     pub num_scenes: usize,
     /// Scenes of these that were there already, from a conversion that did not end.
@@ -75,21 +75,21 @@ pub struct Converted {
     /// Bytes of the pictures written now.
     pub image_bytes: u64,
     /// What opening the source left out, and scenes that could not be read.
-    pub left_out: Ledger,
+    pub left_out: SkipReport,
 }
 
-/// Opens a [`Conversion`] and runs it.
+/// Opens a [`Converter`] and runs it.
 ///
 /// # Errors
 /// As both.
 pub fn convert(
     source: &dyn SceneSource,
-    left_out: &Ledger,
+    left_out: &SkipReport,
     folder: &Path,
     options: &ConvertOptions,
     done: impl FnMut(usize),
-) -> Result<Converted, DataError> {
-    Conversion::open(source, left_out, folder, options)?.run(done)
+) -> Result<ConversionReport, DataError> {
+    Converter::open(source, left_out, folder, options)?.run(done)
 }
 
 /// What a scene that is there is to the source's.
@@ -107,11 +107,11 @@ enum State {
 /// reads. In a folder that was not finished, files are kept whose sums still hold and whose scenes still have the
 /// cameras, time stamps and numbers of frames of the source, and the rest is made; in one that was finished, all sums
 /// are verified. Pictures are not compared.
-pub struct Conversion<'a> {
+pub struct Converter<'a> {
     source: &'a dyn SceneSource,
     folder: PathBuf,
     options: ConvertOptions,
-    journal: Journal,
+    journal: Checksums,
     /// File of every scene that is written.
     index: BTreeMap<String, String>,
     /// Files with a scene that has changed.
@@ -120,22 +120,22 @@ pub struct Conversion<'a> {
     unreadable: BTreeSet<String>,
     pending: Vec<SceneRecord>,
     pending_keys: HashSet<String>,
-    fill: Fill,
-    converted: Converted,
+    fill: ChunkFill,
+    converted: ConversionReport,
 }
 
-impl<'a> Conversion<'a> {
+impl<'a> Converter<'a> {
     /// Looks at `folder` and writes nothing. `left_out` is what opening `source` left out.
     ///
     /// # Errors
     /// [`DataError::BadIndex`] for a folder with other files, of other scenes or made with other options.
     pub fn open(
         source: &'a dyn SceneSource,
-        left_out: &Ledger,
+        left_out: &SkipReport,
         folder: &Path,
         options: &ConvertOptions,
     ) -> Result<Self, DataError> {
-        let journal = Journal::open(folder, &options.made_as())?;
+        let journal = Checksums::open(folder, &options.made_as())?;
         let mut conversion = Self {
             source,
             folder: folder.to_owned(),
@@ -146,8 +146,8 @@ impl<'a> Conversion<'a> {
             unreadable: BTreeSet::new(),
             pending: Vec::new(),
             pending_keys: HashSet::new(),
-            fill: Fill::default(),
-            converted: Converted { left_out: left_out.clone(), ..Converted::default() },
+            fill: ChunkFill::default(),
+            converted: ConversionReport { left_out: left_out.clone(), ..ConversionReport::default() },
         };
         conversion.look()?;
         Ok(conversion)
@@ -155,7 +155,8 @@ impl<'a> Conversion<'a> {
 
     /// Takes up the scenes of the files that the journal knows.
     fn look(&mut self) -> Result<(), DataError> {
-        let unreadable: HashSet<&str> = self.converted.left_out.skips.iter().filter_map(Skip::unreadable).collect();
+        let unreadable: HashSet<&str> =
+            self.converted.left_out.skips.iter().filter_map(SkippedScene::unreadable).collect();
         let names: Vec<&str> = self.journal.names().filter(|name| has_ending(name, "torch")).collect();
         let look = |name: &str| {
             let path = self.folder.join(name);
@@ -206,7 +207,7 @@ impl<'a> Conversion<'a> {
     ///
     /// # Errors
     /// [`DataError::Io`] from writing.
-    pub fn run(mut self, mut done: impl FnMut(usize)) -> Result<Converted, DataError> {
+    pub fn run(mut self, mut done: impl FnMut(usize)) -> Result<ConversionReport, DataError> {
         self.journal.begin()?;
         let stale = std::mem::take(&mut self.stale);
         if !stale.is_empty() || self.index_names_others() {
@@ -277,7 +278,7 @@ impl<'a> Conversion<'a> {
         self.journal.write(&name, &bytes)?;
         self.index.extend(scenes.into_iter().map(|scene| (scene.key, name.clone())));
         self.pending_keys.clear();
-        self.fill = Fill::default();
+        self.fill = ChunkFill::default();
         Ok(())
     }
 
@@ -288,15 +289,15 @@ impl<'a> Conversion<'a> {
         (0..=used.len()).map(chunk_name).find(|name| !used.contains(name)).unwrap_or_default()
     }
 
-    fn finish(mut self) -> Result<Converted, DataError> {
+    fn finish(mut self) -> Result<ConversionReport, DataError> {
         self.flush()?;
         if !self.unreadable.is_empty() {
             let names: Vec<&String> = self.unreadable.iter().collect();
-            let scenes = counted(names.len(), "scene");
+            let scenes = plural(names.len(), "scene");
             let left_out = &mut self.converted.left_out;
             left_out
                 .notes
-                .push(format!("{scenes} could not be read again, kept as converted before ({})", some_of(&names)));
+                .push(format!("{scenes} could not be read again, kept as converted before ({})", first_few(&names)));
             left_out.skips.retain(|skip| !self.unreadable.contains(&skip.key));
         }
         let is_chunks = self.options.to != ConvertTo::Scenes;
@@ -318,7 +319,7 @@ impl<'a> Conversion<'a> {
     }
 }
 
-impl Skip {
+impl SkippedScene {
     /// The key of a scene that would be used if it could be.
     fn unreadable(&self) -> Option<&str> {
         (!self.reason.starts_with(KEPT_FOR_TESTING)).then_some(&self.key)
@@ -326,7 +327,7 @@ impl Skip {
 }
 
 /// Reads a scene; also says how many of its frames had to be encoded.
-fn record(source: &dyn SceneSource, scene: usize, encoding: Encoding) -> Result<(SceneRecord, usize), DataError> {
+fn record(source: &dyn SceneSource, scene: usize, encoding: ImageEncoding) -> Result<(SceneRecord, usize), DataError> {
     let cameras = source.cameras(scene)?;
     let timestamps = source.timestamps(scene)?;
     let read = |frame: usize| {

@@ -9,15 +9,15 @@ use serde::Serialize;
 use crate::error::DataError;
 use crate::files::atomic::replace;
 use crate::image::codec::{encode_jpeg, encode_png};
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::sampling::clip::ViewIndices;
-use crate::sampling::evaluation_index::spread_views;
+use crate::sampling::evaluation_index::even_views;
 use crate::scene_source::SceneSource;
 use crate::sources::chunks::writer::{SceneRecord, write_chunks};
 
 /// How frames are stored.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Encoding {
+pub enum ImageEncoding {
     /// Without loss.
     #[default]
     Png,
@@ -25,8 +25,8 @@ pub enum Encoding {
     Jpeg(u8),
 }
 
-impl Encoding {
-    pub(crate) fn encode(self, frame: &Frame) -> Result<Vec<u8>, DataError> {
+impl ImageEncoding {
+    pub(crate) fn encode(self, frame: &RgbImage) -> Result<Vec<u8>, DataError> {
         match self {
             Self::Png => encode_png(frame),
             Self::Jpeg(quality) => encode_jpeg(frame, quality),
@@ -54,7 +54,7 @@ pub struct Written {
 pub fn write_source(
     source: &dyn SceneSource,
     folder: &Path,
-    encoding: Encoding,
+    encoding: ImageEncoding,
     target_bytes: u64,
     mut written: impl FnMut(usize),
 ) -> Result<Written, DataError> {
@@ -76,7 +76,7 @@ pub fn write_source(
     Ok(total)
 }
 
-/// Writes an evaluation index of every scene of `source`, with the views of [`spread_views`] (`null` where there are
+/// Writes an evaluation index of every scene of `source`, with the views of [`even_views`] (`null` where there are
 /// too few frames); returns how many scenes have views.
 ///
 /// # Errors
@@ -89,7 +89,7 @@ pub fn write_evaluation_index(
 ) -> Result<usize, DataError> {
     let mut entries = Vec::with_capacity(source.num_scenes());
     for scene in 0..source.num_scenes() {
-        let views = spread_views(source.num_frames(scene)?, num_context, num_targets);
+        let views = even_views(source.num_frames(scene)?, num_context, num_targets);
         entries.push((source.key(scene), views));
     }
     let num_usable = entries.iter().filter(|(_, views)| views.is_some()).count();
@@ -136,13 +136,13 @@ mod tests {
             assert_eq!(write_evaluation_index(&path, &source, 4, 3).unwrap(), expected);
             let (items, ledger) = EvaluationIndex::read(&path).unwrap().select(&source, 0);
             assert_eq!((items.len(), ledger.num_scenes), (expected, 3));
-            assert!(items.iter().all(|item| Some(&item.views) == spread_views(16, 4, 3).as_ref()));
+            assert!(items.iter().all(|item| Some(&item.views) == even_views(16, 4, 3).as_ref()));
         }
     }
 
     #[test]
     fn what_is_written_is_counted_scene_by_scene_and_jpeg_is_smaller_at_a_low_quality() {
-        let bytes = [Encoding::Jpeg(10), Encoding::Jpeg(95)].map(|encoding| {
+        let bytes = [ImageEncoding::Jpeg(10), ImageEncoding::Jpeg(95)].map(|encoding| {
             let folder = tempfile::tempdir().unwrap();
             let mut seen = Vec::new();
             let written = write_source(&source(4), folder.path(), encoding, 1, |done| seen.push(done)).unwrap();

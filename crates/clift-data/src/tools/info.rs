@@ -6,7 +6,7 @@ use serde::Serialize;
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::scene_source::SceneSource;
-use crate::skip_report::Skip;
+use crate::skip_report::SkippedScene;
 use crate::statistics::MinMedianMax;
 
 /// What a source holds. Spreads and sizes are `None` for a source without scenes.
@@ -24,7 +24,7 @@ pub struct SourceInfo {
     pub extent: Option<MinMedianMax>,
     /// Scenes whose cameras cannot be read, and those before the first whose first picture can, with the error as the
     /// reason.
-    pub unreadable: Vec<Skip>,
+    pub unreadable: Vec<SkippedScene>,
 }
 
 impl SourceInfo {
@@ -42,7 +42,7 @@ impl SourceInfo {
         let (mut scenes, mut unreadable, mut first_error, mut first_picture) = (Vec::new(), Vec::new(), None, None);
         for (scene, found) in read.into_iter().enumerate() {
             let mut fail = |error: DataError| {
-                unreadable.push(Skip { key: source.key(scene).to_owned(), reason: error.to_string() });
+                unreadable.push(SkippedScene { key: source.key(scene).to_owned(), reason: error.to_string() });
                 first_error.get_or_insert(error);
             };
             match found {

@@ -9,10 +9,10 @@ use serde::{Deserialize, Serialize};
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::geometry::overlap::overlap;
-use crate::random::{between, derive_seed, distinct, draw_from, step_rng};
+use crate::random::{between, derive_seed, sample_distinct, sample_from, step_rng};
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
-use crate::skip_report::{Ledger, counted, some_of};
+use crate::skip_report::{SkipReport, first_few, plural};
 use crate::tools::export::write_index;
 
 /// What an index asks for. The defaults are those of the published RealEstate10K index with four contexts.
@@ -72,7 +72,7 @@ impl OverlapOptions {
             return Err(format!("shorter than {} frames", near + 1));
         }
         let mut rng = step_rng(derive_seed(self.seed, key), 0, "evaluation index");
-        for frame in draw_from(&mut rng, (0..num_frames).collect(), num_frames) {
+        for frame in sample_from(&mut rng, (0..num_frames).collect(), num_frames) {
             let overlaps = |partner: &usize| {
                 let (a, b) = (&cameras[frame], &cameras[*partner]);
                 overlap(a, b).min(overlap(b, a)) >= self.min_overlap
@@ -85,9 +85,9 @@ impl OverlapOptions {
             }
             let partner = partners[between(&mut rng, 0, partners.len() - 1)];
             let (left, right) = (frame.min(partner), frame.max(partner));
-            let mut target = draw_from(&mut rng, (left..=right).collect(), self.num_targets);
+            let mut target = sample_from(&mut rng, (left..=right).collect(), self.num_targets);
             target.sort_unstable();
-            let inner = distinct(&mut rng, right - left - 1, self.num_context - 2);
+            let inner = sample_distinct(&mut rng, right - left - 1, self.num_context - 2);
             let inner = inner.into_iter().map(|offset| left + 1 + offset);
             let context = [left].into_iter().chain(inner).chain([right]).collect();
             return Ok(ViewIndices { context, target });
@@ -107,7 +107,7 @@ pub fn write_overlap_index(
     path: &Path,
     sources: &[&dyn SceneSource],
     options: &OverlapOptions,
-) -> Result<Ledger, DataError> {
+) -> Result<SkipReport, DataError> {
     options.validate()?;
     let mut scenes: Vec<(&dyn SceneSource, usize)> = Vec::new();
     let mut places: HashMap<&str, usize> = HashMap::new();
@@ -130,7 +130,7 @@ pub fn write_overlap_index(
         shared.push(key);
     }
     let note = |shared: &[&str]| {
-        format!("{} in both halves, counted once ({})", counted(shared.len(), "scene"), some_of(shared))
+        format!("{} in both halves, counted once ({})", plural(shared.len(), "scene"), first_few(shared))
     };
     let notes = (!shared.is_empty()).then(|| note(&shared)).into_iter().collect();
     let draw = |(source, scene): &(&dyn SceneSource, usize)| {
@@ -138,7 +138,7 @@ pub fn write_overlap_index(
         options.draw(source.key(*scene), &cameras)
     };
     let drawn: Vec<_> = scenes.par_iter().map(draw).collect();
-    let mut ledger = Ledger { notes, ..Ledger::new(drawn.len()) };
+    let mut ledger = SkipReport { notes, ..SkipReport::new(drawn.len()) };
     let mut entries = Vec::with_capacity(drawn.len());
     for ((source, scene), views) in scenes.into_iter().zip(drawn) {
         let key = source.key(scene);
@@ -165,7 +165,7 @@ mod tests {
         SyntheticSource::new(config).unwrap()
     }
 
-    fn index(source: &dyn SceneSource, options: &OverlapOptions) -> (EvaluationIndex, Ledger) {
+    fn index(source: &dyn SceneSource, options: &OverlapOptions) -> (EvaluationIndex, SkipReport) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         let ledger = write_overlap_index(&path, &[source], options).unwrap();

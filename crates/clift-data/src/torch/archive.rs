@@ -11,7 +11,7 @@ use crate::error::DataError;
 
 /// Bytes of one member of an archive, or a part of them: 24 bytes, because a data set has millions.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Span {
+pub(crate) struct ByteSpan {
     /// Where the member's local header starts in the file. Where its data starts is read from there when it is
     /// needed: looking it up for every member at opening would touch every page of every chunk.
     header_start: u64,
@@ -24,7 +24,7 @@ pub(crate) struct Span {
     is_whole: bool,
 }
 
-impl Span {
+impl ByteSpan {
     /// How many bytes.
     pub fn len(&self) -> u64 {
         u64::from(self.length)
@@ -76,7 +76,7 @@ impl Span {
 
 /// The directory of one archive.
 pub(crate) struct Archive {
-    members: HashMap<String, Span>,
+    members: HashMap<String, ByteSpan>,
 }
 
 impl Archive {
@@ -101,7 +101,7 @@ impl Archive {
                 return Err(bad(format!("member {name} lies behind the end of the file")));
             }
             let span =
-                Span { header_start: entry.header_start(), start: 0, length, crc32: entry.crc32(), is_whole: true };
+                ByteSpan { header_start: entry.header_start(), start: 0, length, crc32: entry.crc32(), is_whole: true };
             members.insert(name.to_owned(), span);
         }
         let archive = Self { members };
@@ -115,7 +115,7 @@ impl Archive {
     }
 
     /// A member by its name without the top folder.
-    pub fn member(&self, name: &str) -> Option<Span> {
+    pub fn member(&self, name: &str) -> Option<ByteSpan> {
         self.members.get(name).copied()
     }
 }

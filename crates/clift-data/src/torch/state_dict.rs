@@ -11,7 +11,7 @@ use half::{bf16, f16};
 
 use crate::error::DataError;
 use crate::files::atomic::replace;
-use crate::torch::archive::{Archive, Span};
+use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::file_kind::refuse_others;
 use crate::torch::pickle::Pickle;
 use crate::torch::pickle_writer::PickleWriter;
@@ -136,7 +136,7 @@ impl StateDict {
         let stored = if is_contiguous { tensor.clone() } else { storage_stretch(tensor).map_err(bad)? };
         let shape: Vec<Option<u64>> = stored.shape.iter().map(|size| Some(*size)).collect();
         let value = Value::Tensor(Box::new(stored));
-        let (span, element_type): (Span, ElementType) =
+        let (span, element_type): (ByteSpan, ElementType) =
             tensor_span(&value, &shape, &FLOATS, &self.archive).map_err(bad)?;
         let bytes = span.read(&self.path).map_err(|error| match error {
             DataError::BadChunk { what, .. } => bad(what),

@@ -1,6 +1,6 @@
 //! Byte ranges of tensors in an archive, and the order of their elements.
 
-use crate::torch::archive::{Archive, Span};
+use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::values::{ElementType, Tensor, Value};
 
 /// Returns where a tensor's bytes lie, after checks of type, shape (`None` is any size), layout and bounds.
@@ -9,7 +9,7 @@ pub(crate) fn tensor_span(
     shape: &[Option<u64>],
     element_types: &[ElementType],
     archive: &Archive,
-) -> Result<(Span, ElementType), String> {
+) -> Result<(ByteSpan, ElementType), String> {
     let Value::Tensor(tensor) = value else { return Err("no tensor".into()) };
     let Tensor { storage, offset, .. } = &**tensor;
     let element_type = storage.element_type;

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::{
-    FileOptions, Frame, IntrinsicsNorm, Ledger, Lens, SceneSource, SourceOptions, Split, Undistortion, decode_image,
-    encode_png,
+    FileOptions, IntrinsicsNorm, Lens, RgbImage, SceneSource, SkipReport, SourceOptions, Split, Undistortion,
+    decode_image, encode_png,
 };
 use serde_json::{Value, json};
 
@@ -19,7 +19,7 @@ const SIZE: [usize; 2] = [24, 16];
 fn png(number: u8) -> Vec<u8> {
     let [width, height] = SIZE;
     let rgb = (0..width * height * 3).map(|i| number.wrapping_mul(31).wrapping_add((i / 5) as u8)).collect();
-    encode_png(&Frame { width, height, rgb }).unwrap()
+    encode_png(&RgbImage { width, height, rgb }).unwrap()
 }
 
 /// A camera-to-world matrix at `(x, 0, 0)`, as rows.
@@ -42,7 +42,7 @@ impl Capture {
         Self(root)
     }
 
-    fn open(&self) -> Result<(Arc<dyn SceneSource>, Ledger), String> {
+    fn open(&self) -> Result<(Arc<dyn SceneSource>, SkipReport), String> {
         let opened = open_at(self.0.path(), Split::Test, &SourceOptions::default());
         opened.map(|opened| (opened.source, opened.report)).map_err(|error| error.to_string())
     }
@@ -106,7 +106,7 @@ fn images_named_twice_are_used_once() {
 }
 
 /// A copy of COLMAP's fixture whose camera has another model, and its first picture as it is on disk.
-fn colmap(model: &str) -> (tempfile::TempDir, Frame) {
+fn colmap(model: &str) -> (tempfile::TempDir, RgbImage) {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&fixtures().join("layouts/colmap_txt"), root.path());
     let path = root.path().join("attic/sparse/0/cameras.txt");

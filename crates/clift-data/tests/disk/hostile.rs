@@ -101,7 +101,7 @@ fn rotations_that_are_not_orthonormal_are_refused() {
 fn turned_images_are_skipped_for_their_shape() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&fixtures().join("layouts/capture"), root.path());
-    let picture = clift_data::Frame { width: 18, height: 32, rgb: vec![9; 18 * 32 * 3] };
+    let picture = clift_data::RgbImage { width: 18, height: 32, rgb: vec![9; 18 * 32 * 3] };
     let png = clift_data::encode_png(&picture).unwrap();
     fs::write(root.path().join("attic/images/10.png"), &png).unwrap();
     fs::write(root.path().join("attic/images/11.png"), "no picture").unwrap();

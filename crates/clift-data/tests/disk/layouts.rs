@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::{
-    Clip, ClipOptions, ClipReader, FileOptions, Ledger, OpenedSource, PoseRotation, PoseScale, SceneFilters,
-    SceneSource, SourceInfo, SourceKind, SourceOptions, Split, ViewIndices,
+    Clip, ClipOptions, ClipReader, FileOptions, OpenedSource, PoseRotation, PoseScale, SceneFilters, SceneSource,
+    SkipReport, SourceInfo, SourceKind, SourceOptions, Split, ViewIndices,
 };
 
 use crate::files::{copy_folder, fixtures};
@@ -134,7 +134,7 @@ fn two_scenes(root: &Path) -> [String; 2] {
     keys
 }
 
-fn open_with(root: &Path, split: Split, files: FileOptions) -> (Arc<dyn SceneSource>, Ledger) {
+fn open_with(root: &Path, split: Split, files: FileOptions) -> (Arc<dyn SceneSource>, SkipReport) {
     let opened = open_at(root, split, &SourceOptions { files, ..SourceOptions::default() }).unwrap();
     (opened.source, opened.report)
 }

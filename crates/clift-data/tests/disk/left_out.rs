@@ -3,14 +3,16 @@
 use std::fs;
 use std::path::Path;
 
-use clift_data::{FileOptions, Frame, Ledger, OpenedSource, SourceKind, SourceOptions, Split, encode_jpeg, encode_png};
+use clift_data::{
+    FileOptions, OpenedSource, RgbImage, SkipReport, SourceKind, SourceOptions, Split, encode_jpeg, encode_png,
+};
 use serde_json::{Value, json};
 
 use crate::files::{copy_folder, fixtures};
 use crate::open_at;
 
-fn picture(width: usize, height: usize) -> Frame {
-    Frame { width, height, rgb: (0..width * height * 3).map(|i| (i * i / 7) as u8).collect() }
+fn picture(width: usize, height: usize) -> RgbImage {
+    RgbImage { width, height, rgb: (0..width * height * 3).map(|i| (i * i / 7) as u8).collect() }
 }
 
 /// Writes pictures and a `transforms.json` that names `frames`.
@@ -33,7 +35,7 @@ fn open(root: &Path) -> Result<OpenedSource, String> {
     open_at(root, Split::Test, &SourceOptions::default()).map_err(|error| error.to_string())
 }
 
-fn frames_left_out(ledger: &Ledger) -> Vec<(&str, &str)> {
+fn frames_left_out(ledger: &SkipReport) -> Vec<(&str, &str)> {
     ledger.frames.iter().map(|skip| (skip.frame.as_str(), skip.reason.as_str())).collect()
 }
 
@@ -197,7 +199,7 @@ fn images_are_found_by_the_end_of_paths() {
 #[test]
 fn exif_orientation_is_reported_for_wrong_shapes() {
     // Of phones: pixels lie as the sensor has them, and a tag says how to turn them.
-    let tagged = |frame: &Frame| {
+    let tagged = |frame: &RgbImage| {
         let jpeg = encode_jpeg(frame, 90).unwrap();
         let exif = b"\xff\xe1\x00\x22Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
         [&jpeg[..2], exif, &jpeg[2..]].concat()

@@ -1,6 +1,6 @@
 //! Lens distortion against COLMAP's camera models and OpenCV's undistortion (`scripts/fixtures/make_layout_fixtures.py`).
 
-use clift_data::{Frame, IntrinsicsNorm, Lens, Undistortion};
+use clift_data::{IntrinsicsNorm, Lens, RgbImage, Undistortion};
 use safetensors::SafeTensors;
 
 use crate::files::fixtures;
@@ -42,7 +42,7 @@ fn rays_are_put_where_colmap_puts_them() {
 fn pictures_are_undistorted_as_by_opencv() {
     let bytes = std::fs::read(fixtures().join("reference/lenses.safetensors")).unwrap();
     let tensors = SafeTensors::deserialize(&bytes).unwrap();
-    let picture = Frame { width: 96, height: 72, rgb: tensors.tensor("picture").unwrap().data().to_vec() };
+    let picture = RgbImage { width: 96, height: 72, rgb: tensors.tensor("picture").unwrap().data().to_vec() };
     for model in MODELS {
         let ([fx, fy, cx, cy], lens) = camera(model, &f64s(&tensors, &format!("{model}.params")));
         let from = IntrinsicsNorm { fx: fx / 96.0, fy: fy / 72.0, cx: cx / 96.0, cy: cy / 72.0 };
@@ -72,7 +72,7 @@ fn pinhole_lenses_change_nothing_and_impossible_ones_fail() {
     for (got, expected) in [(pinhole.intrinsics_norm().fx, 0.8), (pinhole.intrinsics_norm().fy, 1.1)] {
         assert!((got - expected).abs() < 1e-12, "{got}");
     }
-    let frame = Frame { width: 7, height: 5, rgb: (0..105).collect() };
+    let frame = RgbImage { width: 7, height: 5, rgb: (0..105).collect() };
     assert_eq!(pinhole.apply(&frame), frame);
     let message = |norm: IntrinsicsNorm, k1: f64| {
         let lens = Lens { radial: [k1, 0.0, 0.0], ..Lens::default() };

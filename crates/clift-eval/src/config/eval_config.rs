@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_model::{Precision, TokenCount, TokenStorage};
+use clift_model::{Precision, TokenCount, TokenFormat};
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::config::token_selection::Selection;
 
 /// Which scenes and views are rendered, with how many tokens.
@@ -20,11 +20,11 @@ pub struct EvalConfig {
     /// How those are chosen: `paper`, `global`, `scaled` or `random`.
     pub selection: Selection,
     /// What is rendered, of `random`, `patch`, `patch_clift`, `kmeans` and `clift`; empty for all there are weights for.
-    pub variants: Vec<Variant>,
+    pub variants: Vec<Method>,
     /// Number formats that stored tokens are rounded to before they are rendered, as in a scene file: one, or a list of
     /// those to compare.
     #[serde(deserialize_with = "one_or_more")]
-    pub tokens: Vec<TokenStorage>,
+    pub tokens: Vec<TokenFormat>,
     /// Weights of LPIPS, converted by `scripts/tools/convert_vgg.py`; without them it is not measured.
     pub lpips_weights: Option<PathBuf>,
     /// Evaluation index with the context and target frames of every scene. Without one, contexts are
@@ -57,12 +57,12 @@ impl EvalConfig {
 }
 
 /// A format or a list of them.
-fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TokenStorage>, D::Error> {
+fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TokenFormat>, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged, expecting = "a format (\"f32\", \"f16\", \"int8\") or a list of them")]
     enum Written {
-        One(TokenStorage),
-        More(Vec<TokenStorage>),
+        One(TokenFormat),
+        More(Vec<TokenFormat>),
     }
     let mut formats = match Written::deserialize(deserializer)? {
         Written::One(format) => vec![format],
@@ -90,7 +90,7 @@ impl Default for EvalConfig {
             render: Vec::new(),
             selection: Selection::default(),
             variants: Vec::new(),
-            tokens: vec![TokenStorage::F32],
+            tokens: vec![TokenFormat::F32],
             lpips_weights: None,
             index: None,
             num_scenes: 0,
@@ -112,8 +112,8 @@ mod tests {
     #[test]
     fn formats_are_one_or_a_list_each_once() {
         let tokens = |text: &str| serde_json::from_str::<EvalConfig>(text).map(|config| config.tokens);
-        assert_eq!(tokens(r#"{"tokens": "f16"}"#).unwrap(), [TokenStorage::F16]);
-        assert_eq!(tokens(r#"{"tokens": ["int8", "f32", "int8"]}"#).unwrap(), [TokenStorage::Int8, TokenStorage::F32]);
+        assert_eq!(tokens(r#"{"tokens": "f16"}"#).unwrap(), [TokenFormat::F16]);
+        assert_eq!(tokens(r#"{"tokens": ["int8", "f32", "int8"]}"#).unwrap(), [TokenFormat::Int8, TokenFormat::F32]);
         assert!(tokens(r#"{"tokens": []}"#).unwrap_err().to_string().contains("at least one"));
         assert!(tokens(r#"{"tokens": "f64"}"#).unwrap_err().to_string().contains("int8"));
     }

@@ -2,11 +2,11 @@
 
 use std::str::FromStr;
 
-use clift_model::{ModelError, Preset, TokenCount, parse_value};
+use clift_model::{ModelError, SelectionPreset, TokenCount, parse_value};
 use strum::{IntoStaticStr, VariantArray};
 
 use crate::config::eval_config::EvalConfig;
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::config::token_selection::Selection;
 
 /// An experiment of the paper.
@@ -29,23 +29,21 @@ impl Experiment {
     /// Counts are shares, so that other sizes than the paper's 4,096 tokens are served: its patch-wise table has 256
     /// and 1,024 of 4,096, its table of render budgets 4,096 of 8,192 stored and 4,096 to 512 rendered.
     pub fn apply(self, eval: &mut EvalConfig) {
-        let (storage, render, variants): (&[f64], &[f64], &[Variant]) = match self {
-            Self::Main => (&[1.0 / 16.0, 0.125, 0.25, 0.5, 0.75, 1.0], &[], &[Variant::Clift]),
+        let (storage, render, variants): (&[f64], &[f64], &[Method]) = match self {
+            Self::Main => (&[1.0 / 16.0, 0.125, 0.25, 0.5, 0.75, 1.0], &[], &[Method::Clift]),
             Self::Ablation => {
-                (&[1.0 / 32.0, 1.0 / 16.0, 0.125, 0.25, 0.5], &[], &[Variant::Random, Variant::Kmeans, Variant::Clift])
+                (&[1.0 / 32.0, 1.0 / 16.0, 0.125, 0.25, 0.5], &[], &[Method::Random, Method::Kmeans, Method::Clift])
             }
-            Self::Patchwise => (
-                &[1.0 / 16.0, 0.125, 0.25],
-                &[],
-                &[Variant::Patch, Variant::PatchClift, Variant::Kmeans, Variant::Clift],
-            ),
-            Self::Budget => (&[0.5], &[0.75, 0.5, 0.25, 0.125], &[Variant::Clift]),
+            Self::Patchwise => {
+                (&[1.0 / 16.0, 0.125, 0.25], &[], &[Method::Patch, Method::PatchClift, Method::Kmeans, Method::Clift])
+            }
+            Self::Budget => (&[0.5], &[0.75, 0.5, 0.25, 0.125], &[Method::Clift]),
         };
         let shares = |shares: &[f64]| shares.iter().map(|&share| TokenCount::Share(share)).collect();
         (eval.storage, eval.render, eval.variants) = (shares(storage), shares(render), variants.into());
         if self == Self::Budget {
             // What the published table was made with: no momentum, no count per cell.
-            eval.selection = Selection::Preset(Preset::Global);
+            eval.selection = Selection::Preset(SelectionPreset::Global);
         }
     }
 }

@@ -14,7 +14,7 @@ const MAX_NAME: usize = 40;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, strum::IntoStaticStr)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
-pub enum Variant {
+pub enum Method {
     /// Clusters, condensed: the method.
     Clift,
     /// The tokens nearest to the cluster centres, without the condenser.
@@ -31,10 +31,10 @@ pub enum Variant {
     MeanImage,
     /// Images of another system.
     #[serde(untagged)]
-    System(SystemName),
+    System(MethodName),
 }
 
-impl Variant {
+impl Method {
     /// Those of this program.
     pub const OWN: [Self; 7] =
         [Self::Clift, Self::Kmeans, Self::Patch, Self::PatchClift, Self::Random, Self::NearestView, Self::MeanImage];
@@ -51,9 +51,9 @@ impl Variant {
 /// Name of another system, kept for the life of the process: there are a handful.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(transparent)]
-pub struct SystemName(&'static str);
+pub struct MethodName(&'static str);
 
-impl SystemName {
+impl MethodName {
     /// Checks a name: at most 40 characters, and none of this program's variants.
     ///
     /// # Errors
@@ -64,7 +64,7 @@ impl SystemName {
         if name.trim().is_empty() || name.chars().count() > MAX_NAME || name.chars().any(char::is_control) {
             return Err(bad("write 1 to 40 printable characters"));
         }
-        if Variant::OWN.iter().any(|own| own.name() == name) {
+        if Method::OWN.iter().any(|own| own.name() == name) {
             return Err(bad("a variant of this program has that name"));
         }
         let mut names = NAMES.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
@@ -83,7 +83,7 @@ impl SystemName {
 }
 
 // By hand: the derived form would only read text of static lifetime.
-impl<'de> Deserialize<'de> for SystemName {
+impl<'de> Deserialize<'de> for MethodName {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         Self::new(&String::deserialize(deserializer)?).map_err(serde::de::Error::custom)
     }
@@ -96,21 +96,21 @@ mod tests {
     #[test]
     fn names_are_printable_and_not_our_own() {
         for name in ["", " ", "clift", "kmeans", "a\nb", &"x".repeat(41)] {
-            assert!(SystemName::new(name).is_err(), "{name:?}");
+            assert!(MethodName::new(name).is_err(), "{name:?}");
         }
-        let name = SystemName::new("LVSM (2 views)").unwrap();
-        assert_eq!(name, SystemName::new(&String::from("LVSM (2 views)")).unwrap());
+        let name = MethodName::new("LVSM (2 views)").unwrap();
+        assert_eq!(name, MethodName::new(&String::from("LVSM (2 views)")).unwrap());
         assert_eq!(name.as_str(), "LVSM (2 views)");
     }
 
     #[test]
     fn a_variant_is_named_alike_in_json_and_csv() {
-        let other = Variant::System(SystemName::new("MVSplat").unwrap());
-        for variant in Variant::OWN.into_iter().chain([other]) {
+        let other = Method::System(MethodName::new("MVSplat").unwrap());
+        for variant in Method::OWN.into_iter().chain([other]) {
             assert_eq!(serde_json::to_value(variant).unwrap(), variant.name());
-            assert_eq!(serde_json::from_value::<Variant>(variant.name().into()).unwrap(), variant);
+            assert_eq!(serde_json::from_value::<Method>(variant.name().into()).unwrap(), variant);
         }
-        assert_eq!(Variant::OWN.map(Variant::name)[3..6], ["patch_clift", "random", "nearest_view"]);
-        assert!(serde_json::from_value::<Variant>("".into()).is_err());
+        assert_eq!(Method::OWN.map(Method::name)[3..6], ["patch_clift", "random", "nearest_view"]);
+        assert!(serde_json::from_value::<Method>("".into()).is_err());
     }
 }

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use clift_model::{ModelError, Preset};
+use clift_model::{ModelError, SelectionPreset};
 use serde::{Deserialize, Serialize};
 
 /// How the tokens of a view are chosen where fewer are drawn than are stored.
@@ -11,14 +11,14 @@ use serde::{Deserialize, Serialize};
 #[serde(try_from = "String", into = "String")]
 pub enum Selection {
     /// By a published set of rules.
-    Preset(Preset),
+    Preset(SelectionPreset),
     /// At random, for every view anew: what any rule must beat.
     Random,
 }
 
 impl Default for Selection {
     fn default() -> Self {
-        Self::Preset(Preset::default())
+        Self::Preset(SelectionPreset::default())
     }
 }
 
@@ -38,11 +38,11 @@ impl FromStr for Selection {
         if name == "random" {
             return Ok(Self::Random);
         }
-        let preset = Preset::ALL.into_iter().find(|preset| preset.name() == name);
+        let preset = SelectionPreset::ALL.into_iter().find(|preset| preset.name() == name);
         preset.map(Self::Preset).ok_or_else(|| ModelError::BadConfig {
             key: "selection",
             value: name.into(),
-            fix: format!("write one of {}, random", Preset::ALL.map(Preset::name).join(", ")),
+            fix: format!("write one of {}, random", SelectionPreset::ALL.map(SelectionPreset::name).join(", ")),
         })
     }
 }

@@ -3,16 +3,16 @@
 use std::path::Path;
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, EvaluationItem, Ledger, replace_file};
+use clift_data::{ClipReader, EvaluationItem, SkipReport, replace_file};
 use clift_model::ModelError;
 
 use crate::config::eval_config::EvalConfig;
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::evaluator::items::evaluation_items;
 use crate::evaluator::progress::Progress;
 use crate::evaluator::sheets::Sheets;
-use crate::figures::scene_figure::Shown;
+use crate::figures::scene_figure::SceneFigures;
 use crate::metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
 use crate::report::page::{MAX_EXHIBITS, Report};
 use crate::statistics::eval_results::EvalResults;
@@ -20,7 +20,7 @@ use crate::statistics::scenes_csv::write_scenes;
 use crate::statistics::summary::Summary;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::evaluate_scene::evaluate_scene;
-use crate::sweep::predictions::{System, picture_name};
+use crate::sweep::predictions::{ExternalMethod, picture_name};
 use crate::sweep::sweep::Sweep;
 
 /// The scenes and views of an evaluation, and what is measured of each scene.
@@ -30,7 +30,7 @@ pub struct Evaluator {
     description: Description,
     reader: ClipReader,
     items: Vec<EvaluationItem>,
-    ledger: Ledger,
+    ledger: SkipReport,
     device: Device,
 }
 
@@ -69,7 +69,7 @@ impl Evaluator {
     }
 
     /// Which scenes were skipped when the views were chosen.
-    pub fn ledger(&self) -> &Ledger {
+    pub fn ledger(&self) -> &SkipReport {
         &self.ledger
     }
 
@@ -87,7 +87,7 @@ impl Evaluator {
     pub fn evaluate(
         &self,
         models: &EvalModels,
-        systems: &[System],
+        systems: &[ExternalMethod],
         folder: &Path,
         progress: &mut dyn Progress,
     ) -> Result<Summary, EvalError> {
@@ -97,7 +97,7 @@ impl Evaluator {
         progress.done(0, self.items.len());
         let sheets = Sheets::new(folder)?;
         let mut exhibits = Vec::new();
-        let mut show = |key: &str, shown: Shown| {
+        let mut show = |key: &str, shown: SceneFigures| {
             if exhibits.len() < MAX_EXHIBITS {
                 exhibits.push(shown.exhibit);
             }
@@ -137,9 +137,9 @@ impl Evaluator {
         models: &EvalModels,
         sweep: &Sweep,
         limits: Limits,
-        show: &mut dyn FnMut(&str, Shown) -> Result<(), EvalError>,
+        show: &mut dyn FnMut(&str, SceneFigures) -> Result<(), EvalError>,
         progress: &mut dyn Progress,
-    ) -> Result<(EvalResults, Ledger), EvalError> {
+    ) -> Result<(EvalResults, SkipReport), EvalError> {
         let _precision = self.eval.precision.scope();
         let (mut measured, mut ledger) = (EvalResults::default(), self.ledger.clone());
         for skip in &ledger.skips {
@@ -155,7 +155,7 @@ impl Evaluator {
                 Ok(clip) => {
                     let is_shown = i < limits.num_shown;
                     if let Some(results) = evaluate_scene(models, &clip, sweep, is_shown, &mut measured)? {
-                        show(key, Shown::new(&clip, &results, sweep.model.patch_size)?)?;
+                        show(key, SceneFigures::new(&clip, &results, sweep.model.patch_size)?)?;
                     }
                 }
                 Err(error) => {
@@ -187,7 +187,7 @@ impl Evaluator {
     }
 
     /// A folder without a single image is a wrong path, not a system that misses all.
-    fn require_pictures(&self, system: &System, summary: &Summary) -> Result<(), EvalError> {
+    fn require_pictures(&self, system: &ExternalMethod, summary: &Summary) -> Result<(), EvalError> {
         if summary.points.iter().any(|point| point.variant == system.setting().variant) {
             return Ok(());
         }
@@ -200,7 +200,7 @@ impl Evaluator {
     }
 
     /// The methods of the config, or all with weights.
-    fn methods(&self, models: &EvalModels) -> Result<Vec<Variant>, EvalError> {
+    fn methods(&self, models: &EvalModels) -> Result<Vec<Method>, EvalError> {
         let asked = &self.eval.variants;
         if asked.is_empty() {
             return Ok(models.methods());
@@ -209,8 +209,8 @@ impl Evaluator {
             return Ok(asked.clone());
         };
         let fix = match method {
-            Variant::Clift => "stage 2 was not trained on clusters of K-means: leave it out",
-            Variant::PatchClift => {
+            Method::Clift => "stage 2 was not trained on clusters of K-means: leave it out",
+            Method::PatchClift => {
                 "stage 2 was not trained on tiles: train a run with clusters.grouping = \"tile\" and \
                  stage1.init_from this one, and evaluate it with --with"
             }
@@ -254,7 +254,7 @@ fn check_counts(eval: &EvalConfig, fewest_tokens: usize) -> Result<(), EvalError
 ///
 /// # Errors
 /// [`EvalError::Io`].
-pub fn write_ledger(ledger: &Ledger, path: &Path) -> Result<(), EvalError> {
+pub fn write_ledger(ledger: &SkipReport, path: &Path) -> Result<(), EvalError> {
     let text = serde_json::to_vec_pretty(ledger).map_err(std::io::Error::from);
     text.and_then(|text| replace_file(path, &text)).map_err(EvalError::io("writing what was left out", path))
 }

@@ -4,16 +4,16 @@ use std::ffi::OsStr;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use clift_data::Unfinished;
+use clift_data::StagedDir;
 
 use crate::error::EvalError;
-use crate::figures::canvas::Picture;
+use crate::figures::canvas::Canvas;
 use crate::sweep::predictions::file_name;
 
 /// The contact sheets of an evaluation. They replace those of an earlier one in the same folder.
 pub(crate) struct Sheets {
     folder: PathBuf,
-    files: Unfinished,
+    files: StagedDir,
     /// File names of the earlier evaluation's sheets.
     former: Vec<String>,
 }
@@ -22,7 +22,7 @@ impl Sheets {
     /// Starts the sheets of the evaluation in the folder `evaluation`.
     pub fn new(evaluation: &Path) -> Result<Self, EvalError> {
         let folder = evaluation.join("sheets");
-        let files = Unfinished::new(&folder).map_err(EvalError::io("making a folder", &folder))?;
+        let files = StagedDir::new(&folder).map_err(EvalError::io("making a folder", &folder))?;
         // The table of the earlier evaluation names its scenes. Other files in the folder are the user's.
         let table = std::fs::read_to_string(evaluation.join("scenes.csv")).unwrap_or_default();
         let mut keys: Vec<&str> = table.lines().skip(1).filter_map(|line| line.split(',').next()).collect();
@@ -31,7 +31,7 @@ impl Sheets {
     }
 
     /// Writes the sheet of a scene to a temporary folder.
-    pub fn add(&self, sheet: &Picture, key: &str) -> Result<(), EvalError> {
+    pub fn add(&self, sheet: &Canvas, key: &str) -> Result<(), EvalError> {
         sheet.write_png(&self.files.path().join(sheet_name(key)))
     }
 

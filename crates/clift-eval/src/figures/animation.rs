@@ -5,7 +5,7 @@ use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use crate::error::EvalError;
-use crate::figures::canvas::Picture;
+use crate::figures::canvas::Canvas;
 
 /// An animation that is being written, frame by frame: the file is half done until [`Animation::finish`].
 pub struct Animation {
@@ -38,7 +38,7 @@ impl Animation {
     ///
     /// # Errors
     /// [`EvalError::Io`] for a picture of another size, or one too many.
-    pub fn add(&mut self, picture: &Picture) -> Result<(), EvalError> {
+    pub fn add(&mut self, picture: &Canvas) -> Result<(), EvalError> {
         let Some(missing) = self.missing.checked_sub(1) else {
             return Err(failed(&self.path, "more frames than announced"));
         };
@@ -75,7 +75,7 @@ mod tests {
         let colours = [[255, 0, 0], [0, 255, 0], [10, 20, 30]];
         let mut animation = Animation::new(&path, 5, 3, 3, 12).unwrap();
         for colour in colours {
-            animation.add(&Picture::new(5, 3, colour)).unwrap();
+            animation.add(&Canvas::new(5, 3, colour)).unwrap();
         }
         animation.finish().unwrap();
 
@@ -98,12 +98,12 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("a.png");
         let mut animation = Animation::new(&path, 5, 3, 2, 12).unwrap();
-        animation.add(&Picture::new(5, 3, [0; 3])).unwrap();
-        assert!(animation.add(&Picture::new(4, 3, [0; 3])).is_err());
+        animation.add(&Canvas::new(5, 3, [0; 3])).unwrap();
+        assert!(animation.add(&Canvas::new(4, 3, [0; 3])).is_err());
         assert!(animation.finish().is_err(), "one frame of two");
         let mut animation = Animation::new(&path, 5, 3, 1, 12).unwrap();
-        animation.add(&Picture::new(5, 3, [0; 3])).unwrap();
-        assert!(animation.add(&Picture::new(5, 3, [0; 3])).is_err(), "two frames of one");
+        animation.add(&Canvas::new(5, 3, [0; 3])).unwrap();
+        assert!(animation.add(&Canvas::new(5, 3, [0; 3])).is_err(), "two frames of one");
         assert!(Animation::new(&path, 5, 3, 0, 12).is_err());
         assert!(Animation::new(&place.path().join("no/a.png"), 5, 3, 1, 12).is_err());
     }

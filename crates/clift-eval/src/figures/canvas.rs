@@ -41,11 +41,11 @@ impl TextSize {
 
 /// An 8-bit RGB picture to paint on.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Picture {
+pub struct Canvas {
     rgb: RgbImage,
 }
 
-impl Picture {
+impl Canvas {
     /// Makes a picture of one colour.
     pub fn new(width: usize, height: usize, colour: [u8; 3]) -> Self {
         Self { rgb: RgbImage::from_pixel(width as u32, height as u32, image::Rgb(colour)) }
@@ -151,13 +151,13 @@ impl Picture {
     }
 }
 
-impl OriginDimensions for Picture {
+impl OriginDimensions for Canvas {
     fn size(&self) -> Size {
         Size::new(self.rgb.width(), self.rgb.height())
     }
 }
 
-impl DrawTarget for Picture {
+impl DrawTarget for Canvas {
     type Color = Rgb888;
     type Error = std::convert::Infallible;
 
@@ -178,7 +178,7 @@ impl DrawTarget for Picture {
 /// # Errors
 /// [`EvalError::SizeMismatch`] when either picture does not hold `height * width * 3` values, and
 /// [`EvalError::NotFinite`], which would otherwise be painted as no error.
-pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<Picture, EvalError> {
+pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<Canvas, EvalError> {
     check(pred, target, height * width * 3)?;
     let colours: Vec<u8> = pred
         .as_chunks::<3>()
@@ -188,7 +188,7 @@ pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> R
         .map(|(p, t)| p.iter().zip(t).map(|(p, t)| (p.clamp(0.0, 1.0) - t.clamp(0.0, 1.0)).abs()).sum::<f32>() / 3.0)
         .flat_map(|error| error_colour(error / ERROR_FULL_SCALE))
         .collect();
-    Picture::from_rgb8(&colours, height, width)
+    Canvas::from_rgb8(&colours, height, width)
 }
 
 /// Colours a share of the full scale, from black over purple and orange to pale yellow.
@@ -238,14 +238,14 @@ mod tests {
 
     #[test]
     fn unit_values_round_to_the_nearest_level() {
-        let picture = Picture::from_unit(&[-1.0, 0.4999, 2.0], 1, 1).unwrap();
+        let picture = Canvas::from_unit(&[-1.0, 0.4999, 2.0], 1, 1).unwrap();
         assert_eq!(picture.pixel(0, 0), [0, 127, 255]);
     }
 
     #[test]
     fn a_picture_fills_the_place_it_is_given_without_distortion() {
         for (place, expected) in [((64, 64), (64, 40)), ((200, 200), (200, 125)), ((16, 99), (16, 10))] {
-            let fitted = Picture::new(32, 20, [9, 9, 9]).fitted(place.0, place.1);
+            let fitted = Canvas::new(32, 20, [9, 9, 9]).fitted(place.0, place.1);
             assert_eq!((fitted.width(), fitted.height()), expected);
             assert_eq!(fitted.pixel(expected.0 / 2, expected.1 / 2), [9, 9, 9]);
         }
@@ -253,14 +253,14 @@ mod tests {
 
     #[test]
     fn a_whole_factor_repeats_pixels() {
-        let picture = Picture::from_rgb8(&[0, 0, 0, 255, 255, 255], 1, 2).unwrap().fitted(6, 6);
+        let picture = Canvas::from_rgb8(&[0, 0, 0, 255, 255, 255], 1, 2).unwrap().fitted(6, 6);
         assert_eq!([0, 2, 3, 5].map(|x| picture.pixel(x, 2)[0]), [0, 0, 255, 255]);
     }
 
     #[test]
     fn a_png_reads_back_as_it_was_written_and_leaves_no_temporary_file() {
         let folder = tempfile::tempdir().unwrap();
-        let mut picture = Picture::new(40, 20, [1, 2, 3]);
+        let mut picture = Canvas::new(40, 20, [1, 2, 3]);
         picture.write_text("Hi", 2, 2, TextSize::Small, [255, 255, 255]);
         picture.write_png(&folder.path().join("a.png")).unwrap();
         let read = image::open(folder.path().join("a.png")).unwrap().to_rgb8();
@@ -271,7 +271,7 @@ mod tests {
 
     #[test]
     fn a_folder_that_is_missing_is_named() {
-        let error = Picture::new(1, 1, [0; 3]).write_png(Path::new("no/such/folder/a.png")).unwrap_err().to_string();
+        let error = Canvas::new(1, 1, [0; 3]).write_png(Path::new("no/such/folder/a.png")).unwrap_err().to_string();
         assert!(error.starts_with("writing the picture failed: "), "{error}");
         assert!(error.ends_with(": no/such/folder/a.png"), "{error}");
     }

@@ -1,6 +1,6 @@
 //! The contact sheet of a report: a row per target view, a column per thing to compare.
 
-use crate::figures::canvas::{ERROR_FULL_SCALE, Picture, TextSize, error_colour};
+use crate::figures::canvas::{Canvas, ERROR_FULL_SCALE, TextSize, error_colour};
 
 const BACKGROUND: [u8; 3] = [250, 250, 248];
 const INK: [u8; 3] = [28, 28, 30];
@@ -15,7 +15,7 @@ const LEGEND_PX: usize = 192;
 #[derive(Clone, Debug)]
 pub struct Cell {
     /// What is shown: one picture fills the cell, more are tiled.
-    pub pictures: Vec<Picture>,
+    pub pictures: Vec<Canvas>,
     /// A line under the picture, such as `24.31 dB`; may be empty.
     pub caption: String,
 }
@@ -33,7 +33,7 @@ pub struct Row {
 ///
 /// Cells take the size of the first picture that stands alone in its cell, magnified by a whole
 /// factor to at least 192 pixels. Text that is too wide for its cell ends in `..`.
-pub fn sheet(title: &str, columns: &[&str], rows: &[Row]) -> Picture {
+pub fn contact_sheet(title: &str, columns: &[&str], rows: &[Row]) -> Canvas {
     let cells = || rows.iter().flat_map(|row| &row.cells);
     let model = cells().find(|cell| cell.pictures.len() == 1).and_then(|cell| cell.pictures.first());
     let (width, height) = model.map_or((1, 1), |picture| (picture.width().max(1), picture.height().max(1)));
@@ -45,7 +45,7 @@ pub fn sheet(title: &str, columns: &[&str], rows: &[Row]) -> Picture {
     let row_height = small + GAP_PX / 2 + cell_height + 4 + small + 2 * GAP_PX;
     let foot = small + MARGIN_PX;
     let pitch = cell_width + GAP_PX;
-    let mut canvas = Picture::new(
+    let mut canvas = Canvas::new(
         2 * MARGIN_PX + (pitch * columns.len()).saturating_sub(GAP_PX).max(LEGEND_PX),
         head + row_height * rows.len() + foot,
         BACKGROUND,
@@ -72,8 +72,8 @@ pub fn sheet(title: &str, columns: &[&str], rows: &[Row]) -> Picture {
 }
 
 /// Tiles pictures into one area, in the fewest columns that make the tiles largest.
-fn tiled(pictures: &[Picture], width: usize, height: usize) -> Picture {
-    let mut area = Picture::new(width, height, BACKGROUND);
+fn tiled(pictures: &[Canvas], width: usize, height: usize) -> Canvas {
+    let mut area = Canvas::new(width, height, BACKGROUND);
     let Some(first) = pictures.first() else { return area };
     let gap = if pictures.len() == 1 { 0 } else { 2 };
     let tile = |columns: usize| {
@@ -91,7 +91,7 @@ fn tiled(pictures: &[Picture], width: usize, height: usize) -> Picture {
     area
 }
 
-fn paint_legend(canvas: &mut Picture, y: usize) {
+fn paint_legend(canvas: &mut Canvas, y: usize) {
     let (glyph, height) = TextSize::Small.glyph_px();
     let before = "error 0";
     canvas.write_text(before, MARGIN_PX, y, TextSize::Small, FAINT);
@@ -99,7 +99,7 @@ fn paint_legend(canvas: &mut Picture, y: usize) {
     let x = MARGIN_PX + glyph * (before.len() + 1);
     for i in 0..bar {
         let colour = error_colour(i as f32 / (bar - 1) as f32);
-        canvas.paste(&Picture::new(1, height, colour), x + i, y);
+        canvas.paste(&Canvas::new(1, height, colour), x + i, y);
     }
     canvas.write_text(&format!("{ERROR_FULL_SCALE}"), x + bar + glyph, y, TextSize::Small, FAINT);
 }
@@ -117,16 +117,16 @@ fn cut(text: &str, width: usize, size: TextSize) -> String {
 mod tests {
     use super::*;
 
-    fn one(picture: Picture, caption: &str) -> Cell {
+    fn one(picture: Canvas, caption: &str) -> Cell {
         Cell { pictures: vec![picture], caption: caption.to_owned() }
     }
 
     #[test]
     fn cells_are_at_least_192_pixels_wide_and_never_blurred() {
-        let mut picture = Picture::new(32, 32, [0, 0, 255]);
-        picture.paste(&Picture::new(16, 32, [255, 0, 0]), 0, 0);
-        let row = Row { label: String::new(), cells: vec![one(picture, ""), one(Picture::new(32, 32, [0; 3]), "")] };
-        let sheet = sheet("t", &["a", "b"], &[row]);
+        let mut picture = Canvas::new(32, 32, [0, 0, 255]);
+        picture.paste(&Canvas::new(16, 32, [255, 0, 0]), 0, 0);
+        let row = Row { label: String::new(), cells: vec![one(picture, ""), one(Canvas::new(32, 32, [0; 3]), "")] };
+        let sheet = contact_sheet("t", &["a", "b"], &[row]);
         assert_eq!(sheet.width(), 2 * MARGIN_PX + 2 * 192 + GAP_PX);
         let middle = sheet.height() / 2;
         let colours: Vec<_> = (0..192).map(|x| sheet.pixel(MARGIN_PX + x, middle)).collect();
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn four_context_views_are_tiled_two_by_two() {
-        let views = [[1; 3], [2; 3], [3; 3], [4; 3]].map(|colour| Picture::new(64, 64, colour));
+        let views = [[1; 3], [2; 3], [3; 3], [4; 3]].map(|colour| Canvas::new(64, 64, colour));
         let area = tiled(&views, 192, 192);
         let corners = [(10, 10), (150, 10), (10, 150), (150, 150)].map(|(x, y)| area.pixel(x, y)[0]);
         assert_eq!(corners, [1, 2, 3, 4]);
@@ -149,6 +149,6 @@ mod tests {
 
     #[test]
     fn a_sheet_without_rows_is_still_a_picture() {
-        assert!(sheet("nothing was rendered", &[], &[]).height() > 0);
+        assert!(contact_sheet("nothing was rendered", &[], &[]).height() > 0);
     }
 }

@@ -8,7 +8,7 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 
 use crate::error::EvalError;
 use crate::metrics::image_metrics::check;
-use crate::metrics::network_file::{Wanted, WeightFile};
+use crate::metrics::network_file::{NetworkFile, WeightFileSpec};
 use crate::metrics::vgg::{MIN_SIZE_PX, NUM_STAGES, Vgg, VggShape};
 
 /// Smallest side of a picture in pixels.
@@ -18,7 +18,7 @@ pub const LPIPS_MIN_SIZE_PX: usize = MIN_SIZE_PX;
 pub const LPIPS_COMMAND: &str =
     "python3 scripts/tools/convert_vgg.py lpips vgg16-397923af.pth lpips/weights/v0.1/vgg.pth -o lpips-vgg.safetensors";
 
-const WANTED: Wanted = Wanted { what: "LPIPS", format: "clift-lpips-vgg-1", command: LPIPS_COMMAND };
+const WANTED: WeightFileSpec = WeightFileSpec { what: "LPIPS", format: "clift-lpips-vgg-1", command: LPIPS_COMMAND };
 
 /// Mean and spread of the network's inputs, for values in [-1, 1].
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
@@ -51,7 +51,7 @@ impl Lpips {
     }
 
     fn with_shape(path: &Path, shape: VggShape, place: (&Device, DType)) -> Result<Self, EvalError> {
-        let mut file = WeightFile::read(path, WANTED)?;
+        let mut file = NetworkFile::read(path, WANTED)?;
         let vgg = Vgg::take(&mut file, shape, place)?.no_grad();
         let head = |(stage, channels): (usize, usize)| {
             let head = file.take(&format!("head{}.weight", stage + 1), [channels], place)?;

@@ -14,7 +14,7 @@ const MAX_BYTES: u64 = 256 << 20;
 
 /// Which file is expected, and how to get it.
 #[derive(Clone, Copy, Debug)]
-pub struct Wanted {
+pub struct WeightFileSpec {
     /// What it is for, as messages name it.
     pub what: &'static str,
     /// Value of `format` in the file's metadata.
@@ -24,20 +24,20 @@ pub struct Wanted {
 }
 
 /// The tensors of a file, taken out one by one: every one must be asked for, and be of the right shape.
-pub struct WeightFile {
-    wanted: Wanted,
+pub struct NetworkFile {
+    wanted: WeightFileSpec,
     tensors: BTreeMap<String, (Vec<usize>, Vec<f32>)>,
     sha256: String,
     path: PathBuf,
 }
 
-impl WeightFile {
+impl NetworkFile {
     /// Reads a file.
     ///
     /// # Errors
     /// [`EvalError::BadWeights`] for a file that cannot be read, is of another format, or holds anything but finite
     /// f32 values.
-    pub fn read(path: &Path, wanted: Wanted) -> Result<Self, EvalError> {
+    pub fn read(path: &Path, wanted: WeightFileSpec) -> Result<Self, EvalError> {
         let bad = |reason: String| bad_weights(wanted, reason, path);
         let size = std::fs::metadata(path).map_err(|error| bad(error.to_string()))?.len();
         if size > MAX_BYTES {
@@ -102,8 +102,8 @@ impl WeightFile {
     }
 }
 
-fn bad_weights(wanted: Wanted, reason: String, path: &Path) -> EvalError {
-    let Wanted { what, command, .. } = wanted;
+fn bad_weights(wanted: WeightFileSpec, reason: String, path: &Path) -> EvalError {
+    let WeightFileSpec { what, command, .. } = wanted;
     EvalError::BadWeights { what, reason, command, path: path.into() }
 }
 
@@ -115,7 +115,7 @@ mod tests {
 
     use super::*;
 
-    const WANTED: Wanted = Wanted { what: "LPIPS", format: "test-1", command: "convert it" };
+    const WANTED: WeightFileSpec = WeightFileSpec { what: "LPIPS", format: "test-1", command: "convert it" };
 
     fn written(folder: &Path, format: &str, values: &[f32]) -> PathBuf {
         let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
@@ -131,7 +131,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = written(folder.path(), "test-1", &[1.0, 2.0]);
         let device = Device::flex();
-        let open = || WeightFile::read(&path, WANTED).unwrap();
+        let open = || NetworkFile::read(&path, WANTED).unwrap();
         let mut file = open();
         let tensor = file.take("head1.weight", [2], (&device, DType::F32)).unwrap();
         assert_eq!(tensor.into_data().try_to_vec::<f32>().unwrap(), [1.0, 2.0]);
@@ -162,7 +162,7 @@ mod tests {
         for (path, part) in
             [(&other, "test-2"), (&nan, "not finite"), (&cut, ""), (&empty, ""), (&missing, "No such file")]
         {
-            let Err(error) = WeightFile::read(path, WANTED) else { panic!("{} is accepted", path.display()) };
+            let Err(error) = NetworkFile::read(path, WANTED) else { panic!("{} is accepted", path.display()) };
             assert!(error.to_string().contains(part), "{error}");
         }
     }

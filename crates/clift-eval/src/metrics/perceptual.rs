@@ -7,7 +7,7 @@ use burn::module::Module;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 
 use crate::error::EvalError;
-use crate::metrics::network_file::{Wanted, WeightFile};
+use crate::metrics::network_file::{NetworkFile, WeightFileSpec};
 use crate::metrics::vgg::{MIN_SIZE_PX, Vgg, VggShape};
 
 /// Smallest side of a picture in pixels.
@@ -17,7 +17,8 @@ pub const PERCEPTUAL_MIN_SIZE_PX: usize = MIN_SIZE_PX;
 pub const PERCEPTUAL_COMMAND: &str =
     "python3 scripts/tools/convert_vgg.py vgg19 imagenet-vgg-verydeep-19.mat -o vgg19.safetensors";
 
-const WANTED: Wanted = Wanted { what: "the perceptual loss", format: "clift-vgg19-1", command: PERCEPTUAL_COMMAND };
+const WANTED: WeightFileSpec =
+    WeightFileSpec { what: "the perceptual loss", format: "clift-vgg19-1", command: PERCEPTUAL_COMMAND };
 
 /// Mean colour of the network's training pictures, of 255.
 const MEAN_RGB: [f32; 3] = [123.68, 116.779, 103.939];
@@ -44,7 +45,7 @@ impl Perceptual {
     }
 
     fn with_shape(path: &Path, shape: VggShape, place: (&Device, DType)) -> Result<Self, EvalError> {
-        let mut file = WeightFile::read(path, WANTED)?;
+        let mut file = NetworkFile::read(path, WANTED)?;
         let vgg = Vgg::take(&mut file, shape, place)?.no_grad();
         let mean = Tensor::<1>::from_data(TensorData::new(MEAN_RGB.to_vec(), [3]), place).reshape([1, 3, 1, 1]);
         Ok(Self { vgg, mean, sha256: file.finish()? })

@@ -10,7 +10,7 @@ use burn::tensor::ops::{AvgPoolOptions, MaxPoolOptions};
 use burn::tensor::{DType, Device, Tensor};
 
 use crate::error::EvalError;
-use crate::metrics::network_file::WeightFile;
+use crate::metrics::network_file::NetworkFile;
 
 /// Number of stages; pictures are halved between them.
 pub const NUM_STAGES: usize = 5;
@@ -105,8 +105,8 @@ impl Vgg {
     /// Takes the network's tensors, `convS_I.weight` `[out, in, 3, 3]` and `convS_I.bias`, out of a file.
     ///
     /// # Errors
-    /// As [`WeightFile::take`].
-    pub fn take(file: &mut WeightFile, shape: VggShape, place: (&Device, DType)) -> Result<Self, EvalError> {
+    /// As [`NetworkFile::take`].
+    pub fn take(file: &mut NetworkFile, shape: VggShape, place: (&Device, DType)) -> Result<Self, EvalError> {
         let mut inputs = 3;
         let mut stages = Vec::new();
         for (stage, (&count, &outputs)) in shape.convs.iter().zip(&shape.widths).enumerate() {

@@ -5,7 +5,7 @@ use std::io;
 use base64::prelude::{BASE64_STANDARD, Engine};
 use maud::{Markup, html};
 
-use crate::figures::canvas::Picture;
+use crate::figures::canvas::Canvas;
 use crate::report::axis::grouped;
 
 /// Shown where a value was not measured.
@@ -42,7 +42,7 @@ pub fn head(names: &[&str]) -> Markup {
 /// Returns an image as an address that holds its bytes, for `src` and `href`.
 ///
 /// # Errors
-/// As [`Picture::png`].
-pub fn data_uri(picture: &Picture) -> io::Result<String> {
+/// As [`Canvas::png`].
+pub fn data_uri(picture: &Canvas) -> io::Result<String> {
     Ok(format!("data:image/png;base64,{}", BASE64_STANDARD.encode(picture.png()?)))
 }

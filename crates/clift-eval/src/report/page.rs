@@ -3,16 +3,16 @@
 use std::io;
 use std::path::Path;
 
-use clift_data::{Ledger, replace_file};
+use clift_data::{SkipReport, replace_file};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use crate::error::EvalError;
-use crate::figures::scene_figure::Exhibit;
+use crate::figures::scene_figure::SceneFigure;
 use crate::report::axis::{grouped, milliseconds};
 use crate::report::html::{count, number};
 use crate::report::plots::{Figure, figures};
 use crate::report::{date, scene_section, tables};
-use crate::statistics::summary::{Point, Summary};
+use crate::statistics::summary::{Summary, SummaryPoint};
 use crate::statistics::view_metrics::best_variant;
 
 const STYLE: &str = include_str!("style.css");
@@ -40,9 +40,9 @@ pub struct Report {
     /// The measured means.
     pub summary: Summary,
     /// What was left out.
-    pub ledger: Ledger,
+    pub ledger: SkipReport,
     /// Scenes to show; the first [`MAX_EXHIBITS`] are.
-    pub exhibits: Vec<Exhibit>,
+    pub exhibits: Vec<SceneFigure>,
     /// The resolved config, TOML.
     pub config: String,
     /// Where tensors lived.
@@ -65,7 +65,7 @@ impl Report {
     /// Returns the page.
     ///
     /// # Errors
-    /// As [`crate::figures::canvas::Picture::png`].
+    /// As [`crate::figures::canvas::Canvas::png`].
     pub fn to_html(&self) -> io::Result<String> {
         let page = html! {
             (DOCTYPE)
@@ -101,13 +101,14 @@ impl Report {
     /// Returns what one wants to know first.
     fn headline(&self) -> Markup {
         let Summary { num_scenes, num_views, baselines, points, .. } = &self.summary;
-        let best = best_variant(points.iter().map(Point::key));
-        let mut whole: Vec<&Point> = points.iter().filter(|p| Some(p.variant) == best && p.key().is_whole()).collect();
+        let best = best_variant(points.iter().map(SummaryPoint::key));
+        let mut whole: Vec<&SummaryPoint> =
+            points.iter().filter(|p| Some(p.variant) == best && p.key().is_whole()).collect();
         // Of the finest format, where there are several.
         let format = whole.iter().map(|point| point.tokens).min().flatten();
         whole.retain(|point| point.tokens == format);
         let (first, last) = (whole.first(), whole.last());
-        let tokens = |point: &Point| format!("{} tokens", count(point.num_storage_tokens));
+        let tokens = |point: &SummaryPoint| format!("{} tokens", count(point.num_storage_tokens));
         let nearest = baselines.nearest_view.psnr;
         html! {
             @if let (Some(first), Some(last)) = (first, last) {
@@ -183,7 +184,7 @@ impl Report {
     }
 }
 
-fn reached(point: &Point) -> Markup {
+fn reached(point: &SummaryPoint) -> Markup {
     html! { strong { (number(point.psnr, 2)) " dB" } " with " (count(point.num_storage_tokens)) " stored tokens" }
 }
 

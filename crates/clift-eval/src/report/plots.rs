@@ -2,12 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clift_model::TokenStorage;
+use clift_model::TokenFormat;
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::report::axis::{Scale, milliseconds};
 use crate::report::plot::{Level, Look, Mark, Plot, Series};
-use crate::statistics::summary::{Point, Quality, Summary};
+use crate::statistics::summary::{Quality, Summary, SummaryPoint};
 use crate::statistics::view_metrics::best_variant;
 
 const QUALITY: &str = "PSNR, dB";
@@ -32,7 +32,7 @@ pub fn figures(summary: &Summary) -> Vec<Figure> {
         note: "",
     }];
     if summary.points.iter().any(|point| point.key().is_whole() && point.scene_bytes.is_some()) {
-        let kb = |point: &Point| point.scene_bytes.map(|bytes| bytes as f64 / 1e3);
+        let kb = |point: &SummaryPoint| point.scene_bytes.map(|bytes| bytes as f64 / 1e3);
         let mut plot = by_variant(summary, "scene, kB", Scale::Log, kb);
         let on_front = summary.points.iter().filter(|point| point.pareto_bytes);
         plot.front = on_front.filter_map(|point| Some((kb(point)?, point.psnr?))).collect();
@@ -55,17 +55,17 @@ pub fn figures(summary: &Summary) -> Vec<Figure> {
 }
 
 /// The look of a variant, the same in every plot.
-fn look(summary: &Summary, variant: Variant) -> Look {
+fn look(summary: &Summary, variant: Method) -> Look {
     let ours = |i: usize| Look::ALL[i];
     match variant {
-        Variant::Clift => ours(0),
-        Variant::Kmeans => ours(1),
-        Variant::Random => ours(2),
-        Variant::Patch => ours(3),
+        Method::Clift => ours(0),
+        Method::Kmeans => ours(1),
+        Method::Random => ours(2),
+        Method::Patch => ours(3),
         // Baselines are levels, not series.
-        Variant::PatchClift | Variant::NearestView | Variant::MeanImage => ours(4),
-        Variant::System(_) => {
-            let is_system = |variant: &Variant| matches!(variant, Variant::System(_));
+        Method::PatchClift | Method::NearestView | Method::MeanImage => ours(4),
+        Method::System(_) => {
+            let is_system = |variant: &Method| matches!(variant, Method::System(_));
             let systems: BTreeSet<_> = summary.points.iter().map(|point| point.variant).filter(is_system).collect();
             let place = systems.into_iter().position(|system| system == variant).unwrap_or_default();
             Look::OTHERS[place % Look::OTHERS.len()]
@@ -80,20 +80,20 @@ fn has_formats(summary: &Summary) -> bool {
 }
 
 /// A line for every variant and number format, in its look.
-fn series(summary: &Summary, is_joined: bool, mark: impl Fn(&Point) -> Option<Mark>) -> Vec<Series> {
+fn series(summary: &Summary, is_joined: bool, mark: impl Fn(&SummaryPoint) -> Option<Mark>) -> Vec<Series> {
     let has_formats = has_formats(summary);
-    let mut lines: BTreeMap<(Variant, Option<TokenStorage>), Vec<Mark>> = BTreeMap::new();
+    let mut lines: BTreeMap<(Method, Option<TokenFormat>), Vec<Mark>> = BTreeMap::new();
     for point in &summary.points {
         if let Some(mark) = mark(point) {
             lines.entry((point.variant, point.tokens.filter(|_| has_formats))).or_default().push(mark);
         }
     }
-    let line = |((variant, tokens), marks): ((Variant, Option<TokenStorage>), Vec<Mark>)| {
+    let line = |((variant, tokens), marks): ((Method, Option<TokenFormat>), Vec<Mark>)| {
         let mut look = look(summary, variant);
         let mut name = variant.name().to_owned();
-        if let Some(tokens) = tokens.filter(|_| variant != Variant::Random) {
+        if let Some(tokens) = tokens.filter(|_| variant != Method::Random) {
             // The colour is the variant's, the marker the format's.
-            let format = TokenStorage::ALL.iter().position(|format| *format == tokens).unwrap_or_default();
+            let format = TokenFormat::ALL.iter().position(|format| *format == tokens).unwrap_or_default();
             look.marker = Look::ALL[format].marker;
             name = format!("{name}, {}", tokens.name());
         }
@@ -110,9 +110,9 @@ fn levels(summary: &Summary) -> Vec<Level> {
 }
 
 /// The mark of a point at `x`, if its quality is known.
-fn mark(point: &Point, x: f64) -> Option<Mark> {
+fn mark(point: &SummaryPoint, x: f64) -> Option<Mark> {
     let y = point.psnr?;
-    let Point { num_storage_tokens: stored, num_render_tokens: rendered, .. } = *point;
+    let SummaryPoint { num_storage_tokens: stored, num_render_tokens: rendered, .. } = *point;
     let tokens = match (stored, point.key().is_whole()) {
         (0, _) => String::new(),
         (_, true) => format!(", {stored} tokens"),
@@ -126,8 +126,14 @@ fn mark(point: &Point, x: f64) -> Option<Mark> {
 }
 
 /// A line per variant, of the points that are drawn from all they store.
-fn by_variant(summary: &Summary, x_label: &'static str, x_scale: Scale, x: impl Fn(&Point) -> Option<f64>) -> Plot {
-    let whole = |point: &Point| if point.key().is_whole() { x(point).and_then(|x| mark(point, x)) } else { None };
+fn by_variant(
+    summary: &Summary,
+    x_label: &'static str,
+    x_scale: Scale,
+    x: impl Fn(&SummaryPoint) -> Option<f64>,
+) -> Plot {
+    let whole =
+        |point: &SummaryPoint| if point.key().is_whole() { x(point).and_then(|x| mark(point, x)) } else { None };
     let title = format!("PSNR against {x_label}, a line per variant, with the standard error over scenes");
     Plot {
         title,
@@ -142,10 +148,10 @@ fn by_variant(summary: &Summary, x_label: &'static str, x_scale: Scale, x: impl 
 
 /// A line per storage count of the best variant.
 fn by_rendered(summary: &Summary) -> Plot {
-    let best = best_variant(summary.points.iter().map(Point::key));
+    let best = best_variant(summary.points.iter().map(SummaryPoint::key));
     let mut lines: BTreeMap<usize, Vec<Mark>> = BTreeMap::new();
     // Of the finest format, where there are several.
-    let is_best = |point: &&Point| Some(point.variant) == best;
+    let is_best = |point: &&SummaryPoint| Some(point.variant) == best;
     let format = summary.points.iter().filter(is_best).map(|point| point.tokens).min().flatten();
     for point in summary.points.iter().filter(is_best).filter(|point| point.tokens == format) {
         lines.entry(point.num_storage_tokens).or_default().extend(mark(point, point.num_render_tokens as f64));
@@ -176,8 +182,8 @@ fn by_rendered(summary: &Summary) -> Plot {
 
 /// Every point over its time per frame, and the front.
 fn by_time(summary: &Summary) -> Plot {
-    let place = |point: &Point| Some((point.frame_median_s? * 1e3, point.psnr?));
-    let at_time = |point: &Point| {
+    let place = |point: &SummaryPoint| Some((point.frame_median_s? * 1e3, point.psnr?));
+    let at_time = |point: &SummaryPoint| {
         let mark = point.frame_median_s.and_then(|seconds| mark(point, seconds * 1e3))?;
         Some(Mark { error: None, ..mark })
     };

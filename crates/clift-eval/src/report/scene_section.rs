@@ -5,10 +5,10 @@ use std::io;
 use clift_model::SceneClusters;
 use maud::{Markup, html};
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::config::token_selection::Selection;
-use crate::figures::canvas::Picture;
-use crate::figures::scene_figure::{Choice, Drawing, Exhibit};
+use crate::figures::canvas::Canvas;
+use crate::figures::scene_figure::{Drawing, FigureTokens, SceneFigure};
 use crate::report::axis::grouped;
 use crate::report::html::data_uri;
 use crate::statistics::view_metrics::{EvalKey, best_variant};
@@ -25,13 +25,14 @@ const SHARP_BELOW_PX: usize = 100;
 
 /// Returns the section of a scene; `number` tells it from the others of the page, `selection` chose the tokens of its
 /// views.
-pub fn section(exhibit: &Exhibit, number: usize, selection: Option<Selection>) -> io::Result<Markup> {
+pub fn section(exhibit: &SceneFigure, number: usize, selection: Option<Selection>) -> io::Result<Markup> {
     let is_map = |clusters: &&SceneClusters| clusters.centroid_index().len() < clusters.assignment().len();
     let maps: Vec<&SceneClusters> = exhibit.clusters.iter().filter(is_map).collect();
     let best = best_variant(exhibit.choices.iter().map(|choice| choice.setting));
     let choices = exhibit.choices.iter().filter(|choice| Some(choice.setting.variant) == best);
     let most = choices.clone().map(|choice| choice.setting.num_storage_tokens).max();
-    let choices: Vec<&Choice> = choices.filter(|choice| Some(choice.setting.num_storage_tokens) == most).collect();
+    let choices: Vec<&FigureTokens> =
+        choices.filter(|choice| Some(choice.setting.num_storage_tokens) == most).collect();
     Ok(html! {
         article.scene {
             h3 { (exhibit.key) }
@@ -54,28 +55,28 @@ fn row(heading: &str, strip: Markup) -> Markup {
 }
 
 /// Target and nearest view, then a row per variant.
-fn drawings(exhibit: &Exhibit) -> io::Result<Markup> {
+fn drawings(exhibit: &SceneFigure) -> io::Result<Markup> {
     let target_frame = exhibit.target_frame;
-    let of = |variant: Variant| exhibit.drawings.iter().filter(move |drawing| drawing.setting.variant == variant);
+    let of = |variant: Method| exhibit.drawings.iter().filter(move |drawing| drawing.setting.variant == variant);
     let best = best_variant(exhibit.drawings.iter().map(|drawing| drawing.setting));
     let some = exhibit.drawings.iter().filter(|d| Some(d.setting.variant) == best && !d.setting.is_whole());
     let most = some.clone().map(|drawing| drawing.setting.num_storage_tokens).max();
     let some = some.filter(|drawing| Some(drawing.setting.num_storage_tokens) == most);
     let target = html! {
         (image(&exhibit.target, &format!("Target view, frame {target_frame}"), frame(target_frame))?)
-        @for nearest in of(Variant::NearestView) { (drawing(nearest, "nearest view")?) }
+        @for nearest in of(Method::NearestView) { (drawing(nearest, "nearest view")?) }
     };
     Ok(html! {
         (row("target", target))
-        @for variant in [Variant::Clift, Variant::Kmeans, Variant::PatchClift, Variant::Patch, Variant::Random] {
+        @for variant in [Method::Clift, Method::Kmeans, Method::PatchClift, Method::Patch, Method::Random] {
             (strip(variant.name(), &of(variant).filter(|drawing| drawing.setting.is_whole()).collect::<Vec<_>>())?)
         }
         @for other in &exhibit.drawings {
-            @if let Variant::System(name) = other.setting.variant {
+            @if let Method::System(name) = other.setting.variant {
                 (row(name.as_str(), drawing(other, "its picture")?))
             }
         }
-        (strip(&format!("{}, some tokens", best.map_or("", Variant::name)), &some.collect::<Vec<_>>())?)
+        (strip(&format!("{}, some tokens", best.map_or("", Method::name)), &some.collect::<Vec<_>>())?)
     })
 }
 
@@ -96,7 +97,7 @@ fn drawing(drawing: &Drawing, what: &str) -> io::Result<Markup> {
     image(&drawing.picture, &alt, html! { (what) br; (psnr) " dB" })
 }
 
-fn image(picture: &Picture, alt: &str, caption: Markup) -> io::Result<Markup> {
+fn image(picture: &Canvas, alt: &str, caption: Markup) -> io::Result<Markup> {
     let (width, height) = (picture.width(), picture.height());
     Ok(html! {
         figure {
@@ -106,7 +107,7 @@ fn image(picture: &Picture, alt: &str, caption: Markup) -> io::Result<Markup> {
     })
 }
 
-fn sharpness(picture: &Picture) -> &'static str {
+fn sharpness(picture: &Canvas) -> &'static str {
     if picture.width() < SHARP_BELOW_PX { "sharp" } else { "smooth" }
 }
 
@@ -115,7 +116,7 @@ fn frame(frame: usize) -> Markup {
 }
 
 /// The context views, which the maps below refer to by name.
-fn contexts(exhibit: &Exhibit, number: usize) -> io::Result<Markup> {
+fn contexts(exhibit: &SceneFigure, number: usize) -> io::Result<Markup> {
     let [rows, columns] = exhibit.grid;
     let strip = html! {
         @for (view, (picture, &index)) in exhibit.context.iter().zip(&exhibit.context_frames).enumerate() {
@@ -130,13 +131,13 @@ fn contexts(exhibit: &Exhibit, number: usize) -> io::Result<Markup> {
 }
 
 /// Every patch of the context views in the colour of its cluster, centroids ringed.
-fn clusters(exhibit: &Exhibit, number: usize, clusters: &SceneClusters) -> io::Result<Markup> {
+fn clusters(exhibit: &SceneFigure, number: usize, clusters: &SceneClusters) -> io::Result<Markup> {
     let [rows, columns] = exhibit.grid;
     let (per_view, centroids) = (rows * columns, clusters.centroid_index());
     let tint = |assignment: &[u32]| {
-        let mut tint = Picture::new(columns, rows, [0; 3]);
+        let mut tint = Canvas::new(columns, rows, [0; 3]);
         for (patch, &cluster) in assignment.iter().enumerate() {
-            tint.paste(&Picture::new(1, 1, cluster_colour(cluster)), patch % columns, patch / columns);
+            tint.paste(&Canvas::new(1, 1, cluster_colour(cluster)), patch % columns, patch / columns);
         }
         data_uri(&tint)
     };
@@ -157,7 +158,7 @@ fn clusters(exhibit: &Exhibit, number: usize, clusters: &SceneClusters) -> io::R
 }
 
 /// Which tokens the target is drawn from: dots for them, rings for the other stored ones.
-fn chosen(exhibit: &Exhibit, number: usize, choice: &Choice, selection: Option<Selection>) -> Markup {
+fn chosen(exhibit: &SceneFigure, number: usize, choice: &FigureTokens, selection: Option<Selection>) -> Markup {
     let per_view = exhibit.grid.iter().product();
     let EvalKey { num_storage_tokens: stored, num_render_tokens: rendered, .. } = choice.setting;
     let others: Vec<u32> = choice.stored.iter().copied().filter(|id| !choice.chosen.contains(id)).collect();
@@ -177,7 +178,7 @@ fn chosen(exhibit: &Exhibit, number: usize, choice: &Choice, selection: Option<S
 }
 
 /// A figure in units of patches.
-fn map(exhibit: &Exhibit, label: &str, content: Markup, caption: Markup) -> Markup {
+fn map(exhibit: &SceneFigure, label: &str, content: Markup, caption: Markup) -> Markup {
     let [rows, columns] = exhibit.grid;
     html! {
         figure {

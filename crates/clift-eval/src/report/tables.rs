@@ -1,13 +1,13 @@
 //! The tables of the page.
 
-use clift_data::Ledger;
-use clift_model::TokenStorage;
+use clift_data::SkipReport;
+use clift_model::TokenFormat;
 use maud::{Markup, html};
 
 use crate::report::axis::{grouped, milliseconds};
 use crate::report::html::{DASH, count, head, number};
 use crate::statistics::paired::PairedDifference;
-use crate::statistics::summary::{Point, Summary};
+use crate::statistics::summary::{Summary, SummaryPoint};
 use crate::system::machine;
 
 const POINTS_HEAD: [&str; 17] = [
@@ -86,14 +86,14 @@ pub fn points(summary: &Summary) -> Markup {
 }
 
 /// Returns the cells of a point after its name.
-fn cells(point: &Point) -> [String; 16] {
+fn cells(point: &SummaryPoint) -> [String; 16] {
     let tokens = |tokens: usize| if tokens == 0 { DASH.to_owned() } else { count(tokens) };
     let ms = |seconds: Option<f64>| seconds.map_or_else(|| DASH.into(), milliseconds);
     let dot = |is_front: bool| if is_front { "\u{25cf}".to_owned() } else { String::new() };
     [
         tokens(point.num_storage_tokens),
         tokens(point.num_render_tokens),
-        point.tokens.map_or(DASH, TokenStorage::name).to_owned(),
+        point.tokens.map_or(DASH, TokenFormat::name).to_owned(),
         number(point.psnr, 2),
         number(point.psnr_stderr, 2),
         number(point.ssim, 3),
@@ -125,7 +125,7 @@ pub fn differences(differences: &[PairedDifference]) -> Markup {
                                 td { (row.variant.name()) }
                                 td { (row.against.name()) }
                                 td { (count(row.num_storage_tokens)) }
-                                td { (row.tokens.map_or(DASH, TokenStorage::name)) }
+                                td { (row.tokens.map_or(DASH, TokenFormat::name)) }
                                 td { (count(row.num_scenes)) }
                                 td { (grouped(row.psnr, 2)) }
                                 td { (number(row.psnr_stderr, 2)) }
@@ -139,7 +139,7 @@ pub fn differences(differences: &[PairedDifference]) -> Markup {
 }
 
 /// Returns how many scenes were evaluated, and the reasons of the others.
-pub fn left_out(num_evaluated: usize, ledger: &Ledger) -> Markup {
+pub fn left_out(num_evaluated: usize, ledger: &SkipReport) -> Markup {
     html! {
         h2 { "What was left out" }
         p { (count(num_evaluated)) " of " (count(ledger.num_scenes)) " scenes were evaluated." }

@@ -7,14 +7,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
 use crate::statistics::scene_means::capped;
-use crate::statistics::student_t::quantile_95;
+use crate::statistics::student_t::t_quantile_95;
 
 /// What both evaluations measure.
 const METRICS: [&str; 3] = ["psnr", "ssim", "lpips_vgg"];
 
 /// How a line of `views.csv` was made.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-pub struct Made {
+pub struct RowKey {
     /// Its variant.
     pub variant: String,
     /// Tokens in the scene file.
@@ -48,7 +48,7 @@ type Values = [Option<f64>; METRICS.len()];
 #[derive(Clone, Debug, PartialEq)]
 pub struct Evaluation {
     path: PathBuf,
-    views: BTreeMap<Made, BTreeMap<View, Values>>,
+    views: BTreeMap<RowKey, BTreeMap<View, Values>>,
 }
 
 impl Evaluation {
@@ -63,10 +63,10 @@ impl Evaluation {
             return Err(EvalError::NotComparable { reason, path: path.into() });
         };
         let bad = |error: csv::Error| EvalError::NotComparable { reason: error.to_string(), path: file.clone() };
-        let mut views: BTreeMap<Made, BTreeMap<View, Values>> = BTreeMap::new();
+        let mut views: BTreeMap<RowKey, BTreeMap<View, Values>> = BTreeMap::new();
         for row in csv::Reader::from_path(&file).map_err(bad)?.deserialize() {
             let row: Row = row.map_err(bad)?;
-            let made = Made {
+            let made = RowKey {
                 variant: row.variant,
                 num_storage_tokens: row.num_storage_tokens,
                 num_render_tokens: row.num_render_tokens,
@@ -81,14 +81,14 @@ impl Evaluation {
 
 /// One of the two sides of a comparison by variants.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Side {
+pub struct MethodFilter {
     /// The variant.
     pub variant: String,
     /// The number format; any, if there is only one, where it is not given.
     pub tokens: Option<String>,
 }
 
-impl Side {
+impl MethodFilter {
     /// Reads `variant` or `variant:format`.
     pub fn parse(text: &str) -> Self {
         match text.split_once(':') {
@@ -97,14 +97,14 @@ impl Side {
         }
     }
 
-    fn holds(&self, made: &Made) -> bool {
+    fn holds(&self, made: &RowKey) -> bool {
         made.variant == self.variant && self.tokens.as_ref().is_none_or(|tokens| *tokens == made.tokens)
     }
 }
 
 /// The difference of one metric.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Difference {
+pub struct PairedDifference {
     /// Mean over the scenes of the first.
     pub a: f64,
     /// Mean over the scenes of the second.
@@ -119,11 +119,11 @@ pub struct Difference {
 
 /// The differences between two settings.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Pair {
+pub struct PairedRow {
     /// How the first was made.
-    pub a: Made,
+    pub a: RowKey,
     /// How the second was made.
-    pub b: Made,
+    pub b: RowKey,
     /// Scenes with a view of both.
     pub num_scenes: usize,
     /// Views of both.
@@ -133,11 +133,11 @@ pub struct Pair {
     /// Views of the second alone, which are left out.
     pub num_only_b: usize,
     /// In dB; an identical picture counts as 100.
-    pub psnr: Option<Difference>,
+    pub psnr: Option<PairedDifference>,
     /// Of SSIM.
-    pub ssim: Option<Difference>,
+    pub ssim: Option<PairedDifference>,
     /// Of LPIPS, where less is better.
-    pub lpips_vgg: Option<Difference>,
+    pub lpips_vgg: Option<PairedDifference>,
 }
 
 /// Two evaluations side by side.
@@ -148,7 +148,7 @@ pub struct Comparison {
     /// Where the second lies.
     pub b: PathBuf,
     /// One per setting of both.
-    pub pairs: Vec<Pair>,
+    pub pairs: Vec<PairedRow>,
 }
 
 impl Comparison {
@@ -159,26 +159,26 @@ impl Comparison {
     ///
     /// # Errors
     /// [`EvalError::NotComparable`] without a common setting, or without a common view of any.
-    pub fn new(a: &Evaluation, b: &Evaluation, sides: Option<&[Side; 2]>) -> Result<Self, EvalError> {
+    pub fn new(a: &Evaluation, b: &Evaluation, sides: Option<&[MethodFilter; 2]>) -> Result<Self, EvalError> {
         let mut pairs = Vec::new();
         for (made_a, views_a) in &a.views {
             for (made_b, views_b) in &b.views {
                 let matches = match sides {
                     None => made_a == made_b,
                     Some([side_a, side_b]) => {
-                        let counts = |made: &Made| (made.num_storage_tokens, made.num_render_tokens);
+                        let counts = |made: &RowKey| (made.num_storage_tokens, made.num_render_tokens);
                         side_a.holds(made_a) && side_b.holds(made_b) && counts(made_a) == counts(made_b)
                     }
                 };
                 if matches {
-                    pairs.push(Pair::new((made_a, views_a), (made_b, views_b)));
+                    pairs.push(PairedRow::new((made_a, views_a), (made_b, views_b)));
                 }
             }
         }
         let not = |reason: String| EvalError::NotComparable { reason, path: b.path.clone() };
         if pairs.is_empty() {
             let of = |evaluation: &Evaluation| {
-                let made = evaluation.views.keys().map(Made::to_string);
+                let made = evaluation.views.keys().map(RowKey::to_string);
                 made.collect::<Vec<_>>().join(", ")
             };
             return Err(not(format!(
@@ -204,8 +204,8 @@ impl Comparison {
     }
 }
 
-impl Pair {
-    fn new((made_a, a): (&Made, &BTreeMap<View, Values>), (made_b, b): (&Made, &BTreeMap<View, Values>)) -> Self {
+impl PairedRow {
+    fn new((made_a, a): (&RowKey, &BTreeMap<View, Values>), (made_b, b): (&RowKey, &BTreeMap<View, Values>)) -> Self {
         let common: Vec<(&View, &Values, &Values)> =
             a.iter().filter_map(|(view, values)| Some((view, values, b.get(view)?))).collect();
         let scenes: Vec<_> = common.chunk_by(|(a, ..), (b, ..)| a.0 == b.0).collect();
@@ -218,7 +218,7 @@ impl Pair {
                 let sum = values.iter().fold((0.0, 0.0), |sum, value| (sum.0 + value.0, sum.1 + value.1));
                 (!values.is_empty()).then(|| (sum.0 / count, sum.1 / count))
             });
-            Difference::of(&scene_means.collect::<Vec<_>>())
+            PairedDifference::of(&scene_means.collect::<Vec<_>>())
         };
         Self {
             a: made_a.clone(),
@@ -234,7 +234,7 @@ impl Pair {
     }
 }
 
-impl Difference {
+impl PairedDifference {
     /// Of paired values, one pair per scene.
     fn of(pairs: &[(f64, f64)]) -> Option<Self> {
         let count = pairs.len() as f64;
@@ -243,7 +243,7 @@ impl Difference {
         let squares: f64 = pairs.iter().map(|(a, b)| (b - a - difference).powi(2)).sum();
         let stderr = (pairs.len() > 1).then(|| (squares / (count - 1.0) / count).sqrt());
         let interval = stderr.map(|stderr| {
-            let half = quantile_95(pairs.len() - 1) * stderr;
+            let half = t_quantile_95(pairs.len() - 1) * stderr;
             [difference - half, difference + half]
         });
         (!pairs.is_empty()).then_some(Self { a, b, mean: difference, stderr, interval })

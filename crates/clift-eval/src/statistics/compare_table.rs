@@ -2,9 +2,9 @@
 
 use std::fmt;
 
-use crate::statistics::compare::{Comparison, Difference, Made, Pair};
+use crate::statistics::compare::{Comparison, PairedDifference, PairedRow, RowKey};
 
-impl fmt::Display for Made {
+impl fmt::Display for RowKey {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { variant, num_storage_tokens: stored, num_render_tokens: rendered, tokens } = self;
         f.write_str(variant)?;
@@ -43,7 +43,7 @@ impl fmt::Display for Comparison {
             "\nMeans of the paired differences of scenes with 95 % intervals of Student's t; *: zero lies outside. Of LPIPS \
              less is better."
         )?;
-        let left_out = |count: fn(&Pair) -> usize| self.pairs.iter().map(count).max().unwrap_or_default();
+        let left_out = |count: fn(&PairedRow) -> usize| self.pairs.iter().map(count).max().unwrap_or_default();
         let (only_a, only_b) = (left_out(|pair| pair.num_only_a), left_out(|pair| pair.num_only_b));
         if only_a + only_b > 0 {
             let common = self.pairs.iter().map(|pair| pair.num_views).max().unwrap_or_default();
@@ -57,11 +57,11 @@ impl fmt::Display for Comparison {
     }
 }
 
-fn name(pair: &Pair) -> String {
+fn name(pair: &PairedRow) -> String {
     if pair.a == pair.b { pair.a.to_string() } else { format!("{} -> {}", pair.a, pair.b) }
 }
 
-fn interval(difference: Option<Difference>, decimals: usize) -> String {
+fn interval(difference: Option<PairedDifference>, decimals: usize) -> String {
     let Some(difference) = difference else { return "-".into() };
     let mark = if difference.is_clear() { " *" } else { "" };
     match difference.interval {

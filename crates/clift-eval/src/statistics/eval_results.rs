@@ -7,7 +7,7 @@ use std::path::Path;
 use clift_data::replace_file;
 use serde::{Deserialize, Serialize};
 
-use crate::config::method::SystemName;
+use crate::config::method::MethodName;
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
 use crate::statistics::view_metrics::{Cost, EvalKey, ViewMetrics};
@@ -32,7 +32,7 @@ pub struct EvalResults {
     warm: BTreeSet<EvalKey>,
     pub(crate) skipped: BTreeSet<String>,
     pub(crate) not_measured: Vec<NotMeasured>,
-    pub(crate) missing: BTreeMap<SystemName, BTreeSet<String>>,
+    pub(crate) missing: BTreeMap<MethodName, BTreeSet<String>>,
     pub(crate) lpips_sha256: Option<String>,
     /// How rendered tokens were selected; `None` where every view was rendered from all stored tokens.
     pub(crate) selection: Option<Selection>,
@@ -112,7 +112,7 @@ impl EvalResults {
     }
 
     /// Records an image that another system does not have.
-    pub fn miss(&mut self, system: SystemName, picture: String) {
+    pub fn miss(&mut self, system: MethodName, picture: String) {
         self.missing.entry(system).or_default().insert(picture);
     }
 
@@ -173,16 +173,16 @@ const VIEW_COLUMNS: [&str; 11] = [
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenStorage;
+    use clift_model::TokenFormat;
 
     use super::*;
-    use crate::config::method::Variant;
+    use crate::config::method::Method;
 
     const CLIFT: EvalKey = EvalKey {
-        variant: Variant::Clift,
+        variant: Method::Clift,
         num_storage_tokens: 64,
         num_render_tokens: 32,
-        tokens: Some(TokenStorage::F16),
+        tokens: Some(TokenFormat::F16),
     };
 
     #[test]
@@ -193,7 +193,7 @@ mod tests {
         let rows = [
             ("room, \"big\"", 3, CLIFT, measured),
             ("attic", 9, CLIFT, measured),
-            ("attic", 9, EvalKey::baseline(Variant::NearestView), ViewMetrics::quality(f64::INFINITY, None)),
+            ("attic", 9, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(f64::INFINITY, None)),
         ];
         let expected =
             "scene,target_frame,variant,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s,tokens

@@ -5,34 +5,34 @@
 
 use std::collections::BTreeMap;
 
-use clift_model::TokenStorage;
+use clift_model::TokenFormat;
 use serde::{Deserialize, Serialize};
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::statistics::eval_results::{EvalResults, SceneViews};
 use crate::statistics::scene_means::{capped, mean, standard_error};
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
 /// What the paper says is better than what (section 4.3): the better one first.
-const ORDERINGS: [[Variant; 2]; 5] = [
-    [Variant::Kmeans, Variant::Random],
-    [Variant::Clift, Variant::Kmeans],
-    [Variant::Kmeans, Variant::Patch],
-    [Variant::PatchClift, Variant::Patch],
-    [Variant::Clift, Variant::PatchClift],
+const ORDERINGS: [[Method; 2]; 5] = [
+    [Method::Kmeans, Method::Random],
+    [Method::Clift, Method::Kmeans],
+    [Method::Kmeans, Method::Patch],
+    [Method::PatchClift, Method::Patch],
+    [Method::Clift, Method::PatchClift],
 ];
 
 /// Mean difference of the PSNR of the same scenes in two variants, all stored tokens rendered.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PairedDifference {
     /// The variant that the paper finds better.
-    pub variant: Variant,
+    pub variant: Method,
     /// The one it is compared with.
-    pub against: Variant,
+    pub against: Method,
     /// Tokens in the scene file, of both.
     pub num_storage_tokens: usize,
     /// Number format of the stored tokens, of both; random subsets are never rounded.
-    pub tokens: Option<TokenStorage>,
+    pub tokens: Option<TokenFormat>,
     /// Scenes that were measured in both.
     pub num_scenes: usize,
     /// Mean over those scenes of `variant` less `against`, in dB: positive where the paper's order holds.
@@ -46,7 +46,7 @@ pub fn differences(results: &EvalResults) -> Vec<PairedDifference> {
     let mut differences = Vec::new();
     for [variant, against] in ORDERINGS {
         for (key, better) in results.views().filter(|(key, _)| key.variant == variant && key.is_whole()) {
-            let tokens = if against == Variant::Random { Some(TokenStorage::F32) } else { key.tokens };
+            let tokens = if against == Method::Random { Some(TokenFormat::F32) } else { key.tokens };
             let Some(other) = results.of(EvalKey { variant: against, tokens, ..key }) else { continue };
             let per_scene = scene_differences(better, other);
             differences.extend(mean(&per_scene).map(|psnr| PairedDifference {
@@ -77,8 +77,8 @@ fn scene_differences(better: &SceneViews, other: &SceneViews) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    fn key(variant: Variant, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
-        EvalKey { variant, num_storage_tokens, num_render_tokens, tokens: Some(TokenStorage::F32) }
+    fn key(variant: Method, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
+        EvalKey { variant, num_storage_tokens, num_render_tokens, tokens: Some(TokenFormat::F32) }
     }
 
     fn differences_of(rows: &[(&str, usize, EvalKey, f64)]) -> Vec<PairedDifference> {
@@ -91,7 +91,7 @@ mod tests {
 
     #[test]
     fn scenes_are_paired_and_views_averaged_within_them() {
-        let (better, worse) = (key(Variant::Kmeans, 8, 8), key(Variant::Random, 8, 8));
+        let (better, worse) = (key(Method::Kmeans, 8, 8), key(Method::Random, 8, 8));
         let differences = differences_of(&[
             ("attic", 1, better, 21.0),
             ("attic", 2, better, 24.0),
@@ -104,18 +104,18 @@ mod tests {
         ]);
         let [difference] = &differences[..] else { panic!("one ordering at one count") };
         // 2 dB in the attic, -1 dB in the cellar.
-        assert_eq!((difference.variant, difference.against), (Variant::Kmeans, Variant::Random));
+        assert_eq!((difference.variant, difference.against), (Method::Kmeans, Method::Random));
         assert_eq!((difference.num_scenes, difference.psnr, difference.psnr_stderr), (2, 0.5, Some(1.5)));
     }
 
     #[test]
     fn counts_are_compared_with_the_same_count_and_only_where_all_tokens_are_rendered() {
         let differences = differences_of(&[
-            ("attic", 1, key(Variant::Clift, 8, 8), 20.0),
-            ("attic", 1, key(Variant::Clift, 8, 4), 19.0),
-            ("attic", 1, key(Variant::Kmeans, 8, 4), 18.0),
-            ("attic", 1, key(Variant::Kmeans, 16, 16), 22.0),
-            ("attic", 1, key(Variant::Clift, 16, 16), f64::INFINITY),
+            ("attic", 1, key(Method::Clift, 8, 8), 20.0),
+            ("attic", 1, key(Method::Clift, 8, 4), 19.0),
+            ("attic", 1, key(Method::Kmeans, 8, 4), 18.0),
+            ("attic", 1, key(Method::Kmeans, 16, 16), 22.0),
+            ("attic", 1, key(Method::Clift, 16, 16), f64::INFINITY),
         ]);
         let [difference] = &differences[..] else { panic!("one ordering at one count") };
         assert_eq!((difference.num_storage_tokens, difference.psnr), (16, 100.0 - 22.0));

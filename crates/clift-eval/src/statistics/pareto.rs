@@ -2,7 +2,7 @@
 
 /// Indices of the points `(cost, quality)` on the front, by rising cost: no other point costs as little and is as good.
 /// Of equal points the first is taken; points that are not finite are none.
-pub fn front(points: &[(f64, f64)]) -> Vec<usize> {
+pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
     let is_finite = |&i: &usize| points[i].0.is_finite() && points[i].1.is_finite();
     let mut order: Vec<usize> = (0..points.len()).filter(is_finite).collect();
     order.sort_by(|&a, &b| points[a].0.total_cmp(&points[b].0).then(points[b].1.total_cmp(&points[a].1)));
@@ -30,12 +30,12 @@ mod tests {
         expected.sort_by(|a, b| a.0.total_cmp(&b.0));
         expected.dedup();
         assert!(expected.len() > 1, "{expected:?}");
-        assert_eq!(front(&points).into_iter().map(|i| points[i]).collect::<Vec<_>>(), expected);
+        assert_eq!(pareto_front(&points).into_iter().map(|i| points[i]).collect::<Vec<_>>(), expected);
     }
 
     #[test]
     fn equal_points_count_once_and_what_is_not_finite_never() {
-        assert_eq!(front(&[(1.0, 2.0), (1.0, 2.0), (f64::NAN, 9.0), (0.5, f64::NAN)]), [0]);
-        assert_eq!(front(&[]), [0; 0]);
+        assert_eq!(pareto_front(&[(1.0, 2.0), (1.0, 2.0), (f64::NAN, 9.0), (0.5, f64::NAN)]), [0]);
+        assert_eq!(pareto_front(&[]), [0; 0]);
     }
 }

@@ -48,19 +48,19 @@ pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError>
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenStorage;
+    use clift_model::TokenFormat;
 
     use super::*;
-    use crate::config::method::Variant;
+    use crate::config::method::Method;
     use crate::statistics::view_metrics::EvalKey;
 
     #[test]
     fn every_scene_has_its_own_means() {
         let key = EvalKey {
-            variant: Variant::Kmeans,
+            variant: Method::Kmeans,
             num_storage_tokens: 64,
             num_render_tokens: 32,
-            tokens: Some(TokenStorage::F32),
+            tokens: Some(TokenFormat::F32),
         };
         let mut views = EvalResults::default();
         for (scene, frame, psnr, lpips_vgg) in

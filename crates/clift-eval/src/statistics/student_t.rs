@@ -2,7 +2,7 @@
 
 /// Half-width of the central 95 % of the distribution, in its own units: 12.7 with one degree of freedom, 1.96 with
 /// many.
-pub(crate) fn quantile_95(degrees: usize) -> f64 {
+pub(crate) fn t_quantile_95(degrees: usize) -> f64 {
     let (mut low, mut high) = (0.0, 13.0);
     // Halvings of 13: far below what is printed.
     for _ in 0..60 {
@@ -51,7 +51,7 @@ mod tests {
             (131, 1.978_238_539),
             (6473, 1.960_330_539),
         ] {
-            let quantile = quantile_95(degrees);
+            let quantile = t_quantile_95(degrees);
             assert!((quantile - expected).abs() < 1e-6, "{degrees}: {quantile} is not {expected}");
         }
     }

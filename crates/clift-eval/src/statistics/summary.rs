@@ -7,15 +7,15 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use clift_data::{median, p95, replace_file};
-use clift_model::TokenStorage;
+use clift_model::TokenFormat;
 use serde::{Deserialize, Serialize};
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
 use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
-use crate::statistics::pareto::front;
+use crate::statistics::pareto::pareto_front;
 use crate::statistics::scene_means::{capped, mean, scene_means, standard_error};
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
@@ -41,15 +41,15 @@ pub struct Baselines {
 
 /// Means of one setting; `null` is what was not measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Point {
+pub struct SummaryPoint {
     /// How its views were made.
-    pub variant: Variant,
+    pub variant: Method,
     /// Tokens in the scene file.
     pub num_storage_tokens: usize,
     /// Tokens the renderer was given.
     pub num_render_tokens: usize,
     /// Number format of the stored tokens.
-    pub tokens: Option<TokenStorage>,
+    pub tokens: Option<TokenFormat>,
     /// Views measured in this setting; fewer than of the evaluation only where another system's pictures are missing.
     pub num_views: usize,
     /// Mean over scenes of the scene's mean PSNR, in dB.
@@ -96,7 +96,7 @@ pub struct Point {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Missing {
     /// The system.
-    pub variant: Variant,
+    pub variant: Method,
     /// How many target views it has no picture of.
     pub num_missing: usize,
     /// Each of them, inside its folder.
@@ -123,7 +123,7 @@ pub struct Summary {
     /// What the points must beat.
     pub baselines: Baselines,
     /// One per setting, ordered by variant and then by rising token counts.
-    pub points: Vec<Point>,
+    pub points: Vec<SummaryPoint>,
     /// What the paper finds better less what it finds worse, scene by scene.
     pub differences: Vec<PairedDifference>,
 }
@@ -139,14 +139,14 @@ impl Summary {
         let scenes: BTreeSet<&str> = views.iter().map(|(scene, _)| *scene).collect();
         let quality = |variant| results.of(EvalKey::baseline(variant)).map(Quality::new).unwrap_or_default();
         let missing = results.missing.iter().map(|(&system, pictures)| Missing {
-            variant: Variant::System(system),
+            variant: Method::System(system),
             num_missing: pictures.len(),
             pictures: pictures.iter().cloned().collect(),
         });
-        let mut points: Vec<Point> = results
+        let mut points: Vec<SummaryPoint> = results
             .views()
-            .filter(|(key, _)| !matches!(key.variant, Variant::NearestView | Variant::MeanImage))
-            .map(|(key, views)| Point::new(results, key, views))
+            .filter(|(key, _)| !matches!(key.variant, Method::NearestView | Method::MeanImage))
+            .map(|(key, views)| SummaryPoint::new(results, key, views))
             .collect();
         mark_fronts(&mut points);
         Self {
@@ -157,10 +157,7 @@ impl Summary {
             lpips_weights_sha256: results.lpips_sha256.clone(),
             not_measured: results.not_measured.clone(),
             missing: missing.collect(),
-            baselines: Baselines {
-                nearest_view: quality(Variant::NearestView),
-                mean_image: quality(Variant::MeanImage),
-            },
+            baselines: Baselines { nearest_view: quality(Method::NearestView), mean_image: quality(Method::MeanImage) },
             points,
             differences: differences(results),
         }
@@ -188,7 +185,7 @@ impl Quality {
     }
 }
 
-impl Point {
+impl SummaryPoint {
     fn new(results: &EvalResults, key: EvalKey, scenes: &SceneViews) -> Self {
         let Quality { psnr, ssim, lpips_vgg } = Quality::new(scenes);
         let views: Vec<&ViewMetrics> = scenes.values().flat_map(|frames| frames.values()).collect();
@@ -233,10 +230,10 @@ impl Point {
     }
 }
 
-fn mark_fronts(points: &mut [Point]) {
-    let of = |points: &[Point], cost: fn(&Point) -> Option<f64>| {
-        let place = |point: &Point| (cost(point).unwrap_or(f64::NAN), point.psnr.unwrap_or(f64::NAN));
-        front(&points.iter().map(place).collect::<Vec<_>>())
+fn mark_fronts(points: &mut [SummaryPoint]) {
+    let of = |points: &[SummaryPoint], cost: fn(&SummaryPoint) -> Option<f64>| {
+        let place = |point: &SummaryPoint| (cost(point).unwrap_or(f64::NAN), point.psnr.unwrap_or(f64::NAN));
+        pareto_front(&points.iter().map(place).collect::<Vec<_>>())
     };
     for i in of(points, |point| point.frame_median_s) {
         points[i].pareto_time = true;
@@ -251,10 +248,10 @@ mod tests {
     use super::*;
 
     const KEY: EvalKey = EvalKey {
-        variant: Variant::Clift,
+        variant: Method::Clift,
         num_storage_tokens: 64,
         num_render_tokens: 32,
-        tokens: Some(TokenStorage::F16),
+        tokens: Some(TokenFormat::F16),
     };
 
     fn results(views: &[(&str, usize, f64)]) -> EvalResults {
@@ -302,7 +299,7 @@ mod tests {
     #[test]
     fn what_was_not_measured_is_null_and_the_file_has_the_documented_names() {
         let mut views = results(&[("a", 0, 20.0)]);
-        views.add("a", 0, EvalKey::baseline(Variant::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
+        views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
         views.add_gflops(KEY, 2.5);
         views.add_scene_bytes(KEY, 99_000);
         views.set_warm(KEY, Some(1 << 20));

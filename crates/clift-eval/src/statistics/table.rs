@@ -2,9 +2,9 @@
 
 use std::fmt;
 
-use clift_model::TokenStorage;
+use clift_model::TokenFormat;
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Quality, Summary};
 
@@ -32,7 +32,7 @@ impl fmt::Display for Summary {
         let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
         writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes left out\n")?;
         let names = points.iter().map(|point| point.variant.name().chars().count());
-        let width = names.chain([Variant::NearestView.name().len()]).max().unwrap_or_default();
+        let width = names.chain([Method::NearestView.name().len()]).max().unwrap_or_default();
         let mut row = |name: &str, cells: [String; 12], mark: &str| {
             write!(f, "{name:<width$}")?;
             for (cell, width) in cells.iter().zip(WIDTHS) {
@@ -42,7 +42,7 @@ impl fmt::Display for Summary {
         };
         row("variant", HEADERS.map(str::to_owned), "")?;
         for (variant, Quality { psnr, ssim, lpips_vgg }) in
-            [(Variant::NearestView, baselines.nearest_view), (Variant::MeanImage, baselines.mean_image)]
+            [(Method::NearestView, baselines.nearest_view), (Method::MeanImage, baselines.mean_image)]
         {
             let mut cells = std::array::from_fn(|_| cell(None, 0));
             (cells[3], cells[5], cells[6]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3));
@@ -54,7 +54,7 @@ impl fmt::Display for Summary {
             let cells = [
                 count(point.num_storage_tokens),
                 count(point.num_render_tokens),
-                point.tokens.map_or("-", TokenStorage::name).to_owned(),
+                point.tokens.map_or("-", TokenFormat::name).to_owned(),
                 cell(point.psnr, 2),
                 cell(point.psnr_stderr, 2),
                 cell(point.ssim, 3),
@@ -83,7 +83,7 @@ impl fmt::Display for Summary {
             writeln!(f, "\nPSNR of the same scenes, difference and standard error")?;
         }
         for PairedDifference { variant, against, num_storage_tokens, tokens, psnr, psnr_stderr, .. } in differences {
-            let (error, format) = (cell(*psnr_stderr, 2), tokens.map_or("", TokenStorage::name));
+            let (error, format) = (cell(*psnr_stderr, 2), tokens.map_or("", TokenFormat::name));
             let names = format!("{} - {}", variant.name(), against.name());
             writeln!(f, "{names:<24} {num_storage_tokens:>6} tokens {format:<4} {psnr:>+7.2} +- {error} dB")?;
         }
@@ -109,9 +109,9 @@ fn cell(value: Option<f64>, decimals: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenStorage;
+    use clift_model::TokenFormat;
 
-    use crate::config::method::{SystemName, Variant};
+    use crate::config::method::{Method, MethodName};
     use crate::statistics::eval_results::EvalResults;
     use crate::statistics::summary::Summary;
     use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
@@ -120,10 +120,10 @@ mod tests {
     fn the_table_lines_up() {
         let mut views = EvalResults::default();
         let key = EvalKey {
-            variant: Variant::Clift,
+            variant: Method::Clift,
             num_storage_tokens: 64,
             num_render_tokens: 32,
-            tokens: Some(TokenStorage::Int8),
+            tokens: Some(TokenFormat::Int8),
         };
         for (scene, psnr, ms) in [("a", 20.0, 1.0), ("b", 21.0, 2.0)] {
             let measured = ViewMetrics {
@@ -133,11 +133,11 @@ mod tests {
             };
             views.add(scene, 0, key, measured).unwrap();
         }
-        let system = SystemName::new("DepthSplat").unwrap();
-        let other = EvalKey::baseline(Variant::System(system));
+        let system = MethodName::new("DepthSplat").unwrap();
+        let other = EvalKey::baseline(Method::System(system));
         views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) }).unwrap();
         views.miss(system, "b/000000.png".into());
-        views.add("a", 0, EvalKey::baseline(Variant::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
+        views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
         views.add_gflops(key, 45.23);
         views.add_scene_bytes(key, 99_000);
         views.note_not_measured("lpips_vgg", "no weights".into());

@@ -2,33 +2,33 @@
 
 use std::collections::BTreeSet;
 
-use clift_model::TokenStorage;
+use clift_model::TokenFormat;
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 
 /// What views are averaged over: method, token counts and number format. The order is that of the files: variant,
 /// then fewer tokens.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct EvalKey {
     /// How the views were made.
-    pub variant: Variant,
+    pub variant: Method,
     /// Tokens in the scene file; 0 for a baseline.
     pub num_storage_tokens: usize,
     /// Tokens the renderer was given; 0 for a baseline.
     pub num_render_tokens: usize,
     /// Number format of the stored tokens; none where there are none.
-    pub tokens: Option<TokenStorage>,
+    pub tokens: Option<TokenFormat>,
 }
 
 impl EvalKey {
     /// Returns the key of a baseline or of another system, which has no tokens.
-    pub const fn baseline(variant: Variant) -> Self {
+    pub const fn baseline(variant: Method) -> Self {
         Self { variant, num_storage_tokens: 0, num_render_tokens: 0, tokens: None }
     }
 
     /// Returns the name of the number format, empty where there is none.
     pub fn format_name(self) -> &'static str {
-        self.tokens.map_or("", TokenStorage::name)
+        self.tokens.map_or("", TokenFormat::name)
     }
 
     /// Returns whether views are rendered from all stored tokens.
@@ -38,9 +38,9 @@ impl EvalKey {
 }
 
 /// Returns the variant that stands for the method: the condensed one where there is a condenser.
-pub(crate) fn best_variant(keys: impl IntoIterator<Item = EvalKey>) -> Option<Variant> {
-    let there: BTreeSet<Variant> = keys.into_iter().map(|key| key.variant).collect();
-    [Variant::Clift, Variant::PatchClift, Variant::Kmeans, Variant::Random]
+pub(crate) fn best_variant(keys: impl IntoIterator<Item = EvalKey>) -> Option<Method> {
+    let there: BTreeSet<Method> = keys.into_iter().map(|key| key.variant).collect();
+    [Method::Clift, Method::PatchClift, Method::Kmeans, Method::Random]
         .into_iter()
         .find(|variant| there.contains(variant))
 }
@@ -89,9 +89,9 @@ mod tests {
 
     #[test]
     fn the_condensed_variant_stands_for_the_method_where_it_is_there() {
-        let keys = [Variant::NearestView, Variant::Random, Variant::Kmeans].map(EvalKey::baseline);
-        assert_eq!(best_variant(keys), Some(Variant::Kmeans));
-        assert_eq!(best_variant(keys.into_iter().chain([EvalKey::baseline(Variant::Clift)])), Some(Variant::Clift));
-        assert_eq!(best_variant([EvalKey::baseline(Variant::MeanImage)]), None);
+        let keys = [Method::NearestView, Method::Random, Method::Kmeans].map(EvalKey::baseline);
+        assert_eq!(best_variant(keys), Some(Method::Kmeans));
+        assert_eq!(best_variant(keys.into_iter().chain([EvalKey::baseline(Method::Clift)])), Some(Method::Clift));
+        assert_eq!(best_variant([EvalKey::baseline(Method::MeanImage)]), None);
     }
 }

@@ -1,6 +1,6 @@
 //! What a method must beat: the nearest context view, and the mean of all of them.
 
-use clift_data::{DVec3, Pose, Views};
+use clift_data::{ClipViews, DVec3, Pose};
 
 use crate::error::EvalError;
 
@@ -30,7 +30,7 @@ pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, Eva
 ///
 /// # Errors
 /// [`EvalError::NoContext`] without context views.
-pub fn nearest_image(context: &Views, target_c2w: Pose) -> Result<Vec<f32>, EvalError> {
+pub fn nearest_image(context: &ClipViews, target_c2w: Pose) -> Result<Vec<f32>, EvalError> {
     let nearest = nearest_view(&context.c2w, target_c2w)?;
     let size = context.height * context.width * 3;
     Ok(context.images[nearest * size..][..size].iter().map(|&value| f32::from(value) / 255.0).collect())
@@ -40,7 +40,7 @@ pub fn nearest_image(context: &Views, target_c2w: Pose) -> Result<Vec<f32>, Eval
 ///
 /// # Errors
 /// [`EvalError::NoContext`] without context views.
-pub fn mean_image(context: &Views) -> Result<Vec<f32>, EvalError> {
+pub fn mean_image(context: &ClipViews) -> Result<Vec<f32>, EvalError> {
     if context.num_views() == 0 {
         return Err(EvalError::NoContext);
     }
@@ -71,9 +71,9 @@ mod tests {
         Pose { rotation: DMat3::from_rotation_y(yaw_deg.to_radians()), translation: x * DVec3::X }
     }
 
-    fn views(poses: &[Pose], images: Vec<u8>) -> Views {
+    fn views(poses: &[Pose], images: Vec<u8>) -> ClipViews {
         let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
-        Views {
+        ClipViews {
             width: 1,
             height: 1,
             images,

@@ -3,10 +3,10 @@
 
 use burn::tensor::{Int, Tensor, TensorData};
 use clift_data::item_rng;
-use clift_model::{SceneModel, TokenStorage, TrainedModel};
+use clift_model::{SceneModel, TokenFormat, TrainedModel};
 use rand::seq::SliceRandom;
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
@@ -24,22 +24,22 @@ pub(crate) struct CompressedTokens<'a> {
 impl<'a> CompressedTokens<'a> {
     /// Makes a variant's tokens, rounded as a scene file would round them; random subsets have no file.
     pub fn new(
-        variant: Variant,
+        variant: Method,
         models: &'a EvalModels,
         lift: &Tensor<3>,
         index: &LazyClusters,
-        storage: TokenStorage,
+        storage: TokenFormat,
     ) -> Result<Self, EvalError> {
         let model = models.for_method(variant).ok_or(EvalError::NoModel { variant: variant.name() })?;
-        if variant == Variant::Random {
+        if variant == Method::Random {
             let ids = random_subset(lift.dims()[1], index.num_clusters, index.seed);
             return Ok(Self { tokens: select_tokens(lift, &ids), ids, model });
         }
-        let is_tiled = matches!(variant, Variant::Patch | Variant::PatchClift);
+        let is_tiled = matches!(variant, Method::Patch | Method::PatchClift);
         let clusters = if is_tiled { index.tiles()? } else { index.clusters()? };
         let uploaded = clusters.upload(&model.device);
         let tokens = match variant {
-            Variant::Clift | Variant::PatchClift => model.network.compress(lift.clone(), &uploaded),
+            Method::Clift | Method::PatchClift => model.network.compress(lift.clone(), &uploaded),
             _ => uploaded.gather_centroids(lift.clone()),
         };
         let ids = clusters.scenes()[0].centroid_index().to_vec();
@@ -64,8 +64,8 @@ fn random_subset(num_tokens: usize, count: usize, seed: u64) -> Vec<u32> {
 }
 
 /// Tokens `[1, S, D]` as they would come back from a scene file.
-fn rounded(tokens: Tensor<3>, storage: TokenStorage) -> Result<Tensor<3>, EvalError> {
-    if storage == TokenStorage::F32 {
+fn rounded(tokens: Tensor<3>, storage: TokenFormat) -> Result<Tensor<3>, EvalError> {
+    if storage == TokenFormat::F32 {
         return Ok(tokens);
     }
     let (shape, device) = (tokens.dims(), tokens.device());

@@ -2,7 +2,7 @@
 
 use clift_model::{Grouping, TrainedModel};
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 
 /// The models of both stages. They have one encoder.
 #[derive(Clone, Debug)]
@@ -31,28 +31,28 @@ impl EvalModels {
     }
 
     /// Returns the model that renders a method; `None` without one and for baselines.
-    pub fn for_method(&self, method: Variant) -> Option<&TrainedModel> {
+    pub fn for_method(&self, method: Method) -> Option<&TrainedModel> {
         match method {
-            Variant::Random | Variant::Patch | Variant::Kmeans => Some(&self.stage1),
-            Variant::Clift => self.stage2.as_ref(),
-            Variant::PatchClift => self.stage2_tiles.as_ref(),
-            Variant::NearestView | Variant::MeanImage | Variant::System(_) => None,
+            Method::Random | Method::Patch | Method::Kmeans => Some(&self.stage1),
+            Method::Clift => self.stage2.as_ref(),
+            Method::PatchClift => self.stage2_tiles.as_ref(),
+            Method::NearestView | Method::MeanImage | Method::System(_) => None,
         }
     }
 
     /// Returns the methods of an evaluation that names none: all with a model, and tiles without condenser only beside
     /// tiles with one.
-    pub fn methods(&self) -> Vec<Variant> {
-        let all = [Variant::Random, Variant::Patch, Variant::PatchClift, Variant::Kmeans, Variant::Clift];
-        let is_wanted = |method: &Variant| *method != Variant::Patch || self.stage2_tiles.is_some();
+    pub fn methods(&self) -> Vec<Method> {
+        let all = [Method::Random, Method::Patch, Method::PatchClift, Method::Kmeans, Method::Clift];
+        let is_wanted = |method: &Method| *method != Method::Patch || self.stage2_tiles.is_some();
         all.into_iter().filter(|method| self.for_method(*method).is_some()).filter(is_wanted).collect()
     }
 }
 
 /// Returns the method that stage 2 is trained for, on such groups of tokens.
-pub const fn stage2_method(grouping: Grouping) -> Variant {
+pub const fn stage2_method(grouping: Grouping) -> Method {
     match grouping {
-        Grouping::Kmeans => Variant::Clift,
-        Grouping::Tile => Variant::PatchClift,
+        Grouping::Kmeans => Method::Clift,
+        Grouping::Tile => Method::PatchClift,
     }
 }

@@ -4,9 +4,9 @@ use std::time::Instant;
 
 use burn::tensor::Tensor;
 use clift_data::{Clip, derive_seed};
-use clift_model::{Cameras, Convention, SceneModel, scene_file_bytes};
+use clift_model::{Cameras, FlopConvention, SceneModel, scene_file_bytes};
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::EvalKey;
@@ -38,7 +38,7 @@ pub fn evaluate_scene(
     let (stage1, device) = (&models.stage1.network, &models.stage1.device);
     let features = stage1.features(&upload_views(&[&clip.context], device)?);
     // Where stage 2 has trained a norm of the tokens, condensed ones are of that norm, and of its clusters.
-    let normed: Vec<(Variant, Tensor<3>)> = [Variant::Clift, Variant::PatchClift]
+    let normed: Vec<(Method, Tensor<3>)> = [Method::Clift, Method::PatchClift]
         .into_iter()
         .filter_map(|variant| Some((variant, &models.for_method(variant)?.network)))
         .filter(|(_, network)| network.has_token_norm())
@@ -91,7 +91,7 @@ pub fn evaluate_scene(
                 let bytes = scene_file_bytes(num_storage_tokens, dim, clip.context.num_views(), tokens);
                 for rendering in renderings {
                     record(clip, &rendering, into)?;
-                    if variant != Variant::Random {
+                    if variant != Method::Random {
                         into.add_scene_bytes(rendering.setting, bytes);
                     }
                     if !rows.is_empty() {
@@ -101,7 +101,7 @@ pub fn evaluate_scene(
             }
         }
         if is_shown {
-            let own = own.iter().find(|(of, ..)| *of == Variant::Clift);
+            let own = own.iter().find(|(of, ..)| *of == Method::Clift);
             let index = own.map_or(&index, |(.., index)| index);
             material.clusters.push(index.scene_clusters()?.clone());
         }
@@ -170,7 +170,7 @@ impl Drawing<'_> {
             draw(0)?;
             into.set_warm(setting, if has_peak { memory::peak_bytes() } else { None });
             let macs = self.sweep.model.render_macs(target.height, target.width, setting.num_render_tokens)?;
-            into.add_gflops(setting, macs.count(Convention::Macs) as f64 / 1e9);
+            into.add_gflops(setting, macs.count(FlopConvention::Macs) as f64 / 1e9);
         }
         let mut rendered = ScoredViews::new(setting);
         for view in 0..target.num_views() {

@@ -3,7 +3,7 @@
 use std::cell::OnceCell;
 
 use burn::tensor::Tensor;
-use clift_model::{Clusters, Fit, KMeans, SceneClusters, tile_clusters};
+use clift_model::{Clusters, KMeans, KMeansFit, SceneClusters, tile_clusters};
 
 use crate::error::EvalError;
 
@@ -16,7 +16,7 @@ pub(crate) struct LazyClusters<'a> {
     pub seed: u64,
     /// Context views, and rows and columns of tokens of each.
     pub views: (usize, [usize; 2]),
-    fit: OnceCell<Fit>,
+    fit: OnceCell<KMeansFit>,
     tiles: OnceCell<Clusters>,
 }
 
@@ -45,7 +45,7 @@ impl<'a> LazyClusters<'a> {
         Ok(&self.fit()?.clusters)
     }
 
-    fn fit(&self) -> Result<&Fit, EvalError> {
+    fn fit(&self) -> Result<&KMeansFit, EvalError> {
         if let Some(fit) = self.fit.get() {
             return Ok(fit);
         }

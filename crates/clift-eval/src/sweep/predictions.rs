@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use clift_data::Clip;
 use image::{DynamicImage, ImageReader, Limits};
 
-use crate::config::method::{SystemName, Variant};
+use crate::config::method::{Method, MethodName};
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
@@ -17,9 +17,9 @@ use crate::sweep::view_scorer::ViewScorer;
 
 /// Another system with its pictures.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct System {
+pub struct ExternalMethod {
     /// What it is called in tables and plots.
-    pub name: SystemName,
+    pub name: MethodName,
     /// Folder of its pictures.
     pub folder: PathBuf,
     /// Bytes it keeps of a scene, to stand beside scene files.
@@ -27,7 +27,7 @@ pub struct System {
 }
 
 /// The views of a scene as another system drew them.
-pub(crate) struct Scored {
+pub(crate) struct ScoredPredictions {
     pub setting: EvalKey,
     /// By view; those that are there.
     pub measured: BTreeMap<usize, ViewMetrics>,
@@ -35,10 +35,10 @@ pub(crate) struct Scored {
     pub shown: BTreeMap<usize, Vec<f32>>,
 }
 
-impl System {
+impl ExternalMethod {
     /// How its views are made.
     pub const fn setting(&self) -> EvalKey {
-        EvalKey::baseline(Variant::System(self.name))
+        EvalKey::baseline(Method::System(self.name))
     }
 
     /// Measures the pictures of a scene's targets; those that are missing are noted.
@@ -48,9 +48,9 @@ impl System {
         scorer: &ViewScorer,
         rows: &[usize],
         into: &mut EvalResults,
-    ) -> Result<Scored, EvalError> {
+    ) -> Result<ScoredPredictions, EvalError> {
         let setting = self.setting();
-        let mut scored = Scored { setting, measured: BTreeMap::new(), shown: BTreeMap::new() };
+        let mut scored = ScoredPredictions { setting, measured: BTreeMap::new(), shown: BTreeMap::new() };
         for (view, &frame) in clip.target.frame_index.iter().enumerate() {
             let name = picture_name(&clip.key, frame);
             let Some(path) = self.find(&clip.key, frame) else {
@@ -114,14 +114,14 @@ fn read_picture(path: &Path, height: usize, width: usize) -> Result<Vec<f32>, Ev
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{Intrinsics, Pose, Views};
+    use clift_data::{ClipViews, Intrinsics, Pose};
 
     use super::*;
-    use crate::figures::canvas::Picture;
+    use crate::figures::canvas::Canvas;
 
     fn clip() -> Clip {
         let intrinsics = Intrinsics { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0 };
-        let views = |frame_index: Vec<usize>| Views {
+        let views = |frame_index: Vec<usize>| ClipViews {
             width: 24,
             height: 16,
             images: vec![100; frame_index.len() * 24 * 16 * 3],
@@ -132,14 +132,14 @@ mod tests {
         Clip { key: "a/room".into(), context: views(vec![0]), target: views(vec![3, 12, 40]) }
     }
 
-    fn system(folder: &Path) -> System {
-        System { name: SystemName::new("MVSplat").unwrap(), folder: folder.into(), data_bytes: Some(5000) }
+    fn system(folder: &Path) -> ExternalMethod {
+        ExternalMethod { name: MethodName::new("MVSplat").unwrap(), folder: folder.into(), data_bytes: Some(5000) }
     }
 
     fn write(folder: &Path, name: &str, level: u8, (width, height): (usize, usize)) {
         let path = folder.join(name);
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-        Picture::new(width, height, [level; 3]).write_png(&path).unwrap();
+        Canvas::new(width, height, [level; 3]).write_png(&path).unwrap();
     }
 
     #[test]
@@ -155,7 +155,7 @@ mod tests {
         // 51 of 255 levels: a fifth.
         assert!((scored.measured[&2].psnr - -20.0 * 0.2_f64.log10()).abs() < 1e-5);
         assert_eq!(scored.shown.keys().copied().collect::<Vec<_>>(), [2]);
-        let missing = &into.missing[&SystemName::new("MVSplat").unwrap()];
+        let missing = &into.missing[&MethodName::new("MVSplat").unwrap()];
         assert_eq!(missing.iter().collect::<Vec<_>>(), ["a_room/000012.png"]);
     }
 

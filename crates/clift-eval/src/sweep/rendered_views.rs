@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use clift_data::Clip;
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 use crate::sweep::baselines::{mean_image, nearest_image};
@@ -39,8 +39,8 @@ impl ScoredViews {
 /// What every method must beat, measured.
 pub(crate) fn baselines(clip: &Clip, scorer: &ViewScorer, rows: &[usize]) -> Result<Vec<ScoredViews>, EvalError> {
     let mean = mean_image(&clip.context)?;
-    let mut nearest = ScoredViews::new(EvalKey::baseline(Variant::NearestView));
-    let mut means = ScoredViews::new(EvalKey::baseline(Variant::MeanImage));
+    let mut nearest = ScoredViews::new(EvalKey::baseline(Method::NearestView));
+    let mut means = ScoredViews::new(EvalKey::baseline(Method::MeanImage));
     for &pose in &clip.target.c2w {
         nearest.add(nearest_image(&clip.context, pose)?, scorer, rows)?;
         means.add(mean.clone(), scorer, rows)?;

@@ -3,7 +3,7 @@
 use clift_model::SceneClusters;
 
 use crate::statistics::view_metrics::EvalKey;
-use crate::sweep::predictions::Scored;
+use crate::sweep::predictions::ScoredPredictions;
 use crate::sweep::rendered_views::ScoredViews;
 use crate::sweep::token_choice::SelectedTokens;
 
@@ -19,7 +19,7 @@ pub struct SceneResults {
     /// The patches of the stored tokens, and the tokens selected for every target.
     pub(crate) choices: Vec<(EvalKey, Vec<u32>, Vec<SelectedTokens>)>,
     /// The images of other systems.
-    pub(crate) others: Vec<Scored>,
+    pub(crate) others: Vec<ScoredPredictions>,
     /// The views whose images are kept; at least one.
     pub(crate) rows: Vec<usize>,
 }

@@ -1,11 +1,11 @@
 //! Settings of an evaluation of a scene.
 
-use clift_model::{KMeans, ModelConfig, TokenCount, TokenStorage};
+use clift_model::{KMeans, ModelConfig, TokenCount, TokenFormat};
 
-use crate::config::method::Variant;
+use crate::config::method::Method;
 use crate::config::token_selection::Selection;
 use crate::metrics::lpips::Lpips;
-use crate::sweep::predictions::System;
+use crate::sweep::predictions::ExternalMethod;
 
 /// Settings of a sweep.
 #[derive(Clone, Debug)]
@@ -18,9 +18,9 @@ pub struct Sweep {
     pub selection: Selection,
     /// Number formats that stored tokens are rounded to, as in a scene file, one after the other. Random subsets have
     /// no file and are not rounded. Pictures are shown of the first.
-    pub tokens: Vec<TokenStorage>,
+    pub tokens: Vec<TokenFormat>,
     /// Which variants are rendered: those of [`EvalModels::methods`](crate::sweep::eval_models::EvalModels::methods), or fewer.
-    pub variants: Vec<Variant>,
+    pub variants: Vec<Method>,
     /// Latent K-means.
     pub kmeans: KMeans,
     /// Sizes of the networks.
@@ -28,7 +28,7 @@ pub struct Sweep {
     /// LPIPS, where its weights are there.
     pub lpips: Option<Lpips>,
     /// Other systems' pictures.
-    pub systems: Vec<System>,
+    pub systems: Vec<ExternalMethod>,
     /// Whether tensors live in this process's memory, so that its peak says something.
     pub is_cpu: bool,
     /// Seed of K-means and of what is random; each scene derives its own from it and its key.
@@ -52,14 +52,14 @@ impl Sweep {
         counts
     }
 
-    pub(crate) fn formats(&self, variant: Variant) -> &[TokenStorage] {
-        if variant == Variant::Random { &[TokenStorage::F32] } else { &self.tokens }
+    pub(crate) fn formats(&self, variant: Method) -> &[TokenFormat] {
+        if variant == Method::Random { &[TokenFormat::F32] } else { &self.tokens }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use clift_model::Preset;
+    use clift_model::SelectionPreset;
 
     use super::*;
 
@@ -74,8 +74,8 @@ mod tests {
                 TokenCount::Share(1.0),
                 TokenCount::Count(4),
             ],
-            selection: Selection::Preset(Preset::Paper),
-            tokens: vec![TokenStorage::F32],
+            selection: Selection::Preset(SelectionPreset::Paper),
+            tokens: vec![TokenFormat::F32],
             variants: Vec::new(),
             kmeans: KMeans::default(),
             model: ModelConfig::default(),

@@ -65,13 +65,13 @@ fn random_tokens(num_tokens: usize, count: usize, seed: u64, view: usize) -> Vec
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{Intrinsics, Pose, Views};
+    use clift_data::{ClipViews, Intrinsics, Pose};
 
     use super::*;
 
     /// Views of 16 x 16 pixels, side by side.
-    fn views(places: &[f64], frame_index: &[usize]) -> Views {
-        Views {
+    fn views(places: &[f64], frame_index: &[usize]) -> ClipViews {
+        ClipViews {
             width: 16,
             height: 16,
             images: vec![0; places.len() * 16 * 16 * 3],

@@ -3,7 +3,7 @@
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 
-use clift_data::Views as HostViews;
+use clift_data::ClipViews;
 
 use crate::error::EvalError;
 use crate::metrics::image_metrics::{SSIM_MIN_SIZE_PX, psnr, ssim};
@@ -16,13 +16,13 @@ const KEPT_BYTES: usize = 1 << 30;
 
 /// Compares renderings of a scene with its target views.
 pub(crate) struct ViewScorer<'a> {
-    target: &'a HostViews,
+    target: &'a ClipViews,
     lpips: Option<&'a Lpips>,
     kept: RefCell<(usize, BTreeMap<usize, LpipsFeatures>)>,
 }
 
 impl<'a> ViewScorer<'a> {
-    pub fn new(target: &'a HostViews, lpips: Option<&'a Lpips>) -> Self {
+    pub fn new(target: &'a ClipViews, lpips: Option<&'a Lpips>) -> Self {
         let lpips = lpips.filter(|_| target.height.min(target.width) >= LPIPS_MIN_SIZE_PX);
         Self { target, lpips, kept: RefCell::default() }
     }
@@ -58,7 +58,7 @@ impl<'a> ViewScorer<'a> {
 }
 
 /// Ground truth of one target in `[0, 1]`.
-pub(crate) fn target_image(target: &HostViews, view: usize) -> Vec<f32> {
+pub(crate) fn target_image(target: &ClipViews, view: usize) -> Vec<f32> {
     let len = target.height * target.width * 3;
     target.images[view * len..(view + 1) * len].iter().map(|&value| f32::from(value) / 255.0).collect()
 }

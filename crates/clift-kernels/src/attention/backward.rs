@@ -4,10 +4,12 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::attention::shapes::{Gradients, Heads, QUERY_BLOCK, ROW_PADDING, Rows, Sizes, copy_padded, copy_transposed};
+use crate::attention::shapes::{
+    Gradients, HeadBlocks, QUERY_BLOCK, ROW_PADDING, Sizes, StridedRows, copy_padded, copy_transposed,
+};
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
 use crate::primitives::scratch::{Scratch, cut};
-use crate::primitives::shared_slice::Disjoint;
+use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
@@ -16,41 +18,41 @@ const BACKWARD_KEYS: usize = 256;
 
 /// What [`backward`] reads: the inputs and the results of [`forward`](crate::attention::forward::forward), and the output's gradient.
 #[derive(Clone, Copy, Debug)]
-pub struct Saved<'a> {
+pub struct BackwardInputs<'a> {
     /// Queries.
-    pub query: Rows<'a>,
+    pub query: StridedRows<'a>,
     /// Keys.
-    pub key: Rows<'a>,
+    pub key: StridedRows<'a>,
     /// Values.
-    pub value: Rows<'a>,
+    pub value: StridedRows<'a>,
     /// Output of the forward pass.
-    pub output: Rows<'a>,
+    pub output: StridedRows<'a>,
     /// Row sums of the forward pass, `[batch, num_heads, num_queries]`.
     pub log_sum: &'a [f32],
     /// Gradient of the output.
-    pub grad_output: Rows<'a>,
+    pub grad_output: StridedRows<'a>,
 }
 
 /// Computes the gradients of queries, keys and values.
 ///
 /// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`, `dQ = s dS K`,
 /// `dK = s dS^T Q`; the scores are computed again, a block at a time.
-pub fn backward(set: InstructionSet, sizes: Sizes, saved: Saved<'_>, to: Gradients<'_>) {
+pub fn backward(set: InstructionSet, sizes: Sizes, saved: BackwardInputs<'_>, to: Gradients<'_>) {
     let Sizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
     let dim = sizes.dim();
     assert_eq!(saved.log_sum.len(), batch * num_heads * num_queries, "a sum for every row of scores");
     match to {
         Gradients::Packed(packed) => {
             assert!(packed.len() == batch * num_queries * 3 * dim && num_keys == num_queries);
-            let packed = Disjoint::new(packed);
-            let part = |part| Heads { values: &packed, count: num_queries, width: 3 * dim, first: part * dim };
+            let packed = SharedSlice::new(packed);
+            let part = |part| HeadBlocks { values: &packed, count: num_queries, width: 3 * dim, first: part * dim };
             backward_into(set, sizes, saved, [part(0), part(1), part(2)]);
         }
         Gradients::Separate { query, key_value } => {
             assert!(query.len() == batch * num_queries * dim && key_value.len() == batch * num_keys * 2 * dim);
-            let (query, key_value) = (Disjoint::new(query), Disjoint::new(key_value));
-            let part = |part| Heads { values: &key_value, count: num_keys, width: 2 * dim, first: part * dim };
-            let query = Heads { values: &query, count: num_queries, width: dim, first: 0 };
+            let (query, key_value) = (SharedSlice::new(query), SharedSlice::new(key_value));
+            let part = |part| HeadBlocks { values: &key_value, count: num_keys, width: 2 * dim, first: part * dim };
+            let query = HeadBlocks { values: &query, count: num_queries, width: dim, first: 0 };
             backward_into(set, sizes, saved, [query, part(0), part(1)]);
         }
     }
@@ -60,8 +62,8 @@ pub fn backward(set: InstructionSet, sizes: Sizes, saved: Saved<'_>, to: Gradien
 fn backward_into(
     set: InstructionSet,
     sizes: Sizes,
-    saved: Saved<'_>,
-    [grad_query, grad_key, grad_value]: [Heads<'_>; 3],
+    saved: BackwardInputs<'_>,
+    [grad_query, grad_key, grad_value]: [HeadBlocks<'_>; 3],
 ) {
     let Sizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
     let blocks = num_keys.div_ceil(BACKWARD_KEYS);
@@ -98,9 +100,9 @@ fn backward_into(
 
 struct BackwardTask<'a> {
     sizes: Sizes,
-    saved: Saved<'a>,
-    grad_key: Heads<'a>,
-    grad_value: Heads<'a>,
+    saved: BackwardInputs<'a>,
+    grad_key: HeadBlocks<'a>,
+    grad_value: HeadBlocks<'a>,
     scene: usize,
     head: usize,
     keys: Range<usize>,
@@ -130,7 +132,7 @@ impl<'a> Kernel for BackwardTask<'a> {
             QUERY_BLOCK * score_row,
         ];
         let mut grad_query = vec![0.0; num_queries * width];
-        let head_of = |rows: &Rows<'a>, row: usize| rows.head(&sizes, scene, row, head);
+        let head_of = |rows: &StridedRows<'a>, row: usize| rows.head(&sizes, scene, row, head);
         let mut scratch = Scratch::take(lens.iter().sum());
         let [queries, grads, delta, keys_t, values_t, key_rows, key_sums, value_sums, weights, slopes] =
             cut(&mut scratch, lens);

@@ -4,10 +4,12 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::attention::shapes::{Heads, QUERY_BLOCK, ROW_PADDING, Rows, Sizes, copy_padded, copy_transposed};
+use crate::attention::shapes::{
+    HeadBlocks, QUERY_BLOCK, ROW_PADDING, Sizes, StridedRows, copy_padded, copy_transposed,
+};
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
 use crate::primitives::scratch::{Scratch, cut};
-use crate::primitives::shared_slice::Disjoint;
+use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
@@ -21,7 +23,7 @@ const FORWARD_KEYS: usize = 512;
 pub fn forward(
     set: InstructionSet,
     sizes: Sizes,
-    [query, key, value]: [Rows<'_>; 3],
+    [query, key, value]: [StridedRows<'_>; 3],
     output: &mut [f32],
     log_sum: Option<&mut [f32]>,
 ) {
@@ -32,9 +34,9 @@ pub fn forward(
     }
     let blocks = sizes.num_queries.div_ceil(QUERY_BLOCK);
     let parts = sizes.parts(blocks);
-    let output = Disjoint::new(output);
-    let output = Heads { values: &output, count: sizes.num_queries, width: sizes.dim(), first: 0 };
-    let log_sum = log_sum.map(Disjoint::new);
+    let output = SharedSlice::new(output);
+    let output = HeadBlocks { values: &output, count: sizes.num_queries, width: sizes.dim(), first: 0 };
+    let log_sum = log_sum.map(SharedSlice::new);
     (0..sizes.batch * sizes.num_heads * parts).into_par_iter().for_each(|task| {
         let (head, part) = (task / parts, task % parts);
         let bound = |part: usize| (part * blocks / parts * QUERY_BLOCK).min(sizes.num_queries);
@@ -54,11 +56,11 @@ pub fn forward(
 
 struct Forward<'a> {
     sizes: Sizes,
-    query: Rows<'a>,
-    key: Rows<'a>,
-    value: Rows<'a>,
-    output: Heads<'a>,
-    log_sum: Option<&'a Disjoint<'a>>,
+    query: StridedRows<'a>,
+    key: StridedRows<'a>,
+    value: StridedRows<'a>,
+    output: HeadBlocks<'a>,
+    log_sum: Option<&'a SharedSlice<'a>>,
     scene: usize,
     head: usize,
     queries: Range<usize>,

@@ -8,7 +8,7 @@
 #[cfg(test)]
 mod tests;
 
-use crate::primitives::shared_slice::Disjoint;
+use crate::primitives::shared_slice::SharedSlice;
 
 /// Sizes of one attention.
 #[derive(Clone, Copy, Debug)]
@@ -43,7 +43,7 @@ impl Sizes {
 
 /// Rows of tokens inside a slice that may hold more: `[batch, count, dim]` with strides.
 #[derive(Clone, Copy, Debug)]
-pub struct Rows<'a> {
+pub struct StridedRows<'a> {
     /// From the first value on.
     pub values: &'a [f32],
     /// Distance of two scenes.
@@ -52,7 +52,7 @@ pub struct Rows<'a> {
     pub row_stride: usize,
 }
 
-impl<'a> Rows<'a> {
+impl<'a> StridedRows<'a> {
     /// One head of one row.
     pub(crate) fn head(&self, sizes: &Sizes, scene: usize, row: usize, head: usize) -> &'a [f32] {
         let start = scene * self.batch_stride + row * self.row_stride + head * sizes.head_width;
@@ -76,8 +76,8 @@ pub enum Gradients<'a> {
 
 /// Heads of contiguous rows that several threads write, each its own.
 #[derive(Clone, Copy)]
-pub(crate) struct Heads<'a> {
-    pub(crate) values: &'a Disjoint<'a>,
+pub(crate) struct HeadBlocks<'a> {
+    pub(crate) values: &'a SharedSlice<'a>,
     /// Rows of a scene.
     pub(crate) count: usize,
     /// Values of a row, and where in it the first head starts.
@@ -85,7 +85,7 @@ pub(crate) struct Heads<'a> {
     pub(crate) first: usize,
 }
 
-impl Heads<'_> {
+impl HeadBlocks<'_> {
     /// Writes one head of one row.
     ///
     /// # Safety

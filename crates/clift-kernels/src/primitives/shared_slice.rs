@@ -1,18 +1,18 @@
 use std::marker::PhantomData;
 
 /// A slice that several threads write at once, each its own places.
-pub(crate) struct Disjoint<'a> {
+pub(crate) struct SharedSlice<'a> {
     start: *mut f32,
     len: usize,
     slice: PhantomData<&'a mut [f32]>,
 }
 
 // SAFETY: it stands for a `&mut [f32]`; who writes through it promises to write places of their own.
-unsafe impl Send for Disjoint<'_> {}
+unsafe impl Send for SharedSlice<'_> {}
 // SAFETY: as above.
-unsafe impl Sync for Disjoint<'_> {}
+unsafe impl Sync for SharedSlice<'_> {}
 
-impl<'a> Disjoint<'a> {
+impl<'a> SharedSlice<'a> {
     pub(crate) fn new(slice: &'a mut [f32]) -> Self {
         Self { start: slice.as_mut_ptr(), len: slice.len(), slice: PhantomData }
     }

@@ -24,14 +24,14 @@ pub enum InstructionSet {
 
 /// A value of [`InstructionSet::VARIABLE`] that cannot be followed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct BadInstructionSet {
+pub struct InstructionSetError {
     /// What it holds.
     pub text: String,
     /// Whether it is an instruction set, which this processor lacks.
     pub is_known: bool,
 }
 
-impl fmt::Display for BadInstructionSet {
+impl fmt::Display for InstructionSetError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let names = InstructionSet::available().map(InstructionSet::name).collect::<Vec<_>>().join(", ");
         let why = if self.is_known { "this processor does not have it" } else { "it is no instruction set" };
@@ -39,7 +39,7 @@ impl fmt::Display for BadInstructionSet {
     }
 }
 
-impl std::error::Error for BadInstructionSet {}
+impl std::error::Error for InstructionSetError {}
 
 /// Work that is generic over the instruction set. `run` must be `#[inline(always)]`.
 pub(crate) trait Kernel {
@@ -74,18 +74,18 @@ impl InstructionSet {
     ///
     /// # Errors
     /// The text and what it may be, where it names no instruction set that this processor has.
-    pub fn forced() -> Result<Option<Self>, BadInstructionSet> {
+    pub fn forced() -> Result<Option<Self>, InstructionSetError> {
         match std::env::var_os(Self::VARIABLE) {
             None => Ok(None),
             Some(text) => Self::parse(&text.to_string_lossy()),
         }
     }
 
-    fn parse(text: &str) -> Result<Option<Self>, BadInstructionSet> {
+    fn parse(text: &str) -> Result<Option<Self>, InstructionSetError> {
         if text.is_empty() {
             return Ok(None);
         }
-        let bad = |is_known| BadInstructionSet { text: text.to_owned(), is_known };
+        let bad = |is_known| InstructionSetError { text: text.to_owned(), is_known };
         let known = Self::ALL.into_iter().find(|set| set.name() == text).ok_or_else(|| bad(false))?;
         if known.is_available() { Ok(Some(known)) } else { Err(bad(true)) }
     }

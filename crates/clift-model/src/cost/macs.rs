@@ -25,7 +25,7 @@ pub struct Macs {
 /// How an amount of work is told.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "lowercase")]
-pub enum Convention {
+pub enum FlopConvention {
     /// As the paper's numbers come out (render-budget table): one per multiply-accumulate of linear layers, attention
     /// left out, and five per value of `3 L + 2` layer norms. The first two are what fvcore counts where attention is
     /// one fused operation; the number of norms is fitted to the five printed values (`3 L + 1` are there).
@@ -37,7 +37,7 @@ pub enum Convention {
     Flops,
 }
 
-impl Convention {
+impl FlopConvention {
     /// All conventions.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
@@ -56,7 +56,7 @@ impl Convention {
     }
 }
 
-impl FromStr for Convention {
+impl FromStr for FlopConvention {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
@@ -66,11 +66,11 @@ impl FromStr for Convention {
 
 impl Macs {
     /// The amount of work in a convention.
-    pub fn count(self, convention: Convention) -> u64 {
+    pub fn count(self, convention: FlopConvention) -> u64 {
         match convention {
-            Convention::Paper => self.linear + 5 * self.normalised,
-            Convention::Macs => self.linear + self.attention,
-            Convention::Flops => 2 * (self.linear + self.attention),
+            FlopConvention::Paper => self.linear + 5 * self.normalised,
+            FlopConvention::Macs => self.linear + self.attention,
+            FlopConvention::Flops => 2 * (self.linear + self.attention),
         }
     }
 }
@@ -152,7 +152,7 @@ mod tests {
         let printed = [(4096, "70.6", 1), (3072, "63.3", 1), (2048, "56.1", 1), (1024, "48.9", 1), (512, "45.23", 2)];
         for (tokens, expected, decimals) in printed {
             let macs = config.render_macs(256, 256, tokens).unwrap();
-            assert_eq!(format!("{:.decimals$}", macs.count(Convention::Paper) as f64 / 1e9), expected);
+            assert_eq!(format!("{:.decimals$}", macs.count(FlopConvention::Paper) as f64 / 1e9), expected);
         }
     }
 
@@ -163,9 +163,9 @@ mod tests {
             let macs = config.render_macs(256, 256, tokens as usize).unwrap();
             assert_eq!(macs.linear, 41_523_609_600 + 7_077_888 * tokens);
             assert_eq!(macs.attention, 9_663_676_416 + 9_437_184 * tokens);
-            assert_eq!(macs.count(Convention::Flops), 2 * macs.count(Convention::Macs));
+            assert_eq!(macs.count(FlopConvention::Flops), 2 * macs.count(FlopConvention::Macs));
         }
-        let giga = |macs: Macs| (macs.count(Convention::Macs) as f64 / 1e8).round() / 10.0;
+        let giga = |macs: Macs| (macs.count(FlopConvention::Macs) as f64 / 1e8).round() / 10.0;
         assert_eq!(giga(config.render_macs(256, 448, 7168).unwrap()), 271.4);
         assert_eq!(giga(config.encode_macs(4, 256, 256).unwrap()), 291.7);
         assert!(config.render_macs(250, 256, 1).is_err());

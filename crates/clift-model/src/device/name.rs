@@ -1,7 +1,7 @@
 //! Every device this project runs on, by the name a config or a command line gives it.
 
 use burn::tensor::Device;
-use clift_kernels::{BadInstructionSet, InstructionSet};
+use clift_kernels::{InstructionSet, InstructionSetError};
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
@@ -48,7 +48,7 @@ impl DeviceName {
     pub fn open(self) -> Result<Device, ModelError> {
         match self {
             Self::Flex => {
-                let bad = |bad: BadInstructionSet| ModelError::BadConfig {
+                let bad = |bad: InstructionSetError| ModelError::BadConfig {
                     key: InstructionSet::VARIABLE,
                     fix: bad.to_string(),
                     value: bad.text,

@@ -9,19 +9,19 @@ use crate::names::{names, parse};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
-pub enum Variant {
+pub enum CliftVariant {
     /// The paper's equations: pre-norm blocks, two condenser blocks (paper section 3).
     #[default]
     Paper,
     /// The released code's network for `RealEstate10K`: one condenser block, a pre-norm decoder layer with `ReLU` whose
     /// keys and values are the raw tokens of the cluster with its centroid, and one gate with a bias behind it.
     ReleasedRe10k,
-    /// The released code's network for DL3DV: as [`Variant::ReleasedRe10k`], with an RMS norm of every head's queries
+    /// The released code's network for DL3DV: as [`CliftVariant::ReleasedRe10k`], with an RMS norm of every head's queries
     /// and keys in all attention, and a layer norm behind the encoder.
     ReleasedDl3dv,
 }
 
-impl Variant {
+impl CliftVariant {
     /// All variants, in the order they are listed to a user.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
@@ -41,7 +41,7 @@ impl Variant {
     }
 }
 
-impl std::str::FromStr for Variant {
+impl std::str::FromStr for CliftVariant {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {

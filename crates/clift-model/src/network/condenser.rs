@@ -121,7 +121,7 @@ mod tests {
     use burn::tensor::{DType, Device};
 
     use super::*;
-    use crate::network::architecture::Variant;
+    use crate::network::architecture::CliftVariant;
     use crate::network::config::CondenserConfig;
     use crate::testing::{
         Fixture, assert_close, check_gradients, cpu_devices, devices, load_weights, random, to_vec, weight_gradients,
@@ -192,7 +192,7 @@ mod tests {
 
     #[test]
     fn gradients_of_the_released_networks_equal_central_differences_in_f64() {
-        for variant in [Variant::ReleasedRe10k, Variant::ReleasedDl3dv] {
+        for variant in [CliftVariant::ReleasedRe10k, CliftVariant::ReleasedDl3dv] {
             for device in cpu_devices() {
                 let config = ModelConfig { variant, condenser: CondenserConfig::of(variant), ..config(true) };
                 let mut init = Init::new(5, &device);
@@ -218,7 +218,7 @@ mod tests {
 
     #[test]
     fn an_untrained_condenser_returns_the_centroids() {
-        let variants = Variant::ALL.map(|variant| ModelConfig {
+        let variants = CliftVariant::ALL.map(|variant| ModelConfig {
             variant,
             condenser: CondenserConfig::of(variant),
             ..config(true)

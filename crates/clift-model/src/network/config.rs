@@ -3,14 +3,14 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::ModelError;
-use crate::network::architecture::Variant;
+use crate::network::architecture::CliftVariant;
 
 /// Sizes of the encoder, the condenser and the renderer. The defaults are the paper's.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "ModelSection")]
 pub struct ModelConfig {
     /// Which published network the blocks follow.
-    pub variant: Variant,
+    pub variant: CliftVariant,
     /// Width of a token.
     pub dim: usize,
     /// Attention heads in every block; divides `dim`.
@@ -40,7 +40,7 @@ pub struct CondenserConfig {
 impl Default for ModelConfig {
     fn default() -> Self {
         Self {
-            variant: Variant::Paper,
+            variant: CliftVariant::Paper,
             dim: 768,
             num_heads: 8,
             feed_forward_dim: 2048,
@@ -54,13 +54,13 @@ impl Default for ModelConfig {
 
 impl Default for CondenserConfig {
     fn default() -> Self {
-        Self::of(Variant::Paper)
+        Self::of(CliftVariant::Paper)
     }
 }
 
 impl CondenserConfig {
     /// That of a variant.
-    pub fn of(variant: Variant) -> Self {
+    pub fn of(variant: CliftVariant) -> Self {
         Self { num_blocks: if variant.is_released() { 1 } else { 2 }, residual: true }
     }
 }
@@ -69,7 +69,7 @@ impl CondenserConfig {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct ModelSection {
-    variant: Variant,
+    variant: CliftVariant,
     dim: usize,
     num_heads: usize,
     feed_forward_dim: usize,
@@ -237,7 +237,7 @@ mod tests {
     #[test]
     fn one_key_chooses_a_released_network_and_contradictions_are_refused() {
         let parse = |text: &str| serde_json::from_str::<ModelConfig>(text).expect("a model section");
-        for variant in Variant::ALL {
+        for variant in CliftVariant::ALL {
             let config = parse(&format!("{{\"variant\": \"{variant}\"}}"));
             assert_eq!(
                 (config.variant, config.condenser.num_blocks),

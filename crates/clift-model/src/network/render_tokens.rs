@@ -6,13 +6,13 @@ use crate::network::blocks::block::DecoderBlock;
 
 /// Keys and values of a scene's tokens in every block of a renderer.
 #[derive(Clone, Debug)]
-pub struct SceneMemory {
+pub struct KeyValueCache {
     /// Each `[batch, num_render_tokens, 2 dim]`.
     pub(crate) blocks: Vec<Tensor<3>>,
     pub(crate) num_render_tokens: usize,
 }
 
-impl SceneMemory {
+impl KeyValueCache {
     /// How many tokens it is of.
     pub fn num_render_tokens(&self) -> usize {
         self.num_render_tokens

@@ -9,8 +9,8 @@ use burn::tensor::activation::sigmoid;
 use crate::network::blocks::block::DecoderBlock;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
-use crate::network::render_tokens::{RenderTokens, SceneMemory};
-use crate::ops::linear::{linear_in_f32, linear_of_norm};
+use crate::network::render_tokens::{KeyValueCache, RenderTokens};
+use crate::ops::linear::{linear_in_f32, norm_linear};
 use crate::views::patch::{patchify, unpatchify};
 use crate::views::rays::plucker;
 use crate::views::upload::Cameras;
@@ -59,16 +59,16 @@ impl Renderer {
     ///
     /// # Shapes
     /// - `tokens`: `[batch, num_render_tokens, dim]`
-    pub fn memory(&self, tokens: &Tensor<3>) -> SceneMemory {
+    pub fn memory(&self, tokens: &Tensor<3>) -> KeyValueCache {
         let blocks = self.blocks.iter().map(|block| block.memory(tokens.clone())).collect();
-        SceneMemory { blocks, num_render_tokens: tokens.dims()[1] }
+        KeyValueCache { blocks, num_render_tokens: tokens.dims()[1] }
     }
 
     /// Draws target views as [`forward`](Self::forward) does, from what [`memory`](Self::memory) prepared.
     ///
     /// # Shapes
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
-    pub fn draw(&self, memory: &SceneMemory, targets: &Cameras) -> Tensor<5> {
+    pub fn draw(&self, memory: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
         let x = self.embed(targets);
         let x = self.blocks.iter().zip(&memory.blocks).fold(x, |x, (block, memory)| block.forward(x, memory.clone()));
         self.picture(x, targets)
@@ -94,7 +94,7 @@ impl Renderer {
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn picture(&self, x: Tensor<3>, targets: &Cameras) -> Tensor<5> {
         let [batch, views] = targets.dims();
-        let patches = sigmoid(linear_of_norm(&self.output_norm, &self.to_pixels, x));
+        let patches = sigmoid(norm_linear(&self.output_norm, &self.to_pixels, x));
         let [_, num_queries, values] = patches.dims();
         let patches = patches.reshape([batch, views * num_queries, values]);
         unpatchify(patches, [views, targets.height, targets.width], self.patch_size)

@@ -1,5 +1,5 @@
 //! Layer normalisation on a device, in both directions. Every norm of the model stands before a linear
-//! layer: [`linear_of_norm`](crate::ops::linear::linear_of_norm) is the operation.
+//! layer: [`linear_of_norm`](crate::ops::linear::norm_linear) is the operation.
 #![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
 // B scenes, N tokens, D width
 

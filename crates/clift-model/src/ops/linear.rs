@@ -32,7 +32,7 @@ use crate::ops::precision::{MatmulKernels, Precision};
 /// # Panics
 /// When the layer has no bias.
 pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
-    apply(layer, x, Before { gelu: false, precision: Precision::current() })
+    apply(layer, x, Prologue { gelu: false, precision: Precision::current() })
 }
 
 /// [`linear`] in f32 whatever the precision of this thread: for layers that take rays.
@@ -44,7 +44,7 @@ pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
 /// # Panics
 /// When the layer has no bias.
 pub fn linear_in_f32(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
-    apply(layer, x, Before { gelu: false, precision: Precision::F32 })
+    apply(layer, x, Prologue { gelu: false, precision: Precision::F32 })
 }
 
 /// `gelu(x) W + b` with `gelu(x) = x Phi(x)` and the normal distribution function `Phi`.
@@ -55,8 +55,8 @@ pub fn linear_in_f32(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
 ///
 /// # Panics
 /// When the layer has no bias.
-pub fn linear_of_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
-    apply(layer, x, Before { gelu: true, precision: Precision::current() })
+pub fn gelu_linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+    apply(layer, x, Prologue { gelu: true, precision: Precision::current() })
 }
 
 /// `norm(x) W + b` with `norm(x) = (x - mean) / sqrt(variance + 1e-5) * gamma + beta` over a row.
@@ -67,26 +67,26 @@ pub fn linear_of_gelu(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
 ///
 /// # Panics
 /// When the norm or the layer has no bias.
-pub fn linear_of_norm(norm: &LayerNorm, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
+pub fn norm_linear(norm: &LayerNorm, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     norm_then_linear(x, norm.gamma.val(), norm.beta.as_ref().expect("the norm has a bias").val(), layer)
 }
 
 /// What is done before a layer's bias is added.
 #[derive(Clone, Copy, Debug)]
-pub struct Before {
+pub struct Prologue {
     /// Whether the input goes through a GELU.
     gelu: bool,
     /// What the product is computed in.
     precision: Precision,
 }
 
-fn apply(layer: &Linear, x: Tensor<3>, before: Before) -> Tensor<3> {
+fn apply(layer: &Linear, x: Tensor<3>, before: Prologue) -> Tensor<3> {
     let (weight, bias) = parameters(layer, &x);
     let [x, weight, bias] = [x.into_dispatch(), weight.into_dispatch(), bias.into_dispatch()];
     Tensor::from_dispatch(<Dispatch as LinearOps>::linear_layer(x, weight, bias, before))
 }
 
-/// [`linear_of_norm`] with the norm's parameters as tensors.
+/// [`norm_linear`] with the norm's parameters as tensors.
 pub(crate) fn norm_then_linear(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>, layer: &Linear) -> Tensor<3> {
     let (weight, bias) = parameters(layer, &x);
     let [inputs, _outputs] = weight.dims();
@@ -112,18 +112,18 @@ fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
     (weight, bias)
 }
 
-/// The operations behind [`linear`], [`linear_of_gelu`] and [`linear_of_norm`] on a device.
+/// The operations behind [`linear`], [`gelu_linear`] and [`norm_linear`] on a device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait LinearOps: Backend {
-    /// See [`linear`] and [`linear_of_gelu`].
+    /// See [`linear`] and [`gelu_linear`].
     fn linear_layer(
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
-        before: Before,
+        before: Prologue,
     ) -> FloatTensor<Self>;
 
-    /// See [`linear_of_norm`].
+    /// See [`norm_linear`].
     fn norm_then_linear(
         x: FloatTensor<Self>,
         gamma: FloatTensor<Self>,
@@ -215,7 +215,7 @@ fn forward<B: LinearKernels>(
     x: FloatTensor<B>,
     weight: FloatTensor<B>,
     bias: FloatTensor<B>,
-    before: Before,
+    before: Prologue,
 ) -> FloatTensor<B> {
     B::linear_output(before.precision, if before.gelu { B::gelu_output(x) } else { x }, weight, bias)
 }
@@ -227,7 +227,7 @@ macro_rules! linear_ops {
                 x: FloatTensor<Self>,
                 weight: FloatTensor<Self>,
                 bias: FloatTensor<Self>,
-                before: Before,
+                before: Prologue,
             ) -> FloatTensor<Self> {
                 forward::<Self>(x, weight, bias, before)
             }
@@ -256,7 +256,7 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
-        before: Before,
+        before: Prologue,
     ) -> FloatTensor<Self> {
         let ((x, x_node), (weight, weight_node), (bias, bias_node)) =
             (x.into_parts(), weight.into_parts(), bias.into_parts());
@@ -302,7 +302,7 @@ struct LinearBackward;
 struct LinearState<T> {
     x: T,
     weight: T,
-    before: Before,
+    before: Prologue,
 }
 
 impl<B: LinearKernels> Backward<B, 3> for LinearBackward {
@@ -311,7 +311,7 @@ impl<B: LinearKernels> Backward<B, 3> for LinearBackward {
     /// With `a = x` or `gelu(x)`: `dW = a^T dO`, `db = sum dO`, `da = dO W^T`.
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
         register::<B, _, 3>(ops, grads, |LinearState { x, weight, before }, grad, wanted| {
-            let Before { gelu, precision } = before;
+            let Prologue { gelu, precision } = before;
             let [of_x, of_weight, of_bias] = wanted;
             let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
             let grad_weight = of_weight.then(|| {

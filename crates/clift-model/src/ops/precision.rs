@@ -165,7 +165,7 @@ mod tests {
         use burn::nn::{LayerNorm, LayerNormConfig, Linear};
 
         use crate::ops::attention::sdpa::{cross_sdpa, self_sdpa};
-        use crate::ops::linear::{linear, linear_of_gelu, linear_of_norm};
+        use crate::ops::linear::{gelu_linear, linear, norm_linear};
 
         let device = device.clone().autodiff();
         // On a device with f64 as well: the same numbers on all.
@@ -187,8 +187,8 @@ mod tests {
         norm.beta = norm.beta.map(|beta| Param::from_tensor(beta.val().cast(dtype).detach()));
         let output = {
             let _scope = precision.scope();
-            let mixed = self_sdpa(linear_of_norm(&norm, &layers[0], x.clone()), 2);
-            let query = linear_of_gelu(&layers[1], mixed.clone());
+            let mixed = self_sdpa(norm_linear(&norm, &layers[0], x.clone()), 2);
+            let query = gelu_linear(&layers[1], mixed.clone());
             linear(&layers[3], cross_sdpa(query, linear(&layers[2], mixed), 4))
         };
         assert_eq!(output.dtype(), dtype, "results are no halves");

@@ -8,8 +8,8 @@ use safetensors::{Dtype, SafeTensorError, SafeTensors};
 use crate::error::ModelError;
 use crate::names::parse;
 use crate::network::config::ModelConfig;
-use crate::scene::scene::{FORMAT, Scene, VERSION, WorldFrame, dtype_name};
-use crate::scene::token_format::TokenStorage;
+use crate::scene::scene::{FORMAT, Scene, SceneNormalization, VERSION, dtype_name};
+use crate::scene::token_format::TokenFormat;
 use crate::views::camera::ViewCamera;
 
 /// Longest header that is read; those of this version are shorter.
@@ -46,7 +46,7 @@ impl Scene {
     ///
     /// # Errors
     /// [`ModelError::SceneFile`] for a file that is no scene, of another version, cut off, or inconsistent.
-    pub fn read(path: &Path) -> Result<(Self, TokenStorage), ModelError> {
+    pub fn read(path: &Path) -> Result<(Self, TokenFormat), ModelError> {
         let read = || {
             let size = std::fs::metadata(path).map_err(|error| refusal(error.to_string(), GIVE_ANOTHER))?.len();
             if size > MAX_FILE_BYTES {
@@ -64,7 +64,7 @@ impl Scene {
     }
 }
 
-fn from_bytes(bytes: &[u8]) -> Result<(Scene, TokenStorage), Refusal> {
+fn from_bytes(bytes: &[u8]) -> Result<(Scene, TokenFormat), Refusal> {
     check_length(bytes)?;
     let file = SafeTensors::deserialize(bytes).map_err(|error| match error {
         SafeTensorError::MetadataIncompleteBuffer => {
@@ -103,7 +103,7 @@ fn from_bytes(bytes: &[u8]) -> Result<(Scene, TokenStorage), Refusal> {
         width: fields.side("width")?,
         context: cameras.map(|(&c2w, &intrinsics)| ViewCamera { c2w, intrinsics }).collect(),
         context_frames: tensors.u32s("context_frames", &[views])?,
-        world: WorldFrame { mean_c2w, scale: tensors.f64s("world_scale", &[1])?[0] },
+        world: SceneNormalization { mean_c2w, scale: tensors.f64s("world_scale", &[1])?[0] },
         token_ids: tensors.u32s("token_ids", &[num_tokens])?,
         tokens,
         model,
@@ -197,16 +197,16 @@ impl Tensors<'_> {
     }
 
     /// The format of the tokens, how many there are, and their values.
-    fn tokens(&self, dim: usize) -> Result<(TokenStorage, usize, Vec<f32>), String> {
+    fn tokens(&self, dim: usize) -> Result<(TokenFormat, usize, Vec<f32>), String> {
         let dtype = self.view("tokens")?.dtype();
-        let storage = TokenStorage::ALL.into_iter().find(|storage| format!("{dtype:?}") == dtype_name(*storage));
+        let storage = TokenFormat::ALL.into_iter().find(|storage| format!("{dtype:?}") == dtype_name(*storage));
         let storage = storage.ok_or_else(|| format!("its tokens are {dtype:?}, expected F32, F16 or I8"))?;
-        let expected = if storage == TokenStorage::Int8 { 9 } else { 8 };
+        let expected = if storage == TokenFormat::Int8 { 9 } else { 8 };
         if self.0.len() != expected {
             return Err(format!("it has {} tensors, expected {expected}", self.0.len()));
         }
         let count = self.length("token_ids")?;
-        let scales = if storage == TokenStorage::Int8 { self.f32s("token_scales", &[count])? } else { Vec::new() };
+        let scales = if storage == TokenFormat::Int8 { self.f32s("token_scales", &[count])? } else { Vec::new() };
         if let Some(token) = scales.iter().position(|scale| !(scale.is_finite() && *scale >= 0.0)) {
             return Err(format!("token {token} has the scale {}", scales[token]));
         }

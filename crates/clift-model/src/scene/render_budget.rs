@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use crate::error::ModelError;
-use crate::scene::scene_renderer::Viewer;
+use crate::scene::scene_renderer::SceneRenderer;
 use crate::views::camera::ViewCamera;
 
 /// Parts of the stored tokens that are timed, in sixteenths; all of them are timed beside.
@@ -26,8 +26,13 @@ impl RenderBudget {
     /// Times frames of a few counts.
     ///
     /// # Errors
-    /// As [`Viewer::draw`].
-    pub fn measure(viewer: &mut Viewer, view: &ViewCamera, height: usize, width: usize) -> Result<Self, ModelError> {
+    /// As [`SceneRenderer::draw`].
+    pub fn measure(
+        viewer: &mut SceneRenderer,
+        view: &ViewCamera,
+        height: usize,
+        width: usize,
+    ) -> Result<Self, ModelError> {
         let num_storage_tokens = viewer.num_storage_tokens();
         let mut counts: Vec<usize> = SIXTEENTHS
             .iter()
@@ -82,7 +87,7 @@ impl RenderBudget {
 
 /// Median seconds per frame.
 fn median_s(
-    viewer: &mut Viewer,
+    viewer: &mut SceneRenderer,
     views: &[ViewCamera],
     height: usize,
     width: usize,

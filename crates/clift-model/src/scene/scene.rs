@@ -22,7 +22,7 @@
 // S stored tokens, V context views, D width
 
 use crate::network::config::ModelConfig;
-use crate::scene::token_format::TokenStorage;
+use crate::scene::token_format::TokenFormat;
 use crate::tokens::kind::TokenKind;
 use crate::tokens::selection::token_ray::TokenRay;
 use crate::views::camera::ViewCamera;
@@ -36,7 +36,7 @@ pub(crate) const VERSION: &str = "2";
 
 /// How poses of the capture become poses of the scene: `R^T (c - t) * scale` with `[R | t]` the mean pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct WorldFrame {
+pub struct SceneNormalization {
     /// Mean context camera in the capture's world, camera to world, 4 x 4, row-major.
     pub mean_c2w: [f64; 16],
     /// Normalised units per unit of the capture's world.
@@ -65,7 +65,7 @@ pub struct Scene {
     /// Frame of the capture each context view is.
     pub context_frames: Vec<u32>,
     /// The normalised frame in the capture's world.
-    pub world: WorldFrame,
+    pub world: SceneNormalization,
     /// The patch each token stands on, `[S]`: `view * rows * columns + row * columns + column`.
     pub token_ids: Vec<u32>,
     /// What the renderer is given, `[S, D]`.
@@ -96,14 +96,14 @@ impl Scene {
     }
 
     /// Bytes of this scene's file.
-    pub fn file_bytes(&self, storage: TokenStorage) -> u64 {
+    pub fn file_bytes(&self, storage: TokenFormat) -> u64 {
         file_bytes(self.num_tokens(), self.model.dim, self.context.len(), storage)
     }
 }
 
 /// Bytes of a scene file: `8 + 2048 + 136 + 164 V + S (28 + D b)` with V context views, S tokens of width D and b bytes
 /// per value, and four more bytes per token for `int8`.
-pub const fn file_bytes(num_tokens: usize, dim: usize, num_views: usize, storage: TokenStorage) -> u64 {
+pub const fn file_bytes(num_tokens: usize, dim: usize, num_views: usize, storage: TokenFormat) -> u64 {
     // c2w and intrinsics in f64 and a frame number.
     let view = (16 + 4) * 8 + 4;
     let world = (16 + 1) * 8;
@@ -113,11 +113,11 @@ pub const fn file_bytes(num_tokens: usize, dim: usize, num_views: usize, storage
 }
 
 /// Type of the tensor that holds tokens of this format.
-pub(crate) const fn dtype_name(storage: TokenStorage) -> &'static str {
+pub(crate) const fn dtype_name(storage: TokenFormat) -> &'static str {
     match storage {
-        TokenStorage::F32 => "F32",
-        TokenStorage::F16 => "F16",
-        TokenStorage::Int8 => "I8",
+        TokenFormat::F32 => "F32",
+        TokenFormat::F16 => "F16",
+        TokenFormat::Int8 => "I8",
     }
 }
 

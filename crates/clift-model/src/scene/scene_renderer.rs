@@ -8,10 +8,10 @@ use std::time::Instant;
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::error::ModelError;
-use crate::network::render_tokens::SceneMemory;
+use crate::network::render_tokens::KeyValueCache;
 use crate::network::renderer::Renderer;
 use crate::scene::scene::Scene;
-use crate::tokens::selection::rules::Rules;
+use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::selector::Selector;
 use crate::views::camera::ViewCamera;
 use crate::views::upload::Cameras;
@@ -45,7 +45,7 @@ pub fn load_renderer(scene: &Scene, weights: &Path, device: &Device) -> Result<R
 
 /// One drawn frame.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Drawn {
+pub struct RenderedViews {
     /// RGB in `(0, 1)`, `[height, width, 3]`.
     pub pixels: Vec<f32>,
     /// The tokens it was drawn from, ascending; `None` for all.
@@ -58,20 +58,20 @@ pub struct Drawn {
 
 /// Draws frames of a scene one after the other.
 #[derive(Debug)]
-pub struct Viewer {
+pub struct SceneRenderer {
     renderer: Renderer,
     /// Of all stored tokens: what every frame draws from, or from a part of.
-    memory: SceneMemory,
+    memory: KeyValueCache,
     selector: Selector,
     device: Device,
 }
 
-impl Viewer {
+impl SceneRenderer {
     /// Copies a scene's tokens to a device. `renderer` is that of [`load_renderer`], on the same device.
     ///
     /// # Errors
     /// [`ModelError::BadRay`] for a scene that was not read from a file and has rays that are not finite.
-    pub fn new(scene: &Scene, renderer: Renderer, rules: Rules, device: &Device) -> Result<Self, ModelError> {
+    pub fn new(scene: &Scene, renderer: Renderer, rules: SelectionRules, device: &Device) -> Result<Self, ModelError> {
         let shape = [1, scene.num_tokens(), scene.model.dim];
         let tokens = Tensor::from_data(TensorData::new(scene.tokens.clone(), shape), device);
         let selector = Selector::new(rules, &scene.token_rays())?;
@@ -110,7 +110,7 @@ impl Viewer {
         height: usize,
         width: usize,
         num_render_tokens: usize,
-    ) -> Result<Vec<Drawn>, ModelError> {
+    ) -> Result<Vec<RenderedViews>, ModelError> {
         if num_render_tokens >= self.num_storage_tokens() {
             let mut drawn = Vec::with_capacity(views.len());
             for views in views.chunks(self.frames_per_call(height, width)) {
@@ -135,7 +135,7 @@ impl Viewer {
         width: usize,
         chosen: Option<Vec<u32>>,
         select_s: f64,
-    ) -> Result<Vec<Drawn>, ModelError> {
+    ) -> Result<Vec<RenderedViews>, ModelError> {
         let started = Instant::now();
         let cameras = Cameras::of_views(views, height, width, &self.device)?;
         let pictures = match &chosen {
@@ -150,7 +150,9 @@ impl Viewer {
             return Err(ModelError::NotFinite { what: "a rendering", value: pixels[position], position });
         }
         let frames = pixels.chunks_exact(height * width * 3);
-        Ok(frames.map(|pixels| Drawn { pixels: pixels.to_vec(), tokens: chosen.clone(), select_s, render_s }).collect())
+        Ok(frames
+            .map(|pixels| RenderedViews { pixels: pixels.to_vec(), tokens: chosen.clone(), select_s, render_s })
+            .collect())
     }
 }
 
@@ -159,15 +161,15 @@ mod tests {
     use super::*;
     use crate::network::clift::Clift;
     use crate::network::config::ModelConfig;
-    use crate::scene::scene::WorldFrame;
+    use crate::scene::scene::SceneNormalization;
     use crate::testing::devices;
     use crate::tokens::kind::TokenKind;
-    use crate::tokens::selection::rules::Preset;
+    use crate::tokens::selection::rules::SelectionPreset;
     use crate::weights::file;
     use crate::weights::hash;
 
     const MODEL: ModelConfig = ModelConfig {
-        variant: crate::network::architecture::Variant::Paper,
+        variant: crate::network::architecture::CliftVariant::Paper,
         dim: 16,
         num_heads: 2,
         feed_forward_dim: 24,
@@ -197,16 +199,16 @@ mod tests {
             width: 24,
             context: vec![camera(-1.0, 0.3), camera(1.0, -0.3)],
             context_frames: vec![0, 1],
-            world: WorldFrame { mean_c2w: camera(0.0, 0.0).c2w, scale: 1.0 },
+            world: SceneNormalization { mean_c2w: camera(0.0, 0.0).c2w, scale: 1.0 },
             tokens: (0..token_ids.len() * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect(),
             token_ids,
         }
     }
 
-    fn viewer(device: &Device, preset: Preset) -> (Viewer, Scene, Renderer) {
+    fn viewer(device: &Device, preset: SelectionPreset) -> (SceneRenderer, Scene, Renderer) {
         let renderer = Clift::new(&MODEL, 3, device).renderer;
         let scene = scene(&renderer);
-        (Viewer::new(&scene, renderer.clone(), preset.rules(), device).unwrap(), scene, renderer)
+        (SceneRenderer::new(&scene, renderer.clone(), preset.rules(), device).unwrap(), scene, renderer)
     }
 
     fn path(num_frames: usize) -> Vec<ViewCamera> {
@@ -221,7 +223,7 @@ mod tests {
     #[test]
     fn frames_of_all_tokens_are_those_the_renderer_draws_alone() {
         for device in devices() {
-            let (mut viewer, scene, renderer) = viewer(&device, Preset::Paper);
+            let (mut viewer, scene, renderer) = viewer(&device, SelectionPreset::Paper);
             let drawn = viewer.draw(&path(11), 16, 24, 12).unwrap();
             assert_eq!(drawn.len(), 11);
             let tokens: Tensor<3> = Tensor::from_data(TensorData::new(scene.tokens.clone(), [1, 12, 16]), &device);
@@ -237,7 +239,7 @@ mod tests {
 
     #[test]
     fn a_frame_of_some_tokens_is_drawn_from_those_the_selector_chooses() {
-        for preset in Preset::ALL {
+        for preset in SelectionPreset::ALL {
             let device = Device::flex();
             let (mut viewer, scene, renderer) = viewer(&device, preset);
             let drawn = viewer.draw(&path(4), 16, 24, 5).unwrap();
@@ -256,7 +258,7 @@ mod tests {
 
     #[test]
     fn pictures_have_any_size_that_is_whole_patches() {
-        let (mut viewer, ..) = viewer(&Device::flex(), Preset::Paper);
+        let (mut viewer, ..) = viewer(&Device::flex(), SelectionPreset::Paper);
         for (height, width) in [(8, 8), (32, 48), (16, 64)] {
             let view = camera(0.0, 0.0).resized([16, 24], [height, width]);
             assert_eq!(viewer.frames_per_call(height, width), 8);
@@ -268,7 +270,7 @@ mod tests {
 
     #[test]
     fn fewer_frames_of_large_pictures_are_drawn_at_once() {
-        let (viewer, ..) = viewer(&Device::flex(), Preset::Paper);
+        let (viewer, ..) = viewer(&Device::flex(), SelectionPreset::Paper);
         let sizes = [(512, 512), (1024, 1024), (2048, 1024), (1 << 14, 1 << 14), (0, 8)];
         assert_eq!(sizes.map(|(height, width)| viewer.frames_per_call(height, width)), [8, 2, 1, 1, 8]);
     }

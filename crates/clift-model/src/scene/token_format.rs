@@ -31,7 +31,7 @@ const INT8_MAX: f32 = 127.0;
 )]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
-pub enum TokenStorage {
+pub enum TokenFormat {
     /// 32-bit floats: the renderer gets the tokens it would get without a file.
     F32,
     /// 16-bit floats, a relative error of 5e-4.
@@ -41,7 +41,7 @@ pub enum TokenStorage {
     Int8,
 }
 
-impl TokenStorage {
+impl TokenFormat {
     /// All formats.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
@@ -107,7 +107,7 @@ impl TokenStorage {
         }
     }
 
-    /// The tokens that [`TokenStorage::encode`] wrote, after rounding.
+    /// The tokens that [`TokenFormat::encode`] wrote, after rounding.
     pub(crate) fn decode(self, bytes: &[u8], scales: &[f32], dim: usize) -> Vec<f32> {
         match self {
             Self::F32 => bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect(),
@@ -120,7 +120,7 @@ impl TokenStorage {
     }
 }
 
-impl FromStr for TokenStorage {
+impl FromStr for TokenFormat {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
@@ -134,7 +134,7 @@ mod tests {
 
     const DIM: usize = 4;
 
-    fn round_trip(storage: TokenStorage, tokens: &[f32]) -> Vec<f32> {
+    fn round_trip(storage: TokenFormat, tokens: &[f32]) -> Vec<f32> {
         let (bytes, scales) = storage.encode(tokens, DIM).unwrap();
         let with_scales = bytes.len() + 4 * scales.as_ref().map_or(0, Vec::len);
         assert_eq!(with_scales, tokens.len() / DIM * storage.bytes_per_token(DIM));
@@ -144,11 +144,11 @@ mod tests {
     #[test]
     fn each_format_is_as_exact_as_it_says() {
         let tokens: Vec<f32> = (0..400).map(|i| ((i * 7919 % 1000) as f32 - 500.0) * 0.013).collect();
-        assert_eq!(round_trip(TokenStorage::F32, &tokens), tokens);
-        for (got, value) in round_trip(TokenStorage::F16, &tokens).iter().zip(&tokens) {
+        assert_eq!(round_trip(TokenFormat::F32, &tokens), tokens);
+        for (got, value) in round_trip(TokenFormat::F16, &tokens).iter().zip(&tokens) {
             assert!((got - value).abs() <= value.abs() / 2048.0, "{got} against {value}");
         }
-        for (got, token) in round_trip(TokenStorage::Int8, &tokens).chunks(DIM).zip(tokens.chunks(DIM)) {
+        for (got, token) in round_trip(TokenFormat::Int8, &tokens).chunks(DIM).zip(tokens.chunks(DIM)) {
             let largest = token.iter().fold(0.0_f32, |most, value| most.max(value.abs()));
             for (got, value) in got.iter().zip(token) {
                 assert!((got - value).abs() <= largest / 253.9, "{got} against {value} of {token:?}");
@@ -158,21 +158,21 @@ mod tests {
 
     #[test]
     fn tokens_of_zeros_and_of_tiny_values_stay_finite() {
-        for storage in TokenStorage::ALL {
+        for storage in TokenFormat::ALL {
             assert_eq!(round_trip(storage, &[0.0; DIM]), [0.0; DIM]);
             let tiny = round_trip(storage, &[1e-42, -1e-42, 0.0, 1e-45]);
             assert!(tiny.iter().all(|value| value.is_finite() && value.abs() < 1e-41), "{tiny:?}");
         }
-        assert_eq!(round_trip(TokenStorage::Int8, &[-3.0, 3.0, 0.0, 1.5])[..2], [-3.0, 3.0]);
+        assert_eq!(round_trip(TokenFormat::Int8, &[-3.0, 3.0, 0.0, 1.5])[..2], [-3.0, 3.0]);
     }
 
     #[test]
     fn values_beyond_16_bits_are_refused_with_what_holds_them() {
-        let message = TokenStorage::F16.encode(&[1.0, 7e4, 0.0, 0.0], DIM).unwrap_err().to_string();
+        let message = TokenFormat::F16.encode(&[1.0, 7e4, 0.0, 0.0], DIM).unwrap_err().to_string();
         assert_eq!(message, "`tokens` = f16: a token holds 70000, beyond 65504; write f32 or int8");
-        assert!((round_trip(TokenStorage::Int8, &[1.0, 7e4, 0.0, 0.0])[1] - 7e4).abs() < 0.1);
+        assert!((round_trip(TokenFormat::Int8, &[1.0, 7e4, 0.0, 0.0])[1] - 7e4).abs() < 0.1);
         assert_eq!(
-            "bf16".parse::<TokenStorage>().unwrap_err().to_string(),
+            "bf16".parse::<TokenFormat>().unwrap_err().to_string(),
             "`tokens` = bf16: write one of f32, f16, int8"
         );
     }

@@ -8,13 +8,13 @@ use std::path::Path;
 use crate::error::ModelError;
 use crate::files::{folder_of, replace};
 use crate::scene::scene::{FORMAT, HEADER_BYTES, Scene, VERSION, dtype_name};
-use crate::scene::token_format::TokenStorage;
+use crate::scene::token_format::TokenFormat;
 
 /// Where nothing is lost by writing a scene: a folder that exists, and in it nothing of the name or a scene.
 ///
 /// # Errors
 /// [`ModelError::SceneFile`].
-pub fn check_destination(path: &Path) -> Result<(), ModelError> {
+pub fn check_output_path(path: &Path) -> Result<(), ModelError> {
     let refuse = |reason: &str, fix| {
         Err(ModelError::SceneFile { action: "write", reason: reason.to_owned(), fix, path: path.into() })
     };
@@ -46,11 +46,11 @@ impl Scene {
     /// Writes the scene to a temporary name beside `path` that is then renamed: no reader sees half a file.
     ///
     /// # Errors
-    /// [`ModelError::SceneFile`], for what [`check_destination`] refuses too, and [`ModelError::BadConfig`] for tokens that
+    /// [`ModelError::SceneFile`], for what [`check_output_path`] refuses too, and [`ModelError::BadConfig`] for tokens that
     /// `storage` cannot hold.
-    pub fn write(&self, path: &Path, storage: TokenStorage) -> Result<(), ModelError> {
+    pub fn write(&self, path: &Path, storage: TokenFormat) -> Result<(), ModelError> {
         let bytes = self.to_bytes(path, storage)?;
-        check_destination(path)?;
+        check_output_path(path)?;
         replace(path, &bytes).map_err(|error| ModelError::SceneFile {
             action: "write",
             reason: error.to_string(),
@@ -59,7 +59,7 @@ impl Scene {
         })
     }
 
-    fn to_bytes(&self, path: &Path, storage: TokenStorage) -> Result<Vec<u8>, ModelError> {
+    fn to_bytes(&self, path: &Path, storage: TokenFormat) -> Result<Vec<u8>, ModelError> {
         let refuse = |reason| ModelError::SceneFile {
             action: "write",
             reason,

@@ -17,7 +17,7 @@ use crate::weights::hash::visit;
 
 /// Which parameters of a file went into a module.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Loaded {
+pub struct LoadReport {
     /// Parameters that were set from the file.
     pub applied: Vec<String>,
     /// Parameters of the module that the file lacks; they keep their values.
@@ -26,7 +26,7 @@ pub struct Loaded {
     pub unused: Vec<String>,
 }
 
-impl Loaded {
+impl LoadReport {
     /// Demands that file and module hold the same parameters.
     ///
     /// # Errors
@@ -109,7 +109,7 @@ pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
 /// # Errors
 /// [`ModelError::Weights`] when the file cannot be read, a shape differs, or a value is not finite or no 32-bit
 /// float.
-pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError> {
+pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<LoadReport, ModelError> {
     load_part(module, &PathFilter::all(), path)
 }
 
@@ -117,7 +117,7 @@ pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<Loaded, ModelError
 ///
 /// # Errors
 /// As [`load`].
-pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> Result<Loaded, ModelError> {
+pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> Result<LoadReport, ModelError> {
     read(module, SafetensorsStore::from_file(path).filter(part.clone()), part, path)
 }
 
@@ -125,7 +125,7 @@ pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> R
 ///
 /// # Errors
 /// As [`load`].
-pub fn load_module<M: Module>(module: &mut M, name: &str, path: &Path) -> Result<Loaded, ModelError> {
+pub fn load_module<M: Module>(module: &mut M, name: &str, path: &Path) -> Result<LoadReport, ModelError> {
     let store = SafetensorsStore::from_file(path).with_key_remapping(format!("^{name}\\."), "");
     read(module, store, &PathFilter::all(), path)
 }
@@ -135,7 +135,7 @@ fn read<M: Module>(
     store: SafetensorsStore,
     part: &PathFilter,
     path: &Path,
-) -> Result<Loaded, ModelError> {
+) -> Result<LoadReport, ModelError> {
     let error = |reason: String| ModelError::Weights { action: "reading", reason, path: path.into() };
     if !path.is_file() {
         return Err(error("there is no such file".into()));
@@ -157,7 +157,7 @@ fn read<M: Module>(
     let mut unused = result.unused;
     unused.extend(result.skipped.iter().map(|name| name_in_file(name)));
     unused.sort();
-    Ok(Loaded { applied: result.applied, missing, unused })
+    Ok(LoadReport { applied: result.applied, missing, unused })
 }
 
 /// The name that a parameter of a module has in a file: Burn calls those of norms otherwise.

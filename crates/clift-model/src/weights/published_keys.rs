@@ -22,7 +22,7 @@ pub const CONVOLUTIONS: [&str; 2] = ["linear_input", "linear_target"];
 
 /// One tensor of a checkpoint.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct CheckpointTensor {
+pub struct PublishedTensor {
     /// Its key, without a prefix.
     pub key: String,
     /// Its shape.
@@ -31,7 +31,7 @@ pub struct CheckpointTensor {
     pub parts: Vec<(String, Range<usize>)>,
 }
 
-impl CheckpointTensor {
+impl PublishedTensor {
     /// Whether a shape is this tensor's, where a projection may be a convolution of one pixel.
     pub fn fits(&self, shape: &[u64]) -> bool {
         let shape = match shape {
@@ -80,8 +80,8 @@ const LAYERS: [(&str, &str); 13] = [
 ];
 
 /// Lists every tensor of a model's checkpoint, with or without the condenser.
-pub fn tensors(config: &ModelConfig, has_condenser: bool) -> Vec<CheckpointTensor> {
-    let mut list: Vec<CheckpointTensor> = Vec::new();
+pub fn published_tensors(config: &ModelConfig, has_condenser: bool) -> Vec<PublishedTensor> {
+    let mut list: Vec<PublishedTensor> = Vec::new();
     for layer in config.layers().iter().filter(|layer| has_condenser || layer.part != Part::Condenser) {
         for (path, shape) in layer.parameters() {
             let key = published_key(&path);
@@ -92,7 +92,7 @@ pub fn tensors(config: &ModelConfig, has_condenser: bool) -> Vec<CheckpointTenso
                 packed.parts.push((path, first..packed.shape[0]));
             } else {
                 let parts = vec![(path, 0..shape[0])];
-                list.push(CheckpointTensor { key, shape, parts });
+                list.push(PublishedTensor { key, shape, parts });
             }
         }
     }
@@ -118,7 +118,7 @@ fn published_key(path: &str) -> String {
 
 /// A key as this module writes it: without what a compiled or distributed model adds to names, and with one name for
 /// the norms of queries and keys, whose name in published checkpoints is not known.
-pub fn plain_key(key: &str) -> String {
+pub fn canonical_key(key: &str) -> String {
     let mut parts: Vec<&str> = key.split('.').filter(|part| !matches!(*part, "_orig_mod" | "module")).collect();
     if let [.., norm, last] = &mut parts[..] {
         let known = match *norm {
@@ -145,7 +145,7 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
-    use crate::network::architecture::Variant;
+    use crate::network::architecture::CliftVariant;
     use crate::network::config::CondenserConfig;
     use crate::network::layers::Layer;
     use crate::testing::{small_config, small_configs};
@@ -154,7 +154,7 @@ mod tests {
     fn every_parameter_is_in_one_tensor_with_its_shape() {
         for config in small_configs() {
             let mut expected: BTreeMap<_, _> = config.layers().iter().flat_map(Layer::parameters).collect();
-            for tensor in tensors(&config, true) {
+            for tensor in published_tensors(&config, true) {
                 let mut next = 0;
                 for (path, rows) in tensor.parts {
                     assert_eq!(rows.start, next, "{}", tensor.key);
@@ -173,28 +173,34 @@ mod tests {
     fn the_published_network_has_the_published_number_of_parameters() {
         let count = |variant, condenser| {
             let config = ModelConfig { variant, condenser: CondenserConfig::of(variant), ..ModelConfig::default() };
-            tensors(&config, condenser).iter().map(|tensor| tensor.shape.iter().product::<usize>()).sum::<usize>()
+            published_tensors(&config, condenser)
+                .iter()
+                .map(|tensor| tensor.shape.iter().product::<usize>())
+                .sum::<usize>()
         };
-        assert_eq!(count(Variant::ReleasedRe10k, false), 81_239_232); // 81.2 million
-        let condenser = count(Variant::ReleasedRe10k, true) - count(Variant::ReleasedRe10k, false);
+        assert_eq!(count(CliftVariant::ReleasedRe10k, false), 81_239_232); // 81.2 million
+        let condenser = count(CliftVariant::ReleasedRe10k, true) - count(CliftVariant::ReleasedRe10k, false);
         assert_eq!(condenser, 8_468_480); // 8.5 million
         // Two gammas of 96 in each of the 6 + 12 + 2 attentions, and a layer norm.
-        assert_eq!(count(Variant::ReleasedDl3dv, true) - count(Variant::ReleasedRe10k, true), 20 * 2 * 96 + 2 * 768);
+        assert_eq!(
+            count(CliftVariant::ReleasedDl3dv, true) - count(CliftVariant::ReleasedRe10k, true),
+            20 * 2 * 96 + 2 * 768
+        );
     }
 
     #[test]
     fn names_that_tools_add_are_taken_off() {
-        assert_eq!(plain_key("_orig_mod.encoder.layers.0.norm1.weight"), "encoder.layers.0.norm1.weight");
+        assert_eq!(canonical_key("_orig_mod.encoder.layers.0.norm1.weight"), "encoder.layers.0.norm1.weight");
         assert_eq!(
-            plain_key("encoder.layers.0.self_attn.query_norm.scale"),
+            canonical_key("encoder.layers.0.self_attn.query_norm.scale"),
             "encoder.layers.0.self_attn.q_norm.weight"
         );
-        assert_eq!(plain_key("output_norm.weight"), "output_norm.weight");
+        assert_eq!(canonical_key("output_norm.weight"), "output_norm.weight");
     }
 
     #[test]
     fn a_projection_may_be_a_convolution_and_nothing_else_may() {
-        let all = tensors(&small_config(Variant::ReleasedRe10k), true);
+        let all = published_tensors(&small_config(CliftVariant::ReleasedRe10k), true);
         let fits = |key: &str, shape: &[u64]| all.iter().find(|tensor| tensor.key == key).expect("known").fits(shape);
         assert!(fits("linear_input.weight", &[15, 576]) && fits("linear_input.weight", &[15, 576, 1, 1]));
         assert!(!fits("linear_input.weight", &[15, 576, 1]) && !fits("linear_input.weight", &[15, 64, 3, 3]));

@@ -5,17 +5,17 @@
 
 use std::collections::BTreeMap;
 
-use crate::network::architecture::Variant;
+use crate::network::architecture::CliftVariant;
 use crate::network::config::{CondenserConfig, ModelConfig};
-use crate::weights::published_keys::{is_projection, tensors};
+use crate::weights::published_keys::{is_projection, published_tensors};
 
 /// What stands before the number of a layer.
 const LAYERS: [&str; 3] = ["encoder.layers.", "decoder.layers.", "squeezer.blocks."];
 
 /// What a checkpoint shows of its network.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Sizes {
-    /// The network. What the checkpoint does not show has the published size: comparing with [`tensors`] then names what
+pub struct InferredConfig {
+    /// The network. What the checkpoint does not show has the published size: comparing with [`published_tensors`] then names what
     /// is missing.
     pub config: ModelConfig,
     /// Whether it has a condenser.
@@ -43,7 +43,7 @@ impl Votes {
 }
 
 /// A network whose sizes no two kinds of dimensions share, so that a dimension of it says what it is.
-fn probe(variant: Variant) -> ModelConfig {
+fn probe(variant: CliftVariant) -> ModelConfig {
     ModelConfig {
         variant,
         dim: 11 * 101,
@@ -59,14 +59,14 @@ fn probe(variant: Variant) -> ModelConfig {
 /// Reads the sizes off keys without prefix and their shapes, which are empty for what is no tensor.
 ///
 /// `num_heads` is asked for because no shape shows it, but for the variant that normalises heads.
-pub fn sizes<'a>(
-    variant: Variant,
+pub fn infer_config<'a>(
+    variant: CliftVariant,
     num_heads: Option<usize>,
     shapes: impl Iterator<Item = (&'a str, &'a [u64])>,
-) -> Sizes {
+) -> InferredConfig {
     let probe = probe(variant);
     let known: BTreeMap<String, Vec<usize>> =
-        tensors(&probe, true).into_iter().map(|tensor| (tensor.key, tensor.shape)).collect();
+        published_tensors(&probe, true).into_iter().map(|tensor| (tensor.key, tensor.shape)).collect();
     let [mut width, mut hidden, mut patch, mut head] = [(); 4].map(|()| Votes::default());
     let mut layers: [BTreeMap<usize, usize>; 3] = Default::default();
     let (mut has_condenser, mut has_norm_cross) = (false, false);
@@ -124,7 +124,7 @@ pub fn sizes<'a>(
         patch_size: patch.winner().map_or(published.patch_size, |(size, _)| size),
         condenser: CondenserConfig::of(variant),
     };
-    if variant == Variant::Paper {
+    if variant == CliftVariant::Paper {
         config.condenser.num_blocks = condenser.unwrap_or(config.condenser.num_blocks);
         config.condenser.residual = !has_condenser || has_norm_cross;
     }
@@ -132,7 +132,7 @@ pub fn sizes<'a>(
     let num_heads = num_heads.or(shown.map(|size| config.dim / size));
     let knows_heads = num_heads.is_some() || config.dim == published.dim;
     config.num_heads = num_heads.unwrap_or(published.num_heads);
-    Sizes { config, has_condenser, knows_heads, width_key: width.winner().map(|(_, key)| key.to_owned()) }
+    InferredConfig { config, has_condenser, knows_heads, width_key: width.winner().map(|(_, key)| key.to_owned()) }
 }
 
 #[cfg(test)]
@@ -144,16 +144,16 @@ mod tests {
 
     fn shapes(config: &ModelConfig, has_condenser: bool) -> Shapes {
         let wide = |shape: Vec<usize>| shape.into_iter().map(|size| size as u64).collect();
-        tensors(config, has_condenser).into_iter().map(|tensor| (tensor.key, wide(tensor.shape))).collect()
+        published_tensors(config, has_condenser).into_iter().map(|tensor| (tensor.key, wide(tensor.shape))).collect()
     }
 
-    fn read(variant: Variant, num_heads: Option<usize>, shapes: &Shapes) -> Sizes {
-        sizes(variant, num_heads, shapes.iter().map(|(key, shape)| (key.as_str(), &shape[..])))
+    fn read(variant: CliftVariant, num_heads: Option<usize>, shapes: &Shapes) -> InferredConfig {
+        infer_config(variant, num_heads, shapes.iter().map(|(key, shape)| (key.as_str(), &shape[..])))
     }
 
     #[test]
     fn sizes_are_read_off_shapes() {
-        for variant in Variant::ALL {
+        for variant in CliftVariant::ALL {
             for residual in [true, false] {
                 for with_condenser in [true, false] {
                     let mut config = small_config(variant);
@@ -168,9 +168,9 @@ mod tests {
 
     #[test]
     fn the_kinds_of_dimensions_of_the_probe_are_told_apart() {
-        for variant in Variant::ALL {
+        for variant in CliftVariant::ALL {
             let probe = probe(variant);
-            for tensor in tensors(&probe, true) {
+            for tensor in published_tensors(&probe, true) {
                 for size in tensor.shape {
                     let kinds = [
                         size == probe.feed_forward_dim,
@@ -186,7 +186,7 @@ mod tests {
 
     #[test]
     fn one_misshapen_tensor_does_not_change_the_sizes() {
-        for variant in Variant::ALL {
+        for variant in CliftVariant::ALL {
             let config = small_config(variant);
             let all = shapes(&config, true);
             for key in all.keys() {
@@ -202,7 +202,7 @@ mod tests {
 
     #[test]
     fn a_stray_key_makes_no_layer_and_a_missing_layer_no_smaller_network() {
-        let config = small_config(Variant::ReleasedRe10k);
+        let config = small_config(CliftVariant::ReleasedRe10k);
         let mut stray = shapes(&config, true);
         stray.insert("decoder.layers.3.norm1.weight".into(), vec![15]);
         stray.insert("encoder.layers.18446744073709551615.norm1.weight".into(), vec![15]);
@@ -219,8 +219,8 @@ mod tests {
             let got = read(variant, None, &shapes(&config, true));
             (got.knows_heads, got.config.num_heads)
         };
-        assert_eq!(knows(Variant::ReleasedDl3dv, 15), (true, 3));
-        assert_eq!(knows(Variant::ReleasedRe10k, 768), (true, 8));
-        assert!(!knows(Variant::ReleasedRe10k, 15).0 && !knows(Variant::Paper, 15).0);
+        assert_eq!(knows(CliftVariant::ReleasedDl3dv, 15), (true, 3));
+        assert_eq!(knows(CliftVariant::ReleasedRe10k, 768), (true, 8));
+        assert!(!knows(CliftVariant::ReleasedRe10k, 15).0 && !knows(CliftVariant::Paper, 15).0);
     }
 }

@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     const CONFIG: ModelConfig = ModelConfig {
-        variant: crate::network::architecture::Variant::Paper,
+        variant: crate::network::architecture::CliftVariant::Paper,
         dim: 16,
         num_heads: 2,
         feed_forward_dim: 24,

@@ -13,7 +13,7 @@ use clift_model::{ModelConfig, first_not_f32};
 use crate::checkpoint::progress::{Best, Fingerprint, Progress, State, VERSION};
 use crate::config::config::CheckpointConfig;
 use crate::error::TrainError;
-use crate::step::train_state::Learner;
+use crate::step::train_state::TrainState;
 
 const MODEL: &str = "model.bpk";
 const OPTIMIZER: &str = "optimizer.bpk";
@@ -44,7 +44,7 @@ impl Checkpoints {
     ///
     /// # Errors
     /// [`TrainError::Io`]; older checkpoints are then untouched, and what was written of this one is removed.
-    pub fn save(&self, learner: &Learner, progress: &Progress) -> Result<PathBuf, TrainError> {
+    pub fn save(&self, learner: &TrainState, progress: &Progress) -> Result<PathBuf, TrainError> {
         let path = self.path_of(progress.step);
         let temporary = path.with_extension("tmp");
         remove_if_there(&temporary)?;
@@ -58,7 +58,13 @@ impl Checkpoints {
         Ok(path)
     }
 
-    fn write(&self, learner: &Learner, progress: &Progress, temporary: &Path, path: &Path) -> Result<(), TrainError> {
+    fn write(
+        &self,
+        learner: &TrainState,
+        progress: &Progress,
+        temporary: &Path,
+        path: &Path,
+    ) -> Result<(), TrainError> {
         make_folder(temporary).map_err(TrainError::io("making a checkpoint", temporary))?;
         let failed =
             |name: &str, reason: String| TrainError::io(SAVING, &temporary.join(name))(std::io::Error::other(reason));
@@ -95,7 +101,7 @@ impl Checkpoints {
     ///
     /// # Errors
     /// [`TrainError::Damaged`] for a damaged checkpoint: nothing is started over in silence.
-    pub fn resume(&self, learner: &mut Learner) -> Result<Option<Progress>, TrainError> {
+    pub fn resume(&self, learner: &mut TrainState) -> Result<Option<Progress>, TrainError> {
         let mut all = self.list()?;
         let Some(path) = all.pop() else { return Ok(None) };
         let loaded = load(&path, self.model.as_ref(), learner).map_err(|source| {
@@ -181,7 +187,7 @@ fn remove_if_there(folder: &Path) -> Result<(), TrainError> {
     Ok(())
 }
 
-fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut Learner) -> Result<Progress, TrainError> {
+fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut TrainState) -> Result<Progress, TrainError> {
     let State { progress, files, model, loss_scale, .. } = State::read(folder)?;
     if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !files.contains_key(*name)) {
         let reason = format!("it has no checksum of {name}");
@@ -239,11 +245,11 @@ mod tests {
     use super::*;
 
     /// A learner and its first checkpoint below `root`.
-    fn saved(root: &Path) -> (Learner, Checkpoints, PathBuf) {
+    fn saved(root: &Path) -> (TrainState, Checkpoints, PathBuf) {
         let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
         let device = burn::tensor::Device::flex().autodiff();
         let optimizer = crate::step::optimizer::adamw(&crate::config::config::OptimizerConfig::default());
-        let learner = Learner {
+        let learner = TrainState {
             model: clift_model::Clift::new(&config, 0, &device),
             optimizer,
             device,

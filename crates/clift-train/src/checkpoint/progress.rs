@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use crate::error::TrainError;
 use crate::step::loss_scale::LossScale;
-use crate::step::step_guard::Recent;
+use crate::step::step_guard::LossHistory;
 
 /// The version that is written.
 pub(crate) const VERSION: u32 = 3;
@@ -59,7 +59,7 @@ pub struct Progress {
     /// The best validation so far of a step with a checkpoint.
     pub best: Option<Best>,
     /// Loss and gradient norm of the last good steps, with which the next step is compared.
-    pub recent: Recent,
+    pub recent: LossHistory,
 }
 
 /// The best validation of a stage.
@@ -152,7 +152,7 @@ mod tests {
     use super::*;
 
     fn state(values: &[f64], psnr: f64) -> State {
-        let mut recent = Recent::default();
+        let mut recent = LossHistory::default();
         for &value in values {
             recent.push(value, -value);
         }

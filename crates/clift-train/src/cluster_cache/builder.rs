@@ -12,13 +12,13 @@ use clift_model::{Encoder, Grouping, SceneClusters, tile_clusters};
 
 use crate::cluster_cache::cache::ClusterCache;
 use crate::cluster_cache::entry::{VERSION, settings};
-use crate::cluster_cache::resume_log::{Journal, Origin};
+use crate::cluster_cache::resume_log::{CacheKey, ResumeLog};
 use crate::config::config::{ClustersConfig, Config};
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 
 /// What the cache of a run is made from.
-pub struct ClusterJob<'a> {
+pub struct ClusterBuilder<'a> {
     /// Settings of the run.
     pub config: &'a Config,
     /// Training scenes.
@@ -31,7 +31,7 @@ pub struct ClusterJob<'a> {
     pub device: &'a Device,
 }
 
-impl ClusterJob<'_> {
+impl ClusterBuilder<'_> {
     /// Clusters every training scene `num_passes` times, each time with one context set and one count
     /// of the grid, and opens the result. What an interrupted call with the same encoder and settings has done is taken
     /// over; the result is the same, byte for byte. Written to a temporary folder that is then renamed.
@@ -41,8 +41,8 @@ impl ClusterJob<'_> {
     /// [`TrainError::Interrupted`]. A scene that does not fit its views is skipped and noted.
     pub fn make(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
         let Self { config, reader, encoder_hash, .. } = *self;
-        let origin = Origin { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };
-        let mut journal = Journal::open(&folder.with_extension("tmp"), origin)?;
+        let origin = CacheKey { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };
+        let mut journal = ResumeLog::open(&folder.with_extension("tmp"), origin)?;
 
         let total = reader.source.num_scenes();
         let num_scenes = if config.clusters.num_scenes == 0 { total } else { config.clusters.num_scenes.min(total) };

@@ -7,10 +7,10 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use clift_data::Ledger;
+use clift_data::SkipReport;
 use clift_model::SceneClusters;
 
-use crate::cluster_cache::entry::{Entry, Index, VERSION, settings};
+use crate::cluster_cache::entry::{CacheEntry, CacheIndex, VERSION, settings};
 use crate::config::config::Config;
 use crate::error::TrainError;
 
@@ -18,7 +18,7 @@ use crate::error::TrainError;
 #[derive(Debug)]
 pub struct ClusterCache {
     folder: PathBuf,
-    index: Index,
+    index: CacheIndex,
 }
 
 impl ClusterCache {
@@ -30,7 +30,7 @@ impl ClusterCache {
     pub fn open(folder: &Path, config: &Config, encoder: &str) -> Result<Self, TrainError> {
         let path = folder.join("index.json");
         let text = std::fs::read(&path).map_err(TrainError::io("reading the cluster cache", &path))?;
-        let index: Index = serde_json::from_slice(&text).map_err(TrainError::bad_file("cluster cache", &path))?;
+        let index: CacheIndex = serde_json::from_slice(&text).map_err(TrainError::bad_file("cluster cache", &path))?;
         let stale = |reason: String| TrainError::StaleClusters { reason, path: folder.into() };
         if index.version != VERSION {
             return Err(stale(format!("it has version {}, this program writes {VERSION}", index.version)));
@@ -45,13 +45,13 @@ impl ClusterCache {
             return Err(stale("its data, sampler or K-means settings are not this run's".into()));
         }
         if let Some(entry) = index.entries.iter().find(|entry| !entry.is_possible()) {
-            let Entry { key, num_tokens, num_storage_tokens, .. } = entry;
+            let CacheEntry { key, num_tokens, num_storage_tokens, .. } = entry;
             let reason = format!("scene {key} has {num_storage_tokens} clusters of {num_tokens} tokens");
             return Err(TrainError::BadFile { what: "cluster cache", reason, path });
         }
         let data = folder.join("clusters.bin");
         let found = std::fs::metadata(&data).map_err(TrainError::io("opening the cluster cache", &data))?.len();
-        let expected: u64 = index.entries.iter().map(Entry::num_bytes).sum();
+        let expected: u64 = index.entries.iter().map(CacheEntry::num_bytes).sum();
         if found != expected {
             let reason = format!("{found} bytes, {expected} expected");
             return Err(TrainError::BadFile { what: "cluster cache", reason, path: data });
@@ -60,12 +60,12 @@ impl ClusterCache {
     }
 
     /// What was clustered.
-    pub fn entries(&self) -> &[Entry] {
+    pub fn entries(&self) -> &[CacheEntry] {
         &self.index.entries
     }
 
     /// Scenes that could not be clustered.
-    pub fn skipped(&self) -> &Ledger {
+    pub fn skipped(&self) -> &SkipReport {
         &self.index.skipped
     }
 
@@ -73,7 +73,7 @@ impl ClusterCache {
     ///
     /// # Errors
     /// [`TrainError::Io`], and [`clift_model::ModelError::BadClusters`] for indices that contradict each other.
-    pub fn read(&self, entry: &Entry) -> Result<SceneClusters, TrainError> {
+    pub fn read(&self, entry: &CacheEntry) -> Result<SceneClusters, TrainError> {
         let path = self.folder.join("clusters.bin");
         let mut bytes = vec![0; entry.num_bytes() as usize];
         File::open(&path)
@@ -97,12 +97,12 @@ mod tests {
     fn opened(num_tokens: usize, num_storage_tokens: usize) -> String {
         let config = Config::default();
         let folder = tempfile::tempdir().expect("a temporary folder");
-        let entry = Entry { key: "a".into(), context: vec![0], num_tokens, num_storage_tokens, offset_bytes: 0 };
-        let index = Index {
+        let entry = CacheEntry { key: "a".into(), context: vec![0], num_tokens, num_storage_tokens, offset_bytes: 0 };
+        let index = CacheIndex {
             version: VERSION,
             encoder: "e".into(),
             settings: settings(&config),
-            skipped: Ledger::new(1),
+            skipped: SkipReport::new(1),
             entries: vec![entry],
         };
         std::fs::write(folder.path().join("index.json"), serde_json::to_vec(&index).expect("JSON")).expect("writable");

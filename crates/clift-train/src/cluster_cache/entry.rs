@@ -1,6 +1,6 @@
 //! Entries of a cluster cache and their index.
 
-use clift_data::Ledger;
+use clift_data::SkipReport;
 use clift_model::Grouping;
 use serde::{Deserialize, Serialize};
 
@@ -11,7 +11,7 @@ pub(crate) const VERSION: u32 = 1;
 /// One clustered context set of a scene.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Entry {
+pub struct CacheEntry {
     /// Key of the scene.
     pub key: String,
     /// Frames of the contexts.
@@ -27,17 +27,17 @@ pub struct Entry {
 /// What `index.json` holds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Index {
+pub(crate) struct CacheIndex {
     pub version: u32,
     /// Hash of the encoder's weights.
     pub encoder: String,
     /// The settings that decide the clusters, as JSON in a string, compared as text.
     pub settings: String,
-    pub skipped: Ledger,
-    pub entries: Vec<Entry>,
+    pub skipped: SkipReport,
+    pub entries: Vec<CacheEntry>,
 }
 
-impl Entry {
+impl CacheEntry {
     /// Whether a scene can have so many tokens and clusters. No number is allocated or added up before.
     pub(crate) fn is_possible(&self) -> bool {
         (1..=MAX_TOKENS).contains(&self.num_tokens) && (1..=self.num_tokens).contains(&self.num_storage_tokens)

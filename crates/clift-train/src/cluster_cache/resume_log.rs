@@ -8,11 +8,11 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use clift_data::{Ledger, make_folder, publish_file, replace_file};
+use clift_data::{SkipReport, make_folder, publish_file, replace_file};
 use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 
-use crate::cluster_cache::entry::{Entry, Index};
+use crate::cluster_cache::entry::{CacheEntry, CacheIndex};
 use crate::config::config::MAX_TOKENS;
 use crate::error::TrainError;
 
@@ -23,7 +23,7 @@ const JOURNAL: &str = "journal.jsonl";
 /// What a cache is made from: only with the same is it gone on with. The first line of the journal.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Origin {
+pub(crate) struct CacheKey {
     pub version: u32,
     /// Hash of the encoder's weights.
     pub encoder: String,
@@ -45,7 +45,7 @@ struct Line {
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 enum Outcome {
-    Clustered(Entry),
+    Clustered(CacheEntry),
     Skipped { key: String, reason: String },
 }
 
@@ -60,21 +60,21 @@ impl Line {
 
 /// A cache that is being made.
 #[derive(Debug)]
-pub(crate) struct Journal {
+pub(crate) struct ResumeLog {
     folder: PathBuf,
-    origin: Origin,
+    origin: CacheKey,
     data: File,
     lines: File,
-    entries: Vec<Entry>,
+    entries: Vec<CacheEntry>,
     skipped: Vec<(String, String)>,
 }
 
-impl Journal {
+impl ResumeLog {
     /// Goes on in `folder`, or starts anew where it holds nothing of this origin.
     ///
     /// # Errors
     /// [`TrainError::Io`].
-    pub fn open(folder: &Path, origin: Origin) -> Result<Self, TrainError> {
+    pub fn open(folder: &Path, origin: CacheKey) -> Result<Self, TrainError> {
         let failed = |source| TrainError::io("taking up an unfinished cluster cache", folder)(source);
         if let Some(journal) = Self::take_up(folder, &origin).map_err(failed)? {
             return Ok(journal);
@@ -91,7 +91,7 @@ impl Journal {
     }
 
     /// Reads what an earlier process has done and cuts off what it left half done.
-    fn take_up(folder: &Path, origin: &Origin) -> std::io::Result<Option<Self>> {
+    fn take_up(folder: &Path, origin: &CacheKey) -> std::io::Result<Option<Self>> {
         let open = |name: &str| File::options().read(true).write(true).open(folder.join(name));
         let (Ok(mut data), Ok(mut lines)) = (open(DATA), open(JOURNAL)) else { return Ok(None) };
         let (mut entries, mut skipped) = (Vec::new(), Vec::new());
@@ -99,7 +99,7 @@ impl Journal {
         let mut reader = BufReader::new(&lines);
         let mut text = Vec::new();
         reader.read_until(b'\n', &mut text)?;
-        if !serde_json::from_slice::<Origin>(&text).is_ok_and(|found| found == *origin && text.ends_with(b"\n")) {
+        if !serde_json::from_slice::<CacheKey>(&text).is_ok_and(|found| found == *origin && text.ends_with(b"\n")) {
             return Ok(None);
         }
         loop {
@@ -145,7 +145,7 @@ impl Journal {
     /// [`TrainError::Io`], and [`TrainError::NoScenes`] for more tokens than 16 bits can name.
     pub fn add(&mut self, key: &str, context: Vec<usize>, clusters: &SceneClusters) -> Result<(), TrainError> {
         let bytes = encode(clusters)?;
-        let entry = Entry {
+        let entry = CacheEntry {
             key: key.into(),
             context,
             num_tokens: clusters.assignment().len(),
@@ -196,12 +196,12 @@ impl Journal {
         for entry in &entries {
             reasons.remove(&entry.key);
         }
-        let mut ledger = Ledger::new(num_scenes);
+        let mut ledger = SkipReport::new(num_scenes);
         for (key, reason) in reasons {
             ledger.skip(key, reason);
         }
-        let Origin { version, encoder, settings } = origin;
-        let index = Index { version, encoder, settings, skipped: ledger, entries };
+        let CacheKey { version, encoder, settings } = origin;
+        let index = CacheIndex { version, encoder, settings, skipped: ledger, entries };
         let index_path = folder.join("index.json");
         let text = serde_json::to_vec(&index).map_err(TrainError::bad_file("cluster cache", &index_path))?;
         replace_file(&index_path, &text).map_err(TrainError::io(WRITING, &index_path))?;
@@ -240,8 +240,8 @@ mod tests {
 
     use super::*;
 
-    fn origin() -> Origin {
-        Origin { version: 1, encoder: "abc".into(), settings: "{}".into() }
+    fn origin() -> CacheKey {
+        CacheKey { version: 1, encoder: "abc".into(), settings: "{}".into() }
     }
 
     /// Sets of a scene whose tokens all belong to the first cluster or are it.
@@ -250,7 +250,7 @@ mod tests {
     }
 
     /// Does the sets from where the journal stands, 8 in all: the third cannot be clustered, the others grow.
-    fn go_on(journal: &mut Journal, until: u64) {
+    fn go_on(journal: &mut ResumeLog, until: u64) {
         for set in journal.num_sets()..until {
             let key = format!("scene {}", set % 4);
             if set == 2 {
@@ -262,7 +262,7 @@ mod tests {
     }
 
     fn finished(place: &Path) -> [Vec<u8>; 2] {
-        let mut journal = Journal::open(&place.join("clusters.tmp"), origin()).unwrap();
+        let mut journal = ResumeLog::open(&place.join("clusters.tmp"), origin()).unwrap();
         go_on(&mut journal, 8);
         journal.publish(&place.join("clusters"), 4).unwrap();
         assert_eq!(std::fs::read_dir(place.join("clusters")).unwrap().count(), 2, "the journal is gone");
@@ -276,7 +276,7 @@ mod tests {
         let expected = finished(whole.path());
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("clusters.tmp");
-        go_on(&mut Journal::open(&folder, origin()).unwrap(), 6);
+        go_on(&mut ResumeLog::open(&folder, origin()).unwrap(), 6);
         let [data, lines] = [DATA, JOURNAL].map(|name| std::fs::read(folder.join(name)).unwrap());
         let mut taken_over = std::collections::BTreeSet::new();
         let ends = lines.iter().enumerate().filter(|(_, byte)| **byte == b'\n').flat_map(|(end, _)| [end, end + 1]);
@@ -286,7 +286,7 @@ mod tests {
                 std::fs::create_dir_all(&folder).unwrap();
                 std::fs::write(folder.join(JOURNAL), &lines[..length]).unwrap();
                 std::fs::write(folder.join(DATA), &data[..data_length]).unwrap();
-                taken_over.insert(Journal::open(&folder, origin()).unwrap().num_sets());
+                taken_over.insert(ResumeLog::open(&folder, origin()).unwrap().num_sets());
                 assert_eq!(finished(place.path()), expected, "{length}, {data_length}");
                 std::fs::remove_dir_all(place.path().join("clusters")).unwrap();
             }
@@ -300,11 +300,11 @@ mod tests {
         let expected = finished(whole.path());
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("clusters.tmp");
-        go_on(&mut Journal::open(&folder, origin()).unwrap(), 6);
+        go_on(&mut ResumeLog::open(&folder, origin()).unwrap(), 6);
         let mut data = std::fs::read(folder.join(DATA)).unwrap();
         data[7] ^= 1; // of the second set: the first has three numbers of two bytes
         std::fs::write(folder.join(DATA), data).unwrap();
-        assert_eq!(Journal::open(&folder, origin()).unwrap().num_sets(), 1);
+        assert_eq!(ResumeLog::open(&folder, origin()).unwrap().num_sets(), 1);
         assert_eq!(finished(place.path()), expected);
     }
 
@@ -312,9 +312,9 @@ mod tests {
     fn what_is_taken_up_of_a_journal_damaged_anyhow_is_whole_and_the_first_of_it() {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("clusters.tmp");
-        go_on(&mut Journal::open(&folder, origin()).unwrap(), 6);
+        go_on(&mut ResumeLog::open(&folder, origin()).unwrap(), 6);
         let files = [DATA, JOURNAL].map(|name| std::fs::read(folder.join(name)).unwrap());
-        let whole = Journal::open(&folder, origin()).unwrap();
+        let whole = ResumeLog::open(&folder, origin()).unwrap();
         let mut taken_up = BTreeMap::new();
         for case in 0..2_000 {
             let mut rng = item_rng(0, 0, case, 0, "damage");
@@ -332,7 +332,7 @@ mod tests {
                 std::fs::create_dir_all(&folder).unwrap();
                 std::fs::write(folder.join(name), bytes).unwrap();
             }
-            let journal = Journal::open(&folder, origin()).unwrap();
+            let journal = ResumeLog::open(&folder, origin()).unwrap();
             assert_eq!(journal.entries, whole.entries[..journal.entries.len()], "case {case}");
             assert_eq!(journal.skipped, whole.skipped[..journal.skipped.len()], "case {case}");
             let data = std::fs::read(folder.join(DATA)).unwrap();
@@ -346,17 +346,17 @@ mod tests {
     fn a_journal_of_another_origin_is_not_gone_on_with() {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("clusters.tmp");
-        go_on(&mut Journal::open(&folder, origin()).unwrap(), 3);
-        assert_eq!(Journal::open(&folder, origin()).unwrap().num_sets(), 3);
-        let other = Origin { encoder: "abd".into(), ..origin() };
-        assert_eq!(Journal::open(&folder, other).unwrap().num_sets(), 0);
-        assert_eq!(Journal::open(&folder, origin()).unwrap().num_sets(), 0, "and what was there is gone");
+        go_on(&mut ResumeLog::open(&folder, origin()).unwrap(), 3);
+        assert_eq!(ResumeLog::open(&folder, origin()).unwrap().num_sets(), 3);
+        let other = CacheKey { encoder: "abd".into(), ..origin() };
+        assert_eq!(ResumeLog::open(&folder, other).unwrap().num_sets(), 0);
+        assert_eq!(ResumeLog::open(&folder, origin()).unwrap().num_sets(), 0, "and what was there is gone");
     }
 
     #[test]
     fn a_cache_without_a_scene_is_refused_with_the_first_reason() {
         let place = tempfile::tempdir().unwrap();
-        let mut journal = Journal::open(&place.path().join("clusters.tmp"), origin()).unwrap();
+        let mut journal = ResumeLog::open(&place.path().join("clusters.tmp"), origin()).unwrap();
         journal.skip("a", "too short").unwrap();
         let message = journal.publish(&place.path().join("clusters"), 1).unwrap_err().to_string();
         assert!(message.contains("too short"), "{message}");

@@ -8,14 +8,14 @@ use codespan_reporting::files::SimpleFiles;
 use codespan_reporting::term::{self, Chars};
 
 /// The texts a configuration was read from, one after the other, so that one offset names a place in any of them.
-pub(crate) struct Sources<'a> {
+pub(crate) struct SourceText<'a> {
     /// The file and the overrides, by position in `texts`.
     files: SimpleFiles<String, &'a str>,
     /// Every text with the offset of its first byte.
     texts: Vec<(usize, &'a str)>,
 }
 
-impl<'a> Sources<'a> {
+impl<'a> SourceText<'a> {
     pub(crate) fn new(path: &Path, file: &'a str, overrides: &'a [String]) -> Self {
         let (mut files, mut texts, mut start) = (SimpleFiles::new(), Vec::new(), 0);
         let names = std::iter::once(path.display().to_string()).chain(std::iter::repeat("--set".to_owned()));
@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     fn rendered(file: &str, span: Range<usize>) -> String {
-        let sources = Sources::new(Path::new("run.toml"), file, &[]);
+        let sources = SourceText::new(Path::new("run.toml"), file, &[]);
         sources.render(&sources.at(span, "bad name".into(), "too big".into()).with_note("help: shrink it"))
     }
 

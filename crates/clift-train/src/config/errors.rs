@@ -7,12 +7,12 @@ use codespan_reporting::diagnostic::Diagnostic;
 use serde::Serialize;
 use toml::de::{DeTable, DeValue};
 
-use crate::config::diagnostic::Sources;
+use crate::config::diagnostic::SourceText;
 use crate::config::schema::{Keys, nearest};
 use crate::error::TrainError;
 
 /// Finds every key that the type does not know, in the order of the text.
-pub(crate) fn unknown_keys(keys: &Keys, root: &DeTable, sources: &Sources) -> Vec<Diagnostic<usize>> {
+pub(crate) fn unknown_keys(keys: &Keys, root: &DeTable, sources: &SourceText) -> Vec<Diagnostic<usize>> {
     let mut found = Vec::new();
     collect_unknown(keys, keys, root, "", sources, &mut found);
     found.sort_by_key(|(start, _)| *start);
@@ -24,7 +24,7 @@ fn collect_unknown(
     keys: &Keys,
     table: &DeTable,
     section: &str,
-    sources: &Sources,
+    sources: &SourceText,
     found: &mut Vec<(usize, Diagnostic<usize>)>,
 ) {
     if keys.fields.is_none() {
@@ -51,7 +51,7 @@ fn unknown_key(
     span: Range<usize>,
     section: &str,
     is_section: bool,
-    sources: &Sources,
+    sources: &SourceText,
 ) -> Diagnostic<usize> {
     let place = if section.is_empty() { String::new() } else { format!(" in [{section}]") };
     let title = match (is_section, section.is_empty()) {
@@ -72,7 +72,7 @@ fn unknown_key(
 }
 
 /// Turns the deserialiser's message into words, at the value it is about.
-pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sources) -> Diagnostic<usize> {
+pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &SourceText) -> Diagnostic<usize> {
     let message = error.message();
     let span = error.span();
     let path = span.as_ref().and_then(|span| path_at(root, span)).unwrap_or_default();
@@ -102,12 +102,17 @@ pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sou
 }
 
 /// Finds a list that is longer than what was made of it: the deserialiser takes what it needs and forgets the rest.
-pub(crate) fn too_long<T: Serialize>(config: &T, root: &DeTable, sources: &Sources) -> Option<Diagnostic<usize>> {
+pub(crate) fn too_long<T: Serialize>(config: &T, root: &DeTable, sources: &SourceText) -> Option<Diagnostic<usize>> {
     let made = toml::Value::try_from(config).ok()?;
     find_too_long(made.as_table()?, root, "", sources)
 }
 
-fn find_too_long(made: &toml::Table, table: &DeTable, section: &str, sources: &Sources) -> Option<Diagnostic<usize>> {
+fn find_too_long(
+    made: &toml::Table,
+    table: &DeTable,
+    section: &str,
+    sources: &SourceText,
+) -> Option<Diagnostic<usize>> {
     table.iter().find_map(|(key, value)| {
         let name = key.get_ref().as_ref();
         let path = join(section, name);
@@ -124,7 +129,7 @@ fn find_too_long(made: &toml::Table, table: &DeTable, section: &str, sources: &S
 
 /// Puts a value that was refused by its key where it stands, with the places of the other keys the refusal names.
 /// `None` for a refusal that names no key.
-pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &Sources) -> Option<Diagnostic<usize>> {
+pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &SourceText) -> Option<Diagnostic<usize>> {
     let (keys, fix) = match error {
         TrainError::BadConfig { key, fix, .. } => (key.as_str(), fix.as_str()),
         TrainError::Model(ModelError::BadConfig { key, fix, .. }) => (*key, fix.as_str()),

@@ -7,7 +7,7 @@ use codespan_reporting::diagnostic::Diagnostic;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use crate::config::diagnostic::Sources;
+use crate::config::diagnostic::SourceText;
 
 /// What a `--set`, or a former name in the file, changed with respect to the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -43,7 +43,7 @@ type KeyValue<'t> = (Vec<Spanned<String>>, Spanned<DeValue<'t>>);
 
 /// Splits `key=TOML` into the key's parts and the value.
 pub(crate) fn parse_override<'t>(
-    sources: &Sources,
+    sources: &SourceText,
     text: &'t str,
     start: usize,
 ) -> Result<KeyValue<'t>, Box<Diagnostic<usize>>> {

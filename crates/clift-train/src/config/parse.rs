@@ -8,7 +8,7 @@ use toml::Spanned;
 use toml::de::DeTable;
 
 use crate::config::config::Config;
-use crate::config::diagnostic::Sources;
+use crate::config::diagnostic::SourceText;
 use crate::config::errors;
 use crate::config::former_names::rename;
 use crate::config::overrides::{Override, dotted, merge, parse_override, show};
@@ -96,7 +96,7 @@ fn parse_checked<T: DeserializeOwned + Serialize>(
     overrides: &[String],
     check: impl FnOnce(&T) -> Result<(), TrainError>,
 ) -> Result<(T, Vec<Override>), ConfigError> {
-    let sources = Sources::new(path, file, overrides);
+    let sources = SourceText::new(path, file, overrides);
     let padded = sources.padded_overrides();
     let keys = Keys::of::<T>();
     let (mut root, mut changed) = merged(&sources, file, &padded)?;
@@ -121,7 +121,7 @@ fn parse_checked<T: DeserializeOwned + Serialize>(
 
 /// The file's table with the overrides in it, and what those changed.
 fn merged<'t>(
-    sources: &Sources,
+    sources: &SourceText,
     file: &'t str,
     padded: &'t [String],
 ) -> Result<(Spanned<DeTable<'t>>, Vec<Override>), ConfigError> {

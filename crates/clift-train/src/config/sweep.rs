@@ -1,13 +1,13 @@
 //! A config as settings of an evaluation.
 
 use clift_data::derive_seed;
-use clift_eval::{Sweep, Variant};
+use clift_eval::{Method, Sweep};
 use clift_model::{DeviceName, TokenCount};
 
 use crate::config::config::Config;
 
 /// What an evaluation of a run does with every scene, without LPIPS and other systems.
-pub(crate) fn sweep(config: &Config, storage: Vec<TokenCount>, variants: Vec<Variant>) -> Sweep {
+pub(crate) fn sweep(config: &Config, storage: Vec<TokenCount>, variants: Vec<Method>) -> Sweep {
     let Config { seed, eval, clusters, model, device, .. } = config;
     Sweep {
         storage,

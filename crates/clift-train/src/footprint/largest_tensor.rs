@@ -49,7 +49,7 @@ fn check_limit(config: &Config, limit: u64, parts: &[Stage]) -> Result<(), Train
     for &part in parts {
         let LargestTensor { what, bytes, .. } = largest_tensor(config, part)?;
         if bytes > limit {
-            let (key, value, fix) = setting_that_fits(config, part, limit)?;
+            let (key, value, fix) = largest_fitting_setting(config, part, limit)?;
             let of = if part == Stage::Eval { "the evaluation".into() } else { part.name().to_owned() };
             let fix = format!(
                 "{what} of {of} would be one tensor of {bytes} bytes, and {} takes at most {limit} in one: {fix}",
@@ -62,7 +62,11 @@ fn check_limit(config: &Config, limit: u64, parts: &[Stage]) -> Result<(), Train
 }
 
 /// The key to change, its value now, and the change.
-fn setting_that_fits(config: &Config, part: Stage, limit: u64) -> Result<(&'static str, String, String), TrainError> {
+fn largest_fitting_setting(
+    config: &Config,
+    part: Stage,
+    limit: u64,
+) -> Result<(&'static str, String, String), TrainError> {
     let fits = |config: &Config| Ok::<_, TrainError>(largest_tensor(config, part)?.bytes <= limit);
     let mut smaller = config.clone();
     let set_views = |config: &mut Config, count: usize| {

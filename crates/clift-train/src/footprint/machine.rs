@@ -20,7 +20,7 @@ pub fn available_bytes(device: DeviceName) -> Option<u64> {
 }
 
 /// Memory that a process of this program holds besides its tensors: its code, threads and buffers (docs/guide/training.md).
-pub fn own_bytes() -> u64 {
+pub fn process_overhead_bytes() -> u64 {
     20 << 20
 }
 

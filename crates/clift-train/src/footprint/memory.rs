@@ -6,10 +6,10 @@ use clift_model::{InferenceSizes, Parameters, Segment, UpdateSizes, inference_by
 use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::Stage;
-use crate::footprint::machine::own_bytes;
+use crate::footprint::machine::process_overhead_bytes;
 use crate::footprint::scene_sizes::{
-    PARTS, VIEWS_PER_PASS, batch_sizes, cluster_counts, evaluated, image_values, largest, measures_lpips, num_tokens,
-    set_accumulate, trained_parts,
+    PARTS, VIEWS_PER_PASS, batch_sizes, cluster_counts, eval_sizes, image_values, largest_sizes, measures_lpips,
+    num_tokens, set_accumulate, trained_parts,
 };
 
 /// Returns the most memory of the process during a part of a run.
@@ -22,7 +22,7 @@ pub fn peak_bytes(config: &Config, part: Stage) -> Result<u64, TrainError> {
         Stage::Clusters => inference_bytes(&config.model, &clusters(config)?),
         Stage::Eval => inference_bytes(&config.model, &evaluation(config)?),
     };
-    Ok(own_bytes() + bytes as u64)
+    Ok(process_overhead_bytes() + bytes as u64)
 }
 
 /// Describes the part of a run that needs most of those beyond the `available` memory, with a change that would help;
@@ -82,7 +82,7 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         num_scenes,
         is_accumulated: num_scenes < batch_size,
         recompute: config.activation_checkpointing,
-        scene: largest(config, stage)?,
+        scene: largest_sizes(config, stage)?,
         num_image_values,
         loss,
         loss_parameters: vgg.map_or(0.0, |vgg| vgg.parameters),
@@ -113,7 +113,7 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
     let parameters = Parameters::of(&config.model);
     let all = num_tokens(config, eval.num_context)?;
     let stored = eval.storage.iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
-    let sweep = evaluated(config);
+    let sweep = eval_sizes(config);
     let num_drawn: usize = stored.iter().map(|&count| sweep.drawn(count).len()).sum();
     let vgg = measures_lpips(config).then(|| VggShape::VGG16.sizes(config.data.height, config.data.width));
     Ok(InferenceSizes {

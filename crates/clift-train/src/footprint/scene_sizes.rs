@@ -1,6 +1,6 @@
 //! Sizes that the steps of a run can have: all, the typical ones, the largest.
 
-use clift_eval::{LPIPS_MIN_SIZE_PX, Sweep, Variant};
+use clift_eval::{LPIPS_MIN_SIZE_PX, Method, Sweep};
 use clift_model::{Part, SceneSizes};
 
 use crate::config::config::Config;
@@ -28,7 +28,7 @@ pub fn trained_parts(stage: Stage) -> &'static [Part] {
 
 /// Sizes in the middle of what a stage draws.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Middle {
+pub struct TypicalStep {
     /// Context views.
     pub num_context: usize,
     /// Scenes worked off at once, at most.
@@ -55,7 +55,7 @@ pub fn set_accumulate(config: &mut Config, stage: Stage, parts: usize) {
 }
 
 /// Every size that a scene of a stage can have, equally likely; the shares of stage 1 at a few points.
-pub fn drawn(config: &Config, stage: Stage) -> Result<Vec<SceneSizes>, TrainError> {
+pub fn possible_sizes(config: &Config, stage: Stage) -> Result<Vec<SceneSizes>, TrainError> {
     let views = &config.data.views;
     let mut all = Vec::new();
     for num_context in views.min_context..=views.max_context {
@@ -72,7 +72,7 @@ pub fn drawn(config: &Config, stage: Stage) -> Result<Vec<SceneSizes>, TrainErro
 }
 
 /// The sizes that calibration takes: the middle count of contexts and the middle share or count of tokens.
-pub fn middle(config: &Config, stage: Stage) -> Result<Middle, TrainError> {
+pub fn typical_sizes(config: &Config, stage: Stage) -> Result<TypicalStep, TrainError> {
     let views = &config.data.views;
     let num_context = usize::midpoint(views.min_context, views.max_context);
     let scene = training_scene(config, num_context)?;
@@ -83,11 +83,11 @@ pub fn middle(config: &Config, stage: Stage) -> Result<Middle, TrainError> {
         let [low, high] = config.stage1.keep_tokens;
         kept(scene, f64::midpoint(low, high))
     };
-    Ok(Middle { num_context, num_scenes: batch_sizes(config, stage).1, scene })
+    Ok(TypicalStep { num_context, num_scenes: batch_sizes(config, stage).1, scene })
 }
 
 /// The largest scene of a stage.
-pub fn largest(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> {
+pub fn largest_sizes(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> {
     let scene = training_scene(config, config.data.views.max_context)?;
     if stage == Stage::Stage2 {
         let most = cluster_counts(config, scene.num_tokens)?.last().copied();
@@ -103,11 +103,11 @@ pub fn largest(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> 
 }
 
 /// What an evaluation does with a scene: the variants asked for, or all that a run has weights for by itself.
-pub fn evaluated(config: &Config) -> Sweep {
-    let own = [Variant::Random, Variant::Kmeans, Variant::Clift];
+pub fn eval_sizes(config: &Config) -> Sweep {
+    let own = [Method::Random, Method::Kmeans, Method::Clift];
     let mut variants = config.eval.variants.clone();
     // A condenser of tiles is another run's.
-    variants.retain(|variant| *variant != Variant::PatchClift);
+    variants.retain(|variant| *variant != Method::PatchClift);
     sweep(config, config.eval.storage.clone(), if variants.is_empty() { own.to_vec() } else { variants })
 }
 

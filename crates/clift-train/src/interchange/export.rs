@@ -10,8 +10,8 @@ use safetensors::tensor::Dtype;
 
 use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::interchange::model_dir::{Parameter, refuse_existing, to_safetensors};
-use crate::interchange::record::Imported;
+use crate::interchange::model_dir::{Parameter, require_absent, to_safetensors};
+use crate::interchange::record::ImportRecord;
 
 /// What kind of file is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,9 +39,9 @@ pub struct Exported {
 /// [`TrainError::BadConfig`] where `out` exists, [`TrainError::BadFile`] for a weight file that is not the config's model,
 /// and whatever reading and writing give.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
-    refuse_existing(out)?;
+    require_absent(out)?;
     config.model.validate()?;
-    let convolutions = match Imported::read(&model.dir)? {
+    let convolutions = match ImportRecord::read(&model.dir)? {
         Some(imported) => imported.convolutions,
         None => CONVOLUTIONS.map(String::from).into(),
     };

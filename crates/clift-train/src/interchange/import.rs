@@ -4,14 +4,14 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::{ElementType, StateDict};
-use clift_model::{CheckpointTensor, Sizes, published_tensors};
+use clift_model::{InferredConfig, PublishedTensor, published_tensors};
 
 use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::interchange::keys::{Keys, shown};
 use crate::interchange::model_dir::{self, Parameter};
 use crate::interchange::problems;
-use crate::interchange::record::{ImportOptions, Imported, go_on};
+use crate::interchange::record::{ImportOptions, ImportRecord, check_stop};
 
 /// Reads a checkpoint and writes a model directory: all of it or nothing.
 ///
@@ -24,14 +24,14 @@ pub fn import(
     out: &Path,
     options: &ImportOptions,
     stop: &AtomicBool,
-) -> Result<(Config, Imported), TrainError> {
-    model_dir::refuse_existing(out)?;
+) -> Result<(Config, ImportRecord), TrainError> {
+    model_dir::require_absent(out)?;
     let state = StateDict::open(file)?;
     let keys = Keys::of(&state, options)?;
     let options = &ImportOptions { num_heads: num_heads(&state, options)?, ..options.clone() };
     let sizes = keys.sizes(&state, options.variant, options.num_heads);
     check_sizes(&sizes, &keys, &state)?;
-    let Sizes { config: model, has_condenser, .. } = sizes;
+    let InferredConfig { config: model, has_condenser, .. } = sizes;
     let expected = published_tensors(&model, has_condenser);
     let problems = problems::problems(&keys, &state, &expected, options);
     if !problems.is_empty() {
@@ -47,7 +47,7 @@ pub fn import(
     }
     let (mut parameters, mut mapping, mut convolutions, mut num_converted) = (vec![], vec![], vec![], 0);
     for tensor in &expected {
-        go_on(stop)?;
+        check_stop(stop)?;
         let key = &keys.network[&tensor.key];
         let values = state.read(key)?;
         let (element_type, shape) = state.tensor(key).unwrap_or((ElementType::F32, &[]));
@@ -58,7 +58,7 @@ pub fn import(
         parameters.extend(parts(tensor, &values));
         mapping.push((key.clone(), tensor.parts.iter().map(|(path, _)| path.clone()).collect()));
     }
-    let imported = Imported {
+    let imported = ImportRecord {
         version: 1,
         file: file.file_name().unwrap_or_default().to_string_lossy().into_owned(),
         sha256: model_dir::sha256(file)?,
@@ -89,8 +89,8 @@ fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>
 }
 
 /// What no shape shows must be right before anything else can be said.
-fn check_sizes(sizes: &Sizes, keys: &Keys, state: &StateDict) -> Result<(), TrainError> {
-    let Sizes { config: model, knows_heads, width_key, .. } = sizes;
+fn check_sizes(sizes: &InferredConfig, keys: &Keys, state: &StateDict) -> Result<(), TrainError> {
+    let InferredConfig { config: model, knows_heads, width_key, .. } = sizes;
     let file = state.path();
     let num_heads = model.num_heads;
     if !knows_heads || num_heads == 0 || !model.dim.is_multiple_of(num_heads) {
@@ -110,7 +110,7 @@ fn check_sizes(sizes: &Sizes, keys: &Keys, state: &StateDict) -> Result<(), Trai
 }
 
 /// The rows of a tensor that are parameters here.
-fn parts<'a>(tensor: &'a CheckpointTensor, values: &'a [f32]) -> impl Iterator<Item = Parameter> + 'a {
+fn parts<'a>(tensor: &'a PublishedTensor, values: &'a [f32]) -> impl Iterator<Item = Parameter> + 'a {
     let row_len: usize = tensor.shape[1..].iter().product();
     tensor.parts.iter().map(move |(path, rows)| {
         let mut shape = tensor.shape.clone();

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use clift_data::StateDict;
-use clift_model::{PERCEPTUAL_PREFIX, PREFIX, Sizes, Variant, infer_config, plain_key};
+use clift_model::{CliftVariant, InferredConfig, PERCEPTUAL_PREFIX, PREFIX, canonical_key, infer_config};
 
 use crate::error::TrainError;
 use crate::interchange::record::ImportOptions;
@@ -39,7 +39,7 @@ impl Keys {
                     name = name.replace(from, to);
                 }
             }
-            all.push((plain_key(&name), key));
+            all.push((canonical_key(&name), key));
         }
         if let Some(((from, to), _)) = options.renames.iter().zip(&is_used).find(|(_, is_used)| !**is_used) {
             let first = all.first().map_or("none", |(_, key)| key);
@@ -76,7 +76,7 @@ impl Keys {
     }
 
     /// The sizes that the shapes of the network's keys show.
-    pub fn sizes(&self, state: &StateDict, variant: Variant, num_heads: Option<usize>) -> Sizes {
+    pub fn sizes(&self, state: &StateDict, variant: CliftVariant, num_heads: Option<usize>) -> InferredConfig {
         let shape = |key: &str| state.tensor(key).map_or(&[][..], |(_, shape)| shape);
         infer_config(variant, num_heads, self.network.iter().map(|(name, key)| (name.as_str(), shape(key))))
     }

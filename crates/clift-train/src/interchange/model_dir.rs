@@ -8,13 +8,13 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::{PoseRotation, PoseScale, SourceKind, TEMPORARY, publish_file, replace_file};
-use clift_model::{ModelConfig, ModelPath, TrainedModel, Variant, sorted_header};
+use clift_model::{CliftVariant, ModelConfig, ModelPath, TrainedModel, sorted_header};
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 
 use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::interchange::record::{Imported, go_on};
+use crate::interchange::record::{ImportRecord, check_stop};
 
 /// A parameter on the host, in PyTorch's layout.
 #[derive(Clone, Debug, PartialEq)]
@@ -36,9 +36,11 @@ pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
     data.source = SourceKind::Auto;
     (data.views.min_context, data.views.max_context) = (4, 4);
     match model.variant {
-        Variant::Paper => {}
-        Variant::ReleasedRe10k => (data.pose_rotation, data.pose_scale) = (PoseRotation::Quaternion, PoseScale::All),
-        Variant::ReleasedDl3dv => {
+        CliftVariant::Paper => {}
+        CliftVariant::ReleasedRe10k => {
+            (data.pose_rotation, data.pose_scale) = (PoseRotation::Quaternion, PoseScale::All)
+        }
+        CliftVariant::ReleasedDl3dv => {
             (data.width, data.height) = (448, 256);
             (data.pose_rotation, data.pose_scale) = (PoseRotation::Axes, PoseScale::Context);
             data.views.max_context = 6;
@@ -52,7 +54,7 @@ pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
 ///
 /// # Errors
 /// [`TrainError::BadConfig`].
-pub fn refuse_existing(path: &Path) -> Result<(), TrainError> {
+pub fn require_absent(path: &Path) -> Result<(), TrainError> {
     if path.symlink_metadata().is_err() {
         return Ok(());
     }
@@ -80,7 +82,7 @@ pub(crate) fn write(
     folder: &Path,
     config: &Config,
     parameters: &[Parameter],
-    imported: &Imported,
+    imported: &ImportRecord,
     stop: &AtomicBool,
 ) -> Result<(), TrainError> {
     if folder.file_name().is_none() {
@@ -98,10 +100,10 @@ pub(crate) fn write(
     let temporary = temporary.map_err(TrainError::io(writing, above))?;
     let weights_path = temporary.path().join("model.safetensors");
     let bytes = to_safetensors(parameters, HashMap::new(), &weights_path)?;
-    go_on(stop)?;
+    check_stop(stop)?;
     replace_file(&weights_path, &bytes).map_err(TrainError::io(writing, &weights_path))?;
     drop(bytes);
-    go_on(stop)?;
+    check_stop(stop)?;
     let config_path = temporary.path().join("config.toml");
     let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &config_path))?;
     replace_file(&config_path, text.as_bytes()).map_err(TrainError::io(writing, &config_path))?;
@@ -111,8 +113,8 @@ pub(crate) fn write(
 
     let written = ModelPath { dir: temporary.path().into(), weights: weights_path };
     TrainedModel::open(&written, &config.model, &config.device.open()?)?;
-    go_on(stop)?;
-    refuse_existing(folder)?;
+    check_stop(stop)?;
+    require_absent(folder)?;
     publish_file(temporary.path(), folder).map_err(TrainError::io(writing, folder))?;
     let _ = temporary.keep(); // it has another name now
     Ok(())

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
 use clift_data::{ElementType, StateDict};
-use clift_model::{CheckpointTensor, ModelConfig, PREFIX, Variant, plain_key, published_tensors};
+use clift_model::{CliftVariant, ModelConfig, PREFIX, PublishedTensor, canonical_key, published_tensors};
 
 use crate::interchange::keys::{Keys, MAX_SHOWN, is_number, pattern, shown};
 use crate::interchange::record::ImportOptions;
@@ -43,7 +43,7 @@ enum Kind {
 pub(crate) fn problems(
     keys: &Keys,
     state: &StateDict,
-    expected: &[CheckpointTensor],
+    expected: &[PublishedTensor],
     options: &ImportOptions,
 ) -> Vec<Problem> {
     let mut problems = Vec::new();
@@ -76,7 +76,7 @@ pub(crate) fn problems(
     for (kind, prefix, name, key) in unknown.chain(strays) {
         let mut detail = state.tensor(key).map_or_else(String::new, |(_, shape)| format!(" {shape:?}"));
         let full = format!("{prefix}{name}");
-        if plain_key(key) != full {
+        if canonical_key(key) != full {
             let _ = write!(detail, ", renamed {}", shown(&pattern(&full)));
         }
         problems.push(Problem { kind, key: key.clone(), name: name.clone(), detail });
@@ -180,14 +180,14 @@ pub(crate) fn told(
     for (kind, count) in counts.iter().filter(|(_, count)| **count > MAX_LISTED) {
         let _ = write!(text, "\n  {kind}: {} more", count - MAX_LISTED);
     }
-    text.push_str(&way_on(keys, state, options, !unknown.0.is_empty() || !strays.0.is_empty()));
+    text.push_str(&suggest_fix(keys, state, options, !unknown.0.is_empty() || !strays.0.is_empty()));
     text.push_str("\n ");
     text
 }
 
 /// What may be done about it.
-fn way_on(keys: &Keys, state: &StateDict, options: &ImportOptions, has_unknown: bool) -> String {
-    let fitting = Variant::ALL.into_iter().filter(|other| *other != options.variant).find(|other| {
+fn suggest_fix(keys: &Keys, state: &StateDict, options: &ImportOptions, has_unknown: bool) -> String {
+    let fitting = CliftVariant::ALL.into_iter().filter(|other| *other != options.variant).find(|other| {
         let sizes = keys.sizes(state, *other, options.num_heads);
         let options = ImportOptions { convert: true, ..options.clone() };
         sizes.config.validate().is_ok()

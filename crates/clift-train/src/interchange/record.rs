@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clift_model::{PROJECTIONS, Variant};
+use clift_model::{CliftVariant, PROJECTIONS};
 use serde::{Deserialize, Serialize};
 
 use crate::error::TrainError;
@@ -13,7 +13,7 @@ use crate::error::TrainError;
 #[derive(Clone, Debug)]
 pub struct ImportOptions {
     /// Which network it holds.
-    pub variant: Variant,
+    pub variant: CliftVariant,
     /// Its heads, where neither a shape nor the file says them.
     pub num_heads: Option<usize>,
     /// Whether parameters that are not in f32 are converted to it; they are an error otherwise.
@@ -24,7 +24,7 @@ pub struct ImportOptions {
 
 /// What an import did; `import.json` of the model directory.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Imported {
+pub struct ImportRecord {
     /// Version of this file.
     pub version: u32,
     /// Name of the checkpoint.
@@ -32,7 +32,7 @@ pub struct Imported {
     /// SHA-256 of its bytes.
     pub sha256: String,
     /// The network.
-    pub variant: Variant,
+    pub variant: CliftVariant,
     /// Whether it has a condenser, as a second-stage checkpoint has.
     pub has_condenser: bool,
     /// Projections that are 1x1 convolutions there; `clift export` writes them so.
@@ -51,11 +51,11 @@ pub struct Imported {
 }
 
 /// Stops where the user has asked for it.
-pub(crate) fn go_on(stop: &AtomicBool) -> Result<(), TrainError> {
+pub(crate) fn check_stop(stop: &AtomicBool) -> Result<(), TrainError> {
     if stop.load(Ordering::SeqCst) { Err(TrainError::Abandoned { work: "the import".into() }) } else { Ok(()) }
 }
 
-impl Imported {
+impl ImportRecord {
     /// Reads the record of a model directory; `None` for a model that was trained here.
     ///
     /// # Errors

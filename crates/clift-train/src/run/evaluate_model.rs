@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::{ClipReader, OpenedSource, Split, open_dataset};
-use clift_eval::{EvalModels, Summary, System, Variant};
+use clift_eval::{EvalModels, ExternalMethod, Method, Summary};
 use clift_model::{ModelPath, TrainedModel};
 
 use crate::config::config::Config;
@@ -24,7 +24,7 @@ pub fn evaluate_model(
     mut config: Config,
     model: &ModelPath,
     stage1: Option<&ModelPath>,
-    systems: &[System],
+    systems: &[ExternalMethod],
     folder: &Path,
     stop: &AtomicBool,
     sink: &mut dyn Sink,
@@ -44,9 +44,9 @@ pub fn evaluate_model(
         // Its renderer was trained on condensed tokens: what it makes of others is no baseline.
         let asked = &mut config.eval.variants;
         if asked.is_empty() {
-            asked.push(Variant::Clift);
+            asked.push(Method::Clift);
         }
-        if let Some(variant) = asked.iter().find(|variant| **variant != Variant::Clift) {
+        if let Some(variant) = asked.iter().find(|variant| **variant != Method::Clift) {
             let fix = "give the first-stage model that draws it with --stage1".to_owned();
             return Err(TrainError::BadConfig { key: "eval.variants".into(), value: variant.name().into(), fix });
         }

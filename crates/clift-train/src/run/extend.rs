@@ -15,7 +15,7 @@ use crate::events::{Event, Sink, Stage};
 
 /// A step count that grows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Extension {
+pub(crate) struct StepExtension {
     /// Which stage.
     pub stage: Stage,
     /// Its steps until now.
@@ -27,7 +27,7 @@ pub(crate) struct Extension {
 /// What `run.json` says about one that was made.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Extended {
+pub(crate) struct ExtensionRecord {
     stage: Stage,
     from: u64,
     to: u64,
@@ -35,12 +35,12 @@ pub(crate) struct Extended {
     at_step: u64,
 }
 
-impl Extension {
+impl StepExtension {
     /// Prepares the stage of the run in `folder` to go on. Weights of a finished stage are kept under another name.
     ///
     /// # Errors
     /// [`TrainError::BadConfig`] where the stage cannot go on, [`TrainError::Io`].
-    pub fn apply(self, folder: &Path, sink: &mut dyn Sink) -> Result<Extended, TrainError> {
+    pub fn apply(self, folder: &Path, sink: &mut dyn Sink) -> Result<ExtensionRecord, TrainError> {
         let Self { stage, from, to } = self;
         let refuse = |fix: String| {
             let value = format!("{}.steps {from} -> {to}", stage.name());
@@ -71,6 +71,6 @@ impl Extension {
             "{} goes on for {to} steps instead of {from}: after step {at_step} with the learning rates of {to}",
             stage.name()
         )));
-        Ok(Extended { stage, from, to, at_step })
+        Ok(ExtensionRecord { stage, from, to, at_step })
     }
 }

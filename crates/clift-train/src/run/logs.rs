@@ -5,12 +5,12 @@ use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 
-use clift_data::Skip;
+use clift_data::SkippedScene;
 use serde::{Deserialize, Serialize};
 
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage, StepEvent};
-use crate::step::step_guard::BadStep;
+use crate::step::step_guard::SkippedStep;
 
 /// One line of `metrics.jsonl`. JSON holds no NaN and no infinity: such a number is `null`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -66,7 +66,7 @@ impl StepLines {
     /// step: the file is then someone else's, and is left alone.
     pub fn open(path: &Path, stage: Stage, step: u64) -> std::io::Result<Self> {
         if path.exists() {
-            drop_after(path, stage, step)?;
+            truncate_after(path, stage, step)?;
         }
         Ok(Self { path: path.to_owned(), file: None, failure: None })
     }
@@ -111,7 +111,7 @@ struct Place {
     stage: Stage,
 }
 
-fn drop_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
+fn truncate_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
     let mut kept = Vec::new();
     let mut broken: Option<usize> = None;
     let mut is_whole = true;
@@ -144,7 +144,7 @@ pub struct SkipLine {
     pub stage: Stage,
     /// The scene and why.
     #[serde(flatten)]
-    pub skip: Skip,
+    pub skip: SkippedScene,
 }
 
 /// The files that a stage writes step by step, in front of another sink: a line per step in `metrics.jsonl`, one per
@@ -174,7 +174,7 @@ impl<'a> RunLog<'a> {
     }
 
     /// Tells and notes a scene that `step` could not use, once for all steps.
-    pub fn skip(&mut self, stage: Stage, step: u64, skip: &Skip) {
+    pub fn skip(&mut self, stage: Stage, step: u64, skip: &SkippedScene) {
         if self.skipped.insert(skip.key.clone()) {
             self.sink.event(&Event::Skipped { key: skip.key.clone(), reason: skip.reason.clone() });
             self.skips.write(&SkipLine { step, stage, skip: skip.clone() });
@@ -182,7 +182,7 @@ impl<'a> RunLog<'a> {
     }
 
     /// Notes a step that was left out.
-    pub fn bad_step(&mut self, line: &BadStep) {
+    pub fn bad_step(&mut self, line: &SkippedStep) {
         self.bad_steps.write(line);
     }
 
@@ -320,7 +320,7 @@ mod tests {
     #[test]
     fn a_scene_that_is_left_out_is_told_and_saved_once_for_all_draws_and_resumptions() {
         let folder = tempfile::tempdir().unwrap();
-        let skip = |key: &str, reason: &str| Skip { key: key.into(), reason: reason.into() };
+        let skip = |key: &str, reason: &str| SkippedScene { key: key.into(), reason: reason.into() };
         let mut count = Count::default();
         let mut log = RunLog::open(folder.path(), Stage::Stage1, 0, &mut count).unwrap();
         log.skip(Stage::Stage1, 1, &skip("a", "torn"));
@@ -345,10 +345,10 @@ mod tests {
     fn bad_steps_have_a_file_of_their_own_that_is_resumed_like_the_metrics() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("bad_steps.jsonl");
-        let bad = |step| BadStep {
+        let bad = |step| SkippedStep {
             step,
             stage: Stage::Stage1,
-            reason: crate::step::step_guard::Fault::LossSpike,
+            reason: crate::step::step_guard::StepAnomaly::LossSpike,
             loss: Some(2.0),
             grad_norm: None,
             median_loss: Some(0.5),

@@ -10,12 +10,12 @@ use clift_data::{
     ClipReader, OpenedSource, SceneSource, SceneSubset, Split, make_folder, open_dataset, open_training_dataset,
     remove_leftovers,
 };
-use clift_eval::{EvalModels, LPIPS_COMMAND, Summary, System, write_ledger};
+use clift_eval::{EvalModels, ExternalMethod, LPIPS_COMMAND, Summary, write_ledger};
 use clift_model::{
     Clift, ModelError, ModelPath, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
 };
 
-use crate::cluster_cache::builder::ClusterJob;
+use crate::cluster_cache::builder::ClusterBuilder;
 use crate::cluster_cache::cache::ClusterCache;
 use crate::cluster_cache::resume_log::remove_journal;
 use crate::config::config::Config;
@@ -163,7 +163,7 @@ impl Run {
     /// whatever the evaluation gives.
     pub fn evaluate(
         &self,
-        systems: &[System],
+        systems: &[ExternalMethod],
         folder: &Path,
         beside: Option<&Config>,
         stop: &AtomicBool,
@@ -296,7 +296,7 @@ impl Run {
             });
         }
         let encoder = model.encoder.valid();
-        ClusterJob { config: &self.config, reader, encoder: &encoder, encoder_hash, device: &self.device }
+        ClusterBuilder { config: &self.config, reader, encoder: &encoder, encoder_hash, device: &self.device }
             .make(&folder, stop, sink)
     }
 

@@ -10,7 +10,7 @@ use crate::config::config::Config;
 use crate::config::parse::parse_config;
 use crate::error::TrainError;
 use crate::events::Stage;
-use crate::run::extend::{Extended, Extension};
+use crate::run::extend::{ExtensionRecord, StepExtension};
 
 const VERSION: u32 = 1;
 
@@ -30,7 +30,7 @@ pub(crate) struct RunFile {
     pub overfit: Option<usize>,
     /// What `--extend` did, in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub extended: Vec<Extended>,
+    pub extended: Vec<ExtensionRecord>,
 }
 
 impl RunFile {
@@ -76,7 +76,7 @@ pub(crate) fn compare(
     config: &Config,
     overfit: Option<usize>,
     extend: bool,
-) -> Result<Vec<Extension>, TrainError> {
+) -> Result<Vec<StepExtension>, TrainError> {
     let path = folder.join("config.toml");
     let text = std::fs::read_to_string(&path).map_err(TrainError::io("reading the run's config", &path))?;
     let bad = || TrainError::bad_file("config", &path);
@@ -115,10 +115,10 @@ pub(crate) fn compare(
 }
 
 /// The difference in a key as one that `--extend` allows: a larger step count.
-fn extension(key: &str, from: Option<&String>, to: Option<&String>) -> Option<Extension> {
+fn extension(key: &str, from: Option<&String>, to: Option<&String>) -> Option<StepExtension> {
     let (_, stage) = *STEP_COUNTS.iter().find(|(name, _)| *name == key)?;
     let (from, to) = (from?.parse().ok()?, to?.parse().ok()?);
-    (from < to).then_some(Extension { stage, from, to })
+    (from < to).then_some(StepExtension { stage, from, to })
 }
 
 /// Dotted keys and their values as text.
@@ -141,7 +141,7 @@ mod tests {
     use super::*;
 
     /// Compares `config` with a run that was started with another.
-    fn differ(old: &str, config: &Config, extend: bool) -> Result<Vec<Extension>, TrainError> {
+    fn differ(old: &str, config: &Config, extend: bool) -> Result<Vec<StepExtension>, TrainError> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("config.toml"), old).unwrap();
         compare(folder.path(), &RunFile::new(None), config, None, extend)
@@ -188,7 +188,7 @@ mod tests {
         longer.stage2.steps += 10;
         let message = differ(&text, &longer, false).unwrap_err().to_string();
         assert!(message.contains("  stage2.steps: 50000 -> 50010\n") && message.contains("--extend"), "{message}");
-        let expected = Extension { stage: Stage::Stage2, from: 50_000, to: 50_010 };
+        let expected = StepExtension { stage: Stage::Stage2, from: 50_000, to: 50_010 };
         assert_eq!(differ(&text, &longer, true).unwrap(), [expected]);
         longer.stage1.steps -= 1;
         let message = differ(&text, &longer, true).unwrap_err().to_string();

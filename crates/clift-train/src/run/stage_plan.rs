@@ -13,7 +13,7 @@ use crate::checkpoint::checkpoints::Checkpoints;
 use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::Stage;
-use crate::stage::settings::{Part, StageSettings};
+use crate::stage::settings::{StageSettings, TapeSegment};
 use crate::step::batch::StageBatch;
 
 /// Makes the batch of a step, in any thread.
@@ -61,10 +61,10 @@ impl StagePlan<'_> {
 /// Parameters of parts that the stage does not train get no gradient and no decay.
 pub fn freeze(stage: Stage, mut model: Clift) -> Clift {
     let trained = stage.trained();
-    if !trained.contains(&Part::Encoder) {
+    if !trained.contains(&TapeSegment::Encoder) {
         model.encoder = model.encoder.no_grad();
     }
-    if !trained.contains(&Part::Condenser) {
+    if !trained.contains(&TapeSegment::Condenser) {
         model.condenser = model.condenser.no_grad();
     }
     model

@@ -16,11 +16,11 @@ use crate::stage::settings::StageSettings;
 use crate::step::batch::StageBatch;
 use crate::step::loss::psnr_of;
 use crate::step::schedule::warm_up_cosine;
-use crate::step::step_guard::{BadScene, BadStep, Fault};
-use crate::step::train_state::{Learner, Update};
+use crate::step::step_guard::{SkippedStep, SkippedStepScene, StepAnomaly};
+use crate::step::train_state::{TrainState, Update};
 
 /// A stage while it trains.
-pub(crate) struct Training<'a> {
+pub(crate) struct TrainLoop<'a> {
     plan: &'a StagePlan<'a>,
     checkpoints: Checkpoints,
     progress: Progress,
@@ -32,7 +32,7 @@ pub(crate) struct Training<'a> {
     pub(crate) log: RunLog<'a>,
 }
 
-impl<'a> Training<'a> {
+impl<'a> TrainLoop<'a> {
     /// Goes on from `progress`, which is that of the newest checkpoint.
     pub fn new(
         plan: &'a StagePlan,
@@ -46,7 +46,7 @@ impl<'a> Training<'a> {
     }
 
     /// Makes the steps that are left and returns the trained model.
-    pub fn run(&mut self, mut learner: Learner) -> Result<Clift, TrainError> {
+    pub fn run(&mut self, mut learner: TrainState) -> Result<Clift, TrainError> {
         // A kill may have come between a checkpoint and the validation of its step.
         self.validate_if_due(&learner)?;
         for batch in self.plan.prefetch(self.progress.step) {
@@ -70,7 +70,7 @@ impl<'a> Training<'a> {
     }
 
     /// Makes the next step, or leaves it out.
-    fn step(&mut self, learner: Learner, batch: &StageBatch) -> Result<Learner, TrainError> {
+    fn step(&mut self, learner: TrainState, batch: &StageBatch) -> Result<TrainState, TrainError> {
         let started = Instant::now();
         for skip in &batch.skipped {
             self.log.skip(self.plan.settings.stage, self.progress.step + 1, skip);
@@ -119,11 +119,11 @@ impl<'a> Training<'a> {
     }
 
     /// Counts and notes a step that made no update; too many in a row end the run.
-    fn leave_out(&mut self, fault: Fault, update: Update, batch: &StageBatch) -> Result<(), TrainError> {
+    fn leave_out(&mut self, fault: StepAnomaly, update: Update, batch: &StageBatch) -> Result<(), TrainError> {
         self.progress.bad_steps += 1;
         self.progress.num_bad_steps += 1;
         let finite = |value: f64| value.is_finite().then_some(value);
-        let line = BadStep {
+        let line = SkippedStep {
             step: self.progress.step,
             stage: self.plan.settings.stage,
             reason: fault,
@@ -132,7 +132,7 @@ impl<'a> Training<'a> {
             median_loss: self.progress.recent.median_loss(),
             median_grad_norm: self.progress.recent.median_grad_norm(),
             in_a_row: self.progress.bad_steps,
-            scenes: BadScene::all(batch),
+            scenes: SkippedStepScene::all(batch),
         };
         self.log.bad_step(&line);
         let keys = line.scenes.iter().map(|scene| scene.key.as_str()).collect::<Vec<_>>().join(", ");
@@ -146,7 +146,7 @@ impl<'a> Training<'a> {
         Err(TrainError::Diverged { count, step, reason: fault.to_string(), keys, checkpoint })
     }
 
-    fn save(&mut self, learner: &Learner) -> Result<(), TrainError> {
+    fn save(&mut self, learner: &TrainState) -> Result<(), TrainError> {
         // Lines up to here would be missing for good.
         self.log.check()?;
         let path = self.checkpoints.save(learner, &self.progress)?;
@@ -156,7 +156,7 @@ impl<'a> Training<'a> {
     }
 
     /// Saves the steps made so far before the run ends with `error`, which is not theirs.
-    fn save_before(&mut self, error: TrainError, learner: &Learner) -> TrainError {
+    fn save_before(&mut self, error: TrainError, learner: &TrainState) -> TrainError {
         if self.saved < self.progress.step
             && let Err(second) = self.save(learner)
         {
@@ -166,7 +166,7 @@ impl<'a> Training<'a> {
     }
 
     /// Measures the held-out views where this step asks for it and has not been measured.
-    fn validate_if_due(&mut self, learner: &Learner) -> Result<(), TrainError> {
+    fn validate_if_due(&mut self, learner: &TrainState) -> Result<(), TrainError> {
         let Progress { step, bad_steps, validated, .. } = self.progress;
         let is_due = self.is_last() || (is_multiple(step, self.plan.config.eval.every) && bad_steps == 0);
         if !is_due || validated == step {

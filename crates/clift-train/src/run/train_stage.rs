@@ -10,13 +10,13 @@ use crate::error::TrainError;
 use crate::events::{Event, Sink};
 use crate::run::logs::RunLog;
 use crate::run::stage_plan::{StagePlan, freeze};
-use crate::run::train_loop::Training;
+use crate::run::train_loop::TrainLoop;
 use crate::run::validation::Validation;
 use crate::stage::settings::StageSettings;
 use crate::step::loss::Loss;
 use crate::step::loss_scale::LossScale;
 use crate::step::optimizer::adamw;
-use crate::step::train_state::Learner;
+use crate::step::train_state::TrainState;
 
 impl StagePlan<'_> {
     /// Trains from where the stage stands and returns the model when all steps are done. `start` gives
@@ -40,7 +40,7 @@ impl StagePlan<'_> {
         for term in loss.describe() {
             sink.event(&Event::Message(term));
         }
-        let mut learner = Learner {
+        let mut learner = TrainState {
             model,
             optimizer: adamw(optimizer),
             device: self.device.clone(),
@@ -55,7 +55,7 @@ impl StagePlan<'_> {
         let mut log = RunLog::open(run_dir, stage, progress.step, sink)?;
         log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
 
-        let mut training = Training::new(self, checkpoints, progress, validation, stop, log);
+        let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
         let model = training.run(learner).map_err(|error| training.name_checkpoint(error))?;
         training.log.event(&Event::StageFinished { stage, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(model)

@@ -7,8 +7,8 @@ use std::time::Instant;
 use burn::tensor::Device;
 use clift_data::ClipReader;
 use clift_eval::{
-    Description, EvalConfig, EvalError, EvalModels, Evaluator, Limits, Progress, Shown, Summary, Sweep, System,
-    Variant, stage2_method,
+    Description, EvalConfig, EvalError, EvalModels, Evaluator, ExternalMethod, Limits, Method, Progress, SceneFigures,
+    Summary, Sweep, stage2_method,
 };
 use clift_model::{Clift, TokenCount, TrainedModel};
 
@@ -74,7 +74,7 @@ impl<'a> Validation<'a> {
             models.set_stage2(clusters.grouping, model);
             (eval.validation_storage, stage2_method(clusters.grouping))
         } else {
-            (TokenCount::Share(1.0), Variant::Kmeans)
+            (TokenCount::Share(1.0), Method::Kmeans)
         };
         let all = self.evaluator.sweep();
         let sweep = Sweep {
@@ -84,7 +84,7 @@ impl<'a> Validation<'a> {
             variants: vec![method],
             ..all.clone()
         };
-        let mut write_sheet = |_: &str, shown: Shown| {
+        let mut write_sheet = |_: &str, shown: SceneFigures| {
             let making = |source| EvalError::Io { action: "making a folder", source, path: folder.into() };
             std::fs::create_dir_all(folder).map_err(making)?;
             shown.sheet.write_png(&folder.join(format!("step-{step:09}.png")))
@@ -109,7 +109,7 @@ impl<'a> Validation<'a> {
     pub fn evaluate(
         &self,
         models: &EvalModels,
-        systems: &[System],
+        systems: &[ExternalMethod],
         folder: &Path,
         stop: &AtomicBool,
         sink: &mut dyn Sink,

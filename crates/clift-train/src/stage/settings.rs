@@ -5,7 +5,7 @@ use crate::events::Stage;
 
 /// A network with parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
+pub enum TapeSegment {
     /// Context views to light-field tokens.
     Encoder,
     /// The norm of the light-field tokens.
@@ -32,15 +32,15 @@ pub struct StageSettings<'a> {
     /// Learning rate of the renderer, as a factor of the optimiser's.
     pub renderer_lr_factor: f64,
     /// Networks that are trained; the others are frozen.
-    pub trained: &'static [Part],
+    pub trained: &'static [TapeSegment],
 }
 
 impl Stage {
     /// The networks that the stage trains.
-    pub fn trained(self) -> &'static [Part] {
+    pub fn trained(self) -> &'static [TapeSegment] {
         match self {
-            Self::Stage1 => &[Part::Encoder, Part::TokenNorm, Part::Renderer],
-            Self::Stage2 => &[Part::TokenNorm, Part::Condenser, Part::Renderer],
+            Self::Stage1 => &[TapeSegment::Encoder, TapeSegment::TokenNorm, TapeSegment::Renderer],
+            Self::Stage2 => &[TapeSegment::TokenNorm, TapeSegment::Condenser, TapeSegment::Renderer],
             Self::Clusters | Self::Eval => &[],
         }
     }
@@ -94,8 +94,8 @@ mod tests {
         let [one, two] = [Stage::Stage1, Stage::Stage2].map(|stage| config.stage(stage));
         assert_eq!((one.steps, one.batch_size, one.renderer_lr_factor), (90_000, 64, 1.0));
         assert_eq!((two.steps, two.batch_size, two.renderer_lr_factor), (50_000, 80, 0.1));
-        assert!(one.trained.contains(&Part::Encoder) && !one.trained.contains(&Part::Condenser));
-        assert!(two.trained.contains(&Part::Condenser) && !two.trained.contains(&Part::Encoder));
+        assert!(one.trained.contains(&TapeSegment::Encoder) && !one.trained.contains(&TapeSegment::Condenser));
+        assert!(two.trained.contains(&TapeSegment::Condenser) && !two.trained.contains(&TapeSegment::Encoder));
         config.set_accumulate(Stage::Stage2, 5);
         assert_eq!((config.stage(Stage::Stage1).accumulate, config.stage(Stage::Stage2).accumulate), (1, 5));
     }

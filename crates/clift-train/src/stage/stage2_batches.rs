@@ -4,16 +4,16 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use clift_data::{
-    Clip, ClipReader, NoUsableScene, Skip, SlotFiller, ViewIndices, derive_seed, item_rng, step_rng, targets_excluding,
-    uniform_below,
+    Clip, ClipReader, NoUsableScene, SkippedScene, SlotFiller, ViewIndices, derive_seed, item_rng, sample_targets,
+    step_rng, uniform_below,
 };
 use clift_model::SceneClusters;
 
 use crate::cluster_cache::cache::ClusterCache;
-use crate::cluster_cache::entry::Entry;
+use crate::cluster_cache::entry::CacheEntry;
 use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::step::batch::{StageBatch, TokenChoice};
+use crate::step::batch::{StageBatch, TokenSelection};
 
 /// Attempts of one slot, repeated entries included, before the batch fails.
 const FILLER: SlotFiller = SlotFiller { min_attempts: 16, min_scenes: 0, max_attempts: 16 };
@@ -64,7 +64,7 @@ impl Stage2Batches {
             clips.push(clip);
             clusters.push(scene);
         }
-        Ok(StageBatch { clips, tokens: TokenChoice::Clusters(clusters), skipped })
+        Ok(StageBatch { clips, tokens: TokenSelection::Clusters(clusters), skipped })
     }
 
     /// A group in proportion to its entries, so that every entry is equally likely.
@@ -85,7 +85,7 @@ impl Stage2Batches {
         step: u64,
         slot: usize,
         group: &[usize],
-        skipped: &mut Vec<Skip>,
+        skipped: &mut Vec<SkippedScene>,
     ) -> Result<(Clip, SceneClusters), TrainError> {
         // The entry is the first value of its attempt's stream, the targets are the following ones.
         let draw = |attempt| {
@@ -94,22 +94,22 @@ impl Stage2Batches {
         };
         let read = |entry: usize, attempt| {
             let entry = &self.cache.entries()[entry];
-            let skip = |error: TrainError| Skip { key: entry.key.clone(), reason: error.to_string() };
+            let skip = |error: TrainError| SkippedScene { key: entry.key.clone(), reason: error.to_string() };
             self.read(entry, &mut draw(attempt).1).map_err(skip)
         };
         FILLER.fill(|attempt| draw(attempt).0, read, skipped).map_err(|NoUsableScene { attempts, last }| {
-            let Skip { key, reason } = last;
+            let SkippedScene { key, reason } = last;
             TrainError::NoScenes { reason: format!("slot {slot} of step {step}, {attempts} tries; {key}: {reason}") }
         })
     }
 
-    fn read(&self, entry: &Entry, rng: &mut impl rand::Rng) -> Result<(Clip, SceneClusters), TrainError> {
+    fn read(&self, entry: &CacheEntry, rng: &mut impl rand::Rng) -> Result<(Clip, SceneClusters), TrainError> {
         let source = &self.reader.source;
         let scene = source
             .find(&entry.key)
             .ok_or_else(|| TrainError::NoScenes { reason: "the data does not have it any more".into() })?;
         let num_frames = source.num_frames(scene)?;
-        let target = targets_excluding(&entry.context, num_frames, self.num_targets, rng)?;
+        let target = sample_targets(&entry.context, num_frames, self.num_targets, rng)?;
         let clip = self.reader.read(scene, &ViewIndices { context: entry.context.clone(), target })?;
         Ok((clip, self.cache.read(entry)?))
     }

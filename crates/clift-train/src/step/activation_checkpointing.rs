@@ -10,15 +10,15 @@ use burn::tensor::{Gradients, Tensor};
 use clift_model::{Cameras, Clift, EncoderBlock, Views};
 
 use crate::error::TrainError;
-use crate::step::batch::TokenChoice;
-use crate::step::device_batch::Shown;
+use crate::step::batch::TokenSelection;
+use crate::step::device_batch::DeviceBatch;
 use crate::step::loss::{Loss, LossParts};
 
 /// Adds the gradients of `share` times the loss of what is shown, and returns the loss.
 pub(crate) fn backward(
     model: &Clift,
-    shown: &Shown,
-    choice: &TokenChoice,
+    shown: &DeviceBatch,
+    choice: &TokenSelection,
     loss: &Loss,
     share: f64,
     accumulator: &mut GradientsAccumulator<Clift>,
@@ -129,13 +129,13 @@ fn trains<M: Module>(module: &M) -> bool {
 #[cfg(test)]
 mod tests {
     use burn::tensor::Device;
-    use clift_model::{CondenserConfig, ModelConfig, Variant};
+    use clift_model::{CliftVariant, CondenserConfig, ModelConfig};
 
     use super::*;
     use crate::events::Stage;
     use crate::run::stage_plan::freeze;
     use crate::step::batch::StageBatch;
-    use crate::step::device_batch::loss_of;
+    use crate::step::device_batch::render_loss;
     use crate::step::seeded_inputs::{Shape, seeded_batch, seeded_model};
 
     const SHAPE: Shape = Shape { num_context: 2, num_targets: 3, size: [16, 24] };
@@ -144,7 +144,7 @@ mod tests {
 
     /// Every parameter's gradient from both ways.
     fn both(
-        variant: Variant,
+        variant: CliftVariant,
         stage: Stage,
         batch: &StageBatch,
         loss: &Loss,
@@ -174,8 +174,8 @@ mod tests {
             ..ModelConfig::default()
         };
         let model = freeze(stage, seeded_model(&config, 3, device));
-        let shown = Shown::upload(batch, &device.clone().autodiff()).expect("valid");
-        let plain_loss = loss_of(&model, &shown, &batch.tokens, loss).expect("valid").total;
+        let shown = DeviceBatch::upload(batch, &device.clone().autodiff()).expect("valid");
+        let plain_loss = render_loss(&model, &shown, &batch.tokens, loss).expect("valid").total;
         let plain = GradientsParams::from_grads(plain_loss.clone().mul_scalar(0.5).backward(), &model);
         let mut accumulator = GradientsAccumulator::new();
         let parts = backward(&model, &shown, &batch.tokens, loss, 0.5, &mut accumulator).expect("valid");
@@ -188,9 +188,9 @@ mod tests {
         pairs.pairs
     }
 
-    fn subsets(count: u32) -> TokenChoice {
+    fn subsets(count: u32) -> TokenSelection {
         let subset = |scene: u32, view: u32| (0..count).map(|i| (5 * i + view + 2 * scene) % 12).collect();
-        TokenChoice::Subsets((0..2).map(|scene| (0..3).map(|view| subset(scene, view)).collect()).collect())
+        TokenSelection::Subsets((0..2).map(|scene| (0..3).map(|view| subset(scene, view)).collect()).collect())
     }
 
     #[test]
@@ -200,7 +200,7 @@ mod tests {
         let few = StageBatch { tokens: subsets(2), ..all.clone() };
         let many = StageBatch { tokens: subsets(7), ..all.clone() };
         let cases = [(Stage::Stage1, all), (Stage::Stage1, few), (Stage::Stage1, many), (Stage::Stage2, stored)];
-        for variant in Variant::ALL {
+        for variant in CliftVariant::ALL {
             for (stage, batch) in &cases {
                 let pairs = both(variant, *stage, batch, &Loss::default(), &Device::flex());
                 let largest = |values: &[f32]| values.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));

@@ -2,7 +2,7 @@
 // N tokens, K kept tokens, D width
 
 use burn::tensor::Tensor;
-use clift_data::{Clip, Skip};
+use clift_data::{Clip, SkippedScene};
 use clift_model::{Clusters, Condenser, RenderTokens, SceneClusters};
 
 use crate::error::TrainError;
@@ -13,14 +13,14 @@ pub struct StageBatch {
     /// One clip per slot.
     pub clips: Vec<Clip>,
     /// The tokens, slot by slot.
-    pub tokens: TokenChoice,
+    pub tokens: TokenSelection,
     /// Scenes left out on the way.
-    pub skipped: Vec<Skip>,
+    pub skipped: Vec<SkippedScene>,
 }
 
 /// Which tokens the renderer is given.
 #[derive(Clone, Debug, PartialEq)]
-pub enum TokenChoice {
+pub enum TokenSelection {
     /// Stage 1: a subset of the scene's tokens for every target view, `[slots][views][K]`.
     Subsets(Vec<Vec<Vec<u32>>>),
     /// Stage 1: every token.
@@ -36,16 +36,16 @@ impl StageBatch {
         (0..count).map(move |part| {
             let range = part * batch_size / count..(part + 1) * batch_size / count;
             let tokens = match &self.tokens {
-                TokenChoice::Subsets(subsets) => TokenChoice::Subsets(subsets[range.clone()].to_vec()),
-                TokenChoice::All => TokenChoice::All,
-                TokenChoice::Clusters(clusters) => TokenChoice::Clusters(clusters[range.clone()].to_vec()),
+                TokenSelection::Subsets(subsets) => TokenSelection::Subsets(subsets[range.clone()].to_vec()),
+                TokenSelection::All => TokenSelection::All,
+                TokenSelection::Clusters(clusters) => TokenSelection::Clusters(clusters[range.clone()].to_vec()),
             };
             Self { clips: self.clips[range].to_vec(), tokens, skipped: Vec::new() }
         })
     }
 }
 
-impl TokenChoice {
+impl TokenSelection {
     /// What the renderer is given of a scene's tokens.
     pub(crate) fn apply(&self, condenser: &Condenser, lift: Tensor<3>) -> Result<RenderTokens, TrainError> {
         Ok(match self {

@@ -2,15 +2,15 @@
 // B scenes, T target views, N tokens, D width
 
 use burn::tensor::{Device, Tensor};
-use clift_eval::{upload_cameras, upload_pictures, upload_views};
+use clift_eval::{upload_cameras, upload_images, upload_views};
 use clift_model::{Cameras, Clift, SceneModel, Views};
 
 use crate::error::TrainError;
-use crate::step::batch::{StageBatch, TokenChoice};
+use crate::step::batch::{StageBatch, TokenSelection};
 use crate::step::loss::{Loss, LossParts};
 
 /// What a batch shows, on a device.
-pub struct Shown {
+pub struct DeviceBatch {
     /// The given views.
     pub context: Views,
     /// Where the targets were taken from.
@@ -19,7 +19,7 @@ pub struct Shown {
     pub pictures: Tensor<5>,
 }
 
-impl Shown {
+impl DeviceBatch {
     /// Copies the views of a batch to a device.
     pub fn upload(batch: &StageBatch, device: &Device) -> Result<Self, TrainError> {
         let contexts: Vec<_> = batch.clips.iter().map(|clip| &clip.context).collect();
@@ -27,13 +27,18 @@ impl Shown {
         Ok(Self {
             context: upload_views(&contexts, device)?,
             targets: upload_cameras(&targets, device)?,
-            pictures: upload_pictures(&targets, device)?,
+            pictures: upload_images(&targets, device)?,
         })
     }
 }
 
 /// Renders the targets and compares, on the tape.
-pub fn loss_of(model: &Clift, shown: &Shown, choice: &TokenChoice, loss: &Loss) -> Result<LossParts, TrainError> {
+pub fn render_loss(
+    model: &Clift,
+    shown: &DeviceBatch,
+    choice: &TokenSelection,
+    loss: &Loss,
+) -> Result<LossParts, TrainError> {
     let lift = model.encode(&shown.context); // [B, N, D]
     let tokens = choice.apply(&model.condenser, lift)?;
     let rendering = model.render(tokens, &shown.targets);

@@ -106,7 +106,7 @@ mod tests {
     fn overflows_change_the_factor_alone_until_the_gradient_is_that_of_f32() {
         use crate::config::config::OptimizerConfig;
         use crate::step::seeded_inputs::{Shape, seeded_batch, seeded_model};
-        use crate::step::train_state::Learner;
+        use crate::step::train_state::TrainState;
 
         let device = burn::tensor::Device::flex();
         let sizes = clift_model::ModelConfig {
@@ -119,7 +119,7 @@ mod tests {
         };
         let batch = seeded_batch(Shape { num_context: 2, num_targets: 2, size: [16, 16] }, 2, 8, None, 1).unwrap();
         for activation_checkpointing in [false, true] {
-            let learner = |loss_scale| Learner {
+            let learner = |loss_scale| TrainState {
                 model: crate::run::stage_plan::freeze(crate::events::Stage::Stage1, seeded_model(&sizes, 3, &device)),
                 optimizer: crate::step::optimizer::adamw(&OptimizerConfig::default()),
                 device: device.clone().autodiff(),
@@ -128,7 +128,7 @@ mod tests {
                 loss_scale,
             };
             let (_, expected) = learner(None).step(&batch, 1, 1e-4.into(), 1.0).unwrap();
-            let hash = |learner: &Learner| clift_model::weights_hash(&learner.model);
+            let hash = |learner: &TrainState| clift_model::weights_hash(&learner.model);
             let mut half = learner(Some(LossScale { factor: MOST, good_steps: 7 }));
             let start = hash(&half);
             let mut num_overflows = 0;

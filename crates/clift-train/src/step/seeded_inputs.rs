@@ -2,12 +2,12 @@
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
-use clift_data::{Clip, DMat3, DVec3, Intrinsics, Pose, Views, item_rng, step_rng, uniform_below};
+use clift_data::{Clip, ClipViews, DMat3, DVec3, Intrinsics, Pose, item_rng, step_rng, uniform_below};
 use clift_model::{Clift, ModelConfig, SceneClusters};
 use rand::{Rng, RngExt};
 
 use crate::error::TrainError;
-use crate::step::batch::{StageBatch, TokenChoice};
+use crate::step::batch::{StageBatch, TokenSelection};
 
 /// How many pictures of which size an item has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,7 +33,7 @@ pub fn seeded_clip(shape: Shape, seed: u64, slot: usize) -> Clip {
 }
 
 /// Views at places in `[-1, 1]` of the arc.
-fn views(places: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -> Views {
+fn views(places: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -> ClipViews {
     let focal = width as f64;
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: focal / 2.0, cy: height as f64 / 2.0 };
     let mut images = Vec::with_capacity(places.len() * height * width * 3);
@@ -49,7 +49,7 @@ fn views(places: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -> V
         }
     }
     let num_views = places.len();
-    Views {
+    ClipViews {
         width,
         height,
         images,
@@ -90,10 +90,10 @@ pub fn seeded_batch(
     seed: u64,
 ) -> Result<StageBatch, TrainError> {
     let tokens = match num_storage_tokens {
-        None => TokenChoice::All,
+        None => TokenSelection::All,
         Some(count) => {
             let scenes = (0..batch_size).map(|slot| seeded_clusters(num_tokens, count, seed, slot));
-            TokenChoice::Clusters(scenes.collect::<Result<_, _>>()?)
+            TokenSelection::Clusters(scenes.collect::<Result<_, _>>()?)
         }
     };
     let clips = (0..batch_size).map(|slot| seeded_clip(shape, seed, slot)).collect();

@@ -17,7 +17,7 @@ const MIN_STEPS: usize = 20;
 /// Why a step was left out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, strum::Display)]
 #[serde(rename_all = "snake_case")]
-pub enum Fault {
+pub enum StepAnomaly {
     /// Loss or gradient norm was a NaN or an infinity.
     #[strum(to_string = "loss or gradient is not finite")]
     NotFinite,
@@ -32,23 +32,23 @@ pub enum Fault {
 /// Loss and gradient norm of the last good steps. Part of a checkpoint, so that a resumed run judges as it would have.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Recent {
+pub struct LossHistory {
     losses: VecDeque<f64>,
     grad_norms: VecDeque<f64>,
 }
 
-impl Recent {
+impl LossHistory {
     /// What is wrong with a step, before its update.
-    pub fn fault(&self, loss: f64, grad_norm: f64, optimizer: &OptimizerConfig) -> Option<Fault> {
+    pub fn fault(&self, loss: f64, grad_norm: f64, optimizer: &OptimizerConfig) -> Option<StepAnomaly> {
         if !(loss.is_finite() && grad_norm.is_finite()) {
-            return Some(Fault::NotFinite);
+            return Some(StepAnomaly::NotFinite);
         }
         let factor = optimizer.spike_factor;
         let is_spike = |value: f64, median: Option<f64>| factor > 0.0 && median.is_some_and(|m| value > factor * m);
         if is_spike(loss, self.median_loss()) {
-            return Some(Fault::LossSpike);
+            return Some(StepAnomaly::LossSpike);
         }
-        is_spike(grad_norm, self.median_grad_norm()).then_some(Fault::GradNormSpike)
+        is_spike(grad_norm, self.median_grad_norm()).then_some(StepAnomaly::GradNormSpike)
     }
 
     /// Takes a good step into account; bad ones must not raise the bar for those after them.
@@ -79,13 +79,13 @@ fn median(window: &VecDeque<f64>) -> Option<f64> {
 
 /// A line of `bad_steps.jsonl`. JSON holds no NaN and no infinity: such a number is `null`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct BadStep {
+pub struct SkippedStep {
     /// The step that was left out, from 1.
     pub step: u64,
     /// Which stage.
     pub stage: Stage,
     /// Why.
-    pub reason: Fault,
+    pub reason: StepAnomaly,
     /// Loss of the batch.
     pub loss: Option<f64>,
     /// Global norm of the gradient before clipping.
@@ -97,12 +97,12 @@ pub struct BadStep {
     /// How many steps in a row were left out, this one included.
     pub in_a_row: u32,
     /// What the batch was made of.
-    pub scenes: Vec<BadScene>,
+    pub scenes: Vec<SkippedStepScene>,
 }
 
 /// One clip of a batch that was left out.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct BadScene {
+pub struct SkippedStepScene {
     /// Key of the scene.
     pub key: String,
     /// Frames of the contexts.
@@ -111,7 +111,7 @@ pub struct BadScene {
     pub target: Vec<usize>,
 }
 
-impl BadScene {
+impl SkippedStepScene {
     /// The clips of a batch.
     pub fn all(batch: &StageBatch) -> Vec<Self> {
         let scene = |clip: &clift_data::Clip| Self {
@@ -131,17 +131,17 @@ mod tests {
         OptimizerConfig { spike_factor, ..OptimizerConfig::default() }
     }
 
-    fn after(steps: impl IntoIterator<Item = (f64, f64)>) -> Recent {
-        let mut recent = Recent::default();
+    fn after(steps: impl IntoIterator<Item = (f64, f64)>) -> LossHistory {
+        let mut recent = LossHistory::default();
         steps.into_iter().for_each(|(loss, norm)| recent.push(loss, norm));
         recent
     }
 
     #[test]
     fn what_is_not_finite_is_bad_from_the_first_step_on() {
-        let recent = Recent::default();
+        let recent = LossHistory::default();
         for (loss, norm) in [(f64::NAN, 1.0), (1.0, f64::INFINITY), (f64::NEG_INFINITY, f64::NAN)] {
-            assert_eq!(recent.fault(loss, norm, &with_factor(0.0)), Some(Fault::NotFinite));
+            assert_eq!(recent.fault(loss, norm, &with_factor(0.0)), Some(StepAnomaly::NotFinite));
         }
         assert_eq!(recent.fault(1e300, 1e300, &with_factor(2.0)), None, "there is nothing to compare with");
     }
@@ -152,8 +152,8 @@ mod tests {
         let fault = |loss, norm, factor| recent.fault(loss, norm, &with_factor(factor));
         assert_eq!((recent.median_loss(), recent.median_grad_norm()), (Some(11.0), Some(22.0)));
         assert_eq!(fault(33.0, 66.0, 3.0), None, "exactly the factor");
-        assert_eq!(fault(33.1, 66.0, 3.0), Some(Fault::LossSpike));
-        assert_eq!(fault(33.0, 66.1, 3.0), Some(Fault::GradNormSpike));
+        assert_eq!(fault(33.1, 66.0, 3.0), Some(StepAnomaly::LossSpike));
+        assert_eq!(fault(33.0, 66.1, 3.0), Some(StepAnomaly::GradNormSpike));
         assert_eq!(fault(1e30, 1e30, 0.0), None, "0 looks for none");
     }
 

@@ -9,13 +9,13 @@ use clift_model::{Clift, Precision};
 use crate::error::TrainError;
 use crate::step::activation_checkpointing;
 use crate::step::batch::StageBatch;
-use crate::step::device_batch::{Shown, loss_of};
+use crate::step::device_batch::{DeviceBatch, render_loss};
 use crate::step::loss::{Loss, LossParts};
 use crate::step::loss_scale::LossScale;
 use crate::step::optimizer::{clip_factor, norm_on_device, scale};
 
 /// A model with its optimiser on an autodiff device.
-pub struct Learner {
+pub struct TrainState {
     /// What is trained.
     pub model: Clift,
     /// Its optimiser.
@@ -43,11 +43,11 @@ pub struct Update {
     pub applied: bool,
 }
 
-impl Learner {
+impl TrainState {
     /// Makes one update from a batch, worked off in `accumulate` parts, unless its loss or gradient is not finite.
     ///
     /// # Errors
-    /// As [`Learner::step_if`].
+    /// As [`TrainState::step_if`].
     pub fn step(
         self,
         batch: &StageBatch,
@@ -77,10 +77,10 @@ impl Learner {
         let _scope = precision.scope();
         let factor = loss_scale.map_or(1.0, |scale| scale.factor());
         let mut accumulator = GradientsAccumulator::<Clift>::new();
-        let mut read = ReadOnce::default();
+        let mut read = HostReads::default();
         for part in batch.parts(accumulate) {
             let share = part.clips.len() as f64 / batch.clips.len() as f64;
-            let shown = Shown::upload(&part, &device)?;
+            let shown = DeviceBatch::upload(&part, &device)?;
             let parts = if activation_checkpointing {
                 activation_checkpointing::backward(
                     &model,
@@ -91,7 +91,7 @@ impl Learner {
                     &mut accumulator,
                 )?
             } else {
-                let LossParts { total, mse } = loss_of(&model, &shown, &part.tokens, &loss)?;
+                let LossParts { total, mse } = render_loss(&model, &shown, &part.tokens, &loss)?;
                 let grads = total.clone().mul_scalar(share * factor).backward();
                 accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
                 LossParts { total: total.inner(), mse: mse.inner() }
@@ -134,20 +134,20 @@ impl Learner {
 /// The numbers that an update needs on the host. They stay on the device until all are there: every read waits for the
 /// work before it, and leaves a GPU without any until the host has queued more.
 #[derive(Default)]
-struct ReadOnce {
+struct HostReads {
     shares: Vec<f64>,
     /// Loss and mean squared error of every part.
     values: Vec<Tensor<1>>,
 }
 
-/// What [`ReadOnce`] gives.
+/// What [`HostReads`] gives.
 struct Read {
     loss: f64,
     mse: f64,
     grad_norm: f64,
 }
 
-impl ReadOnce {
+impl HostReads {
     fn add(&mut self, share: f64, parts: LossParts) {
         self.shares.push(share);
         self.values.extend([parts.total, parts.mse]);

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clift_eval::{Comparison, Evaluation, Side};
+use clift_eval::{Comparison, Evaluation, MethodFilter};
 
 use crate::commands::parse::parse_sides;
 use crate::output::stdout::print_result;
@@ -28,7 +28,7 @@ pub struct CompareArgs {
     pub b: PathBuf,
     /// Compare a variant of the first with another of the second, at equal counts: kmeans,clift or clift:f32,clift:int8
     #[arg(long, value_name = "A,B", value_parser = parse_sides)]
-    pub variants: Option<[Side; 2]>,
+    pub variants: Option<[MethodFilter; 2]>,
     /// Write the differences as JSON
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,

@@ -8,11 +8,11 @@ use clift_data::{
     open_dataset, open_source,
 };
 use clift_eval::{EncodeOptions, Encoded, encode};
-use clift_model::{DeviceName, ModelPath, TokenCount, TokenStorage, TrainedModel, check_destination};
+use clift_model::{DeviceName, ModelPath, TokenCount, TokenFormat, TrainedModel, check_output_path};
 use clift_train::{Config, Override, read_config};
 
 use crate::commands::data::text::{bytes, count};
-use crate::exit_code::WrongUsage;
+use crate::exit_code::UsageError;
 use crate::output::stdout;
 
 /// Keys that are shown when one has to be chosen.
@@ -45,7 +45,7 @@ pub struct EncodeArgs {
     pub storage: TokenCount,
     /// Number format of the tokens in the file: f32, f16 or int8
     #[arg(long, value_name = "FORMAT", default_value_t)]
-    pub tokens: TokenStorage,
+    pub tokens: TokenFormat,
     /// Change a key of the run's config: `--set 'data.root="PATH"'`
     #[arg(long, value_name = "KEY=TOML")]
     pub set: Vec<String>,
@@ -56,13 +56,13 @@ pub struct EncodeArgs {
 
 /// Encodes one scene and writes its file.
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
-    check_destination(&args.out).map_err(|error| WrongUsage(error.to_string()))?;
+    check_output_path(&args.out).map_err(|error| UsageError(error.to_string()))?;
     let model = ModelPath::find(&args.model)?;
     let (mut config, overrides) = read_config::<Config>(&model.dir.join("config.toml"), &args.set)?;
     // No shape shows heads: another number would be encoded, and drawn, without a word.
     if config.model != model.config()? {
         return Err(
-            WrongUsage("--set model: the network is what the weights were trained with: leave it out".into()).into()
+            UsageError("--set model: the network is what the weights were trained with: leave it out".into()).into()
         );
     }
     for change in &overrides {
@@ -97,7 +97,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
 }
 
 /// What was written, for people.
-fn told(encoded: &Encoded, storage: TokenStorage, path: &Path) -> String {
+fn told(encoded: &Encoded, storage: TokenFormat, path: &Path) -> String {
     let Encoded { scene, num_lift_tokens, cluster_error } = encoded;
     let num_tokens = scene.num_tokens();
     let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
@@ -145,10 +145,10 @@ fn choose(source: &dyn SceneSource, key: Option<&str>) -> anyhow::Result<usize> 
     match key {
         Some(key) => match source.find(key) {
             Some(scene) => Ok(scene),
-            None => Err(WrongUsage(format!("there is no scene {key}; the {num_scenes} there are: {keys}")).into()),
+            None => Err(UsageError(format!("there is no scene {key}; the {num_scenes} there are: {keys}")).into()),
         },
         None if num_scenes == 1 => Ok(0),
-        None => Err(WrongUsage(format!("{num_scenes} scenes; choose one with --scene: {keys}")).into()),
+        None => Err(UsageError(format!("{num_scenes} scenes; choose one with --scene: {keys}")).into()),
     }
 }
 

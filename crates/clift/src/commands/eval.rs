@@ -3,12 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use clift_data::SourceKind;
-use clift_eval::{Experiment, Selection, System, SystemName};
-use clift_model::{DeviceName, ModelPath, TokenCount, TokenStorage};
+use clift_eval::{Experiment, ExternalMethod, MethodName, Selection};
+use clift_model::{DeviceName, ModelPath, TokenCount, TokenFormat};
 use clift_train::{Config, Run, evaluate_model, read_config};
 
 use crate::commands::parse::parse_bytes;
-use crate::exit_code::WrongUsage;
+use crate::exit_code::UsageError;
 use crate::output::{progress, stdout};
 
 /// Evaluates a run or a model and prints the table.
@@ -82,26 +82,26 @@ fn read(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
 }
 
 /// Other systems, with as many names and sizes as there are, or none.
-fn systems(args: &EvalArgs) -> anyhow::Result<Vec<System>> {
+fn systems(args: &EvalArgs) -> anyhow::Result<Vec<ExternalMethod>> {
     let EvalArgs { predictions, name, data_size, .. } = args;
     for (flag, count) in [("--name", name.len()), ("--data-size", data_size.len())] {
         if count != 0 && count != predictions.len() {
             let text =
                 format!("{} --predictions but {count} {flag}: write one for each, in their order", predictions.len());
-            return Err(WrongUsage(text).into());
+            return Err(UsageError(text).into());
         }
     }
-    let mut systems: Vec<System> = Vec::new();
+    let mut systems: Vec<ExternalMethod> = Vec::new();
     for (i, folder) in predictions.iter().enumerate() {
         if !folder.is_dir() {
-            return Err(WrongUsage(format!("there is no folder for --predictions {}", folder.display())).into());
+            return Err(UsageError(format!("there is no folder for --predictions {}", folder.display())).into());
         }
         let of_folder = || folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned();
-        let name = SystemName::new(&name.get(i).cloned().unwrap_or_else(of_folder))?;
+        let name = MethodName::new(&name.get(i).cloned().unwrap_or_else(of_folder))?;
         if systems.iter().any(|system| system.name == name) {
-            return Err(WrongUsage(format!("two --predictions are called {}: write --name", name.as_str())).into());
+            return Err(UsageError(format!("two --predictions are called {}: write --name", name.as_str())).into());
         }
-        systems.push(System { name, folder: Path::to_owned(folder), data_bytes: data_size.get(i).copied() });
+        systems.push(ExternalMethod { name, folder: Path::to_owned(folder), data_bytes: data_size.get(i).copied() });
     }
     Ok(systems)
 }
@@ -142,7 +142,7 @@ pub struct EvalArgs {
     pub selection: Option<Selection>,
     /// Round stored tokens as a scene file would, in each of these formats in turn: f32, f16, int8
     #[arg(long, value_delimiter = ',', value_name = "FORMAT")]
-    pub tokens: Vec<TokenStorage>,
+    pub tokens: Vec<TokenFormat>,
     /// Score another system's pictures of the targets too; repeatable
     #[arg(long, value_name = "DIR")]
     pub predictions: Vec<PathBuf>,

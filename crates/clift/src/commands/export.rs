@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::ValueEnum;
 use clift_model::ModelPath;
-use clift_train::{Config, ExportFormat, export, read_config, refuse_existing};
+use clift_train::{Config, ExportFormat, export, read_config, require_absent};
 
 use crate::output::stdout;
 
@@ -33,7 +33,7 @@ pub enum Format {
 
 /// Writes a model's weights for PyTorch.
 pub fn run(args: &ExportArgs) -> anyhow::Result<()> {
-    refuse_existing(&args.out)?;
+    require_absent(&args.out)?;
     let model = ModelPath::find(&args.model)?;
     let (config, _) = read_config::<Config>(&model.dir.join("config.toml"), &[])?;
     let format = match args.format {

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clift_model::{Convention, Macs, ModelConfig, TokenCount};
+use clift_model::{FlopConvention, Macs, ModelConfig, TokenCount};
 use clift_train::{Config, read_config};
 use serde::Serialize;
 
@@ -76,7 +76,7 @@ fn sizes(args: &FlopsArgs) -> anyhow::Result<Sizes> {
     Ok(Sizes { model, height: data.height, width: data.width, num_context: eval.num_context, counts })
 }
 
-fn count(sizes: &Sizes, convention: Convention) -> anyhow::Result<Counts> {
+fn count(sizes: &Sizes, convention: FlopConvention) -> anyhow::Result<Counts> {
     let Sizes { model, height, width, num_context, counts } = sizes;
     let (height, width, num_context) = (*height, *width, *num_context);
     let num_tokens = model.num_tokens(num_context, height, width)?;
@@ -93,7 +93,7 @@ fn count(sizes: &Sizes, convention: Convention) -> anyhow::Result<Counts> {
         rows.push(row("render", tokens, model.render_macs(height, width, tokens)?));
     }
     // The paper tells neither; its convention is known of rendering alone.
-    if convention != Convention::Paper {
+    if convention != FlopConvention::Paper {
         rows.push(row("encode", num_tokens, model.encode_macs(num_context, height, width)?));
         for count in counts {
             let tokens = count.of(num_tokens)?;
@@ -103,7 +103,7 @@ fn count(sizes: &Sizes, convention: Convention) -> anyhow::Result<Counts> {
     Ok(Counts { convention: convention.name(), width, height, num_context, num_tokens, rows })
 }
 
-fn shown(counts: &Counts, convention: Convention) -> String {
+fn shown(counts: &Counts, convention: FlopConvention) -> String {
     let Counts { width, height, num_context, num_tokens, rows, .. } = counts;
     // As many digits as the paper prints.
     let cell = |giga: f64| match giga {
@@ -124,7 +124,7 @@ pub struct FlopsArgs {
     pub config: Option<PathBuf>,
     /// How to count: paper, macs or flops
     #[arg(long, default_value = "macs")]
-    pub convention: Convention,
+    pub convention: FlopConvention,
     /// Numbers of rendered tokens, or shares of a scene's; those of the paper's table, or of the config, by default
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub render: Vec<TokenCount>,
@@ -140,24 +140,24 @@ pub struct FlopsArgs {
 mod tests {
     use super::*;
 
-    fn counts(convention: Convention) -> Counts {
+    fn counts(convention: FlopConvention) -> Counts {
         let args = FlopsArgs { config: None, convention, render: Vec::new(), set: Vec::new(), json: None };
         count(&sizes(&args).unwrap(), convention).unwrap()
     }
 
     #[test]
     fn the_papers_table_is_printed() {
-        let paper = counts(Convention::Paper);
+        let paper = counts(FlopConvention::Paper);
         let printed: Vec<String> = paper.rows.iter().map(|row| format!("{:.2}", row.giga)).collect();
         assert_eq!(printed, ["70.59", "63.35", "56.10", "48.85", "45.23"]);
-        let text = shown(&paper, Convention::Paper);
+        let text = shown(&paper, FlopConvention::Paper);
         assert!(text.contains("views of 256 x 256, 4 context views, 4096 tokens"), "{text}");
         assert!(text.contains("render  512     45.23"), "{text}");
     }
 
     #[test]
     fn other_conventions_have_attention_the_encoder_and_the_condenser_too() {
-        let (macs, flops) = (counts(Convention::Macs), counts(Convention::Flops));
+        let (macs, flops) = (counts(FlopConvention::Macs), counts(FlopConvention::Flops));
         let works: Vec<&str> = macs.rows.iter().map(|row| row.work).collect();
         assert_eq!(works.iter().filter(|work| **work == "condense").count(), 5);
         assert!(works.contains(&"encode"));

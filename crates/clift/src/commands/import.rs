@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use clift_model::Variant;
-use clift_train::{ImportOptions, Imported, import};
+use clift_model::CliftVariant;
+use clift_train::{ImportOptions, ImportRecord, import};
 
 use crate::output::stdout;
 
@@ -15,7 +15,7 @@ pub struct ImportArgs {
     pub file: PathBuf,
     /// The network it holds: paper, released-re10k or released-dl3dv
     #[arg(long, value_name = "VARIANT")]
-    pub variant: Variant,
+    pub variant: CliftVariant,
     /// The model directory to write
     #[arg(long, short, value_name = "DIR")]
     pub out: PathBuf,
@@ -61,7 +61,7 @@ pub fn run(args: &ImportArgs) -> anyhow::Result<()> {
 }
 
 /// What was not taken over.
-fn told(imported: &Imported) -> Vec<String> {
+fn told(imported: &ImportRecord) -> Vec<String> {
     let mut lines = Vec::new();
     for (first, count) in &imported.ignored {
         lines.push(format!("not of the network: {count} keys {first}.*"));

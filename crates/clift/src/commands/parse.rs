@@ -1,12 +1,12 @@
 //! Shared argument parsers.
 
-use clift_eval::Side;
+use clift_eval::MethodFilter;
 use clift_train::Stage;
 
-pub(crate) fn parse_sides(text: &str) -> Result<[Side; 2], String> {
+pub(crate) fn parse_sides(text: &str) -> Result<[MethodFilter; 2], String> {
     let parts: Vec<&str> = text.split(',').map(str::trim).filter(|part| !part.is_empty()).collect();
     let [a, b] = parts[..] else { return Err("write two variants, such as kmeans,clift".into()) };
-    Ok([Side::parse(a), Side::parse(b)])
+    Ok([MethodFilter::parse(a), MethodFilter::parse(b)])
 }
 
 /// Bytes, or so many kB, MB, GB of a thousand each.

@@ -8,7 +8,7 @@ use clift_data::replace_file;
 use clift_model::{DeviceName, max_tensor_bytes};
 use clift_train::{Config, LargestTensor, PARTS, largest_tensor, memory_warning, read_checked_config};
 
-use crate::exit_code::WrongUsage;
+use crate::exit_code::UsageError;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::table;
 use crate::output::units::{bytes, duration, seconds};
@@ -23,7 +23,7 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     if let Some(json) = &args.json
         && !crate::output::units::folder_of(json).is_dir()
     {
-        return Err(WrongUsage(format!("there is no folder for --json {}", json.display())).into());
+        return Err(UsageError(format!("there is no folder for --json {}", json.display())).into());
     }
     let planned = plan(&config, !args.no_time)?;
     print_result(&shown(&planned))?;

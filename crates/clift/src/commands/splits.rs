@@ -34,14 +34,14 @@ pub fn files(set: &[String]) -> anyhow::Result<(FileOptions, Vec<Override>)> {
 }
 
 /// A half of a folder, or all of one that is not divided.
-pub struct Half {
+pub struct SplitSource {
     /// Which half; `None` for all of a folder that is not divided.
     pub split: Option<Split>,
     /// Its scenes.
     pub opened: OpenedSource,
 }
 
-impl Half {
+impl SplitSource {
     /// What to call it.
     pub fn name(&self) -> String {
         self.split.map_or_else(|| "scenes".into(), |split| split.to_string())
@@ -72,7 +72,7 @@ pub fn options() -> SourceOptions {
 ///
 /// # Errors
 /// The first error of opening one.
-pub fn halves(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Result<Vec<Half>> {
+pub fn splits(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Result<Vec<SplitSource>> {
     // An empty list keeps no scene for testing and divides nothing.
     let list = files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
     let has_list = list.is_some_and(|list| list.num_scenes() > 0);
@@ -93,7 +93,7 @@ pub fn halves(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Resul
                 opened.report.notes.push(note.into());
             }
         }
-        halves.push(Half { split: (!is_whole).then_some(split), opened });
+        halves.push(SplitSource { split: (!is_whole).then_some(split), opened });
     }
     Ok(halves)
 }
@@ -147,7 +147,7 @@ mod tests {
                 std::fs::write(&path, keys).unwrap();
                 PathBuf::from(&path)
             });
-            let halves = halves(&root, splits, &FileOptions { test_scenes, ..FileOptions::default() }).unwrap();
+            let halves = splits(&root, splits, &FileOptions { test_scenes, ..FileOptions::default() }).unwrap();
             let told = halves.iter().map(|half| (half.name(), half.opened.source.num_scenes()));
             told.collect::<Vec<_>>()
         };

@@ -50,6 +50,8 @@ pub(crate) fn rate(per_s: f64) -> String {
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use std::io::{ErrorKind, Write};
+
     use super::*;
     use crate::output::stdout::write_result;
 

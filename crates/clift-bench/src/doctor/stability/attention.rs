@@ -5,8 +5,8 @@ use burn::tensor::{Int, Tensor, TensorData};
 use clift_model::{cluster_attention, cross_sdpa};
 use clift_train::{TrainError, seeded_uniform};
 
-use crate::cases::reference::{InF64, relative_error};
-use crate::doctor::stability::case::{Bound, Case, Outcome, Place};
+use crate::cases::reference::{ToF64, relative_error};
+use crate::doctor::stability::case::{Bound, Case, CaseDevices, Outcome};
 
 pub(crate) const CASES: &[Case] = &[
     Case {
@@ -56,7 +56,7 @@ fn worst(errors: impl IntoIterator<Item = f64>) -> Outcome {
 }
 
 /// Queries that look at every token.
-fn many(place: &Place) -> Result<Outcome, TrainError> {
+fn many(place: &CaseDevices) -> Result<Outcome, TrainError> {
     const DIM: usize = 32;
     let (keys, queries) = (place.size.pick(2048, 1 << 16), place.size.pick(16, 1024));
     let query = seeded_uniform([1, queries, DIM], 0, "stability query", &place.device);
@@ -69,14 +69,14 @@ fn no_gradient() -> TrainError {
 }
 
 /// Cross-attention whose largest score is `largest`.
-fn attended(place: &Place, largest: f64) -> Result<Outcome, TrainError> {
+fn attended(place: &CaseDevices, largest: f64) -> Result<Outcome, TrainError> {
     let (dim, count) = (32, place.size.pick(64, 1024));
     let (query, key_value) = scores_up_to(place, largest, [count, count], dim);
     compared(place, [query, key_value], |[query, key_value]| cross_sdpa(query, key_value, 2))
 }
 
 /// Queries and keys whose largest score is `largest`, and values.
-fn scores_up_to(place: &Place, largest: f64, [queries, keys]: [usize; 2], dim: usize) -> (Tensor<3>, Tensor<3>) {
+fn scores_up_to(place: &CaseDevices, largest: f64, [queries, keys]: [usize; 2], dim: usize) -> (Tensor<3>, Tensor<3>) {
     let drawn =
         |count: usize, width: usize, purpose: &str| seeded_uniform([1, count, width], 0, purpose, &place.device);
     let query: Tensor<3> = drawn(queries, dim, "stability query");
@@ -93,7 +93,7 @@ fn scores_up_to(place: &Place, largest: f64, [queries, keys]: [usize; 2], dim: u
 }
 
 /// Queries whose scores are all near `level`, or all near `-level`, and differ by about one; keys and values.
-fn level_scores(place: &Place, level: f64, [queries, keys]: [usize; 2]) -> [Tensor<3>; 2] {
+fn level_scores(place: &CaseDevices, level: f64, [queries, keys]: [usize; 2]) -> [Tensor<3>; 2] {
     const DIM: usize = 32;
     let head_width = DIM / 2;
     let drawn =
@@ -111,7 +111,7 @@ fn level_scores(place: &Place, level: f64, [queries, keys]: [usize; 2]) -> [Tens
     [query, Tensor::cat(vec![key, drawn(keys, DIM, "stability value")], 2)]
 }
 
-fn clustered(place: &Place) -> Result<Outcome, TrainError> {
+fn clustered(place: &CaseDevices) -> Result<Outcome, TrainError> {
     let (stored, members) = (place.size.pick(8, 64), place.size.pick(64, 1024));
     let inputs = level_scores(place, 1e4, [stored, members]);
     let segment: Vec<i64> = (0..members).map(|member| (member * 7 % stored) as i64).collect();
@@ -124,7 +124,7 @@ fn clustered(place: &Place) -> Result<Outcome, TrainError> {
 
 /// The error of an operation's output and of its inputs' gradients.
 fn compared(
-    place: &Place,
+    place: &CaseDevices,
     inputs: [Tensor<3>; 2],
     operation: impl Fn([Tensor<3>; 2]) -> Tensor<3>,
 ) -> Result<Outcome, TrainError> {

@@ -26,7 +26,7 @@ impl Size {
 
 /// Where a case is computed, and where its f64 reference.
 #[derive(Clone, Debug)]
-pub struct Place {
+pub struct CaseDevices {
     /// Without autodiff.
     pub device: Device,
     /// Flex, whose f64 goes through the composed operations, not through the kernels for f32.
@@ -64,7 +64,7 @@ pub struct Case {
     pub bound: Bound,
     /// Why that.
     pub reason: &'static str,
-    pub(crate) run: fn(&Place) -> Result<Outcome, TrainError>,
+    pub(crate) run: fn(&CaseDevices) -> Result<Outcome, TrainError>,
 }
 
 impl Case {
@@ -80,7 +80,7 @@ impl Case {
     ///
     /// # Errors
     /// Whatever data or model refuse where the case does not expect it.
-    pub fn run(&self, place: &Place) -> Result<Outcome, TrainError> {
+    pub fn run(&self, place: &CaseDevices) -> Result<Outcome, TrainError> {
         (self.run)(place)
     }
 

@@ -3,11 +3,11 @@
 use burn::tensor::Tensor;
 use clift_model::{KMeans, ModelError, SceneClusters};
 use clift_train::{
-    Stage, TokenChoice, TrainError, freeze, seeded_batch, seeded_clusters, seeded_model, seeded_uniform,
+    Stage, TokenSelection, TrainError, freeze, seeded_batch, seeded_clusters, seeded_model, seeded_uniform,
 };
 
-use crate::cases::reference::{InF64, values};
-use crate::doctor::stability::case::{Bound, Case, Outcome, Place};
+use crate::cases::reference::{ToF64, values};
+use crate::doctor::stability::case::{Bound, Case, CaseDevices, Outcome};
 use crate::doctor::stability::compare::{most, update_error};
 use crate::doctor::stability::updates::{network, num_tokens, shape};
 
@@ -80,7 +80,7 @@ pub(crate) const CASES: &[Case] = &[
 ];
 
 /// The difference of the inertia of clusters of `distinct` tokens, each many times over, from f64.
-fn inertia_of(place: &Place, distinct: usize, num_clusters: usize) -> Result<Outcome, TrainError> {
+fn inertia_of(place: &CaseDevices, distinct: usize, num_clusters: usize) -> Result<Outcome, TrainError> {
     let (dim, times) = (place.size.pick(8, 64), place.size.pick(8, 256));
     let few: Tensor<3> = seeded_uniform([1, distinct, dim], 0, "stability tokens", &place.device);
     let tokens = Tensor::cat(vec![few; times], 1);
@@ -92,10 +92,13 @@ fn inertia_of(place: &Place, distinct: usize, num_clusters: usize) -> Result<Out
 }
 
 /// The error of an update of stage 2 with these clusters.
-fn condensed(place: &Place, scene: impl Fn(usize) -> Result<SceneClusters, TrainError>) -> Result<Outcome, TrainError> {
+fn condensed(
+    place: &CaseDevices,
+    scene: impl Fn(usize) -> Result<SceneClusters, TrainError>,
+) -> Result<Outcome, TrainError> {
     let num_tokens = num_tokens(place, 4);
     let mut batch = seeded_batch(shape(place, 4), 2, num_tokens, None, 0)?;
-    batch.tokens = TokenChoice::Clusters(vec![scene(num_tokens)?; 2]);
+    batch.tokens = TokenSelection::Clusters(vec![scene(num_tokens)?; 2]);
     let model = freeze(Stage::Stage2, seeded_model(&network(place), 0, &place.device));
     Ok(Outcome::Error(update_error(place, &model, &batch)?))
 }

@@ -4,23 +4,23 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_model::Clift;
-use clift_train::{Shown, StageBatch, TrainError};
+use clift_train::{DeviceBatch, StageBatch, TrainError};
 
-use crate::cases::reference::{InF64, module_in_f64, values};
+use crate::cases::reference::{ToF64, module_in_f64, values};
 use crate::cases::step::gradients;
-use crate::doctor::stability::case::Place;
+use crate::doctor::stability::case::CaseDevices;
 
 /// Part of the largest gradient below which a parameter's own counts as that: a gradient that is zero in exact
 /// arithmetic, as that of a query with one key, is noise in any other.
 const LEAST_SHARE: f64 = 1e-3;
 
 /// The largest error of an update's loss and of its gradients, each over its own largest entry.
-pub fn update_error(place: &Place, model: &Clift, batch: &StageBatch) -> Result<f64, TrainError> {
-    let shown = Shown::upload(batch, &place.device.clone().autodiff())?;
+pub fn update_error(place: &CaseDevices, model: &Clift, batch: &StageBatch) -> Result<f64, TrainError> {
+    let shown = DeviceBatch::upload(batch, &place.device.clone().autodiff())?;
     let reference = place.reference.clone().autodiff();
-    let ours = gradients(model, batch, Shown { ..shown })?;
+    let ours = gradients(model, batch, DeviceBatch { ..shown })?;
     let copy = module_in_f64(model, &place.reference).train();
-    let shown = Shown::upload(batch, &reference)?.in_f64(&reference);
+    let shown = DeviceBatch::upload(batch, &reference)?.in_f64(&reference);
     let theirs = gradients(&copy, batch, shown)?;
     Ok(largest(model, &ours, &theirs))
 }

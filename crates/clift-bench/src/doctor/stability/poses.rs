@@ -1,6 +1,6 @@
 //! The normalised frame of scenes whose cameras are far away or close together.
 
-use clift_data::{Pose, PoseRotation, PoseScale, SceneFrame};
+use clift_data::{Pose, PoseNormalization, PoseRotation, PoseScale};
 use clift_train::{Shape, TrainError, seeded_clip};
 
 use crate::doctor::stability::case::{Bound, Case, Outcome};
@@ -58,7 +58,7 @@ fn normalised(distance: f64, baseline: f64, in_f32: bool) -> Result<Outcome, Tra
     let here: Vec<Pose> = clip.context.c2w.iter().map(grown).collect();
     let away: Vec<Pose> = here.iter().map(moved).collect();
     let [here, away] = [here, away].map(|poses| {
-        let frame = SceneFrame::find("far", &poses, &[], PoseRotation::default(), PoseScale::default())?;
+        let frame = PoseNormalization::find("far", &poses, &[], PoseRotation::default(), PoseScale::default())?;
         Ok(poses.iter().map(|pose| frame.normalize(*pose)).collect::<Vec<_>>())
     });
     let away = match away {

@@ -6,7 +6,7 @@
 use clift_model::DeviceName;
 use clift_train::TrainError;
 
-use crate::doctor::stability::case::{Bound, Case, Outcome, Place, Row, Size};
+use crate::doctor::stability::case::{Bound, Case, CaseDevices, Outcome, Row, Size};
 
 /// Runs every case on the devices; `tell` is given every row as it is done.
 ///
@@ -14,7 +14,8 @@ use crate::doctor::stability::case::{Bound, Case, Outcome, Place, Row, Size};
 /// A device that cannot be opened.
 pub fn run(devices: &[DeviceName], size: Size, tell: &mut dyn FnMut(&Row)) -> Result<Vec<Row>, TrainError> {
     let reference = DeviceName::Flex.open()?;
-    let places = devices.iter().map(|name| Ok(Place { device: name.open()?, reference: reference.clone(), size }));
+    let places =
+        devices.iter().map(|name| Ok(CaseDevices { device: name.open()?, reference: reference.clone(), size }));
     let places = places.collect::<Result<Vec<_>, TrainError>>()?;
     let rows = Case::all().map(|case| {
         let outcomes = places.iter().map(|place| case.run(place).map_err(|error| error.to_string())).collect();
@@ -38,7 +39,7 @@ pub fn markdown(devices: &[DeviceName], rows: &[Row]) -> String {
             Bound::Refused(_) => "refused".into(),
         };
         let mut cells: Vec<String> = vec![name.into(), breaks.into(), bound, reason.into()];
-        cells.extend(row.outcomes.iter().map(|outcome| shown(row, outcome)));
+        cells.extend(row.outcomes.iter().map(|outcome| table_text(row, outcome)));
         line(&cells)
     });
     let lines: Vec<String> = [line(&header), line(&rule)].into_iter().chain(body).collect();
@@ -46,7 +47,7 @@ pub fn markdown(devices: &[DeviceName], rows: &[Row]) -> String {
 }
 
 /// An outcome in a cell; what does not hold stands out.
-pub fn shown(row: &Row, outcome: &Result<Outcome, String>) -> String {
+pub fn table_text(row: &Row, outcome: &Result<Outcome, String>) -> String {
     let text = match outcome {
         Ok(Outcome::Error(error)) => format!("{error:.1e}"),
         Ok(Outcome::Refused(_)) => "refused".into(),

@@ -3,11 +3,11 @@
 use burn::module::Module;
 use burn::tensor::{Tensor, TensorData};
 use clift_eval::{upload_cameras, upload_views};
-use clift_model::{ModelError, TokenStorage};
+use clift_model::{ModelError, TokenFormat};
 use clift_train::{TrainError, seeded_clip, seeded_model};
 
-use crate::cases::reference::{InF64, module_in_f64, values};
-use crate::doctor::stability::case::{Bound, Case, Outcome, Place};
+use crate::cases::reference::{ToF64, module_in_f64, values};
+use crate::doctor::stability::case::{Bound, Case, CaseDevices, Outcome};
 use crate::doctor::stability::compare::most;
 use crate::doctor::stability::updates::{network, shape};
 
@@ -17,28 +17,28 @@ pub(crate) const CASES: &[Case] = &[
         breaks: "the way to a file and back",
         bound: Bound::Most(1e-5),
         reason: "nothing is rounded; of pictures, whose values are below 1",
-        run: |place| drawn(place, TokenStorage::F32),
+        run: |place| drawn(place, TokenFormat::F32),
     },
     Case {
         name: "tokens in f16",
         breaks: "colours of a renderer that was not trained with them",
         bound: Bound::Most(2e-3),
         reason: "values are rounded by 5e-4, and half a grey level is 2e-3",
-        run: |place| drawn(place, TokenStorage::F16),
+        run: |place| drawn(place, TokenFormat::F16),
     },
     Case {
         name: "tokens in int8",
         breaks: "the same",
         bound: Bound::Most(2e-2),
         reason: "values are rounded by 1/254 of a token's largest",
-        run: |place| drawn(place, TokenStorage::Int8),
+        run: |place| drawn(place, TokenFormat::Int8),
     },
     Case {
         name: "tokens beyond 65,504 in f16",
         breaks: "infinities in a file",
         bound: Bound::Refused("beyond 65504"),
         reason: "f16 ends there",
-        run: |_| match TokenStorage::F16.round(&[1.0, 7e4], 2) {
+        run: |_| match TokenFormat::F16.round(&[1.0, 7e4], 2) {
             Err(error @ ModelError::BadConfig { .. }) => Ok(Outcome::Refused(error.to_string())),
             Err(other) => Err(other.into()),
             Ok(_) => Ok(Outcome::Error(0.0)),
@@ -51,7 +51,7 @@ pub(crate) const CASES: &[Case] = &[
         reason: "1/254 of each token's largest value",
         run: |_| {
             let tokens = [1e-30, -5e-31, 1e30, 3e29];
-            let rounded = TokenStorage::Int8.round(&tokens, 2)?;
+            let rounded = TokenFormat::Int8.round(&tokens, 2)?;
             let largest = [1e-30_f64, 1e-30, 1e30, 1e30];
             let errors = rounded.iter().zip(tokens).zip(largest);
             Ok(Outcome::Error(most(errors.map(|((a, b), largest)| (f64::from(*a) - f64::from(b)) / largest))))
@@ -60,7 +60,7 @@ pub(crate) const CASES: &[Case] = &[
 ];
 
 /// The largest difference of a picture drawn from rounded tokens from one drawn in f64 from those that are not.
-fn drawn(place: &Place, storage: TokenStorage) -> Result<Outcome, TrainError> {
+fn drawn(place: &CaseDevices, storage: TokenFormat) -> Result<Outcome, TrainError> {
     let config = network(place);
     let networks = seeded_model(&config, 0, &place.device).valid();
     let clip = seeded_clip(shape(place, 4), 0, 0);

@@ -5,11 +5,11 @@ use burn::optim::GradientsParams;
 use burn::tensor::Device;
 use clift_model::Clift;
 use clift_train::{
-    Loss, OptimizerConfig, Shown, Stage, StageBatch, TrainError, adamw, clip_global_norm, freeze, global_norm, loss_of,
-    seeded_batch, seeded_model,
+    DeviceBatch, Loss, OptimizerConfig, Stage, StageBatch, TrainError, adamw, clip_global_norm, freeze, global_norm,
+    render_loss, seeded_batch, seeded_model,
 };
 
-use crate::cases::reference::{InF64, module_in_f64, values};
+use crate::cases::reference::{ToF64, module_in_f64, values};
 use crate::doctor::stability::case::{Bound, Case, Outcome};
 use crate::doctor::stability::updates::{network, num_tokens, shape};
 
@@ -43,9 +43,9 @@ fn losses(mut model: Clift, batch: &StageBatch, device: &Device, in_f64: bool) -
     let device = device.clone().autodiff();
     let mut losses = Vec::new();
     for _ in 0..STEPS {
-        let shown = Shown::upload(batch, &device)?;
+        let shown = DeviceBatch::upload(batch, &device)?;
         let shown = if in_f64 { shown.in_f64(&device) } else { shown };
-        let loss = loss_of(&model, &shown, &batch.tokens, &Loss::default())?.total;
+        let loss = render_loss(&model, &shown, &batch.tokens, &Loss::default())?.total;
         losses.push(values(loss.clone().inner())[0]);
         let grads = GradientsParams::from_grads(loss.backward(), &model);
         let norm = global_norm(&model, &grads);

@@ -1,10 +1,10 @@
 //! Whole updates, loss and gradients, on views that are hard.
 
-use clift_data::{Clip, MAX_COORDINATE, Views};
+use clift_data::{Clip, ClipViews, MAX_COORDINATE};
 use clift_model::ModelConfig;
 use clift_train::{Shape, StageBatch, TrainError, seeded_batch, seeded_model};
 
-use crate::doctor::stability::case::{Bound, Case, Outcome, Place};
+use crate::doctor::stability::case::{Bound, Case, CaseDevices, Outcome};
 use crate::doctor::stability::compare::update_error;
 
 /// f32 through a few blocks, forward and backward, as the tests of single blocks have it, times the blocks.
@@ -135,7 +135,7 @@ pub(crate) const CASES: &[Case] = &[
 ];
 
 /// The network of the cases.
-pub(crate) fn network(place: &Place) -> ModelConfig {
+pub(crate) fn network(place: &CaseDevices) -> ModelConfig {
     ModelConfig {
         dim: place.size.pick(16, 64),
         num_heads: 4,
@@ -147,26 +147,26 @@ pub(crate) fn network(place: &Place) -> ModelConfig {
 }
 
 /// Two targets of so many contexts.
-pub(crate) fn shape(place: &Place, num_context: usize) -> Shape {
+pub(crate) fn shape(place: &CaseDevices, num_context: usize) -> Shape {
     let side = place.size.pick(16, 64);
     Shape { num_context, num_targets: if num_context == 1 { 1 } else { 2 }, size: [side, side] }
 }
 
 /// Tokens of such a scene.
-pub(crate) fn num_tokens(place: &Place, num_context: usize) -> usize {
+pub(crate) fn num_tokens(place: &CaseDevices, num_context: usize) -> usize {
     let [height, width] = shape(place, num_context).size;
     num_context * (height / 8) * (width / 8)
 }
 
 /// The error of an update of stage 1 on a scene that is changed.
-fn changed(place: &Place, num_context: usize, change: impl Fn(&mut Clip)) -> Result<Outcome, TrainError> {
+fn changed(place: &CaseDevices, num_context: usize, change: impl Fn(&mut Clip)) -> Result<Outcome, TrainError> {
     let mut batch: StageBatch = seeded_batch(shape(place, num_context), 1, num_tokens(place, num_context), None, 0)?;
     batch.clips.iter_mut().for_each(change);
     let model = clift_train::freeze(clift_train::Stage::Stage1, seeded_model(&network(place), 0, &place.device));
     Ok(Outcome::Error(update_error(place, &model, &batch)?))
 }
 
-fn all_views(clip: &mut Clip) -> [&mut Views; 2] {
+fn all_views(clip: &mut Clip) -> [&mut ClipViews; 2] {
     [&mut clip.context, &mut clip.target]
 }
 

@@ -7,12 +7,12 @@ use proptest::prelude::*;
 use super::*;
 use crate::random::item_rng;
 
-fn sampler() -> BoundedSampler {
-    BoundedSampler::default()
+fn sampler() -> ViewSampler {
+    ViewSampler::default()
 }
 
 /// Smallest and largest of many drawn gaps.
-fn gaps(sampler: &BoundedSampler, num_frames: usize, step: u64, num_context: usize) -> [usize; 2] {
+fn gaps(sampler: &ViewSampler, num_frames: usize, step: u64, num_context: usize) -> [usize; 2] {
     let gaps: BTreeSet<usize> = (0..4_000)
         .map(|slot| {
             let mut rng = item_rng(1, step, slot, 0, "test");
@@ -35,11 +35,11 @@ fn gaps_grow_with_the_step_and_fill_their_bounds() {
 
 #[test]
 fn the_schedule_truncates_and_stays_at_its_last_value() {
-    assert_eq!(schedule(25, 45, 30_000, 1_499), 25);
-    assert_eq!(schedule(25, 45, 30_000, 1_500), 26);
-    assert_eq!(schedule(25, 45, 30_000, 29_999), 44);
-    assert_eq!(schedule(25, 45, 30_000, u64::MAX), 45);
-    assert_eq!(schedule(25, 45, 0, 0), 45);
+    assert_eq!(linear_warm_up(25, 45, 30_000, 1_499), 25);
+    assert_eq!(linear_warm_up(25, 45, 30_000, 1_500), 26);
+    assert_eq!(linear_warm_up(25, 45, 30_000, 29_999), 44);
+    assert_eq!(linear_warm_up(25, 45, 30_000, u64::MAX), 45);
+    assert_eq!(linear_warm_up(25, 45, 0, 0), 45);
 }
 
 #[test]
@@ -67,7 +67,7 @@ fn a_number_of_contexts_outside_the_bounds_is_refused() {
 
 #[test]
 fn half_as_many_contexts_take_half_the_gap() {
-    let sampler = BoundedSampler { min_context: 2, ..sampler() };
+    let sampler = ViewSampler { min_context: 2, ..sampler() };
     assert_eq!(sampler.gap_bounds(0, 6), [25, 45]);
     assert_eq!(sampler.gap_bounds(0, 4), [25, 45]);
     assert_eq!(sampler.gap_bounds(0, 3), [12, 22]);
@@ -94,7 +94,7 @@ fn samples_are_the_same_on_every_platform_and_in_every_release() {
 fn every_inner_frame_is_equally_likely_to_be_a_context() {
     // Gap 25 with 4 contexts: each of 24 inner frames is drawn with chance 1/12, 1,000 of 12,000 times;
     // the deviation is 30.
-    let sampler = BoundedSampler { max_gap: [25, 45], ..sampler() };
+    let sampler = ViewSampler { max_gap: [25, 45], ..sampler() };
     let mut counts = [0_i32; 26];
     for slot in 0..12_000 {
         let views = sampler.sample(26, &[], 0, 4, &mut item_rng(1, 0, slot, 0, "test")).unwrap();
@@ -106,40 +106,39 @@ fn every_inner_frame_is_equally_likely_to_be_a_context() {
 
 #[test]
 fn a_config_names_the_key_the_value_and_the_fix() {
-    let check = |sampler: BoundedSampler| sampler.validate().unwrap_err().to_string();
+    let check = |sampler: ViewSampler| sampler.validate().unwrap_err().to_string();
     assert!(sampler().validate().is_ok());
     assert_eq!(
-        check(BoundedSampler { min_context: 1, ..sampler() }),
+        check(ViewSampler { min_context: 1, ..sampler() }),
         "min_context is 1; a stretch has two ends, so use 2 or more"
     );
-    assert!(check(BoundedSampler { max_context: 3, ..sampler() }).starts_with("max_context is 3"));
-    assert!(check(BoundedSampler { num_targets: 0, ..sampler() }).starts_with("num_targets is 0"));
+    assert!(check(ViewSampler { max_context: 3, ..sampler() }).starts_with("max_context is 3"));
+    assert!(check(ViewSampler { num_targets: 0, ..sampler() }).starts_with("num_targets is 0"));
     for huge in [10_001, usize::MAX] {
         let expected = format!("max_context is {huge}; use 10000 or fewer");
-        assert_eq!(check(BoundedSampler { max_context: huge, ..sampler() }), expected);
+        assert_eq!(check(ViewSampler { max_context: huge, ..sampler() }), expected);
         let expected = format!("num_targets is {huge}; use 10000 or fewer");
-        assert_eq!(check(BoundedSampler { num_targets: huge, ..sampler() }), expected);
+        assert_eq!(check(ViewSampler { num_targets: huge, ..sampler() }), expected);
     }
-    assert!(check(BoundedSampler { min_gap: [30, 25], ..sampler() }).starts_with("min_gap is [30, 25]"));
-    assert!(check(BoundedSampler { max_gap: [45, 40], ..sampler() }).starts_with("max_gap is [45, 40]"));
-    assert!(check(BoundedSampler { max_gap: [20, 135], ..sampler() }).starts_with("max_gap is [20, 135]"));
-    assert!(check(BoundedSampler { min_gap: [4, 45], ..sampler() }).contains("6 distinct contexts need a gap of 5"));
+    assert!(check(ViewSampler { min_gap: [30, 25], ..sampler() }).starts_with("min_gap is [30, 25]"));
+    assert!(check(ViewSampler { max_gap: [45, 40], ..sampler() }).starts_with("max_gap is [45, 40]"));
+    assert!(check(ViewSampler { max_gap: [20, 135], ..sampler() }).starts_with("max_gap is [20, 135]"));
+    assert!(check(ViewSampler { min_gap: [4, 45], ..sampler() }).contains("6 distinct contexts need a gap of 5"));
     assert!(
-        check(BoundedSampler { num_targets: 27, with_replacement: false, ..sampler() })
-            .starts_with("num_targets is 27")
+        check(ViewSampler { num_targets: 27, with_replacement: false, ..sampler() }).starts_with("num_targets is 27")
     );
 }
 
 #[test]
 fn an_unknown_key_is_refused() {
-    let parsed: Result<BoundedSampler, _> = serde_json::from_str(r#"{"min_gaps": [1, 2]}"#);
+    let parsed: Result<ViewSampler, _> = serde_json::from_str(r#"{"min_gaps": [1, 2]}"#);
     assert!(parsed.unwrap_err().to_string().contains("min_gaps"));
 }
 
 #[test]
 fn stage_two_targets_are_distinct_inner_frames_while_there_are_enough() {
     let mut rng = item_rng(1, 0, 0, 0, "test");
-    let mut targets = targets_excluding(&[9, 3, 5], 20, 4, &mut rng).unwrap();
+    let mut targets = sample_targets(&[9, 3, 5], 20, 4, &mut rng).unwrap();
     targets.sort_unstable();
     assert_eq!(targets, [4, 6, 7, 8]);
 }
@@ -147,8 +146,8 @@ fn stage_two_targets_are_distinct_inner_frames_while_there_are_enough() {
 #[test]
 fn stage_two_targets_repeat_when_candidates_are_few_and_fall_back_to_the_contexts() {
     let mut rng = item_rng(1, 0, 0, 0, "test");
-    assert_eq!(targets_excluding(&[3, 5], 20, 3, &mut rng).unwrap(), [4, 4, 4]);
-    let targets = targets_excluding(&[3, 4, 5], 20, 6, &mut rng).unwrap();
+    assert_eq!(sample_targets(&[3, 5], 20, 3, &mut rng).unwrap(), [4, 4, 4]);
+    let targets = sample_targets(&[3, 4, 5], 20, 6, &mut rng).unwrap();
     assert_eq!(targets.len(), 6);
     assert!(targets.iter().all(|target| (3..=5).contains(target)));
 }
@@ -156,9 +155,9 @@ fn stage_two_targets_repeat_when_candidates_are_few_and_fall_back_to_the_context
 #[test]
 fn stage_two_contexts_beyond_the_scene_are_refused() {
     let mut rng = item_rng(1, 0, 0, 0, "test");
-    let message = targets_excluding(&[3, 20], 20, 3, &mut rng).unwrap_err().to_string();
+    let message = sample_targets(&[3, 20], 20, 3, &mut rng).unwrap_err().to_string();
     assert_eq!(message, "not enough frames: 21 needed, 20 in the scene");
-    assert!(targets_excluding(&[], 20, 3, &mut rng).is_err());
+    assert!(sample_targets(&[], 20, 3, &mut rng).is_err());
 }
 
 #[test]
@@ -167,12 +166,12 @@ fn scenes_give_their_centres_where_farthest_points_are_asked_for() {
     let source = crate::synthetic::source::SyntheticSource::new(config).unwrap();
     let centres: Vec<_> = source.cameras(0).unwrap().iter().map(|camera| camera.c2w.translation.to_array()).collect();
     for inner in [InnerViews::Random, InnerViews::FarthestPoint, InnerViews::Even] {
-        let sampler = BoundedSampler { inner, ..sampler() };
+        let sampler = ViewSampler { inner, ..sampler() };
         let drawn = sampler.draw(&source, 0, 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap();
         let sampled = sampler.sample(40, &centres, 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap();
         assert_eq!(drawn, sampled);
     }
-    let sampler = BoundedSampler { inner: InnerViews::FarthestPoint, ..sampler() };
+    let sampler = ViewSampler { inner: InnerViews::FarthestPoint, ..sampler() };
     let message = sampler.sample(40, &[], 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err().to_string();
     assert_eq!(message, "centres are 0; farthest points need one for each of 40 frames");
 }
@@ -181,7 +180,7 @@ fn scenes_give_their_centres_where_farthest_points_are_asked_for() {
 fn the_choice_of_inner_views_changes_neither_ends_nor_targets_and_is_not_written_by_default() {
     let centres: Vec<_> = (0..200).map(|frame| [f64::from(frame), 0.0, 0.0]).collect();
     let views = [InnerViews::Random, InnerViews::FarthestPoint, InnerViews::Even].map(|inner| {
-        let sampler = BoundedSampler { inner, ..sampler() };
+        let sampler = ViewSampler { inner, ..sampler() };
         sampler.sample(200, &centres, 15_000, 6, &mut item_rng(3, 0, 0, 0, "test")).unwrap()
     });
     for other in &views[1..] {
@@ -190,7 +189,7 @@ fn the_choice_of_inner_views_changes_neither_ends_nor_targets_and_is_not_written
         assert_ne!(other.context, views[0].context);
     }
     assert!(!serde_json::to_string(&sampler()).unwrap().contains("inner"));
-    let even = BoundedSampler { inner: InnerViews::Even, ..sampler() };
+    let even = ViewSampler { inner: InnerViews::Even, ..sampler() };
     assert!(serde_json::to_string(&even).unwrap().contains(r#""inner":"even""#));
 }
 
@@ -203,7 +202,7 @@ proptest! {
         num_context in 4_usize..=6,
         with_replacement: bool,
     ) {
-        let sampler = BoundedSampler { with_replacement, ..sampler() };
+        let sampler = ViewSampler { with_replacement, ..sampler() };
         let [min_gap, max_gap] = sampler.gap_bounds(step, num_context);
         let draw = || sampler.sample(num_frames, &[], step, num_context, &mut item_rng(seed, step, 0, 0, "test"));
         let Ok(views) = draw() else {
@@ -231,7 +230,7 @@ proptest! {
         with_replacement: bool,
         inner in prop::sample::select(vec![InnerViews::Random, InnerViews::FarthestPoint, InnerViews::Even]),
     ) {
-        let sampler = BoundedSampler { min_context: 2, max_context: 8, with_replacement, inner, ..sampler() };
+        let sampler = ViewSampler { min_context: 2, max_context: 8, with_replacement, inner, ..sampler() };
         sampler.validate().unwrap();
         // Gaps of the protocol at these steps, for 5 to 8 contexts; fewer take a half or a quarter.
         let [low, high] = match step { 0 => [25, 45], 1_500 => [26, 49], 15_000 => [35, 90], _ => [45, 135] };

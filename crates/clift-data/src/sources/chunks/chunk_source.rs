@@ -9,9 +9,9 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::image::codec::decode;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
-use crate::skip_report::{Ledger, counted, some_of};
+use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::filters::SceneFilters;
@@ -59,7 +59,7 @@ pub struct ChunkSource {
     chunks: Vec<Chunk>,
     scenes: Vec<Entry>,
     positions: HashMap<String, usize>,
-    ledger: Ledger,
+    ledger: SkipReport,
 }
 
 impl ChunkSource {
@@ -99,14 +99,14 @@ impl ChunkSource {
             });
             scenes.push(Entry { key: key.clone(), chunk });
         }
-        let mut source = Self { chunks, ledger: Ledger::new(scenes.len()), scenes, positions: HashMap::new() };
+        let mut source = Self { chunks, ledger: SkipReport::new(scenes.len()), scenes, positions: HashMap::new() };
         source.leave_out(filters, reads_all || filters.is_any_set())?;
         source.positions = source.scenes.iter().enumerate().map(|(i, entry)| (entry.key.clone(), i)).collect();
         Ok(source)
     }
 
     /// What the filters left out, and what could not be read.
-    pub fn ledger(&self) -> &Ledger {
+    pub fn ledger(&self) -> &SkipReport {
         &self.ledger
     }
 
@@ -178,8 +178,8 @@ impl ChunkSource {
             let names: Vec<String> = elsewhere.into_iter().collect();
             let note = format!(
                 "{} also in chunks other than those that index.json names, which are not used ({})",
-                counted(names.len(), "scene"),
-                some_of(&names)
+                plural(names.len(), "scene"),
+                first_few(&names)
             );
             self.ledger.notes.push(note);
         }
@@ -238,7 +238,7 @@ impl SceneSource for ChunkSource {
         table.read_cameras(path)
     }
 
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+    fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         decode(&self.read_encoded(scene, frame)?, self.key(scene), frame)
     }
 

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::files::listing::{file_names, has_ending};
-use crate::skip_report::{Ledger, counted, some_of};
+use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::chunks::table::ChunkTable;
 use crate::sources::test_scenes::TestScenes;
 
@@ -36,8 +36,8 @@ pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> 
     named.sort_unstable();
     files.retain(|file| named.binary_search(&file).is_err());
     let note = || {
-        let counted = counted(files.len(), ".torch file");
-        format!("not in index.json and so not opened: {counted} ({})", some_of(&files))
+        let counted = plural(files.len(), ".torch file");
+        format!("not in index.json and so not opened: {counted} ({})", first_few(&files))
     };
     Ok((!files.is_empty()).then(note))
 }
@@ -46,7 +46,7 @@ pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> 
 ///
 /// # Errors
 /// [`DataError::Io`] for a folder that cannot be listed, and what reading `invalid_keys.txt` gives.
-pub(crate) fn index_of_files(folder: &Path, ledger: &mut Ledger) -> Result<BTreeMap<String, String>, DataError> {
+pub(crate) fn index_of_files(folder: &Path, ledger: &mut SkipReport) -> Result<BTreeMap<String, String>, DataError> {
     let files = torch_files(folder)?;
     let stem = |file: &str| file.strip_suffix(".torch").unwrap_or(file).to_owned();
     let first = files.iter().take(8).find_map(|file| Some((file, ChunkTable::read(&folder.join(file)).ok()?)));
@@ -66,7 +66,7 @@ pub(crate) fn index_of_files(folder: &Path, ledger: &mut Ledger) -> Result<BTree
     Ok(index)
 }
 
-fn index_of_chunks(folder: &Path, files: &[String], ledger: &mut Ledger) -> BTreeMap<String, String> {
+fn index_of_chunks(folder: &Path, files: &[String], ledger: &mut SkipReport) -> BTreeMap<String, String> {
     let tables: Vec<_> = files.par_iter().map(|file| (file, ChunkTable::read(&folder.join(file)))).collect();
     let mut index = BTreeMap::new();
     let mut again = Vec::new();
@@ -90,8 +90,8 @@ fn index_of_chunks(folder: &Path, files: &[String], ledger: &mut Ledger) -> BTre
     }
     if !again.is_empty() {
         again.sort_unstable();
-        let counted = counted(again.len(), "scene");
-        let note = format!("{counted} in more than one file, of which the first is used ({})", some_of(&again));
+        let counted = plural(again.len(), "scene");
+        let note = format!("{counted} in more than one file, of which the first is used ({})", first_few(&again));
         ledger.notes.push(note);
     }
     ledger.notes.push(format!("there is no index.json: the scenes of {} files were looked up", files.len()));
@@ -117,7 +117,7 @@ mod tests {
         let (key, url) = ("a.torch".to_owned(), String::new());
         let scene = SceneRecord { key, url, timestamps: Vec::new(), cameras: Vec::new(), images: Vec::new() };
         std::fs::write(&path, scene_file_bytes(&path, &scene).unwrap()).unwrap();
-        let mut ledger = Ledger::default();
+        let mut ledger = SkipReport::default();
         let index = index_of_files(folder.path(), &mut ledger).unwrap();
         assert_eq!(index, BTreeMap::from([("a.torch".to_owned(), "a.torch.torch".to_owned())]));
         assert!(ledger.notes.is_empty(), "it is no chunk: {ledger}");

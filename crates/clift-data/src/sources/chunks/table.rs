@@ -6,7 +6,7 @@ use std::path::Path;
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::sources::chunks::writer::{camera_bytes, timestamp_bytes};
-use crate::torch::archive::{Archive, Span};
+use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::pickle::Pickle;
 use crate::torch::tensor_span::tensor_span;
 use crate::torch::values::{ElementType, MAX_BYTES, MAX_VALUES, Value};
@@ -19,10 +19,10 @@ const MAX_FRAMES: usize = MAX_VALUES / 8;
 pub(crate) struct SceneTable {
     pub key: String,
     pub url: String,
-    timestamps: Span,
-    cameras: Span,
+    timestamps: ByteSpan,
+    cameras: ByteSpan,
     camera_type: ElementType,
-    pub images: Vec<Span>,
+    pub images: Vec<ByteSpan>,
 }
 
 /// The scenes of one chunk, by key.

@@ -37,7 +37,7 @@ impl SceneRecord {
         if timestamps != images || cameras != images {
             return Err(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps"));
         }
-        if Fill::default().has_room(self) {
+        if ChunkFill::default().has_room(self) {
             return Ok(());
         }
         Err(format!("scene {key} has {images} frames, more than a file holds (about 50,000)"))
@@ -46,7 +46,7 @@ impl SceneRecord {
 
 /// How full a file is.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Fill {
+pub(crate) struct ChunkFill {
     /// Bytes of pictures.
     image_bytes: u64,
     num_frames: usize,
@@ -55,7 +55,7 @@ pub(crate) struct Fill {
     pickle_bytes: usize,
 }
 
-impl Fill {
+impl ChunkFill {
     fn with(self, scene: &SceneRecord) -> Self {
         let num_frames = scene.images.len();
         // A tensor has 19 values and 170 bytes at most; beside a frame's there are two of the scene and the five names.
@@ -105,7 +105,7 @@ pub fn write_chunks(
     let mut index = BTreeMap::new();
     let mut num_chunks = 0;
     let mut pending = Vec::new();
-    let mut fill = Fill::default();
+    let mut fill = ChunkFill::default();
     for scene in scenes {
         let scene = scene?;
         scene.check().map_err(&bad)?;
@@ -113,7 +113,7 @@ pub fn write_chunks(
             write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
             num_chunks += 1;
             pending.clear();
-            fill = Fill::default();
+            fill = ChunkFill::default();
         }
         if index.insert(scene.key.clone(), chunk_name(num_chunks)).is_some() {
             return Err(bad(format!("scene {} comes twice", scene.key)));
@@ -124,7 +124,7 @@ pub fn write_chunks(
             write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
             num_chunks += 1;
             pending.clear();
-            fill = Fill::default();
+            fill = ChunkFill::default();
         }
     }
     if !pending.is_empty() {

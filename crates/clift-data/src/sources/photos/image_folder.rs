@@ -13,7 +13,7 @@ const OTHER_EXTENSIONS: [&str; 8] = ["heic", "webp", "tif", "tiff", "exr", "bmp"
 
 /// The picture files of folders, each folder listed once.
 #[derive(Default)]
-pub(crate) struct PictureFolders {
+pub(crate) struct ImageFolders {
     folders: HashMap<PathBuf, Option<PictureFolder>>,
 }
 
@@ -27,7 +27,7 @@ struct PictureFolder {
     asked: HashSet<String>,
 }
 
-impl PictureFolders {
+impl ImageFolders {
     /// Finds a picture by its path: the file of that name, or the only one that differs in its ending alone. The error
     /// is a reason for the ledger.
     pub fn find(&mut self, path: &Path) -> Result<PathBuf, String> {
@@ -121,7 +121,7 @@ mod tests {
         for name in ["a.JPG", "b.png", "b.jpg", "frame.0001.png", "d.heic", "e.txt"] {
             std::fs::write(folder.path().join(name), "").unwrap();
         }
-        let mut folders = PictureFolders::default();
+        let mut folders = ImageFolders::default();
         assert_eq!(folders.find(&folder.path().join("x")).unwrap_err(), "without a picture");
         assert_eq!(folders.num_unasked(), 0, "a folder without any picture that is looked for is another's");
         let mut find = |name: &str| {
@@ -142,7 +142,7 @@ mod tests {
         assert_eq!(folders.find(&folder.path().join("nowhere/a.png")).unwrap_err(), "without a picture");
         assert_eq!(folders.num_unasked(), 0);
         std::fs::write(folder.path().join("spare.jpg"), "").unwrap();
-        let mut folders = PictureFolders::default();
+        let mut folders = ImageFolders::default();
         folders.find(&folder.path().join("a.JPG")).unwrap();
         assert_eq!(folders.num_unasked(), 3, "b, frame.0001 and spare");
     }

@@ -17,7 +17,7 @@ use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
 use crate::image::codec::read_size;
-use crate::sources::photos::image_folder::PictureFolders;
+use crate::sources::photos::image_folder::ImageFolders;
 use crate::sources::photos::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoOptions, PhotoScene};
 
 /// Most bytes of one `transforms.json`.
@@ -177,7 +177,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         return Err(bad(format!("frame {start}..: its name has {} bytes, more than {MAX_NAME_BYTES}", name.len())));
     }
     entries.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
-    let mut pictures = Pictures { folder, options, folders: PictureFolders::default() };
+    let mut pictures = ImageLocator { folder, options, folders: ImageFolders::default() };
     let (top, mut scene) = (document.optics(), PhotoScene::default());
     let mut taken = HashSet::new();
     for entry in entries {
@@ -221,13 +221,13 @@ fn explain(error: &serde_json::Error, text: &[u8]) -> String {
 }
 
 /// Where the pictures of one scene are looked for.
-struct Pictures<'a> {
+struct ImageLocator<'a> {
     folder: &'a Path,
     options: &'a PhotoOptions,
-    folders: PictureFolders,
+    folders: ImageFolders,
 }
 
-impl Pictures<'_> {
+impl ImageLocator<'_> {
     fn find(&mut self, file_path: &str) -> Result<PathBuf, String> {
         let found = self.find_at(Path::new(file_path));
         if found.is_ok() || !file_path.contains('\\') {

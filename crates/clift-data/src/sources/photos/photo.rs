@@ -8,7 +8,7 @@ use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
 use crate::image::codec::{check_end, decode, exif_orientation, read_size};
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::image::undistort::Undistortion;
 
 /// Most frames of one scene.
@@ -110,7 +110,7 @@ impl Photo {
     }
 
     /// Decodes the picture and undoes the lens.
-    pub fn decode(&self, key: &str, frame: usize) -> Result<Frame, DataError> {
+    pub fn decode(&self, key: &str, frame: usize) -> Result<RgbImage, DataError> {
         let picture = decode(&self.read()?, key, frame)?;
         self.check_shape([picture.width, picture.height])?;
         Ok(match &self.undistortion {

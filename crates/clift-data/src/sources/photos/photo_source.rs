@@ -7,9 +7,9 @@ use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
-use crate::skip_report::{Ledger, counted, some_of};
+use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::filters::SceneFilters;
 use crate::sources::keys::find_by_name;
 use crate::sources::photos::photo::{MissingPhoto, Photo, PhotoOptions, PhotoScene};
@@ -41,7 +41,7 @@ pub(crate) struct PhotoSource {
     scenes: Vec<Entry>,
     positions: HashMap<String, usize>,
     options: PhotoOptions,
-    ledger: Ledger,
+    ledger: SkipReport,
     kept: Mutex<Vec<(usize, Arc<PhotoScene>)>>,
 }
 
@@ -72,7 +72,7 @@ impl PhotoSource {
     pub fn open(folders: Vec<SceneFolder>, options: &PhotoSourceOptions) -> Result<Self, DataError> {
         options.filters.validate()?;
         let findings: Vec<_> = folders.par_iter().map(|folder| examine(folder, options)).collect();
-        let mut ledger = Ledger::new(folders.len());
+        let mut ledger = SkipReport::new(folders.len());
         let (mut scenes, mut first_error, mut num_unnamed) = (Vec::new(), None, 0);
         let (mut num_spare, mut spare) = (0, Vec::new());
         for (folder, findings) in folders.into_iter().zip(findings) {
@@ -110,7 +110,7 @@ impl PhotoSource {
             ledger.notes.push(format!("{num_unnamed} more frames left out"));
         }
         if num_spare > 0 {
-            let note = format!("{} without a camera, not used: {}", counted(num_spare, "picture"), some_of(&spare));
+            let note = format!("{} without a camera, not used: {}", plural(num_spare, "picture"), first_few(&spare));
             ledger.notes.push(note);
         }
         if let (true, Some(error)) = (scenes.is_empty(), first_error) {
@@ -121,7 +121,7 @@ impl PhotoSource {
     }
 
     /// What was left out.
-    pub fn ledger(&self) -> &Ledger {
+    pub fn ledger(&self) -> &SkipReport {
         &self.ledger
     }
 
@@ -266,7 +266,7 @@ impl SceneSource for PhotoSource {
         Ok(self.scene(scene)?.url.clone())
     }
 
-    fn frame(&self, scene: usize, frame: usize) -> Result<Frame, DataError> {
+    fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         self.photo(scene, frame)?.decode(self.key(scene), frame)
     }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::error::DataError;
 use crate::files::listing::{file_names, has_ending};
-use crate::skip_report::{counted, some_of};
+use crate::skip_report::{first_few, plural};
 use crate::sources::keys::{is_dl3dv_key, last_name};
 use crate::sources::photos::colmap::reader::{find_model, read_colmap};
 use crate::sources::photos::image_folder::numbered_pictures;
@@ -154,7 +154,7 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     }
     let mut notes = Vec::new();
     if !again.is_empty() {
-        notes.push(format!("{} to what is used already: {}", counted(again.len(), "link"), some_of(&again)));
+        notes.push(format!("{} to what is used already: {}", plural(again.len(), "link"), first_few(&again)));
     }
     let mut ways: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for (way, _) in &found {
@@ -163,8 +163,8 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     let twice = ways.iter().filter(|(name, ways)| is_dl3dv_key(name) && ways.len() > 1);
     let twice: Vec<String> = twice.map(|(_, ways)| ways.join(" and ")).collect();
     if !twice.is_empty() {
-        let note = format!("{} of DL3DV there more than once, all of which are used: ", counted(twice.len(), "scene"));
-        notes.push(note + &some_of(&twice));
+        let note = format!("{} of DL3DV there more than once, all of which are used: ", plural(twice.len(), "scene"));
+        notes.push(note + &first_few(&twice));
     }
     let key = |way: &str| if ways[last_name(way)].len() > 1 { way.to_owned() } else { last_name(way).to_owned() };
     let keys: Vec<String> = found.iter().map(|(way, _)| key(way)).collect();

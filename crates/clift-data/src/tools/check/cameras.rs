@@ -1,7 +1,7 @@
 //! Plausible intrinsics and poses, whatever the images show.
 
 use crate::geometry::camera::Camera;
-use crate::geometry::normalization::{PoseRotation, PoseScale, SceneFrame};
+use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale};
 use crate::geometry::pose::Pose;
 use crate::tools::check::images::{Sizes, named};
 use crate::tools::check::result::SceneCheck;
@@ -38,7 +38,7 @@ pub(crate) fn look(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
         check.notes.push(sentence);
     }
     let poses: Vec<Pose> = cameras.iter().map(|camera| camera.c2w).collect();
-    let found = SceneFrame::find(&check.key, &poses, &[], PoseRotation::Quaternion, PoseScale::Context);
+    let found = PoseNormalization::find(&check.key, &poses, &[], PoseRotation::Quaternion, PoseScale::Context);
     if let Err(error) = found {
         check.reasons.push(error.to_string());
     }

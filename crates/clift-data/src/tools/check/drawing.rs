@@ -2,8 +2,8 @@
 
 use glam::DMat3;
 
-use crate::image::rgb_image::Frame;
-use crate::tools::features::correspondence::{Match, WIDTH};
+use crate::image::rgb_image::RgbImage;
+use crate::tools::features::correspondence::{Correspondence, WIDTH};
 use crate::tools::features::epipolar::{line, line_back};
 use crate::tools::features::features::reduced;
 
@@ -18,11 +18,11 @@ const LINE: f64 = 0.9;
 
 /// Draws some of the matches: in each frame a dot per corner, and in the dot's colour the epipolar line of the corner
 /// in the other frame.
-pub(crate) fn draw(frames: &[Frame; 2], geometry: &DMat3, matches: &[Match]) -> Frame {
+pub(crate) fn epipolar_image(frames: &[RgbImage; 2], geometry: &DMat3, matches: &[Correspondence]) -> RgbImage {
     let frames = [reduced(&frames[0]), reduced(&frames[1])];
     let height = frames[0].height.max(frames[1].height);
     let width = frames[0].width + GAP + frames[1].width;
-    let mut canvas = Frame { width, height, rgb: vec![255; width * height * 3] };
+    let mut canvas = RgbImage { width, height, rgb: vec![255; width * height * 3] };
     let left = [0, frames[0].width + GAP];
     for (frame, left) in frames.iter().zip(left) {
         for (row, pixels) in frame.rgb.chunks_exact(frame.width * 3).enumerate() {
@@ -63,9 +63,10 @@ pub(crate) fn draw(frames: &[Frame; 2], geometry: &DMat3, matches: &[Match]) -> 
 }
 
 /// Matches that lie far from each other in the first image (farthest point sampling).
-fn spread(matches: &[Match]) -> Vec<Match> {
-    let mut shown: Vec<Match> = Vec::new();
-    let squared = |a: &Match, b: &Match| (0..2).map(|i| (a.first[i] - b.first[i]).powi(2)).sum::<f64>();
+fn spread(matches: &[Correspondence]) -> Vec<Correspondence> {
+    let mut shown: Vec<Correspondence> = Vec::new();
+    let squared =
+        |a: &Correspondence, b: &Correspondence| (0..2).map(|i| (a.first[i] - b.first[i]).powi(2)).sum::<f64>();
     let mut nearest = vec![f64::INFINITY; matches.len()];
     while shown.len() < NUM_SHOWN.min(matches.len()) {
         let place = (0..matches.len()).reduce(|a, b| if nearest[b] > nearest[a] { b } else { a }).unwrap_or(0);
@@ -100,9 +101,9 @@ mod tests {
     fn the_line_of_a_corner_goes_through_its_dot_in_the_other_frame() {
         // A sideways move: lines are rows.
         let geometry = DMat3::from_rows_array(&[0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]);
-        let frames = [(); 2].map(|()| Frame { width: 160, height: 90, rgb: vec![128; 160 * 90 * 3] });
-        let pair = Match { first: [200.0, 102.0], second: [400.0, 102.0] };
-        let canvas = draw(&frames, &geometry, &[pair]);
+        let frames = [(); 2].map(|()| RgbImage { width: 160, height: 90, rgb: vec![128; 160 * 90 * 3] });
+        let pair = Correspondence { first: [200.0, 102.0], second: [400.0, 102.0] };
+        let canvas = epipolar_image(&frames, &geometry, &[pair]);
         assert_eq!((canvas.width, canvas.height), (160 + GAP + 160, 90));
         let pixel = |x: usize, y: usize| &canvas.rgb[(y * canvas.width + x) * 3..][..3];
         let colour = colour(0, 1);

@@ -5,13 +5,13 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 
 use crate::geometry::camera::Camera;
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
-use crate::tools::check::drawing::draw;
+use crate::tools::check::drawing::epipolar_image;
 use crate::tools::check::images::Sizes;
 use crate::tools::check::result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
-use crate::tools::features::correspondence::Match;
-use crate::tools::features::epipolar::{epipolar_distance, of_cameras};
+use crate::tools::features::correspondence::Correspondence;
+use crate::tools::features::epipolar::{epipolar_distance, fundamental_from_cameras};
 use crate::tools::features::features::Features;
 
 /// Pairs of frames of a scene.
@@ -29,7 +29,7 @@ const NOTED_PX: f64 = 3.0;
 /// A pair with its matches, to draw it.
 struct Pair {
     check: PairCheck,
-    matches: Vec<Match>,
+    matches: Vec<Correspondence>,
     distances: Vec<f64>,
 }
 
@@ -40,7 +40,7 @@ pub(crate) fn look(
     cameras: &[Camera],
     sizes: &Sizes,
     check: &mut SceneCheck,
-) -> Option<Frame> {
+) -> Option<RgbImage> {
     let features: Vec<OnceLock<Option<Features>>> = (0..cameras.len()).map(|_| OnceLock::new()).collect();
     let view = SceneViews { source, scene, cameras, sizes, features };
     let mut pairs: Vec<Pair> = view.anchors().into_par_iter().filter_map(|anchor| view.pair_from(anchor)).collect();
@@ -122,7 +122,7 @@ impl SceneViews<'_> {
         let [first, second] = frames;
         let sizes = [self.sizes[first]?, self.sizes[second]?];
         let matches = self.features(first)?.matches(self.features(second)?);
-        let geometry = of_cameras([a, b], sizes);
+        let geometry = fundamental_from_cameras([a, b], sizes);
         let distances: Vec<f64> = matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect();
         let epipolar_px = median(distances.clone())?;
         Some(Pair { check: PairCheck { frames, num_matches: matches.len(), epipolar_px }, matches, distances })
@@ -134,12 +134,12 @@ impl SceneViews<'_> {
         self.features[frame].get_or_init(find).as_ref()
     }
 
-    fn draw(&self, pair: &Pair) -> Option<Frame> {
+    fn draw(&self, pair: &Pair) -> Option<RgbImage> {
         let [first, second] = pair.check.frames;
         let frames = [self.source.frame(self.scene, first).ok()?, self.source.frame(self.scene, second).ok()?];
         let sizes = [self.sizes[first]?, self.sizes[second]?];
-        let geometry = of_cameras([&self.cameras[first], &self.cameras[second]], sizes);
-        Some(draw(&frames, &geometry, &pair.matches))
+        let geometry = fundamental_from_cameras([&self.cameras[first], &self.cameras[second]], sizes);
+        Some(epipolar_image(&frames, &geometry, &pair.matches))
     }
 }
 

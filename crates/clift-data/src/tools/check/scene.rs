@@ -2,33 +2,33 @@
 
 use std::collections::BTreeMap;
 
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
-use crate::skip_report::Ledger;
+use crate::skip_report::SkipReport;
 use crate::sources::test_scenes::KEPT_FOR_TESTING;
 use crate::tools::check::result::SceneCheck;
 use crate::tools::check::{cameras, epipolar, images};
 
 /// Findings of one scene, with an image for inspection.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Checked {
+pub struct CheckedScene {
     /// The findings.
     pub check: SceneCheck,
     /// Two frames with epipolar lines: dots of one colour are the same corner in both and must lie on the lines of
     /// their colour. `None` if too few corners match.
-    pub picture: Option<Frame>,
+    pub picture: Option<RgbImage>,
 }
 
 /// Checks one scene of `source`. Failures are reasons in the result, never errors.
 ///
 /// Decodes all frames, on all cores, and compares about nine pairs of them.
-pub fn check_scene(source: &dyn SceneSource, scene: usize) -> Checked {
+pub fn check_scene(source: &dyn SceneSource, scene: usize) -> CheckedScene {
     let mut check = SceneCheck { key: source.key(scene).to_owned(), ..SceneCheck::default() };
     let cameras = match source.cameras(scene) {
         Ok(cameras) => cameras,
         Err(error) => {
             check.reasons.push(error.to_string());
-            return Checked { check, picture: None };
+            return CheckedScene { check, picture: None };
         }
     };
     check.num_frames = cameras.len();
@@ -36,11 +36,11 @@ pub fn check_scene(source: &dyn SceneSource, scene: usize) -> Checked {
     cameras::look(&cameras, &frames, &mut check);
     let picture = epipolar::look(source, scene, &cameras, &frames, &mut check);
     check.ok = check.reasons.is_empty();
-    Checked { check, picture }
+    CheckedScene { check, picture }
 }
 
 /// Findings for the scenes skipped when the source was opened, except those reserved for testing.
-pub fn left_out(ledger: &Ledger) -> Vec<SceneCheck> {
+pub fn left_out(ledger: &SkipReport) -> Vec<SceneCheck> {
     let skips = ledger.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING);
     let flagged = skips.map(|skip| {
         let mut check = SceneCheck { key: skip.key.clone(), ..SceneCheck::default() };
@@ -52,7 +52,7 @@ pub fn left_out(ledger: &Ledger) -> Vec<SceneCheck> {
 }
 
 /// Adds a note for the frames of a scene skipped when the source was opened.
-pub fn note_frames(ledger: &Ledger, check: &mut SceneCheck) {
+pub fn note_frames(ledger: &SkipReport, check: &mut SceneCheck) {
     let mut by_reason: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for skip in ledger.frames.iter().filter(|skip| skip.key == check.key) {
         by_reason.entry(&skip.reason).or_default().push(&skip.frame);

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::*;
 use crate::scene_source::Split;
-use crate::skip_report::Skip;
+use crate::skip_report::SkippedScene;
 use crate::sources::chunks::chunk_source::ChunkSource;
 use crate::sources::dataset_root::DatasetRoot;
 use crate::sources::filters::SceneFilters;
@@ -18,7 +18,7 @@ const CHUNKS: ConvertOptions = options(ConvertTo::Chunks { target_bytes: 1 });
 const SCENES: ConvertOptions = options(ConvertTo::Scenes);
 
 const fn options(to: ConvertTo) -> ConvertOptions {
-    ConvertOptions { to, encoding: Encoding::Png, opened_with: String::new() }
+    ConvertOptions { to, encoding: ImageEncoding::Png, opened_with: String::new() }
 }
 
 /// Converts a source of which opening has left nothing out.
@@ -27,8 +27,8 @@ fn convert_all(
     folder: &Path,
     options: &ConvertOptions,
     done: impl FnMut(usize),
-) -> Result<Converted, DataError> {
-    convert(source, &Ledger::new(source.num_scenes()), folder, options, done)
+) -> Result<ConversionReport, DataError> {
+    convert(source, &SkipReport::new(source.num_scenes()), folder, options, done)
 }
 
 fn open(root: &Path, split: Split) -> OpenedSource {
@@ -191,7 +191,7 @@ fn a_scene_that_can_no_longer_be_opened_stays_as_it_was_converted() {
         convert_all(&rooms(3), folder.path(), &options, |_| ()).unwrap();
         let before = files(folder.path());
         let again = |reason: &str| {
-            let mut left_out = Ledger::new(3);
+            let mut left_out = SkipReport::new(3);
             left_out.skip(rooms(3).key(2), reason);
             convert(&rooms(2), &left_out, folder.path(), &options, |_| ())
         };
@@ -244,7 +244,7 @@ fn a_folder_that_was_made_with_other_options_is_refused_and_stays_as_it_is() {
     let others = [
         SCENES,
         options(ConvertTo::Chunks { target_bytes: 2 }),
-        ConvertOptions { encoding: Encoding::Jpeg(90), ..CHUNKS },
+        ConvertOptions { encoding: ImageEncoding::Jpeg(90), ..CHUNKS },
         ConvertOptions { opened_with: "data.files.undistort=false".into(), ..CHUNKS },
     ];
     for other in others {
@@ -285,15 +285,15 @@ fn scenes_that_have_changed_since_are_written_anew() {
 #[test]
 fn what_opening_left_out_is_in_the_list_of_what_was_skipped() {
     let folder = tempfile::tempdir().unwrap();
-    let mut left_out = Ledger::new(4);
+    let mut left_out = SkipReport::new(4);
     left_out.skip("far", "without any picture");
     left_out.skip_frame("near", "7.jpg", "without a picture");
     let converted = convert(&second_is_torn(), &left_out, folder.path(), &SCENES, |_| ()).unwrap();
     assert_eq!((converted.num_scenes, converted.left_out.num_scenes, converted.left_out.num_used()), (2, 4, 2));
     let text = std::fs::read(folder.path().join("skipped.json")).unwrap();
-    let saved: Ledger = serde_json::from_slice(&text).unwrap();
+    let saved: SkipReport = serde_json::from_slice(&text).unwrap();
     assert_eq!((&saved, saved.skips.len(), saved.frames.len()), (&converted.left_out, 2, 1));
-    assert_eq!(saved.skips[0], Skip { key: "far".into(), reason: "without any picture".into() });
+    assert_eq!(saved.skips[0], SkippedScene { key: "far".into(), reason: "without any picture".into() });
 }
 
 #[test]

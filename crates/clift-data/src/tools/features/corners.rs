@@ -104,7 +104,7 @@ fn measure(grey: &Grey) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::rgb_image::Frame;
+    use crate::image::rgb_image::RgbImage;
 
     #[test]
     fn the_corners_of_a_square_are_found_and_its_edges_are_not() {
@@ -112,14 +112,14 @@ mod tests {
         let inside = |x: usize, y: usize| (20..50).contains(&x) && (15..40).contains(&y);
         let rgb =
             (0..height).flat_map(|y| (0..width).flat_map(move |x| [if inside(x, y) { 200 } else { 50 }; 3])).collect();
-        let found = find(&Grey::of(&Frame { width, height, rgb }).blurred(), 100);
+        let found = find(&Grey::of(&RgbImage { width, height, rgb }).blurred(), 100);
         assert_eq!(found.len(), 4, "{found:?}");
         for corner in [[20.0, 15.0], [50.0, 15.0], [20.0, 40.0], [50.0, 40.0]] {
             // The blur moves a corner inwards, by the same amount in every view.
             let near = |place: &[f64; 2]| (0..2).all(|i| (place[i] - corner[i]).abs() < 2.0);
             assert!(found.iter().any(near), "{found:?} {corner:?}");
         }
-        assert_eq!(find(&Grey::of(&Frame { width: 20, height: 90, rgb: vec![0; 5400] }), 9).len(), 0);
+        assert_eq!(find(&Grey::of(&RgbImage { width: 20, height: 90, rgb: vec![0; 5400] }), 9).len(), 0);
     }
 
     #[test]

@@ -5,7 +5,7 @@ pub const WIDTH: usize = 640;
 
 /// Two corners that show the same point, in pixels of an image [`WIDTH`] columns wide.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Match {
+pub struct Correspondence {
     /// Column and row in the first image.
     pub first: [f64; 2],
     /// Column and row in the second image.

@@ -84,7 +84,7 @@ fn add(sums: &mut [f32], [across, down, turn]: [f32; 3], strength: f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::rgb_image::Frame;
+    use crate::image::rgb_image::RgbImage;
 
     fn waves(shift: f64, contrast: f64) -> Grey {
         let (width, height) = (64, 64);
@@ -93,7 +93,7 @@ mod tests {
             (127.0 + contrast * ((x * 0.4).sin() + (y * 0.3 + x * 0.1).cos())) as u8
         };
         let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [value(x, y); 3])).collect();
-        Grey::of(&Frame { width, height, rgb }).blurred()
+        Grey::of(&RgbImage { width, height, rgb }).blurred()
     }
 
     #[test]

@@ -4,8 +4,8 @@ use glam::{DMat3, DVec3};
 
 use crate::geometry::camera::Camera;
 use crate::geometry::pose::Pose;
-use crate::random::{below, step_rng};
-use crate::tools::features::correspondence::{Match, WIDTH};
+use crate::random::{step_rng, uniform_below};
+use crate::tools::features::correspondence::{Correspondence, WIDTH};
 
 /// Largest distance of an inlier from its epipolar lines, in pixels.
 const MOST_PX: f64 = 1.5;
@@ -18,9 +18,9 @@ const FEWEST: usize = 20;
 /// Smallest share of inliers; of wrong matches about one in fifty lies on its line.
 const LEAST_SHARE: f64 = 0.25;
 
-/// The fundamental matrix of two cameras whose images have the given columns and rows, in the units of [`Match`]:
+/// The fundamental matrix of two cameras whose images have the given columns and rows, in the units of [`Correspondence`]:
 /// `second^T F first = 0` for a point seen at `first` and `second`.
-pub fn of_cameras(cameras: [&Camera; 2], sizes: [[usize; 2]; 2]) -> DMat3 {
+pub fn fundamental_from_cameras(cameras: [&Camera; 2], sizes: [[usize; 2]; 2]) -> DMat3 {
     // Both images are WIDTH wide; their height keeps the shape of the pixels.
     let inverse_intrinsics = |i: usize| {
         let [columns, rows] = sizes[i].map(|side| side as f64);
@@ -49,7 +49,7 @@ pub fn line_back(geometry: &DMat3, point: [f64; 2]) -> Option<DVec3> {
 }
 
 /// Symmetric epipolar distance in pixels: the mean of the distances of both points to the line of the other.
-pub fn epipolar_distance(geometry: &DMat3, pair: &Match) -> f64 {
+pub fn epipolar_distance(geometry: &DMat3, pair: &Correspondence) -> f64 {
     let away = |line: Option<DVec3>, [x, y]: [f64; 2]| line.map_or(0.0, |line| line.dot(DVec3::new(x, y, 1.0)).abs());
     let there = away(line(geometry, pair.first), pair.second);
     let back = away(line_back(geometry, pair.second), pair.first);
@@ -58,19 +58,19 @@ pub fn epipolar_distance(geometry: &DMat3, pair: &Match) -> f64 {
 
 /// The largest set of matches that agree with one fundamental matrix, by RANSAC with samples of eight; empty if too few
 /// agree. Independent of cameras, so that cameras can be checked against the result.
-pub(crate) fn consistent(matches: &[Match]) -> Vec<Match> {
+pub(crate) fn ransac_inliers(matches: &[Correspondence]) -> Vec<Correspondence> {
     if matches.len() < FEWEST {
         return Vec::new();
     }
     let mut rng = step_rng(0, matches.len() as u64, "epipolar geometry");
-    let mut best: Vec<Match> = Vec::new();
+    let mut best: Vec<Correspondence> = Vec::new();
     let mut tries = 0;
     let mut enough = MAX_TRIES;
     while tries < enough {
         tries += 1;
-        let sample: [Match; 8] = std::array::from_fn(|_| matches[below(&mut rng, matches.len())]);
+        let sample: [Correspondence; 8] = std::array::from_fn(|_| matches[uniform_below(&mut rng, matches.len())]);
         let geometry = eight_point(&sample);
-        let agrees = |pair: &&Match| epipolar_distance(&geometry, pair) < MOST_PX;
+        let agrees = |pair: &&Correspondence| epipolar_distance(&geometry, pair) < MOST_PX;
         let num_agreeing = matches.iter().filter(agrees).count();
         if num_agreeing > best.len() {
             let share = num_agreeing as f64 / matches.len() as f64;
@@ -84,7 +84,7 @@ pub(crate) fn consistent(matches: &[Match]) -> Vec<Match> {
 }
 
 /// A matrix that eight matches satisfy. Its rank may be three, which rejects wrong matches as well as rank two.
-fn eight_point(sample: &[Match; 8]) -> DMat3 {
+fn eight_point(sample: &[Correspondence; 8]) -> DMat3 {
     // Coordinates around zero and of about one keep the elimination accurate.
     let scale = WIDTH as f64 / 2.0;
     let unit = |[x, y]: [f64; 2]| [x / scale - 1.0, y / scale - 1.0];
@@ -135,7 +135,7 @@ mod tests {
     use crate::random::unit;
 
     /// Two cameras that look at about the same, and points that both see.
-    fn scene(num_points: u64) -> ([Camera; 2], Vec<Match>) {
+    fn scene(num_points: u64) -> ([Camera; 2], Vec<Correspondence>) {
         let intrinsics_norm = IntrinsicsNorm { fx: 0.9, fy: 1.2, cx: 0.5, cy: 0.48 };
         let second = Pose { rotation: DMat3::from_rotation_y(0.2), translation: DVec3::new(-0.7, 0.2, 0.1) };
         let cameras = [Pose::IDENTITY, second].map(|c2w| Camera { intrinsics_norm, c2w });
@@ -147,7 +147,7 @@ mod tests {
         let matches = (0..num_points).map(|i| {
             let mut rng = step_rng(5, i, "test");
             let point = DVec3::new(2.0 * unit(&mut rng) - 1.0, 1.5 * unit(&mut rng) - 0.7, 3.0 + 2.0 * unit(&mut rng));
-            Match { first: seen(&cameras[0], point), second: seen(&cameras[1], point) }
+            Correspondence { first: seen(&cameras[0], point), second: seen(&cameras[1], point) }
         });
         let matches = matches.collect();
         (cameras, matches)
@@ -156,7 +156,7 @@ mod tests {
     #[test]
     fn points_seen_by_both_cameras_lie_on_each_others_lines() {
         let (cameras, matches) = scene(50);
-        let geometry = of_cameras([&cameras[0], &cameras[1]], [[320, 240], [1280, 960]]);
+        let geometry = fundamental_from_cameras([&cameras[0], &cameras[1]], [[320, 240], [1280, 960]]);
         for pair in &matches {
             assert!(epipolar_distance(&geometry, pair) < 1e-9, "{pair:?}");
             let line = line(&geometry, pair.first).unwrap();
@@ -181,7 +181,7 @@ mod tests {
             let mut rng = step_rng(6, i as u64, "test");
             pair.second = [640.0 * unit(&mut rng), 480.0 * unit(&mut rng)];
         }
-        let kept = consistent(&matches);
+        let kept = ransac_inliers(&matches);
         let right = matches.iter().enumerate().filter(|(i, _)| i % 3 != 0).map(|(_, pair)| *pair);
         assert!(right.clone().all(|pair| kept.contains(&pair)));
         assert!(kept.len() < 80 + 8, "{}", kept.len());
@@ -189,7 +189,7 @@ mod tests {
             let mut rng = step_rng(7, i as u64, "test");
             pair.second = [640.0 * unit(&mut rng), 480.0 * unit(&mut rng)];
         }
-        assert!(consistent(&matches).is_empty());
-        assert!(consistent(&matches[..19]).is_empty());
+        assert!(ransac_inliers(&matches).is_empty());
+        assert!(ransac_inliers(&matches[..19]).is_empty());
     }
 }

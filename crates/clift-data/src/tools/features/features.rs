@@ -3,11 +3,9 @@
 //! Corners are found in two sizes of an image, described by the gradients around them, matched both ways, and kept if
 //! they agree with one fundamental matrix.
 
-use crate::tools::features::epipolar::epipolar_distance;
-use crate::tools::features::epipolar::of_cameras;
 use crate::image::lanczos::resize_lanczos;
-use crate::image::rgb_image::Frame;
-use crate::tools::features::correspondence::{Match, WIDTH};
+use crate::image::rgb_image::RgbImage;
+use crate::tools::features::correspondence::{Correspondence, WIDTH};
 use crate::tools::features::descriptor::Descriptor;
 use crate::tools::features::epipolar::{self};
 use crate::tools::features::gray_image::Grey;
@@ -28,7 +26,7 @@ pub struct Features {
 
 impl Features {
     /// Finds the corners of an image.
-    pub fn find(frame: &Frame) -> Self {
+    pub fn find(frame: &RgbImage) -> Self {
         let shown = reduced(frame);
         let unit = WIDTH as f64 / shown.width as f64;
         let smaller = |side: usize| ((side as f64 * SMALLER).round() as usize).max(1);
@@ -50,16 +48,16 @@ impl Features {
 
     /// Pairs of corners that are clearly most similar to each other and agree with one epipolar geometry.
     /// Deterministic; empty if too few agree, as for images of different places.
-    pub fn matches(&self, other: &Self) -> Vec<Match> {
+    pub fn matches(&self, other: &Self) -> Vec<Correspondence> {
         let pairs = matching::mutual(&self.descriptors, &other.descriptors);
-        let matches: Vec<Match> =
-            pairs.into_iter().map(|(a, b)| Match { first: self.points[a], second: other.points[b] }).collect();
-        epipolar::consistent(&matches)
+        let matches: Vec<Correspondence> =
+            pairs.into_iter().map(|(a, b)| Correspondence { first: self.points[a], second: other.points[b] }).collect();
+        epipolar::ransac_inliers(&matches)
     }
 }
 
 /// Reduces an image to at most [`WIDTH`] columns.
-pub fn reduced(frame: &Frame) -> Frame {
+pub fn reduced(frame: &RgbImage) -> RgbImage {
     if frame.width <= WIDTH {
         return frame.clone();
     }
@@ -73,6 +71,7 @@ mod tests {
     use crate::scene_source::SceneSource;
     use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::source::SyntheticSource;
+    use crate::tools::features::epipolar::{epipolar_distance, fundamental_from_cameras};
 
     fn room() -> SyntheticSource {
         let config = SyntheticConfig {
@@ -104,7 +103,7 @@ mod tests {
         let cameras = source.cameras(0).unwrap();
         let matches =
             Features::find(&source.frame(0, 4).unwrap()).matches(&Features::find(&source.frame(0, 6).unwrap()));
-        let geometry = of_cameras([&cameras[4], &cameras[6]], [[320, 240]; 2]);
+        let geometry = fundamental_from_cameras([&cameras[4], &cameras[6]], [[320, 240]; 2]);
         let mut distances: Vec<f64> = matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect();
         distances.sort_by(f64::total_cmp);
         assert!(matches.len() > 40, "{}", matches.len());
@@ -113,8 +112,8 @@ mod tests {
 
     #[test]
     fn pictures_of_one_colour_have_no_corners() {
-        let features = Features::find(&Frame { width: 64, height: 48, rgb: vec![90; 64 * 48 * 3] });
+        let features = Features::find(&RgbImage { width: 64, height: 48, rgb: vec![90; 64 * 48 * 3] });
         assert!(features.points.is_empty() && features.matches(&features).is_empty());
-        assert!(Features::find(&Frame { width: 3, height: 2, rgb: vec![9; 18] }).points.is_empty());
+        assert!(Features::find(&RgbImage { width: 3, height: 2, rgb: vec![9; 18] }).points.is_empty());
     }
 }

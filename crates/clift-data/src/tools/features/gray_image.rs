@@ -1,6 +1,6 @@
 //! Gray images in f32.
 
-use crate::image::rgb_image::Frame;
+use crate::image::rgb_image::RgbImage;
 
 /// Brightness in `[0, 255]`, row-major.
 pub(crate) struct Grey {
@@ -11,7 +11,7 @@ pub(crate) struct Grey {
 
 impl Grey {
     /// The mean of the channels, green twice: near the perceived brightness.
-    pub fn of(frame: &Frame) -> Self {
+    pub fn of(frame: &RgbImage) -> Self {
         let values = frame.rgb.as_chunks::<3>().0.iter().map(|[r, g, b]| {
             let sum = u16::from(*r) + 2 * u16::from(*g) + u16::from(*b);
             f32::from(sum) / 4.0

@@ -1,16 +1,16 @@
-use clift_model::{SceneClusters, TokenStorage};
+use clift_model::{SceneClusters, TokenFormat};
 
 use super::*;
-use crate::config::method::{SystemName, Variant};
-use crate::figures::canvas::Picture;
-use crate::figures::scene_figure::{Choice, Drawing};
+use crate::config::method::{Method, MethodName};
+use crate::figures::canvas::Canvas;
+use crate::figures::scene_figure::{Drawing, FigureTokens};
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
 const HOSTILE: &str = "<script>alert('room')</script>";
 
-fn setting(variant: Variant, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
-    EvalKey { variant, num_storage_tokens, num_render_tokens, tokens: Some(TokenStorage::F32) }
+fn setting(variant: Method, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
+    EvalKey { variant, num_storage_tokens, num_render_tokens, tokens: Some(TokenFormat::F32) }
 }
 
 /// Two variants at two counts and one choice, over two scenes.
@@ -18,19 +18,19 @@ fn summary() -> Summary {
     let mut views = EvalResults::default();
     for (scene, shift) in [("a", 0.0), ("b", 1.0)] {
         views
-            .add(scene, 3, EvalKey::baseline(Variant::NearestView), ViewMetrics::quality(15.0 + shift, Some(0.4)))
+            .add(scene, 3, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(15.0 + shift, Some(0.4)))
             .unwrap();
         for (variant, stored, rendered, psnr, ms) in [
-            (Variant::Clift, 4, 4, 16.0, 2.0),
-            (Variant::Clift, 8, 8, 18.0, 3.0),
-            (Variant::Clift, 8, 2, 14.5, 1.0),
-            (Variant::Random, 4, 4, 14.0, 2.5),
+            (Method::Clift, 4, 4, 16.0, 2.0),
+            (Method::Clift, 8, 8, 18.0, 3.0),
+            (Method::Clift, 8, 2, 14.5, 1.0),
+            (Method::Random, 4, 4, 14.0, 2.5),
         ] {
             let setting = setting(variant, stored, rendered);
             let measured =
                 ViewMetrics { render_s: Some(ms * 1e-3), ..ViewMetrics::quality(psnr + shift, Some(psnr / 40.0)) };
             views.add(scene, 3, setting, measured).unwrap();
-            if variant == Variant::Clift {
+            if variant == Method::Clift {
                 views.add_scene_bytes(setting, 1000 * stored as u64);
             }
         }
@@ -39,13 +39,13 @@ fn summary() -> Summary {
 }
 
 /// A scene of two views of 2 x 2 patches.
-fn exhibit(side: usize) -> Exhibit {
-    let picture = |level| Picture::new(side, side, [level; 3]);
+fn exhibit(side: usize) -> SceneFigure {
+    let picture = |level| Canvas::new(side, side, [level; 3]);
     let drawing = |variant, stored, rendered| {
         let setting = if stored == 0 { EvalKey::baseline(variant) } else { setting(variant, stored, rendered) };
         Drawing { setting, psnr: 17.25, picture: picture(90) }
     };
-    Exhibit {
+    SceneFigure {
         key: HOSTILE.into(),
         grid: [2, 2],
         context: vec![picture(10), picture(20)],
@@ -53,21 +53,25 @@ fn exhibit(side: usize) -> Exhibit {
         target: picture(50),
         target_frame: 3,
         drawings: vec![
-            drawing(Variant::NearestView, 0, 0),
-            drawing(Variant::Clift, 4, 4),
-            drawing(Variant::Clift, 8, 2),
-            drawing(Variant::Clift, 8, 8),
+            drawing(Method::NearestView, 0, 0),
+            drawing(Method::Clift, 4, 4),
+            drawing(Method::Clift, 8, 2),
+            drawing(Method::Clift, 8, 8),
         ],
         clusters: vec![
             SceneClusters::new(vec![0, 0, 1, 1, 2, 2, 3, 3], vec![1, 2, 4, 7]).unwrap(),
             SceneClusters::identity(8),
         ],
-        choices: vec![Choice { setting: setting(Variant::Clift, 8, 2), stored: (0..8).collect(), chosen: vec![1, 6] }],
+        choices: vec![FigureTokens {
+            setting: setting(Method::Clift, 8, 2),
+            stored: (0..8).collect(),
+            chosen: vec![1, 6],
+        }],
     }
 }
 
 fn report() -> Report {
-    let mut ledger = Ledger::new(3);
+    let mut ledger = SkipReport::new(3);
     ledger.skip("c", format!("bad frame {HOSTILE}"));
     Report {
         name: format!("run {HOSTILE}"),
@@ -138,7 +142,7 @@ fn no_text_from_data_is_read_as_markup() {
     // In an attribute too, and characters that HTML cannot express are replaced.
     let mut quoted = report();
     quoted.name = "a\" onload=\"b\u{7}&".into();
-    quoted.exhibits[0].drawings[0].setting.variant = Variant::System(SystemName::new("\" onload=\"b").unwrap());
+    quoted.exhibits[0].drawings[0].setting.variant = Method::System(MethodName::new("\" onload=\"b").unwrap());
     let html = page(&quoted);
     assert!(html.contains("<h1>a&quot; onload=&quot;b\u{fffd}&amp;</h1>") && !html.contains("onload=\""), "{html}");
     assert!(html.contains("alt=\"The target as &quot; onload=&quot;b draws it"), "{html}");
@@ -164,7 +168,7 @@ fn an_evaluation_without_choices_says_how_to_get_them_and_one_without_points_is_
 
     plain.summary.points.clear();
     plain.exhibits.clear();
-    plain.ledger = Ledger::default();
+    plain.ledger = SkipReport::default();
     let html = page(&plain);
     assert!(html.contains("Nothing was measured") && html.contains("eval.num_sheets"), "{html}");
 }
@@ -180,12 +184,12 @@ fn a_page_of_many_large_scenes_stays_below_ten_megabytes() {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             (state >> 24) as u8
         };
-        Picture::from_rgb8(&(0..128 * 128 * 3).map(byte).collect::<Vec<_>>(), 128, 128).unwrap()
+        Canvas::from_rgb8(&(0..128 * 128 * 3).map(byte).collect::<Vec<_>>(), 128, 128).unwrap()
     };
     scene.context = (0..6).map(|_| noise()).collect();
     scene.context_frames = (0..6).collect();
     scene.drawings.clear();
-    for variant in [Variant::Clift, Variant::Kmeans, Variant::Random] {
+    for variant in [Method::Clift, Method::Kmeans, Method::Random] {
         for stored in [256, 512, 1024, 2048, 3072, 4096] {
             scene.drawings.push(Drawing { setting: setting(variant, stored, stored), psnr: 20.0, picture: noise() });
         }
@@ -208,10 +212,10 @@ fn a_report_that_cannot_be_written_says_where() {
 
 #[test]
 fn other_systems_stand_in_tables_plots_and_scenes_with_what_they_miss() {
-    let name = SystemName::new("<b>MVSplat</b>").unwrap();
+    let name = MethodName::new("<b>MVSplat</b>").unwrap();
     let mut other = report();
     let mut views = EvalResults::default();
-    let setting = EvalKey::baseline(Variant::System(name));
+    let setting = EvalKey::baseline(Method::System(name));
     views.add("a", 3, setting, ViewMetrics::quality(17.0, Some(0.5))).unwrap();
     views.add_scene_bytes(setting, 5_000);
     views.miss(name, "b/000003.png".into());
@@ -219,7 +223,7 @@ fn other_systems_stand_in_tables_plots_and_scenes_with_what_they_miss() {
     let theirs = Summary::new(&views);
     other.summary.points.extend(theirs.points);
     (other.summary.missing, other.summary.not_measured) = (theirs.missing, theirs.not_measured);
-    other.exhibits[0].drawings.push(Drawing { setting, psnr: 17.0, picture: Picture::new(16, 16, [9; 3]) });
+    other.exhibits[0].drawings.push(Drawing { setting, psnr: 17.0, picture: Canvas::new(16, 16, [9; 3]) });
     let html = page(&other);
     let escaped = "&lt;b&gt;MVSplat&lt;/b&gt;";
     assert!(!html.contains("<b>MVSplat"), "a name is no markup");
@@ -234,10 +238,10 @@ fn other_systems_stand_in_tables_plots_and_scenes_with_what_they_miss() {
 #[test]
 fn several_formats_have_lines_of_their_own() {
     let mut several = report();
-    let mut coarse: Vec<Point> =
-        several.summary.points.iter().filter(|point| point.variant == Variant::Clift).cloned().collect();
+    let mut coarse: Vec<SummaryPoint> =
+        several.summary.points.iter().filter(|point| point.variant == Method::Clift).cloned().collect();
     for point in &mut coarse {
-        (point.tokens, point.scene_bytes) = (Some(TokenStorage::Int8), point.scene_bytes.map(|bytes| bytes / 4));
+        (point.tokens, point.scene_bytes) = (Some(TokenFormat::Int8), point.scene_bytes.map(|bytes| bytes / 4));
     }
     several.summary.points.extend(coarse);
     let html = page(&several);

@@ -55,10 +55,10 @@ fn a_difference_that_is_the_same_in_every_scene_is_clear() {
     let of = |shift: f64| {
         let pairs: Vec<(f64, f64)> =
             (0..30).map(|i| (f64::from(i), f64::from(i) + shift + 0.01 * f64::from(i % 2))).collect();
-        Difference::of(&pairs).unwrap()
+        PairedDifference::of(&pairs).unwrap()
     };
     assert!(of(0.5).is_clear() && of(-0.5).is_clear() && !of(-0.005).is_clear());
-    let single = Difference::of(&[(1.0, 2.0)]).unwrap();
+    let single = PairedDifference::of(&[(1.0, 2.0)]).unwrap();
     assert_eq!((single.mean, single.interval, single.is_clear()), (1.0, None, false));
 }
 
@@ -74,13 +74,13 @@ fn variants_of_one_evaluation_are_compared_at_equal_counts() {
         "x,1,clift,16,16,inf,,,,,f32",
     ];
     let all = evaluation(folder.path(), "all", &rows);
-    let sides = [Side::parse("kmeans:f32"), Side::parse("clift")];
+    let sides = [MethodFilter::parse("kmeans:f32"), MethodFilter::parse("clift")];
     let comparison = Comparison::new(&all, &all, Some(&sides)).unwrap();
     let means: Vec<f64> = comparison.pairs.iter().map(|pair| pair.psnr.unwrap().mean).collect();
     // An identical picture counts as 100 dB.
     assert_eq!(means, [1.0, 75.0]);
     assert!(comparison.to_string().contains("kmeans 8 f32 -> clift 8 f32"), "{comparison}");
-    let sides = [Side::parse("kmeans:f32"), Side::parse("kmeans:int8")];
+    let sides = [MethodFilter::parse("kmeans:f32"), MethodFilter::parse("kmeans:int8")];
     assert_eq!(Comparison::new(&all, &all, Some(&sides)).unwrap().pairs.len(), 1);
 }
 

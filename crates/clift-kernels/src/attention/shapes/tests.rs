@@ -3,9 +3,9 @@ use crate::simd::dispatch::InstructionSet;
 use crate::testing::{assert_close, random};
 
 /// Contiguous rows.
-fn rows(values: &[f32], sizes: &Sizes, count: usize) -> Rows<'static> {
+fn rows(values: &[f32], sizes: &Sizes, count: usize) -> StridedRows<'static> {
     let values: &'static [f32] = values.to_vec().leak();
-    Rows { values, batch_stride: count * sizes.dim(), row_stride: sizes.dim() }
+    StridedRows { values, batch_stride: count * sizes.dim(), row_stride: sizes.dim() }
 }
 
 /// Output and gradients of queries, keys and values in f64, as the formulas are printed.

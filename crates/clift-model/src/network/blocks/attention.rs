@@ -8,7 +8,7 @@ use crate::network::blocks::norms::QkNorm;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::ops::attention::sdpa::self_sdpa;
-use crate::ops::linear::{linear, linear_of_norm};
+use crate::ops::linear::{linear, norm_linear};
 
 /// Self-attention with a packed projection (paper section 3.1: eight heads).
 #[derive(Module, Debug)]
@@ -37,7 +37,7 @@ impl SelfAttention {
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
     pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
-        let packed = linear_of_norm(norm, &self.in_proj, x);
+        let packed = norm_linear(norm, &self.in_proj, x);
         let packed = match &self.qk_norm {
             Some(qk_norm) => qk_norm.packed(packed),
             None => packed,
@@ -100,7 +100,7 @@ impl CrossAttention {
 
 fn project(norm: Option<&LayerNorm>, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     match norm {
-        Some(norm) => linear_of_norm(norm, layer, x),
+        Some(norm) => norm_linear(norm, layer, x),
         None => linear(layer, x),
     }
 }

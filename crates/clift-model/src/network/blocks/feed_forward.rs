@@ -5,7 +5,7 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::{Tensor, activation};
 
 use crate::network::init::Init;
-use crate::ops::linear::{linear, linear_of_gelu, linear_of_norm};
+use crate::ops::linear::{gelu_linear, linear, norm_linear};
 
 /// What stands between the two layers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,9 +41,9 @@ impl FeedForward {
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
     pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
-        let hidden = linear_of_norm(norm, &self.up, x);
+        let hidden = norm_linear(norm, &self.up, x);
         match self.activation {
-            Activation::Gelu => linear_of_gelu(&self.down, hidden),
+            Activation::Gelu => gelu_linear(&self.down, hidden),
             Activation::Relu => linear(&self.down, activation::relu(hidden)),
         }
     }
@@ -66,7 +66,7 @@ mod tests {
         let bias = Some(Param::from_tensor(like.zeros_like().reshape([1])));
         assert_eq!(weight.val().device(), device);
         let dims = x.dims();
-        linear_of_gelu(&Linear { weight, bias }, x.reshape([1, dims.iter().product(), 1])).reshape(dims)
+        gelu_linear(&Linear { weight, bias }, x.reshape([1, dims.iter().product(), 1])).reshape(dims)
     }
 
     #[test]

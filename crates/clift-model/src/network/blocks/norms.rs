@@ -91,11 +91,11 @@ fn per_head(norm: &RmsNorm, x: Tensor<3>) -> Tensor<3> {
 #[cfg(test)]
 mod qk_norm_tests {
     use super::*;
-    use crate::network::architecture::Variant;
+    use crate::network::architecture::CliftVariant;
     use crate::testing::{check_gradients, cpu_devices, devices, random, to_vec};
 
     fn config() -> ModelConfig {
-        ModelConfig { variant: Variant::ReleasedDl3dv, dim: 6, num_heads: 3, ..ModelConfig::default() }
+        ModelConfig { variant: CliftVariant::ReleasedDl3dv, dim: 6, num_heads: 3, ..ModelConfig::default() }
     }
 
     #[test]

@@ -5,18 +5,20 @@
 use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Flex, NdArray, TensorMetadata};
-use clift_kernels::{Gradients, InstructionSet, Rows, Saved, Sizes, attention_backward, attention_forward};
+use clift_kernels::{
+    BackwardInputs, Gradients, InstructionSet, Sizes, StridedRows, attention_backward, attention_forward,
+};
 
-use crate::ops::attention::composed::{Attended, Heads, Projected, composed_backward, forward, split};
+use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv, composed_backward, forward, split};
 use crate::ops::flex::{contiguous, is_native, tensor, values};
 use crate::ops::precision::{MatmulKernels, Precision};
 
 impl AttentionKernels for Flex {
-    fn attend(inputs: &Projected<FloatTensor<Self>>, heads: Heads) -> Attended<FloatTensor<Self>> {
+    fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
         if !inputs.is_native() || heads.precision != Precision::F32 {
-            return Attended { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None };
+            return AttentionOutput { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None };
         }
-        let Heads { num_heads, .. } = heads;
+        let HeadConfig { num_heads, .. } = heads;
         let inputs = inputs.clone().contiguous();
         let sizes = inputs.sizes(num_heads);
         let Sizes { batch, num_queries, head_width, .. } = sizes;
@@ -25,19 +27,19 @@ impl AttentionKernels for Flex {
         let mut log_sum = vec![0.0; batch * num_heads * num_queries];
         attention_forward(InstructionSet::detected(), sizes, inputs.rows(dim), &mut output, Some(&mut log_sum));
         let log_sum = tensor(log_sum, [batch, num_heads, num_queries]);
-        Attended { output: tensor(output, [batch, num_queries, dim]), log_sum: Some(log_sum) }
+        AttentionOutput { output: tensor(output, [batch, num_queries, dim]), log_sum: Some(log_sum) }
     }
 
     fn attend_backward(
-        inputs: Projected<FloatTensor<Self>>,
-        attended: Attended<FloatTensor<Self>>,
-        heads: Heads,
+        inputs: Qkv<FloatTensor<Self>>,
+        attended: AttentionOutput<FloatTensor<Self>>,
+        heads: HeadConfig,
         grad_output: FloatTensor<Self>,
-    ) -> Projected<FloatTensor<Self>> {
+    ) -> Qkv<FloatTensor<Self>> {
         let Some(log_sum) = attended.log_sum else {
             return composed_backward::<Self>(inputs, attended.output, heads, grad_output);
         };
-        let Heads { num_heads, .. } = heads;
+        let HeadConfig { num_heads, .. } = heads;
         let inputs = inputs.contiguous();
         let sizes = inputs.sizes(num_heads);
         let Sizes { batch, num_queries, num_keys, head_width, .. } = sizes;
@@ -45,27 +47,27 @@ impl AttentionKernels for Flex {
         let [output, grad_output] = [attended.output, grad_output].map(contiguous);
         let [query, key, value] = inputs.rows(dim);
         let [output, grad_output] = [&output, &grad_output].map(|x| columns(x, 0));
-        let saved = Saved { query, key, value, output, log_sum: values(&log_sum), grad_output };
+        let saved = BackwardInputs { query, key, value, output, log_sum: values(&log_sum), grad_output };
         let set = InstructionSet::detected();
         match inputs {
-            Projected::Packed(_) => {
+            Qkv::Packed(_) => {
                 let mut grad = vec![0.0; batch * num_queries * 3 * dim];
                 attention_backward(set, sizes, saved, Gradients::Packed(&mut grad));
-                Projected::Packed(tensor(grad, [batch, num_queries, 3 * dim]))
+                Qkv::Packed(tensor(grad, [batch, num_queries, 3 * dim]))
             }
-            Projected::Separate { .. } => {
+            Qkv::Separate { .. } => {
                 let mut query = vec![0.0; batch * num_queries * dim];
                 let mut key_value = vec![0.0; batch * num_keys * 2 * dim];
                 let to = Gradients::Separate { query: &mut query, key_value: &mut key_value };
                 attention_backward(set, sizes, saved, to);
                 let query = tensor(query, [batch, num_queries, dim]);
-                Projected::Separate { query, key_value: tensor(key_value, [batch, num_keys, 2 * dim]) }
+                Qkv::Separate { query, key_value: tensor(key_value, [batch, num_keys, 2 * dim]) }
             }
         }
     }
 }
 
-impl Projected<FlexTensor> {
+impl Qkv<FlexTensor> {
     fn is_native(&self) -> bool {
         match self {
             Self::Packed(packed) => is_native(packed),
@@ -93,7 +95,7 @@ impl Projected<FlexTensor> {
     }
 
     /// Rows of queries, keys and values.
-    fn rows(&self, dim: usize) -> [Rows<'_>; 3] {
+    fn rows(&self, dim: usize) -> [StridedRows<'_>; 3] {
         match self {
             Self::Packed(packed) => [0, 1, 2].map(|part| columns(packed, part * dim)),
             Self::Separate { query, key_value } => [columns(query, 0), columns(key_value, 0), columns(key_value, dim)],
@@ -102,25 +104,25 @@ impl Projected<FlexTensor> {
 }
 
 /// Rows of a contiguous tensor from a column on.
-fn columns(x: &FlexTensor, first: usize) -> Rows<'_> {
+fn columns(x: &FlexTensor, first: usize) -> StridedRows<'_> {
     let [_, count, width] = x.shape().dims();
-    Rows { values: values(x).get(first..).unwrap_or_default(), batch_stride: count * width, row_stride: width }
+    StridedRows { values: values(x).get(first..).unwrap_or_default(), batch_stride: count * width, row_stride: width }
 }
 
 /// Both directions of attention on a device. The bodies here run on every one of them.
 pub trait AttentionKernels: MatmulKernels {
     /// The output, and what the backward can use besides it.
-    fn attend(inputs: &Projected<FloatTensor<Self>>, heads: Heads) -> Attended<FloatTensor<Self>> {
-        Attended { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None }
+    fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
+        AttentionOutput { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None }
     }
 
     /// The gradients of the inputs from that of the output.
     fn attend_backward(
-        inputs: Projected<FloatTensor<Self>>,
-        attended: Attended<FloatTensor<Self>>,
-        heads: Heads,
+        inputs: Qkv<FloatTensor<Self>>,
+        attended: AttentionOutput<FloatTensor<Self>>,
+        heads: HeadConfig,
         grad_output: FloatTensor<Self>,
-    ) -> Projected<FloatTensor<Self>> {
+    ) -> Qkv<FloatTensor<Self>> {
         composed_backward::<Self>(inputs, attended.output, heads, grad_output)
     }
 }

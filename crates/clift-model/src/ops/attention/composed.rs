@@ -8,12 +8,12 @@ use crate::ops::precision::{MatmulKernels, Precision};
 
 /// How attention is computed.
 #[derive(Clone, Copy, Debug)]
-pub struct Heads {
+pub struct HeadConfig {
     pub(crate) num_heads: usize,
     pub(crate) precision: Precision,
 }
 
-impl Heads {
+impl HeadConfig {
     /// So many heads, in the precision of this thread now.
     pub(crate) fn now(num_heads: usize) -> Self {
         Self { num_heads, precision: Precision::current() }
@@ -22,7 +22,7 @@ impl Heads {
 
 /// Queries, keys and values as the projections leave them.
 #[derive(Clone, Debug)]
-pub enum Projected<T> {
+pub enum Qkv<T> {
     /// All three side by side: `[B, N, 3D]`.
     Packed(T),
     /// Queries on their own.
@@ -36,7 +36,7 @@ pub enum Projected<T> {
 
 /// What attention found.
 #[derive(Clone, Debug)]
-pub struct Attended<T> {
+pub struct AttentionOutput<T> {
     /// `[B, Q, D]`
     pub output: T,
     /// Logarithm of the sum of every row of scores, `[B, H, Q]`, where the device saved it.
@@ -44,28 +44,28 @@ pub struct Attended<T> {
 }
 
 /// Queries, keys and values, each `[B, N, D]`.
-pub(crate) fn split<B: Backend>(inputs: &Projected<FloatTensor<B>>) -> [FloatTensor<B>; 3] {
+pub(crate) fn split<B: Backend>(inputs: &Qkv<FloatTensor<B>>) -> [FloatTensor<B>; 3] {
     let part = |packed: &FloatTensor<B>, parts: usize, part: usize| {
         let [batch, count, width] = packed.shape().dims();
         let dim = width / parts;
         B::float_slice(packed.clone(), &[0..batch, 0..count, part * dim..(part + 1) * dim].map(Slice::from))
     };
     match inputs {
-        Projected::Packed(packed) => [0, 1, 2].map(|i| part(packed, 3, i)),
-        Projected::Separate { query, key_value } => [query.clone(), part(key_value, 2, 0), part(key_value, 2, 1)],
+        Qkv::Packed(packed) => [0, 1, 2].map(|i| part(packed, 3, i)),
+        Qkv::Separate { query, key_value } => [query.clone(), part(key_value, 2, 0), part(key_value, 2, 1)],
     }
 }
 
 pub(crate) fn composed_backward<B: MatmulKernels>(
-    inputs: Projected<FloatTensor<B>>,
+    inputs: Qkv<FloatTensor<B>>,
     output: FloatTensor<B>,
-    heads: Heads,
+    heads: HeadConfig,
     grad_output: FloatTensor<B>,
-) -> Projected<FloatTensor<B>> {
+) -> Qkv<FloatTensor<B>> {
     let [query, key, value] = backward::<B>(split::<B>(&inputs), output, heads, grad_output);
     match inputs {
-        Projected::Packed(_) => Projected::Packed(B::float_cat(vec![query, key, value], 2)),
-        Projected::Separate { .. } => Projected::Separate { query, key_value: B::float_cat(vec![key, value], 2) },
+        Qkv::Packed(_) => Qkv::Packed(B::float_cat(vec![query, key, value], 2)),
+        Qkv::Separate { .. } => Qkv::Separate { query, key_value: B::float_cat(vec![key, value], 2) },
     }
 }
 
@@ -81,7 +81,7 @@ pub(crate) fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, n
 
 pub(crate) fn forward<B: MatmulKernels>(
     [query, key, value]: [FloatTensor<B>; 3],
-    Heads { num_heads, precision }: Heads,
+    HeadConfig { num_heads, precision }: HeadConfig,
 ) -> FloatTensor<B> {
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
@@ -100,7 +100,7 @@ pub(crate) fn forward<B: MatmulKernels>(
 pub(crate) fn backward<B: MatmulKernels>(
     [query, key, value]: [FloatTensor<B>; 3],
     output: FloatTensor<B>,
-    Heads { num_heads, precision }: Heads,
+    HeadConfig { num_heads, precision }: HeadConfig,
     grad_output: FloatTensor<B>,
 ) -> [FloatTensor<B>; 3] {
     let [batch, num_queries, dim] = query.shape().dims();

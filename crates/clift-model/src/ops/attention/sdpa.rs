@@ -15,7 +15,7 @@ use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, backend_extensio
 use burn::tensor::{Tensor, assert_shape};
 
 use crate::ops::attention::backends::AttentionKernels;
-use crate::ops::attention::composed::{Attended, Heads, Projected};
+use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv};
 use crate::ops::autodiff::register;
 use crate::ops::mac_counter;
 
@@ -32,7 +32,10 @@ pub fn self_sdpa(query_key_value: Tensor<3>, num_heads: usize) -> Tensor<3> {
     let [batch, count, packed] = query_key_value.dims();
     assert!(packed.is_multiple_of(3 * num_heads), "{num_heads} heads do not divide a third of {packed}");
     mac_counter::add_attention(batch * count * count, packed / 3);
-    Tensor::from_dispatch(<Dispatch as AttentionOps>::self_sdpa(query_key_value.into_dispatch(), Heads::now(num_heads)))
+    Tensor::from_dispatch(<Dispatch as AttentionOps>::self_sdpa(
+        query_key_value.into_dispatch(),
+        HeadConfig::now(num_heads),
+    ))
 }
 
 /// Attention of every query to every key, like [`self_sdpa`].
@@ -47,28 +50,32 @@ pub fn cross_sdpa(query: Tensor<3>, key_value: Tensor<3>, num_heads: usize) -> T
     assert!(dim.is_multiple_of(num_heads), "{num_heads} heads do not divide a width of {dim}");
     mac_counter::add_attention(batch * num_queries * num_keys, dim);
     let (query, key_value) = (query.into_dispatch(), key_value.into_dispatch());
-    Tensor::from_dispatch(<Dispatch as AttentionOps>::cross_sdpa(query, key_value, Heads::now(num_heads)))
+    Tensor::from_dispatch(<Dispatch as AttentionOps>::cross_sdpa(query, key_value, HeadConfig::now(num_heads)))
 }
 
 /// The operations behind [`self_sdpa`] and [`cross_sdpa`] on a device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait AttentionOps: Backend {
     /// See [`self_sdpa`].
-    fn self_sdpa(query_key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self>;
+    fn self_sdpa(query_key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self>;
 
     /// See [`cross_sdpa`].
-    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self>;
+    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self>;
 }
 
 macro_rules! attention_ops {
     ($backend:ty) => {
         impl AttentionOps for $backend {
-            fn self_sdpa(query_key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
-                Self::attend(&Projected::Packed(query_key_value), heads).output
+            fn self_sdpa(query_key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self> {
+                Self::attend(&Qkv::Packed(query_key_value), heads).output
             }
 
-            fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
-                Self::attend(&Projected::Separate { query, key_value }, heads).output
+            fn cross_sdpa(
+                query: FloatTensor<Self>,
+                key_value: FloatTensor<Self>,
+                heads: HeadConfig,
+            ) -> FloatTensor<Self> {
+                Self::attend(&Qkv::Separate { query, key_value }, heads).output
             }
         }
     };
@@ -79,11 +86,11 @@ attention_ops!(NdArray);
 attention_ops!(burn::backend::Cube);
 
 impl<B: AttentionOps + AttentionKernels, C: CheckpointStrategy> AttentionOps for Autodiff<B, C> {
-    fn self_sdpa(query_key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
+    fn self_sdpa(query_key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self> {
         let (packed, node) = query_key_value.into_parts();
         match SdpaBackward.prepare::<C>([node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let state = attend::<B>(Projected::Packed(packed), heads);
+                let state = attend::<B>(Qkv::Packed(packed), heads);
                 let output = state.attended.output.clone();
                 prep.finish(state, output)
             }
@@ -91,11 +98,11 @@ impl<B: AttentionOps + AttentionKernels, C: CheckpointStrategy> AttentionOps for
         }
     }
 
-    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: Heads) -> FloatTensor<Self> {
+    fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self> {
         let ((query, query_node), (key_value, key_value_node)) = (query.into_parts(), key_value.into_parts());
         match SdpaBackward.prepare::<C>([query_node, key_value_node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let state = attend::<B>(Projected::Separate { query, key_value }, heads);
+                let state = attend::<B>(Qkv::Separate { query, key_value }, heads);
                 let output = state.attended.output.clone();
                 prep.finish(state, output)
             }
@@ -109,22 +116,19 @@ struct SdpaBackward;
 
 #[derive(Clone, Debug)]
 pub(crate) struct SdpaState<T> {
-    inputs: Projected<T>,
-    attended: Attended<T>,
-    heads: Heads,
+    inputs: Qkv<T>,
+    attended: AttentionOutput<T>,
+    heads: HeadConfig,
 }
 
 impl<T> SdpaState<T> {
     /// The gradients of the inputs.
-    fn backward<B: AttentionKernels<FloatTensorPrimitive = T>>(self, grad_output: T) -> Projected<T> {
+    fn backward<B: AttentionKernels<FloatTensorPrimitive = T>>(self, grad_output: T) -> Qkv<T> {
         B::attend_backward(self.inputs, self.attended, self.heads, grad_output)
     }
 }
 
-pub(crate) fn attend<B: AttentionKernels>(
-    inputs: Projected<FloatTensor<B>>,
-    heads: Heads,
-) -> SdpaState<FloatTensor<B>> {
+pub(crate) fn attend<B: AttentionKernels>(inputs: Qkv<FloatTensor<B>>, heads: HeadConfig) -> SdpaState<FloatTensor<B>> {
     SdpaState { attended: B::attend(&inputs, heads), inputs, heads }
 }
 
@@ -133,8 +137,8 @@ impl<B: AttentionKernels> Backward<B, 1> for SdpaBackward {
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
         register::<B, _, 1>(ops, grads, |state, grad_output, _| match state.backward::<B>(grad_output) {
-            Projected::Packed(grad) => [Some(grad)],
-            Projected::Separate { .. } => unreachable!("gradients come as the inputs did"),
+            Qkv::Packed(grad) => [Some(grad)],
+            Qkv::Separate { .. } => unreachable!("gradients come as the inputs did"),
         });
     }
 }
@@ -144,8 +148,8 @@ impl<B: AttentionKernels> Backward<B, 2> for SdpaBackward {
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
         register::<B, _, 2>(ops, grads, |state, grad_output, _| match state.backward::<B>(grad_output) {
-            Projected::Separate { query, key_value } => [Some(query), Some(key_value)],
-            Projected::Packed(_) => unreachable!("gradients come as the inputs did"),
+            Qkv::Separate { query, key_value } => [Some(query), Some(key_value)],
+            Qkv::Packed(_) => unreachable!("gradients come as the inputs did"),
         });
     }
 }

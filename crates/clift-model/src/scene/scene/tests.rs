@@ -34,7 +34,7 @@ fn scene() -> Scene {
         width: 24,
         context: vec![camera(-1.0, 0.2), camera(1.0, -0.3)],
         context_frames: vec![3, 41],
-        world: WorldFrame { mean_c2w: camera(17.0, 1.0).c2w, scale: 0.1 + 0.2 },
+        world: SceneNormalization { mean_c2w: camera(17.0, 1.0).c2w, scale: 0.1 + 0.2 },
         tokens: (0..token_ids.len() * DIM).map(|i| (i as f32 - 17.0) * 0.317).collect(),
         token_ids,
     }
@@ -52,7 +52,7 @@ impl Place {
     }
 
     /// The bytes of a file that is well.
-    fn bytes(&self, storage: TokenStorage) -> Vec<u8> {
+    fn bytes(&self, storage: TokenFormat) -> Vec<u8> {
         scene().write(&self.path(), storage).expect("writes");
         std::fs::read(self.path()).expect("reads")
     }
@@ -70,7 +70,7 @@ impl Place {
 
     /// What is said of a file whose header has `from` replaced by `to`.
     fn with_header(&self, from: &str, to: &str) -> String {
-        let bytes = self.bytes(TokenStorage::F32);
+        let bytes = self.bytes(TokenFormat::F32);
         let header = String::from_utf8(bytes[8..8 + HEADER_BYTES].to_vec()).expect("text");
         assert!(header.contains(from), "{from} is not in {header}");
         let header = header.trim_end().replace(from, to);
@@ -81,7 +81,7 @@ impl Place {
     }
 
     /// What is said of a file with bytes of one tensor replaced.
-    fn with_tensor(&self, storage: TokenStorage, name: &str, at: usize, data: &[u8]) -> String {
+    fn with_tensor(&self, storage: TokenFormat, name: &str, at: usize, data: &[u8]) -> String {
         let mut bytes = self.bytes(storage);
         let file = SafeTensors::deserialize(&bytes).expect("valid");
         let start = file.tensor(name).expect("there").data().as_ptr() as usize - bytes.as_ptr() as usize;
@@ -93,7 +93,7 @@ impl Place {
 #[test]
 fn a_scene_survives_its_file_and_the_file_has_the_size_of_the_formula() {
     let place = Place::new();
-    for storage in TokenStorage::ALL {
+    for storage in TokenFormat::ALL {
         let bytes = place.bytes(storage);
         let expected = 8 + 2048 + 136 + 164 * 2 + 5 * (28 + storage.bytes_per_token(DIM));
         assert_eq!((bytes.len(), scene().file_bytes(storage)), (expected, expected as u64), "{storage}");
@@ -102,7 +102,7 @@ fn a_scene_survives_its_file_and_the_file_has_the_size_of_the_formula() {
         let tokens = storage.round(&scene().tokens, DIM).expect("in range");
         assert_eq!(back, Scene { tokens, ..scene() });
         assert_eq!(place.bytes(storage), bytes, "equal scenes are equal files");
-        if storage == TokenStorage::F32 {
+        if storage == TokenFormat::F32 {
             assert_eq!(back, scene(), "to the bit");
         }
     }
@@ -111,7 +111,7 @@ fn a_scene_survives_its_file_and_the_file_has_the_size_of_the_formula() {
 
 #[test]
 fn any_safetensors_reader_finds_the_tokens_and_their_rays() {
-    let bytes = Place::new().bytes(TokenStorage::F16);
+    let bytes = Place::new().bytes(TokenFormat::F16);
     let file = SafeTensors::deserialize(&bytes).expect("valid safetensors");
     let shape = |name: &str| file.tensor(name).expect("there").shape().to_vec();
     assert_eq!((shape("tokens"), shape("token_rays")), (vec![5, DIM], vec![5, 6]));
@@ -137,7 +137,7 @@ fn an_empty_a_short_and_a_cut_off_file_are_refused() {
     let place = Place::new();
     assert!(place.refused(b"").contains("it is cut off: it has 0 bytes; copy it again"));
     assert!(place.refused(&[9, 0, 0]).contains("it is cut off: it has 3 bytes"));
-    let bytes = place.bytes(TokenStorage::Int8);
+    let bytes = place.bytes(TokenFormat::Int8);
     for length in [8, 1000, 8 + HEADER_BYTES - 1, 8 + HEADER_BYTES, bytes.len() - 1] {
         let message = place.refused(&bytes[..length]);
         assert!(message.contains("it is cut off") && message.contains("copy it again"), "{length}: {message}");
@@ -147,14 +147,14 @@ fn an_empty_a_short_and_a_cut_off_file_are_refused() {
 #[test]
 fn bytes_after_the_last_tensor_are_refused() {
     let place = Place::new();
-    let bytes = [place.bytes(TokenStorage::F32), vec![0]].concat();
+    let bytes = [place.bytes(TokenFormat::F32), vec![0]].concat();
     assert!(place.refused(&bytes).contains("goes on after its last tensor"));
 }
 
 #[test]
 fn a_header_of_hostile_length_is_refused_before_it_is_read() {
     let place = Place::new();
-    let bytes = place.bytes(TokenStorage::F32);
+    let bytes = place.bytes(TokenFormat::F32);
     for length in [u64::MAX, 1 << 63, 100_000_000, (1 << 16) + 1] {
         let message = place.refused(&[&length.to_le_bytes()[..], &bytes[8..]].concat());
         assert!(message.contains(&format!("its header would have {length} bytes, more than 65536")), "{message}");
@@ -249,13 +249,13 @@ fn offsets_that_overlap_overflow_or_leave_the_file_are_refused() {
 fn values_that_are_not_finite_are_refused_wherever_they_are() {
     let place = Place::new();
     let (f32_nan, f64_nan) = (f32::NAN.to_le_bytes(), f64::NAN.to_le_bytes());
-    let f32 = TokenStorage::F32;
+    let f32 = TokenFormat::F32;
     assert!(place.with_tensor(f32, "tokens", 4 * 17, &f32_nan).contains("token 2 holds NaN"));
     let infinity = half::f16::INFINITY.to_le_bytes();
-    assert!(place.with_tensor(TokenStorage::F16, "tokens", 2 * 8, &infinity).contains("token 1 holds inf"));
-    assert!(place.with_tensor(TokenStorage::Int8, "token_scales", 4, &f32_nan).contains("token 1 has the scale NaN"));
+    assert!(place.with_tensor(TokenFormat::F16, "tokens", 2 * 8, &infinity).contains("token 1 holds inf"));
+    assert!(place.with_tensor(TokenFormat::Int8, "token_scales", 4, &f32_nan).contains("token 1 has the scale NaN"));
     let negative = (-1.0_f32).to_le_bytes();
-    assert!(place.with_tensor(TokenStorage::Int8, "token_scales", 0, &negative).contains("token 0 has the scale -1"));
+    assert!(place.with_tensor(TokenFormat::Int8, "token_scales", 0, &negative).contains("token 0 has the scale -1"));
     assert!(place.with_tensor(f32, "token_rays", 24 + 8, &f32_nan).contains("the ray of token 1 is"));
     assert!(place.with_tensor(f32, "context_c2w", 8 * 16, &f64_nan).contains("context camera 1 holds NaN"));
     assert!(place.with_tensor(f32, "context_intrinsics", 0, &f64_nan).contains("context camera 0 has the intrinsics"));
@@ -265,20 +265,20 @@ fn values_that_are_not_finite_are_refused_wherever_they_are() {
 
 #[test]
 fn a_scale_whose_tokens_overflow_is_refused() {
-    let message = Place::new().with_tensor(TokenStorage::Int8, "token_scales", 0, &f32::MAX.to_le_bytes());
+    let message = Place::new().with_tensor(TokenFormat::Int8, "token_scales", 0, &f32::MAX.to_le_bytes());
     assert!(message.contains("token 0 holds -inf"), "{message}");
 }
 
 #[test]
 fn only_scenes_are_written_over() {
     let place = Place::new();
-    let refusal = |path: &std::path::Path| scene().write(path, TokenStorage::F16).unwrap_err().to_string();
-    scene().write(&place.path(), TokenStorage::F32).unwrap();
-    scene().write(&place.path(), TokenStorage::F16).unwrap();
+    let refusal = |path: &std::path::Path| scene().write(path, TokenFormat::F16).unwrap_err().to_string();
+    scene().write(&place.path(), TokenFormat::F32).unwrap();
+    scene().write(&place.path(), TokenFormat::F16).unwrap();
     // A scene that was cut off may be made again.
-    let bytes = place.bytes(TokenStorage::F32);
+    let bytes = place.bytes(TokenFormat::F32);
     std::fs::write(place.path(), &bytes[..1000]).unwrap();
-    scene().write(&place.path(), TokenStorage::F16).unwrap();
+    scene().write(&place.path(), TokenFormat::F16).unwrap();
 
     let weights = place.0.path().join("model.safetensors");
     std::fs::write(&weights, b"weights").unwrap();
@@ -300,7 +300,7 @@ fn only_scenes_are_written_over() {
 #[test]
 fn poses_that_are_none_are_refused() {
     let place = Place::new();
-    let f32 = TokenStorage::F32;
+    let f32 = TokenFormat::F32;
     assert!(place.with_tensor(f32, "context_c2w", 0, &2.0_f64.to_le_bytes()).contains("context camera 0 is no pose"));
     let message = place.with_tensor(f32, "context_c2w", 8 * 15, &0.5_f64.to_le_bytes());
     assert!(message.contains("context camera 0 is no pose: its last row is [0.0, 0.0, 0.0, 0.5]"), "{message}");
@@ -316,7 +316,7 @@ fn poses_that_are_none_are_refused() {
 #[test]
 fn patches_that_do_not_exist_or_come_twice_are_refused() {
     let place = Place::new();
-    let ids = |at: usize, id: u32| place.with_tensor(TokenStorage::F32, "token_ids", 4 * at, &id.to_le_bytes());
+    let ids = |at: usize, id: u32| place.with_tensor(TokenFormat::F32, "token_ids", 4 * at, &id.to_le_bytes());
     assert!(ids(1, 12).contains("token 1 is of patch 12 of 12"));
     assert!(ids(1, u32::MAX).contains("token 1 is of patch 4294967295 of 12"));
     assert!(ids(2, 0).contains("token 2 is of patch 0, as another is"));
@@ -338,7 +338,7 @@ fn sizes_that_do_not_fit_the_tokens_are_refused() {
 #[test]
 fn more_patches_than_an_encoder_has_tokens_for_are_refused_before_they_are_counted() {
     let place = Place::new();
-    let bytes = place.bytes(TokenStorage::F32);
+    let bytes = place.bytes(TokenFormat::F32);
     let header = String::from_utf8(bytes[8..8 + HEADER_BYTES].to_vec()).expect("text");
     let mut header = header.trim_end().replace("patch_size\\\":8", "patch_size\\\":1");
     header = header.replace("\"height\":\"16\"", "\"height\":\"16384\"").replace("\"24\"", "\"16384\"");
@@ -350,18 +350,18 @@ fn more_patches_than_an_encoder_has_tokens_for_are_refused_before_they_are_count
 #[test]
 fn a_scene_that_would_be_refused_is_not_written_and_a_failed_write_leaves_the_old_file() {
     let place = Place::new();
-    let before = place.bytes(TokenStorage::F32);
+    let before = place.bytes(TokenFormat::F32);
     let mut broken = scene();
     broken.tokens[3] = f32::NAN;
-    let message = broken.write(&place.path(), TokenStorage::F32).unwrap_err().to_string();
+    let message = broken.write(&place.path(), TokenFormat::F32).unwrap_err().to_string();
     assert!(message.starts_with("cannot write the scene: token 0 holds NaN"), "{message}");
     let long = Scene { key: "k".repeat(1800), ..scene() };
-    let message = long.write(&place.path(), TokenStorage::F32).unwrap_err().to_string();
+    let message = long.write(&place.path(), TokenFormat::F32).unwrap_err().to_string();
     assert!(message.contains("longer than"), "{message}");
     let large = Scene { tokens: vec![1e5; 5 * DIM], ..scene() };
-    assert!(large.write(&place.path(), TokenStorage::F16).is_err());
+    assert!(large.write(&place.path(), TokenFormat::F16).is_err());
     assert_eq!(std::fs::read(place.path()).expect("still there"), before);
     assert_eq!(std::fs::read_dir(place.0.path()).expect("a folder").count(), 1);
-    let message = scene().write(&place.0.path().join("no/room.clift"), TokenStorage::F32).unwrap_err().to_string();
+    let message = scene().write(&place.0.path().join("no/room.clift"), TokenFormat::F32).unwrap_err().to_string();
     assert!(message.contains("choose a folder that exists"), "{message}");
 }

@@ -32,7 +32,7 @@ impl Default for KMeans {
 
 /// Result of [`KMeans::fit`].
 #[derive(Clone, Debug)]
-pub struct Fit {
+pub struct KMeansFit {
     /// The clusters of every scene; the centroid of each is the sample nearest to its mean.
     pub clusters: Clusters,
     /// Sum of squared distances of all tokens to their cluster's mean, per scene.
@@ -41,7 +41,7 @@ pub struct Fit {
     pub iterations: usize,
 }
 
-impl Fit {
+impl KMeansFit {
     /// Share of a scene's [`total_variance`] that its clusters leave within them, 0 for a scene of equal tokens.
     pub fn error(&self, scene: usize, total_variance: f64) -> f64 {
         if total_variance > 0.0 { self.inertia[scene] / total_variance } else { 0.0 }
@@ -80,7 +80,7 @@ impl KMeans {
     /// # Errors
     /// [`ModelError::BadClusters`] when `num_clusters` is not in `1..=num_tokens` or a token is not
     /// finite.
-    pub fn fit(&self, tokens: Tensor<3>, num_clusters: usize, seeds: &[u64]) -> Result<Fit, ModelError> {
+    pub fn fit(&self, tokens: Tensor<3>, num_clusters: usize, seeds: &[u64]) -> Result<KMeansFit, ModelError> {
         let [batch, num_tokens, dim] = tokens.dims();
         assert_eq!(seeds.len(), batch, "one seed per scene");
         if !(1..=num_tokens).contains(&num_clusters) {
@@ -88,7 +88,7 @@ impl KMeans {
         }
         if num_clusters == num_tokens {
             let clusters = Clusters::new(vec![SceneClusters::identity(num_tokens); batch])?;
-            return Ok(Fit { clusters, inertia: vec![0.0; batch], iterations: 0 });
+            return Ok(KMeansFit { clusters, inertia: vec![0.0; batch], iterations: 0 });
         }
         // Refused before any scene is clustered.
         let scenes = tokens.split(1, 0).into_iter().enumerate().map(|(scene, tokens)| {
@@ -103,7 +103,7 @@ impl KMeans {
             inertia.push(labels.inertia());
             iterations = iterations.max(taken);
         }
-        Ok(Fit { clusters: Clusters::new(clusters)?, inertia, iterations })
+        Ok(KMeansFit { clusters: Clusters::new(clusters)?, inertia, iterations })
     }
 
     /// Clusters of one scene and how many iterations they took.
@@ -135,7 +135,7 @@ mod tests {
     use crate::testing::{Fixture, cpu_devices, devices, random, to_vec};
     use crate::tokens::kmeans::labels::ROUNDING;
 
-    fn assert_valid(fit: &Fit, num_clusters: usize) {
+    fn assert_valid(fit: &KMeansFit, num_clusters: usize) {
         for scene in fit.clusters.scenes() {
             let unique: BTreeSet<_> = scene.centroid_index().iter().collect();
             assert_eq!(unique.len(), num_clusters, "centroids are distinct tokens");

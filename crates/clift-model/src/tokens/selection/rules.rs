@@ -20,7 +20,7 @@ pub const MARGIN_CELLS: usize = 4;
 /// A published set of rules.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "lowercase")]
-pub enum Preset {
+pub enum SelectionPreset {
     /// Algorithm 1 as printed: the nearest tokens of every cell, momentum, and a bonus for tokens of the previous
     /// frame.
     Paper,
@@ -33,7 +33,7 @@ pub enum Preset {
     Scaled,
 }
 
-impl Preset {
+impl SelectionPreset {
     /// All presets.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
@@ -43,16 +43,18 @@ impl Preset {
     }
 
     /// The rules behind the name.
-    pub fn rules(self) -> Rules {
+    pub fn rules(self) -> SelectionRules {
         match self {
-            Self::Paper => Rules::default(),
-            Self::Global => Rules { previous_bonus: 0.0, momentum: 0.0, per_cell: false, ..Rules::default() },
-            Self::Scaled => Rules { scaled_cells: true, cuts: true, ..Rules::default() },
+            Self::Paper => SelectionRules::default(),
+            Self::Global => {
+                SelectionRules { previous_bonus: 0.0, momentum: 0.0, per_cell: false, ..SelectionRules::default() }
+            }
+            Self::Scaled => SelectionRules { scaled_cells: true, cuts: true, ..SelectionRules::default() },
         }
     }
 }
 
-impl FromStr for Preset {
+impl FromStr for SelectionPreset {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
@@ -62,7 +64,7 @@ impl FromStr for Preset {
 
 /// How near a token is to a cell, how many each cell is given, and how large it is. The default is the paper's.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rules {
+pub struct SelectionRules {
     /// Weight of the angle between the rays of token and cell, in radians.
     pub angle_weight: f32,
     /// Weight of the distance between the cameras of token and target, in normalised units.
@@ -80,7 +82,7 @@ pub struct Rules {
     pub cuts: bool,
 }
 
-impl Default for Rules {
+impl Default for SelectionRules {
     fn default() -> Self {
         Self {
             angle_weight: 1.0,
@@ -94,7 +96,7 @@ impl Default for Rules {
     }
 }
 
-impl Rules {
+impl SelectionRules {
     /// Side of a cell of the target's grid, in pixels.
     fn cell_px(&self, height: usize, width: usize) -> f64 {
         if self.scaled_cells { height.min(width).max(1) as f64 / SCALED_CELLS } else { CELL_PX }
@@ -110,7 +112,7 @@ impl Rules {
     /// picture.
     ///
     /// # Shapes
-    /// - returns `[rows * columns]` unit directions with `[rows, columns]` of [`Rules::grid`]
+    /// - returns `[rows * columns]` unit directions with `[rows, columns]` of [`SelectionRules::grid`]
     pub fn cell_directions(&self, camera: &ViewCamera, height: usize, width: usize) -> Vec<[f64; 3]> {
         let [rows, columns] = self.grid(height, width);
         let cell_px = self.cell_px(height, width);

@@ -9,7 +9,7 @@
 use rayon::prelude::*;
 
 use crate::error::ModelError;
-use crate::tokens::selection::rules::Rules;
+use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::token_ray::TokenRay;
 use crate::views::camera::ViewCamera;
 
@@ -22,7 +22,7 @@ const GROUP: usize = 32;
 /// Selects the tokens of one frame after the other, and remembers what the next frame needs of the last.
 #[derive(Clone, Debug)]
 pub struct Selector {
-    rules: Rules,
+    rules: SelectionRules,
     origins: Vec<[f64; 3]>,
     directions: Directions,
     /// Rows and columns of the previous frame's grid.
@@ -59,7 +59,7 @@ impl Selector {
     ///
     /// # Errors
     /// [`ModelError::BadRay`] for a ray that is not finite or has no direction.
-    pub fn new(rules: Rules, rays: &[TokenRay]) -> Result<Self, ModelError> {
+    pub fn new(rules: SelectionRules, rays: &[TokenRay]) -> Result<Self, ModelError> {
         let mut directions = Directions { x: Vec::new(), y: Vec::new(), z: Vec::new() };
         for (token, ray) in rays.iter().enumerate() {
             let length = ray.direction.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -134,7 +134,7 @@ impl Selector {
     /// Distances of all tokens to all cells, the nearest of each cell, and the smoothed field for the next frame.
     fn measure(&mut self, cells: &[[f64; 3]], grid: [usize; 2], target: [f64; 3], per_cell: usize) -> Nearest {
         let num_tokens = self.origins.len();
-        let Rules { angle_weight, momentum, .. } = self.rules;
+        let SelectionRules { angle_weight, momentum, .. } = self.rules;
         let offsets = self.offsets(target);
         let keeps_field = momentum > 0.0;
         let momentum = if self.grid == grid { momentum } else { 0.0 };
@@ -162,7 +162,7 @@ impl Selector {
 
     /// The part of a token's distance that is the same for all cells.
     fn offsets(&self, target: [f64; 3]) -> Vec<f32> {
-        let Rules { distance_weight, previous_bonus, .. } = self.rules;
+        let SelectionRules { distance_weight, previous_bonus, .. } = self.rules;
         let offset = |(token, origin): (usize, &[f64; 3])| {
             let between = origin.iter().zip(target).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
             let bonus = if self.previous.get(token) == Some(&true) { previous_bonus } else { 0.0 };

@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::{Device, Tensor, TensorData};
 use clift_data::write_state_dict;
 use clift_model::{
-    Cameras, Clusters, DeviceName, ModelPath, PREFIX, SceneClusters, SceneModel, TrainedModel, Variant, Views,
+    Cameras, CliftVariant, Clusters, DeviceName, ModelPath, PREFIX, SceneClusters, SceneModel, TrainedModel, Views,
 };
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
@@ -17,16 +17,16 @@ use crate::interchange::export::{ExportFormat, export};
 mod keys;
 
 /// Name, variant and heads of every checkpoint that `scripts/fixtures/make_checkpoints.py` wrote.
-const CHECKPOINTS: [(&str, Variant, Option<usize>); 5] = [
-    ("re10k", Variant::ReleasedRe10k, Some(3)),
-    ("re10k_first", Variant::ReleasedRe10k, Some(5)),
-    ("dl3dv", Variant::ReleasedDl3dv, None),
-    ("dl3dv_one", Variant::ReleasedDl3dv, None),
-    ("paper", Variant::Paper, Some(3)),
+const CHECKPOINTS: [(&str, CliftVariant, Option<usize>); 5] = [
+    ("re10k", CliftVariant::ReleasedRe10k, Some(3)),
+    ("re10k_first", CliftVariant::ReleasedRe10k, Some(5)),
+    ("dl3dv", CliftVariant::ReleasedDl3dv, None),
+    ("dl3dv_one", CliftVariant::ReleasedDl3dv, None),
+    ("paper", CliftVariant::Paper, Some(3)),
 ];
 
 /// An import that nobody interrupts.
-fn import(file: &Path, out: &Path, options: &ImportOptions) -> Result<(Config, Imported), TrainError> {
+fn import(file: &Path, out: &Path, options: &ImportOptions) -> Result<(Config, ImportRecord), TrainError> {
     crate::interchange::import::import(file, out, options, &AtomicBool::new(false))
 }
 
@@ -34,7 +34,7 @@ fn fixture(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/checkpoints").join(name)
 }
 
-fn options(variant: Variant, num_heads: Option<usize>) -> ImportOptions {
+fn options(variant: CliftVariant, num_heads: Option<usize>) -> ImportOptions {
     ImportOptions { variant, num_heads, convert: false, renames: Vec::new() }
 }
 
@@ -212,7 +212,7 @@ fn refused(file: &Path, place: &Path, options: &ImportOptions) -> String {
 }
 
 fn re10k() -> ImportOptions {
-    options(Variant::ReleasedRe10k, Some(3))
+    options(CliftVariant::ReleasedRe10k, Some(3))
 }
 
 #[track_caller]
@@ -235,9 +235,9 @@ fn tensors_of(name: &str, rename: impl Fn(&str) -> String) -> Vec<(String, Vec<u
 fn another_variant_is_named_where_it_fits() {
     let place = tempfile::tempdir().unwrap();
     for (name, wrong, right) in [
-        ("dl3dv", Variant::ReleasedRe10k, "--variant released-dl3dv"),
-        ("re10k", Variant::ReleasedDl3dv, "--variant released-re10k"),
-        ("paper", Variant::ReleasedRe10k, "--variant paper"),
+        ("dl3dv", CliftVariant::ReleasedRe10k, "--variant released-dl3dv"),
+        ("re10k", CliftVariant::ReleasedDl3dv, "--variant released-re10k"),
+        ("paper", CliftVariant::ReleasedRe10k, "--variant paper"),
     ] {
         let heads = CHECKPOINTS.iter().find(|(other, ..)| *other == name).unwrap().2.unwrap_or(7);
         let file = fixture(&format!("{name}.ckpt"));
@@ -251,7 +251,7 @@ fn heads_must_divide_the_width() {
     let place = tempfile::tempdir().unwrap();
     let import = |heads| {
         let folder = place.path().join("model");
-        import(&fixture("re10k.ckpt"), &folder, &options(Variant::ReleasedRe10k, heads)).unwrap_err().to_string()
+        import(&fixture("re10k.ckpt"), &folder, &options(CliftVariant::ReleasedRe10k, heads)).unwrap_err().to_string()
     };
     assert_says(
         &import(None),
@@ -265,7 +265,7 @@ fn heads_must_divide_the_width() {
     assert_says(&import(Some(4)), &["`--num-heads` = 4", "width 15 (transformer.decoder.layers.0.", "re10k.ckpt"]);
     // Normalised heads show their width.
     let place = tempfile::tempdir().unwrap();
-    let message = refused(&fixture("dl3dv.ckpt"), place.path(), &options(Variant::ReleasedDl3dv, Some(2)));
+    let message = refused(&fixture("dl3dv.ckpt"), place.path(), &options(CliftVariant::ReleasedDl3dv, Some(2)));
     assert_says(
         &message,
         &["misshapen: transformer.encoder.layers.N.self_attn.q_norm.weight is [2], expected [7] (N = 0, 1, 2)"],
@@ -275,7 +275,7 @@ fn heads_must_divide_the_width() {
 #[test]
 fn half_precision_needs_conversion() {
     let place = tempfile::tempdir().unwrap();
-    let options = options(Variant::ReleasedRe10k, Some(5));
+    let options = options(CliftVariant::ReleasedRe10k, Some(5));
     let message = refused(&fixture("half.ckpt"), place.path(), &options);
     assert_says(
         &message,
@@ -338,7 +338,7 @@ fn exports_store_heads_and_refuse_others() {
     let (config, _) = import(&fixture("re10k.ckpt"), &folder, &re10k()).unwrap();
     let file = place.path().join("out.ckpt");
     export(&config, &ModelPath::find(&folder).unwrap(), ExportFormat::Pytorch, &file).unwrap();
-    let message = import(&file, &again, &options(Variant::ReleasedRe10k, Some(5))).unwrap_err().to_string();
+    let message = import(&file, &again, &options(CliftVariant::ReleasedRe10k, Some(5))).unwrap_err().to_string();
     assert_says(&message, &["`--num-heads` = 5: the checkpoint says it has 3", "out.ckpt"]);
     assert!(!again.exists());
 }

@@ -3,14 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use clift_bench::{BenchEvent, BenchOptions, BenchRow, MAX_CHECKED_TOKENS, Report, Work, run_bench};
+use clift_bench::{BenchCase, BenchEvent, BenchOptions, BenchRow, MAX_CHECKED_TOKENS, Report, run_bench};
 use clift_model::{DeviceName, Precision, TokenCount};
 use clift_train::{Config, read_config};
 
 use crate::commands::bench::data::BenchDataArgs;
 use crate::commands::bench::precision::BenchHalfArgs;
 use crate::commands::parse::parse_repeats;
-use crate::exit_code::WrongUsage;
+use crate::exit_code::UsageError;
 use crate::interrupt;
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
@@ -28,10 +28,10 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     if let Some(json) = &args.json
         && !folder_of(json).is_dir()
     {
-        return Err(WrongUsage(format!("there is no folder for --json {}", json.display())).into());
+        return Err(UsageError(format!("there is no folder for --json {}", json.display())).into());
     }
     let options = BenchOptions {
-        work: if args.work.is_empty() { Work::ALL.into() } else { args.work.clone() },
+        work: if args.work.is_empty() { BenchCase::ALL.into() } else { args.work.clone() },
         repeats: args.repeats,
         warmup: args.warmup,
         error: !args.no_error,
@@ -76,7 +76,7 @@ fn remarks(rows: &[BenchRow]) -> Vec<String> {
     let has = |test: &dyn Fn(&BenchRow) -> bool| rows.iter().any(test);
     let inertia = rows.iter().find_map(|row| row.inertia);
     let mut remarks: Vec<String> = [
-        has(&|row| row.work == Work::Render8Views).then(|| "render_8_views: seconds are per view".into()),
+        has(&|row| row.work == BenchCase::Render8Views).then(|| "render_8_views: seconds are per view".into()),
         inertia.map(|inertia| format!("kmeans: inertia {inertia:.6e}; its error is the inertia's")),
         has(&|row| row.max_rel_error.is_some() && row.work.is_checked_reduced())
             .then(|| format!("* of loss and gradients, with at most {MAX_CHECKED_TOKENS} tokens")),
@@ -122,8 +122,8 @@ pub struct BenchArgs {
     #[arg(required = true)]
     pub config: Option<PathBuf>,
     /// The rows; all of them by default
-    #[arg(long, value_delimiter = ',', value_name = "WORK", help = works_help())]
-    pub work: Vec<Work>,
+    #[arg(long, value_delimiter = ',', value_name = "WORK", help = cases_help())]
+    pub work: Vec<BenchCase>,
     /// Repetitions that count
     #[arg(long, value_name = "COUNT", default_value = "5", value_parser = parse_repeats)]
     pub repeats: usize,
@@ -153,8 +153,8 @@ pub struct BenchArgs {
     pub json: Option<PathBuf>,
 }
 
-fn works_help() -> String {
-    format!("Time these works alone: {}", Work::ALL.map(Work::name).join(", "))
+fn cases_help() -> String {
+    format!("Time these works alone: {}", BenchCase::ALL.map(BenchCase::name).join(", "))
 }
 
 #[cfg(test)]
@@ -163,8 +163,8 @@ mod tests {
 
     use super::*;
 
-    fn row(work: Work, median_s: f64, peak_bytes: Option<u64>, max_rel_error: Option<f64>) -> BenchRow {
-        let inertia = (work == Work::Kmeans).then_some(1234.5);
+    fn row(work: BenchCase, median_s: f64, peak_bytes: Option<u64>, max_rel_error: Option<f64>) -> BenchRow {
+        let inertia = (work == BenchCase::Kmeans).then_some(1234.5);
         BenchRow {
             work,
             median_s,
@@ -179,10 +179,10 @@ mod tests {
     #[test]
     fn the_table_says_what_each_figure_is_of() {
         let rows = vec![
-            row(Work::Encode, 12.345, Some(3 << 30), Some(3.14e-7)),
-            row(Work::Kmeans, 0.5, Some(700 << 20), Some(f64::NAN)),
-            row(Work::Render8Views, 0.0123, None, None),
-            row(Work::Stage1Step, 123.4, None, Some(2e-5)),
+            row(BenchCase::Encode, 12.345, Some(3 << 30), Some(3.14e-7)),
+            row(BenchCase::Kmeans, 0.5, Some(700 << 20), Some(f64::NAN)),
+            row(BenchCase::Render8Views, 0.0123, None, None),
+            row(BenchCase::Stage1Step, 123.4, None, Some(2e-5)),
         ];
         let expected = "\
 flex, 2 threads
@@ -202,14 +202,15 @@ kmeans: inertia 1.234500e3; its error is the inertia's
 
     #[test]
     fn a_table_without_remarks_ends_with_its_last_row() {
-        let rows = vec![row(Work::Encode, 0.002, Some(1 << 20), Some(1e-7))];
+        let rows = vec![row(BenchCase::Encode, 0.002, Some(1 << 20), Some(1e-7))];
         let text = shown(&Report { device: DeviceName::Flex, precision: Precision::F32, threads: 1, rows });
         assert!(text.ends_with("\nencode  2.00 ms  4.00 ms  1 MiB        1.0e-7"), "{text}");
     }
 
     #[test]
     fn the_json_has_the_named_keys_and_null_where_nothing_was_measured() {
-        let rows = vec![row(Work::Kmeans, 0.5, Some(7), Some(0.25)), row(Work::Render8Views, 0.5, None, None)];
+        let rows =
+            vec![row(BenchCase::Kmeans, 0.5, Some(7), Some(0.25)), row(BenchCase::Render8Views, 0.5, None, None)];
         let json =
             serde_json::to_value(Report { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows })
                 .unwrap();

@@ -9,8 +9,8 @@ use clift_eval::{peak_bytes, start_peak};
 use serde::Serialize;
 
 use crate::commands::parse::parse_size;
-use crate::commands::splits::{Splits, halves};
-use crate::exit_code::WrongUsage;
+use crate::commands::splits::{Splits, splits};
+use crate::exit_code::UsageError;
 use crate::output::stdout::print_result;
 use crate::output::table;
 
@@ -54,8 +54,8 @@ struct Report {
 /// Measures and prints.
 pub fn run(args: &BenchDataArgs) -> anyhow::Result<()> {
     let _peak = start_peak();
-    let Some(half) = halves(&args.dir, args.split, &FileOptions::default())?.pop() else {
-        return Err(WrongUsage(format!("{} holds no scenes", args.dir.display())).into());
+    let Some(half) = splits(&args.dir, args.split, &FileOptions::default())?.pop() else {
+        return Err(UsageError(format!("{} holds no scenes", args.dir.display())).into());
     };
     let [width, height] = args.size;
     let clip = ClipOptions {

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clift_bench::{BenchOptions, HalfReport, HalfRow, WORKS, Work, compare_precision};
+use clift_bench::{BenchCase, BenchOptions, PrecisionReport, PrecisionRow, WORKS, compare_precision};
 use clift_model::{DeviceName, TokenCount};
 use clift_train::{Config, read_config};
 
@@ -19,7 +19,7 @@ pub struct BenchHalfArgs {
     pub config: PathBuf,
     /// Rows of the table, separated by commas; all of them by default
     #[arg(long, value_delimiter = ',', value_name = "WORK")]
-    pub work: Vec<Work>,
+    pub work: Vec<BenchCase>,
     /// Repetitions that count
     #[arg(long, value_name = "COUNT", default_value = "5", value_parser = parse_repeats)]
     pub repeats: usize,
@@ -70,14 +70,14 @@ pub fn run(args: &BenchHalfArgs) -> anyhow::Result<()> {
 
 const HEADER: [&str; 7] = ["work", "f32", "f16", "f16/f32", "error", "loss f32, f16", "PSNR"];
 
-fn shown(report: &HalfReport) -> String {
+fn shown(report: &PrecisionReport) -> String {
     let rows: Vec<_> = [HEADER.map(String::from)].into_iter().chain(report.rows.iter().map(cells)).collect();
     let remark = "error: norm of the difference from f32 over its norm, of an update's whole gradient; \
                   PSNR: of an update against its targets, of render against the f32 picture";
     format!("{}\n\n{}\n\n{remark}", report.device, table::columns(&rows))
 }
 
-fn cells(row: &HalfRow) -> [String; 7] {
+fn cells(row: &PrecisionRow) -> [String; 7] {
     let dash = || "-".to_owned();
     let loss = row.loss.map_or_else(dash, |[single, half]| format!("{single:.6}, {half:.6}"));
     let psnr = match (row.psnr(), row.psnr_to_f32) {
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn the_table_has_speed_beside_error() {
-        let row = |work, loss, psnr_to_f32| HalfRow {
+        let row = |work, loss, psnr_to_f32| PrecisionRow {
             work,
             f32_s: 0.5,
             f16_s: 0.25,
@@ -105,9 +105,9 @@ mod tests {
             psnr_to_f32,
         };
         let rows = vec![
-            row(Work::Encode, None, None),
-            row(Work::Render, None, Some(61.25)),
-            row(Work::Stage1Step, Some([0.1, 0.1]), None),
+            row(BenchCase::Encode, None, None),
+            row(BenchCase::Render, None, Some(61.25)),
+            row(BenchCase::Stage1Step, Some([0.1, 0.1]), None),
         ];
         let expected = "\
 flex
@@ -117,7 +117,7 @@ encode       500 ms  250 ms  0.50     1.2e-3  -                   -
 render       500 ms  250 ms  0.50     1.2e-3  -                   61.2 dB
 stage1_step  500 ms  250 ms  0.50     1.2e-3  0.100000, 0.100000  10.000, 10.000 dB
 ";
-        let text = shown(&HalfReport { device: DeviceName::Flex, rows });
+        let text = shown(&PrecisionReport { device: DeviceName::Flex, rows });
         assert!(text.starts_with(expected), "{text}");
     }
 }

@@ -4,11 +4,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clift_data::{Checked, SceneCheck, Split, check_scene, encode_png, left_out, note_frames, replace_file};
+use clift_data::{CheckedScene, SceneCheck, Split, check_scene, encode_png, left_out, note_frames, replace_file};
 use serde::Serialize;
 
 use crate::commands::data::text::count;
-use crate::commands::splits::{Half, Splits, files, halves};
+use crate::commands::splits::{SplitSource, Splits, files, splits};
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::table;
@@ -36,7 +36,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
         fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
     }
     let mut report = Report { scenes: Vec::new(), notes: Vec::new() };
-    for half in halves(&args.dir, args.split, &files(&args.set)?.0)? {
+    for half in splits(&args.dir, args.split, &files(&args.set)?.0)? {
         check_half(&half, args, &mut report)?;
     }
     print_result(&shown(&report))?;
@@ -54,7 +54,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn check_half(half: &Half, args: &CheckArgs, report: &mut Report) -> anyhow::Result<()> {
+fn check_half(half: &SplitSource, args: &CheckArgs, report: &mut Report) -> anyhow::Result<()> {
     let (source, ledger) = (&half.opened.source, &half.opened.report);
     for note in &ledger.notes {
         print_note(&format!("note: {note}"));
@@ -64,7 +64,7 @@ fn check_half(half: &Half, args: &CheckArgs, report: &mut Report) -> anyhow::Res
     let num_scenes = source.num_scenes().min(args.scenes.unwrap_or(usize::MAX));
     let mut counter = Counter::new(&half.name(), num_scenes as u64);
     for scene in 0..num_scenes {
-        let Checked { mut check, picture } = check_scene(source.as_ref(), scene);
+        let CheckedScene { mut check, picture } = check_scene(source.as_ref(), scene);
         note_frames(ledger, &mut check);
         if let (Some(folder), Some(picture)) = (&args.pictures, picture) {
             let path = folder.join(picture_name(half.split, &check.key));

@@ -5,11 +5,14 @@ use std::time::Instant;
 
 use anyhow::Context;
 use clap::ValueEnum;
-use clift_data::{Conversion, ConvertOptions, ConvertTo, Converted, Encoding, KEPT_FOR_TESTING, Ledger, Skip, Split};
+use clift_data::{
+    ConversionReport, ConvertOptions, ConvertTo, Converter, ImageEncoding, KEPT_FOR_TESTING, SkipReport, SkippedScene,
+    Split,
+};
 
 use crate::commands::data::text::{bytes, count};
-use crate::commands::splits::{Half, Splits, files, halves};
-use crate::exit_code::WrongUsage;
+use crate::commands::splits::{SplitSource, Splits, files, splits};
+use crate::exit_code::UsageError;
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
 
@@ -27,10 +30,10 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     changes.retain(|change| change.key != "data.files.test_scenes");
     changes.sort_by(|a, b| a.key.cmp(&b.key));
     let opened_with = changes.iter().map(|change| format!("{}={}", change.key, change.to)).collect::<Vec<_>>();
-    let encoding = args.quality.map_or(Encoding::Png, Encoding::Jpeg);
+    let encoding = args.quality.map_or(ImageEncoding::Png, ImageEncoding::Jpeg);
     let options = ConvertOptions { to, encoding, opened_with: opened_with.join(" ") };
 
-    let halves = halves(&args.dir, args.split, &files)?;
+    let halves = splits(&args.dir, args.split, &files)?;
     // All folders are looked at before anything is written to one.
     let mut conversions = Vec::new();
     for half in &halves {
@@ -39,7 +42,7 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
         let folder = args.out.join(half.split.unwrap_or(Split::Test).to_string());
         refuse_overlap(&args.dir, &folder)?;
         let opened = &half.opened;
-        conversions.push((half, Conversion::open(opened.source.as_ref(), &opened.report, &folder, &options)?, folder));
+        conversions.push((half, Converter::open(opened.source.as_ref(), &opened.report, &folder, &options)?, folder));
     }
     let mut empty = Vec::new();
     for (half, conversion, folder) in conversions {
@@ -62,8 +65,9 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn told(half: &Half, converted: &Converted, seconds: f64, folder: &Path) -> String {
-    let Converted { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, left_out } = converted;
+fn told(half: &SplitSource, converted: &ConversionReport, seconds: f64, folder: &Path) -> String {
+    let ConversionReport { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, left_out } =
+        converted;
     let counted = |number: usize, what: &str| if number > 0 { format!(", {number} {what}") } else { String::new() };
     let found = counted(*num_found, "of them there already");
     let changed = counted(*num_changed, "made anew, which had other cameras or frames");
@@ -79,9 +83,9 @@ fn told(half: &Half, converted: &Converted, seconds: f64, folder: &Path) -> Stri
     )
 }
 
-fn print_skips(left_out: &Ledger, folder: &Path) {
+fn print_skips(left_out: &SkipReport, folder: &Path) {
     // The test half has them.
-    let skips: Vec<&Skip> = left_out.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING).collect();
+    let skips: Vec<&SkippedScene> = left_out.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING).collect();
     for skip in skips.iter().take(MAX_SKIPS_SHOWN) {
         print_note(&format!("left out {}: {}", skip.key, skip.reason));
     }
@@ -105,7 +109,7 @@ fn refuse_overlap(dir: &Path, folder: &Path) -> anyhow::Result<()> {
             dir.display(),
             target.display()
         );
-        return Err(WrongUsage(message).into());
+        return Err(UsageError(message).into());
     }
     Ok(())
 }
@@ -178,7 +182,7 @@ mod tests {
         ] {
             let refused = refuse_overlap(&at(dir), &at(folder));
             assert_eq!(refused.is_err(), is_refused, "{dir} {folder}");
-            assert!(refused.err().is_none_or(|error| error.is::<WrongUsage>()));
+            assert!(refused.err().is_none_or(|error| error.is::<UsageError>()));
         }
     }
 }

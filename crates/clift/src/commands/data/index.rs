@@ -6,8 +6,8 @@ use clift_data::{OverlapOptions, SceneSource, write_overlap_index};
 
 use crate::commands::data::text::count;
 use crate::commands::parse::parse_distance;
-use crate::commands::splits::{Half, Splits, files, halves};
-use crate::exit_code::WrongUsage;
+use crate::commands::splits::{SplitSource, Splits, files, splits};
+use crate::exit_code::UsageError;
 use crate::output::stdout::{print_note, print_result};
 
 /// Writes the index of a half, or of both, and says what has no views.
@@ -22,10 +22,10 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     options.validate()?;
     if args.out.exists() {
         let message = format!("{} is there already, and nothing is written over", args.out.display());
-        return Err(WrongUsage(message).into());
+        return Err(UsageError(message).into());
     }
-    let halves = halves(&args.dir, args.split, &files(&args.set)?.0)?;
-    halves.iter().for_each(Half::print_news);
+    let halves = splits(&args.dir, args.split, &files(&args.set)?.0)?;
+    halves.iter().for_each(SplitSource::print_news);
     let sources: Vec<&dyn SceneSource> = halves.iter().map(|half| half.opened.source.as_ref()).collect();
     let ledger = write_overlap_index(&args.out, &sources, &options)?;
     ledger.notes.iter().for_each(|note| print_note(&format!("note: {note}")));

@@ -7,15 +7,15 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use clift_data::{
-    ClipReader, DataError, DatasetRoot, EvaluationIndex, Ledger, OpenedSource, SceneSource, SceneSubset, SourceInfo,
-    SourceKind, Split, open_dataset, open_source,
+    ClipReader, DataError, DatasetRoot, EvaluationIndex, OpenedSource, SceneSource, SceneSubset, SkipReport,
+    SourceInfo, SourceKind, Split, open_dataset, open_source,
 };
 use clift_eval::evaluation_items;
 use clift_train::{Config, read_config};
 
 use crate::commands::data::info_report::{EvaluationReport, Report, SplitReport};
 use crate::commands::splits::{Splits, halves_there, options};
-use crate::exit_code::WrongUsage;
+use crate::exit_code::UsageError;
 use crate::output::stdout::{print_note, print_result};
 
 /// Synthetic scenes that are looked at: there may be millions, and they are all alike.
@@ -32,7 +32,7 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     }
     let report = if args.path.is_dir() || is_scene {
         if !args.set.is_empty() {
-            return Err(WrongUsage(format!("--set changes a config, but {} is none", args.path.display())).into());
+            return Err(UsageError(format!("--set changes a config, but {} is none", args.path.display())).into());
         }
         of_folder(&args.path)?
     } else {
@@ -108,7 +108,7 @@ fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
     Ok(report)
 }
 
-fn describe(source: &dyn SceneSource, ledger: &Ledger) -> Result<SplitReport, clift_data::DataError> {
+fn describe(source: &dyn SceneSource, ledger: &SkipReport) -> Result<SplitReport, clift_data::DataError> {
     Ok(SplitReport {
         error: None,
         num_scenes: ledger.num_scenes,
@@ -123,7 +123,7 @@ fn describe(source: &dyn SceneSource, ledger: &Ledger) -> Result<SplitReport, cl
     })
 }
 
-fn counts(ledger: &Ledger) -> BTreeMap<String, usize> {
+fn counts(ledger: &SkipReport) -> BTreeMap<String, usize> {
     ledger.counts().into_iter().map(|(reason, count)| (reason.to_owned(), count)).collect()
 }
 
@@ -255,7 +255,7 @@ test              1 scene
     #[test]
     fn frames_without_a_picture_are_listed_scene_by_scene() {
         let mut split = SplitReport { num_scenes: 1, num_used: 1, num_described: 1, ..SplitReport::default() };
-        let mut ledger = Ledger::new(1);
+        let mut ledger = SkipReport::new(1);
         for name in ["0005.jpg", "0016.jpg"] {
             ledger.skip_frame("fox", name, "without a picture");
         }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
-use clift_data::{FrameSkip, Skip, SourceInfo, SourceKind};
+use clift_data::{SkippedFrame, SkippedScene, SourceInfo, SourceKind};
 use serde::Serialize;
 
 use crate::commands::data::text::count;
@@ -41,9 +41,9 @@ pub struct SplitReport {
     /// Scenes the filters leave out, by reason.
     pub skipped: BTreeMap<String, usize>,
     /// The same scenes one by one, each with its reason.
-    pub left_out: Vec<Skip>,
+    pub left_out: Vec<SkippedScene>,
     /// Frames left out of scenes.
-    pub frames: Vec<FrameSkip>,
+    pub frames: Vec<SkippedFrame>,
     /// What else is to be known.
     pub notes: Vec<String>,
     /// Scenes that `info` describes: the first of many synthetic ones, otherwise all that are used.
@@ -101,9 +101,9 @@ fn left_out(skipped: &BTreeMap<String, usize>, rows: &mut Vec<(&str, String)>) {
 }
 
 /// Names the scenes that are left out, reason by reason.
-fn scenes_left_out(skips: &[Skip], rows: &mut Vec<(&str, String)>) {
+fn scenes_left_out(skips: &[SkippedScene], rows: &mut Vec<(&str, String)>) {
     let mut keys: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
-    for Skip { key, reason } in skips {
+    for SkippedScene { key, reason } in skips {
         keys.entry(reason).or_default().push(key);
     }
     let num_reasons = keys.len();
@@ -121,9 +121,9 @@ fn scenes_left_out(skips: &[Skip], rows: &mut Vec<(&str, String)>) {
 }
 
 /// Names the frames that are left out, scene by scene and reason by reason.
-fn frames_left_out(frames: &[FrameSkip], rows: &mut Vec<(&str, String)>) {
+fn frames_left_out(frames: &[SkippedFrame], rows: &mut Vec<(&str, String)>) {
     let mut names: BTreeMap<(&str, &str), Vec<&str>> = BTreeMap::new();
-    for FrameSkip { key, frame, reason } in frames {
+    for SkippedFrame { key, frame, reason } in frames {
         names.entry((key, reason)).or_default().push(frame);
     }
     let num_groups = names.len();
@@ -151,7 +151,7 @@ impl SplitReport {
         frames_left_out(&self.frames, rows);
         rows.extend(self.notes.iter().map(|note| ("  note", note.clone())));
         let Some(info) = &self.info else { return };
-        for Skip { key, reason } in info.unreadable.iter().take(MAX_SCENES_NAMED) {
+        for SkippedScene { key, reason } in info.unreadable.iter().take(MAX_SCENES_NAMED) {
             rows.push(("  unreadable", format!("{key}: {reason}")));
         }
         if info.unreadable.len() > MAX_SCENES_NAMED {

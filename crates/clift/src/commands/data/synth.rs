@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use anyhow::Context;
 use clift_data::{
-    ChunkSource, Encoding, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource,
+    ChunkSource, EvaluationIndex, ImageEncoding, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource,
     write_evaluation_index, write_source,
 };
 use clift_eval::EvalConfig;
@@ -15,7 +15,7 @@ use clift_train::parse_config;
 use crate::commands::data::text::{bytes, count};
 use crate::commands::parse::parse_size;
 use crate::commands::splits::Splits;
-use crate::exit_code::WrongUsage;
+use crate::exit_code::UsageError;
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
 
@@ -39,7 +39,7 @@ pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
             "warning: {size} is not made of patches of {patch}x{patch}: to be cropped to {width}x{height}"
         ));
     }
-    let encoding = args.quality.map_or(Encoding::Png, Encoding::Jpeg);
+    let encoding = args.quality.map_or(ImageEncoding::Png, ImageEncoding::Jpeg);
     for &split in args.split.list() {
         write_split(args, &config, split, encoding)?;
     }
@@ -56,7 +56,12 @@ pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
 }
 
 /// Writes one split, and the index of the test split.
-fn write_split(args: &SynthArgs, config: &SyntheticConfig, split: Split, encoding: Encoding) -> anyhow::Result<()> {
+fn write_split(
+    args: &SynthArgs,
+    config: &SyntheticConfig,
+    split: Split,
+    encoding: ImageEncoding,
+) -> anyhow::Result<()> {
     let source = SyntheticSource::new(SyntheticConfig { split, ..config.clone() })?;
     let folder = args.out.join(split.to_string());
     let started = Instant::now();
@@ -92,7 +97,7 @@ fn config(args: &SynthArgs) -> anyhow::Result<SyntheticConfig> {
     overrides.extend(args.set.iter().cloned());
     let (config, changed) = parse_config::<SyntheticConfig>(Path::new("--set"), "", &overrides)?;
     if changed.iter().any(|change| change.key == "split") {
-        return Err(WrongUsage("choose the split with --split, not with --set split".into()).into());
+        return Err(UsageError("choose the split with --split, not with --set split".into()).into());
     }
     config.validate()?;
     Ok(config)
@@ -115,7 +120,7 @@ fn refuse_existing(out: &Path, splits: Splits) -> anyhow::Result<()> {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         if !allowed.iter().any(|allowed| *allowed == name) {
             let message = "is there already, and nothing is written over; choose another folder or move it away";
-            return Err(WrongUsage(format!("{} {message}", path.display())).into());
+            return Err(UsageError(format!("{} {message}", path.display())).into());
         }
     }
     Ok(())
@@ -138,7 +143,7 @@ fn refuse_another_size(out: &Path, splits: Splits, config: &SyntheticConfig) -> 
         let asked = text(config.num_frames, config.width, config.height);
         if there != asked {
             let message = format!("{} has scenes of {there}, not of {asked}", folder.display());
-            return Err(WrongUsage(format!("{message}; write the same, or choose another folder")).into());
+            return Err(UsageError(format!("{message}; write the same, or choose another folder")).into());
         }
     }
     Ok(())
@@ -233,7 +238,7 @@ pub struct SynthArgs {
 
 #[cfg(test)]
 mod tests {
-    use clift_data::spread_views;
+    use clift_data::even_views;
     use clift_train::Config;
 
     use super::*;
@@ -285,7 +290,7 @@ mod tests {
             assert!(config.data.views.max_gap[1] < num_frames);
             assert_eq!(config.eval.index, None);
             let EvalConfig { num_context, num_targets, .. } = config.eval;
-            assert!(spread_views(num_frames, num_context, num_targets).is_some(), "{num_frames} frames");
+            assert!(even_views(num_frames, num_context, num_targets).is_some(), "{num_frames} frames");
         }
         let index = printed(16, [32, 32], true).eval.index;
         assert_eq!(index.as_deref(), Some(Path::new("/data/a \"room\"/evaluation_index.json")));
@@ -319,7 +324,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let config = SyntheticConfig { num_scenes: 1, num_frames: 3, width: 16, height: 8, ..Default::default() };
         let source = SyntheticSource::new(config.clone()).unwrap();
-        write_source(&source, &folder.path().join("train"), Encoding::Png, 1, |_| ()).unwrap();
+        write_source(&source, &folder.path().join("train"), ImageEncoding::Png, 1, |_| ()).unwrap();
         let refused = |splits, config| refuse_another_size(folder.path(), splits, &config).err();
         assert!(refused(Splits::Test, config.clone()).is_none());
         for (other, asked) in [

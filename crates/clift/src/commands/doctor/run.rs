@@ -1,6 +1,6 @@
 //! `clift doctor`: what this machine can train on.
 
-use clift_bench::{Gradient, Probe, probe};
+use clift_bench::{DeviceCheck, Gradient, probe};
 use clift_eval::machine_rows;
 use clift_model::InstructionSet;
 use clift_model::{DeviceName, Precision};
@@ -82,7 +82,7 @@ fn kernels() -> String {
 }
 
 /// Refuses a gradient that is zero or not finite, or far from the reference.
-fn check(probe: Probe, reference: Option<&Probe>, tolerance: f64) -> Result<Probe, String> {
+fn check(probe: DeviceCheck, reference: Option<&DeviceCheck>, tolerance: f64) -> Result<DeviceCheck, String> {
     let Gradient { values, .. } = &probe.gradient;
     if let Some(value) = values.iter().find(|value| !value.is_finite()) {
         return Err(format!("the gradient holds {value}"));
@@ -101,8 +101,8 @@ fn check(probe: Probe, reference: Option<&Probe>, tolerance: f64) -> Result<Prob
 fn row(
     name: DeviceName,
     precision: Precision,
-    probed: Result<&Probe, &String>,
-    reference: Option<&Probe>,
+    probed: Result<&DeviceCheck, &String>,
+    reference: Option<&DeviceCheck>,
 ) -> [String; 6] {
     let is_half = precision == Precision::F16;
     let is_default = name == DeviceName::default() && !is_half;
@@ -115,7 +115,7 @@ fn row(
     match probed {
         Err(_) if !name.is_built() => [device, "not built".into(), dash(), dash(), dash(), dash()],
         Err(reason) => [device, format!("FAILS: {reason}"), dash(), dash(), dash(), dash()],
-        Ok(Probe { adapter, dtypes, gradient, seconds }) => {
+        Ok(DeviceCheck { adapter, dtypes, gradient, seconds }) => {
             let difference = match reference {
                 _ if is_default => "reference".into(),
                 Some(reference) => format!("{:.1e}", gradient.difference(&reference.gradient)),
@@ -147,9 +147,9 @@ mod tests {
 
     use super::*;
 
-    fn probe(values: Vec<f64>) -> Probe {
+    fn probe(values: Vec<f64>) -> DeviceCheck {
         let gradient = Gradient { loss: 1.0, values };
-        Probe { adapter: "CPU".into(), dtypes: vec!["f32"], gradient, seconds: 0.0125 }
+        DeviceCheck { adapter: "CPU".into(), dtypes: vec!["f32"], gradient, seconds: 0.0125 }
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::builder::RangedU64ValueParser;
-use clift_model::{DeviceName, Precision, Preset, TokenCount};
+use clift_model::{DeviceName, Precision, SelectionPreset, TokenCount};
 
 use crate::commands::parse::parse_size;
 
@@ -33,7 +33,7 @@ pub struct RenderArgs {
     pub budget_ms: Option<f64>,
     /// How the tokens of a frame are chosen: paper, global or scaled
     #[arg(long, value_name = "PRESET", default_value = "scaled")]
-    pub selection: Preset,
+    pub selection: SelectionPreset,
     /// Columns and rows of a frame, multiples of the model's patch; those of the context views by default
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<[usize; 2]>,
@@ -111,7 +111,7 @@ mod tests {
         assert_eq!(parse("--path ./orbit").unwrap().path, CameraPath::File("./orbit".into()));
         let args = parse("--path interpolate --size 64x48 --frames 7 --selection global --render 1/4").unwrap();
         assert_eq!((args.path, args.size, args.frames), (CameraPath::Interpolate, Some([64, 48]), Some(7)));
-        assert_eq!((args.selection, args.render), (Preset::Global, Some(TokenCount::Share(0.25))));
+        assert_eq!((args.selection, args.render), (SelectionPreset::Global, Some(TokenCount::Share(0.25))));
     }
 
     #[test]

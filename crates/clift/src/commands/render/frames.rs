@@ -5,11 +5,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
 use clift_data::{is_empty_folder, upper_median};
-use clift_eval::{Animation, Picture};
-use clift_model::{ViewCamera, Viewer};
+use clift_eval::{Animation, Canvas};
+use clift_model::{SceneRenderer, ViewCamera};
 use clift_train::TrainError;
 
-use crate::exit_code::WrongUsage;
+use crate::exit_code::UsageError;
 use crate::output::counter::Counter;
 
 /// Median seconds per frame.
@@ -33,12 +33,12 @@ pub fn refuse_existing(out: &Path) -> anyhow::Result<()> {
         return Ok(());
     }
     let message = "is not empty, and nothing is written over; choose another folder or move it away";
-    Err(WrongUsage(format!("{} {message}", out.display())).into())
+    Err(UsageError(format!("{} {message}", out.display())).into())
 }
 
 /// Draws every view and writes the frames to `folder`, one by one and as an animation, until `stop` is set.
-pub fn film(
-    viewer: &mut Viewer,
+pub fn write_frames(
+    viewer: &mut SceneRenderer,
     views: &[ViewCamera],
     frames: &Frames,
     folder: &Path,
@@ -56,7 +56,7 @@ pub fn film(
         }
         let drawn = viewer.draw(some, height, width, num_render_tokens);
         for drawn in drawn.with_context(|| format!("drawing frames {first} to {}", first + some.len() - 1))? {
-            let picture = Picture::from_unit(&drawn.pixels, height, width)?;
+            let picture = Canvas::from_unit(&drawn.pixels, height, width)?;
             picture.write_png(&folder.join(format!("frame-{:05}.png", render_s.len())))?;
             animation.add(&picture)?;
             select_s.push(drawn.select_s);

@@ -2,11 +2,11 @@
 
 use anyhow::Context;
 use clift_data::{
-    Intrinsics, PathView, Pose, SceneFrame, Unfinished, interpolate_path, mean_intrinsics, orbit_path, read_poses,
-    replace_file,
+    Intrinsics, PathView, Pose, PoseNormalization, StagedDir, interpolate_path, mean_intrinsics, orbit_path,
+    read_poses, replace_file,
 };
 use clift_model::{
-    DeviceName, MAX_SIDE_PX, ModelError, ModelPath, RenderBudget, Scene, ViewCamera, Viewer, frames_per_call,
+    DeviceName, MAX_SIDE_PX, ModelError, ModelPath, RenderBudget, Scene, SceneRenderer, ViewCamera, frames_per_call,
     load_renderer, render_bytes,
 };
 use clift_train::available_bytes;
@@ -15,7 +15,7 @@ use serde::Serialize;
 use crate::commands::data::text::bytes;
 use crate::commands::render::args::{CameraPath, RenderArgs};
 use crate::commands::render::frames::{self, Frames};
-use crate::exit_code::WrongUsage;
+use crate::exit_code::UsageError;
 use crate::output::stdout::{print_note, print_result};
 
 /// Frames of a path that is made up, unless `--frames` says otherwise.
@@ -57,20 +57,20 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         // The path is out of a file from anywhere: no control character of it reaches the terminal.
         let path = weights.display().to_string();
         let message = format!("the scene was encoded with {}, which is not there", path.escape_debug());
-        return Err(WrongUsage(format!("{message}; give the run with --model RUN")).into());
+        return Err(UsageError(format!("{message}; give the run with --model RUN")).into());
     }
     let stop = crate::interrupt::flag()?;
     let opened = device.open()?;
     args.precision.check("--precision", &opened)?;
     let _precision = args.precision.scope();
     let renderer = load_renderer(&scene, &weights, &opened)?;
-    let mut viewer = Viewer::new(&scene, renderer, args.selection.rules(), &opened)?;
+    let mut viewer = SceneRenderer::new(&scene, renderer, args.selection.rules(), &opened)?;
     let (num_render_tokens, calibration) = tokens(&scene, args, &mut viewer, &views[0], height, width)?;
     // Nothing is in the folder before everything is.
     let making = || format!("making {}", args.out.display());
-    let files = Unfinished::new(&args.out).with_context(making)?;
+    let files = StagedDir::new(&args.out).with_context(making)?;
     let frames = Frames { height, width, num_render_tokens, fps: args.fps };
-    let timing = frames::film(&mut viewer, &views, &frames, files.path(), &stop)?;
+    let timing = frames::write_frames(&mut viewer, &views, &frames, files.path(), &stop)?;
     let report = Report {
         scene: scene.key.clone(),
         path: args.path.to_string(),
@@ -105,7 +105,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
 fn check_size(scene: &Scene, [width, height]: [usize; 2], is_some: bool, device: DeviceName) -> anyhow::Result<()> {
     if width.max(height) > MAX_SIDE_PX {
         let message = format!("--size {width}x{height}: write at most {MAX_SIDE_PX} pixels a side");
-        return Err(WrongUsage(message).into());
+        return Err(UsageError(message).into());
     }
     let num_patches = scene.model.num_tokens(1, height, width)?;
     // Frames of some tokens are drawn alone, each with its own.
@@ -116,7 +116,7 @@ fn check_size(scene: &Scene, [width, height]: [usize; 2], is_some: bool, device:
         let message = format!(
             "frames of {width} x {height} take {needed} of memory, and {available} are free; choose a smaller --size"
         );
-        return Err(WrongUsage(message).into());
+        return Err(UsageError(message).into());
     }
     Ok(())
 }
@@ -125,7 +125,7 @@ fn check_size(scene: &Scene, [width, height]: [usize; 2], is_some: bool, device:
 fn tokens(
     scene: &Scene,
     args: &RenderArgs,
-    viewer: &mut Viewer,
+    viewer: &mut SceneRenderer,
     view: &ViewCamera,
     height: usize,
     width: usize,
@@ -141,7 +141,7 @@ fn tokens(
     let Some(count) = times.most_tokens(budget_ms / 1e3) else {
         let least_ms = (1e4 * times.least_s()).ceil() / 10.0;
         let message = format!("no frame takes less than {least_ms} ms here; write at least --budget-ms {least_ms}");
-        return Err(WrongUsage(format!("{message}, or a smaller --size")).into());
+        return Err(UsageError(format!("{message}, or a smaller --size")).into());
     };
     print_note(&format!("{budget_ms} ms per frame: {count} of {num_storage_tokens} tokens"));
     Ok((count, Some(times)))
@@ -161,15 +161,15 @@ fn path(scene: &Scene, args: &RenderArgs, height: usize, width: usize) -> anyhow
         CameraPath::File(file) => {
             if args.frames.is_some() {
                 return Err(
-                    WrongUsage("a file of poses has its own number of frames: leave --frames out".into()).into()
+                    UsageError("a file of poses has its own number of frames: leave --frames out".into()).into()
                 );
             }
             if !file.exists() {
                 let message = "there is no such file; write interpolate, orbit, or a file of poses";
-                return Err(WrongUsage(format!("--path {}: {message}", file.display())).into());
+                return Err(UsageError(format!("--path {}: {message}", file.display())).into());
             }
             let mean_c2w = Pose::from_matrix(&scene.world.mean_c2w)?;
-            let frame = SceneFrame { mean_c2w, scale: scene.world.scale };
+            let frame = PoseNormalization { mean_c2w, scale: scene.world.scale };
             let default = mean_intrinsics(&context).context("a scene without context views")?;
             read_poses(file, &frame, default, width, height)?
         }

@@ -68,9 +68,9 @@ fn filters_leave_scenes_out_into_the_ledger() {
 #[test]
 fn sources_are_shared_between_threads() {
     let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &ALL).unwrap();
-    let one_by_one: Vec<Frame> = (0..16).map(|i| source.frame(i / 8, i % 8).unwrap()).collect();
+    let one_by_one: Vec<RgbImage> = (0..16).map(|i| source.frame(i / 8, i % 8).unwrap()).collect();
     let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &ALL).unwrap();
-    let at_once: Vec<Frame> = (0..16).into_par_iter().map(|i| source.frame(i / 8, i % 8).unwrap()).collect();
+    let at_once: Vec<RgbImage> = (0..16).into_par_iter().map(|i| source.frame(i / 8, i % 8).unwrap()).collect();
     assert_eq!(at_once, one_by_one);
 }
 

@@ -7,7 +7,7 @@ use crate::error::DataError;
 use crate::files::listing::natural_order;
 use crate::sources::photos::colmap::model::Model;
 use crate::sources::photos::colmap::{binary, text};
-use crate::sources::photos::image_folder::PictureFolders;
+use crate::sources::photos::image_folder::ImageFolders;
 use crate::sources::photos::photo::{MissingPhoto, Photo, PhotoOptions, PhotoScene};
 
 /// The COLMAP model of a folder: the folder itself, or one of the usual subfolders.
@@ -44,7 +44,7 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         optics.insert(id, camera.optics().map_err(bad)?);
     }
     images.sort_by(|a, b| natural_order(&a.name, &b.name));
-    let mut folders = PictureFolders::default();
+    let mut folders = ImageFolders::default();
     let pictures = picture_folder(folder, model, options, &mut folders);
     let mut scene = PhotoScene { notes: other_models(model), ..PhotoScene::default() };
     for (place, image) in images.iter().enumerate() {
@@ -76,7 +76,7 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
 }
 
 /// The folder to which image names are relative.
-fn picture_folder(folder: &Path, model: &Path, options: &PhotoOptions, folders: &mut PictureFolders) -> PathBuf {
+fn picture_folder(folder: &Path, model: &Path, options: &PhotoOptions, folders: &mut ImageFolders) -> PathBuf {
     let mut bases: Vec<&Path> = model.ancestors().take_while(|above| above.starts_with(folder)).collect();
     if !bases.contains(&folder) {
         bases.push(folder);

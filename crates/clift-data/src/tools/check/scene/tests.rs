@@ -16,7 +16,7 @@ use crate::synthetic::source::SyntheticSource;
 /// A room whose frames are traced once.
 struct Traced {
     cameras: Vec<Camera>,
-    frames: Vec<Frame>,
+    frames: Vec<RgbImage>,
 }
 
 /// Two rooms with patterns fine enough to find corners in, seen from nearby as in a video.
@@ -68,7 +68,7 @@ where
         cameras.iter_mut().enumerate().for_each(|(frame, camera)| (self.cameras)(frame, camera));
         Ok(cameras)
     }
-    fn frame(&self, _scene: usize, frame: usize) -> Result<Frame, DataError> {
+    fn frame(&self, _scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         match (self.frame)(frame) {
             usize::MAX => Err(DataError::BadImage { key: "k".into(), frame, what: "it is torn".into() }),
             shown => Ok(self.room.frames[shown].clone()),
@@ -89,7 +89,7 @@ fn turned(c2w: Pose, angle_deg: f64) -> Pose {
 fn rooms_with_right_cameras_pass() {
     for room in rooms() {
         let source = Changed { room, cameras: |_, _: &mut _| (), frame: |frame| frame };
-        let Checked { check, picture } = check_scene(&source, 0);
+        let CheckedScene { check, picture } = check_scene(&source, 0);
         assert!(check.ok && check.reasons.is_empty(), "{check:?}");
         assert_eq!((check.num_frames, check.image_size), (12, Some([320, 240])));
         assert!(check.epipolar_px.is_some_and(|px| px < 0.7), "{check:?}");
@@ -174,7 +174,7 @@ fn frames_that_repeat_or_cannot_be_read_are_told() {
 
 #[test]
 fn scenes_that_were_left_out_are_flagged_with_the_reason() {
-    let mut ledger = Ledger::new(3);
+    let mut ledger = SkipReport::new(3);
     ledger.skip("a", "not a scene");
     for name in ["0005.jpg", "0010.jpg"] {
         ledger.skip_frame("b", name, "no such file");

@@ -1,6 +1,6 @@
 //! Selection against brute force in f64, its edges, and properties.
 
-use crate::Preset;
+use crate::SelectionPreset;
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -29,7 +29,7 @@ fn random_rays(count: usize, seed: u64) -> Vec<TokenRay> {
 
 /// Algorithm 1 with nothing but loops, `acos` and sorting, in f64.
 struct BruteForce {
-    rules: Rules,
+    rules: SelectionRules,
     rays: Vec<TokenRay>,
     frames: Vec<(Vec<Vec<f64>>, Vec<usize>)>,
     forward: Option<[f64; 3]>,
@@ -109,9 +109,9 @@ fn the_angle_is_that_of_acos_from_equal_to_opposite_directions() {
 fn frames_equal_brute_force_for_no_some_and_many_tokens_per_cell() {
     // A grid of (2 + 8) x (1 + 8) = 90 cells: n is 0, 0, 1, 3, 5, 6 and 7.
     let (height, width) = (32, 16);
-    assert_eq!(Rules::default().grid(height, width), [10, 9]);
+    assert_eq!(SelectionRules::default().grid(height, width), [10, 9]);
     let rays = random_rays(700, 1);
-    for preset in Preset::ALL {
+    for preset in SelectionPreset::ALL {
         for count in [1, 89, 90, 350, 470, 600, 699, 700] {
             let mut selector = Selector::new(preset.rules(), &rays).unwrap();
             let mut expected =
@@ -129,7 +129,7 @@ fn frames_equal_brute_force_for_no_some_and_many_tokens_per_cell() {
 
 #[test]
 fn more_tokens_than_there_are_gives_all_of_them_once() {
-    let mut selector = Selector::new(Rules::default(), &random_rays(50, 2)).unwrap();
+    let mut selector = Selector::new(SelectionRules::default(), &random_rays(50, 2)).unwrap();
     for count in [50, 51, 100_000] {
         assert_eq!(selector.select(&camera([0.0; 3], 0.0), 64, 64, count).unwrap(), (0..50).collect::<Vec<_>>());
     }
@@ -149,7 +149,7 @@ fn a_first_step_that_takes_too_many_keeps_the_nearest() {
 #[test]
 fn of_equally_near_tokens_the_lower_ids_are_taken() {
     let ray = TokenRay { origin: [0.1, 0.2, 0.3], direction: [0.0, 0.1, 1.0] };
-    for preset in Preset::ALL {
+    for preset in SelectionPreset::ALL {
         let mut selector = Selector::new(preset.rules(), &[ray; 300]).unwrap();
         for count in [1, 7, 81, 170, 299] {
             selector.reset();
@@ -165,7 +165,7 @@ fn two_tokens(angles: [f64; 2]) -> [TokenRay; 2] {
 }
 
 /// Rules under which a picture of one cell sees tokens by their angle alone.
-const PLAIN: Rules = Rules {
+const PLAIN: SelectionRules = SelectionRules {
     angle_weight: 1.0,
     distance_weight: 0.0,
     previous_bonus: 0.0,
@@ -179,7 +179,7 @@ const PLAIN: Rules = Rules {
 fn a_token_of_the_previous_frame_stays_until_another_is_nearer_by_the_bonus() {
     // The token at 0 is nearer at first; the camera then turns towards the one at 0.05.
     let near = |bonus: f32, turn: f64| {
-        let rules = Rules { previous_bonus: bonus, ..PLAIN };
+        let rules = SelectionRules { previous_bonus: bonus, ..PLAIN };
         let mut selector = Selector::new(rules, &two_tokens([0.0, 0.05])).unwrap();
         let camera = |angle: f64| {
             let mut view = camera([0.0; 3], angle);
@@ -198,7 +198,7 @@ fn a_token_of_the_previous_frame_stays_until_another_is_nearer_by_the_bonus() {
 
 #[test]
 fn momentum_halves_a_step_of_the_distances() {
-    let rules = Rules { momentum: 0.5, ..PLAIN };
+    let rules = SelectionRules { momentum: 0.5, ..PLAIN };
     let mut selector = Selector::new(rules, &two_tokens([0.0, 0.1])).unwrap();
     let camera = |angle: f64| {
         let mut view = camera([0.0; 3], angle);
@@ -226,7 +226,7 @@ fn momentum_halves_a_step_of_the_distances() {
 #[test]
 fn a_cut_starts_without_momentum_where_the_rules_know_cuts() {
     let distance = |cuts: bool, turn: f64| {
-        let rules = Rules { momentum: 0.5, cuts, ..PLAIN };
+        let rules = SelectionRules { momentum: 0.5, cuts, ..PLAIN };
         let mut selector = Selector::new(rules, &two_tokens([0.0, 0.1])).unwrap();
         let view = |angle: f64| ViewCamera { intrinsics: [400.0, 400.0, 8.0, 8.0], ..camera([0.0; 3], angle) };
         selector.select(&view(0.0), 16, 16, 1).unwrap();
@@ -243,14 +243,14 @@ fn a_cut_starts_without_momentum_where_the_rules_know_cuts() {
 fn the_camera_of_a_token_counts_a_fiftieth_of_its_distance() {
     let direction = [0.0, 0.0, 1.0];
     let rays = [TokenRay { origin: [1.0, 0.0, 0.0], direction }, TokenRay { origin: [0.0, 0.2, 0.0], direction }];
-    let mut selector = Selector::new(Preset::Global.rules(), &rays).unwrap();
+    let mut selector = Selector::new(SelectionPreset::Global.rules(), &rays).unwrap();
     assert_eq!(selector.select(&camera([0.0; 3], 0.0), 16, 16, 1).unwrap(), [1]);
     assert_eq!(selector.select(&camera([0.9, 0.0, 0.0], 0.0), 16, 16, 1).unwrap(), [0]);
 }
 
 #[test]
 fn the_grid_covers_the_picture_with_four_cells_around_it() {
-    let [paper, scaled] = [Preset::Paper, Preset::Scaled].map(Preset::rules);
+    let [paper, scaled] = [SelectionPreset::Paper, SelectionPreset::Scaled].map(SelectionPreset::rules);
     assert_eq!(paper.grid(256, 256), [24, 24]);
     assert_eq!(paper.grid(256, 448), [24, 36]);
     assert_eq!(paper.grid(40, 17), [11, 10]);
@@ -272,19 +272,19 @@ fn the_grid_covers_the_picture_with_four_cells_around_it() {
 #[test]
 fn what_cannot_be_selected_from_is_refused() {
     let rays = random_rays(3, 4);
-    let mut selector = Selector::new(Rules::default(), &rays).unwrap();
+    let mut selector = Selector::new(SelectionRules::default(), &rays).unwrap();
     let message = selector.select(&camera([0.0; 3], 0.0), 16, 16, 0).unwrap_err().to_string();
     assert_eq!(message, "`num_render_tokens` = 0: write at least 1");
     let message = selector.select(&camera([f64::NAN, 0.0, 0.0], 0.0), 16, 16, 1).unwrap_err().to_string();
     assert!(message.starts_with("the target's camera holds NaN"), "{message}");
     for direction in [[0.0; 3], [f64::NAN, 0.0, 1.0], [f64::INFINITY, 0.0, 1.0]] {
         let rays = [rays[0], TokenRay { direction, ..rays[1] }];
-        let message = Selector::new(Rules::default(), &rays).unwrap_err().to_string();
+        let message = Selector::new(SelectionRules::default(), &rays).unwrap_err().to_string();
         assert!(message.starts_with("the ray of token 1 cannot be used"), "{message}");
     }
-    assert_eq!("global".parse::<Preset>().unwrap(), Preset::Global);
+    assert_eq!("global".parse::<SelectionPreset>().unwrap(), SelectionPreset::Global);
     assert_eq!(
-        "all".parse::<Preset>().unwrap_err().to_string(),
+        "all".parse::<SelectionPreset>().unwrap_err().to_string(),
         "`selection` = all: write one of paper, global, scaled"
     );
 }
@@ -293,7 +293,7 @@ fn what_cannot_be_selected_from_is_refused() {
 #[ignore = "measures time, which a busy machine has not"]
 fn a_frame_of_8192_tokens_and_576_cells_takes_at_most_15_ms_on_two_cores() {
     let rays = random_rays(8192, 5);
-    for preset in Preset::ALL {
+    for preset in SelectionPreset::ALL {
         for count in [512, 1024, 4096, 8191] {
             let mut selector = Selector::new(preset.rules(), &rays).unwrap();
             let mut times_ms: Vec<f64> = (0..60)
@@ -319,7 +319,7 @@ proptest! {
         num_tokens in 1_usize..400, counts in prop::collection::vec(1_usize..500, 1..5), seed in 0_u64..1000,
         height in 1_usize..40, width in 1_usize..40, preset in 0_usize..3,
     ) {
-        let mut selector = Selector::new(Preset::ALL[preset].rules(), &random_rays(num_tokens, seed)).unwrap();
+        let mut selector = Selector::new(SelectionPreset::ALL[preset].rules(), &random_rays(num_tokens, seed)).unwrap();
         for (frame, count) in counts.into_iter().enumerate() {
             let view = camera([0.1 * frame as f64, 0.0, 0.0], 0.1 * frame as f64);
             let chosen = selector.select(&view, height, width, count).unwrap();
@@ -335,7 +335,7 @@ proptest! {
     ) {
         let rays = random_rays(num_tokens, seed);
         let choose = |count| {
-            let mut selector = Selector::new(Preset::Global.rules(), &rays).unwrap();
+            let mut selector = Selector::new(SelectionPreset::Global.rules(), &rays).unwrap();
             selector.select(&camera([0.0; 3], 0.0), 32, 32, count).unwrap()
         };
         let (few, more) = (choose(few.min(more)), choose(few.max(more)));
@@ -347,7 +347,7 @@ proptest! {
         let rays = random_rays(num_tokens, seed);
         let reversed: Vec<TokenRay> = rays.iter().rev().copied().collect();
         let choose = |rays: &[TokenRay]| {
-            let mut selector = Selector::new(Rules::default(), rays).unwrap();
+            let mut selector = Selector::new(SelectionRules::default(), rays).unwrap();
             selector.select(&camera([0.0; 3], 0.0), 16, 16, count).unwrap()
         };
         let mut renamed: Vec<u32> = choose(&reversed).iter().map(|&token| num_tokens as u32 - 1 - token).collect();
