@@ -204,3 +204,6 @@ fn score_gradients<S: Simd>(simd: S, (scores, slopes): (&mut [f32], &mut [f32]),
         simd.write(slope, simd.mul(weight, simd.sub(simd.read(slope), delta)));
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -5,9 +5,6 @@
 //! projections); each task copies its head once into a contiguous block.
 // B scenes, H heads, Q queries, K keys, E width of a head
 
-#[cfg(test)]
-mod tests;
-
 use crate::primitives::shared_slice::SharedSlice;
 
 /// Sizes of one attention.

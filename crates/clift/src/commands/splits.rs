@@ -142,12 +142,12 @@ mod tests {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini/train");
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("list");
-        let opened = |keys: Option<&str>, splits| {
+        let opened = |keys: Option<&str>, which: Splits| {
             let test_scenes = keys.map(|keys| {
                 std::fs::write(&path, keys).unwrap();
                 PathBuf::from(&path)
             });
-            let halves = splits(&root, splits, &FileOptions { test_scenes, ..FileOptions::default() }).unwrap();
+            let halves = splits(&root, which, &FileOptions { test_scenes, ..FileOptions::default() }).unwrap();
             let told = halves.iter().map(|half| (half.name(), half.opened.source.num_scenes()));
             told.collect::<Vec<_>>()
         };

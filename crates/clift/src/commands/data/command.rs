@@ -74,8 +74,9 @@ Examples:
 }
 
 #[cfg(test)]
-mod args_tests {
+mod tests {
     use clap::Parser;
+    use clift_data::Split;
 
     use super::*;
     use crate::cli::{Args, Command};

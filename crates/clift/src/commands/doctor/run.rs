@@ -147,16 +147,16 @@ mod tests {
 
     use super::*;
 
-    fn probe(values: Vec<f64>) -> DeviceCheck {
+    fn check_of(values: Vec<f64>) -> DeviceCheck {
         let gradient = Gradient { loss: 1.0, values };
         DeviceCheck { adapter: "CPU".into(), dtypes: vec!["f32"], gradient, seconds: 0.0125 }
     }
 
     #[test]
     fn a_gradient_that_is_zero_not_finite_or_far_off_fails() {
-        let reference = probe(vec![1.0, -2.0]);
+        let reference = check_of(vec![1.0, -2.0]);
         let checked =
-            |values: &[f64]| check(probe(values.to_vec()), Some(&reference), TOLERANCE).err().unwrap_or_default();
+            |values: &[f64]| check(check_of(values.to_vec()), Some(&reference), TOLERANCE).err().unwrap_or_default();
         assert_eq!(checked(&[1.0, -2.0001]), "");
         assert_eq!(checked(&[1.0, f64::NAN]), "the gradient holds NaN");
         assert_eq!(checked(&[0.0, 0.0]), "the gradient is zero");
@@ -166,7 +166,7 @@ mod tests {
 
     #[test]
     fn the_table_keeps_its_columns_beside_a_long_failure() {
-        let reference = probe(vec![1.0]);
+        let reference = check_of(vec![1.0]);
         let failure = "panicked: a very long reason".to_owned();
         let rows = [
             HEADER.map(String::from),

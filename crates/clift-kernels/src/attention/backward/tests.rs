@@ -1,4 +1,5 @@
 use super::*;
+use crate::attention::forward::forward;
 use crate::simd::dispatch::InstructionSet;
 use crate::testing::{assert_close, random};
 
@@ -43,7 +44,7 @@ fn reference(sizes: &Sizes, [q, k, v, grad]: [&[f32]; 4]) -> [Vec<f64>; 4] {
 }
 
 /// The gradients of queries, keys and values, unpacked.
-fn gradients(set: InstructionSet, sizes: Sizes, saved: Saved<'_>) -> [Vec<f32>; 3] {
+fn gradients(set: InstructionSet, sizes: Sizes, saved: BackwardInputs<'_>) -> [Vec<f32>; 3] {
     let Sizes { batch, num_queries, num_keys, .. } = sizes;
     let dim = sizes.dim();
     let part = |packed: &[f32], parts: usize, part: usize| {
@@ -77,7 +78,7 @@ fn check(sizes: Sizes, spread: f32) {
             [rows(&q, &sizes, num_queries), rows(&k, &sizes, num_keys), rows(&v, &sizes, num_keys)];
         forward(set, sizes, [query, key, value], &mut output, Some(&mut log_sum));
         assert_close(&output, &expected[0], 1e-5);
-        let saved = Saved {
+        let saved = BackwardInputs {
             query,
             key,
             value,
