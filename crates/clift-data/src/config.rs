@@ -13,41 +13,42 @@ use crate::sources::kind::SourceKind;
 use crate::sources::options::FileOptions;
 use crate::synthetic::config::SyntheticConfig;
 
-/// Scenes and how views are drawn from them.
+/// Data set, image size, pose normalisation and view sampling.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataConfig {
     /// Kind of the data set.
     pub source: SourceKind,
-    /// Folder with `train/` and `test/`, or of scenes, or of one scene; for scenes on disk.
+    /// Folder with `train/` and `test/`, folder of scenes, or folder of one scene; for data sets on disk.
     pub root: Option<PathBuf>,
-    /// Where the parts of a layout are, if not where they are expected; for scenes on disk.
+    /// Paths of the parts of the layout, where they differ from the default; for data sets on disk.
     pub files: FileOptions,
-    /// Columns of every view, a multiple of the patch.
+    /// Columns of every view, a multiple of the patch size.
     pub width: usize,
-    /// Rows of every view, a multiple of the patch.
+    /// Rows of every view, a multiple of the patch size.
     pub height: usize,
-    /// How the mean orientation of the contexts is taken.
+    /// Mean orientation of the context views.
     pub pose_rotation: PoseRotation,
-    /// Which cameras set the scale of a scene: contexts only, or targets as well (the reference's numbers).
+    /// Cameras that define the scale of a scene: contexts only, or contexts and targets (as in the reference
+    /// implementation).
     pub pose_scale: PoseScale,
-    /// Whether the principal point follows the crop exactly: an older way to write `crop = "exact"`.
+    /// Former notation of `crop = "exact"`.
     pub exact_principal_point: bool,
-    /// Where the principal point goes when pictures are cropped: `protocol`, as in published numbers, or `exact`.
+    /// Principal point of cropped images: `protocol`, as in published results, or `exact`.
     #[serde(skip_serializing_if = "Crop::is_default")]
     pub crop: Crop,
-    /// Whether stage 1 flips half of its clips left to right. Stage 2 trains on clusters of clips as they are.
+    /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub flip: bool,
-    /// Which scenes of the files are used.
+    /// Filters of the scenes on disk.
     pub filters: SceneFilters,
-    /// The synthetic scenes.
+    /// Options of the synthetic scenes.
     pub synthetic: SyntheticConfig,
-    /// How context and target frames are drawn for training.
+    /// Sampling of context and target frames for training.
     pub views: ViewSampler,
-    /// Threads that prepare batches; 0 prepares them between the steps.
+    /// Number of threads that prepare batches; 0 prepares them between the steps.
     pub num_threads: usize,
-    /// Batches prepared ahead.
+    /// Number of batches prepared ahead.
     pub num_prefetch: usize,
 }
 
@@ -74,7 +75,7 @@ impl Default for DataConfig {
 }
 
 impl DataConfig {
-    /// How frames and poses are prepared.
+    /// Returns the options of reading a clip.
     pub fn clip_options(&self) -> ClipOptions {
         ClipOptions {
             width: self.width,

@@ -1,4 +1,4 @@
-//! Opening of the scenes that a config names.
+//! Opening the data set of a config.
 
 use std::sync::Arc;
 
@@ -49,15 +49,14 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
         _ => false,
     };
     if split == Split::Train && has_dl3dv && !opened.has_splits && config.files.test_scenes.is_none() {
-        let fix = "the folders hold DL3DV's benchmark scenes too, which are not to be trained on: write the path of an \
-                   evaluation index, or of a file with a key per line (an empty file for none)";
+        let fix = "the folders also hold the benchmark scenes of DL3DV, which must be excluded from training: write the path of an \
+                   evaluation index or of a file with one key per line (an empty file excludes none)";
         return Err(missing("data.files.test_scenes", fix));
     }
     Ok(opened)
 }
 
-/// Opens the training split as [`open_dataset`] does, without the scenes that are too short for any step's views; these
-/// are in the report.
+/// Opens the training split as [`open_dataset`] does, and skips the scenes that are too short for `data.views`.
 ///
 /// # Errors
 /// As [`open_dataset`].
@@ -65,7 +64,7 @@ pub fn open_training_dataset(config: &DataConfig) -> Result<OpenedSource, DataEr
     let mut opened = open_dataset(config, Split::Train)?;
     let source = opened.source.clone();
     let needed = config.views.min_frames();
-    // A scene that cannot be read is reported with its reason when it is sampled.
+    // An unreadable scene is reported when it is sampled.
     let is_short = |scene: &usize| source.num_frames(*scene).is_ok_and(|num_frames| num_frames < needed);
     let (short, long): (Vec<usize>, Vec<usize>) = (0..source.num_scenes()).partition(is_short);
     if short.is_empty() {
@@ -102,8 +101,8 @@ mod tests {
             })
         };
         for split in [Split::Train, Split::Test] {
-            let place = folder.path().join(split.to_string());
-            write_chunks(&place, [(0, 4), (1, 5), (0, 8)].into_iter().map(record), 1).unwrap();
+            let split_folder = folder.path().join(split.to_string());
+            write_chunks(&split_folder, [(0, 4), (1, 5), (0, 8)].into_iter().map(record), 1).unwrap();
         }
         // Two contexts may lie 4 apart, three 8.
         let views =

@@ -1,199 +1,199 @@
-//! What can go wrong between a file and a clip, one documented variant per failure.
+//! Errors of the data crate: one variant per failure.
 
 use std::path::{Path, PathBuf};
 
-/// A failure of this crate. A message says what, where, expected and got, with the path last.
+/// Error of this crate. A message states the problem, the expected and the found value, and the path last.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum DataError {
     /// A file could not be opened, read or written.
     #[error("{action} failed: {source}: {path}", path = path.display())]
     Io {
-        /// What was being done, as a verb phrase ("reading the chunk").
+        /// Operation that failed, as a verb phrase ("reading the chunk").
         action: &'static str,
-        /// The operating system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
-        /// The file.
+        /// File.
         path: PathBuf,
     },
-    /// A camera holds a NaN or an infinity, or its rotation is not one.
+    /// A camera holds a NaN or an infinity, or its rotation matrix is not orthonormal.
     #[error("bad camera: {what}")]
     BadCamera {
-        /// What is wrong with it, with the number that shows it.
+        /// Problem and the value found.
         what: String,
     },
     /// A pickle is malformed, larger than the limits, or uses an opcode that `torch.save` does not write.
     #[error("bad pickle: {what}: {path}", path = path.display())]
     BadPickle {
-        /// What is wrong with it, and at which byte.
+        /// Problem and its byte position.
         what: String,
-        /// The archive that holds it.
+        /// Archive of the pickle.
         path: PathBuf,
     },
-    /// A pickle names a Python object that is not on the allow-list. Nothing of it was run.
-    #[error("the pickle asks for the Python object `{name}`, which is not allowed; nothing was run: {path}", path = path.display())]
+    /// A pickle names a Python object that is not on the allow-list. Pickles are parsed, never executed.
+    #[error("the pickle names the Python object `{name}`, which is not on the allow-list; no code was run: {path}", path = path.display())]
     RefusedGlobal {
-        /// Module and name, as `os.system`.
+        /// Module and name, such as `os.system`.
         name: String,
-        /// The archive that holds it.
+        /// Archive of the pickle.
         path: PathBuf,
     },
-    /// A chunk is truncated, not an archive, or does not hold what the chunk format says.
+    /// A chunk is truncated, is no ZIP archive, or violates the chunk format.
     #[error("bad chunk: {what}: {path}", path = path.display())]
     BadChunk {
-        /// What is wrong with it, with the scene key where there is one.
+        /// Problem, with the scene key if known.
         what: String,
-        /// The chunk.
+        /// Chunk file.
         path: PathBuf,
     },
-    /// A PyTorch checkpoint is truncated, not an archive, or does not hold the tensors that are asked for.
+    /// A PyTorch checkpoint is truncated, is no ZIP archive, or lacks a requested tensor.
     #[error("bad checkpoint: {what}: {path}", path = path.display())]
     BadCheckpoint {
-        /// What is wrong with it, with the key where there is one.
+        /// Problem, with the tensor's key if known.
         what: String,
-        /// The checkpoint.
+        /// Checkpoint file.
         path: PathBuf,
     },
-    /// An `index.json` or evaluation index does not have the expected form.
+    /// An `index.json` or an evaluation index is malformed.
     #[error("bad index: {what}: {path}", path = path.display())]
     BadIndex {
-        /// What is wrong with it.
+        /// Problem.
         what: String,
-        /// The file.
+        /// File.
         path: PathBuf,
     },
-    /// A folder or file holds scenes in no layout that is known, or not in the one asked for.
+    /// A folder or file holds no scenes in a known layout, or none in the requested layout.
     #[error("no scenes found: {what}: {path}", path = path.display())]
     UnknownLayout {
-        /// What was looked for, and what there is.
+        /// Expected files and the files found.
         what: String,
-        /// The folder or file.
+        /// Folder or file.
         path: PathBuf,
     },
-    /// A scene of photos cannot be used: its cameras are malformed, of an unknown model or without pictures.
+    /// A scene of photos cannot be used: malformed cameras, an unknown camera model, or no images.
     #[error("bad scene: {what}: {path}", path = path.display())]
     BadScene {
-        /// What is wrong with it, with the line, camera or picture.
+        /// Problem, with its line, camera or image.
         what: String,
-        /// The file that holds the cameras, or the picture.
+        /// Camera file or image file.
         path: PathBuf,
     },
-    /// A file of camera poses does not have the expected form.
+    /// A file of camera poses is malformed.
     #[error("bad poses: {what}: {path}", path = path.display())]
     BadPoses {
-        /// What is wrong with it, with the position of the pose.
+        /// Problem and the index of the pose.
         what: String,
-        /// The file.
+        /// File.
         path: PathBuf,
     },
-    /// A scene is not in the evaluation index, not even as an unused entry.
+    /// A scene has no entry in the evaluation index; unused scenes have a `null` entry.
     #[error("scene {key} is not in the evaluation index: {path}", path = path.display())]
     MissingIndexKey {
-        /// Key of the scene.
+        /// Scene key.
         key: String,
-        /// The index file.
+        /// Index file.
         path: PathBuf,
     },
-    /// A frame was asked for that the scene does not have.
-    #[error("scene {key} has {num_frames} frames, so there is no frame {frame} (counted from 0)")]
+    /// A frame index is out of range.
+    #[error("scene {key} has {num_frames} frames; frame {frame} (counted from 0) does not exist")]
     NoSuchFrame {
-        /// Key of the scene.
+        /// Scene key.
         key: String,
-        /// Position asked for.
+        /// Requested frame index.
         frame: usize,
-        /// How many frames the scene has.
+        /// Number of frames of the scene.
         num_frames: usize,
     },
-    /// The bytes of a frame are no readable JPEG or PNG, or the picture is larger than the limits.
+    /// An image file is no readable JPEG or PNG, or the image exceeds the size limit.
     #[error("frame {frame} of scene {key} cannot be decoded: {what}")]
     BadImage {
-        /// Key of the scene.
+        /// Scene key.
         key: String,
-        /// Position of the frame in the scene.
+        /// Frame index in the scene.
         frame: usize,
-        /// The decoder's reason.
+        /// Error of the decoder.
         what: String,
     },
-    /// A picture cannot be written.
-    #[error("encoding a {width}x{height} picture failed: {what}")]
+    /// An image cannot be encoded.
+    #[error("encoding a {width}x{height} image failed: {what}")]
     Encode {
         /// Columns.
         width: usize,
         /// Rows.
         height: usize,
-        /// The encoder's reason.
+        /// Error of the encoder.
         what: String,
     },
-    /// A picture is asked for at a larger size than its file has.
+    /// A requested image size exceeds the size of the image file.
     #[error(
-        "cannot make a {width}x{height} picture from one of {from_width}x{from_height}: upscaling is not supported, lower the configured size"
+        "cannot make a {width}x{height} image from a {from_width}x{from_height} image: upscaling is not supported; lower the configured size"
     )]
     Upscale {
-        /// Columns asked for.
+        /// Requested columns.
         width: usize,
-        /// Rows asked for.
+        /// Requested rows.
         height: usize,
-        /// Columns of the file's picture.
+        /// Columns of the image file.
         from_width: usize,
-        /// Rows of the file's picture.
+        /// Rows of the image file.
         from_height: usize,
     },
-    /// The camera centres that set a scene's scale coincide, so that there is no scale.
+    /// The camera centres that define a scene's scale coincide.
     #[error(
         "scene {key} has no baseline: its {num_views} camera centres lie within {extent:.3e} of their mean, \
-         less than {threshold:.3e}, what f32 files can resolve there; leave the scene out or choose other frames"
+         below the resolution of f32 files, {threshold:.3e}; remove the scene or choose other frames"
     )]
     ZeroBaseline {
-        /// Key of the scene.
+        /// Scene key.
         key: String,
-        /// How many views set the scale.
+        /// Number of views that define the scale.
         num_views: usize,
-        /// Largest distance along an axis from the mean centre, in world units.
+        /// Largest distance from the mean centre along an axis, in world units.
         extent: f64,
-        /// Smallest extent that is accepted, in world units.
+        /// Smallest accepted extent, in world units.
         threshold: f64,
     },
     /// A frame of a scene cannot be used.
     #[error("frame {frame} of scene {key}: {source}")]
     InFrame {
-        /// Key of the scene.
+        /// Scene key.
         key: String,
-        /// Position of the frame in the scene.
+        /// Frame index in the scene.
         frame: usize,
-        /// What is wrong with it.
+        /// Cause.
         source: Box<DataError>,
     },
-    /// A configuration value cannot be used.
+    /// A configuration value is invalid.
     #[error("{key} {problem}")]
     BadConfig {
-        /// Dotted key of the value, relative to its table.
+        /// Dotted key, relative to its table.
         key: String,
-        /// The value, what is wrong with it and what would be right, as a verb phrase.
+        /// Value, problem and remedy, as a verb phrase ("is 0; use at least 1").
         problem: String,
     },
-    /// A scene is too short for the views that are to be drawn from it.
+    /// A scene has too few frames for the views to sample.
     #[error("not enough frames: {needed} needed, {got} in the scene")]
     NotEnoughFrames {
-        /// Fewest frames that would do.
+        /// Smallest sufficient number of frames.
         needed: usize,
-        /// Frames the scene has.
+        /// Number of frames of the scene.
         got: usize,
     },
-    /// A scene was asked for that the source does not have.
-    #[error("there are {num_scenes} scenes, so there is no scene {scene} (counted from 0)")]
+    /// A scene index is out of range.
+    #[error("the source has {num_scenes} scenes; scene {scene} (counted from 0) does not exist")]
     NoSuchScene {
-        /// Position asked for.
+        /// Requested scene index.
         scene: usize,
-        /// How many scenes the source has.
+        /// Number of scenes of the source.
         num_scenes: usize,
     },
-    /// No scene is left to train or evaluate on.
+    /// All scenes of a split were skipped.
     #[error("no usable scene: {reason}")]
     NoScenes {
-        /// Split, and why its scenes were skipped.
+        /// Split and its skip report.
         reason: String,
     },
-    /// A batch slot found no usable scene within its tries.
+    /// No scene that was tried for a batch slot is usable.
     #[error(
         "no usable scene for slot {slot} of step {step} in {attempts} tries; the last, {key}, failed with: {reason}"
     )]
@@ -202,35 +202,35 @@ pub enum DataError {
         step: u64,
         /// Slot of the batch.
         slot: usize,
-        /// How many scenes were tried.
+        /// Number of scenes tried.
         attempts: u32,
         /// Key of the last scene tried.
         key: String,
-        /// Why the last one failed.
+        /// Error of the last scene tried.
         reason: String,
     },
-    /// The code that makes a batch panicked.
+    /// A loader thread panicked.
     #[error(transparent)]
     WorkerPanic(#[from] WorkerPanic),
 }
 
-/// The code that makes a batch panicked; the other batches are unaffected.
+/// Panic of the code that prepares a batch. Other batches are unaffected.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("making the batch of step {step} panicked: {message}")]
 pub struct WorkerPanic {
     /// Step of the batch.
     pub step: u64,
-    /// Message of the panic.
+    /// Panic message.
     pub message: String,
 }
 
 impl DataError {
-    /// A [`DataError::BadConfig`] about `key`.
+    /// Creates a [`DataError::BadConfig`].
     pub fn bad_config(key: impl Into<String>, problem: impl Into<String>) -> Self {
         Self::BadConfig { key: key.into(), problem: problem.into() }
     }
 
-    /// Wraps an operating-system error; for `map_err`.
+    /// Returns a function that wraps an error of the operating system, for `map_err`.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, source, path: path.to_path_buf() }
     }

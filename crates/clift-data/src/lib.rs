@@ -1,8 +1,20 @@
-//! Posed photos in, clips out: cameras, data sets and captures in every layout, synthetic scenes, samplers and the
-//! loader.
+//! Files in, clips out: data sets and captures in every layout, synthetic scenes, view samplers and the loader.
 //!
-//! This crate does not depend on Burn: its clips and batches are plain host arrays, and
-//! `clift_model::ClipViews::upload` is the one place where they meet a device.
+//! A clip holds the context and target images of one scene with their normalised cameras. This crate does not depend on
+//! Burn: clips are plain host arrays, which `clift_model::ClipViews::upload` copies to a device.
+//!
+//! ```
+//! use clift_data::{ClipReader, DataConfig, Split, ViewIndices, open_dataset};
+//!
+//! let config = DataConfig { width: 32, height: 24, ..DataConfig::default() }; // synthetic rooms
+//! let opened = open_dataset(&config, Split::Train)?;
+//! println!("{}", opened.report); // skipped scenes and frames
+//!
+//! let reader = ClipReader { source: opened.source, options: config.clip_options() };
+//! let clip = reader.read(0, &ViewIndices { context: vec![0, 8], target: vec![4] })?;
+//! assert_eq!((clip.context.num_views(), clip.target.num_views()), (2, 1));
+//! # Ok::<(), clift_data::DataError>(())
+//! ```
 
 mod config;
 mod dataset;
@@ -22,38 +34,14 @@ mod testing;
 mod tools;
 mod torch;
 
+// Opening a data set.
 pub use config::DataConfig;
 pub use dataset::{open_dataset, open_training_dataset};
 pub use error::{DataError, WorkerPanic};
-pub use files::atomic::{
-    TEMPORARY, make_folder, publish as publish_file, remove_folder, remove_leftovers, replace as replace_file,
-};
-pub use files::staged_dir::{StagedDir, is_empty as is_empty_folder};
-pub use geometry::camera::{Camera, Intrinsics, IntrinsicsNorm};
-pub use geometry::camera_path::{
-    PathView, interpolate as interpolate_path, mean_intrinsics, orbit as orbit_path, read_poses,
-};
-pub use geometry::lens::Lens;
-pub use geometry::normalization::{MAX_COORDINATE, PoseNormalization, PoseRotation, PoseScale};
-pub use geometry::overlap::overlap;
-pub use geometry::path_spread::contexts_along_path;
-pub use geometry::pose::Pose;
-pub use image::codec::{decode as decode_image, encode_jpeg, encode_png};
-pub use image::fit::{Crop, fit as fit_image};
-pub use image::rgb_image::RgbImage;
-pub use image::undistort::Undistortion;
-pub use random::{derive_seed, item_rng, sample_distinct, step_rng, uniform_below};
-pub use sampling::clip::{Clip, ClipViews, ViewIndices};
-pub use sampling::clip_reader::{ClipOptions, ClipReader};
-pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views};
-pub use sampling::inner_views::InnerViews;
-pub use sampling::prefetcher::Prefetcher;
-pub use sampling::scene_order::SceneOrder;
-pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
-pub use sampling::training_clips::{ClipBatch, TrainingClips};
-pub use sampling::view_sampler::{ViewSampler, sample_targets};
 pub use scene_source::{SceneSource, Split};
 pub use skip_report::{SkipReport, SkippedFrame, SkippedScene};
+
+// Layouts on disk, and synthetic scenes.
 pub use sources::chunks::chunk_source::ChunkSource;
 pub use sources::chunks::writer::{SceneRecord, write_chunks};
 pub use sources::dataset_root::DatasetRoot;
@@ -64,9 +52,38 @@ pub use sources::open::{OpenedSource, SAME_SCENES, open_source};
 pub use sources::options::{FileOptions, SourceOptions};
 pub use sources::subset::SceneSubset;
 pub use sources::test_scenes::{KEPT_FOR_TESTING, TestScenes};
-pub use statistics::{MinMedianMax, median, p95, upper_median};
 pub use synthetic::config::SyntheticConfig;
 pub use synthetic::source::SyntheticSource;
+
+// Clips and batches.
+pub use sampling::clip::{Clip, ClipViews, ViewIndices};
+pub use sampling::clip_reader::{ClipOptions, ClipReader};
+pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views};
+pub use sampling::inner_views::InnerViews;
+pub use sampling::prefetcher::Prefetcher;
+pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
+pub use sampling::training_clips::{ClipBatch, TrainingClips};
+pub use sampling::view_sampler::{ViewSampler, sample_targets};
+
+// Cameras and poses.
+pub use geometry::camera::{Camera, Intrinsics, IntrinsicsNorm};
+pub use geometry::camera_path::{
+    PathView, interpolate as interpolate_path, mean_intrinsics, orbit as orbit_path, read_poses,
+};
+pub use geometry::lens::Lens;
+pub use geometry::normalization::{MAX_COORDINATE, PoseNormalization, PoseRotation, PoseScale};
+pub use geometry::overlap::overlap;
+pub use geometry::path_spread::contexts_along_path;
+pub use geometry::pose::Pose;
+pub use glam::{DMat3, DVec3};
+
+// Images.
+pub use image::codec::{decode as decode_image, encode_jpeg, encode_png};
+pub use image::fit::{Crop, fit as fit_image};
+pub use image::rgb_image::RgbImage;
+pub use image::undistort::Undistortion;
+
+// Tools for data sets: describe, check, convert, index.
 pub use tools::check::result::SceneCheck;
 pub use tools::check::scene::{CheckedScene, check_scene, left_out, note_frames};
 pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter, convert};
@@ -74,8 +91,14 @@ pub use tools::export::{ImageEncoding, write_evaluation_index, write_source};
 pub use tools::index_census::IndexCensus;
 pub use tools::info::SourceInfo;
 pub use tools::overlap_index::{OverlapOptions, write_overlap_index};
+
+// PyTorch files, read without executing them.
 pub use torch::pickle::Pickle;
 pub use torch::state_dict::{StateDict, write_state_dict};
 pub use torch::values::ElementType;
 
-pub use glam::{DMat3, DVec3};
+// Atomic writes, random streams and statistics, shared with the crates above.
+pub use files::atomic::{TEMPORARY, make_folder, publish_folder, remove_folder, remove_leftovers, replace_file};
+pub use files::staged_dir::{StagedDir, is_empty_folder};
+pub use random::{derive_seed, item_rng, sample_distinct, step_rng, uniform_below};
+pub use statistics::{MinMedianMax, mean, median, p95, standard_error, upper_median};

@@ -6,57 +6,57 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Slot number of the stream that a whole batch shares; no batch has this many slots.
+/// Slot number of the stream shared by a whole batch; no batch has this many slots.
 const WHOLE_BATCH: u32 = u32::MAX;
 
-/// Derives the seed of one part of a run ("stage1", "stage2", "eval"), so that parts do not repeat each other.
+/// Derives the seed of one part of a run ("stage1", "stage2", "eval"), so that the parts use different streams.
 pub fn derive_seed(seed: u64, purpose: &str) -> u64 {
     mix(seed ^ mix(purpose_tag(purpose)))
 }
 
-/// Makes the generator for one item of a batch: batch slot `slot` at `step`, on its `attempt`-th scene.
+/// Returns the generator of one item of a batch: slot `slot` at step `step`, in its `attempt`-th attempt.
 ///
-/// `purpose` keeps uses apart: equal numbers with different purposes give unrelated streams.
+/// Equal numbers with different purposes give unrelated streams.
 pub fn item_rng(seed: u64, step: u64, slot: u32, attempt: u32, purpose: &str) -> ChaCha8Rng {
     keyed_rng(seed, purpose, step, (u64::from(attempt) << 32) | u64::from(slot))
 }
 
-/// Makes the generator for what all items of the batch at `step` share, such as the number of contexts.
+/// Returns the generator of the values that all items of the batch at `step` share, such as the number of contexts.
 pub fn step_rng(seed: u64, step: u64, purpose: &str) -> ChaCha8Rng {
     keyed_rng(seed, purpose, step, u64::from(WHOLE_BATCH))
 }
 
-/// Draws uniformly from `0..count`; `count` must be at least 1.
+/// Samples uniformly from `0..count`; `count` must be at least 1.
 ///
-/// Written out (high half of a 64 x 64 bit product) instead of taken from `rand`, whose ranges may draw
-/// differently in a later release. The bias is below `count / 2^64`.
+/// The value is the high half of a 64 x 64 bit product, because the ranges of `rand` may sample differently in a later
+/// release. The bias is below `count / 2^64`.
 pub fn uniform_below(rng: &mut impl Rng, count: usize) -> usize {
-    debug_assert!(count > 0, "nothing to draw from");
+    debug_assert!(count > 0, "the range is empty");
     ((u128::from(rng.next_u64()) * count as u128) >> 64) as usize
 }
 
-/// Draws uniformly from `low..=high`.
+/// Samples uniformly from `low..=high`.
 pub(crate) fn between(rng: &mut impl Rng, low: usize, high: usize) -> usize {
     low + uniform_below(rng, high - low + 1)
 }
 
-/// Draws uniformly from `[0, 1)`, in steps of `2^-53`.
+/// Samples uniformly from `[0, 1)`, in steps of `2^-53`.
 pub(crate) fn unit(rng: &mut impl Rng) -> f64 {
     (rng.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
 }
 
-/// Draws `count` distinct values of `0..range` uniformly, in increasing order (Floyd's algorithm).
+/// Samples `count` distinct values of `0..range` uniformly, in increasing order (Floyd's algorithm).
 pub fn sample_distinct(rng: &mut impl Rng, range: usize, count: usize) -> Vec<usize> {
-    let mut drawn = Vec::with_capacity(count);
+    let mut sampled = Vec::with_capacity(count);
     for last in range - count..range {
         let value = uniform_below(rng, last + 1);
-        drawn.push(if drawn.contains(&value) { last } else { value });
+        sampled.push(if sampled.contains(&value) { last } else { value });
     }
-    drawn.sort_unstable();
-    drawn
+    sampled.sort_unstable();
+    sampled
 }
 
-/// Draws `count` of `values` without replacement, in random order.
+/// Samples `count` of `values` without replacement, in random order.
 pub(crate) fn sample_from(rng: &mut impl Rng, mut values: Vec<usize>, count: usize) -> Vec<usize> {
     for i in 0..count {
         let j = between(rng, i, values.len() - 1);
@@ -66,7 +66,8 @@ pub(crate) fn sample_from(rng: &mut impl Rng, mut values: Vec<usize>, count: usi
     values
 }
 
-/// The 32-byte key of the cipher is the four numbers themselves: distinct numbers cannot meet in one stream.
+/// Returns the generator whose 32-byte cipher key consists of the four numbers, so that distinct numbers give distinct
+/// streams.
 fn keyed_rng(seed: u64, purpose: &str, step: u64, item: u64) -> ChaCha8Rng {
     let mut key = [0; 32];
     for (bytes, value) in key.chunks_exact_mut(8).zip([seed, purpose_tag(purpose), step, item]) {
@@ -75,12 +76,12 @@ fn keyed_rng(seed: u64, purpose: &str, step: u64, item: u64) -> ChaCha8Rng {
     ChaCha8Rng::from_seed(key)
 }
 
-/// FNV-1a hash of a purpose's name.
+/// Returns the FNV-1a hash of a purpose.
 fn purpose_tag(purpose: &str) -> u64 {
     purpose.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
 }
 
-/// The finaliser of `SplitMix64`: a bijection of 64 bits that spreads every input bit over the output.
+/// Mixes 64 bits with the finaliser of `SplitMix64`, a bijection.
 pub(crate) fn mix(value: u64) -> u64 {
     let value = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
     let value = (value ^ (value >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -129,14 +130,14 @@ mod tests {
         #[test]
         fn distinct_values_are_distinct_sorted_and_in_range(seed: u64, range in 0_usize..50, share in 0.0_f64..=1.0) {
             let count = (range as f64 * share) as usize;
-            let drawn = sample_distinct(&mut step_rng(seed, 0, "test"), range, count);
-            prop_assert_eq!(drawn.len(), count);
-            prop_assert!(drawn.windows(2).all(|pair| pair[0] < pair[1]));
-            prop_assert!(drawn.iter().all(|&value| value < range));
+            let sampled = sample_distinct(&mut step_rng(seed, 0, "test"), range, count);
+            prop_assert_eq!(sampled.len(), count);
+            prop_assert!(sampled.windows(2).all(|pair| pair[0] < pair[1]));
+            prop_assert!(sampled.iter().all(|&value| value < range));
         }
 
         #[test]
-        fn draws_stay_below_their_count(seed: u64, count in 1_usize..=usize::MAX) {
+        fn samples_stay_below_their_count(seed: u64, count in 1_usize..=usize::MAX) {
             prop_assert!(uniform_below(&mut step_rng(seed, 0, "test"), count) < count);
         }
     }

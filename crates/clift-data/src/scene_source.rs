@@ -12,39 +12,39 @@ use crate::image::rgb_image::RgbImage;
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
 pub enum Split {
-    /// Scenes to train on.
+    /// Training scenes.
     #[default]
     Train,
-    /// Scenes held back for testing.
+    /// Test scenes.
     Test,
 }
 
-/// Scenes with random access to single frames: chunks or photos on disk, or synthetic ones made on the fly.
+/// Scenes with random access to single frames: chunks or photos on disk, or synthetic rooms.
 pub trait SceneSource: Send + Sync {
-    /// How many scenes there are.
+    /// Returns the number of scenes.
     fn num_scenes(&self) -> usize;
-    /// Key of scene `scene` in `0..num_scenes()`.
+    /// Returns the key of scene `scene`, in `0..num_scenes()`.
     fn key(&self, scene: usize) -> &str;
-    /// Position of a key, if the source has it.
+    /// Returns the index of the scene with this key.
     fn find(&self, key: &str) -> Option<usize>;
-    /// Cameras of every frame of a scene, in frame order.
+    /// Returns the cameras of a scene, in frame order.
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError>;
-    /// How many frames a scene has; unless a source knows better, by reading its cameras.
+    /// Returns the number of frames of a scene. The default reads the cameras.
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.cameras(scene)?.len())
     }
-    /// Time stamp of every frame: microseconds in RealEstate10K, otherwise frame numbers; by default positions.
+    /// Returns the time stamp of every frame: microseconds in RealEstate10K, frame numbers otherwise. The default returns
+    /// the frame indices.
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
         Ok((0..self.num_frames(scene)? as i64).collect())
     }
-    /// Where a scene comes from; empty if nothing says.
+    /// Returns the URL of a scene; empty if unknown.
     fn url(&self, _scene: usize) -> Result<String, DataError> {
         Ok(String::new())
     }
     /// Decodes one frame.
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError>;
-    /// The JPEG or PNG file that [`SceneSource::frame`] decodes, byte by byte; `None` where there is none: the picture
-    /// is computed, or resampled on load.
+    /// Returns the bytes of the JPEG or PNG file of a frame; `None` for images that are computed, or resampled on load.
     fn encoded_frame(&self, _scene: usize, _frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         Ok(None)
     }

@@ -1,83 +1,84 @@
-//! The ledger of what was left out: every skipped scene and frame with its reason, counted and printable.
+//! Skipped scenes and frames with their reasons.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// Names of frames that a printed ledger shows per reason; its file has all of them.
+/// Number of names per reason in a printed report.
 const MAX_NAMES_SHOWN: usize = 3;
 
-/// Reasons that a printed ledger shows.
+/// Number of reasons in a printed report.
 const MAX_REASONS_SHOWN: usize = 8;
 
-/// One scene that was left out.
+/// A skipped scene.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkippedScene {
-    /// Key of the scene.
+    /// Scene key.
     pub key: String,
-    /// Why, in words that equal cases share, so that they can be counted.
+    /// Reason, with the same text for equal cases so that they can be counted.
     pub reason: String,
 }
 
-/// One frame that was left out.
+/// A skipped frame.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkippedFrame {
-    /// Key of its scene.
+    /// Scene key.
     pub key: String,
-    /// What its file calls it: the name of a picture, or a time stamp.
+    /// Name of the frame in the camera file: an image name or a time stamp.
     pub frame: String,
-    /// Why, in words that equal cases share.
+    /// Reason, with the same text for equal cases.
     pub reason: String,
 }
 
-/// How many scenes there were and what was left out. Prints as `2 of 3 scenes used; 1 shorter than 46 frames`.
+/// Number of examined scenes, and the scenes and frames that were skipped. Prints as
+/// `2 of 3 scenes used; 1 shorter than 46 frames`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkipReport {
-    /// Scenes looked at, used or not.
+    /// Number of examined scenes, used and skipped.
     pub num_scenes: usize,
-    /// Scenes left out, in the order they were met.
+    /// Skipped scenes, in the order of examination.
     pub skips: Vec<SkippedScene>,
-    /// Frames left out of scenes: those that are used without them, and those that are left out because of them.
+    /// Skipped frames, of used scenes and of scenes that were skipped because of these frames.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub frames: Vec<SkippedFrame>,
-    /// What else is to be known about the scenes, in whole sentences without a stop.
+    /// Further notes on the scenes, without a full stop.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<String>,
 }
 
 impl SkipReport {
-    /// A ledger of `num_scenes` scenes of which none is left out yet.
+    /// Creates a report of `num_scenes` scenes without skipped ones.
     pub fn new(num_scenes: usize) -> Self {
         Self { num_scenes, ..Self::default() }
     }
 
-    /// Notes that a scene is left out.
+    /// Adds a skipped scene.
     pub fn skip(&mut self, key: impl Into<String>, reason: impl Into<String>) {
         self.skips.push(SkippedScene { key: key.into(), reason: reason.into() });
     }
 
-    /// Notes that a frame is left out.
+    /// Adds a skipped frame.
     pub fn skip_frame(&mut self, key: impl Into<String>, frame: impl Into<String>, reason: impl Into<String>) {
         self.frames.push(SkippedFrame { key: key.into(), frame: frame.into(), reason: reason.into() });
     }
 
-    /// Whether anything was left out.
-    pub fn has_gaps(&self) -> bool {
+    /// Returns whether a scene or a frame was skipped.
+    pub fn has_skips(&self) -> bool {
         !(self.skips.is_empty() && self.frames.is_empty())
     }
 
-    /// Whether there is anything to tell: something left out, or a note.
-    pub fn has_news(&self) -> bool {
-        self.has_gaps() || !self.notes.is_empty()
+    /// Returns whether the report has a skipped scene, a skipped frame or a note.
+    pub fn has_content(&self) -> bool {
+        self.has_skips() || !self.notes.is_empty()
     }
 
-    /// Scenes that are used.
+    /// Returns the number of used scenes.
     pub fn num_used(&self) -> usize {
         self.num_scenes.saturating_sub(self.skips.len())
     }
 
-    /// How many scenes each reason left out, by reason.
+    /// Returns the number of skipped scenes per reason.
     pub fn counts(&self) -> BTreeMap<&str, usize> {
         let mut counts = BTreeMap::new();
         for skip in &self.skips {
@@ -86,7 +87,15 @@ impl SkipReport {
         counts
     }
 
-    /// Names of the frames that each reason left out, by reason.
+    /// Appends all entries of another report.
+    pub(crate) fn append(&mut self, other: Self) {
+        self.num_scenes += other.num_scenes;
+        self.skips.extend(other.skips);
+        self.frames.extend(other.frames);
+        self.notes.extend(other.notes);
+    }
+
+    /// Returns the names of the skipped frames per reason.
     pub fn frame_names(&self) -> BTreeMap<&str, Vec<&str>> {
         let mut names: BTreeMap<_, Vec<_>> = BTreeMap::new();
         for skip in &self.frames {
@@ -113,7 +122,7 @@ impl fmt::Display for SkipReport {
     }
 }
 
-/// The first few names, and dots for the others.
+/// Joins the first few names, with dots for the others.
 pub(crate) fn first_few<S: AsRef<str>>(names: &[S]) -> String {
     let mut shown: Vec<&str> = names.iter().take(MAX_NAMES_SHOWN).map(AsRef::as_ref).collect();
     if names.len() > shown.len() {
@@ -122,7 +131,7 @@ pub(crate) fn first_few<S: AsRef<str>>(names: &[S]) -> String {
     shown.join(", ")
 }
 
-/// A count with its noun: `1 scene`, `2 scenes`.
+/// Formats a count with its noun: `1 scene`, `2 scenes`.
 pub(crate) fn plural(count: usize, noun: &str) -> String {
     format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
@@ -132,45 +141,35 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_ledger_prints_used_and_total_and_counts_each_reason() {
-        let mut ledger = SkipReport::new(5);
-        assert_eq!(ledger.to_string(), "5 of 5 scenes used");
-        ledger.skip("a", "shorter than 46 frames");
-        ledger.skip("b", "null in the evaluation index");
-        ledger.skip("c", "shorter than 46 frames");
-        assert_eq!(ledger.to_string(), "2 of 5 scenes used; 1 null in the evaluation index; 2 shorter than 46 frames");
-        (0..8).for_each(|number| ledger.skip("d", format!("broken {number}")));
-        assert!(ledger.to_string().ends_with("; 1 broken 7; 3 for other reasons"), "{ledger}");
+    fn reports_print_used_scenes_and_count_reasons() {
+        let mut report = SkipReport::new(5);
+        assert_eq!(report.to_string(), "5 of 5 scenes used");
+        report.skip("a", "shorter than 46 frames");
+        report.skip("b", "null in the evaluation index");
+        report.skip("c", "shorter than 46 frames");
+        assert_eq!(report.to_string(), "2 of 5 scenes used; 1 null in the evaluation index; 2 shorter than 46 frames");
+        (0..8).for_each(|number| report.skip("d", format!("broken {number}")));
+        assert!(report.to_string().ends_with("; 1 broken 7; 3 for other reasons"), "{report}");
     }
 
     #[test]
-    fn frames_left_out_are_named_and_counted_and_notes_follow() {
-        let mut ledger = SkipReport::new(1);
-        assert!(!ledger.has_gaps());
+    fn reports_print_skipped_frames_then_notes() {
+        let mut report = SkipReport::new(1);
+        assert!(!report.has_content());
+        report.notes.push("both splits hold all scenes".into());
+        assert!(report.has_content() && !report.has_skips());
         for frame in ["1.jpg", "5.jpg", "6.jpg", "7.jpg"] {
-            ledger.skip_frame("fox", frame, "without a picture");
+            report.skip_frame("fox", frame, "without an image");
         }
-        ledger.skip_frame("fox", "9.jpg", "named twice");
-        ledger.notes.push("both splits hold all scenes".into());
+        report.skip_frame("fox", "9.jpg", "named twice");
         let expected = "1 of 1 scenes used; 1 frame named twice (9.jpg); \
-            4 frames without a picture (1.jpg, 5.jpg, 6.jpg, ..); both splits hold all scenes";
-        assert_eq!(ledger.to_string(), expected);
-        assert!(ledger.has_gaps());
+            4 frames without an image (1.jpg, 5.jpg, 6.jpg, ..); both splits hold all scenes";
+        assert_eq!(report.to_string(), expected);
+        assert!(report.has_skips());
     }
 
     #[test]
-    fn a_note_alone_is_news_and_no_gap() {
-        let mut ledger = SkipReport::new(1);
-        assert!(!ledger.has_news());
-        ledger.notes.push("only model 0 is used".into());
-        assert!(ledger.has_news() && !ledger.has_gaps());
-        ledger = SkipReport::new(1);
-        ledger.skip("a", "shorter than 46 frames");
-        assert!(ledger.has_news());
-    }
-
-    #[test]
-    fn a_ledger_without_frames_is_written_as_before_and_older_files_are_read() {
+    fn files_without_frames_and_notes_are_read() {
         let text = serde_json::to_string(&SkipReport::new(2)).unwrap();
         assert_eq!(text, r#"{"num_scenes":2,"skips":[]}"#);
         assert_eq!(serde_json::from_str::<SkipReport>(&text).unwrap(), SkipReport::new(2));

@@ -23,24 +23,25 @@ pub fn upper_median(values: &[f64]) -> f64 {
     if values.is_empty() { f64::NAN } else { *values.select_nth_unstable_by(middle, f64::total_cmp).1 }
 }
 
-/// Returns the mean, summed in the given order; NaN for no values.
-pub fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len() as f64
+/// Returns the mean, summed in the given order; `None` for no values.
+pub fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// Returns the standard error of the mean: the sample standard deviation over the square root of the count. NaN for
+/// Returns the standard error of the mean: the sample standard deviation over the square root of the count. `None` for
 /// fewer than two values.
-pub fn standard_error(values: &[f64]) -> f64 {
-    let (count, mean) = (values.len() as f64, mean(values));
+pub fn standard_error(values: &[f64]) -> Option<f64> {
+    let count = values.len() as f64;
+    let mean = mean(values)?;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    (squares / (count - 1.0) / count).sqrt()
+    (values.len() > 1).then(|| (squares / (count - 1.0) / count).sqrt())
 }
 
 /// Returns the smallest value that 95 % of the values do not exceed (nearest rank): the largest of fewer than 20
 /// values, NaN for no values.
 pub fn p95(values: &[f64]) -> f64 {
     let sorted = sorted(values);
-    // In whole numbers: 0.95 * 20 is above 19 in binary.
+    // Integer arithmetic: 0.95 * 20 exceeds 19 in binary.
     let rank = (sorted.len() * 95).div_ceil(100);
     rank.checked_sub(1).map_or(f64::NAN, |index| sorted[index])
 }
@@ -105,8 +106,8 @@ mod tests {
     #[test]
     fn standard_error_divides_by_one_less_than_the_count() {
         // Deviation sqrt(32), over sqrt(2).
-        assert_eq!((mean(&[22.0, 30.0]), standard_error(&[22.0, 30.0])), (26.0, 4.0));
-        assert!(mean(&[]).is_nan() && standard_error(&[]).is_nan() && standard_error(&[1.0]).is_nan());
+        assert_eq!((mean(&[22.0, 30.0]), standard_error(&[22.0, 30.0])), (Some(26.0), Some(4.0)));
+        assert_eq!((mean(&[]), standard_error(&[]), standard_error(&[1.0])), (None, None, None));
     }
 
     #[test]

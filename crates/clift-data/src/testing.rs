@@ -1,4 +1,4 @@
-//! Data sources made for tests.
+//! Data sources for tests.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ type ChangeCameras = dyn Fn(usize, Vec<Camera>) -> Result<Vec<Camera>, DataError
 type ChangeFrame = dyn Fn(usize, usize, RgbImage) -> Result<RgbImage, DataError> + Send + Sync;
 type EncodedFrame = dyn Fn(usize, usize) -> Option<Vec<u8>> + Send + Sync;
 
-/// A source whose cameras and frames pass through a test's functions; without any they are those of another source.
+/// A source that passes the cameras and frames of another source through functions of a test.
 pub struct TestSource {
     base: Arc<dyn SceneSource>,
     cameras: Box<ChangeCameras>,
@@ -20,7 +20,7 @@ pub struct TestSource {
 }
 
 impl TestSource {
-    /// The scenes of `base`.
+    /// Wraps `base` without changes.
     pub fn new(base: impl SceneSource + 'static) -> Self {
         Self {
             base: Arc::new(base),
@@ -30,7 +30,7 @@ impl TestSource {
         }
     }
 
-    /// Changes the cameras of a scene.
+    /// Sets the function that changes the cameras of a scene.
     pub fn with_cameras(
         self,
         change: impl Fn(usize, Vec<Camera>) -> Result<Vec<Camera>, DataError> + Send + Sync + 'static,
@@ -38,7 +38,7 @@ impl TestSource {
         Self { cameras: Box::new(change), ..self }
     }
 
-    /// Changes a frame of a scene.
+    /// Sets the function that changes a frame.
     pub fn with_frames(
         self,
         change: impl Fn(usize, usize, RgbImage) -> Result<RgbImage, DataError> + Send + Sync + 'static,
@@ -46,7 +46,7 @@ impl TestSource {
         Self { frame: Box::new(change), ..self }
     }
 
-    /// Fails for every frame of the scenes that `is_torn`.
+    /// Makes every frame of the scenes with `is_torn` fail.
     pub fn with_torn_frames(self, is_torn: impl Fn(usize) -> bool + Send + Sync + 'static) -> Self {
         self.with_frames(move |scene, frame, decoded| {
             let torn = || DataError::BadImage { key: scene.to_string(), frame, what: "it is torn".into() };
@@ -54,7 +54,7 @@ impl TestSource {
         })
     }
 
-    /// Adds image files.
+    /// Sets the function that returns image files.
     pub fn with_encoded_frames(
         self,
         encoded_frame: impl Fn(usize, usize) -> Option<Vec<u8>> + Send + Sync + 'static,
@@ -84,7 +84,7 @@ impl SceneSource for TestSource {
     }
 }
 
-/// Scenes without cameras and images, of these numbers of frames.
+/// Scenes with given numbers of frames, without cameras and images.
 pub struct Lengths {
     lengths: Vec<usize>,
     pub keys: Vec<String>,

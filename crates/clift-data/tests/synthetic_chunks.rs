@@ -1,4 +1,4 @@
-//! Synthetic scenes, written as chunks and read back.
+//! Synthetic scenes written as chunks and read back.
 
 use std::path::Path;
 
@@ -45,7 +45,7 @@ fn frames_round_trip_and_cameras_to_f32() {
             assert_eq!(got.len(), expected.len());
             for (got, expected) in got.iter().zip(&expected) {
                 for (got, expected) in numbers(got).into_iter().zip(numbers(expected)) {
-                    // Rooms are up to 4 wide, so a stored w2c is off by 2^-23, and its inverse by a few of those.
+                    // Rooms are up to 4 wide: a stored w2c has an error of 2^-23, its inverse a few times that.
                     assert!((got - expected).abs() < 2e-6, "{got} against {expected}");
                 }
             }
@@ -67,16 +67,4 @@ fn chunks_split_by_size_and_keep_the_description() {
     };
     assert_eq!(described(stored.clone()), described(made));
     assert_eq!(stored.image_size, Some([40, 24]));
-}
-
-#[cfg(unix)]
-#[test]
-fn written_files_have_ordinary_permissions() {
-    use std::os::unix::fs::PermissionsExt;
-    let root = tempfile::tempdir().unwrap();
-    write(root.path());
-    std::fs::write(root.path().join("other"), "").unwrap();
-    let mode = |name: &str| root.path().join(name).metadata().unwrap().permissions().mode();
-    assert_eq!(mode("train/000000.torch"), mode("other"));
-    assert_eq!(mode("train/index.json"), mode("other"));
 }

@@ -82,7 +82,7 @@ fn scenes_skipped_at_opening_are_listed() {
     copy_folder(&data.join("attic"), &data.join("empty"));
     std::fs::remove_dir_all(data.join("empty/images")).unwrap();
     let ran = convert(&data, &place.at("out"), &["--to", "chunks"]).ok();
-    assert!(ran.stderr.contains("left out empty: without any picture"), "{}", ran.stderr);
+    assert!(ran.stderr.contains("left out empty: without any image"), "{}", ran.stderr);
     assert!(ran.stderr.contains("skipped.json"), "{}", ran.stderr);
     let skipped = place.json("out/test/skipped.json");
     assert_eq!((&skipped["num_scenes"], &skipped["skips"][0]["key"]), (&2.into(), &"empty".into()));

@@ -17,7 +17,7 @@ fn captures_train_and_render_and_name_missing_frames() {
     let place = Place::new();
     let ran = place.train("run", &[&data("auto", "capture", ""), "clusters.num_scenes=0"], &[]).ok();
     let text = format!("{}{}", ran.stdout, ran.stderr);
-    let expected = "train: 1 of 1 scenes used; 1 frame without a picture (./images/99); no train/ and test/ folders";
+    let expected = "train: 1 of 1 scenes used; 1 frame without an image (./images/99); no folders train/ and test/";
     assert!(text.contains(expected), "{text}");
     let skipped = place.json("run/skipped-train.json");
     assert_eq!(skipped["frames"][0]["frame"], "./images/99");
@@ -42,7 +42,7 @@ fn dl3dv_training_requires_a_test_scene_list() {
     std::fs::write(place.at("none.txt"), "").unwrap();
     let files = format!("files={{test_scenes='{}'}},", place.at("none.txt").display());
     let ran = place.train("run", &[&data("dl3dv", "dl3dv", &files)], &["--only", "stage1"]).ok();
-    assert!(format!("{}{}", ran.stdout, ran.stderr).contains("both halves are the same scenes"));
+    assert!(format!("{}{}", ran.stdout, ran.stderr).contains("both splits are the same scenes"));
     let files = format!("{files} filters={{min_frames=9}},");
     place
         .train("other", &[&data("auto", "dl3dv", &files)], &[])

@@ -164,7 +164,7 @@ fn unusable_scenes_are_skipped_and_named() {
             place.truncate("data/train/000001.torch");
             data
         }),
-        ("which is not allowed; nothing was run", |place| {
+        ("which is not on the allow-list; no code was run", |place| {
             let data = two_chunks(place);
             let hostile = repository("data-fixtures/hostile/calls_system.torch");
             std::fs::copy(hostile, data.join("train/000001.torch")).unwrap();
@@ -219,7 +219,7 @@ fn too_short_scenes_are_skipped_at_the_start() {
 fn too_small_images_are_refused_with_the_fix() {
     let place = Place::new();
     train_on(&place, &repository(MINI), &["data.height=64"], &[])
-        .fails_with(1, &["cannot make a 32x64 picture from one of 64x36", "lower the configured size"]);
+        .fails_with(1, &["cannot make a 32x64 image from a 64x36 image", "lower the configured size"]);
 }
 
 #[test]

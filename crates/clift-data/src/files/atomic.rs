@@ -1,21 +1,19 @@
-//! Files and folders that are whole or absent: written under a temporary name, synced, renamed.
-//!
-//! A rename is on the disk once the folder it happened in is synced; until then a power cut may undo it.
+//! Atomic writes: a file or folder is written under a temporary name, synced and renamed, so that it is complete under
+//! its final name. The parent folder is synced as well; without that, a power cut may undo the rename.
 
 use std::fs::File;
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 
-/// Start of every temporary file's name: what a kill leaves behind can be told from everything else.
+/// Prefix of the names of temporary files and folders; [`remove_leftovers`] finds them by it.
 pub const TEMPORARY: &str = ".clift-";
 
-/// Replaces `path` with `bytes`. No reader ever sees half a file, and after an error the former one is untouched.
-///
-/// Unlike other temporary files, the result may be read by everyone whom the umask lets: it is meant to be kept.
+/// Replaces the file at `path` atomically; after an error the former file is unchanged. The file has the permissions of
+/// the umask.
 ///
 /// # Errors
-/// The operating system's.
-pub fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+/// Errors of the operating system.
+pub fn replace_file(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let folder = folder_of(path);
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY);
@@ -28,14 +26,14 @@ pub fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     sync_folder(folder)
 }
 
-/// Gives the finished folder `temporary` the name `path`, which must be free: syncs its files, then the folder, renames,
-/// and syncs the rename. Folders inside it are not looked into.
+/// Renames the finished folder `temporary` to `path`, which must not exist, after syncing its files. Subfolders are not
+/// allowed.
 ///
 /// # Errors
-/// The operating system's.
-pub fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
+/// Errors of the operating system.
+pub fn publish_folder(temporary: &Path, path: &Path) -> std::io::Result<()> {
     for item in std::fs::read_dir(temporary)? {
-        // Opened for writing, because Windows syncs no other file.
+        // Windows syncs only files that are open for writing.
         File::options().write(true).open(item?.path())?.sync_all()?;
     }
     sync_folder(temporary)?;
@@ -43,10 +41,10 @@ pub fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
     sync_folder(folder_of(path))
 }
 
-/// Makes a folder, with those above it, that survives a power cut.
+/// Creates a folder and its missing parents, and syncs them.
 ///
 /// # Errors
-/// The operating system's.
+/// Errors of the operating system.
 pub fn make_folder(path: &Path) -> std::io::Result<()> {
     let is_new = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
     let new: Vec<&Path> = path.ancestors().take_while(is_new).collect();
@@ -54,10 +52,10 @@ pub fn make_folder(path: &Path) -> std::io::Result<()> {
     new.into_iter().rev().try_for_each(|folder| sync_folder(folder_of(folder)))
 }
 
-/// Removes a folder so that a kill in the middle leaves no half of it under its name: it is renamed first.
+/// Removes a folder atomically: renames it first, then deletes it.
 ///
 /// # Errors
-/// The operating system's.
+/// Errors of the operating system.
 pub fn remove_folder(path: &Path) -> std::io::Result<()> {
     let doomed = path.with_extension("tmp");
     if doomed.exists() {
@@ -67,11 +65,11 @@ pub fn remove_folder(path: &Path) -> std::io::Result<()> {
     std::fs::remove_dir_all(&doomed)
 }
 
-/// Removes what kills in the middle of [`replace`], of saving weights or of [`crate::files::staged_dir::StagedDir`] have left in
-/// a folder and in those below it. Nobody may be writing there.
+/// Removes the temporary files and folders that killed processes left in `folder` and below it. No other process may
+/// write there. A missing folder is no error.
 ///
 /// # Errors
-/// The operating system's; a folder that is not there holds nothing.
+/// Errors of the operating system.
 pub fn remove_leftovers(folder: &Path) -> std::io::Result<()> {
     let items = match std::fs::read_dir(folder) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
@@ -91,11 +89,10 @@ pub fn remove_leftovers(folder: &Path) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Makes renames and new names in a folder survive a power cut.
+/// Syncs the names in a folder, where the system supports that: Windows and some file systems do not.
 ///
 /// # Errors
-/// The operating system's. A file system that syncs no folders is taken at its word, and so is Windows, which cannot
-/// open one.
+/// Errors of the operating system.
 pub fn sync_folder(folder: &Path) -> std::io::Result<()> {
     if cfg!(windows) {
         return Ok(());
@@ -122,88 +119,78 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_replaced_and_nothing_else_is_left_behind() {
+    fn replaced_files_leave_no_temporary_files() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.json");
-        replace(&path, b"old").unwrap();
-        replace(&path, b"new").unwrap();
+        replace_file(&path, b"old").unwrap();
+        replace_file(&path, b"new").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"new");
         assert_eq!(names(folder.path()), ["a.json"]);
-        assert!(replace(&folder.path().join("missing/a.json"), b"x").is_err());
+        assert!(replace_file(&folder.path().join("missing/a.json"), b"x").is_err());
     }
 
     #[cfg(unix)]
     #[test]
-    fn the_file_has_the_permissions_of_other_files() {
+    fn replaced_files_have_ordinary_permissions() {
         use std::os::unix::fs::PermissionsExt;
         let folder = tempfile::tempdir().unwrap();
         let mode = |name: &str| std::fs::metadata(folder.path().join(name)).unwrap().permissions().mode();
-        replace(&folder.path().join("ours"), b"x").unwrap();
+        replace_file(&folder.path().join("ours"), b"x").unwrap();
         std::fs::write(folder.path().join("plain"), b"x").unwrap();
         assert_eq!(mode("ours"), mode("plain"));
     }
 
     #[test]
-    fn a_folder_is_published_whole_and_only_under_a_free_name() {
-        let place = tempfile::tempdir().unwrap();
-        let (temporary, path) = (place.path().join("step-1.tmp"), place.path().join("step-1"));
+    fn folders_are_published_under_free_names_only() {
+        let root = tempfile::tempdir().unwrap();
+        let (temporary, path) = (root.path().join("step-1.tmp"), root.path().join("step-1"));
         std::fs::create_dir(&temporary).unwrap();
         std::fs::write(temporary.join("model"), b"weights").unwrap();
-        publish(&temporary, &path).unwrap();
+        publish_folder(&temporary, &path).unwrap();
         assert_eq!(std::fs::read(path.join("model")).unwrap(), b"weights");
-        assert_eq!(names(place.path()), ["step-1"]);
+        assert_eq!(names(root.path()), ["step-1"]);
         std::fs::create_dir(&temporary).unwrap();
-        assert!(publish(&temporary, &path).is_err(), "the folder that is there is not empty");
+        assert!(publish_folder(&temporary, &path).is_err(), "the target exists and is not empty");
         assert_eq!(names(&path), ["model"]);
     }
 
     #[test]
-    fn folders_are_made_with_those_above_them_and_may_be_there_already() {
-        let place = tempfile::tempdir().unwrap();
+    fn folders_are_made_with_their_parents() {
+        let root = tempfile::tempdir().unwrap();
         for path in ["a/b/c", "a/b/c", "a/b/d"] {
-            make_folder(&place.path().join(path)).unwrap();
+            make_folder(&root.path().join(path)).unwrap();
         }
-        assert_eq!(names(&place.path().join("a/b")), ["c", "d"]);
-        std::fs::write(place.path().join("file"), b"x").unwrap();
-        assert!(make_folder(&place.path().join("file/a")).is_err());
+        assert_eq!(names(&root.path().join("a/b")), ["c", "d"]);
+        std::fs::write(root.path().join("file"), b"x").unwrap();
+        assert!(make_folder(&root.path().join("file/a")).is_err());
     }
 
     #[test]
-    fn a_folder_is_removed_with_what_an_earlier_removal_left() {
-        let place = tempfile::tempdir().unwrap();
+    fn folders_are_removed_with_former_remains() {
+        let root = tempfile::tempdir().unwrap();
         for name in ["step-1", "step-1.tmp"] {
-            std::fs::create_dir(place.path().join(name)).unwrap();
-            std::fs::write(place.path().join(name).join("model"), b"weights").unwrap();
+            std::fs::create_dir(root.path().join(name)).unwrap();
+            std::fs::write(root.path().join(name).join("model"), b"weights").unwrap();
         }
-        remove_folder(&place.path().join("step-1")).unwrap();
-        assert!(names(place.path()).is_empty());
-        assert!(remove_folder(&place.path().join("step-1")).is_err());
+        remove_folder(&root.path().join("step-1")).unwrap();
+        assert!(names(root.path()).is_empty());
+        assert!(remove_folder(&root.path().join("step-1")).is_err());
     }
 
     #[test]
-    fn leftovers_are_removed_from_every_folder_and_nothing_else() {
-        let place = tempfile::tempdir().unwrap();
-        std::fs::create_dir(place.path().join("eval")).unwrap();
-        std::fs::create_dir_all(place.path().join("stage2/.clift-z3")).unwrap();
+    fn only_leftovers_are_removed_from_all_folders() {
+        let root = tempfile::tempdir().unwrap();
+        std::fs::create_dir(root.path().join("eval")).unwrap();
+        std::fs::create_dir_all(root.path().join("stage2/.clift-z3")).unwrap();
         let files =
             [".clift-x1", "eval/.clift-y2", "stage2/.clift-z3/.tmpQ", "eval/report.html", ".hidden", "clift-notes"];
         for name in files {
-            std::fs::write(place.path().join(name), b"x").unwrap();
+            std::fs::write(root.path().join(name), b"x").unwrap();
         }
-        remove_leftovers(place.path()).unwrap();
-        assert_eq!(names(place.path()), [".hidden", "clift-notes", "eval", "stage2"]);
-        assert!(names(&place.path().join("stage2")).is_empty());
-        assert_eq!(names(&place.path().join("eval")), ["report.html"]);
-        remove_leftovers(&place.path().join("missing")).unwrap();
-    }
-
-    /// What `replace` leaves when the process is killed before the rename is found by its name.
-    #[test]
-    fn temporary_files_have_the_name_that_leftovers_are_known_by() {
-        let place = tempfile::tempdir().unwrap();
-        let file = tempfile::Builder::new().prefix(TEMPORARY).tempfile_in(place.path()).unwrap();
-        let (_, path) = file.keep().unwrap();
-        remove_leftovers(place.path()).unwrap();
-        assert!(!path.exists());
+        remove_leftovers(root.path()).unwrap();
+        assert_eq!(names(root.path()), [".hidden", "clift-notes", "eval", "stage2"]);
+        assert!(names(&root.path().join("stage2")).is_empty());
+        assert_eq!(names(&root.path().join("eval")), ["report.html"]);
+        remove_leftovers(&root.path().join("missing")).unwrap();
     }
 }

@@ -5,10 +5,10 @@ use std::path::Path;
 
 use crate::error::DataError;
 
-/// Most entries of one folder that are looked at.
+/// Largest number of entries of a folder.
 const MAX_ENTRIES: usize = 1_000_000;
 
-/// Names of the entries of a folder, in no order; those that are no UTF-8 are passed over.
+/// Returns the names of the entries of a folder, unsorted, without names that are no UTF-8.
 ///
 /// # Errors
 /// [`DataError::Io`], and [`DataError::UnknownLayout`] for more than a million entries.
@@ -25,12 +25,12 @@ pub(crate) fn file_names(folder: &Path) -> Result<Vec<String>, DataError> {
     Ok(names)
 }
 
-/// Whether a name ends in a dot and `ending`, as it is written.
+/// Returns whether a name has the extension `ending`, case-sensitive.
 pub(crate) fn has_ending(name: &str, ending: &str) -> bool {
     name.strip_suffix(ending).is_some_and(|stem| stem.ends_with('.'))
 }
 
-/// Compares names as people count: `frame_2` before `frame_10`. Equal only for equal names.
+/// Compares names in natural order: `frame_2` before `frame_10`. Only equal names compare equal.
 pub(crate) fn natural_order(a: &str, b: &str) -> Ordering {
     let (mut left, mut right) = (a.as_bytes(), b.as_bytes());
     while let (Some(&x), Some(&y)) = (left.first(), right.first()) {
@@ -48,7 +48,7 @@ pub(crate) fn natural_order(a: &str, b: &str) -> Ordering {
     left.len().cmp(&right.len()).then_with(|| a.cmp(b))
 }
 
-/// Takes the digits at the front, without leading zeros.
+/// Splits off the leading digits; returns them without leading zeros.
 fn take_number<'a>(text: &mut &'a [u8]) -> &'a [u8] {
     let end = text.iter().position(|byte| !byte.is_ascii_digit()).unwrap_or(text.len());
     let (digits, rest) = text.split_at(end);
@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_in_the_order_people_count_in() {
+    fn natural_order_compares_numbers_by_value() {
         let mut names = ["b1", "frame_10.png", "frame_2.png", "frame_002.png", "frame_1a.png", "a", "10", "9", ""];
         names.sort_unstable_by(|a, b| natural_order(a, b));
         let sorted = ["", "9", "10", "a", "b1", "frame_1a.png", "frame_002.png", "frame_2.png", "frame_10.png"];

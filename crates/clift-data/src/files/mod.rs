@@ -1,8 +1,8 @@
 //! Reading and writing files safely.
 //!
-//! - `atomic`: atomic writes of files and folders
-//! - `staged_dir`: atomic write of several files
-//! - `bounded`: read with a size limit
+//! - `atomic`: atomic writes of a file or a folder
+//! - `staged_dir`: several files that appear together
+//! - `bounded`: reading with a size limit
 //! - `listing`: file names of a folder, natural order
 
 pub(crate) mod atomic;

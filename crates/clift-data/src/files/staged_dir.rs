@@ -1,4 +1,4 @@
-//! Files that appear in a folder when all of them are made: an error before leaves none.
+//! Several files that appear in a folder together, once all of them are complete.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -9,30 +9,29 @@ use tempfile::TempDir;
 
 use crate::files::atomic::sync_folder;
 
-/// Start of the names of temporary folders: what a kill leaves behind can be told from everything else, and
-/// [`crate::files::atomic::remove_leftovers`] takes it away too.
+/// Prefix of the names of temporary folders; starts with [`TEMPORARY`](crate::files::atomic::TEMPORARY).
 const PREFIX: &str = ".clift-unfinished-";
 
-/// A folder inside the one that its files are for. Dropped, it leaves nothing behind.
+/// A temporary folder inside the output folder. Dropping it without [`StagedDir::commit`] deletes its files.
 #[derive(Debug)]
 pub struct StagedDir {
     out: PathBuf,
-    /// Whether `out` was made for it.
+    /// Whether [`StagedDir::new`] created `out`.
     is_new: bool,
     files: Option<TempDir>,
 }
 
 impl StagedDir {
-    /// Makes `out` if it is not there, and removes what kills have left in it. Nobody else may be writing there.
+    /// Creates `out` if missing, and removes what killed processes left in it. No other process may write there.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Errors of the operating system.
     pub fn new(out: &Path) -> std::io::Result<Self> {
         let is_new = !out.exists();
         std::fs::create_dir_all(out)?;
         for item in std::fs::read_dir(out)? {
             let item = item?;
-            if is_unfinished(&item.file_name()) {
+            if is_temporary(&item.file_name()) {
                 std::fs::remove_dir_all(item.path())?;
             }
         }
@@ -40,16 +39,16 @@ impl StagedDir {
         Ok(Self { out: out.into(), is_new, files: Some(files) })
     }
 
-    /// Where files are to be written.
+    /// Returns the temporary folder, in which the files are to be written.
     pub fn path(&self) -> &Path {
         self.files.as_ref().map_or(&self.out, |files| files.path())
     }
 
-    /// Moves the files to where they are for, over those of the same names, one after the other. Returns the names.
+    /// Moves the files to the output folder, where they replace files of equal names. Returns the names.
     ///
     /// # Errors
-    /// The operating system's.
-    pub fn keep(mut self) -> std::io::Result<BTreeSet<OsString>> {
+    /// Errors of the operating system.
+    pub fn commit(mut self) -> std::io::Result<BTreeSet<OsString>> {
         let items = std::fs::read_dir(self.path())?;
         let names = items.map(|item| Ok(item?.file_name())).collect::<std::io::Result<BTreeSet<OsString>>>()?;
         for name in &names {
@@ -65,23 +64,23 @@ impl Drop for StagedDir {
     fn drop(&mut self) {
         drop(self.files.take());
         if self.is_new {
-            // Only while nothing else is in it.
+            // Fails, as intended, if the folder is not empty.
             let _ = std::fs::remove_dir(&self.out);
         }
     }
 }
 
-/// Whether a folder holds nothing but what kills have left in it; one that is not there does not.
+/// Returns whether a folder is missing or holds only temporary folders of killed processes.
 ///
 /// # Errors
-/// The operating system's.
-pub fn is_empty(folder: &Path) -> std::io::Result<bool> {
+/// Errors of the operating system.
+pub fn is_empty_folder(folder: &Path) -> std::io::Result<bool> {
     match std::fs::read_dir(folder) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(true),
         Err(error) => Err(error),
         Ok(items) => {
             for item in items {
-                if !is_unfinished(&item?.file_name()) {
+                if !is_temporary(&item?.file_name()) {
                     return Ok(false);
                 }
             }
@@ -90,7 +89,7 @@ pub fn is_empty(folder: &Path) -> std::io::Result<bool> {
     }
 }
 
-fn is_unfinished(name: &std::ffi::OsStr) -> bool {
+fn is_temporary(name: &std::ffi::OsStr) -> bool {
     name.to_string_lossy().starts_with(PREFIX)
 }
 
@@ -106,37 +105,37 @@ mod tests {
     }
 
     #[test]
-    fn files_appear_together_and_over_others() {
-        let place = tempfile::tempdir().unwrap();
-        let out = place.path().join("a/b");
-        let work = StagedDir::new(&out).unwrap();
-        std::fs::write(work.path().join("one"), "new").unwrap();
-        std::fs::write(work.path().join("two"), "new").unwrap();
+    fn committed_files_replace_others() {
+        let root = tempfile::tempdir().unwrap();
+        let out = root.path().join("a/b");
+        let staged = StagedDir::new(&out).unwrap();
+        std::fs::write(staged.path().join("one"), "new").unwrap();
+        std::fs::write(staged.path().join("two"), "new").unwrap();
         std::fs::write(out.join("one"), "old").unwrap();
         std::fs::write(out.join("other"), "old").unwrap();
-        let kept: Vec<OsString> = work.keep().unwrap().into_iter().collect();
-        assert_eq!(kept, ["one", "two"]);
+        let names_moved: Vec<OsString> = staged.commit().unwrap().into_iter().collect();
+        assert_eq!(names_moved, ["one", "two"]);
         assert_eq!(names(&out), ["one", "other", "two"]);
         assert_eq!(std::fs::read_to_string(out.join("one")).unwrap(), "new");
     }
 
     #[test]
-    fn nothing_stays_of_what_was_not_kept_and_of_what_was_killed() {
-        let place = tempfile::tempdir().unwrap();
-        let out = place.path().join("out");
-        let work = StagedDir::new(&out).unwrap();
-        std::fs::write(work.path().join("one"), "").unwrap();
-        drop(work);
-        assert!(!out.exists(), "was made for it");
+    fn uncommitted_and_killed_folders_are_removed() {
+        let root = tempfile::tempdir().unwrap();
+        let out = root.path().join("out");
+        let staged = StagedDir::new(&out).unwrap();
+        std::fs::write(staged.path().join("one"), "").unwrap();
+        drop(staged);
+        assert!(!out.exists(), "created by StagedDir");
 
         std::fs::create_dir_all(out.join(".clift-unfinished-x")).unwrap();
         std::fs::write(out.join(".clift-unfinished-x/one"), "").unwrap();
-        assert!(is_empty(&out).unwrap());
+        assert!(is_empty_folder(&out).unwrap());
         drop(StagedDir::new(&out).unwrap());
-        assert_eq!(names(&out), [""; 0], "was there, and stays");
+        assert_eq!(names(&out), [""; 0], "existed before, and stays");
         std::fs::write(out.join("mine"), "").unwrap();
-        assert!(!is_empty(&out).unwrap());
-        assert!(is_empty(&place.path().join("nowhere")).unwrap());
-        assert!(is_empty(&out.join("mine")).is_err(), "a file");
+        assert!(!is_empty_folder(&out).unwrap());
+        assert!(is_empty_folder(&root.path().join("nowhere")).unwrap());
+        assert!(is_empty_folder(&out.join("mine")).is_err(), "a file");
     }
 }

@@ -186,8 +186,8 @@ mod tests {
             reader.read(0, &views(context, &[1])).unwrap_err().to_string()
         };
         assert!(message(&[2, 2], 32).starts_with("scene 00000000000000b1 has no baseline"), "{}", message(&[2, 2], 32));
-        let missing = "scene 00000000000000b1 has 8 frames, so there is no frame 8 (counted from 0)";
+        let missing = "scene 00000000000000b1 has 8 frames; frame 8 (counted from 0) does not exist";
         assert_eq!(message(&[0, 8], 32), missing);
-        assert!(message(&[0, 7], 65).contains("cannot make a 65x32 picture from one of 64x36"));
+        assert!(message(&[0, 7], 65).contains("cannot make a 65x32 image from a 64x36 image"));
     }
 }

@@ -35,36 +35,36 @@ impl DatasetRoot {
 
     /// Returns whether training and test scenes lie in folders of their own, `train/` and `test/`.
     ///
-    /// A capture may have such a name too, as `train` of Tanks and Temples has: it is a split only if the other split is
-    /// a capture as well and no third capture is beside them.
+    /// A capture may have such a name as well, such as `train` of Tanks and Temples. A capture counts as a split only if
+    /// the other split is a capture too and no third capture lies beside them.
     pub fn has_splits(&self) -> bool {
         self.has_splits
     }
 }
 
 fn has_splits(root: &Path) -> bool {
-    let halves = [Split::Train, Split::Test].map(|split| split.to_string());
-    let there: Vec<&String> = halves.iter().filter(|half| root.join(half).is_dir()).collect();
-    if there.is_empty() || scene_in(root).is_some() {
+    let splits = [Split::Train, Split::Test].map(|split| split.to_string());
+    let present: Vec<&String> = splits.iter().filter(|split| root.join(split).is_dir()).collect();
+    if present.is_empty() || scene_in(root).is_some() {
         return false;
     }
     let is_capture = |name: &String| {
         matches!(scene_in(&root.join(name)), Some(SceneFiles::Transforms(_) | SceneFiles::Colmap { .. }))
     };
-    if !there.iter().any(|half| is_capture(half)) {
+    if !present.iter().any(|split| is_capture(split)) {
         return true;
     }
     let names = file_names(root).unwrap_or_default();
-    there.len() == halves.len() && !names.iter().any(|name| !halves.contains(name) && is_capture(name))
+    present.len() == splits.len() && !names.iter().any(|name| !splits.contains(name) && is_capture(name))
 }
 
-/// The scenes detected in a folder; of photos, with the skipped ones.
+/// The scenes detected in a folder; for photos, with a report of the skipped ones.
 pub(crate) enum DetectedSource {
     Torch(SourceKind),
     Photos(SourceKind, Vec<SceneFolder>, SkipReport),
 }
 
-/// The folder of one split: the root itself where it has no split folders.
+/// The folder of one split; without split folders, the root.
 pub(crate) struct SplitFolder<'a> {
     pub root: &'a DatasetRoot,
     pub base: PathBuf,
@@ -75,20 +75,20 @@ impl<'a> SplitFolder<'a> {
     /// Finds the folder of a split.
     ///
     /// # Errors
-    /// [`DataError::UnknownLayout`] for a split without a folder beside the other split's.
+    /// [`DataError::UnknownLayout`] if only the other split has a folder.
     pub fn find(root: &'a DatasetRoot, split: Split) -> Result<Self, DataError> {
         let base = if root.has_splits { root.path.join(split.to_string()) } else { root.path.clone() };
         let folder = Self { root, base, split };
         if folder.base.exists() {
             return Ok(folder);
         }
-        Err(folder.nothing(&format!("there is no folder {split}/ beside the other split"), &[]))
+        Err(folder.no_scenes(&format!("no folder {split}/ beside the other split"), &[]))
     }
 
-    /// Finds the scenes of the kind asked for, or of the first that is recognised.
+    /// Finds the scenes of the requested kind, or of the detected kind.
     ///
     /// # Errors
-    /// [`DataError::UnknownLayout`] for a folder without scenes, and for one with scenes of DL3DV among others.
+    /// [`DataError::UnknownLayout`] for a folder without scenes, and for DL3DV scenes among other scenes.
     pub fn detect(&self, asked: SourceKind) -> Result<DetectedSource, DataError> {
         let base = &self.base;
         if base.is_file() {
@@ -100,7 +100,7 @@ impl<'a> SplitFolder<'a> {
         match asked {
             SourceKind::Chunks => return Ok(DetectedSource::Torch(SourceKind::Chunks)),
             SourceKind::Scenes if has_torch => return Ok(DetectedSource::Torch(SourceKind::Scenes)),
-            SourceKind::Scenes => return Err(self.nothing("expected .torch files", &[])),
+            SourceKind::Scenes => return Err(self.no_scenes("expected .torch files", &[])),
             SourceKind::Auto if names.iter().any(|name| name == "index.json") => {
                 return Ok(DetectedSource::Torch(SourceKind::Chunks));
             }
@@ -116,52 +116,54 @@ impl<'a> SplitFolder<'a> {
         }
         let FoundScenes { mut scenes, others, notes } = find_scenes(base)?;
         let kind = if asked == SourceKind::Auto { self.recognise(&scenes)? } else { asked };
-        let mut ledger = SkipReport { notes, ..SkipReport::default() };
+        let mut report = SkipReport { notes, ..SkipReport::default() };
         scenes.retain(|scene| {
-            let is_of_layout = match kind {
+            let is_of_kind = match kind {
                 SourceKind::Re10kTxt => matches!(scene.files, SceneFiles::Re10kText { .. }),
                 SourceKind::Dl3dv => matches!(scene.files, SceneFiles::Transforms(_)),
                 _ => true,
             };
-            if !is_of_layout {
-                ledger.num_scenes += 1;
-                ledger.skip(&scene.key, format!("with cameras in another form than {kind} has"));
+            if !is_of_kind {
+                report.num_scenes += 1;
+                report.skip(&scene.key, format!("with cameras in another format than {kind}"));
             }
-            is_of_layout
+            is_of_kind
         });
         if scenes.is_empty() {
             let what = match asked {
                 SourceKind::Auto => {
-                    "looked for index.json with chunks, .torch files, RealEstate10K's .txt files, and for folders with \
-                     a transforms.json or a COLMAP model, three levels down"
+                    "expected index.json with chunks, .torch files, .txt files of RealEstate10K, or folders with a \
+                     transforms.json or a COLMAP model, at most three levels down"
                 }
-                SourceKind::Re10kTxt => "expected RealEstate10K's .txt files",
+                SourceKind::Re10kTxt => "expected .txt files of RealEstate10K",
                 SourceKind::Dl3dv => "expected folders with a transforms.json",
                 _ => "expected folders with a transforms.json or a COLMAP model",
             };
-            return Err(self.nothing(what, &others));
+            return Err(self.no_scenes(what, &others));
         }
         if !others.is_empty() {
-            ledger.notes.push(format!("not opened, each being data of its own: {}", first_few(&others)));
+            report.notes.push(format!("not opened, other data sets: {}", first_few(&others)));
         }
-        Ok(DetectedSource::Photos(kind, scenes, ledger))
+        Ok(DetectedSource::Photos(kind, scenes, report))
     }
 
-    /// The kind that all of these scenes have.
+    /// Returns the kind of the scenes.
+    ///
+    /// # Errors
+    /// [`DataError::UnknownLayout`] for DL3DV scenes among other scenes.
     fn recognise(&self, scenes: &[SceneFolder]) -> Result<SourceKind, DataError> {
         if scenes.iter().all(|scene| matches!(scene.files, SceneFiles::Re10kText { .. })) {
             return Ok(SourceKind::Re10kTxt);
         }
-        // Lenses, incomplete scenes and scenes kept for testing are treated in another way, so that one stray folder
-        // must not decide over all the others.
+        // DL3DV differs in lenses, incomplete scenes and test scenes: one stray folder must not decide the kind.
         match scenes.iter().find(|scene| !scene.is_dl3dv()) {
             None => Ok(SourceKind::Dl3dv),
             Some(other) if scenes.iter().any(SceneFolder::is_dl3dv) => {
                 let num_dl3dv = scenes.iter().filter(|scene| scene.is_dl3dv()).count();
                 let what = format!(
-                    "{num_dl3dv} of {} scenes are DL3DV's by their names and transforms.json, and others, such as {}, \
-                     are not: say with data.source whether all are to be read as \"dl3dv\" or as \"captures\", or keep \
-                     them in folders of their own",
+                    "{num_dl3dv} of {} scenes are DL3DV scenes by their names and transforms.json, and others, such as {}, \
+                     are not: set data.source to \"dl3dv\" or \"captures\" for all scenes, or move them to separate \
+                     folders",
                     scenes.len(),
                     other.key
                 );
@@ -171,20 +173,20 @@ impl<'a> SplitFolder<'a> {
         }
     }
 
-    /// The error for a folder without scenes, with what is there instead.
-    fn nothing(&self, what: &str, others: &[String]) -> DataError {
+    /// Returns the error of a folder without scenes, with the data found instead.
+    fn no_scenes(&self, what: &str, others: &[String]) -> DataError {
         let mut parts = vec![what.to_owned()];
         let folders = [self.base.as_path(), self.root.path()];
         let files = folders.into_iter().map(transforms_in).find(|files| !files.is_empty());
         parts.extend(files.map(|files| {
             format!(
-                "there is no transforms.json, but {}: open one by its path, or write the frames of all into a \
+                "no transforms.json, but {}: open one of them by its path, or merge their frames into one \
                  transforms.json",
                 first_few(&files)
             )
         }));
         if !others.is_empty() {
-            parts.push(format!("below it there is other data, to be opened by itself: {}", first_few(others)));
+            parts.push(format!("other data sets below it, to be opened separately: {}", first_few(others)));
         }
         let what = parts.join("; ");
         let path = if self.base.exists() { self.base.clone() } else { self.root.path.clone() };

@@ -1,17 +1,17 @@
-//! Which scenes of a data set are used.
+//! Filters of the scenes of a data set.
 
 use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 
-/// Which scenes of a data set are used. What they leave out is in the source's [`Ledger`](crate::skip_report::SkipReport).
+/// Filters of the scenes of a data set. Skipped scenes are listed in the [`SkipReport`](crate::skip_report::SkipReport).
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SceneFilters {
-    /// Fewest frames of a usable scene; 0 keeps all. The paper's training set keeps scenes of 46 and more.
+    /// Smallest number of frames; 0 keeps all scenes. The paper trains on scenes of 46 frames and more.
     pub min_frames: usize,
-    /// Largest field of view of any frame, in degrees; pixelSplat leaves out scenes above 100.
+    /// Largest field of view of any frame, in degrees; pixelSplat skips scenes above 100.
     pub max_fov_deg: Option<f64>,
 }
 
@@ -19,7 +19,7 @@ impl SceneFilters {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] naming the field that cannot hold.
+    /// [`DataError::BadConfig`] with the invalid field.
     pub fn validate(&self) -> Result<(), DataError> {
         match self.max_fov_deg {
             Some(limit) if !(limit.is_finite() && limit > 0.0) => {
@@ -29,12 +29,12 @@ impl SceneFilters {
         }
     }
 
-    /// Whether a scene has to be read to know whether it is used.
+    /// Returns whether filtering reads the scenes.
     pub(crate) fn is_any_set(&self) -> bool {
         *self != Self::default()
     }
 
-    /// Why a scene is left out, in words that equal cases share. Its cameras are read only where they matter.
+    /// Returns the reason to skip a scene. Cameras are read only for the field of view.
     pub(crate) fn reason_to_skip(
         &self,
         num_frames: usize,

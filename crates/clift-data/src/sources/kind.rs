@@ -3,25 +3,25 @@
 use serde::{Deserialize, Serialize};
 use strum::Display;
 
-/// Kind of a data set: scenes made on the fly, or a layout of files on disk.
+/// Kind of a data set: synthetic scenes, or a layout of files on disk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
 pub enum SourceKind {
-    /// Ray-traced rooms made on the fly.
+    /// Ray-traced rooms.
     Synthetic,
-    /// The layout that is detected on disk, one of those below.
+    /// The detected layout, one of the layouts below.
     #[default]
     Auto,
-    /// pixelSplat's and DepthSplat's: `NNNNNN.torch` files of many scenes with an `index.json`.
+    /// Chunks of pixelSplat and DepthSplat: `NNNNNN.torch` files of many scenes with an `index.json`.
     Chunks,
-    /// The reference's: a `.torch` file per scene.
+    /// One `.torch` file per scene, as in the reference implementation.
     Scenes,
-    /// RealEstate10K's text files of cameras, and folders of frames.
+    /// RealEstate10K: text files of cameras, and folders of frames.
     Re10kTxt,
-    /// DL3DV's folders: `transforms.json` and `images_8` or `images_4`, by hash. Lens distortion is ignored, as the
-    /// published numbers do.
+    /// DL3DV: folders named by hash, with `transforms.json` and `images_8` or `images_4`. Lens distortion is ignored, as
+    /// in published results.
     Dl3dv,
-    /// Own captures: `transforms.json` or a COLMAP model, a scene per folder. Lens distortion is undone.
+    /// Own captures: one folder per scene, with `transforms.json` or a COLMAP model. Images are undistorted.
     Captures,
 }

@@ -1,13 +1,13 @@
-//! Data sets: kinds, detection, opening.
+//! Data sets on disk: kinds, detection and opening.
 //!
-//! - `kind`: ONE SourceKind
-//! - `options`: paths of a data set's parts
-//! - `filters`: scene filters
+//! - `kind`: kinds of data sets
+//! - `options`: options of opening a data set
+//! - `filters`: filters of scenes
 //! - `keys`: scene keys: DL3DV hashes, look-up
 //! - `test_scenes`: scenes reserved for testing
 //! - `subset`: some scenes of a source
-//! - `dataset_root`: find split folders, detect the layout
-//! - `open`: open any layout as a source
+//! - `dataset_root`: split folders, detection of the layout
+//! - `open`: opening any layout as a source
 //! - `chunks`: pixelSplat chunks
 //! - `photos`: one image file per frame
 

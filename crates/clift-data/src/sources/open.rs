@@ -1,4 +1,4 @@
-//! Opening of data sets on disk in any layout.
+//! Opening data sets on disk in any layout.
 
 use std::collections::HashSet;
 use std::path::PathBuf;
@@ -18,40 +18,39 @@ use crate::sources::photos::photo_source::{PhotoSource, PhotoSourceOptions};
 use crate::sources::photos::scene_folder::{SceneFiles, SceneFolder};
 use crate::sources::test_scenes::{KEPT_AND_ABSENT, TestScenes};
 
-/// Folders that DL3DV's pictures are in, in the order they are preferred: 480 x 270, then larger.
+/// Image folders of DL3DV scenes, by preference: 480 x 270, then larger.
 const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
 
-/// Note on a data set that is not divided: of no interest where a single split is asked for.
-pub const SAME_SCENES: &str =
-    "no train/ and test/ folders and no test scenes in a list: both halves are the same scenes";
+/// Note on a data set whose splits are not separated; irrelevant if only one split is opened.
+pub const SAME_SCENES: &str = "no folders train/ and test/ and no list of test scenes: both splits are the same scenes";
 
 /// An open data set.
 pub struct OpenedSource {
     /// Scenes of the data set.
     pub source: Arc<dyn SceneSource>,
-    /// Layout that was detected, or [`SourceKind::Synthetic`].
+    /// Detected layout, or [`SourceKind::Synthetic`].
     pub kind: SourceKind,
-    /// Whether training and test scenes are apart without a list: in folders `train/` and `test/`, or synthetic.
+    /// Whether training and test scenes are separate without a list: in folders `train/` and `test/`, or synthetic.
     pub has_splits: bool,
     /// Skipped scenes and frames.
     pub report: SkipReport,
 }
 
-/// Opens one split of a data set on disk: `root/train` or `root/test`, or `root` itself where it has neither. `root`
-/// may be a data set, a single scene, or a `transforms.json` of any name.
+/// Opens one split of a data set on disk: `root/train` or `root/test`, or `root` if it has neither. `root` may be a data
+/// set, a single scene, or a `transforms.json` of any name.
 ///
-/// Without folders of their own both splits are the same scenes (the report has a note), unless
-/// [`FileOptions::test_scenes`](crate::sources::options::FileOptions::test_scenes) divides them.
+/// Without split folders both splits are the same scenes (with a note in the report), unless
+/// [`FileOptions::test_scenes`](crate::sources::options::FileOptions::test_scenes) separates them.
 ///
 /// # Errors
 /// [`DataError::UnknownLayout`] for a folder without scenes, [`DataError::BadConfig`] for [`SourceKind::Synthetic`],
-/// and the errors of the layout's reader.
+/// and the errors of the reader of the layout.
 pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) -> Result<OpenedSource, DataError> {
     if options.kind == SourceKind::Synthetic {
-        return Err(DataError::bad_config("source", "is synthetic; write the layout of the folder, or auto"));
+        return Err(DataError::bad_config("source", "is synthetic; use the layout of the folder, or auto"));
     }
     let list = options.files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
-    // An empty list names no test scenes: both splits are then the same.
+    // With an empty list, both splits are the same scenes.
     let list = list.filter(|list| list.num_scenes() > 0);
     let folder = SplitFolder::find(root, split)?;
     let mut opened = match folder.detect(options.kind)? {
@@ -73,39 +72,39 @@ impl SplitFolder<'_> {
         options: &SourceOptions,
         list: Option<&TestScenes>,
     ) -> Result<OpenedSource, DataError> {
-        let mut ledger = SkipReport::default();
+        let mut report = SkipReport::default();
         let index = if kind == SourceKind::Chunks {
             let index = read_index(&self.base.join("index.json"))?;
-            ledger.notes.extend(note_unlisted(&self.base, &index)?);
+            report.notes.extend(note_unlisted(&self.base, &index)?);
             index
         } else {
-            index_of_files(&self.base, &mut ledger)?
+            index_of_files(&self.base, &mut report)?
         };
         let keys: Vec<String> = index.keys().cloned().collect();
-        let kept = self.divide(list, &keys, options, &mut ledger);
+        let kept = self.divide(list, &keys, options, &mut report);
         let kept: HashSet<&str> =
             keys.iter().zip(kept).filter(|(_, kept)| *kept).map(|(key, _)| key.as_str()).collect();
         let is_kept = |key: &str| kept.contains(key);
         let mut source = ChunkSource::of_index(&self.base, &index, is_kept, &options.filters, options.reads_chunks)?;
         if kind == SourceKind::Chunks {
-            source.tell_unlisted(&self.base, &index);
+            source.record_unlisted(&self.base, &index);
         }
-        append(&mut ledger, source.ledger());
-        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits(), report: ledger })
+        report.append(source.report().clone());
+        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits(), report })
     }
 
     fn open_photos(
         &self,
         kind: SourceKind,
         scenes: Vec<SceneFolder>,
-        mut ledger: SkipReport,
+        mut report: SkipReport,
         options: &SourceOptions,
         list: Option<&TestScenes>,
     ) -> Result<OpenedSource, DataError> {
         let is_text = kind == SourceKind::Re10kTxt;
         let mut scenes = if scenes.is_empty() { self.re10k_clips(options)? } else { scenes };
         let keys: Vec<String> = scenes.iter().map(|scene| scene.key.clone()).collect();
-        let mut kept = self.divide(list, &keys, options, &mut ledger).into_iter();
+        let mut kept = self.divide(list, &keys, options, &mut report).into_iter();
         scenes.retain(|_| kept.next().unwrap_or_default());
         let is_dl3dv = kind == SourceKind::Dl3dv;
         let files = &options.files;
@@ -120,11 +119,11 @@ impl SplitFolder<'_> {
             min_size: options.min_size,
         };
         let source = PhotoSource::open(scenes, &source_options)?;
-        append(&mut ledger, source.ledger());
-        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits(), report: ledger })
+        report.append(source.report().clone());
+        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits(), report })
     }
 
-    /// Clips of RealEstate10K as text files, and where their frames are.
+    /// Returns the clips of RealEstate10K as text files, with the folders of their frames.
     fn re10k_clips(&self, options: &SourceOptions) -> Result<Vec<SceneFolder>, DataError> {
         let mut names = file_names(&self.base)?;
         names.sort_unstable();
@@ -139,53 +138,46 @@ impl SplitFolder<'_> {
         };
         let clip = |name: &String| {
             let key = name.strip_suffix(".txt")?;
-            let mut places = folders.iter().map(|folder| folder.join(key));
+            let mut candidates = folders.iter().map(|folder| folder.join(key));
             let frames =
-                places.find(|frames| frames.is_dir()).unwrap_or_else(|| self.root.path().join("frames").join(key));
+                candidates.find(|frames| frames.is_dir()).unwrap_or_else(|| self.root.path().join("frames").join(key));
             let files = SceneFiles::Re10kText { cameras: self.base.join(name), frames };
             Some(SceneFolder { key: key.into(), files })
         };
         Ok(names.iter().filter_map(clip).collect())
     }
 
-    /// Which of the keys belong to the split; the rest goes into the ledger.
+    /// Returns which of the keys belong to the split; adds the others to the report.
     fn divide(
         &self,
         list: Option<&TestScenes>,
         keys: &[String],
         options: &SourceOptions,
-        ledger: &mut SkipReport,
+        report: &mut SkipReport,
     ) -> Vec<bool> {
         let Some(list) = list else { return vec![true; keys.len()] };
         let (kept, mut divided) = list.divide(keys, self.split, !self.root.has_splits());
         if self.root.has_splits() && self.split == Split::Train && !divided.skips.is_empty() {
-            let there = TestScenes::of_keys(&self.test_keys(options).unwrap_or_default());
-            let absent = divided.skips.iter_mut().filter(|skip| !there.contains(&skip.key));
+            let in_test = TestScenes::of_keys(&self.test_keys(options).unwrap_or_default());
+            let absent = divided.skips.iter_mut().filter(|skip| !in_test.contains(&skip.key));
             absent.for_each(|skip| skip.reason = KEPT_AND_ABSENT.into());
         }
-        append(ledger, &divided);
+        report.append(divided);
         kept
     }
 
-    /// Keys of the scenes in `test/`.
+    /// Returns the keys of the scenes in `test/`.
     fn test_keys(&self, options: &SourceOptions) -> Result<Vec<String>, DataError> {
-        let place = SplitFolder::find(self.root, Split::Test)?;
-        Ok(match place.detect(options.kind)? {
+        let folder = SplitFolder::find(self.root, Split::Test)?;
+        Ok(match folder.detect(options.kind)? {
             DetectedSource::Torch(SourceKind::Chunks) => {
-                read_index(&place.base.join("index.json"))?.into_keys().collect()
+                read_index(&folder.base.join("index.json"))?.into_keys().collect()
             }
-            DetectedSource::Torch(_) => index_of_files(&place.base, &mut SkipReport::default())?.into_keys().collect(),
+            DetectedSource::Torch(_) => index_of_files(&folder.base, &mut SkipReport::default())?.into_keys().collect(),
             DetectedSource::Photos(_, scenes, _) => {
-                let scenes = if scenes.is_empty() { place.re10k_clips(options)? } else { scenes };
+                let scenes = if scenes.is_empty() { folder.re10k_clips(options)? } else { scenes };
                 scenes.into_iter().map(|scene| scene.key).collect()
             }
         })
     }
-}
-
-fn append(ledger: &mut SkipReport, more: &SkipReport) {
-    ledger.num_scenes += more.num_scenes;
-    ledger.skips.extend_from_slice(&more.skips);
-    ledger.frames.extend_from_slice(&more.frames);
-    ledger.notes.extend_from_slice(&more.notes);
 }

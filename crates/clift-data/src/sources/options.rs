@@ -7,20 +7,20 @@ use serde::{Deserialize, Serialize};
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
 
-/// Where the parts of a layout are, if not where they are expected.
+/// Paths of the parts of a layout, where they differ from the default.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FileOptions {
-    /// Keys of the scenes kept for testing and out of training: an evaluation index, a JSON list or a key per line.
+    /// File with the keys of the test scenes: an evaluation index, a JSON list, or one key per line.
     pub test_scenes: Option<PathBuf>,
-    /// Folder of the frames of `re10k_txt`, with a folder per key in it or in `train/` and `test/` below it.
+    /// Folder of the frames of `re10k_txt`, with one folder per key, directly or in `train/` and `test/`.
     pub frames: Option<PathBuf>,
-    /// Folder of the pictures within a scene of `dl3dv` or `captures`, such as `images_4`.
+    /// Image folder within a scene of `dl3dv` or `captures`, such as `images_4`.
     pub image_folder: Option<String>,
-    /// Whether lens distortion is undone; by default in `captures` alone.
+    /// Whether images are undistorted; by default only in `captures`.
     pub undistort: Option<bool>,
-    /// Whether scenes of `re10k_txt` and `dl3dv` with missing pictures are used without these frames. Positions of
-    /// frames then differ from those that published indices count.
+    /// Whether scenes of `re10k_txt` and `dl3dv` with missing images are used without these frames. Frame indices then
+    /// differ from those of published evaluation indices.
     pub keep_incomplete: bool,
 }
 
@@ -33,9 +33,9 @@ pub struct SourceOptions {
     pub filters: SceneFilters,
     /// Paths of the parts of the layout.
     pub files: FileOptions,
-    /// Fewest columns and rows of a usable image; for layouts of one file per frame.
+    /// Smallest columns and rows of an image; for layouts with one file per frame.
     pub min_size: [usize; 2],
-    /// Whether every chunk is read even where no filter needs it: unreadable scenes, and scenes that `index.json` does
-    /// not name, are then in the report.
+    /// Whether every chunk is read even without filters, so that unreadable scenes and scenes missing from `index.json`
+    /// are reported.
     pub reads_chunks: bool,
 }

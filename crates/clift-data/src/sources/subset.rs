@@ -1,4 +1,4 @@
-//! Some of the scenes of a source.
+//! A subset of the scenes of a source.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -8,23 +8,23 @@ use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 
-/// The chosen scenes of a source, in the order they were chosen in.
+/// A subset of the scenes of a source, in the given order.
 pub struct SceneSubset {
     source: Arc<dyn SceneSource>,
-    /// Positions in `source`.
+    /// Indices in `source`.
     scenes: Vec<usize>,
-    /// Positions here, by those there.
-    places: HashMap<usize, usize>,
+    /// Indices in this subset by those in `source`.
+    positions: HashMap<usize, usize>,
 }
 
 impl SceneSubset {
-    /// Keeps the scenes at these positions, which the source must have.
+    /// Keeps the scenes with these indices, which must exist in the source.
     pub fn new(source: Arc<dyn SceneSource>, scenes: Vec<usize>) -> Self {
-        let places = scenes.iter().enumerate().map(|(place, scene)| (*scene, place)).collect();
-        Self { source, scenes, places }
+        let positions = scenes.iter().enumerate().map(|(position, scene)| (*scene, position)).collect();
+        Self { source, scenes, positions }
     }
 
-    /// Keeps at most the first `num_scenes`, for `--overfit`.
+    /// Keeps at most the first `num_scenes` scenes.
     pub fn first(source: Arc<dyn SceneSource>, num_scenes: usize) -> Self {
         let scenes = (0..num_scenes.min(source.num_scenes())).collect();
         Self::new(source, scenes)
@@ -41,7 +41,7 @@ impl SceneSource for SceneSubset {
     }
 
     fn find(&self, key: &str) -> Option<usize> {
-        self.places.get(&self.source.find(key)?).copied()
+        self.positions.get(&self.source.find(key)?).copied()
     }
 
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {

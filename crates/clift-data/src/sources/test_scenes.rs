@@ -1,4 +1,4 @@
-//! The scenes that are kept for testing: of DL3DV the 140 of its benchmark, which its folders hold beside all others.
+//! Lists of test scenes, such as the 140 benchmark scenes of DL3DV, whose folders lie beside the training scenes.
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
@@ -11,25 +11,25 @@ use crate::scene_source::Split;
 use crate::skip_report::SkipReport;
 use crate::sources::keys::{last_name, plain_key};
 
-/// Most bytes of a list.
+/// Largest size of a list, in bytes.
 const MAX_BYTES: u64 = 256 << 20;
-/// Why a training half goes without a scene that the test half has: nothing is wrong with it.
+/// Reason of skipping a test scene in the training split; no fault of the scene.
 pub const KEPT_FOR_TESTING: &str = "kept for testing";
-/// Why neither half has a scene that the list keeps for testing and that lies in `train/` alone. Starts with
+/// Reason of skipping a listed scene that lies only in `train/`, so that neither split has it. Starts with
 /// [`KEPT_FOR_TESTING`].
 pub(crate) const KEPT_AND_ABSENT: &str = "kept for testing by the list of test scenes, but not in test/";
 
-/// Keys of the scenes kept for testing, without DepthSplat's prefix, and of DL3DV's without the way to them.
+/// Keys of the test scenes, without the prefix of DepthSplat; for DL3DV scenes, without their path.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct TestScenes {
     keys: BTreeSet<String>,
 }
 
 impl TestScenes {
-    /// Reads an evaluation index (its keys count), a JSON list of keys, or a text file with a key per line.
+    /// Reads the keys of an evaluation index, a JSON list of keys, or a text file with one key per line.
     ///
     /// # Errors
-    /// [`DataError::Io`], and [`DataError::BadIndex`] for a file of another form.
+    /// [`DataError::Io`], and [`DataError::BadIndex`] for another format.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadIndex { what, path: path.to_owned() };
         let bytes = read_bounded(path, MAX_BYTES, "reading the list of test scenes")?;
@@ -38,7 +38,6 @@ impl TestScenes {
         let json = |error: serde_json::Error| bad(format!("expected an index, a list or a key per line, got {error}"));
         let keys: Vec<String> = match text.trim_start().chars().next() {
             Some('{') => {
-                // What the keys stand for is passed over, whatever it is.
                 let index: HashMap<String, Option<IgnoredAny>> = serde_json::from_str(text).map_err(json)?;
                 index.into_keys().collect()
             }
@@ -52,21 +51,21 @@ impl TestScenes {
         Self { keys: keys.iter().map(|key| plain_key(key).to_owned()).collect() }
     }
 
-    /// Whether a scene is one of them, with or without DepthSplat's prefix. Of a key that is the way to a scene, as those
-    /// of several folders of one name are, the last part counts as well.
+    /// Returns whether the list contains a scene, by its key with or without the prefix of DepthSplat, or by the last part
+    /// of a key that is a path.
     pub fn contains(&self, key: &str) -> bool {
         self.keys.contains(plain_key(key)) || self.keys.contains(last_name(key))
     }
 
-    /// How many there are.
+    /// Returns the number of listed scenes.
     pub fn num_scenes(&self) -> usize {
         self.keys.len()
     }
 
-    /// Which of `keys` belong to a split, and a ledger of the others: for training, those in the list; for testing
-    /// where both splits share a folder, those in the list that are not there.
+    /// Returns which of `keys` belong to a split, and a report of the skipped scenes: listed scenes in the training split,
+    /// and in a test split that shares its folder, listed scenes without files.
     pub(crate) fn divide(&self, keys: &[String], split: Split, is_shared: bool) -> (Vec<bool>, SkipReport) {
-        let mut ledger = SkipReport::default();
+        let mut report = SkipReport::default();
         let kept: Vec<bool> = keys
             .iter()
             .map(|key| match split {
@@ -75,14 +74,14 @@ impl TestScenes {
             })
             .collect();
         if split == Split::Train {
-            keys.iter().zip(&kept).filter(|(_, kept)| !**kept).for_each(|(key, _)| ledger.skip(key, KEPT_FOR_TESTING));
+            keys.iter().zip(&kept).filter(|(_, kept)| !**kept).for_each(|(key, _)| report.skip(key, KEPT_FOR_TESTING));
         } else if is_shared {
-            let there: BTreeSet<&str> = keys.iter().flat_map(|key| [plain_key(key), last_name(key)]).collect();
-            let absent = self.keys.iter().filter(|key| !there.contains(key.as_str()));
-            absent.for_each(|key| ledger.skip(key, "in the list of test scenes, but not there"));
+            let present: BTreeSet<&str> = keys.iter().flat_map(|key| [plain_key(key), last_name(key)]).collect();
+            let absent = self.keys.iter().filter(|key| !present.contains(key.as_str()));
+            absent.for_each(|key| report.skip(key, "in the list of test scenes, but not there"));
         }
-        ledger.num_scenes = ledger.skips.len();
-        (kept, ledger)
+        report.num_scenes = report.skips.len();
+        (kept, report)
     }
 }
 
@@ -98,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn an_index_a_list_and_lines_name_the_same_scenes() {
+    fn all_formats_give_the_same_scenes() {
         let index = read(r#"{"a": {"context": [0], "target": [1]}, "dl3dv_b": null}"#).unwrap();
         assert_eq!(index, read(r#" ["b", "a"]"#).unwrap());
         assert_eq!(index, read("a\r\n\n  b\n").unwrap());
@@ -109,16 +108,16 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_is_kept_out_of_training_wherever_its_copies_lie() {
+    fn copies_of_test_scenes_are_kept_out_of_training() {
         let hash = "a".repeat(64);
         let keys = [format!("1K/{hash}"), format!("bench/{hash}"), "1K/attic".into(), "bench/attic".into()];
         for listed in [hash.clone(), format!("11K/{hash}"), format!("dl3dv_{hash}")] {
             let list = read(&listed).unwrap();
             assert_eq!(list.divide(&keys, Split::Train, true).0, [false, false, true, true], "{listed}");
-            let (kept, ledger) = list.divide(&keys, Split::Test, true);
-            assert_eq!((kept, ledger.skips.len()), (vec![true, true, false, false], 0), "{listed}");
+            let (kept, report) = list.divide(&keys, Split::Test, true);
+            assert_eq!((kept, report.skips.len()), (vec![true, true, false, false], 0), "{listed}");
         }
-        // Other captures of one name are not the same scene: the way tells them apart, the name alone means both.
+        // Captures of one name differ by their path; the name alone matches both.
         let kept = |listed: &str| read(listed).unwrap().divide(&keys, Split::Train, true).0;
         assert_eq!(kept("1K/attic"), [true, true, false, true]);
         assert_eq!(kept("attic"), [true, true, false, false]);
@@ -126,14 +125,14 @@ mod tests {
     }
 
     #[test]
-    fn training_goes_without_them_and_testing_has_them_alone() {
+    fn training_and_test_scenes_are_disjoint() {
         let list = read("b c").unwrap();
         assert!(list.contains("b c"), "a line is a key");
         let list = read("b\nc").unwrap();
         let keys = ["a", "dl3dv_b", "d"].map(String::from);
         let divided = |split, is_shared| {
-            let (kept, ledger) = list.divide(&keys, split, is_shared);
-            (kept, ledger.to_string())
+            let (kept, report) = list.divide(&keys, split, is_shared);
+            (kept, report.to_string())
         };
         let train = (vec![true, false, true], "0 of 1 scenes used; 1 kept for testing".to_owned());
         assert_eq!(divided(Split::Train, true), train);

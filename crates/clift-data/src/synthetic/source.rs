@@ -211,8 +211,8 @@ mod tests {
     fn scenes_and_frames_beyond_the_end_are_refused() {
         let source = source(|c| c.num_scenes = 5);
         let message = |scene, frame| source.frame(scene, frame).unwrap_err().to_string();
-        assert_eq!(message(5, 0), "there are 5 scenes, so there is no scene 5 (counted from 0)");
-        let missing = "scene synthetic-0-train-00004 has 16 frames, so there is no frame 16 (counted from 0)";
+        assert_eq!(message(5, 0), "the source has 5 scenes; scene 5 (counted from 0) does not exist");
+        let missing = "scene synthetic-0-train-00004 has 16 frames; frame 16 (counted from 0) does not exist";
         assert_eq!(message(4, 16), missing);
         assert!(source.cameras(5).is_err() && source.num_frames(5).is_err());
         assert_eq!(source.num_frames(4).unwrap(), 16);

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use crate::error::DataError;
-use crate::files::atomic::{TEMPORARY, replace};
+use crate::files::atomic::{TEMPORARY, replace_file};
 use crate::files::listing::has_ending;
 
 /// As `sha256sum` calls it: a line per file, sum and name.
@@ -144,7 +144,7 @@ impl Checksums {
             written.map_err(DataError::io("writing the checksums", &path))?;
         }
         let path = self.folder.join(name);
-        replace(&path, bytes).map_err(DataError::io("writing a file", &path))
+        replace_file(&path, bytes).map_err(DataError::io("writing a file", &path))
     }
 
     /// Removes the files of these names that have a line.
@@ -181,7 +181,7 @@ impl Checksums {
         let lines = self.sums.iter().map(|(name, sum)| format!("{sum}  {name}\n"));
         let text: String = std::iter::once(format!("{MADE_AS}{}\n", self.made_as)).chain(lines).collect();
         let path = self.folder.join(FILE_NAME);
-        replace(&path, text.as_bytes()).map_err(DataError::io("writing the checksums", &path))
+        replace_file(&path, text.as_bytes()).map_err(DataError::io("writing the checksums", &path))
     }
 }
 

@@ -303,7 +303,7 @@ impl<'a> Converter<'a> {
         let is_chunks = self.options.to != ConvertTo::Scenes;
         let index = (is_chunks && !self.index.is_empty()).then(|| serde_json::to_vec_pretty(&self.index));
         let left_out = &self.converted.left_out;
-        let skipped = left_out.has_gaps().then(|| serde_json::to_vec_pretty(left_out));
+        let skipped = left_out.has_skips().then(|| serde_json::to_vec_pretty(left_out));
         for (name, text) in [(INDEX, index), (SKIPPED, skipped)] {
             let Some(text) = text else {
                 // What an earlier run left out is there now.

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::error::DataError;
-use crate::files::atomic::replace;
+use crate::files::atomic::replace_file;
 use crate::image::codec::{encode_jpeg, encode_png};
 use crate::image::rgb_image::RgbImage;
 use crate::sampling::clip::ViewIndices;
@@ -112,7 +112,7 @@ pub(crate) fn write_index<'a>(
         entries.into_iter().map(|(key, views)| (key, views.map(entry))).collect();
     let bad = |error: serde_json::Error| DataError::BadIndex { what: error.to_string(), path: path.to_path_buf() };
     let text = serde_json::to_vec(&entries).map_err(bad)?;
-    replace(path, &text).map_err(DataError::io("writing the evaluation index", path))
+    replace_file(path, &text).map_err(DataError::io("writing the evaluation index", path))
 }
 
 #[cfg(test)]

@@ -103,7 +103,7 @@ mod tests {
         let info = SourceInfo::read(&source).unwrap();
         assert_eq!((info.image_size, info.num_frames.map(|frames| frames.max)), (Some([64, 36]), Some(8.0)));
         assert_eq!((info.unreadable.len(), info.unreadable[0].key.as_str()), (1, "elsewhere"));
-        assert!(info.unreadable[0].reason.contains("scene elsewhere is expected in it"), "{info:?}");
+        assert!(info.unreadable[0].reason.contains("expected scene elsewhere"), "{info:?}");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! The Python names that a pickle may use.
+//! Python names that a pickle may use.
 
 use crate::torch::values::{ElementType, Global};
 
@@ -41,7 +41,7 @@ pub(crate) fn global(module: &str, name: &str, unknown: UnknownClasses) -> Resul
         return Ok(known);
     }
     if unknown == UnknownClasses::Refuse || is_attack(module, name) {
-        return Err(UnpickleError::Refused(shown(module, name)));
+        return Err(UnpickleError::Refused(escaped_name(module, name)));
     }
     Ok(match (module, name) {
         ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state") => Some(Global::RebuildParameter),
@@ -51,14 +51,14 @@ pub(crate) fn global(module: &str, name: &str, unknown: UnknownClasses) -> Resul
     })
 }
 
-/// A name from a file that may be hostile: short enough for a terminal, and without control characters.
-pub(crate) fn shown(module: &str, name: &str) -> String {
+/// Formats a name of a possibly hostile file: at most 120 characters, without control characters.
+pub(crate) fn escaped_name(module: &str, name: &str) -> String {
     let name: String = format!("{module}.{name}").chars().take(120).collect();
     name.escape_debug().to_string()
 }
 
-/// Names that no training program writes into a checkpoint. They would not be run either, but whoever gave the file
-/// away meant to run them elsewhere.
+/// Returns whether no training program writes this name into a checkpoint, so that the file is likely an attack on
+/// programs that execute pickles.
 fn is_attack(module: &str, name: &str) -> bool {
     let package = module.split('.').next().unwrap_or_default();
     match package {
@@ -70,11 +70,11 @@ fn is_attack(module: &str, name: &str) -> bool {
             matches!(name, "eval" | "exec" | "execfile" | "compile" | "open" | "__import__" | "input" | "breakpoint")
         }
         "urllib" | "urllib2" => module != "urllib.parse",
-        // A project may have a package of this name.
+        // A project may have a package named `code`.
         "code" => module == "code",
         "torch" => match module {
             "torch" => matches!(name, "load" | "save" | "compile"),
-            "torch.serialization" => name != "_get_layout", // which a layout is pickled as
+            "torch.serialization" => name != "_get_layout", // pickled layouts use this name
             "torch.jit" => name == "load",
             "torch.utils.cpp_extension" => true,
             _ => module.starts_with("torch.hub") || module.starts_with("torch.package"),
@@ -88,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_only_an_attack_asks_for_is_told_from_what_training_programs_write() {
+    fn attacks_differ_from_names_of_training_programs() {
         for (module, name) in [
             ("os", "system"),
             ("builtins", "eval"),

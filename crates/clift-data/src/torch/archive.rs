@@ -1,4 +1,4 @@
-//! The ZIP archive that `torch.save` writes: members are stored uncompressed, so each can be read on its own.
+//! The ZIP archive of `torch.save`. Its members are uncompressed, so that each can be read on its own.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -9,28 +9,28 @@ use zip::{CompressionMethod, ZipArchive};
 
 use crate::error::DataError;
 
-/// Bytes of one member of an archive, or a part of them: 24 bytes, because a data set has millions.
+/// Byte range of a member of an archive, or of a part of a member. It takes 24 bytes, because a data set has millions.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ByteSpan {
-    /// Where the member's local header starts in the file. Where its data starts is read from there when it is
-    /// needed: looking it up for every member at opening would touch every page of every chunk.
+    /// Start of the member's local header in the file. The start of its data is read from the header on use: reading all
+    /// headers at opening would touch every page of every chunk.
     header_start: u64,
     /// First byte within the member.
     start: u32,
-    /// How many bytes.
+    /// Number of bytes.
     length: u32,
-    /// Checksum of the whole member; zero for a part, which cannot be checked.
+    /// Checksum of the whole member; not used for a part.
     crc32: u32,
     is_whole: bool,
 }
 
 impl ByteSpan {
-    /// How many bytes.
+    /// Returns the number of bytes.
     pub fn len(&self) -> u64 {
         u64::from(self.length)
     }
 
-    /// The part of `length` bytes from `start`, if the member has that many.
+    /// Returns the part of `length` bytes from `start`; `None` if it exceeds the member.
     pub fn part(self, start: u64, length: u64) -> Option<Self> {
         if start == 0 && length == self.len() {
             return Some(self);
@@ -47,11 +47,10 @@ impl ByteSpan {
     /// Reads the bytes from the archive at `path`.
     ///
     /// # Errors
-    /// [`DataError::Io`], and [`DataError::BadChunk`] if the header is not where the directory says, the file ends
-    /// early, or the checksum differs.
+    /// [`DataError::Io`], and [`DataError::BadChunk`] for a missing header, a truncated file or a wrong checksum.
     pub fn read(&self, path: &Path) -> Result<Vec<u8>, DataError> {
         let bad = |what: &str| DataError::BadChunk {
-            what: format!("the member at byte {} {what}; fetch the file again", self.header_start),
+            what: format!("the member at byte {} {what}; download the file again", self.header_start),
             path: path.to_path_buf(),
         };
         let mut file = File::open(path).map_err(DataError::io("opening the chunk", path))?;
@@ -64,11 +63,11 @@ impl ByteSpan {
         let length_at = |at: usize| u64::from(u16::from_le_bytes([header[at], header[at + 1]]));
         let data_start = self.header_start + 30 + length_at(26) + length_at(28) + u64::from(self.start);
         file.seek(SeekFrom::Start(data_start)).map_err(DataError::io("reading the chunk", path))?;
-        // The length was checked against the size of the file at opening, so this allocation is bounded by it.
+        // Bounded by the size of the file: `Archive::open` checks the length.
         let mut bytes = vec![0; self.length as usize];
         file.read_exact(&mut bytes).map_err(|_| bad("lies behind the end of the file"))?;
         if self.is_whole && crc32fast::hash(&bytes) != self.crc32 {
-            return Err(bad("has another checksum than its directory says"));
+            return Err(bad("has another checksum than the directory of the archive"));
         }
         Ok(bytes)
     }
@@ -80,13 +79,16 @@ pub(crate) struct Archive {
 }
 
 impl Archive {
-    /// Reads the directory. Member names lose the archive's own top folder: `data.pkl`, `data/0`.
+    /// Reads the directory. Member names are stored without the top folder: `data.pkl`, `data/0`.
+    ///
+    /// # Errors
+    /// [`DataError::Io`], and [`DataError::BadChunk`] for a malformed archive, compressed members or big-endian data.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
         let file = File::open(path).map_err(DataError::io("opening the chunk", path))?;
         let file_bytes = file.metadata().map_err(DataError::io("opening the chunk", path))?.len();
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|error| {
-            bad(format!("no readable ZIP archive of {file_bytes} bytes, perhaps truncated ({error})"))
+            bad(format!("the file of {file_bytes} bytes is no readable ZIP archive, perhaps truncated ({error})"))
         })?;
         let mut members = HashMap::with_capacity(archive.len());
         for index in 0..archive.len() {
@@ -114,7 +116,7 @@ impl Archive {
         Ok(archive)
     }
 
-    /// A member by its name without the top folder.
+    /// Returns a member by its name without the top folder.
     pub fn member(&self, name: &str) -> Option<ByteSpan> {
         self.members.get(name).copied()
     }

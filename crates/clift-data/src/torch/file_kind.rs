@@ -1,4 +1,4 @@
-//! What a file is that should have been a checkpoint of `torch.save` and is not, and what to do about it.
+//! Recognition of files that are no checkpoint of `torch.save`, with the remedy.
 
 use std::fs::File;
 use std::io::Read;
@@ -6,28 +6,28 @@ use std::path::Path;
 
 use crate::error::DataError;
 
-/// Bytes that are looked at.
+/// Number of bytes read for the recognition.
 const NUM_BYTES: u64 = 512;
-/// The number that `torch.save` began every file with before `PyTorch` 1.6, as a pickle of protocol 2.
+/// Start of the files of `torch.save` before `PyTorch` 1.6: a magic number as a pickle of protocol 2.
 const LEGACY: &[u8] = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.";
 
-/// Refuses what is known to be something else, before anything is read from it.
+/// Refuses files of known other formats.
 ///
 /// # Errors
-/// [`DataError::BadCheckpoint`] with what it is and the way on, [`DataError::Io`] for a file that cannot be read.
+/// [`DataError::BadCheckpoint`] with the format and the remedy, and [`DataError::Io`] for an unreadable file.
 pub(crate) fn refuse_others(path: &Path) -> Result<(), DataError> {
     let bad = |what: &str| Err(DataError::BadCheckpoint { what: what.into(), path: path.to_path_buf() });
     let opening = "opening the checkpoint";
     let metadata = std::fs::metadata(path).map_err(DataError::io(opening, path))?;
     if metadata.is_dir() && path.join("model.safetensors").exists() {
-        return bad("a model directory of this program, which needs no import");
+        return bad("a model directory of clift, which needs no import");
     }
     if metadata.is_dir() {
         return bad("a directory; give the checkpoint file in it");
     }
-    // Opening a pipe waits for whoever writes to it.
+    // Opening a pipe would block.
     if !metadata.is_file() {
-        return bad("no regular file but a pipe or a device; give a file");
+        return bad("a pipe or a device, no regular file; give a file");
     }
     let mut start = Vec::new();
     let file = File::open(path).map_err(DataError::io(opening, path))?;
@@ -35,36 +35,34 @@ pub(crate) fn refuse_others(path: &Path) -> Result<(), DataError> {
     other_kind(&start, metadata.len()).map_or(Ok(()), bad)
 }
 
-/// What a file with this start is, where that is known and no ZIP archive.
+/// Returns a description of a file with this start; `None` if the format is unknown or a ZIP archive.
 fn other_kind(start: &[u8], num_bytes: u64) -> Option<&'static str> {
     let text = start.trim_ascii_start().to_ascii_lowercase();
     if start.is_empty() {
-        return Some("an empty file; fetch it again");
+        return Some("an empty file; download it again");
     }
     if start.starts_with(LEGACY) {
         return Some(
             "written by torch.save in the format from before PyTorch 1.6; convert it in Python: \
-             torch.save(torch.load(\"OLD\", map_location=\"cpu\"), \"NEW\") (weights_only=False runs what is in the file: \
-             only where you trust it)",
+             torch.save(torch.load(\"OLD\", map_location=\"cpu\"), \"NEW\") (weights_only=False executes code of the file: \
+             use it only for files that you trust)",
         );
     }
     if matches!(start, [0x80, 2..=5, ..]) {
-        return Some(
-            "a plain pickle, which torch.save does not write; load it in Python and torch.save its state dict",
-        );
+        return Some("a plain pickle, not written by torch.save; load it in Python and torch.save its state dict");
     }
     let header = start.first_chunk().map(|length| u64::from_le_bytes(*length));
     if start.get(8) == Some(&b'{') && header.is_some_and(|length| length < num_bytes) {
         return Some(
             "a safetensors file; convert it in Python: torch.save({\"state_dict\": safetensors.torch.load_file(\"OLD\")}, \
-             \"NEW.ckpt\"), or write it with `clift export --format pytorch` if it came from there",
+             \"NEW.ckpt\"), or write it with `clift export --format pytorch` if it was exported by clift",
         );
     }
     if ["<!doctype", "<html", "<?xml", "<head"].iter().any(|tag| text.starts_with(tag.as_bytes())) {
-        return Some("a web page: the download gave an error or a page to sign in; fetch the file itself");
+        return Some("a web page: the download returned an error or a sign-in page; download the file itself");
     }
     if text.starts_with(b"version https://git-lfs") {
-        return Some("a pointer of Git LFS and not the file; `git lfs pull` fetches it");
+        return Some("a Git LFS pointer; fetch the file with `git lfs pull`");
     }
     None
 }
@@ -74,9 +72,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_other_kind_of_file_is_named_with_the_way_on() {
-        let place = tempfile::tempdir().unwrap();
-        let path = place.path().join("a.ckpt");
+    fn other_formats_are_named_with_the_remedy() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("a.ckpt");
         let safetensors = [&9_u64.to_le_bytes()[..], b"{\"a\": {}}"].concat();
         for (bytes, what) in [
             (&b""[..], "an empty file"),
@@ -91,22 +89,22 @@ mod tests {
             let message = refuse_others(&path).unwrap_err().to_string();
             assert!(message.contains(what) && message.ends_with("a.ckpt"), "{message}");
         }
-        // What is left to the archive's reader: its own start, and what nobody knows.
+        // ZIP archives and unknown formats are left to the reader of archives.
         for bytes in [&b"PK\x03\x04...."[..], b"P", b"something else"] {
             std::fs::write(&path, bytes).unwrap();
             refuse_others(&path).unwrap();
         }
         let refused = |path: &Path| refuse_others(path).unwrap_err().to_string();
-        assert!(refused(place.path()).contains("a directory; give the checkpoint file in it"));
-        std::fs::write(place.path().join("model.safetensors"), "").unwrap();
-        assert!(refused(place.path()).contains("needs no import"));
+        assert!(refused(root.path()).contains("a directory; give the checkpoint file in it"));
+        std::fs::write(root.path().join("model.safetensors"), "").unwrap();
+        assert!(refused(root.path()).contains("needs no import"));
     }
 
     #[cfg(unix)]
     #[test]
-    fn a_pipe_is_refused_before_it_is_opened() {
-        let place = tempfile::tempdir().unwrap();
-        let path = place.path().join("pipe");
+    fn pipes_are_refused_unopened() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("pipe");
         assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
         let message = refuse_others(&path).unwrap_err().to_string();
         assert!(message.contains("no regular file"), "{message}");

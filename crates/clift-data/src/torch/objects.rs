@@ -1,22 +1,21 @@
-//! What the pickles of checkpoints have beyond those of chunks: objects of any class, sets and bytes. All of it is
-//! passed over.
+//! Opcodes that occur in checkpoints but not in chunks: objects of any class, sets and bytes. All are skipped.
 
 use crate::torch::allow_list::UnpickleError;
 use crate::torch::pickle_machine::PickleMachine;
 use crate::torch::values::Value;
 
 impl PickleMachine<'_> {
-    /// Objects, sets, bytes and what else only checkpoints have.
+    /// Handles the opcodes of objects, sets and bytes; returns false for another opcode.
     pub(crate) fn read_object(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
         match opcode {
-            // BUILD: the state of an object, which stays on the stack.
+            // BUILD: sets the state of the object below it.
             b'b' => {
                 self.pop()?;
                 self.top()?;
             }
             // NEWOBJ, NEWOBJ_EX: a class and its arguments.
-            0x81 => self.replace(2)?,
-            0x92 => self.replace(3)?,
+            0x81 => self.replace_by_opaque(2)?,
+            0x92 => self.replace_by_opaque(3)?,
             // EMPTY_SET, ADDITEMS, FROZENSET
             0x8f => self.push(Value::Opaque)?,
             0x90 => {
@@ -27,19 +26,19 @@ impl PickleMachine<'_> {
                 self.pop_to_mark()?;
                 self.push(Value::Opaque)?;
             }
-            // SHORT_BINSTRING, SHORT_BINBYTES: a length of one byte; BINSTRING, BINBYTES: of four; BINBYTES8,
-            // BYTEARRAY8, BINUNICODE8: of eight. LONG4 is a number of so many bytes.
+            // SHORT_BINSTRING, SHORT_BINBYTES: one byte of length; BINSTRING, BINBYTES, LONG4: four; BINBYTES8,
+            // BYTEARRAY8, BINUNICODE8: eight.
             b'U' | b'C' => {
                 let length = usize::from(self.u8()?);
-                self.pass_over(length)?;
+                self.skip_bytes(length)?;
             }
             b'T' | b'B' | 0x8b => {
                 let length = u32::from_le_bytes(self.array()?) as usize;
-                self.pass_over(length)?;
+                self.skip_bytes(length)?;
             }
             0x8e | 0x96 | 0x8d => {
                 let length = u64::from_le_bytes(self.array()?);
-                self.pass_over(usize::try_from(length).unwrap_or(usize::MAX))?;
+                self.skip_bytes(usize::try_from(length).unwrap_or(usize::MAX))?;
             }
             // POP, POP_MARK, DUP
             b'0' => {
@@ -57,15 +56,15 @@ impl PickleMachine<'_> {
         Ok(true)
     }
 
-    /// An object in the place of what it is made from.
-    fn replace(&mut self, count: usize) -> Result<(), UnpickleError> {
+    /// Replaces the top `count` values by one skipped object.
+    fn replace_by_opaque(&mut self, count: usize) -> Result<(), UnpickleError> {
         for _ in 0..count {
             self.pop()?;
         }
         self.push(Value::Opaque)
     }
 
-    fn pass_over(&mut self, num_bytes: usize) -> Result<(), UnpickleError> {
+    fn skip_bytes(&mut self, num_bytes: usize) -> Result<(), UnpickleError> {
         self.take(num_bytes)?;
         self.push(Value::Opaque)
     }

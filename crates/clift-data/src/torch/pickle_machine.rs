@@ -1,14 +1,14 @@
-//! The state of the unpickler: the bytes that are left, a stack with marks, and a memo.
+//! State of the unpickler: remaining bytes, stack, marks and memo.
 
 use std::collections::{BTreeSet, HashMap};
 
-use crate::torch::allow_list::{UnknownClasses, UnpickleError, global, shown};
+use crate::torch::allow_list::{UnknownClasses, UnpickleError, escaped_name, global};
 use crate::torch::values::{MAX_VALUES, Value, ValueId};
 
-/// Most names of skipped objects that are kept.
-const MAX_PASSED_OVER: usize = 256;
+/// Largest number of recorded names of skipped objects.
+const MAX_SKIPPED_OBJECTS: usize = 256;
 
-/// The pickle machine: a stack, marks into it, and a memo.
+/// The pickle machine: a stack, marks and a memo.
 pub(crate) struct PickleMachine<'a> {
     pub bytes: &'a [u8],
     /// Position of the next byte.
@@ -18,11 +18,11 @@ pub(crate) struct PickleMachine<'a> {
     pub stack: Vec<ValueId>,
     pub marks: Vec<usize>,
     pub memo: HashMap<u32, ValueId>,
-    pub passed_over: BTreeSet<String>,
+    pub skipped_objects: BTreeSet<String>,
 }
 
 impl<'a> PickleMachine<'a> {
-    /// A machine before the first byte.
+    /// Creates a machine at the first byte.
     pub fn new(bytes: &'a [u8], unknown: UnknownClasses) -> Self {
         Self {
             bytes,
@@ -32,30 +32,30 @@ impl<'a> PickleMachine<'a> {
             stack: Vec::new(),
             marks: Vec::new(),
             memo: HashMap::new(),
-            passed_over: BTreeSet::new(),
+            skipped_objects: BTreeSet::new(),
         }
     }
 
-    pub fn passes_over(&self) -> bool {
+    pub fn skips_unknown(&self) -> bool {
         self.unknown == UnknownClasses::Skip
     }
 
-    /// Whether a value was passed over, and what is put into it is too.
-    pub fn is_passed_over(&self, id: ValueId) -> bool {
+    /// Returns whether a value is a skipped object. Items that are added to it are skipped as well.
+    pub fn is_skipped(&self, id: ValueId) -> bool {
         matches!(self.get(id), Value::Opaque)
     }
 
-    /// What cannot be understood is an error in a chunk, and passed over in a checkpoint.
+    /// Replaces an error by a skipped object, if unknown classes are skipped.
     pub fn or_opaque(&self, value: Result<Value, UnpickleError>) -> Result<Value, UnpickleError> {
-        if self.passes_over() { Ok(value.unwrap_or(Value::Opaque)) } else { value }
+        if self.skips_unknown() { Ok(value.unwrap_or(Value::Opaque)) } else { value }
     }
 
     pub fn push_global(&mut self, module: &str, name: &str) -> Result<(), UnpickleError> {
         let value = if let Some(global) = global(module, name, self.unknown)? {
             Value::Global(global)
         } else {
-            if self.passed_over.len() < MAX_PASSED_OVER {
-                self.passed_over.insert(shown(module, name));
+            if self.skipped_objects.len() < MAX_SKIPPED_OBJECTS {
+                self.skipped_objects.insert(escaped_name(module, name));
             }
             Value::Opaque
         };
@@ -87,7 +87,7 @@ impl<'a> PickleMachine<'a> {
         Ok(self.stack.split_off(mark))
     }
 
-    /// The value an opcode works on without taking it off the stack.
+    /// Returns the top value without popping it.
     pub fn top(&self) -> Result<ValueId, UnpickleError> {
         let floor = self.marks.last().copied().unwrap_or(0);
         self.stack[floor..].last().copied().ok_or_else(|| "an opcode without its operands".into())
@@ -95,7 +95,7 @@ impl<'a> PickleMachine<'a> {
 
     pub fn extend_list(&mut self, items: &[ValueId]) -> Result<(), UnpickleError> {
         let list = self.top()?;
-        if self.is_passed_over(list) {
+        if self.is_skipped(list) {
             return Ok(());
         }
         let Value::List(list) = &mut self.values[list.0 as usize] else {
@@ -107,7 +107,7 @@ impl<'a> PickleMachine<'a> {
 
     pub fn extend_dict(&mut self, items: &[ValueId]) -> Result<(), UnpickleError> {
         let dict = self.top()?;
-        if self.is_passed_over(dict) {
+        if self.is_skipped(dict) {
             return Ok(());
         }
         let Value::Dict(dict) = &mut self.values[dict.0 as usize] else {
@@ -158,7 +158,7 @@ impl<'a> PickleMachine<'a> {
         String::from_utf8(bytes).map_err(|_| "a string that is not UTF-8".into())
     }
 
-    /// A line of text without its newline.
+    /// Reads a line of text without its newline.
     pub fn line(&mut self) -> Result<String, UnpickleError> {
         let length = self.bytes[self.at..].iter().position(|&byte| byte == b'\n');
         let line = self.text(length.ok_or("it ends in the middle of a name")?)?;

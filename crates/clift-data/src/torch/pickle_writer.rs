@@ -1,4 +1,4 @@
-//! Writes what `torch.load` reads: a pickle of protocol 2 beside its storages, in a ZIP archive.
+//! Files for `torch.load`: a pickle of protocol 2 and its storages in a ZIP archive.
 
 use std::io::{Cursor, Write};
 
@@ -6,7 +6,7 @@ use zip::result::ZipResult;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-/// A pickle of protocol 2 and the storages it refers to.
+/// A pickle of protocol 2 and its storages.
 pub(crate) struct PickleWriter {
     bytes: Vec<u8>,
     storages: Vec<Vec<u8>>,
@@ -18,13 +18,13 @@ impl PickleWriter {
         Self { bytes: b"\x80\x02".to_vec(), storages: Vec::new() }
     }
 
-    /// A contiguous tensor that is the whole of a new storage.
+    /// Writes a contiguous tensor that fills a new storage.
     pub fn tensor(&mut self, storage_type: &str, storage: Vec<u8>, shape: &[usize]) {
         let stride: Vec<usize> = (0..shape.len()).map(|dimension| shape[dimension + 1..].iter().product()).collect();
         self.strided_tensor(storage_type, storage, shape, &stride);
     }
 
-    /// A tensor in a new storage, from its first element on.
+    /// Writes a tensor that starts at the first element of a new storage.
     pub fn strided_tensor(&mut self, storage_type: &str, storage: Vec<u8>, shape: &[usize], stride: &[usize]) {
         self.raw(b"ctorch._utils\n_rebuild_tensor_v2\n((");
         self.string("storage");
@@ -46,25 +46,26 @@ impl PickleWriter {
         self.storages.push(storage);
     }
 
-    /// A string.
+    /// Writes a string.
     pub fn string(&mut self, text: &str) {
         self.raw(b"X");
         self.raw(&(text.len() as u32).to_le_bytes());
         self.raw(text.as_bytes());
     }
 
-    /// LONG1 with eight bytes: one opcode for every size.
+    /// Writes an integer as LONG1 with eight bytes, for every size.
     pub fn integer(&mut self, value: usize) {
         self.raw(&[0x8a, 8]);
         self.raw(&(value as u64).to_le_bytes());
     }
 
-    /// Opcodes as they are.
+    /// Writes opcodes.
     pub fn raw(&mut self, bytes: &[u8]) {
         self.bytes.extend_from_slice(bytes);
     }
 
-    /// Packs a finished pickle and its storages, stored and aligned to 64 bytes, below the folder `prefix`.
+    /// Returns the archive of the finished pickle and its storages, uncompressed and aligned to 64 bytes, with the top
+    /// folder `prefix`.
     pub fn pack(self, prefix: &str) -> ZipResult<Vec<u8>> {
         let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
         let mut zip = ZipWriter::new(Cursor::new(Vec::new()));

@@ -3,7 +3,7 @@
 use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::values::{ElementType, Tensor, Value};
 
-/// Returns where a tensor's bytes lie, after checks of type, shape (`None` is any size), layout and bounds.
+/// Returns the byte range of a tensor, after checks of type, shape (`None` is any size), layout and bounds.
 pub(crate) fn tensor_span(
     value: &Value,
     shape: &[Option<u64>],
@@ -49,7 +49,7 @@ pub(crate) fn storage_stretch(tensor: &Tensor) -> Result<Tensor, String> {
         length.checked_add(size.saturating_sub(1).checked_mul(stride)?)
     });
     let count = shape.iter().try_fold(1_u64, |count, &size| count.checked_mul(size));
-    // Its elements may not overlap: a small file could claim any number of them.
+    // Overlapping elements are refused: a small file could claim any number of them.
     let is_held = length.zip(count).is_some_and(|(length, count)| count <= length);
     let (Some(length), true) = (length, is_held) else {
         return Err(format!("stride is {stride:?}: an expanded tensor; save it as tensor.contiguous()"));
@@ -59,10 +59,10 @@ pub(crate) fn storage_stretch(tensor: &Tensor) -> Result<Tensor, String> {
 
 /// Reorders the elements of a strided tensor to row-major order.
 pub(crate) fn in_row_major_order(stored: &[f32], shape: &[u64], stride: &[u64]) -> Vec<f32> {
-    let mut places = vec![0_usize];
+    let mut positions = vec![0_usize];
     for (&size, &stride) in shape.iter().zip(stride) {
-        let next = |&place: &usize| (0..size as usize).map(move |i| place + i * stride as usize);
-        places = places.iter().flat_map(next).collect();
+        let next = |&start: &usize| (0..size as usize).map(move |i| start + i * stride as usize);
+        positions = positions.iter().flat_map(next).collect();
     }
-    places.into_iter().map(|place| stored[place]).collect()
+    positions.into_iter().map(|position| stored[position]).collect()
 }

@@ -1,4 +1,4 @@
-//! The opcodes that `torch.save` writes, on a [`PickleMachine`].
+//! Opcodes of `torch.save`, executed on a [`PickleMachine`].
 
 use std::collections::BTreeSet;
 
@@ -6,29 +6,29 @@ use crate::torch::allow_list::{UnknownClasses, UnpickleError};
 use crate::torch::pickle_machine::PickleMachine;
 use crate::torch::values::{Global, MAX_BYTES, Storage, Tensor, Value, ValueId};
 
-/// Deepest nesting of unfinished lists, dicts and tuples; chunks need five.
+/// Deepest nesting of unfinished lists, dicts and tuples in chunks, which need five levels.
 const MAX_DEPTH: usize = 32;
-/// The same in checkpoints, whose configuration objects nest.
+/// Deepest nesting in checkpoints, which contain configuration objects.
 const MAX_CHECKPOINT_DEPTH: usize = 256;
-/// Most dimensions of a tensor.
+/// Largest number of dimensions of a tensor.
 const MAX_DIMENSIONS: usize = 4;
-/// Longest name of a storage; `torch.save` numbers them.
+/// Longest name of a storage; `torch.save` numbers the storages.
 const MAX_STORAGE_KEY_BYTES: usize = 32;
 
-/// What a pickle holds.
+/// Values of a pickle.
 pub(crate) struct Unpickled {
     pub values: Vec<Value>,
     /// The outermost value.
     pub root: ValueId,
-    /// Names of the classes and functions that were passed over.
-    pub passed_over: BTreeSet<String>,
+    /// Python names of skipped objects.
+    pub skipped_objects: BTreeSet<String>,
 }
 
 /// Reads a pickle.
 pub(crate) fn unpickle(bytes: &[u8], unknown: UnknownClasses) -> Result<Unpickled, UnpickleError> {
     let mut machine = PickleMachine::new(bytes, unknown);
     match machine.run() {
-        Ok(root) => Ok(Unpickled { root, passed_over: machine.passed_over, values: machine.values }),
+        Ok(root) => Ok(Unpickled { root, skipped_objects: machine.skipped_objects, values: machine.values }),
         Err(UnpickleError::Bad(what)) => Err(UnpickleError::Bad(format!("{what} (at byte {})", machine.at))),
         Err(refused) => Err(refused),
     }
@@ -40,7 +40,7 @@ impl PickleMachine<'_> {
             let what = format!("it has {} bytes, more than the limit of {MAX_BYTES}", self.bytes.len());
             return Err(UnpickleError::Bad(what));
         }
-        let max_depth = if self.passes_over() { MAX_CHECKPOINT_DEPTH } else { MAX_DEPTH };
+        let max_depth = if self.skips_unknown() { MAX_CHECKPOINT_DEPTH } else { MAX_DEPTH };
         loop {
             match self.u8()? {
                 b'.' => return self.pop(),
@@ -48,7 +48,7 @@ impl PickleMachine<'_> {
                     2..=5 => {}
                     version => return Err(UnpickleError::Bad(format!("protocol {version}, expected 2 to 5"))),
                 },
-                0x95 => drop(self.take(8)?), // FRAME: a length that only matters to streams
+                0x95 => drop(self.take(8)?), // FRAME: the length of a frame, not needed
                 b'(' if self.marks.len() == max_depth => {
                     return Err(UnpickleError::Bad(format!("nested deeper than {max_depth} levels")));
                 }
@@ -57,7 +57,7 @@ impl PickleMachine<'_> {
                     let known = self.read_scalar(opcode)?
                         || self.read_container(opcode)?
                         || self.read_reference(opcode)?
-                        || self.passes_over() && self.read_object(opcode)?;
+                        || self.skips_unknown() && self.read_object(opcode)?;
                     if !known {
                         return Err(UnpickleError::Bad(format!(
                             "opcode {opcode:#04x}, which torch.save does not write"
@@ -68,7 +68,7 @@ impl PickleMachine<'_> {
         }
     }
 
-    /// Numbers, strings, `None`, `True`, `False`.
+    /// Handles the opcodes of numbers, strings, `None`, `True` and `False`; returns false for another opcode.
     fn read_scalar(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
         let value = match opcode {
             b'N' => Value::None,
@@ -81,7 +81,7 @@ impl PickleMachine<'_> {
                 let length = self.u8()? as usize;
                 let digits = self.take(length)?;
                 if length > 8 {
-                    if !self.passes_over() {
+                    if !self.skips_unknown() {
                         return Err("an integer of more than 64 bits".into());
                     }
                     self.push(Value::Opaque)?;
@@ -108,7 +108,7 @@ impl PickleMachine<'_> {
         Ok(true)
     }
 
-    /// Lists, tuples and dicts.
+    /// Handles the opcodes of lists, tuples and dicts; returns false for another opcode.
     fn read_container(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
         match opcode {
             b']' => self.push(Value::List(Vec::new()))?,
@@ -148,7 +148,7 @@ impl PickleMachine<'_> {
         Ok(true)
     }
 
-    /// The memo, Python names, storages and calls.
+    /// Handles the opcodes of the memo, Python names, storages and calls; returns false for another opcode.
     fn read_reference(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
         match opcode {
             b'q' => {
@@ -197,7 +197,7 @@ impl PickleMachine<'_> {
         Ok(true)
     }
 
-    /// `("storage", <storage type>, key, device, number of elements)`
+    /// Reads a storage: `("storage", <storage type>, key, device, number of elements)`.
     fn storage(&self, id: ValueId) -> Result<Storage, UnpickleError> {
         let Value::Tuple(fields) = self.get(id) else { return Err("a storage that is not a tuple".into()) };
         let [kind, storage_type, key, _device, num_elements] = fields[..] else {
@@ -213,7 +213,7 @@ impl PickleMachine<'_> {
         }
     }
 
-    /// The only calls that are understood; all of them only describe data.
+    /// Evaluates a call of an allowed name; these calls only describe data.
     fn call(&self, callee: ValueId, arguments: ValueId) -> Result<Value, UnpickleError> {
         let Value::Tuple(arguments) = self.get(arguments) else {
             return Err("a call whose arguments are no tuple".into());
@@ -240,7 +240,7 @@ impl PickleMachine<'_> {
         }
     }
 
-    /// A short tuple of non-negative integers.
+    /// Reads a tuple of at most [`MAX_DIMENSIONS`] non-negative integers.
     fn counts(&self, id: ValueId) -> Result<Vec<u64>, UnpickleError> {
         let Value::Tuple(items) = self.get(id) else { return Err("a tensor whose sizes are no tuple".into()) };
         if items.len() > MAX_DIMENSIONS {

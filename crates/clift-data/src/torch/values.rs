@@ -1,11 +1,11 @@
-//! Values of a pickle, and the limits of their number and size.
+//! Values of a pickle, with limits of their number and size.
 
-/// Largest pickle that is read; a chunk of 2,000 frames has about 150 kB.
+/// Largest size of a pickle, in bytes; a chunk of 2,000 frames has about 150 kB.
 pub const MAX_BYTES: usize = 16 << 20;
-/// Most values one pickle may build, of at most 250 bytes each; a chunk has about 15 per frame.
+/// Largest number of values of a pickle, of at most 250 bytes each; a chunk has about 15 per frame.
 pub const MAX_VALUES: usize = 1 << 20;
 
-/// Place of a value in its [`Pickle`](crate::torch::pickle::Pickle).
+/// Index of a value in its [`Pickle`](crate::torch::pickle::Pickle).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ValueId(pub(crate) u32);
 
@@ -22,14 +22,14 @@ pub enum ElementType {
     F32,
     /// `torch.DoubleStorage`
     F64,
-    /// `torch.HalfStorage`, in checkpoints alone.
+    /// `torch.HalfStorage`, in checkpoints only.
     F16,
-    /// `torch.BFloat16Storage`, in checkpoints alone.
+    /// `torch.BFloat16Storage`, in checkpoints only.
     BF16,
 }
 
 impl ElementType {
-    /// Bytes of one element.
+    /// Returns the number of bytes of one element.
     pub fn num_bytes(self) -> u64 {
         match self {
             Self::U8 => 1,
@@ -45,40 +45,40 @@ impl ElementType {
 pub enum Global {
     /// `torch._utils._rebuild_tensor_v2`
     RebuildTensor,
-    /// `torch._utils._rebuild_parameter`, or `_rebuild_parameter_with_state` of one with attributes, in checkpoints alone.
+    /// `torch._utils._rebuild_parameter`, or `_rebuild_parameter_with_state`, in checkpoints only.
     RebuildParameter,
     /// `collections.OrderedDict`
     OrderedDict,
-    /// `torch.ByteStorage` and its like.
+    /// `torch.ByteStorage` and the other storage types.
     Storage(ElementType),
 }
 
-/// A storage that the archive keeps beside the pickle.
+/// A storage: a member of the archive beside the pickle.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Storage {
-    /// Type of its elements.
+    /// Element type.
     pub element_type: ElementType,
-    /// Name of its archive member, below `data/`.
+    /// Name of the archive member below `data/`.
     pub key: String,
-    /// How many elements the pickle says it has.
+    /// Number of elements according to the pickle.
     pub num_elements: u64,
 }
 
-/// A tensor as a view of a storage; counts are in elements and not yet checked against the archive.
+/// A tensor as a view of a storage. Counts are in elements and not checked against the archive.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tensor {
-    /// Where its elements are.
+    /// Storage of the elements.
     pub storage: Storage,
-    /// First element.
+    /// Index of the first element.
     pub offset: u64,
-    /// Sizes of its dimensions.
+    /// Sizes of the dimensions.
     pub shape: Vec<u64>,
-    /// Steps between neighbours, one per dimension.
+    /// Steps between neighbours, per dimension.
     pub stride: Vec<u64>,
 }
 
 impl Tensor {
-    /// Whether its elements lie one after the other, in row-major order.
+    /// Returns whether the elements are contiguous in row-major order.
     pub fn is_contiguous(&self) -> bool {
         let mut step = 1_u64;
         self.shape.iter().zip(&self.stride).rev().all(|(&size, &stride)| {
@@ -106,7 +106,7 @@ pub enum Value {
     List(Vec<ValueId>),
     /// A tuple.
     Tuple(Vec<ValueId>),
-    /// A dict in order of insertion; a key that is set twice is in it twice, and the later one counts.
+    /// A dict in order of insertion; of a key that occurs twice, the later value counts.
     Dict(Vec<(ValueId, ValueId)>),
     /// A Python name.
     Global(Global),
@@ -114,6 +114,6 @@ pub enum Value {
     Storage(Box<Storage>),
     /// A tensor.
     Tensor(Box<Tensor>),
-    /// Something of a checkpoint that was passed over: an object of a class that is not known, what was made from it.
+    /// A skipped object of an unknown class in a checkpoint.
     Opaque,
 }

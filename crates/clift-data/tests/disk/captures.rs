@@ -1,4 +1,4 @@
-//! What own captures say, leave out and do in their own way.
+//! Own captures: intrinsics, lenses, duplicate frames, model folders.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -15,25 +15,25 @@ use crate::open_at;
 
 const SIZE: [usize; 2] = [24, 16];
 
-/// A picture of one colour per number.
+/// Returns the PNG of an image that depends on a number.
 fn png(number: u8) -> Vec<u8> {
     let [width, height] = SIZE;
     let rgb = (0..width * height * 3).map(|i| number.wrapping_mul(31).wrapping_add((i / 5) as u8)).collect();
     encode_png(&RgbImage { width, height, rgb }).unwrap()
 }
 
-/// A camera-to-world matrix at `(x, 0, 0)`, as rows.
+/// Returns the rows of a camera-to-world matrix at `(x, 0, 0)`.
 fn at(x: f64) -> Value {
     json!([[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 }
 
-/// A capture with these files and this `transforms.json`.
+/// A capture with image files and a `transforms.json`.
 struct Capture(tempfile::TempDir);
 
 impl Capture {
-    fn new(pictures: &[&str], transforms: &Value) -> Self {
+    fn new(images: &[&str], transforms: &Value) -> Self {
         let root = tempfile::tempdir().unwrap();
-        for (number, name) in pictures.iter().enumerate() {
+        for (number, name) in images.iter().enumerate() {
             let path = root.path().join(name);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             fs::write(path, png(number as u8)).unwrap();
@@ -46,14 +46,6 @@ impl Capture {
         let opened = open_at(self.0.path(), Split::Test, &SourceOptions::default());
         opened.map(|opened| (opened.source, opened.report)).map_err(|error| error.to_string())
     }
-
-    /// Which of the pictures each frame is, and where its camera stands.
-    fn frames(&self) -> Vec<(u8, f64)> {
-        let (source, _) = self.open().unwrap();
-        let cameras = source.cameras(0).unwrap();
-        let number = |frame| (0..9).find(|number| source.encoded_frame(0, frame).unwrap().unwrap() == png(*number));
-        (0..cameras.len()).map(|frame| (number(frame).unwrap(), cameras[frame].c2w.translation[0])).collect()
-    }
 }
 
 fn frame(name: &str, x: f64) -> Value {
@@ -61,19 +53,11 @@ fn frame(name: &str, x: f64) -> Value {
 }
 
 #[test]
-fn frames_are_in_natural_order_with_their_cameras() {
-    let frames = [frame("images/10.png", 10.0), frame("images/9.png", 9.0), frame("images/1.png", 1.0)];
-    let capture =
-        Capture::new(&["images/1.png", "images/10.png", "images/9.png"], &json!({"fl_x": 20, "frames": frames}));
-    assert_eq!(capture.frames(), [(0, 1.0), (2, 9.0), (1, 10.0)]);
-}
-
-#[test]
 fn angles_and_image_size_replace_missing_intrinsics() {
     let angle = 2.0 * (0.5_f64 / 0.8).atan();
     let capture = Capture::new(&["r_0.png"], &json!({"camera_angle_x": angle, "frames": [frame("./r_0", 0.0)]}));
     let k = capture.open().unwrap().0.cameras(0).unwrap()[0].intrinsics_norm;
-    // Square pixels: fy in pixels is fx.
+    // Square pixels.
     for (got, expected) in [(k.fx, 0.8), (k.fy, 0.8 * 24.0 / 16.0), (k.cx, 0.5), (k.cy, 0.5)] {
         assert!((got - expected).abs() < 1e-12, "{k:?}");
     }
@@ -91,7 +75,7 @@ fn frame_intrinsics_override_and_scale_with_images() {
     let cameras = capture.open().unwrap().0.cameras(0).unwrap();
     let [a, b] = [0, 1].map(|frame: usize| cameras[frame].intrinsics_norm);
     assert_eq!([a.fx, a.fy, a.cx, a.cy], [1.0, 1.125, 0.5, 0.45]);
-    // A focal length of its own is for both axes, and not mixed with another's fl_y.
+    // The frame's fl_x holds for both axes and is not mixed with the fl_y of the top level.
     assert_eq!([b.fx, b.fy, b.cx, b.cy], [0.625, 0.9375, 0.25, 1.125]);
 }
 
@@ -100,12 +84,12 @@ fn images_named_twice_are_used_once() {
     let frames = [frame("images/a.png", 0.0), frame("images/a", 1.0), frame("images/b.png", 2.0)];
     let capture = Capture::new(&["images/a.png", "images/b.png"], &json!({"fl_x": 20, "frames": frames}));
     assert_eq!(capture.open().unwrap().0.num_frames(0).unwrap(), 2);
-    let ledger = capture.open().unwrap().1;
-    assert_eq!(ledger.frames[0].reason, "whose picture another frame has");
-    assert_eq!(ledger.frames.len(), 1);
+    let report = capture.open().unwrap().1;
+    assert_eq!(report.frames[0].reason, "with the image of another frame");
+    assert_eq!(report.frames.len(), 1);
 }
 
-/// A copy of COLMAP's fixture whose camera has another model, and its first picture as it is on disk.
+/// Copies the COLMAP fixture with another camera model; returns its first image as stored.
 fn colmap(model: &str) -> (tempfile::TempDir, RgbImage) {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&fixtures().join("layouts/colmap_txt"), root.path());
@@ -124,7 +108,7 @@ fn open(root: &Path, undistort: Option<bool>) -> Arc<dyn SceneSource> {
 
 #[test]
 fn colmap_lenses_are_undistorted_unless_ignored() {
-    // In pixels of twice the picture: cameras scale.
+    // The camera has twice the size of the images.
     let norm = |fx: f64, fy: f64| IntrinsicsNorm { fx: fx / 64.0, fy: fy / 36.0, cx: 31.0 / 64.0, cy: 19.0 / 36.0 };
     for (line, fx, fy, radial, tangential) in [
         ("SIMPLE_PINHOLE 64 36 56 31 19", 56.0, 56.0, [0.0; 2], [0.0; 2]),
@@ -133,31 +117,31 @@ fn colmap_lenses_are_undistorted_unless_ignored() {
         ("RADIAL 64 36 56 31 19 0.1 -0.03", 56.0, 56.0, [0.1, -0.03], [0.0; 2]),
         ("OPENCV 64 36 56 57 31 19 0.1 -0.03 0.002 -0.001", 56.0, 57.0, [0.1, -0.03], [0.002, -0.001]),
     ] {
-        let (root, picture) = colmap(line);
+        let (root, image) = colmap(line);
         let (norm, lens) = (norm(fx, fy), Lens { radial: [radial[0], radial[1], 0.0], tangential });
         let ignored = open(root.path(), Some(false));
         assert_eq!(ignored.cameras(0).unwrap()[0].intrinsics_norm, norm, "{line}");
-        assert_eq!(ignored.frame(0, 0).unwrap(), picture, "{line}");
+        assert_eq!(ignored.frame(0, 0).unwrap(), image, "{line}");
         let source = open(root.path(), None);
         if lens.is_pinhole() {
-            assert_eq!(source.frame(0, 0).unwrap(), picture, "{line}");
+            assert_eq!(source.frame(0, 0).unwrap(), image, "{line}");
             continue;
         }
         let undistortion = Undistortion::new(norm, lens).unwrap();
         assert_eq!(source.cameras(0).unwrap()[0].intrinsics_norm, undistortion.intrinsics_norm(), "{line}");
-        assert_eq!(source.frame(0, 0).unwrap(), undistortion.apply(&picture), "{line}");
-        assert_ne!(source.frame(0, 0).unwrap(), picture, "{line}");
-        assert_eq!(source.encoded_frame(0, 0).unwrap(), None, "no file holds the resampled picture");
+        assert_eq!(source.frame(0, 0).unwrap(), undistortion.apply(&image), "{line}");
+        assert_ne!(source.frame(0, 0).unwrap(), image, "{line}");
+        assert_eq!(source.encoded_frame(0, 0).unwrap(), None, "no file holds the resampled image");
     }
 }
 
 #[test]
 fn colmap_images_are_found_from_any_model_folder() {
-    let (root, picture) = colmap("PINHOLE 64 36 56 57 31 19");
+    let (root, image) = colmap("PINHOLE 64 36 56 57 31 19");
     let scene = root.path().join("attic");
     copy_folder(&scene.join("sparse/0"), &scene.join("sparse/1"));
-    let ledger = open_at(root.path(), Split::Test, &SourceOptions::default()).unwrap().report;
-    assert!(ledger.notes[0].ends_with("sparse/0 has 1 more models, which are not used: only model 0 is"), "{ledger}");
+    let report = open_at(root.path(), Split::Test, &SourceOptions::default()).unwrap().report;
+    assert!(report.notes[0].ends_with("sparse/0 has 1 more models; only model 0 is used"), "{report}");
     let models: [(&str, PathBuf); 3] =
         [("colmap/sparse/0", "images".into()), ("dense/sparse", "dense/images".into()), ("sparse", "images_4".into())];
     for (model, images) in models {
@@ -165,6 +149,6 @@ fn colmap_images_are_found_from_any_model_folder() {
         copy_folder(&scene.join("sparse/0"), &other.path().join("attic").join(model));
         copy_folder(&scene.join("images"), &other.path().join("attic").join(images));
         let source = open(other.path(), None);
-        assert_eq!((source.key(0), source.frame(0, 0).unwrap()), ("attic", picture.clone()), "{model}");
+        assert_eq!((source.key(0), source.frame(0, 0).unwrap()), ("attic", image.clone()), "{model}");
     }
 }

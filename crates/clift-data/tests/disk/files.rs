@@ -1,13 +1,13 @@
-//! Fixtures, and copies of them that tests may break.
+//! Fixtures and their copies.
 
 use std::path::{Path, PathBuf};
 
-/// The checked-in fixtures.
+/// Returns the folder of the fixtures.
 pub fn fixtures() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures")
 }
 
-/// Copies a folder with all that is in it.
+/// Copies a folder with its contents.
 pub fn copy_folder(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).unwrap();
     for entry in std::fs::read_dir(from).unwrap() {

@@ -13,7 +13,7 @@ use crate::open_at;
 
 const KEY: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 
-/// Folder, split, layout and key of each.
+/// Folder, split, layout and key of every fixture.
 const LAYOUTS: [(&str, Split, SourceKind, &str); 10] = [
     ("chunks", Split::Test, SourceKind::Chunks, KEY),
     ("depthsplat", Split::Train, SourceKind::Chunks, "dl3dv_"),
@@ -86,7 +86,7 @@ fn all_layouts_give_the_same_clip() {
 
 #[test]
 fn cameras_equal_those_of_the_fixture_script() {
-    // What the script says of frame 3: 1.0 + 0.2 * 3, -0.5 + 0.03 * 9, 2.0 - 0.1 * 3.
+    // Frame 3 of the script: 1.0 + 0.2 * 3, -0.5 + 0.03 * 9, 2.0 - 0.1 * 3.
     for (name, split, ..) in LAYOUTS {
         let source = open(&layouts().join(name), split, SourceKind::Auto).source;
         let camera = source.cameras(0).unwrap()[3];
@@ -123,14 +123,14 @@ fn captures_open_as_folders_or_file() {
     assert_eq!((model.key(0), model.num_scenes()), ("attic", 1));
 }
 
-/// DL3DV's fixture with frame 3 of one scene renamed, and that scene twice.
+/// Writes two copies of the DL3DV fixture, with a frame of the second renamed; returns their keys.
 fn two_scenes(root: &Path) -> [String; 2] {
     let keys = [KEY.to_owned(), KEY.replace('d', "e")];
     for key in &keys {
         copy_folder(&layouts().join("dl3dv/1K").join(KEY), &root.join("2K").join(key));
     }
-    let pictures = root.join("2K").join(&keys[1]).join("images_8");
-    std::fs::rename(pictures.join("frame_00004.png"), pictures.join("4.png")).unwrap();
+    let images = root.join("2K").join(&keys[1]).join("images_8");
+    std::fs::rename(images.join("frame_00004.png"), images.join("4.png")).unwrap();
     keys
 }
 
@@ -143,62 +143,40 @@ fn open_with(root: &Path, split: Split, files: FileOptions) -> (Arc<dyn SceneSou
 fn incomplete_scenes_are_skipped_unless_asked_for() {
     let root = tempfile::tempdir().unwrap();
     let [whole, torn] = two_scenes(root.path());
-    let (source, ledger) = open_with(root.path(), Split::Test, FileOptions::default());
+    let (source, report) = open_with(root.path(), Split::Test, FileOptions::default());
     assert_eq!((source.num_scenes(), source.key(0)), (1, whole.as_str()));
-    assert_eq!(ledger.skips[0].reason, "with frames that have no picture");
-    assert_eq!((&ledger.frames[0].key, ledger.frames[0].frame.as_str()), (&torn, "images/frame_00004.png"));
+    assert_eq!(report.skips[0].reason, "with frames that have no image");
+    assert_eq!((&report.frames[0].key, report.frames[0].frame.as_str()), (&torn, "images/frame_00004.png"));
 
     let files = FileOptions { keep_incomplete: true, ..FileOptions::default() };
-    let (source, ledger) = open_with(root.path(), Split::Test, files);
+    let (source, report) = open_with(root.path(), Split::Test, files);
     let scene = source.find(&torn).unwrap();
     assert_eq!((source.num_scenes(), source.num_frames(scene).unwrap()), (2, 5));
-    assert!(ledger.skips.is_empty() && ledger.frames.len() == 1);
-    // Joined by name: the frame after the gap has its own picture and camera.
+    assert!(report.skips.is_empty() && report.frames.len() == 1);
+    // Images and cameras are joined by name: the frame after the missing one keeps both.
     let other = source.find(&whole).unwrap();
     assert_eq!(source.frame(scene, 3).unwrap(), source.frame(other, 4).unwrap());
     assert_eq!(source.cameras(scene).unwrap()[3], source.cameras(other).unwrap()[4]);
 }
 
 #[test]
-fn listed_test_scenes_are_kept_out_of_training() {
-    let root = tempfile::tempdir().unwrap();
-    let [train, test] = two_scenes(root.path());
-    let list = root.path().join("benchmark.json");
-    std::fs::write(&list, format!(r#"{{"{test}": null, "00": {{"context": [0], "target": [1]}}}}"#)).unwrap();
-    let files = || FileOptions { test_scenes: Some(list.clone()), keep_incomplete: true, ..FileOptions::default() };
-    let (source, ledger) = open_with(root.path(), Split::Train, files());
-    assert_eq!((source.num_scenes(), source.key(0)), (1, train.as_str()));
-    assert!(ledger.to_string().starts_with("1 of 2 scenes used; 1 kept for testing"), "{ledger}");
-    let (source, ledger) = open_with(root.path(), Split::Test, files());
-    assert_eq!((source.num_scenes(), source.key(0)), (1, test.as_str()));
-    assert!(ledger.to_string().starts_with("1 of 2 scenes used; 1 in the list of test scenes, but not"), "{ledger}");
-
-    // DepthSplat's training chunks prefix the keys; this one's test half has no such scene.
-    std::fs::write(&list, format!("{KEY}\n")).unwrap();
-    let (source, ledger) = open_with(&layouts().join("depthsplat"), Split::Train, files());
-    let expected = "0 of 1 scenes used; 1 kept for testing by the list of test scenes, but not in test/";
-    assert_eq!((source.num_scenes(), ledger.to_string()), (0, expected.into()));
-}
-
-#[test]
 fn filters_and_sizes_skip_scenes_with_reasons() {
-    let ledger = |filters: SceneFilters, min_size: [usize; 2]| {
+    let report = |filters: SceneFilters, min_size: [usize; 2]| {
         let options = SourceOptions { filters, min_size, ..SourceOptions::default() };
-        let OpenedSource { source, report: ledger, .. } =
-            open_at(&layouts().join("dl3dv"), Split::Test, &options).unwrap();
-        assert_eq!(source.num_scenes(), ledger.num_used());
-        ledger.skips.into_iter().map(|skip| skip.reason).collect::<Vec<_>>()
+        let OpenedSource { source, report, .. } = open_at(&layouts().join("dl3dv"), Split::Test, &options).unwrap();
+        assert_eq!(source.num_scenes(), report.num_used());
+        report.skips.into_iter().map(|skip| skip.reason).collect::<Vec<_>>()
     };
     let none = SceneFilters::default;
-    assert_eq!(ledger(none(), [32, 18]), [] as [&str; 0]);
-    assert_eq!(ledger(none(), [32, 19]), ["with pictures smaller than 32x19"]);
-    assert_eq!(ledger(SceneFilters { min_frames: 7, ..none() }, [0, 0]), ["shorter than 7 frames"]);
+    assert_eq!(report(none(), [32, 18]), [] as [&str; 0]);
+    assert_eq!(report(none(), [32, 19]), ["with images smaller than 32x19"]);
+    assert_eq!(report(SceneFilters { min_frames: 7, ..none() }, [0, 0]), ["shorter than 7 frames"]);
     let narrow = SceneFilters { max_fov_deg: Some(40.0), ..none() };
-    assert_eq!(ledger(narrow, [0, 0]), ["with a field of view above 40 degrees"]);
+    assert_eq!(report(narrow, [0, 0]), ["with a field of view above 40 degrees"]);
 }
 
 #[test]
-fn the_folder_of_pictures_may_be_chosen() {
+fn image_folders_may_be_chosen() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&layouts().join("dl3dv"), root.path());
     let scene = root.path().join("1K").join(KEY);
@@ -209,10 +187,7 @@ fn the_folder_of_pictures_may_be_chosen() {
     };
     assert_eq!(chosen("small").unwrap().source.num_frames(0).unwrap(), 6);
     let message = chosen("large").err().unwrap().to_string();
-    assert!(
-        message.contains("none of its 6 frames has a picture, the first being images/frame_00001.png"),
-        "{message}"
-    );
+    assert!(message.contains("none of 6 frames has an image; the first is images/frame_00001.png"), "{message}");
     assert!(message.ends_with("transforms.json"), "{message}");
 }
 
@@ -224,7 +199,7 @@ fn re10k_frames_are_found_where_configured() {
     copy_folder(&layouts().join("re10k_txt/frames"), &elsewhere.join("test"));
     let data = root.path().join("data");
     let message = open_at(&data, Split::Test, &SourceOptions::default()).err().unwrap().to_string();
-    assert!(message.contains("none of its 6 frames has a picture, the first being 1000000"), "{message}");
+    assert!(message.contains("none of 6 frames has an image; the first is 1000000"), "{message}");
     let files = FileOptions { frames: Some(elsewhere), ..FileOptions::default() };
     assert_eq!(open_with(&data, Split::Test, files).0.num_frames(0).unwrap(), 6);
 }
@@ -233,11 +208,11 @@ fn re10k_frames_are_found_where_configured() {
 fn scenes_and_chunks_open_without_an_index() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&layouts().join("scenes"), root.path());
-    let (source, ledger) = open_with(root.path(), Split::Test, FileOptions::default());
-    assert_eq!((source.key(0), ledger.to_string()), (KEY, "1 of 1 scenes used".into()));
+    let (source, report) = open_with(root.path(), Split::Test, FileOptions::default());
+    assert_eq!((source.key(0), report.to_string()), (KEY, "1 of 1 scenes used".into()));
     std::fs::write(root.path().join("test/invalid_keys.txt"), KEY).unwrap();
-    let (source, ledger) = open_with(root.path(), Split::Test, FileOptions::default());
-    assert_eq!((source.num_scenes(), ledger.to_string()), (0, "0 of 1 scenes used; 1 in invalid_keys.txt".into()));
+    let (source, report) = open_with(root.path(), Split::Test, FileOptions::default());
+    assert_eq!((source.num_scenes(), report.to_string()), (0, "0 of 1 scenes used; 1 in invalid_keys.txt".into()));
 
     let chunks = tempfile::tempdir().unwrap();
     copy_folder(&layouts().join("chunks"), chunks.path());
@@ -245,16 +220,16 @@ fn scenes_and_chunks_open_without_an_index() {
     std::fs::write(chunks.path().join("test/000001.torch"), "cut").unwrap();
     let opened = open(chunks.path(), Split::Test, SourceKind::Auto);
     assert_eq!((opened.source.key(0), opened.source.num_frames(0).unwrap()), (KEY, 6));
-    let ledger = opened.report.to_string();
-    assert!(ledger.starts_with("1 of 2 scenes used; 1 bad chunk: "), "{ledger}");
-    assert!(ledger.ends_with("there is no index.json: the scenes of 2 files were looked up"), "{ledger}");
+    let report = opened.report.to_string();
+    assert!(report.starts_with("1 of 2 scenes used; 1 bad chunk: "), "{report}");
+    assert!(report.ends_with("no index.json: the scenes of 2 files were determined from their contents"), "{report}");
 }
 
 #[test]
 fn scenes_of_equal_name_take_distinct_keys() {
     let root = tempfile::tempdir().unwrap();
-    for place in ["a/attic", "b/c/attic", "b/cellar"] {
-        copy_folder(&layouts().join("capture/attic"), &root.path().join(place));
+    for path in ["a/attic", "b/c/attic", "b/cellar"] {
+        copy_folder(&layouts().join("capture/attic"), &root.path().join(path));
     }
     let source = open(root.path(), Split::Test, SourceKind::Auto).source;
     let keys: Vec<&str> = (0..source.num_scenes()).map(|scene| source.key(scene)).collect();
@@ -268,6 +243,6 @@ fn split_folders_differ_from_a_shared_folder() {
     let opened = open(root.path(), Split::Train, SourceKind::Auto);
     assert!(opened.has_splits && opened.report.notes.is_empty());
     let error = open_at(root.path(), Split::Test, &SourceOptions::default()).err().unwrap();
-    assert!(error.to_string().starts_with("no scenes found: there is no folder test/ beside the other split: "));
+    assert!(error.to_string().starts_with("no scenes found: no folder test/ beside the other split: "));
     assert!(!open(&root.path().join("train"), Split::Test, SourceKind::Auto).has_splits);
 }

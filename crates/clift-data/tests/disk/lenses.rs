@@ -1,4 +1,5 @@
-//! Lens distortion against COLMAP's camera models and OpenCV's undistortion (`scripts/fixtures/make_layout_fixtures.py`).
+//! Lens distortion against the camera models of COLMAP and the undistortion of OpenCV
+//! (`scripts/fixtures/make_layout_fixtures.py`).
 
 use clift_data::{IntrinsicsNorm, Lens, RgbImage, Undistortion};
 use safetensors::SafeTensors;
@@ -11,7 +12,7 @@ fn f64s(tensors: &SafeTensors<'_>, name: &str) -> Vec<f64> {
     tensors.tensor(name).unwrap().data().as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect()
 }
 
-/// Intrinsics in pixels and the lens of COLMAP's parameters.
+/// Converts COLMAP parameters to intrinsics in pixels and a lens.
 fn camera(model: &str, params: &[f64]) -> ([f64; 4], Lens) {
     let (pixels, [k1, k2, p1, p2]) = match (model, params) {
         ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f, cx, cy], [k, 0.0, 0.0, 0.0]),
@@ -23,7 +24,7 @@ fn camera(model: &str, params: &[f64]) -> ([f64; 4], Lens) {
 }
 
 #[test]
-fn rays_are_put_where_colmap_puts_them() {
+fn distorted_rays_equal_colmap() {
     let bytes = std::fs::read(fixtures().join("reference/lenses.safetensors")).unwrap();
     let tensors = SafeTensors::deserialize(&bytes).unwrap();
     for model in MODELS {
@@ -39,20 +40,20 @@ fn rays_are_put_where_colmap_puts_them() {
 }
 
 #[test]
-fn pictures_are_undistorted_as_by_opencv() {
+fn undistorted_images_equal_opencv() {
     let bytes = std::fs::read(fixtures().join("reference/lenses.safetensors")).unwrap();
     let tensors = SafeTensors::deserialize(&bytes).unwrap();
-    let picture = RgbImage { width: 96, height: 72, rgb: tensors.tensor("picture").unwrap().data().to_vec() };
+    let image = RgbImage { width: 96, height: 72, rgb: tensors.tensor("picture").unwrap().data().to_vec() };
     for model in MODELS {
         let ([fx, fy, cx, cy], lens) = camera(model, &f64s(&tensors, &format!("{model}.params")));
         let from = IntrinsicsNorm { fx: fx / 96.0, fy: fy / 72.0, cx: cx / 96.0, cy: cy / 72.0 };
         let undistortion = Undistortion::new(from, lens).unwrap();
         let (to, zoom) = (undistortion.intrinsics_norm(), f64s(&tensors, &format!("{model}.zoom"))[0]);
-        // OpenCV's edges have 2,001 points and these 129, which may miss the innermost by a little.
+        // OpenCV samples 2,001 points per edge, this crate 129.
         assert!((to.fx / from.fx / zoom - 1.0).abs() < 1e-5, "{model}: {} against {zoom}", to.fx / from.fx);
         assert!((to.fy / from.fy - to.fx / from.fx).abs() < 1e-15);
         assert_eq!((to.cx, to.cy), (from.cx, from.cy));
-        let got = undistortion.apply(&picture);
+        let got = undistortion.apply(&image);
         assert_eq!((got.width, got.height), (96, 72));
         let expected = tensors.tensor(&format!("{model}.undistorted")).unwrap();
         let differences = got.rgb.iter().zip(expected.data()).map(|(a, b)| a.abs_diff(*b));
@@ -60,13 +61,13 @@ fn pictures_are_undistorted_as_by_opencv() {
         let mean = sum as f64 / got.rgb.len() as f64;
         // OpenCV interpolates with 5 bits.
         assert!(worst <= 2 && mean < 0.1, "{model}: worst {worst}, mean {mean}");
-        let unchanged = picture.rgb.iter().zip(expected.data()).map(|(a, b)| u64::from(a.abs_diff(*b))).sum::<u64>();
-        assert!(unchanged > 20 * sum.max(1), "{model}: a picture left as it is would pass");
+        let unchanged = image.rgb.iter().zip(expected.data()).map(|(a, b)| u64::from(a.abs_diff(*b))).sum::<u64>();
+        assert!(unchanged > 20 * sum.max(1), "{model}: the unchanged image would pass");
     }
 }
 
 #[test]
-fn pinhole_lenses_change_nothing_and_impossible_ones_fail() {
+fn pinhole_lenses_change_nothing_and_invalid_ones_fail() {
     let norm = IntrinsicsNorm { fx: 0.8, fy: 1.1, cx: 0.45, cy: 0.52 };
     let pinhole = Undistortion::new(norm, Lens::default()).unwrap();
     for (got, expected) in [(pinhole.intrinsics_norm().fx, 0.8), (pinhole.intrinsics_norm().fy, 1.1)] {
@@ -78,7 +79,7 @@ fn pinhole_lenses_change_nothing_and_impossible_ones_fail() {
         let lens = Lens { radial: [k1, 0.0, 0.0], ..Lens::default() };
         Undistortion::new(norm, lens).unwrap_err().to_string()
     };
-    assert!(message(norm, -2.0).contains("cannot be undone at the edge of the picture"), "{}", message(norm, -2.0));
-    assert!(message(IntrinsicsNorm { cx: 1.2, ..norm }, 0.01).contains("lies outside of the picture"));
+    assert!(message(norm, -2.0).contains("cannot be undone at the edge of the image"), "{}", message(norm, -2.0));
+    assert!(message(IntrinsicsNorm { cx: 1.2, ..norm }, 0.01).contains("lies outside of the image"));
     assert!(message(norm, f64::INFINITY).contains("k1 is inf"));
 }

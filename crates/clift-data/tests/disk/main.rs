@@ -1,12 +1,12 @@
-//! Scenes on disk: every layout, lens distortion, and what is broken or hostile.
+//! Scenes on disk: every layout, lens distortion, broken and hostile files.
 
 mod captures;
+mod detection;
 mod files;
-mod found;
 mod hostile;
 mod layouts;
-mod left_out;
 mod lenses;
+mod skipped;
 
 use std::path::Path;
 

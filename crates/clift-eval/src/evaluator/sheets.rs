@@ -39,7 +39,7 @@ impl Sheets {
     pub fn keep(self) -> Result<(), EvalError> {
         let Self { folder, files, former } = self;
         let replace = || {
-            let kept = files.keep()?;
+            let kept = files.commit()?;
             for name in former.iter().filter(|name| !kept.contains(OsStr::new(name))) {
                 match std::fs::remove_file(folder.join(name)) {
                     Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),

@@ -5,12 +5,13 @@
 
 use std::collections::BTreeMap;
 
+use clift_data::{mean, standard_error};
 use clift_model::TokenFormat;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
 use crate::statistics::eval_results::{EvalResults, SceneViews};
-use crate::statistics::scene_means::{capped, mean, standard_error};
+use crate::statistics::scene_means::capped;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
 /// What the paper says is better than what (section 4.3): the better one first.

@@ -1,6 +1,8 @@
 //! Means over the views of a scene first and over the scenes then, so that a scene with many targets weighs no more
 //! than one with few.
 
+use clift_data::mean;
+
 use crate::statistics::eval_results::SceneViews;
 use crate::statistics::view_metrics::ViewMetrics;
 
@@ -19,17 +21,4 @@ pub(crate) fn capped(psnr: f64) -> f64 {
 /// Returns the mean over the views of each scene, for the scenes that have a value.
 pub(crate) fn scene_means(views: &SceneViews, value: impl Fn(&ViewMetrics) -> Option<f64>) -> Vec<f64> {
     views.values().filter_map(|frames| mean(&frames.values().filter_map(&value).collect::<Vec<_>>())).collect()
-}
-
-/// Returns the mean; `None` for no values.
-pub(crate) fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-}
-
-/// Returns the sample standard deviation over the square root of the count; `None` below two values.
-pub(crate) fn standard_error(values: &[f64]) -> Option<f64> {
-    let count = values.len() as f64;
-    let mean = mean(values)?;
-    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    (values.len() > 1).then(|| (squares / (count - 1.0) / count).sqrt())
 }

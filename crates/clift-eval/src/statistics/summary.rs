@@ -6,7 +6,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use clift_data::{median, p95, replace_file};
+use clift_data::{mean, median, p95, replace_file, standard_error};
 use clift_model::TokenFormat;
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,7 @@ use crate::error::EvalError;
 use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
-use crate::statistics::scene_means::{capped, mean, scene_means, standard_error};
+use crate::statistics::scene_means::{capped, scene_means};
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
 /// Means of a baseline.

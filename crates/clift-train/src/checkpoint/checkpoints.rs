@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use burn::module::Module;
 use burn::optim::OptimizerRecord;
 use burn::store::ModuleRecord;
-use clift_data::{make_folder, publish_file, remove_folder};
+use clift_data::{make_folder, publish_folder, remove_folder};
 use clift_model::{ModelConfig, first_not_f32};
 
 use crate::checkpoint::progress::{Best, Fingerprint, Progress, State, VERSION};
@@ -83,7 +83,7 @@ impl Checkpoints {
             // Only where somebody moved newer checkpoints away and trains those steps again.
             std::fs::remove_dir_all(path).map_err(TrainError::io("replacing a checkpoint", path))?;
         }
-        publish_file(temporary, path).map_err(TrainError::io(SAVING, path))
+        publish_folder(temporary, path).map_err(TrainError::io(SAVING, path))
     }
 
     /// Writes what a validation has added to the progress into the checkpoint of its step, and removes the checkpoints

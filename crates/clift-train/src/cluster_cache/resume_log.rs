@@ -8,7 +8,7 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use clift_data::{SkipReport, make_folder, publish_file, replace_file};
+use clift_data::{SkipReport, make_folder, publish_folder, replace_file};
 use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 
@@ -206,7 +206,7 @@ impl ResumeLog {
         let text = serde_json::to_vec(&index).map_err(TrainError::bad_file("cluster cache", &index_path))?;
         replace_file(&index_path, &text).map_err(TrainError::io(WRITING, &index_path))?;
         drop((data, lines));
-        publish_file(&folder, path).map_err(TrainError::io("renaming the cluster cache", path))?;
+        publish_folder(&folder, path).map_err(TrainError::io("renaming the cluster cache", path))?;
         remove_journal(path)
     }
 }

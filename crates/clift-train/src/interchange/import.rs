@@ -69,7 +69,7 @@ pub fn import(
         parameters: mapping,
         ignored: keys.ignored,
         outside: keys.outside,
-        passed_over: state.passed_over().clone(),
+        passed_over: state.skipped_objects().clone(),
     };
     let config = model_dir::evaluation_config(model, out);
     model_dir::write(out, &config, &parameters, &imported, stop)?;

@@ -7,7 +7,7 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use clift_data::{PoseRotation, PoseScale, SourceKind, TEMPORARY, publish_file, replace_file};
+use clift_data::{PoseRotation, PoseScale, SourceKind, TEMPORARY, publish_folder, replace_file};
 use clift_model::{CliftVariant, ModelConfig, ModelPath, TrainedModel, sorted_header};
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
@@ -115,7 +115,7 @@ pub(crate) fn write(
     TrainedModel::open(&written, &config.model, &config.device.open()?)?;
     check_stop(stop)?;
     require_absent(folder)?;
-    publish_file(temporary.path(), folder).map_err(TrainError::io(writing, folder))?;
+    publish_folder(temporary.path(), folder).map_err(TrainError::io(writing, folder))?;
     let _ = temporary.keep(); // it has another name now
     Ok(())
 }

@@ -330,7 +330,7 @@ impl Run {
             Split::Test => open_dataset(data, split)?,
         };
         sink.event(&Event::Message(format!("{split}: {ledger}")));
-        if ledger.has_gaps() && self.config.run_dir.is_dir() {
+        if ledger.has_skips() && self.config.run_dir.is_dir() {
             write_ledger(&ledger, &self.folder(&format!("skipped-{split}.json")))?;
         }
         let source: Arc<dyn SceneSource> = match self.overfit {

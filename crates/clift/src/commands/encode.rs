@@ -128,7 +128,7 @@ fn open_folder(
     let options = SourceOptions { files, ..SourceOptions::default() };
     let OpenedSource { source, report: mut ledger, .. } = open_source(&DatasetRoot::find(folder)?, split, &options)?;
     ledger.notes.retain(|note| note != SAME_SCENES);
-    if ledger.has_news() {
+    if ledger.has_content() {
         stdout::print_note(&format!("{}: {ledger}", folder.display()));
     }
     Ok(source)

@@ -49,7 +49,7 @@ impl SplitSource {
 
     /// Tells what opening it left out, and what else is to be known.
     pub fn print_news(&self) {
-        if self.opened.report.has_news() {
+        if self.opened.report.has_content() {
             print_note(&format!("{}: {}", self.name(), self.opened.report));
         }
     }

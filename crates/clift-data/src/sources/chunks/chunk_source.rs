@@ -1,4 +1,4 @@
-//! Scenes in the chunk layout of pixelSplat: `<root>/{train,test}/NNNNNN.torch` with an `index.json`.
+//! Scenes in the chunks of pixelSplat: `<root>/{train,test}/NNNNNN.torch` with an `index.json`.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
@@ -17,19 +17,19 @@ use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::filters::SceneFilters;
 use crate::sources::keys::{DL3DV_PREFIX, find_by_name};
 
-/// One chunk file; its table is read when a scene of it is first needed.
+/// A chunk file, whose table is read on the first use of one of its scenes.
 struct Chunk {
     path: PathBuf,
     table: OnceLock<ChunkTable>,
 }
 
 impl Chunk {
-    /// Checks that the file is there.
+    /// Checks that the file exists.
     fn find(&self) -> Result<(), DataError> {
         let metadata = std::fs::metadata(&self.path)
             .map_err(DataError::io("opening a chunk that index.json lists", &self.path))?;
         if metadata.is_dir() {
-            let what = "index.json lists it as a chunk, but it is a folder".into();
+            let what = "a folder, which index.json lists as a chunk".into();
             return Err(DataError::BadChunk { what, path: self.path.clone() });
         }
         Ok(())
@@ -39,13 +39,13 @@ impl Chunk {
         if let Some(table) = self.table.get() {
             return Ok(table);
         }
-        // Two threads may read the same chunk at once; the first to finish is kept.
+        // Two threads may read the same chunk at once; the first result is kept.
         let read = ChunkTable::read(&self.path)?;
         Ok(self.table.get_or_init(|| read))
     }
 }
 
-/// A scene's key and its chunk.
+/// Key and chunk of a scene.
 struct Entry {
     key: String,
     chunk: usize,
@@ -53,34 +53,33 @@ struct Entry {
 
 /// Scenes of one split of a chunked data set, sorted by key, with random access to single frames.
 ///
-/// Chunks are never read whole: a table of 24 bytes per frame is kept once a chunk has been used (about 0.2 GiB for
-/// all of RealEstate10K), and a frame or a scene's cameras are one read each.
+/// A used chunk keeps a table of 24 bytes per frame in memory (about 0.2 GiB for all of RealEstate10K). A frame, or the
+/// cameras of a scene, take one read.
 pub struct ChunkSource {
     chunks: Vec<Chunk>,
     scenes: Vec<Entry>,
     positions: HashMap<String, usize>,
-    ledger: SkipReport,
+    report: SkipReport,
 }
 
 impl ChunkSource {
-    /// Opens `<root>/<split>`. Without filters this reads `index.json` alone; with filters, every chunk's table.
+    /// Opens `<root>/<split>`. Without filters, only `index.json` is read; with filters, the table of every chunk.
     ///
-    /// Scenes whose chunk is missing, and with filters those that cannot be read, go into the ledger with the error
-    /// as the reason: a data set with a gap can be used.
+    /// Scenes of missing chunks, and with filters unreadable scenes, are skipped and reported with the error.
     ///
     /// # Errors
     /// [`DataError::Io`] for a missing `index.json`, [`DataError::BadIndex`] for one that is no map from keys to files
-    /// beside it, [`DataError::BadConfig`] for wrong filters, and the first chunk's error when every chunk fails.
+    /// beside it, [`DataError::BadConfig`] for invalid filters, and the error of the first chunk if every chunk fails.
     pub fn open(root: &Path, split: Split, filters: &SceneFilters) -> Result<Self, DataError> {
         let folder = root.join(split.to_string());
         let index = read_index(&folder.join("index.json"))?;
         let mut source = Self::of_index(&folder, &index, |_| true, filters, false)?;
-        source.tell_unlisted(&folder, &index);
+        source.record_unlisted(&folder, &index);
         Ok(source)
     }
 
-    /// Opens the scenes of `index`, from keys to files in `folder`, that are `kept`. With `reads_all`, every chunk's
-    /// table is read even without filters.
+    /// Opens the scenes of `index`, a map from keys to files in `folder`, for which `kept` is true. With `reads_all`, the
+    /// table of every chunk is read even without filters.
     pub(crate) fn of_index(
         folder: &Path,
         index: &BTreeMap<String, String>,
@@ -99,18 +98,18 @@ impl ChunkSource {
             });
             scenes.push(Entry { key: key.clone(), chunk });
         }
-        let mut source = Self { chunks, ledger: SkipReport::new(scenes.len()), scenes, positions: HashMap::new() };
-        source.leave_out(filters, reads_all || filters.is_any_set())?;
+        let mut source = Self { chunks, report: SkipReport::new(scenes.len()), scenes, positions: HashMap::new() };
+        source.skip_scenes(filters, reads_all || filters.is_any_set())?;
         source.positions = source.scenes.iter().enumerate().map(|(i, entry)| (entry.key.clone(), i)).collect();
         Ok(source)
     }
 
-    /// What the filters left out, and what could not be read.
-    pub fn ledger(&self) -> &SkipReport {
-        &self.ledger
+    /// Returns the skipped scenes: filtered and unreadable ones.
+    pub fn report(&self) -> &SkipReport {
+        &self.report
     }
 
-    /// Reads the file of one frame, JPEG or PNG, as it is in the chunk.
+    /// Reads the JPEG or PNG file of a frame.
     fn read_encoded(&self, scene: usize, frame: usize) -> Result<Vec<u8>, DataError> {
         let (path, table) = self.table(scene)?;
         let span = table.images.get(frame).ok_or_else(|| DataError::NoSuchFrame {
@@ -121,8 +120,8 @@ impl ChunkSource {
         span.read(path)
     }
 
-    /// Moves scenes into the ledger: those of chunks that fail, and those that the filters do not let through.
-    fn leave_out(&mut self, filters: &SceneFilters, reads_tables: bool) -> Result<(), DataError> {
+    /// Moves the scenes of failing chunks and the filtered scenes to the report.
+    fn skip_scenes(&mut self, filters: &SceneFilters, reads_tables: bool) -> Result<(), DataError> {
         let open = |chunk: &Chunk| {
             chunk.find()?;
             if reads_tables { chunk.table().map(|_| ()) } else { Ok(()) }
@@ -132,30 +131,29 @@ impl ChunkSource {
         if failures.iter().all(Option::is_some) {
             opened.into_iter().next().transpose()?;
         }
-        let verdict = |scene: usize| {
+        let reason = |scene: usize| {
             let failure = failures[self.scenes[scene].chunk].clone();
-            let look = || {
+            let filter = || {
                 if reads_tables {
                     self.table(scene)?;
                 }
                 self.reason_to_skip(scene, filters)
             };
-            failure.or_else(|| look().unwrap_or_else(|error| Some(error.to_string())))
+            failure.or_else(|| filter().unwrap_or_else(|error| Some(error.to_string())))
         };
-        let verdicts: Vec<Option<String>> = (0..self.scenes.len()).into_par_iter().map(verdict).collect();
+        let reasons: Vec<Option<String>> = (0..self.scenes.len()).into_par_iter().map(reason).collect();
         let scenes = std::mem::take(&mut self.scenes);
-        for (entry, reason) in scenes.into_iter().zip(verdicts) {
+        for (entry, reason) in scenes.into_iter().zip(reasons) {
             match reason {
-                Some(reason) => self.ledger.skip(entry.key, reason),
+                Some(reason) => self.report.skip(entry.key, reason),
                 None => self.scenes.push(entry),
             }
         }
         Ok(())
     }
 
-    /// Puts the scenes of chunks that `index` does not name into the ledger. Only tables that have been read are looked
-    /// at.
-    pub(crate) fn tell_unlisted(&mut self, folder: &Path, index: &BTreeMap<String, String>) {
+    /// Reports the scenes of chunks that `index` does not list. Only tables that are in memory are examined.
+    pub(crate) fn record_unlisted(&mut self, folder: &Path, index: &BTreeMap<String, String>) {
         let (mut unlisted, mut elsewhere) = (BTreeSet::new(), BTreeSet::new());
         for chunk in &self.chunks {
             for key in chunk.table.get().iter().flat_map(|table| table.scenes.keys()) {
@@ -170,18 +168,18 @@ impl ChunkSource {
                 }
             }
         }
-        self.ledger.num_scenes += unlisted.len();
+        self.report.num_scenes += unlisted.len();
         for key in unlisted {
-            self.ledger.skip(key, "in a chunk but not in its index.json");
+            self.report.skip(key, "in a chunk but not in its index.json");
         }
         if !elsewhere.is_empty() {
             let names: Vec<String> = elsewhere.into_iter().collect();
             let note = format!(
-                "{} also in chunks other than those that index.json names, which are not used ({})",
+                "{} also in chunks other than those of index.json, not used ({})",
                 plural(names.len(), "scene"),
                 first_few(&names)
             );
-            self.ledger.notes.push(note);
+            self.report.notes.push(note);
         }
     }
 
@@ -190,14 +188,14 @@ impl ChunkSource {
         filters.reason_to_skip(num_frames, || self.cameras(scene))
     }
 
-    /// The table of a scene, with the path of its chunk.
+    /// Returns the table of a scene and the path of its chunk.
     fn table(&self, scene: usize) -> Result<(&Path, &SceneTable), DataError> {
         let num_scenes = self.scenes.len();
         let Entry { key, chunk } = self.scenes.get(scene).ok_or(DataError::NoSuchScene { scene, num_scenes })?;
         let chunk = &self.chunks[*chunk];
         let table = chunk.table()?;
         let scene = table.scenes.get(key).ok_or_else(|| DataError::BadChunk {
-            what: format!("scene {key} is expected in it, but it holds {} other scenes", table.scenes.len()),
+            what: format!("expected scene {key}, found {} other scenes", table.scenes.len()),
             path: chunk.path.clone(),
         })?;
         Ok((&chunk.path, scene))
@@ -214,7 +212,7 @@ impl SceneSource for ChunkSource {
     }
 
     fn find(&self, key: &str) -> Option<usize> {
-        // DepthSplat's training chunks prefix the keys that its indices give without.
+        // The training chunks of DepthSplat prefix the keys; its indices do not.
         let prefixed = || self.positions.get(&format!("{DL3DV_PREFIX}{key}"));
         let by_name = || find_by_name(self.scenes.iter().map(|entry| entry.key.as_str()), key);
         self.positions.get(key).or_else(prefixed).copied().or_else(by_name)

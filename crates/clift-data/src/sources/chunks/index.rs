@@ -1,4 +1,4 @@
-//! Which scene is in which file of a folder of chunks, by `index.json` or by looking.
+//! The file of every scene in a folder of chunks: read from `index.json`, or determined from the files.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -12,10 +12,10 @@ use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::chunks::table::ChunkTable;
 use crate::sources::test_scenes::TestScenes;
 
-/// What the reference's tool writes beside scenes in files of their own: keys of those whose pictures have another size.
+/// List of the reference implementation, beside one file per scene: keys of scenes whose images have another size.
 const INVALID_KEYS: &str = "invalid_keys.txt";
 
-/// Reads `index.json`: scene key to file name, sorted by key.
+/// Reads `index.json`: file names by scene key.
 pub(crate) fn read_index(path: &Path) -> Result<BTreeMap<String, String>, DataError> {
     let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
     let text = std::fs::read(path).map_err(DataError::io("reading the scene index", path))?;
@@ -29,7 +29,7 @@ pub(crate) fn read_index(path: &Path) -> Result<BTreeMap<String, String>, DataEr
     Ok(index)
 }
 
-/// A note on chunks in `folder` that `index` does not name, if there are any.
+/// Returns a note on chunks in `folder` that `index` does not list.
 pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> Result<Option<String>, DataError> {
     let mut files = torch_files(folder)?;
     let mut named: Vec<&String> = index.values().collect();
@@ -37,64 +37,69 @@ pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> 
     files.retain(|file| named.binary_search(&file).is_err());
     let note = || {
         let counted = plural(files.len(), ".torch file");
-        format!("not in index.json and so not opened: {counted} ({})", first_few(&files))
+        format!("not opened, missing from index.json: {counted} ({})", first_few(&files))
     };
     Ok((!files.is_empty()).then(note))
 }
 
-/// Scenes in files of their own, by the names of these. Chunks whose index is missing are looked into.
+/// Returns the file of every scene in a folder without an index: for one file per scene from the file names, for chunks
+/// from their tables.
 ///
 /// # Errors
-/// [`DataError::Io`] for a folder that cannot be listed, and what reading `invalid_keys.txt` gives.
-pub(crate) fn index_of_files(folder: &Path, ledger: &mut SkipReport) -> Result<BTreeMap<String, String>, DataError> {
+/// [`DataError::Io`] for a folder that cannot be listed, and the errors of reading `invalid_keys.txt`.
+pub(crate) fn index_of_files(folder: &Path, report: &mut SkipReport) -> Result<BTreeMap<String, String>, DataError> {
     let files = torch_files(folder)?;
     let stem = |file: &str| file.strip_suffix(".torch").unwrap_or(file).to_owned();
     let first = files.iter().take(8).find_map(|file| Some((file, ChunkTable::read(&folder.join(file)).ok()?)));
     if first.is_some_and(|(file, table)| table.scenes.len() != 1 || !table.scenes.contains_key(&stem(file))) {
-        return Ok(index_of_chunks(folder, &files, ledger));
+        return Ok(index_of_chunks(folder, &files, report));
     }
     let mut index: BTreeMap<String, String> = files.iter().map(|file| (stem(file), file.clone())).collect();
     let invalid = folder.join(INVALID_KEYS);
     if invalid.is_file() {
         let invalid = TestScenes::read(&invalid)?;
         for key in index.keys().filter(|key| invalid.contains(key)) {
-            ledger.num_scenes += 1;
-            ledger.skip(key, format!("in {INVALID_KEYS}"));
+            report.num_scenes += 1;
+            report.skip(key, format!("in {INVALID_KEYS}"));
         }
         index.retain(|key, _| !invalid.contains(key));
     }
     Ok(index)
 }
 
-fn index_of_chunks(folder: &Path, files: &[String], ledger: &mut SkipReport) -> BTreeMap<String, String> {
+fn index_of_chunks(folder: &Path, files: &[String], report: &mut SkipReport) -> BTreeMap<String, String> {
     let tables: Vec<_> = files.par_iter().map(|file| (file, ChunkTable::read(&folder.join(file)))).collect();
     let mut index = BTreeMap::new();
-    let mut again = Vec::new();
+    let mut duplicates = Vec::new();
     for (file, table) in tables {
         match table {
             Ok(table) => {
                 for key in table.scenes.into_keys() {
                     match index.entry(key) {
-                        Entry::Vacant(place) => {
-                            place.insert(file.clone());
+                        Entry::Vacant(entry) => {
+                            entry.insert(file.clone());
                         }
-                        Entry::Occupied(first) => again.push(format!("{} in {} and {file}", first.key(), first.get())),
+                        Entry::Occupied(first) => {
+                            duplicates.push(format!("{} in {} and {file}", first.key(), first.get()))
+                        }
                     }
                 }
             }
             Err(error) => {
-                ledger.num_scenes += 1;
-                ledger.skip(file, error.to_string());
+                report.num_scenes += 1;
+                report.skip(file, error.to_string());
             }
         }
     }
-    if !again.is_empty() {
-        again.sort_unstable();
-        let counted = plural(again.len(), "scene");
-        let note = format!("{counted} in more than one file, of which the first is used ({})", first_few(&again));
-        ledger.notes.push(note);
+    if !duplicates.is_empty() {
+        duplicates.sort_unstable();
+        let counted = plural(duplicates.len(), "scene");
+        let note = format!("{counted} in more than one file, the first of which is used ({})", first_few(&duplicates));
+        report.notes.push(note);
     }
-    ledger.notes.push(format!("there is no index.json: the scenes of {} files were looked up", files.len()));
+    report
+        .notes
+        .push(format!("no index.json: the scenes of {} files were determined from their contents", files.len()));
     index
 }
 
@@ -111,15 +116,15 @@ mod tests {
     use crate::sources::chunks::writer::{SceneRecord, scene_file_bytes};
 
     #[test]
-    fn a_key_may_end_as_a_file_does() {
+    fn keys_may_end_in_the_file_extension() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.torch.torch");
         let (key, url) = ("a.torch".to_owned(), String::new());
         let scene = SceneRecord { key, url, timestamps: Vec::new(), cameras: Vec::new(), images: Vec::new() };
         std::fs::write(&path, scene_file_bytes(&path, &scene).unwrap()).unwrap();
-        let mut ledger = SkipReport::default();
-        let index = index_of_files(folder.path(), &mut ledger).unwrap();
+        let mut report = SkipReport::default();
+        let index = index_of_files(folder.path(), &mut report).unwrap();
         assert_eq!(index, BTreeMap::from([("a.torch".to_owned(), "a.torch.torch".to_owned())]));
-        assert!(ledger.notes.is_empty(), "it is no chunk: {ledger}");
+        assert!(report.notes.is_empty(), "not read as a chunk: {report}");
     }
 }

@@ -1,9 +1,9 @@
-//! PixelSplat chunks.
+//! Scenes in `.torch` files: the chunks of pixelSplat, and one file per scene.
 //!
 //! - `chunk_source`: scenes of pixelSplat chunks
-//! - `index`: scene to chunk index
-//! - `table`: offset table of a chunk
-//! - `writer`: write scenes as chunks
+//! - `index`: the file of every scene
+//! - `table`: byte ranges of the scenes of a chunk
+//! - `writer`: writing scenes as chunks
 
 pub(crate) mod chunk_source;
 pub(crate) mod index;

@@ -1,4 +1,4 @@
-//! What one chunk holds: for each of its scenes, where cameras, time stamps and frames lie in the file.
+//! Byte ranges of the cameras, time stamps and frames of every scene in a chunk.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -11,11 +11,11 @@ use crate::torch::pickle::Pickle;
 use crate::torch::tensor_span::tensor_span;
 use crate::torch::values::{ElementType, MAX_BYTES, MAX_VALUES, Value};
 
-/// Most frames of all scenes of a chunk. Scenes may share a list of frames, so that the size of the pickle does not
-/// limit them; those that do not share have 8 values or more per frame, and fewer frames than this.
+/// Largest number of frames of all scenes of a chunk. The size of the pickle does not bound it, because scenes may share
+/// a list of frames. Scenes without sharing have at least 8 values per frame, thus fewer frames than this.
 const MAX_FRAMES: usize = MAX_VALUES / 8;
 
-/// One scene of a chunk. Pictures and cameras stay in the file.
+/// Byte ranges of one scene of a chunk.
 pub(crate) struct SceneTable {
     pub key: String,
     pub url: String,
@@ -31,19 +31,18 @@ pub(crate) struct ChunkTable {
 }
 
 impl ChunkTable {
-    /// Reads a chunk's directory and pickle, and checks that every tensor has the shape the format asks for and
-    /// lies within its storage.
+    /// Reads the directory and the pickle of a chunk, and checks shape and bounds of every tensor.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
         let archive = Archive::open(path)?;
         let member = archive
             .member("data.pkl")
-            .ok_or_else(|| bad("no member data.pkl, so torch.save did not write it".into()))?;
+            .ok_or_else(|| bad("no member data.pkl: the file was not written by torch.save".into()))?;
         if member.len() > MAX_BYTES as u64 {
             return Err(bad(format!("data.pkl has {} bytes, more than the limit of {MAX_BYTES}", member.len())));
         }
         let pickle = Pickle::parse(&member.read(path)?, path)?;
-        // A chunk is a list of scenes; one scene per file (a bare dict) is a common variant.
+        // A chunk is a list of scenes; files of one scene hold its dict.
         let scenes: Vec<&Value> = match pickle.root() {
             Value::List(items) => items.iter().map(|id| pickle.get(*id)).collect(),
             scene @ Value::Dict(_) => vec![scene],
@@ -58,8 +57,8 @@ impl ChunkTable {
     }
 }
 
-/// Collects the scenes of a pickle. What several scenes may share is counted: a file of a few kB must not fill the
-/// memory.
+/// Collects the scenes of a pickle. Values that scenes may share are counted for every scene, so that a file of a few kB
+/// cannot fill the memory.
 struct Builder<'a> {
     pickle: &'a Pickle,
     archive: &'a Archive,
@@ -75,7 +74,7 @@ impl Builder<'_> {
         let Value::Str(key) = item("key")? else { return Err("`key` is no string".into()) };
         let in_scene = |what: String| format!("key {key:?}: {what}");
         if self.scenes.contains_key(key) {
-            return Err(in_scene("it comes twice".into()));
+            return Err(in_scene("it occurs twice".into()));
         }
         let url = match pickle.item(scene, "url") {
             Some(Value::Str(url)) => url.as_str(),
@@ -136,8 +135,7 @@ impl SceneTable {
         Ok(bytes.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect())
     }
 
-    /// Whether a scene with these time stamps and cameras, as many as it has frames, would be written with the same
-    /// numbers.
+    /// Returns whether these time stamps and cameras, one per frame, equal those of the file after rounding to f32.
     pub fn is_of(&self, path: &Path, timestamps: &[i64], cameras: &[Camera]) -> Result<bool, DataError> {
         Ok(self.timestamps.read(path)? == timestamp_bytes(timestamps)
             && self.cameras.read(path)? == camera_bytes(cameras))

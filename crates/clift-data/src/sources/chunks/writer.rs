@@ -1,25 +1,23 @@
-//! Writes scenes in the chunk layout: files that `torch.load` and [`crate::sources::chunks::chunk_source::ChunkSource`] read.
+//! Writing scenes as chunks, for `torch.load` and [`crate::sources::chunks::chunk_source::ChunkSource`].
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use crate::error::DataError;
-use crate::files::atomic::replace;
+use crate::files::atomic::replace_file;
 use crate::geometry::camera::Camera;
 use crate::torch::pickle_writer::PickleWriter;
 use crate::torch::values::{MAX_BYTES, MAX_VALUES};
 
-/// Size at which a chunk is closed, in bytes of pictures: 100 MB, as in the published RealEstate10K chunks.
-pub const DEFAULT_CHUNK_BYTES: u64 = 100_000_000;
-/// Frames at which a chunk is closed whatever their size: a reader takes 1,048,576 values, some 19 per frame.
+/// Number of frames at which a chunk is closed; readers accept 1,048,576 values, about 19 per frame.
 const MAX_CHUNK_FRAMES: usize = 50_000;
 
 /// One scene to write.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneRecord {
-    /// Unique key.
+    /// Unique scene key.
     pub key: String,
-    /// Where it comes from; may be empty.
+    /// URL of the scene; may be empty.
     pub url: String,
     /// One per frame: microseconds for RealEstate10K, frame numbers for DL3DV.
     pub timestamps: Vec<i64>,
@@ -30,7 +28,7 @@ pub struct SceneRecord {
 }
 
 impl SceneRecord {
-    /// Says which lists differ in length, and whether it is more than a reader takes.
+    /// Checks that the lists have equal lengths and that the scene fits into one file.
     pub(crate) fn check(&self) -> Result<(), String> {
         let Self { key, timestamps, cameras, images, .. } = self;
         let (timestamps, cameras, images) = (timestamps.len(), cameras.len(), images.len());
@@ -40,17 +38,17 @@ impl SceneRecord {
         if ChunkFill::default().has_room(self) {
             return Ok(());
         }
-        Err(format!("scene {key} has {images} frames, more than a file holds (about 50,000)"))
+        Err(format!("scene {key} has {images} frames, above the limit of a file (about 50,000)"))
     }
 }
 
-/// How full a file is.
+/// Sizes of the scenes in a file.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ChunkFill {
-    /// Bytes of pictures.
+    /// Bytes of the images.
     image_bytes: u64,
     num_frames: usize,
-    /// Values and bytes of the pickle, or a few more.
+    /// Upper bounds of the values and bytes of the pickle.
     num_values: usize,
     pickle_bytes: usize,
 }
@@ -58,7 +56,7 @@ pub(crate) struct ChunkFill {
 impl ChunkFill {
     fn with(self, scene: &SceneRecord) -> Self {
         let num_frames = scene.images.len();
-        // A tensor has 19 values and 170 bytes at most; beside a frame's there are two of the scene and the five names.
+        // At most 19 values and 170 bytes per tensor: one tensor per frame, two and five names per scene.
         Self {
             image_bytes: self.image_bytes + scene.images.iter().map(|image| image.len() as u64).sum::<u64>(),
             num_frames: self.num_frames + num_frames,
@@ -67,30 +65,29 @@ impl ChunkFill {
         }
     }
 
-    /// Takes up a scene.
+    /// Adds a scene.
     pub fn add(&mut self, scene: &SceneRecord) {
         *self = self.with(scene);
     }
 
-    /// Whether readers take the file with one scene more.
+    /// Returns whether readers accept the file with one more scene.
     pub fn has_room(self, scene: &SceneRecord) -> bool {
         let Self { num_values, pickle_bytes, .. } = self.with(scene);
         num_values < MAX_VALUES && pickle_bytes < MAX_BYTES
     }
 
-    /// Whether the file has the size that was asked for.
+    /// Returns whether the file has reached the target size.
     pub fn is_full(self, target_bytes: u64) -> bool {
         self.image_bytes >= target_bytes || self.num_frames >= MAX_CHUNK_FRAMES
     }
 }
 
-/// Writes `000000.torch, 000001.torch, ..` and, when all are written, `index.json` into `folder`; returns how many
-/// scenes there are. A chunk is closed once its pictures have `target_bytes` or more. Every file appears under its
-/// name only when it is complete, and an existing `index.json` is not overwritten.
+/// Writes `000000.torch, 000001.torch, ..` and then `index.json` into `folder`; returns the number of scenes. A chunk is
+/// closed once its images have `target_bytes` or more. Every file is written atomically.
 ///
 /// # Errors
-/// Whatever an item carries, [`DataError::Io`] from writing, [`DataError::BadIndex`] for an existing index, two scenes
-/// of one key, or a scene whose lists differ in length.
+/// Errors of the items, [`DataError::Io`] from writing, and [`DataError::BadIndex`] for an existing `index.json`, a
+/// duplicate key or an invalid scene.
 pub fn write_chunks(
     folder: &Path,
     scenes: impl IntoIterator<Item = Result<SceneRecord, DataError>>,
@@ -100,7 +97,7 @@ pub fn write_chunks(
     let index_path = folder.join("index.json");
     let bad = |what: String| DataError::BadIndex { what, path: index_path.clone() };
     if index_path.exists() {
-        return Err(bad("it exists already; choose an empty folder".into()));
+        return Err(bad("the file exists; choose an empty folder".into()));
     }
     let mut index = BTreeMap::new();
     let mut num_chunks = 0;
@@ -116,7 +113,7 @@ pub fn write_chunks(
             fill = ChunkFill::default();
         }
         if index.insert(scene.key.clone(), chunk_name(num_chunks)).is_some() {
-            return Err(bad(format!("scene {} comes twice", scene.key)));
+            return Err(bad(format!("scene {} occurs twice", scene.key)));
         }
         fill.add(&scene);
         pending.push(scene);
@@ -131,7 +128,7 @@ pub fn write_chunks(
         write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
     }
     let text = serde_json::to_vec_pretty(&index).map_err(|error| bad(error.to_string()))?;
-    replace(&index_path, &text).map_err(DataError::io("writing the index", &index_path))?;
+    replace_file(&index_path, &text).map_err(DataError::io("writing the index", &index_path))?;
     Ok(index.len())
 }
 
@@ -139,12 +136,12 @@ pub(crate) fn chunk_name(number: usize) -> String {
     format!("{number:06}.torch")
 }
 
-/// Writes a list of scenes.
+/// Writes a chunk.
 fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
-    replace(path, &chunk_bytes(path, scenes)?).map_err(DataError::io("writing a chunk", path))
+    replace_file(path, &chunk_bytes(path, scenes)?).map_err(DataError::io("writing a chunk", path))
 }
 
-/// The file at `path` of a list of scenes.
+/// Returns the bytes of the chunk at `path`.
 pub(crate) fn chunk_bytes(path: &Path, scenes: &[SceneRecord]) -> Result<Vec<u8>, DataError> {
     let mut pickle = PickleWriter::new();
     pickle.raw(b"](");
@@ -155,7 +152,7 @@ pub(crate) fn chunk_bytes(path: &Path, scenes: &[SceneRecord]) -> Result<Vec<u8>
     pack(path, pickle)
 }
 
-/// The file at `path` of a scene by itself, as the reference's tool writes it.
+/// Returns the bytes of the file at `path` with one scene, as in the reference implementation.
 pub(crate) fn scene_file_bytes(path: &Path, scene: &SceneRecord) -> Result<Vec<u8>, DataError> {
     let mut pickle = PickleWriter::new();
     write_scene(scene, &mut pickle);
@@ -168,12 +165,12 @@ fn pack(path: &Path, pickle: PickleWriter) -> Result<Vec<u8>, DataError> {
     pickle.pack(&prefix).map_err(|error| DataError::io("packing a chunk", path)(error.into()))
 }
 
-/// Time stamps as a file has them.
+/// Returns time stamps in the format of a chunk: i64.
 pub(crate) fn timestamp_bytes(timestamps: &[i64]) -> Vec<u8> {
     timestamps.iter().flat_map(|time| time.to_le_bytes()).collect()
 }
 
-/// Cameras as a file has them: rows of 18 f32.
+/// Returns cameras in the format of a chunk: rows of 18 f32.
 pub(crate) fn camera_bytes(cameras: &[Camera]) -> Vec<u8> {
     let rows = cameras.iter().flat_map(Camera::to_re10k);
     rows.flat_map(|number| (number as f32).to_le_bytes()).collect()
@@ -224,10 +221,10 @@ mod tests {
     }
 
     #[test]
-    fn written_scenes_are_read_back_equal() {
+    fn written_scenes_are_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let records = [record("b", 3), record("a", 5), record("c", 1)];
-        // 303, 510 and 100 bytes of pictures: the second scene closes the first chunk.
+        // 303, 510 and 100 bytes of images: the second scene closes the first chunk.
         let written = write_chunks(&folder.path().join("test"), records.clone().map(Ok), 400).unwrap();
         assert_eq!(written, 3);
         let index = std::fs::read_to_string(folder.path().join("test/index.json")).unwrap();
@@ -253,8 +250,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_never_more_than_a_reader_takes() {
-        // As many scenes of one frame as would fill two files by their pictures' size, and one scene that fills one.
+    fn written_files_stay_within_reader_limits() {
+        // Many scenes of one frame, and one scene that fills a file.
         let most = (MAX_VALUES - 61) / 20;
         let small = (0..20_000).map(|number| record(&format!("{number:05}"), 1));
         let folder = tempfile::tempdir().unwrap();
@@ -262,14 +259,14 @@ mod tests {
         let source =
             ChunkSource::open(folder.path(), Split::Test, &SceneFilters { min_frames: 1, ..Default::default() });
         let source = source.unwrap();
-        assert_eq!(source.ledger().to_string(), "20001 of 20001 scenes used");
+        assert_eq!(source.report().to_string(), "20001 of 20001 scenes used");
         assert_eq!(source.num_frames(source.find("long").unwrap()).unwrap(), most);
         let message = write_chunks(&folder.path().join("train"), [Ok(record("a", most + 1))], 1).unwrap_err();
-        assert!(message.to_string().contains(" frames, more than a file holds (about 50,000)"), "{message}");
+        assert!(message.to_string().contains(" frames, above the limit of a file (about 50,000)"), "{message}");
     }
 
     #[test]
-    fn uneven_lists_doubled_keys_and_an_existing_index_are_refused() {
+    fn invalid_scenes_and_existing_indices_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let mut uneven = record("a", 3);
         uneven.timestamps.pop();
@@ -277,9 +274,9 @@ mod tests {
         assert!(message.contains("scene a has 3 images, 3 cameras, 2 time stamps"), "{message}");
         let message =
             write_chunks(folder.path(), [Ok(record("a", 1)), Ok(record("a", 1))], 1000).unwrap_err().to_string();
-        assert!(message.contains("scene a comes twice"), "{message}");
+        assert!(message.contains("scene a occurs twice"), "{message}");
         write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap();
         let message = write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap_err().to_string();
-        assert!(message.contains("it exists already"), "{message}");
+        assert!(message.contains("the file exists"), "{message}");
     }
 }

@@ -1,7 +1,7 @@
-//! One image file per frame.
+//! Scenes with one image file per frame.
 //!
 //! - `photo`: an image file with its camera
-//! - `image_folder`: join image files to cameras by name
+//! - `image_folder`: look-up of image files by name
 //! - `nerfstudio`: transforms.json (nerfstudio, DL3DV)
 //! - `re10k_text`: RealEstate10K camera text files
 //! - `scene_folder`: folders that hold one scene

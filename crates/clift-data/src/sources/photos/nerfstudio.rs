@@ -1,6 +1,6 @@
-//! Own captures and DL3DV as `transforms.json`, in the form that nerfstudio and instant-ngp write.
+//! `transforms.json` of nerfstudio and instant-ngp: own captures and DL3DV.
 //!
-//! Poses are camera to world with OpenGL's axes (+x right, +y up, -z forward) and become OpenCV's.
+//! Poses are camera to world with OpenGL axes (+x right, +y up, -z forward) and are converted to OpenCV axes.
 
 use std::collections::HashSet;
 use std::fmt;
@@ -20,14 +20,14 @@ use crate::image::codec::read_size;
 use crate::sources::photos::image_folder::ImageFolders;
 use crate::sources::photos::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoOptions, PhotoScene};
 
-/// Most bytes of one `transforms.json`.
+/// Largest size of a `transforms.json`, in bytes.
 const MAX_BYTES: u64 = 128 << 20;
-/// Longest name of a picture: what operating systems take as a path.
+/// Longest name of an image, in bytes: the limit of operating systems for a path.
 const MAX_NAME_BYTES: usize = 4096;
-/// Folders above a picture that are looked for in the scene's own, its name included.
-const MAX_WAYS: usize = 32;
+/// Largest number of trailing parts of an image path that are searched in the scene folder.
+const MAX_SUFFIX_PARTS: usize = 32;
 
-/// Defines a struct with the keys of a camera, which may stand at the top or in a frame.
+/// Defines a struct with the keys of a camera, which may occur at the top level and in a frame.
 macro_rules! with_optics {
     ($name:ident { $($field:ident: $type:ty,)* }) => {
         #[derive(Deserialize)]
@@ -72,7 +72,7 @@ with_optics!(Document { frames: Bounded<Entry, MAX_FRAMES>, });
 with_optics!(Entry { file_path: String, transform_matrix: Bounded<[f64; 4], 4>, });
 
 impl Entry {
-    /// The upper three rows of the matrix; the fourth may be left out.
+    /// Returns the upper three rows of the matrix; the fourth is optional.
     fn c2w_rows(&self) -> Result<[[f64; 4]; 3], String> {
         let rows = &self.transform_matrix.0;
         if let Some(last) = rows.get(3) {
@@ -88,7 +88,7 @@ impl Entry {
     }
 }
 
-/// What is said of a camera. Lengths are in pixels, angles in radians.
+/// Camera keys of one level. Lengths are in pixels, angles in radians.
 struct Optics<'a> {
     camera_model: Option<&'a str>,
     is_fisheye: Option<bool>,
@@ -101,8 +101,8 @@ struct Optics<'a> {
 }
 
 impl<'a> Optics<'a> {
-    /// What a frame says, and where it says nothing, what stands at the top. A focal length of its own overrules an
-    /// angle at the top.
+    /// Returns the keys of a frame, with those of the top level where missing. A focal length of the frame overrides an
+    /// angle of the top level.
     fn or(self, top: &Optics<'a>) -> Self {
         let either = |own: [Option<f64>; 2], top: [Option<f64>; 2]| [own[0].or(top[0]), own[1].or(top[1])];
         let has_focal = self.focal.iter().chain(&self.angle).any(Option::is_some);
@@ -118,7 +118,7 @@ impl<'a> Optics<'a> {
         }
     }
 
-    /// The lens, if it is one that can be undone.
+    /// Returns the lens; refuses lenses without undistortion.
     fn lens(&self) -> Result<Lens, String> {
         let model = self.camera_model.unwrap_or("OPENCV");
         let known = ["PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "perspective"];
@@ -128,13 +128,13 @@ impl<'a> Optics<'a> {
         }
         let [k1, k2, k3, k4] = self.radial.map(Option::unwrap_or_default);
         if k4 != 0.0 {
-            return Err(format!("k4 is {k4}: only lenses of k1, k2, k3, p1 and p2 can be undone"));
+            return Err(format!("k4 is {k4}, expected 0: lenses have k1, k2, k3, p1 and p2"));
         }
         let lens = Lens { radial: [k1, k2, k3], tangential: self.tangential.map(Option::unwrap_or_default) };
         lens.validate().map(|()| lens).map_err(|error| error.to_string())
     }
 
-    /// Columns and rows of the pictures that the intrinsics were given for.
+    /// Returns columns and rows of the images to which the intrinsics apply.
     fn size(&self) -> Result<Option<[f64; 2]>, String> {
         let [Some(width), Some(height)] = self.size else { return Ok(None) };
         for (name, side) in [("w", width), ("h", height)] {
@@ -146,10 +146,10 @@ impl<'a> Optics<'a> {
     }
 
     fn intrinsics_norm(&self, [width, height]: [f64; 2]) -> Result<IntrinsicsNorm, String> {
-        let of_angle = |axis: usize, side: f64| self.angle[axis].map(|angle| 0.5 * side / (0.5 * angle).tan());
-        let [x, y] = [self.focal[0].or_else(|| of_angle(0, width)), self.focal[1].or_else(|| of_angle(1, height))];
+        let from_angle = |axis: usize, side: f64| self.angle[axis].map(|angle| 0.5 * side / (0.5 * angle).tan());
+        let [x, y] = [self.focal[0].or_else(|| from_angle(0, width)), self.focal[1].or_else(|| from_angle(1, height))];
         let (Some(fx), Some(fy)) = (x.or(y), y.or(x)) else {
-            return Err("neither fl_x nor camera_angle_x is given".into());
+            return Err("expected fl_x or camera_angle_x, found neither".into());
         };
         let [cx, cy] = self.centre;
         let intrinsics = Intrinsics { fx, fy, cx: cx.unwrap_or(width / 2.0), cy: cy.unwrap_or(height / 2.0) };
@@ -158,7 +158,7 @@ impl<'a> Optics<'a> {
     }
 }
 
-/// Reads a `transforms.json` and finds its pictures. Frames are in the natural order of their names.
+/// Reads a `transforms.json` and locates its images. Frames are in the natural order of their names.
 ///
 /// # Errors
 /// [`DataError::Io`], and [`DataError::BadScene`] for a file of another form, a camera that cannot be used and two
@@ -177,16 +177,16 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         return Err(bad(format!("frame {start}..: its name has {} bytes, more than {MAX_NAME_BYTES}", name.len())));
     }
     entries.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
-    let mut pictures = ImageLocator { folder, options, folders: ImageFolders::default() };
+    let mut images = ImageLocator { folder, options, folders: ImageFolders::default() };
     let (top, mut scene) = (document.optics(), PhotoScene::default());
-    let mut taken = HashSet::new();
+    let mut used = HashSet::new();
     for entry in entries {
         let name = &entry.file_path;
         let in_frame = |what: String| bad(format!("frame {name}: {what}"));
-        let picture = match pictures.find(name) {
-            Ok(picture) if taken.insert(picture.clone()) => picture,
+        let image = match images.find(name) {
+            Ok(image) if used.insert(image.clone()) => image,
             found => {
-                let reason = found.map_or_else(|reason| reason, |_| "whose picture another frame has".into());
+                let reason = found.map_or_else(|reason| reason, |_| "with the image of another frame".into());
                 scene.missing.push(MissingPhoto { name: name.clone(), reason });
                 continue;
             }
@@ -194,33 +194,33 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let optics = entry.optics().or(&top);
         let lens = optics.lens().map_err(in_frame)?;
         let given = optics.size().map_err(in_frame)?;
-        let size = given.map_or_else(|| read_size(&picture).map(|size| size.map(|side| side as f64)), Ok);
+        let size = given.map_or_else(|| read_size(&image).map(|size| size.map(|side| side as f64)), Ok);
         let Ok(size) = size else {
-            let reason = "whose picture cannot be read".into();
+            let reason = "whose image cannot be read".into();
             scene.missing.push(MissingPhoto { name: name.clone(), reason });
             continue;
         };
         let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;
         let rows = entry.c2w_rows().map_err(in_frame)?;
         let photo = Pose::from_opengl(&rows)
-            .and_then(|c2w| Photo::new(picture, c2w, intrinsics_norm, lens, options.undistort))
+            .and_then(|c2w| Photo::new(image, c2w, intrinsics_norm, lens, options.undistort))
             .map_err(PhotoScene::in_frame(path, name))?;
         scene.photos.push(Photo { shape: given.map(|[width, height]| width / height), ..photo });
     }
-    scene.num_without_camera = pictures.folders.num_unasked();
+    scene.num_without_camera = images.folders.num_unrequested();
     Ok(scene)
 }
 
-/// The reason of the parser, and what it does not say of numbers that Python writes and JSON does not have.
+/// Returns the message of the parser, with a hint on NaN and infinite numbers, which Python writes and JSON does not have.
 fn explain(error: &serde_json::Error, text: &[u8]) -> String {
     let line = text.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
     let column = error.column().min(line.len());
     let near = String::from_utf8_lossy(&line[column.saturating_sub(9)..line.len().min(column + 9)]);
     let hint = if near.contains("NaN") || near.contains("Infinity") { " (a number is NaN or infinite)" } else { "" };
-    format!("expected the form that nerfstudio writes, got {error}{hint}")
+    format!("expected the format of nerfstudio, got {error}{hint}")
 }
 
-/// Where the pictures of one scene are looked for.
+/// Locates the images of one scene.
 struct ImageLocator<'a> {
     folder: &'a Path,
     options: &'a PhotoOptions,
@@ -233,41 +233,41 @@ impl ImageLocator<'_> {
         if found.is_ok() || !file_path.contains('\\') {
             return found;
         }
-        // Windows separates folders so, and some tools write both.
+        // Separator of Windows; some tools mix both.
         self.find_at(Path::new(&file_path.replace('\\', "/")))
     }
 
     fn find_at(&mut self, named: &Path) -> Result<PathBuf, String> {
-        if let Some(folder) = self.chosen_folder() {
+        if let Some(folder) = self.image_folder() {
             let below =
-                if is_of_another_computer(named) { self.longest_way(&folder, named) } else { below_first(named) };
+                if is_absolute(named) { self.longest_suffix(&folder, named) } else { without_first_folder(named) };
             return self.folders.find(&folder.join(below));
         }
         let given = self.folder.join(named);
         let (Some(parent), Some(name)) = (given.parent(), given.file_name()) else {
-            return Err("without a picture".into());
+            return Err("without an image".into());
         };
         if self.folders.has(parent) {
             return self.folders.find(&given);
         }
-        // Pictures scaled down alone, or a path from another folder or computer.
-        let ways = ways_to(named).map(|way| self.folder.join(way));
-        for place in std::iter::once(given.clone()).chain(ways) {
-            let Some(parent) = place.parent().filter(|parent| *parent != self.folder) else { continue };
+        // Only scaled images exist, or the path belongs to another folder or computer.
+        let suffixes = path_suffixes(named).map(|suffix| self.folder.join(suffix));
+        for candidate in std::iter::once(given.clone()).chain(suffixes) {
+            let Some(parent) = candidate.parent().filter(|parent| *parent != self.folder) else { continue };
             let last = parent.file_name().unwrap_or_default().to_string_lossy();
             let scaled = ["", "_2", "_4", "_8"].map(|suffix| parent.with_file_name(format!("{last}{suffix}")));
             if let Some(folder) = scaled.into_iter().find(|folder| self.folders.has(folder)) {
                 return self.folders.find(&folder.join(name));
             }
         }
-        if is_of_another_computer(named) {
+        if is_absolute(named) {
             return self.folders.find(&self.folder.join(name));
         }
-        Err("without a picture".into())
+        Err("without an image".into())
     }
 
-    /// The folder asked for, or the first of those looked for that is there.
-    fn chosen_folder(&mut self) -> Option<PathBuf> {
+    /// Returns the configured image folder, or the first existing default folder.
+    fn image_folder(&mut self) -> Option<PathBuf> {
         if let Some(folder) = &self.options.image_folder {
             return Some(self.folder.join(folder));
         }
@@ -275,33 +275,34 @@ impl ImageLocator<'_> {
         folders.find(|folder| self.folders.has(folder))
     }
 
-    /// As many of the last parts of a path as have their folder in `folder`.
-    fn longest_way(&mut self, folder: &Path, named: &Path) -> PathBuf {
-        let mut ways = ways_to(named);
-        let found = ways.find(|way| way.parent().is_some_and(|parent| self.folders.has(&folder.join(parent))));
+    /// Returns the longest suffix of a path whose parent exists in `folder`.
+    fn longest_suffix(&mut self, folder: &Path, named: &Path) -> PathBuf {
+        let mut suffixes = path_suffixes(named);
+        let found =
+            suffixes.find(|suffix| suffix.parent().is_some_and(|parent| self.folders.has(&folder.join(parent))));
         found.unwrap_or_else(|| named.file_name().unwrap_or_default().into())
     }
 }
 
-/// The last parts of a path, from all of them, or as many as are looked at, to the name alone.
-fn ways_to(path: &Path) -> impl Iterator<Item = PathBuf> {
+/// Returns the suffixes of a path, from the longest (at most [`MAX_SUFFIX_PARTS`] parts) to the file name.
+fn path_suffixes(path: &Path) -> impl Iterator<Item = PathBuf> {
     let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
-    (parts.len().saturating_sub(MAX_WAYS)..parts.len()).map(move |start| parts[start..].iter().collect())
+    (parts.len().saturating_sub(MAX_SUFFIX_PARTS)..parts.len()).map(move |start| parts[start..].iter().collect())
 }
 
-/// Whether a path is absolute, on Windows or elsewhere.
-fn is_of_another_computer(path: &Path) -> bool {
+/// Returns whether a path is absolute, on Windows or on other systems.
+fn is_absolute(path: &Path) -> bool {
     let first = path.components().next().map(|part| part.as_os_str().to_string_lossy());
     path.has_root() || first.is_some_and(|first| first.len() == 2 && first.ends_with(':'))
 }
 
-/// A path without its first folder: `images/left/1.png` is `left/1.png` in `images_8`.
-fn below_first(path: &Path) -> PathBuf {
+/// Returns a path without its first folder: `left/1.png` for `images/left/1.png`.
+fn without_first_folder(path: &Path) -> PathBuf {
     let parts: Vec<_> = path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
     parts[parts.len().min(2).saturating_sub(1)..].iter().collect()
 }
 
-/// A list of at most `MAX` items: what a few bytes of JSON become takes a hundred times their memory.
+/// A list of at most `MAX` items, because parsed JSON takes up to a hundred times the memory of its text.
 struct Bounded<T, const MAX: usize>(Vec<T>);
 
 impl<'de, T: Deserialize<'de>, const MAX: usize> Deserialize<'de> for Bounded<T, MAX> {
@@ -336,10 +337,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn of_a_path_of_many_folders_the_last_are_looked_at() {
-        let ways = |path: &str| ways_to(Path::new(path)).collect::<Vec<_>>();
-        assert_eq!(ways("/a/./b/c.png"), ["a/b/c.png", "b/c.png", "c.png"].map(PathBuf::from));
-        let deep = ways(&"a/".repeat(2000));
-        assert_eq!((deep.len(), deep[0].components().count()), (MAX_WAYS, MAX_WAYS));
+    fn long_paths_give_bounded_suffixes() {
+        let suffixes = |path: &str| path_suffixes(Path::new(path)).collect::<Vec<_>>();
+        assert_eq!(suffixes("/a/./b/c.png"), ["a/b/c.png", "b/c.png", "c.png"].map(PathBuf::from));
+        let deep = suffixes(&"a/".repeat(2000));
+        assert_eq!((deep.len(), deep[0].components().count()), (MAX_SUFFIX_PARTS, MAX_SUFFIX_PARTS));
     }
 }

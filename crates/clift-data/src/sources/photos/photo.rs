@@ -1,4 +1,4 @@
-//! A picture file with its camera, and a scene of them: what every layout of one file per frame is read to.
+//! An image file with its camera, and a scene of such photos, in any layout with one file per frame.
 
 use std::path::{Path, PathBuf};
 
@@ -11,64 +11,64 @@ use crate::image::codec::{check_end, decode, exif_orientation, read_size};
 use crate::image::rgb_image::RgbImage;
 use crate::image::undistort::Undistortion;
 
-/// Most frames of one scene.
+/// Largest number of frames of a scene.
 pub(crate) const MAX_FRAMES: usize = 100_000;
-/// Most bytes of one picture file.
-const MAX_PICTURE_BYTES: u64 = 256 << 20;
-/// By how much the shape (width over height) of a picture may differ from that of its camera: rounding of a picture
-/// scaled down to a few dozen pixels.
+/// Largest size of an image file, in bytes.
+const MAX_IMAGE_BYTES: u64 = 256 << 20;
+/// Largest relative error of an image's aspect ratio against its camera's: rounding of images scaled down to a few dozen
+/// pixels.
 const MAX_SHAPE_ERROR: f64 = 0.02;
 
-/// How photos are found and what is done to them.
+/// Options of locating and loading photos.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PhotoOptions {
-    /// Folder of the pictures, beside the cameras' file, instead of the one that it names.
+    /// Image folder beside the camera file, instead of the folder in the camera file.
     pub image_folder: Option<String>,
-    /// Folders to look for when none is asked for, before the one that the cameras' file names.
+    /// Default image folders, tried before the folder in the camera file.
     pub first_folders: &'static [&'static str],
-    /// Whether lens distortion is undone; otherwise it is ignored.
+    /// Whether images are undistorted; otherwise lens distortion is ignored.
     pub undistort: bool,
 }
 
-/// One picture on disk.
+/// An image on disk with its camera.
 #[derive(Clone, Debug)]
 pub(crate) struct Photo {
     pub path: PathBuf,
-    /// The camera of the picture as it is given out: a pinhole.
+    /// Pinhole camera of the loaded image.
     pub camera: Camera,
-    /// How the file's picture becomes that.
+    /// Undistortion applied on load.
     pub undistortion: Option<Box<Undistortion>>,
-    /// Width over height of the pictures that the intrinsics were given for.
+    /// Aspect ratio (width over height) of the images to which the intrinsics apply.
     pub shape: Option<f64>,
-    /// Microseconds, or the number at the end of the file's name.
+    /// Time stamp in microseconds, or the number at the end of the file name.
     pub time: Option<i64>,
 }
 
-/// A frame that has no photo, by the name its file gives it.
+/// A frame without a usable image, by its name in the camera file.
 pub(crate) struct MissingPhoto {
     pub name: String,
-    /// Why, in words that equal cases share.
+    /// Reason, with the same text for equal cases.
     pub reason: String,
 }
 
-/// The photos of a scene, in the order of their frames.
+/// Photos of a scene, in frame order.
 #[derive(Default)]
 pub(crate) struct PhotoScene {
     pub photos: Vec<Photo>,
     pub missing: Vec<MissingPhoto>,
-    /// Pictures beside those of the frames that no camera is given for.
+    /// Number of images without a camera.
     pub num_without_camera: usize,
-    /// What else is to be known.
+    /// Notes for the skip report.
     pub notes: Vec<String>,
-    /// Where it comes from; empty if nothing says.
+    /// URL of the scene; empty if unknown.
     pub url: String,
 }
 
 impl Photo {
-    /// A photo through `lens`, which is undone on load if `undistort` says so and ignored otherwise.
+    /// Creates a photo. With `undistort`, the image is undistorted on load; otherwise `lens` is ignored.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] for intrinsics that cannot be, and what [`Undistortion::new`] gives.
+    /// [`DataError::BadCamera`] for invalid intrinsics, and the errors of [`Undistortion::new`].
     pub fn new(
         path: PathBuf,
         c2w: Pose,
@@ -87,39 +87,39 @@ impl Photo {
         Ok(Self { path, camera, undistortion: Some(Box::new(undistortion)), shape: None, time })
     }
 
-    /// Reads the file as it is.
+    /// Reads the image file.
     pub fn read(&self) -> Result<Vec<u8>, DataError> {
-        read_bounded(&self.path, MAX_PICTURE_BYTES, "reading a picture")
+        read_bounded(&self.path, MAX_IMAGE_BYTES, "reading an image")
     }
 
-    /// Columns and rows, from the head of the file; its end is looked for as well.
+    /// Reads columns and rows from the header, and checks the aspect ratio and the end of the file.
     pub fn size(&self) -> Result<[usize; 2], DataError> {
         let size = read_size(&self.path)?;
         self.check_shape(size).map_err(|error| match (error, exif_orientation(&self.path)) {
             (DataError::BadScene { what, path }, Some(orientation)) => {
                 let what = format!(
-                    "{what}; its EXIF orientation is {orientation}, which is not applied, because cameras belong to \
-                     the pixels as they are stored"
+                    "{what}; the EXIF orientation {orientation} is not applied, because cameras refer to the stored \
+                     pixels"
                 );
                 DataError::BadScene { what, path }
             }
             (error, _) => error,
         })?;
-        check_end(&self.path, MAX_PICTURE_BYTES)?;
+        check_end(&self.path, MAX_IMAGE_BYTES)?;
         Ok(size)
     }
 
-    /// Decodes the picture and undoes the lens.
+    /// Decodes and undistorts the image.
     pub fn decode(&self, key: &str, frame: usize) -> Result<RgbImage, DataError> {
-        let picture = decode(&self.read()?, key, frame)?;
-        self.check_shape([picture.width, picture.height])?;
+        let image = decode(&self.read()?, key, frame)?;
+        self.check_shape([image.width, image.height])?;
         Ok(match &self.undistortion {
-            Some(undistortion) => undistortion.apply(&picture),
-            None => picture,
+            Some(undistortion) => undistortion.apply(&image),
+            None => image,
         })
     }
 
-    /// A picture that was turned after its camera was found has the wrong camera.
+    /// Checks the aspect ratio against the camera, which is wrong for an image that was rotated later.
     fn check_shape(&self, [width, height]: [usize; 2]) -> Result<(), DataError> {
         let Some(expected) = self.shape else { return Ok(()) };
         let shape = width as f64 / height as f64;
@@ -127,14 +127,14 @@ impl Photo {
             return Ok(());
         }
         let what = format!(
-            "the picture is {width}x{height}, {shape:.3} times as wide as high, and its camera's {expected:.3} times; \
-             it may have been turned or cropped after the cameras were found"
+            "the image is {width}x{height}, aspect ratio {shape:.3}, but its camera has {expected:.3}; the image may have \
+             been rotated or cropped after the calibration"
         );
         Err(DataError::BadScene { what, path: self.path.clone() })
     }
 }
 
-/// The digits that a file's name ends in: 12 of `frame_00012.png`.
+/// Returns the number at the end of a file name: 12 for `frame_00012.png`.
 fn number_at_end(path: &Path) -> Option<i64> {
     let stem = path.file_stem()?.to_str()?;
     let start = stem.rfind(|c: char| !c.is_ascii_digit()).map_or(0, |last| last + 1);
@@ -142,14 +142,14 @@ fn number_at_end(path: &Path) -> Option<i64> {
 }
 
 impl PhotoScene {
-    /// Time stamps that rise from frame to frame; positions where names give none.
+    /// Returns time stamps that increase from frame to frame; frame indices if the names have none.
     pub fn timestamps(&self) -> Vec<i64> {
         let times: Option<Vec<i64>> = self.photos.iter().map(|photo| photo.time).collect();
         let times = times.filter(|times| times.is_sorted_by(|a, b| a < b));
         times.unwrap_or_else(|| (0..self.photos.len() as i64).collect())
     }
 
-    /// An error about a frame of the scene at `path`.
+    /// Returns a function that wraps the error of a frame of the camera file at `path`.
     pub fn in_frame(path: &Path, name: &str) -> impl FnOnce(DataError) -> DataError {
         move |error| DataError::BadScene { what: format!("frame {name}: {error}"), path: path.to_owned() }
     }

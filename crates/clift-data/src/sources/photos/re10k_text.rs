@@ -1,4 +1,4 @@
-//! RealEstate10K as it is published: a text file of cameras per clip, with frames that the user has extracted.
+//! RealEstate10K as published: one text file of cameras per clip; the frames are extracted by the user.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -6,51 +6,50 @@ use std::path::{Path, PathBuf};
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
 use crate::geometry::camera::Camera;
-use crate::sources::photos::image_folder::numbered_pictures;
+use crate::sources::photos::image_folder::numbered_images;
 use crate::sources::photos::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoScene};
 
-/// Most bytes of one file: a hundred times those of the longest clip.
+/// Largest size of a file, in bytes: a hundred times the longest clip.
 const MAX_BYTES: u64 = 16 << 20;
-/// Most characters of a video's address that are kept.
+/// Largest number of stored characters of a URL.
 const MAX_URL_CHARS: usize = 1000;
-/// Columns of a line: a time stamp, four intrinsics, two zeros and a pose of 3 x 4.
+/// Number of columns of a line: a time stamp, four intrinsics, two zeros and a pose of 3 x 4.
 const NUM_COLUMNS: usize = 19;
 
-/// Reads the cameras of a clip and finds their frames, whose names are the time stamps. Frames are in the order of
-/// the file.
+/// Reads the cameras of a clip and locates the frames, which are named by time stamp. Frames are in the order of the file.
 ///
 /// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] that names the line.
+/// [`DataError::Io`], and [`DataError::BadScene`] with the line.
 pub(crate) fn read_re10k_text(path: &Path, frames: &Path) -> Result<PhotoScene, DataError> {
-    let pictures = if frames.is_dir() { numbered_pictures(frames)? } else { HashMap::new() };
+    let images = if frames.is_dir() { numbered_images(frames)? } else { HashMap::new() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
     let text = String::from_utf8(text)
         .map_err(|_| DataError::BadScene { what: "the file is not UTF-8".into(), path: path.to_owned() })?;
-    parse(&text, &pictures).map_err(|what| DataError::BadScene { what, path: path.to_owned() })
+    parse(&text, &images).map_err(|what| DataError::BadScene { what, path: path.to_owned() })
 }
 
-fn parse(text: &str, pictures: &HashMap<i64, PathBuf>) -> Result<PhotoScene, String> {
+fn parse(text: &str, images: &HashMap<i64, PathBuf>) -> Result<PhotoScene, String> {
     let mut scene = PhotoScene::default();
     let mut last = i64::MIN;
     for (number, line) in text.lines().enumerate() {
-        // The first line is the address of the video; some tools leave it out.
-        let is_address = number == 0 && line.split_ascii_whitespace().count() < NUM_COLUMNS;
-        if is_address {
+        // The first line is the URL of the video; some tools omit it.
+        let is_url = number == 0 && line.split_ascii_whitespace().count() < NUM_COLUMNS;
+        if is_url {
             scene.url = line.trim().chars().take(MAX_URL_CHARS).collect();
         }
-        if line.trim().is_empty() || is_address {
+        if line.trim().is_empty() || is_url {
             continue;
         }
         let in_line = |what: String| format!("line {}: {what}", number + 1);
         let (time, camera) = parse_line(line).map_err(in_line)?;
         if time <= last {
-            return Err(in_line(format!("the time stamp {time} does not come after the one above, {last}")));
+            return Err(in_line(format!("the time stamp {time} does not exceed the previous one, {last}")));
         }
         last = time;
         if scene.photos.len() + scene.missing.len() == MAX_FRAMES {
             return Err(in_line(format!("more than {MAX_FRAMES} frames")));
         }
-        match pictures.get(&time) {
+        match images.get(&time) {
             Some(path) => {
                 scene.photos.push(Photo {
                     path: path.clone(),
@@ -60,11 +59,11 @@ fn parse(text: &str, pictures: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Str
                     time: Some(time),
                 });
             }
-            None => scene.missing.push(MissingPhoto { name: time.to_string(), reason: "without a picture".into() }),
+            None => scene.missing.push(MissingPhoto { name: time.to_string(), reason: "without an image".into() }),
         }
     }
-    // Time stamps rise, so that no picture is counted twice.
-    scene.num_without_camera = pictures.len() - scene.photos.len();
+    // Time stamps increase, so that no image is counted twice.
+    scene.num_without_camera = images.len() - scene.photos.len();
     Ok(scene)
 }
 
@@ -77,12 +76,12 @@ fn parse_line(line: &str) -> Result<(i64, Camera), String> {
     let time = words[0].parse().map_err(|_| format!("the time stamp is {:?}, expected a whole number", words[0]))?;
     let mut row = [0.0; 18];
     for (value, word) in row.iter_mut().zip(&words[1..]) {
-        *value = word.parse().map_err(|_| format!("{word:?} is no number"))?;
+        *value = word.parse().map_err(|_| format!("expected a number, got {word:?}"))?;
     }
     Camera::from_re10k(row).map(|camera| (time, camera)).map_err(|error| error.to_string())
 }
 
-/// Whether a text file begins as such a file does: its first or second line is a camera.
+/// Returns whether the first or second line of a text file is a camera of RealEstate10K.
 pub(crate) fn looks_like_re10k(path: &Path) -> bool {
     use std::io::Read;
     let is_file = std::fs::metadata(path).is_ok_and(|metadata| metadata.is_file());

@@ -1,4 +1,4 @@
-//! Which folders hold a scene: cameras in a known form, next to pictures.
+//! Finding the folders that hold a scene: cameras in a known format, with images.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -8,28 +8,28 @@ use crate::files::listing::{file_names, has_ending};
 use crate::skip_report::{first_few, plural};
 use crate::sources::keys::{is_dl3dv_key, last_name};
 use crate::sources::photos::colmap::reader::{find_model, read_colmap};
-use crate::sources::photos::image_folder::numbered_pictures;
+use crate::sources::photos::image_folder::numbered_images;
 use crate::sources::photos::nerfstudio::read_transforms;
 use crate::sources::photos::photo::{PhotoOptions, PhotoScene};
 use crate::sources::photos::re10k_text::{looks_like_re10k, read_re10k_text};
 
-/// How far below the root scenes are looked for: DL3DV has them two folders down.
+/// Depth of the search below the root; scenes of DL3DV lie two folders down.
 const MAX_DEPTH: usize = 3;
-/// Most folders that are looked at.
+/// Largest number of searched folders.
 const MAX_FOLDERS: usize = 200_000;
 
-/// The cameras of one scene.
+/// Camera files of a scene.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum SceneFiles {
     /// A `transforms.json`.
     Transforms(PathBuf),
-    /// A COLMAP model, and the folder of its scene.
+    /// A COLMAP model and the folder of its scene.
     Colmap { folder: PathBuf, model: PathBuf },
-    /// A text file of RealEstate10K, and the folder of its frames.
+    /// A text file of RealEstate10K and the folder of its frames.
     Re10kText { cameras: PathBuf, frames: PathBuf },
 }
 
-/// A scene on disk that has not been read.
+/// An unread scene on disk.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct SceneFolder {
     pub key: String,
@@ -37,7 +37,7 @@ pub(crate) struct SceneFolder {
 }
 
 impl SceneFolder {
-    /// Reads the cameras and finds their pictures.
+    /// Reads the cameras and locates the images.
     pub fn read(&self, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
         match &self.files {
             SceneFiles::Transforms(path) => read_transforms(path, options),
@@ -46,7 +46,7 @@ impl SceneFolder {
         }
     }
 
-    /// The file or folder that the cameras are in.
+    /// Returns the file or folder of the cameras.
     pub fn path(&self) -> &Path {
         match &self.files {
             SceneFiles::Transforms(path) | SceneFiles::Colmap { model: path, .. } => path,
@@ -54,21 +54,21 @@ impl SceneFolder {
         }
     }
 
-    /// Whether this is a scene of DL3DV: a `transforms.json` in a folder named after a hash.
+    /// Returns whether this is a DL3DV scene: a `transforms.json` in a folder named by hash.
     pub fn is_dl3dv(&self) -> bool {
         is_dl3dv_key(&self.key) && matches!(self.files, SceneFiles::Transforms(_))
     }
 
-    /// A file that is a scene by itself, named after its folder.
+    /// Creates a scene of a single camera file, named by its folder.
     pub fn of_file(path: &Path) -> Self {
         let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
         Self { key: name_of(absolute.parent().unwrap_or(path)), files: SceneFiles::Transforms(path.to_owned()) }
     }
 }
 
-/// The scene that a folder is, if it is one.
+/// Returns the scene that lies directly in a folder.
 pub(crate) fn scene_in(folder: &Path) -> Option<SceneFiles> {
-    // DL3DV's benchmark has each scene once more, as COLMAP's model below gaussian_splat/.
+    // First, because the DL3DV benchmark also holds a COLMAP model of every scene, below gaussian_splat/.
     let transforms = ["transforms.json", "nerfstudio/transforms.json"].map(|name| folder.join(name));
     if let Some(path) = transforms.into_iter().find(|path| path.is_file()) {
         return Some(SceneFiles::Transforms(path));
@@ -79,7 +79,7 @@ pub(crate) fn scene_in(folder: &Path) -> Option<SceneFiles> {
     re10k_in(folder)
 }
 
-/// A clip of RealEstate10K in a folder of its own: its cameras as the only text file, frames beside it or one below.
+/// Returns the RealEstate10K clip in a folder: cameras in the only text file, frames beside it or one folder below.
 fn re10k_in(folder: &Path) -> Option<SceneFiles> {
     let names = file_names(folder).ok()?;
     let mut texts = names.iter().filter(|name| has_ending(name, "txt"));
@@ -90,22 +90,22 @@ fn re10k_in(folder: &Path) -> Option<SceneFiles> {
     }
     let below = names.iter().map(|name| folder.join(name)).filter(|path| path.is_dir());
     let mut folders = std::iter::once(folder.to_owned()).chain(below);
-    let frames = folders.find(|frames| numbered_pictures(frames).is_ok_and(|pictures| !pictures.is_empty()))?;
+    let frames = folders.find(|frames| numbered_images(frames).is_ok_and(|images| !images.is_empty()))?;
     Some(SceneFiles::Re10kText { cameras, frames })
 }
 
-/// The scenes of a folder, and what else was met.
+/// Scenes and other data found below a folder.
 pub(crate) struct FoundScenes {
-    /// Sorted by key. A key is the name of the scene's folder, or the way to it where several have that name.
+    /// Scenes sorted by key: the name of the scene folder, or its path if several folders have that name.
     pub scenes: Vec<SceneFolder>,
-    /// Ways to data of other layouts, with what it is.
+    /// Paths of data in other layouts, with a description.
     pub others: Vec<String>,
-    /// What is to be known of the names.
+    /// Notes on links and duplicates.
     pub notes: Vec<String>,
 }
 
-/// Finds the scenes in `base` and below it. Of a folder that links lead to, the way without links is used, or the first
-/// in order of names.
+/// Finds the scenes in `base` and below it. A folder that is reachable by several paths has the path without links, or
+/// the first one in order of names.
 ///
 /// # Errors
 /// [`DataError::Io`] for a `base` that cannot be listed, and [`DataError::UnknownLayout`] for too many folders.
@@ -116,8 +116,8 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
         return Ok(FoundScenes { scenes, others: Vec::new(), notes: Vec::new() });
     }
     let mut found: Vec<(String, SceneFiles)> = Vec::new();
-    let (mut others, mut again) = (Vec::new(), Vec::new());
-    // What each folder is, by its way without links: a scene, by its place in `found`, or none.
+    let (mut others, mut duplicates) = (Vec::new(), Vec::new());
+    // Visited folders by canonical path, with the index in `found` if the folder is a scene.
     let mut seen: HashMap<PathBuf, Option<usize>> = HashMap::new();
     seen.extend(base.canonicalize().map(|base| (base, None)));
     let (mut folders, mut links) = (VecDeque::new(), VecDeque::new());
@@ -128,12 +128,12 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
         match seen.get(&real) {
             Some(Some(scene)) => {
                 let (first, _): &(String, _) = &found[*scene];
-                again.push(format!("{way} to {first}"));
+                duplicates.push(format!("{way} to {first}"));
                 continue;
             }
             Some(None) => continue,
             None if seen.len() > MAX_FOLDERS => {
-                let what = format!("more than {MAX_FOLDERS} folders; give the folder of the scenes themselves");
+                let what = format!("more than {MAX_FOLDERS} folders; give the folder of the scenes");
                 return Err(DataError::UnknownLayout { what, path: base.to_owned() });
             }
             None => {}
@@ -148,25 +148,29 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
             others.push(format!("{way} ({kind})"));
         }
         if way.split('/').count() < MAX_DEPTH {
-            // A folder that may not be listed holds nothing for this user.
+            // Folders without read permission are ignored.
             push_folders(&path, &way, &mut folders, &mut links).unwrap_or_default();
         }
     }
     let mut notes = Vec::new();
-    if !again.is_empty() {
-        notes.push(format!("{} to what is used already: {}", plural(again.len(), "link"), first_few(&again)));
+    if !duplicates.is_empty() {
+        notes.push(format!(
+            "{} to scenes that are used already: {}",
+            plural(duplicates.len(), "link"),
+            first_few(&duplicates)
+        ));
     }
-    let mut ways: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    let mut paths: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for (way, _) in &found {
-        ways.entry(last_name(way)).or_default().push(way);
+        paths.entry(last_name(way)).or_default().push(way);
     }
-    let twice = ways.iter().filter(|(name, ways)| is_dl3dv_key(name) && ways.len() > 1);
-    let twice: Vec<String> = twice.map(|(_, ways)| ways.join(" and ")).collect();
+    let twice = paths.iter().filter(|(name, paths)| is_dl3dv_key(name) && paths.len() > 1);
+    let twice: Vec<String> = twice.map(|(_, paths)| paths.join(" and ")).collect();
     if !twice.is_empty() {
-        let note = format!("{} of DL3DV there more than once, all of which are used: ", plural(twice.len(), "scene"));
+        let note = format!("{} of DL3DV with several copies, all of which are used: ", plural(twice.len(), "scene"));
         notes.push(note + &first_few(&twice));
     }
-    let key = |way: &str| if ways[last_name(way)].len() > 1 { way.to_owned() } else { last_name(way).to_owned() };
+    let key = |way: &str| if paths[last_name(way)].len() > 1 { way.to_owned() } else { last_name(way).to_owned() };
     let keys: Vec<String> = found.iter().map(|(way, _)| key(way)).collect();
     let scenes = found.into_iter().zip(keys);
     let mut scenes: Vec<_> = scenes.map(|((_, files), key)| SceneFolder { key, files }).collect();
@@ -175,7 +179,7 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     Ok(FoundScenes { scenes, others, notes })
 }
 
-/// Appends the ways to the folders in `folder`, in order of their names and those that are links apart.
+/// Appends the paths of the subfolders of `folder`, in order of their names, links separately.
 fn push_folders(
     folder: &Path,
     way: &str,
@@ -194,7 +198,7 @@ fn push_folders(
     Ok(())
 }
 
-/// What a folder without a scene of photos holds instead, if it is data that would have to be opened by itself.
+/// Returns a description of the data of another layout in a folder.
 fn other_data_in(folder: &Path) -> Option<String> {
     let names = file_names(folder).ok()?;
     if names.iter().any(|name| has_ending(name, "torch")) {
@@ -202,12 +206,12 @@ fn other_data_in(folder: &Path) -> Option<String> {
     }
     let mut texts = names.iter().filter(|name| has_ending(name, "txt")).take(8);
     if texts.any(|name| looks_like_re10k(&folder.join(name))) {
-        return Some("RealEstate10K's text files".into());
+        return Some("text files of RealEstate10K".into());
     }
     transforms_in(folder).into_iter().next()
 }
 
-/// Files of cameras with names of their own, such as `transforms_train.json`.
+/// Returns the camera files with other names, such as `transforms_train.json`.
 pub(crate) fn transforms_in(folder: &Path) -> Vec<String> {
     let mut names = file_names(folder).unwrap_or_default();
     names.retain(|name| name.starts_with("transforms") && has_ending(name, "json"));

@@ -229,7 +229,7 @@ fn chunks_have_no_more_frames_than_can_be_read_and_scenes_of_more_are_left_out()
     let converted = convert_all(&long, folder.path(), &one, |_| ()).unwrap();
     assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (2, 1));
     let reason = &converted.left_out.skips[0].reason;
-    assert!(reason.contains("has 60000 frames, more than a file holds"), "{reason}");
+    assert!(reason.contains("has 60000 frames, above the limit of a file"), "{reason}");
     for name in ["000000.torch", "000001.torch"] {
         let table = ChunkTable::read(&folder.path().join(name)).unwrap();
         assert_eq!(table.scenes.into_values().map(|scene| scene.images.len()).collect::<Vec<_>>(), [30_000]);

@@ -314,7 +314,7 @@ fn truncated_damaged_and_hostile_files_are_refused() {
     let copy = place.path().join("calls_system.torch");
     std::fs::copy(hostile, &copy).unwrap();
     let message = refused(&copy, place.path(), &re10k());
-    assert_says(&message, &["which is not allowed; nothing was run"]);
+    assert_says(&message, &["which is not on the allow-list; no code was run"]);
 
     // Values that are not finite.
     let message =

@@ -93,7 +93,7 @@ fn print_skips(left_out: &SkipReport, folder: &Path) {
     if num_more > 0 {
         print_note(&format!("left out {num_more} more"));
     }
-    if left_out.has_gaps() {
+    if left_out.has_skips() {
         print_note(&format!("all that is left out, by name: {}", folder.join("skipped.json").display()));
     }
 }

@@ -88,7 +88,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let json = serde_json::to_vec_pretty(&report).context("writing the report as JSON")?;
     let path = files.path().join("render.json");
     replace_file(&path, &json).with_context(|| format!("writing {}", path.display()))?;
-    files.keep().with_context(making)?;
+    files.commit().with_context(making)?;
     print_result(&format!(
         "{}: {} frames of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
          {:.1} ms per frame on {device} (median): {:.1} ms to choose tokens, {:.1} ms to draw",

@@ -10,7 +10,7 @@ use crate::sources::photos::colmap::model::{
     ColmapCamera, ColmapImage, MAX_NAME_BYTES, MODELS, Model, add_camera, add_image,
 };
 
-/// Bytes of a point of an image: two coordinates and the id of its 3D point.
+/// Bytes of an image point: two coordinates and the id of the 3D point.
 const POINT_BYTES: u64 = 24;
 
 /// Reads `cameras.bin` and `images.bin`.
@@ -22,13 +22,13 @@ fn read_cameras(path: &Path) -> Result<HashMap<u32, ColmapCamera>, DataError> {
     let mut file = Fields::open(path)?;
     let count = u64::from_le_bytes(file.take()?);
     let mut cameras = HashMap::new();
-    for place in 0..count {
+    for index in 0..count {
         let id = u32::from_le_bytes(file.take()?);
         let model = i32::from_le_bytes(file.take()?);
         let (width, height) = (u64::from_le_bytes(file.take()?), u64::from_le_bytes(file.take()?));
         let known = usize::try_from(model).ok().and_then(|model| MODELS.get(model));
         let &(name, num_params) =
-            known.ok_or_else(|| file.bad(format!("camera {place} of {count} has the unknown model {model}")))?;
+            known.ok_or_else(|| file.bad(format!("camera {index} of {count} has the unknown model {model}")))?;
         let params = (0..num_params).map(|_| file.take().map(f64::from_le_bytes)).collect::<Result<_, _>>()?;
         let camera = ColmapCamera { model: name.into(), width, height, params };
         add_camera(&mut cameras, id, camera).map_err(|what| file.bad(what))?;
@@ -79,9 +79,7 @@ impl<'a> Fields<'a> {
         let end = count.and_then(|count| self.at.checked_add(count)).filter(|end| *end <= self.num_bytes);
         self.at = end.ok_or_else(|| {
             let (at, num_bytes) = (self.at, self.num_bytes);
-            self.bad(format!(
-                "what begins at byte {at} lies behind the end of the file, {num_bytes} bytes; it is truncated"
-            ))
+            self.bad(format!("the field at byte {at} exceeds the file of {num_bytes} bytes; the file is truncated"))
         })?;
         Ok(())
     }

@@ -3,7 +3,7 @@
 //! - `model`: cameras and images of a model
 //! - `text`: COLMAP text files
 //! - `binary`: COLMAP binary files
-//! - `reader`: locate and read a COLMAP model
+//! - `reader`: locating and reading a COLMAP model
 
 pub(crate) mod binary;
 pub(crate) mod model;

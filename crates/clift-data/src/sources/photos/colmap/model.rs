@@ -10,7 +10,7 @@ use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
 use crate::sources::photos::photo::MAX_FRAMES;
 
-/// Most cameras of a model: one per image.
+/// Largest number of cameras of a model: one per image.
 const MAX_CAMERAS: usize = MAX_FRAMES;
 /// Longest name of an image, in bytes.
 pub(crate) const MAX_NAME_BYTES: usize = 4096;
@@ -40,10 +40,10 @@ pub(crate) struct ColmapCamera {
 }
 
 impl ColmapCamera {
-    /// Intrinsics over width and height, and the lens.
+    /// Returns normalised intrinsics and the lens.
     ///
     /// # Errors
-    /// A description of an unsupported model, or of parameters that no camera has.
+    /// A description of an unsupported model or of invalid parameters.
     pub fn optics(&self) -> Result<(IntrinsicsNorm, Lens), String> {
         let (focal, centre, distortion) = match (self.model.as_str(), self.params.as_slice()) {
             ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], [0.0; 4]),
@@ -58,13 +58,13 @@ impl ColmapCamera {
                     }
                     _ => format!(
                         "the model is {model}, expected SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV; \
-                         `colmap image_undistorter` turns any into PINHOLE"
+                         `colmap image_undistorter` converts every model to PINHOLE"
                     ),
                 });
             }
         };
         if self.width == 0 || self.height == 0 {
-            return Err(format!("it is {}x{} pixels", self.width, self.height));
+            return Err(format!("the size is {}x{} pixels", self.width, self.height));
         }
         let intrinsics = Intrinsics { fx: focal[0], fy: focal[1], cx: centre[0], cy: centre[1] };
         let intrinsics_norm = IntrinsicsNorm::of_pixels(intrinsics, self.width as f64, self.height as f64);
@@ -85,8 +85,10 @@ pub(crate) struct ColmapImage {
 }
 
 impl ColmapImage {
+    /// Returns the pose, camera to world.
+    ///
     /// # Errors
-    /// [`DataError::BadCamera`] for a value that is not finite, and a quaternion that is not of length 1 to 0.1.
+    /// [`DataError::BadCamera`] for a value that is not finite, and a quaternion whose length is not within 0.1 of 1.
     pub fn c2w(&self) -> Result<Pose, DataError> {
         let bad = |what: String| DataError::BadCamera { what };
         if let Some(value) = self.w2c.iter().find(|value| !value.is_finite()) {
@@ -103,7 +105,7 @@ impl ColmapImage {
     }
 }
 
-/// Cameras by their id, and images in the order of the file.
+/// Cameras by id, and images in file order.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Model {
     pub cameras: HashMap<u32, ColmapCamera>,
@@ -121,7 +123,7 @@ pub(crate) fn add_camera(
     }
     match cameras.insert(id, camera) {
         None => Ok(()),
-        Some(_) => Err(format!("camera {id} comes twice")),
+        Some(_) => Err(format!("camera {id} occurs twice")),
     }
 }
 

@@ -1,4 +1,4 @@
-//! Captures as COLMAP models: `cameras` and `images` as `.bin` or `.txt`, next to the images. Points are skipped.
+//! Captures as COLMAP models: `cameras` and `images` as `.bin` or `.txt`, with an image folder. Points are ignored.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -10,15 +10,15 @@ use crate::sources::photos::colmap::{binary, text};
 use crate::sources::photos::image_folder::ImageFolders;
 use crate::sources::photos::photo::{MissingPhoto, Photo, PhotoOptions, PhotoScene};
 
-/// The COLMAP model of a folder: the folder itself, or one of the usual subfolders.
+/// Returns the folder of the COLMAP model of a scene: the scene folder, or one of the usual subfolders.
 pub(crate) fn find_model(folder: &Path) -> Option<PathBuf> {
-    let places = ["", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "dense/sparse/0", "dense/sparse"];
-    let mut models = places.into_iter().map(|place| if place.is_empty() { folder.into() } else { folder.join(place) });
-    models.find(|model| files_of(model).is_some())
+    let subfolders = ["", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "dense/sparse/0", "dense/sparse"];
+    let mut models = subfolders.into_iter().map(|name| if name.is_empty() { folder.into() } else { folder.join(name) });
+    models.find(|model| model_files(model).is_some())
 }
 
-/// The two files of a model, binary ones first.
-fn files_of(model: &Path) -> Option<([PathBuf; 2], bool)> {
+/// Returns the two files of a model and whether they are binary; binary files take precedence.
+fn model_files(model: &Path) -> Option<([PathBuf; 2], bool)> {
     let both = [("bin", true), ("txt", false)].map(|(ending, is_binary)| {
         (["cameras", "images"].map(|name| model.join(format!("{name}.{ending}"))), is_binary)
     });
@@ -31,8 +31,8 @@ fn files_of(model: &Path) -> Option<([PathBuf; 2], bool)> {
 /// # Errors
 /// [`DataError::Io`], and [`DataError::BadScene`] for a malformed file or an unsupported camera.
 pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
-    let Some(([cameras_path, images_path], is_binary)) = files_of(model) else {
-        let what = "neither cameras.bin and images.bin nor cameras.txt and images.txt".into();
+    let Some(([cameras_path, images_path], is_binary)) = model_files(model) else {
+        let what = "expected cameras.bin and images.bin, or cameras.txt and images.txt".into();
         return Err(DataError::BadScene { what, path: model.to_owned() });
     };
     let read = if is_binary { binary::read } else { text::read };
@@ -45,15 +45,15 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
     }
     images.sort_by(|a, b| natural_order(&a.name, &b.name));
     let mut folders = ImageFolders::default();
-    let pictures = picture_folder(folder, model, options, &mut folders);
+    let image_folder = find_image_folder(folder, model, options, &mut folders);
     let mut scene = PhotoScene { notes: other_models(model), ..PhotoScene::default() };
-    for (place, image) in images.iter().enumerate() {
-        let found = match place.checked_sub(1).map(|before| &images[before].name) {
-            Some(before) if *before == image.name => Err("whose picture another frame has".into()),
-            _ => folders.find(&pictures.join(&image.name)),
+    for (index, image) in images.iter().enumerate() {
+        let found = match index.checked_sub(1).map(|before| &images[before].name) {
+            Some(before) if *before == image.name => Err("with the image of another frame".into()),
+            _ => folders.find(&image_folder.join(&image.name)),
         };
-        let picture = match found {
-            Ok(picture) => picture,
+        let path = match found {
+            Ok(path) => path,
             Err(reason) => {
                 scene.missing.push(MissingPhoto { name: image.name.clone(), reason });
                 continue;
@@ -61,22 +61,22 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         };
         let in_frame = |error| PhotoScene::in_frame(&images_path, &image.name)(error);
         let Some((intrinsics_norm, lens)) = optics.get(&image.camera_id) else {
-            let what = format!("there is no camera {}", image.camera_id);
+            let what = format!("no camera {}", image.camera_id);
             return Err(in_frame(DataError::BadCamera { what }));
         };
         let photo = image
             .c2w()
-            .and_then(|c2w| Photo::new(picture, c2w, *intrinsics_norm, *lens, options.undistort))
+            .and_then(|c2w| Photo::new(path, c2w, *intrinsics_norm, *lens, options.undistort))
             .map_err(in_frame)?;
         let camera = &cameras[&image.camera_id];
         scene.photos.push(Photo { shape: Some(camera.width as f64 / camera.height as f64), ..photo });
     }
-    scene.num_without_camera = folders.num_unasked();
+    scene.num_without_camera = folders.num_unrequested();
     Ok(scene)
 }
 
-/// The folder to which image names are relative.
-fn picture_folder(folder: &Path, model: &Path, options: &PhotoOptions, folders: &mut ImageFolders) -> PathBuf {
+/// Returns the folder to which the image names are relative.
+fn find_image_folder(folder: &Path, model: &Path, options: &PhotoOptions, folders: &mut ImageFolders) -> PathBuf {
     let mut bases: Vec<&Path> = model.ancestors().take_while(|above| above.starts_with(folder)).collect();
     if !bases.contains(&folder) {
         bases.push(folder);
@@ -93,12 +93,12 @@ fn picture_folder(folder: &Path, model: &Path, options: &PhotoOptions, folders: 
     })
 }
 
-/// A note on models beside that in `sparse/0`: COLMAP writes several if it cannot connect all images.
+/// Returns a note on models beside `sparse/0`: COLMAP writes several models if it cannot connect all images.
 fn other_models(model: &Path) -> Vec<String> {
     if model.file_name().is_none_or(|name| name != "0") {
         return Vec::new();
     }
-    let others = (1..100).take_while(|number| files_of(&model.with_file_name(number.to_string())).is_some()).count();
-    let note = || format!("{} has {others} more models, which are not used: only model 0 is", model.display());
+    let others = (1..100).take_while(|number| model_files(&model.with_file_name(number.to_string())).is_some()).count();
+    let note = || format!("{} has {others} more models; only model 0 is used", model.display());
     (others > 0).then(note).into_iter().collect()
 }

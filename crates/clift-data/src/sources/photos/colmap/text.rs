@@ -9,7 +9,7 @@ use std::str::FromStr;
 use crate::error::DataError;
 use crate::sources::photos::colmap::model::{ColmapCamera, ColmapImage, MAX_NAME_BYTES, Model, add_camera, add_image};
 
-/// Most bytes of a line in memory; the rest of a line of points, which may have any length, is skipped.
+/// Largest number of stored bytes of a line; lines of points may be longer, and their rest is skipped.
 const MAX_LINE_BYTES: usize = MAX_NAME_BYTES + 1024;
 
 /// Reads `cameras.txt` and `images.txt`.
@@ -40,7 +40,7 @@ fn read_images(path: &Path) -> Result<Vec<ColmapImage>, DataError> {
     while let Some(line) = lines.next_entry()? {
         let image = parse_image(&line).and_then(|image| add_image(&mut images, image));
         image.map_err(|what| lines.bad(&what))?;
-        // The line of points may be empty: its first words show whether it is missing.
+        // The line of points may be empty, but a camera or image line in its place is an error.
         if lines.next_line()? && !lines.is_of_points() {
             return Err(
                 lines.bad("expected the points of the image above: two lines per image, the second may be empty")
@@ -108,7 +108,7 @@ impl<'a> Lines<'a> {
         Ok(length > 0)
     }
 
-    /// The next line that is neither empty nor a comment.
+    /// Reads the next line that is neither empty nor a comment.
     fn next_entry(&mut self) -> Result<Option<String>, DataError> {
         while self.next_line()? {
             let line = self.line.trim_ascii();
@@ -124,7 +124,7 @@ impl<'a> Lines<'a> {
         Ok(None)
     }
 
-    /// Whether the first ten words are numbers, as in a list of points; the tenth word of an image is its name.
+    /// Returns whether the first ten words are numbers, as in a line of points; the tenth word of an image line is a name.
     fn is_of_points(&self) -> bool {
         let words = self.line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
         let is_number = |word: &[u8]| std::str::from_utf8(word).is_ok_and(|word| word.parse::<f64>().is_ok());

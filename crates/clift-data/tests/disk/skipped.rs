@@ -1,4 +1,4 @@
-//! Pictures and frames that cannot be used, and why.
+//! Unusable images and frames, with their reasons.
 
 use std::fs;
 use std::path::Path;
@@ -11,13 +11,13 @@ use serde_json::{Value, json};
 use crate::files::{copy_folder, fixtures};
 use crate::open_at;
 
-fn picture(width: usize, height: usize) -> RgbImage {
+fn image(width: usize, height: usize) -> RgbImage {
     RgbImage { width, height, rgb: (0..width * height * 3).map(|i| (i * i / 7) as u8).collect() }
 }
 
-/// Writes pictures and a `transforms.json` that names `frames`.
-fn write(root: &Path, pictures: &[(&str, Vec<u8>)], frames: &[&str]) {
-    for (name, bytes) in pictures {
+/// Writes images, and a `transforms.json` with `frames`.
+fn write(root: &Path, images: &[(&str, Vec<u8>)], frames: &[&str]) {
+    for (name, bytes) in images {
         let path = root.join(name);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         fs::write(path, bytes).unwrap();
@@ -35,17 +35,17 @@ fn open(root: &Path) -> Result<OpenedSource, String> {
     open_at(root, Split::Test, &SourceOptions::default()).map_err(|error| error.to_string())
 }
 
-fn frames_left_out(ledger: &SkipReport) -> Vec<(&str, &str)> {
-    ledger.frames.iter().map(|skip| (skip.frame.as_str(), skip.reason.as_str())).collect()
+fn skipped_frames(report: &SkipReport) -> Vec<(&str, &str)> {
+    report.frames.iter().map(|skip| (skip.frame.as_str(), skip.reason.as_str())).collect()
 }
 
 #[test]
 fn truncated_images_are_skipped_at_opening() {
-    let (jpeg, png) = (encode_jpeg(&picture(48, 32), 90).unwrap(), encode_png(&picture(48, 32)).unwrap());
+    let (jpeg, png) = (encode_jpeg(&image(48, 32), 90).unwrap(), encode_png(&image(48, 32)).unwrap());
     let cut = |bytes: &[u8]| bytes[..bytes.len() * 3 / 4].to_vec();
     let padded = |bytes: &[u8]| [bytes, &[0; 900]].concat();
     let appended = |bytes: &[u8]| [bytes, &b"\x01a film of the phone".repeat(99)].concat();
-    let pictures = [
+    let images = [
         ("0.jpg", jpeg.clone()),
         ("1.jpg", cut(&jpeg)),
         ("2.png", png.clone()),
@@ -57,10 +57,10 @@ fn truncated_images_are_skipped_at_opening() {
         ("8.jpg", padded(&cut(&jpeg))),
     ];
     let root = tempfile::tempdir().unwrap();
-    write(root.path(), &pictures, &pictures.clone().map(|(name, _)| name));
-    let OpenedSource { source, report: ledger, .. } = open(root.path()).unwrap();
-    let truncated = ["1.jpg", "3.png", "8.jpg"].map(|name| (name, "whose picture is truncated"));
-    assert_eq!(frames_left_out(&ledger), truncated);
+    write(root.path(), &images, &images.clone().map(|(name, _)| name));
+    let OpenedSource { source, report, .. } = open(root.path()).unwrap();
+    let truncated = ["1.jpg", "3.png", "8.jpg"].map(|name| (name, "whose image is truncated"));
+    assert_eq!(skipped_frames(&report), truncated);
     for frame in 0..source.num_frames(0).unwrap() {
         assert!(source.frame(0, frame).is_ok(), "{frame}");
     }
@@ -68,11 +68,11 @@ fn truncated_images_are_skipped_at_opening() {
 
 #[test]
 fn scenes_without_usable_images_report_the_reason() {
-    let jpeg = encode_jpeg(&picture(48, 32), 90).unwrap();
-    let turned = encode_jpeg(&picture(32, 48), 90).unwrap();
+    let jpeg = encode_jpeg(&image(48, 32), 90).unwrap();
+    let turned = encode_jpeg(&image(32, 48), 90).unwrap();
     let scenes = tempfile::tempdir().unwrap();
     for (name, bytes, frames) in [
-        ("corrupt", b"no picture".to_vec(), &["0.jpg"][..]),
+        ("corrupt", b"no image".to_vec(), &["0.jpg"][..]),
         ("cut", jpeg[..jpeg.len() / 2].to_vec(), &["0.jpg"]),
         ("empty", jpeg.clone(), &[]),
         ("heic", jpeg.clone(), &["0.heic", "1.jpg"]),
@@ -83,59 +83,56 @@ fn scenes_without_usable_images_report_the_reason() {
         let file = if name == "heic" { "1.heic" } else { "0.jpg" };
         write(&scenes.path().join(name), &[(file, bytes)], frames);
     }
-    let ledger = open(scenes.path()).unwrap().report;
-    let reason = |key: &str| ledger.skips.iter().find(|skip| skip.key == key).unwrap().reason.as_str();
-    assert!(reason("corrupt").contains("the picture cannot be read"), "{ledger}");
-    assert!(reason("cut").contains("the picture is truncated"), "{ledger}");
-    assert!(reason("empty").contains("it lists no frames"), "{ledger}");
-    assert!(
-        reason("heic").contains("none of its 2 frames can be used; 1.jpg is one whose picture is neither"),
-        "{ledger}"
-    );
-    assert_eq!(reason("missing"), "without any picture");
-    assert!(reason("turned").contains("may have been turned or cropped"), "{ledger}");
-    assert_eq!(ledger.num_used(), 1);
+    let report = open(scenes.path()).unwrap().report;
+    let reason = |key: &str| report.skips.iter().find(|skip| skip.key == key).unwrap().reason.as_str();
+    assert!(reason("corrupt").contains("the image cannot be read"), "{report}");
+    assert!(reason("cut").contains("the image is truncated"), "{report}");
+    assert!(reason("empty").contains("no frames listed"), "{report}");
+    assert!(reason("heic").contains("none of 2 frames is usable; 1.jpg is a frame whose image is neither"), "{report}");
+    assert_eq!(reason("missing"), "without any image");
+    assert!(reason("turned").contains("may have been rotated or cropped"), "{report}");
+    assert_eq!(report.num_used(), 1);
 
-    // Of a data set whose scenes are used whole, the first picture is looked at.
+    // DL3DV: only the first image of a scene is checked.
     let root = tempfile::tempdir().unwrap();
     for key in ["a", "b"].map(|digit| digit.repeat(64)) {
         write(&root.path().join(key), &[("0.jpg", jpeg.clone()), ("1.jpg", jpeg.clone())], &["0.jpg", "1.jpg"]);
     }
-    fs::write(root.path().join("a".repeat(64)).join("0.jpg"), "no picture").unwrap();
-    let ledger = open(root.path()).unwrap().report;
-    assert!(ledger.skips[0].reason.contains("the picture cannot be read"), "{ledger}");
+    fs::write(root.path().join("a".repeat(64)).join("0.jpg"), "no image").unwrap();
+    let report = open(root.path()).unwrap().report;
+    assert!(report.skips[0].reason.contains("the image cannot be read"), "{report}");
 }
 
 #[test]
 fn unreadable_images_leave_other_frames_in_use() {
     let root = tempfile::tempdir().unwrap();
-    write(root.path(), &[("0.png", encode_png(&picture(48, 32)).unwrap()), ("1.png", vec![9])], &["0.png", "1.png"]);
+    write(root.path(), &[("0.png", encode_png(&image(48, 32)).unwrap()), ("1.png", vec![9])], &["0.png", "1.png"]);
     let path = root.path().join("transforms.json");
     let mut cameras: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
     cameras.as_object_mut().unwrap().retain(|key, _| key != "w");
     fs::write(&path, cameras.to_string()).unwrap();
-    assert_eq!(frames_left_out(&open(root.path()).unwrap().report), [("1.png", "whose picture cannot be read")]);
+    assert_eq!(skipped_frames(&open(root.path()).unwrap().report), [("1.png", "whose image cannot be read")]);
 }
 
 #[test]
-fn pictures_without_a_camera_are_counted() {
-    let png = || encode_png(&picture(48, 32)).unwrap();
+fn images_without_cameras_are_counted() {
+    let png = || encode_png(&image(48, 32)).unwrap();
     let root = tempfile::tempdir().unwrap();
     write(
         &root.path().join("a"),
         &[("images/0.png", png()), ("images/1.png", png()), ("logo.png", png())],
         &["images/0"],
     );
-    let pictures = ["0", "1", "2"].map(|name| (name, png()));
-    let pictures = pictures.map(|(name, png)| (format!("images/{name}.png"), png));
-    let pictures: Vec<(&str, Vec<u8>)> = pictures.iter().map(|(name, png)| (name.as_str(), png.clone())).collect();
-    write(&root.path().join("b"), &pictures, &["images/2", "images/9"]);
-    assert_eq!(open(root.path()).unwrap().report.notes[0], "3 pictures without a camera, not used: 1 of a, 2 of b");
+    let images = ["0", "1", "2"].map(|name| (name, png()));
+    let images = images.map(|(name, png)| (format!("images/{name}.png"), png));
+    let images: Vec<(&str, Vec<u8>)> = images.iter().map(|(name, png)| (name.as_str(), png.clone())).collect();
+    write(&root.path().join("b"), &images, &["images/2", "images/9"]);
+    assert_eq!(open(root.path()).unwrap().report.notes[0], "3 images without a camera, not used: 1 of a, 2 of b");
 
     for (layout, frames) in [("colmap_bin/attic", "images/left"), ("re10k_folders", "")] {
         let copy = tempfile::tempdir().unwrap();
         copy_folder(&fixtures().join("layouts").join(layout), copy.path());
-        let note = "1 picture without a camera, not used: ";
+        let note = "1 image without a camera, not used: ";
         let has_note = || open(copy.path()).unwrap().report.notes.iter().any(|got| got.starts_with(note));
         assert!(!has_note(), "{layout}");
         let mut folder = copy.path().join(frames);
@@ -148,16 +145,16 @@ fn pictures_without_a_camera_are_counted() {
     }
 }
 
-/// All files below a folder.
+/// Returns all files below a folder.
 fn walk(folder: &Path) -> Vec<std::path::PathBuf> {
     let paths = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
     paths.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
 }
 
 #[test]
-fn a_byte_order_mark_is_passed_over() {
+fn byte_order_marks_are_skipped() {
     let root = tempfile::tempdir().unwrap();
-    write(root.path(), &[("0.png", encode_png(&picture(48, 32)).unwrap())], &["0.png"]);
+    write(root.path(), &[("0.png", encode_png(&image(48, 32)).unwrap())], &["0.png"]);
     let path = root.path().join("transforms.json");
     let text = fs::read(&path).unwrap();
     fs::write(&path, [b"\xef\xbb\xbf", &text[..]].concat()).unwrap();
@@ -166,7 +163,7 @@ fn a_byte_order_mark_is_passed_over() {
 
 #[test]
 fn images_are_found_by_the_end_of_paths() {
-    let png = || encode_png(&picture(48, 32)).unwrap();
+    let png = || encode_png(&image(48, 32)).unwrap();
     for (file, named, image_folder) in [
         ("images/0.png", ".\\images\\0.png", None),
         ("images/0.png", "./images\\0.png", None),
@@ -189,32 +186,33 @@ fn images_are_found_by_the_end_of_paths() {
         let opened = opened.unwrap_or_else(|error| panic!("{file} for {named}: {error}"));
         assert_eq!(opened.source.num_frames(0).unwrap(), 1, "{file} for {named}");
     }
-    // A relative path is not looked for where the folder it names is not.
+    // Relative paths keep their folder.
     let root = tempfile::tempdir().unwrap();
     write(root.path(), &[("0.png", png())], &["images/0.png"]);
     let message = open(root.path()).err().unwrap();
-    assert!(message.contains("none of its 1 frames has a picture, the first being images/0.png"), "{message}");
+    assert!(message.contains("none of 1 frames has an image; the first is images/0.png"), "{message}");
 }
 
 #[test]
-fn exif_orientation_is_reported_for_wrong_shapes() {
-    // Of phones: pixels lie as the sensor has them, and a tag says how to turn them.
+fn exif_orientation_is_reported_for_wrong_aspect_ratios() {
+    // Phones store sensor rows, with a tag for the rotation.
     let tagged = |frame: &RgbImage| {
         let jpeg = encode_jpeg(frame, 90).unwrap();
         let exif = b"\xff\xe1\x00\x22Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
         [&jpeg[..2], exif, &jpeg[2..]].concat()
     };
     let root = tempfile::tempdir().unwrap();
-    let pictures = [("0.jpg", tagged(&picture(48, 32))), ("1.jpg", tagged(&picture(32, 48)))];
-    write(root.path(), &pictures, &["0.jpg", "1.jpg"]);
+    let images = [("0.jpg", tagged(&image(48, 32))), ("1.jpg", tagged(&image(32, 48)))];
+    write(root.path(), &images, &["0.jpg", "1.jpg"]);
     let opened = open(root.path()).unwrap();
-    let expected = "whose picture has another shape than its camera, and an EXIF orientation, which is not applied";
-    assert_eq!(frames_left_out(&opened.report), [("1.jpg", expected)]);
+    let expected =
+        "whose image has another aspect ratio than its camera, and an EXIF orientation, which is not applied";
+    assert_eq!(skipped_frames(&opened.report), [("1.jpg", expected)]);
     let frame = opened.source.frame(0, 0).unwrap();
     assert_eq!((frame.width, frame.height), (48, 32), "as stored");
     fs::remove_file(root.path().join("0.jpg")).unwrap();
     let message = open(root.path()).err().unwrap();
-    assert!(message.contains("its EXIF orientation is 6, which is not applied"), "{message}");
+    assert!(message.contains("the EXIF orientation 6 is not applied"), "{message}");
 }
 
 #[test]
@@ -236,5 +234,5 @@ fn listed_scenes_missing_from_test_are_flagged() {
     assert_eq!(flagged(SourceKind::Scenes), [("00000000000000a1".to_owned(), reason)]);
     fs::remove_dir_all(root.path().join("test")).unwrap();
     copy_folder(&root.path().join("train"), &root.path().join("test"));
-    assert!(flagged(SourceKind::Auto).is_empty(), "the test half has it");
+    assert!(flagged(SourceKind::Auto).is_empty(), "the test split has it");
 }

@@ -1,4 +1,4 @@
-//! What is found where, and what is told of the rest.
+//! Detection of data sets: splits, links, duplicates, other layouts.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use crate::open_at;
 
 const HASH: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 
-/// Copies part of the fixtures of layouts.
+/// Copies a fixture of a layout.
 fn copy(part: &str, to: &Path) {
     copy_folder(&fixtures().join("layouts").join(part), to);
 }
@@ -45,12 +45,12 @@ fn duplicate_benchmark_scenes_are_in_no_training_set() {
     let train = open(root.path(), Split::Train, &options).unwrap();
     assert_eq!(keys(&train), [other.as_str()]);
     assert_eq!(train.report.counts()["kept for testing"], 2);
-    let note = format!("1 scene of DL3DV there more than once, all of which are used: 1K/{HASH} and bench/{HASH}");
+    let note = format!("1 scene of DL3DV with several copies, all of which are used: 1K/{HASH} and bench/{HASH}");
     assert!(train.report.notes.contains(&note), "{:?}", train.report.notes);
     let test = open(root.path(), Split::Test, &options).unwrap();
     assert_eq!(keys(&test), [format!("1K/{HASH}"), format!("bench/{HASH}")]);
-    assert!(test.report.skips.is_empty(), "both are there: {}", test.report);
-    assert_eq!(test.source.find(HASH), Some(0), "an index names the hash alone");
+    assert!(test.report.skips.is_empty(), "both copies exist: {}", test.report);
+    assert_eq!(test.source.find(HASH), Some(0), "indices contain only the hash");
 }
 
 #[test]
@@ -59,13 +59,13 @@ fn dl3dv_scenes_among_others_are_no_captures() {
     copy("dl3dv", root.path());
     copy("colmap_bin/attic", &root.path().join("1K/stray"));
     let message = open(root.path(), Split::Train, &SourceOptions::default()).err().unwrap();
-    assert!(message.contains("1 of 2 scenes are DL3DV's") && message.contains("such as stray"), "{message}");
+    assert!(message.contains("1 of 2 scenes are DL3DV scenes") && message.contains("such as stray"), "{message}");
     assert!(message.contains("data.source"), "{message}");
     let asked = SourceOptions { kind: SourceKind::Dl3dv, ..SourceOptions::default() };
     let opened = open(root.path(), Split::Train, &asked).unwrap();
     assert_eq!(keys(&opened), [HASH]);
     let skip = &opened.report.skips[0];
-    assert_eq!((skip.key.as_str(), skip.reason.as_str()), ("stray", "with cameras in another form than dl3dv has"));
+    assert_eq!((skip.key.as_str(), skip.reason.as_str()), ("stray", "with cameras in another format than dl3dv"));
     let asked = SourceOptions { kind: SourceKind::Captures, ..SourceOptions::default() };
     assert_eq!(open(root.path(), Split::Train, &asked).unwrap().source.num_scenes(), 2);
 }
@@ -78,10 +78,10 @@ fn captures_named_as_splits_hide_no_others() {
     let opened = open_any(root.path(), Split::Train);
     assert_eq!((keys(&opened), opened.has_splits), (vec!["train", "truck"], false));
     fs::rename(root.path().join("truck"), root.path().join("test")).unwrap();
-    assert!(has_splits(root.path()), "two halves of one capture each");
+    assert!(has_splits(root.path()), "two splits of one capture each");
     copy("colmap_bin/attic", &root.path().join("truck"));
     assert!(!has_splits(root.path()));
-    // A clip of RealEstate10K is a file beside its folder, so that the half it is alone in looks like a scene.
+    // A single RealEstate10K clip in a split looks like a scene folder.
     let clips = tempfile::tempdir().unwrap();
     copy("re10k_txt/test", &clips.path().join("train"));
     assert!(has_splits(clips.path()));
@@ -92,17 +92,17 @@ fn captures_named_as_splits_hide_no_others() {
 fn linked_folders_keep_their_own_names() {
     use std::os::unix::fs::symlink;
     let root = tempfile::tempdir().unwrap();
-    let place = |name: &str| root.path().join(name);
+    let path = |name: &str| root.path().join(name);
     for name in ["far/y", "z"] {
-        copy("colmap_bin/attic", &place(name));
+        copy("colmap_bin/attic", &path(name));
     }
-    // Names before and after that of the folder: neither order of listing decides.
+    // Links before and after the folder in order of names.
     for (link, to) in [("a", "z"), ("zz", "z"), ("b", "far"), ("self", "."), ("gone", "nowhere")] {
-        symlink(place(to), place(link)).unwrap();
+        symlink(path(to), path(link)).unwrap();
     }
     let opened = open_any(root.path(), Split::Test);
     assert_eq!(keys(&opened), ["y", "z"]);
-    assert_eq!(opened.report.notes[0], "2 links to what is used already: a to z, zz to z");
+    assert_eq!(opened.report.notes[0], "2 links to scenes that are used already: a to z, zz to z");
 }
 
 #[test]
@@ -113,7 +113,7 @@ fn unindexed_chunks_and_scenes_are_reported() {
     fs::copy(train.join("000000.torch"), train.join("000001.torch")).unwrap();
     fs::write(train.join("index.json"), r#"{"00000000000000a1": "000000.torch"}"#).unwrap();
     let opened = open_any(root.path(), Split::Train);
-    assert_eq!(opened.report.notes, ["not in index.json and so not opened: 1 .torch file (000001.torch)"]);
+    assert_eq!(opened.report.notes, ["not opened, missing from index.json: 1 .torch file (000001.torch)"]);
     let filters = SceneFilters { min_frames: 2, max_fov_deg: None };
     for options in [
         SourceOptions { reads_chunks: true, ..SourceOptions::default() },
@@ -125,13 +125,12 @@ fn unindexed_chunks_and_scenes_are_reported() {
         assert!(opened.report.to_string().starts_with(expected), "{}", opened.report);
         assert_eq!(opened.report.skips[0].key, "00000000000000a2");
     }
-    // The other half's scenes are no news.
     let index = r#"{"00000000000000a1": "000000.torch", "00000000000000a2": "000001.torch"}"#;
     fs::write(train.join("index.json"), index).unwrap();
     let options = SourceOptions { reads_chunks: true, ..SourceOptions::default() };
     let opened = open(root.path(), Split::Train, &options).unwrap();
-    let expected = "2 of 2 scenes used; 2 scenes also in chunks other than those that index.json names, which are not \
-                    used (00000000000000a1, 00000000000000a2)";
+    let expected = "2 of 2 scenes used; 2 scenes also in chunks other than those of index.json, not used \
+                    (00000000000000a1, 00000000000000a2)";
     assert_eq!(opened.report.to_string(), expected);
 }
 
@@ -144,10 +143,9 @@ fn duplicate_scenes_use_the_first_file() {
     fs::copy(train.join("000000.torch"), train.join("000009.torch")).unwrap();
     let opened = open_any(root.path(), Split::Train);
     assert_eq!(opened.source.num_scenes(), 2);
-    let expected = "2 scenes in more than one file, of which the first is used (00000000000000a1 in 000000.torch and \
+    let expected = "2 scenes in more than one file, the first of which is used (00000000000000a1 in 000000.torch and \
                     000009.torch, 00000000000000a2 in 000000.torch and 000009.torch)";
     assert_eq!(opened.report.notes[0], expected);
-    // Without the second file everything is as it was.
     fs::remove_file(train.join("000009.torch")).unwrap();
     assert!(open_any(root.path(), Split::Train).source.frame(1, 7).is_ok());
 }
@@ -160,13 +158,13 @@ fn data_of_other_layouts_is_named() {
     copy("re10k_txt", &root.path().join("clips"));
     let opened = open_any(root.path(), Split::Test);
     assert_eq!(keys(&opened), ["attic"]);
-    let expected = "not opened, each being data of its own: clips/test (RealEstate10K's text files), \
+    let expected = "not opened, other data sets: clips/test (text files of RealEstate10K), \
                     re10k/test (chunks or scenes in .torch files), re10k/train (chunks or scenes in .torch files)";
     assert_eq!(opened.report.notes[0], expected);
     fs::remove_dir_all(root.path().join("captures")).unwrap();
     fs::remove_dir_all(root.path().join("clips")).unwrap();
     let message = open(root.path(), Split::Test, &SourceOptions::default()).err().unwrap();
-    assert!(message.contains("there is other data, to be opened by itself: re10k/test (chunks"), "{message}");
+    assert!(message.contains("other data sets below it, to be opened separately: re10k/test (chunks"), "{message}");
 }
 
 #[test]
@@ -179,7 +177,7 @@ fn several_camera_files_are_refused_by_name() {
     for split in [Split::Train, Split::Test] {
         let message = open(root.path(), split, &SourceOptions::default()).err().unwrap();
         let expected =
-            "there is no transforms.json, but transforms_test.json, transforms_train.json: open one by its path";
+            "no transforms.json, but transforms_test.json, transforms_train.json: open one of them by its path";
         assert!(message.contains(expected), "{split}: {message}");
     }
 }
