@@ -5,12 +5,13 @@
 //! what was found is found again: `clift-attack --target NAME --seed S --first NUMBER --count 1`.
 
 mod counting;
-mod layouts;
 mod mutate;
+mod readers;
 mod report;
 mod setup;
 mod targets;
 mod watch;
+mod words;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
@@ -19,7 +20,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use layouts::LAYOUT_TARGETS;
 use mutate::Mutator;
 use report::Attacked;
 use setup::Setup;
@@ -57,20 +57,15 @@ struct Args {
     list: bool,
 }
 
-/// Every reader.
-fn all_targets() -> impl Iterator<Item = &'static Target> {
-    TARGETS.iter().chain(LAYOUT_TARGETS)
-}
-
 fn main() -> ExitCode {
     let args = Args::parse();
     if args.list {
-        for target in all_targets() {
+        for target in TARGETS {
             println!("{}", target.name);
         }
         return ExitCode::SUCCESS;
     }
-    if let Some(unknown) = args.target.iter().find(|name| all_targets().all(|target| target.name != **name)) {
+    if let Some(unknown) = args.target.iter().find(|name| TARGETS.iter().all(|target| target.name != **name)) {
         eprintln!("there is no reader {unknown}; --list names them");
         return ExitCode::from(2);
     }
@@ -83,7 +78,7 @@ fn main() -> ExitCode {
     };
     let messages = hush_panics();
     watch::start(Duration::from_secs(MOST_SECONDS));
-    let chosen = all_targets().filter(|target| args.target.is_empty() || args.target.iter().any(|n| n == target.name));
+    let chosen = TARGETS.iter().filter(|target| args.target.is_empty() || args.target.iter().any(|n| n == target.name));
     let mut rows = Vec::new();
     for target in chosen {
         let row = attack(target, &setup, &args, &messages);
@@ -119,15 +114,16 @@ fn hush_panics() -> Messages {
 }
 
 fn attack(target: &Target, setup: &Setup, args: &Args, messages: &Messages) -> Attacked {
-    let seeds = (target.seeds)(setup);
-    let mut read = (target.open)(setup);
+    let seeds = (target.seeds)(setup, target.file);
+    let mut read = (target.open)(setup, target.file);
     let mut row = Attacked::new(target.name);
     for (i, seed) in seeds.iter().enumerate() {
         if let Err(error) = read(seed) {
             row.find(format!("valid file {i} is refused: {error}"), None);
         }
     }
-    let mutator = Mutator { seeds: &seeds, words: target.words, repair: target.repair };
+    let words = words::list(target.words);
+    let mutator = Mutator { seeds: &seeds, words: &words, repair: target.repair };
     let started = Instant::now();
     for number in args.first..args.first.saturating_add(args.count.unwrap_or(u64::MAX)) {
         if started.elapsed().as_secs_f64() >= args.seconds || row.findings.len() >= report::MOST_FINDINGS {
@@ -149,7 +145,7 @@ fn attack(target: &Target, setup: &Setup, args: &Args, messages: &Messages) -> A
 
 /// Reads one input; what is wrong with how that went.
 fn execute(
-    read: &mut targets::Read,
+    read: &mut readers::Read,
     bytes: &[u8],
     target: &Target,
     number: u64,
