@@ -46,7 +46,7 @@ fn every_row_has_its_time_and_error() {
         let number = |key: &str| row[key].as_f64().unwrap_or_else(|| panic!("{key} of {row}"));
         assert!(number("median_s") > 0.0 && number("p95_s") >= number("median_s"), "{row}");
         assert_eq!(row["samples_s"].as_array().map(Vec::len), Some(2), "{row}");
-        // f32 through a block or two; an f32 that was compared with itself would give exactly 0 everywhere.
+        // f32 through one or two blocks; f32 compared with itself would give exactly 0 everywhere.
         // Selection gives ids, which have no error.
         assert_eq!(row["max_rel_error"].is_null(), row["work"] == "select", "{row}");
         assert!(row["max_rel_error"].is_null() || number("max_rel_error") < 1e-4, "{row}");
@@ -83,7 +83,7 @@ fn an_interrupted_benchmark_writes_nothing() {
     let place = Place::new();
     let json = place.at("bench.json").display().to_string();
     for (name, code) in [("-INT", 130), ("-TERM", 143)] {
-        // Thousands of repetitions: the second row goes on for longer than the signal takes.
+        // Thousands of repetitions: the second row lasts until the signal arrives.
         let mut child = spawn(args(&["--work", "encode,render", "--no-error", "--repeats", "3000", "--json", &json]));
         let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
         assert!(lines.any(|line| line.starts_with("encode: ")), "the first row is done");

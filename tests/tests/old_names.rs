@@ -1,4 +1,4 @@
-//! Type names that were replaced and appear in no source any more.
+//! Replaced type names, which no source may contain.
 
 use std::collections::BTreeSet;
 

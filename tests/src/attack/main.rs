@@ -1,8 +1,8 @@
 //! Attacks every reader with damaged files: `bash scripts/check/attack.sh` (docs/results/robustness.md).
 //!
-//! Starts from valid files, mutates them, and reads each. A reader may accept or refuse; it may not panic, hang, take
-//! memory beyond its bound, or refuse without a word. An execution is a function of (reader, seed, number), so that
-//! what was found is found again: `clift-attack --target NAME --seed S --first NUMBER --count 1`.
+//! Starts from valid files, mutates them, and reads each. A reader may accept or refuse; it may not panic, hang, exceed
+//! its bound of memory, or refuse without a message. An execution is a function of (reader, seed, number):
+//! `clift-attack --target NAME --seed S --first NUMBER --count 1` repeats it.
 
 mod counting;
 mod mutate;
@@ -25,7 +25,7 @@ use report::Attacked;
 use setup::Setup;
 use targets::{TARGETS, Target};
 
-/// Longest that one execution may take: no valid input takes a hundredth of it.
+/// Longest execution in seconds: no valid input takes a hundredth of it.
 const MOST_SECONDS: u64 = 10;
 
 /// Attacks readers with damaged files.
@@ -143,7 +143,7 @@ fn attack(target: &Target, setup: &Setup, args: &Args, messages: &Messages) -> A
     row
 }
 
-/// Reads one input; what is wrong with how that went.
+/// Reads one input and returns the finding, if any.
 fn execute(
     read: &mut readers::Read,
     bytes: &[u8],
@@ -158,7 +158,7 @@ fn execute(
     watch::enter(target.name, seed, number);
     let before = counting::start();
     let started = Instant::now();
-    // What a reader leaves half done is made anew by the next input's files.
+    // The files of the next input replace any that an unwound reader left half done.
     let result = catch_unwind(AssertUnwindSafe(|| read(bytes)));
     let (elapsed, peak) = (started.elapsed(), counting::peak().saturating_sub(before));
     watch::leave();

@@ -1,4 +1,4 @@
-//! The valid files that attacks start from: fixtures, and what a small run leaves.
+//! The valid files that attacks start from: fixtures, and the files of a small run.
 
 use std::io::{Cursor, Read, Write};
 use std::path::{Path, PathBuf};
@@ -44,7 +44,7 @@ num_sheets = 0
 num_validation_scenes = 1
 ";
 
-/// A folder with a run, a scene file of it, and a place for damaged copies.
+/// A folder with a run, its scene files, and damaged copies.
 pub struct Setup {
     folder: TempDir,
     /// The run's config.
@@ -54,7 +54,7 @@ pub struct Setup {
 impl Setup {
     /// Trains the run and stores a scene of it with the command line.
     pub fn make() -> Result<Self, String> {
-        // Files are written once per execution: in memory, where there is such a place.
+        // In memory where possible: files are written once per execution.
         let memory = Path::new("/dev/shm");
         let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
         let folder = folder.map_err(|error| error.to_string())?;
@@ -72,7 +72,7 @@ impl Setup {
         Ok(Self { folder, config })
     }
 
-    /// Where the run is.
+    /// The run directory.
     pub fn run(&self) -> PathBuf {
         self.folder.path().join("run")
     }
@@ -104,7 +104,7 @@ fn text(path: &Path) -> String {
     path.display().to_string()
 }
 
-/// Runs the command line that lies beside this program.
+/// Runs the command line beside this program.
 fn clift(args: &[&str]) -> Result<(), String> {
     let program = std::env::current_exe().map_err(|error| error.to_string())?.with_file_name("clift-under-test");
     let output = Command::new(&program)

@@ -1,4 +1,4 @@
-//! A run from the first step to the report, and its directory.
+//! A complete run and every file of its directory.
 
 use serde_json::Value;
 
@@ -197,7 +197,7 @@ fn early_stages_name_what_to_run_first() {
     place
         .train("run", &[], &["--only", "stage2"])
         .fails_with(2, &["error: stage2 needs the cluster cache, which is not there; run --only clusters first: "]);
-    // Without stage 2 there is still something to measure, and it says so.
+    // Without stage 2 the evaluation measures stage 1 and prints a note.
     let ran = place.eval("run", &[]).ok();
     assert!(ran.stderr.contains("stage 2 has not run"), "{}", ran.stderr);
     assert!(!ran.stdout.contains("\nclift "), "{}", ran.stdout);
