@@ -28,22 +28,8 @@ const NUMBERS: [u64; 20] = [
 ];
 
 /// Replacements of numbers in texts.
-const TEXTS: [&str; 14] = [
-    "0",
-    "-1",
-    "1",
-    "2",
-    "65536",
-    "4294967296",
-    "9223372036854775807",
-    "9223372036854775808",
-    "18446744073709551615",
-    "4611686018427387904",
-    "1e308",
-    "1e999",
-    "-0.0",
-    "null",
-];
+const TEXTS: &str = "0 -1 1 2 65536 4294967296 9223372036854775807 9223372036854775808 18446744073709551615 \
+    4611686018427387904 1e308 1e999 -0.0 null";
 
 /// Largest size that insertions produce.
 const MOST_BYTES: usize = 1 << 20;
@@ -146,7 +132,8 @@ fn overwrite_number(bytes: &mut [u8], at: usize, rng: &mut ChaCha8Rng) {
 fn replace_digits(bytes: &mut Vec<u8>, at: usize, rng: &mut ChaCha8Rng) {
     let Some(start) = (at..bytes.len()).find(|&i| bytes[i].is_ascii_digit()) else { return };
     let end = (start..bytes.len()).find(|&i| !bytes[i].is_ascii_digit()).unwrap_or(bytes.len());
-    let text = TEXTS[below(rng, TEXTS.len())];
+    let texts: Vec<&str> = TEXTS.split(' ').collect();
+    let text = texts[below(rng, texts.len())];
     bytes.splice(start..end, text.bytes());
 }
 

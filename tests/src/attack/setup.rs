@@ -13,35 +13,15 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 /// The smallest run that has everything.
 const RUN: &str = "\
 seed = 0
-[data]
-width = 16
-height = 16
-synthetic = { num_scenes = 4, num_frames = 8, width = 16, height = 16, samples_per_pixel = 1 }
-views = { min_context = 2, max_context = 2, min_gap = [3, 3], max_gap = [6, 6], warm_up_steps = 0, num_targets = 2 }
-[model]
-dim = 16
-num_heads = 2
-feed_forward_dim = 24
-num_encoder_blocks = 1
-num_renderer_blocks = 1
-condenser = { num_blocks = 1 }
-[stage1]
-steps = 2
-batch_size = 1
-[clusters]
-grid = [0.5, 1.0]
-num_passes = 1
-num_scenes = 3
-[stage2]
-steps = 1
-batch_size = 1
-[eval]
-storage = [0.5]
-num_scenes = 1
-num_context = 2
-num_targets = 1
-num_sheets = 0
-num_validation_scenes = 1
+data = { width = 16, height = 16, \
+    synthetic = { num_scenes = 4, num_frames = 8, width = 16, height = 16, samples_per_pixel = 1 }, \
+    views = { min_context = 2, max_context = 2, min_gap = [3, 3], max_gap = [6, 6], warm_up_steps = 0, num_targets = 2 } }
+model = { dim = 16, num_heads = 2, feed_forward_dim = 24, num_encoder_blocks = 1, num_renderer_blocks = 1, \
+    condenser = { num_blocks = 1 } }
+stage1 = { steps = 2, batch_size = 1 }
+clusters = { grid = [0.5, 1.0], num_passes = 1, num_scenes = 3 }
+stage2 = { steps = 1, batch_size = 1 }
+eval = { storage = [0.5], num_scenes = 1, num_context = 2, num_targets = 1, num_sheets = 0, num_validation_scenes = 1 }
 ";
 
 /// A folder with a run, its scene files, and damaged copies.
