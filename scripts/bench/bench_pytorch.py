@@ -8,7 +8,7 @@ Needs Python 3.11 and nothing else: it makes its own virtual environment from sc
 clift, unless `--python` and `--clift` name what there is.
 
 A round starts one process of each side, in turn the other way round, with the same number of threads; a process does
-one piece of work only, and its peak memory is what the kernel says at its end. PyTorch is the twin (clift_torch.py) on
+one piece of work only, and its peak memory is read from the kernel at its end. PyTorch is the twin (clift_torch.py) on
 fused attention, with the faster ways of torch_cases.py; where it has several, all are timed first and the fastest
 competes. Ours is `clift bench`. A round in which somebody else used the processor is thrown away and made again.
 
@@ -334,7 +334,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--venv", type=Path, metavar="DIR", default=ROOT / ".venv-bench")
     parser.add_argument("--max-busy", type=float, default=0.15, help="cores that others may use")
     parser.add_argument("--wait", type=float, default=300.0, help="seconds to wait for quiet, or to throw away")
-    parser.add_argument("--force", action="store_true", help="measure on a loaded machine; the JSON says so")
+    parser.add_argument("--force", action="store_true", help="measure on a loaded machine; recorded in the JSON")
     args = parser.parse_args()
     names = [row.work for row in rows()]
     if args.work is None:

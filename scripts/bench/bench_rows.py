@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# `side` is that of every view in pixels, `batch` that of training steps; everything else works on one scene.
+# `side` is that of every view in pixels, `batch` that of training steps; all other cases use one scene.
 FULL = dict(dim=768, heads=8, feed_forward=2048, encoder_blocks=6, renderer_blocks=6, condenser_blocks=2)
 FULL |= dict(contexts=4, side=256, targets=1, batch=1)
 TINY = dict(dim=128, heads=8, feed_forward=341, encoder_blocks=3, renderer_blocks=3, condenser_blocks=2)

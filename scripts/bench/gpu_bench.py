@@ -4,7 +4,7 @@
     python3 gpu_bench.py --clift ./clift --tiny                   # does everything run? seconds on flex, no judgement
 
 Needs Python 3.11. PyTorch is looked for in the Python that `--python` names, by default this one; where it is missing
-its columns stay empty and the table says so. The work is the paper's network on 4 contexts of 256 x 256: encoding, a
+its columns stay empty, and the table has a note. The work is the paper's network on 4 contexts of 256 x 256: encoding, a
 view from 512 to 4,096 tokens, an update of both stages. A figure is the median over all repetitions of all rounds.
 
 clift computes in f32 and with f16 products, PyTorch (the twin in clift_torch.py, with fused attention and AdamW) in f32
@@ -37,7 +37,7 @@ OURS = ("f32", "f16")
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table: a work, and from how many tokens a view is drawn."""
+    """A row of the table: a case, and the number of tokens a view is rendered from."""
 
     work: str
     render_tokens: int | None = None

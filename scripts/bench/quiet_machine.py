@@ -90,16 +90,16 @@ def load() -> tuple[float, str]:
 def wait_until_quiet(max_busy: float, max_wait: float) -> None:
     """Returns once at most `max_busy` cores are busy; raises `Loaded` after `max_wait` seconds."""
     deadline = time.monotonic() + max_wait
-    told = False
+    warned = False
     while True:
         busy, sentence = load()
         if busy <= max_busy:
             return
         if time.monotonic() >= deadline:
             raise Loaded(f"{sentence}; waited {max_wait:.0f} s for at most {max_busy}")
-        if not told:
+        if not warned:
             print(f"  waiting: {sentence}", flush=True)
-            told = True
+            warned = True
 
 
 def run(command: list[str], extra_env: dict[str, str]) -> Finished:

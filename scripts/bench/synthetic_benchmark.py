@@ -5,7 +5,7 @@ For each seed: trains configs/synthetic.toml; trains two further condensers on t
 and one without residuals (the equations as printed); evaluates all of them on the same views. Prints a table per
 comparison: the difference of each seed over its scenes with its standard error, and the mean over seeds.
 
-What is there is not made again, so that an interrupted benchmark goes on where it was. With --jobs, seeds are trained
+Existing results are kept, so that an interrupted benchmark resumes. With --jobs, seeds are trained
 side by side, each on its share of the cores, which takes less time in all; what they print is in OUT/seed-N.log then.
 
     python3 scripts/bench/synthetic_benchmark.py --seeds 0,1,2 --jobs 3
@@ -92,7 +92,7 @@ class Seed:
 
 
 def scene_means(folder: Path) -> dict[tuple[str, int], dict[str, float]]:
-    """Mean PSNR of every scene by (variant, tokens), of views drawn from all tokens."""
+    """Mean PSNR of every scene by (variant, tokens), of views rendered from all tokens."""
     values: dict[tuple[str, int], dict[str, list[float]]] = {}
     with (folder / "views.csv").open(newline="") as file:
         for row in csv.DictReader(file):

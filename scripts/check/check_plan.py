@@ -1,10 +1,10 @@
-"""Compares what `clift plan` says with what a run then takes.
+"""Compares the estimates of `clift plan` with a measured run.
 
     python3 scripts/check/check_plan.py configs/tiny.toml --steps 120 --scenes 40 --set ..
 
 Plans, runs the parts one after the other in processes of their own, plans again, and prints a table: parameters,
-peak resident memory, and seconds per step or scene. Other work on the machine changes the seconds: what was planned
-before and after says by how much.
+peak resident memory, and seconds per step or scene. Other work on the machine changes the seconds; the two plans
+show by how much.
 """
 
 import argparse

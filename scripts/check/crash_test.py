@@ -6,7 +6,7 @@
     python3 scripts/check/crash_test.py --kills 200 --seed 1
 
 Every other kill waits for a file or folder under a temporary name to appear, that is, for a save, and comes up to a few
-milliseconds after it; the others come at a moment drawn evenly over the time of a whole run. Every file of a finished run
+milliseconds after it; the others come at a moment uniform over the time of a whole run. Every file of a finished run
 must equal that of the undisturbed one, but for times: metrics without `step_s`, the evaluation without its times,
 checkpoints by the progress that they hold.
 """

@@ -98,7 +98,7 @@ def vgg19_weights(path: Path) -> dict[str, np.ndarray]:
 
 
 def mean_colour(mat: dict) -> np.ndarray | None:
-    """The mean colour a MatConvNet file was trained with, where it tells."""
+    """The mean colour in a MatConvNet file, if the file holds one."""
     for place in ("meta", "normalization"):
         node = mat.get(place)
         node = getattr(node, "normalization", node)

@@ -10,7 +10,7 @@ released code. Modules carry the names that the checkpoints' keys have below
 Variants: `released-re10k`, `released-dl3dv` (adds `input_norm` and the q_norm, k_norm
 of every attention), and `paper`, whose condenser is clift_torch's, below `squeezer.blocks`.
 
-    python scripts/twin/clift_released.py FILE            # loads an export strictly and says what it is
+    python scripts/twin/clift_released.py FILE            # loads an export strictly and prints its sizes
     python scripts/twin/clift_released.py FILE --same-as FIXTURE.ckpt   # and compares every value
 """
 
@@ -271,7 +271,7 @@ def read(path: str) -> dict[str, Tensor]:
 
 
 def said_heads(path: str) -> int | None:
-    """The heads that an export says it has."""
+    """The number of heads in an export."""
     if path.endswith(".safetensors"):
         from safetensors import safe_open
 
@@ -285,7 +285,7 @@ def said_heads(path: str) -> int | None:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Loads an export into the PyTorch twin, strictly.")
     parser.add_argument("file", help="what `clift export` wrote")
-    parser.add_argument("--num-heads", type=int, help="heads, where neither a shape nor the file says them")
+    parser.add_argument("--num-heads", type=int, help="number of heads, where neither a shape nor the file holds it")
     parser.add_argument("--same-as", help="a checkpoint whose every value must be the same, bit for bit")
     args = parser.parse_args()
     state = read(args.file)

@@ -1,4 +1,4 @@
-//! The command line under test: cargo hands the path of a package's own binary to its tests.
+//! The command line under test: cargo passes the path of a package's own binary to its tests.
 
 fn main() -> std::process::ExitCode {
     clift::main()

@@ -1,5 +1,5 @@
-//! What adapters say of themselves is what the open device allows. Alone in its process: the Vulkan loader does not stand
-//! instances that come and go on several threads.
+//! The limits that adapters report hold on the open device. Alone in its process: the Vulkan loader fails when several
+//! threads open and close instances.
 
 use burn::tensor::{DType, Tensor};
 use clift_model::{DeviceName, Precision, adapters, max_tensor_bytes};
@@ -19,7 +19,7 @@ fn adapter_limits_hold_on_the_open_device() {
     assert_eq!(device.supports_dtype(DType::F16), used.has_f16);
     assert_eq!(Precision::F16.check("precision", &device).is_ok(), used.has_f16);
 
-    // A tensor as large as is said can be made and read; this is the claim that refusals rest on. Of large limits, 128 MiB.
+    // A tensor of the reported size (at most 128 MiB) can be made and read, as the checks before a run assume.
     let len = (most.min(128 << 20) / 4) as usize;
     let ones = Tensor::<1>::ones([len], &device);
     let share = ones.sum().into_scalar::<f32>() / len as f32;

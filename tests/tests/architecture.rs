@@ -9,7 +9,7 @@ type Crate = (&'static str, &'static str, &'static str);
 
 const CRATES: [Crate; 8] = [
     ("clift-kernels", "", "simd primitives attention cluster_attention gelu layer_norm linear"),
-    ("clift-model", "clift-kernels", "error files device ops views tokens network cost weights scene"),
+    ("clift-model", "clift-kernels", "error names files device ops views tokens network cost weights scene"),
     (
         "clift-data",
         "",
@@ -35,7 +35,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift",
         "clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",
-        "output interrupt exit_code commands cli",
+        "output interrupt exit_code commands cli reference",
     ),
 ];
 
@@ -43,7 +43,6 @@ const MAX_FILES: usize = 15;
 const MAX_LINES: usize = 400;
 
 #[test]
-#[ignore = "until the files are moved"]
 fn sources_keep_the_layout() {
     let found = violations(&sources(&["crates", "tests"], &["rs", "toml"]));
     assert!(found.is_empty(), "{} violations:\n{}", found.len(), found.join("\n"));
@@ -200,6 +199,8 @@ fn check_imports(order: &str, modules: &Modules, found: &mut Vec<String>) {
             match resolve(&path, modules) {
                 Some(file) if file == *name => {}
                 Some(file) => imports.push((name.clone(), file, line)),
+                // The root may name a folder itself, to call into its files.
+                None if name.is_empty() && modules.contains_key(&path) => {}
                 None => found.push(format!("{}:{line}: `{path}` is in no file", module.path)),
             }
         }

@@ -6,18 +6,9 @@ use serde_json::Value;
 
 use crate::support::{Place, clift, finish, repository, signal, spawn};
 
-const WORKS: [&str; 10] = [
-    "encode",
-    "kmeans",
-    "condense",
-    "cluster_attention",
-    "select",
-    "render",
-    "render_8_views",
-    "stage1_step",
-    "stage1_step_tiny",
-    "stage2_step",
-];
+/// Names of the rows, in order.
+const ROWS: &str = "encode kmeans condense cluster_attention select render render_8_views stage1_step \
+    stage1_step_tiny stage2_step";
 
 /// Arguments for a network that takes milliseconds.
 fn args(flags: &[&str]) -> Vec<String> {
@@ -33,7 +24,7 @@ fn every_row_has_its_time_and_error() {
     let place = Place::new();
     let json = place.at("bench.json").display().to_string();
     let ran = clift(args(&["--repeats", "2", "--warmup", "0", "--json", &json])).ok();
-    for work in WORKS {
+    for work in ROWS.split(' ') {
         assert!(ran.stdout.lines().any(|line| line.starts_with(&format!("{work}  "))), "{work}: {}", ran.stdout);
         assert!(ran.stderr.lines().any(|line| line.starts_with(&format!("{work}: "))), "{work}: {}", ran.stderr);
     }
@@ -41,12 +32,13 @@ fn every_row_has_its_time_and_error() {
     assert_eq!(report["device"], "flex");
     assert!(report["threads"].as_u64().is_some_and(|threads| threads > 0));
     let rows = report["rows"].as_array().expect("rows");
-    assert_eq!(rows.iter().map(|row| &row["work"]).collect::<Vec<_>>(), WORKS);
+    let names: Vec<&str> = rows.iter().map(|row| row["work"].as_str().expect("a name")).collect();
+    assert_eq!(names.join(" "), ROWS);
     for row in rows {
         let number = |key: &str| row[key].as_f64().unwrap_or_else(|| panic!("{key} of {row}"));
         assert!(number("median_s") > 0.0 && number("p95_s") >= number("median_s"), "{row}");
         assert_eq!(row["samples_s"].as_array().map(Vec::len), Some(2), "{row}");
-        // f32 through a block or two; an f32 that was compared with itself would give exactly 0 everywhere.
+        // f32 through one or two blocks; f32 compared with itself would give exactly 0 everywhere.
         // Selection gives ids, which have no error.
         assert_eq!(row["max_rel_error"].is_null(), row["work"] == "select", "{row}");
         assert!(row["max_rel_error"].is_null() || number("max_rel_error") < 1e-4, "{row}");
@@ -83,7 +75,7 @@ fn an_interrupted_benchmark_writes_nothing() {
     let place = Place::new();
     let json = place.at("bench.json").display().to_string();
     for (name, code) in [("-INT", 130), ("-TERM", 143)] {
-        // Thousands of repetitions: the second row goes on for longer than the signal takes.
+        // Thousands of repetitions: the second row lasts until the signal arrives.
         let mut child = spawn(args(&["--work", "encode,render", "--no-error", "--repeats", "3000", "--json", &json]));
         let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
         assert!(lines.any(|line| line.starts_with("encode: ")), "the first row is done");

@@ -1,5 +1,5 @@
-//! Where dependencies come from and what their licences are, by `deny.toml`: the part of `cargo deny check licenses
-//! sources` that needs no other tool. Knows what is built here, while cargo-deny looks at every target and feature.
+//! Sources and licences of dependencies, by `deny.toml`: `cargo deny check licenses sources` without the tool, for the
+//! dependencies of this build; cargo-deny checks every target and feature.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
@@ -55,7 +55,7 @@ fn allowed() -> (Vec<String>, BTreeMap<String, String>) {
     (allowed, exceptions.filter_map(|line| Some((quoted(line)?, line.to_owned()))).collect())
 }
 
-/// Whether an SPDX expression can be kept: one side of every OR, both sides of every AND.
+/// Returns whether an SPDX expression is satisfied: one side of every OR, both sides of every AND.
 fn holds(expression: &str, is_allowed: &dyn Fn(&str) -> bool) -> bool {
     let expression = expression.trim();
     let outer = |word: &str| {

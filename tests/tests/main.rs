@@ -1,4 +1,4 @@
-//! Whole runs through the command line: what a user types, and the files and exit codes that follow.
+//! Whole runs through the command line: arguments in, files and exit codes out.
 //!
 //! `training` runs the stages, stops them and resumes them; `evaluation` measures, encodes and renders; `data` converts and
 //! checks data sets; `input` is wrong or damaged input. `architecture`, `links` and

@@ -1,4 +1,4 @@
-//! Type names that were replaced and appear in no source any more.
+//! Replaced type names, which no source may contain.
 
 use std::collections::BTreeSet;
 
@@ -11,7 +11,6 @@ const OLD_NAMES: &str = "Accumulator Attended BadInstructionSet BadStep BoundedS
     TokenStorage Trained Unfinished WorldFrame WrongUsage";
 
 #[test]
-#[ignore = "until the types are renamed"]
 fn replaced_names_are_gone() {
     let found = old_names(&sources(&["crates", "tests/src", "tests/tests"], &["rs"]));
     assert!(found.is_empty(), "{} old names:\n{}", found.len(), found.join("\n"));
@@ -20,7 +19,8 @@ fn replaced_names_are_gone() {
 /// Old names in code, as `path:line: name`.
 fn old_names(sources: &Sources) -> Vec<String> {
     let names: BTreeSet<&str> = OLD_NAMES.split_whitespace().collect();
-    let lines = sources.iter().flat_map(|(path, text)| text.lines().enumerate().map(move |(i, line)| (path, i, line)));
+    let others = sources.iter().filter(|(path, _)| !path.ends_with("old_names.rs"));
+    let lines = others.flat_map(|(path, text)| text.lines().enumerate().map(move |(i, line)| (path, i, line)));
     let words = lines.flat_map(|(path, i, line)| {
         let code = without_strings(line);
         let words = code.split(|c: char| !c.is_alphanumeric() && c != '_');

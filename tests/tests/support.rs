@@ -1,4 +1,4 @@
-//! Runs the command line in temporary folders and reads what it leaves there.
+//! Runs the command line in temporary folders and reads the files of the runs.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use tempfile::TempDir;
 
 /// The smallest run that has everything: two 16 x 16 views of 4 tokens each, 8 rooms, a fraction of a second.
 ///
-/// Replaces every section, so that tuning `configs/tiny.toml` does not reach these tests.
+/// Replaces every section, so that changes of `configs/tiny.toml` do not affect these tests.
 const MICRO: [&str; 9] = [
     "seed=0",
     "device=flex",
@@ -33,7 +33,7 @@ pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the repository").join(path)
 }
 
-/// What a command left behind.
+/// Exit code and output of a command.
 #[derive(Debug)]
 pub struct Ran {
     pub code: Option<i32>,
@@ -48,7 +48,7 @@ impl Ran {
         self
     }
 
-    /// Expects this exit code and an error, no panic; gives the error stream.
+    /// Expects this exit code, an error and no panic; returns the error stream.
     #[track_caller]
     pub fn fails(self, code: i32) -> String {
         assert_eq!(self.code, Some(code), "stdout:\n{}\nstderr:\n{}", self.stdout, self.stderr);
@@ -85,7 +85,7 @@ pub fn start(command: &mut Command) -> Child {
     piped.spawn().expect("the binary under test starts")
 }
 
-/// Runs a training that kills itself at `moment` (see `clift-killed`), and expects that it did.
+/// Runs a training that must kill itself at `moment` (see `clift-killed`).
 pub fn killed_at(moment: &str, args: &[String]) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_clift-killed"));
     let ran = finish(start(command.arg(moment).args(args)));
@@ -119,7 +119,7 @@ pub fn finish(child: Child) -> Ran {
     Ran { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
 }
 
-/// A micro run that several tests start from: trained once for all of them.
+/// A micro run that several tests copy, trained once.
 pub struct Shared {
     set: &'static [&'static str],
     flags: &'static [&'static str],
@@ -146,7 +146,7 @@ impl Place {
         Self(tempfile::tempdir().expect("a temporary folder"))
     }
 
-    /// Path of something in the folder.
+    /// Path of an item of the folder.
     pub fn at(&self, name: &str) -> PathBuf {
         self.0.path().join(name)
     }
@@ -167,9 +167,9 @@ impl Place {
         clift(self.train_args(name, set, flags))
     }
 
-    /// Makes the run `name` of a shared one, as if it had been trained here.
+    /// Copies a shared run to `name`, as if it had been trained here.
     pub fn copy(&self, shared: &Shared, name: &str) {
-        // The only file that holds the run's own path.
+        // The only file that holds the path of its run.
         let config = Path::new("config.toml");
         let moved = |bytes: &[u8], from: &Path, to: &Path| {
             let text = String::from_utf8(bytes.to_vec()).expect("text");
@@ -201,17 +201,17 @@ impl Place {
         clift(["eval", &run].iter().chain(flags))
     }
 
-    /// What is in a file of the folder.
+    /// Reads a file of the folder.
     pub fn bytes(&self, name: &str) -> Vec<u8> {
         std::fs::read(self.at(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
     }
 
-    /// What is in a text file of the folder.
+    /// Reads a text file of the folder.
     pub fn text(&self, name: &str) -> String {
         String::from_utf8(self.bytes(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
     }
 
-    /// What is in a JSON file of the folder.
+    /// Reads a JSON file of the folder.
     pub fn json(&self, name: &str) -> Value {
         serde_json::from_slice(&self.bytes(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
     }
@@ -222,7 +222,7 @@ impl Place {
         text.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}"))).collect()
     }
 
-    /// The lines of a run's `metrics.jsonl` without what the clock decides.
+    /// The lines of a run's `metrics.jsonl` without times.
     pub fn metrics_but_time(&self, run: &str) -> Vec<Value> {
         let mut lines = self.metrics(run);
         for line in &mut lines {
@@ -252,13 +252,13 @@ impl Place {
         }
     }
 
-    /// Expects the same files, but for what the clock decides: weights, clusters, metrics, steps left out, samples, the
-    /// progress in the last checkpoints, and the evaluation.
+    /// Expects the same files but for times: weights, clusters, metrics, skipped steps, samples, the progress in the last
+    /// checkpoints, and the evaluation.
     pub fn assert_same_run(&self, run: &str, other: &str) {
         assert_eq!(self.metrics_but_time(run), self.metrics_but_time(other), "no step is missing or doubled");
         let compared = |run: &str| {
             let mut files = files(&self.at(run));
-            // The time of day is in the report, times in `views.csv`; `config.toml` holds the run's own path.
+            // The report holds the date, `views.csv` times, and `config.toml` the path of its run.
             let is_result = |path: &Path| {
                 let name = path.strip_prefix(self.at(run)).expect("below").display().to_string();
                 let (others, progress) = (["metrics.jsonl", "config.toml", "lock"], name.contains("/checkpoints/"));
@@ -279,7 +279,7 @@ impl Place {
         assert_eq!(self.summary_but_time(run), self.summary_but_time(other));
     }
 
-    /// A run's `summary.json` without what the clock decides.
+    /// A run's `summary.json` without times.
     pub fn summary_but_time(&self, run: &str) -> Value {
         let mut summary = self.json(&format!("{run}/eval/summary.json"));
         for point in summary["points"].as_array_mut().expect("a list") {
@@ -300,13 +300,13 @@ impl Place {
         steps
     }
 
-    /// What the last checkpoint of a stage says about the training.
+    /// The progress in the last checkpoint of a stage.
     pub fn progress(&self, run: &str, stage: &str) -> Value {
         let step = *self.checkpoints(run, stage).last().expect("a checkpoint");
         self.json(&format!("{run}/{stage}/checkpoints/step-{step:09}/state.json"))["progress"].take()
     }
 
-    /// Writes half of a file back.
+    /// Cuts a file in half.
     pub fn truncate(&self, name: &str) {
         let bytes = self.bytes(name);
         std::fs::write(self.at(name), &bytes[..bytes.len() / 2]).expect("writable");
@@ -358,8 +358,7 @@ pub fn sources(folders: &[&str], endings: &[&str]) -> BTreeMap<String, String> {
 pub struct Weights(pub BTreeMap<String, Vec<f32>>);
 
 impl Weights {
-    /// Reads a weight file. Its bytes may differ where its weights do not: Burn writes the header's metadata in
-    /// any order.
+    /// Reads a weight file. Files of equal weights differ in bytes: Burn writes the header's metadata in any order.
     fn read(path: &Path) -> Self {
         let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
         let file = safetensors::SafeTensors::deserialize(&bytes).expect("valid safetensors");

@@ -48,3 +48,8 @@ pub fn main() -> ExitCode {
         }
     }
 }
+
+/// Compiles the code of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+struct Readme;

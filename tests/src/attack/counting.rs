@@ -3,7 +3,7 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// No reader asks for as much at once, whatever a file says; the system would end the process without a word.
+/// Largest allocation. Above it the system would end the process without a message.
 const MOST_AT_ONCE: usize = 8 << 30;
 
 static IN_USE: AtomicUsize = AtomicUsize::new(0);
@@ -50,7 +50,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-/// Starts a new peak at what is in use, and returns that.
+/// Resets the peak to the bytes in use, and returns them.
 pub fn start() -> usize {
     let in_use = IN_USE.load(Ordering::Relaxed);
     PEAK.store(in_use, Ordering::Relaxed);

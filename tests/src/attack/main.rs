@@ -1,16 +1,17 @@
 //! Attacks every reader with damaged files: `bash scripts/check/attack.sh` (docs/results/robustness.md).
 //!
-//! Starts from valid files, mutates them, and reads each. A reader may accept or refuse; it may not panic, hang, take
-//! memory beyond its bound, or refuse without a word. An execution is a function of (reader, seed, number), so that
-//! what was found is found again: `clift-attack --target NAME --seed S --first NUMBER --count 1`.
+//! Starts from valid files, mutates them, and reads each. A reader may accept or refuse; it may not panic, hang, exceed
+//! its bound of memory, or refuse without a message. An execution is a function of (reader, seed, number):
+//! `clift-attack --target NAME --seed S --first NUMBER --count 1` repeats it.
 
 mod counting;
-mod layouts;
 mod mutate;
+mod readers;
 mod report;
 mod setup;
 mod targets;
 mod watch;
+mod words;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
@@ -19,13 +20,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use layouts::LAYOUT_TARGETS;
 use mutate::Mutator;
 use report::Attacked;
 use setup::Setup;
 use targets::{TARGETS, Target};
 
-/// Longest that one execution may take: no valid input takes a hundredth of it.
+/// Longest execution in seconds: no valid input takes a hundredth of it.
 const MOST_SECONDS: u64 = 10;
 
 /// Attacks readers with damaged files.
@@ -57,20 +57,15 @@ struct Args {
     list: bool,
 }
 
-/// Every reader.
-fn all_targets() -> impl Iterator<Item = &'static Target> {
-    TARGETS.iter().chain(LAYOUT_TARGETS)
-}
-
 fn main() -> ExitCode {
     let args = Args::parse();
     if args.list {
-        for target in all_targets() {
+        for target in TARGETS {
             println!("{}", target.name);
         }
         return ExitCode::SUCCESS;
     }
-    if let Some(unknown) = args.target.iter().find(|name| all_targets().all(|target| target.name != **name)) {
+    if let Some(unknown) = args.target.iter().find(|name| TARGETS.iter().all(|target| target.name != **name)) {
         eprintln!("there is no reader {unknown}; --list names them");
         return ExitCode::from(2);
     }
@@ -83,7 +78,7 @@ fn main() -> ExitCode {
     };
     let messages = hush_panics();
     watch::start(Duration::from_secs(MOST_SECONDS));
-    let chosen = all_targets().filter(|target| args.target.is_empty() || args.target.iter().any(|n| n == target.name));
+    let chosen = TARGETS.iter().filter(|target| args.target.is_empty() || args.target.iter().any(|n| n == target.name));
     let mut rows = Vec::new();
     for target in chosen {
         let row = attack(target, &setup, &args, &messages);
@@ -119,15 +114,16 @@ fn hush_panics() -> Messages {
 }
 
 fn attack(target: &Target, setup: &Setup, args: &Args, messages: &Messages) -> Attacked {
-    let seeds = (target.seeds)(setup);
-    let mut read = (target.open)(setup);
+    let seeds = (target.seeds)(setup, target.file);
+    let mut read = (target.open)(setup, target.file);
     let mut row = Attacked::new(target.name);
     for (i, seed) in seeds.iter().enumerate() {
         if let Err(error) = read(seed) {
             row.find(format!("valid file {i} is refused: {error}"), None);
         }
     }
-    let mutator = Mutator { seeds: &seeds, words: target.words, repair: target.repair };
+    let words = words::list(target.words);
+    let mutator = Mutator { seeds: &seeds, words: &words, repair: target.repair };
     let started = Instant::now();
     for number in args.first..args.first.saturating_add(args.count.unwrap_or(u64::MAX)) {
         if started.elapsed().as_secs_f64() >= args.seconds || row.findings.len() >= report::MOST_FINDINGS {
@@ -147,9 +143,9 @@ fn attack(target: &Target, setup: &Setup, args: &Args, messages: &Messages) -> A
     row
 }
 
-/// Reads one input; what is wrong with how that went.
+/// Reads one input and returns the finding, if any.
 fn execute(
-    read: &mut targets::Read,
+    read: &mut readers::Read,
     bytes: &[u8],
     target: &Target,
     number: u64,
@@ -162,7 +158,7 @@ fn execute(
     watch::enter(target.name, seed, number);
     let before = counting::start();
     let started = Instant::now();
-    // What a reader leaves half done is made anew by the next input's files.
+    // The files of the next input replace any that an unwound reader left half done.
     let result = catch_unwind(AssertUnwindSafe(|| read(bytes)));
     let (elapsed, peak) = (started.elapsed(), counting::peak().saturating_sub(before));
     watch::leave();

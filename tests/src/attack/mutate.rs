@@ -3,7 +3,7 @@
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Lengths and counts that readers trip over.
+/// Boundary values of lengths and counts.
 const NUMBERS: [u64; 20] = [
     0,
     1,
@@ -27,25 +27,11 @@ const NUMBERS: [u64; 20] = [
     u64::MAX,
 ];
 
-/// What stands in a text where a number was.
-const TEXTS: [&str; 14] = [
-    "0",
-    "-1",
-    "1",
-    "2",
-    "65536",
-    "4294967296",
-    "9223372036854775807",
-    "9223372036854775808",
-    "18446744073709551615",
-    "4611686018427387904",
-    "1e308",
-    "1e999",
-    "-0.0",
-    "null",
-];
+/// Replacements of numbers in texts.
+const TEXTS: &str = "0 -1 1 2 65536 4294967296 9223372036854775807 9223372036854775808 18446744073709551615 \
+    4611686018427387904 1e308 1e999 -0.0 null";
 
-/// Largest input that is made of a smaller one.
+/// Largest size that insertions produce.
 const MOST_BYTES: usize = 1 << 20;
 
 /// Damages one reader's valid files.
@@ -54,7 +40,7 @@ pub struct Mutator<'a> {
     pub seeds: &'a [Vec<u8>],
     /// Words of the format.
     pub words: &'a [&'a [u8]],
-    /// Puts right what would hide the damage: checksums.
+    /// Corrects checksums, which would hide the damage from later checks.
     pub repair: fn(&mut [u8]),
 }
 
@@ -67,7 +53,7 @@ impl Mutator<'_> {
         for _ in 0..=below(&mut rng, 6) {
             self.damage(&mut bytes, &mut rng);
         }
-        // Half of the time the damage is one that checksums do not see.
+        // Half of the inputs pass the checksums.
         if rng.random_bool(0.5) {
             (self.repair)(&mut bytes);
         }
@@ -142,15 +128,16 @@ fn overwrite_number(bytes: &mut [u8], at: usize, rng: &mut ChaCha8Rng) {
     bytes[at..end].copy_from_slice(&part[..end - at]);
 }
 
-/// Puts another number where the next one of a text stands.
+/// Replaces the next number of a text.
 fn replace_digits(bytes: &mut Vec<u8>, at: usize, rng: &mut ChaCha8Rng) {
     let Some(start) = (at..bytes.len()).find(|&i| bytes[i].is_ascii_digit()) else { return };
     let end = (start..bytes.len()).find(|&i| !bytes[i].is_ascii_digit()).unwrap_or(bytes.len());
-    let text = TEXTS[below(rng, TEXTS.len())];
+    let texts: Vec<&str> = TEXTS.split(' ').collect();
+    let text = texts[below(rng, texts.len())];
     bytes.splice(start..end, text.bytes());
 }
 
-/// A number of a name, the same everywhere (FNV-1a).
+/// A hash of a name, the same on every platform (FNV-1a).
 fn name_hash(name: &str) -> u64 {
     name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
 }

@@ -1,29 +1,29 @@
-//! What an attack came to.
+//! Results of an attack.
 
 use std::fmt::Write as _;
 use std::time::Duration;
 
-/// A reader that has so many findings is not attacked further.
+/// Findings after which the attack of a reader stops.
 pub const MOST_FINDINGS: usize = 20;
 
-/// Longest message: a refusal is read by people.
+/// Longest error message in bytes: people read it.
 pub const MOST_MESSAGE: usize = 20_000;
 
-/// What happened to one reader.
+/// Results of one reader.
 #[derive(Debug)]
 pub struct Attacked {
     name: &'static str,
     /// Inputs read.
     pub executions: u64,
-    /// Inputs that were taken.
+    /// Inputs accepted.
     pub accepted: u64,
-    /// Longest of them.
+    /// Longest execution.
     pub slowest: Duration,
-    /// Most bytes that one took.
+    /// Peak memory of one execution.
     pub peak_bytes: usize,
-    /// Seconds of all.
+    /// Seconds of all executions.
     pub seconds: f64,
-    /// What was wrong, each once.
+    /// Findings, each once.
     pub findings: Vec<String>,
 }
 
@@ -33,14 +33,14 @@ impl Attacked {
         Self { name, executions: 0, accepted: 0, slowest, peak_bytes: 0, seconds: 0.0, findings }
     }
 
-    /// Notes a finding and the file that shows it.
+    /// Records a finding and the file that shows it.
     pub fn find(&mut self, what: String, saved: Option<String>) {
         if self.findings.iter().all(|known| !known.starts_with(&what)) {
             self.findings.push(saved.map_or(what.clone(), |saved| format!("{what} ({saved})")));
         }
     }
 
-    /// One line for people.
+    /// The line that is printed.
     pub fn line(&self) -> String {
         let Self { name, executions, accepted, slowest, peak_bytes, seconds, findings } = self;
         let mut line = format!(
@@ -55,7 +55,7 @@ impl Attacked {
     }
 }
 
-/// The table.
+/// The table of all readers.
 pub fn markdown(rows: &[Attacked], seconds: f64, seed: u64) -> String {
     let mut text = format!(
         "`clift-attack --seconds {seconds} --seed {seed}`:\n\n\

@@ -1,4 +1,4 @@
-//! The valid files that attacks start from: fixtures, and what a small run leaves.
+//! The valid files that attacks start from: fixtures, and the files of a small run.
 
 use std::io::{Cursor, Read, Write};
 use std::path::{Path, PathBuf};
@@ -13,38 +13,18 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 /// The smallest run that has everything.
 const RUN: &str = "\
 seed = 0
-[data]
-width = 16
-height = 16
-synthetic = { num_scenes = 4, num_frames = 8, width = 16, height = 16, samples_per_pixel = 1 }
-views = { min_context = 2, max_context = 2, min_gap = [3, 3], max_gap = [6, 6], warm_up_steps = 0, num_targets = 2 }
-[model]
-dim = 16
-num_heads = 2
-feed_forward_dim = 24
-num_encoder_blocks = 1
-num_renderer_blocks = 1
-condenser = { num_blocks = 1 }
-[stage1]
-steps = 2
-batch_size = 1
-[clusters]
-grid = [0.5, 1.0]
-num_passes = 1
-num_scenes = 3
-[stage2]
-steps = 1
-batch_size = 1
-[eval]
-storage = [0.5]
-num_scenes = 1
-num_context = 2
-num_targets = 1
-num_sheets = 0
-num_validation_scenes = 1
+data = { width = 16, height = 16, \
+    synthetic = { num_scenes = 4, num_frames = 8, width = 16, height = 16, samples_per_pixel = 1 }, \
+    views = { min_context = 2, max_context = 2, min_gap = [3, 3], max_gap = [6, 6], warm_up_steps = 0, num_targets = 2 } }
+model = { dim = 16, num_heads = 2, feed_forward_dim = 24, num_encoder_blocks = 1, num_renderer_blocks = 1, \
+    condenser = { num_blocks = 1 } }
+stage1 = { steps = 2, batch_size = 1 }
+clusters = { grid = [0.5, 1.0], num_passes = 1, num_scenes = 3 }
+stage2 = { steps = 1, batch_size = 1 }
+eval = { storage = [0.5], num_scenes = 1, num_context = 2, num_targets = 1, num_sheets = 0, num_validation_scenes = 1 }
 ";
 
-/// A folder with a run, a scene file of it, and a place for damaged copies.
+/// A folder with a run, its scene files, and damaged copies.
 pub struct Setup {
     folder: TempDir,
     /// The run's config.
@@ -54,7 +34,7 @@ pub struct Setup {
 impl Setup {
     /// Trains the run and stores a scene of it with the command line.
     pub fn make() -> Result<Self, String> {
-        // Files are written once per execution: in memory, where there is such a place.
+        // In memory where possible: files are written once per execution.
         let memory = Path::new("/dev/shm");
         let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
         let folder = folder.map_err(|error| error.to_string())?;
@@ -72,7 +52,7 @@ impl Setup {
         Ok(Self { folder, config })
     }
 
-    /// Where the run is.
+    /// The run directory.
     pub fn run(&self) -> PathBuf {
         self.folder.path().join("run")
     }
@@ -104,7 +84,7 @@ fn text(path: &Path) -> String {
     path.display().to_string()
 }
 
-/// Runs the command line that lies beside this program.
+/// Runs the command line beside this program.
 fn clift(args: &[&str]) -> Result<(), String> {
     let program = std::env::current_exe().map_err(|error| error.to_string())?.with_file_name("clift-under-test");
     let output = Command::new(&program)
@@ -115,10 +95,38 @@ fn clift(args: &[&str]) -> Result<(), String> {
     if output.status.success() { Ok(()) } else { Err(String::from_utf8_lossy(&output.stderr).into_owned()) }
 }
 
-/// A file of the repository.
+/// The folder of the fixtures.
+pub fn fixtures() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../data-fixtures")
+}
+
+/// Reads a fixture.
 pub fn fixture(path: &str) -> Vec<u8> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../data-fixtures").join(path);
-    std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+    read(&fixtures().join(path))
+}
+
+/// Reads a file that exists.
+pub fn read(path: &Path) -> Vec<u8> {
+    std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// Writes a file of a temporary folder.
+pub fn write(path: &Path, bytes: &[u8]) {
+    std::fs::write(path, bytes).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+}
+
+/// Copies a folder with everything in it.
+pub fn copy_folder(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).expect("a temporary folder is writable");
+    for entry in std::fs::read_dir(from).expect("a folder") {
+        let path = entry.expect("readable").path();
+        let target = to.join(path.file_name().expect("named"));
+        if path.is_dir() {
+            copy_folder(&path, &target);
+        } else {
+            std::fs::copy(&path, &target).expect("readable");
+        }
+    }
 }
 
 /// A member of an archive of `torch.save`.

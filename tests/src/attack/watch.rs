@@ -1,4 +1,4 @@
-//! Ends the process, with the number of the execution, where one does not end by itself.
+//! Ends the process with the number of the execution that hangs.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -30,7 +30,7 @@ pub fn start(most: Duration) {
     });
 }
 
-/// Notes what runs.
+/// Records the start of an execution.
 pub fn enter(target: &'static str, seed: u64, number: u64) {
     NUMBER.store(number, Ordering::Relaxed);
     if let Ok(mut running) = RUNNING.lock() {
@@ -38,7 +38,7 @@ pub fn enter(target: &'static str, seed: u64, number: u64) {
     }
 }
 
-/// Notes that nothing runs.
+/// Records the end of an execution.
 pub fn leave() {
     if let Ok(mut running) = RUNNING.lock() {
         *running = None;

@@ -1,10 +1,10 @@
-//! Converting data: what is refused, what is left out, how a folder is divided.
+//! `clift data convert`: refused targets, skipped scenes, splits.
 
 use clift_data::{ChunkSource, SceneFilters, SceneRecord, SceneSource, Split, write_chunks};
 
 use crate::support::{Place, clift, copy_folder, repository};
 
-/// Scenes of eight 64 x 36 pictures, two for training and one for testing.
+/// Scenes of eight images of 64 x 36, two for training and one for testing.
 const MINI: &str = "data-fixtures/re10k-mini";
 
 /// `clift data convert` with these words.
@@ -56,7 +56,7 @@ fn test_scene_lists_split_conversion_and_check() {
     let place = Place::new();
     std::fs::write(place.at("list.txt"), "00000000000000a2\n").unwrap();
     let list = format!("data.files.test_scenes={}", place.at("list.txt").display());
-    // Without halves: all of it is one folder.
+    // Without split folders: all scenes lie in one folder.
     let (from, out) = (repository(MINI).join("train"), place.at("out"));
     let ran = convert(&from, &out, &["--to", "scenes", "--set", &list]).ok();
     assert!(ran.stdout.contains("train: 1 scene of 2") && ran.stdout.contains("test: 1 scene of 1"), "{}", ran.stdout);
@@ -68,7 +68,7 @@ fn test_scene_lists_split_conversion_and_check() {
     let words = ["data", "check", from.to_str().unwrap(), "--split", "test", "--set", &list];
     let ran = clift(words);
     assert!(ran.stdout.contains("test/00000000000000a2") && ran.stdout.contains("\n\n1 scene, "), "{}", ran.stdout);
-    // In training it is missing for a good reason.
+    // The training split omits it.
     let ran = clift(["data", "check", from.to_str().unwrap(), "--set", &list]);
     assert!(ran.stdout.contains("\n\n2 scenes, ") && !ran.stdout.contains("train/00000000000000a2"), "{}", ran.stdout);
     convert(&from, &place.at("no"), &["--to", "scenes", "--set", "data.width=64"]).fails_with(2, &["unknown key"]);

@@ -2,7 +2,7 @@
 
 use crate::support::{Place, clift};
 
-/// Two rooms with patterns fine enough to find corners in.
+/// Two rooms with textures fine enough for corners.
 fn rooms(place: &Place) -> String {
     let rooms = place.at("rooms").display().to_string();
     let words = ["data", "synth", &rooms, "--scenes", "2", "--frames", "9", "--size", "240x160", "--split", "test"];
@@ -36,7 +36,7 @@ fn scenes_are_checked_converted_and_checked_again() {
     assert!(text.contains("2 scenes of 2, 2 of them there already; 0 frames written"), "{text}");
     clift(["data", "check", &packed]).ok();
 
-    // A scene whose file is cut off is flagged; converting again makes it anew.
+    // A truncated scene is flagged; converting again rewrites it.
     let path = place.at("packed").join(format!("test/{key}.torch"));
     let bytes = std::fs::read(&path).unwrap();
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();

@@ -6,7 +6,7 @@ use clift_data::{StateDict, write_state_dict};
 
 use crate::support::{Place, clift, files, repository};
 
-/// Pictures of 2 x 3 patches, as the sizes of the fixtures' networks do not matter.
+/// Images of 2 x 3 patches: the fixtures' networks accept any size.
 const SMALL: [&str; 6] = ["--set", "data.width=24", "--set", "data.height=16", "--set", "eval.num_sheets=1"];
 
 fn checkpoint(name: &str) -> String {
@@ -17,7 +17,7 @@ fn mini() -> String {
     repository("data-fixtures/re10k-mini").display().to_string()
 }
 
-/// Imports a fixture into the folder `name` and returns that.
+/// Imports a fixture into the folder `name` and returns its path.
 fn import(place: &Place, file: &str, variant: &str, num_heads: &str, name: &str) -> String {
     let folder = place.at(name).display().to_string();
     let ran = clift(["import", file, "--variant", variant, "--num-heads", num_heads, "-o", &folder]).ok();
@@ -162,7 +162,7 @@ fn released_variants_train_and_export() {
         clift(["export", &run, "--format", "pytorch", "-o", &file]).ok();
         let name = format!("{variant}-model");
         let folder = place.at(&name).display().to_string();
-        // The export says that the network has two heads.
+        // The exported file holds the number of heads, two.
         let ran = clift(["import", &file, "--variant", variant, "-o", &folder]).ok();
         assert!(ran.stdout.contains(" 2 heads, "), "{}", ran.stdout);
         assert!(place.model(&name) == second, "the weights come back bit for bit");
@@ -202,7 +202,7 @@ fn an_export_writes_over_nothing() {
     for format in ["pytorch", "safetensors"] {
         clift(["export", &model, "--format", format, "-o", &weights]).fails_with(2, &["nothing is written over"]);
     }
-    // Before any work: nothing of the model is looked at.
+    // The output path is checked before the model is read.
     clift(["export", "no/such/model", "--format", "pytorch", "-o", &weights])
         .fails_with(2, &["nothing is written over"]);
     assert!(place.bytes("model/model.safetensors") == before);

@@ -1,4 +1,4 @@
-//! Evaluations through the command line: formats, fronts, other systems' pictures, LPIPS, comparisons, counts of work.
+//! Evaluations through the command line: formats, Pareto fronts, external methods, LPIPS, comparisons, counts.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -11,7 +11,7 @@ use crate::support::{Place, STAGE_1, WHOLE, clift, repository};
 
 const WIDTHS: [usize; 5] = [64, 128, 256, 512, 512];
 
-/// Scene and target frame of every view that was measured.
+/// Scene and target frame of every measured view.
 fn views(place: &Place, folder: &str) -> Vec<(String, String)> {
     let text = place.text(&format!("{folder}/views.csv"));
     let views = text.lines().skip(1).map(|line| {
@@ -22,7 +22,7 @@ fn views(place: &Place, folder: &str) -> Vec<(String, String)> {
     views.into_iter().collect()
 }
 
-/// A file as `scripts/tools/convert_vgg.py` writes it, with small random weights.
+/// Writes a file in the form of `scripts/tools/convert_vgg.py`, with small random weights.
 fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) {
     let mut state = 1_u32;
     let mut random = |count: usize, scale: f32| -> Vec<u8> {
@@ -82,7 +82,7 @@ fn every_format_and_count_has_speed_and_fronts() {
         assert!(number("render_p95_s") >= number("render_median_s") && number("render_median_s") > 0.0, "{point}");
         assert!(number("frame_median_s") >= number("render_median_s"), "{point}");
         assert!(number("gflops") > 0.0 && number("num_views") == 6.0, "{point}");
-        // Where the system tells, a process takes more than a mebibyte.
+        // Null on systems that do not report it; a process takes more than a mebibyte.
         assert!(point["peak_bytes"].is_null() || number("peak_bytes") > 1e6, "{point}");
     }
     for front in ["pareto_time", "pareto_bytes"] {
@@ -127,7 +127,7 @@ fn predictions_are_scored_and_missing_images_named() {
     assert!(place.text("run/eval/report.html").contains("Grey &amp; co"));
     assert_eq!(place.text("run/eval/views.csv").matches(",Grey & co,0,0,").count(), 5);
 
-    // Another size, no picture at all, a name that is taken, more names than folders.
+    // Another size, no image at all, a reserved name, more names than folders.
     let (scene, frame) = &views[1];
     let small = place.at("small").join(scene);
     std::fs::create_dir_all(&small).unwrap();
@@ -206,7 +206,7 @@ fn the_perceptual_loss_trains_both_stages() {
     // The same updates, computed again; the same losses to the last digit of f32.
     place.train("again", &[weight, &file, "activation_checkpointing=true"], &[]).ok();
     place.assert_same_result("again", "run");
-    // And it does make a difference.
+    // The term changes the weights.
     place.copy(&WHOLE, "plain");
     assert!(place.weights("plain", "stage1") != place.weights("run", "stage1"));
     assert!(place.weights("plain", "stage2").part("condenser.") != place.weights("run", "stage2").part("condenser."));
@@ -223,7 +223,7 @@ fn two_evaluations_are_compared_pair_by_pair() {
     assert!(ran.stdout.contains("clift 8 f32") && ran.stdout.contains("random 4 f32"), "{}", ran.stdout);
     let comparison = place.json("difference.json");
     let pairs = comparison["pairs"].as_array().unwrap();
-    // Six settings and the two baselines, whose pictures do not depend on the weights.
+    // Six settings and the two baselines, whose images do not depend on the weights.
     assert_eq!(pairs.len(), 8);
     let points = |run: &str| points(&place, &format!("{run}/eval"));
     for pair in pairs {

@@ -1,4 +1,4 @@
-//! The report of an evaluation, and evaluations that draw from chosen tokens.
+//! The HTML report of an evaluation, and evaluations that render from selected tokens.
 
 use crate::support::{Place, STAGE_1, WHOLE};
 

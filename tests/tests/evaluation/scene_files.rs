@@ -1,4 +1,4 @@
-//! Scenes that are kept: encoded, drawn again, measured.
+//! Scene files through the command line: encoded, rendered, measured.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 
 use crate::support::{Place, STAGE_1, Shared, WHOLE, clift, repository};
 
-/// A run whose variants differ by more than rounding.
+/// A run whose methods differ by more than rounding.
 static LONGER: Shared = Shared::new(&["stage1.steps=60", "stage2.steps=20"], &[]);
 
 const KEY: &str = "synthetic-0-test-00000";
@@ -65,7 +65,7 @@ fn evaluated(place: &Place, eval: &str, num_tokens: usize, num_render_tokens: us
     rows.map(|row| (row[5].parse().expect("a number"), row[6].parse().expect("a number"))).collect()
 }
 
-/// Draws a clip's targets from a scene file, each from so many of its tokens.
+/// Renders a clip's targets from a scene file, each view from `num_render_tokens` tokens.
 fn drawn(
     scene: &Path,
     weights: &Path,
@@ -123,7 +123,7 @@ fn scene_files_reproduce_the_evaluation() {
         });
         assert_eq!(point.unwrap()["scene_bytes"], bytes);
 
-        // Rounded or not, the file gives what the evaluation has in memory, to the last digit.
+        // Images from the file equal those of the evaluation in memory to the last digit, at every format.
         let from_file = measure(&clip, &drawn(&place.at(&name), &weights, &clip, SelectionPreset::Paper, count));
         assert_eq!(from_file, evaluated(&place, storage, count, count), "{name}");
         let exact = evaluated(&place, "run/eval", count, count);
@@ -136,7 +136,7 @@ fn scene_files_reproduce_the_evaluation() {
             assert!((psnr - exact).abs() <= loss_db, "{name}: {psnr} dB against {exact}");
         }
 
-        // The command draws the same pictures, rounded to 8 bits: half a level is at most 0.02 dB here.
+        // The command renders the same images, rounded to 8 bits: half a level is at most 0.02 dB here.
         let out = format!("{count}-{storage}");
         let poses = place.at("poses.json").display().to_string();
         clift(render_args(&place, &name, &out, &["--path", &poses])).ok();
@@ -252,7 +252,7 @@ fn what_cannot_be_drawn_says_what_to_do() {
         let path = if flags[0] == "--path" { &[][..] } else { &orbit[..] };
         render(&[path, &flags].concat()).fails_with(2, &[expected]);
     }
-    // The second pose is no camera: nothing is drawn of the first either.
+    // The second pose is an invalid camera: the command also writes no frame of the first.
     let pose = json!({"c2w": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]});
     let far = json!({"c2w": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0]]});
     std::fs::write(place.at("poses.json"), json!({"poses": [pose, far]}).to_string()).unwrap();
@@ -318,7 +318,7 @@ fn scene_files_overwrite_only_scene_files() {
     encode("room.clift", &[]).ok();
     encode("room.clift", &["--storage", "8"]).ok();
     assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);
-    // Other heads fit the same weights, and draw another picture.
+    // Another number of heads fits the same weights and would change every image.
     for change in ["model.num_heads=1", "model={num_heads=1}"] {
         encode("heads.clift", &["--set", change])
             .fails_with(2, &["--set model: the network is what the weights were trained with"]);

@@ -1,11 +1,11 @@
-//! Patch-wise grouping beside K-means, on the same stage 1.
+//! Tiles against K-means, with the same stage 1.
 
 use crate::support::{Place, WHOLE, clift};
 
-/// A tile for every view at least.
+/// At least one tile per view.
 const STORAGE: &str = "eval.validation_storage=0.5";
 
-/// The run `name` whose stage 2 is trained on tiles, on the stage 1 of `run`.
+/// Trains stage 2 of the run `name` on tiles, from the stage 1 of `run`.
 fn train_on_tiles(place: &Place, name: &str) {
     let from = format!("stage1.init_from=\"{}\"", place.at("run").display());
     place.train(name, &["stage1.steps=0", &from, "clusters.grouping=\"tile\"", STORAGE], &[]).ok();

@@ -1,4 +1,4 @@
-//! Input that is wrong, damaged or missing: what it says and what goes on.
+//! Runs on wrong, damaged or missing data, checkpoints and weights.
 
 use std::path::{Path, PathBuf};
 
@@ -6,9 +6,9 @@ use clift_data::{ChunkSource, SceneFilters, SceneRecord, SceneSource, Split, wri
 
 use crate::support::{Place, Ran, STAGE_1, WHOLE, copy_folder, files, repository};
 
-/// The pictures of two training scenes and a test scene, written by PyTorch's own `torch.save`.
+/// Images of two training scenes and a test scene, written by PyTorch's `torch.save`.
 const MINI: &str = "data-fixtures/re10k-mini";
-/// The training scenes of it.
+/// Keys of the training scenes.
 const KEYS: [&str; 2] = ["00000000000000a1", "00000000000000a2"];
 
 /// Trains the micro run on a folder of chunks.
@@ -58,7 +58,7 @@ fn moved_cameras(place: &Place, change: impl Fn(&mut clift_data::DVec3)) -> Path
     changed_scene(place, |scene| scene.cameras.iter_mut().for_each(|camera| change(&mut camera.c2w.translation)))
 }
 
-/// Expects a run that left the second scene out for `reason`, said so, and trained on the first one.
+/// Expects a run that skipped the second scene for `reason`, reported it, and trained on the first.
 fn assert_second_is_skipped(place: &Place, ran: Ran, reason: &str) {
     let stderr = ran.ok().stderr;
     let lines: Vec<_> = stderr.lines().filter(|line| line.starts_with("skipped ")).collect();
@@ -87,7 +87,7 @@ fn what_the_data_refutes_is_refused_before_any_step() {
     let nowhere = place.at("nowhere");
     let message = train_on(&place, &nowhere, &[], &[]).fails(1);
     assert!(message.trim_end().ends_with(&nowhere.display().to_string()), "{message}");
-    // The corrected command is no other run: nothing was trained with the wrong one.
+    // The corrected command is accepted: the refused one started no run.
     train_on(&place, &repository(MINI), &[], &["--only", "stage1"]).ok();
 }
 
@@ -144,7 +144,7 @@ fn targets_that_are_contexts_are_measured() {
     let place = Place::new();
     std::fs::write(place.at("index.json"), r#"{"00000000000000b1": {"context": [0, 7], "target": [0, 7]}}"#).unwrap();
     let index = format!("eval.index={:?}", place.at("index.json"));
-    // Contexts that are neighbours leave no other frame to draw targets from.
+    // Between neighbouring contexts no other frame is left for targets.
     let views = "data.views={min_context=2, max_context=2, min_gap=[1, 1], max_gap=[1, 1], num_targets=3}";
     let stderr = train_on(&place, &repository(MINI), &[&index, views], &[]).ok().stderr;
     assert!(!stderr.contains("skipped"), "{stderr}");
@@ -156,7 +156,7 @@ fn targets_that_are_contexts_are_measured() {
 
 #[test]
 fn unusable_scenes_are_skipped_and_named() {
-    /// Makes a data set of which the second scene cannot be used.
+    /// Makes a data set whose second scene is unusable.
     type Damage = fn(&Place) -> PathBuf;
     let cases: [(&str, Damage); 6] = [
         ("data/train/000001.torch", |place| {
@@ -261,7 +261,7 @@ fn damaged_checkpoints_are_errors_and_change_nothing() {
         for missing in [false, true] {
             let run = place.at("run");
             copy_folder(&place.at("whole"), &run);
-            // A stage whose last checkpoint is there and whose weights are not: it goes on from the checkpoint.
+            // Without its weights the stage resumes from the last checkpoint.
             std::fs::remove_file(run.join("stage1/model.safetensors")).unwrap();
             if missing {
                 std::fs::remove_file(run.join(newest).join(file)).unwrap();

@@ -1,11 +1,11 @@
-//! What is said of wrong input: one file of `tests/snapshots` each. `CLIFT_UPDATE_SNAPSHOTS=1 cargo test` writes them
-//! anew; read what changed before it is committed.
+//! Error messages of wrong input, one file of `tests/snapshots` each. `CLIFT_UPDATE_SNAPSHOTS=1 cargo test` rewrites
+//! them; read the difference before you commit it.
 
 use std::path::Path;
 
 use crate::support::{Place, Ran, clift, repository};
 
-/// A config in which nothing is wrong.
+/// A valid config.
 const RIGHT: &str = "\
 run_dir = \"DIR/run\"
 device = \"flex\"
@@ -57,7 +57,7 @@ num_context = 2
 num_targets = 2
 ";
 
-/// Name, what is replaced in the config by what, and arguments behind `train CONFIG`.
+/// Name, replaced text of the config, replacement, and arguments after `train CONFIG`.
 const CONFIGS: [(&str, &str, &str, &[&str]); 40] = [
     ("unknown-key", "dim = 16", "dimm = 16", &[]),
     ("unknown-section", "[clusters]", "[cluster]", &[]),
@@ -143,7 +143,7 @@ fn every_wrong_input_gives_its_message() {
     assert!(differing.is_empty(), "{}", differing.join("\n\n"));
 }
 
-/// How an error differs from its snapshot, which is written where that is asked for.
+/// Compares an error with its snapshot, or writes the snapshot if `CLIFT_UPDATE_SNAPSHOTS` is set.
 fn differs(name: &str, ran: &Ran, dir: &str) -> Option<String> {
     let code = ran.code.map_or_else(|| "none".into(), |code| code.to_string());
     let said = format!("exit code {code}\n{}", ran.stderr.replace(dir, "DIR"));

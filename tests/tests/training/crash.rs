@@ -4,12 +4,12 @@ use std::time::{Duration, Instant};
 
 use crate::support::{Place, finish, spawn};
 
-/// Every step is saved: about half of the time goes into that.
+/// A checkpoint after every step takes about half of the time.
 const SAVING: [&str; 4] = ["stage1.steps=40", "stage2.steps=30", "eval.every=10", "checkpoint={every=1, keep=2}"];
 
 const NUM_KILLS: usize = 8;
 
-/// A share of the time between 0 and 1, the same in every test run (an LCG's upper bits).
+/// A value in [0, 1), the same in every test run (the upper bits of an LCG).
 fn draw(state: &mut u64) -> f64 {
     *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
     (*state >> 33) as f64 / (1_u64 << 31) as f64

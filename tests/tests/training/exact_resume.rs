@@ -1,8 +1,8 @@
-//! A run that is killed at a known step ends with the files of one that was not, bit for bit.
+//! A run killed at a chosen step and resumed ends with the files of an undisturbed run, bit for bit.
 
 use crate::support::{Place, Shared, killed_at};
 
-/// Thirty steps of which seventeen are saved, in both stages.
+/// Thirty steps per stage, with a checkpoint at step 17.
 const THIRTY: [&str; 4] = ["stage1.steps=30", "stage2.steps=30", "eval.every=17", "checkpoint={every=17, keep=2}"];
 static UNDISTURBED: Shared = Shared::new(&THIRTY, &[]);
 
@@ -17,7 +17,7 @@ fn killed_runs_end_the_same_with_any_loader_threads() {
     ] {
         let set = [&THIRTY[..], threads].concat();
         let kill_at = |moment: &str| killed_at(moment, &place.train_args(name, &set, &[]));
-        // Between the save of a step and its validation, then with eight steps that are lost.
+        // Between the save of a step and its validation; then eight steps after the save.
         kill_at("saved/stage1/17");
         kill_at("step/stage1/25");
         assert_eq!(place.checkpoints(name, "stage1"), [17]);
@@ -28,7 +28,7 @@ fn killed_runs_end_the_same_with_any_loader_threads() {
         let ran = place.train(name, &set, &[]).ok();
         assert!(ran.stderr.contains("stage2: resumed after 17 of 30 steps"), "{}", ran.stderr);
         assert_eq!(place.checkpoints(name, "stage1"), [17, 30]);
-        // Also what decides which checkpoints are kept: the best validation so far.
+        // The best validation decides which checkpoints are kept.
         assert!(place.progress(name, "stage2")["best"]["step"].is_u64());
         place.assert_same_run(name, "whole");
     }
@@ -67,7 +67,7 @@ fn what_killed_saves_leave_is_cleared_away() {
         "parts/stage1/.clift-z/.tmpAb12Cd",
         "parts/stage1/checkpoints/step-000000034.tmp/model.bpk",
         "parts/stage2/checkpoints/step-000000002.tmp/model.bpk",
-        // It does not say what it was made from.
+        // Without the inputs of the build in its first line.
         "parts/clusters.tmp/clusters.bin",
     ];
     for name in leftovers {
@@ -79,7 +79,7 @@ fn what_killed_saves_leave_is_cleared_away() {
     place.assert_same_run("parts", "whole");
 }
 
-/// So low that steps are left out: a random batch is often 1.1 times the median.
+/// A low spike factor: the loss of a random batch is often 1.1 times the median.
 const SPIKES: [&str; 5] = [
     "stage1.steps=80",
     "stage1.optimizer={learning_rate=1e-3, warm_up_steps=2, spike_factor=1.1, max_bad_steps=50}",
@@ -120,7 +120,7 @@ fn spikes_are_skipped_identically_after_kills() {
         };
         assert!(scenes.iter().all(is_clip), "{line}");
     }
-    // The median of its own window is what a step is compared with.
+    // A step is compared with the median of its own window.
     let first = lines[0]["step"].as_u64().expect("a number") as usize;
     let mut losses: Vec<f64> = metrics[..first - 1].iter().map(|line| line["loss"].as_f64().expect("finite")).collect();
     losses.sort_by(f64::total_cmp);
@@ -134,7 +134,7 @@ fn spikes_are_skipped_identically_after_kills() {
 #[test]
 fn consecutive_spikes_stop_the_run() {
     let place = Place::new();
-    // With a batch in three a spike, some three follow each other.
+    // One batch in three is a spike, so three follow each other soon.
     let spikes = "stage1.optimizer={learning_rate=1e-3, warm_up_steps=2, spike_factor=1.01, max_bad_steps=3}";
     let set = ["stage1.steps=400", "eval.every=0", "checkpoint={every=5, keep=1}", spikes];
     let message = place.train("run", &set, &["--only", "stage1"]).fails(1);
@@ -146,7 +146,7 @@ fn consecutive_spikes_stop_the_run() {
         message.trim_end().ends_with(&format!("the last good checkpoint is {}", checkpoint.display())),
         "{message}"
     );
-    // The same steps are bad again: nothing but the same message comes of trying.
+    // A second try meets the same spikes and ends with the same message.
     let again = place.train("run", &set, &["--only", "stage1"]).fails(1);
     let told = |message: &str| message.lines().find(|line| line.starts_with("error: ")).map(str::to_owned);
     assert_eq!(told(&again), told(&message));

@@ -1,4 +1,4 @@
-//! `--extend`: more steps than a run was started with.
+//! `--extend`: more steps than at the start of the run.
 
 use crate::support::{Place, WHOLE, files, killed_at};
 
@@ -26,7 +26,7 @@ fn extended_stages_follow_the_longer_schedule() {
     assert!((5..=8).all(|step| rate("run", step) == rate("eight", step)));
     assert!(rate("run", 3) < rate("eight", 3) && rate("run", 5) > rate("run", 4));
 
-    // The run now has that count: no flag is needed, and it has not forgotten.
+    // The run now has this count: the flag is not needed, and run.json keeps the record.
     place.train("run", &more, &[]).ok();
     assert_eq!(place.json("run/run.json")["extended"], expected);
     assert!(place.train("run", &[], &["--extend"]).fails(2).contains("stage2.steps: 8 -> 4"), "counts do not shrink");
@@ -41,11 +41,11 @@ fn an_extended_stage_resumes_exactly() {
     }
     place.train("whole", &twelve, &["--only", "stage1", "--extend"]).ok();
     let mut args = place.train_args("parts", &six, &["--only", "stage1"]);
-    // Killed after the weights were renamed and before the new count was written: as if it had not been asked for.
+    // Killed after the weights were renamed and before the new count was written: the extension has no effect.
     let weights = place.at("parts/stage1/model.safetensors");
     std::fs::rename(&weights, place.at("parts/stage1/model-6-steps.safetensors")).expect("renames");
     crate::support::clift(&args).ok();
-    assert!(weights.exists(), "made again from the last checkpoint");
+    assert!(weights.exists(), "written again from the last checkpoint");
     std::fs::remove_file(place.at("parts/stage1/model-6-steps.safetensors")).expect("removes");
 
     args = place.train_args("parts", &twelve, &["--only", "stage1", "--extend"]);

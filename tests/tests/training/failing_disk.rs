@@ -1,22 +1,22 @@
-//! Disks that are full, folders that cannot be written, data that vanishes: the run ends with a message and goes on later.
+//! Full disks, unwritable folders, vanished data: the run ends with a message and can be resumed.
 
 use std::path::Path;
 use std::process::Command;
 
 use crate::support::{BINARY, Place, STAGE_1, Shared, clift, finish, killed_at, spawn, start, wait_for_steps};
 
-/// Twelve saved steps and as many to come.
+/// Stage 1 of 24 steps, with a checkpoint at step 12.
 const HALF: [&str; 4] = ["stage1.steps=24", "stage2.steps=12", "eval.every=12", "checkpoint={every=12, keep=2}"];
 static UNDISTURBED: Shared = Shared::new(&HALF, &[]);
 
-/// Expects a message with what failed, where the stage stands and what there is to go on from.
+/// Expects a message that names the last good checkpoint, and no half-written one beside it.
 fn assert_names_the_last_good_checkpoint(place: &Place, run: &str, step: u64, message: &str) {
     let checkpoint = place.at(&format!("{run}/stage1/checkpoints/step-{step:09}")).display().to_string();
     assert!(message.trim_end().ends_with(&format!("the last good checkpoint is {checkpoint}")), "{message}");
     assert_eq!(place.checkpoints(run, "stage1"), [step], "nothing half-written lies beside it");
 }
 
-/// No file may grow beyond the limit: what a full disk is to a checkpoint, without the right to mount one.
+/// A limit on file sizes stops a save as a full disk does, without the right to mount one.
 #[test]
 fn failed_saves_keep_the_checkpoint_and_runs_resume() {
     let place = Place::new();
@@ -40,7 +40,7 @@ fn failed_saves_keep_the_checkpoint_and_runs_resume() {
     place.assert_same_run("run", "whole");
 }
 
-/// A small file system in memory, unmounted when dropped. Only root may have one.
+/// A small file system in memory, unmounted when dropped; needs root.
 struct SmallDisk<'a>(&'a Path);
 
 impl<'a> SmallDisk<'a> {
@@ -83,7 +83,7 @@ fn full_disks_keep_the_checkpoint_and_runs_resume() {
     assert!(message.contains("stage1 stopped after step 24; "), "{message}");
     assert_names_the_last_good_checkpoint(&place, run, 12, &message);
 
-    // Not even a line of metrics fits: the run stops before the next save, and with no gap in its metrics.
+    // No line of metrics fits: the run stops before the next save, without a gap in its metrics.
     let rest = vec![1; free() as usize];
     let _ = std::fs::write(folder.join("more-ballast"), rest);
     finish(spawn(place.train_args(run, &HALF, &[]))).fails_with(1, &["No space left on device"]);
@@ -105,7 +105,7 @@ fn impossible_run_directories_are_errors() {
         message.contains("making the run directory failed: ") && message.trim_end().ends_with("file/run"),
         "{message}"
     );
-    // A folder that turned into something else.
+    // A file in place of a folder.
     place.copy(&STAGE_1, "run");
     std::fs::write(place.at("run/clusters.tmp"), b"not a folder").expect("writable");
     let message = place.train("run", &[], &[]).fails(1);

@@ -1,8 +1,8 @@
-//! What a setting does to the weights.
+//! Effects of hyper-parameters on the weights.
 
 use crate::support::{Place, Weights};
 
-/// Root mean square of the moves of all values.
+/// Root mean square change of all values.
 fn rms_move(after: &Weights, before: &Weights) -> f64 {
     let count = before.0.values().map(Vec::len).sum::<usize>() as f64;
     (after.moved_from(before).map(|moved| moved * moved).sum::<f64>() / count).sqrt()

@@ -1,4 +1,4 @@
-//! The loss curve of a small run, checked in: a change of the arithmetic shows here.
+//! The loss curve of a small run against a checked-in reference, which detects changes of the arithmetic.
 
 use serde_json::{Value, json};
 
@@ -12,7 +12,7 @@ fn losses(lines: &[Value], stage: &str) -> Vec<f64> {
     lines.map(|line| line["loss"].as_f64().expect("a finite loss")).collect()
 }
 
-/// Trains with the settings of the reference, all of them written in it.
+/// Trains with the settings that the reference lists.
 fn train(place: &Place, reference: &Value, device: &str) -> Vec<Value> {
     let mut args = vec!["train".to_owned(), repository("configs/tiny.toml").display().to_string()];
     let set = reference["set"].as_array().expect("a list").iter().map(|text| text.as_str().expect("text").to_owned());
@@ -23,7 +23,7 @@ fn train(place: &Place, reference: &Value, device: &str) -> Vec<Value> {
     place.metrics("run")
 }
 
-/// How far a loss may be from the reference, as a share of it.
+/// Largest relative difference of a loss from the reference.
 ///
 /// The kernels depend on the processor, so sums are rounded differently: ndarray, whose kernels are others
 /// altogether, is 6e-7 off in stage 1, and one thread, two or five give the same bits. A learning rate of 1.001 times

@@ -1,7 +1,7 @@
 //! Training runs: what a run writes (`pipeline`, `loss_curve`, `hyperparameters`), and runs that stop and resume.
 //!
 //! `exact_resume` and `resume` kill a run at chosen steps, `crash` at random ones; `signals` sends signals and starts second
-//! processes; `extend` adds steps to a finished stage; `failing_disk` takes the disk or the data away.
+//! processes; `extend` adds steps to a finished stage; `failing_disk` fills the disk or removes the data.
 
 #[cfg(unix)]
 mod crash;

@@ -1,4 +1,4 @@
-//! What a second command of the same run keeps, refuses and makes anew.
+//! A second command on an existing run: kept, refused and repeated work.
 
 use std::time::{Duration, Instant};
 
@@ -41,7 +41,7 @@ fn a_finished_run_is_left_as_it_is() {
     let after = files(&place.at("run"));
     assert!(before.keys().eq(after.keys()), "{:?}", after.keys());
     for (path, bytes) in &before {
-        // The evaluation is made again; its timings differ.
+        // The evaluation is repeated; its timings differ.
         let timed =
             ["summary.json", "views.csv", "report.html"].iter().any(|name| path.ends_with(format!("eval/{name}")));
         assert!(timed || *bytes == after[path], "{} changed", path.display());
@@ -113,7 +113,7 @@ fn an_evaluation_can_be_interrupted() {
     signal(&child, "-INT");
     finish(child).fails_with(130, &["interrupted during the evaluation, after ", " scenes; nothing was written"]);
     assert_eq!((names(), place.bytes("run/eval/summary.json")), (before, summary));
-    // A shorter evaluation leaves no sheet of a longer one, and whatever else is there.
+    // A shorter evaluation removes the sheets of a longer one and no other file.
     std::fs::write(sheets.join("mine.png"), b"").expect("writable");
     clift(["eval", &run, "--set", "eval.num_sheets=1", "--set", "eval.num_scenes=2"]).ok();
     assert_eq!(names().len(), 2);

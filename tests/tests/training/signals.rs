@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::support::{Place, finish, signal, spawn, start, wait_for_steps};
 
-/// Steps enough that a run is still going when the signal comes.
+/// A run that lasts until the signal arrives.
 const LONG: [&str; 5] =
     ["stage1.steps=20000", "stage2.steps=120", "eval.every=0", "checkpoint.every=10000", "data.num_threads=0"];
 
@@ -19,7 +19,7 @@ fn is_hang_up_ignored() -> bool {
 
 #[test]
 fn signals_save_and_runs_resume_to_the_same_result() {
-    // Enough steps that a stage is still going when the signal comes: a step takes milliseconds.
+    // A stage lasts until the signal arrives: a step takes milliseconds.
     let set = ["stage1.steps=120", "stage2.steps=120", "eval.every=50", "checkpoint.every=25"];
     let place = Place::new();
     place.train("whole", &set, &[]).ok();
@@ -51,7 +51,7 @@ fn second_signals_end_runs_without_saving() {
     // The first batch takes far longer than two signals.
     let set = [&LONG[..], &["stage1.batch_size=50000"]].concat();
     let mut child = spawn(place.train_args("run", &set, &[]));
-    // It listens before it takes the run.
+    // The handler is installed before the lock is taken.
     let id = child.id().to_string();
     while std::fs::read_to_string(place.at("run/lock")).unwrap_or_default() != id {
         assert!(child.try_wait().expect("a child").is_none(), "the run ended before it began");
@@ -102,7 +102,7 @@ fn second_processes_are_refused_while_the_first_lives() {
     signal(&first, "-KILL");
     let status = first.wait().expect("a child");
     assert_eq!(status.signal(), Some(9));
-    // What the dead process left locks nothing. Its lines would be taken for those of the next.
+    // The lock of the killed process is void. Its metrics are removed, since the next wait counts lines.
     std::fs::remove_file(place.at("run/metrics.jsonl")).expect("removes");
     let mut next = spawn(place.train_args("run", &LONG, &[]));
     wait_for_steps(&place.at("run"), &mut next, 5);

@@ -34,7 +34,7 @@ pub const CASES: &[Case] = &[
     ),
     Tolerance::forward(0.0, "whole numbers, of which every sum is exact; of equally near means the first is taken")
         .case("K-means: ties, more clusters than different tokens", |place| {
-            // Four different tokens in each scene of 16, in no order; the first is another one where it is to be wrong.
+            // Four different tokens in each scene of 16, unordered; the wrong input changes the first.
             let first = usize::from(place.is_wrong());
             let kind = |i: usize| if i == 0 { first } else { i * (i + 1) / 2 % 4 };
             let token = |i: usize| (0..DIM).map(move |d| (kind(i) * (d % 3)) as f32 - 1.0);
@@ -43,7 +43,7 @@ pub const CASES: &[Case] = &[
         }),
 ];
 
-/// Tokens of two scenes about six places each.
+/// Tokens of two scenes around six centres each.
 fn scattered(place: &Place) -> Vec<f32> {
     let noise = crate::place::values(place.random([2, 48, DIM], 3));
     let centre = |i: usize| (i / DIM % 6 * 7 + i % DIM * 5) as f32;

@@ -1,4 +1,4 @@
-//! The condenser in all its forms, and the attention inside clusters that it is made of.
+//! All forms of the condenser, and attention inside clusters.
 
 use burn::tensor::{Int, Tensor};
 use clift_model::{CliftVariant, Clusters, Condenser, CondenserConfig, ModelConfig, SceneClusters, cluster_attention};

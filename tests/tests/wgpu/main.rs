@@ -1,7 +1,7 @@
-//! What a GPU computes (Mesa's software Vulkan counts), held against the CPU:
+//! Results of a GPU (or Mesa's software Vulkan) against the CPU:
 //! `cargo test --release --workspace --features wgpu --test wgpu_suite -- --nocapture` prints a table.
 //!
-//! Without an adapter nothing is compared, and a line says so; with `CLIFT_REQUIRE_WGPU` set that is a failure.
+//! Without an adapter the tests print a line and pass; with `CLIFT_REQUIRE_WGPU` set they fail.
 
 mod clusters;
 mod condenser;
@@ -21,10 +21,10 @@ use clift_model::DeviceName;
 use place::Place;
 use table::{Case, Difference};
 
-/// Set where a machine without an adapter is a failure.
+/// Environment variable that makes a missing adapter a failure.
 const REQUIRED: &str = "CLIFT_REQUIRE_WGPU";
 
-/// Why the suite fails, shown as it is.
+/// Reason of a failure, printed without quotes.
 struct Failure(String);
 
 impl std::fmt::Debug for Failure {
@@ -72,7 +72,7 @@ fn every_operation_gives_what_the_cpu_gives() -> Result<(), Failure> {
     if failures.is_empty() { Ok(()) } else { Err(Failure(failures.join("\n"))) }
 }
 
-/// A tolerance that a wrong input passes is none.
+/// Every tolerance is tight enough to fail on slightly wrong inputs.
 #[test]
 fn every_tolerance_detects_slightly_wrong_inputs() {
     let mut passed = Vec::new();

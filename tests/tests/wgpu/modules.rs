@@ -1,4 +1,4 @@
-//! The operations of encoder and renderer, the blocks they make, and the two networks.
+//! The operations and blocks of encoder and renderer, and both networks.
 
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
@@ -11,7 +11,7 @@ use clift_train::mse;
 use crate::place::{BATCH, DIM, NUM_TOKENS, Place, SIZE, VIEWS, network, values};
 use crate::table::{Case, Tolerance, Values};
 
-/// A product of vectors of a few dozen numbers in f32: the order of the sum moves the last two bits.
+/// Dot products of a few dozen f32 numbers: the order of the sum changes the last two bits.
 const PRODUCT: &str = "sums of 32 to 72 products in another order";
 const SOFTMAX: Tolerance =
     Tolerance::both(5e-6, 2e-5, "the same, and another `exp` (a GPU's may be off by 3 units in the last place)");
@@ -140,7 +140,7 @@ fn render(place: &Place, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {
     })
 }
 
-/// So many tokens for every view of every scene, some of them twice over all views.
+/// `count` tokens for every view of every scene; views share some.
 pub fn subsets(count: usize) -> Vec<Vec<Vec<u32>>> {
     let subset = |start: usize| (0..count).map(|i| ((start + 5 * i) % NUM_TOKENS) as u32).collect();
     (0..BATCH).map(|scene| (0..VIEWS).map(|view| subset(scene + 3 * view)).collect()).collect()

@@ -1,4 +1,4 @@
-//! What happens where a GPU was asked for and there is none.
+//! Commands and the suite on a machine without a GPU.
 #![cfg(target_os = "linux")]
 
 use std::path::Path;
@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 
 use crate::REQUIRED;
 
-/// Runs a command that finds no driver, neither Vulkan's nor OpenGL's.
+/// Runs a command without a Vulkan or OpenGL driver.
 fn without_adapter(command: &mut Command) -> (Option<i32>, String) {
     for variable in ["VK_ICD_FILENAMES", "VK_DRIVER_FILES", "__EGL_VENDOR_LIBRARY_FILENAMES"] {
         command.env(variable, "/nonexistent");

@@ -1,4 +1,4 @@
-//! Where a case runs, and the numbers it runs on: the same on every device.
+//! The device and the inputs of a case; the inputs are the same on every device.
 // B scenes, V views, N tokens, D width
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
@@ -14,34 +14,35 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::table::{Named, Values};
 
-/// Rows and columns of a picture: two rows of three patches, so that the two cannot be mistaken for each other.
+/// Rows and columns of an image: two rows of three patches, so that swapped axes are detected.
 pub const SIZE: [usize; 2] = [16, 24];
-/// Scenes, and views of each, given and drawn.
+/// Scenes of a batch.
 pub const BATCH: usize = 2;
+/// Context views, and target views, of a scene.
 pub const VIEWS: usize = 2;
 /// Tokens of a scene.
 pub const NUM_TOKENS: usize = VIEWS * 6;
 /// Width of a token.
 pub const DIM: usize = 32;
 
-/// A device, and whether the inputs are those of the case or a little off.
+/// A device, and whether the inputs are slightly wrong.
 pub struct Place {
     pub device: Device,
     is_wrong: bool,
 }
 
 impl Place {
-    /// The case as it is.
+    /// The right inputs on a device.
     pub fn new(device: &Device) -> Self {
         Self { device: device.clone().autodiff(), is_wrong: false }
     }
 
-    /// The same with one number of every input changed by two hundredths of its range.
+    /// The same device with one number of every input changed by two hundredths of its range.
     pub fn wrong(&self) -> Self {
         Self { device: self.device.clone(), is_wrong: true }
     }
 
-    /// Whether the case is to make its inputs a little wrong, where [`random`](Self::random) does not.
+    /// Returns whether inputs not made by [`random`](Self::random) must be slightly wrong.
     pub fn is_wrong(&self) -> bool {
         self.is_wrong
     }
@@ -88,7 +89,7 @@ impl Place {
         })
     }
 
-    /// A scene's clip: waves of colour, seen from places of an arc.
+    /// A scene's clip: waves of colour, with cameras on an arc.
     pub fn clip(&self, scene: usize) -> Clip {
         let views = |places: [f64; VIEWS]| {
             let [height, width] = SIZE;
@@ -117,19 +118,19 @@ impl Place {
         (0..BATCH).map(|scene| self.clip(scene)).collect()
     }
 
-    /// The given views of a batch.
-    pub fn context(&self) -> clift_model::Views {
+    /// Context views of a batch.
+    pub fn context(&self) -> clift_model::ClipViews {
         let clips = self.clips();
         upload_views(&clips.iter().map(|clip| &clip.context).collect::<Vec<_>>(), &self.device).expect("equal sizes")
     }
 
-    /// The cameras to draw.
+    /// Target cameras of a batch.
     pub fn targets(&self) -> Cameras {
         let clips = self.clips();
         upload_cameras(&clips.iter().map(|clip| &clip.target).collect::<Vec<_>>(), &self.device).expect("equal sizes")
     }
 
-    /// Runs `f` on inputs, and back from a fixed gradient of its result.
+    /// Runs `f` forward on inputs and backward from a fixed gradient of the result.
     pub fn differentiate<M: Module, const COUNT: usize>(
         &self,
         module: &M,

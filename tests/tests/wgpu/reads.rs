@@ -1,5 +1,4 @@
-//! How often a training step waits for the device: every read of a buffer does, and a GPU has nothing to do while the
-//! host looks at what it got and queues the next work.
+//! Reads of the device per training step: during each read the GPU idles until the host queues more work.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -11,7 +10,7 @@ use crate::place::{Place, values};
 use crate::updates::{batch, learner, step};
 use crate::{Failure, gpu};
 
-/// Counts the buffers that are mapped to be read, which wgpu logs wherever in the process it comes from.
+/// Counts the buffers that are mapped for reading, from the log of wgpu.
 struct CountReads;
 
 static NUM_READS: AtomicUsize = AtomicUsize::new(0);

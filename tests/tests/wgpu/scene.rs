@@ -1,4 +1,4 @@
-//! A scene's way to a file and back to pictures.
+//! Encoding to a scene file, and rendering from it.
 
 use std::path::Path;
 
@@ -35,10 +35,10 @@ pub const CASES: &[Case] = &[
         .case("scene: int8 file to pictures", |place| draw(place, TokenFormat::Int8)),
 ];
 
-/// So many of the room's 12 tokens are stored. A pair, of which rounding once chose, is among the clusters.
+/// Stored tokens of the room's 12. One cluster is a pair, whose centroid once depended on rounding.
 const STORED: usize = 7;
 
-/// Encodes a synthetic room on the place's device, writes it and reads it back.
+/// Encodes a synthetic room on the device of `place`, writes the file and reads it back.
 fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
     let [height, width] = SIZE;
     let synthetic = SyntheticConfig {
@@ -71,7 +71,7 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
     Scene::read(&path).expect("what was written is read").0
 }
 
-/// Draws a file that the CPU made from three cameras: from all tokens, and from those that selection chooses.
+/// Renders a file made on the CPU from three cameras: from all tokens, and from selected ones.
 fn draw(place: &Place, storage: TokenFormat) -> Values {
     let folder = tempfile::tempdir().expect("a folder");
     let maker = Place::new(&cpu());

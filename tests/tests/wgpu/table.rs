@@ -1,47 +1,47 @@
-//! The rows of the comparison: an operation, how far off it may be and why, and how far off it is.
+//! The rows of the comparison: an operation, its tolerance with the reason, its error.
 
 use std::time::Duration;
 
 use crate::place::Place;
 
-/// Something the model computes, in both directions.
+/// An operation of the model, forward and backward.
 pub struct Case {
-    /// What it is.
+    /// Name of the operation.
     pub operation: &'static str,
-    /// How far off it may be.
+    /// Largest errors.
     pub tolerance: Tolerance,
-    /// Computes it on a device, always from the same numbers.
+    /// Runs the operation on a device, always with the same inputs.
     pub run: fn(&Place) -> Values,
 }
 
-/// How far two devices may be apart.
+/// Largest relative differences between two devices.
 #[derive(Clone, Copy)]
 pub struct Tolerance {
-    /// Most difference of results, over the largest of them.
+    /// Difference of results over the largest result.
     forward: f64,
-    /// The same of gradients, each tensor over its own largest; `None` for what has none.
+    /// Difference of gradients, each tensor over its own largest entry; `None` without gradients.
     backward: Option<f64>,
-    /// Why there is a difference, and why no more.
+    /// Reason of the difference.
     reason: &'static str,
 }
 
 impl Tolerance {
-    /// Of results that have no gradient.
+    /// Tolerance of results without gradient.
     pub const fn forward(forward: f64, reason: &'static str) -> Self {
         Self { forward, backward: None, reason }
     }
 
-    /// Of results and gradients.
+    /// Tolerance of results and gradients.
     pub const fn both(forward: f64, backward: f64, reason: &'static str) -> Self {
         Self { forward, backward: Some(backward), reason }
     }
 
-    /// For another reason.
+    /// The same tolerance for another reason.
     pub const fn because(self, reason: &'static str) -> Self {
         Self { reason, ..self }
     }
 
-    /// An operation that may be off by so much.
+    /// An operation with this tolerance.
     pub const fn case(self, operation: &'static str, run: fn(&Place) -> Values) -> Case {
         Case { operation, tolerance: self, run }
     }
@@ -50,7 +50,7 @@ impl Tolerance {
 /// Named tensors on the host.
 pub type Named = Vec<(String, Vec<f64>)>;
 
-/// What a [`Case`] computes.
+/// Results of a [`Case`].
 #[derive(Default)]
 pub struct Values {
     /// Results.
@@ -59,26 +59,26 @@ pub struct Values {
     pub backward: Named,
 }
 
-/// How far two devices are apart.
+/// Relative differences between two devices.
 #[derive(Debug)]
 pub struct Difference {
     forward: Worst,
     backward: Worst,
 }
 
-/// The tensor that is farthest off.
+/// The tensor with the largest error.
 #[derive(Debug, Default)]
 struct Worst {
     error: f64,
     name: String,
 }
 
-/// Gradients of which the largest entry is below this share of the largest of all are measured against that: those that
-/// are zero in exact arithmetic, such as of what is added to every score of a softmax, are nothing but rounding.
+/// Smallest scale of a gradient, as a share of the largest of all: gradients that are zero in exact arithmetic, such as
+/// those of a constant added to every score of a softmax, consist of rounding.
 const SMALLEST_SCALE: f64 = 1e-3;
 
 impl Difference {
-    /// Compares what two devices computed.
+    /// Compares the results of two devices.
     pub fn of(got: &Values, expected: &Values) -> Self {
         Self {
             forward: Worst::of(&got.forward, &expected.forward, 0.0),
@@ -86,7 +86,7 @@ impl Difference {
         }
     }
 
-    /// Whether there is none.
+    /// Returns whether all values are equal.
     pub fn is_zero(&self) -> bool {
         self.forward.error == 0.0 && self.backward.error == 0.0
     }
@@ -100,7 +100,7 @@ impl Worst {
         let errors = got.iter().zip(expected).map(|((name, got), (expected_name, expected))| {
             assert_eq!((name, got.len()), (expected_name, expected.len()), "name and length of a tensor");
             let apart = got.iter().zip(expected).map(|(a, b)| (a - b).abs());
-            // `f64::max` would pass over NaN.
+            // `f64::max` would ignore NaN.
             let apart = apart.fold(0.0, |most, value| if value > most || value.is_nan() { value } else { most });
             let error = if apart == 0.0 { 0.0 } else { apart / largest(expected).max(floor) };
             Self { error, name: name.clone() }
@@ -112,7 +112,7 @@ impl Worst {
     }
 
     fn is_within(&self, tolerance: f64) -> bool {
-        // Not for NaN either.
+        // False for NaN.
         self.error <= tolerance
     }
 }
@@ -135,7 +135,7 @@ impl Case {
         format!("| {} | {forward} | {backward} | {seconds:.1} | {reason} |", self.operation)
     }
 
-    /// What is too far off.
+    /// Errors beyond the tolerance.
     pub fn complaints(&self, difference: &Difference) -> Vec<String> {
         let directions = [
             ("result", &difference.forward, Some(self.tolerance.forward)),
@@ -151,7 +151,7 @@ impl Case {
         too_far.collect()
     }
 
-    /// How many tolerances there are.
+    /// Number of tolerances.
     pub fn num_directions(&self) -> usize {
         1 + usize::from(self.tolerance.backward.is_some())
     }

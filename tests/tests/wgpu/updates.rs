@@ -1,4 +1,4 @@
-//! Whole updates by the same code that trains: loss, gradient, AdamW.
+//! Whole updates by the code of training: loss, gradient, AdamW.
 
 use burn::module::Module;
 use clift_eval::upload_images;
@@ -39,7 +39,7 @@ pub fn learner(place: &Place, stage: Stage, activation_checkpointing: bool) -> T
     }
 }
 
-/// What the stage sees.
+/// A batch of a stage.
 pub fn batch(place: &Place, stage: Stage) -> StageBatch {
     let tokens = match stage {
         Stage::Stage2 => TokenSelection::Clusters(clusters()),
@@ -85,9 +85,9 @@ fn gradient(place: &Place, model: &Clift, batch: &StageBatch) -> Named {
     gradients(model, &loss.backward())
 }
 
-/// By how much of the learning rate every weight has moved, times its gradient.
+/// Change of every weight in units of the learning rate, times its gradient.
 ///
-/// `AdamW`'s first update is the sign of the gradient, and where that is nothing but rounding, so is its sign.
+/// `AdamW`'s first update is the sign of the gradient, which is random where the gradient is rounding.
 fn moved(before: &Named, after: &Named, gradients: &Named) -> Named {
     let weights = before.iter().zip(after);
     let moved = weights.filter_map(|((name, before), (_, after))| {

@@ -155,7 +155,7 @@ mod tests {
             let (fitted, _) = fit(&frame, norm, width, height, false).unwrap();
             let differences = fitted.rgb.iter().zip(expected.data()).map(|(a, b)| a.abs_diff(*b));
             let mean = differences.clone().map(f64::from).sum::<f64>() / fitted.rgb.len() as f64;
-            // Decoders enlarge the chroma differently; of real photos the mean is 0.07 to 0.28 (docs/data-tools.md).
+            // Decoders enlarge the chroma differently; of real photos the mean is 0.07 to 0.28 (docs/contributing.md).
             assert!(mean < 0.5 && differences.max() <= Some(8), "{number}: {mean}");
         }
     }

@@ -1,8 +1,7 @@
 //! The scene of every batch slot: a function of (seed, step, slot), never of threads.
 
-use crate::derive_seed;
 use crate::error::DataError;
-use crate::random::mix;
+use crate::random::{derive_seed, mix};
 
 /// Rounds of the Feistel network behind [`SceneOrder`]; four suffice in theory, small rooms for error cost nothing.
 const FEISTEL_ROUNDS: u64 = 8;

@@ -1,4 +1,4 @@
-//! Bytes of tensors that the networks need, counted from what the hand-written operations save (docs/plan.md).
+//! Bytes of tensors that the networks need, counted from the values that operations save (docs/guide/training.md).
 // In f32 values: x = N D of a block's own rows
 
 use crate::cost::largest_tensor::kmeans_values;
@@ -11,7 +11,7 @@ use crate::network::layers::{Layer, LayerKind, Part, Rows};
 const F32: f64 = 4.0;
 
 /// Bytes of the C library's heap for a byte that a backward pass keeps: freed pieces below 32 MiB stay in the heap.
-/// Measured at 1.05 to 1.22 (docs/plan.md).
+/// Measured at 1.05 to 1.22 (docs/guide/training.md).
 const HEAP: f64 = 1.2;
 
 /// A segment of a forward and backward pass of one scene; numbers of f32 values.
@@ -265,7 +265,7 @@ mod tests {
 
     #[test]
     fn the_papers_update_is_within_fifteen_percent_of_its_measured_peak() {
-        // docs/performance.md, full size, batch 1; a process of this program holds 26 MB besides its tensors.
+        // docs/results/performance.md, full size, batch 1; a process of this program holds 26 MB besides its tensors.
         let config = ModelConfig::default();
         for (trained, recompute, measured) in [(STAGE1, false, 2.26e9), (STAGE1, true, 1.72e9), (STAGE2, false, 1.43e9)]
         {

@@ -302,13 +302,13 @@ mod tests {
         let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
         assert!(message.contains("tensors of another type than float"), "{message}");
 
-        struct InF64;
-        impl ModuleMapper for InF64 {
+        struct ToF64;
+        impl ModuleMapper for ToF64 {
             fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
                 param.map(|tensor| tensor.cast(DType::F64))
             }
         }
-        let wide = learner.model.valid().map(&mut InF64);
+        let wide = learner.model.valid().map(&mut ToF64);
         wide.into_record().save(&path).expect("it can be written");
         sign(&step, MODEL);
         let message = checkpoints.resume(&mut learner).unwrap_err().to_string();

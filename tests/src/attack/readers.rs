@@ -1,0 +1,203 @@
+//! The readers, each with one damaged file.
+
+use std::fmt::Display;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use burn::tensor::Device;
+use clift_data::{
+    ChunkSource, DatasetRoot, EvaluationIndex, Pickle, RgbImage, SceneFilters, SceneSource, SourceOptions, Split,
+    TestScenes, decode_image, encode_jpeg, encode_png, open_source,
+};
+use clift_model::{Clift, CliftVariant, Scene, load_part};
+use clift_train::{
+    CheckpointConfig, Checkpoints, ClusterCache, Config, ImportOptions, Loss, OptimizerConfig, Run, TrainState, adamw,
+    import, read_checked_config,
+};
+
+use crate::setup::{Setup, copy_folder, fixture, fixtures, read, with_pickle, write};
+
+/// Reads bytes to the end, or returns the error message.
+pub type Read = Box<dyn FnMut(&[u8]) -> Result<(), String>>;
+
+/// A chunk of two scenes.
+pub const CHUNK: &str = "re10k-mini/train/000000.torch";
+/// The index of its folder.
+pub const CHUNK_INDEX: &str = "re10k-mini/train/index.json";
+
+/// Drops a result, and turns its error into text.
+fn done<T, E: Display>(result: Result<T, E>) -> Result<(), String> {
+    result.map(drop).map_err(|error| error.to_string())
+}
+
+/// A reader of one file.
+fn file(setup: &Setup, name: &str, read: impl Fn(&Path) -> Result<(), String> + 'static) -> Read {
+    let path = setup.fresh(name).join(name);
+    Box::new(move |bytes| {
+        write(&path, bytes);
+        read(&path)
+    })
+}
+
+pub fn pickle(_: &Setup, _: &'static str) -> Read {
+    Box::new(|bytes| done(Pickle::parse(bytes, Path::new("attack.pkl"))))
+}
+
+/// A folder of one chunk, of which `damaged` is made of the bytes.
+fn chunks(setup: &Setup, damaged: &'static str, make: fn(&[u8]) -> Vec<u8>) -> Read {
+    let root = setup.fresh(damaged);
+    let place = move |file: &str| root.join(file.trim_start_matches("re10k-mini/"));
+    std::fs::create_dir_all(place("train")).expect("a temporary folder is writable");
+    for name in [CHUNK, CHUNK_INDEX] {
+        write(&place(name), &fixture(name));
+    }
+    Box::new(move |bytes| {
+        write(&place(damaged), &make(bytes));
+        let open = || ChunkSource::open(&place(""), Split::Train, &SceneFilters::default());
+        scenes(&open().map_err(|error| error.to_string())?, |source, scene| source.url(scene).map(drop))
+    })
+}
+
+pub fn chunk(setup: &Setup, file: &'static str) -> Read {
+    chunks(setup, file, <[u8]>::to_vec)
+}
+
+pub fn chunk_pickle(setup: &Setup, file: &'static str) -> Read {
+    chunks(setup, file, |bytes| with_pickle(&fixture(CHUNK), bytes))
+}
+
+/// Reads cameras, times and the first frames of every scene.
+fn scenes<S: SceneSource + ?Sized>(
+    source: &S,
+    more: impl Fn(&S, usize) -> Result<(), clift_data::DataError>,
+) -> Result<(), String> {
+    let read_scene = |scene| {
+        source.cameras(scene)?;
+        source.timestamps(scene)?;
+        more(source, scene)?;
+        (0..source.num_frames(scene)?.min(3)).try_for_each(|frame| source.frame(scene, frame).map(drop))
+    };
+    done((0..source.num_scenes()).try_for_each(read_scene))
+}
+
+/// An image of 40 x 24 pixels with a pattern.
+fn pattern() -> RgbImage {
+    let rgb = (0..40 * 24 * 3).map(|i: usize| (i * 7 % 251) as u8).collect();
+    RgbImage { width: 40, height: 24, rgb }
+}
+
+pub fn pngs() -> Vec<Vec<u8>> {
+    vec![encode_png(&pattern()).expect("a valid image")]
+}
+
+pub fn jpegs() -> Vec<Vec<u8>> {
+    [90, 10].map(|quality| encode_jpeg(&pattern(), quality).expect("a valid image")).into()
+}
+
+pub fn image(_: &Setup, _: &'static str) -> Read {
+    Box::new(|bytes| done(decode_image(bytes, "attack", 0)))
+}
+
+pub fn evaluation_index(setup: &Setup, _: &'static str) -> Read {
+    file(setup, "index.json", |path| done(EvaluationIndex::read(path)))
+}
+
+pub fn config(setup: &Setup, name: &'static str) -> Read {
+    file(setup, name, |path| done(read_checked_config(path, &[], Config::validate)))
+}
+
+pub fn scene_file(setup: &Setup, name: &'static str) -> Read {
+    file(setup, name, |path| done(Scene::read(path)))
+}
+
+pub fn test_scenes(setup: &Setup, _: &'static str) -> Read {
+    file(setup, "test-scenes", |path| done(TestScenes::read(path)))
+}
+
+pub fn weights(setup: &Setup, _: &'static str) -> Read {
+    let model = setup.model();
+    file(setup, "model.safetensors", move |path| {
+        let loaded = load_part(&mut model.clone(), &Clift::stage1_part(), path).map_err(|error| error.to_string())?;
+        done(loaded.require_all(path))
+    })
+}
+
+/// Resumes from a checkpoint with one damaged file, whose checksum is corrected: otherwise no other check is reached.
+pub fn checkpoint(setup: &Setup, name: &'static str) -> Read {
+    let folder = setup.fresh(&format!("checkpoint-{name}"));
+    let step = folder.join("step-000000002");
+    copy_folder(&setup.checkpoint(), &step);
+    let mut state: serde_json::Value = serde_json::from_slice(&read(&step.join("state.json"))).expect("a valid state");
+    let model = setup.model();
+    Box::new(move |bytes| {
+        write(&step.join(name), bytes);
+        if name != "state.json" {
+            state["files"][name] = serde_json::json!({"num_bytes": bytes.len(), "crc32": crc32fast::hash(bytes)});
+            write(&step.join("state.json"), state.to_string().as_bytes());
+        }
+        let mut train_state = TrainState {
+            model: model.clone(),
+            optimizer: adamw(&OptimizerConfig::default()),
+            device: Device::flex().autodiff(),
+            loss: Loss::default(),
+            activation_checkpointing: false,
+            loss_scale: None,
+        };
+        done(Checkpoints::new(folder.clone(), CheckpointConfig::default()).resume(&mut train_state))
+    })
+}
+
+/// Reads every entry of a cluster cache with one damaged file.
+pub fn clusters(setup: &Setup, file: &'static str) -> Read {
+    let root = setup.fresh(&file.replace('/', "-"));
+    copy_folder(&setup.run().join("clusters"), &root.join("clusters"));
+    let config = setup.config.clone();
+    let index: serde_json::Value =
+        serde_json::from_slice(&read(&root.join("clusters/index.json"))).expect("a valid index");
+    let encoder = index["encoder"].as_str().expect("a hash").to_owned();
+    Box::new(move |bytes| {
+        write(&root.join(file), bytes);
+        let cache = ClusterCache::open(&root.join("clusters"), &config, &encoder).map_err(|error| error.to_string())?;
+        done(cache.entries().iter().try_for_each(|entry| cache.read(entry).map(drop)))
+    })
+}
+
+pub fn run_file(setup: &Setup, name: &'static str) -> Read {
+    let run = setup.fresh("run-file");
+    let config = Config { run_dir: run.clone(), ..setup.config.clone() };
+    Box::new(move |bytes| {
+        write(&run.join(name), bytes);
+        done(Run::reopen(config.clone()))
+    })
+}
+
+/// A copy of the data set that `path` is part of, with the file replaced.
+pub fn layout(setup: &Setup, path: &'static str) -> Read {
+    let inside = path.splitn(3, '/').nth(2).expect("a file of a layout");
+    let root = setup.fresh(&path.replace('/', "-"));
+    copy_folder(&fixtures().join(path.trim_end_matches(inside)), &root);
+    let file = root.join(inside);
+    Box::new(move |bytes| {
+        write(&file, bytes);
+        let opened =
+            DatasetRoot::find(&root).and_then(|root| open_source(&root, Split::Test, &SourceOptions::default()));
+        scenes(&*opened.map_err(|error| error.to_string())?.source, |_, _| Ok(()))
+    })
+}
+
+pub fn published_checkpoint(setup: &Setup, _: &'static str) -> Read {
+    let folder = setup.fresh("published-checkpoint");
+    let (file, out) = (folder.join("last.ckpt"), folder.join("model"));
+    let options =
+        ImportOptions { variant: CliftVariant::ReleasedRe10k, num_heads: Some(3), convert: true, renames: Vec::new() };
+    Box::new(move |bytes| {
+        write(&file, bytes);
+        let imported = done(import(&file, &out, &options, &AtomicBool::new(false)));
+        if imported.is_ok() {
+            std::fs::remove_dir_all(&out).expect("a model was written");
+        } else {
+            assert!(!out.exists(), "a refused checkpoint leaves no files");
+        }
+        imported
+    })
+}
