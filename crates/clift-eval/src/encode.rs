@@ -1,4 +1,4 @@
-//! A capture to a scene: contexts, tokens, clusters, condenser.
+//! Encoding of captured images as a scene: contexts, tokens, clusters, condenser.
 // N encoder tokens, S stored tokens, D width
 
 use burn::tensor::Tensor;
@@ -11,49 +11,49 @@ use clift_model::{
 use crate::error::EvalError;
 use crate::upload::{upload_views, view_cameras};
 
-/// How a scene is encoded.
+/// Settings of [`encode`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct EncodeOptions {
-    /// Frames the encoder sees; `None`: `num_context` frames, spread along the path.
+    /// Context frames; `None` for `num_context` frames along the camera path.
     pub context: Option<Vec<usize>>,
-    /// Context views in training, at most.
+    /// Number of context views without `context`, such as the number in training.
     pub num_context: usize,
-    /// How many tokens are stored.
+    /// Number of stored tokens.
     pub storage: TokenCount,
-    /// Groups of tokens that the model was trained on.
+    /// Token groups that the model was trained on.
     pub grouping: Grouping,
     /// Latent K-means.
     pub kmeans: KMeans,
     /// Seed of the run.
     pub seed: u64,
-    /// The model as the user typed it: noted in the scene.
+    /// Path of the model as given by the user, for the scene file.
     pub model_path: String,
 }
 
 /// An encoded scene.
 #[derive(Clone, Debug)]
-pub struct Encoded {
+pub struct EncodedScene {
     /// The scene.
     pub scene: Scene,
-    /// Tokens before clustering.
+    /// Number of tokens before clustering.
     pub num_lift_tokens: usize,
-    /// Share of the tokens' variance that is left within clusters.
+    /// Variance within clusters as a share of the total variance of the tokens.
     pub cluster_error: f64,
 }
 
-/// Encodes a scene of `reader`. Clusters are those of `clift eval` for the same contexts and count.
+/// Encodes a scene of `reader`. The clusters equal those of `clift eval` for the same contexts and count.
 ///
 /// # Errors
-/// [`ModelError::BadConfig`] for contexts that the scene does not have, [`ModelError::BadTokenCount`] for a count that it
-/// does not have, and whatever reading the capture gives.
+/// [`ModelError::BadConfig`] for frames that the scene does not have, [`ModelError::BadTokenCount`] for a count above the
+/// number of tokens, and the errors of reading the images.
 pub fn encode(
     model: &TrainedModel,
     reader: &ClipReader,
     scene: usize,
     options: &EncodeOptions,
-) -> Result<Encoded, EvalError> {
+) -> Result<EncodedScene, EvalError> {
     if options.grouping != Grouping::Kmeans {
-        let fix = "scenes are of K-means tokens: encode with a run whose clusters.grouping is \"kmeans\"".into();
+        let fix = "scene files need K-means tokens: encode with a run with clusters.grouping = \"kmeans\"".into();
         return Err(bad_config("clusters.grouping", "\"patch\"".into(), fix));
     }
     let key = reader.source.key(scene);
@@ -92,37 +92,37 @@ pub fn encode(
         token_ids,
         tokens,
     };
-    Ok(Encoded { scene, num_lift_tokens, cluster_error })
+    Ok(EncodedScene { scene, num_lift_tokens, cluster_error })
 }
 
-/// The frames asked for, or as many as in training, spread along the path.
-fn context_frames(poses: &[Pose], asked: Option<&[usize]>, num_views: usize) -> Result<Vec<usize>, EvalError> {
+/// Checks the requested context frames, or chooses `num_views` frames along the camera path.
+fn context_frames(poses: &[Pose], requested: Option<&[usize]>, num_views: usize) -> Result<Vec<usize>, EvalError> {
     let num_frames = poses.len();
     let bad = |value: String, fix: String| bad_config("--context", value, fix);
-    let Some(asked) = asked else {
+    let Some(requested) = requested else {
         return contexts_along_path(poses, num_views.min(num_frames)).ok_or_else(|| {
-            bad(num_views.to_string(), format!("the scene has {num_frames} frames; name frames to use"))
+            bad(num_views.to_string(), format!("the scene has {num_frames} frames; list the frames to use"))
         });
     };
-    let list = asked.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
-    let mut sorted = asked.to_vec();
+    let list = requested.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
+    let mut sorted = requested.to_vec();
     sorted.sort_unstable();
     sorted.dedup();
-    if asked.len() < 2 || sorted.len() < asked.len() {
+    if requested.len() < 2 || sorted.len() < requested.len() {
         return Err(bad(list, "write at least two frames, each once".into()));
     }
-    if let Some(frame) = asked.iter().find(|frame| **frame >= num_frames) {
+    if let Some(frame) = requested.iter().find(|frame| **frame >= num_frames) {
         let last = num_frames.saturating_sub(1);
         return Err(bad(list, format!("there is no frame {frame}; the scene has frames 0 to {last}")));
     }
-    Ok(asked.to_vec())
+    Ok(requested.to_vec())
 }
 
 fn bad_config(key: &'static str, value: String, fix: String) -> EvalError {
     ModelError::BadConfig { key, value, fix }.into()
 }
 
-/// Clusters, and the share of the tokens' variance that is left within them.
+/// Returns the clusters, and the variance within clusters as a share of the total variance.
 fn cluster(kmeans: &KMeans, lift: &Tensor<3>, storage: TokenCount, seed: u64) -> Result<(Clusters, f64), EvalError> {
     let [_, num_tokens, _] = lift.dims();
     let fit = kmeans.fit(lift.clone(), storage.of(num_tokens)?, &[seed])?;
@@ -136,16 +136,16 @@ mod tests {
 
     use super::*;
 
-    /// Tokens of two values: `num_kinds` places, far apart, with a little noise.
-    fn tokens(num_tokens: usize, num_kinds: usize) -> Tensor<3> {
-        let value = |i: usize| [(i % num_kinds) as f32 * 10.0, ((i * 7919) % 101) as f32 * 1e-3];
+    /// Tokens of two values in two distant groups, with a little noise.
+    fn tokens(num_tokens: usize) -> Tensor<3> {
+        let value = |i: usize| [(i % 2) as f32 * 10.0, ((i * 7919) % 101) as f32 * 1e-3];
         let values: Vec<f32> = (0..num_tokens).flat_map(value).collect();
         Tensor::from_data(TensorData::new(values, [1, num_tokens, 2]), &Device::flex())
     }
 
     #[test]
-    fn the_error_is_the_variance_within_clusters_over_the_total() {
-        let lift = tokens(64, 2);
+    fn the_error_is_the_share_of_variance_within_clusters() {
+        let lift = tokens(64);
         let values: Vec<f32> = lift.to_data().try_to_vec().unwrap();
         let rows: Vec<[f64; 2]> = values.chunks(2).map(|row| [f64::from(row[0]), f64::from(row[1])]).collect();
         let spread = |rows: &[[f64; 2]]| {
@@ -156,22 +156,19 @@ mod tests {
         let expected = (spread(&even) + spread(&odd)) / spread(&rows);
         let (_, error) = cluster(&KMeans::default(), &lift, TokenCount::Count(2), 1).unwrap();
         assert!((error / expected - 1.0).abs() < 1e-3, "{error} against {expected}"); // f32
-    }
 
-    #[test]
-    fn a_scene_of_equal_tokens_has_no_error() {
         let lift = Tensor::<3>::ones([1, 8, 2], &Device::flex());
         assert_eq!(cluster(&KMeans::default(), &lift, TokenCount::Count(2), 1).unwrap().1, 0.0);
     }
 
     #[test]
-    fn contexts_are_those_asked_for_or_spread_and_wrong_ones_are_named() {
+    fn context_frames_are_checked_or_spread() {
         let at = |x: f64| Pose { translation: [x, 0.0, 0.0].into(), ..Pose::IDENTITY };
         let poses: Vec<Pose> = (0..10).map(f64::from).map(at).collect();
         assert_eq!(context_frames(&poses, None, 4).unwrap(), [0, 3, 6, 9]);
         assert_eq!(context_frames(&poses[..3], None, 4).unwrap(), [0, 1, 2]);
         assert_eq!(context_frames(&poses, Some(&[7, 2]), 4).unwrap(), [7, 2]);
-        let message = |asked: &[usize]| context_frames(&poses, Some(asked), 4).unwrap_err().to_string();
+        let message = |frames: &[usize]| context_frames(&poses, Some(frames), 4).unwrap_err().to_string();
         assert_eq!(message(&[0, 10]), "`--context` = 0,10: there is no frame 10; the scene has frames 0 to 9");
         assert_eq!(message(&[3, 3]), "`--context` = 3,3: write at least two frames, each once");
         assert_eq!(message(&[3]), "`--context` = 3: write at least two frames, each once");

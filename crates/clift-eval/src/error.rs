@@ -1,35 +1,35 @@
-//! What can go wrong between a rendering and a report, one documented variant per failure.
+//! Errors of metrics, sweeps, comparisons and reports.
 
 use std::path::{Path, PathBuf};
 
-/// A failure of this crate. A message says what, where, expected and got, with the path last.
+/// An error of this crate. Messages have the problem, the value found, and the path last.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum EvalError {
     /// A file could not be read or written.
     #[error("{action} failed: {source}: {path}", path = path.display())]
     Io {
-        /// What was being done, as a verb phrase ("writing the summary").
+        /// The failed action as a verb phrase, such as "writing the summary".
         action: &'static str,
-        /// The operating system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
         /// The file.
         path: PathBuf,
     },
-    /// Two images that are to be compared do not hold the same number of values.
-    #[error("the images differ in size: expected {expected} values like the target, got {got} in the prediction")]
+    /// Two compared images have different numbers of values.
+    #[error("image sizes differ: expected {expected} values, got {got}")]
     SizeMismatch {
-        /// Values of the target, or of the shape that was given.
+        /// Values of the target, or of the given shape.
         expected: usize,
         /// Values of the other image.
         got: usize,
     },
-    /// An image holds a NaN or an infinity, so a metric of it means nothing.
-    #[error("the {image} is not finite: value {index} is {value}")]
+    /// An image has a NaN or an infinity.
+    #[error("the {image} is not finite: value {value} at index {index}")]
     NotFinite {
         /// `"prediction"` or `"target"`.
         image: &'static str,
-        /// Where, counted in values.
+        /// Index of the value.
         index: usize,
         /// The NaN or infinity.
         value: f32,
@@ -46,85 +46,85 @@ pub enum EvalError {
         /// Rows.
         height: usize,
     },
-    /// A file with the weights of a network that measures pictures cannot be used.
-    #[error("bad weights for {what}: {reason}; `{command}` makes them: {path}", path = path.display())]
+    /// The weight file of a metric or loss is not usable.
+    #[error("bad weights for {what}: {reason}; make the file with `{command}`: {path}", path = path.display())]
     BadWeights {
-        /// What they are for.
+        /// The metric or loss.
         what: &'static str,
-        /// What is wrong with them.
+        /// The problem.
         reason: String,
-        /// What to run.
+        /// Command that makes the file.
         command: &'static str,
         /// The file.
         path: PathBuf,
     },
-    /// A name that another system cannot have.
-    #[error("`{name}` cannot be the name of a system: {reason}")]
-    BadSystemName {
-        /// What was written.
+    /// The name of an external method is not allowed.
+    #[error("bad method name `{name}`: {reason}")]
+    BadMethodName {
+        /// The name.
         name: String,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
-    /// A picture of another system cannot be compared with its target.
-    #[error("bad picture: {reason}: {path}", path = path.display())]
+    /// An image of an external method is not comparable with its target.
+    #[error("bad image: {reason}: {path}", path = path.display())]
     BadPrediction {
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
-        /// The picture.
+        /// The image.
         path: PathBuf,
     },
-    /// Another system's folder holds none of the pictures that are evaluated.
+    /// The folder of an external method has none of the evaluated target images.
     #[error(
-        "{name} has none of the {expected} target pictures; the first would be {first}, or the same in a folder \
-         `color` of its scene: {path}",
+        "{name} has none of the {expected} target images, such as {first}, also not in a folder `color` of the scene: \
+         {path}",
         path = path.display()
     )]
     NoPredictions {
-        /// The system.
+        /// Name of the method.
         name: &'static str,
-        /// How many there could be.
+        /// Number of target images.
         expected: usize,
-        /// The first that was looked for.
+        /// Path of the first target image in the folder.
         first: String,
         /// The folder.
         path: PathBuf,
     },
-    /// Two evaluations cannot be compared.
+    /// Two evaluations are not comparable.
     #[error("{reason}: {path}", path = path.display())]
     NotComparable {
-        /// Why not.
+        /// The problem.
         reason: String,
         /// The evaluation.
         path: PathBuf,
     },
-    /// A baseline was asked for a scene that has no context view.
-    #[error("a baseline needs at least one context view, got none")]
+    /// A scene without context views has no baseline.
+    #[error("baselines need at least one context view, got none")]
     NoContext,
-    /// A view was reported twice, which would count it twice in every mean.
-    #[error("{view} was already measured: a view counts once")]
+    /// A view was added twice under one key, and would count twice in every mean.
+    #[error("duplicate view: {view}")]
     DuplicateView {
-        /// Scene, frame, variant and token counts.
+        /// Scene, frame, method and token counts.
         view: String,
     },
-    /// A method was asked for without weights that render it.
-    #[error("there are no weights that render the variant `{variant}`")]
+    /// No model renders a method.
+    #[error("no weights for the method `{method}`")]
     NoModel {
-        /// The name of the method.
-        variant: &'static str,
+        /// Name of the method.
+        method: &'static str,
     },
-    /// No scene can be evaluated.
+    /// No scene is left to evaluate.
     #[error("no usable scene: {reason}")]
     NoScenes {
-        /// Why every scene was skipped.
+        /// Reasons of the skipped scenes.
         reason: String,
     },
-    /// The evaluation was asked to stop.
-    #[error("interrupted during the evaluation, after {done} of {total} scenes; nothing was written")]
+    /// The caller stopped the evaluation.
+    #[error("interrupted during the evaluation, after {done} of {total} scenes; no results were written")]
     Interrupted {
-        /// Scenes done.
+        /// Evaluated scenes.
         done: usize,
-        /// Scenes in all.
+        /// All scenes of the evaluation.
         total: usize,
     },
     /// Scenes could not be read.
@@ -136,18 +136,18 @@ pub enum EvalError {
     /// A tensor could not be read back from its device.
     #[error("reading a rendering from its device failed: {reason}")]
     Tensor {
-        /// The device's reason.
+        /// Error of the device.
         reason: String,
     },
 }
 
 impl EvalError {
-    /// Wraps an operating-system error; for `map_err`.
+    /// Wraps an error of the operating system; for `map_err`.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, source, path: path.to_path_buf() }
     }
 
-    /// Wraps a device's error; for `map_err`.
+    /// Wraps an error of a device; for `map_err`.
     pub(crate) fn tensor(reason: impl std::fmt::Debug) -> Self {
         Self::Tensor { reason: format!("{reason:?}") }
     }

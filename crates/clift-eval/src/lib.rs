@@ -1,4 +1,24 @@
-//! Metrics, baselines, evaluation sweeps and their pictures
+//! Evaluation of compressive light-field tokens: encode images, render views, measure quality and cost, write reports.
+//!
+//! [`encode`] compresses captured images to a scene. [`Evaluator`] measures trained models on test scenes with every method
+//! and token count, and writes tables, contact sheets and an HTML report. The metrics also work on plain slices:
+//!
+//! ```
+//! use clift_eval::{Canvas, psnr, ssim};
+//!
+//! # fn main() -> Result<(), clift_eval::EvalError> {
+//! let (height, width) = (16, 16);
+//! let target = vec![0.5; height * width * 3];
+//! let rendering: Vec<f32> = target.iter().map(|value| value + 0.1).collect();
+//! assert!((psnr(&rendering, &target)? - 20.0).abs() < 1e-3);
+//! assert!(ssim(&rendering, &target, height, width)? > 0.9);
+//! let image = Canvas::from_unit(&rendering, height, width)?;
+//! assert_eq!(image.pixel(0, 0), [153; 3]);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! The example `encode_and_render` encodes a folder of photos and renders a view.
 
 mod config;
 mod encode;
@@ -14,33 +34,47 @@ mod system;
 mod testing;
 mod upload;
 
-pub use config::eval_config::EvalConfig;
-pub use config::experiment::Experiment;
-pub use config::method::{Method, MethodName};
-pub use config::token_selection::Selection;
-pub use encode::{EncodeOptions, Encoded, encode};
+// Errors of all functions.
 pub use error::EvalError;
-pub use evaluator::evaluator::{Description, Evaluator, Limits, write_ledger};
-pub use evaluator::items::evaluation_items;
-pub use evaluator::progress::Progress;
-pub use figures::animation::Animation;
-pub use figures::canvas::Canvas;
-pub use figures::scene_figure::{SceneFigure, SceneFigures};
+
+// Encode images; clips as tensors.
+pub use encode::{EncodeOptions, EncodedScene, encode};
+pub use upload::{upload_cameras, upload_images, upload_views, view_cameras};
+
+// Metrics and the perceptual loss.
 pub use metrics::image_metrics::{psnr, ssim};
 pub use metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
 pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Perceptual};
 pub use metrics::vgg::VggShape;
-pub use report::page::Report;
-pub use statistics::compare::{Comparison, Evaluation, MethodFilter};
-pub use statistics::eval_results::EvalResults;
-pub use statistics::paired::PairedDifference;
-pub use statistics::summary::Summary;
-pub use statistics::view_metrics::{EvalKey, ViewMetrics};
+
+// Settings of an evaluation.
+pub use config::eval_config::EvalConfig;
+pub use config::experiment::Experiment;
+pub use config::method::{Method, MethodName};
+pub use config::token_selection::Selection;
+
+// A complete evaluation with its files.
+pub use evaluator::evaluator::{Evaluator, RunDescription, SceneLimits, write_skip_report};
+pub use evaluator::items::evaluation_items;
+pub use evaluator::progress::Progress;
+
+// One scene with every method and token count.
 pub use sweep::eval_models::{EvalModels, stage2_method};
 pub use sweep::evaluate_scene::evaluate_scene;
 pub use sweep::predictions::ExternalMethod;
 pub use sweep::scene_results::SceneResults;
 pub use sweep::sweep::Sweep;
-pub use system::machine::rows as machine_rows;
+
+// Results and comparisons.
+pub use statistics::compare::{Comparison, Evaluation, MethodFilter};
+pub use statistics::eval_results::EvalResults;
+pub use statistics::summary::Summary;
+
+// Figures and animations.
+pub use figures::animation::Animation;
+pub use figures::canvas::Canvas;
+pub use figures::scene_figure::SceneFigures;
+
+// The machine, for reports.
+pub use system::machine::machine_rows;
 pub use system::memory::{peak_bytes, start_peak};
-pub use upload::{upload_cameras, upload_images, upload_views, view_cameras};

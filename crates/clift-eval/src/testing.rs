@@ -1,4 +1,4 @@
-//! The fixtures that inline tests share.
+//! Reference fixtures for unit tests.
 
 use std::path::{Path, PathBuf};
 
@@ -8,12 +8,12 @@ use safetensors::{Dtype, SafeTensors};
 /// Channels of the narrow networks in the fixtures.
 pub const NARROW: [usize; 5] = [4, 6, 8, 8, 10];
 
-/// Where a file of `data-fixtures/reference` lies.
+/// Returns the path of a file in `data-fixtures/reference`.
 pub fn reference_path(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join(format!("../../data-fixtures/reference/{name}.safetensors"))
 }
 
-/// A file of inputs and expected outputs.
+/// A fixture with inputs and expected outputs.
 pub struct Reference(Vec<u8>);
 
 impl Reference {
@@ -26,7 +26,7 @@ impl Reference {
         Self(std::fs::read(path).unwrap_or_else(|error| panic!("{error}: {}", path.display())))
     }
 
-    /// Names of the tensors that start with `prefix`, without it.
+    /// Returns the tensor names that start with `prefix`, without `prefix`.
     pub fn names(&self, prefix: &str) -> Vec<String> {
         let file = SafeTensors::deserialize(&self.0).unwrap();
         file.names().into_iter().filter_map(|name| name.strip_prefix(prefix)).map(String::from).collect()

@@ -1,4 +1,4 @@
-//! Clips of the data crate as tensors of the model crate.
+//! Clips of `clift-data` as tensors of `clift-model`.
 
 use burn::tensor::{Device, Tensor};
 use clift_data::ClipViews;
@@ -6,7 +6,7 @@ use clift_model::{Cameras, ViewCamera, Views};
 
 use crate::error::EvalError;
 
-/// Puts one set of views per scene together on a device.
+/// Uploads images and cameras, one set of views per scene.
 ///
 /// # Shapes
 /// - `scenes`: sets of the same number of views of the same size
@@ -19,18 +19,18 @@ pub fn upload_views(scenes: &[&ClipViews], device: &Device) -> Result<Views, Eva
     Ok(Views::upload(&pixel_values(scenes), &c2w, &intrinsics, shape(scenes), device)?)
 }
 
-/// The pictures alone, RGB in `[0, 1]`, `[batch, views, height, width, 3]`. See [`upload_views`].
+/// Uploads only the images, RGB in `[0, 1]`, `[batch, views, height, width, 3]`. See [`upload_views`].
 pub fn upload_images(scenes: &[&ClipViews], device: &Device) -> Result<Tensor<5>, EvalError> {
     Ok(clift_model::upload_images(&pixel_values(scenes), shape(scenes), device)?)
 }
 
-/// The cameras alone. See [`upload_views`].
+/// Uploads only the cameras. See [`upload_views`].
 pub fn upload_cameras(scenes: &[&ClipViews], device: &Device) -> Result<Cameras, EvalError> {
     let (c2w, intrinsics) = camera_values(scenes);
     Ok(Cameras::upload(&c2w, &intrinsics, shape(scenes), device)?)
 }
 
-/// The cameras of one scene on the host, as token selection takes them.
+/// Returns the cameras of one scene on the host, the input of token selection.
 pub fn view_cameras(views: &ClipViews) -> Vec<ViewCamera> {
     let cameras = views.c2w.iter().zip(&views.intrinsics);
     cameras.map(|(pose, k)| ViewCamera { c2w: pose.to_matrix_f64(), intrinsics: [k.fx, k.fy, k.cx, k.cy] }).collect()
@@ -47,7 +47,7 @@ fn camera_values(scenes: &[&ClipViews]) -> (Vec<f32>, Vec<f32>) {
     (c2w, intrinsics)
 }
 
-/// `[batch, views, height, width]` of the first scene; the uploads check the others against it.
+/// Returns `[batch, views, height, width]` from the first scene; the uploads check the other scenes.
 fn shape(scenes: &[&ClipViews]) -> [usize; 4] {
     scenes.first().map_or([0; 4], |first| [scenes.len(), first.num_views(), first.height, first.width])
 }

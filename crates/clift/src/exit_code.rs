@@ -69,10 +69,10 @@ pub(crate) fn data_exit_code(error: &clift_data::DataError) -> u8 {
 }
 
 pub(crate) fn eval_exit_code(error: &EvalError) -> u8 {
-    use EvalError::{BadSystemName, BadWeights, Interrupted, NoPredictions, NotComparable};
+    use EvalError::{BadMethodName, BadWeights, Interrupted, NoPredictions, NotComparable};
     match error {
         Interrupted { .. } => interrupt::exit_code(),
-        BadSystemName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => WRONG_USAGE,
+        BadMethodName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => WRONG_USAGE,
         EvalError::Data(error) => data_exit_code(error),
         EvalError::Model(error) => model_exit_code(error),
         _ => FAILED,

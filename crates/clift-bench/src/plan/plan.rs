@@ -197,7 +197,7 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
         for &count in &counts {
             let scene = stored(scene, count);
             let rendered = sweep
-                .drawn(count)
+                .token_counts(count)
                 .into_iter()
                 .map(|num_render_tokens| macs_of(model, Part::Renderer, &SceneSizes { num_render_tokens, ..scene }));
             rest += macs_of(model, Part::Condenser, &scene) + rendered.sum::<f64>();

@@ -1,4 +1,4 @@
-//! The ways in which an image is made: our own, two baselines, and other systems by name.
+//! Rendering methods: own methods, two baselines, and external methods by name.
 
 use std::collections::BTreeSet;
 use std::sync::Mutex;
@@ -7,21 +7,21 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::error::EvalError;
 
-/// Largest number of characters of a name.
+/// Largest number of characters in a name.
 const MAX_NAME: usize = 40;
 
-/// How a view was made.
+/// A method that makes images of target views.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, strum::IntoStaticStr)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
 pub enum Method {
-    /// Clusters, condensed: the method.
+    /// Condensed K-means clusters: the method of the paper.
     Clift,
-    /// The tokens nearest to the cluster centres, without the condenser.
+    /// Centroid tokens of K-means clusters, without condenser.
     Kmeans,
-    /// The tokens in the middle of rectangular tiles of the context views, without a condenser.
+    /// Centre tokens of rectangular tiles of the context views, without condenser.
     Patch,
-    /// The same behind a condenser that was trained on tiles.
+    /// Condensed tiles, with a condenser trained on tiles.
     PatchClift,
     /// A random subset of all tokens.
     Random,
@@ -29,43 +29,43 @@ pub enum Method {
     NearestView,
     /// Baseline: the mean of the context views.
     MeanImage,
-    /// Images of another system.
+    /// Images of a method of another program.
     #[serde(untagged)]
-    System(MethodName),
+    External(MethodName),
 }
 
 impl Method {
-    /// Those of this program.
+    /// The methods of this program.
     pub const OWN: [Self; 7] =
         [Self::Clift, Self::Kmeans, Self::Patch, Self::PatchClift, Self::Random, Self::NearestView, Self::MeanImage];
 
-    /// The name in files and tables.
+    /// Returns the name in files and tables.
     pub fn name(self) -> &'static str {
         match self {
-            Self::System(name) => name.as_str(),
+            Self::External(name) => name.as_str(),
             own => own.into(),
         }
     }
 }
 
-/// Name of another system, kept for the life of the process: there are a handful.
+/// Name of an external method. The few names live until the process ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(transparent)]
 pub struct MethodName(&'static str);
 
 impl MethodName {
-    /// Checks a name: at most 40 characters, and none of this program's variants.
+    /// Checks a name: 1 to 40 printable characters, not the name of an own method.
     ///
     /// # Errors
-    /// [`EvalError::BadSystemName`].
+    /// [`EvalError::BadMethodName`].
     pub fn new(name: &str) -> Result<Self, EvalError> {
         static NAMES: Mutex<BTreeSet<&'static str>> = Mutex::new(BTreeSet::new());
-        let bad = |reason: &str| EvalError::BadSystemName { name: name.into(), reason: reason.into() };
+        let bad = |reason: &str| EvalError::BadMethodName { name: name.into(), reason: reason.into() };
         if name.trim().is_empty() || name.chars().count() > MAX_NAME || name.chars().any(char::is_control) {
-            return Err(bad("write 1 to 40 printable characters"));
+            return Err(bad("use 1 to 40 printable characters"));
         }
         if Method::OWN.iter().any(|own| own.name() == name) {
-            return Err(bad("a variant of this program has that name"));
+            return Err(bad("reserved for a method of clift; choose another name"));
         }
         let mut names = NAMES.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         if let Some(known) = names.get(name) {
@@ -82,7 +82,7 @@ impl MethodName {
     }
 }
 
-// By hand: the derived form would only read text of static lifetime.
+// The derived implementation would only read text of static lifetime.
 impl<'de> Deserialize<'de> for MethodName {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         Self::new(&String::deserialize(deserializer)?).map_err(serde::de::Error::custom)
@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_printable_and_not_our_own() {
+    fn names_are_printable_and_not_reserved() {
         for name in ["", " ", "clift", "kmeans", "a\nb", &"x".repeat(41)] {
             assert!(MethodName::new(name).is_err(), "{name:?}");
         }
@@ -104,11 +104,11 @@ mod tests {
     }
 
     #[test]
-    fn a_variant_is_named_alike_in_json_and_csv() {
-        let other = Method::System(MethodName::new("MVSplat").unwrap());
-        for variant in Method::OWN.into_iter().chain([other]) {
-            assert_eq!(serde_json::to_value(variant).unwrap(), variant.name());
-            assert_eq!(serde_json::from_value::<Method>(variant.name().into()).unwrap(), variant);
+    fn names_are_equal_in_json_and_csv() {
+        let other = Method::External(MethodName::new("MVSplat").unwrap());
+        for method in Method::OWN.into_iter().chain([other]) {
+            assert_eq!(serde_json::to_value(method).unwrap(), method.name());
+            assert_eq!(serde_json::from_value::<Method>(method.name().into()).unwrap(), method);
         }
         assert_eq!(Method::OWN.map(Method::name)[3..6], ["patch_clift", "random", "nearest_view"]);
         assert!(serde_json::from_value::<Method>("".into()).is_err());

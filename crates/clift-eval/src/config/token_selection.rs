@@ -1,4 +1,4 @@
-//! How the tokens of a view are selected.
+//! Token selection settings.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,13 +6,13 @@ use std::str::FromStr;
 use clift_model::{ModelError, SelectionPreset};
 use serde::{Deserialize, Serialize};
 
-/// How the tokens of a view are chosen where fewer are drawn than are stored.
+/// Selection of the rendered tokens of a view, for fewer tokens than stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Selection {
-    /// By a published set of rules.
+    /// A published preset of Algorithm 1.
     Preset(SelectionPreset),
-    /// At random, for every view anew: what any rule must beat.
+    /// Random tokens for every view: a baseline of the presets.
     Random,
 }
 
@@ -66,7 +66,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_selection_is_a_name_in_files_and_on_the_command_line() {
+    fn selections_are_names() {
         for name in ["paper", "global", "scaled", "random"] {
             let selection: Selection = serde_json::from_str(&format!("\"{name}\"")).unwrap();
             assert_eq!((selection.to_string(), name.parse::<Selection>().unwrap()), (name.to_owned(), selection));

@@ -1,4 +1,4 @@
-//! An evaluation: measures trained models on scenes they were not trained on and writes the results.
+//! Evaluation of trained models on test scenes, with all output files.
 
 use std::path::Path;
 
@@ -14,29 +14,29 @@ use crate::evaluator::progress::Progress;
 use crate::evaluator::sheets::Sheets;
 use crate::figures::scene_figure::SceneFigures;
 use crate::metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
-use crate::report::page::{MAX_EXHIBITS, Report};
+use crate::report::page::{MAX_FIGURES, Report};
+use crate::statistics::csv_files::{write_scenes, write_views};
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::scenes_csv::write_scenes;
 use crate::statistics::summary::Summary;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::evaluate_scene::evaluate_scene;
-use crate::sweep::predictions::{ExternalMethod, picture_name};
+use crate::sweep::predictions::{ExternalMethod, image_name};
 use crate::sweep::sweep::Sweep;
 
-/// The scenes and views of an evaluation, and what is measured of each scene.
+/// The scenes and views of an evaluation, and the settings of every scene.
 pub struct Evaluator {
     eval: EvalConfig,
     sweep: Sweep,
-    description: Description,
+    description: RunDescription,
     reader: ClipReader,
     items: Vec<EvaluationItem>,
-    ledger: SkipReport,
+    skip_report: SkipReport,
     device: Device,
 }
 
-/// What a report states about the evaluated run.
+/// Description of the evaluated run for the report.
 #[derive(Clone, Debug)]
-pub struct Description {
+pub struct RunDescription {
     /// Name of the run.
     pub name: String,
     /// The config of the run, as TOML.
@@ -46,65 +46,70 @@ pub struct Description {
 }
 
 impl Evaluator {
-    /// Chooses the scenes of `reader` and the views that `eval` names. `sweep` holds the settings of every scene: token
-    /// counts and formats as in `eval`; methods, LPIPS and other systems are added by [`evaluate`](Self::evaluate).
+    /// Chooses the scenes and views of `eval` from `reader`. `sweep` has the settings of every scene; token counts and
+    /// formats equal those of `eval`. [`evaluate`](Self::evaluate) adds methods, LPIPS and external methods.
     ///
     /// # Errors
-    /// As [`evaluation_items`], [`ModelError::BadConfig`] for a count that a scene does not have or a precision that the
-    /// device does not have.
+    /// As [`evaluation_items`]; [`ModelError::BadConfig`] for a token count above the tokens of a scene, or a precision that
+    /// the device does not have.
     pub fn new(
         eval: EvalConfig,
         sweep: Sweep,
-        description: Description,
+        description: RunDescription,
         reader: ClipReader,
         device: &Device,
     ) -> Result<Self, EvalError> {
         eval.precision.check("eval.precision", device)?;
-        let (items, ledger) = evaluation_items(&eval, &reader)?;
-        // Checked here, so that a run does not fail after training.
+        let (items, skip_report) = evaluation_items(&eval, &reader)?;
+        // An early check: a run must not fail after training.
         let tokens_per_view = sweep.model.num_tokens(1, reader.options.height, reader.options.width)?;
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
         check_counts(&eval, fewest_views * tokens_per_view)?;
-        Ok(Self { eval, sweep, description, reader, items, ledger, device: device.clone() })
+        Ok(Self { eval, sweep, description, reader, items, skip_report, device: device.clone() })
     }
 
-    /// Which scenes were skipped when the views were chosen.
-    pub fn ledger(&self) -> &SkipReport {
-        &self.ledger
+    /// Returns the scenes that were skipped when the views were chosen.
+    pub fn skip_report(&self) -> &SkipReport {
+        &self.skip_report
     }
 
-    /// The settings of every scene.
+    /// Returns the settings of every scene.
     pub fn sweep(&self) -> &Sweep {
         &self.sweep
     }
 
     /// Measures every scene and writes `report.html`, `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the
-    /// contact sheets to `folder`. The images of `systems` are scored too.
+    /// contact sheets to `folder`. Scores the images of `external_methods` too.
     ///
     /// # Errors
     /// As [`measure`](Self::measure), [`ModelError::BadConfig`] for a method without weights, [`EvalError::NoScenes`] when
-    /// every scene failed, [`EvalError::NoPredictions`] for a system without any image.
+    /// every scene failed, [`EvalError::NoPredictions`] for an external method without any image.
     pub fn evaluate(
         &self,
         models: &EvalModels,
-        systems: &[ExternalMethod],
+        external_methods: &[ExternalMethod],
         folder: &Path,
         progress: &mut dyn Progress,
     ) -> Result<Summary, EvalError> {
         let lpips = self.lpips(progress)?;
-        let variants = self.methods(models)?;
-        let sweep = Sweep { variants, lpips: lpips.clone().ok(), systems: systems.to_vec(), ..self.sweep.clone() };
+        let methods = self.methods(models)?;
+        let sweep = Sweep {
+            methods,
+            lpips: lpips.clone().ok(),
+            external_methods: external_methods.to_vec(),
+            ..self.sweep.clone()
+        };
         progress.done(0, self.items.len());
         let sheets = Sheets::new(folder)?;
-        let mut exhibits = Vec::new();
-        let mut show = |key: &str, shown: SceneFigures| {
-            if exhibits.len() < MAX_EXHIBITS {
-                exhibits.push(shown.exhibit);
+        let mut figures = Vec::new();
+        let mut keep_figures = |key: &str, scene: SceneFigures| {
+            if figures.len() < MAX_FIGURES {
+                figures.push(scene.figure);
             }
-            sheets.add(&shown.sheet, key)
+            sheets.add(&scene.contact_sheet, key)
         };
-        let limits = Limits { num_scenes: self.items.len(), num_shown: self.eval.num_sheets };
-        let (mut measured, ledger) = self.measure(models, &sweep, limits, &mut show, progress)?;
+        let limits = SceneLimits { num_scenes: self.items.len(), num_figures: self.eval.num_sheets };
+        let (mut measured, skip_report) = self.measure(models, &sweep, limits, &mut keep_figures, progress)?;
         match &lpips {
             Ok(lpips) => measured.set_lpips_weights(lpips.sha256()),
             Err(reason) => measured.note_not_measured("lpips_vgg", reason.clone()),
@@ -113,36 +118,36 @@ impl Evaluator {
         if summary.num_views == 0 {
             return Err(EvalError::NoScenes { reason: "every scene of the evaluation failed".into() });
         }
-        for system in systems {
-            self.require_pictures(system, &summary)?;
+        for external in external_methods {
+            self.require_images(external, &summary)?;
         }
         sheets.commit()?;
         summary.write(&folder.join("summary.json"))?;
         write_scenes(&measured, &folder.join("scenes.csv"))?;
-        measured.write_views(&folder.join("views.csv"))?;
-        write_ledger(&ledger, &folder.join("skipped.json"))?;
-        let Description { name, config, device } = self.description.clone();
-        let report = Report { name, summary: summary.clone(), ledger, exhibits, config, device };
+        write_views(&measured, &folder.join("views.csv"))?;
+        write_skip_report(&skip_report, &folder.join("skipped.json"))?;
+        let RunDescription { name, config, device } = self.description.clone();
+        let report = Report { name, summary: summary.clone(), skip_report, figures, config, device };
         report.write(&folder.join("report.html"))?;
         Ok(summary)
     }
 
-    /// Measures the first scenes with `sweep` and passes figures of the first of them to `show`. Returns the
-    /// measurements, and which scenes were skipped: those whose views could not be chosen or read.
+    /// Measures the first scenes with `sweep`, and passes figures of the first scenes to `keep_figures`. Returns the
+    /// metrics, and the scenes whose views could not be chosen or read.
     ///
     /// # Errors
-    /// [`EvalError::Interrupted`] when `progress` asks to stop; as [`evaluate_scene`] and `show`.
+    /// [`EvalError::Interrupted`] when `progress` requests a stop; as [`evaluate_scene`] and `keep_figures`.
     pub fn measure(
         &self,
         models: &EvalModels,
         sweep: &Sweep,
-        limits: Limits,
-        show: &mut dyn FnMut(&str, SceneFigures) -> Result<(), EvalError>,
+        limits: SceneLimits,
+        keep_figures: &mut dyn FnMut(&str, SceneFigures) -> Result<(), EvalError>,
         progress: &mut dyn Progress,
     ) -> Result<(EvalResults, SkipReport), EvalError> {
         let _precision = self.eval.precision.scope();
-        let (mut measured, mut ledger) = (EvalResults::default(), self.ledger.clone());
-        for skip in &ledger.skips {
+        let (mut measured, mut skip_report) = (EvalResults::default(), self.skip_report.clone());
+        for skip in &skip_report.skips {
             measured.skip(&skip.key);
         }
         let total = self.items.len().min(limits.num_scenes);
@@ -153,84 +158,84 @@ impl Evaluator {
             let key = self.reader.source.key(item.scene);
             match self.reader.read(item.scene, &item.views) {
                 Ok(clip) => {
-                    let is_shown = i < limits.num_shown;
-                    if let Some(results) = evaluate_scene(models, &clip, sweep, is_shown, &mut measured)? {
-                        show(key, SceneFigures::new(&clip, &results, sweep.model.patch_size)?)?;
+                    let keep_images = i < limits.num_figures;
+                    if let Some(results) = evaluate_scene(models, &clip, sweep, keep_images, &mut measured)? {
+                        keep_figures(key, SceneFigures::new(&clip, &results, sweep.model.patch_size)?)?;
                     }
                 }
                 Err(error) => {
                     let reason = error.to_string();
                     measured.skip(key);
                     progress.skipped(key, &reason);
-                    ledger.skip(key, reason);
+                    skip_report.skip(key, reason);
                 }
             }
             progress.done(i + 1, total);
         }
-        Ok((measured, ledger))
+        Ok((measured, skip_report))
     }
 
-    /// LPIPS, or the reason why it is not measured.
+    /// Loads LPIPS, or returns the reason why LPIPS is not measured.
     fn lpips(&self, progress: &mut dyn Progress) -> Result<Result<Lpips, String>, EvalError> {
         let size = self.reader.options.width.min(self.reader.options.height);
         Ok(match self.eval.lpips_path() {
             _ if size < LPIPS_MIN_SIZE_PX => {
-                Err(format!("pictures are below {LPIPS_MIN_SIZE_PX} x {LPIPS_MIN_SIZE_PX} pixels"))
+                Err(format!("images are smaller than {LPIPS_MIN_SIZE_PX} x {LPIPS_MIN_SIZE_PX} pixels"))
             }
             Some(path) => {
                 let lpips = Lpips::load(path, &self.device)?;
                 progress.note(&format!("LPIPS: weights with SHA-256 {}", lpips.sha256()));
                 Ok(lpips)
             }
-            None => Err(format!("eval.lpips_weights is not set; `{LPIPS_COMMAND}` makes the file")),
+            None => Err(format!("eval.lpips_weights is not set; make the file with `{LPIPS_COMMAND}`")),
         })
     }
 
-    /// A folder without a single image is a wrong path, not a system that misses all.
-    fn require_pictures(&self, system: &ExternalMethod, summary: &Summary) -> Result<(), EvalError> {
-        if summary.points.iter().any(|point| point.variant == system.setting().variant) {
+    /// Refuses an external method without any image: probably a wrong path.
+    fn require_images(&self, external: &ExternalMethod, summary: &Summary) -> Result<(), EvalError> {
+        if summary.points.iter().any(|point| point.method == external.key().method) {
             return Ok(());
         }
         let first = self.items.first().and_then(|item| {
             let frame = item.views.target.first()?;
-            Some(picture_name(self.reader.source.key(item.scene), *frame))
+            Some(image_name(self.reader.source.key(item.scene), *frame))
         });
-        let (name, first, path) = (system.name.as_str(), first.unwrap_or_default(), system.folder.clone());
+        let (name, first, path) = (external.name.as_str(), first.unwrap_or_default(), external.folder.clone());
         Err(EvalError::NoPredictions { name, expected: summary.num_views, first, path })
     }
 
-    /// The methods of the config, or all with weights.
+    /// Returns the methods of the config, or all methods with weights.
     fn methods(&self, models: &EvalModels) -> Result<Vec<Method>, EvalError> {
-        let asked = &self.eval.variants;
-        if asked.is_empty() {
+        let requested = &self.eval.variants;
+        if requested.is_empty() {
             return Ok(models.methods());
         }
-        let Some(method) = asked.iter().find(|method| models.for_method(**method).is_none()) else {
-            return Ok(asked.clone());
+        let Some(method) = requested.iter().find(|method| models.for_method(**method).is_none()) else {
+            return Ok(requested.clone());
         };
         let fix = match method {
-            Method::Clift => "stage 2 was not trained on clusters of K-means: leave it out",
+            Method::Clift => "stage 2 was not trained on K-means clusters; remove the method",
             Method::PatchClift => {
-                "stage 2 was not trained on tiles: train a run with clusters.grouping = \"tile\" and \
-                 stage1.init_from this one, and evaluate it with --with"
+                "stage 2 was not trained on tiles; train a run with clusters.grouping = \"tile\" and \
+                 stage1.init_from = this run, and pass the new run with --with"
             }
-            _ => "baselines are always measured: leave it out",
+            _ => "baselines are always measured; remove the method",
         };
         let (value, fix) = (method.name().into(), fix.into());
         Err(ModelError::BadConfig { key: "eval.variants", value, fix }.into())
     }
 }
 
-/// How many scenes are measured, and of how many of them figures are made.
+/// Numbers of measured scenes and of scenes with figures.
 #[derive(Clone, Copy, Debug)]
-pub struct Limits {
-    /// Scenes that are measured, from the first.
+pub struct SceneLimits {
+    /// Number of measured scenes, from the first.
     pub num_scenes: usize,
-    /// Scenes with figures, from the first.
-    pub num_shown: usize,
+    /// Number of scenes with figures, from the first.
+    pub num_figures: usize,
 }
 
-/// Refuses counts that a scene with `fewest_tokens` does not have, and render counts that no scene would use.
+/// Refuses storage counts above `fewest_tokens`, the smallest scene, and render counts that no scene would use.
 fn check_counts(eval: &EvalConfig, fewest_tokens: usize) -> Result<(), EvalError> {
     let bad = |key, value: String, fix| Err(ModelError::BadConfig { key, value, fix }.into());
     let counts = eval.storage.iter().map(|count| ("eval.storage", count));
@@ -250,11 +255,11 @@ fn check_counts(eval: &EvalConfig, fewest_tokens: usize) -> Result<(), EvalError
     Ok(())
 }
 
-/// Writes which scenes were skipped, and why.
+/// Writes skipped scenes with their reasons as JSON.
 ///
 /// # Errors
 /// [`EvalError::Io`].
-pub fn write_ledger(ledger: &SkipReport, path: &Path) -> Result<(), EvalError> {
-    let text = serde_json::to_vec_pretty(ledger).map_err(std::io::Error::from);
-    text.and_then(|text| replace_file(path, &text)).map_err(EvalError::io("writing what was left out", path))
+pub fn write_skip_report(skip_report: &SkipReport, path: &Path) -> Result<(), EvalError> {
+    let text = serde_json::to_vec_pretty(skip_report).map_err(std::io::Error::from);
+    text.and_then(|text| replace_file(path, &text)).map_err(EvalError::io("writing the skipped scenes", path))
 }

@@ -1,16 +1,16 @@
-//! Progress of an evaluation, as the caller shows it.
+//! Progress interface of an evaluation.
 
-/// Receives the progress of an evaluation, and stops the evaluation.
+/// Receiver of progress, with the request to stop.
 pub trait Progress {
-    /// `scenes` of `total` are done; first called with none.
+    /// Reports that `scenes` of `total` are done. The first call has 0 scenes.
     fn done(&mut self, scenes: usize, total: usize);
 
-    /// Something worth a line.
+    /// Reports a line of text.
     fn note(&mut self, text: &str);
 
-    /// A scene was skipped.
+    /// Reports a skipped scene.
     fn skipped(&mut self, key: &str, reason: &str);
 
-    /// Whether the evaluation shall stop.
+    /// Returns whether to stop the evaluation.
     fn is_interrupted(&self) -> bool;
 }

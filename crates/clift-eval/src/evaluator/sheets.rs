@@ -10,11 +10,11 @@ use crate::error::EvalError;
 use crate::figures::canvas::Canvas;
 use crate::sweep::predictions::file_name;
 
-/// The contact sheets of an evaluation. They replace those of an earlier one in the same folder.
+/// The contact sheets of an evaluation, which replace the sheets of an earlier evaluation in the same folder.
 pub(crate) struct Sheets {
     folder: PathBuf,
     files: StagedDir,
-    /// File names of the earlier evaluation's sheets.
+    /// File names of the earlier sheets.
     former: Vec<String>,
 }
 
@@ -23,7 +23,7 @@ impl Sheets {
     pub fn new(evaluation: &Path) -> Result<Self, EvalError> {
         let folder = evaluation.join("sheets");
         let files = StagedDir::new(&folder).map_err(EvalError::io("making a folder", &folder))?;
-        // The table of the earlier evaluation names its scenes. Other files in the folder are the user's.
+        // The earlier scenes.csv lists the earlier scenes. Other files in the folder belong to the user.
         let table = std::fs::read_to_string(evaluation.join("scenes.csv")).unwrap_or_default();
         let mut keys: Vec<&str> = table.lines().skip(1).filter_map(|line| line.split(',').next()).collect();
         keys.dedup();
@@ -35,7 +35,7 @@ impl Sheets {
         sheet.write_png(&self.files.path().join(sheet_name(key)))
     }
 
-    /// Gives all sheets their final names and removes those of the earlier evaluation.
+    /// Renames all sheets to their final names and removes the earlier sheets.
     pub fn keep(self) -> Result<(), EvalError> {
         let Self { folder, files, former } = self;
         let replace = || {

@@ -1,4 +1,4 @@
-//! Pictures that move: animated PNG, which browsers play and other programs show as the first frame.
+//! Animated PNG. Browsers play the file; other programs show the first frame.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -7,19 +7,19 @@ use std::path::{Path, PathBuf};
 use crate::error::EvalError;
 use crate::figures::canvas::Canvas;
 
-/// An animation that is being written, frame by frame: the file is half done until [`Animation::finish`].
+/// Writer of an animation, frame by frame. The file is complete after [`Animation::finish`].
 pub struct Animation {
     path: PathBuf,
     writer: png::Writer<BufWriter<File>>,
-    /// Frames that are still to come: the encoder itself would write a file that lacks some.
+    /// Frames still to add. The encoder itself would finish a file with too few frames.
     missing: usize,
 }
 
 impl Animation {
-    /// Starts an endless animation of `num_frames` pictures of `width` by `height`, `fps` of them per second.
+    /// Starts a looping animation of `num_frames` images of `width` by `height` pixels at `fps` frames per second.
     ///
     /// # Errors
-    /// [`EvalError::Io`] for no frames or no picture.
+    /// [`EvalError::Io`] for zero frames or an image without pixels, and for a file that cannot be written.
     pub fn new(path: &Path, width: usize, height: usize, num_frames: usize, fps: u16) -> Result<Self, EvalError> {
         let writing = |source| EvalError::Io { action: "writing the animation", source, path: path.to_owned() };
         let file = BufWriter::new(File::create(path).map_err(writing)?);
@@ -37,24 +37,24 @@ impl Animation {
     /// Adds the next frame.
     ///
     /// # Errors
-    /// [`EvalError::Io`] for a picture of another size, or one too many.
-    pub fn add(&mut self, picture: &Canvas) -> Result<(), EvalError> {
+    /// [`EvalError::Io`] for an image of another size, or more than `num_frames` frames.
+    pub fn add(&mut self, image: &Canvas) -> Result<(), EvalError> {
         let Some(missing) = self.missing.checked_sub(1) else {
-            return Err(failed(&self.path, "more frames than announced"));
+            return Err(failed(&self.path, "more frames than num_frames"));
         };
-        self.writer.write_image_data(picture.as_rgb8()).map_err(|error| failed(&self.path, error))?;
+        self.writer.write_image_data(image.as_rgb8()).map_err(|error| failed(&self.path, error))?;
         self.missing = missing;
         Ok(())
     }
 
-    /// Ends the file.
+    /// Completes the file.
     ///
     /// # Errors
-    /// [`EvalError::Io`] when frames are missing or the file cannot be written.
+    /// [`EvalError::Io`] for fewer than `num_frames` frames, or a file that cannot be written.
     pub fn finish(self) -> Result<(), EvalError> {
         let Self { path, writer, missing } = self;
         if missing > 0 {
-            return Err(failed(&path, format!("{missing} frames fewer than announced")));
+            return Err(failed(&path, format!("{missing} frames fewer than num_frames")));
         }
         writer.finish().map_err(|error| failed(&path, error))
     }
@@ -69,9 +69,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_frame_comes_back_at_its_time_and_the_first_is_what_a_still_viewer_shows() {
-        let place = tempfile::tempdir().unwrap();
-        let path = place.path().join("a.png");
+    fn frames_read_back_with_their_delay() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
         let colours = [[255, 0, 0], [0, 255, 0], [10, 20, 30]];
         let mut animation = Animation::new(&path, 5, 3, 3, 12).unwrap();
         for colour in colours {
@@ -94,9 +94,9 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_another_size_or_missing_ones_are_errors() {
-        let place = tempfile::tempdir().unwrap();
-        let path = place.path().join("a.png");
+    fn wrong_sizes_and_frame_counts_are_errors() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
         let mut animation = Animation::new(&path, 5, 3, 2, 12).unwrap();
         animation.add(&Canvas::new(5, 3, [0; 3])).unwrap();
         assert!(animation.add(&Canvas::new(4, 3, [0; 3])).is_err());
@@ -105,6 +105,6 @@ mod tests {
         animation.add(&Canvas::new(5, 3, [0; 3])).unwrap();
         assert!(animation.add(&Canvas::new(5, 3, [0; 3])).is_err(), "two frames of one");
         assert!(Animation::new(&path, 5, 3, 0, 12).is_err());
-        assert!(Animation::new(&place.path().join("no/a.png"), 5, 3, 1, 12).is_err());
+        assert!(Animation::new(&folder.path().join("no/a.png"), 5, 3, 1, 12).is_err());
     }
 }

@@ -1,4 +1,4 @@
-//! 8-bit RGB pictures: what a report shows, and how it reaches the disk.
+//! 8-bit RGB images: pixels, text, error maps, PNG files.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use image::{ImageEncoder, RgbImage};
 use crate::error::EvalError;
 use crate::metrics::image_metrics::check;
 
-/// Mean absolute error over red, green and blue that [`error_map`] shows as its brightest colour.
+/// Mean absolute error over red, green and blue at the brightest colour of [`error_map`].
 pub const ERROR_FULL_SCALE: f32 = 0.25;
 
 /// Size of a line of text.
@@ -32,29 +32,29 @@ impl TextSize {
         }
     }
 
-    /// Columns and rows of one character.
+    /// Returns the width and height of one character, in pixels.
     pub fn glyph_px(self) -> (usize, usize) {
         let size = self.font().character_size;
         (size.width as usize, size.height as usize)
     }
 }
 
-/// An 8-bit RGB picture to paint on.
+/// An 8-bit RGB image to paint on.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Canvas {
     rgb: RgbImage,
 }
 
 impl Canvas {
-    /// Makes a picture of one colour.
+    /// Makes an image of one colour.
     pub fn new(width: usize, height: usize, colour: [u8; 3]) -> Self {
         Self { rgb: RgbImage::from_pixel(width as u32, height as u32, image::Rgb(colour)) }
     }
 
-    /// Takes an 8-bit `[height, width, 3]` array.
+    /// Copies an 8-bit `[height, width, 3]` array.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`] when there are not `height * width * 3` values.
+    /// [`EvalError::SizeMismatch`] unless there are `height * width * 3` values.
     pub fn from_rgb8(rgb: &[u8], height: usize, width: usize) -> Result<Self, EvalError> {
         let mismatch = EvalError::SizeMismatch { expected: height * width * 3, got: rgb.len() };
         if rgb.len() != height * width * 3 {
@@ -66,33 +66,33 @@ impl Canvas {
     /// Rounds a `[height, width, 3]` array in [0, 1] to 8 bits; values outside are clamped.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`] when there are not `height * width * 3` values.
+    /// [`EvalError::SizeMismatch`] unless there are `height * width * 3` values.
     pub fn from_unit(values: &[f32], height: usize, width: usize) -> Result<Self, EvalError> {
         let rgb: Vec<u8> = values.iter().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
         Self::from_rgb8(&rgb, height, width)
     }
 
-    /// The pixels, `[height, width, 3]`.
+    /// Returns the pixels, `[height, width, 3]`.
     pub fn as_rgb8(&self) -> &[u8] {
         self.rgb.as_raw()
     }
 
-    /// Columns.
+    /// Returns the number of columns.
     pub fn width(&self) -> usize {
         self.rgb.width() as usize
     }
 
-    /// Rows.
+    /// Returns the number of rows.
     pub fn height(&self) -> usize {
         self.rgb.height() as usize
     }
 
-    /// Colour of the pixel in column `x` and row `y`.
+    /// Returns the colour of the pixel in column `x` and row `y`.
     pub fn pixel(&self, x: usize, y: usize) -> [u8; 3] {
         self.rgb.get_pixel(x as u32, y as u32).0
     }
 
-    /// Repeats every pixel `factor` times along both axes, so that each stays visible as it is.
+    /// Repeats every pixel `factor` times along both axes.
     #[must_use]
     pub fn magnified(&self, factor: usize) -> Self {
         let factor = factor.max(1) as u32;
@@ -100,8 +100,8 @@ impl Canvas {
         Self { rgb: RgbImage::from_fn(width, height, |x, y| *self.rgb.get_pixel(x / factor, y / factor)) }
     }
 
-    /// Scales to fill `width` by `height` as far as its proportions allow. Whole factors repeat pixels;
-    /// between them the next larger one is shrunk, which keeps the edges of small pictures sharp.
+    /// Scales the image to fit into `width` by `height` pixels without distortion. Whole factors repeat pixels; for other
+    /// factors the next larger magnification is shrunk, which keeps the edges of small images sharp.
     #[must_use]
     pub fn fitted(&self, width: usize, height: usize) -> Self {
         let scale = (width as f64 / self.width() as f64).min(height as f64 / self.height() as f64);
@@ -114,22 +114,21 @@ impl Canvas {
         Self { rgb: image::imageops::resize(&magnified.rgb, width, height, image::imageops::FilterType::Triangle) }
     }
 
-    /// Paints `other` with its top left corner at column `x` and row `y`; what does not fit is cut off.
+    /// Copies `other` to column `x` and row `y` (top left corner), cropped at the border.
     pub fn paste(&mut self, other: &Self, x: usize, y: usize) {
         image::imageops::replace(&mut self.rgb, &other.rgb, x as i64, y as i64);
     }
 
-    /// Writes one line of text whose top left corner is at column `x` and row `y`.
-    /// Characters beyond Latin-1 are drawn as `?`.
+    /// Writes one line of text at column `x` and row `y` (top left corner). Characters beyond Latin-1 become `?`.
     pub fn write_text(&mut self, text: &str, x: usize, y: usize, size: TextSize, colour: [u8; 3]) {
         let style = MonoTextStyle::new(size.font(), Rgb888::new(colour[0], colour[1], colour[2]));
         let Ok(_) = Text::with_baseline(text, Point::new(x as i32, y as i32), style, Baseline::Top).draw(self);
     }
 
-    /// The bytes of a PNG file.
+    /// Encodes the image as PNG.
     ///
     /// # Errors
-    /// For a picture without pixels.
+    /// For an image without pixels.
     pub fn png(&self) -> std::io::Result<Vec<u8>> {
         let mut png = Vec::new();
         image::codecs::png::PngEncoder::new(&mut png)
@@ -138,13 +137,13 @@ impl Canvas {
         Ok(png)
     }
 
-    /// Writes the picture as PNG, under a temporary name first, so that no reader sees half a file.
+    /// Writes the image as a PNG file, atomically.
     ///
     /// # Errors
     /// [`EvalError::Io`] when the folder cannot be written.
     pub fn write_png(&self, path: &Path) -> Result<(), EvalError> {
         self.png().and_then(|png| replace_file(path, &png)).map_err(|source| EvalError::Io {
-            action: "writing the picture",
+            action: "writing the image",
             source,
             path: path.to_owned(),
         })
@@ -163,7 +162,7 @@ impl DrawTarget for Canvas {
 
     fn draw_iter<I: IntoIterator<Item = Pixel<Rgb888>>>(&mut self, pixels: I) -> Result<(), Self::Error> {
         for Pixel(point, colour) in pixels {
-            let (x, y) = (point.x as u32, point.y as u32); // a negative one wraps to beyond the picture
+            let (x, y) = (point.x as u32, point.y as u32); // a negative coordinate wraps beyond the image
             if let Some(pixel) = self.rgb.get_pixel_mut_checked(x, y) {
                 *pixel = image::Rgb([colour.r(), colour.g(), colour.b()]);
             }
@@ -172,12 +171,12 @@ impl DrawTarget for Canvas {
     }
 }
 
-/// Paints where a rendering is wrong: the mean absolute error over red, green and blue, through
-/// [`error_colour`], black at 0 and brightest from [`ERROR_FULL_SCALE`] on.
+/// Makes an image of the mean absolute error over red, green and blue, in the colours of [`error_colour`]: black at 0,
+/// brightest from [`ERROR_FULL_SCALE`] on.
 ///
 /// # Errors
-/// [`EvalError::SizeMismatch`] when either picture does not hold `height * width * 3` values, and
-/// [`EvalError::NotFinite`], which would otherwise be painted as no error.
+/// [`EvalError::SizeMismatch`] unless both images hold `height * width * 3` values, and [`EvalError::NotFinite`] for a NaN
+/// or an infinity, which would look like no error.
 pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<Canvas, EvalError> {
     check(pred, target, height * width * 3)?;
     let colours: Vec<u8> = pred
@@ -191,9 +190,8 @@ pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> R
     Canvas::from_rgb8(&colours, height, width)
 }
 
-/// Colours a share of the full scale, from black over purple and orange to pale yellow.
-///
-/// Matplotlib's `inferno`, whose lightness grows evenly, as a polynomial of degree 6.
+/// Returns the colour of a share of the full scale, from black over purple and orange to pale yellow: Matplotlib's
+/// `inferno` with its evenly growing lightness, as a polynomial of degree 6.
 pub fn error_colour(share: f32) -> [u8; 3] {
     const COEFFICIENTS: [[f64; 3]; 7] = [
         [0.000_219, 0.001_651, -0.019_481],
@@ -220,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn no_error_is_black_and_more_error_is_never_darker() {
+    fn colours_start_black_and_grow_lighter() {
         assert_eq!(error_colour(0.0), [0, 0, 0]);
         let shades: Vec<f32> = (0..=64).map(|i| lightness(error_colour(i as f32 / 64.0))).collect();
         assert!(shades.is_sorted(), "{shades:?}");
@@ -237,42 +235,34 @@ mod tests {
     }
 
     #[test]
-    fn unit_values_round_to_the_nearest_level() {
-        let picture = Canvas::from_unit(&[-1.0, 0.4999, 2.0], 1, 1).unwrap();
-        assert_eq!(picture.pixel(0, 0), [0, 127, 255]);
+    fn unit_values_round_and_clamp() {
+        let image = Canvas::from_unit(&[-1.0, 0.4999, 2.0], 1, 1).unwrap();
+        assert_eq!(image.pixel(0, 0), [0, 127, 255]);
     }
 
     #[test]
-    fn a_picture_fills_the_place_it_is_given_without_distortion() {
-        for (place, expected) in [((64, 64), (64, 40)), ((200, 200), (200, 125)), ((16, 99), (16, 10))] {
-            let fitted = Canvas::new(32, 20, [9, 9, 9]).fitted(place.0, place.1);
+    fn fitted_images_keep_proportions_and_pixels() {
+        for (size, expected) in [((64, 64), (64, 40)), ((200, 200), (200, 125)), ((16, 99), (16, 10))] {
+            let fitted = Canvas::new(32, 20, [9, 9, 9]).fitted(size.0, size.1);
             assert_eq!((fitted.width(), fitted.height()), expected);
             assert_eq!(fitted.pixel(expected.0 / 2, expected.1 / 2), [9, 9, 9]);
         }
+        let image = Canvas::from_rgb8(&[0, 0, 0, 255, 255, 255], 1, 2).unwrap().fitted(6, 6);
+        assert_eq!([0, 2, 3, 5].map(|x| image.pixel(x, 2)[0]), [0, 0, 255, 255]);
     }
 
     #[test]
-    fn a_whole_factor_repeats_pixels() {
-        let picture = Canvas::from_rgb8(&[0, 0, 0, 255, 255, 255], 1, 2).unwrap().fitted(6, 6);
-        assert_eq!([0, 2, 3, 5].map(|x| picture.pixel(x, 2)[0]), [0, 0, 255, 255]);
-    }
-
-    #[test]
-    fn a_png_reads_back_as_it_was_written_and_leaves_no_temporary_file() {
+    fn png_files_read_back() {
         let folder = tempfile::tempdir().unwrap();
-        let mut picture = Canvas::new(40, 20, [1, 2, 3]);
-        picture.write_text("Hi", 2, 2, TextSize::Small, [255, 255, 255]);
-        picture.write_png(&folder.path().join("a.png")).unwrap();
+        let mut image = Canvas::new(40, 20, [1, 2, 3]);
+        image.write_text("Hi", 2, 2, TextSize::Small, [255, 255, 255]);
+        image.write_png(&folder.path().join("a.png")).unwrap();
         let read = image::open(folder.path().join("a.png")).unwrap().to_rgb8();
-        assert_eq!(read, picture.rgb);
+        assert_eq!(read, image.rgb);
         assert!(read.pixels().any(|pixel| pixel.0 == [255, 255, 255]));
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
-    }
-
-    #[test]
-    fn a_folder_that_is_missing_is_named() {
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary file");
         let error = Canvas::new(1, 1, [0; 3]).write_png(Path::new("no/such/folder/a.png")).unwrap_err().to_string();
-        assert!(error.starts_with("writing the picture failed: "), "{error}");
+        assert!(error.starts_with("writing the image failed: "), "{error}");
         assert!(error.ends_with(": no/such/folder/a.png"), "{error}");
     }
 }

@@ -1,4 +1,4 @@
-//! The contact sheet of a report: a row per target view, a column per thing to compare.
+//! The contact sheet of a scene: a row per target view, a column per method.
 
 use crate::figures::canvas::{Canvas, ERROR_FULL_SCALE, TextSize, error_colour};
 
@@ -7,36 +7,36 @@ const INK: [u8; 3] = [28, 28, 30];
 const FAINT: [u8; 3] = [120, 120, 124];
 const MARGIN_PX: usize = 20;
 const GAP_PX: usize = 10;
-/// Cells are at least this wide, so that pictures of 32 pixels can be judged by eye.
+/// Smallest width of a cell, so that images of 32 pixels are large enough to compare by eye.
 const MIN_CELL_PX: usize = 192;
 const LEGEND_PX: usize = 192;
 
-/// One place of the sheet: a picture, or several small ones tiled into the same area.
+/// One cell of the sheet.
 #[derive(Clone, Debug)]
 pub struct Cell {
-    /// What is shown: one picture fills the cell, more are tiled.
-    pub pictures: Vec<Canvas>,
-    /// A line under the picture, such as `24.31 dB`; may be empty.
+    /// One image fills the cell; several images are tiled.
+    pub images: Vec<Canvas>,
+    /// Line below the image, such as `24.31 dB`; may be empty.
     pub caption: String,
 }
 
 /// A labelled row of cells, one target view.
 #[derive(Clone, Debug)]
 pub struct Row {
-    /// What the row is, such as `living-room, frame 17`.
+    /// Label above the row, such as `frame 17`.
     pub label: String,
     /// One cell per column.
     pub cells: Vec<Cell>,
 }
 
-/// Lays out a sheet: title, column titles, rows, and the scale of the error maps at the foot.
+/// Makes a sheet of title, column titles, rows, and the colour scale of the error maps.
 ///
-/// Cells take the size of the first picture that stands alone in its cell, magnified by a whole
-/// factor to at least 192 pixels. Text that is too wide for its cell ends in `..`.
+/// A cell has the size of the first image that is alone in its cell, magnified by a whole factor to at least 192 pixels.
+/// Text that is wider than its cell ends in `..`.
 pub fn contact_sheet(title: &str, columns: &[&str], rows: &[Row]) -> Canvas {
     let cells = || rows.iter().flat_map(|row| &row.cells);
-    let model = cells().find(|cell| cell.pictures.len() == 1).and_then(|cell| cell.pictures.first());
-    let (width, height) = model.map_or((1, 1), |picture| (picture.width().max(1), picture.height().max(1)));
+    let first = cells().find(|cell| cell.images.len() == 1).and_then(|cell| cell.images.first());
+    let (width, height) = first.map_or((1, 1), |image| (image.width().max(1), image.height().max(1)));
     let factor = MIN_CELL_PX.div_ceil(width);
     let (cell_width, cell_height) = (width * factor, height * factor);
     let (small, large) = (TextSize::Small.glyph_px().1, TextSize::Large.glyph_px().1);
@@ -62,7 +62,7 @@ pub fn contact_sheet(title: &str, columns: &[&str], rows: &[Row]) -> Canvas {
         canvas.write_text(&cut(&row.label, full_width, TextSize::Small), MARGIN_PX, top, TextSize::Small, FAINT);
         for (column, cell) in row.cells.iter().enumerate() {
             let (x, y) = (MARGIN_PX + pitch * column, top + small + GAP_PX / 2);
-            canvas.paste(&tiled(&cell.pictures, cell_width, cell_height), x, y);
+            canvas.paste(&tiled(&cell.images, cell_width, cell_height), x, y);
             let caption = cut(&cell.caption, cell_width, TextSize::Small);
             canvas.write_text(&caption, x, y + cell_height + 4, TextSize::Small, INK);
         }
@@ -71,22 +71,22 @@ pub fn contact_sheet(title: &str, columns: &[&str], rows: &[Row]) -> Canvas {
     canvas
 }
 
-/// Tiles pictures into one area, in the fewest columns that make the tiles largest.
-fn tiled(pictures: &[Canvas], width: usize, height: usize) -> Canvas {
+/// Tiles images into one area, in the fewest columns with the largest tiles.
+fn tiled(images: &[Canvas], width: usize, height: usize) -> Canvas {
     let mut area = Canvas::new(width, height, BACKGROUND);
-    let Some(first) = pictures.first() else { return area };
-    let gap = if pictures.len() == 1 { 0 } else { 2 };
+    let Some(first) = images.first() else { return area };
+    let gap = if images.len() == 1 { 0 } else { 2 };
     let tile = |columns: usize| {
-        let rows = pictures.len().div_ceil(columns);
+        let rows = images.len().div_ceil(columns);
         let fit = |space: usize, count: usize| (space.saturating_sub(gap * (count - 1)) / count).max(1);
         (fit(width, columns), fit(height, rows))
     };
-    let shown = |(w, h): (usize, usize)| (w * first.height()).min(h * first.width());
-    let columns = (1..=pictures.len()).rev().max_by_key(|&columns| shown(tile(columns))).unwrap_or(1);
+    let scale = |(w, h): (usize, usize)| (w * first.height()).min(h * first.width());
+    let columns = (1..=images.len()).rev().max_by_key(|&columns| scale(tile(columns))).unwrap_or(1);
     let (tile_width, tile_height) = tile(columns);
-    for (i, picture) in pictures.iter().enumerate() {
-        let picture = picture.fitted(tile_width, tile_height);
-        area.paste(&picture, (i % columns) * (tile_width + gap), (i / columns) * (tile_height + gap));
+    for (i, image) in images.iter().enumerate() {
+        let image = image.fitted(tile_width, tile_height);
+        area.paste(&image, (i % columns) * (tile_width + gap), (i / columns) * (tile_height + gap));
     }
     area
 }
@@ -104,7 +104,7 @@ fn paint_legend(canvas: &mut Canvas, y: usize) {
     canvas.write_text(&format!("{ERROR_FULL_SCALE}"), x + bar + glyph, y, TextSize::Small, FAINT);
 }
 
-/// Shortens text to what fits `width` pixels, marked with `..`.
+/// Shortens text to `width` pixels and marks the cut with `..`.
 fn cut(text: &str, width: usize, size: TextSize) -> String {
     let fits = width / size.glyph_px().0;
     if text.chars().count() <= fits {
@@ -117,15 +117,15 @@ fn cut(text: &str, width: usize, size: TextSize) -> String {
 mod tests {
     use super::*;
 
-    fn one(picture: Canvas, caption: &str) -> Cell {
-        Cell { pictures: vec![picture], caption: caption.to_owned() }
+    fn one(image: Canvas, caption: &str) -> Cell {
+        Cell { images: vec![image], caption: caption.to_owned() }
     }
 
     #[test]
-    fn cells_are_at_least_192_pixels_wide_and_never_blurred() {
-        let mut picture = Canvas::new(32, 32, [0, 0, 255]);
-        picture.paste(&Canvas::new(16, 32, [255, 0, 0]), 0, 0);
-        let row = Row { label: String::new(), cells: vec![one(picture, ""), one(Canvas::new(32, 32, [0; 3]), "")] };
+    fn small_images_are_magnified_to_192_pixels_unblurred() {
+        let mut image = Canvas::new(32, 32, [0, 0, 255]);
+        image.paste(&Canvas::new(16, 32, [255, 0, 0]), 0, 0);
+        let row = Row { label: String::new(), cells: vec![one(image, ""), one(Canvas::new(32, 32, [0; 3]), "")] };
         let sheet = contact_sheet("t", &["a", "b"], &[row]);
         assert_eq!(sheet.width(), 2 * MARGIN_PX + 2 * 192 + GAP_PX);
         let middle = sheet.height() / 2;
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn four_context_views_are_tiled_two_by_two() {
+    fn four_images_are_tiled_two_by_two() {
         let views = [[1; 3], [2; 3], [3; 3], [4; 3]].map(|colour| Canvas::new(64, 64, colour));
         let area = tiled(&views, 192, 192);
         let corners = [(10, 10), (150, 10), (10, 150), (150, 150)].map(|(x, y)| area.pixel(x, y)[0]);
@@ -142,13 +142,9 @@ mod tests {
     }
 
     #[test]
-    fn text_that_is_too_wide_is_cut_with_dots() {
+    fn long_text_is_cut_and_sheets_may_be_empty() {
         assert_eq!(cut("abcdefgh", 7 * 8, TextSize::Small), "abcdefgh");
         assert_eq!(cut("abcdefghi", 7 * 8, TextSize::Small), "abcdef..");
-    }
-
-    #[test]
-    fn a_sheet_without_rows_is_still_a_picture() {
-        assert!(contact_sheet("nothing was rendered", &[], &[]).height() > 0);
+        assert!(contact_sheet("no rows", &[], &[]).height() > 0);
     }
 }

@@ -1,176 +1,169 @@
-//! What is shown of a scene: a contact sheet, and small pictures for the report.
+//! The figures of one scene: a contact sheet at full size, and small images for the report.
 
-use clift_data::Clip;
+use clift_data::{Clip, ClipViews};
 use clift_model::SceneClusters;
 
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::figures::canvas::{Canvas, error_map};
 use crate::figures::contact_sheet::{Cell, Row, contact_sheet};
-use crate::statistics::view_metrics::{EvalKey, best_variant};
+use crate::statistics::view_metrics::{EvalKey, best_method};
 use crate::sweep::rendered_views::ScoredViews;
 use crate::sweep::scene_results::SceneResults;
-use crate::sweep::token_choice::SelectedTokens;
 use crate::sweep::view_scorer::target_image;
 
-/// Longer side of an exhibit's pictures: a report holds dozens of them.
+/// Longer side of an image in the report, which holds dozens of images.
 const MAX_SIDE_PX: usize = 128;
 
-/// Both forms of what is shown of a scene.
+/// Both figures of a scene.
 #[derive(Clone, Debug)]
 pub struct SceneFigures {
     /// Up to six target views at full size.
-    pub sheet: Canvas,
+    pub contact_sheet: Canvas,
     /// One target view, small.
-    pub exhibit: SceneFigure,
+    pub figure: SceneFigure,
 }
 
 /// One scene in a report.
 #[derive(Clone, Debug)]
 pub struct SceneFigure {
     /// Key of the scene.
-    pub key: String,
+    pub scene: String,
     /// Rows and columns of patches of a view.
     pub grid: [usize; 2],
-    /// Context views.
+    /// Context images.
     pub context: Vec<Canvas>,
-    /// The frame each context view is.
+    /// Frames of the context images.
     pub context_frames: Vec<usize>,
-    /// The target view in the middle.
+    /// The target image in the middle of the kept target views.
     pub target: Canvas,
-    /// Its frame.
+    /// Frame of the target image.
     pub target_frame: usize,
-    /// That view, drawn in every setting, baselines included; ordered by setting.
-    pub drawings: Vec<Drawing>,
-    /// Clusters of the context views' tokens, by rising count.
+    /// Renderings of the target view, baselines and external methods included, ordered by key.
+    pub images: Vec<FigureImage>,
+    /// Clusters of the context tokens, by ascending number of clusters.
     pub clusters: Vec<SceneClusters>,
-    /// The tokens that view is drawn from where they are chosen; ordered by setting.
-    pub choices: Vec<FigureTokens>,
+    /// Tokens that were selected for the target view, ordered by key.
+    pub selections: Vec<FigureTokens>,
 }
 
-/// The target view of an exhibit in one setting.
+/// A rendering of the target view of a figure.
 #[derive(Clone, Debug)]
-pub struct Drawing {
-    /// How it was drawn.
-    pub setting: EvalKey,
-    /// Its PSNR in dB.
+pub struct FigureImage {
+    /// Method and token counts.
+    pub key: EvalKey,
+    /// PSNR in dB.
     pub psnr: f64,
-    /// What it looks like.
-    pub picture: Canvas,
+    /// The rendering.
+    pub image: Canvas,
 }
 
-/// Stored tokens, and those that a view is drawn from.
+/// The stored tokens of a scene, and the tokens selected for the target view.
 #[derive(Clone, Debug)]
 pub struct FigureTokens {
-    /// How it was drawn.
-    pub setting: EvalKey,
-    /// Patches of the context views that the stored tokens stand on.
+    /// Method and token counts.
+    pub key: EvalKey,
+    /// Context patches of the stored tokens.
     pub stored: Vec<u32>,
-    /// Those of them that were chosen.
-    pub chosen: Vec<u32>,
+    /// Context patches of the selected tokens.
+    pub selected: Vec<u32>,
 }
 
 impl SceneFigures {
-    /// Makes sheet and exhibit of the results of a scene, whose patches have `patch_size` pixels.
+    /// Makes both figures from the results of a scene with patches of `patch_size` pixels.
     ///
     /// # Errors
     /// [`EvalError::SizeMismatch`] for results of another clip.
     pub fn new(clip: &Clip, results: &SceneResults, patch_size: usize) -> Result<Self, EvalError> {
-        let rows = &results.rows;
-        let sheet = scene_sheet(clip, &results.renderings, rows)?;
-        Ok(Self { sheet, exhibit: SceneFigure::new(clip, results, rows[rows.len() / 2], patch_size)? })
+        let views = &results.kept_views;
+        let contact_sheet = scene_sheet(clip, &results.renderings, views)?;
+        let figure = SceneFigure::new(clip, results, views[views.len() / 2], patch_size)?;
+        Ok(Self { contact_sheet, figure })
     }
 }
 
 impl SceneFigure {
     fn new(clip: &Clip, results: &SceneResults, view: usize, patch_size: usize) -> Result<Self, EvalError> {
         let (height, width) = (clip.target.height, clip.target.width);
-        let context = clip.context.images.chunks(height * width * 3);
-        let context = context.map(|rgb| Ok(small(Canvas::from_rgb8(rgb, height, width)?)));
-        let mut drawings = Vec::new();
-        for rendered in &results.renderings {
-            let picture = small(Canvas::from_unit(&rendered.shown[&view], height, width)?);
-            drawings.push(Drawing { setting: rendered.setting, psnr: rendered.measured[view].psnr, picture });
-        }
-        for scored in &results.others {
-            if let (Some(pixels), Some(measured)) = (scored.shown.get(&view), scored.measured.get(&view)) {
-                let picture = small(Canvas::from_unit(pixels, height, width)?);
-                drawings.push(Drawing { setting: scored.setting, psnr: measured.psnr, picture });
+        let mut images = Vec::new();
+        for rendering in &results.renderings {
+            if let (Some(pixels), Some(metrics)) = (rendering.images.get(&view), rendering.metrics.get(&view)) {
+                let image = small(Canvas::from_unit(pixels, height, width)?);
+                images.push(FigureImage { key: rendering.key, psnr: metrics.psnr, image });
             }
         }
-        drawings.sort_by_key(|drawing| drawing.setting);
-        drawings.dedup_by_key(|drawing| drawing.setting);
-        let choice = |(setting, stored, chosen): &(EvalKey, Vec<u32>, Vec<SelectedTokens>)| {
-            let chosen = chosen[view].tokens.iter().map(|&token| stored[token as usize]).collect();
-            FigureTokens { setting: *setting, stored: stored.clone(), chosen }
-        };
-        let mut choices: Vec<FigureTokens> = results.choices.iter().map(choice).collect();
-        choices.sort_by_key(|choice| choice.setting);
-        choices.dedup_by_key(|choice| choice.setting);
+        images.sort_by_key(|image| image.key);
+        images.dedup_by_key(|image| image.key);
+        let selections = results.selections.iter().map(|(key, stored, selected)| {
+            let selected = selected[view].tokens.iter().map(|&token| stored[token as usize]).collect();
+            FigureTokens { key: *key, stored: stored.clone(), selected }
+        });
+        let mut selections: Vec<FigureTokens> = selections.collect();
+        selections.sort_by_key(|selection| selection.key);
+        selections.dedup_by_key(|selection| selection.key);
         let mut clusters = results.clusters.clone();
         clusters.sort_by_key(|clusters| clusters.centroid_index().len());
         clusters.dedup_by_key(|clusters| clusters.centroid_index().len());
         Ok(Self {
-            key: clip.key.clone(),
+            scene: clip.key.clone(),
             grid: [height / patch_size, width / patch_size],
-            context: context.collect::<Result<_, EvalError>>()?,
+            context: canvases(&clip.context)?.into_iter().map(small).collect(),
             context_frames: clip.context.frame_index.clone(),
             target: small(Canvas::from_unit(&target_image(&clip.target, view), height, width)?),
             target_frame: clip.target.frame_index[view],
-            drawings,
+            images,
             clusters,
-            choices,
+            selections,
         })
     }
 }
 
-fn small(picture: Canvas) -> Canvas {
-    let too_large = picture.width().max(picture.height()) > MAX_SIDE_PX;
-    if too_large { picture.fitted(MAX_SIDE_PX, MAX_SIDE_PX) } else { picture }
+fn canvases(views: &ClipViews) -> Result<Vec<Canvas>, EvalError> {
+    let (height, width) = (views.height, views.width);
+    views.images.chunks(height * width * 3).map(|rgb| Canvas::from_rgb8(rgb, height, width)).collect()
 }
 
-/// Columns: contexts, target, nearest view, then the fewest and the most tokens of the best variant
-/// there is, and the error of the last.
-fn scene_sheet(clip: &Clip, renderings: &[ScoredViews], shown_views: &[usize]) -> Result<Canvas, EvalError> {
-    let best = best_variant(renderings.iter().map(|rendering| rendering.setting));
-    let shown = renderings.iter().filter(|r| Some(r.setting.variant) == best && r.setting.is_whole());
-    let mut shown: Vec<&ScoredViews> = shown.collect();
-    shown.sort_by_key(|r| r.setting.num_storage_tokens);
-    shown.dedup_by_key(|r| r.setting.num_storage_tokens);
-    if shown.len() > 2 {
-        shown = vec![shown[0], shown[shown.len() - 1]];
+fn small(image: Canvas) -> Canvas {
+    let too_large = image.width().max(image.height()) > MAX_SIDE_PX;
+    if too_large { image.fitted(MAX_SIDE_PX, MAX_SIDE_PX) } else { image }
+}
+
+/// Makes the contact sheet. Columns: contexts, target, nearest view, the best method with its fewest and its most tokens,
+/// and the error of the last rendering.
+fn scene_sheet(clip: &Clip, renderings: &[ScoredViews], views: &[usize]) -> Result<Canvas, EvalError> {
+    let best = best_method(renderings.iter().map(|rendering| rendering.key));
+    let mut best: Vec<&ScoredViews> =
+        renderings.iter().filter(|r| Some(r.key.method) == best && r.key.is_whole()).collect();
+    best.sort_by_key(|r| r.key.num_storage_tokens);
+    best.dedup_by_key(|r| r.key.num_storage_tokens);
+    if best.len() > 2 {
+        best = vec![best[0], best[best.len() - 1]];
     }
-    let nearest = renderings.iter().find(|r| r.setting.variant == Method::NearestView);
+    let nearest = renderings.iter().find(|r| r.key.method == Method::NearestView);
 
     let (height, width) = (clip.target.height, clip.target.width);
-    let frame_len = height * width * 3;
-    let contexts: Vec<Canvas> = clip
-        .context
-        .images
-        .chunks(frame_len)
-        .map(|rgb| Canvas::from_rgb8(rgb, height, width))
-        .collect::<Result<_, _>>()?;
+    let contexts = canvases(&clip.context)?;
     let mut columns = vec!["contexts".to_owned(), "target".into(), "nearest view".into()];
-    for rendered in &shown {
-        columns.push(format!("{}, {} tokens", rendered.setting.variant.name(), rendered.setting.num_storage_tokens));
+    for rendering in &best {
+        columns.push(format!("{}, {} tokens", rendering.key.method.name(), rendering.key.num_storage_tokens));
     }
     columns.push("error".into());
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
 
     let mut rows = Vec::new();
-    for &view in shown_views {
-        let truth = target_image(&clip.target, view);
-        let cell = |picture: Canvas, caption: String| Cell { pictures: vec![picture], caption };
+    for &view in views {
+        let target = target_image(&clip.target, view);
+        let cell = |image: Canvas, caption: String| Cell { images: vec![image], caption };
         let mut cells = vec![
-            Cell { pictures: contexts.clone(), caption: String::new() },
-            cell(Canvas::from_unit(&truth, height, width)?, String::new()),
+            Cell { images: contexts.clone(), caption: String::new() },
+            cell(Canvas::from_unit(&target, height, width)?, String::new()),
         ];
-        for rendered in nearest.iter().chain(&shown) {
-            let caption = format!("{:.2} dB", rendered.measured[view].psnr);
-            cells.push(cell(Canvas::from_unit(&rendered.shown[&view], height, width)?, caption));
+        for rendering in nearest.iter().chain(&best) {
+            let caption = format!("{:.2} dB", rendering.metrics[&view].psnr);
+            cells.push(cell(Canvas::from_unit(&rendering.images[&view], height, width)?, caption));
         }
-        if let Some(last) = shown.last() {
-            cells.push(cell(error_map(&last.shown[&view], &truth, height, width)?, String::new()));
+        if let Some(last) = best.last() {
+            cells.push(cell(error_map(&last.images[&view], &target, height, width)?, String::new()));
         }
         rows.push(Row { label: format!("frame {}", clip.target.frame_index[view]), cells });
     }
@@ -182,10 +175,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn small_pictures_stay_as_they_are_and_large_ones_shrink() {
+    fn only_large_images_shrink() {
         let size = |height, width| {
-            let picture = small(Canvas::new(width, height, [7; 3]));
-            (picture.height(), picture.width())
+            let image = small(Canvas::new(width, height, [7; 3]));
+            (image.height(), image.width())
         };
         assert_eq!([size(32, 32), size(256, 512), size(512, 256)], [(32, 32), (64, 128), (128, 64)]);
     }

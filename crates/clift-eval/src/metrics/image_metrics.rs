@@ -1,6 +1,6 @@
-//! PSNR and SSIM of one picture, in f64, as the papers of this field compute them.
+//! PSNR and SSIM of one image, in f64.
 //!
-//! Pictures are row-major `[height, width, 3]` slices with values in [0, 1].
+//! Images are row-major `[height, width, 3]` slices with values in [0, 1].
 
 use crate::error::EvalError;
 
@@ -14,10 +14,10 @@ const SSIM_C2: f64 = 0.03 * 0.03;
 /// scikit-image's `use_sample_covariance`: n / (n - 1) with n = 11 x 11.
 const SAMPLE_COVARIANCE: f64 = 121.0 / 120.0;
 
-/// Measures the peak signal-to-noise ratio in dB, after clamping both pictures to [0, 1].
+/// Measures the peak signal-to-noise ratio in dB, after clamping both images to [0, 1].
 ///
-/// The mean squared error is over all values. Identical pictures have no error and give `+inf`;
-/// [`crate::statistics::scene_means::PSNR_CAP_DB`] is what a mean takes for it.
+/// The mean squared error is over all values. Identical images give `+inf`; means count
+/// [`crate::statistics::scene_means::PSNR_CAP_DB`] instead.
 ///
 /// # Errors
 /// [`EvalError::SizeMismatch`], and [`EvalError::NotFinite`] where clamping would hide a NaN or an infinity.
@@ -31,11 +31,11 @@ pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, EvalError> {
     Ok(-10.0 * (squared_error / target.len() as f64).log10())
 }
 
-/// Measures the structural similarity of two `[height, width, 3]` pictures; 1 for identical ones.
+/// Measures the structural similarity of two `[height, width, 3]` images; 1 for identical images.
 ///
-/// This is scikit-image's `structural_similarity(win_size=11, gaussian_weights=True, data_range=1)`:
-/// Gaussian window of sigma 1.5 and 11 taps, sample covariance, only windows wholly inside the
-/// picture, mean over positions and then channels. The pictures are not clamped.
+/// Equals scikit-image's `structural_similarity(win_size=11, gaussian_weights=True, data_range=1)`: Gaussian window of
+/// sigma 1.5 and 11 taps, sample covariance, only windows inside the image, mean over positions and then channels. The
+/// images are not clamped.
 ///
 /// # Errors
 /// [`EvalError::ImageTooSmall`] below 11 x 11 pixels, [`EvalError::SizeMismatch`], [`EvalError::NotFinite`].
@@ -44,7 +44,7 @@ pub fn ssim(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result
     if height < SSIM_MIN_SIZE_PX || width < SSIM_MIN_SIZE_PX {
         return Err(EvalError::ImageTooSmall { metric: "SSIM", min: SSIM_MIN_SIZE_PX, width, height });
     }
-    // One thread: a 256 x 256 picture takes 13 ms, and callers have many pictures to spread over cores.
+    // Single-threaded (13 ms for 256 x 256): callers have many images to distribute over cores.
     let per_channel = [0, 1, 2].map(|channel| {
         let plane = |image: &[f32]| image.iter().skip(channel).step_by(3).map(|&v| f64::from(v)).collect();
         ssim_of_planes(plane(pred), plane(target), width)
@@ -81,7 +81,7 @@ fn gaussian_taps() -> [f64; SSIM_MIN_SIZE_PX] {
     taps.map(|tap| tap / sum)
 }
 
-/// Filters with `taps` along both axes and keeps the positions whose window lies inside the plane.
+/// Filters with `taps` along both axes, at the positions whose window lies inside the plane.
 fn blur(plane: &[f64], width: usize, taps: &[f64; SSIM_MIN_SIZE_PX]) -> Vec<f64> {
     let height = plane.len() / width;
     let mut blurred = Vec::with_capacity(plane.len());
@@ -98,7 +98,7 @@ fn blur(plane: &[f64], width: usize, taps: &[f64; SSIM_MIN_SIZE_PX]) -> Vec<f64>
     blurred
 }
 
-/// Refuses pictures of the wrong size and values that no metric can judge.
+/// Refuses images of the wrong size, NaN and infinity.
 pub(crate) fn check(pred: &[f32], target: &[f32], expected: usize) -> Result<(), EvalError> {
     for (image, name) in [(target, "target"), (pred, "prediction")] {
         if image.len() != expected || image.is_empty() {
@@ -127,55 +127,38 @@ mod tests {
         for i in 0..count {
             let (pred, target) = (&pred[i * size..][..size], &target[i * size..][..size]);
             let (psnr, ssim) = (psnr(pred, target).unwrap(), ssim(pred, target, height, width).unwrap());
-            // Both sides clamp and sum in f64, in another order: 1e-9 dB is far above the 1e-13 of that.
+            // Both sides clamp and sum in f64, in different orders: an error of 1e-13.
             assert!(psnr == expected_psnr[i] || (psnr - expected_psnr[i]).abs() < 1e-9, "pair {i}: {psnr} dB");
-            // The variances are differences of numbers near 1, divided by at least C2 = 9e-4:
-            // 1e-16 / 9e-4 = 1e-13 per pixel, so 1e-10 leaves room and still tells f32 filters (1e-6) apart.
+            // The variances are differences of numbers near 1, divided by at least C2 = 9e-4: 1e-16 / 9e-4 = 1e-13 per
+            // pixel. 1e-10 has room and still detects f32 filters (1e-6).
             assert!((ssim - expected_ssim[i]).abs() < 1e-10, "pair {i}: {ssim} is not {}", expected_ssim[i]);
         }
     }
 
     #[test]
-    fn psnr_of_a_constant_offset_is_its_logarithm() {
+    fn psnr_clamps_and_is_exact() {
         // 0.75 - 0.25 is exact in f32, so the mean squared error is exactly 1/4.
         assert_eq!(psnr(&[0.75; 12], &[0.25; 12]).unwrap(), -10.0 * 0.25_f64.log10());
-    }
-
-    #[test]
-    fn psnr_of_identical_pictures_is_infinite() {
-        assert_eq!(psnr(&[0.5; 12], &[0.5; 12]).unwrap(), f64::INFINITY);
-    }
-
-    #[test]
-    fn values_beyond_the_range_are_clamped_for_psnr() {
         assert_eq!(psnr(&[1.5, -0.25, 1.0], &[1.0, 0.0, 1.0]).unwrap(), f64::INFINITY);
     }
 
     #[test]
-    fn a_prediction_that_is_not_finite_is_an_error() {
+    fn bad_images_are_errors() {
         for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let mut pred = vec![0.5; 11 * 11 * 3];
             pred[7] = value;
             let target = vec![0.5; 11 * 11 * 3];
-            let messages = [psnr(&pred, &target), ssim(&pred, &target, 11, 11)].map(|r| r.unwrap_err().to_string());
-            for message in messages {
-                assert_eq!(message, format!("the prediction is not finite: value 7 is {value}"));
+            for result in [psnr(&pred, &target), ssim(&pred, &target, 11, 11)] {
+                let expected = format!("the prediction is not finite: value {value} at index 7");
+                assert_eq!(result.unwrap_err().to_string(), expected);
             }
         }
-    }
-
-    #[test]
-    fn ssim_needs_one_whole_window() {
         let image = vec![0.5; 11 * 11 * 3];
         assert!((ssim(&image, &image, 11, 11).unwrap() - 1.0).abs() < 1e-15);
         let message = ssim(&image[..10 * 11 * 3], &image[..10 * 11 * 3], 10, 11).unwrap_err().to_string();
         assert_eq!(message, "SSIM needs at least 11 x 11 pixels, got 11 x 10");
-    }
-
-    #[test]
-    fn pictures_of_two_sizes_are_an_error() {
         let message = psnr(&[0.5; 9], &[0.5; 12]).unwrap_err().to_string();
-        assert_eq!(message, "the images differ in size: expected 12 values like the target, got 9 in the prediction");
+        assert_eq!(message, "image sizes differ: expected 12 values, got 9");
         assert!(psnr(&[], &[]).is_err());
         assert!(ssim(&[0.5; 12], &[0.5; 12], 11, 11).is_err());
     }

@@ -1,4 +1,4 @@
-//! LPIPS with VGG-16, version 0.1: how far apart two pictures are in what a network sees (arXiv 1801.03924).
+//! LPIPS with VGG-16, version 0.1: perceptual distance of two images (arXiv 1801.03924).
 // C channels, H rows, W columns
 
 use std::path::Path;
@@ -11,33 +11,34 @@ use crate::metrics::image_metrics::check;
 use crate::metrics::network_file::{NetworkFile, WeightFileSpec};
 use crate::metrics::vgg::{MIN_SIZE_PX, NUM_STAGES, Vgg, VggShape};
 
-/// Smallest side of a picture in pixels.
+/// Smallest side of an image, in pixels.
 pub const LPIPS_MIN_SIZE_PX: usize = MIN_SIZE_PX;
 
-/// The command that makes the weight file.
+/// Command that makes the weight file.
 pub const LPIPS_COMMAND: &str =
     "python3 scripts/tools/convert_vgg.py lpips vgg16-397923af.pth lpips/weights/v0.1/vgg.pth -o lpips-vgg.safetensors";
 
 const WANTED: WeightFileSpec = WeightFileSpec { what: "LPIPS", format: "clift-lpips-vgg-1", command: LPIPS_COMMAND };
 
-/// Mean and spread of the network's inputs, for values in [-1, 1].
+/// Mean of the network's inputs, for values in [-1, 1].
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
+/// Standard deviation of the inputs.
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 
-/// Guards the norm of a position without any activation.
+/// Added to the norm of a position, which is zero without activation.
 const MIN_NORM: f64 = 1e-10;
 
-/// The metric with its weights. The same numbers as the `lpips` package, `LPIPS(net="vgg")(.., normalize=True)`.
+/// The metric with its weights. Equals `LPIPS(net="vgg")(.., normalize=True)` of the `lpips` package.
 #[derive(Clone, Debug)]
 pub struct Lpips {
     vgg: Vgg,
-    /// How much each channel of each stage counts, `[1, C, 1, 1]`.
+    /// Weight of every channel, per stage, `[1, C, 1, 1]`.
     heads: Vec<Tensor<4>>,
     device: Device,
     sha256: String,
 }
 
-/// What the network sees in a picture: unit vectors along the channels of every stage, `[1, C, H, W]`.
+/// Features of an image: unit vectors along the channels, per stage, `[1, C, H, W]`.
 #[derive(Clone, Debug)]
 pub struct LpipsFeatures(Vec<Tensor<4>>);
 
@@ -50,32 +51,32 @@ impl Lpips {
         Self::with_shape(path, VggShape::VGG16, (device, DType::F32))
     }
 
-    fn with_shape(path: &Path, shape: VggShape, place: (&Device, DType)) -> Result<Self, EvalError> {
+    fn with_shape(path: &Path, shape: VggShape, options: (&Device, DType)) -> Result<Self, EvalError> {
         let mut file = NetworkFile::read(path, WANTED)?;
-        let vgg = Vgg::take(&mut file, shape, place)?.no_grad();
+        let vgg = Vgg::take(&mut file, shape, options)?.no_grad();
         let head = |(stage, channels): (usize, usize)| {
-            let head = file.take(&format!("head{}.weight", stage + 1), [channels], place)?;
+            let head = file.take(&format!("head{}.weight", stage + 1), [channels], options)?;
             Ok(head.reshape([1, channels, 1, 1]))
         };
         let heads = shape.widths.into_iter().enumerate().map(head).collect::<Result<_, EvalError>>()?;
-        Ok(Self { vgg, heads, device: place.0.clone(), sha256: file.finish()? })
+        Ok(Self { vgg, heads, device: options.0.clone(), sha256: file.finish()? })
     }
 
-    /// SHA-256 of the weight file, 64 hexadecimal digits.
+    /// Returns the SHA-256 of the weight file, 64 hexadecimal digits.
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
 
-    /// Looks at a picture, `[height, width, 3]` with values in [0, 1]; others are not clamped.
+    /// Computes the features of an image, `[height, width, 3]` in `[0, 1]`; other values are not clamped.
     ///
     /// # Errors
     /// [`EvalError::SizeMismatch`], [`EvalError::NotFinite`], and [`EvalError::ImageTooSmall`] below 16 x 16 pixels.
-    pub fn features(&self, picture: &[f32], height: usize, width: usize) -> Result<LpipsFeatures, EvalError> {
-        check(picture, picture, height * width * 3)?;
+    pub fn features(&self, image: &[f32], height: usize, width: usize) -> Result<LpipsFeatures, EvalError> {
+        check(image, image, height * width * 3)?;
         if height.min(width) < LPIPS_MIN_SIZE_PX {
             return Err(EvalError::ImageTooSmall { metric: "LPIPS", min: LPIPS_MIN_SIZE_PX, width, height });
         }
-        let pixels = TensorData::new(picture.to_vec(), [1, height, width, 3]);
+        let pixels = TensorData::new(image.to_vec(), [1, height, width, 3]);
         let dtype = self.heads[0].dtype();
         let pixels = Tensor::<4>::from_data(pixels, (&self.device, dtype)).permute([0, 3, 1, 2]); // [1, 3, H, W]
         let channel = |values: [f32; 3]| {
@@ -89,25 +90,20 @@ impl Lpips {
         Ok(LpipsFeatures(self.vgg.features(input).into_iter().map(unit).collect()))
     }
 
-    /// How far apart two pictures of one size are; 0 for identical ones.
+    /// Returns the distance of two images of the same size; 0 for identical images.
     ///
     /// # Errors
     /// [`EvalError::Tensor`] when the device fails.
     pub fn distance(&self, a: &LpipsFeatures, b: &LpipsFeatures) -> Result<f64, EvalError> {
-        let mut sum: Option<Tensor<1>> = None;
-        for stage in 0..NUM_STAGES {
-            let apart = (a.0[stage].clone() - b.0[stage].clone()).square() * self.heads[stage].clone();
-            let mean = apart.sum_dim(1).mean(); // over positions
-            sum = Some(match sum {
-                Some(sum) => sum + mean,
-                None => mean,
-            });
-        }
-        let sum = sum.expect("there are stages").into_data().convert::<f64>();
+        let stages = (0..NUM_STAGES).map(|stage| {
+            let squared = (a.0[stage].clone() - b.0[stage].clone()).square() * self.heads[stage].clone();
+            squared.sum_dim(1).mean() // over positions
+        });
+        let sum = stages.reduce(|sum, mean| sum + mean).expect("NUM_STAGES is 5").into_data().convert::<f64>();
         Ok(sum.try_to_vec::<f64>().map_err(EvalError::tensor)?[0])
     }
 
-    /// [`Lpips::distance`] of two pictures, `[height, width, 3]`.
+    /// Returns the distance of two images, `[height, width, 3]`.
     ///
     /// # Errors
     /// As [`Lpips::features`].
@@ -117,22 +113,22 @@ impl Lpips {
 }
 
 impl LpipsFeatures {
-    /// Bytes the features take.
+    /// Returns the bytes of the features.
     pub(crate) fn num_bytes(&self) -> usize {
         self.0.iter().map(|stage| stage.dims().iter().product::<usize>() * size_of::<f32>()).sum()
     }
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use clift_model::DeviceName;
 
     use super::*;
     use crate::metrics::image_metrics::{psnr, ssim};
     use crate::testing::{NARROW, Reference, reference_path};
 
-    /// The metric of the narrow network of the fixtures.
-    pub(crate) fn narrow(device: &Device) -> Lpips {
+    /// Loads the narrow network of the fixtures.
+    fn narrow(device: &Device) -> Lpips {
         let path = reference_path("lpips_weights");
         Lpips::with_shape(&path, VggShape { widths: NARROW, ..VggShape::VGG16 }, (device, DType::F32)).unwrap()
     }
@@ -144,12 +140,13 @@ pub(crate) mod tests {
         for pair in pairs {
             let shape = fixture.shape(&format!("input.target.{pair}"));
             let [height, width, 3] = shape[..] else { panic!("{shape:?}") };
-            let picture = |kind: &str| fixture.f32s(&format!("input.{kind}.{pair}"));
-            let (pred, target) = (picture("prediction"), picture("target"));
+            let image = |kind: &str| fixture.f32s(&format!("input.{kind}.{pair}"));
+            let (pred, target) = (image("prediction"), image("target"));
             let expected = |metric: &str| fixture.f64s(&format!("output.{metric}.{pair}"))[0];
-            let apart = lpips.measure(&pred, &target, height, width).unwrap();
-            assert!((apart - expected("lpips")).abs() <= tolerance, "{pair}: {apart} is not {}", expected("lpips"));
-            most = most.max((apart - expected("lpips")).abs());
+            let distance = lpips.measure(&pred, &target, height, width).unwrap();
+            let error = (distance - expected("lpips")).abs();
+            assert!(error <= tolerance, "{pair}: {distance} is not {}", expected("lpips"));
+            most = most.max(error);
             let (psnr, ssim) = (psnr(&pred, &target).unwrap(), ssim(&pred, &target, height, width).unwrap());
             assert!(psnr == expected("psnr") || (psnr - expected("psnr")).abs() <= 1e-4, "{pair}: {psnr} dB");
             assert!((ssim - expected("ssim")).abs() <= 1e-5, "{pair}: SSIM {ssim}");
@@ -158,48 +155,44 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_narrow_network_gives_pytorchs_distances_at_odd_sizes() {
+    fn narrow_networks_equal_pytorch() {
         let fixture = Reference::open("lpips");
         for device in [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().unwrap()) {
-            // The distances are 0.01 to 1 and f32 through 13 layers leaves 1e-6 of them.
+            // Distances are 0.01 to 1; 13 layers in f32 have a relative error of 1e-6.
             check_fixture(&narrow(&device), &fixture, 1e-5);
         }
     }
 
-    /// `scripts/check/check_vgg.py` writes the folder: the full network, the package's own heads and numbers.
+    /// `scripts/check/check_vgg.py` writes the folder: full network, heads and distances of the package.
     #[test]
     #[ignore = "needs the files of scripts/check/check_vgg.py"]
-    fn the_full_network_gives_the_lpips_packages_distances() {
+    fn the_full_network_equals_the_lpips_package() {
         let folder = std::path::PathBuf::from(std::env::var("CLIFT_CHECK_VGG").expect("the folder of check_vgg.py"));
         let lpips = Lpips::load(&folder.join("lpips-vgg.safetensors"), &Device::flex()).unwrap();
         check_fixture(&lpips, &Reference::read(&folder.join("lpips.safetensors")), 1e-5);
     }
 
     #[test]
-    fn identical_pictures_are_not_apart_and_constant_ones_are_finite() {
+    fn identical_images_have_distance_zero() {
         let lpips = narrow(&Device::flex());
         for value in [0.0, 0.5, 1.0] {
             let flat = vec![value; 17 * 19 * 3];
             assert_eq!(lpips.measure(&flat, &flat, 17, 19).unwrap(), 0.0);
         }
-        let apart = lpips.measure(&[0.0; 17 * 19 * 3], &[1.0; 17 * 19 * 3], 17, 19).unwrap();
-        assert!(apart.is_finite() && apart > 0.0, "{apart}");
+        let distance = lpips.measure(&[0.0; 17 * 19 * 3], &[1.0; 17 * 19 * 3], 17, 19).unwrap();
+        assert!(distance.is_finite() && distance > 0.0, "{distance}");
     }
 
     #[test]
-    fn pictures_that_cannot_be_judged_are_refused() {
+    fn bad_images_and_weights_are_errors() {
         let lpips = narrow(&Device::flex());
         let message = lpips.measure(&[0.5; 15 * 40 * 3], &[0.5; 15 * 40 * 3], 15, 40).unwrap_err().to_string();
         assert_eq!(message, "LPIPS needs at least 16 x 16 pixels, got 40 x 15");
         assert!(lpips.measure(&[0.5; 7], &[0.5; 16 * 16 * 3], 16, 16).is_err());
         assert!(lpips.measure(&[f32::NAN; 16 * 16 * 3], &[0.5; 16 * 16 * 3], 16, 16).is_err());
-    }
-
-    #[test]
-    fn a_network_of_another_size_is_refused_with_the_command() {
-        let message = Lpips::load(&reference_path("lpips_weights"), &Device::flex()).unwrap_err().to_string();
-        assert!(message.contains("conv1_1.weight has shape") && message.contains("convert_vgg.py lpips"), "{message}");
-        let message = Lpips::load(&reference_path("perceptual_weights"), &Device::flex()).unwrap_err().to_string();
-        assert!(message.contains("clift-vgg19-1"), "{message}");
+        for (file, part) in [("lpips_weights", "conv1_1.weight has shape"), ("perceptual_weights", "clift-vgg19-1")] {
+            let message = Lpips::load(&reference_path(file), &Device::flex()).unwrap_err().to_string();
+            assert!(message.contains(part) && message.contains("convert_vgg.py lpips"), "{message}");
+        }
     }
 }

@@ -1,4 +1,4 @@
-//! Weights of networks that cannot come with this program: safetensors files that `scripts/tools/convert_vgg.py` writes.
+//! Weight files of the VGG networks, made by `scripts/tools/convert_vgg.py`: safetensors, read strictly.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,21 +9,21 @@ use sha2::{Digest, Sha256};
 
 use crate::error::EvalError;
 
-/// Larger files are refused before they are read; VGG-16 with its heads takes 59 MB.
+/// Largest accepted file; VGG-16 with its heads has 59 MB.
 const MAX_BYTES: u64 = 256 << 20;
 
-/// Which file is expected, and how to get it.
+/// The expected file, and the command that makes the file.
 #[derive(Clone, Copy, Debug)]
 pub struct WeightFileSpec {
-    /// What it is for, as messages name it.
+    /// Purpose of the weights, for error messages.
     pub what: &'static str,
     /// Value of `format` in the file's metadata.
     pub format: &'static str,
-    /// The command that makes it.
+    /// Command that makes the file.
     pub command: &'static str,
 }
 
-/// The tensors of a file, taken out one by one: every one must be asked for, and be of the right shape.
+/// The tensors of a file. The reader must take every tensor, with the right shape.
 pub struct NetworkFile {
     wanted: WeightFileSpec,
     tensors: BTreeMap<String, (Vec<usize>, Vec<f32>)>,
@@ -35,20 +35,20 @@ impl NetworkFile {
     /// Reads a file.
     ///
     /// # Errors
-    /// [`EvalError::BadWeights`] for a file that cannot be read, is of another format, or holds anything but finite
-    /// f32 values.
+    /// [`EvalError::BadWeights`] for a file that cannot be read, has another format, or holds values that are not finite
+    /// f32.
     pub fn read(path: &Path, wanted: WeightFileSpec) -> Result<Self, EvalError> {
         let bad = |reason: String| bad_weights(wanted, reason, path);
         let size = std::fs::metadata(path).map_err(|error| bad(error.to_string()))?.len();
         if size > MAX_BYTES {
-            return Err(bad(format!("it has {size} bytes, at most {MAX_BYTES} are read")));
+            return Err(bad(format!("{size} bytes, expected at most {MAX_BYTES}")));
         }
         let bytes = std::fs::read(path).map_err(|error| bad(error.to_string()))?;
         let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(|error| bad(error.to_string()))?;
         let format = metadata.metadata().as_ref().and_then(|entries| entries.get("format")).cloned();
         if format.as_deref() != Some(wanted.format) {
             let found = format.unwrap_or_else(|| "none".into());
-            return Err(bad(format!("its format is {found}, expected {}", wanted.format)));
+            return Err(bad(format!("format {found}, expected {}", wanted.format)));
         }
         let file = SafeTensors::deserialize(&bytes).map_err(|error| bad(error.to_string()))?;
         let mut tensors = BTreeMap::new();
@@ -59,7 +59,7 @@ impl NetworkFile {
             let values: Vec<f32> =
                 view.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
             if values.iter().any(|value| !value.is_finite()) {
-                return Err(bad(format!("{name} is not finite")));
+                return Err(bad(format!("{name} has a NaN or an infinity")));
             }
             tensors.insert(name, (view.shape().to_vec(), values));
         }
@@ -70,7 +70,7 @@ impl NetworkFile {
     /// Takes a tensor out.
     ///
     /// # Errors
-    /// [`EvalError::BadWeights`] where it is missing or of another shape.
+    /// [`EvalError::BadWeights`] for a missing tensor or another shape.
     pub fn take<const D: usize>(
         &mut self,
         name: &str,
@@ -86,14 +86,14 @@ impl NetworkFile {
         Ok(Tensor::from_data(TensorData::new(values, shape), (device, dtype)))
     }
 
-    /// Demands that nothing is left, and gives the SHA-256 of the file in 64 hexadecimal digits.
+    /// Checks that every tensor was taken, and returns the SHA-256 of the file in 64 hexadecimal digits.
     ///
     /// # Errors
-    /// [`EvalError::BadWeights`] naming what has no place.
+    /// [`EvalError::BadWeights`] with the first tensor that is not part of the network.
     pub fn finish(self) -> Result<String, EvalError> {
         match self.tensors.keys().next() {
             None => Ok(self.sha256),
-            Some(name) => Err(self.bad(format!("{name} has no place in the network"))),
+            Some(name) => Err(self.bad(format!("{name} is not part of the network in the network"))),
         }
     }
 
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn every_tensor_is_asked_for_and_of_the_right_shape() {
+    fn tensors_are_taken_completely_with_their_shapes() {
         let folder = tempfile::tempdir().unwrap();
         let path = written(folder.path(), "test-1", &[1.0, 2.0]);
         let device = Device::flex();
@@ -142,14 +142,16 @@ mod tests {
             open().finish().unwrap_err(),
         ]
         .map(|error| error.to_string());
-        for (message, part) in messages.iter().zip(["head2.weight is missing", "expected [3]", "has no place"]) {
+        for (message, part) in
+            messages.iter().zip(["head2.weight is missing", "expected [3]", "is not part of the network"])
+        {
             assert!(message.starts_with("bad weights for LPIPS: ") && message.contains(part), "{message}");
             assert!(message.contains("`convert it`") && message.ends_with("test-1-2.safetensors"), "{message}");
         }
     }
 
     #[test]
-    fn other_formats_and_hostile_files_are_refused() {
+    fn wrong_and_broken_files_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let other = written(folder.path(), "test-2", &[1.0]);
         let nan = written(folder.path(), "test-1", &[f32::NAN; 3]);
@@ -160,7 +162,7 @@ mod tests {
         std::fs::write(&empty, "").unwrap();
         let missing = folder.path().join("missing.safetensors");
         for (path, part) in
-            [(&other, "test-2"), (&nan, "not finite"), (&cut, ""), (&empty, ""), (&missing, "No such file")]
+            [(&other, "test-2"), (&nan, "a NaN or an infinity"), (&cut, ""), (&empty, ""), (&missing, "No such file")]
         {
             let Err(error) = NetworkFile::read(path, WANTED) else { panic!("{} is accepted", path.display()) };
             assert!(error.to_string().contains(part), "{error}");

@@ -10,23 +10,23 @@ use crate::error::EvalError;
 use crate::metrics::network_file::{NetworkFile, WeightFileSpec};
 use crate::metrics::vgg::{MIN_SIZE_PX, Vgg, VggShape};
 
-/// Smallest side of a picture in pixels.
+/// Smallest side of an image, in pixels.
 pub const PERCEPTUAL_MIN_SIZE_PX: usize = MIN_SIZE_PX;
 
-/// The command that makes the weight file.
+/// Command that makes the weight file.
 pub const PERCEPTUAL_COMMAND: &str =
     "python3 scripts/tools/convert_vgg.py vgg19 imagenet-vgg-verydeep-19.mat -o vgg19.safetensors";
 
 const WANTED: WeightFileSpec =
     WeightFileSpec { what: "the perceptual loss", format: "clift-vgg19-1", command: PERCEPTUAL_COMMAND };
 
-/// Mean colour of the network's training pictures, of 255.
+/// Mean colour of the network's training images, out of 255.
 const MEAN_RGB: [f32; 3] = [123.68, 116.779, 103.939];
 
-/// What the mean absolute difference of each feature is multiplied by.
+/// Factors of the mean absolute differences, per feature.
 const FACTORS: [f64; 5] = [1.0 / 2.6, 1.0 / 4.8, 1.0 / 3.7, 1.0 / 5.6, 10.0 / 1.5];
 
-/// The frozen network.
+/// The perceptual loss with its frozen network.
 #[derive(Clone, Debug)]
 pub struct Perceptual {
     vgg: Vgg,
@@ -36,7 +36,7 @@ pub struct Perceptual {
 }
 
 impl Perceptual {
-    /// Reads the weights, to a device without autodiff: they are constants of the loss.
+    /// Reads the weights, which are constants of the loss, to a device without autodiff.
     ///
     /// # Errors
     /// [`EvalError::BadWeights`] with the command that makes the file.
@@ -44,21 +44,21 @@ impl Perceptual {
         Self::with_shape(path, VggShape::VGG19, (device, DType::F32))
     }
 
-    fn with_shape(path: &Path, shape: VggShape, place: (&Device, DType)) -> Result<Self, EvalError> {
+    fn with_shape(path: &Path, shape: VggShape, options: (&Device, DType)) -> Result<Self, EvalError> {
         let mut file = NetworkFile::read(path, WANTED)?;
-        let vgg = Vgg::take(&mut file, shape, place)?.no_grad();
-        let mean = Tensor::<1>::from_data(TensorData::new(MEAN_RGB.to_vec(), [3]), place).reshape([1, 3, 1, 1]);
+        let vgg = Vgg::take(&mut file, shape, options)?.no_grad();
+        let mean = Tensor::<1>::from_data(TensorData::new(MEAN_RGB.to_vec(), [3]), options).reshape([1, 3, 1, 1]);
         Ok(Self { vgg, mean, sha256: file.finish()? })
     }
 
-    /// SHA-256 of the weight file, 64 hexadecimal digits.
+    /// Returns the SHA-256 of the weight file, 64 hexadecimal digits.
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
 
-    /// Mean absolute differences of the pictures and of five features, weighted, over 255.
+    /// Returns the weighted mean absolute differences of the images and of five features, over 255.
     ///
-    /// The gradient of a difference of exactly zero is zero, so that identical pictures have no gradient at all.
+    /// Identical images have zero gradient, since the gradient at a difference of exactly zero is zero.
     ///
     /// # Shapes
     /// - `rendering`, `target`: `[batch, views, height, width, 3]` in `[0, 1]`, both sides at least 16 pixels; the
@@ -67,19 +67,19 @@ impl Perceptual {
     pub fn forward(&self, rendering: Tensor<5>, target: Tensor<5>) -> Tensor<1> {
         let target = self.features(target.detach());
         let rendering = self.features(rendering);
-        let apart = |(rendering, target): (Tensor<4>, Tensor<4>)| (rendering - target).abs().mean();
+        let difference = |(rendering, target): (Tensor<4>, Tensor<4>)| (rendering - target).abs().mean();
         let mut pairs = rendering.into_iter().zip(target);
-        let first = apart(pairs.next().expect("the pictures themselves"));
-        let sum = pairs.zip(FACTORS).fold(first, |sum, (pair, factor)| sum + apart(pair).mul_scalar(factor));
-        // Not divided: the gradient of a division by a number is rounded to f32.
+        let first = difference(pairs.next().expect("features start with the images"));
+        let sum = pairs.zip(FACTORS).fold(first, |sum, (pair, factor)| sum + difference(pair).mul_scalar(factor));
+        // A multiplication, since Burn rounds the gradient of a division by a scalar to f32.
         sum.mul_scalar(1.0 / 255.0)
     }
 
-    /// The pictures in the network's units, and its features: `[B V, C, H, W]` each.
-    fn features(&self, pictures: Tensor<5>) -> Vec<Tensor<4>> {
-        let [batch, views, height, width, 3] = pictures.dims() else { panic!("pictures are RGB") };
-        let pictures = pictures.reshape([batch * views, height, width, 3]).permute([0, 3, 1, 2]);
-        let input = pictures.mul_scalar(255.0) - self.mean.clone();
+    /// Returns the images in the units of the network and the features, `[B V, C, H, W]` each.
+    fn features(&self, images: Tensor<5>) -> Vec<Tensor<4>> {
+        let [batch, views, height, width, 3] = images.dims() else { panic!("images have three channels") };
+        let images = images.reshape([batch * views, height, width, 3]).permute([0, 3, 1, 2]);
+        let input = images.mul_scalar(255.0) - self.mean.clone();
         let mut features = vec![input.clone()];
         features.extend(self.vgg.features(input));
         features
@@ -93,17 +93,17 @@ mod tests {
     use super::*;
     use crate::testing::{NARROW, Reference, reference_path};
 
-    fn narrow(place: (&Device, DType)) -> Perceptual {
+    fn narrow(options: (&Device, DType)) -> Perceptual {
         let shape = VggShape { widths: NARROW, ..VggShape::VGG19 };
-        Perceptual::with_shape(&reference_path("perceptual_weights"), shape, place).unwrap()
+        Perceptual::with_shape(&reference_path("perceptual_weights"), shape, options).unwrap()
     }
 
     fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f64> {
         tensor.into_data().convert::<f64>().try_to_vec().unwrap()
     }
 
-    /// Loss and gradient of the rendering.
-    fn both(loss: &Perceptual, rendering: Tensor<5>, target: Tensor<5>) -> (f64, Vec<f64>) {
+    /// Returns the loss and its gradient with respect to the rendering.
+    fn loss_and_grad(loss: &Perceptual, rendering: Tensor<5>, target: Tensor<5>) -> (f64, Vec<f64>) {
         let rendering = rendering.autodiff().require_grad();
         let loss = loss.forward(rendering.clone(), target.autodiff());
         let grads = loss.backward();
@@ -117,15 +117,16 @@ mod tests {
     }
 
     #[test]
-    fn loss_and_gradient_equal_pytorchs_at_an_odd_size() {
+    fn loss_and_gradient_equal_pytorch() {
         let fixture = Reference::open("perceptual");
         for device in [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().unwrap()) {
             for (dtype, tolerance) in [(DType::F64, 1e-9), (DType::F32, 1e-4)] {
                 let tensor = |name: &str| fixture.tensor::<5>(name, &device, dtype);
-                let (loss, grad) = both(&narrow((&device, dtype)), tensor("input.rendering"), tensor("input.target"));
+                let (loss, grad) =
+                    loss_and_grad(&narrow((&device, dtype)), tensor("input.rendering"), tensor("input.target"));
                 let expected = fixture.f64s("output.loss")[0];
-                // A difference near zero may change its sign with rounding, and with it an entry of the gradient: in
-                // f32 the tolerance is of the largest entry, of which one sign moves at most a little.
+                // Rounding can flip the sign of a difference near zero, and change an entry of the gradient. In f32 the
+                // tolerance is therefore relative to the largest entry.
                 assert!((loss - expected).abs() <= tolerance * 0.1 * expected, "{loss} is not {expected}");
                 let error = largest_difference(&grad, &fixture.f64s("grad.input.rendering"));
                 assert!(error <= tolerance, "{dtype:?}: {error:.2e}");
@@ -134,13 +135,13 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_equals_central_differences_in_f64() {
+    fn gradients_equal_central_differences_in_f64() {
         let fixture = Reference::open("perceptual");
         let device = Device::flex();
         let loss = narrow((&device, DType::F64));
         let tensor = |name: &str| fixture.tensor::<5>(name, &device, DType::F64);
         let (rendering, target) = (tensor("input.rendering"), tensor("input.target"));
-        let (_, grad) = both(&loss, rendering.clone(), target.clone());
+        let (_, grad) = loss_and_grad(&loss, rendering.clone(), target.clone());
         let (shape, start) = (rendering.dims(), values(rendering));
         let at = |index: usize, by: f64| {
             let mut moved = start.clone();
@@ -148,8 +149,8 @@ mod tests {
             let moved = Tensor::from_data(TensorData::new(moved, shape), (&device, DType::F64));
             values(loss.forward(moved, target.clone()))[0]
         };
-        // The loss is piecewise linear between kinks (absolute values, ReLU): the step is small enough that few
-        // entries have one within it, and rounding leaves 1e-16 / 1e-7 = 1e-9 of a loss near 1.
+        // The loss is piecewise linear between kinks (absolute values, ReLU). With this step few entries have a kink in
+        // the interval, and rounding is 1e-16 / 1e-7 = 1e-9 of a loss near 1.
         let step = 1e-7;
         let scale = grad.iter().fold(0.0_f64, |scale, value| scale.max(value.abs()));
         let indices: Vec<usize> = (0..start.len()).step_by(37).collect();
@@ -162,12 +163,12 @@ mod tests {
     }
 
     #[test]
-    fn identical_and_constant_pictures_have_a_finite_loss_and_identical_ones_no_gradient() {
+    fn identical_images_have_zero_loss_and_gradient() {
         for device in [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().unwrap()) {
             let loss = narrow((&device, DType::F32));
             let flat = |value: f32| Tensor::<5>::full([1, 2, 16, 18, 3], value, &device);
             for (a, b) in [(0.0, 0.0), (0.5, 0.5), (0.0, 1.0), (1.0, 0.0)] {
-                let (value, grad) = both(&loss, flat(a), flat(b));
+                let (value, grad) = loss_and_grad(&loss, flat(a), flat(b));
                 assert!(value.is_finite() && grad.iter().all(|value| value.is_finite()), "{a} {b}");
                 assert_eq!(value == 0.0, a == b);
                 assert_eq!(grad.iter().all(|&value| value == 0.0), a == b, "{a} {b}");
@@ -176,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn the_weights_get_no_gradient() {
+    fn weights_are_frozen() {
         struct Tracked(usize);
         impl burn::module::ModuleVisitor for Tracked {
             fn visit_float<const D: usize>(&mut self, param: &burn::module::Param<Tensor<D>>) {
@@ -193,17 +194,17 @@ mod tests {
     /// `scripts/check/check_vgg.py` writes the folder.
     #[test]
     #[ignore = "needs the files of scripts/check/check_vgg.py"]
-    fn the_full_network_gives_pytorchs_loss_and_gradient() {
+    fn the_full_network_equals_pytorch() {
         let folder = std::path::PathBuf::from(std::env::var("CLIFT_CHECK_VGG").expect("the folder of check_vgg.py"));
         let device = Device::flex();
         let loss = Perceptual::load(&folder.join("vgg19.safetensors"), &device).unwrap();
         let fixture = Reference::read(&folder.join("perceptual.safetensors"));
         let tensor = |name: &str| fixture.tensor::<5>(name, &device, DType::F32);
-        let (value, grad) = both(&loss, tensor("input.rendering"), tensor("input.target"));
+        let (value, grad) = loss_and_grad(&loss, tensor("input.rendering"), tensor("input.target"));
         let expected = fixture.f64s("output.loss")[0];
         assert!((value - expected).abs() <= 1e-4 * expected, "{value} is not {expected}");
         let error = largest_difference(&grad, &fixture.f64s("grad.input.rendering"));
-        // Signs of differences that rounding turns around: see above.
+        // As above: rounding flips signs of differences.
         assert!(error <= 1e-3, "{error:.2e}");
         println!("loss {value} for {expected}, largest error of the gradient {error:.2e} of its largest entry");
     }

@@ -1,5 +1,5 @@
-//! VGG networks up to their last convolution: 3 x 3 convolutions in five stages with poolings between them.
-// B pictures, C channels, H rows, W columns
+//! VGG features: 3 x 3 convolutions in five stages with pooling between the stages.
+// B images, C channels, H rows, W columns
 
 use burn::module::{Module, Param};
 use burn::nn::PaddingConfig2d;
@@ -12,18 +12,18 @@ use burn::tensor::{DType, Device, Tensor};
 use crate::error::EvalError;
 use crate::metrics::network_file::NetworkFile;
 
-/// Number of stages; pictures are halved between them.
+/// Number of stages. Pooling halves the image between stages.
 pub const NUM_STAGES: usize = 5;
 
-/// Smallest side of a picture that every stage still has a value of.
+/// Smallest side of an image for which every stage has a value.
 pub const MIN_SIZE_PX: usize = 1 << (NUM_STAGES - 1);
 
-/// How pictures are halved: over 2 x 2 values, an odd last row or column left out.
+/// Pooling over 2 x 2 values. An odd last row or column is dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pooling {
-    /// The largest.
+    /// The maximum.
     Max,
-    /// Their mean.
+    /// The mean.
     Average,
 }
 
@@ -32,11 +32,11 @@ pub enum Pooling {
 pub struct VggShape {
     /// Channels of each stage.
     pub widths: [usize; NUM_STAGES],
-    /// Convolutions of each stage; those of the last that no feature needs are left out.
+    /// Convolutions of each stage, without convolutions behind the last feature.
     pub convs: [usize; NUM_STAGES],
-    /// Convolutions of each stage up to the one whose output is a feature, 1 or more.
+    /// Convolutions of each stage up to the feature, at least 1.
     pub taps: [usize; NUM_STAGES],
-    /// Between the stages.
+    /// Pooling between the stages.
     pub pooling: Pooling,
 }
 
@@ -54,23 +54,23 @@ impl VggShape {
     };
 }
 
-/// What a network takes on one picture, in f32 values and multiplications.
+/// Cost of a network for one image, in f32 values and multiply-accumulates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VggSizes {
-    /// Weights.
+    /// Parameters.
     pub parameters: f64,
     /// Multiply-accumulates of a forward pass.
     pub macs: f64,
-    /// Values of all convolutions and poolings together.
+    /// Output values of all convolutions and poolings.
     pub outputs: f64,
-    /// Values of the features.
+    /// Output values of the features.
     pub features: f64,
-    /// Values of the largest layer.
+    /// Output values of the largest layer.
     pub widest: f64,
 }
 
 impl VggShape {
-    /// Counts what a picture of so many pixels takes.
+    /// Computes the cost of an image of `height` by `width` pixels.
     pub fn sizes(&self, height: usize, width: usize) -> VggSizes {
         let mut sizes = VggSizes { parameters: 0.0, macs: 0.0, outputs: 0.0, features: 0.0, widest: 0.0 };
         let mut inputs = 3.0;
@@ -102,11 +102,11 @@ pub struct Vgg {
 }
 
 impl Vgg {
-    /// Takes the network's tensors, `convS_I.weight` `[out, in, 3, 3]` and `convS_I.bias`, out of a file.
+    /// Takes the tensors `convS_I.weight` `[out, in, 3, 3]` and `convS_I.bias` out of a file.
     ///
     /// # Errors
     /// As [`NetworkFile::take`].
-    pub fn take(file: &mut NetworkFile, shape: VggShape, place: (&Device, DType)) -> Result<Self, EvalError> {
+    pub fn take(file: &mut NetworkFile, shape: VggShape, options: (&Device, DType)) -> Result<Self, EvalError> {
         let mut inputs = 3;
         let mut stages = Vec::new();
         for (stage, (&count, &outputs)) in shape.convs.iter().zip(&shape.widths).enumerate() {
@@ -115,9 +115,9 @@ impl Vgg {
                 let name = format!("conv{}_{i}", stage + 1);
                 let mut conv = Conv2dConfig::new([inputs, outputs], [3, 3])
                     .with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1))
-                    .init(place.0);
-                conv.weight = frozen(file.take(&format!("{name}.weight"), [outputs, inputs, 3, 3], place)?);
-                conv.bias = Some(frozen(file.take(&format!("{name}.bias"), [outputs], place)?));
+                    .init(options.0);
+                conv.weight = frozen(file.take(&format!("{name}.weight"), [outputs, inputs, 3, 3], options)?);
+                conv.bias = Some(frozen(file.take(&format!("{name}.bias"), [outputs], options)?));
                 convs.push(conv);
                 inputs = outputs;
             }
@@ -126,17 +126,17 @@ impl Vgg {
         Ok(Self { stages, shape })
     }
 
-    /// The features of every stage.
+    /// Computes the features of every stage.
     ///
     /// # Shapes
-    /// - `pictures`: `[batch, 3, height, width]`, both sides at least [`MIN_SIZE_PX`]
+    /// - `images`: `[batch, 3, height, width]`, both sides at least [`MIN_SIZE_PX`]
     /// - returns `[batch, channels, height / 2^s, width / 2^s]` for the stages s = 0 to 4
-    pub fn features(&self, pictures: Tensor<4>) -> Vec<Tensor<4>> {
-        let mut x = pictures;
+    pub fn features(&self, images: Tensor<4>) -> Vec<Tensor<4>> {
+        let mut x = images;
         let mut features = Vec::new();
         for (stage, convs) in self.stages.iter().enumerate() {
             if stage > 0 {
-                x = self.shape.pooling.halved(x); // [B, C, H, W] -> [B, C, H/2, W/2]
+                x = self.shape.pooling.downsample(x); // [B, C, H, W] -> [B, C, H/2, W/2]
             }
             for (i, conv) in convs.iter().enumerate() {
                 x = relu(conv.forward(x));
@@ -150,7 +150,7 @@ impl Vgg {
 }
 
 impl Pooling {
-    fn halved(self, x: Tensor<4>) -> Tensor<4> {
+    fn downsample(self, x: Tensor<4>) -> Tensor<4> {
         match self {
             Self::Max => max_pool2d(x, MaxPoolOptions::new([2, 2])),
             Self::Average => avg_pool2d(x, AvgPoolOptions::new([2, 2])),
@@ -158,7 +158,7 @@ impl Pooling {
     }
 }
 
-/// A parameter that gets no gradient.
+/// Returns a parameter without gradient.
 fn frozen<const D: usize>(tensor: Tensor<D>) -> Param<Tensor<D>> {
     Param::from_tensor(tensor).set_require_grad(false)
 }
@@ -168,14 +168,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_whole_networks_have_their_published_sizes() {
+    fn vgg16_has_its_published_size() {
         // Convolutions of VGG-16 without the classifier: 14,714,688 weights and 15.35e9 multiplications at 224 pixels.
         let sizes = VggShape::VGG16.sizes(224, 224);
         assert_eq!(sizes.parameters, 14_714_688.0);
         assert!((sizes.macs / 15.35e9 - 1.0).abs() < 1e-3, "{}", sizes.macs);
-        // 122 values a pixel.
+        // 122 values per pixel.
         assert_eq!((sizes.features, sizes.widest), (122.0 * 224.0 * 224.0, 64.0 * 224.0 * 224.0));
-        // An odd last row is left out on the way down.
+        // Pooling drops an odd last row.
         assert_eq!(VggShape::VGG16.sizes(17, 17).features, (64 * 17 * 17 + 128 * 64 + 256 * 16 + 512 * 4 + 512) as f64);
     }
 }

@@ -1,17 +1,17 @@
-//! The time a report was made.
+//! Date and time of a report.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Now, as `2026-03-01 14:05 UTC`.
+/// Returns the current time, such as `2026-03-01 14:05 UTC`.
 pub fn now() -> String {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     since.map_or_else(|_| "before 1970".into(), |since| utc(since.as_secs()))
 }
 
-/// Seconds since 1970 as date and time.
+/// Formats seconds since 1970 as date and time.
 fn utc(seconds: u64) -> String {
     let (days, minutes) = (seconds / 86_400, seconds / 60 % 1440);
-    // Years that begin in March end with the leap day; 400 of them have 146,097 days.
+    // Years that begin in March end with the leap day; 400 years have 146,097 days.
     let days = days + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);
     let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
@@ -27,7 +27,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn seconds_are_dates() {
+    fn seconds_become_dates() {
         // From `date -u -d @SECONDS`.
         for (seconds, expected) in [
             (0, "1970-01-01 00:00 UTC"),

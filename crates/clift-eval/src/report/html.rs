@@ -1,4 +1,4 @@
-//! What every section of the page needs: numbers as text, table heads, images as addresses. maud escapes all text.
+//! Parts of every section: numbers as text, table heads, images as data URIs. maud escapes all text.
 
 use std::io;
 
@@ -8,10 +8,10 @@ use maud::{Markup, html};
 use crate::figures::canvas::Canvas;
 use crate::report::axis::grouped;
 
-/// Shown where a value was not measured.
+/// Text of a value that was not measured.
 pub const DASH: &str = "\u{2013}";
 
-/// Returns a value as text, a dash where it was not measured.
+/// Returns a value as text; a dash without a finite value.
 pub fn number(value: Option<f64>, decimals: usize) -> String {
     value.filter(|value| value.is_finite()).map_or_else(|| DASH.into(), |value| grouped(value, decimals))
 }
@@ -21,7 +21,7 @@ pub fn count(count: usize) -> String {
     grouped(count as f64, 0)
 }
 
-/// Returns the head of a table; a line break in a name starts its second line.
+/// Returns the head of a table. A line break in a name starts a second line.
 pub fn head(names: &[&str]) -> Markup {
     html! {
         thead {
@@ -39,10 +39,10 @@ pub fn head(names: &[&str]) -> Markup {
     }
 }
 
-/// Returns an image as an address that holds its bytes, for `src` and `href`.
+/// Returns an image as a data URI for `src` and `href`.
 ///
 /// # Errors
 /// As [`Canvas::png`].
-pub fn data_uri(picture: &Canvas) -> io::Result<String> {
-    Ok(format!("data:image/png;base64,{}", BASE64_STANDARD.encode(picture.png()?)))
+pub fn data_uri(image: &Canvas) -> io::Result<String> {
+    Ok(format!("data:image/png;base64,{}", BASE64_STANDARD.encode(image.png()?)))
 }

@@ -1,4 +1,4 @@
-//! An evaluation as one HTML file that needs nothing beside it: no network, no scripts, no other files.
+//! An evaluation as one self-contained HTML file: no network access, no scripts, no other files.
 
 use std::io;
 use std::path::Path;
@@ -10,47 +10,46 @@ use crate::error::EvalError;
 use crate::figures::scene_figure::SceneFigure;
 use crate::report::axis::{grouped, milliseconds};
 use crate::report::html::{count, number};
-use crate::report::plots::{Figure, figures};
+use crate::report::plots::{PlotSection, plot_sections};
 use crate::report::{date, scene_section, tables};
 use crate::statistics::summary::{Summary, SummaryPoint};
-use crate::statistics::view_metrics::best_variant;
+use crate::statistics::view_metrics::best_method;
 
 const STYLE: &str = include_str!("style.css");
 
-/// Most scenes that are shown, which bounds the size of the file.
-pub const MAX_EXHIBITS: usize = 6;
+/// Largest number of scenes in a report, which bounds the size of the file.
+pub const MAX_FIGURES: usize = 6;
 
-const SCENES_NOTE: &str = "The target view in the middle of each scene, as every variant draws it. In the maps a patch \
-                           of the context views has the colour of its cluster, and rings are the centroids: the tokens \
-                           that are stored.";
+const SCENES_NOTE: &str = "The middle target view of each scene, rendered by every method. In the maps, a patch of the \
+                           context views has the colour of its cluster; rings mark the centroids, which are the \
+                           stored tokens.";
 
-const CHOICE: &str = "Where views are drawn from fewer tokens than are stored, dots are those chosen for the target and \
-                      rings the other stored ones.";
+const SELECTION_NOTE: &str = "For views rendered from fewer tokens than stored, dots mark the tokens selected for the \
+                              target and rings mark the other stored tokens.";
 
-const FOOTNOTE: &str = "PSNR is of pictures clamped to [0, 1]; SSIM has a Gaussian window of 11 taps; LPIPS is version \
-                        0.1 with VGG-16. Means are over the views of a scene, then over scenes; \u{b1} is the standard \
-                        error over scenes. A dash is what was not measured. Times are of this machine, under whatever \
-                        else it did.";
+const FOOTNOTE: &str = "PSNR: images clamped to [0, 1]. SSIM: Gaussian window of 11 taps. LPIPS: version 0.1 with \
+                        VGG-16. Means are over the views of a scene, then over scenes; \u{b1} is the standard error \
+                        over scenes. A dash: not measured. Times are of this machine, including other load.";
 
-/// What a report is made of.
+/// The content of a report.
 #[derive(Clone, Debug)]
 pub struct Report {
-    /// What was evaluated, such as the name of a run.
+    /// Name of the evaluated run or model.
     pub name: String,
-    /// The measured means.
+    /// Means of all keys.
     pub summary: Summary,
-    /// What was left out.
-    pub ledger: SkipReport,
-    /// Scenes to show; the first [`MAX_EXHIBITS`] are.
-    pub exhibits: Vec<SceneFigure>,
-    /// The resolved config, TOML.
+    /// Skipped scenes with their reasons.
+    pub skip_report: SkipReport,
+    /// Figures of scenes; the report has the first [`MAX_FIGURES`].
+    pub figures: Vec<SceneFigure>,
+    /// The resolved config as TOML.
     pub config: String,
-    /// Where tensors lived.
+    /// Name of the device.
     pub device: String,
 }
 
 impl Report {
-    /// Writes the file, under a temporary name first.
+    /// Writes the report, atomically.
     ///
     /// # Errors
     /// [`EvalError::Io`] when the folder is missing or cannot be written.
@@ -85,7 +84,7 @@ impl Report {
                         (tables::points(&self.summary))
                         (tables::differences(&self.summary.differences))
                         (self.scenes()?)
-                        (tables::left_out(self.summary.num_scenes, &self.ledger))
+                        (tables::skipped(self.summary.num_scenes, &self.skip_report))
                         (tables::machine(&self.device))
                         h2 { "Config" }
                         details { summary { "Every key, resolved" } pre { (self.config) } }
@@ -98,13 +97,13 @@ impl Report {
         Ok(page.into_string().replace(|c: char| c.is_control() && !matches!(c, '\n' | '\t'), "\u{fffd}"))
     }
 
-    /// Returns what one wants to know first.
+    /// Returns the main results.
     fn headline(&self) -> Markup {
         let Summary { num_scenes, num_views, baselines, points, .. } = &self.summary;
-        let best = best_variant(points.iter().map(SummaryPoint::key));
+        let best = best_method(points.iter().map(SummaryPoint::key));
         let mut whole: Vec<&SummaryPoint> =
-            points.iter().filter(|p| Some(p.variant) == best && p.key().is_whole()).collect();
-        // Of the finest format, where there are several.
+            points.iter().filter(|p| Some(p.method) == best && p.key().is_whole()).collect();
+        // With several formats, the finest.
         let format = whole.iter().map(|point| point.tokens).min().flatten();
         whole.retain(|point| point.tokens == format);
         let (first, last) = (whole.first(), whole.last());
@@ -113,11 +112,11 @@ impl Report {
         html! {
             @if let (Some(first), Some(last)) = (first, last) {
                 p.lead {
-                    (first.variant.name()) " reaches " (reached(first))
-                    @if first != last { " and " (reached(last)) }
+                    (first.method.name()) " reaches " (psnr_at(first))
+                    @if first != last { " and " (psnr_at(last)) }
                     "."
                     @if let Some(gain) = last.psnr.zip(nearest).map(|(psnr, nearest)| psnr - nearest) {
-                        " With the latter it is " (grouped(gain.abs(), 2)) " dB "
+                        " The latter is " (grouped(gain.abs(), 2)) " dB "
                         (if gain < 0.0 { "below" } else { "above" }) " a copy of the nearest context view."
                     }
                 }
@@ -125,7 +124,7 @@ impl Report {
             dl.tiles {
                 @for point in first.into_iter().chain(last.filter(|_| whole.len() > 1)) {
                     @let error = point.psnr_stderr.map(|error| format!("\u{b1} {error:.2}")).unwrap_or_default();
-                    (tile(&format!("{}, {}", point.variant.name(), tokens(point)), &number(point.psnr, 2), "dB", &error))
+                    (tile(&format!("{}, {}", point.method.name(), tokens(point)), &number(point.psnr, 2), "dB", &error))
                 }
                 (tile("nearest view", &number(nearest, 2), "dB", "a copy, no model"))
                 @if let Some((point, bytes)) = first.and_then(|point| Some((point, point.scene_bytes?))) {
@@ -134,7 +133,7 @@ impl Report {
                 @if let Some((point, seconds)) = last.and_then(|point| Some((point, point.frame_median_s?))) {
                     (tile("a frame", &milliseconds(seconds), "ms", &tokens(point)))
                 }
-                @let scenes = format!("of {}", count(self.ledger.num_scenes.max(*num_scenes)));
+                @let scenes = format!("of {}", count(self.skip_report.num_scenes.max(*num_scenes)));
                 (tile("scenes evaluated", &count(*num_scenes), &scenes, &format!("{} views", count(*num_views))))
             }
         }
@@ -145,7 +144,7 @@ impl Report {
         html! {
             h2 { "Quality and cost" }
             div.figures {
-                @for Figure { heading, plot, note } in figures(&self.summary) {
+                @for PlotSection { heading, plot, note } in plot_sections(&self.summary) {
                     section {
                         h3 { (heading) }
                         (plot.to_html())
@@ -155,36 +154,36 @@ impl Report {
             }
             p.note {
                 @if has_error { "Error bars are one standard error over scenes. " }
-                "Rest on a mark to read its values."
+                "Hover over a mark to read its values."
             }
         }
     }
 
     fn scenes(&self) -> io::Result<Markup> {
-        let has_choices = self.exhibits.iter().any(|exhibit| !exhibit.choices.is_empty());
+        let has_selections = self.figures.iter().any(|figure| !figure.selections.is_empty());
         Ok(html! {
             h2 { "Scenes" }
-            @if self.exhibits.is_empty() {
-                p.none { "None is shown: " code { "eval.num_sheets" } " is 0." }
+            @if self.figures.is_empty() {
+                p.none { "No figures: " code { "eval.num_sheets" } " is 0." }
             } @else {
                 p.note { (SCENES_NOTE) }
                 p.note {
-                    @if has_choices {
-                        (CHOICE)
+                    @if has_selections {
+                        (SELECTION_NOTE)
                     } @else {
-                        "All views are drawn from all stored tokens. " code { "clift eval RUN --render 1/4,1/2" }
-                        " draws them from fewer, chosen for each view, and shows which."
+                        "All views are rendered from all stored tokens. " code { "clift eval RUN --render 1/4,1/2" }
+                        " renders views from fewer tokens, selected for each view, and marks the selected tokens."
                     }
                 }
             }
-            @for (number, exhibit) in self.exhibits.iter().take(MAX_EXHIBITS).enumerate() {
-                (scene_section::section(exhibit, number, self.summary.selection)?)
+            @for (number, figure) in self.figures.iter().take(MAX_FIGURES).enumerate() {
+                (scene_section::section(figure, number, self.summary.selection)?)
             }
         })
     }
 }
 
-fn reached(point: &SummaryPoint) -> Markup {
+fn psnr_at(point: &SummaryPoint) -> Markup {
     html! { strong { (number(point.psnr, 2)) " dB" } " with " (count(point.num_storage_tokens)) " stored tokens" }
 }
 

@@ -1,4 +1,4 @@
-//! A plot as inline SVG: points with error bars, joined or not, over two axes. Colours are the page's.
+//! A plot as inline SVG: points with error bars, joined or not, over two axes. The style sheet has the colours.
 
 use std::fmt::Write;
 
@@ -6,7 +6,7 @@ use maud::{Markup, html};
 
 use crate::report::axis::{Axis, Scale};
 
-// Small enough that the text can still be read where the plot is shrunk to the width of a phone.
+// Small enough for readable text where the plot shrinks to the width of a phone.
 const WIDTH: f64 = 460.0;
 const HEIGHT: f64 = 320.0;
 const LEFT: f64 = 56.0;
@@ -14,7 +14,7 @@ const RIGHT: f64 = 12.0;
 const TOP: f64 = 12.0;
 const BOTTOM: f64 = 48.0;
 
-/// How a series is drawn: a class of the style sheet for its colour, and a marker for those who cannot tell colours.
+/// Colour and marker of a series. The marker identifies a series without colour.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Look {
     /// Class of the style sheet.
@@ -33,7 +33,7 @@ impl Look {
         Self { class: "c4", marker: "M-5 -3.8H5L0 5.2z" },
     ];
 
-    /// Looks of other systems.
+    /// Looks of external methods.
     pub const OTHERS: [Self; 3] = [
         Self { class: "c5", marker: "M-5 -1.6H-1.6V-5H1.6V-1.6H5V1.6H1.6V5H-1.6V1.6H-5z" },
         Self { class: "c6", marker: "M-2.8 -4.9H2.8L5.6 0L2.8 4.9H-2.8L-5.6 0z" },
@@ -41,64 +41,64 @@ impl Look {
     ];
 }
 
-/// One measured value.
+/// One measured point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mark {
-    /// Along the horizontal axis.
+    /// Value on the horizontal axis.
     pub x: f64,
-    /// Along the vertical axis.
+    /// Value on the vertical axis.
     pub y: f64,
-    /// Half the length of its error bar.
+    /// Half the length of the error bar.
     pub error: Option<f64>,
-    /// Text that is shown where the pointer rests on the mark.
+    /// Tooltip.
     pub title: String,
 }
 
-/// Values that belong together.
+/// Marks with one look and one legend entry.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Series {
     /// Name in the legend.
     pub name: String,
     /// Colour and marker.
     pub look: Look,
-    /// Whether its marks are joined, in their order.
+    /// Whether a line joins the marks, in their order.
     pub is_joined: bool,
-    /// The values.
+    /// The marks.
     pub marks: Vec<Mark>,
 }
 
-/// A value to compare with: a line across the plot.
+/// A horizontal line across the plot, such as a baseline.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Level {
     /// Name in the legend.
     pub name: String,
     /// Class of the style sheet.
     pub class: &'static str,
-    /// Along the vertical axis.
+    /// Value on the vertical axis.
     pub y: f64,
 }
 
-/// A plot to be drawn.
+/// A plot over two axes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plot {
-    /// What it shows, for those who cannot see it.
+    /// Description for screen readers.
     pub title: String,
     /// Label of the horizontal axis, with its unit.
     pub x_label: &'static str,
-    /// Spread of the horizontal axis.
+    /// Scale of the horizontal axis.
     pub x_scale: Scale,
     /// Label of the vertical axis, with its unit.
     pub y_label: &'static str,
-    /// What is drawn.
+    /// Series of marks. The first series is drawn on top.
     pub series: Vec<Series>,
-    /// Lines across.
+    /// Horizontal lines.
     pub levels: Vec<Level>,
-    /// A staircase through these points: the Pareto front, by rising x.
+    /// Points of the Pareto front by ascending x, drawn as a staircase; may be empty.
     pub front: Vec<(f64, f64)>,
 }
 
 impl Plot {
-    /// Returns the SVG and its legend, or a sentence where there is nothing to draw.
+    /// Returns the SVG with its legend, or a sentence for a plot without points.
     pub fn to_html(&self) -> Markup {
         let marks = || self.series.iter().flat_map(|series| &series.marks);
         let ends = |mark: &Mark| {
@@ -109,10 +109,10 @@ impl Plot {
         let levels = self.levels.iter().map(|level| level.y);
         let y_axis = Axis::new(Scale::Linear, marks().flat_map(ends).chain(levels));
         let (Some(x_axis), Some(y_axis)) = (x_axis, y_axis) else {
-            return html! { p.none { "Nothing was measured that could be drawn here." } };
+            return html! { p.none { "No measured points." } };
         };
-        let x = |value: f64| LEFT + x_axis.place(value) * (WIDTH - LEFT - RIGHT);
-        let y = |value: f64| HEIGHT - BOTTOM - y_axis.place(value) * (HEIGHT - TOP - BOTTOM);
+        let x = |value: f64| LEFT + x_axis.position(value) * (WIDTH - LEFT - RIGHT);
+        let y = |value: f64| HEIGHT - BOTTOM - y_axis.position(value) * (HEIGHT - TOP - BOTTOM);
         let (right, bottom) = (WIDTH - RIGHT, HEIGHT - BOTTOM);
         let (middle_x, middle_y) = (f64::midpoint(LEFT, right), f64::midpoint(TOP, bottom));
         html! {
@@ -142,7 +142,7 @@ impl Plot {
                 @for (front_x, front_y) in &self.front {
                     circle.front cx=(tenths(x(*front_x))) cy=(tenths(y(*front_y))) r="8" {}
                 }
-                // The first, which is the method, on top.
+                // The first series, the main method, is on top.
                 @for series in self.series.iter().rev() { (series.to_html(x, y)) }
             }
             (self.legend())
@@ -208,7 +208,7 @@ fn error_bar(x: f64, low: f64, high: f64) -> String {
     format!("M{x:.1} {low:.1}V{high:.1}M{left:.1} {low:.1}H{right:.1}M{left:.1} {high:.1}H{right:.1}")
 }
 
-/// Returns the path of a staircase through points by rising x.
+/// Returns the path of a staircase through points by ascending x.
 fn staircase(points: impl Iterator<Item = (f64, f64)>) -> String {
     let mut path = String::new();
     for (i, (x, y)) in points.enumerate() {
@@ -243,24 +243,15 @@ mod tests {
     }
 
     #[test]
-    fn a_plot_has_labels_marks_error_bars_a_legend_and_escaped_names() {
-        let svg = text(&plot(vec![mark(8.0, 14.0), mark(16.0, 18.0)]));
-        assert_eq!(svg.matches("class=\"mark\" transform").count(), 2);
-        assert_eq!(svg.matches("class=\"error\"").count(), 2);
-        assert_eq!(svg.matches("<circle class=\"front\"").count(), 2);
-        for part in
-            ["quality &amp; tokens", "a &lt; b", ">tokens</text>", ">PSNR, dB</text>", ">8</text>", ">16</text>"]
-        {
+    fn marks_lie_within_the_axes_and_names_are_escaped() {
+        let svg = text(&plot(vec![mark(8.0, 14.0), mark(16.0, 18.0), mark(4096.0, 30.0)]));
+        let counts = ["class=\"mark\" transform", "class=\"error\"", "<circle class=\"front\""];
+        assert_eq!(counts.map(|part| svg.matches(part).count()), [3, 3, 2]);
+        for part in ["quality &amp; tokens", "a &lt; b", ">tokens</text>", ">PSNR, dB</text>", ">8</text>"] {
             assert!(svg.contains(part), "{part}: {svg}");
         }
-        assert!(svg.contains("nearest view") && svg.contains("Pareto front"));
-    }
-
-    #[test]
-    fn marks_and_error_bars_lie_within_the_axes() {
-        let svg = text(&plot(vec![mark(8.0, 14.0), mark(16.0, 18.0), mark(4096.0, 30.0)]));
-        for place in svg.split("translate(").skip(2) {
-            let (x, y) = place.split_once(')').unwrap().0.split_once(' ').unwrap();
+        for position in svg.split("translate(").skip(2) {
+            let (x, y) = position.split_once(')').unwrap().0.split_once(' ').unwrap();
             let (x, y): (f64, f64) = (x.parse().unwrap(), y.parse().unwrap());
             assert!((LEFT..=WIDTH - RIGHT).contains(&x) && (TOP..=HEIGHT - BOTTOM).contains(&y), "({x}, {y})");
         }
@@ -268,8 +259,8 @@ mod tests {
     }
 
     #[test]
-    fn a_plot_of_nothing_says_so() {
-        assert!(text(&plot(Vec::new())).contains("Nothing was measured"));
-        assert!(text(&plot(vec![Mark { x: f64::NAN, ..mark(0.0, 1.0) }])).contains("Nothing was measured"));
+    fn plots_without_points_have_a_sentence() {
+        assert!(text(&plot(Vec::new())).contains("No measured points"));
+        assert!(text(&plot(vec![Mark { x: f64::NAN, ..mark(0.0, 1.0) }])).contains("No measured points"));
     }
 }

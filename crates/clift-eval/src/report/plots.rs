@@ -8,91 +8,89 @@ use crate::config::method::Method;
 use crate::report::axis::{Scale, milliseconds};
 use crate::report::plot::{Level, Look, Mark, Plot, Series};
 use crate::statistics::summary::{Quality, Summary, SummaryPoint};
-use crate::statistics::view_metrics::best_variant;
+use crate::statistics::view_metrics::best_method;
 
 const QUALITY: &str = "PSNR, dB";
 
-/// A plot under a heading.
-pub struct Figure {
-    /// What it shows.
+/// A plot with heading and note.
+pub struct PlotSection {
+    /// The quantity on the horizontal axis, in words.
     pub heading: &'static str,
     /// The plot.
     pub plot: Plot,
-    /// What has to be known to read it; may be empty.
+    /// Note below the plot; may be empty.
     pub note: &'static str,
 }
 
-/// The figures that a summary has values for.
-pub fn figures(summary: &Summary) -> Vec<Figure> {
-    let mut figures = vec![Figure {
+/// Returns the plots that a summary has values for.
+pub fn plot_sections(summary: &Summary) -> Vec<PlotSection> {
+    let mut sections = vec![PlotSection {
         heading: "Quality against stored tokens",
-        plot: by_variant(summary, "stored tokens", Scale::LogValues, |point| {
+        plot: by_method(summary, "stored tokens", Scale::LogValues, |point| {
             (point.num_storage_tokens > 0).then_some(point.num_storage_tokens as f64)
         }),
         note: "",
     }];
     if summary.points.iter().any(|point| point.key().is_whole() && point.scene_bytes.is_some()) {
         let kb = |point: &SummaryPoint| point.scene_bytes.map(|bytes| bytes as f64 / 1e3);
-        let mut plot = by_variant(summary, "scene, kB", Scale::Log, kb);
+        let mut plot = by_method(summary, "scene, kB", Scale::Log, kb);
         let on_front = summary.points.iter().filter(|point| point.pareto_bytes);
         plot.front = on_front.filter_map(|point| Some((kb(point)?, point.psnr?))).collect();
         plot.front.sort_by(|a, b| a.0.total_cmp(&b.0));
-        figures.push(Figure { heading: "Quality against the size of a scene", plot, note: "" });
+        sections.push(PlotSection { heading: "Quality against the size of a scene", plot, note: "" });
     }
     if summary.points.iter().any(|point| !point.key().is_whole()) {
-        figures.push(Figure {
+        sections.push(PlotSection {
             heading: "Quality against rendered tokens",
             plot: by_rendered(summary),
-            note: "The last mark of a line is drawn from all tokens that are stored.",
+            note: "The last mark of a line is rendered from all stored tokens.",
         });
     }
     if summary.points.iter().any(|point| point.frame_median_s.is_some()) {
-        let note =
-            "Each view is drawn alone, the choice of its tokens included where they are chosen: medians over views.";
-        figures.push(Figure { heading: "Quality against time per frame", plot: by_time(summary), note });
+        let note = "Medians over views, each rendered in a call of its own; includes token selection.";
+        sections.push(PlotSection { heading: "Quality against time per frame", plot: by_time(summary), note });
     }
-    figures
+    sections
 }
 
-/// The look of a variant, the same in every plot.
-fn look(summary: &Summary, variant: Method) -> Look {
-    let ours = |i: usize| Look::ALL[i];
-    match variant {
-        Method::Clift => ours(0),
-        Method::Kmeans => ours(1),
-        Method::Random => ours(2),
-        Method::Patch => ours(3),
+/// Returns the look of a method, the same in every plot.
+fn look(summary: &Summary, method: Method) -> Look {
+    match method {
+        Method::Clift => Look::ALL[0],
+        Method::Kmeans => Look::ALL[1],
+        Method::Random => Look::ALL[2],
+        Method::Patch => Look::ALL[3],
         // Baselines are levels, not series.
-        Method::PatchClift | Method::NearestView | Method::MeanImage => ours(4),
-        Method::System(_) => {
-            let is_system = |variant: &Method| matches!(variant, Method::System(_));
-            let systems: BTreeSet<_> = summary.points.iter().map(|point| point.variant).filter(is_system).collect();
-            let place = systems.into_iter().position(|system| system == variant).unwrap_or_default();
-            Look::OTHERS[place % Look::OTHERS.len()]
+        Method::PatchClift | Method::NearestView | Method::MeanImage => Look::ALL[4],
+        Method::External(_) => {
+            let methods = summary.points.iter().map(|point| point.method);
+            let external: BTreeSet<_> = methods.filter(|method| matches!(method, Method::External(_))).collect();
+            let index = external.into_iter().position(|other| other == method).unwrap_or_default();
+            Look::OTHERS[index % Look::OTHERS.len()]
         }
     }
 }
 
-/// Whether stored tokens have several number formats, so that lines are told apart by them too.
+/// Returns whether stored tokens have several number formats, which then have lines of their own.
 fn has_formats(summary: &Summary) -> bool {
     let stored = summary.points.iter().filter(|point| point.scene_bytes.is_some());
     stored.filter_map(|point| point.tokens).collect::<BTreeSet<_>>().len() > 1
 }
 
-/// A line for every variant and number format, in its look.
+/// Returns a line for every method and number format.
 fn series(summary: &Summary, is_joined: bool, mark: impl Fn(&SummaryPoint) -> Option<Mark>) -> Vec<Series> {
     let has_formats = has_formats(summary);
     let mut lines: BTreeMap<(Method, Option<TokenFormat>), Vec<Mark>> = BTreeMap::new();
     for point in &summary.points {
         if let Some(mark) = mark(point) {
-            lines.entry((point.variant, point.tokens.filter(|_| has_formats))).or_default().push(mark);
+            lines.entry((point.method, point.tokens.filter(|_| has_formats))).or_default().push(mark);
         }
     }
-    let line = |((variant, tokens), marks): ((Method, Option<TokenFormat>), Vec<Mark>)| {
-        let mut look = look(summary, variant);
-        let mut name = variant.name().to_owned();
-        if let Some(tokens) = tokens.filter(|_| variant != Method::Random) {
-            // The colour is the variant's, the marker the format's.
+    let line = |((method, tokens), marks): ((Method, Option<TokenFormat>), Vec<Mark>)| {
+        let mut look = look(summary, method);
+        let mut name = method.name().to_owned();
+        if let Some(tokens) = tokens.filter(|_| method != Method::Random) {
+            // Colour of the method, marker of the format.
             let format = TokenFormat::ALL.iter().position(|format| *format == tokens).unwrap_or_default();
             look.marker = Look::ALL[format].marker;
             name = format!("{name}, {}", tokens.name());
@@ -109,7 +107,7 @@ fn levels(summary: &Summary) -> Vec<Level> {
     all.into_iter().filter_map(level).collect()
 }
 
-/// The mark of a point at `x`, if its quality is known.
+/// Returns the mark of a point at `x`; `None` without PSNR.
 fn mark(point: &SummaryPoint, x: f64) -> Option<Mark> {
     let y = point.psnr?;
     let SummaryPoint { num_storage_tokens: stored, num_render_tokens: rendered, .. } = *point;
@@ -121,12 +119,12 @@ fn mark(point: &SummaryPoint, x: f64) -> Option<Mark> {
     let format = point.tokens.map(|tokens| format!(" in {}", tokens.name())).unwrap_or_default();
     let error = point.psnr_stderr.map(|error| format!(" \u{b1} {error:.2}")).unwrap_or_default();
     let time = point.frame_median_s.map(|s| format!(", {} ms per frame", milliseconds(s))).unwrap_or_default();
-    let title = format!("{}{tokens}{format}: {y:.2}{error} dB{time}", point.variant.name());
+    let title = format!("{}{tokens}{format}: {y:.2}{error} dB{time}", point.method.name());
     Some(Mark { x, y, error: point.psnr_stderr, title })
 }
 
-/// A line per variant, of the points that are drawn from all they store.
-fn by_variant(
+/// Plots a line per method over the points that render all stored tokens.
+fn by_method(
     summary: &Summary,
     x_label: &'static str,
     x_scale: Scale,
@@ -134,7 +132,7 @@ fn by_variant(
 ) -> Plot {
     let whole =
         |point: &SummaryPoint| if point.key().is_whole() { x(point).and_then(|x| mark(point, x)) } else { None };
-    let title = format!("PSNR against {x_label}, a line per variant, with the standard error over scenes");
+    let title = format!("PSNR against {x_label}, a line per method, with the standard error over scenes");
     Plot {
         title,
         x_label,
@@ -146,12 +144,12 @@ fn by_variant(
     }
 }
 
-/// A line per storage count of the best variant.
+/// Plots a line per storage count of the best method.
 fn by_rendered(summary: &Summary) -> Plot {
-    let best = best_variant(summary.points.iter().map(SummaryPoint::key));
+    let best = best_method(summary.points.iter().map(SummaryPoint::key));
     let mut lines: BTreeMap<usize, Vec<Mark>> = BTreeMap::new();
-    // Of the finest format, where there are several.
-    let is_best = |point: &&SummaryPoint| Some(point.variant) == best;
+    // With several formats, the finest.
+    let is_best = |point: &&SummaryPoint| Some(point.method) == best;
     let format = summary.points.iter().filter(is_best).map(|point| point.tokens).min().flatten();
     for point in summary.points.iter().filter(is_best).filter(|point| point.tokens == format) {
         lines.entry(point.num_storage_tokens).or_default().extend(mark(point, point.num_render_tokens as f64));
@@ -160,7 +158,7 @@ fn by_rendered(summary: &Summary) -> Plot {
     for marks in lines.values_mut() {
         marks.sort_by(|a, b| a.x.total_cmp(&b.x));
     }
-    // The largest counts, where there are more lines than looks.
+    // With more lines than looks, the largest counts.
     let surplus = lines.len().saturating_sub(Look::ALL.len());
     let looks = Look::ALL.into_iter().cycle();
     let series = lines.into_iter().skip(surplus).rev().zip(looks).map(|((stored, marks), look)| Series {
@@ -180,17 +178,17 @@ fn by_rendered(summary: &Summary) -> Plot {
     }
 }
 
-/// Every point over its time per frame, and the front.
+/// Plots every point over its time per frame, and the Pareto front.
 fn by_time(summary: &Summary) -> Plot {
-    let place = |point: &SummaryPoint| Some((point.frame_median_s? * 1e3, point.psnr?));
+    let position = |point: &SummaryPoint| Some((point.frame_median_s? * 1e3, point.psnr?));
     let at_time = |point: &SummaryPoint| {
         let mark = point.frame_median_s.and_then(|seconds| mark(point, seconds * 1e3))?;
         Some(Mark { error: None, ..mark })
     };
-    let mut front: Vec<_> = summary.points.iter().filter(|point| point.pareto_time).filter_map(place).collect();
+    let mut front: Vec<_> = summary.points.iter().filter(|point| point.pareto_time).filter_map(position).collect();
     front.sort_by(|a, b| a.0.total_cmp(&b.0));
     Plot {
-        title: "PSNR against time per frame, every point, with the Pareto front".into(),
+        title: "PSNR against time per frame: every point, with the Pareto front".into(),
         x_label: "time per frame, ms",
         x_scale: Scale::Linear,
         y_label: QUALITY,

@@ -8,10 +8,10 @@ use crate::report::axis::{grouped, milliseconds};
 use crate::report::html::{DASH, count, head, number};
 use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Summary, SummaryPoint};
-use crate::system::machine;
+use crate::system::machine::machine_rows;
 
 const POINTS_HEAD: [&str; 17] = [
-    "variant",
+    "method",
     "stored\ntokens",
     "rendered\ntokens",
     "format\n\u{a0}",
@@ -19,7 +19,7 @@ const POINTS_HEAD: [&str; 17] = [
     "\u{b1}\ndB",
     "SSIM\n\u{a0}",
     "LPIPS\n\u{a0}",
-    "drawing\nms",
+    "render\nms",
     "p95\nms",
     "frame\nms",
     "p95\nms",
@@ -30,18 +30,18 @@ const POINTS_HEAD: [&str; 17] = [
     "front:\nbytes",
 ];
 
-const POINTS_NOTE: &str = "Each view is drawn alone, keys and values of its tokens included; a frame is the choice of tokens and \
-                           the drawing; times are medians and 95th percentiles over views. A point is on a front if no \
-                           other has its PSNR in as little time per frame, or in as few bytes. Memory is the peak of \
-                           the whole process. GMAC are multiply-accumulates per view, attention included.";
+const POINTS_NOTE: &str = "Each view is rendered in a call of its own, including the keys and values of its tokens. Frame: token \
+                           selection and rendering. Times are medians and 95th percentiles over views. A point is on a \
+                           front if no other point has its PSNR in as little time per frame, or in as few bytes. Memory: \
+                           peak of the whole process. GMAC: multiply-accumulates per view, attention included.";
 
 const DIFFERENCES_HEAD: [&str; 7] =
     ["better", "worse", "stored\ntokens", "format\n\u{a0}", "scenes\n\u{a0}", "difference\ndB", "\u{b1}\ndB"];
 
-const DIFFERENCES_NOTE: &str = "PSNR of the variant that the paper finds better less that of the other, on the same \
-                                scenes: below zero where these scenes disagree.";
+const DIFFERENCES_NOTE: &str = "PSNR of the method that the paper finds better minus PSNR of the other method, on the \
+                                same scenes; negative where these scenes disagree with the paper.";
 
-/// Returns the table of all points, baselines first, and what is missing in it.
+/// Returns the table of all points, baselines first, with notes on missing images and metrics.
 pub fn points(summary: &Summary) -> Markup {
     let Summary { baselines, points, missing, not_measured, num_views, .. } = summary;
     html! {
@@ -62,10 +62,10 @@ pub fn points(summary: &Summary) -> Markup {
                         }
                     }
                     @for (i, point) in points.iter().enumerate() {
-                        @let is_first = i == 0 || points[i - 1].variant != point.variant;
+                        @let is_first = i == 0 || points[i - 1].method != point.method;
                         @let is_front = point.pareto_time || point.pareto_bytes;
                         tr.first[is_first].front-row[is_front] {
-                            td { (point.variant.name()) }
+                            td { (point.method.name()) }
                             @for cell in cells(point) { td { (cell) } }
                         }
                     }
@@ -75,8 +75,8 @@ pub fn points(summary: &Summary) -> Markup {
         p.note { (POINTS_NOTE) }
         @for missing in missing {
             p.note {
-                (missing.variant.name()) ": " (missing.num_missing) " of " (num_views)
-                " pictures are missing; its means are over the rest."
+                (missing.method.name()) ": " (missing.num_missing) " of " (num_views)
+                " images are missing; the means are over the others."
             }
         }
         @for missing in not_measured {
@@ -85,7 +85,7 @@ pub fn points(summary: &Summary) -> Markup {
     }
 }
 
-/// Returns the cells of a point after its name.
+/// Returns the cells of a point after the method.
 fn cells(point: &SummaryPoint) -> [String; 16] {
     let tokens = |tokens: usize| if tokens == 0 { DASH.to_owned() } else { count(tokens) };
     let ms = |seconds: Option<f64>| seconds.map_or_else(|| DASH.into(), milliseconds);
@@ -110,7 +110,7 @@ fn cells(point: &SummaryPoint) -> [String; 16] {
     ]
 }
 
-/// Returns the table of paired differences; nothing where there is no pair.
+/// Returns the table of paired differences; nothing without pairs.
 pub fn differences(differences: &[PairedDifference]) -> Markup {
     html! {
         @if !differences.is_empty() {
@@ -122,7 +122,7 @@ pub fn differences(differences: &[PairedDifference]) -> Markup {
                     tbody {
                         @for row in differences {
                             tr {
-                                td { (row.variant.name()) }
+                                td { (row.method.name()) }
                                 td { (row.against.name()) }
                                 td { (count(row.num_storage_tokens)) }
                                 td { (row.tokens.map_or(DASH, TokenFormat::name)) }
@@ -138,33 +138,33 @@ pub fn differences(differences: &[PairedDifference]) -> Markup {
     }
 }
 
-/// Returns how many scenes were evaluated, and the reasons of the others.
-pub fn left_out(num_evaluated: usize, ledger: &SkipReport) -> Markup {
+/// Returns the number of evaluated scenes, and the reasons of the skipped scenes.
+pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
     html! {
-        h2 { "What was left out" }
-        p { (count(num_evaluated)) " of " (count(ledger.num_scenes)) " scenes were evaluated." }
-        @if ledger.skips.is_empty() {
-            p { "None was left out." }
+        h2 { "Skipped scenes" }
+        p { (count(num_evaluated)) " of " (count(skip_report.num_scenes)) " scenes were evaluated." }
+        @if skip_report.skips.is_empty() {
+            p { "No scene was skipped." }
         } @else {
             table.plain {
                 thead { tr { th { "scenes" } th { "reason" } } }
                 tbody {
-                    @for (reason, count) in ledger.counts() { tr { td { (count) } td { (reason) } } }
+                    @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (reason) } } }
                 }
             }
-            p.note { "Each by its name: " code { "skipped.json" } "." }
+            p.note { "All names: " code { "skipped.json" } "." }
         }
     }
 }
 
-/// Returns the table of program, device and machine.
+/// Returns the table of program version, device and machine.
 pub fn machine(device: &str) -> Markup {
-    let ours = [("clift", env!("CARGO_PKG_VERSION").to_owned()), ("device", device.to_owned())];
+    let program = [("clift", env!("CARGO_PKG_VERSION").to_owned()), ("device", device.to_owned())];
     html! {
         h2 { "Machine" }
         table.plain {
             tbody {
-                @for (name, value) in ours.into_iter().chain(machine::rows()) { tr { td { (name) } td { (value) } } }
+                @for (name, value) in program.into_iter().chain(machine_rows()) { tr { td { (name) } td { (value) } } }
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Two evaluations side by side: differences of the same views, scene by scene.
+//! Comparison of two evaluations: differences of the same views, scene by scene.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -6,31 +6,33 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
-use crate::statistics::scene_means::capped;
+use crate::statistics::scene_means::{capped, mean, standard_error};
 use crate::statistics::student_t::t_quantile_95;
 
-/// What both evaluations measure.
+/// Compared metrics.
 const METRICS: [&str; 3] = ["psnr", "ssim", "lpips_vgg"];
 
-/// How a line of `views.csv` was made.
+/// The key of a row of `views.csv`, as text.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct RowKey {
-    /// Its variant.
-    pub variant: String,
+    /// Name of the method.
+    #[serde(rename = "variant")]
+    pub method: String,
     /// Tokens in the scene file.
     pub num_storage_tokens: usize,
-    /// Tokens the renderer was given.
+    /// Tokens of a rendering.
     pub num_render_tokens: usize,
-    /// Number format of the stored tokens; empty where there are none.
+    /// Number format of the stored tokens; empty without tokens.
     pub tokens: String,
 }
 
-/// A row of `views.csv`, as far as it is compared.
+/// The compared columns of `views.csv`.
 #[derive(Deserialize)]
 struct Row {
     scene: String,
     target_frame: usize,
-    variant: String,
+    #[serde(rename = "variant")]
+    method: String,
     num_storage_tokens: usize,
     num_render_tokens: usize,
     psnr: Option<f64>,
@@ -44,7 +46,7 @@ struct Row {
 type View = (String, usize);
 type Values = [Option<f64>; METRICS.len()];
 
-/// What an evaluation measured of every view.
+/// The metrics of every view of an evaluation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Evaluation {
     path: PathBuf,
@@ -52,64 +54,64 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
-    /// Reads the `views.csv` of a run, of an evaluation's folder, or itself.
+    /// Reads `views.csv` from a run, from the folder of an evaluation, or from the path of the file.
     ///
     /// # Errors
-    /// [`EvalError::NotComparable`] where there is none, or it is not one.
+    /// [`EvalError::NotComparable`] without `views.csv`, or for a file of another format.
     pub fn read(path: &Path) -> Result<Self, EvalError> {
         let candidates = [path.join("views.csv"), path.join("eval").join("views.csv"), path.to_owned()];
         let Some(file) = candidates.into_iter().find(|candidate| candidate.is_file()) else {
-            let reason = "there is no views.csv, and none in `eval`; `clift eval` writes it".into();
+            let reason = "no views.csv here or in `eval`; `clift eval` writes the file".into();
             return Err(EvalError::NotComparable { reason, path: path.into() });
         };
         let bad = |error: csv::Error| EvalError::NotComparable { reason: error.to_string(), path: file.clone() };
         let mut views: BTreeMap<RowKey, BTreeMap<View, Values>> = BTreeMap::new();
         for row in csv::Reader::from_path(&file).map_err(bad)?.deserialize() {
             let row: Row = row.map_err(bad)?;
-            let made = RowKey {
-                variant: row.variant,
+            let key = RowKey {
+                method: row.method,
                 num_storage_tokens: row.num_storage_tokens,
                 num_render_tokens: row.num_render_tokens,
                 tokens: row.tokens,
             };
             let psnr = row.psnr.map(capped);
-            views.entry(made).or_default().insert((row.scene, row.target_frame), [psnr, row.ssim, row.lpips_vgg]);
+            views.entry(key).or_default().insert((row.scene, row.target_frame), [psnr, row.ssim, row.lpips_vgg]);
         }
         Ok(Self { path: path.into(), views })
     }
 }
 
-/// One of the two sides of a comparison by variants.
+/// One side of a comparison of methods.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MethodFilter {
-    /// The variant.
-    pub variant: String,
-    /// The number format; any, if there is only one, where it is not given.
+    /// The method.
+    pub method: String,
+    /// The number format; `None` for any format.
     pub tokens: Option<String>,
 }
 
 impl MethodFilter {
-    /// Reads `variant` or `variant:format`.
+    /// Parses `method` or `method:format`.
     pub fn parse(text: &str) -> Self {
         match text.split_once(':') {
-            Some((variant, tokens)) => Self { variant: variant.into(), tokens: Some(tokens.into()) },
-            None => Self { variant: text.into(), tokens: None },
+            Some((method, tokens)) => Self { method: method.into(), tokens: Some(tokens.into()) },
+            None => Self { method: text.into(), tokens: None },
         }
     }
 
-    fn holds(&self, made: &RowKey) -> bool {
-        made.variant == self.variant && self.tokens.as_ref().is_none_or(|tokens| *tokens == made.tokens)
+    fn matches(&self, key: &RowKey) -> bool {
+        key.method == self.method && self.tokens.as_ref().is_none_or(|tokens| *tokens == key.tokens)
     }
 }
 
-/// The difference of one metric.
+/// The paired difference of one metric.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct PairedDifference {
-    /// Mean over the scenes of the first.
+pub struct MetricDifference {
+    /// Mean over scenes of the first evaluation.
     pub a: f64,
-    /// Mean over the scenes of the second.
+    /// Mean over scenes of the second evaluation.
     pub b: f64,
-    /// Mean over scenes of second minus first.
+    /// Mean over scenes of the second minus the first.
     pub mean: f64,
     /// Standard error of `mean`; null for a single scene.
     pub stderr: Option<f64>,
@@ -117,48 +119,48 @@ pub struct PairedDifference {
     pub interval: Option<[f64; 2]>,
 }
 
-/// The differences between two settings.
+/// The differences between two keys.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PairedRow {
-    /// How the first was made.
+    /// Key in the first evaluation.
     pub a: RowKey,
-    /// How the second was made.
+    /// Key in the second evaluation.
     pub b: RowKey,
-    /// Scenes with a view of both.
+    /// Scenes with a common view.
     pub num_scenes: usize,
-    /// Views of both.
+    /// Common views.
     pub num_views: usize,
-    /// Views of the first alone, which are left out.
+    /// Ignored views of the first evaluation, missing in the second.
     pub num_only_a: usize,
-    /// Views of the second alone, which are left out.
+    /// Ignored views of the second evaluation, missing in the first.
     pub num_only_b: usize,
-    /// In dB; an identical picture counts as 100.
-    pub psnr: Option<PairedDifference>,
-    /// Of SSIM.
-    pub ssim: Option<PairedDifference>,
-    /// Of LPIPS, where less is better.
-    pub lpips_vgg: Option<PairedDifference>,
+    /// Difference of PSNR in dB; an identical image counts as 100 dB.
+    pub psnr: Option<MetricDifference>,
+    /// Difference of SSIM.
+    pub ssim: Option<MetricDifference>,
+    /// Difference of LPIPS; lower is better.
+    pub lpips_vgg: Option<MetricDifference>,
 }
 
-/// Two evaluations side by side.
+/// A comparison of two evaluations.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
-    /// Where the first lies.
+    /// Path of the first evaluation.
     pub a: PathBuf,
-    /// Where the second lies.
+    /// Path of the second evaluation.
     pub b: PathBuf,
-    /// One per setting of both.
+    /// One row per common key.
     pub pairs: Vec<PairedRow>,
 }
 
 impl Comparison {
-    /// Compares every setting that both have, or one variant of the first with one of the second at equal counts.
+    /// Compares all common keys, or one method of the first with one method of the second at equal token counts.
     ///
-    /// Differences are of the same target frames of the same scenes: first the mean of each scene's views, then over
-    /// scenes. Views that only one side has are left out and counted.
+    /// Differences are between the same target frames of the same scenes: means over the views of a scene, then over the
+    /// scenes. Views of only one evaluation are ignored and counted.
     ///
     /// # Errors
-    /// [`EvalError::NotComparable`] without a common setting, or without a common view of any.
+    /// [`EvalError::NotComparable`] without a common key or without a common view.
     pub fn new(a: &Evaluation, b: &Evaluation, sides: Option<&[MethodFilter; 2]>) -> Result<Self, EvalError> {
         let mut pairs = Vec::new();
         for (made_a, views_a) in &a.views {
@@ -166,8 +168,8 @@ impl Comparison {
                 let matches = match sides {
                     None => made_a == made_b,
                     Some([side_a, side_b]) => {
-                        let counts = |made: &RowKey| (made.num_storage_tokens, made.num_render_tokens);
-                        side_a.holds(made_a) && side_b.holds(made_b) && counts(made_a) == counts(made_b)
+                        let counts = |key: &RowKey| (key.num_storage_tokens, key.num_render_tokens);
+                        side_a.matches(made_a) && side_b.matches(made_b) && counts(made_a) == counts(made_b)
                     }
                 };
                 if matches {
@@ -175,26 +177,20 @@ impl Comparison {
                 }
             }
         }
-        let not = |reason: String| EvalError::NotComparable { reason, path: b.path.clone() };
+        let not_comparable = |reason: String| EvalError::NotComparable { reason, path: b.path.clone() };
         if pairs.is_empty() {
-            let of = |evaluation: &Evaluation| {
-                let made = evaluation.views.keys().map(RowKey::to_string);
-                made.collect::<Vec<_>>().join(", ")
-            };
-            return Err(not(format!(
-                "no setting is in both: {} has {}; the other has {}",
-                a.path.display(),
-                of(a),
-                of(b)
-            )));
+            let keys = |of: &Evaluation| of.views.keys().map(RowKey::to_string).collect::<Vec<_>>().join(", ");
+            let path = a.path.display();
+            let reason = format!("no common method and token count: {path} has {}; the other has {}", keys(a), keys(b));
+            return Err(not_comparable(reason));
         }
         if pairs.iter().all(|pair| pair.num_views == 0) {
             let first = |evaluation: &Evaluation| {
                 let view = evaluation.views.values().flat_map(BTreeMap::keys).next();
                 view.map_or_else(String::new, |(scene, frame)| format!("{scene}, frame {frame}"))
             };
-            return Err(not(format!(
-                "no target view is in both: {} begins with {}, the other with {}; evaluate both with one index",
+            return Err(not_comparable(format!(
+                "no common target view: {} starts with {}, the other with {}; evaluate both with the same index",
                 a.path.display(),
                 first(a),
                 first(b)
@@ -210,7 +206,7 @@ impl PairedRow {
             a.iter().filter_map(|(view, values)| Some((view, values, b.get(view)?))).collect();
         let scenes: Vec<_> = common.chunk_by(|(a, ..), (b, ..)| a.0 == b.0).collect();
         let difference = |metric: usize| {
-            // A view counts where both have the metric.
+            // Only views with the metric in both evaluations count.
             let scene_means = scenes.iter().filter_map(|views| {
                 let values: Vec<(f64, f64)> =
                     views.iter().filter_map(|(_, a, b)| Some((a[metric]?, b[metric]?))).collect();
@@ -218,7 +214,7 @@ impl PairedRow {
                 let sum = values.iter().fold((0.0, 0.0), |sum, value| (sum.0 + value.0, sum.1 + value.1));
                 (!values.is_empty()).then(|| (sum.0 / count, sum.1 / count))
             });
-            PairedDifference::of(&scene_means.collect::<Vec<_>>())
+            MetricDifference::of(&scene_means.collect::<Vec<_>>())
         };
         Self {
             a: made_a.clone(),
@@ -234,22 +230,23 @@ impl PairedRow {
     }
 }
 
-impl PairedDifference {
-    /// Of paired values, one pair per scene.
+impl MetricDifference {
+    /// Computes the difference from one pair of values per scene; `None` without scenes.
     fn of(pairs: &[(f64, f64)]) -> Option<Self> {
-        let count = pairs.len() as f64;
-        let mean = |value: &dyn Fn(&(f64, f64)) -> f64| pairs.iter().map(value).sum::<f64>() / count;
-        let (a, b, difference) = (mean(&|pair| pair.0), mean(&|pair| pair.1), mean(&|pair| pair.1 - pair.0));
-        let squares: f64 = pairs.iter().map(|(a, b)| (b - a - difference).powi(2)).sum();
-        let stderr = (pairs.len() > 1).then(|| (squares / (count - 1.0) / count).sqrt());
+        let means = |value: fn(&(f64, f64)) -> f64| {
+            let values: Vec<f64> = pairs.iter().map(value).collect();
+            Some((mean(&values)?, standard_error(&values)))
+        };
+        let ((a, _), (b, _), (difference, stderr)) =
+            (means(|pair| pair.0)?, means(|pair| pair.1)?, means(|pair| pair.1 - pair.0)?);
         let interval = stderr.map(|stderr| {
             let half = t_quantile_95(pairs.len() - 1) * stderr;
             [difference - half, difference + half]
         });
-        (!pairs.is_empty()).then_some(Self { a, b, mean: difference, stderr, interval })
+        Some(Self { a, b, mean: difference, stderr, interval })
     }
 
-    /// Whether the confidence interval does not hold zero.
+    /// Returns whether the confidence interval excludes zero.
     pub fn is_clear(&self) -> bool {
         self.interval.is_some_and(|[low, high]| low > 0.0 || high < 0.0)
     }

@@ -1,13 +1,13 @@
-//! The table that a terminal shows of a comparison.
+//! The terminal table of a comparison.
 
 use std::fmt;
 
-use crate::statistics::compare::{Comparison, PairedDifference, PairedRow, RowKey};
+use crate::statistics::compare::{Comparison, MetricDifference, PairedRow, RowKey};
 
 impl fmt::Display for RowKey {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { variant, num_storage_tokens: stored, num_render_tokens: rendered, tokens } = self;
-        f.write_str(variant)?;
+        let Self { method, num_storage_tokens: stored, num_render_tokens: rendered, tokens } = self;
+        f.write_str(method)?;
         match (stored, stored == rendered) {
             (0, _) => {}
             (_, true) => write!(f, " {stored}")?,
@@ -40,17 +40,17 @@ impl fmt::Display for Comparison {
         }
         writeln!(
             f,
-            "\nMeans of the paired differences of scenes with 95 % intervals of Student's t; *: zero lies outside. Of LPIPS \
-             less is better."
+            "\nMeans of paired differences over scenes, with 95 % intervals of Student's t; *: the interval excludes zero. Lower \
+             LPIPS is better."
         )?;
-        let left_out = |count: fn(&PairedRow) -> usize| self.pairs.iter().map(count).max().unwrap_or_default();
-        let (only_a, only_b) = (left_out(|pair| pair.num_only_a), left_out(|pair| pair.num_only_b));
+        let largest = |count: fn(&PairedRow) -> usize| self.pairs.iter().map(count).max().unwrap_or_default();
+        let (only_a, only_b) = (largest(|pair| pair.num_only_a), largest(|pair| pair.num_only_b));
         if only_a + only_b > 0 {
             let common = self.pairs.iter().map(|pair| pair.num_views).max().unwrap_or_default();
             writeln!(
                 f,
-                "The evaluations are of other target views: the {common} of both are compared, up to {only_a} of A alone and \
-                 {only_b} of B alone are left out."
+                "The evaluations have different target views: {common} common views are compared, up to {only_a} views of A \
+                 and {only_b} views of B are ignored."
             )?;
         }
         Ok(())
@@ -61,7 +61,7 @@ fn name(pair: &PairedRow) -> String {
     if pair.a == pair.b { pair.a.to_string() } else { format!("{} -> {}", pair.a, pair.b) }
 }
 
-fn interval(difference: Option<PairedDifference>, decimals: usize) -> String {
+fn interval(difference: Option<MetricDifference>, decimals: usize) -> String {
     let Some(difference) = difference else { return "-".into() };
     let mark = if difference.is_clear() { " *" } else { "" };
     match difference.interval {

@@ -7,18 +7,18 @@
 //! - `pareto`: Pareto front
 //! - `paired`: paired differences of methods
 //! - `summary`: summary.json
-//! - `scenes_csv`: scenes.csv
+//! - `csv_files`: views.csv and scenes.csv
 //! - `table`: the terminal table
 //! - `compare`: two evaluations, view by view
 //! - `compare_table`: its terminal table
 
 pub(crate) mod compare;
 pub(crate) mod compare_table;
+pub(crate) mod csv_files;
 pub(crate) mod eval_results;
 pub(crate) mod paired;
 pub(crate) mod pareto;
 pub(crate) mod scene_means;
-pub(crate) mod scenes_csv;
 pub(crate) mod student_t;
 pub(crate) mod summary;
 pub(crate) mod table;

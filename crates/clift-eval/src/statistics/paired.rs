@@ -1,7 +1,7 @@
-//! Which variant is better, scene by scene.
+//! Paired differences of methods, scene by scene.
 //!
-//! Scenes differ far more than variants do: the standard error of a difference is that of the differences of the same
-//! scenes, not that of two means.
+//! Scenes differ far more than methods. The standard error is therefore computed from the differences within scenes, not
+//! from two means.
 
 use std::collections::BTreeMap;
 
@@ -14,7 +14,7 @@ use crate::statistics::eval_results::{EvalResults, SceneViews};
 use crate::statistics::scene_means::capped;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
-/// What the paper says is better than what (section 4.3): the better one first.
+/// Pairs of methods, the better method of the paper first (section 4.3).
 const ORDERINGS: [[Method; 2]; 5] = [
     [Method::Kmeans, Method::Random],
     [Method::Clift, Method::Kmeans],
@@ -23,35 +23,36 @@ const ORDERINGS: [[Method; 2]; 5] = [
     [Method::Clift, Method::PatchClift],
 ];
 
-/// Mean difference of the PSNR of the same scenes in two variants, all stored tokens rendered.
+/// Mean PSNR difference of two methods on the same scenes, rendered from all stored tokens.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PairedDifference {
-    /// The variant that the paper finds better.
-    pub variant: Method,
-    /// The one it is compared with.
+    /// The method that the paper finds better.
+    #[serde(rename = "variant")]
+    pub method: Method,
+    /// The other method.
     pub against: Method,
-    /// Tokens in the scene file, of both.
+    /// Tokens in the scene file, for both methods.
     pub num_storage_tokens: usize,
-    /// Number format of the stored tokens, of both; random subsets are never rounded.
+    /// Number format of the stored tokens of `method`; random subsets are always f32.
     pub tokens: Option<TokenFormat>,
-    /// Scenes that were measured in both.
+    /// Scenes measured with both methods.
     pub num_scenes: usize,
-    /// Mean over those scenes of `variant` less `against`, in dB: positive where the paper's order holds.
+    /// Mean over scenes of `method` minus `against`, in dB; positive in agreement with the paper.
     pub psnr: f64,
-    /// Standard error of that mean; `null` for a single scene.
+    /// Standard error of `psnr`; `null` for a single scene.
     pub psnr_stderr: Option<f64>,
 }
 
-/// Compares both variants of every ordering at equal counts, by ordering and rising token count.
+/// Compares the methods of every pair at equal token counts, by pair and ascending count.
 pub fn differences(results: &EvalResults) -> Vec<PairedDifference> {
     let mut differences = Vec::new();
-    for [variant, against] in ORDERINGS {
-        for (key, better) in results.views().filter(|(key, _)| key.variant == variant && key.is_whole()) {
+    for [method, against] in ORDERINGS {
+        for (key, better) in results.views().filter(|(key, _)| key.method == method && key.is_whole()) {
             let tokens = if against == Method::Random { Some(TokenFormat::F32) } else { key.tokens };
-            let Some(other) = results.of(EvalKey { variant: against, tokens, ..key }) else { continue };
+            let Some(other) = results.of(EvalKey { method: against, tokens, ..key }) else { continue };
             let per_scene = scene_differences(better, other);
             differences.extend(mean(&per_scene).map(|psnr| PairedDifference {
-                variant,
+                method,
                 against,
                 num_storage_tokens: key.num_storage_tokens,
                 tokens: key.tokens,
@@ -64,7 +65,7 @@ pub fn differences(results: &EvalResults) -> Vec<PairedDifference> {
     differences
 }
 
-/// Returns the mean PSNR difference of every scene, over the views of both sides.
+/// Returns the mean PSNR difference of every scene over the common views.
 fn scene_differences(better: &SceneViews, other: &SceneViews) -> Vec<f64> {
     let of_scene = |(scene, views): (&String, &BTreeMap<usize, ViewMetrics>)| {
         let others = other.get(scene)?;
@@ -78,8 +79,8 @@ fn scene_differences(better: &SceneViews, other: &SceneViews) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    fn key(variant: Method, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
-        EvalKey { variant, num_storage_tokens, num_render_tokens, tokens: Some(TokenFormat::F32) }
+    fn key(method: Method, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
+        EvalKey { method, num_storage_tokens, num_render_tokens, tokens: Some(TokenFormat::F32) }
     }
 
     fn differences_of(rows: &[(&str, usize, EvalKey, f64)]) -> Vec<PairedDifference> {
@@ -91,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn scenes_are_paired_and_views_averaged_within_them() {
+    fn scenes_are_paired_at_equal_counts() {
         let (better, worse) = (key(Method::Kmeans, 8, 8), key(Method::Random, 8, 8));
         let differences = differences_of(&[
             ("attic", 1, better, 21.0),
@@ -100,26 +101,17 @@ mod tests {
             ("attic", 2, worse, 21.0),
             ("cellar", 1, better, 10.0),
             ("cellar", 1, worse, 11.0),
-            // ViewMetrics on one side alone.
+            // Without a counterpart.
             ("hall", 1, better, 30.0),
-        ]);
-        let [difference] = &differences[..] else { panic!("one ordering at one count") };
-        // 2 dB in the attic, -1 dB in the cellar.
-        assert_eq!((difference.variant, difference.against), (Method::Kmeans, Method::Random));
-        assert_eq!((difference.num_scenes, difference.psnr, difference.psnr_stderr), (2, 0.5, Some(1.5)));
-    }
-
-    #[test]
-    fn counts_are_compared_with_the_same_count_and_only_where_all_tokens_are_rendered() {
-        let differences = differences_of(&[
-            ("attic", 1, key(Method::Clift, 8, 8), 20.0),
             ("attic", 1, key(Method::Clift, 8, 4), 19.0),
             ("attic", 1, key(Method::Kmeans, 8, 4), 18.0),
+            // A single scene.
             ("attic", 1, key(Method::Kmeans, 16, 16), 22.0),
             ("attic", 1, key(Method::Clift, 16, 16), f64::INFINITY),
         ]);
-        let [difference] = &differences[..] else { panic!("one ordering at one count") };
-        assert_eq!((difference.num_storage_tokens, difference.psnr), (16, 100.0 - 22.0));
-        assert_eq!(difference.psnr_stderr, None, "of a single scene");
+        let rows = differences.iter().map(|d| (d.method, d.num_storage_tokens, d.num_scenes, d.psnr, d.psnr_stderr));
+        // 2 dB in the attic, -1 dB in the cellar; an infinite PSNR counts as 100 dB.
+        let expected = [(Method::Kmeans, 8, 2, 0.5, Some(1.5)), (Method::Clift, 16, 1, 78.0, None)];
+        assert_eq!(rows.collect::<Vec<_>>(), expected);
     }
 }

@@ -1,7 +1,7 @@
-//! The Pareto front: what nothing else beats in both cost and quality.
+//! The Pareto front of cost and quality.
 
-/// Indices of the points `(cost, quality)` on the front, by rising cost: no other point costs as little and is as good.
-/// Of equal points the first is taken; points that are not finite are none.
+/// Returns the indices of the points `(cost, quality)` on the front, by ascending cost: no other point has at most the cost
+/// and at least the quality. Of equal points the first counts; points with a NaN or an infinity are ignored.
 pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
     let is_finite = |&i: &usize| points[i].0.is_finite() && points[i].1.is_finite();
     let mut order: Vec<usize> = (0..points.len()).filter(is_finite).collect();
@@ -20,7 +20,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_front_is_what_no_other_point_beats() {
+    fn no_point_dominates_the_front() {
         // A grid of costs and qualities with ties, against the definition.
         let points: Vec<(f64, f64)> =
             (0..60_u32).map(|i| (f64::from(i * 7 % 11), f64::from(i * 13 % 17) - f64::from(i % 3))).collect();
@@ -31,10 +31,6 @@ mod tests {
         expected.dedup();
         assert!(expected.len() > 1, "{expected:?}");
         assert_eq!(pareto_front(&points).into_iter().map(|i| points[i]).collect::<Vec<_>>(), expected);
-    }
-
-    #[test]
-    fn equal_points_count_once_and_what_is_not_finite_never() {
         assert_eq!(pareto_front(&[(1.0, 2.0), (1.0, 2.0), (f64::NAN, 9.0), (0.5, f64::NAN)]), [0]);
         assert_eq!(pareto_front(&[]), [0; 0]);
     }

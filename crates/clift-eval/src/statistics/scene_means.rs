@@ -1,19 +1,17 @@
-//! Means over the views of a scene first and over the scenes then, so that a scene with many targets weighs no more
-//! than one with few.
+//! Means over the views of a scene, then over the scenes, so every scene has the same weight.
 
 use clift_data::mean;
 
 use crate::statistics::eval_results::SceneViews;
 use crate::statistics::view_metrics::ViewMetrics;
 
-/// What an identical image counts as in a mean, in dB; larger values are counted as this too.
+/// Upper bound of a PSNR in a mean, in dB, for identical images with their infinite PSNR.
 ///
-/// Its PSNR is infinite, which no mean survives and JSON cannot hold. 100 dB is what one wrong 8-bit
-/// level in one of the values of a 256 x 256 image gives (101 dB), so nothing real is cut off.
-/// Leaving such views out instead would lower the mean of the method that got them right.
+/// A mean cannot hold infinity, nor can JSON. A single wrong 8-bit level in a 256 x 256 image has 101 dB, so the bound
+/// affects no real difference. Skipping identical views would lower the mean of the better method.
 pub const PSNR_CAP_DB: f64 = 100.0;
 
-/// Limits a PSNR to [`PSNR_CAP_DB`].
+/// SceneLimits a PSNR to [`PSNR_CAP_DB`].
 pub(crate) fn capped(psnr: f64) -> f64 {
     psnr.min(PSNR_CAP_DB)
 }

@@ -1,10 +1,9 @@
 //! Student's t distribution with a whole number of degrees of freedom.
 
-/// Half-width of the central 95 % of the distribution, in its own units: 12.7 with one degree of freedom, 1.96 with
-/// many.
+/// Returns the half-width of the central 95 % of the distribution: 12.7 for one degree of freedom, 1.96 for many.
 pub(crate) fn t_quantile_95(degrees: usize) -> f64 {
     let (mut low, mut high) = (0.0, 13.0);
-    // Halvings of 13: far below what is printed.
+    // 60 bisections of 13 are exact to rounding.
     for _ in 0..60 {
         let middle = f64::midpoint(low, high);
         if central(middle, degrees) < 0.95 {
@@ -16,7 +15,7 @@ pub(crate) fn t_quantile_95(degrees: usize) -> f64 {
     f64::midpoint(low, high)
 }
 
-/// Probability of `|T| < t` (Abramowitz and Stegun 26.7.3 and 26.7.4).
+/// Returns the probability of `|T| < t` (Abramowitz and Stegun 26.7.3 and 26.7.4).
 fn central(t: f64, degrees: usize) -> f64 {
     let (sin, cos) = (t / (degrees as f64).sqrt()).atan().sin_cos();
     let square = cos * cos;
@@ -38,7 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_quantiles_are_those_of_the_tables() {
+    fn quantiles_equal_scipy() {
         // scipy.stats.t.ppf(0.975, n)
         for (degrees, expected) in [
             (1, 12.706_204_736),

@@ -1,7 +1,7 @@
-//! `summary.json`: the means that a paper prints.
+//! `summary.json`: means of quality, time and cost.
 //!
-//! A mean is over the views of a scene first and over the scenes then, so that a scene with many
-//! targets weighs no more than one with few. The mean over all views stands beside it.
+//! Means are over the views of a scene, then over the scenes, so every scene has the same weight. Fields `.._per_view` are
+//! means over all views.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -30,7 +30,7 @@ pub struct Quality {
     pub lpips_vgg: Option<f64>,
 }
 
-/// The pictures every method must beat.
+/// Quality of the baselines, which every method must exceed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Baselines {
     /// Copying the nearest context view.
@@ -39,24 +39,25 @@ pub struct Baselines {
     pub mean_image: Quality,
 }
 
-/// Means of one setting; `null` is what was not measured.
+/// Means of one key; `null` where nothing was measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SummaryPoint {
-    /// How its views were made.
-    pub variant: Method,
+    /// The method.
+    #[serde(rename = "variant")]
+    pub method: Method,
     /// Tokens in the scene file.
     pub num_storage_tokens: usize,
-    /// Tokens the renderer was given.
+    /// Tokens of a rendering.
     pub num_render_tokens: usize,
     /// Number format of the stored tokens.
     pub tokens: Option<TokenFormat>,
-    /// Views measured in this setting; fewer than of the evaluation only where another system's pictures are missing.
+    /// Measured views; below the views of the evaluation only for an external method with missing images.
     pub num_views: usize,
     /// Mean over scenes of the scene's mean PSNR, in dB.
     pub psnr: Option<f64>,
-    /// Standard error of `psnr` over the scenes; `null` for a single scene.
+    /// Standard error of `psnr` over scenes; `null` for a single scene.
     pub psnr_stderr: Option<f64>,
-    /// Mean PSNR over all views, in dB: differs from `psnr` where scenes have different numbers of views.
+    /// Mean PSNR over all views, in dB. Equals `psnr` if all scenes have the same number of views.
     pub psnr_per_view: Option<f64>,
     /// Views whose PSNR is infinite, counted as [`crate::statistics::scene_means::PSNR_CAP_DB`] in the means.
     pub num_identical_views: usize,
@@ -68,23 +69,23 @@ pub struct SummaryPoint {
     pub lpips_vgg: Option<f64>,
     /// Mean LPIPS over all views.
     pub lpips_vgg_per_view: Option<f64>,
-    /// Mean seconds of the renderer per view.
+    /// Mean rendering time per view, in seconds.
     pub render_s: Option<f64>,
-    /// Their median.
+    /// Median rendering time per view, in seconds.
     pub render_median_s: Option<f64>,
-    /// What 95 % of them do not exceed (nearest rank).
+    /// 95th percentile of the rendering time (nearest rank), in seconds.
     pub render_p95_s: Option<f64>,
-    /// Mean seconds per token selection.
+    /// Mean time of a token selection, in seconds.
     pub select_s: Option<f64>,
-    /// Median seconds per view, selection and renderer together.
+    /// Median time per frame (selection and rendering), in seconds.
     pub frame_median_s: Option<f64>,
-    /// What 95 % of them do not exceed.
+    /// 95th percentile of the time per frame, in seconds.
     pub frame_p95_s: Option<f64>,
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
-    /// Bytes of a scene file, or the data size given for another system.
+    /// Bytes of a scene file, or the given data size of an external method.
     pub scene_bytes: Option<u64>,
-    /// Most resident memory of the whole process while a view was drawn, weights and all; on a CPU alone.
+    /// Peak resident memory of the process, weights included, while a view was rendered; on CPUs only.
     pub peak_bytes: Option<u64>,
     /// Whether no other point is as good in PSNR for as little time per frame (`frame_median_s`).
     pub pareto_time: bool,
@@ -92,15 +93,17 @@ pub struct SummaryPoint {
     pub pareto_bytes: bool,
 }
 
-/// Pictures that another system does not have.
+/// Target images that an external method does not have.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Missing {
-    /// The system.
-    pub variant: Method,
-    /// How many target views it has no picture of.
+pub struct MissingImages {
+    /// The external method.
+    #[serde(rename = "variant")]
+    pub method: Method,
+    /// Number of target views without image.
     pub num_missing: usize,
-    /// Each of them, inside its folder.
-    pub pictures: Vec<String>,
+    /// Paths of the missing images in the folder of the method.
+    #[serde(rename = "pictures")]
+    pub images: Vec<String>,
 }
 
 /// The content of `summary.json`.
@@ -110,26 +113,26 @@ pub struct Summary {
     pub num_scenes: usize,
     /// Different target views measured.
     pub num_views: usize,
-    /// Scenes left out, each with its reason in the log.
+    /// Skipped scenes; `skipped.json` has the reasons.
     pub num_skipped: usize,
-    /// How the rendered tokens of a view were chosen; `null` where every view is drawn from all stored ones.
+    /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
     pub selection: Option<Selection>,
-    /// SHA-256 of the weights that LPIPS was measured with.
+    /// SHA-256 of the LPIPS weights.
     pub lpips_weights_sha256: Option<String>,
-    /// Numbers that are `null` everywhere, and why.
+    /// Metrics that are `null` everywhere, with reasons.
     pub not_measured: Vec<NotMeasured>,
-    /// Where another system's pictures were incomplete.
-    pub missing: Vec<Missing>,
-    /// What the points must beat.
+    /// External methods with missing images.
+    pub missing: Vec<MissingImages>,
+    /// Baselines.
     pub baselines: Baselines,
-    /// One per setting, ordered by variant and then by rising token counts.
+    /// One point per key, ordered by method and ascending token counts.
     pub points: Vec<SummaryPoint>,
-    /// What the paper finds better less what it finds worse, scene by scene.
+    /// Paired differences of methods in the order of the paper.
     pub differences: Vec<PairedDifference>,
 }
 
 impl Summary {
-    /// Averages over the views of each scene first and over the scenes then.
+    /// Averages the results over the views of each scene, then over the scenes.
     pub fn new(results: &EvalResults) -> Self {
         let views: BTreeSet<(&str, usize)> = results
             .views()
@@ -137,15 +140,15 @@ impl Summary {
             .flat_map(|(scene, frames)| frames.keys().map(move |&frame| (scene.as_str(), frame)))
             .collect();
         let scenes: BTreeSet<&str> = views.iter().map(|(scene, _)| *scene).collect();
-        let quality = |variant| results.of(EvalKey::baseline(variant)).map(Quality::new).unwrap_or_default();
-        let missing = results.missing.iter().map(|(&system, pictures)| Missing {
-            variant: Method::System(system),
-            num_missing: pictures.len(),
-            pictures: pictures.iter().cloned().collect(),
+        let quality = |method| results.of(EvalKey::baseline(method)).map(Quality::new).unwrap_or_default();
+        let missing = results.missing.iter().map(|(&name, images)| MissingImages {
+            method: Method::External(name),
+            num_missing: images.len(),
+            images: images.iter().cloned().collect(),
         });
         let mut points: Vec<SummaryPoint> = results
             .views()
-            .filter(|(key, _)| !matches!(key.variant, Method::NearestView | Method::MeanImage))
+            .filter(|(key, _)| !matches!(key.method, Method::NearestView | Method::MeanImage))
             .map(|(key, views)| SummaryPoint::new(results, key, views))
             .collect();
         mark_fronts(&mut points);
@@ -171,7 +174,7 @@ impl Summary {
         serde_json::to_vec_pretty(self)
             .map_err(std::io::Error::from)
             .and_then(|json| replace_file(path, &[&json[..], b"\n"].concat()))
-            .map_err(|source| EvalError::Io { action: "writing the summary", source, path: path.to_owned() })
+            .map_err(EvalError::io("writing the summary", path))
     }
 }
 
@@ -196,7 +199,7 @@ impl SummaryPoint {
         let (render_s, frame_s) = (values(|view| view.render_s), values(ViewMetrics::frame_s));
         let cost = results.cost(key);
         Self {
-            variant: key.variant,
+            method: key.method,
             num_storage_tokens: key.num_storage_tokens,
             num_render_tokens: key.num_render_tokens,
             tokens: key.tokens,
@@ -225,15 +228,15 @@ impl SummaryPoint {
 
     /// Returns the key of the point.
     pub(crate) const fn key(&self) -> EvalKey {
-        let Self { variant, num_storage_tokens, num_render_tokens, tokens, .. } = *self;
-        EvalKey { variant, num_storage_tokens, num_render_tokens, tokens }
+        let Self { method, num_storage_tokens, num_render_tokens, tokens, .. } = *self;
+        EvalKey { method, num_storage_tokens, num_render_tokens, tokens }
     }
 }
 
 fn mark_fronts(points: &mut [SummaryPoint]) {
     let of = |points: &[SummaryPoint], cost: fn(&SummaryPoint) -> Option<f64>| {
-        let place = |point: &SummaryPoint| (cost(point).unwrap_or(f64::NAN), point.psnr.unwrap_or(f64::NAN));
-        pareto_front(&points.iter().map(place).collect::<Vec<_>>())
+        let position = |point: &SummaryPoint| (cost(point).unwrap_or(f64::NAN), point.psnr.unwrap_or(f64::NAN));
+        pareto_front(&points.iter().map(position).collect::<Vec<_>>())
     };
     for i in of(points, |point| point.frame_median_s) {
         points[i].pareto_time = true;
@@ -248,7 +251,7 @@ mod tests {
     use super::*;
 
     const KEY: EvalKey = EvalKey {
-        variant: Method::Clift,
+        method: Method::Clift,
         num_storage_tokens: 64,
         num_render_tokens: 32,
         tokens: Some(TokenFormat::F16),
@@ -262,42 +265,27 @@ mod tests {
         results
     }
 
-    fn summary(views: &[(&str, usize, f64)]) -> Summary {
-        Summary::new(&results(views))
-    }
-
     #[test]
-    fn a_scene_with_many_views_weighs_no_more_than_one_with_few() {
-        let summary = summary(&[("a", 0, 20.0), ("a", 1, 22.0), ("a", 2, 24.0), ("b", 0, 30.0)]);
-        let point = &summary.points[0];
-        assert_eq!((point.psnr, point.psnr_per_view), (Some(26.0), Some(24.0)));
-        // Scene means 22 and 30: standard deviation sqrt(32), over sqrt(2).
-        assert_eq!(point.psnr_stderr, Some(4.0));
-        assert_eq!((summary.num_scenes, summary.num_views), (2, 4));
-    }
-
-    #[test]
-    fn the_standard_error_of_one_scene_is_not_known() {
-        assert_eq!(summary(&[("a", 0, 20.0), ("a", 1, 22.0)]).points[0].psnr_stderr, None);
-    }
-
-    #[test]
-    fn an_identical_picture_counts_as_the_cap_and_is_counted() {
-        let point = summary(&[("a", 0, f64::INFINITY), ("b", 0, 20.0)]).points.remove(0);
-        assert_eq!((point.psnr, point.num_identical_views), (Some(60.0), 1));
-    }
-
-    #[test]
-    fn the_summary_does_not_depend_on_the_order_of_the_views() {
-        // Sums of these differ in the last bit when they are added in another order.
+    fn means_weigh_scenes_equally_and_cap_psnr() {
+        for (views, psnr, psnr_per_view, psnr_stderr, num_identical) in [
+            // Scene means 22 and 30: standard deviation sqrt(32), over sqrt(2).
+            (&[("a", 0, 20.0), ("a", 1, 22.0), ("a", 2, 24.0), ("b", 0, 30.0)][..], 26.0, 24.0, Some(4.0), 0),
+            (&[("a", 0, 20.0), ("a", 1, 22.0)], 21.0, 21.0, None, 0),
+            (&[("a", 0, f64::INFINITY), ("b", 0, 20.0)], 60.0, 60.0, Some(40.0), 1),
+        ] {
+            let point = Summary::new(&results(views)).points.remove(0);
+            assert_eq!((point.psnr, point.psnr_per_view), (Some(psnr), Some(psnr_per_view)));
+            assert_eq!((point.psnr_stderr, point.num_identical_views), (psnr_stderr, num_identical));
+        }
+        // Sums of these values depend on their order in the last bit.
         let mut views = [("a", 0, 20.1), ("a", 1, 22.7), ("a", 2, 1e-9), ("b", 0, 30.3), ("c", 5, 17.77)];
-        let forward = summary(&views);
+        let forward = Summary::new(&results(&views));
         views.reverse();
-        assert_eq!(summary(&views), forward);
+        assert_eq!(Summary::new(&results(&views)), forward);
     }
 
     #[test]
-    fn what_was_not_measured_is_null_and_the_file_has_the_documented_names() {
+    fn the_file_has_the_documented_names() {
         let mut views = results(&[("a", 0, 20.0)]);
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
         views.add_gflops(KEY, 2.5);
@@ -331,14 +319,14 @@ mod tests {
         });
         assert_eq!(serde_json::from_str::<serde_json::Value>(&text).unwrap(), expected);
         assert_eq!(serde_json::from_str::<Summary>(&text).unwrap(), summary);
-        // Files of earlier versions have a key more.
+        // Files of earlier versions have one more key.
         let mut former = expected;
         former["adaptive"] = serde_json::json!([]);
         assert_eq!(serde_json::from_value::<Summary>(former).unwrap(), summary);
     }
 
     #[test]
-    fn times_have_a_median_and_a_95th_percentile_alone_and_with_selection() {
+    fn times_have_medians_and_95th_percentiles() {
         let mut views = EvalResults::default();
         for frame in 0..20 {
             let ms = if frame == 7 { 100.0 } else { 1.0 + frame as f64 };
@@ -355,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn the_fronts_of_time_and_of_bytes_are_each_marked() {
+    fn both_pareto_fronts_are_marked() {
         let mut views = EvalResults::default();
         // (stored, dB, ms, bytes): the second is slower and worse than the first but smaller than the third.
         for (stored, psnr, ms, bytes) in [(8, 20.0, 1.0, 900), (4, 19.0, 2.0, 400), (16, 22.0, 3.0, 1600)] {

@@ -1,4 +1,4 @@
-//! The table that a terminal shows: quality, tokens and cost of each setting; `-` is what was not measured.
+//! The terminal table of a summary: quality, tokens and cost of every key; `-` was not measured.
 
 use std::fmt;
 
@@ -8,7 +8,7 @@ use crate::config::method::Method;
 use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Quality, Summary};
 
-/// Missing pictures that are named; the file names all.
+/// Largest number of missing images in the table; `summary.json` has all.
 const MAX_NAMED: usize = 3;
 
 const HEADERS: [&str; 12] = [
@@ -30,8 +30,8 @@ const WIDTHS: [usize; 12] = [7, 9, 6, 8, 6, 6, 6, 10, 9, 7, 7, 9];
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
-        writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes left out\n")?;
-        let names = points.iter().map(|point| point.variant.name().chars().count());
+        writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes skipped\n")?;
+        let names = points.iter().map(|point| point.method.name().chars().count());
         let width = names.chain([Method::NearestView.name().len()]).max().unwrap_or_default();
         let mut row = |name: &str, cells: [String; 12], mark: &str| {
             write!(f, "{name:<width$}")?;
@@ -40,13 +40,13 @@ impl fmt::Display for Summary {
             }
             writeln!(f, "{mark}")
         };
-        row("variant", HEADERS.map(str::to_owned), "")?;
-        for (variant, Quality { psnr, ssim, lpips_vgg }) in
+        row("method", HEADERS.map(str::to_owned), "")?;
+        for (method, Quality { psnr, ssim, lpips_vgg }) in
             [(Method::NearestView, baselines.nearest_view), (Method::MeanImage, baselines.mean_image)]
         {
             let mut cells = std::array::from_fn(|_| cell(None, 0));
             (cells[3], cells[5], cells[6]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3));
-            row(variant.name(), cells, "")?;
+            row(method.name(), cells, "")?;
         }
         for point in points {
             let count = |count: usize| if count == 0 { cell(None, 0) } else { count.to_string() };
@@ -71,30 +71,27 @@ impl fmt::Display for Summary {
                 (false, true) => "  b",
                 (false, false) => "",
             };
-            row(point.variant.name(), cells, mark)?;
+            row(point.method.name(), cells, mark)?;
         }
         if points.iter().any(|point| point.pareto_time || point.pareto_bytes) {
             writeln!(f, "\nt: no other point has this PSNR in this time per frame (median); b: in as few bytes")?;
         }
         if let Some(selection) = self.selection {
-            writeln!(f, "\nrendered tokens were chosen by {selection}")?;
+            writeln!(f, "\nrendered tokens were selected by {selection}")?;
         }
         if !differences.is_empty() {
-            writeln!(f, "\nPSNR of the same scenes, difference and standard error")?;
+            writeln!(f, "\nPSNR differences on the same scenes, with standard errors")?;
         }
-        for PairedDifference { variant, against, num_storage_tokens, tokens, psnr, psnr_stderr, .. } in differences {
+        for PairedDifference { method, against, num_storage_tokens, tokens, psnr, psnr_stderr, .. } in differences {
             let (error, format) = (cell(*psnr_stderr, 2), tokens.map_or("", TokenFormat::name));
-            let names = format!("{} - {}", variant.name(), against.name());
+            let names = format!("{} - {}", method.name(), against.name());
             writeln!(f, "{names:<24} {num_storage_tokens:>6} tokens {format:<4} {psnr:>+7.2} +- {error} dB")?;
         }
         for missing in &self.missing {
-            let named = missing.pictures.iter().take(MAX_NAMED).cloned().collect::<Vec<_>>().join(", ");
-            let more = if missing.pictures.len() > MAX_NAMED { ", .." } else { "" };
-            let (name, count) = (missing.variant.name(), missing.num_missing);
-            writeln!(
-                f,
-                "{name}: {count} of {num_views} pictures are missing, its means are over the rest: {named}{more}"
-            )?;
+            let named = missing.images.iter().take(MAX_NAMED).cloned().collect::<Vec<_>>().join(", ");
+            let more = if missing.images.len() > MAX_NAMED { ", .." } else { "" };
+            let (name, count) = (missing.method.name(), missing.num_missing);
+            writeln!(f, "{name}: {count} of {num_views} images are missing; means are over the others: {named}{more}")?;
         }
         for missing in &self.not_measured {
             writeln!(f, "{} is not measured: {}", missing.metric, missing.reason)?;
@@ -117,10 +114,10 @@ mod tests {
     use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
     #[test]
-    fn the_table_lines_up() {
+    fn table_columns_are_aligned() {
         let mut views = EvalResults::default();
         let key = EvalKey {
-            variant: Method::Clift,
+            method: Method::Clift,
             num_storage_tokens: 64,
             num_render_tokens: 32,
             tokens: Some(TokenFormat::Int8),
@@ -133,25 +130,25 @@ mod tests {
             };
             views.add(scene, 0, key, measured).unwrap();
         }
-        let system = MethodName::new("DepthSplat").unwrap();
-        let other = EvalKey::baseline(Method::System(system));
+        let name = MethodName::new("DepthSplat").unwrap();
+        let other = EvalKey::baseline(Method::External(name));
         views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) }).unwrap();
-        views.miss(system, "b/000000.png".into());
+        views.record_missing_image(name, "b/000000.png".into());
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
         views.add_gflops(key, 45.23);
         views.add_scene_bytes(key, 99_000);
         views.note_not_measured("lpips_vgg", "no weights".into());
         let expected = "\
-2 views of 2 scenes, 0 scenes left out
+2 views of 2 scenes, 0 scenes skipped
 
-variant       stored  rendered format  PSNR dB  +- dB   SSIM  LPIPS  render ms  frame ms  p95 ms    GMAC  scene kB
+method        stored  rendered format  PSNR dB  +- dB   SSIM  LPIPS  render ms  frame ms  p95 ms    GMAC  scene kB
 nearest_view       -         -      -    18.00      -  0.500      -          -         -       -       -         -
 mean_image         -         -      -        -      -      -      -          -         -       -       -         -
 clift             64        32   int8    20.50   0.50  0.205      -        1.5      11.5    12.0    45.2      99.0 tb
 DepthSplat         -         -      -    19.00      -      -  0.250          -         -       -       -         -
 
 t: no other point has this PSNR in this time per frame (median); b: in as few bytes
-DepthSplat: 1 of 2 pictures are missing, its means are over the rest: b/000000.png
+DepthSplat: 1 of 2 images are missing; means are over the others: b/000000.png
 lpips_vgg is not measured: no weights
 ";
         assert_eq!(Summary::new(&views).to_string(), expected);

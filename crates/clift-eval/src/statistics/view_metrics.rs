@@ -1,4 +1,4 @@
-//! What is measured of a view, and the key of its row in tables and files.
+//! The metrics of a view, and the key of a row in tables and files.
 
 use std::collections::BTreeSet;
 
@@ -6,27 +6,27 @@ use clift_model::TokenFormat;
 
 use crate::config::method::Method;
 
-/// What views are averaged over: method, token counts and number format. The order is that of the files: variant,
-/// then fewer tokens.
+/// The key that views are averaged under: method, token counts and number format. Keys are ordered as in the files: by
+/// method, then by ascending token counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct EvalKey {
-    /// How the views were made.
-    pub variant: Method,
+    /// The method.
+    pub method: Method,
     /// Tokens in the scene file; 0 for a baseline.
     pub num_storage_tokens: usize,
-    /// Tokens the renderer was given; 0 for a baseline.
+    /// Tokens of a rendering; 0 for a baseline.
     pub num_render_tokens: usize,
-    /// Number format of the stored tokens; none where there are none.
+    /// Number format of the stored tokens; `None` without tokens.
     pub tokens: Option<TokenFormat>,
 }
 
 impl EvalKey {
-    /// Returns the key of a baseline or of another system, which has no tokens.
-    pub const fn baseline(variant: Method) -> Self {
-        Self { variant, num_storage_tokens: 0, num_render_tokens: 0, tokens: None }
+    /// Returns the key of a baseline or of an external method, which have no tokens.
+    pub const fn baseline(method: Method) -> Self {
+        Self { method, num_storage_tokens: 0, num_render_tokens: 0, tokens: None }
     }
 
-    /// Returns the name of the number format, empty where there is none.
+    /// Returns the name of the number format; empty without tokens.
     pub fn format_name(self) -> &'static str {
         self.tokens.map_or("", TokenFormat::name)
     }
@@ -37,15 +37,15 @@ impl EvalKey {
     }
 }
 
-/// Returns the variant that stands for the method: the condensed one where there is a condenser.
-pub(crate) fn best_variant(keys: impl IntoIterator<Item = EvalKey>) -> Option<Method> {
-    let there: BTreeSet<Method> = keys.into_iter().map(|key| key.variant).collect();
+/// Returns the main method among the keys: a condensed method, else K-means, else random tokens.
+pub(crate) fn best_method(keys: impl IntoIterator<Item = EvalKey>) -> Option<Method> {
+    let found: BTreeSet<Method> = keys.into_iter().map(|key| key.method).collect();
     [Method::Clift, Method::PatchClift, Method::Kmeans, Method::Random]
         .into_iter()
-        .find(|variant| there.contains(variant))
+        .find(|method| found.contains(method))
 }
 
-/// The metrics of one view; `None` is what was not measured.
+/// The metrics of one view; `None` was not measured.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ViewMetrics {
     /// Peak signal-to-noise ratio in dB; infinite for an identical image.
@@ -54,9 +54,9 @@ pub struct ViewMetrics {
     pub ssim: Option<f64>,
     /// LPIPS with VGG-16; `None` without its weights and below 16 x 16 pixels.
     pub lpips_vgg: Option<f64>,
-    /// Seconds the renderer took for this view alone, from tokens to pixels.
+    /// Rendering time of this view, from tokens to pixels, in seconds.
     pub render_s: Option<f64>,
-    /// Seconds token selection took.
+    /// Time of the token selection, in seconds.
     pub select_s: Option<f64>,
 }
 
@@ -72,14 +72,14 @@ impl ViewMetrics {
     }
 }
 
-/// Cost of a key, the same for every view; `None` is what was not computed.
+/// Cost of a key, the same for every view; `None` was not computed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Cost {
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
-    /// Bytes of a scene file, or the data size that was given for another system.
+    /// Bytes of a scene file, or the given data size of an external method.
     pub scene_bytes: Option<u64>,
-    /// Peak memory of the whole process while a view was rendered.
+    /// Peak memory of the process while a view was rendered.
     pub peak_bytes: Option<u64>,
 }
 
@@ -88,10 +88,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_condensed_variant_stands_for_the_method_where_it_is_there() {
+    fn condensed_methods_come_first() {
         let keys = [Method::NearestView, Method::Random, Method::Kmeans].map(EvalKey::baseline);
-        assert_eq!(best_variant(keys), Some(Method::Kmeans));
-        assert_eq!(best_variant(keys.into_iter().chain([EvalKey::baseline(Method::Clift)])), Some(Method::Clift));
-        assert_eq!(best_variant([EvalKey::baseline(Method::MeanImage)]), None);
+        assert_eq!(best_method(keys), Some(Method::Kmeans));
+        assert_eq!(best_method(keys.into_iter().chain([EvalKey::baseline(Method::Clift)])), Some(Method::Clift));
+        assert_eq!(best_method([EvalKey::baseline(Method::MeanImage)]), None);
     }
 }

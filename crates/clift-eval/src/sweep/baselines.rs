@@ -1,11 +1,11 @@
-//! What a method must beat: the nearest context view, and the mean of all of them.
+//! Baselines: the nearest context view, and the mean of all context views.
 
 use clift_data::{ClipViews, DVec3, Pose};
 
 use crate::error::EvalError;
 
-/// Poses closer than this, relative to the largest distance or in radians, count as equally near:
-/// rounding must not choose between cameras that turn on the spot.
+/// Tolerance of a tie, relative to the largest distance or in radians. Rounding must not decide between cameras that
+/// rotate in place.
 const TIE: f64 = 1e-9;
 
 /// Finds the context view whose camera centre is nearest to the target's.
@@ -26,7 +26,7 @@ pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, Eva
     Ok(near[first])
 }
 
-/// Copies the nearest context view's picture, `[height, width, 3]` in [0, 1].
+/// Returns the image of the nearest context view, `[height, width, 3]` in [0, 1].
 ///
 /// # Errors
 /// [`EvalError::NoContext`] without context views.
@@ -36,7 +36,7 @@ pub fn nearest_image(context: &ClipViews, target_c2w: Pose) -> Result<Vec<f32>, 
     Ok(context.images[nearest * size..][..size].iter().map(|&value| f32::from(value) / 255.0).collect())
 }
 
-/// Averages the context views' pictures, `[height, width, 3]` in [0, 1].
+/// Returns the mean of the context images, `[height, width, 3]` in [0, 1].
 ///
 /// # Errors
 /// [`EvalError::NoContext`] without context views.
@@ -54,7 +54,7 @@ pub fn mean_image(context: &ClipViews) -> Result<Vec<f32>, EvalError> {
     Ok(sums.into_iter().map(|sum| (f64::from(sum) / scale) as f32).collect())
 }
 
-/// Angle of the rotation between two poses, from its sine and cosine so that small angles are exact too.
+/// Returns the rotation angle between two poses, from its sine and cosine, which is exact for small angles too.
 fn rotation_angle_rad(a: Pose, b: Pose) -> f64 {
     let r = a.rotation.transpose() * b.rotation;
     let axis = DVec3::new(r.y_axis.z - r.z_axis.y, r.z_axis.x - r.x_axis.z, r.x_axis.y - r.y_axis.x);
@@ -84,25 +84,19 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_camera_centre_wins_whatever_its_rotation() {
-        assert_eq!(nearest_view(&[pose(1.0, 0.0), pose(0.5, 90.0)], pose(0.0, 0.0)).unwrap(), 1);
+    fn distance_decides_then_angle_then_index() {
+        for (context, target, expected, case) in [
+            ([pose(1.0, 0.0), pose(0.5, 90.0)], pose(0.0, 0.0), 1, "distance before angle"),
+            ([pose(1.0, 40.0), pose(-1.0, 5.0)], pose(0.0, 10.0), 1, "angle at equal distance"),
+            ([pose(1.0, 20.0), pose(-1.0, 0.0)], pose(0.0, 10.0), 0, "index at equal angle"),
+            ([pose(1.0 - 1e-14, 90.0), pose(1.0, 1.0)], pose(0.0, 0.0), 1, "a rounding difference is a tie"),
+        ] {
+            assert_eq!(nearest_view(&context, target).unwrap(), expected, "{case}");
+        }
     }
 
     #[test]
-    fn at_equal_distance_the_smaller_angle_wins_and_then_the_lower_index() {
-        let target = pose(0.0, 10.0);
-        assert_eq!(nearest_view(&[pose(1.0, 40.0), pose(-1.0, 5.0)], target).unwrap(), 1);
-        assert_eq!(nearest_view(&[pose(1.0, 20.0), pose(-1.0, 0.0)], target).unwrap(), 0);
-    }
-
-    #[test]
-    fn rounding_does_not_decide_a_tie() {
-        let turned_on_the_spot = [pose(1.0 - 1e-14, 90.0), pose(1.0, 1.0)];
-        assert_eq!(nearest_view(&turned_on_the_spot, pose(0.0, 0.0)).unwrap(), 1);
-    }
-
-    #[test]
-    fn the_rotation_angle_is_right_from_tiny_to_half_a_turn() {
+    fn rotation_angles_are_exact() {
         for angle_deg in [0.0, 1e-6, 30.0, 90.0, 150.0, 180.0] {
             let angle = rotation_angle_rad(pose(0.0, 0.0), pose(0.0, angle_deg)).to_degrees();
             // Products of sines and cosines near 1 round at 1e-16; 1e-12 degrees is above that.
@@ -111,14 +105,10 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_image_averages_every_view_and_the_nearest_one_is_copied() {
+    fn baseline_images_are_the_mean_and_a_copy() {
         let context = views(&[pose(0.0, 0.0), pose(1.0, 0.0)], vec![0, 51, 255, 255, 102, 255]);
         assert_eq!(mean_image(&context).unwrap(), [0.5, 0.3, 1.0]);
         assert_eq!(nearest_image(&context, pose(0.9, 0.0)).unwrap(), [1.0, 0.4, 1.0]);
-    }
-
-    #[test]
-    fn no_context_is_an_error() {
         let empty = views(&[], Vec::new());
         assert!(matches!(mean_image(&empty), Err(EvalError::NoContext)));
         assert!(matches!(nearest_image(&empty, Pose::IDENTITY), Err(EvalError::NoContext)));

@@ -7,21 +7,21 @@ use crate::config::method::Method;
 /// The models of both stages. They have one encoder.
 #[derive(Clone, Debug)]
 pub struct EvalModels {
-    /// Renders random subsets and the centroids of clusters.
+    /// Renders random subsets and cluster centroids.
     pub stage1: TrainedModel,
-    /// Renders tokens that its condenser makes of K-means clusters.
+    /// Condenses and renders K-means clusters.
     pub stage2: Option<TrainedModel>,
-    /// Renders tokens that its condenser makes of tiles.
+    /// Condenses and renders tiles.
     pub stage2_tiles: Option<TrainedModel>,
 }
 
 impl EvalModels {
-    /// Takes the model of stage 1.
+    /// Starts with the model of stage 1.
     pub fn new(stage1: TrainedModel) -> Self {
         Self { stage1, stage2: None, stage2_tiles: None }
     }
 
-    /// Takes a model of stage 2, trained on such groups of tokens and on the encoder of stage 1.
+    /// Sets a model of stage 2, trained on such groups of tokens and on the encoder of stage 1.
     pub fn set_stage2(&mut self, grouping: Grouping, mut model: TrainedModel) {
         model.share_encoder(&self.stage1);
         match grouping {
@@ -36,12 +36,11 @@ impl EvalModels {
             Method::Random | Method::Patch | Method::Kmeans => Some(&self.stage1),
             Method::Clift => self.stage2.as_ref(),
             Method::PatchClift => self.stage2_tiles.as_ref(),
-            Method::NearestView | Method::MeanImage | Method::System(_) => None,
+            Method::NearestView | Method::MeanImage | Method::External(_) => None,
         }
     }
 
-    /// Returns the methods of an evaluation that names none: all with a model, and tiles without condenser only beside
-    /// tiles with one.
+    /// Returns the default methods: every method with a model. Uncondensed tiles need condensed tiles beside them.
     pub fn methods(&self) -> Vec<Method> {
         let all = [Method::Random, Method::Patch, Method::PatchClift, Method::Kmeans, Method::Clift];
         let is_wanted = |method: &Method| *method != Method::Patch || self.stage2_tiles.is_some();
@@ -49,7 +48,7 @@ impl EvalModels {
     }
 }
 
-/// Returns the method that stage 2 is trained for, on such groups of tokens.
+/// Returns the method of a stage 2 that is trained on such groups of tokens.
 pub const fn stage2_method(grouping: Grouping) -> Method {
     match grouping {
         Grouping::Kmeans => Method::Clift,

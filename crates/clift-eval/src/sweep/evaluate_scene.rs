@@ -1,4 +1,4 @@
-//! The sweep: every scene encoded once, rendered with every variant at every token count.
+//! The sweep of one scene: encoded once, rendered by every method at every token count.
 
 use std::time::Instant;
 
@@ -14,183 +14,174 @@ use crate::sweep::compressed_tokens::{CompressedTokens, select_tokens};
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
 use crate::sweep::rendered_views::{ScoredViews, baselines};
-use crate::sweep::scene_results::{SceneResults, sheet_rows};
+use crate::sweep::scene_results::{SceneResults, kept_views};
 use crate::sweep::sweep::Sweep;
-use crate::sweep::token_choice::{SelectedTokens, choose};
+use crate::sweep::token_choice::{SelectedTokens, select_for_views};
 use crate::sweep::view_scorer::ViewScorer;
 use crate::system::memory;
 use crate::upload::{upload_cameras, upload_views};
 
-/// Renders and measures the targets of one scene; returns its images where they are to be shown.
+/// Renders and scores the target views of one scene, and adds their metrics to `metrics`.
 ///
-/// Sampling per scene as in the paper: one random subset shared by all its targets.
+/// As in the paper, all target views of a scene share one random subset. Returns the images, clusters and selected
+/// tokens of the scene if `keep_images` is set and the scene has a target view.
 ///
 /// # Errors
-/// [`BadTokenCount`](clift_model::ModelError::BadTokenCount) for a count the scene does not have, [`EvalError::NotFinite`] for a
-/// rendering that is not finite, and whatever the model refuses.
+/// [`BadTokenCount`](clift_model::ModelError::BadTokenCount) for a count above the tokens of the scene,
+/// [`EvalError::NotFinite`] for a rendering with a NaN or an infinity, and the errors of the model.
 pub fn evaluate_scene(
     models: &EvalModels,
     clip: &Clip,
     sweep: &Sweep,
-    is_shown: bool,
-    into: &mut EvalResults,
+    keep_images: bool,
+    metrics: &mut EvalResults,
 ) -> Result<Option<SceneResults>, EvalError> {
     let (stage1, device) = (&models.stage1.network, &models.stage1.device);
     let features = stage1.features(&upload_views(&[&clip.context], device)?);
-    // Where stage 2 has trained a norm of the tokens, condensed ones are of that norm, and of its clusters.
+    // A stage 2 with its own token norm clusters and condenses the tokens of its own norm.
     let normed: Vec<(Method, Tensor<3>)> = [Method::Clift, Method::PatchClift]
         .into_iter()
-        .filter_map(|variant| Some((variant, &models.for_method(variant)?.network)))
+        .filter_map(|method| Some((method, &models.for_method(method)?.network)))
         .filter(|(_, network)| network.has_token_norm())
-        .map(|(variant, network)| (variant, network.normalize(features.clone())))
+        .map(|(method, network)| (method, network.normalize(features.clone())))
         .collect();
     let lift = stage1.normalize(features); // [1, N, D]
     let [_, num_tokens, dim] = lift.dims();
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
     let views = (clip.context.num_views(), grid);
-    let rows = if is_shown { sheet_rows(clip.target.num_views()) } else { Vec::new() };
-    let is_shown = !rows.is_empty();
+    let kept_views = if keep_images { kept_views(clip.target.num_views()) } else { Vec::new() };
+    let keep_images = !kept_views.is_empty();
     let scorer = ViewScorer::new(&clip.target, sweep.lpips.as_ref());
-    let drawing = Drawing { clip, scorer: &scorer, cameras: upload_cameras(&[&clip.target], device)?, sweep };
-    let mut material = SceneResults::new(baselines(clip, &scorer, &rows)?, rows.clone());
-    for rendering in &material.renderings {
-        record(clip, rendering, into)?;
+    let renderer = TargetRenderer { clip, scorer: &scorer, cameras: upload_cameras(&[&clip.target], device)?, sweep };
+    let mut results = SceneResults::new(baselines(clip, &scorer, &kept_views)?, kept_views.clone());
+    for rendering in &results.renderings {
+        record(clip, rendering, metrics)?;
     }
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
         let index = LazyClusters::new(&sweep.kmeans, &lift, views, num_storage_tokens, seed);
-        let own: Vec<_> = normed
+        let own_norm: Vec<_> = normed
             .iter()
             .map(|(of, lift)| (*of, lift, LazyClusters::new(&sweep.kmeans, lift, views, num_storage_tokens, seed)))
             .collect();
-        for &variant in &sweep.variants {
-            let own = own.iter().find(|(of, ..)| *of == variant);
+        for &method in &sweep.methods {
+            let own = own_norm.iter().find(|(of, ..)| *of == method);
             let (lift, index) = own.map_or((&lift, &index), |(_, lift, index)| (*lift, index));
-            for (i, &tokens) in sweep.formats(variant).iter().enumerate() {
-                let rows = if i == 0 { &rows[..] } else { &[] };
-                let stored = CompressedTokens::new(variant, models, lift, index, tokens)?;
-                let whole = EvalKey {
-                    variant,
-                    num_storage_tokens,
-                    num_render_tokens: num_storage_tokens,
-                    tokens: Some(tokens),
-                };
-                let mut renderings = vec![drawing.render(&stored, None, whole, rows, into)?];
+            for (i, &tokens) in sweep.formats(method).iter().enumerate() {
+                let kept_views = if i == 0 { &kept_views[..] } else { &[] };
+                let stored = CompressedTokens::new(method, models, lift, index, tokens)?;
+                let whole =
+                    EvalKey { method, num_storage_tokens, num_render_tokens: num_storage_tokens, tokens: Some(tokens) };
+                let mut renderings = vec![renderer.render(&stored, None, whole, kept_views, metrics)?];
                 let can_select = stored.model.network.supports_selection();
                 for num_render_tokens in sweep.render_counts(num_storage_tokens).into_iter().filter(|_| can_select) {
                     let some = EvalKey { num_render_tokens, ..whole };
                     let patch_size = sweep.model.patch_size;
-                    into.selection = Some(sweep.selection);
-                    let chosen = choose(sweep.selection, clip, &stored.ids, patch_size, num_render_tokens, seed)?;
-                    renderings.push(drawing.render(&stored, Some(&chosen), some, rows, into)?);
-                    if !rows.is_empty() {
-                        material.choices.push((some, stored.ids.clone(), chosen));
+                    metrics.selection = Some(sweep.selection);
+                    let selected =
+                        select_for_views(sweep.selection, clip, &stored.ids, patch_size, num_render_tokens, seed)?;
+                    renderings.push(renderer.render(&stored, Some(&selected), some, kept_views, metrics)?);
+                    if !kept_views.is_empty() {
+                        results.selections.push((some, stored.ids.clone(), selected));
                     }
                 }
                 let bytes = scene_file_bytes(num_storage_tokens, dim, clip.context.num_views(), tokens);
                 for rendering in renderings {
-                    record(clip, &rendering, into)?;
-                    if variant != Method::Random {
-                        into.add_scene_bytes(rendering.setting, bytes);
+                    record(clip, &rendering, metrics)?;
+                    if method != Method::Random {
+                        metrics.add_scene_bytes(rendering.key, bytes);
                     }
-                    if !rows.is_empty() {
-                        material.renderings.push(rendering);
+                    if !kept_views.is_empty() {
+                        results.renderings.push(rendering);
                     }
                 }
             }
         }
-        if is_shown {
-            let own = own.iter().find(|(of, ..)| *of == Method::Clift);
+        if keep_images {
+            let own = own_norm.iter().find(|(of, ..)| *of == Method::Clift);
             let index = own.map_or(&index, |(.., index)| index);
-            material.clusters.push(index.scene_clusters()?.clone());
+            results.clusters.push(index.scene_clusters()?.clone());
         }
     }
-    for system in &sweep.systems {
-        let scored = system.score(clip, &scorer, &rows, into)?;
-        for (&view, &measured) in &scored.measured {
-            let frame = clip.target.frame_index[view];
-            if !into.contains(&clip.key, frame, scored.setting) {
-                into.add(&clip.key, frame, scored.setting, measured)?;
-            }
-        }
-        material.others.push(scored);
+    for external in &sweep.external_methods {
+        let scored = external.score(clip, &scorer, &kept_views, metrics)?;
+        record(clip, &scored, metrics)?;
+        results.renderings.push(scored);
     }
-    Ok(is_shown.then_some(material))
+    Ok(keep_images.then_some(results))
 }
 
-/// Adds what was measured of a scene in one setting.
-fn record(clip: &Clip, rendering: &ScoredViews, into: &mut EvalResults) -> Result<(), EvalError> {
-    for (&frame, &measured) in clip.target.frame_index.iter().zip(&rendering.measured) {
-        // A target drawn twice is one view.
-        if !into.contains(&clip.key, frame, rendering.setting) {
-            into.add(&clip.key, frame, rendering.setting, measured)?;
+/// Adds the metrics of a scene under one key. A frame that is a target twice counts once.
+fn record(clip: &Clip, rendering: &ScoredViews, metrics: &mut EvalResults) -> Result<(), EvalError> {
+    for (&view, &measured) in &rendering.metrics {
+        let frame = clip.target.frame_index[view];
+        if !metrics.contains(&clip.key, frame, rendering.key) {
+            metrics.add(&clip.key, frame, rendering.key, measured)?;
         }
     }
     Ok(())
 }
 
-/// The targets of a scene, to be drawn in many settings.
-struct Drawing<'a> {
+/// Renders and times the target views of a scene, key by key.
+struct TargetRenderer<'a> {
     clip: &'a Clip,
     scorer: &'a ViewScorer<'a>,
     cameras: Cameras,
     sweep: &'a Sweep,
 }
 
-impl Drawing<'_> {
-    /// Draws every target alone, from all stored tokens or from those chosen for it.
+impl TargetRenderer<'_> {
+    /// Renders every target view in a call of its own, from all stored tokens or from the tokens selected for the view.
     ///
-    /// The clock runs from tokens on the device to pixels on the host. Nothing is shared between views, so that times of
-    /// any two settings can be compared; a viewer that draws a scene from all its tokens again and again keeps their keys
-    /// and values and is faster.
+    /// The measured time is from tokens on the device to pixels on the host. Views share no work, so the times of any two
+    /// keys are comparable. A viewer that keeps the keys and values of a scene's tokens between frames is faster.
     fn render(
         &self,
         stored: &CompressedTokens,
-        chosen: Option<&[SelectedTokens]>,
-        setting: EvalKey,
-        rows: &[usize],
-        into: &mut EvalResults,
+        selected: Option<&[SelectedTokens]>,
+        key: EvalKey,
+        kept_views: &[usize],
+        metrics: &mut EvalResults,
     ) -> Result<ScoredViews, EvalError> {
         let target = &self.clip.target;
         let device = stored.tokens.device();
-        let draw = |view: usize| -> Result<Vec<f32>, EvalError> {
-            let tokens: Tensor<3> = match chosen {
-                Some(chosen) => select_tokens(&stored.tokens, &chosen[view].tokens), // [1, S, D] -> [1, R, D]
+        let render = |view: usize| -> Result<Vec<f32>, EvalError> {
+            let tokens: Tensor<3> = match selected {
+                Some(selected) => select_tokens(&stored.tokens, &selected[view].tokens), // [1, S, D] -> [1, R, D]
                 None => stored.tokens.clone(),
             };
-            let image = stored.model.network.render(tokens, &narrowed(&self.cameras, view, 1)); // [1, 1, H, W, 3]
+            let image = stored.model.network.render(tokens, &camera_of(&self.cameras, view)); // [1, 1, H, W, 3]
             image.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
         };
-        // So that the clock does not count what is still queued.
+        // Queued work must not count as rendering time.
         device.sync().map_err(EvalError::tensor)?;
-        if !into.is_warm(setting) {
-            // Once before all views of the setting that are timed: for what a device does only once, and for the memory.
+        if !metrics.is_warm(key) {
+            // One untimed view per key: one-time work of the device, and the peak memory.
             let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
-            draw(0)?;
-            into.set_warm(setting, if has_peak { memory::peak_bytes() } else { None });
-            let macs = self.sweep.model.render_macs(target.height, target.width, setting.num_render_tokens)?;
-            into.add_gflops(setting, macs.count(FlopConvention::Macs) as f64 / 1e9);
+            render(0)?;
+            metrics.set_warm(key, if has_peak { memory::peak_bytes() } else { None });
+            let macs = self.sweep.model.render_macs(target.height, target.width, key.num_render_tokens)?;
+            metrics.add_gflops(key, macs.count(FlopConvention::Macs) as f64 / 1e9);
         }
-        let mut rendered = ScoredViews::new(setting);
+        let mut rendered = ScoredViews::new(key);
         for view in 0..target.num_views() {
             let started = Instant::now();
-            let pixels = draw(view)?;
+            let pixels = render(view)?;
             let render_s = started.elapsed().as_secs_f64();
-            rendered.add(pixels, self.scorer, rows)?;
-            let measured = &mut rendered.measured[view];
+            let measured = rendered.add(view, pixels, self.scorer, kept_views)?;
             measured.render_s = Some(render_s);
-            measured.select_s = chosen.map(|chosen| chosen[view].select_s);
+            measured.select_s = selected.map(|selected| selected[view].select_s);
         }
         Ok(rendered)
     }
 }
 
-/// `count` views of a scene from the view `start` on.
-fn narrowed(cameras: &Cameras, start: usize, count: usize) -> Cameras {
+/// Returns the camera of one view.
+fn camera_of(cameras: &Cameras, view: usize) -> Cameras {
     Cameras {
-        c2w: cameras.c2w.clone().narrow(1, start, count),
-        intrinsics: cameras.intrinsics.clone().narrow(1, start, count),
+        c2w: cameras.c2w.clone().narrow(1, view, 1),
+        intrinsics: cameras.intrinsics.clone().narrow(1, view, 1),
         ..*cameras
     }
 }

@@ -1,4 +1,4 @@
-//! Clusters or tiles of a scene's tokens, computed once, for the first method that needs them.
+//! Clusters or tiles of a scene's tokens, computed for the first method that needs them.
 
 use std::cell::OnceCell;
 
@@ -7,14 +7,14 @@ use clift_model::{Clusters, KMeans, KMeansFit, SceneClusters, tile_clusters};
 
 use crate::error::EvalError;
 
-/// Groups of one count, made when the first variant asks.
+/// Clusters and tiles of one count, each computed on first use.
 pub(crate) struct LazyClusters<'a> {
     pub kmeans: &'a KMeans,
-    /// Tokens that are clustered, `[1, N, D]`.
+    /// The clustered tokens, `[1, N, D]`.
     pub lift: &'a Tensor<3>,
     pub num_clusters: usize,
     pub seed: u64,
-    /// Context views, and rows and columns of tokens of each.
+    /// Number of context views, and rows and columns of patches of a view.
     pub views: (usize, [usize; 2]),
     fit: OnceCell<KMeansFit>,
     tiles: OnceCell<Clusters>,
@@ -31,7 +31,7 @@ impl<'a> LazyClusters<'a> {
         Self { kmeans, lift, num_clusters, seed, views, fit: OnceCell::new(), tiles: OnceCell::new() }
     }
 
-    /// Tiles of the context views, [`tile_clusters`].
+    /// Returns the tiles of the context views, see [`tile_clusters`].
     pub fn tiles(&self) -> Result<&Clusters, EvalError> {
         if let Some(tiles) = self.tiles.get() {
             return Ok(tiles);
@@ -41,6 +41,7 @@ impl<'a> LazyClusters<'a> {
         Ok(self.tiles.get_or_init(|| tiles))
     }
 
+    /// Returns the clusters of latent K-means.
     pub fn clusters(&self) -> Result<&Clusters, EvalError> {
         Ok(&self.fit()?.clusters)
     }
@@ -53,7 +54,7 @@ impl<'a> LazyClusters<'a> {
         Ok(self.fit.get_or_init(|| fit))
     }
 
-    /// Those of the one scene there is.
+    /// Returns the clusters of the scene.
     pub fn scene_clusters(&self) -> Result<&SceneClusters, EvalError> {
         Ok(&self.clusters()?.scenes()[0])
     }

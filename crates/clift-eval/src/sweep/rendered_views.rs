@@ -1,4 +1,4 @@
-//! The targets of a scene in one setting: measured, and kept where they are to be shown.
+//! The target views of a scene as one key renders them: metrics, and images for the figures.
 
 use std::collections::BTreeMap;
 
@@ -10,40 +10,44 @@ use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 use crate::sweep::baselines::{mean_image, nearest_image};
 use crate::sweep::view_scorer::ViewScorer;
 
-/// All targets of a scene in one setting.
+/// The scored target views of a scene under one key.
 pub(crate) struct ScoredViews {
-    /// How they were made.
-    pub setting: EvalKey,
-    /// By view.
-    pub measured: Vec<ViewMetrics>,
-    /// The pictures that are shown, by view: `height * width * 3` values of RGB.
-    pub shown: BTreeMap<usize, Vec<f32>>,
+    pub key: EvalKey,
+    /// Metrics by target view. Only an external method can miss views.
+    pub metrics: BTreeMap<usize, ViewMetrics>,
+    /// Kept images by target view, `[height, width, 3]` in `[0, 1]`.
+    pub images: BTreeMap<usize, Vec<f32>>,
 }
 
 impl ScoredViews {
-    pub fn new(setting: EvalKey) -> Self {
-        Self { setting, measured: Vec::new(), shown: BTreeMap::new() }
+    pub fn new(key: EvalKey) -> Self {
+        Self { key, metrics: BTreeMap::new(), images: BTreeMap::new() }
     }
 
-    /// Measures the next view, and keeps its picture if it is to be shown.
-    pub fn add(&mut self, pixels: Vec<f32>, scorer: &ViewScorer, rows: &[usize]) -> Result<(), EvalError> {
-        let view = self.measured.len();
-        self.measured.push(scorer.measure(&pixels, view)?);
-        if rows.contains(&view) {
-            self.shown.insert(view, pixels);
+    /// Scores the image of a target view, and keeps the image of a view in `kept_views`.
+    pub fn add(
+        &mut self,
+        view: usize,
+        pixels: Vec<f32>,
+        scorer: &ViewScorer,
+        kept_views: &[usize],
+    ) -> Result<&mut ViewMetrics, EvalError> {
+        let metrics = scorer.measure(&pixels, view)?;
+        if kept_views.contains(&view) {
+            self.images.insert(view, pixels);
         }
-        Ok(())
+        Ok(self.metrics.entry(view).insert_entry(metrics).into_mut())
     }
 }
 
-/// What every method must beat, measured.
-pub(crate) fn baselines(clip: &Clip, scorer: &ViewScorer, rows: &[usize]) -> Result<Vec<ScoredViews>, EvalError> {
+/// Scores both baselines: the nearest context view and the mean of the context views.
+pub(crate) fn baselines(clip: &Clip, scorer: &ViewScorer, kept_views: &[usize]) -> Result<Vec<ScoredViews>, EvalError> {
     let mean = mean_image(&clip.context)?;
     let mut nearest = ScoredViews::new(EvalKey::baseline(Method::NearestView));
     let mut means = ScoredViews::new(EvalKey::baseline(Method::MeanImage));
-    for &pose in &clip.target.c2w {
-        nearest.add(nearest_image(&clip.context, pose)?, scorer, rows)?;
-        means.add(mean.clone(), scorer, rows)?;
+    for (view, &pose) in clip.target.c2w.iter().enumerate() {
+        nearest.add(view, nearest_image(&clip.context, pose)?, scorer, kept_views)?;
+        means.add(view, mean.clone(), scorer, kept_views)?;
     }
     Ok(vec![nearest, means])
 }

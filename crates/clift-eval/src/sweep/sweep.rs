@@ -1,4 +1,4 @@
-//! Settings of an evaluation of a scene.
+//! Settings of a sweep over methods and token counts.
 
 use clift_model::{KMeans, ModelConfig, TokenCount, TokenFormat};
 
@@ -10,40 +10,41 @@ use crate::sweep::predictions::ExternalMethod;
 /// Settings of a sweep.
 #[derive(Clone, Debug)]
 pub struct Sweep {
-    /// Token counts a scene is stored with.
+    /// Token counts of the stored scene.
     pub storage: Vec<TokenCount>,
-    /// Token counts a view is drawn from beside all that are stored, of these; those that are not fewer are left out.
+    /// Token counts of a rendered view, beside all stored tokens: numbers, or shares of the stored tokens. Counts that are
+    /// not below the stored count are ignored.
     pub render: Vec<TokenCount>,
-    /// How fewer tokens are chosen.
+    /// Selection of the rendered tokens.
     pub selection: Selection,
-    /// Number formats that stored tokens are rounded to, as in a scene file, one after the other. Random subsets have
-    /// no file and are not rounded. Pictures are shown of the first.
+    /// Number formats of the stored tokens, as in a scene file, each measured. Random subsets stay f32. Images are kept of
+    /// the first format.
     pub tokens: Vec<TokenFormat>,
-    /// Which variants are rendered: those of [`EvalModels::methods`](crate::sweep::eval_models::EvalModels::methods), or fewer.
-    pub variants: Vec<Method>,
+    /// Rendered methods: all of [`EvalModels::methods`](crate::sweep::eval_models::EvalModels::methods), or fewer.
+    pub methods: Vec<Method>,
     /// Latent K-means.
     pub kmeans: KMeans,
     /// Sizes of the networks.
     pub model: ModelConfig,
-    /// LPIPS, where its weights are there.
+    /// LPIPS; `None` without its weights.
     pub lpips: Option<Lpips>,
-    /// Other systems' pictures.
-    pub systems: Vec<ExternalMethod>,
-    /// Whether tensors live in this process's memory, so that its peak says something.
+    /// Methods of other programs, given by their images.
+    pub external_methods: Vec<ExternalMethod>,
+    /// Whether the device is a CPU, where the peak memory of the process includes the tensors.
     pub is_cpu: bool,
-    /// Seed of K-means and of what is random; each scene derives its own from it and its key.
+    /// Seed of K-means and of random tokens. Every scene derives a seed of its own from this seed and its key.
     pub seed: u64,
 }
 
 impl Sweep {
-    /// Tokens that a target is drawn from, for every time it is drawn where a scene has `num_storage_tokens`.
-    pub fn drawn(&self, num_storage_tokens: usize) -> Vec<usize> {
+    /// Returns the token count of every rendering of a target view in a scene of `num_storage_tokens`.
+    pub fn token_counts(&self, num_storage_tokens: usize) -> Vec<usize> {
         let counts = [vec![num_storage_tokens], self.render_counts(num_storage_tokens)].concat();
-        let num_formats: usize = self.variants.iter().map(|&variant| self.formats(variant).len()).sum();
+        let num_formats: usize = self.methods.iter().map(|&method| self.formats(method).len()).sum();
         counts.repeat(num_formats)
     }
 
-    /// Counts that views are drawn from where a scene has `num_storage_tokens`: fewer than those, rising.
+    /// Returns the render counts below `num_storage_tokens`, ascending.
     pub(crate) fn render_counts(&self, num_storage_tokens: usize) -> Vec<usize> {
         let counts = self.render.iter().filter_map(|count| count.of(num_storage_tokens).ok());
         let mut counts: Vec<usize> = counts.filter(|&count| count < num_storage_tokens).collect();
@@ -52,8 +53,9 @@ impl Sweep {
         counts
     }
 
-    pub(crate) fn formats(&self, variant: Method) -> &[TokenFormat] {
-        if variant == Method::Random { &[TokenFormat::F32] } else { &self.tokens }
+    /// Returns the number formats of a method.
+    pub(crate) fn formats(&self, method: Method) -> &[TokenFormat] {
+        if method == Method::Random { &[TokenFormat::F32] } else { &self.tokens }
     }
 }
 
@@ -64,7 +66,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn views_are_drawn_from_fewer_tokens_than_are_stored_each_count_once() {
+    fn render_counts_are_distinct_and_below_storage() {
         let sweep = Sweep {
             storage: Vec::new(),
             render: vec![
@@ -76,11 +78,11 @@ mod tests {
             ],
             selection: Selection::Preset(SelectionPreset::Paper),
             tokens: vec![TokenFormat::F32],
-            variants: Vec::new(),
+            methods: Vec::new(),
             kmeans: KMeans::default(),
             model: ModelConfig::default(),
             lpips: None,
-            systems: Vec::new(),
+            external_methods: Vec::new(),
             is_cpu: true,
             seed: 0,
         };

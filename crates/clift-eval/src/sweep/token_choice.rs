@@ -5,26 +5,26 @@ use std::time::Instant;
 
 use clift_data::{Clip, item_rng};
 use clift_model::{ModelError, Selector, TokenRay};
-use rand::seq::SliceRandom;
 
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
+use crate::sweep::compressed_tokens::random_subset;
 use crate::upload::view_cameras;
 
-/// The tokens of one view.
+/// The tokens selected for one view.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct SelectedTokens {
     /// Rows of the stored tokens, ascending.
     pub tokens: Vec<u32>,
-    /// Seconds of the selection.
+    /// Time of the selection, in seconds.
     pub select_s: f64,
 }
 
-/// Selects the tokens of every target of a clip, in the order of its frames, which momentum needs; the result is in
-/// the order of the targets.
+/// Selects tokens for every target view of a clip, and returns them in the order of the target views. Momentum (Algorithm
+/// 1) needs the views in the order of their frames.
 ///
-/// `ids` are the patches of the context views that the stored tokens stand on, `[num_storage_tokens]`.
-pub(crate) fn choose(
+/// `ids` are the patches of the stored tokens in the context views, `[S]`.
+pub(crate) fn select_for_views(
     selection: Selection,
     clip: &Clip,
     ids: &[u32],
@@ -35,8 +35,11 @@ pub(crate) fn choose(
     let target = &clip.target;
     let mut order: Vec<usize> = (0..target.num_views()).collect();
     order.sort_by_key(|&view| target.frame_index[view]);
-    let mut choose: Box<dyn FnMut(usize) -> Result<Vec<u32>, ModelError>> = match selection {
-        Selection::Random => Box::new(|view| Ok(random_tokens(ids.len(), num_render_tokens, seed, view))),
+    let mut select: Box<dyn FnMut(usize) -> Result<Vec<u32>, ModelError>> = match selection {
+        Selection::Random => Box::new(|view| {
+            let rng = item_rng(seed, view as u64, 0, 0, "random selection");
+            Ok(random_subset(ids.len(), num_render_tokens, rng))
+        }),
         Selection::Preset(preset) => {
             let context = view_cameras(&clip.context);
             let rays = TokenRay::of_patches(ids, &context, clip.context.height, clip.context.width, patch_size);
@@ -45,22 +48,13 @@ pub(crate) fn choose(
             Box::new(move |view| selector.select(&cameras[view], target.height, target.width, num_render_tokens))
         }
     };
-    let mut chosen = vec![SelectedTokens { tokens: Vec::new(), select_s: 0.0 }; order.len()];
+    let mut selected = vec![SelectedTokens { tokens: Vec::new(), select_s: 0.0 }; order.len()];
     for view in order {
         let started = Instant::now();
-        let tokens = choose(view)?;
-        chosen[view] = SelectedTokens { tokens, select_s: started.elapsed().as_secs_f64() };
+        let tokens = select(view)?;
+        selected[view] = SelectedTokens { tokens, select_s: started.elapsed().as_secs_f64() };
     }
-    Ok(chosen)
-}
-
-/// `count` of `num_tokens` without replacement, ascending.
-fn random_tokens(num_tokens: usize, count: usize, seed: u64, view: usize) -> Vec<u32> {
-    let mut tokens: Vec<u32> = (0..num_tokens as u32).collect();
-    tokens.shuffle(&mut item_rng(seed, view as u64, 0, 0, "random selection"));
-    tokens.truncate(count);
-    tokens.sort_unstable();
-    tokens
+    Ok(selected)
 }
 
 #[cfg(test)]
@@ -86,28 +80,25 @@ mod tests {
     }
 
     fn tokens(selection: Selection, clip: &Clip, count: usize) -> Vec<Vec<u32>> {
-        let chosen = choose(selection, clip, &[0, 1, 2, 3, 4, 5, 6, 7], 8, count, 5).unwrap();
-        chosen.into_iter().map(|chosen| chosen.tokens).collect()
+        let selected = select_for_views(selection, clip, &[0, 1, 2, 3, 4, 5, 6, 7], 8, count, 5).unwrap();
+        selected.into_iter().map(|selected| selected.tokens).collect()
     }
 
     #[test]
-    fn momentum_follows_the_frames_and_not_the_order_of_the_list() {
+    fn momentum_follows_the_order_of_frames() {
         let places = [-1.0, -0.3, 0.4, 1.0];
         let listed = tokens(Selection::default(), &clip(&places, &[1, 2, 3, 4]), 3);
-        let mut reversed_places = places;
-        reversed_places.reverse();
-        let mut reversed = tokens(Selection::default(), &clip(&reversed_places, &[4, 3, 2, 1]), 3);
+        let mut reversed = tokens(Selection::default(), &clip(&[1.0, 0.4, -0.3, -1.0], &[4, 3, 2, 1]), 3);
         reversed.reverse();
         assert_eq!(reversed, listed);
         assert!(listed.iter().all(|tokens| tokens.len() == 3));
     }
 
     #[test]
-    fn random_tokens_are_distinct_and_of_seed_and_view() {
-        let drawn = tokens(Selection::Random, &clip(&[0.0; 20], &(0..20).collect::<Vec<_>>()), 4);
-        assert!(drawn.iter().all(|tokens| tokens.len() == 4 && tokens.windows(2).all(|pair| pair[0] < pair[1])));
-        assert!(drawn.iter().any(|tokens| *tokens != drawn[0]), "every view anew");
-        assert_eq!(random_tokens(8, 4, 5, 3), drawn[3]);
-        assert!((0..20).any(|view| random_tokens(8, 4, 6, view) != drawn[view]));
+    fn random_tokens_differ_between_views() {
+        let sampled = tokens(Selection::Random, &clip(&[0.0; 20], &(0..20).collect::<Vec<_>>()), 4);
+        assert!(sampled.iter().all(|tokens| tokens.len() == 4 && tokens.windows(2).all(|pair| pair[0] < pair[1])));
+        assert!(sampled.iter().any(|tokens| *tokens != sampled[0]));
+        assert_eq!(random_subset(8, 4, item_rng(5, 3, 0, 0, "random selection")), sampled[3]);
     }
 }

@@ -1,37 +1,32 @@
-//! The resident memory of this process at its peak, where the system tells.
+//! Peak resident memory of the process, on Linux.
 
-use std::path::Path;
+use crate::system::machine::proc_field;
 
-/// Starts a new peak at what is resident now. `None` where the system cannot: then there is no peak either.
+/// Resets the peak to the resident memory of now. Returns `None` where the system has no resettable peak.
 pub fn start_peak() -> Option<()> {
-    give_back();
+    release_free_memory();
     // 5 resets the "high water mark" (proc(5)).
     std::fs::write("/proc/self/clear_refs", "5").ok()
 }
 
-/// Returns what was freed to the system: glibc keeps it otherwise, and a row after an f64 comparison would seem to
-/// need twice its memory.
-fn give_back() {
+/// Returns freed memory to the system. glibc keeps freed memory otherwise, and a bench row after an f64 comparison would
+/// count the memory of the comparison.
+fn release_free_memory() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     {
         unsafe extern "C" {
             fn malloc_trim(pad: usize) -> std::ffi::c_int;
         }
-        // SAFETY: a function of the C library that every program here is linked with; it may be called at any time
-        // from any thread (malloc_trim(3)) and touches free memory alone.
+        // SAFETY: malloc_trim is a function of the linked C library. Any thread may call malloc_trim at any time
+        // (malloc_trim(3)); the call touches only free memory.
         unsafe { malloc_trim(0) };
     }
 }
 
-/// Most bytes resident since [`start_peak`].
+/// Returns the peak of the resident memory since [`start_peak`], in bytes.
 pub fn peak_bytes() -> Option<u64> {
-    field_bytes(Path::new("/proc/self/status"), "VmHWM:")
-}
-
-fn field_bytes(path: &Path, name: &str) -> Option<u64> {
-    let text = std::fs::read_to_string(path).ok()?;
-    let value = text.lines().find_map(|line| line.strip_prefix(name))?;
-    Some(value.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024)
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    Some(proc_field(&status, "VmHWM")?.strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024)
 }
 
 #[cfg(test)]
@@ -39,25 +34,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_peak_holds_what_was_freed_and_a_new_one_starts_lower() {
+    fn the_peak_includes_freed_memory_until_reset() {
         const BYTES: u64 = 1 << 28;
         if start_peak().is_none() {
-            return; // a system without it
+            return;
         }
         drop(std::hint::black_box(vec![1_u8; BYTES as usize]));
         let Some(peak) = peak_bytes() else { return };
         assert!(peak >= BYTES, "{peak}");
         start_peak();
-        // What other tests allocate meanwhile is far from a quarter of a gibibyte.
+        // Other tests allocate far less meanwhile.
         assert!(peak_bytes().is_some_and(|after| after < peak - BYTES / 2));
-    }
-
-    #[test]
-    fn a_file_without_the_field_gives_none() {
-        let file = tempfile::NamedTempFile::new().expect("a temporary file");
-        std::fs::write(file.path(), "VmRSS:\t  7 kB\nVmHWM:\t  12 kB\n").expect("writable");
-        assert_eq!(field_bytes(file.path(), "VmHWM:"), Some(12 * 1024));
-        assert_eq!(field_bytes(file.path(), "VmSwap:"), None);
-        assert_eq!(field_bytes(Path::new("no/such/file"), "VmHWM:"), None);
     }
 }

@@ -1,7 +1,7 @@
 //! The machine, for reports.
 //!
 //! - `machine`: processor and memory, for reports
-//! - `memory`: peak and available memory
+//! - `memory`: peak memory of the process
 
 pub(crate) mod machine;
 pub(crate) mod memory;

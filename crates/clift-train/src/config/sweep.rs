@@ -6,19 +6,19 @@ use clift_model::{DeviceName, TokenCount};
 
 use crate::config::config::Config;
 
-/// What an evaluation of a run does with every scene, without LPIPS and other systems.
-pub(crate) fn sweep(config: &Config, storage: Vec<TokenCount>, variants: Vec<Method>) -> Sweep {
+/// What an evaluation of a run does with every scene, without LPIPS and external methods.
+pub(crate) fn sweep(config: &Config, storage: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
     let Config { seed, eval, clusters, model, device, .. } = config;
     Sweep {
         storage,
         render: eval.render.clone(),
         selection: eval.selection,
         tokens: eval.tokens.clone(),
-        variants,
+        methods,
         kmeans: clusters.kmeans.clone(),
         model: model.clone(),
         lpips: None,
-        systems: Vec::new(),
+        external_methods: Vec::new(),
         is_cpu: matches!(device, DeviceName::Flex | DeviceName::Ndarray),
         seed: derive_seed(*seed, "eval"),
     }

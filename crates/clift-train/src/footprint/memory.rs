@@ -114,7 +114,7 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
     let all = num_tokens(config, eval.num_context)?;
     let stored = eval.storage.iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
     let sweep = eval_sizes(config);
-    let num_drawn: usize = stored.iter().map(|&count| sweep.drawn(count).len()).sum();
+    let num_drawn: usize = stored.iter().map(|&count| sweep.token_counts(count).len()).sum();
     let vgg = measures_lpips(config).then(|| VggShape::VGG16.sizes(config.data.height, config.data.width));
     Ok(InferenceSizes {
         // Both stages have a renderer of their own.

@@ -10,7 +10,7 @@ use clift_data::{
     ClipReader, OpenedSource, SceneSource, SceneSubset, Split, make_folder, open_dataset, open_training_dataset,
     remove_leftovers,
 };
-use clift_eval::{EvalModels, ExternalMethod, LPIPS_COMMAND, Summary, write_ledger};
+use clift_eval::{EvalModels, ExternalMethod, LPIPS_COMMAND, Summary, write_skip_report};
 use clift_model::{
     Clift, ModelError, ModelPath, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
 };
@@ -331,7 +331,7 @@ impl Run {
         };
         sink.event(&Event::Message(format!("{split}: {ledger}")));
         if ledger.has_skips() && self.config.run_dir.is_dir() {
-            write_ledger(&ledger, &self.folder(&format!("skipped-{split}.json")))?;
+            write_skip_report(&ledger, &self.folder(&format!("skipped-{split}.json")))?;
         }
         let source: Arc<dyn SceneSource> = match self.overfit {
             Some(count) => Arc::new(SceneSubset::first(source, count)),

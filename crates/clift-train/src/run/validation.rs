@@ -7,8 +7,8 @@ use std::time::Instant;
 use burn::tensor::Device;
 use clift_data::ClipReader;
 use clift_eval::{
-    Description, EvalConfig, EvalError, EvalModels, Evaluator, ExternalMethod, Limits, Method, Progress, SceneFigures,
-    Summary, Sweep, stage2_method,
+    EvalConfig, EvalError, EvalModels, Evaluator, ExternalMethod, Method, Progress, RunDescription, SceneFigures,
+    SceneLimits, Summary, Sweep, stage2_method,
 };
 use clift_model::{Clift, TokenCount, TrainedModel};
 
@@ -38,15 +38,15 @@ impl<'a> Validation<'a> {
     ) -> Result<Self, TrainError> {
         largest_tensor::check(config, device, &[Stage::Eval])?;
         let run_dir = &config.run_dir;
-        let description = Description {
+        let description = RunDescription {
             name: run_dir.file_name().unwrap_or(run_dir.as_os_str()).to_string_lossy().into_owned(),
             config: toml::to_string_pretty(config).map_err(TrainError::bad_file("config", run_dir))?,
             device: config.device.to_string(),
         };
         let sweep = sweep(config, eval.storage.clone(), Vec::new());
         let evaluator = Evaluator::new(eval, sweep, description, reader, device)?;
-        if !evaluator.ledger().skips.is_empty() {
-            sink.event(&Event::Message(format!("evaluation: {}", evaluator.ledger())));
+        if !evaluator.skip_report().skips.is_empty() {
+            sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report())));
         }
         Ok(Self { config, evaluator })
     }
@@ -81,15 +81,15 @@ impl<'a> Validation<'a> {
             storage: vec![storage],
             render: Vec::new(),
             tokens: all.tokens[..1].to_vec(),
-            variants: vec![method],
+            methods: vec![method],
             ..all.clone()
         };
-        let mut write_sheet = |_: &str, shown: SceneFigures| {
+        let mut write_sheet = |_: &str, figures: SceneFigures| {
             let making = |source| EvalError::Io { action: "making a folder", source, path: folder.into() };
             std::fs::create_dir_all(folder).map_err(making)?;
-            shown.sheet.write_png(&folder.join(format!("step-{step:09}.png")))
+            figures.contact_sheet.write_png(&folder.join(format!("step-{step:09}.png")))
         };
-        let limits = Limits { num_scenes: eval.num_validation_scenes, num_shown: 1 };
+        let limits = SceneLimits { num_scenes: eval.num_validation_scenes, num_figures: 1 };
         let mut progress = EvalEvents { stop, sink, is_stage: false };
         let measured = match self.evaluator.measure(&models, &sweep, limits, &mut write_sheet, &mut progress) {
             Err(EvalError::Interrupted { .. }) => return Ok(None),

@@ -7,7 +7,7 @@ use clift_data::{
     ClipReader, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions, Split,
     open_dataset, open_source,
 };
-use clift_eval::{EncodeOptions, Encoded, encode};
+use clift_eval::{EncodeOptions, EncodedScene, encode};
 use clift_model::{DeviceName, ModelPath, TokenCount, TokenFormat, TrainedModel, check_output_path};
 use clift_train::{Config, Override, read_config};
 
@@ -97,8 +97,8 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
 }
 
 /// What was written, for people.
-fn told(encoded: &Encoded, storage: TokenFormat, path: &Path) -> String {
-    let Encoded { scene, num_lift_tokens, cluster_error } = encoded;
+fn told(encoded: &EncodedScene, storage: TokenFormat, path: &Path) -> String {
+    let EncodedScene { scene, num_lift_tokens, cluster_error } = encoded;
     let num_tokens = scene.num_tokens();
     let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
     format!(

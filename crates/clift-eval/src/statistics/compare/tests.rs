@@ -12,7 +12,7 @@ fn evaluation(folder: &Path, name: &str, rows: &[&str]) -> Evaluation {
 }
 
 #[test]
-fn differences_are_paired_by_scene_and_frame() {
+fn differences_are_paired_by_view() {
     let folder = tempfile::tempdir().unwrap();
     let a = evaluation(
         folder.path(),
@@ -24,7 +24,7 @@ fn differences_are_paired_by_scene_and_frame() {
             "z,1,clift,8,8,10,0.5,,0.1,,f32",
         ],
     );
-    // Another order, one view more and one less.
+    // Another order, one additional view and one missing view.
     let b = evaluation(
         folder.path(),
         "b",
@@ -44,26 +44,26 @@ fn differences_are_paired_by_scene_and_frame() {
     let [low, high] = psnr.interval.unwrap();
     assert!((low - (2.0 - 12.706_204_736)).abs() < 1e-6 && (high - (2.0 + 12.706_204_736)).abs() < 1e-6);
     assert!(!psnr.is_clear());
-    assert_eq!(pair.lpips_vgg, None, "only one side has it");
+    assert_eq!(pair.lpips_vgg, None, "only one evaluation has LPIPS");
     let text = comparison.to_string();
     assert!(text.contains("clift 8 f32") && text.contains("+2.000 [-10.706, +14.706]"), "{text}");
-    assert!(text.contains("up to 1 of A alone and 1 of B alone are left out"), "{text}");
+    assert!(text.contains("up to 1 views of A and 1 views of B are ignored"), "{text}");
 }
 
 #[test]
-fn a_difference_that_is_the_same_in_every_scene_is_clear() {
+fn consistent_differences_are_clear() {
     let of = |shift: f64| {
         let pairs: Vec<(f64, f64)> =
             (0..30).map(|i| (f64::from(i), f64::from(i) + shift + 0.01 * f64::from(i % 2))).collect();
-        PairedDifference::of(&pairs).unwrap()
+        MetricDifference::of(&pairs).unwrap()
     };
     assert!(of(0.5).is_clear() && of(-0.5).is_clear() && !of(-0.005).is_clear());
-    let single = PairedDifference::of(&[(1.0, 2.0)]).unwrap();
+    let single = MetricDifference::of(&[(1.0, 2.0)]).unwrap();
     assert_eq!((single.mean, single.interval, single.is_clear()), (1.0, None, false));
 }
 
 #[test]
-fn variants_of_one_evaluation_are_compared_at_equal_counts() {
+fn methods_are_compared_at_equal_counts() {
     let folder = tempfile::tempdir().unwrap();
     let rows = [
         "x,1,kmeans,8,8,20,,,,,f32",
@@ -77,7 +77,7 @@ fn variants_of_one_evaluation_are_compared_at_equal_counts() {
     let sides = [MethodFilter::parse("kmeans:f32"), MethodFilter::parse("clift")];
     let comparison = Comparison::new(&all, &all, Some(&sides)).unwrap();
     let means: Vec<f64> = comparison.pairs.iter().map(|pair| pair.psnr.unwrap().mean).collect();
-    // An identical picture counts as 100 dB.
+    // An identical image counts as 100 dB.
     assert_eq!(means, [1.0, 75.0]);
     assert!(comparison.to_string().contains("kmeans 8 f32 -> clift 8 f32"), "{comparison}");
     let sides = [MethodFilter::parse("kmeans:f32"), MethodFilter::parse("kmeans:int8")];
@@ -85,20 +85,20 @@ fn variants_of_one_evaluation_are_compared_at_equal_counts() {
 }
 
 #[test]
-fn what_cannot_be_compared_says_why() {
+fn incomparable_evaluations_are_errors() {
     let folder = tempfile::tempdir().unwrap();
     let a = evaluation(folder.path(), "a", &["x,1,clift,8,8,20,,,,,f32"]);
     let counts = evaluation(folder.path(), "counts", &["x,1,clift,16,16,20,,,,,f32"]);
     let scenes = evaluation(folder.path(), "scenes", &["y,1,clift,8,8,20,,,,,f32"]);
     let message = |b: &Evaluation| Comparison::new(&a, b, None).unwrap_err().to_string();
-    assert!(message(&counts).contains("no setting is in both") && message(&counts).contains("clift 16 f32"));
-    assert!(message(&scenes).contains("no target view is in both") && message(&scenes).contains("y, frame 1"));
+    assert!(message(&counts).contains("no common method and token count") && message(&counts).contains("clift 16 f32"));
+    assert!(message(&scenes).contains("no common target view") && message(&scenes).contains("y, frame 1"));
     let missing = Evaluation::read(&folder.path().join("nowhere")).unwrap_err().to_string();
-    assert!(missing.contains("`clift eval` writes it") && missing.ends_with("nowhere"), "{missing}");
+    assert!(missing.contains("`clift eval` writes the file") && missing.ends_with("nowhere"), "{missing}");
     let bad = folder.path().join("views.csv");
     std::fs::write(&bad, format!("{HEAD}\nx,1,clift,eight,8,20,,,,\n")).unwrap();
     assert!(Evaluation::read(&bad).is_err());
-    // Without the column of formats, as before there was one.
+    // Files of earlier versions have no column of formats.
     std::fs::write(&bad, format!("{HEAD}\nx,1,clift,8,8,20,,,,\n")).unwrap();
     assert!(Evaluation::read(&bad).is_ok());
 }

@@ -1,0 +1,148 @@
+//! `views.csv` and `scenes.csv`: the metrics of every view, and their means per scene. An empty field was not measured.
+
+use std::path::Path;
+
+use clift_data::replace_file;
+
+use crate::error::EvalError;
+use crate::statistics::eval_results::EvalResults;
+use crate::statistics::scene_means::{capped, mean};
+use crate::statistics::view_metrics::ViewMetrics;
+
+const VIEW_COLUMNS: [&str; 11] = [
+    "scene",
+    "target_frame",
+    "variant",
+    "num_storage_tokens",
+    "num_render_tokens",
+    "psnr",
+    "ssim",
+    "lpips_vgg",
+    "render_s",
+    "select_s",
+    "tokens",
+];
+
+const SCENE_COLUMNS: [&str; 9] =
+    ["scene", "variant", "num_storage_tokens", "num_render_tokens", "tokens", "num_views", "psnr", "ssim", "lpips_vgg"];
+
+/// Writes `views.csv`: a row per key and view, baselines included. An identical image has the PSNR `inf`.
+///
+/// # Errors
+/// [`EvalError::Io`] when the file cannot be written.
+pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
+    let rows = results.views().flat_map(|(key, scenes)| {
+        let views = scenes.iter().flat_map(|(scene, frames)| frames.iter().map(move |view| (scene, view)));
+        views.map(move |(scene, (frame, view))| {
+            [
+                scene.clone(),
+                frame.to_string(),
+                key.method.name().into(),
+                key.num_storage_tokens.to_string(),
+                key.num_render_tokens.to_string(),
+                view.psnr.to_string(),
+                text(view.ssim),
+                text(view.lpips_vgg),
+                text(view.render_s),
+                text(view.select_s),
+                key.format_name().into(),
+            ]
+        })
+    });
+    write(path, VIEW_COLUMNS, rows).map_err(EvalError::io("writing the metrics of the views", path))
+}
+
+/// Writes `scenes.csv`: a row per key and scene, baselines included, with means over the views of the scene.
+///
+/// # Errors
+/// [`EvalError::Io`] when the file cannot be written.
+pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
+    let rows = results.views().flat_map(|(key, scenes)| {
+        scenes.iter().map(move |(scene, views)| {
+            let mean_of = |value: fn(&ViewMetrics) -> Option<f64>| {
+                text(mean(&views.values().filter_map(value).collect::<Vec<_>>()))
+            };
+            [
+                scene.clone(),
+                key.method.name().into(),
+                key.num_storage_tokens.to_string(),
+                key.num_render_tokens.to_string(),
+                key.format_name().into(),
+                views.len().to_string(),
+                mean_of(|view| Some(capped(view.psnr))),
+                mean_of(|view| view.ssim),
+                mean_of(|view| view.lpips_vgg),
+            ]
+        })
+    });
+    write(path, SCENE_COLUMNS, rows).map_err(EvalError::io("writing the means of the scenes", path))
+}
+
+fn text(value: Option<f64>) -> String {
+    value.map(|value| value.to_string()).unwrap_or_default()
+}
+
+fn write<const N: usize>(
+    path: &Path,
+    columns: [&str; N],
+    rows: impl Iterator<Item = [String; N]>,
+) -> std::io::Result<()> {
+    let mut csv = csv::Writer::from_writer(Vec::new());
+    csv.write_record(columns)?;
+    for row in rows {
+        csv.write_record(&row)?;
+    }
+    replace_file(path, &csv.into_inner().map_err(csv::IntoInnerError::into_error)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use clift_model::TokenFormat;
+
+    use super::*;
+    use crate::config::method::Method;
+    use crate::statistics::view_metrics::EvalKey;
+
+    #[test]
+    fn rows_have_a_fixed_order() {
+        let key = EvalKey {
+            method: Method::Clift,
+            num_storage_tokens: 64,
+            num_render_tokens: 32,
+            tokens: Some(TokenFormat::F16),
+        };
+        let measured =
+            |psnr, lpips_vgg| ViewMetrics { lpips_vgg, render_s: Some(0.25), ..ViewMetrics::quality(psnr, Some(0.5)) };
+        let rows = [
+            ("room, \"big\"", 3, key, measured(f64::INFINITY, None)),
+            ("attic", 9, key, measured(20.0, Some(0.25))),
+            ("attic", 2, key, measured(23.0, Some(0.75))),
+            ("attic", 9, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.5, None)),
+        ];
+        let views = "\
+scene,target_frame,variant,num_storage_tokens,num_render_tokens,psnr,ssim,lpips_vgg,render_s,select_s,tokens
+attic,2,clift,64,32,23,0.5,0.75,0.25,,f16
+attic,9,clift,64,32,20,0.5,0.25,0.25,,f16
+\"room, \"\"big\"\"\",3,clift,64,32,inf,0.5,,0.25,,f16
+attic,9,nearest_view,0,0,18.5,,,,,
+";
+        let scenes = "\
+scene,variant,num_storage_tokens,num_render_tokens,tokens,num_views,psnr,ssim,lpips_vgg
+attic,clift,64,32,f16,2,21.5,0.5,0.5
+\"room, \"\"big\"\"\",clift,64,32,f16,1,100,0.5,
+attic,nearest_view,0,0,,1,18.5,,
+";
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.csv");
+        for order in [[0, 1, 2, 3], [3, 2, 1, 0]] {
+            let mut results = EvalResults::default();
+            for (scene, frame, key, view) in order.map(|i| rows[i]) {
+                results.add(scene, frame, key, view).unwrap();
+            }
+            write_views(&results, &path).unwrap();
+            assert_eq!(std::fs::read_to_string(&path).unwrap(), views);
+            write_scenes(&results, &path).unwrap();
+            assert_eq!(std::fs::read_to_string(&path).unwrap(), scenes);
+        }
+    }
+}
