@@ -1,0 +1,168 @@
+//! Generates `docs/reference/cli.md` from the command tree and `docs/reference/config.md` from the doc comments and
+//! defaults of [`Config`]. `CLIFT_UPDATE=1 cargo test --release --workspace --lib reference` rewrites both pages.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use clap::builder::StyledStr;
+use clap::{Arg, Command, CommandFactory};
+use clift_train::Config;
+use toml::{Table, Value};
+
+use crate::cli::Args;
+
+/// A struct of a source file: its doc comment and its public fields.
+#[derive(Default)]
+struct Section {
+    doc: String,
+    fields: Vec<Field>,
+}
+
+struct Field {
+    name: String,
+    kind: String,
+    doc: String,
+}
+
+fn repository(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path)
+}
+
+fn compare(path: &str, text: &str) {
+    let path = repository(path);
+    if std::env::var_os("CLIFT_UPDATE").is_some() {
+        fs::write(&path, text).expect("writable page");
+    }
+    let page = fs::read_to_string(&path).unwrap_or_default();
+    let line = page.lines().zip(text.lines()).position(|(old, new)| old != new);
+    assert!(page == text, "{} is outdated from line {line:?}: see the page of this module", path.display());
+}
+
+#[test]
+fn cli_page_is_current() {
+    let mut command = Args::command();
+    command.build();
+    let mut page = "# Command line\n\nGenerated from `clift --help`.\n".to_owned();
+    add_command(&command, &mut page);
+    compare("docs/reference/cli.md", &page);
+}
+
+/// Adds a command, its arguments and its subcommands.
+fn add_command(command: &Command, page: &mut String) {
+    let (name, about) = (command.get_bin_name().unwrap_or("clift"), command.get_long_about().or(command.get_about()));
+    let usage = command.clone().render_usage().to_string().replace("Usage: ", "");
+    write!(page, "\n## {name}\n\n{}\n\n```text\n{}\n```\n", text(about), usage.trim()).unwrap();
+    let is_listed = |arg: &&Arg| !["help", "version"].contains(&arg.get_id().as_str());
+    let arguments = command.get_arguments().filter(is_listed).map(|arg| (argument(arg), help(arg)));
+    let children: Vec<&Command> = command.get_subcommands().filter(|child| child.get_name() != "help").collect();
+    let commands = children.iter().map(|child| (child.get_bin_name().unwrap().to_owned(), text(child.get_about())));
+    for (i, (name, help)) in arguments.chain(commands).enumerate() {
+        let short = help.split(['[', '\n']).next().unwrap_or_default().trim();
+        assert!(short.chars().count() <= 80 && !short.ends_with('.'), "{name}: {short}");
+        let head = if i == 0 { "\n| argument | |\n|---|---|\n" } else { "" };
+        writeln!(page, "{head}| `{name}` | {} |", cell(&help)).unwrap();
+    }
+    if let Some(after) = command.get_after_help() {
+        write!(page, "\n```text\n{after}\n```\n").unwrap();
+    }
+    children.into_iter().for_each(|child| add_command(child, page));
+}
+
+fn text(text: Option<&StyledStr>) -> String {
+    text.map(ToString::to_string).unwrap_or_default()
+}
+
+/// Formats the flags and the value of an argument: `-o, --out <FILE>`.
+fn argument(arg: &Arg) -> String {
+    let short = arg.get_short().map(|short| format!("-{short}"));
+    let flags: Vec<String> = short.into_iter().chain(arg.get_long().map(|long| format!("--{long}"))).collect();
+    let names = arg.get_value_names().filter(|_| arg.get_action().takes_values()).unwrap_or_default();
+    let value = names.iter().map(|name| format!("<{name}>"));
+    [flags.join(", ")].into_iter().chain(value).collect::<Vec<_>>().join(" ").trim().to_owned()
+}
+
+/// Formats the help of an argument with its default and possible values.
+fn help(arg: &Arg) -> String {
+    let mut help = text(arg.get_long_help().or(arg.get_help()));
+    if arg.get_action().takes_values() {
+        let values = |names: Vec<String>, label: &str| {
+            if names.is_empty() { String::new() } else { format!(" [{label}: {}]", names.join(", ")) }
+        };
+        help += &values(arg.get_default_values().iter().map(|value| value.display().to_string()).collect(), "default");
+        help += &values(arg.get_possible_values().iter().map(|value| value.get_name().into()).collect(), "values");
+    }
+    help
+}
+
+fn cell(text: &str) -> String {
+    text.replace("\n\n", ". ").replace('\n', " ").replace('|', "\\|").replace('<', "\\<")
+}
+
+#[test]
+fn config_page_is_current() {
+    let mut sections = BTreeMap::new();
+    for folder in ["clift-data", "clift-eval", "clift-model", "clift-train"] {
+        read_sections(&repository("crates").join(folder).join("src"), &mut sections);
+    }
+    let defaults = Table::try_from(Config::default()).expect("a table");
+    let mut page =
+        "# Config\n\nEvery key of a config file, generated from `Config`. `clift train CONFIG --set KEY=TOML` \
+                    overrides a key.\n\n## Top level\n"
+            .to_owned();
+    add_section("", &sections["Config"], &defaults, &sections, &mut page);
+    compare("docs/reference/config.md", &page);
+}
+
+/// Reads the structs of all source files below a folder.
+fn read_sections(folder: &Path, sections: &mut BTreeMap<String, Section>) {
+    for entry in fs::read_dir(folder).expect("a folder") {
+        let path = entry.expect("an entry").path();
+        if path.is_dir() {
+            read_sections(&path, sections);
+            continue;
+        }
+        let (mut doc, mut name) = (String::new(), None);
+        for line in fs::read_to_string(&path).expect("a source file").lines() {
+            if let Some(text) = line.trim_start().strip_prefix("///") {
+                doc.push_str(text);
+            } else if let Some(declared) = line.strip_prefix("pub struct ").and_then(|line| line.strip_suffix(" {")) {
+                name = Some(declared.to_owned());
+                sections.insert(declared.to_owned(), Section { doc: std::mem::take(&mut doc), fields: Vec::new() });
+            } else if let Some((field, kind)) = line.strip_prefix("    pub ").and_then(|line| line.split_once(": "))
+                && let Some(section) = name.as_ref().and_then(|name| sections.get_mut(name))
+            {
+                let kind = kind.trim_end_matches(',').to_owned();
+                section.fields.push(Field { name: field.to_owned(), kind, doc: std::mem::take(&mut doc) });
+            } else if !line.trim_start().starts_with("#[") {
+                doc.clear();
+                name = name.filter(|_| !line.starts_with('}'));
+            }
+        }
+    }
+}
+
+/// Adds the keys of a section, then the sections below it.
+fn add_section(
+    path: &str,
+    section: &Section,
+    defaults: &Table,
+    sections: &BTreeMap<String, Section>,
+    page: &mut String,
+) {
+    page.push_str("\n| key | default | |\n|---|---|---|\n");
+    let (nested, keys): (Vec<&Field>, Vec<&Field>) = section.fields.iter().partition(|field| {
+        sections.contains_key(&field.kind) && defaults.get(&field.name).is_some_and(Value::is_table)
+    });
+    for Field { name, doc, .. } in keys {
+        let default = defaults.get(name).map_or("unset".to_owned(), |value| format!("`{value}`"));
+        writeln!(page, "| `{name}` | {default} | {} |", cell(doc.trim())).unwrap();
+    }
+    for Field { name, kind, .. } in nested {
+        let path = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
+        let (section, defaults) = (&sections[kind], defaults[name].as_table().expect("a table"));
+        write!(page, "\n## [{path}]\n\n{}\n", section.doc.trim()).unwrap();
+        add_section(&path, section, defaults, sections, page);
+    }
+}
