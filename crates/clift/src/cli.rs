@@ -159,22 +159,8 @@ mod tests {
     }
 
     #[test]
-    fn valid_command_lines_are_accepted() {
-        for line in [
-            "train a.toml --only stage2 --overfit 3",
-            "eval run --storage 256,1/16 --render 16,1/2 --selection random",
-            "eval run --tokens f32,int8 --predictions a --predictions b",
-            "eval --checkpoint model --data re10k",
-            "compare a b --methods kmeans,clift:int8",
-            "flops --convention paper",
-            "render a.clift -o out --path ./orbit --size 64x48 --frames 7 --render 1/4",
-            "import a.ckpt --variant released-re10k -o m --rename a=b",
-            "export m --format pytorch -o a.ckpt",
-            "bench a.toml --work encode,stage1_step_tiny",
-            "bench half a.toml",
-            "data check dir --pictures out --scenes 3",
-            "data convert dir out --to scenes --set data.files.undistort=false",
-        ] {
+    fn old_words_are_accepted() {
+        for line in ["bench half a.toml --work encode", "compare a b --variants kmeans,clift:int8"] {
             let parsed = Args::try_parse_from(["clift"].into_iter().chain(line.split(' ')));
             assert!(parsed.is_ok(), "{line}: {}", parsed.unwrap_err());
         }
@@ -183,30 +169,23 @@ mod tests {
     #[test]
     fn wrong_command_lines_are_refused() {
         for line in [
-            "train a.toml --only stage3",
             "train a.toml --overfit 0",
             "eval",
             "eval --checkpoint model",
             "eval run --checkpoint model --data re10k",
-            "eval run --storage 0",
             "eval run --selection nearest",
             "eval run --name MVSplat",
             "compare a b --methods kmeans",
-            "flops --convention flop",
             "flops --set model.dim=8",
             "render a.clift -o out --path orbit --frames 0",
-            "render a.clift -o out --path orbit --fps 0",
             "render a.clift -o out --path orbit --budget-ms 30 --render 5",
             "render a.clift -o out --path orbit --selection all",
-            "render a.clift -o out --frames 3",
             "import a.ckpt --variant re10k -o m",
             "import a.ckpt --variant paper -o m --rename a",
             "bench",
             "bench a.toml --repeats 0",
-            "data synth",
             "data synth out --quality 101",
             "data synth out --chunk-mb 0",
-            "data index dir",
             "data convert dir out --to zip",
         ] {
             assert!(Args::try_parse_from(["clift"].into_iter().chain(line.split(' '))).is_err(), "{line}");

@@ -35,6 +35,14 @@ impl std::fmt::Display for UsageError {
 
 impl std::error::Error for UsageError {}
 
+/// Returns a [`UsageError`] with a formatted message from the function.
+macro_rules! usage_bail {
+    ($($message:tt)*) => {
+        return Err($crate::exit_code::UsageError(format!($($message)*)).into())
+    };
+}
+pub(crate) use usage_bail;
+
 /// Returns the exit code of an error.
 pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
     if error.is::<UsageError>() || error.is::<clift_train::ConfigError>() {

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clap::builder::StyledStr;
 use clap::{Arg, Command, CommandFactory};
@@ -13,31 +13,16 @@ use toml::{Table, Value};
 
 use crate::cli::Args;
 
-/// A struct of a source file: its doc comment and its public fields.
-#[derive(Default)]
-struct Section {
-    doc: String,
-    fields: Vec<Field>,
-}
-
-struct Field {
-    name: String,
-    kind: String,
-    doc: String,
-}
-
-fn repository(path: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path)
-}
+/// Structs of the source files by name: doc comment, and name, type and doc comment of each public field.
+type Structs = BTreeMap<String, (String, Vec<[String; 3]>)>;
 
 fn compare(path: &str, text: &str) {
-    let path = repository(path);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path);
     if std::env::var_os("CLIFT_UPDATE").is_some() {
         fs::write(&path, text).expect("writable page");
     }
     let page = fs::read_to_string(&path).unwrap_or_default();
-    let line = page.lines().zip(text.lines()).position(|(old, new)| old != new);
-    assert!(page == text, "{} is outdated from line {line:?}: see the page of this module", path.display());
+    assert!(page == text, "{} is outdated; `CLIFT_UPDATE=1` rewrites the page", path.display());
 }
 
 #[test]
@@ -102,67 +87,58 @@ fn cell(text: &str) -> String {
 
 #[test]
 fn config_page_is_current() {
-    let mut sections = BTreeMap::new();
-    for folder in ["clift-data", "clift-eval", "clift-model", "clift-train"] {
-        read_sections(&repository("crates").join(folder).join("src"), &mut sections);
+    let mut structs = Structs::new();
+    for name in ["clift-data", "clift-eval", "clift-model", "clift-train"] {
+        read_structs(&Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(name).join("src"), &mut structs);
     }
     let defaults = Table::try_from(Config::default()).expect("a table");
     let mut page =
-        "# Config\n\nEvery key of a config file, generated from `Config`. `clift train CONFIG --set KEY=TOML` \
-                    overrides a key.\n\n## Top level\n"
-            .to_owned();
-    add_section("", &sections["Config"], &defaults, &sections, &mut page);
+        "# Config\n\nGenerated from the doc comments of `Config`. `--set KEY=TOML` overrides a key.\n".to_owned();
+    add_section("", &structs["Config"].1, &defaults, &structs, &mut page);
     compare("docs/reference/config.md", &page);
 }
 
 /// Reads the structs of all source files below a folder.
-fn read_sections(folder: &Path, sections: &mut BTreeMap<String, Section>) {
+fn read_structs(folder: &Path, structs: &mut Structs) {
     for entry in fs::read_dir(folder).expect("a folder") {
         let path = entry.expect("an entry").path();
         if path.is_dir() {
-            read_sections(&path, sections);
+            read_structs(&path, structs);
             continue;
         }
-        let (mut doc, mut name) = (String::new(), None);
+        let (mut doc, mut name) = (String::new(), String::new());
         for line in fs::read_to_string(&path).expect("a source file").lines() {
             if let Some(text) = line.trim_start().strip_prefix("///") {
                 doc.push_str(text);
             } else if let Some(declared) = line.strip_prefix("pub struct ").and_then(|line| line.strip_suffix(" {")) {
-                name = Some(declared.to_owned());
-                sections.insert(declared.to_owned(), Section { doc: std::mem::take(&mut doc), fields: Vec::new() });
+                name = declared.to_owned();
+                structs.insert(name.clone(), (std::mem::take(&mut doc), Vec::new()));
             } else if let Some((field, kind)) = line.strip_prefix("    pub ").and_then(|line| line.split_once(": "))
-                && let Some(section) = name.as_ref().and_then(|name| sections.get_mut(name))
+                && let Some((_, fields)) = structs.get_mut(&name)
             {
-                let kind = kind.trim_end_matches(',').to_owned();
-                section.fields.push(Field { name: field.to_owned(), kind, doc: std::mem::take(&mut doc) });
+                fields.push([field, kind.trim_end_matches(','), doc.trim()].map(String::from));
+                doc.clear();
             } else if !line.trim_start().starts_with("#[") {
                 doc.clear();
-                name = name.filter(|_| !line.starts_with('}'));
+                name = if line.starts_with('}') { String::new() } else { name };
             }
         }
     }
 }
 
 /// Adds the keys of a section, then the sections below it.
-fn add_section(
-    path: &str,
-    section: &Section,
-    defaults: &Table,
-    sections: &BTreeMap<String, Section>,
-    page: &mut String,
-) {
+fn add_section(path: &str, fields: &[[String; 3]], defaults: &Table, structs: &Structs, page: &mut String) {
+    let is_section =
+        |[name, kind, _]: &&[String; 3]| structs.contains_key(kind) && defaults.get(name).is_some_and(Value::is_table);
     page.push_str("\n| key | default | |\n|---|---|---|\n");
-    let (nested, keys): (Vec<&Field>, Vec<&Field>) = section.fields.iter().partition(|field| {
-        sections.contains_key(&field.kind) && defaults.get(&field.name).is_some_and(Value::is_table)
-    });
-    for Field { name, doc, .. } in keys {
+    for [name, _, doc] in fields.iter().filter(|field| !is_section(field)) {
         let default = defaults.get(name).map_or("unset".to_owned(), |value| format!("`{value}`"));
-        writeln!(page, "| `{name}` | {default} | {} |", cell(doc.trim())).unwrap();
+        writeln!(page, "| `{name}` | {default} | {} |", cell(doc)).unwrap();
     }
-    for Field { name, kind, .. } in nested {
+    for [name, kind, _] in fields.iter().filter(is_section) {
         let path = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
-        let (section, defaults) = (&sections[kind], defaults[name].as_table().expect("a table"));
-        write!(page, "\n## [{path}]\n\n{}\n", section.doc.trim()).unwrap();
-        add_section(&path, section, defaults, sections, page);
+        let (doc, fields) = &structs[kind];
+        write!(page, "\n## [{path}]\n\n{}\n", doc.trim()).unwrap();
+        add_section(&path, fields, defaults[name].as_table().expect("a table"), structs, page);
     }
 }

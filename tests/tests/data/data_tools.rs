@@ -59,7 +59,8 @@ fn indices_hold_overlapping_views_and_are_not_overwritten() {
     }
     clift(["data", "index", &rooms, "-o", &out]).fails_with(2, &["exists; remove it"]);
     let other = place.at("other.json").display().to_string();
-    clift(["data", "index", &rooms, "-o", &other]).fails_with(1, &["no scene has overlapping views 45 to 135 frames apart"]);
+    clift(["data", "index", &rooms, "-o", &other])
+        .fails_with(1, &["no scene has overlapping views 45 to 135 frames apart"]);
 }
 
 #[test]

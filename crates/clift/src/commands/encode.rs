@@ -12,7 +12,7 @@ use clift_model::{ModelPath, TokenCount, TokenFormat, TrainedModel, check_output
 use clift_train::{Config, Override};
 
 use crate::commands::shared_args::{ConfigArgs, read_config};
-use crate::exit_code::UsageError;
+use crate::exit_code::{UsageError, usage_bail};
 use crate::output::stdout::{print_note, print_result};
 use crate::output::units::{file_size, plural};
 
@@ -57,8 +57,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let (mut config, overrides) = read_config(&model.dir.join("config.toml"), &args.overrides.set, |_| Ok(()))?;
     // Tensor shapes do not determine the number of heads: a wrong one would silently change the tokens.
     if config.model != model.config()? {
-        let text = "--set model: the weights were trained with another network; remove the override";
-        return Err(UsageError(text.into()).into());
+        usage_bail!("--set model: the weights were trained with another network; remove the override");
     }
     config.device = args.overrides.device.unwrap_or(config.device);
     // The config of an imported model has no data set.
@@ -134,13 +133,11 @@ fn find_scene(source: &dyn SceneSource, key: Option<&str>) -> anyhow::Result<usi
         keys.push("..");
     }
     let keys = keys.join(", ");
-    match key {
-        Some(key) => match source.find(key) {
-            Some(scene) => Ok(scene),
-            None => Err(UsageError(format!("no scene {key}; the {num_scenes} scenes are: {keys}")).into()),
-        },
-        None if num_scenes == 1 => Ok(0),
-        None => Err(UsageError(format!("{num_scenes} scenes; choose one with --scene: {keys}")).into()),
+    match (key, key.and_then(|key| source.find(key))) {
+        (_, Some(scene)) => Ok(scene),
+        (Some(key), None) => usage_bail!("no scene {key}; the {num_scenes} scenes are: {keys}"),
+        (None, None) if num_scenes == 1 => Ok(0),
+        (None, None) => usage_bail!("{num_scenes} scenes; choose one with --scene: {keys}"),
     }
 }
 

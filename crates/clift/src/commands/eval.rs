@@ -9,7 +9,7 @@ use clift_train::{Config, Run, evaluate_model};
 
 use crate::commands::parse::parse_bytes;
 use crate::commands::shared_args::{ConfigArgs, read_config};
-use crate::exit_code::UsageError;
+use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::progress::progress_sink;
 use crate::output::stdout::{print_evaluation, print_note};
@@ -85,20 +85,18 @@ fn external_methods(args: &EvalArgs) -> anyhow::Result<Vec<ExternalMethod>> {
     let EvalArgs { predictions, name, data_size, .. } = args;
     for (flag, count) in [("--name", name.len()), ("--data-size", data_size.len())] {
         if count != 0 && count != predictions.len() {
-            let text = format!("{} --predictions but {count} {flag}: give one for each, in order", predictions.len());
-            return Err(UsageError(text).into());
+            usage_bail!("{} --predictions but {count} {flag}: give one for each, in order", predictions.len());
         }
     }
     let mut methods: Vec<ExternalMethod> = Vec::new();
     for (i, folder) in predictions.iter().enumerate() {
         if !folder.is_dir() {
-            return Err(UsageError(format!("--predictions: no folder {}", folder.display())).into());
+            usage_bail!("--predictions: no folder {}", folder.display());
         }
         let folder_name = || folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned();
         let name = MethodName::new(&name.get(i).cloned().unwrap_or_else(folder_name))?;
         if methods.iter().any(|method| method.name == name) {
-            let text = format!("two --predictions have the name {}: set distinct names with --name", name.as_str());
-            return Err(UsageError(text).into());
+            usage_bail!("two --predictions have the name {}: set distinct names with --name", name.as_str());
         }
         methods.push(ExternalMethod { name, folder: folder.clone(), data_bytes: data_size.get(i).copied() });
     }

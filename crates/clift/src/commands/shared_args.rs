@@ -7,7 +7,7 @@ use clift_model::DeviceName;
 use clift_train::{Config, Override, TrainError, read_checked_config};
 use serde::Serialize;
 
-use crate::exit_code::UsageError;
+use crate::exit_code::usage_bail;
 use crate::output::json::write_json;
 use crate::output::stdout::{print_note, print_result};
 
@@ -58,11 +58,10 @@ pub struct JsonArg {
 
 impl JsonArg {
     /// Checks that the folder of the file exists, before a command that takes minutes.
-    pub fn check_folder(&self) -> Result<(), UsageError> {
-        let folder = self.path.as_deref().and_then(Path::parent).filter(|folder| !folder.as_os_str().is_empty());
-        match folder {
-            Some(folder) if !folder.is_dir() => {
-                Err(UsageError(format!("--json: no folder {}; create it first", folder.display())))
+    pub fn check_folder(&self) -> anyhow::Result<()> {
+        match self.path.as_deref().and_then(Path::parent) {
+            Some(folder) if !folder.as_os_str().is_empty() && !folder.is_dir() => {
+                usage_bail!("--json: no folder {}; create it first", folder.display())
             }
             _ => Ok(()),
         }

@@ -145,19 +145,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn set_accepts_keys_of_files_only() {
-        let files =
-            |set: &[&str]| SourceArgs { dir: "".into(), set: set.iter().map(|&key| key.into()).collect() }.files();
-        let (read, changes) = files(&["data.files.image_folder=images_4"]).unwrap();
-        assert_eq!(read.image_folder.as_deref(), Some("images_4"));
-        assert_eq!(changes[0].to_string(), "--set data.files.image_folder: (default) -> \"images_4\"");
-        assert!(files(&[]).unwrap().1.is_empty());
-        for wrong in ["data.width=64", "data.files.undistrot=true", "stage1.steps=2"] {
-            assert!(files(&[wrong]).unwrap_err().is::<clift_train::ConfigError>(), "{wrong}");
-        }
-    }
-
-    #[test]
     fn list_of_test_scenes_divides_a_folder_without_splits() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini/train");
         let folder = tempfile::tempdir().unwrap();

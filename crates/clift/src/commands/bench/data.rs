@@ -10,7 +10,7 @@ use serde::Serialize;
 use crate::commands::parse::{parse_size, parse_views};
 use crate::commands::shared_args::JsonArg;
 use crate::commands::splits::{Splits, open_splits};
-use crate::exit_code::UsageError;
+use crate::exit_code::usage_bail;
 use crate::output::stdout::print_result;
 use crate::output::table::table;
 
@@ -54,7 +54,7 @@ struct Report {
 pub fn run(args: &BenchDataArgs) -> anyhow::Result<()> {
     let _peak = start_peak();
     let Some(split) = open_splits(&args.dir, args.split, &FileOptions::default())?.pop() else {
-        return Err(UsageError(format!("no scenes in {}", args.dir.display())).into());
+        usage_bail!("no scenes in {}", args.dir.display());
     };
     let [width, height] = args.size;
     let clip = ClipOptions {
@@ -92,33 +92,4 @@ fn report_text(report: &Report, [num_context, num_targets]: [usize; 2]) -> Strin
     ];
     let title = format!("clips of {num_context} + {num_targets} frames, {width}x{height}");
     format!("{title}\n\n{}", table(["read", "speed"], rows))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn table_has_units() {
-        let throughput = Throughput {
-            size: [256, 256],
-            num_threads: 2,
-            sequential_clips_per_s: 51.26,
-            random_median_s: 0.0301,
-            random_p95_s: 0.05,
-            random_clips_per_s: 33.0,
-            sequential: Vec::new(),
-            random: Vec::new(),
-        };
-        let text = report_text(&Report { peak_bytes: Some(123_456_789), throughput }, [4, 6]);
-        let expected = "\
-clips of 4 + 6 frames, 256x256
-
-read           speed
-in order       51.3 clips/s on 2 threads
-at random      33.0 clips/s on one thread
-one at random  30.1 ms (p95: 50.0 ms)
-peak memory    123 MB";
-        assert_eq!(text, expected);
-    }
 }

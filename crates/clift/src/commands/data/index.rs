@@ -6,7 +6,7 @@ use clift_data::{OverlapOptions, SceneSource, write_overlap_index};
 
 use crate::commands::parse::parse_distance;
 use crate::commands::splits::{SourceArgs, SplitSource, Splits};
-use crate::exit_code::UsageError;
+use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::units::plural;
 
@@ -21,7 +21,7 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     };
     options.validate()?;
     if args.out.exists() {
-        return Err(UsageError(format!("{} exists; remove it or choose another file", args.out.display())).into());
+        usage_bail!("{} exists; remove it or choose another file", args.out.display());
     }
     let splits = args.source.open(args.split)?;
     splits.iter().for_each(SplitSource::print_report);

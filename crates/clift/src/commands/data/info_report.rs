@@ -96,40 +96,36 @@ impl fmt::Display for Report {
     }
 }
 
-/// Appends the skipped scenes by reason.
-fn skipped_scenes(skips: &[SkippedScene], rows: &mut Vec<(&str, String)>) {
-    let mut keys: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
-    for SkippedScene { key, reason } in skips {
-        keys.entry(reason).or_default().push(key);
-    }
-    let num_reasons = keys.len();
-    for (reason, keys) in keys.into_iter().take(MAX_LISTED_SCENES) {
-        let more = if keys.len() > MAX_LISTED_SCENES { ", .." } else { "" };
-        let listed = keys[..keys.len().min(MAX_LISTED_SCENES)].join(", ");
-        rows.push(match keys.len() {
-            1 => ("  skipped", format!("{listed}: {reason}")),
-            number => ("  skipped", format!("{number} {reason}: {listed}{more}")),
-        });
-    }
-    if num_reasons > MAX_LISTED_SCENES {
-        rows.push(("  skipped", format!("scenes for {} more reasons", num_reasons - MAX_LISTED_SCENES)));
-    }
+/// Formats up to `most` names, with `..` for the others.
+fn first_names(names: &[&str], most: usize) -> String {
+    let more = if names.len() > most { ", .." } else { "" };
+    format!("{}{more}", names[..names.len().min(most)].join(", "))
 }
 
-/// Appends the skipped frames by scene and reason.
-fn skipped_frames(frames: &[SkippedFrame], rows: &mut Vec<(&str, String)>) {
+/// Appends the skipped scenes by reason, then the skipped frames by scene and reason.
+fn skipped_rows(scenes: &[SkippedScene], frames: &[SkippedFrame], rows: &mut Vec<(&str, String)>) {
+    let mut keys: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for SkippedScene { key, reason } in scenes {
+        keys.entry(reason).or_default().push(key);
+    }
+    let scenes = keys.iter().map(|(reason, keys)| match keys[..] {
+        [key] => format!("{key}: {reason}"),
+        _ => format!("{} {reason}: {}", keys.len(), first_names(keys, MAX_LISTED_SCENES)),
+    });
     let mut names: BTreeMap<(&str, &str), Vec<&str>> = BTreeMap::new();
     for SkippedFrame { key, frame, reason } in frames {
         names.entry((key, reason)).or_default().push(frame);
     }
-    let num_groups = names.len();
-    for ((key, reason), names) in names.into_iter().take(MAX_LISTED_SCENES) {
-        let more = if names.len() > MAX_LISTED_FRAMES { ", .." } else { "" };
-        let listed = names[..names.len().min(MAX_LISTED_FRAMES)].join(", ");
-        rows.push(("  skipped", format!("of {key} {} {reason}: {listed}{more}", plural(names.len(), "frame"))));
-    }
-    if num_groups > MAX_LISTED_SCENES {
-        rows.push(("  skipped", format!("frames of {} more scenes", num_groups - MAX_LISTED_SCENES)));
+    let frames = names.iter().map(|((key, reason), names)| {
+        format!("of {key} {} {reason}: {}", plural(names.len(), "frame"), first_names(names, MAX_LISTED_FRAMES))
+    });
+    for (mut groups, more) in
+        [(scenes.collect::<Vec<_>>(), "scenes for {} more reasons"), (frames.collect(), "frames of {} more scenes")]
+    {
+        let num_more = groups.len().saturating_sub(MAX_LISTED_SCENES);
+        groups.truncate(MAX_LISTED_SCENES);
+        groups.extend((num_more > 0).then(|| more.replace("{}", &num_more.to_string())));
+        rows.extend(groups.into_iter().map(|group| ("  skipped", group)));
     }
 }
 
@@ -143,8 +139,7 @@ impl SplitReport {
         let first = format!("; described by the first {}", self.num_described);
         let first = if self.num_described < self.num_used { first.as_str() } else { "" };
         rows.push((name, format!("{used}{}{first}", plural(self.num_scenes, "scene"))));
-        skipped_scenes(&self.left_out, rows);
-        skipped_frames(&self.frames, rows);
+        skipped_rows(&self.left_out, &self.frames, rows);
         rows.extend(self.notes.iter().map(|note| ("  note", note.clone())));
         let Some(info) = &self.info else { return };
         for SkippedScene { key, reason } in info.unreadable.iter().take(MAX_LISTED_SCENES) {

@@ -9,7 +9,7 @@ use clift_eval::{Animation, Canvas};
 use clift_model::{SceneRenderer, ViewCamera};
 use clift_train::TrainError;
 
-use crate::exit_code::UsageError;
+use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
 
 /// Median seconds per frame: token selection and rendering.
@@ -32,8 +32,7 @@ pub fn require_empty(out: &Path) -> anyhow::Result<()> {
     if is_empty_folder(out).with_context(|| format!("reading {}", out.display()))? {
         return Ok(());
     }
-    Err(UsageError(format!("output folder {} is not empty; choose another folder or move it away", out.display()))
-        .into())
+    usage_bail!("output folder {} is not empty; choose another folder or move it away", out.display())
 }
 
 /// Renders every view and writes the frames and the animation to `folder`, until `stop` is set.

@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use crate::commands::render::args::{CameraPath, RenderArgs};
 use crate::commands::render::frames::{self, Frames};
-use crate::exit_code::UsageError;
+use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::json::write_json;
 use crate::output::stdout::{print_note, print_result};
@@ -57,8 +57,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     if args.model.is_none() && !weights.exists() {
         // The path comes from an untrusted file: control characters must not reach the terminal.
         let path = weights.display().to_string();
-        let message = format!("the weights of the scene are not found at {}; set --model RUN", path.escape_debug());
-        return Err(UsageError(message).into());
+        usage_bail!("the weights of the scene are not found at {}; set --model RUN", path.escape_debug());
     }
     let stop = interrupt::flag()?;
     let opened = device.open()?;
@@ -102,8 +101,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
 /// Refuses sizes that are not multiples of the patch, exceed the limit of images or exceed the available memory.
 fn check_size(scene: &Scene, [width, height]: [usize; 2], selects: bool, device: DeviceName) -> anyhow::Result<()> {
     if width.max(height) > MAX_SIDE_PX {
-        let message = format!("--size {width}x{height}: write at most {MAX_SIDE_PX} pixels per side");
-        return Err(UsageError(message).into());
+        usage_bail!("--size {width}x{height}: write at most {MAX_SIDE_PX} pixels per side");
     }
     let num_patches = scene.model.num_tokens(1, height, width)?;
     // With token selection every frame has its own tokens and is rendered alone.
@@ -111,10 +109,9 @@ fn check_size(scene: &Scene, [width, height]: [usize; 2], selects: bool, device:
     let needed = render_bytes(&scene.model, scene.num_tokens(), num_patches * num_frames);
     if let Some(available) = available_bytes(device).filter(|available| needed > *available) {
         let (needed, available) = (file_size(needed), file_size(available));
-        let message = format!(
+        usage_bail!(
             "frames of {width} x {height} need {needed} of memory, {available} are available; choose a smaller --size"
         );
-        return Err(UsageError(message).into());
     }
     Ok(())
 }
@@ -138,9 +135,9 @@ fn token_count(
     }
     let Some(count) = times.most_tokens(budget_ms / 1e3) else {
         let least_ms = (1e4 * times.least_s()).ceil() / 10.0;
-        let message =
-            format!("the fastest frame takes {least_ms} ms on this device; write at least --budget-ms {least_ms}");
-        return Err(UsageError(format!("{message}, or a smaller --size")).into());
+        usage_bail!(
+            "the fastest frame takes {least_ms} ms on this device; raise --budget-ms or choose a smaller --size"
+        );
     };
     print_note(&format!("{budget_ms} ms per frame: {count} of {num_storage_tokens} tokens"));
     Ok((count, Some(times)))
@@ -159,12 +156,10 @@ fn path_cameras(scene: &Scene, args: &RenderArgs, height: usize, width: usize) -
         CameraPath::Orbit => orbit_path(&context, args.frames.unwrap_or(DEFAULT_FRAMES)),
         CameraPath::File(file) => {
             if args.frames.is_some() {
-                let message = "a file of poses determines the number of frames; remove --frames";
-                return Err(UsageError(message.into()).into());
+                usage_bail!("a file of poses determines the number of frames; remove --frames");
             }
             if !file.exists() {
-                let message = "no such file; write interpolate, orbit or the path of a file of poses";
-                return Err(UsageError(format!("--path {}: {message}", file.display())).into());
+                usage_bail!("--path {}: no such file; write interpolate, orbit or a file of poses", file.display());
             }
             let mean_c2w = Pose::from_matrix(&scene.world.mean_c2w)?;
             let frame = PoseNormalization { mean_c2w, scale: scene.world.scale };
