@@ -54,7 +54,7 @@ fn every_row_has_its_time_and_error() {
 fn rows_are_chosen_and_errors_omitted_on_request() {
     let place = Place::new();
     let json = place.at("bench.json").display().to_string();
-    let chosen = ["--work", "render,encode", "--no-error", "--repeats", "1", "--json", &json];
+    let chosen = ["--case", "render,encode", "--no-error", "--repeats", "1", "--json", &json];
     clift(args(&chosen)).ok();
     let rows = &place.json("bench.json")["rows"];
     assert_eq!((&rows[0]["work"], &rows[1]["work"]), (&"encode".into(), &"render".into()));
@@ -63,7 +63,7 @@ fn rows_are_chosen_and_errors_omitted_on_request() {
 
 #[test]
 fn what_cannot_be_timed_is_wrong_usage() {
-    clift(args(&["--work", "encode,incode"])).fails_with(2, &["'incode'", "the works are encode, kmeans, condense"]);
+    clift(args(&["--case", "encode,incode"])).fails_with(2, &["'incode'", "the works are encode, kmeans, condense"]);
     clift(args(&["--storage", "17"])).fails_with(2, &["`--storage` = 17"]);
     clift(args(&["--json", "no/such/folder/bench.json"])).fails_with(2, &["no folder"]);
     clift(args(&["--set", "data.width=20"]))
@@ -76,7 +76,7 @@ fn an_interrupted_benchmark_writes_nothing() {
     let json = place.at("bench.json").display().to_string();
     for (name, code) in [("-INT", 130), ("-TERM", 143)] {
         // Thousands of repetitions: the second row lasts until the signal arrives.
-        let mut child = spawn(args(&["--work", "encode,render", "--no-error", "--repeats", "3000", "--json", &json]));
+        let mut child = spawn(args(&["--case", "encode,render", "--no-error", "--repeats", "3000", "--json", &json]));
         let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
         assert!(lines.any(|line| line.starts_with("encode: ")), "the first row is done");
         signal(&child, name);

@@ -1,21 +1,21 @@
-//! Errors to exit codes.
+//! Error messages and exit codes.
 
 use clift_eval::EvalError;
 use clift_train::TrainError;
 
 use crate::interrupt;
 
-/// Done.
+/// The command succeeded.
 pub(crate) const DONE: u8 = 0;
 
-/// Something failed.
+/// The command failed.
 pub(crate) const FAILED: u8 = 1;
 
-/// The command line or the config is wrong.
-pub(crate) const WRONG_USAGE: u8 = 2;
+/// The command line, the config or the model is invalid.
+pub(crate) const USAGE: u8 = 2;
 
-/// The error with its causes, without those that a message quotes already.
-pub(crate) fn message(error: &anyhow::Error) -> String {
+/// Formats an error with its causes. Causes that the text already contains are omitted.
+pub(crate) fn error_message(error: &anyhow::Error) -> String {
     error
         .chain()
         .skip(1)
@@ -23,7 +23,7 @@ pub(crate) fn message(error: &anyhow::Error) -> String {
         .fold(error.to_string(), |text, cause| if text.contains(&cause) { text } else { format!("{text}: {cause}") })
 }
 
-/// The command line asks for something that cannot be done.
+/// An invalid combination of arguments.
 #[derive(Debug)]
 pub(crate) struct UsageError(pub(crate) String);
 
@@ -35,9 +35,18 @@ impl std::fmt::Display for UsageError {
 
 impl std::error::Error for UsageError {}
 
+/// Returns a [`UsageError`] with a formatted message from the function.
+macro_rules! usage_bail {
+    ($($message:tt)*) => {
+        return Err($crate::exit_code::UsageError(format!($($message)*)).into())
+    };
+}
+pub(crate) use usage_bail;
+
+/// Returns the exit code of an error.
 pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
     if error.is::<UsageError>() || error.is::<clift_train::ConfigError>() {
-        return WRONG_USAGE;
+        return USAGE;
     }
     if let Some(error) = error.downcast_ref::<clift_data::DataError>() {
         return data_exit_code(error);
@@ -51,10 +60,10 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
     error.downcast_ref::<TrainError>().map_or(FAILED, train_exit_code)
 }
 
-pub(crate) fn train_exit_code(error: &TrainError) -> u8 {
+fn train_exit_code(error: &TrainError) -> u8 {
     match error {
         TrainError::Interrupted { .. } | TrainError::Abandoned { .. } => interrupt::exit_code(),
-        TrainError::BadConfig { .. } | TrainError::OtherRun { .. } | TrainError::Missing { .. } => WRONG_USAGE,
+        TrainError::BadConfig { .. } | TrainError::OtherRun { .. } | TrainError::Missing { .. } => USAGE,
         TrainError::Eval(error) => eval_exit_code(error),
         TrainError::Data(error) => data_exit_code(error),
         TrainError::Model(error) => model_exit_code(error),
@@ -63,23 +72,23 @@ pub(crate) fn train_exit_code(error: &TrainError) -> u8 {
     }
 }
 
-pub(crate) fn data_exit_code(error: &clift_data::DataError) -> u8 {
+fn data_exit_code(error: &clift_data::DataError) -> u8 {
     use clift_data::DataError::{BadConfig, UnknownLayout};
-    if matches!(error, BadConfig { .. } | UnknownLayout { .. }) { WRONG_USAGE } else { FAILED }
+    if matches!(error, BadConfig { .. } | UnknownLayout { .. }) { USAGE } else { FAILED }
 }
 
-pub(crate) fn eval_exit_code(error: &EvalError) -> u8 {
+fn eval_exit_code(error: &EvalError) -> u8 {
     use EvalError::{BadMethodName, BadWeights, Interrupted, NoPredictions, NotComparable};
     match error {
         Interrupted { .. } => interrupt::exit_code(),
-        BadMethodName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => WRONG_USAGE,
+        BadMethodName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => USAGE,
         EvalError::Data(error) => data_exit_code(error),
         EvalError::Model(error) => model_exit_code(error),
         _ => FAILED,
     }
 }
 
-pub(crate) fn model_exit_code(error: &clift_model::ModelError) -> u8 {
+fn model_exit_code(error: &clift_model::ModelError) -> u8 {
     use clift_model::ModelError::{
         BadConfig, BadTokenCount, NoConfig, NoDevice, NoModel, NotDivisible, NotImported, OtherRenderer,
     };
@@ -91,7 +100,7 @@ pub(crate) fn model_exit_code(error: &clift_model::ModelError) -> u8 {
         | NoModel { .. }
         | NotDivisible { .. }
         | NotImported { .. }
-        | OtherRenderer { .. } => WRONG_USAGE,
+        | OtherRenderer { .. } => USAGE,
         _ => FAILED,
     }
 }
@@ -101,21 +110,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cause_is_shown_once() {
+    fn cause_is_printed_once() {
         let missing = clift_train::read_config::<clift_train::Config>("no.toml".as_ref(), &[]).unwrap_err();
-        let text = message(&anyhow::Error::from(missing).context("starting"));
+        let text = error_message(&anyhow::Error::from(missing).context("starting"));
         assert!(text.starts_with("starting: reading the configuration failed: "), "{text}");
         assert_eq!(text.matches("os error").count(), 1, "{text}");
     }
 
     #[test]
-    fn what_the_user_can_change_is_wrong_usage_and_the_rest_has_failed() {
+    fn user_errors_and_failures_have_distinct_codes() {
         let bad_config = || clift_data::SyntheticConfig { num_frames: 0, ..Default::default() }.validate();
-        assert_eq!(exit_code(&UsageError("no".into()).into()), WRONG_USAGE);
-        assert_eq!(exit_code(&bad_config().unwrap_err().into()), WRONG_USAGE);
-        assert_eq!(exit_code(&TrainError::from(bad_config().unwrap_err()).into()), WRONG_USAGE);
+        assert_eq!(exit_code(&UsageError("no".into()).into()), USAGE);
+        assert_eq!(exit_code(&bad_config().unwrap_err().into()), USAGE);
+        assert_eq!(exit_code(&TrainError::from(bad_config().unwrap_err()).into()), USAGE);
         let stopped = |source| TrainError::Stopped { source, stage: "stage1", step: 3, checkpoint: "none".into() };
-        assert_eq!(exit_code(&stopped(Box::new(bad_config().unwrap_err().into())).into()), WRONG_USAGE);
+        assert_eq!(exit_code(&stopped(Box::new(bad_config().unwrap_err().into())).into()), USAGE);
         assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), 130);
         assert_eq!(exit_code(&TrainError::Abandoned { work: "`encode`".into() }.into()), 130);
         assert_eq!(exit_code(&clift_data::DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);

@@ -1,5 +1,4 @@
-//! Ctrl-C, SIGTERM and a closed terminal: the first signal asks the work to stop in good order, the second ends the
-//! process.
+//! Ctrl-C, SIGTERM and SIGHUP: the first signal requests a stop after the state is saved, the second ends the process.
 
 use std::sync::atomic::{AtomicBool, AtomicUsize};
 use std::sync::{Arc, OnceLock};
@@ -8,18 +7,21 @@ use anyhow::Context;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
 
-/// What a shell adds to the number of the signal that ended a process.
+/// Offset of exit codes of signals, as in shells.
 const SIGNALLED: u8 = 128;
 
-/// The number of the last signal; 0 for none.
+/// Number of the last signal; 0 for none.
 static LAST_SIGNAL: OnceLock<Arc<AtomicUsize>> = OnceLock::new();
 
-/// A flag that is set when the process is asked to stop.
+/// Listens for signals and returns a flag that the first one sets.
+///
+/// # Errors
+/// Errors of the operating system.
 pub fn flag() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let last = LAST_SIGNAL.get_or_init(Arc::default);
     let listen = |signal: i32| {
-        // In this order: the flag is what the second signal finds set.
+        // The shutdown is registered before the flag: it must only see a flag that an earlier signal has set.
         flag::register_conditional_shutdown(signal, i32::from(SIGNALLED) + signal, stop.clone())?;
         flag::register_usize(signal, last.clone(), signal as usize)?;
         flag::register(signal, stop.clone())
@@ -34,14 +36,13 @@ pub fn flag() -> anyhow::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
-/// The exit code of a process that stopped because it was asked to: 128 and the number of the signal.
+/// Returns the exit code of an interrupted process: 128 plus the number of the signal.
 pub fn exit_code() -> u8 {
     let last = LAST_SIGNAL.get().map_or(0, |last| last.load(std::sync::atomic::Ordering::SeqCst));
     SIGNALLED + u8::try_from(last).ok().filter(|last| *last != 0).unwrap_or(SIGINT as u8)
 }
 
-/// Whether the process was started to ignore a signal, as `nohup` does with SIGHUP. Linux tells; elsewhere it is taken
-/// for not ignored.
+/// Returns whether the process ignores a signal from its start, as `nohup` sets for SIGHUP. Linux only; `false` elsewhere.
 #[cfg(unix)]
 fn is_ignored(signal: i32) -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
@@ -66,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_signal_the_code_is_that_of_ctrl_c() {
+    fn exit_code_without_a_signal_is_that_of_ctrl_c() {
         assert_eq!(exit_code(), 130);
     }
 }

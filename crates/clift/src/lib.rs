@@ -1,10 +1,20 @@
-//! The command line of clift: arguments and printing, nothing else.
+//! The command line of clift: parses the arguments, calls the library crates, prints results and returns the exit code.
+//!
+//! The binary has one line:
+//!
+//! ```no_run
+//! fn main() -> std::process::ExitCode {
+//!     clift::main()
+//! }
+//! ```
 
 mod cli;
 mod commands;
 mod exit_code;
 mod interrupt;
 mod output;
+#[cfg(test)]
+mod reference;
 
 use std::process::ExitCode;
 
@@ -14,11 +24,11 @@ use crate::cli::{Args, Command};
 use crate::commands::bench::cases::{BenchArgs, BenchCommand};
 use crate::commands::data::command::DataCommand;
 use crate::commands::{bench, compare, data, doctor, encode, eval, export, flops, import, plan, render, train};
-use crate::exit_code::{DONE, exit_code, message};
+use crate::exit_code::{DONE, error_message, exit_code};
 use crate::output::stdout;
 
-/// Runs the command line of this process and returns its exit code: 0 done, 1 failed, 2 wrong usage
-/// or config, 130 (Ctrl-C), 143 (SIGTERM) or 129 (a closed terminal) interrupted after saving.
+/// Runs the command line of this process and returns the exit code: 0 done, 1 failed, 2 invalid command line, config or
+/// model, 129 (closed terminal), 130 (Ctrl-C) or 143 (SIGTERM) interrupted.
 pub fn main() -> ExitCode {
     let result = match Args::parse().command {
         Command::Train(args) => train::run(&args),
@@ -35,7 +45,7 @@ pub fn main() -> ExitCode {
         Command::Plan(args) => plan::run(&args),
         Command::Doctor(args) => doctor::run::run(&args),
         Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => bench::data::run(&args),
-        Command::Bench(BenchArgs { command: Some(BenchCommand::Half(args)), .. }) => bench::precision::run(&args),
+        Command::Bench(BenchArgs { command: Some(BenchCommand::Precision(args)), .. }) => bench::precision::run(&args),
         Command::Bench(args) => bench::cases::run(&args),
         Command::Import(args) => import::run(&args),
         Command::Export(args) => export::run(&args),
@@ -43,7 +53,7 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::from(DONE),
         Err(error) => {
-            stdout::print_note(&format!("error: {}", message(&error)));
+            stdout::print_note(&format!("error: {}", error_message(&error)));
             ExitCode::from(exit_code(&error))
         }
     }

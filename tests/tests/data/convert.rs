@@ -46,9 +46,9 @@ fn conversion_into_other_data_is_refused_unwritten() {
     assert!(!other.join("train").exists(), "the other half is not begun");
 
     let inside = convert(&out, &out.join("scenes"), &["--to", "scenes"]).fails(2);
-    assert!(inside.contains("choose a folder beside it"), "{inside}");
+    assert!(inside.contains("choose an output folder outside the input"), "{inside}");
     let onto = convert(&out, &out, &["--to", "chunks"]).fails(2);
-    assert!(onto.contains("choose a folder beside it"), "{onto}");
+    assert!(onto.contains("choose an output folder outside the input"), "{onto}");
 }
 
 #[test]
@@ -82,7 +82,7 @@ fn scenes_skipped_at_opening_are_listed() {
     copy_folder(&data.join("attic"), &data.join("empty"));
     std::fs::remove_dir_all(data.join("empty/images")).unwrap();
     let ran = convert(&data, &place.at("out"), &["--to", "chunks"]).ok();
-    assert!(ran.stderr.contains("left out empty: without any image"), "{}", ran.stderr);
+    assert!(ran.stderr.contains("skipped empty: without any image"), "{}", ran.stderr);
     assert!(ran.stderr.contains("skipped.json"), "{}", ran.stderr);
     let skipped = place.json("out/test/skipped.json");
     assert_eq!((&skipped["num_scenes"], &skipped["skips"][0]["key"]), (&2.into(), &"empty".into()));
@@ -105,12 +105,12 @@ fn conversion_and_check_without_scenes_fail() {
     write_chunks(&data.join("test"), [Ok(record)], 1).unwrap();
     let ran = convert(&data, &place.at("out"), &["--to", "chunks"]);
     assert!(ran.stdout.contains("0 scenes of 1"), "{}", ran.stdout);
-    ran.fails_with(1, &["left out torn: ", "not one scene could be converted (test)"]);
+    ran.fails_with(1, &["skipped torn: ", "no scene of test could be converted"]);
     assert!(!place.at("out/test/index.json").exists());
 
     std::fs::remove_file(data.join("test/000000.torch")).unwrap();
     std::fs::write(data.join("test/index.json"), "{}").unwrap();
-    clift(["data", "check", data.to_str().unwrap()]).fails_with(1, &["no scene was checked"]);
+    clift(["data", "check", data.to_str().unwrap()]).fails_with(1, &["no scenes to check"]);
 }
 
 #[test]

@@ -15,8 +15,8 @@ fn rooms(place: &Place) -> String {
 fn scenes_are_checked_converted_and_checked_again() {
     let place = Place::new();
     let rooms = rooms(&place);
-    let (json, pictures) = (place.at("check.json").display().to_string(), place.at("lines").display().to_string());
-    let ran = clift(["data", "check", &rooms, "--json", &json, "--pictures", &pictures]).ok();
+    let (json, images) = (place.at("check.json").display().to_string(), place.at("lines").display().to_string());
+    let ran = clift(["data", "check", &rooms, "--json", &json, "--images", &images]).ok();
     assert!(ran.stdout.contains("2 scenes, 2 ok, 0 flagged"), "{}", ran.stdout);
     let report = place.json("check.json");
     let scene = &report["scenes"][0];
@@ -31,9 +31,9 @@ fn scenes_are_checked_converted_and_checked_again() {
     let packed = place.at("packed").display().to_string();
     let convert = || clift(["data", "convert", &rooms, &packed, "--to", "scenes"]).ok();
     let text = convert().stdout;
-    assert!(text.contains("2 scenes of 2; 18 frames written, 18 as they were and 0 encoded"), "{text}");
+    assert!(text.contains("2 scenes of 2; 18 frames written, 18 copied and 0 encoded"), "{text}");
     let text = convert().stdout;
-    assert!(text.contains("2 scenes of 2, 2 of them there already; 0 frames written"), "{text}");
+    assert!(text.contains("2 scenes of 2, 2 of them already complete; 0 frames written"), "{text}");
     clift(["data", "check", &packed]).ok();
 
     // A truncated scene is flagged; converting again rewrites it.
@@ -43,7 +43,7 @@ fn scenes_are_checked_converted_and_checked_again() {
     let ran = clift(["data", "check", &packed]);
     assert!(ran.stdout.contains("2 scenes, 1 ok, 1 flagged"), "{}", ran.stdout);
     ran.fails_with(1, &["1 of 2 scenes flagged"]);
-    assert!(convert().stdout.contains("2 scenes of 2, 1 of them there already; 9 frames written"));
+    assert!(convert().stdout.contains("2 scenes of 2, 1 of them already complete; 9 frames written"));
     clift(["data", "check", &packed]).ok();
 }
 
@@ -57,9 +57,10 @@ fn indices_hold_overlapping_views_and_are_not_overwritten() {
     for entry in place.json("index.json").as_object().unwrap().values() {
         assert_eq!((entry["context"].as_array().unwrap().len(), entry["target"].as_array().unwrap().len()), (4, 2));
     }
-    clift(["data", "index", &rooms, "-o", &out]).fails_with(2, &["nothing is written over"]);
+    clift(["data", "index", &rooms, "-o", &out]).fails_with(2, &["exists; remove it"]);
     let other = place.at("other.json").display().to_string();
-    clift(["data", "index", &rooms, "-o", &other]).fails_with(1, &["frames 45 to 135 apart are asked for"]);
+    clift(["data", "index", &rooms, "-o", &other])
+        .fails_with(1, &["no scene has overlapping views 45 to 135 frames apart"]);
 }
 
 #[test]
@@ -69,7 +70,7 @@ fn reading_is_timed_and_the_clips_are_named() {
     let json = place.at("bench.json").display().to_string();
     let words = ["bench", "data", &rooms, "--split", "test", "--size", "64x64", "--views", "3+2", "--clips", "5"];
     let ran = clift(words.into_iter().chain(["--json", &json])).ok();
-    assert!(ran.stdout.starts_with("clips of 3 + 2 frames, 64x64\nin order "), "{}", ran.stdout);
+    assert!(ran.stdout.starts_with("clips of 3 + 2 frames, 64x64\n\nread "), "{}", ran.stdout);
     let report = place.json("bench.json");
     assert!(report["sequential_clips_per_s"].as_f64().unwrap() > 0.0);
     assert_eq!(report["random"].as_array().unwrap().len(), 5);

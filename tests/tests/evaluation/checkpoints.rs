@@ -247,7 +247,7 @@ fn an_evaluation_without_the_published_index_says_so() {
     let (data, out) = (mini(), place.at("eval").display().to_string());
     let index = repository("data-fixtures/re10k-mini/evaluation_index.json").display().to_string();
     let args = ["eval", "--checkpoint", &model, "--data", &data, "--out", &out, "--storage", "6"];
-    let note = "this is not the published protocol";
+    let note = "published figures use an evaluation index";
     let ran = clift(args.iter().chain(&SMALL).chain(&["--set", "eval.num_context=2"])).ok();
     assert!(ran.stderr.contains(note), "{}", ran.stderr);
     let ran = clift(args.iter().chain(&SMALL).chain(&["--index", &index])).ok();

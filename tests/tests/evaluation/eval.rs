@@ -244,7 +244,7 @@ fn two_evaluations_are_compared_pair_by_pair() {
         }
     }
     // One variant against another, and evaluations of other scenes.
-    let ran = clift(["compare", &a, &a, "--variants", "random,kmeans"]).ok();
+    let ran = clift(["compare", &a, &a, "--methods", "random,kmeans"]).ok();
     assert!(ran.stdout.contains("random 4 f32 -> kmeans 4 f32"), "{}", ran.stdout);
     let out = place.at("fewer");
     place.eval("b", &["--set", "eval.num_scenes=2", "--out", out.to_str().unwrap()]).ok();

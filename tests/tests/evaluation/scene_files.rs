@@ -241,13 +241,13 @@ fn what_cannot_be_drawn_says_what_to_do() {
 
     let other = place.at("other/stage1/model.safetensors").display().to_string();
     for (flags, expected) in [
-        (["--budget-ms", "0.0001"], "no frame takes less than "),
+        (["--budget-ms", "0.0001"], "the fastest frame takes "),
         (["--size", "20x16"], "an image of 20 x 16 does not divide into patches of 8 x 8"),
-        (["--size", "1000000x8"], "--size 1000000x8: write at most 16384 pixels a side"),
-        (["--size", "17179869184x17179869184"], "--size 17179869184x17179869184: write at most 16384 pixels a side"),
+        (["--size", "1000000x8"], "--size 1000000x8: write at most 16384 pixels per side"),
+        (["--size", "17179869184x17179869184"], "--size 17179869184x17179869184: write at most 16384 pixels per side"),
         (["--render", "9"], "a scene has 2 tokens"),
         (["--model", &other], "the scene was made for the renderer "),
-        (["--path", "interpolated"], "--path interpolated: there is no such file; write interpolate, orbit, or"),
+        (["--path", "interpolated"], "--path interpolated: no such file; write interpolate, orbit or"),
     ] {
         let path = if flags[0] == "--path" { &[][..] } else { &orbit[..] };
         render(&[path, &flags].concat()).fails_with(2, &[expected]);
@@ -258,16 +258,16 @@ fn what_cannot_be_drawn_says_what_to_do() {
     std::fs::write(place.at("poses.json"), json!({"poses": [pose, far]}).to_string()).unwrap();
     let poses = place.at("poses.json").display().to_string();
     render(&["--path", &poses]).fails_with(1, &["pose 1: bad camera: it stands "]);
-    render(&["--path", &poses, "--frames", "3"]).fails_with(2, &["has its own number of frames"]);
+    render(&["--path", &poses, "--frames", "3"]).fails_with(2, &["a file of poses determines the number of frames"]);
     assert!(!place.at("out").exists(), "nothing is left of what was refused");
 
     std::fs::create_dir(place.at("out")).unwrap();
     std::fs::write(place.at("out/notes.txt"), "").unwrap();
-    with(&[]).fails_with(2, &["is not empty, and nothing is written over"]);
+    with(&[]).fails_with(2, &["is not empty; choose another folder"]);
     std::fs::remove_file(place.at("out/notes.txt")).unwrap();
 
     std::fs::rename(place.at("run"), place.at("moved")).unwrap();
-    with(&[]).fails_with(2, &["which is not there; give the run with --model RUN"]);
+    with(&[]).fails_with(2, &["the weights of the scene are not found at ", "; set --model RUN"]);
     let moved = place.at("moved").display().to_string();
     with(&["--model", &moved]).ok();
 
@@ -321,7 +321,7 @@ fn scene_files_overwrite_only_scene_files() {
     // Another number of heads fits the same weights and would change every image.
     for change in ["model.num_heads=1", "model={num_heads=1}"] {
         encode("heads.clift", &["--set", change])
-            .fails_with(2, &["--set model: the network is what the weights were trained with"]);
+            .fails_with(2, &["--set model: the weights were trained with another network"]);
     }
 }
 
@@ -331,7 +331,7 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     place.copy(&STAGE_1, "run");
     let encode = |flags: &[&str]| clift(encode_args(&place, "run", "room.clift", flags));
     encode(&[]).fails_with(2, &["scenes; choose one with --scene: synthetic-0-test-00000, "]);
-    encode(&["--scene", "attic"]).fails_with(2, &["there is no scene attic; the "]);
+    encode(&["--scene", "attic"]).fails_with(2, &["no scene attic; the "]);
     encode(&["--scene", KEY, "--context", "0,8"])
         .fails_with(2, &["`--context` = 0,8: there is no frame 8; the scene has frames 0 to 7"]);
     encode(&["--scene", KEY, "--storage", "9"]).fails_with(2, &["a scene has 8 tokens"]);

@@ -116,7 +116,7 @@ const COMMANDS: [(&str, &[&str]); 6] = [
     ("no-such-config", &["train", "DIR/nothing.toml"]),
     ("no-such-stage", &["train", "DIR/right.toml", "--only", "stage3"]),
     ("no-such-device", &["train", "DIR/right.toml", "--device", "gpu"]),
-    ("no-such-work", &["bench", "DIR/right.toml", "--work", "incode"]),
+    ("no-such-work", &["bench", "DIR/right.toml", "--case", "incode"]),
     ("no-such-run", &["eval", "DIR/nothing"]),
     ("no-such-command", &["tarin", "DIR/right.toml"]),
 ];

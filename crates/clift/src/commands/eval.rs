@@ -4,58 +4,57 @@ use std::path::{Path, PathBuf};
 
 use clift_data::SourceKind;
 use clift_eval::{Experiment, ExternalMethod, MethodName, Selection};
-use clift_model::{DeviceName, ModelPath, TokenCount, TokenFormat};
-use clift_train::{Config, Run, evaluate_model, read_config};
+use clift_model::{ModelPath, TokenCount, TokenFormat};
+use clift_train::{Config, Run, evaluate_model};
 
 use crate::commands::parse::parse_bytes;
-use crate::exit_code::UsageError;
-use crate::output::{progress, stdout};
+use crate::commands::shared_args::{ConfigArgs, read_config};
+use crate::exit_code::usage_bail;
+use crate::interrupt;
+use crate::output::progress::progress_sink;
+use crate::output::stdout::{print_evaluation, print_note};
 
 /// Evaluates a run or a model and prints the table.
 pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
-    let systems = systems(args)?;
+    let external = external_methods(args)?;
     let model = args.checkpoint.as_deref().map(ModelPath::find).transpose()?;
     let folder = match (&model, &args.run) {
         (Some(model), _) => &model.dir,
         (None, Some(run)) => run,
-        (None, None) => unreachable!("the command line asks for one of the two"),
+        (None, None) => unreachable!("clap requires a run or --checkpoint"),
     };
-    let config = read(args, folder)?;
+    let config = eval_config(args, folder)?;
     let out: PathBuf = args.out.clone().unwrap_or_else(|| folder.join("eval"));
-    let beside = args.with.as_ref().map(|run| -> anyhow::Result<Config> {
-        let (mut other, _) = read_config::<Config>(&run.join("config.toml"), &[])?;
-        other.run_dir.clone_from(run);
-        Ok(other)
+    let with = args.with.as_ref().map(|run| -> anyhow::Result<Config> {
+        let (mut config, _) = read_config(&run.join("config.toml"), &[], |_| Ok(()))?;
+        config.run_dir.clone_from(run);
+        Ok(config)
     });
-    let beside = beside.transpose()?;
+    let with = with.transpose()?;
     if model.is_some() && config.eval.index.is_none() {
-        stdout::print_note(
-            "without --index, contexts and targets are spread evenly over each scene: this is not the published protocol, \
-             whose evaluation index names four contexts, and the figures do not compare with published ones",
+        print_note(
+            "warning: without --index, contexts and targets are spread evenly over each scene; published figures use an \
+             evaluation index with four contexts and are not comparable",
         );
     }
-    let mut sink = progress::sink();
-    let stop = crate::interrupt::flag()?;
+    let mut sink = progress_sink();
+    let stop = interrupt::flag()?;
     let summary = match &model {
-        None => Run::reopen(config)?.evaluate(&systems, &out, beside.as_ref(), &stop, sink.as_mut())?,
+        None => Run::reopen(config)?.evaluate(&external, &out, with.as_ref(), &stop, sink.as_mut())?,
         Some(model) => {
             let stage1 = args.stage1.as_deref().map(ModelPath::find).transpose()?;
-            evaluate_model(config, model, stage1.as_ref(), &systems, &out, &stop, sink.as_mut())?
+            evaluate_model(config, model, stage1.as_ref(), &external, &out, &stop, sink.as_mut())?
         }
     };
     drop(sink);
-    stdout::print_evaluation(&summary, &out)
+    print_evaluation(&summary, &out)
 }
 
-/// The config of a run or model directory with what the command line changes.
-fn read(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
-    let (mut config, overrides) = read_config::<Config>(&folder.join("config.toml"), &args.set)?;
-    for change in overrides {
-        stdout::print_note(&change.to_string());
-    }
-    // A run may have been moved since it was trained.
+/// Reads the config of a run or model directory and applies the options of the command line.
+fn eval_config(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
+    let mut config = args.overrides.read(&folder.join("config.toml"), |_| Ok(()))?;
+    // The directory may have been moved since it was written.
     config.run_dir = folder.to_path_buf();
-    config.device = args.device.unwrap_or(config.device);
     if let Some(data) = &args.data {
         config.data.root = Some(data.clone());
         if config.data.source == SourceKind::Synthetic {
@@ -81,87 +80,81 @@ fn read(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
     Ok(config)
 }
 
-/// Other systems, with as many names and sizes as there are, or none.
-fn systems(args: &EvalArgs) -> anyhow::Result<Vec<ExternalMethod>> {
+/// Returns the external methods of `--predictions`, each with its name and data size.
+fn external_methods(args: &EvalArgs) -> anyhow::Result<Vec<ExternalMethod>> {
     let EvalArgs { predictions, name, data_size, .. } = args;
     for (flag, count) in [("--name", name.len()), ("--data-size", data_size.len())] {
         if count != 0 && count != predictions.len() {
-            let text =
-                format!("{} --predictions but {count} {flag}: write one for each, in their order", predictions.len());
-            return Err(UsageError(text).into());
+            usage_bail!("{} --predictions but {count} {flag}: give one for each, in order", predictions.len());
         }
     }
-    let mut systems: Vec<ExternalMethod> = Vec::new();
+    let mut methods: Vec<ExternalMethod> = Vec::new();
     for (i, folder) in predictions.iter().enumerate() {
         if !folder.is_dir() {
-            return Err(UsageError(format!("there is no folder for --predictions {}", folder.display())).into());
+            usage_bail!("--predictions: no folder {}", folder.display());
         }
-        let of_folder = || folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned();
-        let name = MethodName::new(&name.get(i).cloned().unwrap_or_else(of_folder))?;
-        if systems.iter().any(|system| system.name == name) {
-            return Err(UsageError(format!("two --predictions are called {}: write --name", name.as_str())).into());
+        let folder_name = || folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned();
+        let name = MethodName::new(&name.get(i).cloned().unwrap_or_else(folder_name))?;
+        if methods.iter().any(|method| method.name == name) {
+            usage_bail!("two --predictions have the name {}: set distinct names with --name", name.as_str());
         }
-        systems.push(ExternalMethod { name, folder: Path::to_owned(folder), data_bytes: data_size.get(i).copied() });
+        methods.push(ExternalMethod { name, folder: folder.clone(), data_bytes: data_size.get(i).copied() });
     }
-    Ok(systems)
+    Ok(methods)
 }
 
 /// Arguments of `clift eval`.
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
-    /// A run directory
+    /// Run directory
     #[arg(required_unless_present = "checkpoint", conflicts_with = "checkpoint")]
     pub run: Option<PathBuf>,
-    /// Measure the model of a directory, as `clift import` writes, instead of a run
+    /// Evaluate a model directory (from `clift import`) instead of a run
     #[arg(long, value_name = "MODEL", requires = "data")]
     pub checkpoint: Option<PathBuf>,
-    /// Folder of the data: with --checkpoint, or where a run's data has moved
+    /// Data set, for --checkpoint or for a run whose data has moved
     #[arg(long, value_name = "DIR")]
     pub data: Option<PathBuf>,
-    /// The first-stage model of --checkpoint: adds random and K-means tokens, drawn by it
+    /// Stage-1 model of --checkpoint; adds the methods random and kmeans
     #[arg(long, value_name = "MODEL", requires = "checkpoint")]
     pub stage1: Option<PathBuf>,
-    /// An experiment of the paper: main, ablation, patchwise or budget
+    /// Run an experiment of the paper: main, ablation, patchwise or budget
     ///
-    /// Sets variants, --storage, --render and --selection; those given beside it win. main: quality against data size.
-    /// ablation: random tokens, K-means, K-means and condenser. patchwise: tiles of the views against K-means, each
-    /// with and without condenser; needs --with. budget: half of the tokens stored, fewer and fewer of them rendered.
+    /// Sets the methods, --storage, --render and --selection; options of the command line take precedence. main: quality
+    /// against data size. ablation: random tokens, K-means, K-means with condenser. patchwise: tiles of the views against
+    /// K-means, with and without condenser; needs --with. budget: half of the tokens stored, decreasing rendered counts.
     #[arg(long, value_name = "NAME")]
     pub preset: Option<Experiment>,
-    /// Another run of the same stage 1 with another clusters.grouping, measured on the same views
+    /// Add a run with the same stage 1 and another clusters.grouping
     #[arg(long, value_name = "RUN", conflicts_with = "checkpoint")]
     pub with: Option<PathBuf>,
-    /// Token counts to store, as numbers or shares: --storage 256,1/16
+    /// Stored token counts, as numbers or shares, e.g. 256,1/16
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub storage: Vec<TokenCount>,
-    /// Draw views from fewer tokens than are stored too, numbers or shares of those: --render 128,1/2
+    /// Also render from fewer tokens: numbers or shares of the stored, e.g. 128,1/2
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub render: Vec<TokenCount>,
-    /// How those are chosen: paper, global, scaled or random
+    /// Select rendered tokens by this rule: paper, global, scaled or random
     #[arg(long, alias = "select", value_name = "PRESET")]
     pub selection: Option<Selection>,
-    /// Round stored tokens as a scene file would, in each of these formats in turn: f32, f16, int8
+    /// Number formats of the stored tokens: f32, f16, int8
     #[arg(long, value_delimiter = ',', value_name = "FORMAT")]
     pub tokens: Vec<TokenFormat>,
-    /// Score another system's pictures of the targets too; repeatable
+    /// Also score the target images of an external method; repeatable
     #[arg(long, value_name = "DIR")]
     pub predictions: Vec<PathBuf>,
-    /// What it is called, once per --predictions in their order; the folder's name by default
+    /// Display name of each --predictions folder, in order [default: folder name]
     #[arg(long, value_name = "NAME", requires = "predictions")]
     pub name: Vec<String>,
-    /// What it keeps of a scene, such as 12.5MB, once per --predictions in their order
+    /// Stored bytes per scene of each --predictions folder, in order, e.g. 12.5MB
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, requires = "predictions")]
     pub data_size: Vec<u64>,
-    /// An evaluation index (JSON) with the context and target frames of every scene
+    /// Evaluation index (JSON): context and target frames of every scene
     #[arg(long, value_name = "FILE")]
     pub index: Option<PathBuf>,
-    /// Change a key of the run's config: `--set eval.num_scenes=10`
-    #[arg(long, value_name = "KEY=TOML")]
-    pub set: Vec<String>,
-    /// Where tensors live: flex, ndarray or wgpu
-    #[arg(long, value_name = "DEVICE")]
-    pub device: Option<DeviceName>,
-    /// Where to write; `eval` inside the run by default
+    #[command(flatten)]
+    pub overrides: ConfigArgs,
+    /// Output folder [default: `eval` in the run]
     #[arg(long, short, value_name = "DIR")]
     pub out: Option<PathBuf>,
 }

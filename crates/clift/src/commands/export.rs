@@ -6,32 +6,32 @@ use clap::ValueEnum;
 use clift_model::ModelPath;
 use clift_train::{Config, ExportFormat, export, read_config, require_absent};
 
-use crate::output::stdout;
+use crate::output::stdout::print_result;
 
 /// Arguments of `clift export`.
 #[derive(Debug, clap::Args)]
 pub struct ExportArgs {
-    /// A model directory, a run directory, or a model.safetensors in one
+    /// Model directory, run directory, or model.safetensors in one of them
     #[arg(value_name = "MODEL|RUN")]
     pub model: PathBuf,
-    /// What kind of file is written
+    /// Format of the file
     #[arg(long, value_name = "FORMAT")]
     pub format: Format,
-    /// The file to write
+    /// File to write
     #[arg(long, short, value_name = "FILE")]
     pub out: PathBuf,
 }
 
-/// Kinds of files.
+/// Formats of weight files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Format {
-    /// For torch.load
+    /// File for torch.load
     Pytorch,
-    /// The same keys in a safetensors file
+    /// Safetensors file with the same parameter names
     Safetensors,
 }
 
-/// Writes a model's weights for PyTorch.
+/// Writes the weights of a model for PyTorch.
 pub fn run(args: &ExportArgs) -> anyhow::Result<()> {
     require_absent(&args.out)?;
     let model = ModelPath::find(&args.model)?;
@@ -42,8 +42,8 @@ pub fn run(args: &ExportArgs) -> anyhow::Result<()> {
     };
     let exported = export(&config, &model, format, &args.out)?;
     let condenser = if exported.has_condenser { "with condenser" } else { "without condenser" };
-    stdout::print_result(&format!(
-        "{}: {} tensors, {} values, {} {condenser}, of {}",
+    print_result(&format!(
+        "{}: {} tensors, {} values, {} {condenser}, from {}",
         args.out.display(),
         exported.num_tensors,
         exported.num_values,

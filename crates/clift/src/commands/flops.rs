@@ -3,16 +3,17 @@
 use std::path::PathBuf;
 
 use clift_model::{FlopConvention, Macs, ModelConfig, TokenCount};
-use clift_train::{Config, read_config};
+use clift_train::Config;
 use serde::Serialize;
 
-use crate::output::stdout::{print_note, print_result};
-use crate::output::table;
+use crate::commands::shared_args::{JsonArg, read_config};
+use crate::output::stdout::print_result;
+use crate::output::table::table;
 
-/// Rendered tokens of the paper's table.
+/// Token counts of the paper's table of rendering costs.
 const PAPER_TOKENS: [usize; 5] = [4096, 3072, 2048, 1024, 512];
 
-/// What `--json` holds.
+/// Content of `--json`.
 #[derive(Debug, Serialize)]
 struct Counts {
     convention: &'static str,
@@ -23,28 +24,28 @@ struct Counts {
     rows: Vec<Row>,
 }
 
-/// One amount of work.
+/// Cost of one part.
 #[derive(Debug, Serialize)]
 struct Row {
-    /// `render` of a view, `encode` or `condense` of a scene.
+    /// `render` (per view), `encode` or `condense` (per scene).
     work: &'static str,
-    /// Tokens that are drawn from, made or kept.
+    /// Tokens that are rendered from, encoded or stored.
     num_tokens: usize,
-    /// Thousands of millions in the convention.
+    /// Cost in 10^9 units of the convention.
     giga: f64,
-    /// Of these, multiply-accumulates of linear layers.
+    /// Multiply-accumulates of linear layers.
     linear_macs: u64,
-    /// And of attention.
+    /// Multiply-accumulates of attention.
     attention_macs: u64,
 }
 
-/// Sizes that work is counted of.
+/// Sizes of the network, of the views and of the token counts.
 struct Sizes {
     model: ModelConfig,
     height: usize,
     width: usize,
     num_context: usize,
-    /// Rendered and stored.
+    /// Rendered and stored tokens.
     counts: Vec<TokenCount>,
 }
 
@@ -52,12 +53,8 @@ struct Sizes {
 pub fn run(args: &FlopsArgs) -> anyhow::Result<()> {
     let sizes = sizes(args)?;
     let counts = count(&sizes, args.convention)?;
-    print_result(&shown(&counts, args.convention))?;
-    if let Some(json) = &args.json {
-        crate::output::json::write(&counts, json)?;
-        print_result(&format!("results: {}", json.display()))?;
-    }
-    Ok(())
+    print_result(&report_text(&counts, args.convention))?;
+    args.json.write(&counts)
 }
 
 fn sizes(args: &FlopsArgs) -> anyhow::Result<Sizes> {
@@ -66,12 +63,7 @@ fn sizes(args: &FlopsArgs) -> anyhow::Result<Sizes> {
         let counts = given(PAPER_TOKENS.map(TokenCount::Count).into());
         return Ok(Sizes { model: ModelConfig::default(), height: 256, width: 256, num_context: 4, counts });
     };
-    let (config, overrides) = read_config::<Config>(path, &args.set)?;
-    for change in overrides {
-        print_note(&change.to_string());
-    }
-    config.validate()?;
-    let Config { model, data, eval, .. } = config;
+    let (Config { model, data, eval, .. }, _) = read_config(path, &args.set, Config::validate)?;
     let counts = given(eval.storage.into_iter().rev().collect());
     Ok(Sizes { model, height: data.height, width: data.width, num_context: eval.num_context, counts })
 }
@@ -92,7 +84,7 @@ fn count(sizes: &Sizes, convention: FlopConvention) -> anyhow::Result<Counts> {
         let tokens = count.of(num_tokens)?;
         rows.push(row("render", tokens, model.render_macs(height, width, tokens)?));
     }
-    // The paper tells neither; its convention is known of rendering alone.
+    // The paper counts rendering only.
     if convention != FlopConvention::Paper {
         rows.push(row("encode", num_tokens, model.encode_macs(num_context, height, width)?));
         for count in counts {
@@ -103,66 +95,50 @@ fn count(sizes: &Sizes, convention: FlopConvention) -> anyhow::Result<Counts> {
     Ok(Counts { convention: convention.name(), width, height, num_context, num_tokens, rows })
 }
 
-fn shown(counts: &Counts, convention: FlopConvention) -> String {
+fn report_text(counts: &Counts, convention: FlopConvention) -> String {
     let Counts { width, height, num_context, num_tokens, rows, .. } = counts;
-    // As many digits as the paper prints.
+    // The precision of the paper's table.
     let cell = |giga: f64| match giga {
         giga if giga >= 100.0 => format!("{giga:.1}"),
         giga if giga >= 1.0 => format!("{giga:.2}"),
         giga => format!("{giga:.4}"),
     };
-    let head = ["work", "tokens", convention.unit()].map(String::from);
     let rows = rows.iter().map(|row| [row.work.into(), row.num_tokens.to_string(), cell(row.giga)]);
-    let table = table::columns(&[head].into_iter().chain(rows).collect::<Vec<_>>());
+    let table = table(["part", "tokens", convention.unit()], rows);
     format!("views of {width} x {height}, {num_context} context views, {num_tokens} tokens\n\n{table}")
 }
 
 /// Arguments of `clift flops`.
 #[derive(Debug, clap::Args)]
 pub struct FlopsArgs {
-    /// The experiment whose sizes are used, a TOML file; the paper's sizes by default
+    /// Config file (TOML) with the sizes to count [default: the paper's sizes]
     pub config: Option<PathBuf>,
-    /// How to count: paper, macs or flops
+    /// Counting convention: paper, macs or flops
     #[arg(long, default_value = "macs")]
     pub convention: FlopConvention,
-    /// Numbers of rendered tokens, or shares of a scene's; those of the paper's table, or of the config, by default
+    /// Rendered tokens, as numbers or shares [default: the paper's, or the config's]
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub render: Vec<TokenCount>,
-    /// Change a key of the config: `--set model.dim=512`
+    /// Override a key of the config, e.g. model.dim=512; repeatable
     #[arg(long, value_name = "KEY=TOML", requires = "config")]
     pub set: Vec<String>,
-    /// Write the counts as JSON
-    #[arg(long, value_name = "FILE")]
-    pub json: Option<PathBuf>,
+    #[command(flatten)]
+    pub json: JsonArg,
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn counts(convention: FlopConvention) -> Counts {
-        let args = FlopsArgs { config: None, convention, render: Vec::new(), set: Vec::new(), json: None };
-        count(&sizes(&args).unwrap(), convention).unwrap()
-    }
-
     #[test]
-    fn the_papers_table_is_printed() {
-        let paper = counts(FlopConvention::Paper);
+    fn paper_convention_gives_the_papers_table() {
+        let (convention, json) = (FlopConvention::Paper, JsonArg { path: None });
+        let args = FlopsArgs { config: None, convention, render: Vec::new(), set: Vec::new(), json };
+        let paper = count(&sizes(&args).unwrap(), convention).unwrap();
         let printed: Vec<String> = paper.rows.iter().map(|row| format!("{:.2}", row.giga)).collect();
         assert_eq!(printed, ["70.59", "63.35", "56.10", "48.85", "45.23"]);
-        let text = shown(&paper, FlopConvention::Paper);
+        let text = report_text(&paper, FlopConvention::Paper);
         assert!(text.contains("views of 256 x 256, 4 context views, 4096 tokens"), "{text}");
         assert!(text.contains("render  512     45.23"), "{text}");
-    }
-
-    #[test]
-    fn other_conventions_have_attention_the_encoder_and_the_condenser_too() {
-        let (macs, flops) = (counts(FlopConvention::Macs), counts(FlopConvention::Flops));
-        let works: Vec<&str> = macs.rows.iter().map(|row| row.work).collect();
-        assert_eq!(works.iter().filter(|work| **work == "condense").count(), 5);
-        assert!(works.contains(&"encode"));
-        for (macs, flops) in macs.rows.iter().zip(&flops.rows) {
-            assert!((2.0 * macs.giga - flops.giga).abs() < 1e-9);
-        }
     }
 }

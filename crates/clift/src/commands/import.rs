@@ -5,34 +5,36 @@ use std::path::PathBuf;
 use clift_model::CliftVariant;
 use clift_train::{ImportOptions, ImportRecord, import};
 
-use crate::output::stdout;
+use crate::commands::parse::parse_rename;
+use crate::interrupt;
+use crate::output::stdout::print_result;
 
 /// Arguments of `clift import`.
 #[derive(Debug, clap::Args)]
 pub struct ImportArgs {
-    /// A checkpoint that PyTorch wrote
+    /// Checkpoint written by PyTorch
     #[arg(value_name = "CKPT")]
     pub file: PathBuf,
-    /// The network it holds: paper, released-re10k or released-dl3dv
+    /// Network of the checkpoint: paper, released-re10k or released-dl3dv
     #[arg(long, value_name = "VARIANT")]
     pub variant: CliftVariant,
-    /// The model directory to write
+    /// Model directory to write
     #[arg(long, short, value_name = "DIR")]
     pub out: PathBuf,
-    /// Attention heads [default: 8 for the published width 768]
+    /// Number of attention heads [default: 8 for the published width 768]
     ///
-    /// No shape shows them but in released-dl3dv. What `clift export` writes says them.
+    /// Tensor shapes do not determine the number of heads, except for released-dl3dv. `clift export` stores it.
     #[arg(long, value_name = "COUNT")]
     pub num_heads: Option<usize>,
-    /// Take parameters in f16, bf16 or f64 as well, converted to f32
+    /// Accept f16, bf16 and f64 parameters and convert them to f32
     #[arg(long)]
     pub convert: bool,
-    /// Replace a part of every key as messages print it, repeatedly: `--rename attn.qn=attn.q_norm`
+    /// Replace part of every parameter name, e.g. attn.qn=attn.q_norm; repeatable
     #[arg(long, value_name = "FROM=TO", value_parser = parse_rename)]
     pub rename: Vec<(String, String)>,
 }
 
-/// Imports a checkpoint and prints what became what.
+/// Imports a checkpoint and prints the origin of every parameter.
 pub fn run(args: &ImportArgs) -> anyhow::Result<()> {
     let options = ImportOptions {
         variant: args.variant,
@@ -40,48 +42,37 @@ pub fn run(args: &ImportArgs) -> anyhow::Result<()> {
         convert: args.convert,
         renames: args.rename.clone(),
     };
-    let stop = crate::interrupt::flag()?;
-    let (config, imported) = import(&args.file, &args.out, &options, &stop)?;
+    let (config, record) = import(&args.file, &args.out, &options, &*interrupt::flag()?)?;
     let model = &config.model;
     let mut lines: Vec<String> =
-        imported.parameters.iter().map(|(key, paths)| format!("{key} -> {}", paths.join(", "))).collect();
-    lines.extend(told(&imported));
+        record.parameters.iter().map(|(key, paths)| format!("{key} -> {}", paths.join(", "))).collect();
+    lines.extend(skipped(&record));
     lines.push(format!(
-        "{}: {} of width {}, {} heads, {} + {} layers, {}; {} tensors, all of the network's",
+        "{}: {}, width {}, {} heads, {} + {} layers, {}; {} tensors, the network is complete",
         args.out.display(),
-        imported.variant,
+        record.variant,
         model.dim,
         model.num_heads,
         model.num_encoder_blocks,
         model.num_renderer_blocks,
-        if imported.has_condenser { "with its condenser" } else { "without condenser (a first-stage checkpoint)" },
-        imported.parameters.len(),
+        if record.has_condenser { "with condenser" } else { "without condenser (a stage-1 checkpoint)" },
+        record.parameters.len(),
     ));
-    stdout::print_result(&lines.join("\n"))
+    print_result(&lines.join("\n"))
 }
 
-/// What was not taken over.
-fn told(imported: &ImportRecord) -> Vec<String> {
-    let mut lines = Vec::new();
-    for (first, count) in &imported.ignored {
-        lines.push(format!("not of the network: {count} keys {first}.*"));
+/// Describes the content of the checkpoint that was skipped or converted.
+fn skipped(record: &ImportRecord) -> Vec<String> {
+    let ignored =
+        record.ignored.iter().map(|(first, count)| format!("skipped, other networks: {count} keys {first}.*"));
+    let unknown = record.outside.iter().map(|(pattern, count)| format!("skipped, unknown keys: {count} x {pattern}"));
+    let mut lines: Vec<String> = ignored.chain(unknown).collect();
+    if !record.passed_over.is_empty() {
+        let names: Vec<&str> = record.passed_over.iter().map(String::as_str).collect();
+        lines.push(format!("skipped, Python objects (never executed): {}", names.join(", ")));
     }
-    for (pattern, count) in &imported.outside {
-        lines.push(format!("passed over, neither the network's nor known otherwise: {count} x {pattern}"));
-    }
-    if !imported.passed_over.is_empty() {
-        let names: Vec<&str> = imported.passed_over.iter().map(String::as_str).collect();
-        lines.push(format!("passed over, not run: {}", names.join(", ")));
-    }
-    if imported.num_converted > 0 {
-        lines.push(format!("converted to f32: {} tensors", imported.num_converted));
+    if record.num_converted > 0 {
+        lines.push(format!("converted to f32: {} tensors", record.num_converted));
     }
     lines
-}
-
-fn parse_rename(text: &str) -> Result<(String, String), String> {
-    match text.split_once('=') {
-        Some((from, to)) if !from.is_empty() => Ok((from.into(), to.into())),
-        _ => Err("write FROM=TO".into()),
-    }
 }

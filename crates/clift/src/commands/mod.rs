@@ -1,19 +1,20 @@
-//! One file per command.
+//! One file or folder per command: arguments, the call, the printed result.
 //!
-//! - `parse`: shared argument parsers
+//! - `parse`: parsers of argument values
+//! - `shared_args`: arguments that several commands share
+//! - `splits`: open the splits of a data set
 //! - `train`: `clift train`
 //! - `eval`: `clift eval`
 //! - `compare`: `clift compare`
 //! - `flops`: `clift flops`
 //! - `encode`: `clift encode`
-//! - `plan`: `clift plan`
-//! - `import`: `clift import`
-//! - `export`: `clift export`
-//! - `splits`: open the splits of a folder
 //! - `render`: `clift render`
 //! - `data`: `clift data`
-//! - `bench`: `clift bench`
+//! - `plan`: `clift plan`
 //! - `doctor`: `clift doctor`
+//! - `bench`: `clift bench`
+//! - `import`: `clift import`
+//! - `export`: `clift export`
 
 pub(crate) mod bench;
 pub(crate) mod compare;
@@ -27,5 +28,6 @@ pub(crate) mod import;
 pub(crate) mod parse;
 pub(crate) mod plan;
 pub(crate) mod render;
+pub(crate) mod shared_args;
 pub(crate) mod splits;
 pub(crate) mod train;

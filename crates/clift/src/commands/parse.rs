@@ -1,28 +1,28 @@
-//! Shared argument parsers.
+//! Parsers of argument values.
 
 use clift_eval::MethodFilter;
 use clift_train::Stage;
 
-pub(crate) fn parse_sides(text: &str) -> Result<[MethodFilter; 2], String> {
+/// Parses two methods, as `kmeans,clift`.
+pub(crate) fn parse_methods(text: &str) -> Result<[MethodFilter; 2], String> {
     let parts: Vec<&str> = text.split(',').map(str::trim).filter(|part| !part.is_empty()).collect();
-    let [a, b] = parts[..] else { return Err("write two variants, such as kmeans,clift".into()) };
+    let [a, b] = parts[..] else { return Err("write two methods, e.g. kmeans,clift".into()) };
     Ok([MethodFilter::parse(a), MethodFilter::parse(b)])
 }
 
-/// Bytes, or so many kB, MB, GB of a thousand each.
+/// Parses a number of bytes with an optional decimal unit, as `12.5MB`.
 pub(crate) fn parse_bytes(text: &str) -> Result<u64, String> {
-    let text = text.trim();
-    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic()).trim();
-    let factor = match text[text.trim_end_matches(|c: char| c.is_ascii_alphabetic()).len()..].to_lowercase().as_str() {
+    let number = text.trim().trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let factor = match text.trim()[number.len()..].to_lowercase().as_str() {
         "" | "b" => 1.0,
         "k" | "kb" => 1e3,
         "m" | "mb" => 1e6,
         "g" | "gb" => 1e9,
-        _ => return Err("write a number of bytes, or of kB, MB or GB".into()),
+        _ => return Err("write a number of bytes, kB, MB or GB".into()),
     };
-    match digits.parse::<f64>() {
+    match number.trim().parse::<f64>() {
         Ok(number) if number > 0.0 && number * factor < 1e15 => Ok((number * factor).round() as u64),
-        _ => Err("write a positive number of bytes, or of kB, MB or GB".into()),
+        _ => Err("write a positive number of bytes, kB, MB or GB".into()),
     }
 }
 
@@ -31,27 +31,64 @@ pub(crate) fn parse_stage(text: &str) -> Result<Stage, String> {
     stages.into_iter().find(|stage| stage.name() == text).ok_or_else(|| "write stage1, clusters or stage2".into())
 }
 
-pub(crate) fn parse_overfit(text: &str) -> Result<usize, String> {
-    match text.parse() {
-        Ok(count) if count > 0 => Ok(count),
-        _ => Err("write how many scenes, at least 1".into()),
-    }
+/// Parses a number of at least 1.
+pub(crate) fn parse_count(text: &str) -> Result<usize, String> {
+    text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "write a number of at least 1".into())
 }
 
-pub(crate) fn parse_repeats(text: &str) -> Result<usize, String> {
-    match text.parse() {
-        Ok(count) if count > 0 => Ok(count),
-        _ => Err("write how often, at least 1".into()),
-    }
+/// Parses `[width, height]` in pixels, as `64x48`.
+pub(crate) fn parse_size(text: &str) -> Result<[usize; 2], String> {
+    let size = parse_pair(text, "x").or_else(|| parse_pair(text, "X"));
+    size.filter(|size| !size.contains(&0)).ok_or_else(|| "write width and height in pixels, e.g. 64x48".into())
 }
 
-pub fn parse_size(text: &str) -> Result<[usize; 2], String> {
-    let size =
-        text.split_once(['x', 'X']).and_then(|(width, height)| Some([width.parse().ok()?, height.parse().ok()?]));
-    size.filter(|size| !size.contains(&0)).ok_or_else(|| "write columns and rows, as 64x48".into())
-}
-
+/// Parses fewest and most frames, as `45..135`.
 pub(crate) fn parse_distance(text: &str) -> Result<[usize; 2], String> {
-    let distance = text.split_once("..").and_then(|(near, far)| Some([near.parse().ok()?, far.parse().ok()?]));
-    distance.ok_or_else(|| "write fewest and most frames, as 45..135".into())
+    parse_pair(text, "..").ok_or_else(|| "write fewest and most frames, e.g. 45..135".into())
+}
+
+/// Parses context and target frames of a clip, as `4+6`. Poses are normalised by at least two contexts.
+pub(crate) fn parse_views(text: &str) -> Result<[usize; 2], String> {
+    let views = parse_pair(text, "+").filter(|[context, _]| *context >= 2);
+    views.ok_or_else(|| "write contexts (at least 2) and targets, e.g. 4+6".into())
+}
+
+/// Parses milliseconds per frame.
+pub(crate) fn parse_budget_ms(text: &str) -> Result<f64, String> {
+    let budget = text.parse().ok().filter(|budget: &f64| *budget > 0.0 && budget.is_finite());
+    budget.ok_or_else(|| "write milliseconds per frame, more than 0".into())
+}
+
+/// Parses a replacement in parameter names, as `attn.qn=attn.q_norm`.
+pub(crate) fn parse_rename(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((from, to)) if !from.is_empty() => Ok((from.into(), to.into())),
+        _ => Err("write FROM=TO".into()),
+    }
+}
+
+fn parse_pair(text: &str, separator: &str) -> Option<[usize; 2]> {
+    let (first, second) = text.split_once(separator)?;
+    Some([first.parse().ok()?, second.parse().ok()?])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_are_parsed_or_refused() {
+        let sizes = ["12", "1.5kB", "3 MB", "2g"].map(|text| parse_bytes(text).unwrap());
+        assert_eq!(sizes, [12, 1500, 3_000_000, 2_000_000_000]);
+        for text in ["", "MB", "-1", "0", "1TB", "1e99GB", "nan"] {
+            assert!(parse_bytes(text).is_err(), "{text}");
+        }
+        assert_eq!(
+            (parse_size("64x48"), parse_distance("6..20"), parse_views("4+6")),
+            (Ok([64, 48]), Ok([6, 20]), Ok([4, 6]))
+        );
+        let refused = [parse_size("64"), parse_size("0x4"), parse_size("4x"), parse_distance("6"), parse_views("1+6")];
+        assert!(refused.iter().all(Result::is_err) && parse_count("0").is_err(), "{refused:?}");
+        assert!(parse_budget_ms("0").is_err() && parse_budget_ms("nan").is_err());
+    }
 }

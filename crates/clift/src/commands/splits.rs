@@ -1,6 +1,6 @@
-//! The halves of a data folder, whatever its layout.
+//! Opens the splits of a data set in any layout.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use clift_data::{
@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::output::stdout::print_note;
 
-/// The keys of a config that say where the parts of a layout are: those that `--set` takes here.
+/// The config keys that `--set` accepts for a data set: `data.files.*`.
 #[derive(Debug, Default, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
 struct Keys {
@@ -24,93 +24,113 @@ struct DataKeys {
     files: FileOptions,
 }
 
-/// Reads `--set data.files.KEY=VALUE`; also gives back what was set.
-///
-/// # Errors
-/// [`clift_train::ConfigError`] for any other key and for values of another type.
-pub fn files(set: &[String]) -> anyhow::Result<(FileOptions, Vec<Override>)> {
-    let (keys, changes) = parse_config::<Keys>(Path::new("--set"), "", set)?;
-    Ok((keys.data.files, changes))
+/// A data set on the command line.
+#[derive(Debug, clap::Args)]
+pub struct SourceArgs {
+    /// Data set in any layout, or one scene
+    pub dir: PathBuf,
+    /// Set a path of the layout, e.g. data.files.image_folder=images_4; repeatable
+    #[arg(long, value_name = "data.files.KEY=TOML")]
+    pub set: Vec<String>,
 }
 
-/// A half of a folder, or all of one that is not divided.
+impl SourceArgs {
+    /// Returns the options of `--set` and what they changed.
+    ///
+    /// # Errors
+    /// [`clift_train::ConfigError`] for any other key and for values of another type.
+    pub fn files(&self) -> anyhow::Result<(FileOptions, Vec<Override>)> {
+        let (keys, changes) = parse_config::<Keys>(Path::new("--set"), "", &self.set)?;
+        Ok((keys.data.files, changes))
+    }
+
+    /// Opens the present splits.
+    ///
+    /// # Errors
+    /// As [`Self::files`] and [`open_splits`].
+    pub fn open(&self, splits: Splits) -> anyhow::Result<Vec<SplitSource>> {
+        open_splits(&self.dir, splits, &self.files()?.0)
+    }
+}
+
+/// A split of a data set, or all scenes of one without splits.
 pub struct SplitSource {
-    /// Which half; `None` for all of a folder that is not divided.
+    /// The split; `None` for a data set without splits.
     pub split: Option<Split>,
     /// Its scenes.
     pub opened: OpenedSource,
 }
 
 impl SplitSource {
-    /// What to call it.
+    /// Returns the display name: `train`, `test` or `scenes`.
     pub fn name(&self) -> String {
         self.split.map_or_else(|| "scenes".into(), |split| split.to_string())
     }
 
-    /// Tells what opening it left out, and what else is to be known.
-    pub fn print_news(&self) {
+    /// Prints skipped scenes and notes from opening the source.
+    pub fn print_report(&self) {
         if self.opened.report.has_content() {
             print_note(&format!("{}: {}", self.name(), self.opened.report));
         }
     }
 }
 
-/// The halves asked for that are there; one, whichever, for a folder that is not divided.
-pub fn halves_there(root: &DatasetRoot, splits: Splits) -> Vec<Split> {
-    let is_there = |split: &Split| root.path().join(split.to_string()).is_dir();
-    let there: Vec<Split> = splits.list().iter().copied().filter(is_there).collect();
-    if there.is_empty() || !root.has_splits() { splits.list()[splits.list().len() - 1..].to_vec() } else { there }
+/// Returns the requested splits that exist; a single one for a data set without splits.
+pub fn present_splits(root: &DatasetRoot, splits: Splits) -> Vec<Split> {
+    let requested = splits.list();
+    let is_present = |split: &Split| root.path().join(split.to_string()).is_dir();
+    let present: Vec<Split> = requested.iter().copied().filter(is_present).collect();
+    if present.is_empty() || !root.has_splits() { requested[requested.len() - 1..].to_vec() } else { present }
 }
 
-/// How all of a folder is opened: everything is going to be read, so that chunks are looked into.
-pub fn options() -> SourceOptions {
+/// Returns the options for reading every scene of a source, which includes the content of chunks.
+pub fn read_all_options() -> SourceOptions {
     SourceOptions { reads_chunks: true, ..SourceOptions::default() }
 }
 
-/// Opens the halves asked for that are there. A folder without `train/` and `test/` counts once, unless a list of test
+/// Opens the requested splits that exist. A folder without `train/` and `test/` is opened once, unless a list of test
 /// scenes divides it.
 ///
 /// # Errors
-/// The first error of opening one.
-pub fn splits(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Result<Vec<SplitSource>> {
-    // An empty list keeps no scene for testing and divides nothing.
+/// The first error of opening a split.
+pub fn open_splits(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Result<Vec<SplitSource>> {
+    // An empty list divides nothing.
     let list = files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
     let has_list = list.is_some_and(|list| list.num_scenes() > 0);
     let root = DatasetRoot::find(root)?;
     let is_listed = has_list && !root.has_splits();
-    let wanted = if is_listed { splits.list().to_vec() } else { halves_there(&root, splits) };
-    let mut halves = Vec::new();
-    for split in wanted {
-        let mut opened = open_source(&root, split, &SourceOptions { files: files.clone(), ..options() })?;
+    let present = if is_listed { splits.list().to_vec() } else { present_splits(&root, splits) };
+    let mut sources = Vec::new();
+    for split in present {
+        let mut opened = open_source(&root, split, &SourceOptions { files: files.clone(), ..read_all_options() })?;
         let is_whole = !opened.has_splits && !has_list;
         if is_whole {
-            // Here they are no halves.
             opened.report.notes.retain(|note| note != SAME_SCENES);
             let source = &opened.source;
             if files.test_scenes.is_none() && (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene))) {
-                let note = "DL3DV's folders hold the scenes of its benchmark too; --set data.files.test_scenes=LIST \
-                            keeps those apart";
+                let note = "folders of DL3DV include its benchmark scenes; reserve these for testing with \
+                            --set data.files.test_scenes=LIST";
                 opened.report.notes.push(note.into());
             }
         }
-        halves.push(SplitSource { split: (!is_whole).then_some(split), opened });
+        sources.push(SplitSource { split: (!is_whole).then_some(split), opened });
     }
-    Ok(halves)
+    Ok(sources)
 }
 
 /// One split, or both.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Splits {
-    /// Scenes to train on
+    /// Training scenes
     Train,
-    /// Scenes held back
+    /// Test scenes
     Test,
-    /// Both
+    /// Both splits
     Both,
 }
 
 impl Splits {
-    /// The splits meant.
+    /// Returns the splits.
     pub fn list(self) -> &'static [Split] {
         match self {
             Self::Train => &[Split::Train],
@@ -122,40 +142,27 @@ impl Splits {
 
 #[cfg(test)]
 mod tests {
-    use std::path::PathBuf;
-
     use super::*;
 
     #[test]
-    fn set_takes_the_keys_of_the_files_and_no_others() {
-        let (read, changes) = files(&["data.files.image_folder=images_4".into()]).unwrap();
-        assert_eq!(read.image_folder.as_deref(), Some("images_4"));
-        assert_eq!(changes[0].to_string(), "--set data.files.image_folder: (default) -> \"images_4\"");
-        assert!(files(&[]).unwrap().1.is_empty());
-        for wrong in ["data.width=64", "data.files.undistrot=true", "stage1.steps=2"] {
-            assert!(files(&[wrong.into()]).unwrap_err().is::<clift_train::ConfigError>(), "{wrong}");
-        }
-    }
-
-    #[test]
-    fn a_list_divides_a_folder_without_halves() {
+    fn list_of_test_scenes_divides_a_folder_without_splits() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini/train");
-        let place = tempfile::tempdir().unwrap();
-        let path = place.path().join("list");
-        let opened = |keys: Option<&str>, which: Splits| {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("list");
+        let opened = |keys: Option<&str>, splits: Splits| {
             let test_scenes = keys.map(|keys| {
                 std::fs::write(&path, keys).unwrap();
-                PathBuf::from(&path)
+                path.clone()
             });
-            let halves = splits(&root, which, &FileOptions { test_scenes, ..FileOptions::default() }).unwrap();
-            let told = halves.iter().map(|half| (half.name(), half.opened.source.num_scenes()));
-            told.collect::<Vec<_>>()
+            let sources = open_splits(&root, splits, &FileOptions { test_scenes, ..FileOptions::default() }).unwrap();
+            let counts = sources.iter().map(|source| (source.name(), source.opened.source.num_scenes()));
+            counts.collect::<Vec<_>>()
         };
         let all = opened(None, Splits::Both);
         assert_eq!((all.len(), &all[0].0[..]), (1, "scenes"));
         assert_eq!(opened(Some(""), Splits::Both), all);
-        let half = open_source(&DatasetRoot::find(&root).unwrap(), Split::Test, &SourceOptions::default()).unwrap();
-        let key = half.source.key(0);
+        let test = open_source(&DatasetRoot::find(&root).unwrap(), Split::Test, &SourceOptions::default()).unwrap();
+        let key = test.source.key(0);
         let (train, test) = (("train".to_owned(), all[0].1 - 1), ("test".to_owned(), 1));
         assert_eq!(opened(Some(key), Splits::Both), [train.clone(), test.clone()]);
         assert_eq!(opened(Some(key), Splits::Train), [train]);

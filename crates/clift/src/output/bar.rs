@@ -5,10 +5,11 @@ use std::time::Duration;
 use clift_train::{Event, Sink};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
-use crate::output::event_line::{duration, line, numbers, rate};
+use crate::output::event_line::{event_line, step_metrics};
 use crate::output::stdout::print_note;
+use crate::output::units::{duration, rate};
 
-/// A progress bar per stage, with lines above it for what happens once.
+/// A progress bar per stage, with the lines of other events above the bar.
 #[derive(Default)]
 pub struct Bar {
     bar: Option<ProgressBar>,
@@ -21,7 +22,7 @@ impl Sink for Bar {
         {
             bar.finish_and_clear();
         }
-        if let Some(line) = line(event) {
+        if let Some(line) = event_line(event) {
             match &self.bar {
                 Some(bar) => bar.println(line),
                 None => print_note(&line),
@@ -32,7 +33,7 @@ impl Sink for Bar {
                 self.bar = Some(progress_bar(stage.name(), *done, *num_steps));
             }
             (Event::Step(step), Some(bar)) => {
-                bar.set_message(numbers(step));
+                bar.set_message(step_metrics(step));
                 bar.set_position(step.step);
             }
             (Event::Progress { done, .. }, Some(bar)) => bar.set_position(*done),
@@ -41,12 +42,13 @@ impl Sink for Bar {
     }
 }
 
-// Everything up to the message fits 80 columns; the message is cut where the line ends, so that it never wraps.
+// Everything up to the message fits 80 columns. The message is cut at the end of the line: a wrapped bar would leave
+// copies of itself behind.
 const TEMPLATE: &str = "{prefix} {bar:16.cyan/dim} {pos}/{len}{pace}  {wide_msg}";
 
-/// A bar on the standard error stream that has `done` of `total` behind it.
+/// Creates a bar on the standard error, at `done` of `total`.
 pub(crate) fn progress_bar(name: &str, done: u64, total: u64) -> ProgressBar {
-    // Steps of an earlier process must not count for the rate: they pass unseen, and the clock starts then.
+    // Steps of an earlier process must not count for the rate: the position is set before the clock starts.
     let hidden = ProgressDrawTarget::hidden();
     let bar = ProgressBar::with_draw_target(Some(total), hidden).with_style(style()).with_prefix(name.to_owned());
     bar.update(|state| state.set_pos(done));
@@ -58,13 +60,13 @@ pub(crate) fn progress_bar(name: &str, done: u64, total: u64) -> ProgressBar {
 
 fn style() -> ProgressStyle {
     let pace = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
-        // A failed write shortens the line, which is all there is to it.
+        // A failed write only shortens the line.
         let _ = out.write_str(&pace(state.per_sec(), state.eta()));
     };
     ProgressStyle::with_template(TEMPLATE).unwrap_or_else(|_| ProgressStyle::default_bar()).with_key("pace", pace)
 }
 
-/// Rate and time left; nothing while the rate is unknown.
+/// Formats rate and time left; empty while the rate is unknown.
 fn pace(per_s: f64, left: Duration) -> String {
     if per_s > 0.0 { format!("  {}, {} left", rate(per_s), duration(left.as_secs_f64())) } else { String::new() }
 }
@@ -77,7 +79,7 @@ mod tests {
     use crate::output::event_line::tests::step;
 
     #[test]
-    fn the_template_of_the_bar_is_valid_and_the_bar_follows_the_steps() {
+    fn bar_follows_steps_and_template_is_valid() {
         assert!(ProgressStyle::with_template(TEMPLATE).is_ok());
         let mut sink = Bar::default();
         sink.event(&Event::StageStarted { stage: Stage::Stage1, done: 40, num_steps: 100 });
@@ -88,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bar_shows_no_time_left_before_the_first_step() {
+    fn no_time_left_before_the_first_step() {
         assert_eq!(pace(0.0, Duration::ZERO), "");
         assert_eq!(pace(0.125, Duration::from_secs(80)), "  8.0 s each, 1 min 20 s left");
     }

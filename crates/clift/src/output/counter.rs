@@ -1,4 +1,4 @@
-//! Progress of work that is no training: so many of so many things.
+//! Progress of counted work outside training.
 
 use std::io::IsTerminal;
 use std::time::Instant;
@@ -6,35 +6,35 @@ use std::time::Instant;
 use indicatif::ProgressBar;
 
 use crate::output::bar::progress_bar;
-use crate::output::event_line::{duration, rate};
 use crate::output::stdout::print_note;
+use crate::output::units::{duration, rate};
 
-/// Seconds between two plain lines.
+/// Seconds between two progress lines.
 const INTERVAL_S: f64 = 10.0;
 
-/// Counts things that get done: a bar on a terminal, a line every ten seconds elsewhere.
+/// A counter of finished items: a bar on a terminal, a line every ten seconds elsewhere.
 pub struct Counter {
     name: String,
     total: u64,
     bar: Option<ProgressBar>,
     started: Instant,
-    shown: Instant,
+    last_line: Instant,
 }
 
 impl Counter {
-    /// Starts counting to `total`.
+    /// Creates a counter from 0 to `total`.
     pub fn new(name: &str, total: u64) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| progress_bar(name, 0, total));
         let now = Instant::now();
-        Self { name: name.into(), total, bar, started: now, shown: now }
+        Self { name: name.into(), total, bar, started: now, last_line: now }
     }
 
-    /// Shows that `done` are done.
+    /// Sets the number of finished items.
     pub fn set(&mut self, done: u64) {
         match &self.bar {
             Some(bar) => bar.set_position(done),
-            None if self.shown.elapsed().as_secs_f64() >= INTERVAL_S => {
-                self.shown = Instant::now();
+            None if self.last_line.elapsed().as_secs_f64() >= INTERVAL_S => {
+                self.last_line = Instant::now();
                 let line = line(&self.name, done, self.total, self.started.elapsed().as_secs_f64());
                 print_note(&line);
             }
@@ -42,7 +42,7 @@ impl Counter {
         }
     }
 
-    /// Writes a line, above the bar where there is one.
+    /// Prints a line, above the bar if there is one.
     pub fn note(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.println(line),
@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_has_the_mean_rate_and_the_time_left() {
+    fn line_has_mean_rate_and_time_left() {
         assert_eq!(line("train", 40, 100, 10.0), "train 40/100  4.0/s, 15 s left");
         assert_eq!(line("train", 0, 100, 0.0), line("train", 0, 100, 1e-9));
     }

@@ -1,4 +1,4 @@
-//! Tables, JSON, progress.
+//! Results, notes and progress for people: results go to the standard output, everything else to the standard error.
 //!
 //! - `units`: seconds, bytes, counts
 //! - `table`: aligned columns

@@ -1,27 +1,28 @@
-//! Lines for logs.
+//! Progress as lines for log files.
 
 use std::io::Write;
 
 use clift_train::{Event, Sink, StepEvent};
 
-use crate::output::event_line::{duration, line, numbers};
+use crate::output::event_line::{event_line, step_metrics};
+use crate::output::units::duration;
 
-/// Seconds of training between two lines of progress.
+/// Seconds of training between two progress lines.
 const INTERVAL_S: f64 = 10.0;
 
-/// Lines for logs: what happens once at once, progress every ten seconds of training, the first and the last step.
+/// Lines for log files: events at once; steps every ten seconds of training, and the first and the last one.
 pub struct PlainLines<W> {
     out: W,
     since_line_s: f64,
     /// Steps and seconds since the stage started or resumed.
     pace: (u64, f64),
-    shown_tenth: u64,
+    printed_tenth: u64,
 }
 
 impl<W: Write> PlainLines<W> {
-    /// Writes to `out`.
+    /// Creates a sink that writes to `out`.
     pub fn new(out: W) -> Self {
-        Self { out, since_line_s: 0.0, pace: (0, 0.0), shown_tenth: 0 }
+        Self { out, since_line_s: 0.0, pace: (0, 0.0), printed_tenth: 0 }
     }
 
     fn step_line(&mut self, event: &StepEvent) -> Option<String> {
@@ -36,7 +37,10 @@ impl<W: Write> PlainLines<W> {
         let left = duration(mean_step_s * event.num_steps.saturating_sub(event.step) as f64);
         let (name, step, num_steps) = (event.stage.name(), event.step, event.num_steps);
         let width = num_steps.to_string().len();
-        Some(format!("{name} {step:>width$}/{num_steps}  {}  {mean_step_s:.3} s/step, {left} left", numbers(event)))
+        Some(format!(
+            "{name} {step:>width$}/{num_steps}  {}  {mean_step_s:.3} s/step, {left} left",
+            step_metrics(event)
+        ))
     }
 }
 
@@ -46,17 +50,17 @@ impl<W: Write> Sink for PlainLines<W> {
             Event::Step(step) => self.step_line(step),
             Event::Progress { stage, done, total } => {
                 let tenth = done * 10 / (*total).max(1);
-                let line = (tenth > self.shown_tenth).then(|| format!("{} {done}/{total}", stage.name()));
-                self.shown_tenth = self.shown_tenth.max(tenth);
+                let line = (tenth > self.printed_tenth).then(|| format!("{} {done}/{total}", stage.name()));
+                self.printed_tenth = self.printed_tenth.max(tenth);
                 line
             }
-            _ => line(event),
+            _ => event_line(event),
         };
         if matches!(event, Event::StageStarted { .. }) {
-            (self.pace, self.since_line_s, self.shown_tenth) = ((0, 0.0), 0.0, 0);
+            (self.pace, self.since_line_s, self.printed_tenth) = ((0, 0.0), 0.0, 0);
         }
         if let Some(line) = line {
-            drop(writeln!(self.out, "{line}")); // nowhere to show a failure to show something
+            drop(writeln!(self.out, "{line}")); // no other stream could report the failure
         }
     }
 }
@@ -68,7 +72,7 @@ mod tests {
     use super::*;
     use crate::output::event_line::tests::step;
 
-    fn shown(events: &[Event]) -> String {
+    fn printed(events: &[Event]) -> String {
         let mut sink = PlainLines::new(Vec::new());
         for event in events {
             sink.event(event);
@@ -77,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn plain_lines_are_throttled_to_one_in_ten_seconds_of_training() {
+    fn steps_print_one_line_per_ten_seconds() {
         let mut events = vec![Event::StageStarted { stage: Stage::Stage1, done: 0, num_steps: 100 }];
         events.extend((1..=100).map(|number| step(number, 0.25)));
         events.push(Event::StageFinished { stage: Stage::Stage1, elapsed_s: 25.0 });
@@ -88,31 +92,33 @@ stage1  81/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 5 s left
 stage1 100/100  loss 0.0123  21.50 dB  lr 4.00e-4  0.250 s/step, 0 s left
 stage1: done in 25 s
 ";
-        assert_eq!(shown(&events), expected);
+        assert_eq!(printed(&events), expected);
     }
 
     #[test]
-    fn what_happens_once_is_shown_at_once() {
+    fn events_are_printed_at_once() {
         let events = [
             Event::StageStarted { stage: Stage::Stage2, done: 40, num_steps: 100 },
             Event::Evaluated { stage: Stage::Stage2, step: 50, psnr: 24.309, ssim: None, num_views: 12 },
             Event::Checkpoint { path: "runs/tiny/stage2/step-50".into() },
             Event::Skipped { key: "room".into(), reason: "3 frames".into() },
             Event::Warning("hot".into()),
+            Event::StageStarted { stage: Stage::Eval, done: 0, num_steps: 7 },
         ];
         let expected = "stage2: resumed after 40 of 100 steps
-stage2 step 50: 24.31 dB over 12 held-out views
+stage2 step 50: 24.31 dB over 12 validation views
 saved runs/tiny/stage2/step-50
 skipped room: 3 frames
 warning: hot
+eval: 7 scenes
 ";
-        assert_eq!(shown(&events), expected);
+        assert_eq!(printed(&events), expected);
     }
 
     #[test]
-    fn clustering_is_shown_every_tenth() {
+    fn progress_prints_every_tenth() {
         let events: Vec<_> = (1..=40).map(|done| Event::Progress { stage: Stage::Clusters, done, total: 40 }).collect();
-        let text = shown(&events);
+        let text = printed(&events);
         assert_eq!(text.lines().count(), 10);
         assert!(text.starts_with("clusters 4/40\nclusters 8/40\n") && text.ends_with("clusters 40/40\n"));
     }

@@ -1,4 +1,4 @@
-//! Choose bar or lines.
+//! Choose a progress bar or progress lines.
 
 use std::io::IsTerminal;
 
@@ -7,8 +7,8 @@ use clift_train::Sink;
 use crate::output::bar::Bar;
 use crate::output::plain::PlainLines;
 
-/// Chooses the sink that suits the standard error stream of this process.
-pub fn sink() -> Box<dyn Sink> {
+/// Creates a progress bar if the standard error is a terminal, progress lines otherwise.
+pub fn progress_sink() -> Box<dyn Sink> {
     if std::io::stderr().is_terminal() {
         Box::new(Bar::default())
     } else {

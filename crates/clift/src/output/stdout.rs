@@ -6,15 +6,15 @@ use std::path::Path;
 use anyhow::Context;
 use clift_eval::Summary;
 
-/// Writes a line or more to the standard output, at once.
+/// Writes one or more lines to the standard output and flushes them.
 ///
 /// # Errors
-/// The operating system's, except that a reader who has left, as `head` does, is none: the rest is not wanted.
+/// Errors of the operating system. A closed pipe, as `head` leaves behind, is no error.
 pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
 }
 
-/// Writes what an evaluation found and where it lies.
+/// Writes the table of an evaluation and the paths of its report and files.
 ///
 /// # Errors
 /// As [`print_result`].
@@ -23,14 +23,41 @@ pub fn print_evaluation(summary: &Summary, folder: &Path) -> anyhow::Result<()> 
     print_result(&format!("{summary}\nreport: {}\nresults: {}", report.display(), folder.display()))
 }
 
-pub(crate) fn write_result(mut out: impl Write, text: &str) -> anyhow::Result<()> {
+fn write_result(mut out: impl Write, text: &str) -> anyhow::Result<()> {
     match writeln!(out, "{text}").and_then(|()| out.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
         written => written.context("writing to the standard output"),
     }
 }
 
-/// Writes a line to the standard error stream, if that can be: there is nowhere to show a failure to show something.
+/// Writes a line to the standard error. A failure is ignored: no other stream could report it.
 pub fn print_note(text: &str) {
     drop(writeln!(std::io::stderr(), "{text}"));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A stream that fails when it is flushed.
+    struct Fails(ErrorKind);
+
+    impl Write for Fails {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            Ok(bytes.len())
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Err(self.0.into())
+        }
+    }
+
+    #[test]
+    fn closed_pipe_is_no_error_but_full_disk_is() {
+        assert!(write_result(Fails(ErrorKind::BrokenPipe), "row").is_ok());
+        let error = write_result(Fails(ErrorKind::StorageFull), "row").unwrap_err();
+        assert_eq!(format!("{error:#}"), "writing to the standard output: no storage space");
+        let mut out = Vec::new();
+        write_result(&mut out, "row").unwrap();
+        assert_eq!(out, b"row\n");
+    }
 }

@@ -1,7 +1,8 @@
-//! Tables on a terminal.
+//! Tables of aligned columns.
 
-/// Columns of equal width, two blanks apart.
-pub fn columns<const COUNT: usize>(rows: &[[String; COUNT]]) -> String {
+/// Formats a header and rows in columns of equal width, two spaces apart.
+pub fn table<const COUNT: usize>(header: [&str; COUNT], rows: impl IntoIterator<Item = [String; COUNT]>) -> String {
+    let rows: Vec<_> = [header.map(String::from)].into_iter().chain(rows).collect();
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0) + 2;
     let widths: [usize; COUNT] = std::array::from_fn(width);
     let line = |row: &[String; COUNT]| {

@@ -1,8 +1,6 @@
-//! Seconds, bytes and folders as they are printed.
+//! Seconds, rates, bytes and counts as text.
 
-use std::path::Path;
-
-/// Three digits of a duration.
+/// Formats seconds with three significant digits: `12.3 ms`, `1.00 s`, `123 s`.
 pub fn seconds(seconds: f64) -> String {
     match seconds {
         s if s >= 100.0 => format!("{s:.0} s"),
@@ -14,26 +12,43 @@ pub fn seconds(seconds: f64) -> String {
     }
 }
 
-/// A long time in days, hours and minutes.
-pub fn duration(s: f64) -> String {
-    let minutes = (s / 60.0).round() as u64;
-    match (minutes / (24 * 60), minutes / 60 % 24, minutes % 60) {
-        _ if s < 100.0 => seconds(s),
-        (0, 0, minutes) => format!("{minutes} min"),
-        (0, hours, minutes) => format!("{hours} h {minutes} min"),
-        (days, hours, _) => format!("{days} d {hours} h"),
+/// Formats a duration in its two largest units: `59 s`, `1 min 1 s`, `7 h 45 min`, `2 d 12 h`.
+pub fn duration(seconds: f64) -> String {
+    let total = seconds.max(0.0).round() as u64;
+    match (total / 86_400, total / 3600 % 24, total / 60 % 60, total % 60) {
+        (0, 0, 0, s) => format!("{s} s"),
+        (0, 0, min, s) => format!("{min} min {s} s"),
+        (0, h, min, _) => format!("{h} h {min} min"),
+        (d, h, ..) => format!("{d} d {h} h"),
     }
 }
 
-/// Bytes in MiB or GiB.
-pub fn bytes(bytes: u64) -> String {
+/// Formats a rate per second, below 1 as seconds per item: `12.3/s`, `2.5 s each`.
+pub fn rate(per_s: f64) -> String {
+    if per_s >= 1.0 { format!("{per_s:.1}/s") } else { format!("{:.1} s each", 1.0 / per_s) }
+}
+
+/// Formats an amount of memory in MiB or GiB.
+pub fn memory_size(bytes: u64) -> String {
     let mib = bytes as f64 / (1024.0 * 1024.0);
     if mib < 1024.0 { format!("{mib:.0} MiB") } else { format!("{:.2} GiB", mib / 1024.0) }
 }
 
-/// The folder a file is to lie in.
-pub fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+/// Formats the size of a file with decimal prefixes: `999 bytes`, `23.5 MB`.
+pub fn file_size(bytes: u64) -> String {
+    let units = ["bytes", "kB", "MB", "GB", "TB"];
+    let mut value = bytes as f64;
+    let mut unit = 0;
+    while value >= 999.5 && unit + 1 < units.len() {
+        value /= 1000.0;
+        unit += 1;
+    }
+    if unit == 0 { format!("{bytes} bytes") } else { format!("{value:.1} {}", units[unit]) }
+}
+
+/// Formats a count with its noun: `1 scene`, `2 scenes`.
+pub fn plural(count: usize, noun: &str) -> String {
+    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
 
 #[cfg(test)]
@@ -41,8 +56,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn long_times_are_days_hours_and_minutes() {
-        let shown = [0.5, 59.0, 120.0, 3660.0, 90_000.0].map(duration);
-        assert_eq!(shown, ["500 ms", "59.0 s", "2 min", "1 h 1 min", "1 d 1 h"]);
+    fn values_are_formatted_with_fitting_units() {
+        let durations = [0.4, 59.0, 61.0, 3600.0 * 7.75, 86_400.0 * 2.5].map(duration);
+        assert_eq!(durations, ["0 s", "59 s", "1 min 1 s", "7 h 45 min", "2 d 12 h"]);
+        assert_eq!([12.34, 1.0, 0.4].map(rate), ["12.3/s", "1.0/s", "2.5 s each"]);
+        let sizes = [0, 999, 1000, 999_960, 23_456_789].map(file_size);
+        assert_eq!(sizes, ["0 bytes", "999 bytes", "1.0 kB", "1.0 MB", "23.5 MB"]);
+        assert_eq!([1, 2, 0].map(|count| plural(count, "scene")), ["1 scene", "2 scenes", "0 scenes"]);
     }
 }

@@ -4,41 +4,24 @@ use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
 use clift_bench::{BenchCase, BenchEvent, BenchOptions, BenchRow, MAX_CHECKED_TOKENS, Report, run_bench};
-use clift_model::{DeviceName, Precision, TokenCount};
-use clift_train::{Config, read_config};
+use clift_model::Precision;
 
 use crate::commands::bench::data::BenchDataArgs;
-use crate::commands::bench::precision::BenchHalfArgs;
-use crate::commands::parse::parse_repeats;
-use crate::exit_code::UsageError;
+use crate::commands::bench::precision::BenchPrecisionArgs;
+use crate::commands::bench::timing_args::TimingArgs;
 use crate::interrupt;
 use crate::output::counter::Counter;
-use crate::output::stdout::{print_note, print_result};
-use crate::output::table;
-use crate::output::units::{bytes, folder_of, seconds};
+use crate::output::stdout::print_result;
+use crate::output::table::table;
+use crate::output::units::{memory_size, seconds};
 
-/// Times what is asked for, prints the table and writes the JSON.
+/// Times the chosen cases, prints the table and writes the JSON.
 pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
-    let (mut config, overrides) = read_config::<Config>(args.config.as_deref().unwrap_or(Path::new("")), &args.set)?;
-    for change in overrides {
-        print_note(&change.to_string());
-    }
-    config.device = args.device.unwrap_or(config.device);
-    // Found out now and not after minutes of work.
-    if let Some(json) = &args.json
-        && !folder_of(json).is_dir()
-    {
-        return Err(UsageError(format!("there is no folder for --json {}", json.display())).into());
-    }
-    let options = BenchOptions {
-        work: if args.work.is_empty() { BenchCase::ALL.into() } else { args.work.clone() },
-        repeats: args.repeats,
-        warmup: args.warmup,
-        error: !args.no_error,
-        storage: args.storage,
-        render: args.render,
-        features: args.features.clone(),
-    };
+    let timing = &args.timing;
+    let config = timing.config.read(args.config.as_deref().unwrap_or(Path::new("")), |_| Ok(()))?;
+    timing.json.check_folder()?;
+    let options = timing.options(&BenchCase::ALL);
+    let options = BenchOptions { error: !args.no_error, features: args.features.clone(), ..options };
     let stop = interrupt::flag()?;
     let mut counter: Option<Counter> = None;
     let report = run_bench(&config, &options, &stop, &mut |event| match event {
@@ -53,33 +36,28 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     });
     drop(counter);
     let report = report?;
-    print_result(&shown(&report))?;
-    if let Some(json) = &args.json {
-        crate::output::json::write(&report, json)?;
-        print_result(&format!("results: {}", json.display()))?;
-    }
-    Ok(())
+    print_result(&report_text(&report))?;
+    timing.json.write(&report)
 }
 
-const HEADER: [&str; 5] = ["work", "median", "p95", "peak memory", "error against f64"];
-
-/// The table with what must be known to read it.
-fn shown(report: &Report) -> String {
-    let rows: Vec<_> = [HEADER.map(String::from)].into_iter().chain(report.rows.iter().map(cells)).collect();
-    let half = if report.precision == Precision::F16 { ", f16 products" } else { "" };
-    let title = format!("{}, {} threads{half}\n", report.device, report.threads);
-    [title, table::columns(&rows)].into_iter().chain(remarks(&report.rows)).collect::<Vec<_>>().join("\n")
+/// Formats the table with its remarks.
+fn report_text(report: &Report) -> String {
+    let header = ["case", "median", "p95", "peak memory", "error against f64"];
+    let f16 = if report.precision == Precision::F16 { ", f16 products" } else { "" };
+    let title = format!("{}, {} threads{f16}\n", report.device, report.threads);
+    let table = table(header, report.rows.iter().map(cells));
+    [title, table].into_iter().chain(remarks(&report.rows)).collect::<Vec<_>>().join("\n")
 }
 
-/// What must be known to read the rows, after an empty line.
+/// Returns an empty line and the remarks that apply to the rows, or nothing.
 fn remarks(rows: &[BenchRow]) -> Vec<String> {
     let has = |test: &dyn Fn(&BenchRow) -> bool| rows.iter().any(test);
     let inertia = rows.iter().find_map(|row| row.inertia);
     let mut remarks: Vec<String> = [
-        has(&|row| row.work == BenchCase::Render8Views).then(|| "render_8_views: seconds are per view".into()),
-        inertia.map(|inertia| format!("kmeans: inertia {inertia:.6e}; its error is the inertia's")),
+        has(&|row| row.work == BenchCase::Render8Views).then(|| "render_8_views: seconds per view".into()),
+        inertia.map(|inertia| format!("kmeans: inertia {inertia:.6e}; the error is that of the inertia")),
         has(&|row| row.max_rel_error.is_some() && row.work.is_checked_reduced())
-            .then(|| format!("* of loss and gradients, with at most {MAX_CHECKED_TOKENS} tokens")),
+            .then(|| format!("* error of loss and gradients, with at most {MAX_CHECKED_TOKENS} tokens")),
         has(&|row| row.max_rel_error.is_none()).then(|| "- not compared with f64".into()),
     ]
     .into_iter()
@@ -98,63 +76,39 @@ fn cells(row: &BenchRow) -> [String; 5] {
         Some(error) if error.is_finite() => format!("{error:.1e}{mark}"),
         Some(_) => format!("not finite{mark}"),
     };
-    let peak = row.peak_bytes.map_or_else(|| "unknown".into(), bytes);
+    let peak = row.peak_bytes.map_or_else(|| "unknown".into(), memory_size);
     [row.work.to_string(), seconds(row.median_s), seconds(row.p95_s), peak, error]
 }
 
-/// What is timed instead of the parts of the method.
+/// Measurements other than the cases of a config.
 #[derive(Debug, Subcommand)]
 pub enum BenchCommand {
-    /// Time how fast clips are read from a folder, in order and at random
+    /// Time reading clips from a data set, in order and at random
     Data(BenchDataArgs),
-    /// Time f16 products beside f32 ones, in turn, with what they change: loss, PSNR and gradient
-    Half(BenchHalfArgs),
+    /// Compare f16 with f32 matrix products: time, loss, PSNR, gradient
+    #[command(alias = "half")]
+    Precision(BenchPrecisionArgs),
 }
 
 /// Arguments of `clift bench`.
 #[derive(Debug, clap::Args)]
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+#[command(after_help = format!("Cases:\n  {}", BenchCase::ALL.map(BenchCase::name).join(", ")))]
 pub struct BenchArgs {
-    /// Something else to time.
+    /// Another measurement.
     #[command(subcommand)]
     pub command: Option<BenchCommand>,
-    /// The experiment whose sizes are used, a TOML file
+    /// Config file (TOML) with the sizes to time
     #[arg(required = true)]
     pub config: Option<PathBuf>,
-    /// The rows; all of them by default
-    #[arg(long, value_delimiter = ',', value_name = "WORK", help = cases_help())]
-    pub work: Vec<BenchCase>,
-    /// Repetitions that count
-    #[arg(long, value_name = "COUNT", default_value = "5", value_parser = parse_repeats)]
-    pub repeats: usize,
-    /// Repetitions before them that do not
-    #[arg(long, value_name = "COUNT", default_value = "1")]
-    pub warmup: usize,
-    /// Leave out the comparison with f64
+    #[command(flatten)]
+    pub timing: TimingArgs,
+    /// Skip the comparison with f64
     #[arg(long)]
     pub no_error: bool,
-    /// Where tensors live: flex, ndarray or wgpu
-    #[arg(long, value_name = "DEVICE")]
-    pub device: Option<DeviceName>,
-    /// Change a key of the config: `--set stage1.batch_size=1`
-    #[arg(long, value_name = "KEY=TOML")]
-    pub set: Vec<String>,
-    /// Tokens that are stored, as a number or a share: clusters of K-means, condenser and stage 2
-    #[arg(long, value_name = "COUNT", default_value = "1/4")]
-    pub storage: TokenCount,
-    /// Tokens that `render` and `render_8_views` draw from, as a number or a share; all by default
-    #[arg(long, value_name = "COUNT")]
-    pub render: Option<TokenCount>,
-    /// Let K-means cluster the tensor `features`, [N, D] in f32, of a safetensors file
+    /// Cluster `features`, f32 [N, D], of this safetensors file in `kmeans`
     #[arg(long, value_name = "FILE")]
     pub features: Option<PathBuf>,
-    /// Write the figures, with every repetition, as JSON
-    #[arg(long, value_name = "FILE")]
-    pub json: Option<PathBuf>,
-}
-
-fn cases_help() -> String {
-    format!("Time these works alone: {}", BenchCase::ALL.map(BenchCase::name).join(", "))
 }
 
 #[cfg(test)]
@@ -177,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_says_what_each_figure_is_of() {
+    fn table_has_units_and_remarks() {
         let rows = vec![
             row(BenchCase::Encode, 12.345, Some(3 << 30), Some(3.14e-7)),
             row(BenchCase::Kmeans, 0.5, Some(700 << 20), Some(f64::NAN)),
@@ -187,44 +141,19 @@ mod tests {
         let expected = "\
 flex, 2 threads
 
-work            median   p95      peak memory  error against f64
+case            median   p95      peak memory  error against f64
 encode          12.3 s   24.7 s   3.00 GiB     3.1e-7
 kmeans          500 ms   1.00 s   700 MiB      not finite
 render_8_views  12.3 ms  24.6 ms  unknown      -
 stage1_step     123 s    247 s    unknown      2.0e-5 *
 
-render_8_views: seconds are per view
-kmeans: inertia 1.234500e3; its error is the inertia's
-* of loss and gradients, with at most 1024 tokens
+render_8_views: seconds per view
+kmeans: inertia 1.234500e3; the error is that of the inertia
+* error of loss and gradients, with at most 1024 tokens
 - not compared with f64";
-        assert_eq!(shown(&Report { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows }), expected);
-    }
-
-    #[test]
-    fn a_table_without_remarks_ends_with_its_last_row() {
-        let rows = vec![row(BenchCase::Encode, 0.002, Some(1 << 20), Some(1e-7))];
-        let text = shown(&Report { device: DeviceName::Flex, precision: Precision::F32, threads: 1, rows });
-        assert!(text.ends_with("\nencode  2.00 ms  4.00 ms  1 MiB        1.0e-7"), "{text}");
-    }
-
-    #[test]
-    fn the_json_has_the_named_keys_and_null_where_nothing_was_measured() {
-        let rows =
-            vec![row(BenchCase::Kmeans, 0.5, Some(7), Some(0.25)), row(BenchCase::Render8Views, 0.5, None, None)];
-        let json =
-            serde_json::to_value(Report { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows })
-                .unwrap();
-        let expected = serde_json::json!({
-            "device": "flex",
-            "precision": "f32",
-            "threads": 2,
-            "rows": [
-                {"work": "kmeans", "median_s": 0.5, "p95_s": 1.0, "peak_bytes": 7, "max_rel_error": 0.25,
-                    "samples_s": [0.5], "inertia": 1234.5},
-                {"work": "render_8_views", "median_s": 0.5, "p95_s": 1.0, "peak_bytes": null,
-                    "max_rel_error": null, "samples_s": [0.5]},
-            ],
-        });
-        assert_eq!(json, expected);
+        let mut report = Report { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows };
+        assert_eq!(report_text(&report), expected);
+        report.rows.truncate(1);
+        assert!(report_text(&report).ends_with("\nencode  12.3 s  24.7 s  3.00 GiB     3.1e-7"));
     }
 }

@@ -1,100 +1,61 @@
-//! `clift bench half`.
+//! `clift bench precision`.
 
 use std::path::PathBuf;
 
-use clift_bench::{BenchCase, BenchOptions, PrecisionReport, PrecisionRow, WORKS, compare_precision};
-use clift_model::{DeviceName, TokenCount};
-use clift_train::{Config, read_config};
+use clift_bench::{PrecisionReport, PrecisionRow, WORKS, compare_precision};
 
-use crate::commands::parse::parse_repeats;
+use crate::commands::bench::timing_args::TimingArgs;
 use crate::interrupt;
-use crate::output::stdout::{print_note, print_result};
-use crate::output::table;
+use crate::output::stdout::print_result;
+use crate::output::table::table;
 use crate::output::units::seconds;
 
-/// Arguments of `clift bench half`.
+/// Arguments of `clift bench precision`.
 #[derive(Debug, clap::Args)]
-pub struct BenchHalfArgs {
-    /// The experiment whose sizes are used, a TOML file
+pub struct BenchPrecisionArgs {
+    /// Config file (TOML) with the sizes to time
     pub config: PathBuf,
-    /// Rows of the table, separated by commas; all of them by default
-    #[arg(long, value_delimiter = ',', value_name = "WORK")]
-    pub work: Vec<BenchCase>,
-    /// Repetitions that count
-    #[arg(long, value_name = "COUNT", default_value = "5", value_parser = parse_repeats)]
-    pub repeats: usize,
-    /// Repetitions before them that do not
-    #[arg(long, value_name = "COUNT", default_value = "1")]
-    pub warmup: usize,
-    /// Where tensors live: flex or wgpu
-    #[arg(long, value_name = "DEVICE")]
-    pub device: Option<DeviceName>,
-    /// Change a key of the config: `--set stage1.batch_size=1`
-    #[arg(long, value_name = "KEY=TOML")]
-    pub set: Vec<String>,
-    /// Tokens that are stored, as a number or a share, for stage 2
-    #[arg(long, value_name = "COUNT", default_value = "1/4")]
-    pub storage: TokenCount,
-    /// Tokens that a view is drawn from, as a number or a share; all by default
-    #[arg(long, value_name = "COUNT")]
-    pub render: Option<TokenCount>,
-    /// Write the figures as JSON
-    #[arg(long, value_name = "FILE")]
-    pub json: Option<PathBuf>,
+    #[command(flatten)]
+    pub timing: TimingArgs,
 }
 
-/// Compares both precisions, prints the table and writes the JSON.
-pub fn run(args: &BenchHalfArgs) -> anyhow::Result<()> {
-    let (mut config, overrides) = read_config::<Config>(&args.config, &args.set)?;
-    for change in overrides {
-        print_note(&change.to_string());
-    }
-    config.device = args.device.unwrap_or(config.device);
-    let options = BenchOptions {
-        work: if args.work.is_empty() { WORKS.into() } else { args.work.clone() },
-        repeats: args.repeats,
-        warmup: args.warmup,
-        error: false,
-        storage: args.storage,
-        render: args.render,
-        features: None,
-    };
-    let report = compare_precision(&config, &options, &*interrupt::flag()?)?;
-    print_result(&shown(&report))?;
-    if let Some(json) = &args.json {
-        crate::output::json::write(&report, json)?;
-        print_result(&format!("results: {}", json.display()))?;
-    }
-    Ok(())
+/// Times both precisions in turn, prints the table and writes the JSON.
+pub fn run(args: &BenchPrecisionArgs) -> anyhow::Result<()> {
+    let timing = &args.timing;
+    let config = timing.config.read(&args.config, |_| Ok(()))?;
+    let report = compare_precision(&config, &timing.options(&WORKS), &*interrupt::flag()?)?;
+    print_result(&report_text(&report))?;
+    timing.json.write(&report)
 }
 
-const HEADER: [&str; 7] = ["work", "f32", "f16", "f16/f32", "error", "loss f32, f16", "PSNR"];
-
-fn shown(report: &PrecisionReport) -> String {
-    let rows: Vec<_> = [HEADER.map(String::from)].into_iter().chain(report.rows.iter().map(cells)).collect();
-    let remark = "error: norm of the difference from f32 over its norm, of an update's whole gradient; \
-                  PSNR: of an update against its targets, of render against the f32 picture";
-    format!("{}\n\n{}\n\n{remark}", report.device, table::columns(&rows))
+fn report_text(report: &PrecisionReport) -> String {
+    let header = ["case", "f32", "f16", "f16/f32", "error", "loss f32, f16", "PSNR"];
+    let remark = "error: norm of the difference from f32 over the norm of f32, for updates of the whole gradient; \
+                  PSNR: of updates against their targets, of render against the f32 image";
+    format!("{}\n\n{}\n\n{remark}", report.device, table(header, report.rows.iter().map(cells)))
 }
 
 fn cells(row: &PrecisionRow) -> [String; 7] {
     let dash = || "-".to_owned();
-    let loss = row.loss.map_or_else(dash, |[single, half]| format!("{single:.6}, {half:.6}"));
+    let loss = row.loss.map_or_else(dash, |[f32, f16]| format!("{f32:.6}, {f16:.6}"));
     let psnr = match (row.psnr(), row.psnr_to_f32) {
-        (Some([single, half]), _) => format!("{single:.3}, {half:.3} dB"),
+        (Some([f32, f16]), _) => format!("{f32:.3}, {f16:.3} dB"),
         (None, Some(psnr)) => format!("{psnr:.1} dB"),
         (None, None) => dash(),
     };
-    let [single, half] = [row.f32_s, row.f16_s].map(seconds);
-    [row.work.to_string(), single, half, format!("{:.2}", row.ratio), format!("{:.1e}", row.error), loss, psnr]
+    let [f32_time, f16_time] = [row.f32_s, row.f16_s].map(seconds);
+    [row.work.to_string(), f32_time, f16_time, format!("{:.2}", row.ratio), format!("{:.1e}", row.error), loss, psnr]
 }
 
 #[cfg(test)]
 mod tests {
+    use clift_bench::BenchCase;
+    use clift_model::DeviceName;
+
     use super::*;
 
     #[test]
-    fn the_table_has_speed_beside_error() {
+    fn table_has_speed_beside_error() {
         let row = |work, loss, psnr_to_f32| PrecisionRow {
             work,
             f32_s: 0.5,
@@ -112,12 +73,12 @@ mod tests {
         let expected = "\
 flex
 
-work         f32     f16     f16/f32  error   loss f32, f16       PSNR
+case         f32     f16     f16/f32  error   loss f32, f16       PSNR
 encode       500 ms  250 ms  0.50     1.2e-3  -                   -
 render       500 ms  250 ms  0.50     1.2e-3  -                   61.2 dB
 stage1_step  500 ms  250 ms  0.50     1.2e-3  0.100000, 0.100000  10.000, 10.000 dB
 ";
-        let text = shown(&PrecisionReport { device: DeviceName::Flex, rows });
+        let text = report_text(&PrecisionReport { device: DeviceName::Flex, rows });
         assert!(text.starts_with(expected), "{text}");
     }
 }

@@ -1,96 +1,97 @@
 //! `clift data check`.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context;
 use clift_data::{CheckedScene, SceneCheck, Split, check_scene, encode_png, left_out, note_frames, replace_file};
 use serde::Serialize;
 
-use crate::commands::data::text::count;
-use crate::commands::splits::{SplitSource, Splits, files, splits};
+use crate::commands::shared_args::JsonArg;
+use crate::commands::splits::{SourceArgs, SplitSource, Splits};
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
-use crate::output::table;
+use crate::output::table::table;
+use crate::output::units::plural;
 
-/// A scene's row, with its half.
+/// Findings of one scene.
 #[derive(Debug, Serialize)]
 struct Row {
-    /// Folder it is in; `None` where there is one folder for all.
+    /// Split of the scene; `None` for a data set without splits.
     split: Option<Split>,
     #[serde(flatten)]
     check: SceneCheck,
 }
 
-/// What `--json` writes.
+/// Content of `--json`.
 #[derive(Debug, Serialize)]
 struct Report {
     scenes: Vec<Row>,
-    /// What is to be known of the whole.
+    /// Notes on the data set.
     notes: Vec<String>,
 }
 
-/// Checks every scene, prints the table and fails when one is flagged or there is none.
+impl Report {
+    fn num_flagged(&self) -> usize {
+        self.scenes.iter().filter(|row| !row.check.ok).count()
+    }
+}
+
+/// Checks every scene and prints the table.
+///
+/// # Errors
+/// If a scene is flagged, or if there are no scenes.
 pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
-    if let Some(folder) = &args.pictures {
-        fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
+    if let Some(folder) = &args.images {
+        fs::create_dir_all(folder).with_context(|| format!("creating {}", folder.display()))?;
     }
     let mut report = Report { scenes: Vec::new(), notes: Vec::new() };
-    for half in splits(&args.dir, args.split, &files(&args.set)?.0)? {
-        check_half(&half, args, &mut report)?;
+    for split in args.source.open(args.split)? {
+        check_split(&split, args, &mut report)?;
     }
-    print_result(&shown(&report))?;
-    if let Some(path) = &args.json {
-        let text = serde_json::to_vec_pretty(&report).context("writing the report as JSON")?;
-        replace_file(path, &text).with_context(|| format!("writing {}", path.display()))?;
-    }
-    anyhow::ensure!(!report.scenes.is_empty(), "no scene was checked: {}", args.dir.display());
-    let flagged = report.scenes.iter().filter(|row| !row.check.ok).count();
+    print_result(&report_text(&report))?;
+    args.json.write(&report)?;
+    anyhow::ensure!(!report.scenes.is_empty(), "no scenes to check in {}", args.source.dir.display());
+    let flagged = report.num_flagged();
     anyhow::ensure!(
         flagged == 0,
-        "{flagged} of {} flagged; the reasons stand above",
-        count(report.scenes.len(), "scene")
+        "{flagged} of {} flagged; the table above lists the reasons",
+        plural(report.scenes.len(), "scene")
     );
     Ok(())
 }
 
-fn check_half(half: &SplitSource, args: &CheckArgs, report: &mut Report) -> anyhow::Result<()> {
-    let (source, ledger) = (&half.opened.source, &half.opened.report);
-    for note in &ledger.notes {
+fn check_split(split: &SplitSource, args: &CheckArgs, report: &mut Report) -> anyhow::Result<()> {
+    let (source, skips) = (&split.opened.source, &split.opened.report);
+    for note in &skips.notes {
         print_note(&format!("note: {note}"));
     }
-    report.notes.extend_from_slice(&ledger.notes);
-    report.scenes.extend(left_out(ledger).into_iter().map(|check| Row { split: half.split, check }));
+    report.notes.extend_from_slice(&skips.notes);
+    report.scenes.extend(left_out(skips).into_iter().map(|check| Row { split: split.split, check }));
     let num_scenes = source.num_scenes().min(args.scenes.unwrap_or(usize::MAX));
-    let mut counter = Counter::new(&half.name(), num_scenes as u64);
+    let mut counter = Counter::new(&split.name(), num_scenes as u64);
     for scene in 0..num_scenes {
         let CheckedScene { mut check, picture } = check_scene(source.as_ref(), scene);
-        note_frames(ledger, &mut check);
-        if let (Some(folder), Some(picture)) = (&args.pictures, picture) {
-            let path = folder.join(picture_name(half.split, &check.key));
-            write_picture(&path, &encode_png(&picture)?)?;
+        note_frames(skips, &mut check);
+        if let (Some(folder), Some(image)) = (&args.images, picture) {
+            let path = folder.join(image_name(split.split, &check.key));
+            replace_file(&path, &encode_png(&image)?).with_context(|| format!("writing {}", path.display()))?;
         }
-        report.scenes.push(Row { split: half.split, check });
+        report.scenes.push(Row { split: split.split, check });
         counter.set(scene as u64 + 1);
     }
     Ok(())
 }
 
-fn write_picture(path: &Path, png: &[u8]) -> anyhow::Result<()> {
-    replace_file(path, png).with_context(|| format!("writing {}", path.display()))
-}
-
-/// `test-KEY.png`; a key may hold what a file name may not.
-fn picture_name(split: Option<Split>, key: &str) -> String {
+/// Returns `test-KEY.png`, with `_` for characters of the key that a file name cannot contain.
+fn image_name(split: Option<Split>, key: &str) -> String {
     let safe = |c: char| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' };
     let key: String = key.chars().map(safe).collect();
     split.map_or_else(|| format!("{key}.png"), |split| format!("{split}-{key}.png"))
 }
 
-const HEADER: [&str; 6] = ["scene", "frames", "size", "field of view", "epipolar", ""];
-
-fn shown(report: &Report) -> String {
-    let mut rows = vec![HEADER.map(String::from)];
+fn report_text(report: &Report) -> String {
+    let mut rows = Vec::new();
     let mut sentences = Vec::new();
     for Row { split, check } in &report.scenes {
         let name = split.map_or_else(|| check.key.clone(), |split| format!("{split}/{}", check.key));
@@ -106,35 +107,30 @@ fn shown(report: &Report) -> String {
         sentences.extend(check.reasons.iter().map(|reason| format!("{name}: {reason}")));
         sentences.extend(check.notes.iter().map(|note| format!("{name}: note: {note}")));
     }
-    let mut text = table::columns(&rows);
+    let mut text = table(["scene", "frames", "size", "field of view", "epipolar", ""], rows);
     if !sentences.is_empty() {
         text = format!("{text}\n\n{}", sentences.join("\n"));
     }
-    let flagged = report.scenes.iter().filter(|row| !row.check.ok).count();
-    let total = count(report.scenes.len(), "scene");
-    format!("{text}\n\n{total}, {} ok, {flagged} flagged", report.scenes.len() - flagged)
+    let (num_scenes, flagged) = (report.scenes.len(), report.num_flagged());
+    format!("{text}\n\n{}, {} ok, {flagged} flagged", plural(num_scenes, "scene"), num_scenes - flagged)
 }
 
 /// Arguments of `clift data check`.
 #[derive(Debug, clap::Args)]
 pub struct CheckArgs {
-    /// Scenes in any layout, or one scene
-    pub dir: PathBuf,
-    /// Which half, where there are two
+    #[command(flatten)]
+    pub source: SourceArgs,
+    /// Check this split, if there are two
     #[arg(long, value_enum, default_value_t = Splits::Both)]
     pub split: Splits,
-    /// Check the first N scenes of each half
+    /// Check the first N scenes of each split
     #[arg(long, value_name = "N")]
     pub scenes: Option<usize>,
-    /// Write what was found as JSON
-    #[arg(long, value_name = "FILE")]
-    pub json: Option<PathBuf>,
-    /// Write a picture of every scene there: two frames with epipolar lines
-    #[arg(long, value_name = "OUT")]
-    pub pictures: Option<PathBuf>,
-    /// Say where parts of the layout are, as in a config: `--set data.files.image_folder=images_4`
-    #[arg(long, value_name = "data.files.KEY=TOML")]
-    pub set: Vec<String>,
+    #[command(flatten)]
+    pub json: JsonArg,
+    /// Write an image per scene: two frames with epipolar lines
+    #[arg(long, alias = "pictures", value_name = "OUT")]
+    pub images: Option<PathBuf>,
 }
 
 #[cfg(test)]
@@ -142,7 +138,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_table_has_a_row_per_scene_and_a_sentence_per_reason() {
+    fn table_has_rows_and_reasons() {
         let good = SceneCheck {
             key: "a".into(),
             ok: true,
@@ -167,17 +163,12 @@ b: it has no frames
 b: note: so much
 
 2 scenes, 1 ok, 1 flagged";
-        assert_eq!(shown(&report), expected);
-        let json = serde_json::to_value(&report).unwrap();
-        assert_eq!((&json["scenes"][0]["key"], &json["scenes"][0]["ok"]), (&"a".into(), &true.into()));
-        assert_eq!((&json["scenes"][0]["split"], &json["scenes"][1]["split"]), (&"train".into(), &().into()));
-        assert_eq!(json["scenes"][1]["reasons"][0], "it has no frames");
-        assert!(json["scenes"][1]["epipolar_px"].is_null());
+        assert_eq!(report_text(&report), expected);
     }
 
     #[test]
-    fn a_picture_is_named_after_its_scene_and_stays_in_its_folder() {
-        assert_eq!(picture_name(Some(Split::Test), "00ff"), "test-00ff.png");
-        assert_eq!(picture_name(None, "../1K/a b"), ".._1K_a_b.png");
+    fn image_name_stays_in_the_folder() {
+        assert_eq!(image_name(Some(Split::Test), "00ff"), "test-00ff.png");
+        assert_eq!(image_name(None, "../1K/a b"), ".._1K_a_b.png");
     }
 }

@@ -6,120 +6,113 @@ use std::time::Instant;
 use anyhow::Context;
 use clap::ValueEnum;
 use clift_data::{
-    ConversionReport, ConvertOptions, ConvertTo, Converter, ImageEncoding, KEPT_FOR_TESTING, SkipReport, SkippedScene,
-    Split,
+    ConversionReport, ConvertOptions, ConvertTo, Converter, KEPT_FOR_TESTING, SkipReport, SkippedScene, Split,
 };
 
-use crate::commands::data::text::{bytes, count};
-use crate::commands::splits::{SplitSource, Splits, files, splits};
-use crate::exit_code::UsageError;
+use crate::commands::shared_args::ChunkArgs;
+use crate::commands::splits::{SourceArgs, SplitSource, Splits, open_splits};
+use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
+use crate::output::units::{file_size, plural};
 
-/// Scenes that are named when they are left out; `skipped.json` has all.
-const MAX_SKIPS_SHOWN: usize = 50;
+/// Most skipped scenes that are printed; `skipped.json` lists all.
+const MAX_LISTED_SKIPS: usize = 50;
 
-/// Converts both halves and says what was left out. Fails where a half has no scene.
+/// Converts the splits and prints the skipped scenes.
+///
+/// # Errors
+/// If no scene of a split can be converted.
 pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     let to = match args.to {
-        ConvertForm::Chunks => ConvertTo::Chunks { target_bytes: args.chunk_mb * 1_000_000 },
+        ConvertForm::Chunks => ConvertTo::Chunks { target_bytes: args.chunks.target_bytes() },
         ConvertForm::Scenes => ConvertTo::Scenes,
     };
-    let (files, mut changes) = files(&args.set)?;
-    // The list says which scenes there are, and nothing about how they look.
+    let (files, mut changes) = args.source.files()?;
+    // The list of test scenes selects scenes and changes nothing in them.
     changes.retain(|change| change.key != "data.files.test_scenes");
     changes.sort_by(|a, b| a.key.cmp(&b.key));
     let opened_with = changes.iter().map(|change| format!("{}={}", change.key, change.to)).collect::<Vec<_>>();
-    let encoding = args.quality.map_or(ImageEncoding::Png, ImageEncoding::Jpeg);
-    let options = ConvertOptions { to, encoding, opened_with: opened_with.join(" ") };
+    let options = ConvertOptions { to, encoding: args.chunks.encoding(), opened_with: opened_with.join(" ") };
 
-    let halves = splits(&args.dir, args.split, &files)?;
-    // All folders are looked at before anything is written to one.
-    let mut conversions = Vec::new();
-    for half in &halves {
-        half.print_news();
-        // A folder that is not divided becomes the test half: what `clift eval` and `clift encode` read.
-        let folder = args.out.join(half.split.unwrap_or(Split::Test).to_string());
-        refuse_overlap(&args.dir, &folder)?;
-        let opened = &half.opened;
-        conversions.push((half, Converter::open(opened.source.as_ref(), &opened.report, &folder, &options)?, folder));
+    let dir = &args.source.dir;
+    let splits = open_splits(dir, args.split, &files)?;
+    // Every output folder is checked before the first is written.
+    let mut converters = Vec::new();
+    for split in &splits {
+        split.print_report();
+        // A data set without splits becomes the test split, which `clift eval` and `clift encode` read.
+        let folder = args.out.join(split.split.unwrap_or(Split::Test).to_string());
+        require_disjoint(dir, &folder)?;
+        let opened = &split.opened;
+        converters.push((split, Converter::open(opened.source.as_ref(), &opened.report, &folder, &options)?, folder));
     }
     let mut empty = Vec::new();
-    for (half, conversion, folder) in conversions {
+    for (split, converter, folder) in converters {
         let started = Instant::now();
-        let mut counter = Counter::new(&half.name(), half.opened.source.num_scenes() as u64);
-        let converted = conversion.run(|done| counter.set(done as u64))?;
+        let mut counter = Counter::new(&split.name(), split.opened.source.num_scenes() as u64);
+        let report = converter.run(|done| counter.set(done as u64))?;
         drop(counter);
-        print_skips(&converted.left_out, &folder);
-        print_result(&told(half, &converted, started.elapsed().as_secs_f64(), &folder))?;
-        if converted.num_scenes == 0 {
-            empty.push(half.name());
+        print_skips(&report.left_out, &folder);
+        print_result(&describe(split, &report, started.elapsed().as_secs_f64(), &folder))?;
+        if report.num_scenes == 0 {
+            empty.push(split.name());
         }
     }
-    anyhow::ensure!(
-        empty.is_empty(),
-        "not one scene could be converted ({}): {}",
-        empty.join(", "),
-        args.dir.display()
-    );
+    anyhow::ensure!(empty.is_empty(), "no scene of {} could be converted: {}", empty.join(", "), dir.display());
     Ok(())
 }
 
-fn told(half: &SplitSource, converted: &ConversionReport, seconds: f64, folder: &Path) -> String {
+fn describe(split: &SplitSource, report: &ConversionReport, seconds: f64, folder: &Path) -> String {
     let ConversionReport { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, left_out } =
-        converted;
-    let counted = |number: usize, what: &str| if number > 0 { format!(", {number} {what}") } else { String::new() };
-    let found = counted(*num_found, "of them there already");
-    let changed = counted(*num_changed, "made anew, which had other cameras or frames");
+        report;
+    let optional = |number: usize, text: &str| if number > 0 { format!(", {number} {text}") } else { String::new() };
+    let found = optional(*num_found, "of them already complete");
+    let changed = optional(*num_changed, "rewritten, because cameras or frames changed");
     format!(
-        "{}: {} of {}{found}{changed}; {} written, {} as they were and {num_encoded} encoded, {} in {seconds:.1} s: {}",
-        half.name(),
-        count(*num_scenes, "scene"),
+        "{}: {} of {}{found}{changed}; {} written, {} copied and {num_encoded} encoded, {} in {seconds:.1} s: {}",
+        split.name(),
+        plural(*num_scenes, "scene"),
         left_out.num_scenes,
-        count(*num_frames, "frame"),
+        plural(*num_frames, "frame"),
         num_frames - num_encoded,
-        bytes(*image_bytes),
+        file_size(*image_bytes),
         folder.display(),
     )
 }
 
-fn print_skips(left_out: &SkipReport, folder: &Path) {
-    // The test half has them.
-    let skips: Vec<&SkippedScene> = left_out.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING).collect();
-    for skip in skips.iter().take(MAX_SKIPS_SHOWN) {
-        print_note(&format!("left out {}: {}", skip.key, skip.reason));
+fn print_skips(report: &SkipReport, folder: &Path) {
+    // Scenes reserved for testing are part of the other split.
+    let skips: Vec<&SkippedScene> = report.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING).collect();
+    for skip in skips.iter().take(MAX_LISTED_SKIPS) {
+        print_note(&format!("skipped {}: {}", skip.key, skip.reason));
     }
-    let num_more = skips.len().saturating_sub(MAX_SKIPS_SHOWN);
+    let num_more = skips.len().saturating_sub(MAX_LISTED_SKIPS);
     if num_more > 0 {
-        print_note(&format!("left out {num_more} more"));
+        print_note(&format!("skipped {num_more} more"));
     }
-    if left_out.has_skips() {
-        print_note(&format!("all that is left out, by name: {}", folder.join("skipped.json").display()));
+    if report.has_skips() {
+        print_note(&format!("all skipped scenes and frames: {}", folder.join("skipped.json").display()));
     }
 }
 
-/// Refuses to write where the source's scenes are looked for, or around them.
-fn refuse_overlap(dir: &Path, folder: &Path) -> anyhow::Result<()> {
+/// Checks that neither folder contains the other: the output would change the input.
+fn require_disjoint(dir: &Path, folder: &Path) -> anyhow::Result<()> {
     let dir = dir.canonicalize().with_context(|| format!("opening {}", dir.display()))?;
-    let target = real_path(folder).with_context(|| format!("finding the full path of {}", folder.display()))?;
+    let target = real_path(folder).with_context(|| format!("resolving the path of {}", folder.display()))?;
     if target.starts_with(&dir) || dir.starts_with(&target) {
-        let message = format!(
-            "scenes of {} would be written to {}: the one is in the other, and writing would change what is read; \
-             choose a folder beside it",
-            dir.display(),
-            target.display()
-        );
-        return Err(UsageError(message).into());
+        let (dir, target) = (dir.display(), target.display());
+        usage_bail!("input {dir} and output {target} contain one another; choose an output folder outside the input");
     }
     Ok(())
 }
 
-/// The full path, without links, of a folder that may not be there yet.
+/// Returns the absolute path of a folder that may not exist yet, with links resolved.
 fn real_path(path: &Path) -> std::io::Result<PathBuf> {
     let path = std::path::absolute(path)?;
-    let there = path.ancestors().find(|ancestor| ancestor.exists()).unwrap_or(&path);
-    let missing = path.strip_prefix(there).unwrap_or(Path::new(""));
-    let mut real = there.canonicalize()?;
+    let existing = path.ancestors().find(|ancestor| ancestor.exists()).unwrap_or(&path);
+    let missing = path.strip_prefix(existing).unwrap_or(Path::new(""));
+    let mut real = existing.canonicalize()?;
     for part in missing.components() {
         match part {
             Component::ParentDir => drop(real.pop()),
@@ -132,33 +125,26 @@ fn real_path(path: &Path) -> std::io::Result<PathBuf> {
 /// Arguments of `clift data convert`.
 #[derive(Debug, clap::Args)]
 pub struct ConvertArgs {
-    /// Scenes in any layout, or one scene
-    pub dir: PathBuf,
-    /// Folder to write to: new, or one that an interrupted conversion left
+    #[command(flatten)]
+    pub source: SourceArgs,
+    /// Output folder: new, or of an interrupted conversion
     pub out: PathBuf,
-    /// What to write
+    /// Layout to write
     #[arg(long, value_enum)]
     pub to: ConvertForm,
-    /// Which half, where there are two
+    /// Convert this split, if there are two
     #[arg(long, value_enum, default_value_t = Splits::Both)]
     pub split: Splits,
-    /// Size at which a chunk is closed, in megabytes of pictures
-    #[arg(long, value_name = "M", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..=4000))]
-    pub chunk_mb: u64,
-    /// Store pictures that need encoding as JPEG of this quality, 1 to 100, instead of PNG (without loss)
-    #[arg(long, value_name = "Q", value_parser = clap::value_parser!(u8).range(1..=100))]
-    pub quality: Option<u8>,
-    /// Say where parts of the layout are, as in a config: `--set data.files.image_folder=images_4`
-    #[arg(long, value_name = "data.files.KEY=TOML")]
-    pub set: Vec<String>,
+    #[command(flatten)]
+    pub chunks: ChunkArgs,
 }
 
-/// What is written.
+/// Layouts of converted scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ConvertForm {
-    /// NNNNNN.torch files of many scenes, with index.json
+    /// Chunks: NNNNNN.torch files of many scenes, with index.json
     Chunks,
-    /// A KEY.torch file per scene
+    /// One KEY.torch file per scene
     Scenes,
 }
 
@@ -167,7 +153,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_in_the_source_or_around_it_is_refused_and_one_beside_it_is_not() {
+    fn output_inside_or_around_the_input_is_refused() {
         let place = tempfile::tempdir().unwrap();
         let at = |name: &str| place.path().join(name);
         std::fs::create_dir_all(at("data/test")).unwrap();
@@ -180,9 +166,7 @@ mod tests {
             ("data", "data-packed/test", false),
             ("data", "packed/test", false),
         ] {
-            let refused = refuse_overlap(&at(dir), &at(folder));
-            assert_eq!(refused.is_err(), is_refused, "{dir} {folder}");
-            assert!(refused.err().is_none_or(|error| error.is::<UsageError>()));
+            assert_eq!(require_disjoint(&at(dir), &at(folder)).is_err(), is_refused, "{dir} {folder}");
         }
     }
 }

@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use clift_data::{OverlapOptions, SceneSource, write_overlap_index};
 
-use crate::commands::data::text::count;
 use crate::commands::parse::parse_distance;
-use crate::commands::splits::{SplitSource, Splits, files, splits};
-use crate::exit_code::UsageError;
+use crate::commands::splits::{SourceArgs, SplitSource, Splits};
+use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result};
+use crate::output::units::plural;
 
-/// Writes the index of a half, or of both, and says what has no views.
+/// Writes the evaluation index and prints the number of scenes with and without views.
 pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     let options = OverlapOptions {
         num_context: args.context,
@@ -21,22 +21,21 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     };
     options.validate()?;
     if args.out.exists() {
-        let message = format!("{} is there already, and nothing is written over", args.out.display());
-        return Err(UsageError(message).into());
+        usage_bail!("{} exists; remove it or choose another file", args.out.display());
     }
-    let halves = splits(&args.dir, args.split, &files(&args.set)?.0)?;
-    halves.iter().for_each(SplitSource::print_news);
-    let sources: Vec<&dyn SceneSource> = halves.iter().map(|half| half.opened.source.as_ref()).collect();
-    let ledger = write_overlap_index(&args.out, &sources, &options)?;
-    ledger.notes.iter().for_each(|note| print_note(&format!("note: {note}")));
-    let used = count(ledger.num_used(), "scene");
-    print_result(&format!("{used} of {} with views: {}", ledger.num_scenes, args.out.display()))?;
-    for (reason, number) in ledger.counts() {
+    let splits = args.source.open(args.split)?;
+    splits.iter().for_each(SplitSource::print_report);
+    let sources: Vec<&dyn SceneSource> = splits.iter().map(|split| split.opened.source.as_ref()).collect();
+    let report = write_overlap_index(&args.out, &sources, &options)?;
+    report.notes.iter().for_each(|note| print_note(&format!("note: {note}")));
+    let used = plural(report.num_used(), "scene");
+    print_result(&format!("{used} of {} with views: {}", report.num_scenes, args.out.display()))?;
+    for (reason, number) in report.counts() {
         print_result(&format!("null: {number} {reason}"))?;
     }
-    if ledger.num_used() == 0 {
+    if report.num_used() == 0 {
         let [near, far] = options.distance;
-        anyhow::bail!("no scene has views; frames {near} to {far} apart are asked for: change --distance or --overlap");
+        anyhow::bail!("no scene has overlapping views {near} to {far} frames apart; lower --distance or --overlap");
     }
     Ok(())
 }
@@ -44,12 +43,12 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
 /// Arguments of `clift data index`.
 #[derive(Debug, clap::Args)]
 pub struct IndexArgs {
-    /// Scenes in any layout
-    pub dir: PathBuf,
-    /// Where to write
+    #[command(flatten)]
+    pub source: SourceArgs,
+    /// Index file to write
     #[arg(long, short, value_name = "FILE")]
     pub out: PathBuf,
-    /// Which half, where there are two
+    /// Use this split, if there are two
     #[arg(long, value_enum, default_value_t = Splits::Test)]
     pub split: Splits,
     /// Context frames per scene
@@ -61,13 +60,10 @@ pub struct IndexArgs {
     /// Fewest and most frames from the first context to the last
     #[arg(long, value_name = "A..B", default_value = "45..135", value_parser = parse_distance)]
     pub distance: [usize; 2],
-    /// Least overlap of the first and the last context
+    /// Minimum overlap of the first and the last context
     #[arg(long, value_name = "SHARE", default_value_t = 0.6)]
     pub overlap: f64,
-    /// Decides which of the possible frames are taken
+    /// Seed of the sampled frames
     #[arg(long, value_name = "S", default_value_t = 123)]
     pub seed: u64,
-    /// Say where parts of the layout are, as in a config: `--set data.files.image_folder=images_4`
-    #[arg(long, value_name = "data.files.KEY=TOML")]
-    pub set: Vec<String>,
 }

@@ -5,75 +5,59 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::Context;
 use clift_data::{
     ClipReader, DataError, DatasetRoot, EvaluationIndex, OpenedSource, SceneSource, SceneSubset, SkipReport,
     SourceInfo, SourceKind, Split, open_dataset, open_source,
 };
 use clift_eval::evaluation_items;
-use clift_train::{Config, read_config};
+use clift_train::Config;
 
 use crate::commands::data::info_report::{EvaluationReport, Report, SplitReport};
-use crate::commands::splits::{Splits, halves_there, options};
-use crate::exit_code::UsageError;
-use crate::output::stdout::{print_note, print_result};
+use crate::commands::shared_args::{JsonArg, read_config};
+use crate::commands::splits::{Splits, present_splits, read_all_options};
+use crate::exit_code::usage_bail;
+use crate::output::stdout::print_result;
 
-/// Synthetic scenes that are looked at: there may be millions, and they are all alike.
+/// Most synthetic scenes that are described: a config may have millions of similar ones.
 const MAX_SYNTHETIC: usize = 1000;
 
-/// Prints what a folder or a config holds.
+/// Describes a data set, a config or an evaluation index.
 pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     let is_json = args.path.extension().is_some_and(|extension| extension == "json");
-    // A scene may be given by its cameras, of which there may be several files: transforms_train.json.
+    // A scene may be given by one of its camera files, e.g. transforms_train.json.
     let name = args.path.file_name().unwrap_or_default().to_string_lossy();
     let is_scene = is_json && name.starts_with("transforms");
     if is_json && !is_scene {
-        return of_index(args);
+        let census = EvaluationIndex::read(&args.path)?.census();
+        print_result(&format!("{census}\n"))?;
+        return args.json.write(&census);
     }
     let report = if args.path.is_dir() || is_scene {
         if !args.set.is_empty() {
-            return Err(UsageError(format!("--set changes a config, but {} is none", args.path.display())).into());
+            usage_bail!("--set needs a config, {} is a data set", args.path.display());
         }
-        of_folder(&args.path)?
+        describe_folder(&args.path)?
     } else {
-        let (config, overrides) = read_config::<Config>(&args.path, &args.set)?;
-        for change in overrides {
-            print_note(&change.to_string());
-        }
-        config.validate()?;
-        of_config(&args.path, &config)?
+        let (config, _) = read_config(&args.path, &args.set, Config::validate)?;
+        describe_config(&args.path, &config)?
     };
     print_result(&report.to_string())?;
-    if let Some(path) = &args.json {
-        let text = serde_json::to_vec_pretty(&report).context("writing the report as JSON")?;
-        std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
-    }
+    args.json.write(&report)?;
     let failed = report.splits.values().filter_map(|split| split.error.as_ref());
     let failed = failed.chain(report.evaluation.as_ref().and_then(|evaluation| evaluation.error.as_ref()));
-    anyhow::ensure!(failed.count() == 0, "not all of it can be used; the reason stands above");
+    anyhow::ensure!(failed.count() == 0, "a part of the data is not usable; the table above lists the reason");
     Ok(())
 }
 
-/// Prints what an evaluation index asks for.
-fn of_index(args: &InfoArgs) -> anyhow::Result<()> {
-    let census = EvaluationIndex::read(&args.path)?.census();
-    print_result(&format!("{census}\n"))?;
-    if let Some(path) = &args.json {
-        let text = serde_json::to_vec_pretty(&census).context("writing the counts as JSON")?;
-        std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
-    }
-    Ok(())
-}
-
-fn of_folder(root: &Path) -> anyhow::Result<Report> {
+fn describe_folder(root: &Path) -> anyhow::Result<Report> {
     let mut report = Report { path: root.to_owned(), ..Report::default() };
     let root = DatasetRoot::find(root)?;
-    for split in halves_there(&root, Splits::Both) {
+    for split in present_splits(&root, Splits::Both) {
         let name = if root.has_splits() { split.to_string() } else { "all".into() };
-        let described = match open_source(&root, split, &options()) {
+        let described = match open_source(&root, split, &read_all_options()) {
             Ok(opened) => {
                 report.layout = Some(opened.kind);
-                describe(opened.source.as_ref(), &opened.report)
+                describe_split(opened.source.as_ref(), &opened.report)
             }
             Err(error @ DataError::UnknownLayout { .. }) => return Err(error.into()),
             Err(error) => Err(error),
@@ -83,11 +67,11 @@ fn of_folder(root: &Path) -> anyhow::Result<Report> {
     Ok(report)
 }
 
-fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
+fn describe_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
     let data = &config.data;
     let mut report = Report { path: path.to_owned(), ..Report::default() };
     for split in [Split::Train, Split::Test] {
-        let described = open_dataset(data, split).and_then(|OpenedSource { source, report: ledger, .. }| {
+        let described = open_dataset(data, split).and_then(|OpenedSource { source, report: skips, .. }| {
             if split == Split::Test {
                 report.evaluation = Some(evaluation(config, source.clone()));
             }
@@ -95,7 +79,7 @@ fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
                 SourceKind::Synthetic => Arc::new(SceneSubset::first(source, MAX_SYNTHETIC)),
                 _ => source,
             };
-            let mut described = describe(source.as_ref(), &ledger)?;
+            let mut described = describe_split(source.as_ref(), &skips)?;
             if split == Split::Train {
                 described.views = Some(long_enough(config, source.as_ref()));
             }
@@ -108,37 +92,37 @@ fn of_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
     Ok(report)
 }
 
-fn describe(source: &dyn SceneSource, ledger: &SkipReport) -> Result<SplitReport, clift_data::DataError> {
+fn describe_split(source: &dyn SceneSource, skips: &SkipReport) -> Result<SplitReport, clift_data::DataError> {
     Ok(SplitReport {
         error: None,
-        num_scenes: ledger.num_scenes,
-        num_used: ledger.num_used(),
-        skipped: counts(ledger),
-        left_out: ledger.skips.clone(),
-        frames: ledger.frames.clone(),
-        notes: ledger.notes.clone(),
+        num_scenes: skips.num_scenes,
+        num_used: skips.num_used(),
+        skipped: counts(skips),
+        left_out: skips.skips.clone(),
+        frames: skips.frames.clone(),
+        notes: skips.notes.clone(),
         num_described: source.num_scenes(),
         info: Some(SourceInfo::read(source)?),
         views: None,
     })
 }
 
-fn counts(ledger: &SkipReport) -> BTreeMap<String, usize> {
-    ledger.counts().into_iter().map(|(reason, count)| (reason.to_owned(), count)).collect()
+fn counts(skips: &SkipReport) -> BTreeMap<String, usize> {
+    skips.counts().into_iter().map(|(reason, count)| (reason.to_owned(), count)).collect()
 }
 
 fn or_error<E: fmt::Display>(described: Result<SplitReport, E>) -> SplitReport {
     described.unwrap_or_else(|error| SplitReport { error: Some(error.to_string()), ..Default::default() })
 }
 
-/// Frames that the longest of the shortest stretches has, and how many scenes have as many.
+/// Returns the frames that `data.views` needs, and the number of scenes that have them.
 fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
     let views = &config.data.views;
     let gaps = (views.min_context..=views.max_context).map(|num_context| views.gap_bounds(u64::MAX, num_context)[0]);
     let needed = gaps.max().unwrap_or(0) + 1;
     let mut num_long = 0;
     for scene in 0..source.num_scenes() {
-        // A scene that cannot be read is named where the scenes are described.
+        // Unreadable scenes are part of the description.
         num_long += usize::from(source.num_frames(scene).is_ok_and(|count| count >= needed));
     }
     [needed, num_long]
@@ -147,11 +131,11 @@ fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
 fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport {
     let reader = ClipReader { source, options: config.data.clip_options() };
     match evaluation_items(&config.eval, &reader) {
-        Ok((items, ledger)) => EvaluationReport {
+        Ok((items, skips)) => EvaluationReport {
             error: None,
             num_scenes: items.len(),
             num_views: items.iter().map(|item| item.views.target.len()).sum(),
-            skipped: counts(&ledger),
+            skipped: counts(&skips),
         },
         Err(error) => EvaluationReport { error: Some(error.to_string()), ..Default::default() },
     }
@@ -160,21 +144,18 @@ fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport
 /// Arguments of `clift data info`.
 #[derive(Debug, clap::Args)]
 pub struct InfoArgs {
-    /// A folder of scenes, one scene, a config (TOML) or an evaluation index (JSON)
+    /// Data set, one scene, config (TOML) or evaluation index (JSON)
     #[arg(value_name = "DIR|CONFIG|INDEX")]
     pub path: PathBuf,
-    /// Change a key of the config: `--set data.filters.min_frames=60`
+    /// Override a key of the config, e.g. data.filters.min_frames=60; repeatable
     #[arg(long, value_name = "KEY=TOML")]
     pub set: Vec<String>,
-    /// Also write it to a JSON file
-    #[arg(long, value_name = "FILE")]
-    pub json: Option<PathBuf>,
+    #[command(flatten)]
+    pub json: JsonArg,
 }
 
 #[cfg(test)]
 mod tests {
-    use std::path::PathBuf;
-
     use super::*;
 
     fn fixtures() -> PathBuf {
@@ -182,12 +163,12 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_is_described_split_by_split() {
-        let text = of_folder(&fixtures()).unwrap().to_string();
+    fn folder_is_described_split_by_split() {
+        let text = describe_folder(&fixtures()).unwrap().to_string();
         let expected = "layout            chunks
 train             2 scenes
   frames          8 / 8 / 8 (smallest / median / largest)
-  picture         64x36
+  image           64x36
   field of view   58.1 / 58.1 / 58.1 deg
   path extent     0.350 / 0.350 / 0.350
 test              1 scene
@@ -196,35 +177,26 @@ test              1 scene
     }
 
     #[test]
-    fn a_config_is_described_with_what_its_filters_views_and_evaluation_leave() {
+    fn config_is_described_with_its_remaining_scenes() {
         let mut config = Config::default();
         (config.data.source, config.data.root) = (SourceKind::Chunks, Some(fixtures()));
         (config.data.width, config.data.height) = (48, 32);
         config.data.filters.min_frames = 8;
         config.eval.index = Some(fixtures().join("evaluation_index.json"));
-        let text = of_config(Path::new("a.toml"), &config).unwrap().to_string();
+        let text = describe_config(Path::new("a.toml"), &config).unwrap().to_string();
         assert!(text.contains("  long enough     0 of 2: data.views needs 46 frames"), "{text}");
-        assert!(text.contains("evaluation        4 views of 1 scene\n  left out        2 without views"), "{text}");
+        assert!(text.contains("evaluation        4 views of 1 scene\n  skipped         2 without views"), "{text}");
         assert!(text.ends_with("tokens per scene  96 to 144"), "{text}");
 
         config.data.filters.min_frames = 9;
-        let report = of_config(Path::new("a.toml"), &config).unwrap();
+        let report = describe_config(Path::new("a.toml"), &config).unwrap();
         let error = report.splits["train"].error.as_deref().unwrap();
         assert!(error.contains("0 of 2 scenes used; 2 shorter than 9 frames"), "{error}");
         assert!(report.evaluation.is_none());
     }
 
     #[test]
-    fn a_folder_without_scenes_says_what_was_looked_for_and_one_inside_a_split_is_described() {
-        let error = of_folder(Path::new(env!("CARGO_MANIFEST_DIR"))).unwrap_err();
-        assert!(error.to_string().starts_with("no scenes found: looked for index.json with chunks, "), "{error}");
-        assert_eq!(crate::exit_code::exit_code(&error), crate::exit_code::WRONG_USAGE);
-        let text = of_folder(&fixtures().join("train")).unwrap().to_string();
-        assert!(text.starts_with("layout            chunks\nall               2 scenes\n"), "{text}");
-    }
-
-    #[test]
-    fn scenes_left_out_are_named_with_their_reason_and_one_bad_scene_hides_no_other() {
+    fn skipped_scenes_are_listed_with_reasons() {
         let root = tempfile::tempdir().unwrap();
         let train = root.path().join("train");
         std::fs::create_dir(&train).unwrap();
@@ -232,39 +204,39 @@ test              1 scene
         std::fs::write(train.join("000001.torch"), "cut").unwrap();
         let index = r#"{"00000000000000a1": "000000.torch", "elsewhere": "000000.torch", "cut": "000001.torch"}"#;
         std::fs::write(train.join("index.json"), index).unwrap();
-        let report = of_folder(root.path()).unwrap();
+        let report = describe_folder(root.path()).unwrap();
         let split = &report.splits["train"];
         assert!(split.error.is_none() && split.info.is_some());
         let keys: Vec<&str> = split.left_out.iter().map(|skip| skip.key.as_str()).collect();
         assert!(keys.contains(&"cut") && keys.contains(&"elsewhere"), "{keys:?}");
         let text = report.to_string();
         assert!(text.contains("train             1 of "), "{text}");
-        for expected in ["  left out        cut: bad chunk: ", "  left out        elsewhere: bad chunk: "] {
+        for expected in ["  skipped         cut: bad chunk: ", "  skipped         elsewhere: bad chunk: "] {
             assert!(text.contains(expected), "{text}");
         }
     }
 
     #[test]
-    fn a_single_capture_that_cannot_be_used_is_no_half() {
+    fn unusable_capture_has_no_split() {
         let root = tempfile::tempdir().unwrap();
         std::fs::write(root.path().join("transforms.json"), r#"{"fl_x": 20, "frames": []}"#).unwrap();
-        let text = of_folder(root.path()).unwrap().to_string();
+        let text = describe_folder(root.path()).unwrap().to_string();
         assert!(text.starts_with("all               bad scene: it lists no frames: "), "{text}");
     }
 
     #[test]
-    fn frames_without_a_picture_are_listed_scene_by_scene() {
+    fn skipped_frames_are_listed_by_scene() {
         let mut split = SplitReport { num_scenes: 1, num_used: 1, num_described: 1, ..SplitReport::default() };
-        let mut ledger = SkipReport::new(1);
+        let mut skips = SkipReport::new(1);
         for name in ["0005.jpg", "0016.jpg"] {
-            ledger.skip_frame("fox", name, "without a picture");
+            skips.skip_frame("fox", name, "without a picture");
         }
-        (split.frames, split.notes) = (ledger.frames, vec!["both halves are the same scenes".into()]);
+        (split.frames, split.notes) = (skips.frames, vec!["both halves are the same scenes".into()]);
         let splits = BTreeMap::from([("all".into(), split)]);
         let text = Report { layout: Some(SourceKind::Captures), splits, ..Report::default() }.to_string();
         let expected = "layout            captures
 all               1 scene
-  left out        of fox 2 frames without a picture: 0005.jpg, 0016.jpg
+  skipped         of fox 2 frames without a picture: 0005.jpg, 0016.jpg
   note            both halves are the same scenes";
         assert_eq!(text, expected);
     }

@@ -1,4 +1,4 @@
-//! What `clift data info` tells, as a table and as JSON.
+//! Table and JSON of `clift data info`.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -7,63 +7,63 @@ use std::path::PathBuf;
 use clift_data::{SkippedFrame, SkippedScene, SourceInfo, SourceKind};
 use serde::Serialize;
 
-use crate::commands::data::text::count;
+use crate::output::units::plural;
 
-/// Scenes whose frames are named; JSON has all.
-const MAX_SCENES_NAMED: usize = 20;
-/// Frames that are named of one scene.
-const MAX_FRAMES_NAMED: usize = 50;
+/// Most scenes, and groups of scenes, that the table lists; the JSON lists all.
+const MAX_LISTED_SCENES: usize = 20;
+/// Most frames of one scene that the table lists.
+const MAX_LISTED_FRAMES: usize = 50;
 
-/// What is told about a folder or a config.
+/// Description of a data set or of a config's use of one.
 #[derive(Debug, Default, Serialize)]
 pub struct Report {
-    /// What was looked at.
+    /// Path of the data set or config.
     pub path: PathBuf,
-    /// How the scenes lie on disk; for a folder.
+    /// Detected layout of a data set.
     pub layout: Option<SourceKind>,
-    /// By name; `all` for a folder without `train/` and `test/`.
+    /// Splits by name; `all` for a data set without splits.
     pub splits: BTreeMap<String, SplitReport>,
-    /// Scenes that are evaluated, or why there are none; for a config.
+    /// Scenes of the evaluation of a config.
     pub evaluation: Option<EvaluationReport>,
-    /// Tokens of a scene with the fewest and the most contexts; for a config.
+    /// Tokens per scene of a config, with the fewest and the most contexts.
     pub num_tokens: Option<[usize; 2]>,
 }
 
-/// One half of a data set.
+/// Description of one split.
 #[derive(Debug, Default, Serialize)]
 pub struct SplitReport {
-    /// Why the split cannot be used.
+    /// Reason why the split is not usable.
     pub error: Option<String>,
-    /// Scenes there are.
+    /// Number of scenes.
     pub num_scenes: usize,
-    /// Scenes the filters leave.
+    /// Number of scenes after the filters.
     pub num_used: usize,
-    /// Scenes the filters leave out, by reason.
+    /// Number of skipped scenes by reason.
     pub skipped: BTreeMap<String, usize>,
-    /// The same scenes one by one, each with its reason.
+    /// Skipped scenes, each with its reason.
     pub left_out: Vec<SkippedScene>,
-    /// Frames left out of scenes.
+    /// Skipped frames, each with its reason.
     pub frames: Vec<SkippedFrame>,
-    /// What else is to be known.
+    /// Notes on the split.
     pub notes: Vec<String>,
-    /// Scenes that `info` describes: the first of many synthetic ones, otherwise all that are used.
+    /// Number of scenes that `info` describes: all used scenes, or the first synthetic ones.
     pub num_described: usize,
-    /// Their description.
+    /// Sizes and extents of these scenes.
     pub info: Option<SourceInfo>,
-    /// Frames that `data.views` needs, and how many of the described scenes have them; for training scenes.
+    /// Frames that `data.views` needs, and the number of described scenes that have them; for training scenes.
     pub views: Option<[usize; 2]>,
 }
 
-/// What an evaluation takes.
+/// Scenes of an evaluation.
 #[derive(Debug, Default, Serialize)]
 pub struct EvaluationReport {
-    /// Why nothing can be evaluated.
+    /// Reason why no scene can be evaluated.
     pub error: Option<String>,
-    /// Scenes.
+    /// Number of scenes.
     pub num_scenes: usize,
-    /// Target views of all scenes.
+    /// Number of target views of all scenes.
     pub num_views: usize,
-    /// Scenes left out, by reason.
+    /// Number of skipped scenes by reason.
     pub skipped: BTreeMap<String, usize>,
 }
 
@@ -76,15 +76,15 @@ impl fmt::Display for Report {
         let names = if self.splits.contains_key("all") { &["all"][..] } else { &["train", "test"] };
         for name in names {
             match self.splits.get(*name) {
-                None => rows.push((name, "not there".into())),
+                None => rows.push((name, "not found".into())),
                 Some(split) => split.rows(name, &mut rows),
             }
         }
         if let Some(evaluation) = &self.evaluation {
             let counted =
-                format!("{} of {}", count(evaluation.num_views, "view"), count(evaluation.num_scenes, "scene"));
+                format!("{} of {}", plural(evaluation.num_views, "view"), plural(evaluation.num_scenes, "scene"));
             rows.push(("evaluation", evaluation.error.clone().unwrap_or(counted)));
-            left_out(&evaluation.skipped, &mut rows);
+            rows.extend(evaluation.skipped.iter().map(|(reason, count)| ("  skipped", format!("{count} {reason}"))));
         }
         match self.num_tokens {
             Some([fewest, most]) if fewest == most => rows.push(("tokens per scene", fewest.to_string())),
@@ -96,44 +96,36 @@ impl fmt::Display for Report {
     }
 }
 
-fn left_out(skipped: &BTreeMap<String, usize>, rows: &mut Vec<(&str, String)>) {
-    rows.extend(skipped.iter().map(|(reason, count)| ("  left out", format!("{count} {reason}"))));
+/// Formats up to `most` names, with `..` for the others.
+fn first_names(names: &[&str], most: usize) -> String {
+    let more = if names.len() > most { ", .." } else { "" };
+    format!("{}{more}", names[..names.len().min(most)].join(", "))
 }
 
-/// Names the scenes that are left out, reason by reason.
-fn scenes_left_out(skips: &[SkippedScene], rows: &mut Vec<(&str, String)>) {
+/// Appends the skipped scenes by reason, then the skipped frames by scene and reason.
+fn skipped_rows(scenes: &[SkippedScene], frames: &[SkippedFrame], rows: &mut Vec<(&str, String)>) {
     let mut keys: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
-    for SkippedScene { key, reason } in skips {
+    for SkippedScene { key, reason } in scenes {
         keys.entry(reason).or_default().push(key);
     }
-    let num_reasons = keys.len();
-    for (reason, keys) in keys.into_iter().take(MAX_SCENES_NAMED) {
-        let more = if keys.len() > MAX_SCENES_NAMED { ", .." } else { "" };
-        let shown = keys[..keys.len().min(MAX_SCENES_NAMED)].join(", ");
-        rows.push(match keys.len() {
-            1 => ("  left out", format!("{shown}: {reason}")),
-            number => ("  left out", format!("{number} {reason}: {shown}{more}")),
-        });
-    }
-    if num_reasons > MAX_SCENES_NAMED {
-        rows.push(("  left out", format!("scenes for {} more reasons", num_reasons - MAX_SCENES_NAMED)));
-    }
-}
-
-/// Names the frames that are left out, scene by scene and reason by reason.
-fn frames_left_out(frames: &[SkippedFrame], rows: &mut Vec<(&str, String)>) {
+    let scenes = keys.iter().map(|(reason, keys)| match keys[..] {
+        [key] => format!("{key}: {reason}"),
+        _ => format!("{} {reason}: {}", keys.len(), first_names(keys, MAX_LISTED_SCENES)),
+    });
     let mut names: BTreeMap<(&str, &str), Vec<&str>> = BTreeMap::new();
     for SkippedFrame { key, frame, reason } in frames {
         names.entry((key, reason)).or_default().push(frame);
     }
-    let num_groups = names.len();
-    for ((key, reason), names) in names.into_iter().take(MAX_SCENES_NAMED) {
-        let more = if names.len() > MAX_FRAMES_NAMED { ", .." } else { "" };
-        let shown = names[..names.len().min(MAX_FRAMES_NAMED)].join(", ");
-        rows.push(("  left out", format!("of {key} {} {reason}: {shown}{more}", count(names.len(), "frame"))));
-    }
-    if num_groups > MAX_SCENES_NAMED {
-        rows.push(("  left out", format!("frames of {} more scenes", num_groups - MAX_SCENES_NAMED)));
+    let frames = names.iter().map(|((key, reason), names)| {
+        format!("of {key} {} {reason}: {}", plural(names.len(), "frame"), first_names(names, MAX_LISTED_FRAMES))
+    });
+    for (mut groups, more) in
+        [(scenes.collect::<Vec<_>>(), "scenes for {} more reasons"), (frames.collect(), "frames of {} more scenes")]
+    {
+        let num_more = groups.len().saturating_sub(MAX_LISTED_SCENES);
+        groups.truncate(MAX_LISTED_SCENES);
+        groups.extend((num_more > 0).then(|| more.replace("{}", &num_more.to_string())));
+        rows.extend(groups.into_iter().map(|group| ("  skipped", group)));
     }
 }
 
@@ -146,22 +138,21 @@ impl SplitReport {
         let used = if self.skipped.is_empty() { String::new() } else { format!("{} of ", self.num_used) };
         let first = format!("; described by the first {}", self.num_described);
         let first = if self.num_described < self.num_used { first.as_str() } else { "" };
-        rows.push((name, format!("{used}{}{first}", count(self.num_scenes, "scene"))));
-        scenes_left_out(&self.left_out, rows);
-        frames_left_out(&self.frames, rows);
+        rows.push((name, format!("{used}{}{first}", plural(self.num_scenes, "scene"))));
+        skipped_rows(&self.left_out, &self.frames, rows);
         rows.extend(self.notes.iter().map(|note| ("  note", note.clone())));
         let Some(info) = &self.info else { return };
-        for SkippedScene { key, reason } in info.unreadable.iter().take(MAX_SCENES_NAMED) {
+        for SkippedScene { key, reason } in info.unreadable.iter().take(MAX_LISTED_SCENES) {
             rows.push(("  unreadable", format!("{key}: {reason}")));
         }
-        if info.unreadable.len() > MAX_SCENES_NAMED {
-            rows.push(("  unreadable", format!("{} more scenes", info.unreadable.len() - MAX_SCENES_NAMED)));
+        if info.unreadable.len() > MAX_LISTED_SCENES {
+            rows.push(("  unreadable", format!("{} more scenes", info.unreadable.len() - MAX_LISTED_SCENES)));
         }
         if let Some(frames) = info.num_frames {
             rows.push(("  frames", format!("{frames} (smallest / median / largest)")));
         }
         if let Some([width, height]) = info.image_size {
-            rows.push(("  picture", format!("{width}x{height}")));
+            rows.push(("  image", format!("{width}x{height}")));
         }
         if let Some(fov) = info.fov_deg {
             rows.push(("  field of view", format!("{fov:.1} deg")));
@@ -171,7 +162,7 @@ impl SplitReport {
         }
         if let Some([needed, num_long]) = self.views {
             let of = self.num_described;
-            rows.push(("  long enough", format!("{num_long} of {of}: data.views needs {}", count(needed, "frame"))));
+            rows.push(("  long enough", format!("{num_long} of {of}: data.views needs {}", plural(needed, "frame"))));
         }
     }
 }

@@ -1,8 +1,8 @@
-//! `clift data`.
+//! `clift data`: create, inspect, check, convert and index data sets.
 //!
 //! - `synth`: `clift data synth`
+//! - `info_report`: table and JSON of `clift data info`
 //! - `info`: `clift data info`
-//! - `info_report`: its table and JSON
 //! - `check`: `clift data check`
 //! - `convert`: `clift data convert`
 //! - `index`: `clift data index`
@@ -15,4 +15,3 @@ pub(crate) mod index;
 pub(crate) mod info;
 pub(crate) mod info_report;
 pub(crate) mod synth;
-pub(crate) mod text;

@@ -1,35 +1,32 @@
-//! The adapters that the device `wgpu` can be, with the limits that matter.
+//! Table of the GPU adapters for `wgpu`, with their limits.
 
 use clift_model::{ADAPTER_VARIABLE, Adapter, adapters};
 
-use crate::output::table;
-use crate::output::units::bytes;
+use crate::output::table::table;
+use crate::output::units::memory_size;
 
-/// Adapters and their limits, or why there are none; nothing in a build without `wgpu`.
-pub fn shown() -> Option<String> {
+/// Formats the adapters with their limits, or the reason why there are none; `None` in a build without `wgpu`.
+pub fn adapter_text() -> Option<String> {
     if !cfg!(feature = "wgpu") {
         return None;
     }
-    // Drivers that fail do so in many ways.
-    let found = clift_bench::caught(adapters);
-    Some(match found {
-        Ok(found) if found.is_empty() => "\nno adapter for wgpu: install a Vulkan driver".into(),
-        Ok(found) => format!("\n{}", text(&found)),
-        Err(panic) => format!("\nno adapter for wgpu: panicked: {panic}"),
+    // Drivers may panic.
+    Some(match clift_bench::caught(adapters) {
+        Ok(found) if found.is_empty() => "\nno adapter for wgpu; install a Vulkan driver".into(),
+        Ok(found) => format!("\n{}", adapter_table(&found)),
+        Err(panic) => format!("\nno adapter for wgpu: the driver panicked: {panic}"),
     })
 }
 
-const HEADER: [&str; 7] = ["adapter of wgpu", "kind", "API", "driver", "largest tensor", "workgroup", "f16"];
-
-fn text(adapters: &[Adapter]) -> String {
-    let rows: Vec<_> = [HEADER.map(String::from)].into_iter().chain(adapters.iter().map(cells)).collect();
-    let mut lines = vec![table::columns(&rows)];
+fn adapter_table(adapters: &[Adapter]) -> String {
+    let header = ["adapter of wgpu", "kind", "API", "driver", "largest tensor", "workgroup", "f16"];
+    let mut lines = vec![table(header, adapters.iter().map(cells))];
     let details = adapters.iter().map(|adapter| {
         let Adapter { name, limits, .. } = adapter;
         format!(
-            "{name}: a shader sees {} of a buffer at once, a buffer has at most {}, a launch {} workgroups a side",
-            bytes(limits.max_binding_bytes),
-            bytes(limits.max_buffer_bytes),
+            "{name}: at most {} per binding, {} per buffer, {} workgroups per dimension",
+            memory_size(limits.max_binding_bytes),
+            memory_size(limits.max_buffer_bytes),
             limits.max_workgroups
         )
     });
@@ -39,10 +36,10 @@ fn text(adapters: &[Adapter]) -> String {
             let others = adapters.iter().filter(|adapter| !adapter.is_used);
             let others = others.map(|adapter| format!("{ADAPTER_VARIABLE}='{}'", adapter.selector));
             let others = others.collect::<Vec<_>>().join(" or ");
-            lines.push(format!("wgpu is {}; to choose another: {others}", used.name));
+            lines.push(format!("wgpu uses {}; select another with {others}", used.name));
         }
-        Some(used) => lines.push(format!("wgpu is {}", used.name)),
-        None => lines.push(format!("{ADAPTER_VARIABLE} names none of them")),
+        Some(used) => lines.push(format!("wgpu uses {}", used.name)),
+        None => lines.push(format!("{ADAPTER_VARIABLE} matches no adapter")),
     }
     lines.join("\n")
 }
@@ -54,7 +51,7 @@ fn cells(adapter: &Adapter) -> [String; 7] {
         (*kind).into(),
         api.clone(),
         driver.clone(),
-        bytes(limits.max_tensor_bytes()),
+        memory_size(limits.max_tensor_bytes()),
         format!("{} threads, {} KiB", limits.max_workgroup_threads, limits.max_workgroup_bytes >> 10),
         if *has_f16 { "yes" } else { "no" }.into(),
     ]
@@ -67,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn several_adapters_say_which_is_used_and_how_to_choose_another() {
+    fn table_names_the_used_adapter_and_the_others() {
         let limits = Limits {
             max_binding_bytes: (1 << 31) - 4,
             max_buffer_bytes: 1 << 40,
@@ -89,10 +86,10 @@ mod tests {
 adapter of wgpu  kind          API     driver     largest tensor  workgroup             f16
 Card 0           discrete GPU  Vulkan  maker 1.2  2.00 GiB        1024 threads, 48 KiB  no
 Card 1           discrete GPU  Vulkan  maker 1.2  2.00 GiB        1024 threads, 48 KiB  yes
-Card 0: a shader sees 2.00 GiB of a buffer at once, a buffer has at most 1024.00 GiB, a launch 65535 workgroups a side
-Card 1: a shader sees 2.00 GiB of a buffer at once, a buffer has at most 1024.00 GiB, a launch 65535 workgroups a side
-wgpu is Card 0; to choose another: CUBECL_WGPU_DEFAULT_DEVICE='DiscreteGpu(1)'";
-        assert_eq!(text(&[adapter(0), adapter(1)]), expected);
-        assert!(text(&[adapter(1)]).ends_with("names none of them"));
+Card 0: at most 2.00 GiB per binding, 1024.00 GiB per buffer, 65535 workgroups per dimension
+Card 1: at most 2.00 GiB per binding, 1024.00 GiB per buffer, 65535 workgroups per dimension
+wgpu uses Card 0; select another with CUBECL_WGPU_DEFAULT_DEVICE='DiscreteGpu(1)'";
+        assert_eq!(adapter_table(&[adapter(0), adapter(1)]), expected);
+        assert!(adapter_table(&[adapter(1)]).ends_with("matches no adapter"));
     }
 }

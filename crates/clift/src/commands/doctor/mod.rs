@@ -1,4 +1,4 @@
-//! `clift doctor`.
+//! `clift doctor`: check the devices of this machine.
 //!
 //! - `args`: arguments of `clift doctor`
 //! - `adapters`: the adapter table

@@ -1,4 +1,4 @@
-//! `clift doctor --stability`: the hard cases.
+//! `clift doctor --stability`.
 
 use anyhow::Context;
 use clift_bench::{Size, StabilityRow, run_stability, stability_markdown, stability_text};
@@ -8,21 +8,22 @@ use clift_model::DeviceName;
 use crate::commands::doctor::args::DoctorArgs;
 use crate::output::stdout::{print_note, print_result};
 
-/// Runs every case on every device of the build, and fails if one is beyond its bound.
+/// Runs every case on every device of the build.
+///
+/// # Errors
+/// If an error exceeds its bound.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
     let size = if args.small { Size::Small } else { Size::Full };
     let rows = run_stability(&devices, size, &mut |row| print_note(&line(&devices, row)))?;
     if let Some(path) = &args.markdown {
-        let text = format!("{}\n{}\n", head(args.small), stability_markdown(&devices, &rows));
+        let text = format!("{}\n{}\n", markdown_head(args.small), stability_markdown(&devices, &rows));
         replace_file(path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
         print_result(&format!("table: {}", path.display()))?;
     }
-    let broken = rows.iter().filter(|row| !row.holds()).count();
-    print_result(&format!("{} of {} cases hold on {}", rows.len() - broken, rows.len(), names(&devices)))?;
-    if broken > 0 {
-        return Err(anyhow::anyhow!("{broken} cases do not hold"));
-    }
+    let failed = rows.iter().filter(|row| !row.holds()).count();
+    print_result(&format!("{} of {} cases within bounds on {}", rows.len() - failed, rows.len(), names(&devices)))?;
+    anyhow::ensure!(failed == 0, "{failed} cases exceed their bound");
     Ok(())
 }
 
@@ -36,8 +37,8 @@ fn line(devices: &[DeviceName], row: &StabilityRow) -> String {
     format!("{}: {}", row.case.name, outcomes.collect::<Vec<_>>().join(", "))
 }
 
-/// What stands above the table.
-fn head(small: bool) -> String {
+/// Returns the text above the Markdown table.
+fn markdown_head(small: bool) -> String {
     let command = if small { "clift doctor --stability --small" } else { "clift doctor --stability" };
     format!(
         "# Numbers on hard scenes

@@ -1,4 +1,4 @@
-//! The frames of a path, on disk.
+//! Renders the frames of a path and writes them.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,36 +9,35 @@ use clift_eval::{Animation, Canvas};
 use clift_model::{SceneRenderer, ViewCamera};
 use clift_train::TrainError;
 
-use crate::exit_code::UsageError;
+use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
 
-/// Median seconds per frame.
+/// Median seconds per frame: token selection and rendering.
 pub struct Timing {
     pub select_s: f64,
     pub render_s: f64,
 }
 
-/// What is drawn of every view.
+/// Settings of all frames.
 pub struct Frames {
     pub height: usize,
     pub width: usize,
     pub num_render_tokens: usize,
-    /// Per second of the animation.
+    /// Frames per second of the animation.
     pub fps: u16,
 }
 
-/// Frames of a former path would mix with those of this one.
-pub fn refuse_existing(out: &Path) -> anyhow::Result<()> {
+/// Checks that the output folder is empty or absent: frames of another path would mix with the new ones.
+pub fn require_empty(out: &Path) -> anyhow::Result<()> {
     if is_empty_folder(out).with_context(|| format!("reading {}", out.display()))? {
         return Ok(());
     }
-    let message = "is not empty, and nothing is written over; choose another folder or move it away";
-    Err(UsageError(format!("{} {message}", out.display())).into())
+    usage_bail!("output folder {} is not empty; choose another folder or move it away", out.display())
 }
 
-/// Draws every view and writes the frames to `folder`, one by one and as an animation, until `stop` is set.
+/// Renders every view and writes the frames and the animation to `folder`, until `stop` is set.
 pub fn write_frames(
-    viewer: &mut SceneRenderer,
+    renderer: &mut SceneRenderer,
     views: &[ViewCamera],
     frames: &Frames,
     folder: &Path,
@@ -48,19 +47,19 @@ pub fn write_frames(
     let mut animation = Animation::new(&folder.join("animation.png"), width, height, views.len(), fps)?;
     let mut counter = Counter::new("frames", views.len() as u64);
     let (mut select_s, mut render_s) = (Vec::new(), Vec::new());
-    for some in views.chunks(viewer.frames_per_call(height, width)) {
+    for some in views.chunks(renderer.frames_per_call(height, width)) {
         let first = render_s.len();
         if stop.load(Ordering::Relaxed) {
             let work = format!("frame {first} of {}", views.len());
             return Err(TrainError::Abandoned { work }.into());
         }
-        let drawn = viewer.draw(some, height, width, num_render_tokens);
-        for drawn in drawn.with_context(|| format!("drawing frames {first} to {}", first + some.len() - 1))? {
-            let picture = Canvas::from_unit(&drawn.pixels, height, width)?;
-            picture.write_png(&folder.join(format!("frame-{:05}.png", render_s.len())))?;
-            animation.add(&picture)?;
-            select_s.push(drawn.select_s);
-            render_s.push(drawn.render_s);
+        let rendered = renderer.draw(some, height, width, num_render_tokens);
+        for view in rendered.with_context(|| format!("rendering frames {first} to {}", first + some.len() - 1))? {
+            let image = Canvas::from_unit(&view.pixels, height, width)?;
+            image.write_png(&folder.join(format!("frame-{:05}.png", render_s.len())))?;
+            animation.add(&image)?;
+            select_s.push(view.select_s);
+            render_s.push(view.render_s);
         }
         counter.set(render_s.len() as u64);
     }

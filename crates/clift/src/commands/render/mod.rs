@@ -1,4 +1,4 @@
-//! `clift render`.
+//! `clift render`: frames of a scene file along a camera path.
 //!
 //! - `args`: arguments of `clift render`
 //! - `frames`: render and write every frame

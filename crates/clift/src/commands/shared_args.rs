@@ -1,0 +1,99 @@
+//! Arguments that several commands share.
+
+use std::path::{Path, PathBuf};
+
+use clift_data::ImageEncoding;
+use clift_model::DeviceName;
+use clift_train::{Config, Override, TrainError, read_checked_config};
+use serde::Serialize;
+
+use crate::exit_code::usage_bail;
+use crate::output::json::write_json;
+use crate::output::stdout::{print_note, print_result};
+
+/// Options that override keys of a config.
+#[derive(Debug, clap::Args)]
+pub struct ConfigArgs {
+    /// Override a key of the config, e.g. stage1.steps=100; repeatable
+    #[arg(long, value_name = "KEY=TOML")]
+    pub set: Vec<String>,
+    /// Select the device: flex, ndarray or wgpu [default: `device` of the config]
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<DeviceName>,
+}
+
+impl ConfigArgs {
+    /// Reads a config with these overrides and checks its values.
+    ///
+    /// # Errors
+    /// As [`read_config`].
+    pub fn read(&self, path: &Path, check: impl FnOnce(&Config) -> Result<(), TrainError>) -> anyhow::Result<Config> {
+        let (mut config, _) = read_config(path, &self.set, check)?;
+        config.device = self.device.unwrap_or(config.device);
+        Ok(config)
+    }
+}
+
+/// Reads a config, applies the overrides of `--set`, checks the values and prints what changed.
+///
+/// # Errors
+/// [`clift_train::ConfigError`] for a file or an override that is no valid config, and the errors of `check`.
+pub fn read_config(
+    path: &Path,
+    set: &[String],
+    check: impl FnOnce(&Config) -> Result<(), TrainError>,
+) -> anyhow::Result<(Config, Vec<Override>)> {
+    let (config, overrides) = read_checked_config(path, set, check)?;
+    overrides.iter().for_each(|change| print_note(&change.to_string()));
+    Ok((config, overrides))
+}
+
+/// The option `--json`.
+#[derive(Debug, clap::Args)]
+pub struct JsonArg {
+    /// Write the results as JSON
+    #[arg(long = "json", value_name = "FILE")]
+    pub path: Option<PathBuf>,
+}
+
+impl JsonArg {
+    /// Checks that the folder of the file exists, before a command that takes minutes.
+    pub fn check_folder(&self) -> anyhow::Result<()> {
+        match self.path.as_deref().and_then(Path::parent) {
+            Some(folder) if !folder.as_os_str().is_empty() && !folder.is_dir() => {
+                usage_bail!("--json: no folder {}; create it first", folder.display())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Writes the file, if one is given, and prints its path.
+    pub fn write(&self, results: &impl Serialize) -> anyhow::Result<()> {
+        let Some(path) = &self.path else { return Ok(()) };
+        write_json(results, path)?;
+        print_result(&format!("results: {}", path.display()))
+    }
+}
+
+/// Options of written scenes.
+#[derive(Debug, clap::Args)]
+pub struct ChunkArgs {
+    /// Set the size at which a chunk is closed, in MB of images
+    #[arg(long, value_name = "M", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..=4000))]
+    pub chunk_mb: u64,
+    /// Encode images as JPEG of this quality, 1 to 100 [default: lossless PNG]
+    #[arg(long, value_name = "Q", value_parser = clap::value_parser!(u8).range(1..=100))]
+    pub quality: Option<u8>,
+}
+
+impl ChunkArgs {
+    /// Returns the bytes of images at which a chunk is closed.
+    pub fn target_bytes(&self) -> u64 {
+        self.chunk_mb * 1_000_000
+    }
+
+    /// Returns the encoding of images that are encoded.
+    pub fn encoding(&self) -> ImageEncoding {
+        self.quality.map_or(ImageEncoding::Png, ImageEncoding::Jpeg)
+    }
+}

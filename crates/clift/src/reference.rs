@@ -1,0 +1,144 @@
+//! Generates `docs/reference/cli.md` from the command tree and `docs/reference/config.md` from the doc comments and
+//! defaults of [`Config`]. `CLIFT_UPDATE=1 cargo test --release --workspace --lib reference` rewrites both pages.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::fs;
+use std::path::Path;
+
+use clap::builder::StyledStr;
+use clap::{Arg, Command, CommandFactory};
+use clift_train::Config;
+use toml::{Table, Value};
+
+use crate::cli::Args;
+
+/// Structs of the source files by name: doc comment, and name, type and doc comment of each public field.
+type Structs = BTreeMap<String, (String, Vec<[String; 3]>)>;
+
+fn compare(path: &str, text: &str) {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path);
+    if std::env::var_os("CLIFT_UPDATE").is_some() {
+        fs::write(&path, text).expect("writable page");
+    }
+    let page = fs::read_to_string(&path).unwrap_or_default();
+    assert!(page == text, "{} is outdated; `CLIFT_UPDATE=1` rewrites the page", path.display());
+}
+
+#[test]
+fn cli_page_is_current() {
+    let mut command = Args::command();
+    command.build();
+    let mut page = "# Command line\n\nGenerated from `clift --help`.\n".to_owned();
+    add_command(&command, &mut page);
+    compare("docs/reference/cli.md", &page);
+}
+
+/// Adds a command, its arguments and its subcommands.
+fn add_command(command: &Command, page: &mut String) {
+    let (name, about) = (command.get_bin_name().unwrap_or("clift"), command.get_long_about().or(command.get_about()));
+    let usage = command.clone().render_usage().to_string().replace("Usage: ", "");
+    write!(page, "\n## {name}\n\n{}\n\n```text\n{}\n```\n", text(about), usage.trim()).unwrap();
+    let is_listed = |arg: &&Arg| !["help", "version"].contains(&arg.get_id().as_str());
+    let arguments = command.get_arguments().filter(is_listed).map(|arg| (argument(arg), help(arg)));
+    let children: Vec<&Command> = command.get_subcommands().filter(|child| child.get_name() != "help").collect();
+    let commands = children.iter().map(|child| (child.get_bin_name().unwrap().to_owned(), text(child.get_about())));
+    for (i, (name, help)) in arguments.chain(commands).enumerate() {
+        let short = help.split(['[', '\n']).next().unwrap_or_default().trim();
+        assert!(short.chars().count() <= 80 && !short.ends_with('.'), "{name}: {short}");
+        let head = if i == 0 { "\n| argument | |\n|---|---|\n" } else { "" };
+        writeln!(page, "{head}| `{name}` | {} |", cell(&help)).unwrap();
+    }
+    if let Some(after) = command.get_after_help() {
+        write!(page, "\n```text\n{after}\n```\n").unwrap();
+    }
+    children.into_iter().for_each(|child| add_command(child, page));
+}
+
+fn text(text: Option<&StyledStr>) -> String {
+    text.map(ToString::to_string).unwrap_or_default()
+}
+
+/// Formats the flags and the value of an argument: `-o, --out <FILE>`.
+fn argument(arg: &Arg) -> String {
+    let short = arg.get_short().map(|short| format!("-{short}"));
+    let flags: Vec<String> = short.into_iter().chain(arg.get_long().map(|long| format!("--{long}"))).collect();
+    let names = arg.get_value_names().filter(|_| arg.get_action().takes_values()).unwrap_or_default();
+    let value = names.iter().map(|name| format!("<{name}>"));
+    [flags.join(", ")].into_iter().chain(value).collect::<Vec<_>>().join(" ").trim().to_owned()
+}
+
+/// Formats the help of an argument with its default and possible values.
+fn help(arg: &Arg) -> String {
+    let mut help = text(arg.get_long_help().or(arg.get_help()));
+    if arg.get_action().takes_values() {
+        let values = |names: Vec<String>, label: &str| {
+            if names.is_empty() { String::new() } else { format!(" [{label}: {}]", names.join(", ")) }
+        };
+        help += &values(arg.get_default_values().iter().map(|value| value.display().to_string()).collect(), "default");
+        help += &values(arg.get_possible_values().iter().map(|value| value.get_name().into()).collect(), "values");
+    }
+    help
+}
+
+fn cell(text: &str) -> String {
+    text.replace("\n\n", ". ").replace('\n', " ").replace('|', "\\|").replace('<', "\\<")
+}
+
+#[test]
+fn config_page_is_current() {
+    let mut structs = Structs::new();
+    for name in ["clift-data", "clift-eval", "clift-model", "clift-train"] {
+        read_structs(&Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(name).join("src"), &mut structs);
+    }
+    let defaults = Table::try_from(Config::default()).expect("a table");
+    let mut page =
+        "# Config\n\nGenerated from the doc comments of `Config`. `--set KEY=TOML` overrides a key.\n".to_owned();
+    add_section("", &structs["Config"].1, &defaults, &structs, &mut page);
+    compare("docs/reference/config.md", &page);
+}
+
+/// Reads the structs of all source files below a folder.
+fn read_structs(folder: &Path, structs: &mut Structs) {
+    for entry in fs::read_dir(folder).expect("a folder") {
+        let path = entry.expect("an entry").path();
+        if path.is_dir() {
+            read_structs(&path, structs);
+            continue;
+        }
+        let (mut doc, mut name) = (String::new(), String::new());
+        for line in fs::read_to_string(&path).expect("a source file").lines() {
+            if let Some(text) = line.trim_start().strip_prefix("///") {
+                doc.push_str(text);
+            } else if let Some(declared) = line.strip_prefix("pub struct ").and_then(|line| line.strip_suffix(" {")) {
+                name = declared.to_owned();
+                structs.insert(name.clone(), (std::mem::take(&mut doc), Vec::new()));
+            } else if let Some((field, kind)) = line.strip_prefix("    pub ").and_then(|line| line.split_once(": "))
+                && let Some((_, fields)) = structs.get_mut(&name)
+            {
+                fields.push([field, kind.trim_end_matches(','), doc.trim()].map(String::from));
+                doc.clear();
+            } else if !line.trim_start().starts_with("#[") {
+                doc.clear();
+                name = if line.starts_with('}') { String::new() } else { name };
+            }
+        }
+    }
+}
+
+/// Adds the keys of a section, then the sections below it.
+fn add_section(path: &str, fields: &[[String; 3]], defaults: &Table, structs: &Structs, page: &mut String) {
+    let is_section =
+        |[name, kind, _]: &&[String; 3]| structs.contains_key(kind) && defaults.get(name).is_some_and(Value::is_table);
+    page.push_str("\n| key | default | |\n|---|---|---|\n");
+    for [name, _, doc] in fields.iter().filter(|field| !is_section(field)) {
+        let default = defaults.get(name).map_or("unset".to_owned(), |value| format!("`{value}`"));
+        writeln!(page, "| `{name}` | {default} | {} |", cell(doc)).unwrap();
+    }
+    for [name, kind, _] in fields.iter().filter(is_section) {
+        let path = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
+        let (doc, fields) = &structs[kind];
+        write!(page, "\n## [{path}]\n\n{}\n", doc.trim()).unwrap();
+        add_section(&path, fields, defaults[name].as_table().expect("a table"), structs, page);
+    }
+}
