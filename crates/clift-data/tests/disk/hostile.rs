@@ -63,7 +63,7 @@ fn errors_of_transforms_json_are_named() {
         ("\"OPENCV\"", "\"OPENCV_FISHEYE\"", "camera_model is OPENCV_FISHEYE, expected one of PINHOLE, "),
         ("\"fl_x\"", "\"is_fisheye\": true, \"fl_x\"", "camera_model is OPENCV_FISHEYE"),
         ("\"fl_x\"", "\"k4\": 0.1, \"fl_x\"", "k4 is 0.1: only lenses of"),
-        ("\"fl_x\"", "\"k1\": -9.5, \"fl_x\"", "cannot be undone at the edge of the picture"),
+        ("\"fl_x\"", "\"k1\": -9.5, \"fl_x\"", "cannot be undone at the edge of the image"),
         ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 1.0, 1.0]", "transform_matrix ends in [0.0, 0.0, 1.0, 1.0]"),
         ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]", "a list of more than 4 items"),
         ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0]", "invalid length 3"),

@@ -85,8 +85,8 @@ fn scenes_without_usable_images_report_the_reason() {
     }
     let ledger = open(scenes.path()).unwrap().report;
     let reason = |key: &str| ledger.skips.iter().find(|skip| skip.key == key).unwrap().reason.as_str();
-    assert!(reason("corrupt").contains("the picture cannot be read"), "{ledger}");
-    assert!(reason("cut").contains("the picture is truncated"), "{ledger}");
+    assert!(reason("corrupt").contains("the image cannot be read"), "{ledger}");
+    assert!(reason("cut").contains("the image is truncated"), "{ledger}");
     assert!(reason("empty").contains("it lists no frames"), "{ledger}");
     assert!(
         reason("heic").contains("none of its 2 frames can be used; 1.jpg is one whose picture is neither"),
@@ -103,7 +103,7 @@ fn scenes_without_usable_images_report_the_reason() {
     }
     fs::write(root.path().join("a".repeat(64)).join("0.jpg"), "no picture").unwrap();
     let ledger = open(root.path()).unwrap().report;
-    assert!(ledger.skips[0].reason.contains("the picture cannot be read"), "{ledger}");
+    assert!(ledger.skips[0].reason.contains("the image cannot be read"), "{ledger}");
 }
 
 #[test]
@@ -228,7 +228,7 @@ fn listed_scenes_missing_from_test_are_flagged() {
         let options = SourceOptions { kind: layout, files, ..SourceOptions::default() };
         let opened = open_at(root.path(), Split::Train, &options).unwrap();
         assert_eq!((opened.source.num_scenes(), opened.report.skips.len()), (1, 1));
-        let flagged = clift_data::left_out(&opened.report).into_iter();
+        let flagged = clift_data::skipped_scenes(&opened.report).into_iter();
         flagged.map(|check| (check.key, check.reasons.concat())).collect::<Vec<_>>()
     };
     let reason = "kept for testing by the list of test scenes, but not in test/".to_owned();

@@ -78,7 +78,7 @@ fn pinhole_lenses_change_nothing_and_impossible_ones_fail() {
         let lens = Lens { radial: [k1, 0.0, 0.0], ..Lens::default() };
         Undistortion::new(norm, lens).unwrap_err().to_string()
     };
-    assert!(message(norm, -2.0).contains("cannot be undone at the edge of the picture"), "{}", message(norm, -2.0));
-    assert!(message(IntrinsicsNorm { cx: 1.2, ..norm }, 0.01).contains("lies outside of the picture"));
+    assert!(message(norm, -2.0).contains("cannot be undone at the edge of the image"), "{}", message(norm, -2.0));
+    assert!(message(IntrinsicsNorm { cx: 1.2, ..norm }, 0.01).contains("lies outside of the image"));
     assert!(message(norm, f64::INFINITY).contains("k1 is inf"));
 }

@@ -4,7 +4,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clift_data::{CheckedScene, SceneCheck, Split, check_scene, encode_png, left_out, note_frames, replace_file};
+use clift_data::{
+    CheckedScene, SceneCheck, Split, check_scene, encode_png, note_skipped_frames, replace_file, skipped_scenes,
+};
 use serde::Serialize;
 
 use crate::commands::data::text::count;
@@ -60,15 +62,15 @@ fn check_half(half: &SplitSource, args: &CheckArgs, report: &mut Report) -> anyh
         print_note(&format!("note: {note}"));
     }
     report.notes.extend_from_slice(&ledger.notes);
-    report.scenes.extend(left_out(ledger).into_iter().map(|check| Row { split: half.split, check }));
+    report.scenes.extend(skipped_scenes(ledger).into_iter().map(|check| Row { split: half.split, check }));
     let num_scenes = source.num_scenes().min(args.scenes.unwrap_or(usize::MAX));
     let mut counter = Counter::new(&half.name(), num_scenes as u64);
     for scene in 0..num_scenes {
-        let CheckedScene { mut check, picture } = check_scene(source.as_ref(), scene);
-        note_frames(ledger, &mut check);
-        if let (Some(folder), Some(picture)) = (&args.pictures, picture) {
+        let CheckedScene { mut check, image } = check_scene(source.as_ref(), scene);
+        note_skipped_frames(ledger, &mut check);
+        if let (Some(folder), Some(image)) = (&args.pictures, image) {
             let path = folder.join(picture_name(half.split, &check.key));
-            write_picture(&path, &encode_png(&picture)?)?;
+            write_picture(&path, &encode_png(&image)?)?;
         }
         report.scenes.push(Row { split: half.split, check });
         counter.set(scene as u64 + 1);

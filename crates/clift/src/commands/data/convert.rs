@@ -50,7 +50,7 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
         let mut counter = Counter::new(&half.name(), half.opened.source.num_scenes() as u64);
         let converted = conversion.run(|done| counter.set(done as u64))?;
         drop(counter);
-        print_skips(&converted.left_out, &folder);
+        print_skips(&converted.skipped, &folder);
         print_result(&told(half, &converted, started.elapsed().as_secs_f64(), &folder))?;
         if converted.num_scenes == 0 {
             empty.push(half.name());
@@ -66,7 +66,7 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
 }
 
 fn told(half: &SplitSource, converted: &ConversionReport, seconds: f64, folder: &Path) -> String {
-    let ConversionReport { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, left_out } =
+    let ConversionReport { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, skipped } =
         converted;
     let counted = |number: usize, what: &str| if number > 0 { format!(", {number} {what}") } else { String::new() };
     let found = counted(*num_found, "of them there already");
@@ -75,7 +75,7 @@ fn told(half: &SplitSource, converted: &ConversionReport, seconds: f64, folder: 
         "{}: {} of {}{found}{changed}; {} written, {} as they were and {num_encoded} encoded, {} in {seconds:.1} s: {}",
         half.name(),
         count(*num_scenes, "scene"),
-        left_out.num_scenes,
+        skipped.num_scenes,
         count(*num_frames, "frame"),
         num_frames - num_encoded,
         bytes(*image_bytes),
