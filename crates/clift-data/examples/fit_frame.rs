@@ -1,4 +1,4 @@
-//! Decodes a picture, rescales and crops it as training does, and writes it as PNG; `scripts/check/check_pillow.py` compares.
+//! Decodes an image, rescales and crops it as training does, and writes it as PNG; `scripts/check/check_pillow.py` compares.
 //!
 //!     cargo run --release -p clift-data --example fit_frame -- 256x256 IN.jpg OUT.png [IN OUT ..]
 

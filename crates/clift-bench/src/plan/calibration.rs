@@ -281,7 +281,7 @@ pub fn loading_s(config: &Config) -> Option<f64> {
     for scene in 0..num_scenes {
         let mut rng = item_rng(config.seed, 0, scene as u32, 0, "plan views");
         let source = reader.source.as_ref();
-        let drawn = views.draw(source, scene, views.warm_up_steps, views.max_context, &mut rng).ok()?;
+        let drawn = views.sample(source, scene, views.warm_up_steps, views.max_context, &mut rng).ok()?;
         let num_views = drawn.context.len() + drawn.target.len();
         let mut least_s = f64::INFINITY;
         for _ in 0..2 {

@@ -5,7 +5,7 @@ use glam::DVec3;
 use crate::error::DataError;
 use crate::geometry::pose::Pose;
 
-/// Pinhole intrinsics in pixels of one image; the pixel in column `i` and row `j` has its centre at
+/// Pinhole intrinsics in pixels of one image. The centre of the pixel in column `i` and row `j` is
 /// `(i + 0.5, j + 0.5)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Intrinsics {
@@ -36,7 +36,7 @@ impl IntrinsicsNorm {
     /// Checks that focal lengths are positive and all numbers finite.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] with the first number that is not.
+    /// [`DataError::BadCamera`] with the first number that fails.
     pub fn validate(self) -> Result<(), DataError> {
         let Self { fx, fy, cx, cy } = self;
         for (name, focal) in [("fx", fx), ("fy", fy)] {
@@ -53,30 +53,30 @@ impl IntrinsicsNorm {
     }
 
     /// Divides `intrinsics` in pixels by the size of their image, in pixels.
-    pub fn of_pixels(intrinsics: Intrinsics, width: f64, height: f64) -> Self {
+    pub fn from_pixels(intrinsics: Intrinsics, width: f64, height: f64) -> Self {
         let Intrinsics { fx, fy, cx, cy } = intrinsics;
         Self { fx: fx / width, fy: fy / height, cx: cx / width, cy: cy / height }
     }
 
-    /// Intrinsics in pixels of an image of `width` by `height` pixels.
+    /// Returns the intrinsics in pixels of an image of `width` by `height` pixels.
     pub fn to_pixels(self, width: usize, height: usize) -> Intrinsics {
         let (width, height) = (width as f64, height as f64);
         Intrinsics { fx: self.fx * width, fy: self.fy * height, cx: self.cx * width, cy: self.cy * height }
     }
 }
 
-/// A camera as files give it.
+/// A pinhole camera in the world of its scene, as stored in files.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Intrinsics over width and height.
     pub intrinsics_norm: IntrinsicsNorm,
-    /// Camera to world.
+    /// Camera-to-world pose, OpenCV axes.
     pub c2w: Pose,
 }
 
 impl Camera {
-    /// Reads the 18 numbers of a frame of RealEstate10K and its chunks: `fx fy cx cy` over width and height, two
-    /// placeholders (ignored), then `w2c` as 3 x 4, row-major, OpenCV axes. `c2w` is its matrix inverse.
+    /// Converts the 18 numbers of a RealEstate10K frame: `fx fy cx cy` over width and height, two placeholders
+    /// (ignored), then `w2c` as 3 x 4, row-major, OpenCV axes. `c2w` is the matrix inverse of `w2c`.
     ///
     /// # Errors
     /// [`DataError::BadCamera`] for intrinsics that fail [`IntrinsicsNorm::validate`] and as [`Pose::from_rows`].
@@ -88,7 +88,7 @@ impl Camera {
         Ok(Self { intrinsics_norm, c2w: w2c.matrix_inverse() })
     }
 
-    /// The 18 numbers that [`Camera::from_re10k`] reads, with zeros for the placeholders.
+    /// Returns the 18 numbers that [`Camera::from_re10k`] reads, with zeros for the placeholders.
     pub fn to_re10k(&self) -> [f64; 18] {
         let IntrinsicsNorm { fx, fy, cx, cy } = self.intrinsics_norm;
         let mut row = [0.0; 18];
@@ -97,8 +97,8 @@ impl Camera {
         row
     }
 
-    /// Horizontal and vertical field of view in degrees: the angles between the rays through the midpoints of opposite
-    /// image edges, as in pixelSplat's limit of 100 degrees.
+    /// Returns the horizontal and the vertical field of view in degrees: the angles between the rays through the
+    /// midpoints of opposite image edges, as pixelSplat's filter computes them.
     pub fn fov_deg(&self) -> (f64, f64) {
         let IntrinsicsNorm { fx, fy, cx, cy } = self.intrinsics_norm;
         let ray = |u: f64, v: f64| DVec3::new((u - cx) / fx, (v - cy) / fy, 1.0);
@@ -106,7 +106,8 @@ impl Camera {
     }
 }
 
-/// Angle between two directions in degrees; `atan2` is exact where `acos` loses half the digits.
+/// Returns the angle between two directions in degrees. `atan2` is accurate for small angles, where `acos` loses half
+/// the digits.
 fn angle_deg(a: DVec3, b: DVec3) -> f64 {
     a.cross(b).length().atan2(a.dot(b)).to_degrees()
 }
@@ -125,7 +126,7 @@ mod tests {
     ];
 
     #[test]
-    fn a_re10k_row_becomes_the_camera_computed_by_hand() {
+    fn re10k_row_matches_the_camera_computed_by_hand() {
         let camera = Camera::from_re10k(LOOKS_ALONG_X).unwrap();
         assert_eq!(camera.intrinsics_norm, IntrinsicsNorm { fx: 0.9, fy: 1.6, cx: 0.5, cy: 0.25 });
         assert_eq!(camera.c2w.translation, DVec3::new(1.0, 2.0, 3.0));
@@ -138,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_re10k_row_survives_the_way_there_and_back() {
+    fn re10k_row_with_rounded_rotation_round_trips() {
         // A rotation rounded to three decimals: its transpose is not its inverse.
         let mut row = LOOKS_ALONG_X;
         row[6..18].copy_from_slice(&[0.866, -0.5, 0.0, 10.0, 0.5, 0.866, 0.0, -20.0, 0.0, 0.0, 1.0, 30.0]);
@@ -149,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn field_of_view_of_half_a_width_of_focal_length_is_90_degrees() {
+    fn focal_length_of_half_the_width_is_90_degrees() {
         let mut row = LOOKS_ALONG_X;
         row[..4].copy_from_slice(&[0.5, 1.0, 0.5, 0.5]);
         let (x, y) = Camera::from_re10k(row).unwrap().fov_deg();
@@ -158,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_row_says_which_number_is_bad() {
+    fn invalid_row_names_the_first_invalid_number() {
         let message = |index: usize, value: f64| {
             let mut row = LOOKS_ALONG_X;
             row[index] = value;

@@ -1,4 +1,4 @@
-//! Camera paths to render: through the context views, around their common focus, or from a file.
+//! Camera paths for rendering: through the context views, an orbit around their focus, or read from a file.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -11,42 +11,43 @@ use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::normalization::{PoseNormalization, check_near};
 use crate::geometry::pose::Pose;
 
-/// Radius of an orbit over the contexts' extent; farther out the contexts show little.
+/// Radius of an orbit over the extent of the context centres; farther out the contexts show little.
 const ORBIT_SHARE: f64 = 0.7;
 
-/// Smallest radius of an orbit, for contexts on a line; the normalised contexts reach to 1.
+/// Smallest radius of an orbit, for contexts on a line. Normalised contexts reach to 1.
 const MIN_ORBIT_RADIUS: f64 = 0.1;
 
-/// Distance of an orbit's focus if the contexts look parallel, and its bounds otherwise.
+/// Distance of an orbit's focus for contexts with parallel axes.
 const FOCUS: f64 = 2.0;
+/// Bounds of the distance otherwise.
 const FOCUS_RANGE: [f64; 2] = [0.5, 8.0];
 
-/// Most poses of a file.
+/// Largest number of poses in a file.
 const MAX_POSES: usize = 100_000;
 
 /// One view to render, in the scene's normalised frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PathView {
-    /// Camera to world.
+    /// Camera-to-world pose.
     pub c2w: Pose,
-    /// In pixels of the rendered image.
+    /// Intrinsics in pixels of the rendered image.
     pub intrinsics: Intrinsics,
 }
 
-/// A smooth path through all context views in their order: the first frame is the first view, the last frame the last.
+/// Returns a smooth path through all context views in their order, from the first view to the last.
 ///
-/// Centres follow a Catmull-Rom spline; orientations are interpolated spherically, intrinsics linearly.
+/// Centres follow a Catmull-Rom spline. Orientations are interpolated spherically, intrinsics linearly.
 pub fn interpolate(context: &[PathView], num_frames: usize) -> Vec<PathView> {
     let Some(last) = context.len().checked_sub(1) else { return Vec::new() };
-    let place = |frame: usize| last as f64 * frame as f64 / num_frames.saturating_sub(1).max(1) as f64;
-    (0..num_frames).map(|frame| between(context, place(frame))).collect()
+    let time = |frame: usize| last as f64 * frame as f64 / num_frames.saturating_sub(1).max(1) as f64;
+    (0..num_frames).map(|frame| view_at(context, time(frame))).collect()
 }
 
-/// The view at `place` in `0..=context.len() - 1`.
-fn between(context: &[PathView], place: f64) -> PathView {
+/// Interpolates the view at `time` in `[0, context.len() - 1]`.
+fn view_at(context: &[PathView], time: f64) -> PathView {
     let last = context.len() - 1;
-    let first = (place as usize).min(last.saturating_sub(1));
-    let t = place - first as f64;
+    let first = (time as usize).min(last.saturating_sub(1));
+    let t = time - first as f64;
     let [before, from, to, after] =
         [first.saturating_sub(1), first, (first + 1).min(last), (first + 2).min(last)].map(|view| &context[view]);
     let [a, b, c, d] = [before, from, to, after].map(|view| view.c2w.translation);
@@ -58,8 +59,8 @@ fn between(context: &[PathView], place: f64) -> PathView {
     PathView { c2w: Pose { rotation, translation }, intrinsics }
 }
 
-/// A closed ellipse around the mean view, facing the focus of the context views; its radii are 0.7 of the extent of
-/// their centres. The frame after the last would equal the first.
+/// Returns a closed ellipse around the mean view that faces the focus of the context views. The radii are 0.7 of the
+/// extent of the context centres. A frame after the last would equal the first.
 pub fn orbit(context: &[PathView], num_frames: usize) -> Vec<PathView> {
     let Some(intrinsics) = mean_intrinsics(context) else { return Vec::new() };
     let focus = focus_distance(context) * DVec3::Z;
@@ -72,7 +73,7 @@ pub fn orbit(context: &[PathView], num_frames: usize) -> Vec<PathView> {
     (0..num_frames).map(view).collect()
 }
 
-/// Mean intrinsics of the context views; `None` without any.
+/// Returns the mean intrinsics of the context views, `None` for no views.
 pub fn mean_intrinsics(context: &[PathView]) -> Option<Intrinsics> {
     let count = context.len() as f64;
     let mean = |value: fn(&Intrinsics) -> f64| context.iter().map(|view| value(&view.intrinsics) / count).sum();
@@ -84,57 +85,59 @@ pub fn mean_intrinsics(context: &[PathView]) -> Option<Intrinsics> {
     })
 }
 
-/// Distance along the mean view's axis of the point nearest to the axes of all views (least squares).
+/// Returns the distance along the mean view's axis of the point nearest to the axes of all views (least squares).
 fn focus_distance(context: &[PathView]) -> f64 {
-    let (mut above, mut below) = (0.0, 0.0);
+    let (mut numerator, mut denominator) = (0.0, 0.0);
     for view in context {
         let axis = view.c2w.rotation.z_axis;
         // With A = I - d d^T: z = sum(e^T A o) / sum(e^T A e).
-        above += view.c2w.translation.z - axis.z * axis.dot(view.c2w.translation);
-        below += 1.0 - axis.z * axis.z;
+        numerator += view.c2w.translation.z - axis.z * axis.dot(view.c2w.translation);
+        denominator += 1.0 - axis.z * axis.z;
     }
-    let distance = above / below;
-    // Parallel axes meet nowhere, diverging ones behind the cameras.
-    if below > 1e-6 && distance > 0.0 { distance.clamp(FOCUS_RANGE[0], FOCUS_RANGE[1]) } else { FOCUS }
+    let distance = numerator / denominator;
+    // Parallel axes do not meet, diverging ones meet behind the cameras.
+    if denominator > 1e-6 && distance > 0.0 { distance.clamp(FOCUS_RANGE[0], FOCUS_RANGE[1]) } else { FOCUS }
 }
 
-/// A camera at `centre` that looks at `point`, upright in the frame of the mean view.
+/// Returns a camera at `centre` that looks at `point`, upright in the frame of the mean view.
 fn look_at(centre: DVec3, point: DVec3) -> Pose {
     let forward = (point - centre).normalize();
     let right = DVec3::Y.cross(forward).normalize();
     Pose { rotation: DMat3::from_cols(right, forward.cross(right), forward), translation: centre }
 }
 
-/// Accepted focal lengths of a file over width and height; its end bounds the principal point's distance from 0.
+/// Accepted focal lengths of a file over width and height. The upper bound also limits the principal point's distance
+/// from 0.
 const INTRINSICS: RangeInclusive<f64> = 1e-3..=1e3;
 
-/// A file of poses.
+/// The JSON form of a pose file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct PoseFile {
     poses: Vec<FilePose>,
 }
 
-/// One pose of a file.
+/// One pose of a pose file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FilePose {
-    /// Camera to world in the capture's world, OpenCV axes; three or four rows.
+    /// Three or four rows of a camera-to-world matrix in the capture's world, OpenCV axes.
     c2w: Vec<[f64; 4]>,
-    /// `fx, fy, cx, cy` over width and height; the mean of the context views if missing.
+    /// `fx, fy, cx, cy` over width and height. Default: the mean of the context views.
     #[serde(default)]
     intrinsics_norm: Option<[f64; 4]>,
 }
 
-/// Reads `{"poses": [{"c2w": [[..4], [..4], [..4]], "intrinsics_norm": [fx, fy, cx, cy]}, ..]}`: camera-to-world poses
-/// in the world of the capture's own files (OpenCV axes), for images of `width` by `height` pixels, and moves them into
-/// `frame`. A pose without intrinsics gets `default`.
+/// Reads `{"poses": [{"c2w": [[..4], [..4], [..4]], "intrinsics_norm": [fx, fy, cx, cy]}, ..]}` and normalises the poses.
+///
+/// Poses are camera to world in the world of the capture's files, OpenCV axes. Images have `width` by `height` pixels.
+/// A pose without intrinsics gets `default`.
 ///
 /// # Errors
-/// [`DataError::Io`], and [`DataError::BadPoses`] for another form or an invalid pose, with its position.
+/// [`DataError::Io`], and [`DataError::BadPoses`] for another form or an invalid pose, with the position of the pose.
 pub fn read_poses(
     path: &Path,
-    frame: &PoseNormalization,
+    normalization: &PoseNormalization,
     default: Intrinsics,
     width: usize,
     height: usize,
@@ -155,9 +158,9 @@ pub fn read_poses(
             _ => return Err(bad(format!("{} rows, expected 3 or 4", pose.c2w.len()))),
         };
         if last != [0.0, 0.0, 0.0, 1.0] {
-            return Err(bad(format!("its last row is {last:?}, expected [0, 0, 0, 1]")));
+            return Err(bad(format!("the last row is {last:?}, expected [0, 0, 0, 1]")));
         }
-        let c2w = frame.normalize(Pose::from_rows(&rows).map_err(|error| bad(error.to_string()))?);
+        let c2w = normalization.normalize(Pose::from_rows(&rows).map_err(|error| bad(error.to_string()))?);
         check_near(&c2w).map_err(|error| bad(error.to_string()))?;
         let intrinsics = match pose.intrinsics_norm {
             None => default,
@@ -167,7 +170,7 @@ pub fn read_poses(
             Some(other) => {
                 let most = INTRINSICS.end();
                 return Err(bad(format!(
-                    "its intrinsics are {other:?}; expected fx and fy from {} to {most}, cx and cy within {most} of 0",
+                    "intrinsics_norm is {other:?}; expected fx and fy from {} to {most}, cx and cy within {most} of 0",
                     INTRINSICS.start()
                 )));
             }
@@ -203,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interpolated_path_goes_through_every_context_view() {
+    fn interpolated_path_passes_every_context_view() {
         let context = walk();
         let path = interpolate(&context, 31);
         assert_eq!(path.len(), 31);
@@ -213,13 +216,13 @@ mod tests {
         for view in &path {
             assert!(view.c2w.orthonormality_defect() < 1e-12);
         }
-        // No frame goes farther than a few times the mean step.
+        // No step is longer than a few times the mean step.
         let step = |pair: &[PathView]| pair[0].c2w.translation.distance(pair[1].c2w.translation);
         assert!(path.windows(2).all(|pair| step(pair) < 0.2), "2 units in 30 steps");
     }
 
     #[test]
-    fn half_way_between_two_views_is_half_the_turn_and_the_mean_of_the_rest() {
+    fn midpoint_has_half_the_turn_and_mean_intrinsics() {
         let mut context = vec![view([0.0; 3], 0.2), view([1.0, 2.0, 0.0], 0.8)];
         context[1].intrinsics.fx = 60.0;
         let middle = interpolate(&context, 3)[1];
@@ -232,15 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn opposite_signs_of_a_quaternion_do_not_take_the_long_way() {
-        // Three quarters of a half turn to either side of 170 degrees.
-        let context = [view([0.0; 3], 2.9), view([1.0, 0.0, 0.0], -2.9)];
-        let middle = interpolate(&context, 3)[1];
-        assert_close(&middle, &view([0.5, 0.0, 0.0], std::f64::consts::PI), 1e-9);
-    }
-
-    #[test]
-    fn an_orbit_looks_at_what_the_views_look_at_and_ends_where_it_starts() {
+    fn orbit_faces_the_focus_of_the_contexts() {
         // Two cameras that look at (0, 0, 3) from either side.
         let turn = 1.0_f64.atan2(3.0);
         let context = [view([-1.0, 0.0, 0.0], turn), view([1.0, 0.0, 0.0], -turn)];
@@ -254,7 +249,7 @@ mod tests {
             assert!(view.c2w.rotation.y_axis.y > 0.9, "upright");
         }
         assert!((path[0].c2w.translation.x - 0.7).abs() < 1e-12);
-        assert!((path[3].c2w.translation.y - 0.1).abs() < 1e-12, "contexts on a line: a small way up and down");
+        assert!((path[3].c2w.translation.y - 0.1).abs() < 1e-12, "smallest radius for contexts on a line");
         let parallel = [view([-1.0, 0.0, 0.0], 0.0), view([1.0, 0.0, 0.0], 0.0)];
         assert_eq!(focus_distance(&parallel), FOCUS);
         assert!(orbit(&[], 3).is_empty());
@@ -269,39 +264,38 @@ mod tests {
     }
 
     #[test]
-    fn poses_of_a_file_are_moved_into_the_frame_of_the_scene() {
+    fn poses_of_a_file_are_normalised() {
         let views = read(
-            r#"{"poses": [{"c2w": [[1,0,0,3],[0,1,0,0],[0,0,1,0.5]]},
+            r#"{"poses": [{"c2w": [[1,0,0,501],[0,1,0,0],[0,0,1,0.5]]},
                 {"c2w": [[1,0,0,1],[0,1,0,0],[0,0,1,0],[0,0,0,1]], "intrinsics_norm": [0.5, 1.0, 0.5, 0.25]}]}"#,
         )
         .unwrap();
-        assert_close(&views[0], &view([4.0, 0.0, 1.0], 0.0), 1e-12);
+        assert_close(&views[0], &view([1000.0, 0.0, 1.0], 0.0), 1e-12);
         assert_eq!(views[0].intrinsics, K);
         assert_close(&views[1], &view([0.0; 3], 0.0), 1e-12);
         assert_eq!(views[1].intrinsics, Intrinsics { fx: 32.0, fy: 32.0, cx: 32.0, cy: 8.0 });
     }
 
     #[test]
-    fn a_file_that_holds_no_poses_says_what_is_expected_and_where_it_goes_wrong() {
+    fn invalid_pose_files_name_pose_and_problem() {
         for (json, part) in [
             ("[]", "expected {\"poses\": "),
             (r#"{"poses": []}"#, "0 poses, expected 1 to 100000"),
             (r#"{"poses": [{"c2w": [[1,0,0,0]]}]}"#, "pose 0: 1 rows, expected 3 or 4"),
             (r#"{"poses": [{"c2w": [[2,0,0,0],[0,1,0,0],[0,0,1,0]]}]}"#, "pose 0: bad camera: the rotation is off"),
-            (r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,2]]}]}"#, "its last row is"),
+            (r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,2]]}]}"#, "the last row is"),
             (
                 r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "intrinsics_norm": [0,1,0,0]}]}"#,
-                "pose 0: its intrinsics are [0.0, 1.0",
+                "pose 0: intrinsics_norm is [0.0, 1.0",
             ),
             (
                 r#"{"poses": [{"c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "intrinsics_norm": [1,1,1e39,0.5]}]}"#,
-                "pose 0: its intrinsics are [1.0, 1.0, 1e39",
+                "pose 0: intrinsics_norm is [1.0, 1.0, 1e39",
             ),
             (
-                r#"{"poses": [{"c2w": [[1,0,0,1e6],[0,1,0,0],[0,0,1,0]]}]}"#,
-                "pose 0: bad camera: it stands 1999998 times",
+                r#"{"poses": [{"c2w": [[1,0,0,506],[0,1,0,0],[0,0,1,0]]}]}"#,
+                "pose 0: bad camera: the camera is 1010 times the contexts' extent away",
             ),
-            (r#"{"poses": [{"c2w": [[1,0,0,1e300],[0,1,0,0],[0,0,1,0]]}]}"#, "pose 0: bad camera: it stands 2"),
             (r#"{"poses": [], "frames": []}"#, "unknown field `frames`"),
         ] {
             let message = read(json).unwrap_err().to_string();

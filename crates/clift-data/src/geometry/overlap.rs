@@ -1,20 +1,21 @@
-//! View overlap of two cameras from poses alone.
+//! View overlap of two cameras, from poses and intrinsics alone.
 
 use glam::DVec3;
 
 use crate::geometry::camera::Camera;
 use crate::geometry::pose::Pose;
 
-/// Rays along a side of the image.
+/// Rays along each side of the image.
 const SIDE: usize = 32;
 
-/// Share in `[0, 1]` of `from`'s image that `to` may see: of a grid of 32 x 32 rays, those with any point in front of
-/// `from` that projects into the image of `to`. pixelSplat's measure, which needs no depth: the epipolar line of the
-/// ray crosses the other image. An upper bound of the true overlap.
+/// Returns the share in `[0, 1]` of the image of `from` that `to` may see: the rays of a 32 x 32 grid with any point in
+/// front of `from` that projects into the image of `to`.
+///
+/// pixelSplat's measure. It needs no depth and is an upper bound of the true overlap.
 pub fn overlap(from: &Camera, to: &Camera) -> f64 {
     let motion = to.c2w.inverse().after(from.c2w);
-    let place = |index: usize| (index as f64 + 0.5) / SIDE as f64;
-    let rays = (0..SIDE * SIDE).map(|ray| [place(ray % SIDE), place(ray / SIDE)]);
+    let coordinate = |index: usize| (index as f64 + 0.5) / SIDE as f64;
+    let rays = (0..SIDE * SIDE).map(|ray| [coordinate(ray % SIDE), coordinate(ray / SIDE)]);
     let seen = rays.filter(|[u, v]| {
         let k = from.intrinsics_norm;
         is_seen(motion, DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0), to)
@@ -22,8 +23,8 @@ pub fn overlap(from: &Camera, to: &Camera) -> f64 {
     seen.count() as f64 / (SIDE * SIDE) as f64
 }
 
-/// Whether any point at `t > 0` of the ray from the origin, moved by `motion`, lies in the camera's view: four planes
-/// through the camera's centre, each a linear condition on `t`.
+/// Returns whether any point at `t > 0` of the ray from the origin, moved by `motion`, lies in the view of `to`. The
+/// view is bounded by four planes through the camera centre, each a linear condition on `t`.
 fn is_seen(motion: Pose, direction: DVec3, to: &Camera) -> bool {
     let k = to.intrinsics_norm;
     let inside = |DVec3 { x, y, z }: DVec3| {
@@ -58,29 +59,28 @@ mod tests {
     }
 
     #[test]
-    fn the_same_camera_overlaps_wholly_and_the_opposite_one_not_at_all() {
+    fn overlap_of_equal_opposite_and_shifted_cameras() {
         let here = camera(0.0, [0.0; 3]);
         assert_eq!(overlap(&here, &here), 1.0);
         assert_eq!(overlap(&here, &camera(180.0, [0.0; 3])), 0.0);
         assert_eq!(overlap(&here, &camera(90.0, [0.0; 3])), 0.0);
-        // From behind everything is seen, at a distance; from in front what is ahead.
+        // Every ray is seen at some distance, from behind and from in front.
         assert_eq!(overlap(&here, &camera(0.0, [0.0, 0.0, -3.0])), 1.0);
         assert_eq!(overlap(&here, &camera(0.0, [0.0, 0.0, 3.0])), 1.0);
-        // Face to face, each sees what is between the two: along every ray there is a stretch, seen from 3 ahead.
+        // Face to face: a part of every ray lies between the cameras.
         assert_eq!(overlap(&here, &camera(180.0, [0.0, 0.0, 3.0])), 1.0);
     }
 
     #[test]
-    fn turning_on_the_spot_by_half_the_view_leaves_half_of_the_angle() {
-        // Of a view from -45 to 45 degrees the other sees 0 to 90: columns whose tangent is 0 to 1, half of them. Rows:
-        // a ray at 10 degrees of turn and the same height is at the edge of the other's rows or outside of them.
+    fn turning_by_half_the_view_leaves_less_than_half() {
+        // A camera turned by 45 degrees sees half of the columns, and in these not all rows.
         let share = overlap(&camera(0.0, [0.0; 3]), &camera(45.0, [0.0; 3]));
         assert!((0.35..0.5).contains(&share), "{share}");
         assert_eq!(share, overlap(&camera(0.0, [0.0; 3]), &camera(-45.0, [0.0; 3])));
     }
 
     #[test]
-    fn a_ray_is_seen_where_trying_many_depths_finds_it_seen() {
+    fn is_seen_agrees_with_sampled_depths() {
         let (mut num_seen, mut num_missed) = (0, 0);
         for i in 0..2000 {
             let mut rng = step_rng(3, i, "test");
@@ -97,7 +97,7 @@ mod tests {
             num_seen += usize::from(seen);
             num_missed += usize::from(seen && !tried);
         }
-        // What is seen over a sliver of depths only may be missed by trying.
+        // Sampled depths may miss a short visible interval.
         assert!((300..1700).contains(&num_seen) && num_missed < 20, "{num_missed} of {num_seen}");
     }
 }

@@ -1,7 +1,7 @@
 //! Rigid poses in f64.
 //!
-//! Camera axes are OpenCV's: +x right, +y down, +z forward. The name of a pose gives its direction: `c2w` (camera to
-//! world) or `w2c` (world to camera).
+//! Camera axes are OpenCV's: +x right, +y down, +z forward. The name of a variable gives the direction of the pose:
+//! `c2w` (camera to world) or `w2c` (world to camera).
 
 use glam::{DMat3, DMat4, DQuat, DVec3, DVec4};
 
@@ -10,12 +10,12 @@ use crate::error::DataError;
 /// Largest entry of `R^T R - I` of an accepted rotation; published poses reach about 4e-4.
 const MAX_DEFECT: f64 = 1e-2;
 
-/// A rigid motion `x' = rotation * x + translation`; the variable's name gives its direction, `c2w` or `w2c`.
+/// A rigid motion `x' = rotation * x + translation`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
     /// Rotation matrix.
     pub rotation: DMat3,
-    /// Translation in world units; of a `c2w` pose, the camera centre.
+    /// Translation in world units. For a `c2w` pose this is the camera centre.
     pub translation: DVec3,
 }
 
@@ -23,11 +23,11 @@ impl Pose {
     /// The identity.
     pub const IDENTITY: Self = Self { rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
-    /// Reads the upper three rows of a 4 x 4 matrix.
+    /// Converts the upper three rows of a 4 x 4 matrix.
     ///
     /// # Errors
-    /// [`DataError::BadCamera`] for a value that is not finite, and for a rotation that is not orthonormal to 1e-2 with
-    /// determinant +1.
+    /// [`DataError::BadCamera`] for a value that is not finite, for a rotation that departs from an orthonormal one by
+    /// more than 1e-2, and for a determinant below 0.
     pub fn from_rows(rows: &[[f64; 4]; 3]) -> Result<Self, DataError> {
         let [x, y, z] = rows.map(|[a, b, c, _]| DVec3::new(a, b, c));
         let pose = Self { rotation: DMat3::from_rows(x, y, z), translation: rows.map(|row| row[3]).into() };
@@ -45,9 +45,8 @@ impl Pose {
         Ok(pose)
     }
 
-    /// Reads the upper three rows of a camera-to-world matrix in OpenGL/Blender axes (+x right, +y up, -z forward), as
-    /// in nerfstudio's `transforms.json`, and converts the camera's axes: `rows * diag(1, -1, -1, 1)`. World axes and
-    /// camera centre do not change.
+    /// Converts the upper three rows of a camera-to-world matrix with OpenGL camera axes (+x right, +y up, -z forward),
+    /// as in nerfstudio's `transforms.json`: `rows * diag(1, -1, -1, 1)`. World axes and camera centre do not change.
     ///
     /// # Errors
     /// As [`Pose::from_rows`].
@@ -56,17 +55,17 @@ impl Pose {
         Ok(Self { rotation: DMat3::from_cols(rotation.x_axis, -rotation.y_axis, -rotation.z_axis), translation })
     }
 
-    /// Row-major 4 x 4 matrix in f32, as tensors hold it.
+    /// Returns the row-major 4 x 4 matrix in f32, the layout of camera tensors.
     pub fn to_matrix(self) -> [f32; 16] {
         self.to_matrix_f64().map(|value| value as f32)
     }
 
-    /// Row-major 4 x 4 matrix.
+    /// Returns the row-major 4 x 4 matrix.
     pub fn to_matrix_f64(self) -> [f64; 16] {
         DMat4::from_mat3_translation(self.rotation, self.translation).to_rows_array()
     }
 
-    /// Reads a row-major 4 x 4 matrix, whose last row is ignored.
+    /// Converts a row-major 4 x 4 matrix. The last row is ignored.
     ///
     /// # Errors
     /// As [`Pose::from_rows`].
@@ -74,22 +73,22 @@ impl Pose {
         Self::from_rows(&[0, 1, 2].map(|row| [0, 1, 2, 3].map(|column| matrix[row * 4 + column])))
     }
 
-    /// Inverse of an orthonormal rotation and its translation: `[R^T | -R^T t]`.
+    /// Returns the inverse motion `[R^T | -R^T t]` of an orthonormal rotation.
     #[must_use]
     pub fn inverse(self) -> Self {
         let rotation = self.rotation.transpose();
         Self { rotation, translation: -(rotation * self.translation) }
     }
 
-    /// Inverse of the matrix. The readers of the chunk format invert `w2c` as a matrix, and the inverse of a rotation
-    /// rounded to f32 or to nine decimals differs from its transpose.
+    /// Returns the inverse of the matrix. Readers of the chunk format invert `w2c` as a matrix, and the inverse of a
+    /// rotation rounded to f32 or to nine decimals differs from its transpose.
     pub(crate) fn matrix_inverse(self) -> Self {
-        // By way of the transpose, glam rounds as files written before have it.
+        // With the two transposes glam rounds as the writers of existing files did.
         let rotation = self.rotation.transpose().inverse().transpose();
         Self { rotation, translation: -(rotation * self.translation) }
     }
 
-    /// The motion `x -> self(first(x))`.
+    /// Returns the composed motion `x -> self(first(x))`.
     #[must_use]
     pub fn after(self, first: Self) -> Self {
         Self { rotation: self.rotation * first.rotation, translation: self.apply(first.translation) }
@@ -100,13 +99,13 @@ impl Pose {
         self.rotation * point + self.translation
     }
 
-    /// Largest absolute entry of `R^T R - I`.
+    /// Returns the largest absolute entry of `R^T R - I`.
     pub fn orthonormality_defect(self) -> f64 {
         let difference = self.rotation.transpose() * self.rotation - DMat3::IDENTITY;
         difference.to_cols_array().into_iter().fold(0.0, |largest: f64, value| largest.max(value.abs()))
     }
 
-    /// Refuses values that are not finite.
+    /// Checks that all values are finite.
     pub(crate) fn check_finite(self) -> Result<(), DataError> {
         let mut values = self.rotation.to_rows_array().into_iter().chain(self.translation.to_array());
         match values.find(|value| !value.is_finite()) {
@@ -115,10 +114,10 @@ impl Pose {
         }
     }
 
-    /// Unit quaternion of the rotation, from the largest of its four squared components.
+    /// Returns the unit quaternion of the rotation, computed from the largest of the four squared components.
     ///
-    // Not `DQuat::from_mat3`: of a rotation rounded to four digits its result differs from that of scipy's
-    // `Rotation.from_matrix`, with which published poses are normalised, by more than rounding.
+    // Not `DQuat::from_mat3`: for a rotation rounded to four digits it departs from scipy's `Rotation.from_matrix`,
+    // which normalises published poses, by more than rounding.
     pub(crate) fn quaternion(self) -> DQuat {
         let [[xx, yx, zx], [xy, yy, zy], [xz, yz, zz]] = self.rotation.to_cols_array_2d();
         let squares = [1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz];
@@ -136,20 +135,8 @@ impl Pose {
     }
 }
 
-/// Normalises with the rounding of poses in files written before: glam sums `w` last and multiplies by a reciprocal.
+/// Normalises a quaternion with the rounding of existing files: glam's `normalize` sums `w` last and multiplies by a
+/// reciprocal.
 pub(crate) fn unit_quaternion(q: DQuat) -> DQuat {
     q / DVec4::new(q.w, q.x, q.y, q.z).length()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn opengl_identity_becomes_diag_1_minus_1_minus_1() {
-        let rows = [[1.0, 0.0, 0.0, 4.0], [0.0, 1.0, 0.0, 5.0], [0.0, 0.0, 1.0, 6.0]];
-        let c2w = Pose::from_opengl(&rows).unwrap();
-        assert_eq!(c2w.rotation, DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
-        assert_eq!(c2w.translation, DVec3::new(4.0, 5.0, 6.0));
-    }
 }

@@ -1,4 +1,4 @@
-//! JPEG and PNG files: decoding with limits, encoding, checks for truncation.
+//! JPEG and PNG files: bounded decoding, encoding, detection of truncated files.
 
 use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
@@ -12,29 +12,29 @@ use crate::error::DataError;
 use crate::files::bounded::read_bounded;
 use crate::image::rgb_image::RgbImage;
 
-/// Most columns or rows of a decoded image.
+/// Largest number of columns or rows of a decoded image.
 pub const MAX_SIDE: u32 = 16_384;
-/// Most memory for decoding one image: 8,192 x 8,192 RGB and the decoder's own copy.
+/// Largest memory for decoding one image: 8,192 x 8,192 RGB and the decoder's copy.
 const MAX_DECODE_BYTES: u64 = 512 << 20;
-/// Bytes at the end of a file in which its end marker is searched before the whole file is read.
+/// Bytes at the end of a file that are searched for the end marker before the whole file is read.
 const TAIL_BYTES: u64 = 512;
 /// End marker of a JPEG.
 const JPEG_END: &[u8] = &[0xff, 0xd9];
-/// End of a PNG: the type of the last chunk, and its checksum.
+/// End of a PNG: type and checksum of the last chunk.
 const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 
-/// Decodes a JPEG or PNG file to 8-bit RGB; gray becomes RGB, an alpha channel is dropped.
+/// Decodes a JPEG or PNG file to 8-bit RGB. Gray becomes RGB, an alpha channel is dropped.
 ///
 /// # Errors
-/// [`DataError::BadImage`] with `key` and `frame`: another format, broken or truncated data, or a side above
+/// [`DataError::BadImage`] with `key` and `frame` for another format, broken or truncated data, and a side above
 /// [`MAX_SIDE`].
 pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
     let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
     let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {
-        return Err(bad(format!("its {} bytes are neither JPEG nor PNG", bytes.len())));
+        return Err(bad(format!("the {} bytes are neither JPEG nor PNG", bytes.len())));
     };
     if format == ImageFormat::Jpeg && !has_jpeg_end(bytes) {
-        return Err(bad(format!("its JPEG data of {} bytes is truncated", bytes.len())));
+        return Err(bad(format!("the JPEG data of {} bytes is truncated", bytes.len())));
     }
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_SIDE);
@@ -42,12 +42,12 @@ pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataErr
     limits.max_alloc = Some(MAX_DECODE_BYTES);
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(limits);
-    let picture = reader.decode().map_err(|error| bad(error.to_string()))?.into_rgb8();
-    let (width, height) = picture.dimensions();
+    let image = reader.decode().map_err(|error| bad(error.to_string()))?.into_rgb8();
+    let (width, height) = image.dimensions();
     if width == 0 || height == 0 {
-        return Err(bad(format!("it is {width}x{height}")));
+        return Err(bad(format!("the image is {width}x{height}")));
     }
-    Ok(RgbImage { width: width as usize, height: height as usize, rgb: picture.into_raw() })
+    Ok(RgbImage { width: width as usize, height: height as usize, rgb: image.into_raw() })
 }
 
 /// Reads the columns and rows of a JPEG or PNG file from its header.
@@ -56,31 +56,32 @@ pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataErr
 /// [`DataError::Io`], and [`DataError::BadScene`] for a file of another format.
 pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
-    let metadata = std::fs::metadata(path).map_err(DataError::io("opening a picture", path))?;
+    let metadata = std::fs::metadata(path).map_err(DataError::io("opening an image", path))?;
     if !metadata.is_file() {
-        return Err(bad("expected a picture, and it is no file".into()));
+        return Err(bad("expected an image file, found a folder or device".into()));
     }
-    let reader = ImageReader::open(path).map_err(DataError::io("opening a picture", path))?;
-    let reader = reader.with_guessed_format().map_err(DataError::io("reading a picture", path))?;
+    let reader = ImageReader::open(path).map_err(DataError::io("opening an image", path))?;
+    let reader = reader.with_guessed_format().map_err(DataError::io("reading an image", path))?;
     if !matches!(reader.format(), Some(ImageFormat::Jpeg | ImageFormat::Png)) {
-        return Err(bad("the picture is neither JPEG nor PNG".into()));
+        return Err(bad("the image is neither JPEG nor PNG".into()));
     }
     let (width, height) = reader
         .into_dimensions()
-        .map_err(|error| bad(format!("the picture cannot be read: {}", error.to_string().trim_end())))?;
+        .map_err(|error| bad(format!("the image cannot be read: {}", error.to_string().trim_end())))?;
     if width == 0 || height == 0 {
-        return Err(bad(format!("the picture is {width}x{height}")));
+        return Err(bad(format!("the image is {width}x{height}")));
     }
     Ok([width as usize, height as usize])
 }
 
-/// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated. Reads the last bytes of most files, and
-/// all bytes of those with data after the image, as phones append it.
+/// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated.
+///
+/// Reads only the last bytes, except of files with data after the image, such as a phone's film.
 ///
 /// # Errors
 /// [`DataError::Io`], and [`DataError::BadScene`] for a truncated file.
 pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
-    const READING: &str = "reading the end of a picture";
+    const READING: &str = "reading the end of an image";
     let io = || DataError::io(READING, path);
     let mut file = File::open(path).map_err(io())?;
     let num_bytes = file.metadata().map_err(io())?.len();
@@ -98,29 +99,29 @@ pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
     if is_whole {
         return Ok(());
     }
-    let what = format!("the picture is truncated: its {num_bytes} bytes have no end marker");
+    let what = format!("the image is truncated: its {num_bytes} bytes have no end marker");
     Err(DataError::BadScene { what, path: path.to_owned() })
 }
 
-/// The EXIF orientation of an image file, 2 to 8; `None` for 1 (upright), and for a file without one.
+/// Reads the EXIF orientation of an image file, 2 to 8. Returns `None` for 1 (upright) and for no orientation.
 pub(crate) fn exif_orientation(path: &Path) -> Option<u8> {
     let mut decoder = ImageReader::open(path).ok()?.with_guessed_format().ok()?.into_decoder().ok()?;
     decoder.orientation().ok().map(image::metadata::Orientation::to_exif).filter(|orientation| *orientation != 1)
 }
 
-/// Whether the image ends before the file; the decoder would fill the missing part of a truncated JPEG with gray.
+/// Returns whether the JPEG data has its end marker. The decoder fills the missing part of a truncated JPEG with gray.
 fn has_jpeg_end(bytes: &[u8]) -> bool {
     let padding = bytes.iter().rev().take_while(|byte| **byte == 0).count();
-    bytes[..bytes.len() - padding].ends_with(JPEG_END) || ends_after_a_scan(bytes).unwrap_or_default()
+    bytes[..bytes.len() - padding].ends_with(JPEG_END) || has_end_after_scan(bytes).unwrap_or_default()
 }
 
-/// Walks the segments of a JPEG up to the first end marker after a scan; appended data, such as a phone's film, may
-/// contain any bytes. `None` if the data ends within a segment.
-fn ends_after_a_scan(bytes: &[u8]) -> Option<bool> {
+/// Reads the segments of a JPEG up to the first end marker and returns whether a scan precedes it. Data after the
+/// marker may contain any bytes. Returns `None` if the data ends within a segment.
+fn has_end_after_scan(bytes: &[u8]) -> Option<bool> {
     let mut rest = bytes;
     let mut has_scan = false;
     loop {
-        // In a scan 0xff is followed by 0 or a restart, before a marker it may be repeated.
+        // In a scan, 0xff precedes 0 or a restart marker; before a marker, 0xff may be repeated.
         let is_marker = |pair: &[u8]| pair[0] == 0xff && !matches!(pair[1], 0x00 | 0xd0..=0xd7 | 0xff);
         let at = rest.windows(2).position(is_marker)?;
         let marker = rest[at + 1];
@@ -140,28 +141,28 @@ fn ends_after_a_scan(bytes: &[u8]) -> Option<bool> {
 /// Encodes an image as JPEG of `quality` in `1..=100`.
 ///
 /// # Errors
-/// [`DataError::Encode`] for an image whose `rgb` does not match its size, or beyond the format's limits.
-pub fn encode_jpeg(frame: &RgbImage, quality: u8) -> Result<Vec<u8>, DataError> {
+/// [`DataError::Encode`] for an image whose `rgb` does not match its size, and beyond the limits of the format.
+pub fn encode_jpeg(image: &RgbImage, quality: u8) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
-    encode(JpegEncoder::new_with_quality(&mut bytes, quality), frame)?;
+    encode(JpegEncoder::new_with_quality(&mut bytes, quality), image)?;
     Ok(bytes)
 }
 
-/// Encodes an image as PNG, without loss.
+/// Encodes an image as PNG (lossless).
 ///
 /// # Errors
 /// As [`encode_jpeg`].
-pub fn encode_png(frame: &RgbImage) -> Result<Vec<u8>, DataError> {
+pub fn encode_png(image: &RgbImage) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
-    encode(PngEncoder::new(&mut bytes), frame)?;
+    encode(PngEncoder::new(&mut bytes), image)?;
     Ok(bytes)
 }
 
-fn encode(encoder: impl ImageEncoder, frame: &RgbImage) -> Result<(), DataError> {
-    let &RgbImage { width, height, ref rgb } = frame;
+fn encode(encoder: impl ImageEncoder, image: &RgbImage) -> Result<(), DataError> {
+    let &RgbImage { width, height, ref rgb } = image;
     let bad = |what: String| DataError::Encode { width, height, what };
     if rgb.len() != width * height * 3 {
-        return Err(bad(format!("it has {} values, expected {}", rgb.len(), width * height * 3)));
+        return Err(bad(format!("the image has {} values, expected {}", rgb.len(), width * height * 3)));
     }
     encoder
         .write_image(rgb, width as u32, height as u32, ExtendedColorType::Rgb8)
@@ -178,32 +179,32 @@ mod tests {
     }
 
     #[test]
-    fn png_round_trips_exactly_and_jpeg_within_a_few_levels() {
-        let frame = ramp(40, 24);
-        assert_eq!(decode(&encode_png(&frame).unwrap(), "k", 0).unwrap(), frame);
-        let jpeg = decode(&encode_jpeg(&frame, 95).unwrap(), "k", 0).unwrap();
-        let worst = jpeg.rgb.iter().zip(&frame.rgb).map(|(a, b)| a.abs_diff(*b)).max();
-        assert!(worst.is_some_and(|worst| worst < 16), "{worst:?}"); // colour is stored at half resolution
+    fn png_round_trips_exactly_and_jpeg_closely() {
+        let image = ramp(40, 24);
+        assert_eq!(decode(&encode_png(&image).unwrap(), "k", 0).unwrap(), image);
+        let jpeg = decode(&encode_jpeg(&image, 95).unwrap(), "k", 0).unwrap();
+        let worst = jpeg.rgb.iter().zip(&image.rgb).map(|(a, b)| a.abs_diff(*b)).max();
+        assert!(worst.is_some_and(|worst| worst < 16), "{worst:?}"); // JPEG stores colour at half the resolution
     }
 
     #[test]
-    fn an_unreadable_jpeg_names_scene_and_frame() {
+    fn unreadable_files_name_scene_and_frame() {
         let jpeg = encode_jpeg(&ramp(40, 24), 90).unwrap();
         for length in [40, jpeg.len() / 2, jpeg.len() - 2] {
             let message = decode(&jpeg[..length], "00ff", 7).unwrap_err().to_string();
             assert!(message.starts_with("frame 7 of scene 00ff cannot be decoded: "), "{message}");
             assert!(message.contains("truncated"), "{message}");
         }
-        let broken = b"\xff\xd8\xff\xe0\x00\x04\xff\xda\x00\x02\xff\xd9"; // a scan without tables or sizes
+        let broken = b"\xff\xd8\xff\xe0\x00\x04\xff\xda\x00\x02\xff\xd9"; // a scan without tables and sizes
         let message = decode(broken, "00ff", 7).unwrap_err().to_string();
         assert!(message.starts_with("frame 7 of scene 00ff cannot be decoded: "), "{message}");
         assert_eq!(decode(&[&jpeg[..], &[0; 9]].concat(), "00ff", 7).unwrap().width, 40); // padding is common
         let message = decode(b"GIF89a....", "00ff", 7).unwrap_err().to_string();
-        assert!(message.ends_with("its 10 bytes are neither JPEG nor PNG"), "{message}");
+        assert!(message.ends_with("the 10 bytes are neither JPEG nor PNG"), "{message}");
     }
 
     #[test]
-    fn whatever_is_appended_to_a_jpeg_does_not_make_it_truncated() {
+    fn data_after_a_jpeg_is_not_truncation() {
         let jpeg = encode_jpeg(&ramp(40, 24), 90).unwrap();
         let mut state = 1_u32;
         let mut film: Vec<u8> = std::iter::repeat_with(|| {
@@ -222,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn a_jpeg_ends_behind_its_scans_and_not_within_a_segment() {
+    fn jpeg_ends_after_its_scans() {
         let head = b"\xff\xd8\xff\xe1\x00\x06\xff\xd8\xff\xd9\xff\xff\xda\x00\x04\xff\xd9\x01\xff\x00\x02\xff\xd3\x03";
         let scans = [&head[..], b"\xff\xc4\x00\x04\xff\xd9\xff\xda\x00\x02\x05\xff\x00"].concat();
         for whole in [&head[..], &scans] {
@@ -230,7 +231,7 @@ mod tests {
             assert!(has_jpeg_end(&[whole, b"\xff\xff\xd9 film \xff\xda"].concat()));
             assert!(!has_jpeg_end(&[whole, b"\xff"].concat()));
         }
-        // The end markers of a preview and of a table are not the picture's.
+        // The end markers of a preview and of a table are not the image's.
         for length in 10..scans.len() {
             let part = &scans[..length];
             assert!(part.ends_with(JPEG_END) || !has_jpeg_end(part), "{length}");
@@ -238,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_png_that_claims_to_be_huge_is_refused_before_memory_is_taken() {
+    fn png_with_a_huge_header_is_refused() {
         let mut png = encode_png(&ramp(4, 4)).unwrap();
         png[16..24].copy_from_slice(&[0, 1, 0, 0, 0, 1, 0, 0]); // 65,536 x 65,536
         let checksum = crc32fast::hash(&png[12..29]).to_be_bytes();

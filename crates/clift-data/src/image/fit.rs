@@ -1,4 +1,4 @@
-//! Images and intrinsics fitted to the model's size.
+//! Images and intrinsics rescaled and cropped to the model's size.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,49 +11,48 @@ use crate::image::rgb_image::RgbImage;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Crop {
-    /// Its offset from the image centre is that in the rescaled image, as in published results: half a pixel off if the
-    /// margin of the crop is odd.
+    /// Keeps the offset from the image centre, as in published results: half a pixel off if the margin is odd.
     #[default]
     Protocol,
-    /// Moves with the pixels.
+    /// Moves with the cropped pixels.
     Exact,
 }
 
 impl Crop {
-    /// Whether the key is not written, so that settings files from before the key compare equal.
+    /// Returns whether serde skips the value. Settings files from before this key then compare equal.
     #[allow(clippy::trivially_copy_pass_by_ref)] // serde's signature
     pub fn is_default(&self) -> bool {
         *self == Self::default()
     }
 }
 
-/// Rescales an image until it just covers `width` by `height` pixels, crops the centre, and adapts the intrinsics, as
-/// pixelSplat's `rescale_and_crop`.
+/// Rescales an image to the smallest size that covers `width` by `height` pixels, crops the centre, and adapts the
+/// intrinsics, as pixelSplat's `rescale_and_crop`.
 ///
 /// Focal lengths, in pixels, are `fx_norm * scaled_width` and `fy_norm * scaled_height`. The principal point is
 /// `cx = width / 2 + (cx_norm - 0.5) * scaled_width`, and `cy` likewise: half a pixel off if the margin
-/// `scaled_width - width` is odd, as in published results. With `exact_principal_point` it moves with the crop:
-/// `cx = cx_norm * scaled_width - margin / 2` with the margin halved downwards.
+/// `scaled_width - width` is odd, as in published results. With `exact_principal_point`,
+/// `cx = cx_norm * scaled_width - floor(margin / 2)`.
 ///
-// Departs from pixelSplat, which keeps cx_norm: equal for a principal point at the centre, as in RealEstate10K, and off
-// by (cx_norm - 0.5) * margin elsewhere, as in photos of phones.
+// Departs from pixelSplat, which keeps cx_norm: correct for a principal point at the centre, as in RealEstate10K, and
+// wrong by (cx_norm - 0.5) * margin elsewhere, as in phone photos.
 ///
 /// # Errors
-/// [`DataError::Upscale`] if `width` or `height` is larger than the image's.
+/// [`DataError::Upscale`] if `width` or `height` exceeds that of the image.
 pub fn fit(
-    frame: &RgbImage,
+    image: &RgbImage,
     intrinsics_norm: IntrinsicsNorm,
     width: usize,
     height: usize,
     exact_principal_point: bool,
 ) -> Result<(RgbImage, Intrinsics), DataError> {
-    if width > frame.width || height > frame.height {
-        return Err(DataError::Upscale { width, height, from_width: frame.width, from_height: frame.height });
+    if width > image.width || height > image.height {
+        return Err(DataError::Upscale { width, height, from_width: image.width, from_height: image.height });
     }
-    let (scaled_width, scaled_height) = covering_size((frame.width, frame.height), (width, height));
+    let (scaled_width, scaled_height) = covering_size((image.width, image.height), (width, height));
     let (column, row) = ((scaled_width - width) / 2, (scaled_height - height) / 2);
     let window = Window { column, row, width, height };
-    let cropped = resize_lanczos_window(frame, scaled_width, scaled_height, window);
+    let cropped = resize_lanczos_window(image, scaled_width, scaled_height, window);
     let in_scaled = intrinsics_norm.to_pixels(scaled_width, scaled_height);
     let (cx, cy) = if exact_principal_point {
         (in_scaled.cx - column as f64, in_scaled.cy - row as f64)
@@ -65,7 +64,7 @@ pub fn fit(
     Ok((cropped, Intrinsics { fx: in_scaled.fx, fy: in_scaled.fy, cx, cy }))
 }
 
-/// The smallest size with the aspect ratio of `from` that covers `to`; both as (width, height).
+/// Returns the smallest size with the aspect ratio of `from` that covers `to`, all as (width, height).
 fn covering_size(from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
     let scale = (to.1 as f64 / from.1 as f64).max(to.0 as f64 / from.0 as f64);
     let side = |from: usize| (from as f64 * scale).round_ties_even() as usize;
@@ -83,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn fitted_sizes_crops_and_focal_factors_equal_the_protocols_table() {
+    fn sizes_crops_and_focal_lengths_equal_the_protocol() {
         // (source) -> (target): rescaled size, crop offset, factor of fx, exact principal point, all as width first.
         let table = [
             ((640, 360), (256, 256), (455, 256), (99, 0), 1.777_34, 128.5),
@@ -95,35 +94,21 @@ mod tests {
             assert_eq!(covering_size(from, to), scaled);
             assert_eq!(((scaled.0 - to.0) / 2, (scaled.1 - to.1) / 2), offset);
             let norm = IntrinsicsNorm { fx: 0.9, fy: 1.6, cx: 0.5, cy: 0.5 };
-            let frame = RgbImage { width: from.0, height: from.1, rgb: vec![9; from.0 * from.1 * 3] };
-            let (fitted, protocol) = fit(&frame, norm, to.0, to.1, false).unwrap();
+            let image = RgbImage { width: from.0, height: from.1, rgb: vec![9; from.0 * from.1 * 3] };
+            let (fitted, protocol) = fit(&image, norm, to.0, to.1, false).unwrap();
             assert_eq!((fitted.width, fitted.height, fitted.rgb.len()), (to.0, to.1, to.0 * to.1 * 3));
             assert!((protocol.fx / to.0 as f64 / norm.fx - factor).abs() < 1e-5, "{protocol:?}"); // printed to 5 digits
             assert_eq!((protocol.fy, protocol.cx, protocol.cy), (1.6 * 256.0, to.0 as f64 / 2.0, 128.0));
-            let (_, moved) = fit(&frame, norm, to.0, to.1, true).unwrap();
+            let (_, moved) = fit(&image, norm, to.0, to.1, true).unwrap();
             assert_eq!((moved.fx, moved.cx, moved.cy), (protocol.fx, exact, 128.0));
         }
     }
 
     #[test]
-    fn a_crop_without_rescaling_takes_the_centre_pixels() {
-        let frame = ramp(9, 4);
-        let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.6, cy: 0.5 };
-        let (fitted, intrinsics) = fit(&frame, norm, 4, 4, true).unwrap();
-        for y in 0..4 {
-            for x in 0..4 {
-                let (got, expected) = ((y * 4 + x) * 3, (y * 9 + x + 2) * 3);
-                assert_eq!(fitted.rgb[got..got + 3], frame.rgb[expected..expected + 3]);
-            }
-        }
-        assert!((intrinsics.cx - 3.4).abs() < 1e-12, "{intrinsics:?}"); // 0.6 * 9 - 2
-    }
-
-    #[test]
-    fn a_principal_point_off_the_centre_is_half_a_pixel_from_the_exact_one_at_most() {
-        let frame = ramp(108, 192);
+    fn protocol_and_exact_principal_points_differ_by_half_a_pixel() {
+        let image = ramp(108, 192);
         let norm = IntrinsicsNorm { fx: 1.27, fy: 0.72, cx: 0.6, cy: 0.55 };
-        let [protocol, exact] = [false, true].map(|exact| fit(&frame, norm, 64, 64, exact).unwrap().1);
+        let [protocol, exact] = [false, true].map(|exact| fit(&image, norm, 64, 64, exact).unwrap().1);
         // 64 x 114, 25 rows cut off above and below: 0.55 * 114 - 25 = 37.7.
         assert!((exact.cx - 38.4).abs() < 1e-12 && (exact.cy - 37.7).abs() < 1e-12, "{exact:?}");
         assert!((protocol.cx - exact.cx).abs() < 1e-12 && (protocol.cy - exact.cy).abs() < 1e-12, "{protocol:?}");
@@ -133,14 +118,14 @@ mod tests {
     }
 
     #[test]
-    fn upscaling_is_refused_with_both_sizes() {
+    fn upscaling_error_names_both_sizes() {
         let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
         let message = fit(&ramp(64, 36), norm, 32, 48, false).unwrap_err().to_string();
         assert!(message.contains("32x48") && message.contains("64x36"), "{message}");
     }
 
     #[test]
-    fn a_jpeg_is_decoded_rescaled_and_cropped_as_pillow_does_it_to_a_fraction_of_a_level() {
+    fn fitted_jpegs_equal_pillow_within_one_level() {
         let bytes = include_bytes!("../../../../data-fixtures/reference/fitted.safetensors");
         let tensors = safetensors::SafeTensors::deserialize(bytes).unwrap();
         let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
@@ -148,14 +133,14 @@ mod tests {
             let expected = tensors.tensor(&format!("{number}.output")).unwrap();
             let &[height, width, 3] = expected.shape() else { panic!("{:?}", expected.shape()) };
             let file = tensors.tensor(&format!("{number}.jpeg")).unwrap().data();
-            // The frame header's sampling of the luma: 2 x 2, so that decoders have to enlarge the chroma (4:2:0).
+            // The luma sampling of the frame header is 2 x 2: decoders must enlarge the chroma (4:2:0).
             let header = file.windows(2).position(|marker| marker == [0xff, 0xc0]).unwrap();
             assert_eq!(file[header + 11], 0x22);
-            let frame = decode(file, "k", 0).unwrap();
-            let (fitted, _) = fit(&frame, norm, width, height, false).unwrap();
+            let image = decode(file, "k", 0).unwrap();
+            let (fitted, _) = fit(&image, norm, width, height, false).unwrap();
             let differences = fitted.rgb.iter().zip(expected.data()).map(|(a, b)| a.abs_diff(*b));
             let mean = differences.clone().map(f64::from).sum::<f64>() / fitted.rgb.len() as f64;
-            // Decoders enlarge the chroma differently; of real photos the mean is 0.07 to 0.28 (docs/contributing.md).
+            // Decoders enlarge the chroma differently; the mean is 0.07 to 0.28 for real photos (docs/contributing.md).
             assert!(mean < 0.5 && differences.max() <= Some(8), "{number}: {mean}");
         }
     }

@@ -1,15 +1,15 @@
 //! Pillow's 8-bit LANCZOS resize, bit for bit.
 //!
-//! Two passes, columns then rows, each with weights in 22-bit fixed point and a result rounded to 8 bits. The images of
-//! published results were resized so. `fast_image_resize` 6.1 keeps weights in 16 bits: four times as fast
-//! (0.5 against 2.2 ms a photo), but other values in 8 % of a real photo and by up to 35 levels at hard edges.
+//! Two passes, columns then rows, with weights in 22-bit fixed point and results rounded to 8 bits: the resize behind
+//! published results. `fast_image_resize` 6.1 has 16-bit weights and is faster (0.5 against 2.2 ms per photo), but
+//! changes 8 % of the values of a real photo, by up to 35 levels at hard edges.
 
 use std::f64::consts::PI;
 use std::ops::Range;
 
 use crate::image::rgb_image::RgbImage;
 
-/// Fraction bits of a weight: 32, minus 8 for the pixel, minus 2 for the overshoot of a sum.
+/// Fraction bits of a weight: 32 minus 8 for the pixel and 2 for the overshoot of a sum.
 const PRECISION_BITS: u32 = 32 - 8 - 2;
 /// Radius of the filter in pixels of the smaller image.
 const SUPPORT: f64 = 3.0;
@@ -27,37 +27,37 @@ pub struct Window {
     pub height: usize,
 }
 
-/// Resizes to `width` by `height` pixels, with antialiasing if it reduces.
+/// Resizes to `width` by `height` pixels, with antialiasing where the image is reduced.
 ///
 /// # Panics
-/// When a size is zero or `frame.rgb` does not have `height * width * 3` values.
-pub fn resize_lanczos(frame: &RgbImage, width: usize, height: usize) -> RgbImage {
-    resize_lanczos_window(frame, width, height, Window { column: 0, row: 0, width, height })
+/// Panics if a size is zero or `image.rgb` does not have `height * width * 3` values.
+pub fn resize_lanczos(image: &RgbImage, width: usize, height: usize) -> RgbImage {
+    resize_lanczos_window(image, width, height, Window { column: 0, row: 0, width, height })
 }
 
-/// The part `window` of the result of [`resize_lanczos`]. Pixels outside are not computed: for a 256 x 256 crop of a
-/// 640 x 360 photo, nearly half.
+/// Returns the part `window` of the result of [`resize_lanczos`], without computing the other pixels: nearly half of
+/// them for a 256 x 256 crop of a 640 x 360 photo.
 ///
 /// # Panics
-/// As [`resize_lanczos`], and when the window is not inside `width` by `height`.
-pub fn resize_lanczos_window(frame: &RgbImage, width: usize, height: usize, window: Window) -> RgbImage {
-    assert_eq!(frame.rgb.len(), frame.height * frame.width * 3, "a frame of {}x{}", frame.width, frame.height);
-    assert!(frame.width * frame.height * window.width * window.height > 0, "a picture without pixels");
+/// Panics like [`resize_lanczos`], and if the window is not inside `width` by `height`.
+pub fn resize_lanczos_window(image: &RgbImage, width: usize, height: usize, window: Window) -> RgbImage {
+    assert_eq!(image.rgb.len(), image.height * image.width * 3, "an image of {}x{}", image.width, image.height);
+    assert!(image.width * image.height * window.width * window.height > 0, "an image without pixels");
     let [column_end, row_end] = [window.column + window.width, window.row + window.height];
     assert!(column_end <= width && row_end <= height, "{window:?} of {width}x{height}");
-    let column_taps = (width != frame.width).then(|| weights(frame.width, width, window.column..column_end));
-    let row_taps = (height != frame.height).then(|| weights(frame.height, height, window.row..row_end));
-    // The rows of the input that any row of the window looks at.
+    let column_taps = (width != image.width).then(|| weights(image.width, width, window.column..column_end));
+    let row_taps = (height != image.height).then(|| weights(image.height, height, window.row..row_end));
+    // Input rows that the rows of the window depend on.
     let [top, bottom] = match row_taps.as_deref() {
         Some([first, .., last]) => [first.first, last.first + last.weights.len()],
         Some([only]) => [only.first, only.first + only.weights.len()],
         _ => [window.row, row_end],
     };
-    let input = &frame.rgb[top * frame.width * 3..bottom * frame.width * 3];
+    let input = &image.rgb[top * image.width * 3..bottom * image.width * 3];
     let narrowed = if let Some(taps) = &column_taps {
-        resize_columns(input, frame.width, taps)
+        resize_columns(input, image.width, taps)
     } else {
-        let rows = input.chunks_exact(frame.width * 3);
+        let rows = input.chunks_exact(image.width * 3);
         rows.flat_map(|row| &row[window.column * 3..column_end * 3]).copied().collect()
     };
     let rgb = match &row_taps {
@@ -67,20 +67,20 @@ pub fn resize_lanczos_window(frame: &RgbImage, width: usize, height: usize, wind
     RgbImage { width: window.width, height: window.height, rgb }
 }
 
-/// Weights of one output pixel, and the first input pixel that they apply to.
+/// Weights of one output pixel, and the input pixel of the first weight.
 struct Taps {
     first: usize,
     weights: Vec<i32>,
 }
 
-/// The taps of the output pixels `wanted` along one axis that goes from `from` to `to` pixels.
-fn weights(from: usize, to: usize, wanted: Range<usize>) -> Vec<Taps> {
+/// Returns the taps of the output pixels `pixels` along one axis that is resized from `from` to `to` pixels.
+fn weights(from: usize, to: usize, pixels: Range<usize>) -> Vec<Taps> {
     let scale = from as f64 / to as f64;
     let stretch = scale.max(1.0);
     let support = SUPPORT * stretch;
     let taps = |pixel: usize| {
         let centre = (pixel as f64 + 0.5) * scale;
-        // Truncated, not floored, as a C cast does; below zero both give an index that is clamped.
+        // Truncated like Pillow's C cast; negative values are clamped.
         let first = (centre - support + 0.5).max(0.0) as usize;
         let end = ((centre + support + 0.5) as usize).min(from);
         let values: Vec<f64> =
@@ -92,7 +92,7 @@ fn weights(from: usize, to: usize, wanted: Range<usize>) -> Vec<Taps> {
         };
         Taps { first, weights: values.iter().map(fixed).collect() }
     };
-    wanted.map(taps).collect()
+    pixels.map(taps).collect()
 }
 
 fn lanczos(x: f64) -> f64 {
@@ -100,12 +100,12 @@ fn lanczos(x: f64) -> f64 {
     if (-SUPPORT..SUPPORT).contains(&x) { sinc(x) * sinc(x / SUPPORT) } else { 0.0 }
 }
 
-/// Converts a sum of weighted pixels, which started at one half, to 8 bits.
+/// Converts a sum of weighted pixels to 8 bits. The sum starts at one half.
 fn round(sum: i32) -> u8 {
     (sum >> PRECISION_BITS).clamp(0, 255) as u8
 }
 
-/// Compiles a pass twice on x86-64, for any processor and with AVX2, and selects at run time. Sums are of integers, so
+/// Compiles a pass twice on x86-64, for any processor and for AVX2, and selects at run time. The sums are integers, so
 /// both results are equal.
 macro_rules! fastest {
     ($name:ident, $portable:ident, ($($arg:ident: $type:ty),*)) => {
@@ -129,12 +129,12 @@ macro_rules! fastest {
 fastest!(resize_columns, columns, (rgb: &[u8], width: usize, taps: &[Taps]));
 fastest!(resize_rows, rows, (rgb: &[u8], row_bytes: usize, top: usize, taps: &[Taps]));
 
-/// Always inlined, so that it is compiled with the instructions of its caller.
+/// Resizes the rows of an image along the columns. Inlined, so that the caller's instruction set applies.
 #[inline(always)]
 #[allow(clippy::inline_always)]
 fn columns(rgb: &[u8], width: usize, taps: &[Taps]) -> Vec<u8> {
     let mut resized = Vec::with_capacity(rgb.len() / width * taps.len());
-    // Four channels, one of them idle: a pixel is then one vector.
+    // Four channels, one of them unused, make a pixel one vector.
     let mut wide = vec![[0_i32; 4]; width];
     for row in rgb.chunks_exact(width * 3) {
         for (pixel, [r, g, b]) in wide.iter_mut().zip(row.as_chunks::<3>().0) {
@@ -154,7 +154,7 @@ fn columns(rgb: &[u8], width: usize, taps: &[Taps]) -> Vec<u8> {
     resized
 }
 
-/// `rgb` starts with row `top` of the image in which the taps count rows.
+/// Resizes an image along the rows. `rgb` starts with row `top` of the image whose rows the taps index.
 #[inline(always)]
 #[allow(clippy::inline_always)]
 fn rows(rgb: &[u8], row_bytes: usize, top: usize, taps: &[Taps]) -> Vec<u8> {
@@ -179,18 +179,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn resized_pictures_equal_pillows_bit_for_bit() {
+    fn resized_images_equal_pillow_bit_for_bit() {
         let bytes = include_bytes!("../../../../data-fixtures/reference/lanczos.safetensors");
         let tensors = SafeTensors::deserialize(bytes).unwrap();
-        let frame = |name: &str| {
+        let image = |name: &str| {
             let tensor = tensors.tensor(name).unwrap();
             let &[height, width, 3] = tensor.shape() else { panic!("{name} has shape {:?}", tensor.shape()) };
             RgbImage { width, height, rgb: tensor.data().to_vec() }
         };
         let mut num_cases = 0;
         while tensors.tensor(&format!("{num_cases}.input")).is_ok() {
-            let expected = frame(&format!("{num_cases}.output"));
-            let got = resize_lanczos(&frame(&format!("{num_cases}.input")), expected.width, expected.height);
+            let expected = image(&format!("{num_cases}.output"));
+            let got = resize_lanczos(&image(&format!("{num_cases}.input")), expected.width, expected.height);
             assert!(got == expected, "case {num_cases}, {}x{}", expected.width, expected.height);
             num_cases += 1;
         }
@@ -198,11 +198,11 @@ mod tests {
     }
 
     #[test]
-    fn a_window_is_the_same_part_of_the_whole() {
+    fn window_equals_the_same_part_of_the_image() {
         let rgb = (0..61 * 47 * 3).map(|i| (i * 7919 % 251) as u8).collect();
-        let frame = RgbImage { width: 61, height: 47, rgb };
+        let image = RgbImage { width: 61, height: 47, rgb };
         for (width, height) in [(23, 11), (61, 20), (30, 47), (61, 47), (61, 1)] {
-            let whole = resize_lanczos(&frame, width, height);
+            let whole = resize_lanczos(&image, width, height);
             for (column, row, columns, rows) in
                 [(0, 0, width, height), (3, 0, 9, 1), (width - 1, height - 1, 1, 1), (5, height / 2, 7, height / 2)]
             {
@@ -210,7 +210,7 @@ mod tests {
                     continue;
                 }
                 let window = Window { column, row, width: columns, height: rows };
-                let part = resize_lanczos_window(&frame, width, height, window);
+                let part = resize_lanczos_window(&image, width, height, window);
                 let lines = whole.rgb.chunks_exact(width * 3).skip(row).take(rows);
                 let expected: Vec<u8> =
                     lines.flat_map(|line| &line[column * 3..(column + columns) * 3]).copied().collect();
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn both_compilations_of_a_pass_give_the_same() {
+    fn both_compilations_of_a_pass_are_equal() {
         let rgb: Vec<u8> = (0..64 * 48 * 3).map(|i| (i * 7919 % 256) as u8).collect();
         let taps = weights(64, 45, 3..40);
         assert_eq!(resize_columns(&rgb, 64, &taps), columns(&rgb, 64, &taps));

@@ -3,10 +3,10 @@
 /// An 8-bit RGB image, row-major `[height, width, 3]`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RgbImage {
-    /// Columns.
+    /// Number of columns.
     pub width: usize,
-    /// Rows.
+    /// Number of rows.
     pub height: usize,
-    /// `height * width * 3` values.
+    /// Pixels, `height * width * 3` values.
     pub rgb: Vec<u8>,
 }

@@ -1,4 +1,4 @@
-//! Resampling of distorted images to pinhole images.
+//! Resampling of lens-distorted images to pinhole images.
 
 use rayon::prelude::*;
 
@@ -10,10 +10,10 @@ use crate::image::rgb_image::RgbImage;
 /// Points of each image edge at which the lens is inverted.
 const EDGE_POINTS: usize = 129;
 
-/// A pinhole camera inside the view of a distorted one, and the map between their pixels.
+/// A pinhole camera within the view of a distorted camera, and the map between their pixels.
 ///
-/// Camera centre, principal point and image size are equal. The focal lengths are multiplied by one factor, the
-/// smallest for which every pixel lies in the distorted image: no blank corners, as OpenCV's `alpha = 0`.
+/// Camera centre, principal point and image size are equal. Both focal lengths are multiplied by the smallest factor
+/// for which every pixel lies in the distorted image: no blank corners, as OpenCV's `alpha = 0`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Undistortion {
     from: IntrinsicsNorm,
@@ -22,22 +22,22 @@ pub struct Undistortion {
 }
 
 impl Undistortion {
-    /// Finds the pinhole camera for images taken with `intrinsics_norm` through `lens`.
+    /// Computes the pinhole camera for images taken with `intrinsics_norm` through `lens`.
     ///
     /// # Errors
     /// [`DataError::BadCamera`] for a lens that cannot be inverted at the image edge, and for a principal point outside
-    /// of the image.
+    /// the image.
     pub fn new(intrinsics_norm: IntrinsicsNorm, lens: Lens) -> Result<Self, DataError> {
         lens.validate()?;
         let IntrinsicsNorm { fx, fy, cx, cy } = intrinsics_norm;
         let bad = |what: String| DataError::BadCamera { what };
-        // The ray of each edge nearest to the axis bounds the rectangle without blank pixels.
+        // The ray of each edge that is nearest to the axis bounds the rectangle without blank pixels.
         let [mut left, mut right, mut top, mut bottom] = [f64::INFINITY; 4];
         for step in 0..EDGE_POINTS {
             let share = step as f64 / (EDGE_POINTS - 1) as f64;
             let ray = |u: f64, v: f64| {
                 lens.undistort([(u - cx) / fx, (v - cy) / fy]).ok_or_else(|| {
-                    bad(format!("the lens distortion ({lens:?}) cannot be undone at the edge of the picture"))
+                    bad(format!("the lens distortion ({lens:?}) cannot be undone at the edge of the image"))
                 })
             };
             left = left.min(-ray(0.0, share)?[0]);
@@ -47,7 +47,7 @@ impl Undistortion {
         }
         if left.min(right).min(top).min(bottom) <= 0.0 {
             return Err(bad(format!(
-                "the principal point ({cx}, {cy}) of a distorted camera lies outside of the picture"
+                "the principal point ({cx}, {cy}) of a distorted camera lies outside of the image"
             )));
         }
         let needed = [cx / left / fx, (1.0 - cx) / right / fx, cy / top / fy, (1.0 - cy) / bottom / fy];
@@ -55,58 +55,58 @@ impl Undistortion {
         Ok(Self { from: intrinsics_norm, lens, to: IntrinsicsNorm { fx: fx * zoom, fy: fy * zoom, cx, cy } })
     }
 
-    /// Intrinsics of the pinhole camera.
+    /// Returns the intrinsics of the pinhole camera.
     pub fn intrinsics_norm(&self) -> IntrinsicsNorm {
         self.to
     }
 
-    /// Resamples an image bilinearly to the same size; positions that round beyond the edge are clamped to it.
-    pub fn apply(&self, frame: &RgbImage) -> RgbImage {
-        let &RgbImage { width, height, ref rgb } = frame;
+    /// Resamples an image bilinearly to the same size. Positions beyond the edge by rounding are clamped to the edge.
+    pub fn apply(&self, image: &RgbImage) -> RgbImage {
+        let &RgbImage { width, height, ref rgb } = image;
         let mut undistorted = vec![0; rgb.len()];
         let rows = undistorted.par_chunks_exact_mut(width * 3).enumerate();
-        // Positions first, colours second: the compiler vectorises a loop of arithmetic only.
+        // Positions first, colours second: the compiler vectorises only the loop without memory access.
         rows.for_each_init(
             || vec![[0; 2]; width],
-            |places, (row, pixels)| {
-                self.find_places(row, [width, height], places);
-                for (pixel, place) in pixels.as_chunks_mut().0.iter_mut().zip(&*places) {
-                    *pixel = bilinear(frame, *place);
+            |positions, (row, pixels)| {
+                self.find_positions(row, [width, height], positions);
+                for (pixel, position) in pixels.as_chunks_mut().0.iter_mut().zip(&*positions) {
+                    *pixel = bilinear(image, *position);
                 }
             },
         );
         RgbImage { width, height, rgb: undistorted }
     }
 
-    /// Position of each pixel of a row in the distorted image, clamped to it: column and row from the centre of the
-    /// first pixel, in units of 1 / [`STEPS`] pixel.
-    fn find_places(&self, row: usize, [width, height]: [usize; 2], places: &mut [[u32; 2]]) {
+    /// Computes the position of each pixel of a row in the distorted image, clamped to the image: column and row from
+    /// the centre of the first pixel, in units of 1 / [`STEPS`] pixel.
+    fn find_positions(&self, row: usize, [width, height]: [usize; 2], positions: &mut [[u32; 2]]) {
         let (from, to) = (self.from.to_pixels(width, height), self.to.to_pixels(width, height));
         let (step_x, y) = (1.0 / to.fx, (row as f64 + 0.5 - to.cy) / to.fy);
         let most = [width, height].map(|side| ((side - 1) * STEPS) as f64);
         let steps = STEPS as f64;
-        for (column, place) in places.iter_mut().enumerate() {
+        for (column, position) in positions.iter_mut().enumerate() {
             let x = (f64::from(column as u32) + 0.5 - to.cx) * step_x;
             let [x, y] = self.lens.distort([x, y]);
             let at = [(x * from.fx + from.cx - 0.5) * steps + 0.5, (y * from.fy + from.cy - 0.5) * steps + 0.5];
-            *place = [at[0].clamp(0.0, most[0]) as u32, at[1].clamp(0.0, most[1]) as u32];
+            *position = [at[0].clamp(0.0, most[0]) as u32, at[1].clamp(0.0, most[1]) as u32];
         }
     }
 }
 
-/// Steps per pixel of a position: the product of two and a colour fits into 32 bits.
+/// Steps per pixel of a position. The product of two positions within a pixel and a colour fits into 32 bits.
 const STEPS: usize = 2048;
 
-/// Bilinear colour at a position in units of 1 / [`STEPS`] pixel.
-fn bilinear(frame: &RgbImage, place: [u32; 2]) -> [u8; 3] {
+/// Interpolates the colour at a position in units of 1 / [`STEPS`] pixel bilinearly.
+fn bilinear(image: &RgbImage, position: [u32; 2]) -> [u8; 3] {
     let steps = STEPS as u32;
-    let [column, row] = place.map(|at| (at / steps) as usize);
-    let [x, y] = place.map(|at| at % steps);
-    let right = (column + 1).min(frame.width - 1);
-    let below = (row + 1).min(frame.height - 1);
+    let [column, row] = position.map(|at| (at / steps) as usize);
+    let [x, y] = position.map(|at| at % steps);
+    let right = (column + 1).min(image.width - 1);
+    let below = (row + 1).min(image.height - 1);
     let pixel = |column: usize, row: usize| {
-        let start = (row * frame.width + column) * 3;
-        &frame.rgb[start..start + 3]
+        let start = (row * image.width + column) * 3;
+        &image.rgb[start..start + 3]
     };
     let (a, b, c, d) = (pixel(column, row), pixel(right, row), pixel(column, below), pixel(right, below));
     [0, 1, 2].map(|channel| {

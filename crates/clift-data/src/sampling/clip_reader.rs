@@ -90,9 +90,11 @@ impl ClipReader {
 
     fn fitted(&self, scene: usize, frame: usize, camera: &Camera) -> Result<(RgbImage, Intrinsics), DataError> {
         let ClipOptions { width, height, exact_principal_point, .. } = self.options;
-        let picture = self.source.frame(scene, frame)?;
-        fit(&picture, camera.intrinsics_norm, width, height, exact_principal_point).map_err(|source| {
-            DataError::InFrame { key: self.source.key(scene).to_owned(), frame, source: Box::new(source) }
+        let image = self.source.frame(scene, frame)?;
+        fit(&image, camera.intrinsics_norm, width, height, exact_principal_point).map_err(|source| DataError::InFrame {
+            key: self.source.key(scene).to_owned(),
+            frame,
+            source: Box::new(source),
         })
     }
 }

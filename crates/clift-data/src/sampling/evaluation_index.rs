@@ -88,29 +88,29 @@ impl EvaluationIndex {
 
     /// The first `limit` scenes of `source` to evaluate (0: all), in the order of the file, and what is left out on
     /// the way: null entries, empty entries, keys that the source does not have, scenes whose cameras cannot be read
-    /// and those that lack a frame. The ledger counts the entries that were looked at.
+    /// and those that lack a frame. The report counts the entries that were looked at.
     pub fn select(&self, source: &dyn SceneSource, limit: usize) -> (Vec<EvaluationItem>, SkipReport) {
-        let mut ledger = SkipReport::default();
+        let mut report = SkipReport::default();
         let mut items = Vec::new();
         for (key, views) in &self.entries {
             if limit > 0 && items.len() == limit {
                 break;
             }
-            ledger.num_scenes += 1;
+            report.num_scenes += 1;
             let Some(views) = views else {
-                ledger.skip(key, "without views in the evaluation index");
+                report.skip(key, "without views in the evaluation index");
                 continue;
             };
             let Some(scene) = source.find(key) else {
-                ledger.skip(key, "not in the data");
+                report.skip(key, "not in the data");
                 continue;
             };
             match source.cameras(scene).and_then(|cameras| self.check_frames(key, views, cameras.len())) {
                 Ok(()) => items.push(EvaluationItem { scene, views: views.clone() }),
-                Err(error) => ledger.skip(key, error.to_string()),
+                Err(error) => report.skip(key, error.to_string()),
             }
         }
-        (items, ledger)
+        (items, report)
     }
 
     fn check_frames(&self, key: &str, views: &ViewIndices, num_frames: usize) -> Result<(), DataError> {
@@ -247,15 +247,15 @@ mod tests {
     fn selecting_counts_what_is_left_out() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
         let source = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
-        let (items, ledger) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&source, 0);
+        let (items, report) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&source, 0);
         let views = ViewIndices { context: vec![0, 2, 5, 7], target: vec![1, 3, 4, 6] };
         assert_eq!(items, [EvaluationItem { scene: 0, views }]);
-        assert_eq!(ledger.to_string(), "1 of 3 scenes used; 2 without views in the evaluation index");
+        assert_eq!(report.to_string(), "1 of 3 scenes used; 2 without views in the evaluation index");
 
         let train = ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap();
-        let (items, ledger) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&train, 0);
+        let (items, report) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&train, 0);
         assert!(items.is_empty());
-        assert_eq!(ledger.counts()["not in the data"], 1);
+        assert_eq!(report.counts()["not in the data"], 1);
     }
 
     #[test]
@@ -273,12 +273,12 @@ mod tests {
         let index = index(&format!("{{{}}}", entries.join(","))).unwrap();
         let scenes = |items: &[EvaluationItem]| items.iter().map(|item| item.scene).collect::<Vec<_>>();
 
-        let (items, ledger) = index.select(&source, 0);
-        assert_eq!((scenes(&items), ledger.num_scenes), (vec![2, 3, 4], 5));
-        assert!(ledger.skips[0].reason.contains("asks for frame 8 of scene"), "{ledger}");
-        assert_eq!(ledger.skips[1].reason, "bad camera: the pose holds NaN");
+        let (items, report) = index.select(&source, 0);
+        assert_eq!((scenes(&items), report.num_scenes), (vec![2, 3, 4], 5));
+        assert!(report.skips[0].reason.contains("asks for frame 8 of scene"), "{report}");
+        assert_eq!(report.skips[1].reason, "bad camera: the pose holds NaN");
 
-        let (items, ledger) = index.select(&source, 2);
-        assert_eq!((scenes(&items), ledger.num_scenes, ledger.num_used()), (vec![2, 3], 4, 2));
+        let (items, report) = index.select(&source, 2);
+        assert_eq!((scenes(&items), report.num_scenes, report.num_used()), (vec![2, 3], 4, 2));
     }
 }

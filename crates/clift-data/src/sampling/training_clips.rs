@@ -120,7 +120,7 @@ impl TrainingClips {
         num_context: usize,
     ) -> Result<Clip, DataError> {
         let mut rng = item_rng(self.seed, step, slot as u32, attempt, "views");
-        let views = self.sampler.draw(self.source.as_ref(), scene, step, num_context, &mut rng)?;
+        let views = self.sampler.sample(self.source.as_ref(), scene, step, num_context, &mut rng)?;
         let clip = (self.read)(scene, &views)?;
         // A stream of its own, so that the views drawn are the same with and without it.
         let is_flipped = self.flip && unit(&mut item_rng(self.seed, step, slot as u32, attempt, "flip")) < 0.5;

@@ -145,7 +145,7 @@ impl ViewSampler {
     ///
     /// # Errors
     /// As [`ViewSampler::sample`], and whatever reading the scene gives.
-    pub fn draw(
+    pub fn sample(
         &self,
         source: &dyn SceneSource,
         scene: usize,
@@ -154,10 +154,10 @@ impl ViewSampler {
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
         if !self.inner.needs_centres() {
-            return self.sample(source.num_frames(scene)?, &[], step, num_context, rng);
+            return self.sample_frames(source.num_frames(scene)?, &[], step, num_context, rng);
         }
         let centres: Vec<_> = source.cameras(scene)?.iter().map(|camera| camera.c2w.translation.to_array()).collect();
-        self.sample(centres.len(), &centres, step, num_context, rng)
+        self.sample_frames(centres.len(), &centres, step, num_context, rng)
     }
 
     /// Draws the views of one item from a scene of `num_frames` frames with their camera centres, which may be left out
@@ -171,7 +171,7 @@ impl ViewSampler {
     /// [`DataError::BadConfig`] when `num_context` is outside `[min_context, max_context]`.
     ///
     /// [`validate`]: Self::validate
-    pub fn sample(
+    pub fn sample_frames(
         &self,
         num_frames: usize,
         centres: &[[f64; 3]],

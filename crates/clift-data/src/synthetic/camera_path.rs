@@ -1,4 +1,4 @@
-//! The camera's path: an arc around the middle of the room, facing a slowly moving point inside.
+//! The camera's path: an arc around the middle of the room that faces a slowly moving point.
 
 use std::f64::consts::TAU;
 
@@ -13,15 +13,15 @@ use crate::synthetic::config::LookDirection;
 /// Smallest distance between the camera and any surface, in the scene's units of length.
 pub(crate) const CLEARANCE: f64 = 0.25;
 
-/// A smooth camera path; `time` runs from 0 to 1.
+/// A smooth camera path. `time` runs from 0 to 1.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct CameraPath {
     radius: f64,
     start: f64,
     sweep: f64,
-    /// Height of the camera relative to the room's middle, downwards, and how far it swings.
+    /// Mean height of the camera relative to the room's middle, downwards, and the amplitude of its swing.
     height: [f64; 2],
-    /// The fixated point and how far it swings.
+    /// Mean fixated point, and the amplitude of its swing.
     target: [DVec3; 2],
     phase: f64,
     looks: LookDirection,
@@ -34,15 +34,15 @@ const INNER_RADIUS: f64 = 0.25;
 const RADIUS_SWING: f64 = 0.06;
 
 impl CameraPath {
-    /// Samples a path about `length` long in a room of `half_size` (y is down).
-    pub fn draw(rng: &mut impl Rng, half_size: DVec3, length: f64, looks: LookDirection) -> Self {
+    /// Samples a path of about `length` in a room of `half_size` (y is down).
+    pub fn sample(rng: &mut impl Rng, half_size: DVec3, length: f64, looks: LookDirection) -> Self {
         let widest = half_size.x.min(half_size.z) - CLEARANCE;
         let radius = widest * (0.86 + 0.08 * unit(rng));
         let side = if unit(rng) < 0.5 { -1.0 } else { 1.0 };
         let tall = half_size.y;
         let mut around = |size: f64| (2.0 * unit(rng) - 1.0) * size;
         let height = [tall * (-0.15 + around(0.2)), around(0.15 * tall)];
-        // At most 0.6 of the radius from the axis, so that the camera never stands where it looks.
+        // At most 0.6 of the radius from the axis: the camera never reaches its fixated point.
         let target = DVec3::new(around(0.1 * radius), tall * (0.2 + around(0.15)), around(0.1 * radius));
         let (sin, cos) = around(0.5 * TAU).sin_cos();
         let pan = radius * (0.35 + around(0.1));
@@ -58,12 +58,12 @@ impl CameraPath {
         }
     }
 
-    /// Smallest and largest horizontal distance of the camera from the room's vertical axis.
+    /// Returns the smallest and the largest horizontal distance of the camera from the room's vertical axis.
     pub fn radius_bounds(&self) -> [f64; 2] {
         [self.radius * (1.0 - RADIUS_SWING), self.radius * (1.0 + RADIUS_SWING)]
     }
 
-    /// Camera centre.
+    /// Returns the camera centre.
     pub fn position(&self, time: f64) -> DVec3 {
         let (sin, cos) = (self.start + self.sweep * time).sin_cos();
         let radius = self.radius * (1.0 + RADIUS_SWING * (TAU * time + self.phase).sin());
@@ -71,7 +71,7 @@ impl CameraPath {
         DVec3::new(radius * cos, height, radius * sin)
     }
 
-    /// Upright camera with square pixels and a horizontal field of view of `fov_deg` degrees.
+    /// Returns an upright camera with square pixels and a horizontal field of view of `fov_deg` degrees.
     pub fn camera(&self, time: f64, fov_deg: f64, aspect: f64) -> Camera {
         let position = self.position(time);
         let swing = (TAU * time + self.phase).cos();
@@ -79,7 +79,7 @@ impl CameraPath {
         let inwards = target + swing * drift - position;
         let forward = match self.looks {
             LookDirection::In => inwards,
-            // Away from the axis of the room, as far up or down as inwards.
+            // Away from the vertical axis, with the height of the direction inwards.
             LookDirection::Out => {
                 let away = self.radius / INNER_RADIUS / position.x.hypot(position.z);
                 DVec3::new(away * position.x, inwards.y, away * position.z)
@@ -95,8 +95,7 @@ impl CameraPath {
     }
 }
 
-/// Expects a vector other than zero: a camera is never at its fixated point, nor looks straight down. Not
-/// [`DVec3::normalize`], which multiplies by the reciprocal: rooms would change.
+/// Normalises a vector other than zero. [`DVec3::normalize`] multiplies by the reciprocal, which would change rooms.
 fn unit_vector(v: DVec3) -> DVec3 {
     v / v.length()
 }

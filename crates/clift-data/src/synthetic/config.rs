@@ -1,35 +1,35 @@
-//! Options of synthetic scenes, and their valid ranges.
+//! Options of synthetic scenes and their valid ranges.
 
 use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
 use crate::scene_source::Split;
 
-/// Most scenes of one source: the table of key blocks is then below 1 MiB.
+/// Largest number of scenes of one source: the table of key blocks stays below 1 MiB.
 pub(crate) const MAX_SCENES: usize = 32_000_000;
 
 /// Viewing direction of the camera on its path.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LookDirection {
-    /// From near the walls to the middle: all views show the same objects.
+    /// From near the walls towards the middle: all views show the same objects.
     #[default]
     In,
-    /// From near the middle to the walls, turning: views far apart on the path show nothing in common.
+    /// From near the middle towards the walls: views far apart on the path do not overlap.
     Out,
 }
 
-/// Options of synthetic scenes. Lengths are in the scene's own unit; a room is 3 to 4 units wide.
+/// Options of synthetic scenes. Lengths are in units of the scene; a default room is 3 to 4 units wide.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SyntheticConfig {
-    /// Seed of all scenes. Seeds, like splits, share no scene.
+    /// Seed of all scenes. Different seeds share no scene.
     pub seed: u64,
-    /// Family of scenes, `"train"` or `"test"`. No scene is in both, whatever the seed.
+    /// Split, `"train"` or `"test"`. The splits share no scene, for any seed.
     pub split: Split,
-    /// Scenes in the source, up to 32 million; unused ones cost nothing.
+    /// Number of scenes, up to 32 million. Unused scenes cost nothing.
     pub num_scenes: usize,
-    /// Frames along each camera path.
+    /// Number of frames along each camera path.
     pub num_frames: usize,
     /// Columns of a frame.
     pub width: usize,
@@ -39,16 +39,16 @@ pub struct SyntheticConfig {
     pub fov_deg: f64,
     /// Smallest and largest distance from the middle of a room to its walls; 1 or more.
     pub room_half_size: [f64; 2],
-    /// Fewest and most boxes and balls in a room; a crowded room may hold fewer.
+    /// Smallest and largest number of boxes and balls in a room; a crowded room may hold fewer.
     pub num_objects: [usize; 2],
-    /// Which way the camera looks, `"in"` or `"out"`.
+    /// Viewing direction of the camera, `"in"` or `"out"`.
     pub looks: LookDirection,
-    /// Length of the camera path from the first to the last frame, before small swings. Longer is harder. A camera that
-    /// looks out rotates by the arc's angle of a camera that looks in.
+    /// Length of the camera path from the first to the last frame, without small swings; longer is harder. A camera that
+    /// looks out rotates by the angle of this path.
     pub path_length: f64,
-    /// Cycles of the wall patterns per unit of length; patterns on objects are twice as fine. Finer is harder.
+    /// Cycles of the wall patterns per unit of length; finer is harder. Patterns on objects are twice as fine.
     pub texture_frequency: f64,
-    /// Share of rooms that are empty and have one colour per wall, so that scenes differ in complexity.
+    /// Share of empty rooms with one colour per wall, for scenes of different complexity.
     pub plain_share: f64,
     /// Strength of highlights and reflections, which depend on the view: 0 is matt, 1 is polished.
     pub specular: f64,
@@ -127,47 +127,39 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_config_names_the_key_the_value_and_the_fix() {
-        let check = |change: fn(&mut SyntheticConfig)| {
+    fn invalid_value_is_named_with_its_key() {
+        type Change = fn(&mut SyntheticConfig);
+        let cases: [(Change, &str); 19] = [
+            (|c| c.num_frames = 0, "num_frames is 0; use 1 to 100000"),
+            (|c| c.num_scenes = MAX_SCENES + 1, "num_scenes is 32000001"),
+            (|c| c.width = 0, "width is 0"),
+            (|c| c.height = 20_000, "height is 20000"),
+            (|c| c.fov_deg = f64::NAN, "fov_deg is NaN"),
+            (|c| c.fov_deg = f64::INFINITY, "fov_deg is inf"),
+            (|c| c.room_half_size = [2.0, 1.0], "room_half_size is [2, 1]"),
+            (|c| c.room_half_size = [0.5, 1.0], "room_half_size is [0.5, 1]"),
+            (|c| c.room_half_size = [f64::NAN, 2.0], "room_half_size is [NaN, 2]"),
+            (|c| c.room_half_size = [1.5, f64::INFINITY], "room_half_size is [1.5, inf]"),
+            (|c| c.num_objects = [4, 2], "num_objects is [4, 2]"),
+            (|c| c.path_length = 0.0, "path_length is 0"),
+            (|c| c.path_length = f64::INFINITY, "path_length is inf"),
+            (|c| c.texture_frequency = -1.0, "texture_frequency is -1"),
+            (|c| c.texture_frequency = f64::NAN, "texture_frequency is NaN"),
+            (|c| c.plain_share = 1.5, "plain_share is 1.5"),
+            (|c| c.specular = 1.5, "specular is 1.5"),
+            (|c| c.specular = f64::NEG_INFINITY, "specular is -inf"),
+            (|c| c.samples_per_pixel = 6, "samples_per_pixel is 6"),
+        ];
+        for (change, expected) in cases {
             let mut config = SyntheticConfig::default();
             change(&mut config);
-            config.validate().unwrap_err().to_string()
-        };
-        assert_eq!(check(|c| c.num_frames = 0), "num_frames is 0; use 1 to 100000");
-        assert!(check(|c| c.num_scenes = MAX_SCENES + 1).starts_with("num_scenes is 32000001"));
-        assert!(check(|c| c.width = 0).starts_with("width is 0"));
-        assert!(check(|c| c.height = 20_000).starts_with("height is 20000"));
-        assert!(check(|c| c.fov_deg = f64::NAN).starts_with("fov_deg is NaN"));
-        assert!(check(|c| c.room_half_size = [2.0, 1.0]).starts_with("room_half_size is [2, 1]"));
-        assert!(check(|c| c.room_half_size = [0.5, 1.0]).starts_with("room_half_size is [0.5, 1]"));
-        assert!(check(|c| c.num_objects = [4, 2]).starts_with("num_objects is [4, 2]"));
-        assert!(check(|c| c.path_length = 0.0).starts_with("path_length is 0"));
-        assert!(check(|c| c.texture_frequency = -1.0).starts_with("texture_frequency is -1"));
-        assert!(check(|c| c.plain_share = 1.5).starts_with("plain_share is 1.5"));
-        assert!(check(|c| c.specular = 1.5).starts_with("specular is 1.5"));
-        assert!(check(|c| c.samples_per_pixel = 6).starts_with("samples_per_pixel is 6"));
-    }
-
-    #[test]
-    fn a_number_that_is_not_finite_is_refused_by_its_key() {
-        for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
-            let valid = SyntheticConfig::default;
-            for (key, config) in [
-                ("fov_deg", SyntheticConfig { fov_deg: value, ..valid() }),
-                ("room_half_size", SyntheticConfig { room_half_size: [value, 2.0], ..valid() }),
-                ("room_half_size", SyntheticConfig { room_half_size: [1.5, value], ..valid() }),
-                ("path_length", SyntheticConfig { path_length: value, ..valid() }),
-                ("texture_frequency", SyntheticConfig { texture_frequency: value, ..valid() }),
-                ("specular", SyntheticConfig { specular: value, ..valid() }),
-            ] {
-                let message = config.validate().unwrap_err().to_string();
-                assert!(message.starts_with(&format!("{key} is ")), "{value}: {message}");
-            }
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.starts_with(expected), "{message}");
         }
     }
 
     #[test]
-    fn an_unknown_key_is_refused_and_a_missing_one_takes_its_default() {
+    fn unknown_key_is_refused_and_missing_key_has_default() {
         let parsed: Result<SyntheticConfig, _> = serde_json::from_str(r#"{"sed": 1}"#);
         assert!(parsed.unwrap_err().to_string().contains("sed"));
         let parsed: SyntheticConfig = serde_json::from_str(r#"{"split": "test"}"#).unwrap();

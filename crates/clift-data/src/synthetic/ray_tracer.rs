@@ -1,19 +1,19 @@
 //! A small ray tracer: nearest surface, soft shadows and occlusion in closed form, one mirrored bounce.
 //!
-//! Soft shadows follow from the distance at which the ray to the lamp passes an object, not from samples of the lamp:
-//! images have no noise, and a frame is a pure function of scene and camera.
+//! Soft shadows are computed from the distance at which the ray to the lamp passes an object, not by sampling the lamp.
+//! Images have no noise, and a frame is a pure function of room and camera.
 
 use glam::{DVec3, Vec3};
 
 use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
-use crate::synthetic::room::{Object, Scene, Shape, turned};
+use crate::synthetic::room::{Object, Room, Shape, turned};
 
-/// Smallest slope of a slab test, which keeps the test finite for rays along an axis.
+/// Smallest absolute slope of a slab test; keeps the test finite for rays along an axis.
 const LEAST_SLOPE: f32 = 1e-6;
-/// Smallest weight of a mirrored ray; below it the ray hardly changes an 8-bit value.
+/// Smallest weight of a mirrored ray; rays of smaller weight hardly change an 8-bit value.
 const LEAST_MIRROR: f32 = 0.02;
-/// Ambient light over the lamp's.
+/// Brightness of the ambient light.
 const AMBIENT: f32 = 0.6;
 /// Brightness of the lamp.
 const LAMP: f32 = 2.2;
@@ -28,15 +28,15 @@ struct Hit {
     normal: Vec3,
     albedo: Vec3,
     gloss: f32,
-    /// Position of the object in the scene's list; `None` for the room.
+    /// Index of the object in the room; `None` for a wall.
     object: Option<usize>,
 }
 
-/// Renders `scene` with `side * side` rays per pixel.
+/// Renders `room` with `side * side` rays per pixel.
 ///
 /// `specular` in `[0, 1]` scales all light that depends on the viewing direction.
 pub(crate) fn render(
-    scene: &Scene,
+    room: &Room,
     camera: &Camera,
     width: usize,
     height: usize,
@@ -54,7 +54,7 @@ pub(crate) fn render(
                 let x = (column as f64 + offset(sample % side) - intrinsics.cx) / intrinsics.fx;
                 let y = (row as f64 + offset(sample / side) - intrinsics.cy) / intrinsics.fy;
                 let direction = (camera.c2w.rotation * DVec3::new(x, y, 1.0)).as_vec3().normalize();
-                sum += display(trace(scene, origin, direction, specular, true));
+                sum += display(trace(room, origin, direction, specular, true));
             }
             let scale = 255.0 / (side * side) as f32;
             rgb.extend(sum.to_array().map(|value| (value * scale + 0.5) as u8));
@@ -63,23 +63,23 @@ pub(crate) fn render(
     RgbImage { width, height, rgb }
 }
 
-/// Linear light to display values in `[0, 1]`: a soft shoulder, then gamma 2.
+/// Converts linear light to display values in `[0, 1]`: a soft shoulder, then gamma 2.
 fn display(light: Vec3) -> Vec3 {
     light.map(|x| (x * (1.0 + x * 0.1) / (1.0 + x * 0.45)).clamp(0.0, 1.0).sqrt())
 }
 
-/// Linear light along a ray.
-fn trace(scene: &Scene, origin: Vec3, direction: Vec3, specular: f32, may_mirror: bool) -> Vec3 {
-    let hit = nearest(scene, origin, direction);
-    let to_lamp = scene.lamp - hit.point;
+/// Returns the linear light along a ray.
+fn trace(room: &Room, origin: Vec3, direction: Vec3, specular: f32, may_mirror: bool) -> Vec3 {
+    let hit = nearest(room, origin, direction);
+    let to_lamp = room.lamp - hit.point;
     let distance = to_lamp.length().max(1e-3);
     let to_lamp = to_lamp * (1.0 / distance);
     let facing = hit.normal.dot(to_lamp).max(0.0);
-    let reaching = if facing > 0.0 { LAMP * shadow(scene, &hit, to_lamp) } else { 0.0 };
+    let reaching = if facing > 0.0 { LAMP * shadow(room, &hit, to_lamp) } else { 0.0 };
     let falloff = 1.0 / (1.0 + (distance / LAMP_REACH).powi(2));
 
-    let diffuse = AMBIENT * openness(scene, &hit) + reaching * facing * falloff;
-    let mut light = hit.albedo * diffuse + lamp_glow(scene, &hit);
+    let diffuse = AMBIENT * openness(room, &hit) + reaching * facing * falloff;
+    let mut light = hit.albedo * diffuse + lamp_glow(room, &hit);
     let shine = specular * hit.gloss;
     if shine > 0.0 {
         let mirrored = direction.reflect(hit.normal);
@@ -91,15 +91,16 @@ fn trace(scene: &Scene, origin: Vec3, direction: Vec3, specular: f32, may_mirror
         let weight = shine * (0.12 + 0.88 * grazing.powi(5));
         if may_mirror && weight > LEAST_MIRROR {
             let start = hit.point + hit.normal * 1e-3;
-            light = light.lerp_monotonic(trace(scene, start, mirrored, specular, false), weight);
+            light = light.lerp_monotonic(trace(room, start, mirrored, specular, false), weight);
         }
     }
     light
 }
 
-fn nearest(scene: &Scene, origin: Vec3, direction: Vec3) -> Hit {
+/// Returns the nearest surface along a ray.
+fn nearest(room: &Room, origin: Vec3, direction: Vec3) -> Hit {
     let mut best = (f32::INFINITY, Vec3::ZERO, None);
-    for (index, object) in scene.objects.iter().enumerate() {
+    for (index, object) in room.objects.iter().enumerate() {
         if let Some((distance, normal)) = meet(object, origin, direction)
             && distance < best.0
         {
@@ -108,14 +109,14 @@ fn nearest(scene: &Scene, origin: Vec3, direction: Vec3) -> Hit {
     }
     let (distance, normal, object) = best;
     if let Some(index) = object {
-        let (point, object) = (origin + direction * distance, &scene.objects[index]);
+        let (point, object) = (origin + direction * distance, &room.objects[index]);
         let [u, v] = surface(object, point, normal);
         return Hit { point, normal, albedo: object.texture.color(u, v), gloss: object.gloss, object: Some(index) };
     }
-    meet_room(scene, origin, direction)
+    meet_room(room, origin, direction)
 }
 
-/// Distance and normal where a ray from outside meets an object.
+/// Returns the distance and the normal at which a ray from outside meets an object.
 fn meet(object: &Object, origin: Vec3, direction: Vec3) -> Option<(f32, Vec3)> {
     let from_center = origin - object.center;
     match object.shape {
@@ -140,8 +141,8 @@ fn meet(object: &Object, origin: Vec3, direction: Vec3) -> Option<(f32, Vec3)> {
     }
 }
 
-/// Distances at which a line enters and leaves a box around the origin, the axis of the face it enters, and its slope
-/// along that axis.
+/// Returns the distances at which a line enters and leaves a box around the origin, the axis of the entered face, and
+/// the slope of the line along that axis.
 fn slabs(origin: Vec3, direction: Vec3, half_size: Vec3) -> (f32, f32, usize, f32) {
     let (mut near, mut far, mut entered) = (f32::NEG_INFINITY, f32::INFINITY, 0);
     for axis in 0..3 {
@@ -155,12 +156,12 @@ fn slabs(origin: Vec3, direction: Vec3, half_size: Vec3) -> (f32, f32, usize, f3
     (near, far, entered, direction[entered])
 }
 
-/// Moves a slope off zero.
+/// Limits a slope to at least [`LEAST_SLOPE`] in absolute value.
 fn steep(slope: f32) -> f32 {
     if slope.abs() < LEAST_SLOPE { LEAST_SLOPE.copysign(slope) } else { slope }
 }
 
-/// Texture coordinates of a point on an object: the coordinates of the object's own frame along the face.
+/// Returns the texture coordinates of a point on an object: the coordinates along the face in the object's frame.
 fn surface(object: &Object, point: Vec3, normal: Vec3) -> [f32; 2] {
     let local = point - object.center;
     let Shape::Block { turn, .. } = object.shape else { return [local.x + local.z, local.y] };
@@ -174,12 +175,12 @@ fn surface(object: &Object, point: Vec3, normal: Vec3) -> [f32; 2] {
     }
 }
 
-/// Intersection of a ray from inside the room with a wall.
-fn meet_room(scene: &Scene, origin: Vec3, direction: Vec3) -> Hit {
+/// Intersects a ray from inside the room with a wall.
+fn meet_room(room: &Room, origin: Vec3, direction: Vec3) -> Hit {
     let (mut distance, mut axis) = (f32::INFINITY, 0);
     for candidate in 0..3 {
         let slope = steep(direction[candidate]);
-        let reached = (scene.half_size[candidate].copysign(slope) - origin[candidate]) / slope;
+        let reached = (room.half_size[candidate].copysign(slope) - origin[candidate]) / slope;
         if reached < distance {
             (distance, axis) = (reached, candidate);
         }
@@ -190,17 +191,17 @@ fn meet_room(scene: &Scene, origin: Vec3, direction: Vec3) -> Hit {
     normal[axis] = if forward { -1.0 } else { 1.0 };
     let [x, y, z] = point.to_array();
     let [u, v] = [[z, y], [x, z], [x, y]][axis];
-    let albedo = scene.walls[axis * 2 + usize::from(forward)].color(u, v);
+    let albedo = room.walls[axis * 2 + usize::from(forward)].color(u, v);
     let is_floor = axis == 1 && forward;
     Hit { point, normal, albedo, gloss: if is_floor { 0.35 } else { 0.0 }, object: None }
 }
 
-/// Visible share of the lamp: 1 without shadow, 0 in full shadow.
-fn shadow(scene: &Scene, hit: &Hit, to_lamp: Vec3) -> f32 {
+/// Returns the visible share of the lamp: 1 without shadow, 0 in full shadow.
+fn shadow(room: &Room, hit: &Hit, to_lamp: Vec3) -> f32 {
     let mut share = 1.0;
-    for (index, object) in scene.objects.iter().enumerate() {
+    for (index, object) in room.objects.iter().enumerate() {
         if hit.object == Some(index) {
-            continue; // a convex object shades itself where its normal points away from the lamp
+            continue; // the normal already shades the side of a convex object that faces away from the lamp
         }
         let from_center = hit.point - object.center;
         share *= match object.shape {
@@ -220,16 +221,16 @@ fn shadow(scene: &Scene, hit: &Hit, to_lamp: Vec3) -> f32 {
     share
 }
 
-/// Share of ambient light that reaches a point: less in corners and beside objects.
-fn openness(scene: &Scene, hit: &Hit) -> f32 {
+/// Returns the share of ambient light that reaches a point: less in corners and beside objects.
+fn openness(room: &Room, hit: &Hit) -> f32 {
     let mut share = 1.0;
     for axis in 0..3 {
-        let to_wall = scene.half_size[axis] - hit.point[axis].abs();
+        let to_wall = room.half_size[axis] - hit.point[axis].abs();
         if hit.normal[axis].abs() < 0.9 {
             share *= 1.0 - 0.4 / (1.0 + (5.0 * to_wall).powi(2));
         }
     }
-    for (index, object) in scene.objects.iter().enumerate() {
+    for (index, object) in room.objects.iter().enumerate() {
         if hit.object == Some(index) {
             continue;
         }
@@ -245,17 +246,17 @@ fn openness(scene: &Scene, hit: &Hit) -> f32 {
     share
 }
 
-/// The lamp itself, a soft disc on the ceiling.
-fn lamp_glow(scene: &Scene, hit: &Hit) -> Vec3 {
+/// Returns the light of the lamp itself, a soft disc on the ceiling.
+fn lamp_glow(room: &Room, hit: &Hit) -> Vec3 {
     if hit.object.is_some() || hit.normal.y < 0.5 {
         return Vec3::ZERO;
     }
-    let across = hit.point - scene.lamp;
+    let across = hit.point - room.lamp;
     let squared = across.x.powi(2) + across.z.powi(2);
     Vec3::new(1.0, 0.95, 0.85) * (2.0 * smooth(1.5 - 12.0 * squared))
 }
 
-/// Hermite step from 0 to 1.
+/// Returns the Hermite step from 0 to 1.
 fn smooth(x: f32) -> f32 {
     let x = x.clamp(0.0, 1.0);
     x * x * (3.0 - 2.0 * x)
@@ -270,23 +271,23 @@ mod tests {
 
     const RED: Vec3 = Vec3::new(1.0, 0.0, 0.0);
 
-    /// A room of one colour with one ball in it, and the default camera path.
-    fn scene(room: Vec3, ball: Vec3, gloss: f32) -> Scene {
+    /// A room of one colour with one ball, and the default camera path.
+    fn room_with_ball(walls: Vec3, ball: Vec3, gloss: f32) -> Room {
         let config = SyntheticConfig { num_objects: [0, 0], ..Default::default() };
-        let mut scene = Scene::draw(&mut step_rng(5, 0, "test"), &config);
-        scene.walls = [(); 6].map(|()| Texture::plain(room));
+        let mut room = Room::sample(&mut step_rng(5, 0, "test"), &config);
+        room.walls = [(); 6].map(|()| Texture::plain(walls));
         let shape = Shape::Ball { radius: 0.2 };
         let center = Vec3::new(0.1, 0.2, -0.1);
-        scene.objects.push(Object { shape, center, texture: Texture::plain(ball), gloss });
-        scene
+        room.objects.push(Object { shape, center, texture: Texture::plain(ball), gloss });
+        room
     }
 
     #[test]
-    fn a_ball_appears_where_the_camera_projects_its_centre() {
-        let scene = scene(Vec3::ZERO, RED, 0.0);
+    fn ball_appears_at_its_projected_centre() {
+        let room = room_with_ball(Vec3::ZERO, RED, 0.0);
         for time in [0.0, 0.2, 0.4, 0.6, 0.8, 1.0] {
-            let camera = scene.path.camera(time, 75.0, 1.5);
-            let frame = render(&scene, &camera, 192, 128, 1, 0.0);
+            let camera = room.path.camera(time, 75.0, 1.5);
+            let frame = render(&room, &camera, 192, 128, 1, 0.0);
             let (mut sum, mut count) = ([0.0; 2], 0.0);
             for (index, pixel) in frame.rgb.chunks_exact(3).enumerate() {
                 if pixel[0] > 30 && pixel[2] == 0 {
@@ -295,10 +296,10 @@ mod tests {
                     count += 1.0;
                 }
             }
-            let [x, y, depth] = camera.c2w.inverse().apply(scene.objects[0].center.as_dvec3()).to_array();
+            let [x, y, depth] = camera.c2w.inverse().apply(room.objects[0].center.as_dvec3()).to_array();
             let pixels = camera.intrinsics_norm.to_pixels(192, 128);
             let center = [pixels.fx * x / depth + pixels.cx, pixels.fy * y / depth + pixels.cy];
-            // A ball off the axis looks like an ellipse whose middle lies outwards of the projected centre, by
+            // The image of a ball off the axis is an ellipse whose middle lies outwards of the projected centre, by
             // less than (radius / depth)^2 of the distance from the axis.
             for (axis, middle) in [pixels.cx, pixels.cy].into_iter().enumerate() {
                 let off_axis = (center[axis] - middle).abs();
@@ -313,25 +314,25 @@ mod tests {
     }
 
     #[test]
-    fn the_floor_below_a_ball_is_in_shadow() {
-        let mut scene = scene(Vec3::ONE, RED, 0.0);
-        let floor = scene.half_size.y;
-        scene.lamp = Vec3::new(0.1, -floor + 0.1, -0.1);
+    fn floor_below_a_ball_is_in_shadow() {
+        let mut room = room_with_ball(Vec3::ONE, RED, 0.0);
+        let floor = room.half_size.y;
+        room.lamp = Vec3::new(0.1, -floor + 0.1, -0.1);
         let light =
-            |scene: &Scene, x: f32| trace(scene, Vec3::new(x, floor - 0.05, -0.1), Vec3::new(0.0, 1.0, 0.0), 0.0, true);
-        let (below, beside) = (light(&scene, 0.1), light(&scene, 0.9));
+            |room: &Room, x: f32| trace(room, Vec3::new(x, floor - 0.05, -0.1), Vec3::new(0.0, 1.0, 0.0), 0.0, true);
+        let (below, beside) = (light(&room, 0.1), light(&room, 0.9));
         assert!(below.y < 0.5 * beside.y, "{below:?} {beside:?}");
-        scene.objects.clear();
-        let (below, beside) = (light(&scene, 0.1), light(&scene, 0.9));
-        assert!(below.y > beside.y, "without the ball it is brightest below the lamp");
+        room.objects.clear();
+        let (below, beside) = (light(&room, 0.1), light(&room, 0.9));
+        assert!(below.y > beside.y, "without the ball the floor is brightest below the lamp");
     }
 
     #[test]
-    fn only_specular_surfaces_change_with_the_view() {
-        let scene = scene(Vec3::new(0.2, 0.4, 0.8), RED, 1.0);
-        let ball = &scene.objects[0];
+    fn only_specular_surfaces_depend_on_the_view() {
+        let room = room_with_ball(Vec3::new(0.2, 0.4, 0.8), RED, 1.0);
+        let ball = &room.objects[0];
         let top = ball.center + Vec3::new(0.0, -0.2, 0.0);
-        let seen_from = |origin: Vec3, specular: f32| trace(&scene, origin, (top - origin).normalize(), specular, true);
+        let seen_from = |origin: Vec3, specular: f32| trace(&room, origin, (top - origin).normalize(), specular, true);
         let (left, right) = (Vec3::new(-1.0, -0.6, 0.3), Vec3::new(0.9, -0.3, 0.2));
         let difference = |specular: f32| (seen_from(left, specular) - seen_from(right, specular)).length();
         assert!(difference(0.0) < 1e-4, "{}", difference(0.0));
@@ -339,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_block_is_met_at_its_faces() {
+    fn turned_block_is_hit_at_its_faces() {
         let turn = [0.6, 0.8];
         let half_size = Vec3::new(0.3, 0.2, 0.1);
         let shape = Shape::Block { half_size, turn };
@@ -354,6 +355,6 @@ mod tests {
         }
         assert!(meet(&object, Vec3::new(0.0, 0.5, 0.0), Vec3::new(0.0, 0.0, 1.0)).is_none());
         let behind = meet(&object, Vec3::new(1.0, 0.0, 4.0), Vec3::new(0.0, 0.0, 1.0));
-        assert!(behind.is_none(), "what is behind the origin is not met");
+        assert!(behind.is_none(), "an object behind the origin is not hit");
     }
 }

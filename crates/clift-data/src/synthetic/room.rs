@@ -1,4 +1,4 @@
-//! A synthetic scene: a box-shaped room, boxes and balls on its floor, a lamp and a camera path.
+//! A room: box-shaped walls, boxes and balls on the floor, a lamp and a camera path.
 
 use glam::{DVec3, Vec3};
 use rand::Rng;
@@ -9,7 +9,7 @@ use crate::synthetic::camera_path::{CLEARANCE, CameraPath};
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::texture::Texture;
 
-/// Attempts to place an object, each a little smaller, before the room counts as full.
+/// Attempts to place an object, each 4 % smaller, before the room counts as full.
 const MAX_PLACEMENTS: u32 = 60;
 
 /// Geometry of an object.
@@ -36,7 +36,7 @@ pub(crate) struct Object {
 }
 
 impl Object {
-    /// Radius of the upright cylinder around the object.
+    /// Returns the radius of the upright cylinder around the object.
     pub fn reach(&self) -> f32 {
         match self.shape {
             Shape::Ball { radius } => radius,
@@ -45,9 +45,9 @@ impl Object {
     }
 }
 
-/// A scene: the room is centred on the origin, x right, y down, z forward.
+/// A synthetic scene: a room around the origin with x right, y down, z forward.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Scene {
+pub(crate) struct Room {
     pub half_size: Vec3,
     /// Textures at -x, +x, -y (ceiling), +y (floor), -z, +z.
     pub walls: [Texture; 6],
@@ -56,18 +56,18 @@ pub(crate) struct Scene {
     pub path: CameraPath,
 }
 
-impl Scene {
-    /// Samples a scene of a valid `config`.
-    pub fn draw(rng: &mut ChaCha8Rng, config: &SyntheticConfig) -> Self {
+impl Room {
+    /// Samples a room. Expects a valid `config`.
+    pub fn sample(rng: &mut ChaCha8Rng, config: &SyntheticConfig) -> Self {
         let [small, large] = config.room_half_size;
         let mut half = || small + (large - small) * unit(rng);
         let (wide, deep) = (half(), half());
         let tall = small * (0.6 + 0.15 * unit(rng));
         let half_size = DVec3::new(wide, tall, deep);
-        let path = CameraPath::draw(rng, half_size, config.path_length, config.looks);
+        let path = CameraPath::sample(rng, half_size, config.path_length, config.looks);
         let lamp = DVec3::new(wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35));
 
-        // No random number if no room is plain: such rooms stay as they were before the option.
+        // Without plain rooms no random number is drawn: rooms equal those from before this option.
         let is_plain = config.plain_share > 0.0 && unit(rng) < config.plain_share;
         let hue = unit(rng);
         let frequency = if is_plain { 0.0 } else { config.texture_frequency };
@@ -75,26 +75,26 @@ impl Scene {
             let (hue, saturation, value, frequency) = match side {
                 2 => (hue, 0.1, 0.9, 0.5 * frequency),
                 3 => (0.05 + 0.1 * unit(rng), 0.35, 0.75, frequency),
-                // Four walls a quarter turn of hue apart, so that no two look alike.
+                // The hues of the four walls are a quarter turn apart.
                 _ => {
                     let quarter = [0.0, 0.5, 0.0, 0.0, 0.25, 0.75][side] + swing(rng, 0.05);
                     let value = if side < 2 { 0.95 } else { 0.7 };
                     (hue + quarter, 0.5 + 0.3 * unit(rng), value, frequency)
                 }
             };
-            Texture::draw(rng, hue, saturation, value, frequency)
+            Texture::sample(rng, hue, saturation, value, frequency)
         });
 
-        let mut scene = Self { half_size: half_size.as_vec3(), walls, objects: Vec::new(), lamp: lamp.as_vec3(), path };
+        let mut room = Self { half_size: half_size.as_vec3(), walls, objects: Vec::new(), lamp: lamp.as_vec3(), path };
         let [fewest, most] = if is_plain { [0, 0] } else { config.num_objects };
         for _ in 0..between(rng, fewest, most) {
-            let object = (0..MAX_PLACEMENTS).find_map(|attempt| scene.try_object(rng, config, attempt));
-            scene.objects.extend(object);
+            let object = (0..MAX_PLACEMENTS).find_map(|attempt| room.try_object(rng, config, attempt));
+            room.objects.extend(object);
         }
-        scene
+        room
     }
 
-    /// Samples an object on the floor; `None` if it would touch the path, a wall or another object.
+    /// Samples an object on the floor. Returns `None` if the object touches the path, a wall or another object.
     fn try_object(&self, rng: &mut impl Rng, config: &SyntheticConfig, attempt: u32) -> Option<Object> {
         let scale = config.room_half_size[0] * 0.96_f64.powi(attempt as i32);
         let mut size = |low: f64, high: f64| (scale * (low + (high - low) * unit(rng))) as f32;
@@ -110,7 +110,7 @@ impl Scene {
         let Vec3 { x: wide, y: floor, z: deep } = self.half_size;
         let center = Vec3::new(wide * swing(rng, 1.0) as f32, floor - height, deep * swing(rng, 1.0) as f32);
         let hue = unit(rng);
-        let texture = Texture::draw(rng, hue, 0.75, 0.95, 2.0 * config.texture_frequency);
+        let texture = Texture::sample(rng, hue, 0.75, 0.95, 2.0 * config.texture_frequency);
         let object = Object { shape, center, texture, gloss: unit(rng) as f32 };
         self.has_room_for(&object).then_some(object)
     }
@@ -130,7 +130,7 @@ impl Scene {
     }
 }
 
-/// Rotates about the vertical axis; `turn` is (cosine, sine).
+/// Rotates a vector about the vertical axis by (cosine, sine).
 pub(crate) fn turned(v: Vec3, [cos, sin]: [f32; 2]) -> Vec3 {
     Vec3::new(cos * v.x + sin * v.z, v.y, cos * v.z - sin * v.x)
 }
@@ -146,7 +146,7 @@ mod tests {
     use crate::random::step_rng;
     use crate::synthetic::config::LookDirection;
 
-    /// Distance from a point to an object's surface, 0 inside.
+    /// Returns the distance from a point to the surface of an object, 0 inside.
     fn distance(object: &Object, point: Vec3) -> f32 {
         let from_center = point - object.center;
         match object.shape {
@@ -155,13 +155,13 @@ mod tests {
         }
     }
 
-    fn scenes(config: &SyntheticConfig) -> Vec<Scene> {
-        (0..200).map(|index| Scene::draw(&mut step_rng(3, index, "test"), config)).collect()
+    fn rooms(config: &SyntheticConfig) -> Vec<Room> {
+        (0..200).map(|index| Room::sample(&mut step_rng(3, index, "test"), config)).collect()
     }
 
     #[test]
-    fn the_camera_stays_clear_of_walls_and_objects() {
-        // f32 in the room, f64 on the path: 1e-5 covers the difference.
+    fn camera_stays_clear_of_walls_and_objects() {
+        // The room is in f32, the path in f64: 1e-5 covers the difference.
         let least = CLEARANCE as f32 - 1e-5;
         let crowded = SyntheticConfig {
             room_half_size: [1.0, 3.0],
@@ -171,12 +171,12 @@ mod tests {
         };
         let turning = SyntheticConfig { looks: LookDirection::Out, ..crowded.clone() };
         for config in [SyntheticConfig::default(), crowded, turning] {
-            for scene in scenes(&config) {
+            for room in rooms(&config) {
                 for time in 0..=500 {
-                    let position = scene.path.position(f64::from(time) / 500.0).as_vec3();
-                    let to_walls = scene.half_size - position.abs();
-                    assert!(to_walls.min_element() > least, "{position} in {}", scene.half_size);
-                    for object in &scene.objects {
+                    let position = room.path.position(f64::from(time) / 500.0).as_vec3();
+                    let to_walls = room.half_size - position.abs();
+                    assert!(to_walls.min_element() > least, "{position} in {}", room.half_size);
+                    for object in &room.objects {
                         let apart = distance(object, position);
                         assert!(apart > least, "{apart} from {object:?}");
                     }
@@ -186,16 +186,16 @@ mod tests {
     }
 
     #[test]
-    fn objects_stand_on_the_floor_inside_the_room_and_apart() {
-        for scene in scenes(&SyntheticConfig::default()) {
-            for (i, object) in scene.objects.iter().enumerate() {
+    fn objects_stand_apart_on_the_floor() {
+        for room in rooms(&SyntheticConfig::default()) {
+            for (i, object) in room.objects.iter().enumerate() {
                 let height = match object.shape {
                     Shape::Ball { radius } => radius,
                     Shape::Block { half_size, .. } => half_size.y,
                 };
-                assert!((object.center.y + height - scene.half_size.y).abs() < 1e-5);
-                assert!([0, 2].iter().all(|&axis| object.center[axis].abs() + object.reach() < scene.half_size[axis]));
-                for other in &scene.objects[i + 1..] {
+                assert!((object.center.y + height - room.half_size.y).abs() < 1e-5);
+                assert!([0, 2].iter().all(|&axis| object.center[axis].abs() + object.reach() < room.half_size[axis]));
+                for other in &room.objects[i + 1..] {
                     let Vec3 { x, z, .. } = object.center - other.center;
                     assert!(x.hypot(z) > object.reach() + other.reach());
                 }
@@ -204,11 +204,11 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_looks_out_turns_its_back_on_the_middle() {
+    fn camera_that_looks_out_faces_away_from_the_middle() {
         for looks in [LookDirection::In, LookDirection::Out] {
-            for scene in scenes(&SyntheticConfig { looks, ..Default::default() }) {
+            for room in rooms(&SyntheticConfig { looks, ..Default::default() }) {
                 for time in [0.0, 0.3, 1.0] {
-                    let camera = scene.path.camera(time, 75.0, 1.0).c2w;
+                    let camera = room.path.camera(time, 75.0, 1.0).c2w;
                     let (forward, centre) = (camera.rotation.z_axis, camera.translation);
                     let away = forward.x * centre.x + forward.z * centre.z;
                     assert_eq!(away > 0.0, looks == LookDirection::Out, "{forward} at {centre}");
@@ -218,19 +218,19 @@ mod tests {
     }
 
     #[test]
-    fn a_share_of_the_rooms_is_plain_and_none_unless_asked_for() {
+    fn plain_share_sets_the_number_of_empty_rooms() {
         let plain = |plain_share| {
             let config = SyntheticConfig { plain_share, ..Default::default() };
-            scenes(&config).iter().filter(|scene| scene.objects.is_empty()).count()
+            rooms(&config).iter().filter(|room| room.objects.is_empty()).count()
         };
         assert_eq!((plain(0.0), plain(1.0)), (0, 200));
-        // Four standard deviations of 200 throws: 28.
+        // Four standard deviations of 200 samples: 28.
         assert!((72..=128).contains(&plain(0.5)), "{}", plain(0.5));
     }
 
     #[test]
-    fn rooms_hold_as_many_objects_as_asked_for_by_default() {
-        let counts: Vec<usize> = scenes(&SyntheticConfig::default()).iter().map(|scene| scene.objects.len()).collect();
+    fn default_rooms_have_the_configured_number_of_objects() {
+        let counts: Vec<usize> = rooms(&SyntheticConfig::default()).iter().map(|room| room.objects.len()).collect();
         assert!(counts.iter().all(|count| (3..=5).contains(count)), "{counts:?}");
         assert!([3, 4, 5].iter().all(|wanted| counts.contains(wanted)));
     }

@@ -1,7 +1,7 @@
 //! Synthetic scenes from seeds: textured rooms with boxes and balls, ray traced on demand.
 //!
-//! A scene is a pure function of (seed, split, index), a frame of (scene, frame): unused scenes cost nothing, and
-//! threads need no coordination. Cameras are exact.
+//! A scene is a pure function of (seed, split, index), a frame of (scene, frame). Unused scenes cost nothing, threads
+//! need no coordination, and cameras are exact.
 
 use std::sync::OnceLock;
 
@@ -12,12 +12,12 @@ use crate::random::step_rng;
 use crate::scene_source::{SceneSource, Split};
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::ray_tracer;
-use crate::synthetic::room::Scene;
+use crate::synthetic::room::Room;
 
-/// Keys of a block, which are formatted together on first use.
+/// Number of keys per block. The keys of a block are formatted together on first use.
 const KEYS_PER_BLOCK: usize = 1024;
 
-/// Synthetic scenes, traced on demand. Keys are `synthetic-<seed>-<split>-<index>`.
+/// A source of synthetic scenes, rendered on demand. Keys are `synthetic-<seed>-<split>-<index>`.
 #[derive(Debug)]
 pub struct SyntheticSource {
     config: SyntheticConfig,
@@ -25,17 +25,17 @@ pub struct SyntheticSource {
 }
 
 impl SyntheticSource {
-    /// Makes a source without tracing anything.
+    /// Creates a source without rendering any frame.
     ///
     /// # Errors
-    /// Those of [`SyntheticConfig::validate`].
+    /// As [`SyntheticConfig::validate`].
     pub fn new(config: SyntheticConfig) -> Result<Self, DataError> {
         config.validate()?;
         let num_blocks = config.num_scenes.div_ceil(KEYS_PER_BLOCK);
         Ok(Self { config, key_blocks: (0..num_blocks).map(|_| OnceLock::new()).collect() })
     }
 
-    /// The options of the scenes.
+    /// Returns the options of the scenes.
     pub fn config(&self) -> &SyntheticConfig {
         &self.config
     }
@@ -44,7 +44,7 @@ impl SyntheticSource {
         format!("synthetic-{}-{}-", self.config.seed, self.config.split)
     }
 
-    fn scene(&self, scene: usize) -> Result<Scene, DataError> {
+    fn room(&self, scene: usize) -> Result<Room, DataError> {
         let num_scenes = self.config.num_scenes;
         if scene >= num_scenes {
             return Err(DataError::NoSuchScene { scene, num_scenes });
@@ -54,12 +54,12 @@ impl SyntheticSource {
             Split::Test => "synthetic test scene",
         };
         let mut rng = step_rng(self.config.seed, scene as u64, purpose);
-        Ok(Scene::draw(&mut rng, &self.config))
+        Ok(Room::sample(&mut rng, &self.config))
     }
 
-    fn camera(&self, scene: &Scene, frame: usize) -> Camera {
+    fn camera(&self, room: &Room, frame: usize) -> Camera {
         let time = frame as f64 / (self.config.num_frames - 1).max(1) as f64;
-        scene.path.camera(time, self.config.fov_deg, self.config.width as f64 / self.config.height as f64)
+        room.path.camera(time, self.config.fov_deg, self.config.width as f64 / self.config.height as f64)
     }
 }
 
@@ -69,12 +69,12 @@ impl SceneSource for SyntheticSource {
     }
 
     fn key(&self, scene: usize) -> &str {
-        let (block, place) = (scene / KEYS_PER_BLOCK, scene % KEYS_PER_BLOCK);
+        let (block, position) = (scene / KEYS_PER_BLOCK, scene % KEYS_PER_BLOCK);
         let keys = self.key_blocks[block].get_or_init(|| {
             let (prefix, first) = (self.key_prefix(), block * KEYS_PER_BLOCK);
             (first..self.config.num_scenes.min(first + KEYS_PER_BLOCK)).map(|i| format!("{prefix}{i:05}")).collect()
         });
-        &keys[place]
+        &keys[position]
     }
 
     fn find(&self, key: &str) -> Option<usize> {
@@ -88,19 +88,18 @@ impl SceneSource for SyntheticSource {
     }
 
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        let scene = self.scene(scene)?;
-        Ok((0..self.config.num_frames).map(|frame| self.camera(&scene, frame)).collect())
+        let room = self.room(scene)?;
+        Ok((0..self.config.num_frames).map(|frame| self.camera(&room, frame)).collect())
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-        let position = scene;
-        let scene = self.scene(position)?;
+        let room = self.room(scene)?;
         let SyntheticConfig { num_frames, width, height, samples_per_pixel, specular, .. } = self.config;
         if frame >= num_frames {
-            return Err(DataError::NoSuchFrame { key: self.key(position).to_owned(), frame, num_frames });
+            return Err(DataError::NoSuchFrame { key: self.key(scene).to_owned(), frame, num_frames });
         }
-        let camera = self.camera(&scene, frame);
-        Ok(ray_tracer::render(&scene, &camera, width, height, samples_per_pixel.isqrt(), specular as f32))
+        let camera = self.camera(&room, frame);
+        Ok(ray_tracer::render(&room, &camera, width, height, samples_per_pixel.isqrt(), specular as f32))
     }
 }
 
@@ -109,8 +108,6 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
-    use crate::random::item_rng;
-    use crate::sampling::view_sampler::{ViewSampler, sample_targets};
     use crate::synthetic::config::MAX_SCENES;
 
     fn source(change: impl FnOnce(&mut SyntheticConfig)) -> SyntheticSource {
@@ -119,47 +116,8 @@ mod tests {
         SyntheticSource::new(config).unwrap()
     }
 
-    fn psnr(a: &[f64], b: &[f64]) -> f64 {
-        let mse = a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / a.len() as f64;
-        -10.0 * (mse / 255.0_f64.powi(2)).log10()
-    }
-
-    /// Mean PSNR over held-out scenes of copying the nearest context, and of the mean of the contexts.
-    fn baselines(source: &SyntheticSource, gaps: [usize; 2]) -> [f64; 2] {
-        let sampler = ViewSampler { min_gap: [gaps[0]; 2], max_gap: [gaps[1]; 2], ..Default::default() };
-        let num_scenes = 200;
-        let mut sums = [0.0; 2];
-        for scene in 0..num_scenes {
-            let mut rng = item_rng(1, 0, scene as u32, 0, "test");
-            let num_frames = source.config().num_frames;
-            let views = sampler.sample(num_frames, &[], 0, 4, &mut rng).unwrap();
-            let target = sample_targets(&views.context, num_frames, 1, &mut rng).unwrap()[0];
-            let center = source.cameras(scene).unwrap().into_iter().map(|c| c.c2w.translation).collect::<Vec<_>>();
-            let pixels = |frame: usize| -> Vec<f64> {
-                source.frame(scene, frame).unwrap().rgb.into_iter().map(f64::from).collect()
-            };
-            let truth = pixels(target);
-            let away = |frame: usize| center[frame].distance_squared(center[target]);
-            let nearest = views.context.iter().copied().min_by(|&a, &b| away(a).total_cmp(&away(b))).unwrap();
-            let contexts: Vec<Vec<f64>> = views.context.iter().map(|&frame| pixels(frame)).collect();
-            let mean: Vec<f64> =
-                (0..truth.len()).map(|i| contexts.iter().map(|context| context[i]).sum::<f64>() / 4.0).collect();
-            sums[0] += psnr(&truth, &pixels(nearest));
-            sums[1] += psnr(&truth, &mean);
-        }
-        sums.map(|sum| sum / num_scenes as f64)
-    }
-
     #[test]
-    fn copying_the_nearest_context_predicts_a_target_poorly() {
-        // 14.3 and 13.7 dB for the defaults: what a trained model has to beat by a margin one can see.
-        let [nearest, mean] = baselines(&source(|c| c.split = Split::Test), [15, 15]);
-        assert!((13.5..15.0).contains(&nearest), "nearest context {nearest:.2} dB");
-        assert!((13.0..14.5).contains(&mean), "mean of the contexts {mean:.2} dB");
-    }
-
-    #[test]
-    fn a_frame_is_a_function_of_the_seed_the_split_and_its_position() {
+    fn frames_depend_on_seed_and_position_alone() {
         let first = source(|_| ()).frame(7, 3).unwrap();
         let second = source(|c| c.num_scenes = 8).frame(7, 3).unwrap();
         assert_eq!(first, second);
@@ -170,12 +128,12 @@ mod tests {
     }
 
     #[test]
-    fn train_and_test_scenes_never_coincide() {
+    fn splits_and_seeds_share_no_scene() {
         let mut seen = Vec::new();
         for split in [Split::Train, Split::Test] {
             for seed in 0..3 {
                 let source = source(|c| (c.split, c.seed) = (split, seed));
-                seen.extend((0..100).map(|scene| source.scene(scene).unwrap()));
+                seen.extend((0..100).map(|scene| source.room(scene).unwrap()));
             }
         }
         for (i, scene) in seen.iter().enumerate() {
@@ -184,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn keys_are_unique_and_found_again() {
+    fn keys_are_unique_and_found() {
         let source = source(|c| (c.seed, c.num_scenes) = (7, 3_000));
         let keys: BTreeSet<&str> = (0..3_000).map(|scene| source.key(scene)).collect();
         assert_eq!(keys.len(), 3_000);
@@ -198,17 +156,17 @@ mod tests {
     }
 
     #[test]
-    fn the_most_scenes_cost_nothing_up_front() {
+    fn largest_source_costs_nothing_up_front() {
         let source = source(|c| c.num_scenes = MAX_SCENES);
         assert_eq!(source.key(MAX_SCENES - 1), "synthetic-0-train-31999999");
         source.frame(MAX_SCENES - 1, 0).unwrap();
-        // What grows with the number of scenes: a place per block of keys, and the one block that was asked for.
+        // One block of keys is formatted; the table of blocks grows with the number of scenes.
         let keys: Vec<usize> = source.key_blocks.iter().filter_map(|block| Some(block.get()?.len())).collect();
         assert_eq!((source.key_blocks.len(), keys), (MAX_SCENES / KEYS_PER_BLOCK, vec![KEYS_PER_BLOCK]));
     }
 
     #[test]
-    fn scenes_and_frames_beyond_the_end_are_refused() {
+    fn positions_beyond_the_end_are_refused() {
         let source = source(|c| c.num_scenes = 5);
         let message = |scene, frame| source.frame(scene, frame).unwrap_err().to_string();
         assert_eq!(message(5, 0), "the source has 5 scenes; scene 5 (counted from 0) does not exist");
@@ -219,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_are_rigid_upright_and_as_long_apart_as_the_path_says() {
+    fn cameras_are_rigid_upright_and_follow_the_path_length() {
         let source = source(|c| (c.width, c.height, c.num_frames) = (64, 32, 200));
         for scene in 0..50 {
             let cameras = source.cameras(scene).unwrap();
@@ -239,15 +197,8 @@ mod tests {
     }
 
     #[test]
-    fn a_single_frame_is_a_scene_too() {
-        let source = source(|c| c.num_frames = 1);
-        assert!(source.cameras(0).unwrap()[0].c2w.translation.is_finite());
-        source.frame(0, 0).unwrap();
-    }
-
-    #[test]
-    fn every_frame_shows_something() {
-        // The deviation of a channel over a frame is 50 to 60 on average; a blank wall in shade has below 10.
+    fn every_frame_has_contrast() {
+        // The standard deviation of a channel is 50 to 60 on average, and below 10 for a blank wall in shade.
         let source = source(|_| ());
         for scene in 0..100 {
             for frame in 0..16 {

@@ -1,4 +1,4 @@
-//! Procedural surface colours: two colours and a pattern that mixes them.
+//! Procedural surface colours: two colours mixed by a pattern.
 
 use std::f32::consts::TAU;
 
@@ -7,7 +7,7 @@ use rand::Rng;
 
 use crate::random::{uniform_below, unit};
 
-/// How the two colours alternate.
+/// Pattern in which the two colours alternate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Pattern {
     Gradient,
@@ -21,7 +21,7 @@ enum Pattern {
 pub(crate) struct Texture {
     pattern: Pattern,
     colors: [Vec3; 2],
-    /// Unit direction of the pattern's first axis along the surface.
+    /// Unit direction of the pattern's first axis in surface coordinates.
     axis: [f32; 2],
     /// Radians per unit of length.
     rate: f32,
@@ -31,8 +31,8 @@ pub(crate) struct Texture {
 impl Texture {
     /// Samples a texture around `hue` (in turns), with patterns of about `frequency` cycles per unit of length.
     ///
-    /// `saturation` and `value` are those of the brighter colour.
-    pub fn draw(rng: &mut impl Rng, hue: f64, saturation: f64, value: f64, frequency: f64) -> Self {
+    /// `saturation` and `value` describe the brighter colour.
+    pub fn sample(rng: &mut impl Rng, hue: f64, saturation: f64, value: f64, frequency: f64) -> Self {
         let pattern = [Pattern::Gradient, Pattern::Stripes, Pattern::Checkers, Pattern::Waves][uniform_below(rng, 4)];
         let turn = unit(rng) * std::f64::consts::TAU;
         let shift = 0.12 + 0.3 * unit(rng);
@@ -46,13 +46,13 @@ impl Texture {
         }
     }
 
-    /// One colour all over.
+    /// Returns a texture of one colour.
     #[cfg(test)]
     pub fn plain(color: Vec3) -> Self {
         Self { pattern: Pattern::Gradient, colors: [color; 2], axis: [1.0, 0.0], rate: 0.0, phase: 0.0 }
     }
 
-    /// Linear colour at the surface coordinates `u`, `v`.
+    /// Returns the linear colour at the surface coordinates `u`, `v`.
     pub fn color(&self, u: f32, v: f32) -> Vec3 {
         let along = (u * self.axis[0] + v * self.axis[1]) * self.rate + self.phase;
         let across = (v * self.axis[0] - u * self.axis[1]) * self.rate;
@@ -72,7 +72,7 @@ fn soft_edge(wave: f32) -> f32 {
     x * x * (3.0 - 2.0 * x)
 }
 
-/// Linear colour of a hue in turns, saturation and value (the display's gamma is taken as 2).
+/// Converts hue (in turns), saturation and value to a linear colour, for a display gamma of 2.
 fn linear_color(hue: f64, saturation: f64, value: f64) -> Vec3 {
     let channels = [0.0, 2.0 / 3.0, 1.0 / 3.0].map(|offset: f64| {
         let distance = ((hue + offset).rem_euclid(1.0) * 6.0 - 3.0).abs() - 1.0;

@@ -44,7 +44,7 @@ impl Checksums {
     pub fn open(folder: &Path, made_as: &str) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadIndex { what, path: folder.to_path_buf() };
         let path = folder.join(FILE_NAME);
-        let mut journal = Self {
+        let mut checksums = Self {
             folder: folder.to_path_buf(),
             made_as: made_as.to_owned(),
             sums: BTreeMap::new(),
@@ -69,21 +69,21 @@ impl Checksums {
                     continue;
                 }
                 if hash_file(&file)? == sum {
-                    journal.damaged.remove(name);
-                    journal.sums.insert(name.to_owned(), sum.to_owned());
-                } else if !journal.sums.contains_key(name) {
-                    journal.damaged.insert(name.to_owned());
+                    checksums.damaged.remove(name);
+                    checksums.sums.insert(name.to_owned(), sum.to_owned());
+                } else if !checksums.sums.contains_key(name) {
+                    checksums.damaged.insert(name.to_owned());
                 }
             }
         }
-        journal.refuse_others()?;
+        checksums.refuse_others()?;
         // Lists of what there is are written again whatever they say.
-        let has_scenes = journal.sums.keys().chain(&journal.damaged).any(|name| has_ending(name, "torch"));
+        let has_scenes = checksums.sums.keys().chain(&checksums.damaged).any(|name| has_ending(name, "torch"));
         match found {
             Some(found) if found != made_as && has_scenes => Err(bad(format!(
                 "its files were made as: {found}; asked for are: {made_as}; give the same options or choose another folder"
             ))),
-            _ => Ok(journal),
+            _ => Ok(checksums),
         }
     }
 
@@ -210,18 +210,18 @@ mod tests {
         let path = folder.path().join("a");
         std::fs::write(&path, b"abc").unwrap();
         assert_eq!(hash_file(&path).unwrap(), "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
-        let mut journal = Checksums::open(&folder.path().join("out"), "chunks").unwrap();
-        journal.begin().unwrap();
-        journal.write("a", b"abc").unwrap();
-        assert_eq!(journal.sums["a"], hash_file(&path).unwrap());
+        let mut checksums = Checksums::open(&folder.path().join("out"), "chunks").unwrap();
+        checksums.begin().unwrap();
+        checksums.write("a", b"abc").unwrap();
+        assert_eq!(checksums.sums["a"], hash_file(&path).unwrap());
     }
 
     /// A folder with the files `a.torch`, `b.torch` and `c.torch`.
     fn three(folder: &Path) {
-        let mut journal = Checksums::open(folder, "chunks").unwrap();
-        journal.begin().unwrap();
+        let mut checksums = Checksums::open(folder, "chunks").unwrap();
+        checksums.begin().unwrap();
         for name in ["a.torch", "b.torch", "c.torch"] {
-            journal.write(name, name.as_bytes()).unwrap();
+            checksums.write(name, name.as_bytes()).unwrap();
         }
     }
 
@@ -233,12 +233,12 @@ mod tests {
         std::fs::write(at("a.torch"), "changed").unwrap();
         let text = std::fs::read_to_string(at(FILE_NAME)).unwrap();
         std::fs::write(at(FILE_NAME), format!("{text}18ac3e7343f01689")).unwrap();
-        let mut journal = Checksums::open(folder.path(), "chunks").unwrap();
-        assert_eq!(journal.names().collect::<Vec<_>>(), ["b.torch", "c.torch"]);
+        let mut checksums = Checksums::open(folder.path(), "chunks").unwrap();
+        assert_eq!(checksums.names().collect::<Vec<_>>(), ["b.torch", "c.torch"]);
         assert!(at("a.torch").exists(), "looking changes nothing");
-        journal.begin().unwrap();
+        checksums.begin().unwrap();
         assert!(!at("a.torch").exists());
-        journal.remove_all(["b.torch", "never.torch"]).unwrap();
+        checksums.remove_all(["b.torch", "never.torch"]).unwrap();
         let text = std::fs::read_to_string(at(FILE_NAME)).unwrap();
         assert_eq!(text.lines().count(), 2);
         assert!(text.starts_with("# made as: chunks\n") && text.ends_with("  c.torch\n"), "{text}");
@@ -278,9 +278,9 @@ mod tests {
     #[test]
     fn a_folder_without_scenes_may_be_made_in_another_way() {
         let folder = tempfile::tempdir().unwrap();
-        let mut journal = Checksums::open(folder.path(), "chunks").unwrap();
-        journal.begin().unwrap();
-        journal.write("skipped.json", b"all of them").unwrap();
+        let mut checksums = Checksums::open(folder.path(), "chunks").unwrap();
+        checksums.begin().unwrap();
+        checksums.write("skipped.json", b"all of them").unwrap();
         Checksums::open(folder.path(), "scenes").unwrap().begin().unwrap();
         assert!(std::fs::read_to_string(folder.path().join(FILE_NAME)).unwrap().starts_with("# made as: scenes\n"));
     }
@@ -297,9 +297,9 @@ mod tests {
         let path = folder.path().join(FILE_NAME);
         let text = std::fs::read_to_string(&path).unwrap();
         std::fs::write(&path, format!("{text}{}  d\n", hex::encode(Sha256::digest(b"d")))).unwrap();
-        let mut journal = Checksums::open(folder.path(), "chunks").unwrap();
-        assert_eq!(journal.names().collect::<Vec<_>>(), ["a.torch", "b.torch", "c.torch"]);
-        journal.begin().unwrap();
+        let mut checksums = Checksums::open(folder.path(), "chunks").unwrap();
+        assert_eq!(checksums.names().collect::<Vec<_>>(), ["a.torch", "b.torch", "c.torch"]);
+        checksums.begin().unwrap();
         assert!(!leftover.exists());
     }
 
@@ -330,7 +330,8 @@ mod tests {
             (format!("{MADE_AS}chunks\n{sums}"), "its notes.txt is not what SHA256SUMS says"),
         ] {
             std::fs::write(at(FILE_NAME), &text).unwrap();
-            let message = Checksums::open(folder.path(), "chunks").and_then(|mut journal| journal.begin()).unwrap_err();
+            let message =
+                Checksums::open(folder.path(), "chunks").and_then(|mut checksums| checksums.begin()).unwrap_err();
             assert!(message.to_string().contains(expected), "{message}");
             assert_eq!(std::fs::read_to_string(at("notes.txt")).unwrap(), "second");
             assert_eq!(std::fs::read_to_string(at(FILE_NAME)).unwrap(), text);

@@ -22,9 +22,9 @@ const MAX_NAME_BYTES: usize = 200;
 /// What is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ConvertTo {
-    /// `NNNNNN.torch` files of many scenes, each closed at so many bytes of pictures, and `index.json`.
+    /// `NNNNNN.torch` files of many scenes, each closed at so many bytes of images, and `index.json`.
     Chunks {
-        /// Bytes of pictures.
+        /// Bytes of images.
         target_bytes: u64,
     },
     /// `<key>.torch`, a file per scene.
@@ -50,12 +50,12 @@ impl ConvertOptions {
             ConvertTo::Chunks { target_bytes } => format!("chunks of {target_bytes} bytes"),
             ConvertTo::Scenes => "a file per scene".into(),
         };
-        let pictures = match self.encoding {
+        let images = match self.encoding {
             ImageEncoding::Png => "PNG".into(),
             ImageEncoding::Jpeg(quality) => format!("JPEG of quality {quality}"),
         };
         let with = if self.opened_with.is_empty() { "" } else { ", with " };
-        format!("{form}, {pictures}{with}{}", self.opened_with)
+        format!("{form}, {images}{with}{}", self.opened_with)
     }
 }
 
@@ -72,7 +72,7 @@ pub struct ConversionReport {
     pub num_frames: usize,
     /// Frames of these that had to be encoded.
     pub num_encoded: usize,
-    /// Bytes of the pictures written now.
+    /// Bytes of the images written now.
     pub image_bytes: u64,
     /// What opening the source left out, and scenes that could not be read.
     pub left_out: SkipReport,
@@ -111,7 +111,7 @@ pub struct Converter<'a> {
     source: &'a dyn SceneSource,
     folder: PathBuf,
     options: ConvertOptions,
-    journal: Checksums,
+    checksums: Checksums,
     /// File of every scene that is written.
     index: BTreeMap<String, String>,
     /// Files with a scene that has changed.
@@ -135,12 +135,12 @@ impl<'a> Converter<'a> {
         folder: &Path,
         options: &ConvertOptions,
     ) -> Result<Self, DataError> {
-        let journal = Checksums::open(folder, &options.made_as())?;
+        let checksums = Checksums::open(folder, &options.made_as())?;
         let mut conversion = Self {
             source,
             folder: folder.to_owned(),
             options: options.clone(),
-            journal,
+            checksums,
             index: BTreeMap::new(),
             stale: BTreeSet::new(),
             unreadable: BTreeSet::new(),
@@ -153,11 +153,11 @@ impl<'a> Converter<'a> {
         Ok(conversion)
     }
 
-    /// Takes up the scenes of the files that the journal knows.
+    /// Takes up the scenes of the files that the checksums knows.
     fn look(&mut self) -> Result<(), DataError> {
         let unreadable: HashSet<&str> =
             self.converted.left_out.skips.iter().filter_map(SkippedScene::unreadable).collect();
-        let names: Vec<&str> = self.journal.names().filter(|name| has_ending(name, "torch")).collect();
+        let names: Vec<&str> = self.checksums.names().filter(|name| has_ending(name, "torch")).collect();
         let look = |name: &str| {
             let path = self.folder.join(name);
             let tables: Vec<SceneTable> = ChunkTable::read(&path)?.scenes.into_values().collect();
@@ -208,13 +208,13 @@ impl<'a> Converter<'a> {
     /// # Errors
     /// [`DataError::Io`] from writing.
     pub fn run(mut self, mut done: impl FnMut(usize)) -> Result<ConversionReport, DataError> {
-        self.journal.begin()?;
+        self.checksums.begin()?;
         let stale = std::mem::take(&mut self.stale);
         if !stale.is_empty() || self.index_names_others() {
             // It names files that are about to go, or are gone.
-            self.journal.remove_all([INDEX])?;
+            self.checksums.remove_all([INDEX])?;
         }
-        self.journal.remove_all(stale.iter().map(String::as_str))?;
+        self.checksums.remove_all(stale.iter().map(String::as_str))?;
         for scene in 0..self.source.num_scenes() {
             let key = self.source.key(scene);
             if !self.index.contains_key(key) && !self.pending_keys.contains(key) {
@@ -230,7 +230,7 @@ impl<'a> Converter<'a> {
 
     /// Whether the index that is there names files that are not.
     fn index_names_others(&self) -> bool {
-        let there: HashSet<&str> = self.journal.names().collect();
+        let there: HashSet<&str> = self.checksums.names().collect();
         let is_other = |index: BTreeMap<String, String>| index.values().any(|file| !there.contains(file.as_str()));
         there.contains(INDEX) && read_index(&self.folder.join(INDEX)).map_or(true, is_other)
     }
@@ -275,7 +275,7 @@ impl<'a> Converter<'a> {
                 (name, bytes)
             }
         };
-        self.journal.write(&name, &bytes)?;
+        self.checksums.write(&name, &bytes)?;
         self.index.extend(scenes.into_iter().map(|scene| (scene.key, name.clone())));
         self.pending_keys.clear();
         self.fill = ChunkFill::default();
@@ -307,12 +307,12 @@ impl<'a> Converter<'a> {
         for (name, text) in [(INDEX, index), (SKIPPED, skipped)] {
             let Some(text) = text else {
                 // What an earlier run left out is there now.
-                self.journal.remove_all([name])?;
+                self.checksums.remove_all([name])?;
                 continue;
             };
             let path = self.folder.join(name);
             let text = text.map_err(|error| DataError::BadIndex { what: error.to_string(), path })?;
-            self.journal.write(name, &text)?;
+            self.checksums.write(name, &text)?;
         }
         self.converted.num_scenes = self.index.len();
         Ok(self.converted)

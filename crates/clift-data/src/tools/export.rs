@@ -134,8 +134,8 @@ mod tests {
         for (num_frames, expected) in [(16, 3), (6, 0)] {
             let source = source(num_frames);
             assert_eq!(write_evaluation_index(&path, &source, 4, 3).unwrap(), expected);
-            let (items, ledger) = EvaluationIndex::read(&path).unwrap().select(&source, 0);
-            assert_eq!((items.len(), ledger.num_scenes), (expected, 3));
+            let (items, report) = EvaluationIndex::read(&path).unwrap().select(&source, 0);
+            assert_eq!((items.len(), report.num_scenes), (expected, 3));
             assert!(items.iter().all(|item| Some(&item.views) == even_views(16, 4, 3).as_ref()));
         }
     }

@@ -22,7 +22,7 @@ pub struct SourceInfo {
     pub fov_deg: Option<MinMedianMax>,
     /// Largest distance along a world axis of a camera centre from the scene's mean centre, one number per scene.
     pub extent: Option<MinMedianMax>,
-    /// Scenes whose cameras cannot be read, and those before the first whose first picture can, with the error as the
+    /// Scenes whose cameras cannot be read, and those before the first whose first image can, with the error as the
     /// reason.
     pub unreadable: Vec<SkippedScene>,
 }
@@ -39,7 +39,7 @@ impl SourceInfo {
             Ok((cameras.len(), fov_deg, extent(&cameras)))
         });
         let read: Vec<Result<_, DataError>> = read.collect();
-        let (mut scenes, mut unreadable, mut first_error, mut first_picture) = (Vec::new(), Vec::new(), None, None);
+        let (mut scenes, mut unreadable, mut first_error, mut first_image) = (Vec::new(), Vec::new(), None, None);
         for (scene, found) in read.into_iter().enumerate() {
             let mut fail = |error: DataError| {
                 unreadable.push(SkippedScene { key: source.key(scene).to_owned(), reason: error.to_string() });
@@ -47,8 +47,8 @@ impl SourceInfo {
             };
             match found {
                 Ok(found) => {
-                    if first_picture.is_none() && found.0 > 0 {
-                        first_picture = source.frame(scene, 0).map_err(&mut fail).ok();
+                    if first_image.is_none() && found.0 > 0 {
+                        first_image = source.frame(scene, 0).map_err(&mut fail).ok();
                     }
                     scenes.push(found);
                 }
@@ -64,7 +64,7 @@ impl SourceInfo {
         Ok(Self {
             num_scenes: source.num_scenes(),
             num_frames: MinMedianMax::of(&lengths),
-            image_size: first_picture.map(|frame| [frame.width, frame.height]),
+            image_size: first_image.map(|frame| [frame.width, frame.height]),
             fov_deg: MinMedianMax::of(&fields),
             extent: MinMedianMax::of(&extents),
             unreadable,

@@ -64,8 +64,8 @@ impl OverlapOptions {
     /// Draws the views of a scene: a frame at random, a partner at random among those that follow it in steps of one
     /// from the smallest distance on, in both directions, while the overlap lasts; the next frame at random where none
     /// does. Targets are distinct, from the first context to the last, contexts included, in increasing order. Inner
-    /// contexts are distinct and uniform. The error is a reason for the ledger.
-    fn draw(&self, key: &str, cameras: &[Camera]) -> Result<ViewIndices, String> {
+    /// contexts are distinct and uniform. The error is a reason for the report.
+    fn sample_views(&self, key: &str, cameras: &[Camera]) -> Result<ViewIndices, String> {
         let num_frames = cameras.len();
         let [near, far] = self.distance;
         if num_frames <= near {
@@ -97,12 +97,12 @@ impl OverlapOptions {
 }
 
 /// Writes an index of every scene of `sources` that [`EvaluationIndex`](crate::sampling::evaluation_index::EvaluationIndex) reads, `null` for
-/// scenes without such views; nothing if no scene has any. The ledger says which and why. A scene's views depend on its
+/// scenes without such views; nothing if no scene has any. The report says which and why. A scene's views depend on its
 /// cameras, its key and the seed alone: other scenes may come and go.
 ///
 /// # Errors
 /// [`DataError::BadConfig`] for options that cannot hold, [`DataError::BadIndex`] for a key that two sources have with
-/// different cameras, and [`DataError::Io`]. A scene whose cameras cannot be read is in the ledger.
+/// different cameras, and [`DataError::Io`]. A scene whose cameras cannot be read is in the report.
 pub fn write_overlap_index(
     path: &Path,
     sources: &[&dyn SceneSource],
@@ -135,21 +135,21 @@ pub fn write_overlap_index(
     let notes = (!shared.is_empty()).then(|| note(&shared)).into_iter().collect();
     let draw = |(source, scene): &(&dyn SceneSource, usize)| {
         let cameras = source.cameras(*scene).map_err(|error| error.to_string())?;
-        options.draw(source.key(*scene), &cameras)
+        options.sample_views(source.key(*scene), &cameras)
     };
     let drawn: Vec<_> = scenes.par_iter().map(draw).collect();
-    let mut ledger = SkipReport { notes, ..SkipReport::new(drawn.len()) };
+    let mut report = SkipReport { notes, ..SkipReport::new(drawn.len()) };
     let mut entries = Vec::with_capacity(drawn.len());
     for ((source, scene), views) in scenes.into_iter().zip(drawn) {
         let key = source.key(scene);
-        let views = views.map_err(|reason| ledger.skip(key, reason)).ok();
+        let views = views.map_err(|reason| report.skip(key, reason)).ok();
         entries.push((key, views));
     }
     // Nothing to evaluate is no index.
-    if ledger.num_used() > 0 {
+    if report.num_used() > 0 {
         write_index(path, entries)?;
     }
-    Ok(ledger)
+    Ok(report)
 }
 
 #[cfg(test)]
@@ -168,17 +168,17 @@ mod tests {
     fn index(source: &dyn SceneSource, options: &OverlapOptions) -> (EvaluationIndex, SkipReport) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
-        let ledger = write_overlap_index(&path, &[source], options).unwrap();
-        (EvaluationIndex::read(&path).unwrap(), ledger)
+        let report = write_overlap_index(&path, &[source], options).unwrap();
+        (EvaluationIndex::read(&path).unwrap(), report)
     }
 
     #[test]
     fn every_pair_of_the_index_overlaps_and_lies_as_far_apart_as_asked() {
         let source = rooms(60, 3.0);
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
-        let (written, ledger) = index(&source, &options);
+        let (written, report) = index(&source, &options);
         let (items, _) = written.select(&source, 0);
-        assert!(items.len() > 10 && items.len() == ledger.num_used(), "{ledger}");
+        assert!(items.len() > 10 && items.len() == report.num_used(), "{report}");
         let mut spans = Vec::new();
         for item in &items {
             let ViewIndices { context, target } = &item.views;
@@ -199,12 +199,12 @@ mod tests {
     fn scenes_without_views_are_null_and_in_the_ledger() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
-        let ledger = write_overlap_index(&path, &[&rooms(40, 3.0)], &OverlapOptions::default()).unwrap();
-        assert_eq!(ledger.to_string(), "0 of 20 scenes used; 20 shorter than 46 frames");
+        let report = write_overlap_index(&path, &[&rooms(40, 3.0)], &OverlapOptions::default()).unwrap();
+        assert_eq!(report.to_string(), "0 of 20 scenes used; 20 shorter than 46 frames");
         assert!(!path.exists(), "an index without views");
-        let (written, ledger) = index(&first_is_short(rooms(60, 3.0)), &OverlapOptions::default());
+        let (written, report) = index(&first_is_short(rooms(60, 3.0)), &OverlapOptions::default());
         assert_eq!((written.num_keys(), written.usable().count()), (20, 19));
-        assert_eq!(ledger.to_string(), "19 of 20 scenes used; 1 shorter than 46 frames");
+        assert_eq!(report.to_string(), "19 of 20 scenes used; 1 shorter than 46 frames");
     }
 
     /// Rooms of which the first has ten frames.
@@ -229,10 +229,10 @@ mod tests {
         let cameras: Vec<Camera> = (0..60).map(camera).collect();
         let options = |near, far| OverlapOptions { distance: [near, far], ..OverlapOptions::default() };
         for key in ["a", "b", "c", "d", "e", "f"] {
-            let ViewIndices { context, .. } = options(4, 50).draw(key, &cameras).unwrap();
+            let ViewIndices { context, .. } = options(4, 50).sample_views(key, &cameras).unwrap();
             assert!((4..=12).contains(&(context[3] - context[0])), "{context:?}");
         }
-        let reason = options(20, 50).draw("a", &cameras).unwrap_err();
+        let reason = options(20, 50).sample_views("a", &cameras).unwrap_err();
         assert_eq!(reason, "without two frames 20 to 50 apart that overlap by 0.6");
     }
 
@@ -257,18 +257,18 @@ mod tests {
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
         let other = SyntheticConfig { num_scenes: 3, num_frames: 60, seed: 1, path_length: 3.0, ..Default::default() };
         let other = SyntheticSource::new(other).unwrap();
-        let ledger = write_overlap_index(&path, &[&rooms(60, 3.0), &other], &options).unwrap();
+        let report = write_overlap_index(&path, &[&rooms(60, 3.0), &other], &options).unwrap();
         let written = EvaluationIndex::read(&path).unwrap();
-        assert_eq!((ledger.num_scenes, written.num_keys()), (23, 23));
+        assert_eq!((report.num_scenes, written.num_keys()), (23, 23));
         let alone = index(&other, &options).0;
         for scene in 0..3 {
             let key = other.key(scene);
             assert_eq!(written.views(key, 60).unwrap(), alone.views(key, 60).unwrap());
         }
-        let ledger = write_overlap_index(&path, &[&other, &other], &options).unwrap();
-        assert_eq!(ledger.num_scenes, 3);
+        let report = write_overlap_index(&path, &[&other, &other], &options).unwrap();
+        assert_eq!(report.num_scenes, 3);
         let keys = [0, 1, 2].map(|scene| other.key(scene)).join(", ");
-        assert_eq!(ledger.notes, [format!("3 scenes in both halves, counted once ({keys})")]);
+        assert_eq!(report.notes, [format!("3 scenes in both halves, counted once ({keys})")]);
         let rooms = rooms(60, 3.0);
         let shorter = first_is_short(self::rooms(60, 3.0));
         let message = write_overlap_index(&path, &[&rooms, &shorter], &options).unwrap_err().to_string();
@@ -286,11 +286,11 @@ mod tests {
         let num_used = index(&whole, &options).1.num_used();
         let orders: [[&dyn SceneSource; 2]; 2] = [[&whole, &broken], [&broken, &whole]];
         for sources in orders {
-            let ledger = write_overlap_index(&path, &sources, &options).unwrap();
-            assert_eq!((ledger.num_used(), ledger.notes.len()), (num_used, 1), "{ledger}");
+            let report = write_overlap_index(&path, &sources, &options).unwrap();
+            assert_eq!((report.num_used(), report.notes.len()), (num_used, 1), "{report}");
         }
-        let ledger = write_overlap_index(&path, &[&broken, &broken], &options).unwrap();
-        assert_eq!((ledger.num_used(), ledger.skips.len()), (0, 20), "{ledger}");
+        let report = write_overlap_index(&path, &[&broken, &broken], &options).unwrap();
+        assert_eq!((report.num_used(), report.skips.len()), (0, 20), "{report}");
     }
 
     #[test]

@@ -226,7 +226,7 @@ fn listed_scenes_missing_from_test_are_flagged() {
         let options = SourceOptions { kind: layout, files, ..SourceOptions::default() };
         let opened = open_at(root.path(), Split::Train, &options).unwrap();
         assert_eq!((opened.source.num_scenes(), opened.report.skips.len()), (1, 1));
-        let flagged = clift_data::left_out(&opened.report).into_iter();
+        let flagged = clift_data::skipped_scenes(&opened.report).into_iter();
         flagged.map(|check| (check.key, check.reasons.concat())).collect::<Vec<_>>()
     };
     let reason = "kept for testing by the list of test scenes, but not in test/".to_owned();

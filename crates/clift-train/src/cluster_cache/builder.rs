@@ -81,7 +81,7 @@ impl ClusterBuilder<'_> {
         let num_context = views.min_context + uniform_below(&mut rng, views.max_context - views.min_context + 1);
         // The gaps that stage 1 ends with.
         let last_step = config.stage1.steps.min(views.warm_up_steps);
-        let context = views.draw(reader.source.as_ref(), scene, last_step, num_context, &mut rng)?.context;
+        let context = views.sample(reader.source.as_ref(), scene, last_step, num_context, &mut rng)?.context;
         let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
         let ClustersConfig { grouping, grid, kmeans, .. } = &config.clusters;
         let num_tokens = config.model.num_tokens(num_context, clip.context.height, clip.context.width)?;

@@ -16,7 +16,7 @@ fn gaps(sampler: &ViewSampler, num_frames: usize, step: u64, num_context: usize)
     let gaps: BTreeSet<usize> = (0..4_000)
         .map(|slot| {
             let mut rng = item_rng(1, step, slot, 0, "test");
-            let views = sampler.sample(num_frames, &[], step, num_context, &mut rng).unwrap();
+            let views = sampler.sample_frames(num_frames, &[], step, num_context, &mut rng).unwrap();
             views.context[num_context - 1] - views.context[0]
         })
         .collect();
@@ -50,17 +50,17 @@ fn a_short_scene_lowers_the_largest_gap() {
 #[test]
 fn a_scene_of_smallest_gap_plus_one_frame_is_just_enough() {
     let mut rng = item_rng(1, 0, 0, 0, "test");
-    let views = sampler().sample(26, &[], 0, 4, &mut rng).unwrap();
+    let views = sampler().sample_frames(26, &[], 0, 4, &mut rng).unwrap();
     assert_eq!((views.context[0], views.context[3]), (0, 25));
-    let error = sampler().sample(25, &[], 0, 4, &mut rng).unwrap_err();
+    let error = sampler().sample_frames(25, &[], 0, 4, &mut rng).unwrap_err();
     assert_eq!(error.to_string(), "not enough frames: 26 needed, 25 in the scene");
-    assert!(sampler().sample(0, &[], 0, 4, &mut rng).is_err());
+    assert!(sampler().sample_frames(0, &[], 0, 4, &mut rng).is_err());
 }
 
 #[test]
 fn a_number_of_contexts_outside_the_bounds_is_refused() {
     for num_context in [0, 1, 3, 7] {
-        let error = sampler().sample(200, &[], 0, num_context, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err();
+        let error = sampler().sample_frames(200, &[], 0, num_context, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err();
         assert_eq!(error.to_string(), format!("num_context is {num_context}; the sampler is set to 4 to 6"));
     }
 }
@@ -85,7 +85,7 @@ fn the_number_of_contexts_is_a_function_of_seed_and_step_and_takes_every_value()
 // The expected values come from an implementation of this sampler in Python.
 #[test]
 fn samples_are_the_same_on_every_platform_and_in_every_release() {
-    let views = sampler().sample(279, &[], 1_500, 6, &mut item_rng(7, 1_500, 3, 0, "views")).unwrap();
+    let views = sampler().sample_frames(279, &[], 1_500, 6, &mut item_rng(7, 1_500, 3, 0, "views")).unwrap();
     assert_eq!(views.context, [168, 189, 195, 202, 204, 208]);
     assert_eq!(views.target, [170, 196, 205, 194, 172, 203]);
 }
@@ -97,7 +97,7 @@ fn every_inner_frame_is_equally_likely_to_be_a_context() {
     let sampler = ViewSampler { max_gap: [25, 45], ..sampler() };
     let mut counts = [0_i32; 26];
     for slot in 0..12_000 {
-        let views = sampler.sample(26, &[], 0, 4, &mut item_rng(1, 0, slot, 0, "test")).unwrap();
+        let views = sampler.sample_frames(26, &[], 0, 4, &mut item_rng(1, 0, slot, 0, "test")).unwrap();
         views.context.iter().for_each(|&frame| counts[frame] += 1);
     }
     assert_eq!((counts[0], counts[25]), (12_000, 12_000));
@@ -167,12 +167,12 @@ fn scenes_give_their_centres_where_farthest_points_are_asked_for() {
     let centres: Vec<_> = source.cameras(0).unwrap().iter().map(|camera| camera.c2w.translation.to_array()).collect();
     for inner in [InnerViews::Random, InnerViews::FarthestPoint, InnerViews::Even] {
         let sampler = ViewSampler { inner, ..sampler() };
-        let drawn = sampler.draw(&source, 0, 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap();
-        let sampled = sampler.sample(40, &centres, 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap();
+        let drawn = sampler.sample(&source, 0, 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap();
+        let sampled = sampler.sample_frames(40, &centres, 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap();
         assert_eq!(drawn, sampled);
     }
     let sampler = ViewSampler { inner: InnerViews::FarthestPoint, ..sampler() };
-    let message = sampler.sample(40, &[], 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err().to_string();
+    let message = sampler.sample_frames(40, &[], 0, 5, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err().to_string();
     assert_eq!(message, "centres are 0; farthest points need one for each of 40 frames");
 }
 
@@ -181,7 +181,7 @@ fn the_choice_of_inner_views_changes_neither_ends_nor_targets_and_is_not_written
     let centres: Vec<_> = (0..200).map(|frame| [f64::from(frame), 0.0, 0.0]).collect();
     let views = [InnerViews::Random, InnerViews::FarthestPoint, InnerViews::Even].map(|inner| {
         let sampler = ViewSampler { inner, ..sampler() };
-        sampler.sample(200, &centres, 15_000, 6, &mut item_rng(3, 0, 0, 0, "test")).unwrap()
+        sampler.sample_frames(200, &centres, 15_000, 6, &mut item_rng(3, 0, 0, 0, "test")).unwrap()
     });
     for other in &views[1..] {
         assert_eq!((other.context[0], other.context[5]), (views[0].context[0], views[0].context[5]));
@@ -204,7 +204,7 @@ proptest! {
     ) {
         let sampler = ViewSampler { with_replacement, ..sampler() };
         let [min_gap, max_gap] = sampler.gap_bounds(step, num_context);
-        let draw = || sampler.sample(num_frames, &[], step, num_context, &mut item_rng(seed, step, 0, 0, "test"));
+        let draw = || sampler.sample_frames(num_frames, &[], step, num_context, &mut item_rng(seed, step, 0, 0, "test"));
         let Ok(views) = draw() else {
             prop_assert!(num_frames <= min_gap);
             return Ok(());
@@ -240,7 +240,7 @@ proptest! {
         let centre = |frame: usize| [(frame / 3) as f64, ((frame / 3) as f64).sin(), 0.0];
         let centres: Vec<_> = (0..num_frames).map(centre).collect();
         let mut rng = item_rng(seed, step, 0, 0, "test");
-        let Ok(ViewIndices { context, target }) = sampler.sample(num_frames, &centres, step, num_context, &mut rng) else {
+        let Ok(ViewIndices { context, target }) = sampler.sample_frames(num_frames, &centres, step, num_context, &mut rng) else {
             prop_assert!(num_frames <= min_gap);
             return Ok(());
         };

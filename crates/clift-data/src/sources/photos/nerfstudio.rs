@@ -153,7 +153,7 @@ impl<'a> Optics<'a> {
         };
         let [cx, cy] = self.centre;
         let intrinsics = Intrinsics { fx, fy, cx: cx.unwrap_or(width / 2.0), cy: cy.unwrap_or(height / 2.0) };
-        let intrinsics_norm = IntrinsicsNorm::of_pixels(intrinsics, width, height);
+        let intrinsics_norm = IntrinsicsNorm::from_pixels(intrinsics, width, height);
         intrinsics_norm.validate().map(|()| intrinsics_norm).map_err(|error| error.to_string())
     }
 }

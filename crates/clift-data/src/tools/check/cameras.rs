@@ -3,7 +3,7 @@
 use crate::geometry::camera::Camera;
 use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale};
 use crate::geometry::pose::Pose;
-use crate::tools::check::images::{Sizes, named};
+use crate::tools::check::images::{Sizes, list_frames};
 use crate::tools::check::result::SceneCheck;
 
 /// Plausible fields of view, in degrees.
@@ -22,7 +22,7 @@ const MOST_DEFECT: f64 = 1e-3;
 const NOTED_DEFECT: f64 = 1e-4;
 
 /// Checks intrinsics, rotations and centres.
-pub(crate) fn look(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
+pub(crate) fn check_cameras(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     if cameras.is_empty() {
         check.reasons.push("it has no frames".into());
         return;
@@ -61,7 +61,7 @@ fn intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     });
     if let Some(&first) = implausible.first() {
         let [narrow, wide] = fields(&cameras[first]);
-        let frames = named(&implausible);
+        let frames = list_frames(&implausible);
         check
             .reasons
             .push(format!("fields of view of {narrow:.1} and {wide:.1} degrees in {frames}, expected {low} to {high}"));
@@ -76,9 +76,9 @@ fn intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     });
     if let Some(&first) = outside.first() {
         let k = cameras[first].intrinsics_norm;
-        let frames = named(&outside);
+        let frames = list_frames(&outside);
         check.reasons.push(format!(
-            "principal point at ({:.3}, {:.3}) of the picture in {frames}, expected {low} to {high}",
+            "principal point at ({:.3}, {:.3}) of the image in {frames}, expected {low} to {high}",
             k.cx, k.cy
         ));
     }
@@ -90,7 +90,7 @@ fn intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     let Some(worst) = aspects.reduce(|a, b| if off(b) > off(a) { b } else { a }) else { return };
     let sentence = format!("focal lengths in pixels have the ratio fx / fy = {worst:.3}");
     if off(worst) > MOST_ASPECT {
-        check.reasons.push(format!("{sentence}: are they for another picture size?"));
+        check.reasons.push(format!("{sentence}: are they for another image size?"));
     } else if off(worst) > NOTED_ASPECT {
         check.notes.push(format!("{sentence}: pixels are not square"));
     }

@@ -35,7 +35,7 @@ pub(crate) fn epipolar_image(frames: &[RgbImage; 2], geometry: &DMat3, matches: 
         let colour = colour(i, shown.len());
         let sides = [(pair.first, line_back(geometry, pair.second)), (pair.second, line(geometry, pair.first))];
         for ((point, line), (frame, left)) in sides.into_iter().zip(frames.iter().zip(left)) {
-            // Matches are in pixels of a picture WIDTH wide.
+            // Matches are in pixels of an image WIDTH wide.
             let unit = frame.width as f64 / WIDTH as f64;
             let mut paint = |distance: &dyn Fn(f64, f64) -> f64, colour: [u8; 3]| {
                 for y in 0..frame.height {

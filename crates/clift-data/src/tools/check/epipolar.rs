@@ -34,7 +34,7 @@ struct Pair {
 }
 
 /// Measures the epipolar distance of a scene, and draws the pair nearest to it.
-pub(crate) fn look(
+pub(crate) fn check_poses(
     source: &dyn SceneSource,
     scene: usize,
     cameras: &[Camera],
@@ -51,7 +51,7 @@ pub(crate) fn look(
     let pooled: Vec<f64> = pairs.iter().flat_map(|pair| evenly(&pair.distances, MAX_MATCHES)).collect();
     if pooled.len() < MIN_MATCHES {
         check.notes.push(format!(
-            "poses were not compared with the pictures: {} matching corners in {} pairs of frames",
+            "poses were not compared with the images: {} matching corners in {} pairs of frames",
             pooled.len(),
             pairs.len()
         ));
@@ -62,7 +62,7 @@ pub(crate) fn look(
     if scene_px > MAX_EPIPOLAR_PX {
         check.reasons.push(format!(
             "corners lie {scene_px:.2} px from their epipolar lines (median at 640 columns), more than \
-             {MAX_EPIPOLAR_PX}: poses or intrinsics do not fit the pictures"
+             {MAX_EPIPOLAR_PX}: poses or intrinsics do not fit the images"
         ));
     } else {
         for PairCheck { frames: [a, b], epipolar_px, .. } in &check.pairs {

@@ -21,19 +21,24 @@ const MOST_TURN_DEG: f64 = 1.0;
 pub(crate) type Sizes = Vec<Option<[usize; 2]>>;
 
 /// Decodes every frame, on all cores.
-pub(crate) fn look(source: &dyn SceneSource, scene: usize, cameras: &[Camera], check: &mut SceneCheck) -> Sizes {
+pub(crate) fn check_images(
+    source: &dyn SceneSource,
+    scene: usize,
+    cameras: &[Camera],
+    check: &mut SceneCheck,
+) -> Sizes {
     let read = (0..cameras.len()).into_par_iter().map(|frame| {
-        let picture = source.frame(scene, frame)?;
+        let image = source.frame(scene, frame)?;
         let mut hasher = DefaultHasher::new();
-        picture.rgb.hash(&mut hasher);
-        Ok(([picture.width, picture.height], hasher.finish()))
+        image.rgb.hash(&mut hasher);
+        Ok(([image.width, image.height], hasher.finish()))
     });
     let read: Vec<Result<([usize; 2], u64), DataError>> = read.collect();
     let failures: Vec<(usize, String)> =
         read.iter().enumerate().filter_map(|(frame, read)| Some((frame, read.as_ref().err()?.to_string()))).collect();
     if let Some((_, first)) = failures.first() {
         let frames: Vec<usize> = failures.iter().map(|(frame, _)| *frame).collect();
-        check.reasons.push(format!("{} cannot be read; the first: {first}", named(&frames)));
+        check.reasons.push(format!("{} cannot be read; the first: {first}", list_frames(&frames)));
     }
     let sizes: Sizes = read.iter().map(|read| Some(read.as_ref().ok()?.0)).collect();
     let mut counts: BTreeMap<[usize; 2], usize> = BTreeMap::new();
@@ -65,11 +70,11 @@ fn compare(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
         (if is_moved { &mut contradictions } else { &mut equal }).push(frame);
     }
     if !contradictions.is_empty() {
-        let frames = named(&contradictions);
-        check.reasons.push(format!("{frames} repeat the picture of an earlier frame that has another camera"));
+        let frames = list_frames(&contradictions);
+        check.reasons.push(format!("{frames} repeat the image of an earlier frame that has another camera"));
     }
     if !equal.is_empty() {
-        check.notes.push(format!("{} repeat the picture and the camera of an earlier frame", named(&equal)));
+        check.notes.push(format!("{} repeat the image and the camera of an earlier frame", list_frames(&equal)));
     }
 }
 
@@ -86,7 +91,7 @@ fn extent(cameras: &[Camera]) -> f64 {
 }
 
 /// `3 frames (1, 4, 7)`, with dots beyond a handful.
-pub(crate) fn named(frames: &[usize]) -> String {
+pub(crate) fn list_frames(frames: &[usize]) -> String {
     let list: Vec<String> = frames.iter().take(MAX_NAMED).map(ToString::to_string).collect();
     let more = if frames.len() > MAX_NAMED { ", .." } else { "" };
     let noun = if frames.len() == 1 { "frame" } else { "frames" };

@@ -16,7 +16,7 @@ pub struct CheckedScene {
     pub check: SceneCheck,
     /// Two frames with epipolar lines: dots of one colour are the same corner in both and must lie on the lines of
     /// their colour. `None` if too few corners match.
-    pub picture: Option<RgbImage>,
+    pub image: Option<RgbImage>,
 }
 
 /// Checks one scene of `source`. Failures are reasons in the result, never errors.
@@ -28,33 +28,33 @@ pub fn check_scene(source: &dyn SceneSource, scene: usize) -> CheckedScene {
         Ok(cameras) => cameras,
         Err(error) => {
             check.reasons.push(error.to_string());
-            return CheckedScene { check, picture: None };
+            return CheckedScene { check, image: None };
         }
     };
     check.num_frames = cameras.len();
-    let frames = images::look(source, scene, &cameras, &mut check);
-    cameras::look(&cameras, &frames, &mut check);
-    let picture = epipolar::look(source, scene, &cameras, &frames, &mut check);
+    let frames = images::check_images(source, scene, &cameras, &mut check);
+    cameras::check_cameras(&cameras, &frames, &mut check);
+    let image = epipolar::check_poses(source, scene, &cameras, &frames, &mut check);
     check.ok = check.reasons.is_empty();
-    CheckedScene { check, picture }
+    CheckedScene { check, image }
 }
 
 /// Findings for the scenes skipped when the source was opened, except those reserved for testing.
-pub fn left_out(ledger: &SkipReport) -> Vec<SceneCheck> {
-    let skips = ledger.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING);
+pub fn skipped_scenes(report: &SkipReport) -> Vec<SceneCheck> {
+    let skips = report.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING);
     let flagged = skips.map(|skip| {
         let mut check = SceneCheck { key: skip.key.clone(), ..SceneCheck::default() };
         check.reasons.push(skip.reason.clone());
-        note_frames(ledger, &mut check);
+        note_skipped_frames(report, &mut check);
         check
     });
     flagged.collect()
 }
 
 /// Adds a note for the frames of a scene skipped when the source was opened.
-pub fn note_frames(ledger: &SkipReport, check: &mut SceneCheck) {
+pub fn note_skipped_frames(report: &SkipReport, check: &mut SceneCheck) {
     let mut by_reason: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
-    for skip in ledger.frames.iter().filter(|skip| skip.key == check.key) {
+    for skip in report.frames.iter().filter(|skip| skip.key == check.key) {
         by_reason.entry(&skip.reason).or_default().push(&skip.frame);
     }
     for (reason, names) in by_reason {

@@ -109,7 +109,7 @@ fn every_layout_is_converted_to_the_same_scene() {
 }
 
 #[test]
-fn pictures_without_a_file_are_encoded() {
+fn images_without_a_file_are_encoded() {
     let folder = tempfile::tempdir().unwrap();
     let converted = convert_all(&rooms(3), &folder.path().join("test"), &CHUNKS, |_| ()).unwrap();
     assert_eq!((converted.num_frames, converted.num_encoded), (9, 9));
@@ -146,7 +146,7 @@ fn an_interrupted_conversion_goes_on_and_ends_with_the_same_files() {
         for name in got.keys().filter(|name| *name != "SHA256SUMS") {
             assert!(got[name] == expected[name], "{name}");
         }
-        // Finished: no picture is read again.
+        // Finished: no image is read again.
         let again = interrupted(6, 0);
         let converted = convert_all(&again, folder.path(), &options, |_| ()).unwrap();
         assert_eq!((converted.num_found, converted.num_frames), (6, 0));

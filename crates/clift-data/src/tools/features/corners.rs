@@ -1,6 +1,6 @@
 //! Shi-Tomasi corners: places where the image changes in every direction.
 
-use crate::tools::features::gray_image::Grey;
+use crate::tools::features::gray_image::GrayImage;
 
 /// Half the side of the square of summed gradients, in pixels.
 const REACH: usize = 2;
@@ -8,18 +8,18 @@ const REACH: usize = 2;
 const APART: usize = 4;
 /// Smallest distance from the edge, in pixels: corners nearer to it have no descriptor.
 const MARGIN: usize = 12;
-/// Smallest measure of a corner, in squared grey levels per pixel: above the noise of a JPEG.
+/// Smallest measure of a corner, in squared gray levels per pixel: above the noise of a JPEG.
 const LEAST: f32 = 4.0;
 /// Cells of an image, about; they share the corners evenly, so that corners cover the image.
 const CELLS: usize = 96;
 
 /// At most `count` corners as column and row; the centre of the first pixel is at (0.5, 0.5).
-pub(crate) fn find(grey: &Grey, count: usize) -> Vec<[f64; 2]> {
-    let (width, height) = (grey.width, grey.height);
+pub(crate) fn find(gray: &GrayImage, count: usize) -> Vec<[f64; 2]> {
+    let (width, height) = (gray.width, gray.height);
     if width.min(height) <= 2 * MARGIN {
         return Vec::new();
     }
-    let measure = measure(grey);
+    let measure = measure(gray);
     let at = |x: usize, y: usize| measure[y * width + x];
     let mut found = Vec::new();
     for y in MARGIN..height - MARGIN {
@@ -65,12 +65,12 @@ fn top(before: f32, middle: f32, after: f32) -> f64 {
 }
 
 /// The smaller eigenvalue of the summed products of gradients around every pixel; zero at the edge.
-fn measure(grey: &Grey) -> Vec<f32> {
-    let (width, height) = (grey.width, grey.height);
+fn measure(gray: &GrayImage) -> Vec<f32> {
+    let (width, height) = (gray.width, gray.height);
     let mut products = vec![[0.0_f32; 3]; width * height];
     for y in 1..height - 1 {
         for x in 1..width - 1 {
-            let [dx, dy] = grey.gradient(x, y);
+            let [dx, dy] = gray.gradient(x, y);
             products[y * width + x] = [dx * dx, dx * dy, dy * dy];
         }
     }
@@ -112,14 +112,14 @@ mod tests {
         let inside = |x: usize, y: usize| (20..50).contains(&x) && (15..40).contains(&y);
         let rgb =
             (0..height).flat_map(|y| (0..width).flat_map(move |x| [if inside(x, y) { 200 } else { 50 }; 3])).collect();
-        let found = find(&Grey::of(&RgbImage { width, height, rgb }).blurred(), 100);
+        let found = find(&GrayImage::new(&RgbImage { width, height, rgb }).blurred(), 100);
         assert_eq!(found.len(), 4, "{found:?}");
         for corner in [[20.0, 15.0], [50.0, 15.0], [20.0, 40.0], [50.0, 40.0]] {
             // The blur moves a corner inwards, by the same amount in every view.
             let near = |place: &[f64; 2]| (0..2).all(|i| (place[i] - corner[i]).abs() < 2.0);
             assert!(found.iter().any(near), "{found:?} {corner:?}");
         }
-        assert_eq!(find(&Grey::of(&RgbImage { width: 20, height: 90, rgb: vec![0; 5400] }), 9).len(), 0);
+        assert_eq!(find(&GrayImage::new(&RgbImage { width: 20, height: 90, rgb: vec![0; 5400] }), 9).len(), 0);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Descriptors of corners: upright histograms of gradient directions in 4 x 4 cells, as SIFT's.
 
-use crate::tools::features::gray_image::Grey;
+use crate::tools::features::gray_image::GrayImage;
 
 /// Cells along a side.
 const CELLS: usize = 4;
@@ -23,17 +23,17 @@ pub(crate) struct Descriptor {
 
 impl Descriptor {
     /// Describes the surroundings of (x, y), in pixels; `None` near the edge and for a constant surrounding.
-    pub fn at(grey: &Grey, x: f64, y: f64) -> Option<Self> {
+    pub fn at(gray: &GrayImage, x: f64, y: f64) -> Option<Self> {
         let half = (CELLS as f32 * CELL_PX / 2.0) as i64 + 1;
         let (column, row) = (x.floor() as i64, y.floor() as i64);
         let inside = |place: i64, size: usize| place - half >= 1 && place + half < size as i64 - 1;
-        if !inside(column, grey.width) || !inside(row, grey.height) {
+        if !inside(column, gray.width) || !inside(row, gray.height) {
             return None;
         }
         let mut sums = [0.0_f32; CELLS * CELLS * DIRECTIONS];
         for v in row - half..=row + half {
             for u in column - half..=column + half {
-                let [dx, dy] = grey.gradient(u as usize, v as usize);
+                let [dx, dy] = gray.gradient(u as usize, v as usize);
                 // Place in cells, 0 at the middle of the first.
                 let across = ((u as f64 + 0.5 - x) as f32) / CELL_PX + (CELLS as f32 - 1.0) / 2.0;
                 let down = ((v as f64 + 0.5 - y) as f32) / CELL_PX + (CELLS as f32 - 1.0) / 2.0;
@@ -86,18 +86,18 @@ mod tests {
     use super::*;
     use crate::image::rgb_image::RgbImage;
 
-    fn waves(shift: f64, contrast: f64) -> Grey {
+    fn waves(shift: f64, contrast: f64) -> GrayImage {
         let (width, height) = (64, 64);
         let value = |x: usize, y: usize| {
             let (x, y) = (x as f64 - shift, y as f64);
             (127.0 + contrast * ((x * 0.4).sin() + (y * 0.3 + x * 0.1).cos())) as u8
         };
         let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [value(x, y); 3])).collect();
-        Grey::of(&RgbImage { width, height, rgb }).blurred()
+        GrayImage::new(&RgbImage { width, height, rgb }).blurred()
     }
 
     #[test]
-    fn a_descriptor_moves_with_the_picture_and_ignores_contrast() {
+    fn a_descriptor_moves_with_the_image_and_ignores_contrast() {
         let here = Descriptor::at(&waves(0.0, 60.0), 30.5, 30.5).unwrap();
         let moved = Descriptor::at(&waves(3.0, 60.0), 33.5, 30.5).unwrap();
         let faint = Descriptor::at(&waves(0.0, 30.0), 30.5, 30.5).unwrap();
@@ -112,7 +112,7 @@ mod tests {
     #[test]
     fn there_is_none_at_the_edge_or_on_a_plain_wall() {
         assert!(Descriptor::at(&waves(0.0, 60.0), 8.0, 30.0).is_none());
-        let plain = Grey { width: 64, height: 64, values: vec![7.0; 64 * 64] };
+        let plain = GrayImage { width: 64, height: 64, values: vec![7.0; 64 * 64] };
         assert!(Descriptor::at(&plain, 30.0, 30.0).is_none());
     }
 }

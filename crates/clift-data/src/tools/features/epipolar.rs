@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_matches_are_sorted_out_and_pictures_of_other_places_have_none() {
+    fn wrong_matches_are_sorted_out_and_images_of_other_places_have_none() {
         let (_, mut matches) = scene(120);
         for (i, pair) in matches.iter_mut().enumerate().filter(|(i, _)| i % 3 == 0) {
             let mut rng = step_rng(6, i as u64, "test");

@@ -8,7 +8,7 @@ use crate::image::rgb_image::RgbImage;
 use crate::tools::features::correspondence::{Correspondence, WIDTH};
 use crate::tools::features::descriptor::Descriptor;
 use crate::tools::features::epipolar::{self};
-use crate::tools::features::gray_image::Grey;
+use crate::tools::features::gray_image::GrayImage;
 use crate::tools::features::{corners, matching};
 
 /// Most corners of the two sizes of an image.
@@ -32,12 +32,12 @@ impl Features {
         let smaller = |side: usize| ((side as f64 * SMALLER).round() as usize).max(1);
         let second = resize_lanczos(&shown, smaller(shown.width), smaller(shown.height));
         let mut features = Self::default();
-        for (picture, count) in [&shown, &second].into_iter().zip(MAX_CORNERS) {
-            let grey = Grey::of(picture).blurred();
+        for (image, count) in [&shown, &second].into_iter().zip(MAX_CORNERS) {
+            let gray = GrayImage::new(image).blurred();
             let (scale_x, scale_y) =
-                (shown.width as f64 / picture.width as f64 * unit, shown.height as f64 / picture.height as f64 * unit);
-            for [x, y] in corners::find(&grey, count) {
-                if let Some(descriptor) = Descriptor::at(&grey, x, y) {
+                (shown.width as f64 / image.width as f64 * unit, shown.height as f64 / image.height as f64 * unit);
+            for [x, y] in corners::find(&gray, count) {
+                if let Some(descriptor) = Descriptor::at(&gray, x, y) {
                     features.points.push([x * scale_x, y * scale_y]);
                     features.descriptors.push(descriptor);
                 }
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_matches_itself_in_place() {
+    fn a_image_matches_itself_in_place() {
         let features = Features::find(&room().frame(0, 0).unwrap());
         assert!(features.points.len() > 80, "{}", features.points.len());
         let matches = features.matches(&features);
@@ -107,11 +107,11 @@ mod tests {
         let mut distances: Vec<f64> = matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect();
         distances.sort_by(f64::total_cmp);
         assert!(matches.len() > 40, "{}", matches.len());
-        assert!(distances[matches.len() / 2] < 1.0, "{distances:?}"); // half a pixel of the picture, which is 320 wide
+        assert!(distances[matches.len() / 2] < 1.0, "{distances:?}"); // half a pixel of the image, which is 320 wide
     }
 
     #[test]
-    fn pictures_of_one_colour_have_no_corners() {
+    fn images_of_one_colour_have_no_corners() {
         let features = Features::find(&RgbImage { width: 64, height: 48, rgb: vec![90; 64 * 48 * 3] });
         assert!(features.points.is_empty() && features.matches(&features).is_empty());
         assert!(Features::find(&RgbImage { width: 3, height: 2, rgb: vec![9; 18] }).points.is_empty());

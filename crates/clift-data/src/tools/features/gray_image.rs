@@ -3,20 +3,20 @@
 use crate::image::rgb_image::RgbImage;
 
 /// Brightness in `[0, 255]`, row-major.
-pub(crate) struct Grey {
+pub(crate) struct GrayImage {
     pub width: usize,
     pub height: usize,
     pub values: Vec<f32>,
 }
 
-impl Grey {
+impl GrayImage {
     /// The mean of the channels, green twice: near the perceived brightness.
-    pub fn of(frame: &RgbImage) -> Self {
-        let values = frame.rgb.as_chunks::<3>().0.iter().map(|[r, g, b]| {
+    pub fn new(image: &RgbImage) -> Self {
+        let values = image.rgb.as_chunks::<3>().0.iter().map(|[r, g, b]| {
             let sum = u16::from(*r) + 2 * u16::from(*g) + u16::from(*b);
             f32::from(sum) / 4.0
         });
-        Self { width: frame.width, height: frame.height, values: values.collect() }
+        Self { width: image.width, height: image.height, values: values.collect() }
     }
 
     /// Smooths by a binomial filter (1 4 6 4 1): a Gaussian of one pixel.

@@ -4,7 +4,9 @@ use std::fs;
 use std::path::PathBuf;
 
 use anyhow::Context;
-use clift_data::{CheckedScene, SceneCheck, Split, check_scene, encode_png, left_out, note_frames, replace_file};
+use clift_data::{
+    CheckedScene, SceneCheck, Split, check_scene, encode_png, note_skipped_frames, replace_file, skipped_scenes,
+};
 use serde::Serialize;
 
 use crate::commands::shared_args::JsonArg;
@@ -67,13 +69,13 @@ fn check_split(split: &SplitSource, args: &CheckArgs, report: &mut Report) -> an
         print_note(&format!("note: {note}"));
     }
     report.notes.extend_from_slice(&skips.notes);
-    report.scenes.extend(left_out(skips).into_iter().map(|check| Row { split: split.split, check }));
+    report.scenes.extend(skipped_scenes(skips).into_iter().map(|check| Row { split: split.split, check }));
     let num_scenes = source.num_scenes().min(args.scenes.unwrap_or(usize::MAX));
     let mut counter = Counter::new(&split.name(), num_scenes as u64);
     for scene in 0..num_scenes {
-        let CheckedScene { mut check, picture } = check_scene(source.as_ref(), scene);
-        note_frames(skips, &mut check);
-        if let (Some(folder), Some(image)) = (&args.images, picture) {
+        let CheckedScene { mut check, image } = check_scene(source.as_ref(), scene);
+        note_skipped_frames(skips, &mut check);
+        if let (Some(folder), Some(image)) = (&args.images, image) {
             let path = folder.join(image_name(split.split, &check.key));
             replace_file(&path, &encode_png(&image)?).with_context(|| format!("writing {}", path.display()))?;
         }

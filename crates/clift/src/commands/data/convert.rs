@@ -53,7 +53,7 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
         let mut counter = Counter::new(&split.name(), split.opened.source.num_scenes() as u64);
         let report = converter.run(|done| counter.set(done as u64))?;
         drop(counter);
-        print_skips(&report.left_out, &folder);
+        print_skips(&report.skipped, &folder);
         print_result(&describe(split, &report, started.elapsed().as_secs_f64(), &folder))?;
         if report.num_scenes == 0 {
             empty.push(split.name());
@@ -64,7 +64,7 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
 }
 
 fn describe(split: &SplitSource, report: &ConversionReport, seconds: f64, folder: &Path) -> String {
-    let ConversionReport { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, left_out } =
+    let ConversionReport { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, skipped } =
         report;
     let optional = |number: usize, text: &str| if number > 0 { format!(", {number} {text}") } else { String::new() };
     let found = optional(*num_found, "of them already complete");
@@ -73,7 +73,7 @@ fn describe(split: &SplitSource, report: &ConversionReport, seconds: f64, folder
         "{}: {} of {}{found}{changed}; {} written, {} copied and {num_encoded} encoded, {} in {seconds:.1} s: {}",
         split.name(),
         plural(*num_scenes, "scene"),
-        left_out.num_scenes,
+        skipped.num_scenes,
         plural(*num_frames, "frame"),
         num_frames - num_encoded,
         file_size(*image_bytes),

@@ -67,7 +67,7 @@ impl ColmapCamera {
             return Err(format!("the size is {}x{} pixels", self.width, self.height));
         }
         let intrinsics = Intrinsics { fx: focal[0], fy: focal[1], cx: centre[0], cy: centre[1] };
-        let intrinsics_norm = IntrinsicsNorm::of_pixels(intrinsics, self.width as f64, self.height as f64);
+        let intrinsics_norm = IntrinsicsNorm::from_pixels(intrinsics, self.width as f64, self.height as f64);
         let [k1, k2, p1, p2] = distortion;
         let lens = Lens { radial: [k1, k2, 0.0], tangential: [p1, p2] };
         let checked = intrinsics_norm.validate().and_then(|()| lens.validate());

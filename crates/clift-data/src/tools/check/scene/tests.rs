@@ -89,17 +89,17 @@ fn turned(c2w: Pose, angle_deg: f64) -> Pose {
 fn rooms_with_right_cameras_pass() {
     for room in rooms() {
         let source = Changed { room, cameras: |_, _: &mut _| (), frame: |frame| frame };
-        let CheckedScene { check, picture } = check_scene(&source, 0);
+        let CheckedScene { check, image } = check_scene(&source, 0);
         assert!(check.ok && check.reasons.is_empty(), "{check:?}");
         assert_eq!((check.num_frames, check.image_size), (12, Some([320, 240])));
         assert!(check.epipolar_px.is_some_and(|px| px < 0.7), "{check:?}");
         assert!(check.pairs.len() >= 5, "{check:?}");
-        assert_eq!(picture.unwrap().height, 240);
+        assert_eq!(image.unwrap().height, 240);
     }
 }
 
 #[test]
-fn cameras_that_do_not_fit_the_pictures_are_flagged() {
+fn cameras_that_do_not_fit_the_images_are_flagged() {
     let flagged = |name: &str, check: SceneCheck| {
         assert!(!check.ok, "{name}: {check:?}");
         assert!(check.epipolar_px.is_some_and(|px| px > MAX_EPIPOLAR_PX), "{name}: {check:?}");
@@ -131,10 +131,7 @@ fn implausible_cameras_are_flagged_with_what_is_implausible() {
         check.reasons.join("; ")
     };
     let text = reasons(check(|_, camera| camera.intrinsics_norm.cx = 0.9));
-    assert!(
-        text.contains("principal point at (0.900, 0.500) of the picture in 12 frames (0, 1, 2, 3, 4, ..)"),
-        "{text}"
-    );
+    assert!(text.contains("principal point at (0.900, 0.500) of the image in 12 frames (0, 1, 2, 3, 4, ..)"), "{text}");
     let text = reasons(check(|frame, camera| {
         if frame == 3 {
             camera.intrinsics_norm.fx = 0.2;
@@ -142,7 +139,7 @@ fn implausible_cameras_are_flagged_with_what_is_implausible() {
     }));
     assert!(text.contains("degrees in 1 frame (3), expected 5 to 120"), "{text}");
     let text = reasons(check(|_, camera| camera.intrinsics_norm.fy *= 2.0));
-    assert!(text.contains("fx / fy = 0.500: are they for another picture size?"), "{text}");
+    assert!(text.contains("fx / fy = 0.500: are they for another image size?"), "{text}");
     let text = reasons(check(|frame, camera| camera.c2w.rotation.x_axis.x += 0.004 * f64::from(frame == 5)));
     assert!(text.contains("off orthonormal ones by up to"), "{text}");
     let text = reasons(check(|_, camera| camera.c2w.translation = DVec3::new(1.0, 2.0, 3.0)));
@@ -160,7 +157,7 @@ fn frames_that_repeat_or_cannot_be_read_are_told() {
     };
     let stuck = of(|frame| frame.min(5), |_, _| ());
     assert!(!stuck.ok);
-    assert_eq!(stuck.reasons, ["2 frames (6, 7) repeat the picture of an earlier frame that has another camera"]);
+    assert_eq!(stuck.reasons, ["2 frames (6, 7) repeat the image of an earlier frame that has another camera"]);
     let torn = of(|frame| if frame == 2 { usize::MAX } else { frame }, |_, _| ());
     assert!(
         torn.reasons[0].starts_with("1 frame (2) cannot be read; the first: frame 2 of scene k cannot"),
@@ -169,22 +166,22 @@ fn frames_that_repeat_or_cannot_be_read_are_told() {
     // Too small for corners: said, and not held against the scene.
     let small = of(|frame| frame, |_, _| ());
     assert!(small.ok && small.epipolar_px.is_none(), "{small:?}");
-    assert!(small.notes[0].starts_with("poses were not compared with the pictures: 0 matching corners"), "{small:?}");
+    assert!(small.notes[0].starts_with("poses were not compared with the images: 0 matching corners"), "{small:?}");
 }
 
 #[test]
 fn scenes_that_were_left_out_are_flagged_with_the_reason() {
-    let mut ledger = SkipReport::new(3);
-    ledger.skip("a", "not a scene");
+    let mut report = SkipReport::new(3);
+    report.skip("a", "not a scene");
     for name in ["0005.jpg", "0010.jpg"] {
-        ledger.skip_frame("b", name, "no such file");
+        report.skip_frame("b", name, "no such file");
     }
-    let checks = left_out(&ledger);
+    let checks = skipped_scenes(&report);
     assert_eq!(checks.len(), 1);
     assert!(!checks[0].ok && checks[0].key == "a" && checks[0].reasons == ["not a scene"]);
     assert!(checks[0].notes.is_empty());
     let mut check = SceneCheck { key: "b".into(), ok: true, ..SceneCheck::default() };
-    note_frames(&ledger, &mut check);
+    note_skipped_frames(&report, &mut check);
     assert!(check.ok);
     assert_eq!(check.notes, ["2 frames left out, no such file: 0005.jpg, 0010.jpg"]);
 }
