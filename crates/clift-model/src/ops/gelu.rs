@@ -18,7 +18,7 @@ pub trait GeluKernels: Backend {
 
     /// `grad * (Phi(x) + x * phi(x))` with the normal density `phi`.
     fn gelu_grad(x: FloatTensor<Self>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
-        backward::<Self>(x, grad)
+        gelu_backward::<Self>(x, grad)
     }
 }
 
@@ -26,7 +26,7 @@ fn output<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     B::float_mul(x.clone(), normal_cdf::<B>(x))
 }
 
-pub(crate) fn backward<B: Backend>(x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
+pub(crate) fn gelu_backward<B: Backend>(x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
     let density = B::float_exp(B::float_mul_scalar(B::float_mul(x.clone(), x.clone()), (-0.5).into()));
     let density = B::float_mul_scalar(density, (1.0 / (2.0 * std::f64::consts::PI).sqrt()).into());
     let slope = B::float_add(normal_cdf::<B>(x.clone()), B::float_mul(x, density));
@@ -51,7 +51,7 @@ impl GeluKernels for Flex {
 
     fn gelu_grad(x: FloatTensor<Self>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
         if !is_native(&x) {
-            return backward::<Self>(x, grad);
+            return gelu_backward::<Self>(x, grad);
         }
         let mut grad = contiguous(grad);
         gelu_backward(InstructionSet::detected(), values(&contiguous(x)), values_mut(&mut grad));

@@ -27,7 +27,7 @@ pub trait LayerNormKernels: Backend {
 
     /// The gradients of `x`, `gamma` and `beta`.
     fn norm_backward(state: NormState<FloatTensor<Self>>, grad: FloatTensor<Self>) -> [FloatTensor<Self>; 3] {
-        backward::<Self>(state, grad)
+        layer_norm_backward::<Self>(state, grad)
     }
 }
 
@@ -68,7 +68,7 @@ fn output<B: Backend>(x: FloatTensor<B>, gamma: FloatTensor<B>, beta: FloatTenso
 
 /// With `y` the normalised rows and `g = dO gamma`: `dx = (g - mean(g) - y mean(g y)) / deviation`,
 /// `dgamma = sum(dO y)`, `dbeta = sum(dO)`.
-fn backward<B: Backend>(state: NormState<FloatTensor<B>>, grad: FloatTensor<B>) -> [FloatTensor<B>; 3] {
+fn layer_norm_backward<B: Backend>(state: NormState<FloatTensor<B>>, grad: FloatTensor<B>) -> [FloatTensor<B>; 3] {
     let NormState { x, gamma, .. } = state;
     let [batch, count, dim] = x.shape().dims();
     let (normal, inverse) = normal::<B>(x);
@@ -105,7 +105,7 @@ impl LayerNormKernels for Flex {
 
     fn norm_backward(state: NormState<FloatTensor<Self>>, grad: FloatTensor<Self>) -> [FloatTensor<Self>; 3] {
         let Some(statistics) = &state.statistics else {
-            return backward::<Self>(state, grad);
+            return layer_norm_backward::<Self>(state, grad);
         };
         let [batch, count, dim] = state.x.shape().dims();
         let [x, gamma, grad] = [state.x, state.gamma, grad].map(contiguous);

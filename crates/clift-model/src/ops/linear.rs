@@ -211,7 +211,7 @@ impl LinearKernels for NdArray {}
 #[cfg(feature = "wgpu")]
 impl LinearKernels for burn::backend::Cube {}
 
-fn forward<B: LinearKernels>(
+fn linear_forward<B: LinearKernels>(
     x: FloatTensor<B>,
     weight: FloatTensor<B>,
     bias: FloatTensor<B>,
@@ -229,7 +229,7 @@ macro_rules! linear_ops {
                 bias: FloatTensor<Self>,
                 before: Prologue,
             ) -> FloatTensor<Self> {
-                forward::<Self>(x, weight, bias, before)
+                linear_forward::<Self>(x, weight, bias, before)
             }
 
             fn norm_then_linear(
@@ -262,10 +262,10 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
             (x.into_parts(), weight.into_parts(), bias.into_parts());
         match LinearBackward.prepare::<C>([x_node, weight_node, bias_node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let output = forward::<B>(x.clone(), weight.clone(), bias, before);
+                let output = linear_forward::<B>(x.clone(), weight.clone(), bias, before);
                 prep.finish(LinearState { x, weight, before }, output)
             }
-            OpsKind::UnTracked(prep) => prep.finish(forward::<B>(x, weight, bias, before)),
+            OpsKind::UnTracked(prep) => prep.finish(linear_forward::<B>(x, weight, bias, before)),
         }
     }
 

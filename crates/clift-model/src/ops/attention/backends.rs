@@ -6,22 +6,22 @@ use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Flex, NdArray, TensorMetadata};
 use clift_kernels::{
-    BackwardInputs, Gradients, InstructionSet, Sizes, StridedRows, attention_backward, attention_forward,
+    BackwardInputs, AttentionGradients, InstructionSet, AttentionSizes, StridedRows, attention_backward, attention_forward,
 };
 
-use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv, composed_backward, forward, split};
+use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv, composed_backward, attention_forward, split};
 use crate::ops::flex::{contiguous, is_native, tensor, values};
 use crate::ops::precision::{MatmulKernels, Precision};
 
 impl AttentionKernels for Flex {
     fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
         if !inputs.is_native() || heads.precision != Precision::F32 {
-            return AttentionOutput { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None };
+            return AttentionOutput { output: attention_forward::<Self>(split::<Self>(inputs), heads), log_sum: None };
         }
         let HeadConfig { num_heads, .. } = heads;
         let inputs = inputs.clone().contiguous();
         let sizes = inputs.sizes(num_heads);
-        let Sizes { batch, num_queries, head_width, .. } = sizes;
+        let AttentionSizes { batch, num_queries, head_width, .. } = sizes;
         let dim = num_heads * head_width;
         let mut output = vec![0.0; batch * num_queries * dim];
         let mut log_sum = vec![0.0; batch * num_heads * num_queries];
@@ -42,7 +42,7 @@ impl AttentionKernels for Flex {
         let HeadConfig { num_heads, .. } = heads;
         let inputs = inputs.contiguous();
         let sizes = inputs.sizes(num_heads);
-        let Sizes { batch, num_queries, num_keys, head_width, .. } = sizes;
+        let AttentionSizes { batch, num_queries, num_keys, head_width, .. } = sizes;
         let dim = num_heads * head_width;
         let [output, grad_output] = [attended.output, grad_output].map(contiguous);
         let [query, key, value] = inputs.rows(dim);
@@ -52,13 +52,13 @@ impl AttentionKernels for Flex {
         match inputs {
             Qkv::Packed(_) => {
                 let mut grad = vec![0.0; batch * num_queries * 3 * dim];
-                attention_backward(set, sizes, saved, Gradients::Packed(&mut grad));
+                attention_backward(set, sizes, saved, AttentionGradients::Packed(&mut grad));
                 Qkv::Packed(tensor(grad, [batch, num_queries, 3 * dim]))
             }
             Qkv::Separate { .. } => {
                 let mut query = vec![0.0; batch * num_queries * dim];
                 let mut key_value = vec![0.0; batch * num_keys * 2 * dim];
-                let to = Gradients::Separate { query: &mut query, key_value: &mut key_value };
+                let to = AttentionGradients::Separate { query: &mut query, key_value: &mut key_value };
                 attention_backward(set, sizes, saved, to);
                 let query = tensor(query, [batch, num_queries, dim]);
                 Qkv::Separate { query, key_value: tensor(key_value, [batch, num_keys, 2 * dim]) }
@@ -84,14 +84,14 @@ impl Qkv<FlexTensor> {
         }
     }
 
-    fn sizes(&self, num_heads: usize) -> Sizes {
+    fn sizes(&self, num_heads: usize) -> AttentionSizes {
         let (query, key_value, parts) = match self {
             Self::Packed(packed) => (packed, packed, 3),
             Self::Separate { query, key_value } => (query, key_value, 1),
         };
         let [batch, num_queries, width] = query.shape().dims();
         let [_, num_keys, _] = key_value.shape().dims();
-        Sizes { batch, num_queries, num_keys, num_heads, head_width: width / parts / num_heads }
+        AttentionSizes { batch, num_queries, num_keys, num_heads, head_width: width / parts / num_heads }
     }
 
     /// Rows of queries, keys and values.
@@ -113,7 +113,7 @@ fn columns(x: &FlexTensor, first: usize) -> StridedRows<'_> {
 pub trait AttentionKernels: MatmulKernels {
     /// The output, and what the backward can use besides it.
     fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
-        AttentionOutput { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None }
+        AttentionOutput { output: attention_forward::<Self>(split::<Self>(inputs), heads), log_sum: None }
     }
 
     /// The gradients of the inputs from that of the output.
