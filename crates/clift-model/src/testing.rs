@@ -134,6 +134,41 @@ pub fn random<const D: usize>(shape: [usize; D], seed: u64, device: &Device) -> 
     Tensor::from_data(TensorData::new(values, shape), (device, dtype))
 }
 
+/// Returns the output of `f` and the gradients of the inputs under a cotangent; zeros for an input without a gradient.
+pub fn output_and_gradients<const COUNT: usize>(
+    inputs: [Tensor<3>; COUNT],
+    cotangent: Tensor<3>,
+    f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
+) -> (Tensor<3>, [Tensor<3>; COUNT]) {
+    let tracked = inputs.map(|input| input.autodiff().require_grad());
+    let output = f(tracked.clone());
+    let grads = (output.clone() * cotangent.autodiff()).sum().backward();
+    let gradients = tracked.map(|input| input.grad(&grads).unwrap_or_else(|| input.inner().zeros_like()));
+    (output.inner(), gradients)
+}
+
+/// Asserts that output and gradients of `f` in f32, which takes the native kernels on flex, equal those in f64, which
+/// takes the composed operations. Results that are zero in f64 are not compared.
+#[track_caller]
+pub fn check_native<const COUNT: usize>(
+    inputs: [Tensor<3>; COUNT],
+    cotangent: Tensor<3>,
+    f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
+    tolerance: f64,
+) {
+    let inputs = inputs.map(|input| input.cast(DType::F32));
+    let cotangent = cotangent.cast(DType::F32);
+    let (output, grads) = output_and_gradients(inputs.clone(), cotangent.clone(), &f);
+    let wide = inputs.map(|input| input.cast(DType::F64));
+    let (expected, expected_grads) = output_and_gradients(wide, cotangent.cast(DType::F64), &f);
+    assert_close(&output.cast(DType::F64), &expected, tolerance);
+    for (grad, expected) in grads.into_iter().zip(&expected_grads) {
+        if expected.clone().abs().max().into_scalar::<f64>() > 1e-12 {
+            assert_close(&grad.cast(DType::F64), expected, tolerance);
+        }
+    }
+}
+
 /// Asserts that the gradient of `f` under a random cotangent equals central differences in f64,
 /// to `tolerance` of its largest entry.
 ///
@@ -144,14 +179,12 @@ pub fn check_gradients<const COUNT: usize>(
     f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
     tolerance: f64,
 ) {
-    let tracked = inputs.clone().map(|input| input.autodiff().require_grad());
-    let output = f(tracked.clone());
-    let cotangent = random(output.dims(), 99, &inputs[0].device());
-    let grads = (output * cotangent.clone().autodiff()).sum().backward();
+    let cotangent = random(f(inputs.clone()).dims(), 99, &inputs[0].device());
+    let (_, gradients) = output_and_gradients(inputs.clone(), cotangent.clone(), &f);
     let loss = |inputs: [Tensor<3>; COUNT]| to_vec((f(inputs) * cotangent.clone()).sum())[0];
     let step = 1e-5;
-    for position in 0..COUNT {
-        let analytic = to_vec(tracked[position].grad(&grads).expect("every input is tracked"));
+    for (position, gradient) in gradients.into_iter().enumerate() {
+        let analytic = to_vec(gradient);
         let shape = inputs[position].dims();
         let values = to_vec(inputs[position].clone());
         let moved = |index: usize, by: f64| {

@@ -1,22 +1,26 @@
-//! Attention on Burn's CPU backend: f32 by the kernels of `clift-kernels`, straight from the packed
-//! projections and into packed gradients.
-#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+//! The implementation of every backend: on flex and in f32 the native kernels, which read packed projections and write
+//! packed gradients; elsewhere attention in chunks of queries.
+#![expect(
+    deprecated,
+    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
+)]
 
 use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Flex, NdArray, TensorMetadata};
 use clift_kernels::{
-    BackwardInputs, AttentionGradients, InstructionSet, AttentionSizes, StridedRows, attention_backward, attention_forward,
+    AttentionGradients, AttentionSizes, BackwardInputs, InstructionSet, StridedRows, attention_backward,
+    attention_forward,
 };
 
-use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv, composed_backward, attention_forward, split};
+use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv, composed_backward, composed_forward};
 use crate::ops::flex::{contiguous, is_native, tensor, values};
 use crate::ops::precision::{MatmulKernels, Precision};
 
 impl AttentionKernels for Flex {
     fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
         if !inputs.is_native() || heads.precision != Precision::F32 {
-            return AttentionOutput { output: attention_forward::<Self>(split::<Self>(inputs), heads), log_sum: None };
+            return composed_forward::<Self>(inputs, heads);
         }
         let HeadConfig { num_heads, .. } = heads;
         let inputs = inputs.clone().contiguous();
@@ -37,7 +41,7 @@ impl AttentionKernels for Flex {
         grad_output: FloatTensor<Self>,
     ) -> Qkv<FloatTensor<Self>> {
         let Some(log_sum) = attended.log_sum else {
-            return composed_backward::<Self>(inputs, attended.output, heads, grad_output);
+            return composed_backward::<Self>(&inputs, attended.output, heads, grad_output);
         };
         let HeadConfig { num_heads, .. } = heads;
         let inputs = inputs.contiguous();
@@ -94,7 +98,7 @@ impl Qkv<FlexTensor> {
         AttentionSizes { batch, num_queries, num_keys, num_heads, head_width: width / parts / num_heads }
     }
 
-    /// Rows of queries, keys and values.
+    /// Returns the rows of queries, keys and values.
     fn rows(&self, dim: usize) -> [StridedRows<'_>; 3] {
         match self {
             Self::Packed(packed) => [0, 1, 2].map(|part| columns(packed, part * dim)),
@@ -103,27 +107,27 @@ impl Qkv<FlexTensor> {
     }
 }
 
-/// Rows of a contiguous tensor from a column on.
+/// Returns the rows of a contiguous tensor, starting with column `first`.
 fn columns(x: &FlexTensor, first: usize) -> StridedRows<'_> {
     let [_, count, width] = x.shape().dims();
     StridedRows { values: values(x).get(first..).unwrap_or_default(), batch_stride: count * width, row_stride: width }
 }
 
-/// Both directions of attention on a device. The bodies here run on every one of them.
+/// Attention and its gradients on a backend. The default implementations run on every backend.
 pub trait AttentionKernels: MatmulKernels {
-    /// The output, and what the backward can use besides it.
+    /// Computes the output, and the log sums if the native kernel runs.
     fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
-        AttentionOutput { output: attention_forward::<Self>(split::<Self>(inputs), heads), log_sum: None }
+        composed_forward::<Self>(inputs, heads)
     }
 
-    /// The gradients of the inputs from that of the output.
+    /// Computes the gradients of the inputs from the gradient of the output.
     fn attend_backward(
         inputs: Qkv<FloatTensor<Self>>,
         attended: AttentionOutput<FloatTensor<Self>>,
         heads: HeadConfig,
         grad_output: FloatTensor<Self>,
     ) -> Qkv<FloatTensor<Self>> {
-        composed_backward::<Self>(inputs, attended.output, heads, grad_output)
+        composed_backward::<Self>(&inputs, attended.output, heads, grad_output)
     }
 }
 
