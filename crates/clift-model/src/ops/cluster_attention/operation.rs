@@ -228,10 +228,10 @@ fn dot<B: Backend>(a: FloatTensor<B>, b: FloatTensor<B>) -> FloatTensor<B> {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::Device;
+    use burn::tensor::{DType, Device};
 
     use super::*;
-    use crate::testing::{assert_close, check_gradients, cpu_devices, devices, random, to_vec};
+    use crate::testing::{assert_close, check_gradients, check_native, cpu_devices, devices, random, to_vec};
 
     fn cluster_attention(
         query: Tensor<3>,
@@ -250,58 +250,33 @@ mod tests {
         Tensor::from_ints(SEGMENTS, device)
     }
 
-    /// Computes the attention by a loop over centroids.
-    fn reference(q: &Tensor<3>, k: &Tensor<3>, v: &Tensor<3>, num_heads: usize) -> Vec<f64> {
-        let [batch, num_segments, dim] = q.dims();
-        let (q, k, v) = (to_vec(q.clone()), to_vec(k.clone()), to_vec(v.clone()));
-        let width = dim / num_heads;
-        let mut output = vec![0.0; batch * num_segments * dim];
-        for segment in 0..batch * num_segments {
-            let members: Vec<usize> = (0..SEGMENTS.len()).filter(|&i| SEGMENTS[i] == segment as i64).collect();
-            for head in 0..num_heads {
-                let columns = head * width..(head + 1) * width;
-                let scores: Vec<f64> = members
-                    .iter()
-                    .map(|i| columns.clone().map(|c| q[segment * dim + c] * k[i * dim + c]).sum::<f64>())
-                    .map(|dot| dot / (width as f64).sqrt())
-                    .collect();
-                let maximum = scores.iter().copied().fold(f64::MIN, f64::max);
-                let total: f64 = scores.iter().map(|score| (score - maximum).exp()).sum();
-                for (i, score) in members.iter().zip(&scores) {
-                    let weight = (score - maximum).exp() / total;
-                    columns.clone().for_each(|c| output[segment * dim + c] += weight * v[i * dim + c]);
-                }
-            }
-        }
-        output
+    fn inputs(device: &Device) -> [Tensor<3>; 3] {
+        [(4, 1), (7, 2), (7, 3)].map(|(count, seed)| random([2, count, 8], seed, device))
     }
 
-    #[test]
-    fn output_equals_a_loop_over_centroids() {
-        for device in devices() {
-            let [q, k, v] = [(4, 1), (7, 2), (7, 3)].map(|(count, seed)| random([2, count, 8], seed, &device));
-            let [q, k, v] = [q, k, v].map(|x| x.cast(burn::tensor::DType::F32));
-            let output = to_vec(cluster_attention(q.clone(), k.clone(), v.clone(), segments(&device), 2));
-            for (got, expected) in output.iter().zip(reference(&q, &k, &v, 2)) {
-                assert!((got - expected).abs() < 1e-6, "{got} against {expected}");
-            }
-            assert!(output[3 * 8..4 * 8].iter().all(|&value| value == 0.0), "segment 3 has no members");
-        }
+    fn attend([q, k, v]: [Tensor<3>; 3]) -> Tensor<3> {
+        let segments = segments(&q.device());
+        cluster_attention(q, k, v, segments, 2)
     }
 
     #[test]
     fn gradients_equal_central_differences_in_f64() {
         for device in cpu_devices() {
-            let inputs = [random([2, 4, 8], 1, &device), random([2, 7, 8], 2, &device), random([2, 7, 8], 3, &device)];
-            let segments = segments(&device);
-            check_gradients(
-                inputs,
-                |[q, k, v]| {
-                    let segments = if q.is_autodiff() { segments.clone().autodiff() } else { segments.clone() };
-                    cluster_attention(q, k, v, segments, 2)
-                },
-                1e-6,
-            );
+            check_gradients(inputs(&device), attend, 1e-6);
+        }
+    }
+
+    #[test]
+    fn native_kernels_equal_the_composed_operation() {
+        let device = Device::flex();
+        check_native(inputs(&device), random([2, 4, 8], 4, &device), attend, 1e-5);
+    }
+
+    #[test]
+    fn a_segment_without_members_gives_zeros() {
+        for device in devices() {
+            let output = to_vec(attend(inputs(&device).map(|x| x.cast(DType::F32))));
+            assert!(output[3 * 8..4 * 8].iter().all(|&value| value == 0.0), "segment 3 has no members");
         }
     }
 
