@@ -256,7 +256,7 @@ mod tests {
         let path = folder.path().join("model.safetensors");
         for config in small_configs() {
             let model = Clift::new(&config, 0, &Device::flex());
-            file::save(&model, &path).expect("writes");
+            file::save_weights(&model, &path).expect("writes");
             let bytes = std::fs::read(&path).expect("reads");
             let file = safetensors::SafeTensors::deserialize(&bytes).expect("valid");
             let built: BTreeMap<String, Vec<usize>> =

@@ -1,7 +1,7 @@
 //! A scene that is kept: its tokens and what the renderer needs beside the weights, as one `.clift` file.
 //!
 //! The file is safetensors with a header of a fixed length, so that its size is known beforehand
-//! ([`file_bytes`]):
+//! ([`scene_file_bytes`]):
 //!
 //! | part | type | shape |
 //! |---|---|---|
@@ -97,13 +97,13 @@ impl Scene {
 
     /// Bytes of this scene's file.
     pub fn file_bytes(&self, storage: TokenFormat) -> u64 {
-        file_bytes(self.num_tokens(), self.model.dim, self.context.len(), storage)
+        scene_file_bytes(self.num_tokens(), self.model.dim, self.context.len(), storage)
     }
 }
 
 /// Bytes of a scene file: `8 + 2048 + 136 + 164 V + S (28 + D b)` with V context views, S tokens of width D and b bytes
 /// per value, and four more bytes per token for `int8`.
-pub const fn file_bytes(num_tokens: usize, dim: usize, num_views: usize, storage: TokenFormat) -> u64 {
+pub const fn scene_file_bytes(num_tokens: usize, dim: usize, num_views: usize, storage: TokenFormat) -> u64 {
     // c2w and intrinsics in f64 and a frame number.
     let view = (16 + 4) * 8 + 4;
     let world = (16 + 1) * 8;

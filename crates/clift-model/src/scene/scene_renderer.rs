@@ -147,7 +147,7 @@ impl SceneRenderer {
             pictures.try_to_vec::<f32>().map_err(|error| ModelError::Device { reason: format!("{error:?}") })?;
         let render_s = started.elapsed().as_secs_f64() / views.len() as f64;
         if let Some(position) = pixels.iter().position(|value| !value.is_finite()) {
-            return Err(ModelError::NotFinite { what: "a rendering", value: pixels[position], position });
+            return Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position });
         }
         let frames = pixels.chunks_exact(height * width * 3);
         Ok(frames
@@ -282,7 +282,7 @@ mod tests {
         let path = place.path().join("model.safetensors");
         let model = Clift::new(&MODEL, 3, &device);
         let scene = scene(&model.renderer);
-        file::save(&model, &path).unwrap();
+        file::save_weights(&model, &path).unwrap();
         let renderer = load_renderer(&scene, &path, &device).unwrap();
         assert_eq!(hash::renderer_hash(&renderer, &MODEL), scene.renderer_hash);
 
@@ -292,12 +292,12 @@ mod tests {
         let message = load_renderer(&other_heads, &path, &device).unwrap_err().to_string();
         assert!(message.starts_with("the scene was made for the renderer"), "{message}");
 
-        file::save(&Clift::new(&MODEL, 4, &device), &path).unwrap();
+        file::save_weights(&Clift::new(&MODEL, 4, &device), &path).unwrap();
         let message = load_renderer(&scene, &path, &device).unwrap_err().to_string();
         let expected = format!("the scene was made for the renderer {}, this", &scene.renderer_hash[..12]);
         assert!(message.starts_with(&expected) && message.contains("(--model RUN)"), "{message}");
 
-        file::save(&model.encoder, &path).unwrap();
+        file::save_weights(&model.encoder, &path).unwrap();
         let mut small = scene.clone();
         small.model.num_renderer_blocks = 1;
         let message = load_renderer(&small, &path, &device).unwrap_err().to_string();

@@ -52,14 +52,14 @@ impl LoadReport {
 ///
 /// # Errors
 /// [`ModelError::Weights`].
-pub fn save<M: Module>(module: &M, path: &Path) -> Result<(), ModelError> {
+pub fn save_weights<M: Module>(module: &M, path: &Path) -> Result<(), ModelError> {
     save_part(module, &PathFilter::all(), path)
 }
 
-/// Does [`save`] for the parameters whose paths match `part`. The file equals that of a module without the others.
+/// Does [`save_weights`] for the parameters whose paths match `part`. The file equals that of a module without the others.
 ///
 /// # Errors
-/// As [`save`].
+/// As [`save_weights`].
 pub fn save_part<M: Module>(module: &M, part: &PathFilter, path: &Path) -> Result<(), ModelError> {
     let error = |reason: String| ModelError::Weights { action: "writing", reason, path: path.into() };
     // The store and the crate below it have temporary names of their own, which a kill leaves behind: in a folder whose
@@ -104,7 +104,7 @@ pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads parameters written by [`save`] into a module and says which.
+/// Reads parameters written by [`save_weights`] into a module and says which.
 ///
 /// # Errors
 /// [`ModelError::Weights`] when the file cannot be read, a shape differs, or a value is not finite or no 32-bit
@@ -206,7 +206,7 @@ pub fn first_not_f32<M: Module>(module: &M) -> Option<(String, DType)> {
 
 #[cfg(test)]
 mod tests {
-    use crate::weights::hash::hash;
+    use crate::weights::hash::weights_hash;
     use burn::tensor::Device;
 
     use super::*;
@@ -229,11 +229,11 @@ mod tests {
     fn weights_survive_a_file_to_the_bit() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let path = directory.path().join("model.safetensors");
-        save(&model(1), &path).expect("writes");
+        save_weights(&model(1), &path).expect("writes");
         let mut other = model(2);
-        assert_ne!(hash(&other), hash(&model(1)));
+        assert_ne!(weights_hash(&other), weights_hash(&model(1)));
         load(&mut other, &path).expect("reads").require_all(&path).expect("the same model");
-        assert_eq!(hash(&other), hash(&model(1)));
+        assert_eq!(weights_hash(&other), weights_hash(&model(1)));
         // Nothing else is left, and whoever may read other files may read it.
         let usual = directory.path().join("usual");
         File::create(&usual).expect("writes");
@@ -246,7 +246,7 @@ mod tests {
     fn a_file_of_another_model_is_named_with_what_differs() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let path = directory.path().join("model.safetensors");
-        save(&model(1).encoder, &path).expect("writes");
+        save_weights(&model(1).encoder, &path).expect("writes");
         let loaded = load(&mut model(2), &path).expect("nothing fits, nothing breaks");
         let message = loaded.require_all(&path).unwrap_err().to_string();
         assert!(message.contains("86 parameters missing (condenser.blocks.0"), "{message}");
@@ -258,7 +258,7 @@ mod tests {
         let files: Vec<Vec<u8>> = (0..4)
             .map(|i| {
                 let path = directory.path().join(format!("{i}.safetensors"));
-                save(&model(1), &path).expect("writes");
+                save_weights(&model(1), &path).expect("writes");
                 std::fs::read(path).expect("reads")
             })
             .collect();
@@ -274,12 +274,12 @@ mod tests {
     fn names_and_shapes_in_messages_are_those_of_the_file() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let path = directory.path().join("model.safetensors");
-        save(&model(1).encoder, &path).expect("writes");
+        save_weights(&model(1).encoder, &path).expect("writes");
         let missing = load(&mut model(2), &path).expect("nothing fits, nothing breaks").missing;
         assert!(missing.iter().any(|name| name == "renderer.output_norm.weight"), "{missing:?}");
         assert!(!missing.iter().any(|name| name.contains(".gamma") || name.contains(".beta")), "{missing:?}");
 
-        save(&model(1), &path).expect("writes");
+        save_weights(&model(1), &path).expect("writes");
         let config = ModelConfig {
             dim: 16,
             num_heads: 2,
@@ -304,7 +304,7 @@ mod tests {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let path = directory.path().join("model.safetensors");
         assert!(load(&mut model(1), &path).unwrap_err().to_string().contains("no such file"));
-        save(&model(1), &path).expect("writes");
+        save_weights(&model(1), &path).expect("writes");
         let bytes = std::fs::read(&path).expect("reads");
         std::fs::write(&path, &bytes[..bytes.len() / 2]).expect("writes");
         assert!(load(&mut model(1), &path).is_err());

@@ -9,7 +9,7 @@ use crate::network::renderer::Renderer;
 
 /// Hash of all parameters of a module: their paths, shapes and values, as 64 hexadecimal digits.
 /// Equal weights have equal hashes on every device.
-pub fn hash<M: Module>(module: &M) -> String {
+pub fn weights_hash<M: Module>(module: &M) -> String {
     let mut sha = Sha256::new();
     visit(module, |name, shape, data| {
         sha.update(name.as_bytes());
@@ -21,11 +21,11 @@ pub fn hash<M: Module>(module: &M) -> String {
     hex::encode(sha.finalize())
 }
 
-/// [`hash`] of a renderer's weights together with the settings that rendering depends on and no shape shows: variant
+/// [`weights_hash`] of a renderer's weights together with the settings that rendering depends on and no shape shows: variant
 /// and heads.
 pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
     let ModelConfig { variant, num_heads, .. } = config;
-    hex::encode(Sha256::digest(format!("{variant} {num_heads} {}", hash(renderer))))
+    hex::encode(Sha256::digest(format!("{variant} {num_heads} {}", weights_hash(renderer))))
 }
 
 /// Calls `f` with path, shape and values of every parameter, in the module's order.

@@ -52,7 +52,7 @@ impl TrainedModel {
 
     /// Whether both models have the same encoder, as those of the two stages of a run must.
     pub fn has_encoder_of(&self, other: &Self) -> bool {
-        hash::hash(&self.network.encoder) == hash::hash(&other.network.encoder)
+        hash::weights_hash(&self.network.encoder) == hash::weights_hash(&other.network.encoder)
     }
 
     /// Replaces the encoder by that of `other`, which must be equal, so that its weights are in memory once.
@@ -118,7 +118,7 @@ mod tests {
         let path = |name: &str| ModelPath { dir: place.path().into(), weights: place.path().join(name) };
         let [stage1, stage2] = ["stage1", "stage2"].map(path);
         file::save_part(&network, &Clift::stage1_part(), &stage1.weights).unwrap();
-        file::save(&network, &stage2.weights).unwrap();
+        file::save_weights(&network, &stage2.weights).unwrap();
         let names = |path: &ModelPath| {
             let bytes = std::fs::read(&path.weights).unwrap();
             let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
@@ -132,7 +132,7 @@ mod tests {
         let models = [&stage1, &stage2].map(|path| TrainedModel::open(path, &CONFIG, &device).unwrap());
         assert_eq!([0, 1].map(|i| models[i].has_condenser), [false, true]);
         assert!(models[0].has_encoder_of(&models[1]));
-        assert_eq!(hash::hash(&models[1].network), hash::hash(&network));
+        assert_eq!(hash::weights_hash(&models[1].network), hash::weights_hash(&network));
         let other = TrainedModel::snapshot(&Clift::new(&CONFIG, 4, &device), &CONFIG, false);
         assert!(!other.has_encoder_of(&models[0]));
 
@@ -141,7 +141,7 @@ mod tests {
         let loaded = file::load_part(&mut read, &Clift::stage1_part(), &stage2.weights).unwrap();
         assert!(loaded.missing.is_empty() && loaded.unused.iter().all(|name| is_condenser(name)), "{loaded:?}");
         assert_eq!(loaded.unused.len() + trained_in_stage1.len(), names(&stage2).len());
-        assert_eq!(hash::hash(&read.condenser), hash::hash(&Clift::new(&CONFIG, 5, &device).condenser));
+        assert_eq!(hash::weights_hash(&read.condenser), hash::weights_hash(&Clift::new(&CONFIG, 5, &device).condenser));
         file::load_part(&mut read, &Clift::stage1_part(), &stage1.weights)
             .unwrap()
             .require_all(&stage1.weights)
