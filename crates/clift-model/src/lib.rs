@@ -51,8 +51,8 @@ pub use ops::linear::{gelu_linear, linear, norm_linear};
 pub use ops::precision::Precision;
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::render_budget::RenderBudget;
-pub use scene::scene::{Scene, SceneNormalization, file_bytes as scene_file_bytes};
-pub use scene::scene_renderer::{RenderedViews, SceneRenderer, frames_per_call, load_renderer};
+pub use scene::scene::{Scene, SceneNormalization, scene_file_bytes};
+pub use scene::scene_renderer::{RenderedView, SceneRenderer, frames_per_call, load_renderer};
 pub use scene::token_format::TokenFormat;
 pub use scene::write::check_output_path;
 pub use tokens::clusters::{ClusterIndex, Clusters, SceneClusters};
@@ -67,8 +67,8 @@ pub use views::camera::ViewCamera;
 pub use views::patch::{patchify, unpatchify};
 pub use views::rays::plucker;
 pub use views::upload::{Cameras, Views, upload_images};
-pub use weights::file::{first_not_f32, load_part, save as save_weights, save_part, sorted_header};
-pub use weights::hash::hash as weights_hash;
+pub use weights::file::{first_not_f32, load_part, save_part, save_weights, sorted_header};
+pub use weights::hash::weights_hash;
 pub use weights::model_path::{ModelPath, check_heads, refuse_checkpoint};
 pub use weights::published_keys::{
     CONVOLUTIONS, PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
