@@ -13,11 +13,6 @@ pub struct KeyValueCache {
 }
 
 impl KeyValueCache {
-    /// Returns the number of tokens.
-    pub fn num_render_tokens(&self) -> usize {
-        self.num_render_tokens
-    }
-
     /// Returns the keys and values of some tokens, given by their indices.
     #[must_use]
     pub fn select(&self, tokens: &[u32]) -> Self {

@@ -79,7 +79,7 @@ impl SceneRenderer {
 
     /// Returns the number of the scene's tokens.
     pub fn num_storage_tokens(&self) -> usize {
-        self.cache.num_render_tokens()
+        self.cache.num_render_tokens
     }
 
     /// Returns the number of frames of `width` by `height` pixels that one call renders.

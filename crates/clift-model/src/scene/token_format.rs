@@ -177,9 +177,5 @@ mod tests {
             "`tokens` = f16: a token contains 70000, the largest 16-bit float is 65504; write f32 or int8"
         );
         assert!((round_trip(TokenFormat::Int8, &[1.0, 7e4, 0.0, 0.0])[1] - 7e4).abs() < 0.1);
-        assert_eq!(
-            "bf16".parse::<TokenFormat>().unwrap_err().to_string(),
-            "`tokens` = bf16: write one of f32, f16, int8"
-        );
     }
 }

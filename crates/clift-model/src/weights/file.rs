@@ -9,7 +9,7 @@ use burn::module::Module;
 use burn::store::{
     ApplyError, BurnToPyTorchAdapter, ModuleSnapshot, PathFilter, PyTorchToBurnAdapter, SafetensorsStore,
 };
-use burn::tensor::DType;
+use burn::tensor::{DType, TensorData};
 
 use crate::error::ModelError;
 use crate::files::{TEMPORARY, folder_of, publish};
@@ -147,7 +147,7 @@ fn read<M: Module>(
     if let Some((name, dtype)) = first_not_f32(module) {
         return Err(error(format!("{name} is {dtype:?}, expected F32")));
     }
-    if let Some(name) = first_non_finite(module) {
+    if let Some((name, _)) = first(module, |data| data.iter::<f32>().any(|value| !value.is_finite())) {
         return Err(error(format!("{name} contains values that are not finite")));
     }
     // Burn also reports absent parameters that do not match the filter.
@@ -181,22 +181,16 @@ fn describe(error: &ApplyError) -> String {
     format!("{} is {found:?}, expected {expected:?}", name_in_file(path))
 }
 
-/// Returns the path of the first parameter with a value that is not finite.
-fn first_non_finite<M: Module>(module: &M) -> Option<String> {
-    let mut found = None;
-    visit(module, |name, _, data| {
-        if found.is_none() && data.iter::<f32>().any(|value| !value.is_finite()) {
-            found = Some(name.to_owned());
-        }
-    });
-    found
-}
-
 /// Returns path and type of the first parameter that is no 32-bit float.
 pub fn first_not_f32<M: Module>(module: &M) -> Option<(String, DType)> {
+    first(module, |data| data.dtype() != DType::F32)
+}
+
+/// Returns path and type of the first parameter whose values fulfil a condition.
+fn first<M: Module>(module: &M, condition: impl Fn(&TensorData) -> bool) -> Option<(String, DType)> {
     let mut found = None;
     visit(module, |name, _, data| {
-        if found.is_none() && data.dtype() != DType::F32 {
+        if found.is_none() && condition(data) {
             found = Some((name.to_owned(), data.dtype()));
         }
     });

@@ -101,46 +101,39 @@ mod tests {
     use super::*;
     use crate::testing::{Fixture, assert_close, devices, load_weights, weight_gradients};
 
-    fn config() -> ModelConfig {
-        ModelConfig { dim: 16, num_heads: 4, feed_forward_dim: 24, ..ModelConfig::default() }
-    }
-
-    // A block of width 16 in f32 against f64.
-    const OUTPUT: f64 = 5e-6;
-    const GRADIENT: f64 = 2e-5;
-
-    #[test]
-    fn encoder_block_equals_pytorchs_with_gradients() {
-        let fixture = Fixture::open("encoder_block");
+    /// Expects output and gradients of a block of width 16 in f32 to equal those of PyTorch in f64.
+    fn assert_equals_pytorch<M: Module>(
+        name: &str,
+        input_names: &[&str],
+        new: fn(&ModelConfig, &mut Init) -> M,
+        forward: fn(&M, &[Tensor<3>]) -> Tensor<3>,
+    ) {
+        let config = ModelConfig { dim: 16, num_heads: 4, feed_forward_dim: 24, ..ModelConfig::default() };
+        let fixture = Fixture::open(name);
         for device in devices() {
             let device = device.autodiff();
-            let block = load_weights(EncoderBlock::new(&config(), &mut Init::new(0, &device)), &fixture, "weight.");
-            let x = fixture.tensor::<3>("input.x", &device).require_grad();
-            let output = block.forward(x.clone());
-            assert_close(&output.clone().inner(), &fixture.tensor::<3>("output.x", &device).inner(), OUTPUT);
-            let grads = (output * fixture.tensor("input.cotangent", &device)).sum().backward();
-            let expected = fixture.tensor::<3>("grad.input.x", &device).inner();
-            assert_close(&x.grad(&grads).expect("tracked"), &expected, GRADIENT);
-            weight_gradients(&block, &grads, &fixture, "grad.weight.", GRADIENT);
-        }
-    }
-
-    #[test]
-    fn decoder_block_equals_pytorchs_with_gradients() {
-        let fixture = Fixture::open("decoder_block");
-        for device in devices() {
-            let device = device.autodiff();
-            let block = load_weights(DecoderBlock::new(&config(), &mut Init::new(0, &device)), &fixture, "weight.");
-            let x = fixture.tensor::<3>("input.x", &device).require_grad();
-            let memory = fixture.tensor::<3>("input.memory", &device).require_grad();
-            let output = block.forward(x.clone(), block.project_tokens(memory.clone()));
-            assert_close(&output.clone().inner(), &fixture.tensor::<3>("output.x", &device).inner(), OUTPUT);
-            let grads = (output * fixture.tensor("input.cotangent", &device)).sum().backward();
-            for (name, input) in [("x", x), ("memory", memory)] {
-                let expected = fixture.tensor::<3>(&format!("grad.input.{name}"), &device).inner();
-                assert_close(&input.grad(&grads).expect("tracked"), &expected, GRADIENT);
+            let tensor = |name: &str| fixture.tensor::<3>(name, &device);
+            let block = load_weights(new(&config, &mut Init::new(0, &device)), &fixture, "weight.");
+            let inputs = input_names.iter().map(|name| tensor(&format!("input.{name}")).require_grad());
+            let inputs: Vec<Tensor<3>> = inputs.collect();
+            let output = forward(&block, &inputs);
+            assert_close(&output.clone().inner(), &tensor("output.x").inner(), 5e-6);
+            let grads = (output * tensor("input.cotangent")).sum().backward();
+            for (name, input) in input_names.iter().zip(inputs) {
+                let expected = tensor(&format!("grad.input.{name}")).inner();
+                assert_close(&input.grad(&grads).expect("tracked"), &expected, 2e-5);
             }
-            weight_gradients(&block, &grads, &fixture, "grad.weight.", GRADIENT);
+            weight_gradients(&block, &grads, &fixture, "grad.weight.", 2e-5);
         }
+    }
+
+    #[test]
+    fn blocks_equal_pytorch_with_gradients() {
+        assert_equals_pytorch("encoder_block", &["x"], EncoderBlock::new, |block, inputs| {
+            block.forward(inputs[0].clone())
+        });
+        assert_equals_pytorch("decoder_block", &["x", "memory"], DecoderBlock::new, |block, inputs| {
+            block.forward(inputs[0].clone(), block.project_tokens(inputs[1].clone()))
+        });
     }
 }

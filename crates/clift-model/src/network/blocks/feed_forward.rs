@@ -54,7 +54,7 @@ mod tests {
     use burn::module::Param;
 
     use super::*;
-    use crate::testing::{Fixture, assert_close, check_gradients, cpu_devices, devices, random};
+    use crate::testing::{Fixture, assert_close, devices};
 
     /// GELU alone: `gelu_linear` with the identity as its layer.
     fn gelu(x: Tensor<3>) -> Tensor<3> {
@@ -76,13 +76,6 @@ mod tests {
             let y = gelu(x.clone());
             assert_close(&y.clone().inner(), &expected.inner(), 1e-6);
             assert_close(&x.grad(&y.sum().backward()).expect("tracked"), &slope.inner(), 2e-6);
-        }
-    }
-
-    #[test]
-    fn gelu_gradient_equals_central_differences_in_f64() {
-        for device in cpu_devices() {
-            check_gradients([random([2, 5, 8], 1, &device) * 3.0], |[x]| gelu(x), 1e-6);
         }
     }
 }
