@@ -64,8 +64,7 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
 }
 
 fn describe(split: &SplitSource, report: &ConversionReport, seconds: f64, folder: &Path) -> String {
-    let ConversionReport { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, skipped } =
-        report;
+    let ConversionReport { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, skipped } = report;
     let optional = |number: usize, text: &str| if number > 0 { format!(", {number} {text}") } else { String::new() };
     let found = optional(*num_found, "of them already complete");
     let changed = optional(*num_changed, "rewritten, because cameras or frames changed");
