@@ -1,6 +1,6 @@
 //! Means over the views of a scene, then over the scenes, so every scene has the same weight.
 
-use clift_data::mean;
+pub(crate) use clift_data::mean;
 
 use crate::statistics::eval_results::SceneViews;
 use crate::statistics::view_metrics::ViewMetrics;
