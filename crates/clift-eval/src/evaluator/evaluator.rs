@@ -111,7 +111,7 @@ impl Evaluator {
         let limits = SceneLimits { num_scenes: self.items.len(), num_figures: self.eval.num_sheets };
         let (mut measured, skip_report) = self.measure(models, &sweep, limits, &mut keep_figures, progress)?;
         match &lpips {
-            Ok(lpips) => measured.set_lpips_weights(lpips.sha256()),
+            Ok(lpips) => measured.lpips_sha256 = Some(lpips.sha256().into()),
             Err(reason) => measured.note_not_measured("lpips_vgg", reason.clone()),
         }
         let summary = Summary::new(&measured);
