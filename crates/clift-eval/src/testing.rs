@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
+use clift_data::{ClipViews, Intrinsics, Pose};
 use safetensors::{Dtype, SafeTensors};
 
 /// Channels of the narrow networks in the fixtures.
@@ -54,5 +55,18 @@ impl Reference {
 
     pub fn tensor<const D: usize>(&self, name: &str, device: &Device, dtype: DType) -> Tensor<D> {
         Tensor::from_data(TensorData::new(self.f64s(name), self.shape(name)), (device, dtype))
+    }
+}
+
+/// Makes views of one gray level.
+pub fn gray_views((width, height): (usize, usize), level: u8, c2w: Vec<Pose>, frame_index: Vec<usize>) -> ClipViews {
+    let intrinsics = Intrinsics { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0 };
+    ClipViews {
+        width,
+        height,
+        images: vec![level; frame_index.len() * height * width * 3],
+        intrinsics: vec![intrinsics; c2w.len()],
+        c2w,
+        frame_index,
     }
 }

@@ -117,7 +117,7 @@ fn predictions_are_scored_and_missing_images_named() {
     let flags = ["--predictions", &grey, "--name", "Grey & co", "--data-size", "1.5kB"];
     let ran = place.eval("run", &flags).ok();
     let missing = format!("{}/{:0>6}.png", views[0].0, views[0].1);
-    assert!(ran.stdout.contains("Grey & co: 1 of 6 pictures are missing"), "{}", ran.stdout);
+    assert!(ran.stdout.contains("Grey & co: 1 of 6 images are missing"), "{}", ran.stdout);
     assert!(ran.stdout.contains(&missing), "{}", ran.stdout);
     let summary = place.json("run/eval/summary.json");
     assert_eq!(summary["missing"][0]["pictures"], serde_json::json!([missing]));
@@ -133,14 +133,14 @@ fn predictions_are_scored_and_missing_images_named() {
     std::fs::create_dir_all(&small).unwrap();
     image::RgbImage::new(8, 16).save(small.join(format!("{frame:0>6}.png"))).unwrap();
     let small = place.at("small").display().to_string();
-    place.eval("run", &["--predictions", &small]).fails_with(1, &["it has 8 x 16 pixels, the target 16 x 16"]);
+    place.eval("run", &["--predictions", &small]).fails_with(1, &["8 x 16 pixels, expected 16 x 16 like the target"]);
     let empty = place.at("empty");
     std::fs::create_dir_all(&empty).unwrap();
     let empty = empty.display().to_string();
     place
         .eval("run", &["--predictions", &empty])
-        .fails_with(2, &["empty has none of the 6 target pictures; the first would be synthetic-0-test-"]);
-    place.eval("run", &["--predictions", &grey, "--name", "clift"]).fails_with(2, &["a variant of this program"]);
+        .fails_with(2, &["empty has none of the 6 target images, such as synthetic-0-test-"]);
+    place.eval("run", &["--predictions", &grey, "--name", "clift"]).fails_with(2, &["reserved for a method of clift"]);
     let two = ["--predictions", &grey, "--name", "a", "--name", "b"];
     place.eval("run", &two).fails_with(2, &["1 --predictions but 2 --name"]);
     place.eval("run", &["--predictions", "no/such/folder"]).fails_with(2, &["no/such/folder"]);
@@ -152,7 +152,7 @@ fn lpips_needs_its_weights() {
     place.copy(&STAGE_1, "run");
     let ran = place.eval("run", &[]).ok();
     assert!(
-        ran.stdout.contains("lpips_vgg is not measured: eval.lpips_weights is not set; `python3"),
+        ran.stdout.contains("lpips_vgg is not measured: eval.lpips_weights is not set; make the file with `python3"),
         "{}",
         ran.stdout
     );
@@ -181,7 +181,7 @@ fn lpips_needs_its_weights() {
     write_vgg(&other, "clift-vgg19-1", [2, 2, 4, 4, 2], false);
     place
         .eval("run", &["--set", &format!("eval.lpips_weights={other:?}")])
-        .fails_with(2, &["its format is clift-vgg19-1", "convert_vgg.py lpips"]);
+        .fails_with(2, &["format clift-vgg19-1, expected", "convert_vgg.py lpips"]);
     let set = ["eval.lpips_weights=\"no/such/file\""];
     place.train("new", &set, &[]).fails_with(2, &["`eval.lpips_weights` = no/such/file: there is no such file"]);
 }

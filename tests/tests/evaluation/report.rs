@@ -10,10 +10,10 @@ fn reports_need_no_other_file() {
     for part in ["<title>run", "synthetic-0-test-00000", "3 of 3 scenes were evaluated", "num_encoder_blocks = 1"] {
         assert!(html.contains(part), "{part}");
     }
-    for section in ["Quality and cost", "All points", "Scenes", "What was left out", "Machine", "Config"] {
+    for section in ["Quality and cost", "All points", "Scenes", "Skipped scenes", "Machine", "Config"] {
         assert!(html.contains(&format!("<h2>{section}</h2>")), "{section}");
     }
-    assert!(!html.contains("http") && !html.contains("tokens chosen"));
+    assert!(!html.contains("http") && !html.contains("tokens selected"));
     assert_eq!(html.matches("<article").count(), 1, "eval.num_sheets = 1");
     // Pictures of 16 x 16 pixels: styles, plots and config are most of it.
     assert!(html.len() < 200_000, "{} bytes", html.len());
@@ -23,7 +23,7 @@ fn reports_need_no_other_file() {
     let ran = place.eval("run", &flags).ok();
     assert!(ran.stdout.contains("elsewhere/report.html"), "{}", ran.stdout);
     let chosen = place.text("elsewhere/report.html");
-    assert!(chosen.contains("4 of 8 tokens chosen") && chosen.contains("Quality against rendered tokens"));
+    assert!(chosen.contains("4 of 8 tokens selected") && chosen.contains("Quality against rendered tokens"));
     assert_eq!(chosen.matches("<article").count(), 2);
     assert_eq!(place.text("run/eval/report.html"), html, "--out leaves the run's own report alone");
 }

@@ -111,7 +111,7 @@ fn an_evaluation_can_be_interrupted() {
         std::thread::sleep(Duration::from_millis(2));
     }
     signal(&child, "-INT");
-    finish(child).fails_with(130, &["interrupted during the evaluation, after ", " scenes; nothing was written"]);
+    finish(child).fails_with(130, &["interrupted during the evaluation, after ", " scenes; no results were written"]);
     assert_eq!((names(), place.bytes("run/eval/summary.json")), (before, summary));
     // A shorter evaluation removes the sheets of a longer one and no other file.
     std::fs::write(sheets.join("mine.png"), b"").expect("writable");

@@ -109,9 +109,9 @@ impl Evaluator {
             sheets.add(&scene.contact_sheet, key)
         };
         let limits = SceneLimits { num_scenes: self.items.len(), num_figures: self.eval.num_sheets };
-        let (mut measured, skip_report) = self.measure(models, &sweep, limits, &mut keep_figures, progress)?;
+        let (mut measured, skipped) = self.measure(models, &sweep, limits, &mut keep_figures, progress)?;
         match &lpips {
-            Ok(lpips) => measured.set_lpips_weights(lpips.sha256()),
+            Ok(lpips) => measured.lpips_sha256 = Some(lpips.sha256().into()),
             Err(reason) => measured.note_not_measured("lpips_vgg", reason.clone()),
         }
         let summary = Summary::new(&measured);
@@ -125,9 +125,9 @@ impl Evaluator {
         summary.write(&folder.join("summary.json"))?;
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;
-        write_skip_report(&skip_report, &folder.join("skipped.json"))?;
+        write_skip_report(&skipped, &folder.join("skipped.json"))?;
         let RunDescription { name, config, device } = self.description.clone();
-        let report = Report { name, summary: summary.clone(), skip_report, figures, config, device };
+        let report = Report { name, summary: summary.clone(), skipped, figures, config, device };
         report.write(&folder.join("report.html"))?;
         Ok(summary)
     }

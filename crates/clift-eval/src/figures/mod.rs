@@ -1,6 +1,6 @@
 //! Result images.
 //!
-//! - `canvas`: an RGB image to draw on
+//! - `canvas`: an 8-bit RGB image with text
 //! - `contact_sheet`: rows of views, columns of methods
 //! - `animation`: animated PNG, streamed
 //! - `scene_figure`: images of one scene for a report

@@ -16,8 +16,7 @@ const SAMPLE_COVARIANCE: f64 = 121.0 / 120.0;
 
 /// Measures the peak signal-to-noise ratio in dB, after clamping both images to [0, 1].
 ///
-/// The mean squared error is over all values. Identical images give `+inf`; means count
-/// [`crate::statistics::scene_means::PSNR_CAP_DB`] instead.
+/// The mean squared error is over all values. Identical images give `+inf`, which counts as 100 dB in means.
 ///
 /// # Errors
 /// [`EvalError::SizeMismatch`], and [`EvalError::NotFinite`] where clamping would hide a NaN or an infinity.

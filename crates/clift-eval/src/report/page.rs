@@ -39,7 +39,7 @@ pub struct Report {
     /// Means of all keys.
     pub summary: Summary,
     /// Skipped scenes with their reasons.
-    pub skip_report: SkipReport,
+    pub skipped: SkipReport,
     /// Figures of scenes; the report has the first [`MAX_FIGURES`].
     pub figures: Vec<SceneFigure>,
     /// The resolved config as TOML.
@@ -84,7 +84,7 @@ impl Report {
                         (tables::points(&self.summary))
                         (tables::differences(&self.summary.differences))
                         (self.scenes()?)
-                        (tables::skipped(self.summary.num_scenes, &self.skip_report))
+                        (tables::skipped(self.summary.num_scenes, &self.skipped))
                         (tables::machine(&self.device))
                         h2 { "Config" }
                         details { summary { "Every key, resolved" } pre { (self.config) } }
@@ -133,7 +133,7 @@ impl Report {
                 @if let Some((point, seconds)) = last.and_then(|point| Some((point, point.frame_median_s?))) {
                     (tile("a frame", &milliseconds(seconds), "ms", &tokens(point)))
                 }
-                @let scenes = format!("of {}", count(self.skip_report.num_scenes.max(*num_scenes)));
+                @let scenes = format!("of {}", count(self.skipped.num_scenes.max(*num_scenes)));
                 (tile("scenes evaluated", &count(*num_scenes), &scenes, &format!("{} views", count(*num_views))))
             }
         }

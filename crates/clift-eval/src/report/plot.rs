@@ -89,11 +89,11 @@ pub struct Plot {
     pub x_scale: Scale,
     /// Label of the vertical axis, with its unit.
     pub y_label: &'static str,
-    /// Series of marks. The first series is drawn on top.
+    /// Series of marks. The first series is on top.
     pub series: Vec<Series>,
     /// Horizontal lines.
     pub levels: Vec<Level>,
-    /// Points of the Pareto front by ascending x, drawn as a staircase; may be empty.
+    /// Points of the Pareto front by ascending x, joined as a staircase; may be empty.
     pub front: Vec<(f64, f64)>,
 }
 

@@ -25,7 +25,7 @@ impl fmt::Display for Comparison {
         writeln!(
             f,
             "{:<width$}  scenes  PSNR of A  B - A, dB (95 %)          B - A, SSIM (95 %)            B - A, LPIPS (95 %)",
-            "setting"
+            "method"
         )?;
         for (pair, name) in self.pairs.iter().zip(&names) {
             let psnr = pair.psnr.map_or_else(|| "-".into(), |difference| format!("{:.2}", difference.a));

@@ -104,11 +104,6 @@ impl EvalResults {
         self.not_measured.push(NotMeasured { metric: metric.into(), reason });
     }
 
-    /// Records the weights of LPIPS.
-    pub fn set_lpips_weights(&mut self, sha256: &str) {
-        self.lpips_sha256 = Some(sha256.into());
-    }
-
     /// Records an image that an external method does not have.
     pub fn record_missing_image(&mut self, method: MethodName, image: String) {
         self.missing.entry(method).or_default().insert(image);

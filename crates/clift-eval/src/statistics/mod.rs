@@ -1,6 +1,6 @@
 //! Results, their summaries and comparisons.
 //!
-//! - `view_metrics`: EvalKey, ViewMetrics, Cost
+//! - `view_metrics`: `EvalKey`, `ViewMetrics`, `Cost`
 //! - `eval_results`: all measured views, one owner
 //! - `scene_means`: mean per scene, then over scenes
 //! - `student_t`: Student's t quantile

@@ -11,7 +11,7 @@ use crate::statistics::view_metrics::ViewMetrics;
 /// affects no real difference. Skipping identical views would lower the mean of the better method.
 pub const PSNR_CAP_DB: f64 = 100.0;
 
-/// SceneLimits a PSNR to [`PSNR_CAP_DB`].
+/// Limits a PSNR to [`PSNR_CAP_DB`].
 pub(crate) fn capped(psnr: f64) -> f64 {
     psnr.min(PSNR_CAP_DB)
 }

@@ -63,24 +63,17 @@ fn rotation_angle_rad(a: Pose, b: Pose) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{DMat3, Intrinsics};
+    use clift_data::DMat3;
 
     use super::*;
+    use crate::testing::gray_views;
 
     fn pose(x: f64, yaw_deg: f64) -> Pose {
         Pose { rotation: DMat3::from_rotation_y(yaw_deg.to_radians()), translation: x * DVec3::X }
     }
 
     fn views(poses: &[Pose], images: Vec<u8>) -> ClipViews {
-        let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
-        ClipViews {
-            width: 1,
-            height: 1,
-            images,
-            c2w: poses.to_vec(),
-            intrinsics: vec![intrinsics; poses.len()],
-            frame_index: (0..poses.len()).collect(),
-        }
+        ClipViews { images, ..gray_views((1, 1), 0, poses.to_vec(), (0..poses.len()).collect()) }
     }
 
     #[test]

@@ -15,7 +15,7 @@ use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
 use crate::sweep::rendered_views::{ScoredViews, baselines};
 use crate::sweep::scene_results::{SceneResults, kept_views};
-use crate::sweep::sweep::Sweep;
+use crate::sweep::sweep::{Sweep, render_counts};
 use crate::sweep::token_choice::{SelectedTokens, select_for_views};
 use crate::sweep::view_scorer::ViewScorer;
 use crate::system::memory;
@@ -75,7 +75,9 @@ pub fn evaluate_scene(
                     EvalKey { method, num_storage_tokens, num_render_tokens: num_storage_tokens, tokens: Some(tokens) };
                 let mut renderings = vec![renderer.render(&stored, None, whole, kept_views, metrics)?];
                 let can_select = stored.model.network.supports_selection();
-                for num_render_tokens in sweep.render_counts(num_storage_tokens).into_iter().filter(|_| can_select) {
+                for num_render_tokens in
+                    render_counts(&sweep.render, num_storage_tokens).into_iter().filter(|_| can_select)
+                {
                     let some = EvalKey { num_render_tokens, ..whole };
                     let patch_size = sweep.model.patch_size;
                     metrics.selection = Some(sweep.selection);

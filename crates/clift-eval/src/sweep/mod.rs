@@ -7,7 +7,7 @@
 //! - `token_choice`: tokens selected for each view
 //! - `baselines`: nearest view and mean image
 //! - `view_scorer`: score renderings of a scene
-//! - `rendered_views`: scored views of one EvalKey
+//! - `rendered_views`: scored views of one `EvalKey`
 //! - `predictions`: images of another method, scored
 //! - `scene_results`: results of one scene
 //! - `evaluate_scene`: encode once, render every key

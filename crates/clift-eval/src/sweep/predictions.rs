@@ -100,22 +100,15 @@ fn read_image(path: &Path, height: usize, width: usize) -> Result<Vec<f32>, Eval
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{ClipViews, Intrinsics, Pose};
+    use clift_data::Pose;
 
     use super::*;
     use crate::figures::canvas::Canvas;
+    use crate::testing::gray_views;
 
     fn clip() -> Clip {
-        let intrinsics = Intrinsics { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0 };
-        let views = |frame_index: Vec<usize>| ClipViews {
-            width: 24,
-            height: 16,
-            images: vec![100; frame_index.len() * 24 * 16 * 3],
-            c2w: vec![Pose::IDENTITY; frame_index.len()],
-            intrinsics: vec![intrinsics; frame_index.len()],
-            frame_index,
-        };
-        Clip { key: "a/room".into(), context: views(vec![0]), target: views(vec![3, 12, 40]) }
+        let views = |frames: &[usize]| gray_views((24, 16), 100, vec![Pose::IDENTITY; frames.len()], frames.to_vec());
+        Clip { key: "a/room".into(), context: views(&[0]), target: views(&[3, 12, 40]) }
     }
 
     fn external(folder: &Path) -> ExternalMethod {

@@ -39,18 +39,9 @@ pub struct Sweep {
 impl Sweep {
     /// Returns the token count of every rendering of a target view in a scene of `num_storage_tokens`.
     pub fn token_counts(&self, num_storage_tokens: usize) -> Vec<usize> {
-        let counts = [vec![num_storage_tokens], self.render_counts(num_storage_tokens)].concat();
+        let counts = [vec![num_storage_tokens], render_counts(&self.render, num_storage_tokens)].concat();
         let num_formats: usize = self.methods.iter().map(|&method| self.formats(method).len()).sum();
         counts.repeat(num_formats)
-    }
-
-    /// Returns the render counts below `num_storage_tokens`, ascending.
-    pub(crate) fn render_counts(&self, num_storage_tokens: usize) -> Vec<usize> {
-        let counts = self.render.iter().filter_map(|count| count.of(num_storage_tokens).ok());
-        let mut counts: Vec<usize> = counts.filter(|&count| count < num_storage_tokens).collect();
-        counts.sort_unstable();
-        counts.dedup();
-        counts
     }
 
     /// Returns the number formats of a method.
@@ -59,36 +50,26 @@ impl Sweep {
     }
 }
 
+/// Returns the counts of `render` below `num_storage_tokens`, ascending.
+pub(crate) fn render_counts(render: &[TokenCount], num_storage_tokens: usize) -> Vec<usize> {
+    let counts = render.iter().filter_map(|count| count.of(num_storage_tokens).ok());
+    let mut counts: Vec<usize> = counts.filter(|&count| count < num_storage_tokens).collect();
+    counts.sort_unstable();
+    counts.dedup();
+    counts
+}
+
 #[cfg(test)]
 mod tests {
-    use clift_model::SelectionPreset;
-
     use super::*;
 
     #[test]
     fn render_counts_are_distinct_and_below_storage() {
-        let sweep = Sweep {
-            storage: Vec::new(),
-            render: vec![
-                TokenCount::Count(16),
-                TokenCount::Share(0.5),
-                TokenCount::Count(64),
-                TokenCount::Share(1.0),
-                TokenCount::Count(4),
-            ],
-            selection: Selection::Preset(SelectionPreset::Paper),
-            tokens: vec![TokenFormat::F32],
-            methods: Vec::new(),
-            kmeans: KMeans::default(),
-            model: ModelConfig::default(),
-            lpips: None,
-            external_methods: Vec::new(),
-            is_cpu: true,
-            seed: 0,
-        };
-        assert_eq!(sweep.render_counts(128), [4, 16, 64]);
-        assert_eq!(sweep.render_counts(32), [4, 16]);
-        assert_eq!(sweep.render_counts(2), [1]);
-        assert_eq!(sweep.render_counts(1), [0; 0]);
+        let (count, share) = (TokenCount::Count, TokenCount::Share);
+        let render = [count(16), share(0.5), count(64), share(1.0), count(4)];
+        let cases: [(usize, &[usize]); 4] = [(128, &[4, 16, 64]), (32, &[4, 16]), (2, &[1]), (1, &[])];
+        for (num_storage_tokens, expected) in cases {
+            assert_eq!(render_counts(&render, num_storage_tokens), expected);
+        }
     }
 }

@@ -59,20 +59,15 @@ pub(crate) fn select_for_views(
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{ClipViews, Intrinsics, Pose};
+    use clift_data::{ClipViews, Pose};
 
     use super::*;
+    use crate::testing::gray_views;
 
     /// Views of 16 x 16 pixels, side by side.
-    fn views(places: &[f64], frame_index: &[usize]) -> ClipViews {
-        ClipViews {
-            width: 16,
-            height: 16,
-            images: vec![0; places.len() * 16 * 16 * 3],
-            c2w: places.iter().map(|&x| Pose { translation: [x, 0.0, 0.0].into(), ..Pose::IDENTITY }).collect(),
-            intrinsics: vec![Intrinsics { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0 }; places.len()],
-            frame_index: frame_index.to_vec(),
-        }
+    fn views(x: &[f64], frames: &[usize]) -> ClipViews {
+        let poses = x.iter().map(|&x| Pose { translation: [x, 0.0, 0.0].into(), ..Pose::IDENTITY });
+        gray_views((16, 16), 0, poses.collect(), frames.to_vec())
     }
 
     fn clip(targets: &[f64], frame_index: &[usize]) -> Clip {

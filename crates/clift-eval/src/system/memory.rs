@@ -2,7 +2,7 @@
 
 use crate::system::machine::proc_field;
 
-/// Resets the peak to the resident memory of now. Returns `None` where the system has no resettable peak.
+/// Resets the peak to the current resident memory. Returns `None` where the system has no resettable peak.
 pub fn start_peak() -> Option<()> {
     release_free_memory();
     // 5 resets the "high water mark" (proc(5)).

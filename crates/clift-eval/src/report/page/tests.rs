@@ -66,12 +66,12 @@ fn figure() -> SceneFigure {
 }
 
 fn report() -> Report {
-    let mut skip_report = SkipReport::new(3);
-    skip_report.skip("c", format!("bad frame {HOSTILE}"));
+    let mut skipped = SkipReport::new(3);
+    skipped.skip("c", format!("bad frame {HOSTILE}"));
     Report {
         name: format!("run {HOSTILE}"),
         summary: summary(),
-        skip_report,
+        skipped,
         figures: vec![figure()],
         config: format!("data.root = \"{HOSTILE}\""),
         device: "flex".into(),
@@ -127,7 +127,7 @@ fn pages_without_selections_or_points_explain_the_gap() {
 
     plain.summary.points.clear();
     plain.figures.clear();
-    plain.skip_report = SkipReport::default();
+    plain.skipped = SkipReport::default();
     let html = page(&plain);
     assert!(html.contains("No measured points") && html.contains("eval.num_sheets"), "{html}");
 }
