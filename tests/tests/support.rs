@@ -195,6 +195,13 @@ impl Place {
         }
     }
 
+    /// Runs the command line with the words of a text, where `DIR` is the folder and `REPO` the repository.
+    pub fn clift(&self, words: &str) -> Ran {
+        let (dir, repository) = (self.at("").display().to_string(), repository("").display().to_string());
+        let path = |word: &str| word.replace("DIR/", &dir).replace("REPO/", &repository);
+        clift(words.split_whitespace().map(path))
+    }
+
     /// Evaluates the run `name`.
     pub fn eval(&self, name: &str, flags: &[&str]) -> Ran {
         let run = self.at(name).display().to_string();

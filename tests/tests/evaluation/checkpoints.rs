@@ -1,37 +1,31 @@
 //! Published checkpoints in and out, through the command line.
 
-use std::path::Path;
-
 use clift_data::{StateDict, write_state_dict};
 
-use crate::support::{Place, clift, files, repository};
+use crate::support::{Place, files, repository};
 
 /// Images of 2 x 3 patches: the fixtures' networks accept any size.
-const SMALL: [&str; 6] = ["--set", "data.width=24", "--set", "data.height=16", "--set", "eval.num_sheets=1"];
+const SMALL: &str = "--set data.width=24 --set data.height=16 --set eval.num_sheets=1";
+
+const DATA: &str = "--data REPO/data-fixtures/re10k-mini";
+const INDEX: &str = "--index REPO/data-fixtures/re10k-mini/evaluation_index.json";
 
 fn checkpoint(name: &str) -> String {
-    repository(&format!("data-fixtures/checkpoints/{name}.ckpt")).display().to_string()
+    format!("REPO/data-fixtures/checkpoints/{name}.ckpt")
 }
 
-fn mini() -> String {
-    repository("data-fixtures/re10k-mini").display().to_string()
-}
-
-/// Imports a fixture into the folder `name` and returns its path.
+/// Imports a fixture into the folder `name` and returns its path in [`Place::clift`].
 fn import(place: &Place, file: &str, variant: &str, num_heads: &str, name: &str) -> String {
-    let folder = place.at(name).display().to_string();
-    let ran = clift(["import", file, "--variant", variant, "--num-heads", num_heads, "-o", &folder]).ok();
+    let words = format!("import {file} --variant {variant} --num-heads {num_heads} -o DIR/{name}");
+    let ran = place.clift(&words).ok();
     assert!(ran.stdout.contains("transformer.output_norm.weight -> renderer.output_norm.weight"), "{}", ran.stdout);
-    folder
+    format!("DIR/{name}")
 }
 
 /// Evaluates a model on the test scene of the small data set.
-fn evaluate(model: &str, out: &Path, flags: &[&str]) -> serde_json::Value {
-    let index = repository("data-fixtures/re10k-mini/evaluation_index.json").display().to_string();
-    let (data, out_text) = (mini(), out.display().to_string());
-    let fixed = ["eval", "--checkpoint", model, "--data", &data, "--index", &index, "--out", &out_text];
-    clift(fixed.iter().chain(&SMALL).chain(flags)).ok();
-    serde_json::from_slice(&std::fs::read(out.join("summary.json")).unwrap()).unwrap()
+fn evaluate(place: &Place, model: &str, out: &str, flags: &str) -> serde_json::Value {
+    place.clift(&format!("eval --checkpoint {model} {DATA} {INDEX} --out DIR/{out} {SMALL} {flags}")).ok();
+    place.json(&format!("{out}/summary.json"))
 }
 
 fn variants(summary: &serde_json::Value) -> Vec<&str> {
@@ -57,7 +51,7 @@ fn published_checkpoints_import_evaluate_encode_and_render() {
         ] {
             assert!(config.contains(&line), "{line}\nis not in\n{config}");
         }
-        let summary = evaluate(&model, &place.at(&format!("{name}-eval")), &[]);
+        let summary = evaluate(&place, &model, &format!("{name}-eval"), "");
         assert_eq!((&summary["num_scenes"], &summary["num_views"]), (&1.into(), &4.into()));
         assert_eq!(variants(&summary), ["clift"]);
         // The reference's shares of 24 tokens.
@@ -69,13 +63,10 @@ fn published_checkpoints_import_evaluate_encode_and_render() {
             .collect();
         assert_eq!(stored, [1, 3, 6, 12, 18, 24]);
 
-        let scene = place.at(&format!("{name}.clift")).display().to_string();
-        let data = mini();
-        let encode = ["encode", &model, &data, "--scene", "00000000000000b1", "-o", &scene, "--storage", "1/2"];
-        clift(encode.iter().chain(&SMALL)).ok();
-        let out = place.at(&format!("{name}-drawn")).display().to_string();
-        clift(["render", &scene, "--path", "interpolate", "--frames", "3", "-o", &out]).ok();
-        assert!(place.at(&format!("{name}-drawn/frame-00002.png")).exists());
+        let data = "REPO/data-fixtures/re10k-mini --scene 00000000000000b1";
+        place.clift(&format!("encode {model} {data} -o DIR/{name}.clift --storage 1/2 {SMALL}")).ok();
+        place.clift(&format!("render DIR/{name}.clift --path interpolate --frames 3 -o DIR/{name}-frames")).ok();
+        assert!(place.at(&format!("{name}-frames/frame-00002.png")).exists());
     }
 }
 
@@ -84,7 +75,7 @@ fn a_first_stage_model_adds_the_uncondensed_variants() {
     let place = Place::new();
     let model = import(&place, &checkpoint("re10k"), "released-re10k", "3", "second");
     // The same network before its second stage: another renderer, no condenser.
-    let state = StateDict::open(checkpoint("re10k").as_ref()).unwrap();
+    let state = StateDict::open(&repository("data-fixtures/checkpoints/re10k.ckpt")).unwrap();
     let first: Vec<_> = state
         .keys()
         .filter(|key| key.starts_with("transformer.") && !key.contains("squeezer"))
@@ -101,11 +92,11 @@ fn a_first_stage_model_adds_the_uncondensed_variants() {
         .collect();
     let file = place.at("first.ckpt");
     write_state_dict(&file, &first, &[]).unwrap();
-    let first = import(&place, &file.display().to_string(), "released-re10k", "3", "first");
+    let first = import(&place, "DIR/first.ckpt", "released-re10k", "3", "first");
 
-    assert_eq!(variants(&evaluate(&first, &place.at("a"), &[])), ["kmeans", "random"]);
-    let alone = evaluate(&first, &place.at("a"), &["--storage", "6"]);
-    let both = evaluate(&model, &place.at("b"), &["--stage1", &first, "--storage", "6"]);
+    assert_eq!(variants(&evaluate(&place, &first, "a", "")), ["kmeans", "random"]);
+    let alone = evaluate(&place, &first, "a", "--storage 6");
+    let both = evaluate(&place, &model, "b", &format!("--stage1 {first} --storage 6"));
     assert_eq!(variants(&both), ["clift", "kmeans", "random"]);
     let psnr = |summary: &serde_json::Value, variant: &str| {
         let points = summary["points"].as_array().unwrap();
@@ -114,17 +105,16 @@ fn a_first_stage_model_adds_the_uncondensed_variants() {
     assert_eq!(psnr(&alone, "kmeans"), psnr(&both, "kmeans"), "the first stage's own renderer draws them");
 
     let other = import(&place, &checkpoint("re10k_first"), "released-re10k", "5", "other");
-    let (data, out) = (mini(), place.at("c").display().to_string());
-    let args = ["eval", "--checkpoint", &model, "--stage1", &other, "--data", &data, "--out", &out];
-    clift(args.iter().chain(&SMALL)).fails_with(2, &["model.num_heads"]);
+    place
+        .clift(&format!("eval --checkpoint {model} --stage1 {other} {DATA} --out DIR/c {SMALL}"))
+        .fails_with(2, &["model.num_heads"]);
 }
 
 #[test]
 fn unfit_checkpoints_are_refused_and_leave_nothing() {
     let place = Place::new();
-    let folder = place.at("model").display().to_string();
     let import = |file: &str, variant: &str, heads: &str| {
-        clift(["import", file, "--variant", variant, "--num-heads", heads, "-o", &folder])
+        place.clift(&format!("import {file} --variant {variant} --num-heads {heads} -o DIR/model"))
     };
     let message = import(&checkpoint("dl3dv"), "released-re10k", "7").fails(1);
     for part in ["unknown: transformer.input_norm.weight [14]", "nothing was written", "--variant released-dl3dv"] {
@@ -157,13 +147,10 @@ fn released_variants_train_and_export() {
         let points = place.json(&format!("{variant}/eval/summary.json"));
         assert_eq!(variants(&points), ["clift", "kmeans", "random"]);
 
-        let file = place.at(&format!("{variant}.ckpt")).display().to_string();
-        let run = place.at(variant).display().to_string();
-        clift(["export", &run, "--format", "pytorch", "-o", &file]).ok();
+        place.clift(&format!("export DIR/{variant} --format pytorch -o DIR/{variant}.ckpt")).ok();
         let name = format!("{variant}-model");
-        let folder = place.at(&name).display().to_string();
         // The exported file holds the number of heads, two.
-        let ran = clift(["import", &file, "--variant", variant, "-o", &folder]).ok();
+        let ran = place.clift(&format!("import DIR/{variant}.ckpt --variant {variant} -o DIR/{name}")).ok();
         assert!(ran.stdout.contains(" 2 heads, "), "{}", ran.stdout);
         assert!(place.model(&name) == second, "the weights come back bit for bit");
     }
@@ -172,7 +159,8 @@ fn released_variants_train_and_export() {
 #[test]
 fn dl3dv_starts_from_re10k_and_lists_new_parameters() {
     let place = Place::new();
-    let from = import(&place, &checkpoint("re10k"), "released-re10k", "3", "re10k");
+    import(&place, &checkpoint("re10k"), "released-re10k", "3", "re10k");
+    let from = place.at("re10k");
     let model = "model={variant='released-dl3dv', dim=15, num_heads=3, feed_forward_dim=22, num_encoder_blocks=1, \
                  num_renderer_blocks=2}";
     let set = [model, &format!("stage1.init_from={from:?}"), "stage1.steps=0"];
@@ -197,14 +185,12 @@ fn dl3dv_starts_from_re10k_and_lists_new_parameters() {
 fn an_export_writes_over_nothing() {
     let place = Place::new();
     let model = import(&place, &checkpoint("re10k"), "released-re10k", "3", "model");
-    let weights = place.at("model/model.safetensors").display().to_string();
     let before = place.bytes("model/model.safetensors");
-    for format in ["pytorch", "safetensors"] {
-        clift(["export", &model, "--format", format, "-o", &weights]).fails_with(2, &["nothing is written over"]);
-    }
     // The output path is checked before the model is read.
-    clift(["export", "no/such/model", "--format", "pytorch", "-o", &weights])
-        .fails_with(2, &["nothing is written over"]);
+    for words in [&format!("{model} --format pytorch"), "no/such/model --format safetensors"] {
+        let ran = place.clift(&format!("export {words} -o DIR/model/model.safetensors"));
+        ran.fails_with(2, &["nothing is written over"]);
+    }
     assert!(place.bytes("model/model.safetensors") == before);
 }
 
@@ -212,15 +198,13 @@ fn an_export_writes_over_nothing() {
 fn heads_unlike_the_weights_are_refused() {
     let place = Place::new();
     let model = import(&place, &checkpoint("re10k"), "released-re10k", "3", "model");
-    let (data, out) = (mini(), place.at("eval").display().to_string());
-    let heads = ["--set", "model.num_heads=5"];
-    let args = ["eval", "--checkpoint", &model, "--data", &data, "--out", &out];
-    clift(args.iter().chain(&SMALL).chain(&heads)).fails_with(2, &["`model.num_heads` = 5", "3 heads"]);
+    place
+        .clift(&format!("eval --checkpoint {model} {DATA} --out DIR/eval {SMALL} --set model.num_heads=5"))
+        .fails_with(2, &["`model.num_heads` = 5", "3 heads"]);
 
     let network = "model={variant='released-re10k', dim=15, num_heads=5, feed_forward_dim=22, num_encoder_blocks=1, \
                    num_renderer_blocks=2}";
-    let weights = place.at("model/model.safetensors").display().to_string();
-    for from in [&model, &weights] {
+    for from in [place.at("model"), place.at("model/model.safetensors")] {
         let set = [network, &format!("stage1.init_from={from:?}"), "stage1.steps=0"];
         place.train("run", &set, &["--only", "stage1"]).fails_with(2, &["`model.num_heads` = 5", "3 heads"]);
     }
@@ -229,13 +213,11 @@ fn heads_unlike_the_weights_are_refused() {
 #[test]
 fn checkpoints_not_imported_are_refused_with_the_command() {
     let place = Place::new();
-    let (file, data) = (checkpoint("re10k"), mini());
-    let out = place.at("out.ckpt").display().to_string();
-    let command = format!("clift import {file} --variant");
-    for args in
-        [vec!["eval", "--checkpoint", &file, "--data", &data], vec!["export", &file, "--format", "pytorch", "-o", &out]]
+    let (name, file) = (checkpoint("re10k"), repository("data-fixtures/checkpoints/re10k.ckpt"));
+    let command = format!("clift import {} --variant", file.display());
+    for words in [format!("eval --checkpoint {name} {DATA}"), format!("export {name} --format pytorch -o DIR/out.ckpt")]
     {
-        clift(args).fails_with(2, &[&command]);
+        place.clift(&words).fails_with(2, &[&command]);
     }
     place.train("run", &[&format!("stage1.init_from={file:?}")], &["--only", "stage1"]).fails_with(2, &[&command]);
 }
@@ -244,12 +226,10 @@ fn checkpoints_not_imported_are_refused_with_the_command() {
 fn an_evaluation_without_the_published_index_says_so() {
     let place = Place::new();
     let model = import(&place, &checkpoint("re10k_first"), "released-re10k", "5", "model");
-    let (data, out) = (mini(), place.at("eval").display().to_string());
-    let index = repository("data-fixtures/re10k-mini/evaluation_index.json").display().to_string();
-    let args = ["eval", "--checkpoint", &model, "--data", &data, "--out", &out, "--storage", "6"];
+    let words = format!("eval --checkpoint {model} {DATA} --out DIR/eval --storage 6 {SMALL}");
     let note = "published figures use an evaluation index";
-    let ran = clift(args.iter().chain(&SMALL).chain(&["--set", "eval.num_context=2"])).ok();
+    let ran = place.clift(&format!("{words} --set eval.num_context=2")).ok();
     assert!(ran.stderr.contains(note), "{}", ran.stderr);
-    let ran = clift(args.iter().chain(&SMALL).chain(&["--index", &index])).ok();
+    let ran = place.clift(&format!("{words} {INDEX}")).ok();
     assert!(!ran.stderr.contains(note), "{}", ran.stderr);
 }
