@@ -42,5 +42,5 @@ pub use sweep::predictions::ExternalMethod;
 pub use sweep::scene_results::SceneResults;
 pub use sweep::sweep::Sweep;
 pub use system::machine::rows as machine_rows;
-pub use system::memory::{peak_bytes, start_peak};
+pub use system::memory::{available_bytes, peak_bytes, start_peak};
 pub use upload::{upload_cameras, upload_images, upload_views, view_cameras};

@@ -192,7 +192,7 @@ mod tests {
         assert_eq!(args.work, [BenchCase::Encode, BenchCase::Stage1StepTiny]);
         assert_eq!((args.repeats, args.warmup, args.storage), (5, 1, TokenCount::Share(0.25)));
         let message = parse(&["--work", "incode"]).unwrap_err().to_string();
-        assert!(message.contains("'incode'") && message.contains("the works are encode, kmeans"), "{message}");
+        assert!(message.contains("'incode'") && message.contains("the cases are encode, kmeans"), "{message}");
         assert!(parse(&["--repeats", "0"]).is_err());
     }
 }

@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
+use clift_eval::available_bytes;
 use clift_model::DeviceName;
-use clift_train::{Config, Run, RunOptions, Stage, available_bytes, memory_warning, read_checked_config};
+use clift_train::{Config, Run, RunOptions, Stage, memory_warning, read_checked_config};
 
 use crate::commands::parse::{parse_overfit, parse_stage};
 use crate::output::{progress, stdout};

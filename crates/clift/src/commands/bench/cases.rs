@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use clift_bench::{BenchCase, BenchEvent, BenchOptions, BenchRow, MAX_CHECKED_TOKENS, Report, run_bench};
+use clift_bench::{BenchCase, BenchEvent, BenchOptions, BenchReport, BenchRow, MAX_CHECKED_TOKENS, run_bench};
 use clift_model::{DeviceName, Precision, TokenCount};
 use clift_train::{Config, read_config};
 
@@ -31,7 +31,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
         return Err(UsageError(format!("there is no folder for --json {}", json.display())).into());
     }
     let options = BenchOptions {
-        work: if args.work.is_empty() { BenchCase::ALL.into() } else { args.work.clone() },
+        cases: if args.work.is_empty() { BenchCase::ALL.into() } else { args.work.clone() },
         repeats: args.repeats,
         warmup: args.warmup,
         error: !args.no_error,
@@ -47,7 +47,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
         }
         BenchEvent::Finished(row) => {
             if let Some(counter) = &counter {
-                counter.note(&format!("{}: {}", row.work, seconds(row.median_s)));
+                counter.note(&format!("{}: {}", row.case, seconds(row.median_s)));
             }
         }
     });
@@ -64,7 +64,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
 const HEADER: [&str; 5] = ["work", "median", "p95", "peak memory", "error against f64"];
 
 /// The table with what must be known to read it.
-fn shown(report: &Report) -> String {
+fn shown(report: &BenchReport) -> String {
     let rows: Vec<_> = [HEADER.map(String::from)].into_iter().chain(report.rows.iter().map(cells)).collect();
     let half = if report.precision == Precision::F16 { ", f16 products" } else { "" };
     let title = format!("{}, {} threads{half}\n", report.device, report.threads);
@@ -76,9 +76,9 @@ fn remarks(rows: &[BenchRow]) -> Vec<String> {
     let has = |test: &dyn Fn(&BenchRow) -> bool| rows.iter().any(test);
     let inertia = rows.iter().find_map(|row| row.inertia);
     let mut remarks: Vec<String> = [
-        has(&|row| row.work == BenchCase::Render8Views).then(|| "render_8_views: seconds are per view".into()),
+        has(&|row| row.case == BenchCase::Render8Views).then(|| "render_8_views: seconds are per view".into()),
         inertia.map(|inertia| format!("kmeans: inertia {inertia:.6e}; its error is the inertia's")),
-        has(&|row| row.max_rel_error.is_some() && row.work.is_checked_reduced())
+        has(&|row| row.max_rel_error.is_some() && row.case.is_checked_reduced())
             .then(|| format!("* of loss and gradients, with at most {MAX_CHECKED_TOKENS} tokens")),
         has(&|row| row.max_rel_error.is_none()).then(|| "- not compared with f64".into()),
     ]
@@ -92,14 +92,14 @@ fn remarks(rows: &[BenchRow]) -> Vec<String> {
 }
 
 fn cells(row: &BenchRow) -> [String; 5] {
-    let mark = if row.work.is_checked_reduced() { " *" } else { "" };
+    let mark = if row.case.is_checked_reduced() { " *" } else { "" };
     let error = match row.max_rel_error {
         None => "-".into(),
         Some(error) if error.is_finite() => format!("{error:.1e}{mark}"),
         Some(_) => format!("not finite{mark}"),
     };
     let peak = row.peak_bytes.map_or_else(|| "unknown".into(), bytes);
-    [row.work.to_string(), seconds(row.median_s), seconds(row.p95_s), peak, error]
+    [row.case.to_string(), seconds(row.median_s), seconds(row.p95_s), peak, error]
 }
 
 /// What is timed instead of the parts of the method.
@@ -154,7 +154,7 @@ pub struct BenchArgs {
 }
 
 fn cases_help() -> String {
-    format!("Time these works alone: {}", BenchCase::ALL.map(BenchCase::name).join(", "))
+    format!("Time these works alone: {}", BenchCase::names())
 }
 
 #[cfg(test)]
@@ -163,10 +163,10 @@ mod tests {
 
     use super::*;
 
-    fn row(work: BenchCase, median_s: f64, peak_bytes: Option<u64>, max_rel_error: Option<f64>) -> BenchRow {
-        let inertia = (work == BenchCase::Kmeans).then_some(1234.5);
+    fn row(case: BenchCase, median_s: f64, peak_bytes: Option<u64>, max_rel_error: Option<f64>) -> BenchRow {
+        let inertia = (case == BenchCase::Kmeans).then_some(1234.5);
         BenchRow {
-            work,
+            case,
             median_s,
             p95_s: median_s * 2.0,
             peak_bytes,
@@ -197,13 +197,16 @@ render_8_views: seconds are per view
 kmeans: inertia 1.234500e3; its error is the inertia's
 * of loss and gradients, with at most 1024 tokens
 - not compared with f64";
-        assert_eq!(shown(&Report { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows }), expected);
+        assert_eq!(
+            shown(&BenchReport { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows }),
+            expected
+        );
     }
 
     #[test]
     fn a_table_without_remarks_ends_with_its_last_row() {
         let rows = vec![row(BenchCase::Encode, 0.002, Some(1 << 20), Some(1e-7))];
-        let text = shown(&Report { device: DeviceName::Flex, precision: Precision::F32, threads: 1, rows });
+        let text = shown(&BenchReport { device: DeviceName::Flex, precision: Precision::F32, threads: 1, rows });
         assert!(text.ends_with("\nencode  2.00 ms  4.00 ms  1 MiB        1.0e-7"), "{text}");
     }
 
@@ -212,7 +215,7 @@ kmeans: inertia 1.234500e3; its error is the inertia's
         let rows =
             vec![row(BenchCase::Kmeans, 0.5, Some(7), Some(0.25)), row(BenchCase::Render8Views, 0.5, None, None)];
         let json =
-            serde_json::to_value(Report { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows })
+            serde_json::to_value(BenchReport { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows })
                 .unwrap();
         let expected = serde_json::json!({
             "device": "flex",

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clift_bench::{BenchCase, BenchOptions, PrecisionReport, PrecisionRow, WORKS, compare_precision};
+use clift_bench::{BenchCase, BenchOptions, PRECISION_CASES, PrecisionReport, PrecisionRow, compare_precision};
 use clift_model::{DeviceName, TokenCount};
 use clift_train::{Config, read_config};
 
@@ -51,7 +51,7 @@ pub fn run(args: &BenchHalfArgs) -> anyhow::Result<()> {
     }
     config.device = args.device.unwrap_or(config.device);
     let options = BenchOptions {
-        work: if args.work.is_empty() { WORKS.into() } else { args.work.clone() },
+        cases: if args.work.is_empty() { PRECISION_CASES.into() } else { args.work.clone() },
         repeats: args.repeats,
         warmup: args.warmup,
         error: false,
@@ -86,7 +86,7 @@ fn cells(row: &PrecisionRow) -> [String; 7] {
         (None, None) => dash(),
     };
     let [single, half] = [row.f32_s, row.f16_s].map(seconds);
-    [row.work.to_string(), single, half, format!("{:.2}", row.ratio), format!("{:.1e}", row.error), loss, psnr]
+    [row.case.to_string(), single, half, format!("{:.2}", row.ratio), format!("{:.1e}", row.error), loss, psnr]
 }
 
 #[cfg(test)]
@@ -95,8 +95,8 @@ mod tests {
 
     #[test]
     fn the_table_has_speed_beside_error() {
-        let row = |work, loss, psnr_to_f32| PrecisionRow {
-            work,
+        let row = |case, loss, psnr_to_f32| PrecisionRow {
+            case,
             f32_s: 0.5,
             f16_s: 0.25,
             ratio: 0.5,

@@ -11,7 +11,7 @@ pub fn shown() -> Option<String> {
         return None;
     }
     // Drivers that fail do so in many ways.
-    let found = clift_bench::caught(adapters);
+    let found = clift_bench::catch_panic(adapters);
     Some(match found {
         Ok(found) if found.is_empty() => "\nno adapter for wgpu: install a Vulkan driver".into(),
         Ok(found) => format!("\n{}", text(&found)),

@@ -1,7 +1,7 @@
 //! `clift doctor --stability`: the hard cases.
 
 use anyhow::Context;
-use clift_bench::{Size, StabilityRow, run_stability, stability_markdown, stability_text};
+use clift_bench::{CaseSize, StabilityRow, outcome_text, run_stability, stability_markdown};
 use clift_data::replace_file;
 use clift_model::DeviceName;
 
@@ -11,14 +11,14 @@ use crate::output::stdout::{print_note, print_result};
 /// Runs every case on every device of the build, and fails if one is beyond its bound.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
-    let size = if args.small { Size::Small } else { Size::Full };
+    let size = if args.small { CaseSize::Small } else { CaseSize::Full };
     let rows = run_stability(&devices, size, &mut |row| print_note(&line(&devices, row)))?;
     if let Some(path) = &args.markdown {
         let text = format!("{}\n{}\n", head(args.small), stability_markdown(&devices, &rows));
         replace_file(path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
         print_result(&format!("table: {}", path.display()))?;
     }
-    let broken = rows.iter().filter(|row| !row.holds()).count();
+    let broken = rows.iter().filter(|row| !row.is_within_bound()).count();
     print_result(&format!("{} of {} cases hold on {}", rows.len() - broken, rows.len(), names(&devices)))?;
     if broken > 0 {
         return Err(anyhow::anyhow!("{broken} cases do not hold"));
@@ -32,7 +32,7 @@ fn names(devices: &[DeviceName]) -> String {
 
 fn line(devices: &[DeviceName], row: &StabilityRow) -> String {
     let outcomes = devices.iter().zip(&row.outcomes);
-    let outcomes = outcomes.map(|(device, outcome)| format!("{device} {}", stability_text(row, outcome)));
+    let outcomes = outcomes.map(|(device, outcome)| format!("{device} {}", outcome_text(row, outcome)));
     format!("{}: {}", row.case.name, outcomes.collect::<Vec<_>>().join(", "))
 }
 

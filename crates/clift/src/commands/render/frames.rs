@@ -51,8 +51,8 @@ pub fn write_frames(
     for some in views.chunks(viewer.frames_per_call(height, width)) {
         let first = render_s.len();
         if stop.load(Ordering::Relaxed) {
-            let work = format!("frame {first} of {}", views.len());
-            return Err(TrainError::Abandoned { work }.into());
+            let task = format!("rendering frame {first} of {}", views.len());
+            return Err(TrainError::Abandoned { task }.into());
         }
         let drawn = viewer.draw(some, height, width, num_render_tokens);
         for drawn in drawn.with_context(|| format!("drawing frames {first} to {}", first + some.len() - 1))? {
