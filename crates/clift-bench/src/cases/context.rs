@@ -14,7 +14,7 @@ use crate::cases::options::{BenchOptions, MAX_CHECKED_TOKENS};
 
 /// Sizes, device and inputs shared by all rows.
 pub struct BenchContext {
-    /// Sizes, seed and optimisers.
+    /// Config of the sizes, the seed and the optimizers.
     pub config: Config,
     /// Where tensors live, without autodiff.
     pub device: Device,

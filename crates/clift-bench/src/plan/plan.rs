@@ -321,7 +321,7 @@ mod tests {
         for device in [DeviceName::Flex, DeviceName::Ndarray] {
             let plan = plan(&Config { device, ..config.clone() }, true).expect("runs");
             for part in plan.parts {
-                let seconds = part.seconds.expect("asked for");
+                let seconds = part.seconds.expect("timed");
                 assert!(seconds > 0.0 && seconds < 60.0, "{device} {}: {seconds}", part.part);
             }
         }

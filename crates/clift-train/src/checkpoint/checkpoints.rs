@@ -290,6 +290,14 @@ mod tests {
         assert!(message.contains("the checksum of model.bpk is missing"), "{message}");
     }
 
+    /// Casts parameters to f64.
+    struct InF64;
+    impl ModuleMapper for InF64 {
+        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            param.map(|tensor| tensor.cast(DType::F64))
+        }
+    }
+
     #[test]
     fn weights_of_other_types_are_refused() {
         let place = tempfile::tempdir().unwrap();
@@ -305,12 +313,6 @@ mod tests {
         let message = checkpoints.resume(&mut train_state).unwrap_err().to_string();
         assert!(message.contains("a tensor is not of a float type"), "{message}");
 
-        struct InF64;
-        impl ModuleMapper for InF64 {
-            fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-                param.map(|tensor| tensor.cast(DType::F64))
-            }
-        }
         let wide = train_state.model.valid().map(&mut InF64);
         wide.into_record().save(&path).unwrap();
         update_checksum(&step, MODEL);

@@ -43,8 +43,8 @@ pub(crate) struct Fingerprint {
     crc32: u32,
 }
 
-/// Position in training. With the weights and the optimiser state it determines the rest of the run: batches, schedules
-/// and random draws are functions of the seed and the step.
+/// Position in training. With the weights and the optimizer state it determines the rest of the run: batches, schedules
+/// and random streams are functions of the seed and the step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {

@@ -243,6 +243,13 @@ mod tests {
         CacheKey { version: 1, encoder: "abc".into(), settings: "{}".into() }
     }
 
+    /// Makes a temporary folder, and returns it with the folder of a build in it.
+    fn new_build() -> (tempfile::TempDir, PathBuf) {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("clusters.tmp");
+        (place, folder)
+    }
+
     /// Makes one cluster of all tokens.
     fn clusters(num_tokens: usize) -> SceneClusters {
         SceneClusters::new(vec![0; num_tokens], vec![0]).unwrap()
@@ -273,8 +280,7 @@ mod tests {
     fn log_cut_anywhere_gives_the_same_cache() {
         let whole = tempfile::tempdir().unwrap();
         let expected = finished(whole.path());
-        let place = tempfile::tempdir().unwrap();
-        let folder = place.path().join("clusters.tmp");
+        let (place, folder) = new_build();
         add_sets(&mut ResumeLog::open(&folder, cache_key()).unwrap(), 6);
         let [data, lines] = [DATA, JOURNAL].map(|name| std::fs::read(folder.join(name)).unwrap());
         let mut taken_over = std::collections::BTreeSet::new();
@@ -295,8 +301,7 @@ mod tests {
 
     #[test]
     fn sets_of_a_damaged_log_are_a_prefix() {
-        let place = tempfile::tempdir().unwrap();
-        let folder = place.path().join("clusters.tmp");
+        let (_place, folder) = new_build();
         add_sets(&mut ResumeLog::open(&folder, cache_key()).unwrap(), 6);
         let files = [DATA, JOURNAL].map(|name| std::fs::read(folder.join(name)).unwrap());
         let whole = ResumeLog::open(&folder, cache_key()).unwrap();
@@ -329,8 +334,7 @@ mod tests {
 
     #[test]
     fn log_of_other_inputs_is_discarded() {
-        let place = tempfile::tempdir().unwrap();
-        let folder = place.path().join("clusters.tmp");
+        let (_place, folder) = new_build();
         add_sets(&mut ResumeLog::open(&folder, cache_key()).unwrap(), 3);
         assert_eq!(ResumeLog::open(&folder, cache_key()).unwrap().num_sets(), 3);
         let other = CacheKey { encoder: "abd".into(), ..cache_key() };

@@ -240,10 +240,6 @@ mod tests {
         assert!(message.starts_with("`data.width, data.height` = 256, 256: synthetic scenes are 32 x 32"), "{message}");
         (config.data.synthetic.width, config.data.synthetic.height) = (256, 256);
         config.validate().expect("the default is valid");
-        config.stage1.keep_tokens = [0.5, 0.25];
-        let message = config.validate().unwrap_err().to_string();
-        assert_eq!(message, "`stage1.keep_tokens` = [0.5, 0.25]: write 0 < smallest <= largest <= 1");
-        config.stage1.keep_tokens = [0.25, 1.0];
         config.loss.perceptual_weight = -0.5;
         let message = config.validate().unwrap_err().to_string();
         assert_eq!(message, "`loss.perceptual_weight` = -0.5: write 0 or a positive number");
@@ -262,10 +258,6 @@ mod tests {
         (config.data.width, config.data.height) = (256, 256);
         config.loss.perceptual_weight = 0.0;
         assert_eq!(config.loss.weights().expect("no term"), None);
-        config.clusters.grid = vec![TokenCount::Count(5000)];
-        let message = config.validate().unwrap_err().to_string();
-        assert_eq!(message, "`clusters.grid` = 5000: a scene has as few as 4096 tokens");
-        config.clusters.grid = vec![TokenCount::Count(64)];
         config.data.views.min_context = 0;
         assert!(config.validate().is_err(), "and no panic");
         config.data.views.min_context = 4;

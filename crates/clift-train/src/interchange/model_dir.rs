@@ -37,7 +37,7 @@ pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
     match model.variant {
         CliftVariant::Paper => {}
         CliftVariant::ReleasedRe10k => {
-            (data.pose_rotation, data.pose_scale) = (PoseRotation::Quaternion, PoseScale::All)
+            (data.pose_rotation, data.pose_scale) = (PoseRotation::Quaternion, PoseScale::All);
         }
         CliftVariant::ReleasedDl3dv => {
             (data.width, data.height) = (448, 256);

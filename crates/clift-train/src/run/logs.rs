@@ -214,7 +214,7 @@ mod tests {
         let mut count = Count::default();
         let mut log = RunLog::open(path.parent().unwrap(), from.0, from.1, &mut count).unwrap();
         for &(stage, step) in steps {
-            log.event(&Event::Step(StepEvent { stage, step, ..STEP }));
+            log.event(&Event::Step(StepEvent { step, stage, ..STEP }));
         }
         log.check().unwrap();
         assert_eq!(count.0, steps.len(), "events are passed on");
