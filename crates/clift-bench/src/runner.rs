@@ -42,9 +42,10 @@ pub struct BenchRow {
     pub p95_s: f64,
     /// Peak memory of the process during the samples; `None` on a GPU, and on systems without this counter.
     pub peak_bytes: Option<u64>,
-    /// Largest difference from f64 over the largest value; `None` without `--error`. For an update: the largest error of
-    /// the loss and of each parameter's gradient, with at most [`MAX_CHECKED_TOKENS`] tokens. For K-means: the relative
-    /// difference of the inertia, since the f64 clustering may differ.
+    /// Largest difference from f64 over the largest value; `None` without the f64 check. For an update: the largest error
+    /// of the loss and of each parameter's gradient, with at most
+    /// [`MAX_CHECKED_TOKENS`](crate::MAX_CHECKED_TOKENS) tokens. For K-means: the relative difference of the inertia, since
+    /// the f64 clustering may differ.
     pub max_rel_error: Option<f64>,
     /// Seconds of every timed repetition; per view for `render_8_views`.
     pub samples_s: Vec<f64>,

@@ -28,7 +28,7 @@ pub struct TypicalStep {
     pub scene: SceneSizes,
 }
 
-/// Returns every size that a scene of a stage can have, equally likely; the share of tokens in stage 1 at [`NUM_SHARES`] points.
+/// Returns every size that a scene of a stage can have, equally likely; in stage 1 for a few shares of tokens.
 pub fn possible_sizes(config: &Config, stage: Stage) -> Result<Vec<SceneSizes>, TrainError> {
     let views = &config.data.views;
     let mut all = Vec::new();
