@@ -63,7 +63,7 @@ fn rows_are_chosen_and_errors_omitted_on_request() {
 
 #[test]
 fn what_cannot_be_timed_is_wrong_usage() {
-    clift(args(&["--case", "encode,incode"])).fails_with(2, &["'incode'", "the works are encode, kmeans, condense"]);
+    clift(args(&["--case", "encode,incode"])).fails_with(2, &["'incode'", "the cases are encode, kmeans, condense"]);
     clift(args(&["--storage", "17"])).fails_with(2, &["`--storage` = 17"]);
     clift(args(&["--json", "no/such/folder/bench.json"])).fails_with(2, &["no folder"]);
     clift(args(&["--set", "data.width=20"]))
@@ -82,7 +82,10 @@ fn an_interrupted_benchmark_writes_nothing() {
         signal(&child, name);
         let rest: Vec<String> = lines.collect();
         assert_eq!(finish(child).code, Some(code), "{rest:?}");
-        assert!(rest.iter().any(|line| line == "error: interrupted during `render`; nothing was written"), "{rest:?}");
+        assert!(
+            rest.iter().any(|line| line == "error: interrupted while timing `render`; no output files were written"),
+            "{rest:?}"
+        );
         assert!(!place.at("bench.json").exists());
     }
 }

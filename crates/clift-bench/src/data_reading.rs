@@ -1,4 +1,4 @@
-//! How fast clips are read, one after another and at random.
+//! `clift bench data`: clips read per second, in order and at random.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -9,21 +9,21 @@ use clift_data::{
 };
 use serde::Serialize;
 
-/// Batches of one clip that are prepared ahead.
+/// Clips prepared ahead.
 const NUM_PREFETCH: usize = 8;
 
-/// What is read.
+/// Clips to read.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ThroughputOptions {
-    /// How views are prepared.
+    /// Size and frame of the views.
     pub clip: ClipOptions,
-    /// Context and target frames of a clip, all different where the scene has as many.
+    /// Context and target frames of a clip, distinct if the scene has enough.
     pub num_views: [usize; 2],
     /// Clips of each measurement.
     pub num_clips: usize,
     /// Threads of the sequential measurement.
     pub num_threads: usize,
-    /// Decides frames and, at random, scenes.
+    /// Seed of frames and of random scenes.
     pub seed: u64,
 }
 
@@ -32,26 +32,26 @@ pub struct ThroughputOptions {
 pub struct ReadClip {
     /// Key of the scene.
     pub key: String,
-    /// Frames given.
+    /// Context frames.
     pub context: Vec<usize>,
-    /// Frames to render.
+    /// Target frames.
     pub target: Vec<usize>,
 }
 
-/// What was measured. Another program can read the same clips and compare.
+/// Measured times, with the clips, so that another program can read the same ones.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Throughput {
     /// Columns and rows of a view.
     pub size: [usize; 2],
     /// Threads of the sequential measurement.
     pub num_threads: usize,
-    /// Clips per second, scene after scene in the order of the source, prepared ahead by the threads.
+    /// Clips per second in the order of the source, prepared ahead by the threads.
     pub sequential_clips_per_s: f64,
-    /// Seconds from asking for a random clip to having it, one at a time, on one thread: the middle, ..
+    /// Median latency in seconds of a random clip, read alone on one thread.
     pub random_median_s: f64,
-    /// .. and 95 of 100 take no longer.
+    /// 95th percentile of this latency.
     pub random_p95_s: f64,
-    /// Clips per second of that.
+    /// Random clips per second on one thread.
     pub random_clips_per_s: f64,
     /// Clips read in order.
     pub sequential: Vec<ReadClip>,
@@ -59,11 +59,11 @@ pub struct Throughput {
     pub random: Vec<ReadClip>,
 }
 
-/// Reads clips in order and then at random, and times both.
+/// Times reading clips in order and then at random.
 ///
 /// # Errors
-/// [`DataError::BadConfig`] for no clips, views or scenes, and the first clip's error that cannot be read.
-pub fn measure(source: &Arc<dyn SceneSource>, options: &ThroughputOptions) -> Result<Throughput, DataError> {
+/// [`DataError::BadConfig`] for no clips, views or scenes, and the error of the first unreadable clip.
+pub fn measure_reading(source: &Arc<dyn SceneSource>, options: &ThroughputOptions) -> Result<Throughput, DataError> {
     let ThroughputOptions { clip, num_clips, num_threads, seed, .. } = *options;
     for (key, value) in
         [("num_clips", num_clips), ("num_context", options.num_views[0]), ("num_scenes", source.num_scenes())]
@@ -73,15 +73,18 @@ pub fn measure(source: &Arc<dyn SceneSource>, options: &ThroughputOptions) -> Re
         }
     }
     let reader = ClipReader { source: Arc::clone(source), options: clip };
-    let views = |scene: usize, place: usize| {
+    let views = |scene: usize, index: usize| {
         let num_frames = source.num_frames(scene)?;
-        Ok((scene, choose(num_frames, options.num_views, &mut item_rng(seed, place as u64, 0, 0, "bench views"))))
+        Ok((
+            scene,
+            sample_frames(num_frames, options.num_views, &mut item_rng(seed, index as u64, 0, 0, "bench views")),
+        ))
     };
     let at_random =
-        |place: usize| uniform_below(&mut item_rng(seed, place as u64, 0, 0, "bench scene"), source.num_scenes());
-    let in_order = (0..num_clips).map(|place| views(place % source.num_scenes(), place));
+        |index: usize| uniform_below(&mut item_rng(seed, index as u64, 0, 0, "bench scene"), source.num_scenes());
+    let in_order = (0..num_clips).map(|index| views(index % source.num_scenes(), index));
     let in_order: Vec<(usize, ViewIndices)> = in_order.collect::<Result<_, DataError>>()?;
-    let random = (0..num_clips).map(|place| views(at_random(place), num_clips + place));
+    let random = (0..num_clips).map(|index| views(at_random(index), num_clips + index));
     let random: Vec<(usize, ViewIndices)> = random.collect::<Result<_, DataError>>()?;
 
     let list = in_order.clone();
@@ -123,19 +126,18 @@ pub fn measure(source: &Arc<dyn SceneSource>, options: &ThroughputOptions) -> Re
     })
 }
 
-/// Frames spread at random over a scene: the contexts in order, then the targets.
-fn choose(num_frames: usize, [num_context, num_targets]: [usize; 2], rng: &mut impl rand::Rng) -> ViewIndices {
+/// Samples frames of a scene, distinct if the scene has enough, and spreads the targets among the contexts.
+fn sample_frames(num_frames: usize, [num_context, num_targets]: [usize; 2], rng: &mut impl rand::Rng) -> ViewIndices {
     let num_views = num_context + num_targets;
     let mut frames = sample_distinct(rng, num_frames, num_views.min(num_frames));
     while frames.len() < num_views && num_frames > 0 {
         frames.push(uniform_below(rng, num_frames));
     }
-    // Every so many is a target, so that the contexts span the scene.
     let is_target =
-        |place: usize| place * num_targets / num_views.max(1) != (place + 1) * num_targets / num_views.max(1);
+        |index: usize| index * num_targets / num_views.max(1) != (index + 1) * num_targets / num_views.max(1);
     let (mut context, mut target) = (Vec::new(), Vec::new());
-    for (place, frame) in frames.into_iter().enumerate() {
-        if is_target(place) { &mut target } else { &mut context }.push(frame);
+    for (index, frame) in frames.into_iter().enumerate() {
+        if is_target(index) { &mut target } else { &mut context }.push(frame);
     }
     ViewIndices { context, target }
 }
@@ -147,7 +149,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn clips_are_read_in_order_and_at_random_and_named() {
+    fn clips_are_read_in_order_and_at_random() {
         let config = SyntheticConfig { num_scenes: 3, num_frames: 12, width: 16, height: 16, ..Default::default() };
         let source: Arc<dyn SceneSource> = Arc::new(SyntheticSource::new(config).unwrap());
         let clip = ClipOptions {
@@ -158,25 +160,25 @@ mod tests {
             exact_principal_point: false,
         };
         let options = ThroughputOptions { clip, num_views: [4, 3], num_clips: 7, num_threads: 2, seed: 1 };
-        let measured = measure(&source, &options).unwrap();
+        let measured = measure_reading(&source, &options).unwrap();
         assert_eq!((measured.sequential.len(), measured.random.len()), (7, 7));
         let keys: Vec<&str> = measured.sequential.iter().map(|clip| clip.key.as_str()).collect();
         assert_eq!(keys[..4], [source.key(0), source.key(1), source.key(2), source.key(0)]);
         assert!(measured.sequential.iter().all(|clip| clip.context.len() == 4 && clip.target.len() == 3));
         assert!(measured.sequential_clips_per_s > 0.0 && measured.random_median_s <= measured.random_p95_s);
-        assert_eq!(measured.random, measure(&source, &options).unwrap().random);
-        assert!(measure(&source, &ThroughputOptions { num_clips: 0, ..options }).is_err());
+        assert_eq!(measured.random, measure_reading(&source, &options).unwrap().random);
+        assert!(measure_reading(&source, &ThroughputOptions { num_clips: 0, ..options }).is_err());
     }
 
     #[test]
-    fn chosen_frames_are_distinct_where_the_scene_has_as_many() {
+    fn sampled_frames_are_distinct_in_long_scenes() {
         let mut rng = item_rng(1, 0, 0, 0, "test");
-        let ViewIndices { context, target } = choose(20, [4, 6], &mut rng);
+        let ViewIndices { context, target } = sample_frames(20, [4, 6], &mut rng);
         let mut all = [context, target].concat();
         all.sort_unstable();
         all.dedup();
         assert_eq!(all.len(), 10);
-        let few = choose(3, [4, 6], &mut rng);
+        let few = sample_frames(3, [4, 6], &mut rng);
         assert!((few.context.len(), few.target.len()) == (4, 6) && few.context.iter().all(|frame| *frame < 3));
     }
 }

@@ -1,4 +1,19 @@
 //! Measures the program itself: `clift bench`, `clift doctor` and `clift plan`.
+//!
+//! ```
+//! use std::sync::atomic::AtomicBool;
+//!
+//! use clift_bench::{BenchCase, BenchOptions, run_bench};
+//! use clift_train::Config;
+//!
+//! let mut config = Config { run_dir: "run".into(), ..Config::default() };
+//! (config.data.width, config.data.height) = (16, 16);
+//! (config.model.dim, config.model.num_heads, config.model.feed_forward_dim) = (16, 2, 24);
+//! let options = BenchOptions { repeats: 3, warmup: 1, ..BenchOptions::new(vec![BenchCase::Encode]) };
+//! let report = run_bench(&config, &options, &AtomicBool::new(false), &mut |_| {})?;
+//! assert_eq!(report.rows[0].samples_s.len(), 3);
+//! # Ok::<(), clift_train::TrainError>(())
+//! ```
 
 mod cases;
 mod data_reading;
@@ -7,15 +22,17 @@ mod plan;
 mod precision;
 mod runner;
 
+// Time and error of the parts of the method
 pub use cases::case::BenchCase;
 pub use cases::options::{BenchOptions, MAX_CHECKED_TOKENS};
-pub use cases::reference::module_in_f64;
-pub use data_reading::{Throughput, ThroughputOptions, measure as measure_reading};
-pub use doctor::probe::{DeviceCheck, Gradient, caught, probe};
-pub use doctor::stability::case::{Row as StabilityRow, Size};
-pub use doctor::stability::suite::{
-    markdown as stability_markdown, run as run_stability, table_text as stability_text,
-};
-pub use plan::plan::{PartPlan, Plan, check as check_plan, plan};
-pub use precision::{PrecisionReport, PrecisionRow, WORKS, compare as compare_precision};
-pub use runner::{BenchEvent, Report, Row as BenchRow, run as run_bench};
+pub use runner::{BenchEvent, BenchReport, BenchRow, run_bench};
+// f16 beside f32
+pub use precision::{PRECISION_CASES, PrecisionReport, PrecisionRow, compare_precision};
+// Reading of clips
+pub use data_reading::{ReadClip, Throughput, ThroughputOptions, measure_reading};
+// Devices and numerical stability
+pub use doctor::probe::{DeviceCheck, Gradient, catch_panic, probe};
+pub use doctor::stability::case::{Bound, CaseSize, Outcome, StabilityCase, StabilityRow};
+pub use doctor::stability::suite::{outcome_text, run_stability, stability_markdown};
+// Memory and time of a run before it starts
+pub use plan::plan::{PartPlan, Plan, check_plan, plan};

@@ -1,4 +1,4 @@
-//! `clift bench half`: f16 products beside f32 ones, speed and what they cost in one row.
+//! `clift bench precision`: time and error of f16 products beside f32 products.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -8,81 +8,88 @@ use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::median;
 use clift_model::{DeviceName, Precision};
-use clift_train::{Config, DeviceBatch, Stage, TrainError, freeze, psnr_of};
+use clift_train::{Config, DeviceBatch, Stage, TrainError, freeze, psnr_of_mse};
 use serde::Serialize;
 
 use crate::cases::case::BenchCase;
 use crate::cases::context::BenchContext;
-use crate::cases::forward::{Encode, Render};
+use crate::cases::forward::{EncodeCase, RenderCase};
 use crate::cases::options::BenchOptions;
+use crate::cases::prepare::prepare;
 use crate::cases::reference::values;
 use crate::cases::step::{gradients, loss_factor, micro_batch};
 use crate::cases::task::{BenchTask, Forward};
 
-/// The works that are compared.
-pub const WORKS: [BenchCase; 4] = [BenchCase::Encode, BenchCase::Render, BenchCase::Stage1Step, BenchCase::Stage2Step];
+/// The cases that can be compared.
+pub const PRECISION_CASES: [BenchCase; 4] =
+    [BenchCase::Encode, BenchCase::Render, BenchCase::Stage1Step, BenchCase::Stage2Step];
 
-/// What was measured.
+/// Results of a comparison.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PrecisionReport {
-    /// Where tensors were.
+    /// Device of the tensors.
     pub device: DeviceName,
-    /// One per work.
+    /// One row per case.
     pub rows: Vec<PrecisionRow>,
 }
 
-/// One work in both precisions.
+/// One case in both precisions.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PrecisionRow {
-    /// Which work.
-    pub work: BenchCase,
+    /// The case.
+    #[serde(rename = "work")]
+    pub case: BenchCase,
     /// Median seconds with f32 products.
     pub f32_s: f64,
-    /// Median seconds with f16 products, in turn with the others.
+    /// Median seconds with f16 products; repetitions alternate between f32 and f16.
     pub f16_s: f64,
-    /// The second over the first.
+    /// `f16_s` over `f32_s`.
     pub ratio: f64,
-    /// Norm of the difference over the norm of the f32 result: of tokens, of pictures, of an update's whole gradient.
+    /// Norm of the difference over the norm of the f32 result: tokens, images or the whole gradient of an update.
     pub error: f64,
-    /// Of an update: the loss in f32 and in f16. PSNR is `-10 log10` of it.
+    /// Loss of an update in f32 and in f16.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub loss: Option<[f64; 2]>,
-    /// Of pictures: PSNR of the f16 ones against the f32 ones, in dB.
+    /// PSNR of f16 images against f32 images in dB.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_to_f32: Option<f64>,
 }
 
 impl PrecisionRow {
-    /// PSNR of an update's pictures against its targets, in f32 and in f16.
+    /// Returns the PSNR of an update's renderings in dB, in f32 and in f16.
     pub fn psnr(&self) -> Option<[f64; 2]> {
-        self.loss.map(|loss| loss.map(psnr_of))
+        self.loss.map(|loss| loss.map(psnr_of_mse))
     }
 }
 
-/// Times the works of `options` in both precisions, in turn, on the device of `config`, and compares their results.
+/// Times the cases of `options` in both precisions, alternating, on the device of `config`, and compares their results.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for sizes that cannot be, [`clift_model::ModelError::BadConfig`] on a device without f16,
+/// [`TrainError::BadConfig`] for impossible sizes, [`clift_model::ModelError::BadConfig`] on a device without f16,
 /// [`TrainError::Abandoned`] after `stop` was set.
-pub fn compare(config: &Config, options: &BenchOptions, stop: &AtomicBool) -> Result<PrecisionReport, TrainError> {
-    if let Some(other) = options.work.iter().find(|work| !WORKS.contains(work)) {
-        let fix = format!("write some of {}", WORKS.map(BenchCase::name).join(", "));
+pub fn compare_precision(
+    config: &Config,
+    options: &BenchOptions,
+    stop: &AtomicBool,
+) -> Result<PrecisionReport, TrainError> {
+    if let Some(other) = options.cases.iter().find(|case| !PRECISION_CASES.contains(case)) {
+        let fix = format!("write some of {}", PRECISION_CASES.map(BenchCase::name).join(", "));
         return Err(TrainError::BadConfig { key: "--work".into(), value: other.name().into(), fix });
     }
-    let [single, half] = [Precision::F32, Precision::F16]
+    let [single, f16] = [Precision::F32, Precision::F16]
         .map(|precision| BenchContext::new(&Config { precision, ..config.clone() }, options));
-    let contexts = [single?, half?];
+    let contexts = [single?, f16?];
     let mut rows = Vec::new();
-    for work in WORKS.into_iter().filter(|work| options.work.contains(work)) {
-        let [f32_s, f16_s] = times(work, &contexts, options, stop)?;
-        let Compared { error, loss, psnr_to_f32 } = compared(work, &contexts[0])?;
-        rows.push(PrecisionRow { work, f32_s, f16_s, ratio: f16_s / f32_s, error, loss, psnr_to_f32 });
+    for case in PRECISION_CASES.into_iter().filter(|case| options.cases.contains(case)) {
+        let [f32_s, f16_s] = median_times(case, &contexts, options, stop)?;
+        let PrecisionErrors { error, loss, psnr_to_f32 } = precision_errors(case, &contexts[0])?;
+        rows.push(PrecisionRow { case, f32_s, f16_s, ratio: f16_s / f32_s, error, loss, psnr_to_f32 });
     }
     Ok(PrecisionReport { device: config.device, rows })
 }
 
-fn times(
-    work: BenchCase,
+fn median_times(
+    case: BenchCase,
     contexts: &[BenchContext; 2],
     options: &BenchOptions,
     stop: &AtomicBool,
@@ -91,13 +98,13 @@ fn times(
     let mut tasks: Vec<Box<dyn BenchTask>> = Vec::new();
     for context in contexts {
         let _scope = scoped(context);
-        tasks.push(work.prepare(context)?);
+        tasks.push(prepare(case, context)?);
     }
     let mut samples = [Vec::new(), Vec::new()];
     for repeat in 0..options.warmup + options.repeats {
         for ((task, context), samples) in tasks.iter_mut().zip(contexts).zip(&mut samples) {
             if stop.load(Ordering::Relaxed) {
-                return Err(TrainError::Abandoned { work: format!("`{}`", work.name()) });
+                return Err(TrainError::Abandoned { task: format!("timing `{case}`") });
             }
             let _scope = scoped(context);
             context.sync()?;
@@ -112,31 +119,35 @@ fn times(
     Ok(samples.map(|samples| median(&samples)))
 }
 
-struct Compared {
+struct PrecisionErrors {
     error: f64,
     loss: Option<[f64; 2]>,
     psnr_to_f32: Option<f64>,
 }
 
-fn compared(work: BenchCase, context: &BenchContext) -> Result<Compared, TrainError> {
+fn precision_errors(case: BenchCase, context: &BenchContext) -> Result<PrecisionErrors, TrainError> {
     let both = |forward: &dyn Fn() -> Tensor<1>| {
         [Precision::F32, Precision::F16].map(|precision| {
             let _scope = precision.scope();
             values(forward())
         })
     };
-    let stage = match work {
+    let stage = match case {
         BenchCase::Encode => {
-            let encode = Encode::new(context)?;
-            let [single, half] = both(&|| encode.forward());
-            return Ok(Compared { error: distance(&half, &single), loss: None, psnr_to_f32: None });
+            let encode = EncodeCase::new(context)?;
+            let [single, f16] = both(&|| encode.forward());
+            return Ok(PrecisionErrors { error: relative_distance(&f16, &single), loss: None, psnr_to_f32: None });
         }
         BenchCase::Render => {
-            let render = Render::new(context, 1)?;
-            let [single, half] = both(&|| render.forward());
-            let squares = half.iter().zip(&single).map(|(a, b)| (a - b).powi(2));
+            let render = RenderCase::new(context, 1)?;
+            let [single, f16] = both(&|| render.forward());
+            let squares = f16.iter().zip(&single).map(|(a, b)| (a - b).powi(2));
             let mse = squares.sum::<f64>() / single.len() as f64;
-            return Ok(Compared { error: distance(&half, &single), loss: None, psnr_to_f32: Some(psnr_of(mse)) });
+            return Ok(PrecisionErrors {
+                error: relative_distance(&f16, &single),
+                loss: None,
+                psnr_to_f32: Some(psnr_of_mse(mse)),
+            });
         }
         BenchCase::Stage2Step => Stage::Stage2,
         _ => Stage::Stage1,
@@ -146,24 +157,28 @@ fn compared(work: BenchCase, context: &BenchContext) -> Result<Compared, TrainEr
     let mut results = Vec::new();
     for precision in [Precision::F32, Precision::F16] {
         let _scope = precision.scope();
-        let shown = DeviceBatch::upload(&batch, &context.device.clone().autodiff())?;
-        let (loss, grads) = gradients(&model, &batch, shown)?;
-        results.push((loss, flat(&model, &grads, loss_factor())));
+        let device_batch = DeviceBatch::upload(&batch, &context.device.clone().autodiff())?;
+        let (loss, grads) = gradients(&model, &batch, device_batch)?;
+        results.push((loss, flat_gradient(&model, &grads, loss_factor())));
     }
-    let [(single_loss, single), (half_loss, half)] = &results[..] else { unreachable!("two precisions") };
-    Ok(Compared { error: distance(half, single), loss: Some([*single_loss, *half_loss]), psnr_to_f32: None })
+    let [(single_loss, single), (f16_loss, f16)] = &results[..] else { unreachable!("two precisions") };
+    Ok(PrecisionErrors {
+        error: relative_distance(f16, single),
+        loss: Some([*single_loss, *f16_loss]),
+        psnr_to_f32: None,
+    })
 }
 
-/// `|a - b| / |b|`, NaN where a value is none.
-fn distance(a: &[f64], b: &[f64]) -> f64 {
+/// Returns `|a - b| / |b|`, NaN if a value is NaN.
+fn relative_distance(a: &[f64], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len(), "the same result twice");
     let norm = |squares: f64| squares.sqrt();
     let difference = norm(a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum());
     if difference == 0.0 { 0.0 } else { difference / norm(b.iter().map(|b| b.powi(2)).sum()) }
 }
 
-/// The gradient of all parameters, one after the other, over the factor of its loss.
-fn flat<M: Module>(model: &M, grads: &GradientsParams, factor: f64) -> Vec<f64> {
+/// Returns the gradients of all parameters in one list, divided by the factor of the loss.
+fn flat_gradient<M: Module>(model: &M, grads: &GradientsParams, factor: f64) -> Vec<f64> {
     struct Collect<'a>(&'a GradientsParams, Vec<f64>);
     impl ModuleVisitor for Collect<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
@@ -183,27 +198,30 @@ mod tests {
     use crate::runner::tests::{config, options};
 
     #[test]
-    fn every_row_is_near_f32_and_not_equal_to_it() {
-        let report = compare(&config(DeviceName::Flex), &options(&WORKS), &AtomicBool::new(false)).expect("runs");
-        assert_eq!(report.rows.iter().map(|row| row.work).collect::<Vec<_>>(), WORKS);
+    fn every_row_is_close_to_f32_but_not_equal() {
+        let report = compare_precision(&config(DeviceName::Flex), &options(&PRECISION_CASES), &AtomicBool::new(false))
+            .expect("runs");
+        assert_eq!(report.rows.iter().map(|row| row.case).collect::<Vec<_>>(), PRECISION_CASES);
         for row in &report.rows {
             // Operands of 11 bits, through two blocks and back.
             assert!(row.error > 1e-6 && row.error < 1e-2, "{row:?}");
-            let is_step = matches!(row.work, BenchCase::Stage1Step | BenchCase::Stage2Step);
-            assert_eq!((row.loss.is_some(), row.psnr_to_f32.is_some()), (is_step, row.work == BenchCase::Render));
-            if let Some([single, half]) = row.psnr() {
-                assert!((single - half).abs() < 0.01, "{row:?}");
+            let is_step = matches!(row.case, BenchCase::Stage1Step | BenchCase::Stage2Step);
+            assert_eq!((row.loss.is_some(), row.psnr_to_f32.is_some()), (is_step, row.case == BenchCase::Render));
+            if let Some([single, f16]) = row.psnr() {
+                assert!((single - f16).abs() < 0.01, "{row:?}");
             }
             assert!(row.psnr_to_f32.is_none_or(|psnr| psnr > 50.0), "{row:?}");
         }
-        let refused = compare(&config(DeviceName::Ndarray), &options(&WORKS), &AtomicBool::new(false)).unwrap_err();
+        let refused =
+            compare_precision(&config(DeviceName::Ndarray), &options(&PRECISION_CASES), &AtomicBool::new(false))
+                .unwrap_err();
         assert!(refused.to_string().contains("no f16"), "{refused}");
     }
 
     #[test]
-    fn the_distance_is_that_of_norms() {
-        assert_eq!(distance(&[3.0, 4.0], &[0.0, 4.0]), 0.75);
-        assert_eq!(distance(&[0.0], &[0.0]), 0.0);
-        assert!(distance(&[f64::NAN], &[1.0]).is_nan());
+    fn distance_is_relative_to_norm() {
+        assert_eq!(relative_distance(&[3.0, 4.0], &[0.0, 4.0]), 0.75);
+        assert_eq!(relative_distance(&[0.0], &[0.0]), 0.0);
+        assert!(relative_distance(&[f64::NAN], &[1.0]).is_nan());
     }
 }

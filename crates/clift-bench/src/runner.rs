@@ -1,7 +1,7 @@
-//! `clift bench`: how long the parts of the method take on a device, and how far each result is from f64.
+//! `clift bench`: time of the parts of the method on a device, and the error of each result against f64.
 //!
-//! Inputs are drawn from the config's seed; no data is read. Speed stands beside error, so that a kernel that is
-//! fast because it is wrong shows.
+//! Inputs come from the config's seed; no data is read. Time and error are measured together, because a wrong kernel can be
+//! fast.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -15,47 +15,49 @@ use serde::Serialize;
 use crate::cases::case::BenchCase;
 use crate::cases::context::BenchContext;
 use crate::cases::options::BenchOptions;
+use crate::cases::prepare::prepare;
 
-/// What was measured.
+/// Results of a benchmark.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Report {
-    /// Where tensors were.
+pub struct BenchReport {
+    /// Device of the tensors.
     pub device: DeviceName,
-    /// What the operands of matrix products were.
+    /// Operands of matrix products.
     pub precision: Precision,
     /// Threads of the CPU devices.
     pub threads: usize,
-    /// One per work.
-    pub rows: Vec<Row>,
+    /// One row per case.
+    pub rows: Vec<BenchRow>,
 }
 
-/// What was measured of one work.
+/// Measurements of one case.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Row {
-    /// Which work.
-    pub work: BenchCase,
-    /// Middle of the samples.
+pub struct BenchRow {
+    /// The case.
+    #[serde(rename = "work")]
+    pub case: BenchCase,
+    /// Median of the samples.
     pub median_s: f64,
     /// 95th percentile of the samples, nearest rank.
     pub p95_s: f64,
-    /// Most memory of the whole process during the samples; `None` on a GPU, whose memory the system does not
-    /// tell, and where the system has no such count.
+    /// Peak memory of the process during the samples; `None` on a GPU, and on systems without this counter.
     pub peak_bytes: Option<u64>,
-    /// Largest difference from f64 over the largest value; `None` where it was not asked for. Of an update: the
-    /// largest over its loss and the gradient of each parameter, with at most [`MAX_CHECKED_TOKENS`] tokens. Of
-    /// K-means: the relative difference of the inertia, whose f64 clustering may take another turn.
+    /// Largest difference from f64 over the largest value; `None` without the f64 check. For an update: the largest error
+    /// of the loss and of each parameter's gradient, with at most
+    /// [`MAX_CHECKED_TOKENS`](crate::MAX_CHECKED_TOKENS) tokens. For K-means: the relative difference of the inertia, since
+    /// the f64 clustering may differ.
     pub max_rel_error: Option<f64>,
-    /// Seconds of every repetition that counts; of `render_8_views` an eighth of them.
+    /// Seconds of every timed repetition; per view for `render_8_views`.
     pub samples_s: Vec<f64>,
-    /// Of K-means: sum of squared distances to the cluster means.
+    /// Sum of squared distances to the cluster means, for K-means.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub inertia: Option<f64>,
 }
 
-/// What a benchmark tells while it runs.
+/// Progress of a benchmark.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum BenchEvent<'a> {
-    /// So many repetitions of all are done; the comparison with f64 counts as one.
+    /// Repetitions that are done; the comparison with f64 counts as one.
     Progress {
         /// Repetitions so far.
         done: usize,
@@ -63,51 +65,50 @@ pub enum BenchEvent<'a> {
         total: usize,
     },
     /// A row is complete.
-    Finished(&'a Row),
+    Finished(&'a BenchRow),
 }
 
-/// Times every work that `options` names on the device of `config`.
+/// Times the cases of `options` on the device of `config`.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for sizes that cannot be, [`TrainError::Abandoned`] between two repetitions
-/// after `stop` was set, and what the device or a file of features gives.
-pub fn run(
+/// [`TrainError::BadConfig`] for impossible sizes, [`TrainError::Abandoned`] between two repetitions after `stop` was set, and
+/// those of the device or of the file of features.
+pub fn run_bench(
     config: &Config,
     options: &BenchOptions,
     stop: &AtomicBool,
-    tell: &mut dyn FnMut(BenchEvent),
-) -> Result<Report, TrainError> {
+    report: &mut dyn FnMut(BenchEvent),
+) -> Result<BenchReport, TrainError> {
     let context = BenchContext::new(config, options)?;
-    let works: Vec<BenchCase> = BenchCase::ALL.into_iter().filter(|work| options.work.contains(work)).collect();
-    let total = works.len() * (options.warmup + options.repeats + usize::from(options.error));
+    let cases: Vec<BenchCase> = BenchCase::ALL.iter().copied().filter(|case| options.cases.contains(case)).collect();
+    let total = cases.len() * (options.warmup + options.repeats + usize::from(options.error));
     let mut done = 0;
-    let mut rows = Vec::with_capacity(works.len());
-    for work in works {
+    let mut rows = Vec::with_capacity(cases.len());
+    for case in cases {
         let mut advance = |count| {
             done += count;
-            tell(BenchEvent::Progress { done, total });
-            // Between repetitions, so that no time is of half a repetition.
+            report(BenchEvent::Progress { done, total });
             if stop.load(Ordering::Relaxed) {
-                Err(TrainError::Abandoned { work: format!("`{}`", work.name()) })
+                Err(TrainError::Abandoned { task: format!("timing `{case}`") })
             } else {
                 Ok(())
             }
         };
-        let row = measure(work, &context, options, &mut advance)?;
-        tell(BenchEvent::Finished(&row));
+        let row = measure(case, &context, options, &mut advance)?;
+        report(BenchEvent::Finished(&row));
         rows.push(row);
     }
-    Ok(Report { device: config.device, precision: config.precision, threads: rayon::current_num_threads(), rows })
+    Ok(BenchReport { device: config.device, precision: config.precision, threads: rayon::current_num_threads(), rows })
 }
 
 fn measure(
-    work: BenchCase,
+    case: BenchCase,
     context: &BenchContext,
     options: &BenchOptions,
     advance: &mut dyn FnMut(usize) -> Result<(), TrainError>,
-) -> Result<Row, TrainError> {
+) -> Result<BenchRow, TrainError> {
     let _precision = context.config.precision.scope();
-    let mut task = work.prepare(context)?;
+    let mut task = prepare(case, context)?;
     context.sync()?;
     advance(0)?;
     for _ in 0..options.warmup {
@@ -120,7 +121,7 @@ fn measure(
     for _ in 0..options.repeats {
         let started = Instant::now();
         task.run()?;
-        // A device that queues its work has only accepted it.
+        // The device may only have queued the computation.
         context.sync()?;
         samples_s.push(started.elapsed().as_secs_f64() / task.num_views() as f64);
         advance(1)?;
@@ -135,15 +136,13 @@ fn measure(
         None
     };
     let (median_s, p95_s) = (median(&samples_s), p95(&samples_s));
-    Ok(Row { work, median_s, p95_s, peak_bytes, max_rel_error, samples_s, inertia })
+    Ok(BenchRow { case, median_s, p95_s, peak_bytes, max_rel_error, samples_s, inertia })
 }
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use clift_model::TokenCount;
-
     use clift_data::ViewSampler;
-    use clift_model::ModelConfig;
+    use clift_model::{ModelConfig, TokenCount};
 
     use super::*;
 
@@ -164,32 +163,32 @@ pub(crate) mod tests {
         config
     }
 
-    pub fn options(work: &[BenchCase]) -> BenchOptions {
+    pub fn options(cases: &[BenchCase]) -> BenchOptions {
         let storage = TokenCount::Share(0.25);
-        BenchOptions { work: work.into(), repeats: 2, warmup: 0, error: true, storage, render: None, features: None }
+        BenchOptions { repeats: 2, error: true, storage, ..BenchOptions::new(cases.into()) }
     }
 
     #[test]
-    fn every_row_runs_on_every_cpu_device_and_is_close_to_f64() {
+    fn every_row_runs_close_to_f64_on_cpu_devices() {
         for device in [DeviceName::Flex, DeviceName::Ndarray] {
             let mut events = Vec::new();
             let mut note = |event: BenchEvent| match event {
                 BenchEvent::Progress { done, total } => events.push((done, total)),
                 BenchEvent::Finished(_) => {}
             };
-            let options = options(&BenchCase::ALL);
-            let report = run(&config(device), &options, &AtomicBool::new(false), &mut note).expect("runs");
-            assert_eq!(report.rows.iter().map(|row| row.work).collect::<Vec<_>>(), BenchCase::ALL);
+            let options = options(BenchCase::ALL);
+            let report = run_bench(&config(device), &options, &AtomicBool::new(false), &mut note).expect("runs");
+            assert_eq!(report.rows.iter().map(|row| row.case).collect::<Vec<_>>(), BenchCase::ALL);
             for row in &report.rows {
                 // Blocks of f32 as in the tests of the model: outputs to 1e-5, gradients to 5e-5.
                 let close = row.max_rel_error.map(|error| error < 1e-4);
-                assert_eq!(close, (row.work != BenchCase::Select).then_some(true), "{device}: {row:?}");
+                assert_eq!(close, (row.case != BenchCase::Select).then_some(true), "{device}: {row:?}");
                 assert_eq!(row.samples_s.len(), 2);
                 assert!(row.samples_s.iter().all(|sample| (0.0..=row.p95_s).contains(sample)));
-                assert_eq!(row.inertia.is_some(), row.work == BenchCase::Kmeans);
+                assert_eq!(row.inertia.is_some(), row.case == BenchCase::Kmeans);
             }
             // An f32 result that was compared with itself would be exact.
-            let exact = |row: &&Row| row.work != BenchCase::Kmeans && row.max_rel_error == Some(0.0);
+            let exact = |row: &&BenchRow| row.case != BenchCase::Kmeans && row.max_rel_error == Some(0.0);
             assert_eq!(report.rows.iter().find(exact), None);
             let total = BenchCase::ALL.len() * 3;
             assert_eq!(events.last(), Some(&(total, total)));
@@ -197,17 +196,17 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_stop_ends_it_before_the_first_repetition() {
+    fn stop_ends_benchmark_before_first_repetition() {
         let mut events = Vec::new();
         let mut note = |event: BenchEvent| events.push(matches!(event, BenchEvent::Progress { done: 0, .. }));
         let options = options(&[BenchCase::Render, BenchCase::Encode]);
-        let stopped = run(&config(DeviceName::Flex), &options, &AtomicBool::new(true), &mut note).unwrap_err();
-        assert_eq!(stopped.to_string(), "interrupted during `encode`; nothing was written");
+        let stopped = run_bench(&config(DeviceName::Flex), &options, &AtomicBool::new(true), &mut note).unwrap_err();
+        assert_eq!(stopped.to_string(), "interrupted while timing `encode`; no output files were written");
         assert_eq!(events, [true]);
     }
 
     #[test]
-    fn the_scenes_of_a_config_need_not_be_there_but_its_sizes_must_fit() {
+    fn scenes_may_be_absent_but_sizes_must_fit() {
         let mut config = config(DeviceName::Flex);
         config.data.source = clift_data::SourceKind::Chunks;
         let prepared = |config: &Config, storage: &str| {
@@ -222,7 +221,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn an_update_is_compared_with_few_tokens_in_the_shape_it_has() {
+    fn checked_update_keeps_its_shape_with_fewer_tokens() {
         let mut config = config(DeviceName::Flex);
         (config.data.width, config.data.height) = (448, 256);
         config.stage1.batch_size = 64;

@@ -77,4 +77,4 @@ pub use figures::scene_figure::SceneFigures;
 
 // The machine, for reports.
 pub use system::machine::machine_rows;
-pub use system::memory::{peak_bytes, start_peak};
+pub use system::memory::{available_bytes, peak_bytes, start_peak};

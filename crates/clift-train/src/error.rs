@@ -1,22 +1,22 @@
-//! What can go wrong in a run, one documented variant per failure.
+//! Errors of training runs.
 
 use std::path::{Path, PathBuf};
 
-/// A failure of this crate. A message says what, where, expected and got, with the path last.
+/// An error of this crate. Messages have the problem, the value found, the remedy, and the path last.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum TrainError {
     /// A file could not be opened, read or written.
     #[error("{action} failed: {source}: {path}", path = path.display())]
     Io {
-        /// What was being done, as a verb phrase.
+        /// The action, as a verb phrase.
         action: &'static str,
-        /// The operating system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
         /// The file.
         path: PathBuf,
     },
-    /// A configuration value is out of its range.
+    /// A value of the configuration is invalid.
     #[error("`{key}` = {value}: {fix}")]
     BadConfig {
         /// Dotted key, as in the TOML file.
@@ -26,91 +26,91 @@ pub enum TrainError {
         /// What to write instead.
         fix: String,
     },
-    /// The run directory holds a run with other settings.
+    /// The run directory contains a run with other settings.
     #[error(
-        "this run was started with other settings:\n{differences}\nresume with the old values, {or}choose another \
-         `run_dir`, or start over with --fresh: {path}",
+        "this run was started with other settings:\n{differences}\nresume with the old values, {or}set another `run_dir`, or \
+         start a new run with --fresh: {path}",
         path = path.display()
     )]
     OtherRun {
         /// One line per differing key: `key: old -> new`.
         differences: String,
-        /// Another way on, where there is one.
+        /// Another remedy, or empty.
         or: &'static str,
         /// The run directory.
         path: PathBuf,
     },
-    /// A file of a run does not hold what it should.
+    /// The content of a file is invalid.
     #[error("bad {what}: {reason}: {path}", path = path.display())]
     BadFile {
-        /// Which kind of file.
+        /// Kind of the file.
         what: &'static str,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
         /// The file.
         path: PathBuf,
     },
-    /// The cluster cache belongs to another encoder or other settings.
-    #[error("stale cluster cache: {reason}; move it away to make a new one: {path}", path = path.display())]
+    /// The cluster cache was built with another encoder or other settings.
+    #[error("stale cluster cache: {reason}; remove the cache to build a new one: {path}", path = path.display())]
     StaleClusters {
         /// What differs.
         reason: String,
-        /// The cache.
+        /// Folder of the cache.
         path: PathBuf,
     },
-    /// The weights of the two stages belong to different trainings.
+    /// Stage 2 was trained on another encoder than that of stage 1.
     #[error(
-        "the weights of stage 2 were trained on another encoder than stage 1 has now; move stage2/ and clusters/ away \
-         and train stage 2 again: {path}",
+        "stage 2 was trained on another encoder than that of stage 1; remove stage2/ and clusters/ and train stage 2 again: \
+         {path}",
         path = path.display()
     )]
     OtherEncoder {
         /// The weights of stage 2.
         path: PathBuf,
     },
-    /// A stage needs the result of one that has not run.
-    #[error("{stage} needs {what}, which is not there; run {first} first: {path}", path = path.display())]
+    /// A stage needs the result of a stage that has not run.
+    #[error("{stage} needs {what}, not found at {path}; run `{first}` first", path = path.display())]
     Missing {
-        /// The stage that was asked for.
+        /// The requested stage.
         stage: &'static str,
-        /// What it needs.
+        /// The missing result.
         what: &'static str,
-        /// The stage that makes it.
+        /// Arguments that make the result.
         first: &'static str,
-        /// Where it was looked for.
+        /// Expected path.
         path: PathBuf,
     },
     /// A tensor could not be read back from its device.
     #[error("reading tokens from their device failed: {reason}")]
     Tensor {
-        /// The device's reason.
+        /// Error of the device.
         reason: String,
     },
-    /// Several steps in a row had to be left out.
+    /// Too many consecutive steps were skipped.
     #[error(
-        "{count} steps in a row were left out, up to step {step}: {reason} (scenes {keys}); bad_steps.jsonl has them \
-         all; the last good checkpoint is {checkpoint}"
+        "skipped {count} consecutive steps, the last at step {step}: {reason} (scenes {keys}); all are listed in \
+         bad_steps.jsonl; the last good checkpoint is {checkpoint}"
     )]
     Diverged {
-        /// How many.
+        /// Number of skipped steps.
         count: u32,
-        /// The last of them.
+        /// The last skipped step.
         step: u64,
-        /// What was wrong with that.
+        /// Anomaly of the last step.
         reason: String,
-        /// Scenes of its batch.
+        /// Scenes of the last batch.
         keys: String,
         /// The newest checkpoint, or "none".
         checkpoint: String,
     },
-    /// A stage could not go on. What it had done is on the disk.
+    /// A stage failed after it had saved its steps.
     #[error("{source}\n{stage} stopped after step {step}; the last good checkpoint is {checkpoint}")]
     Stopped {
-        /// What went wrong.
+        /// The error.
         source: Box<TrainError>,
         /// The stage.
         stage: &'static str,
-        /// Its last step.
+        /// The last step.
         step: u64,
         /// The newest checkpoint, or "none".
         checkpoint: String,
@@ -118,15 +118,15 @@ pub enum TrainError {
     /// A checkpoint cannot be read.
     #[error("{source}\nthe newest checkpoint is damaged: {fix}")]
     Damaged {
-        /// What is wrong with it.
+        /// The problem.
         source: Box<TrainError>,
-        /// What to do about it.
+        /// The remedy.
         fix: String,
     },
-    /// Another process works in the run directory.
-    #[error("{holder} is working in this run directory; wait for its end or choose another `run_dir`: {path}", path = path.display())]
+    /// Another process uses the run directory.
+    #[error("run directory {path} is in use by {holder}; wait until it exits or set another `run_dir`", path = path.display())]
     Locked {
-        /// Which process, where that is known.
+        /// The process, if known.
         holder: String,
         /// The run directory.
         path: PathBuf,
@@ -134,31 +134,31 @@ pub enum TrainError {
     /// No scene is left to train or evaluate on.
     #[error("no usable scene: {reason}")]
     NoScenes {
-        /// Why none is left.
+        /// Why no scene is left.
         reason: String,
     },
-    /// The run was asked to stop, and has saved.
+    /// The run was interrupted and has saved its steps.
     #[error("interrupted at step {step}; the same command resumes")]
     Interrupted {
-        /// Steps done.
+        /// The last step.
         step: u64,
     },
-    /// Work that keeps nothing of what is not done was asked to stop.
-    #[error("interrupted during {work}; nothing was written")]
+    /// A task without intermediate results was interrupted.
+    #[error("interrupted while {task}; no output files were written")]
     Abandoned {
-        /// What was not finished.
-        work: String,
+        /// The unfinished task, as a gerund phrase.
+        task: String,
     },
-    /// A device gave up on work it had accepted.
+    /// A device failed.
     #[error("the device failed: {reason}")]
     Device {
-        /// Its own words.
+        /// Error of the device.
         reason: String,
     },
     /// Scenes could not be read.
     #[error(transparent)]
     Data(#[from] clift_data::DataError),
-    /// The model refused its input or its weights.
+    /// Input or weights of the model are invalid.
     #[error(transparent)]
     Model(#[from] clift_model::ModelError),
     /// Evaluation failed.
@@ -173,18 +173,18 @@ impl From<clift_data::WorkerPanic> for TrainError {
 }
 
 impl TrainError {
-    /// Wraps an operating-system error; for `map_err`.
+    /// Wraps an error of the operating system; for `map_err`.
     pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, source, path: path.to_path_buf() }
     }
 
-    /// A [`TrainError::BadFile`]; for `map_err`.
+    /// Makes a [`TrainError::BadFile`]; for `map_err`.
     pub fn bad_file<E: std::fmt::Display>(what: &'static str, path: &Path) -> impl FnOnce(E) -> Self {
         move |reason| Self::BadFile { what, reason: reason.to_string(), path: path.to_path_buf() }
     }
 }
 
-/// A [`TrainError::BadConfig`].
+/// Makes a [`TrainError::BadConfig`].
 pub(crate) fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {
     TrainError::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
 }

@@ -1,4 +1,4 @@
-//! What a run tells: typed events, which sinks write to the disk or show to people.
+//! Events of a run, which sinks print or write to files.
 
 use std::path::PathBuf;
 
@@ -11,29 +11,30 @@ use serde::{Deserialize, Serialize};
 pub enum Stage {
     /// Encoder and renderer.
     Stage1,
-    /// The cache of clusters that stage 2 trains on.
+    /// The cluster cache, on which stage 2 trains.
     Clusters,
-    /// Condenser, with the renderer at a smaller rate.
+    /// Condenser, and the renderer at a smaller learning rate.
     Stage2,
-    /// The measurement of held-out views after training.
+    /// The evaluation after training.
     Eval,
 }
 
 impl Stage {
-    /// The name in files, on the command line and in folders.
+    /// Returns the name in files, on the command line and of folders.
     pub fn name(self) -> &'static str {
         self.into()
     }
 }
 
-/// One optimiser update.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// One optimizer update; a line of `metrics.jsonl`, where NaN and infinity are written as `null`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct StepEvent {
-    /// Which stage.
-    pub stage: Stage,
-    /// Updates so far in this stage, from 1.
+    /// Step of the stage, from 1.
     pub step: u64,
-    /// Updates the stage will have.
+    /// The stage.
+    pub stage: Stage,
+    /// Number of steps of the stage.
+    #[serde(skip)]
     pub num_steps: u64,
     /// Training loss of the batch.
     pub loss: f64,
@@ -47,69 +48,69 @@ pub struct StepEvent {
     pub step_s: f64,
 }
 
-/// Something that happened in a run.
+/// An event of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
-    /// A stage begins or is resumed.
+    /// A stage starts or resumes.
     StageStarted {
-        /// Which stage.
+        /// The stage.
         stage: Stage,
-        /// Steps done before: 0, or the step of the checkpoint it resumes from.
+        /// Steps done before: 0, or the step of the checkpoint.
         done: u64,
-        /// Steps (scenes, for the clusters) it will have.
+        /// Number of steps; of context sets for the cluster cache.
         num_steps: u64,
     },
     /// An update was made.
     Step(StepEvent),
-    /// A part of a stage that makes no updates is done: a scene was clustered.
+    /// A stage without updates has processed a context set or a scene.
     Progress {
-        /// Which stage.
+        /// The stage.
         stage: Stage,
-        /// How many are done.
+        /// Number done.
         done: u64,
-        /// How many there are.
+        /// Number in total.
         total: u64,
     },
-    /// Held-out views were measured.
+    /// Validation views were measured.
     Evaluated {
-        /// Which stage.
+        /// The stage.
         stage: Stage,
-        /// Updates so far in this stage.
+        /// Step of the stage.
         step: u64,
         /// Mean PSNR in dB.
         psnr: f64,
-        /// Mean SSIM; `None` for pictures below 11 pixels.
+        /// Mean SSIM; `None` for images below 11 pixels.
         ssim: Option<f64>,
-        /// How many views.
+        /// Number of views.
         num_views: usize,
     },
-    /// A checkpoint is on the disk.
+    /// A checkpoint was saved.
     Checkpoint {
-        /// Its folder.
+        /// Folder of the checkpoint.
         path: PathBuf,
     },
-    /// A scene, frame or batch was left out.
+    /// A scene was skipped.
     Skipped {
-        /// What.
+        /// Key of the scene.
         key: String,
-        /// Why.
+        /// Reason.
         reason: String,
     },
-    /// Something is wrong and the run goes on.
+    /// A problem that does not stop the run.
     Warning(String),
-    /// Something worth a line.
+    /// Information for the log.
     Message(String),
-    /// A stage is done.
+    /// A stage is finished.
     StageFinished {
-        /// Which stage.
+        /// The stage.
         stage: Stage,
-        /// Seconds of wall time since it started or resumed.
+        /// Seconds of wall time since the start or the resumption.
         elapsed_s: f64,
     },
 }
 
-/// Takes events as they happen. A sink never stops a run: one that fails reports that at its end.
+/// Receiver of events. A sink does not stop a run; a failing one reports the failure at the end.
 pub trait Sink {
-    /// Takes one event.
+    /// Receives one event.
     fn event(&mut self, event: &Event);
 }

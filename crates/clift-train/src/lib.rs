@@ -1,7 +1,30 @@
 //! The two-stage trainer: stage 1, cluster cache, stage 2, checkpoints and resume.
 //!
-//! [`Run`] is an experiment in its directory. The training loop is [`trainer::StagePlan::train`], the
-//! same for both stages; they differ in the batches they build.
+//! [`Run`] is an experiment in its directory. It trains both stages and evaluates; a second call resumes it.
+//!
+//! ```no_run
+//! use std::path::Path;
+//! use std::sync::atomic::AtomicBool;
+//!
+//! use clift_train::{Config, Event, Run, RunOptions, Sink, read_config};
+//!
+//! struct Print;
+//!
+//! impl Sink for Print {
+//!     fn event(&mut self, event: &Event) {
+//!         println!("{event:?}");
+//!     }
+//! }
+//!
+//! let overrides = ["stage1.steps=1000".to_owned()];
+//! let (config, _) = read_config::<Config>(Path::new("configs/tiny.toml"), &overrides)?;
+//! let run = Run::open(config, &RunOptions::default(), &mut Print)?;
+//! let summary = run.train(None, &AtomicBool::new(false), &mut Print)?;
+//! println!("{:?}", summary.map(|summary| summary.points));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! `examples/custom_loss.rs` makes single updates with [`TrainState`] and an own loss term.
 
 mod checkpoint;
 mod cluster_cache;
@@ -14,34 +37,43 @@ mod run;
 mod stage;
 mod step;
 
-pub use checkpoint::checkpoints::Checkpoints;
-pub use cluster_cache::cache::ClusterCache;
-pub use config::config::{CheckpointConfig, Config, OptimizerConfig, Stage1Config};
+// Configuration
+pub use config::config::{
+    CheckpointConfig, ClustersConfig, Config, LossConfig, OptimizerConfig, Stage1Config, Stage2Config,
+};
 pub use config::overrides::Override;
 pub use config::parse::{ConfigError, parse_config, read_checked_config, read_config};
+// A run, its events and errors
 pub use error::TrainError;
 pub use events::{Event, Sink, Stage, StepEvent};
-pub use footprint::largest_tensor::{LargestTensor, largest_tensor};
-pub use footprint::machine::available_bytes;
-pub use footprint::memory::{memory_warning, peak_bytes};
-pub use footprint::scene_sizes::{
-    PARTS, TypicalStep, batch_sizes, cluster_counts, eval_sizes, measures_lpips, num_tokens, possible_sizes, scene,
-    stored, trained_parts, typical_sizes,
-};
-pub use interchange::export::{ExportFormat, export};
-pub use interchange::import::import;
-pub use interchange::model_dir::require_absent;
-pub use interchange::record::{ImportOptions, ImportRecord};
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::{Run, RunOptions};
-pub use run::stage_plan::freeze;
 pub use stage::settings::StageSettings;
+// One update
+pub use run::stage_plan::freeze;
 pub use step::batch::{StageBatch, TokenSelection};
 pub use step::device_batch::{DeviceBatch, render_loss};
-pub use step::loss::{Loss, mse, psnr_of};
+pub use step::loss::{ImageLoss, Loss, LossParts, MeanSquared, mse, psnr_of_mse};
 pub use step::loss_scale::LossScale;
 pub use step::optimizer::{adamw, clip_global_norm, global_norm};
 pub use step::schedule::warm_up_cosine;
-pub use step::seeded_inputs::{Shape, seeded_batch, seeded_clip, seeded_clusters, seeded_model, seeded_uniform};
 pub use step::step_guard::StepAnomaly;
 pub use step::train_state::{TrainState, Update};
+// Results of the stages
+pub use checkpoint::checkpoints::Checkpoints;
+pub use checkpoint::progress::Progress;
+pub use cluster_cache::cache::ClusterCache;
+// Published checkpoints
+pub use interchange::export::{ExportFormat, Exported, export};
+pub use interchange::import::import;
+pub use interchange::model_dir::require_absent;
+pub use interchange::record::{ImportOptions, ImportRecord};
+// Memory and sizes of a run
+pub use footprint::largest_tensor::{LargestTensor, largest_tensor};
+pub use footprint::memory::{memory_warning, peak_bytes};
+pub use footprint::scene_sizes::{
+    PARTS, TypicalStep, cluster_counts, eval_sizes, measures_lpips, num_tokens, possible_sizes, scene_with_all_tokens,
+    scene_with_stored_tokens, typical_sizes,
+};
+// Seeded inputs for tests and benchmarks
+pub use step::seeded_inputs::{ClipShape, seeded_batch, seeded_clip, seeded_clusters, seeded_model, seeded_uniform};

@@ -126,7 +126,7 @@ mod tests {
         let stopped = |source| TrainError::Stopped { source, stage: "stage1", step: 3, checkpoint: "none".into() };
         assert_eq!(exit_code(&stopped(Box::new(bad_config().unwrap_err().into())).into()), USAGE);
         assert_eq!(exit_code(&TrainError::Interrupted { step: 3 }.into()), 130);
-        assert_eq!(exit_code(&TrainError::Abandoned { work: "`encode`".into() }.into()), 130);
+        assert_eq!(exit_code(&TrainError::Abandoned { task: "timing `encode`".into() }.into()), 130);
         assert_eq!(exit_code(&clift_data::DataError::NoSuchScene { scene: 1, num_scenes: 1 }.into()), FAILED);
         assert_eq!(exit_code(&anyhow::anyhow!("anything else")), FAILED);
     }

@@ -117,7 +117,7 @@ fn unfit_checkpoints_are_refused_and_leave_nothing() {
         place.clift(&format!("import {file} --variant {variant} --num-heads {heads} -o DIR/model"))
     };
     let message = import(&checkpoint("dl3dv"), "released-re10k", "7").fails(1);
-    for part in ["unknown: transformer.input_norm.weight [14]", "nothing was written", "--variant released-dl3dv"] {
+    for part in ["unknown: transformer.input_norm.weight [14]", "no files were written", "--variant released-dl3dv"] {
         assert!(message.contains(part), "{part}\nis not in\n{message}");
     }
     import(&checkpoint("re10k"), "released-re10k", "4").fails(2);

@@ -183,7 +183,7 @@ fn lpips_needs_its_weights() {
         .eval("run", &["--set", &format!("eval.lpips_weights={other:?}")])
         .fails_with(2, &["format clift-vgg19-1, expected", "convert_vgg.py lpips"]);
     let set = ["eval.lpips_weights=\"no/such/file\""];
-    place.train("new", &set, &[]).fails_with(2, &["`eval.lpips_weights` = no/such/file: there is no such file"]);
+    place.train("new", &set, &[]).fails_with(2, &["`eval.lpips_weights` = no/such/file: file not found"]);
 }
 
 #[test]

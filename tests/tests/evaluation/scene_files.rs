@@ -300,7 +300,7 @@ fn a_path_that_is_interrupted_leaves_nothing_behind() {
         std::thread::sleep(std::time::Duration::from_millis(2));
     }
     signal(&child, "-INT");
-    finish(child).fails_with(130, &["error: interrupted during frame ", "nothing was written"]);
+    finish(child).fails_with(130, &["error: interrupted while rendering frame ", "no output files were written"]);
     assert!(!place.at("out").exists());
 }
 

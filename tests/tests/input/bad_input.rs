@@ -241,7 +241,7 @@ fn truncated_weights_and_stale_caches_are_refused() {
         1,
         &[
             "stale cluster cache: its tokens are of encoder 0123456789ab, the run's is ",
-            "move it away to make a new one",
+            "remove the cache to build a new one",
         ],
     );
     assert!(!place.at("run/stage2").exists(), "nothing is trained on it");
@@ -272,7 +272,7 @@ fn damaged_checkpoints_are_errors_and_change_nothing() {
             let before = files(&run.join("stage1"));
             let message = place.train("run", &[], &["--only", "stage1"]).fails(1);
             assert!(message.contains(&run.join(newest).join(file).display().to_string()), "{file}: {message}");
-            let fix = "the newest checkpoint is damaged: move step-000000006 away to go on from step-000000004";
+            let fix = "the newest checkpoint is damaged: remove step-000000006 to resume from step-000000004";
             assert!(message.trim_end().ends_with(fix), "{file}: {message}");
             assert!(files(&run.join("stage1")) == before, "{file}: a checkpoint was changed");
             assert_eq!(place.metrics("run"), place.metrics("whole"), "{file}: a step was made or forgotten");
@@ -289,8 +289,8 @@ fn three_steps_without_finite_loss_stop_the_run() {
     place.train("run", &set, &[]).fails_with(
         1,
         &[
-            "step 2 left out: loss or gradient is not finite (scenes synthetic-0-train-",
-            "3 steps in a row were left out, up to step 4: loss or gradient is not finite",
+            "skipped step 2: loss or gradient is not finite (scenes synthetic-0-train-",
+            "skipped 3 consecutive steps, the last at step 4: loss or gradient is not finite",
             &place.at("run/stage1/checkpoints").display().to_string(),
         ],
     );

@@ -138,7 +138,7 @@ fn consecutive_spikes_stop_the_run() {
     let spikes = "stage1.optimizer={learning_rate=1e-3, warm_up_steps=2, spike_factor=1.01, max_bad_steps=3}";
     let set = ["stage1.steps=400", "eval.every=0", "checkpoint={every=5, keep=1}", spikes];
     let message = place.train("run", &set, &["--only", "stage1"]).fails(1);
-    assert!(message.contains("error: 3 steps in a row were left out, up to step "), "{message}");
+    assert!(message.contains("error: skipped 3 consecutive steps, the last at step "), "{message}");
     assert!(message.contains(" is a spike (scenes synthetic-0-train-"), "{message}");
     let step = *place.checkpoints("run", "stage1").last().expect("a checkpoint");
     let checkpoint = place.at(&format!("run/stage1/checkpoints/step-{step:09}"));

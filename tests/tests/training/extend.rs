@@ -9,7 +9,7 @@ fn extended_stages_follow_the_longer_schedule() {
     let former = place.bytes("run/stage2/model.safetensors");
     let before = files(&place.at("run"));
     let more = ["stage2.steps=8"];
-    place.train("run", &more, &[]).fails_with(2, &["  stage2.steps: 4 -> 8\n", "train on with --extend"]);
+    place.train("run", &more, &[]).fails_with(2, &["  stage2.steps: 4 -> 8\n", "continue with --extend"]);
     assert!(files(&place.at("run")) == before, "a refusal changes nothing");
 
     let ran = place.train("run", &more, &["--extend"]).ok();
@@ -66,7 +66,7 @@ fn what_cannot_go_on_is_refused() {
     let before = files(&place.at("run"));
     place
         .train("run", &["stage1.steps=9"], &["--extend"])
-        .fails_with(2, &["clusters/ was made with the encoder that stage 1 has now"]);
+        .fails_with(2, &["clusters/ depends on the present encoder of stage 1"]);
     place
         .train("run", &["stage2.steps=9", "seed=1"], &["--extend"])
         .fails_with(2, &["settings:\n  seed: 0 -> 1\nresume"]);
@@ -74,6 +74,6 @@ fn what_cannot_go_on_is_refused() {
     std::fs::remove_dir_all(place.at("run/stage2/checkpoints")).expect("removes");
     place
         .train("run", &["stage2.steps=9"], &["--extend"])
-        .fails_with(2, &["stage2/checkpoints, from which the stage would go on, is gone"]);
+        .fails_with(2, &["the stage has no checkpoint to resume from in stage2/checkpoints"]);
     assert!(place.at("run/stage2/model.safetensors").exists());
 }

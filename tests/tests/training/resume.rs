@@ -82,7 +82,7 @@ fn fresh_moves_the_former_run_aside() {
     place.train("run", &[], &["--fresh", "--only", "clusters"]).fails_with(2, &["--fresh"]);
     assert!(files(&place.at("run")) == before, "a later stage cannot be fresh: nothing is moved");
     let ran = place.train("run", &["stage1.steps=3"], &["--only", "stage1", "--fresh"]).ok();
-    assert!(ran.stderr.contains("moved the former run to "), "{}", ran.stderr);
+    assert!(ran.stderr.contains("renamed the existing run to "), "{}", ran.stderr);
     assert!(files(&place.at("run.1")).into_values().eq(before.into_values()), "every byte of it");
     assert_eq!(place.metrics("run").len(), 3);
     place.train("run", &[], &["--only", "stage1", "--fresh"]).ok();

@@ -87,7 +87,7 @@ fn second_processes_are_refused_while_the_first_lives() {
     let place = Place::new();
     let mut first = spawn(place.train_args("run", &LONG, &[]));
     wait_for_steps(&place.at("run"), &mut first, 5);
-    let holder = format!("process {} is working in this run directory", first.id());
+    let holder = format!(" is in use by process {}; wait until it exits", first.id());
     for flags in [&[][..], &["--fresh"], &["--only", "clusters"]] {
         let message = place.train("run", &LONG, flags).fails(1);
         assert!(message.contains(&holder) && message.trim_end().ends_with("/run"), "{message}");

@@ -1,4 +1,4 @@
-//! The row of latent K-means, on the seed's encoder or on features from a file.
+//! The row of latent K-means, on the tokens of the seeded encoder or on features of a file.
 // N tokens, D width
 
 use std::path::Path;
@@ -15,8 +15,8 @@ use crate::cases::task::BenchTask;
 /// Name of the tensor in a file of features.
 const FEATURES: &str = "features";
 
-/// Clusters the tokens of one scene, always from the same seed.
-pub struct Clustering {
+/// K-means of one scene's tokens, from the same seed in every repetition.
+pub struct KMeansCase {
     kmeans: KMeans,
     tokens: Tensor<3>,
     num_clusters: usize,
@@ -24,7 +24,7 @@ pub struct Clustering {
     fit: Option<KMeansFit>,
 }
 
-impl Clustering {
+impl KMeansCase {
     pub fn new(context: &BenchContext) -> Result<Self, TrainError> {
         let tokens = match &context.features {
             Some(path) => read_features(path, &context.device)?,
@@ -32,7 +32,7 @@ impl Clustering {
         };
         let num_clusters = context.stored_of(tokens.dims()[1])?;
         let kmeans = context.config.clusters.kmeans.clone();
-        Ok(Self { kmeans, tokens, num_clusters, seed: context.seed(), fit: None })
+        Ok(Self { kmeans, tokens, num_clusters, seed: context.config.seed, fit: None })
     }
 
     fn fit(&self, tokens: Tensor<3>) -> Result<KMeansFit, ModelError> {
@@ -40,7 +40,7 @@ impl Clustering {
     }
 }
 
-impl BenchTask for Clustering {
+impl BenchTask for KMeansCase {
     fn run(&mut self) -> Result<(), TrainError> {
         self.fit = Some(self.fit(self.tokens.clone())?);
         Ok(())
@@ -62,8 +62,8 @@ impl BenchTask for Clustering {
     }
 }
 
-/// Sum of squared distances of the tokens to the mean of their cluster, in f64: what scikit-learn calls
-/// `inertia_`. K-means itself tells the distances to the means of the iteration before, in the device's floats.
+/// Returns the sum of squared distances of the tokens to the mean of their cluster in f64: `inertia_` of scikit-learn.
+/// [`KMeansFit::inertia`] uses the means of the iteration before, in the device's floats.
 fn inertia(tokens: &Tensor<3>, fit: &KMeansFit) -> f64 {
     let dim = tokens.dims()[2];
     let tokens = values(tokens.clone());
@@ -82,7 +82,7 @@ fn inertia(tokens: &Tensor<3>, fit: &KMeansFit) -> f64 {
     distances.sum()
 }
 
-/// The tensor `features`, `[N, D]` in f32, of a safetensors file, as one scene.
+/// Reads the tensor `features`, `[N, D]` in f32, of a safetensors file as one scene, `[1, N, D]`.
 fn read_features(path: &Path, device: &Device) -> Result<Tensor<3>, TrainError> {
     let bad = |reason: String| TrainError::bad_file("features", path)(reason);
     let bytes = std::fs::read(path).map_err(TrainError::io("reading the features", path))?;
@@ -107,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_inertia_is_about_the_means_and_not_about_the_kept_samples() {
+    fn inertia_is_measured_from_cluster_means() {
         let tokens = Tensor::<3>::from_floats([[[0.0, 0.0], [2.0, 0.0], [10.0, 1.0], [10.0, 4.0]]], &Device::flex());
         let scene = SceneClusters::new(vec![0, 0, 1, 1], vec![0, 2]).expect("valid");
         let fit = KMeansFit { clusters: Clusters::new(vec![scene]).expect("one"), inertia: vec![0.0], iterations: 0 };
@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn features_are_read_and_files_without_them_refused() {
+    fn features_are_read_and_other_tensors_refused() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("features.safetensors");
         let write = |name: &str, shape: Vec<usize>| {

@@ -8,30 +8,34 @@ use burn::tensor::{Device, Tensor};
 use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
 use clift_eval::upload_views;
 use clift_model::{Clift, DeviceName, ModelConfig, SceneModel, TokenCount};
-use clift_train::{Config, Shape, Stage1Config, TrainError, seeded_clip, seeded_model};
+use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
 
 use crate::cases::options::{BenchOptions, MAX_CHECKED_TOKENS};
 
-/// The sizes and the device that all rows share.
+/// Sizes, device and inputs shared by all rows.
 pub struct BenchContext {
-    /// Sizes, seed and optimisers.
+    /// Config of the sizes, the seed and the optimizers.
     pub config: Config,
     /// Where tensors live, without autodiff.
     pub device: Device,
-    /// Whether the device works in this process's memory.
+    /// Whether tensors are in the memory of this process.
     pub is_cpu: bool,
     storage: TokenCount,
     render: Option<TokenCount>,
-    /// The file that K-means clusters.
+    /// File of features for K-means.
     pub features: Option<PathBuf>,
-    /// Tokens of one scene, made once.
+    /// Tokens of one scene, computed once.
     lift: OnceCell<Tensor<3>>,
 }
 
 impl BenchContext {
+    /// Checks the sizes and opens the device of a config. The scenes of the config are not opened.
+    ///
+    /// # Errors
+    /// [`TrainError::BadConfig`] for impossible sizes and counts, and those of the device.
     pub fn new(config: &Config, options: &BenchOptions) -> Result<Self, TrainError> {
         let mut config = config.clone();
-        // Pictures are made up, so that it does not matter where the config has its own, or whether they are there.
+        // The rows use seeded images: the data of the config need not exist.
         let DataConfig { width, height, .. } = config.data;
         let synthetic = SyntheticConfig { width, height, ..SyntheticConfig::default() };
         (config.data.source, config.data.synthetic) = (SourceKind::Synthetic, synthetic);
@@ -52,13 +56,13 @@ impl BenchContext {
         Ok(context)
     }
 
-    /// The same with other sizes.
+    /// Returns a context of another config on the same device.
     fn with(&self, config: Config) -> Self {
         let (device, is_cpu, storage) = (self.device.clone(), self.is_cpu, self.storage);
         Self { config, device, is_cpu, storage, render: None, features: None, lift: OnceCell::new() }
     }
 
-    /// The small network of `stage1_step_tiny`, whatever the config is: 256 tokens, 64 queries, batch 8.
+    /// Returns the small network of `stage1_step_tiny`: 256 tokens, 64 target patches, batch 8 for every config.
     pub fn tiny(&self) -> Self {
         let model = ModelConfig {
             dim: 128,
@@ -75,7 +79,7 @@ impl BenchContext {
         self.with(Config { seed, device, precision, data, model, stage1, ..Config::default() })
     }
 
-    /// The same network on at most [`MAX_CHECKED_TOKENS`] tokens: smaller pictures, then fewer scenes and views.
+    /// Returns the same network on at most [`MAX_CHECKED_TOKENS`] tokens: smaller images, then fewer scenes and views.
     pub fn reduced(&self) -> Result<Self, TrainError> {
         let mut config = self.config.clone();
         let patch = config.model.patch_size;
@@ -97,21 +101,18 @@ impl BenchContext {
         Ok(reduced)
     }
 
-    pub fn seed(&self) -> u64 {
-        self.config.seed
-    }
-
-    /// Tokens of one scene.
+    /// Returns the number of tokens of one scene.
     pub fn num_tokens(&self) -> Result<usize, TrainError> {
         let DataConfig { width, height, views, .. } = &self.config.data;
         Ok(self.config.model.num_tokens(views.min_context, *height, *width)?)
     }
 
+    /// Returns the number of stored tokens of one scene.
     pub fn num_storage_tokens(&self) -> Result<usize, TrainError> {
         self.stored_of(self.num_tokens()?)
     }
 
-    /// Tokens that a view is drawn from.
+    /// Returns the number of tokens from which a view is rendered.
     pub fn num_render_tokens(&self) -> Result<usize, TrainError> {
         let all = self.num_tokens()?;
         let Some(count) = self.render else { return Ok(all) };
@@ -119,30 +120,33 @@ impl BenchContext {
         count.of(all).map_err(|error| bad(error.to_string()))
     }
 
+    /// Returns the number of stored tokens of a scene with `num_tokens` tokens.
     pub fn stored_of(&self, num_tokens: usize) -> Result<usize, TrainError> {
         self.storage.of(num_tokens).map_err(|error| self.bad_storage(&error.to_string()))
     }
 
+    /// Makes the error of an impossible `--storage`.
     pub fn bad_storage(&self, fix: &str) -> TrainError {
         TrainError::BadConfig { key: "--storage".into(), value: self.storage.to_string(), fix: fix.into() }
     }
 
-    pub fn shape(&self) -> Shape {
+    /// Returns the numbers and the size of the views of a scene.
+    pub fn shape(&self) -> ClipShape {
         let DataConfig { width, height, views, .. } = &self.config.data;
-        Shape { num_context: views.min_context, num_targets: views.num_targets, size: [*height, *width] }
+        ClipShape { num_context: views.min_context, num_targets: views.num_targets, size: [*height, *width] }
     }
 
-    /// A scene with so many targets.
+    /// Makes a scene with `num_targets` target views.
     pub fn clip(&self, num_targets: usize) -> Clip {
-        seeded_clip(Shape { num_targets, ..self.shape() }, self.seed(), 0)
+        seeded_clip(ClipShape { num_targets, ..self.shape() }, self.config.seed, 0)
     }
 
-    /// A model to train, with the seed's weights.
+    /// Makes a model with seeded weights on the autodiff device.
     pub fn model(&self) -> Clift {
-        seeded_model(&self.config.model, self.seed(), &self.device)
+        seeded_model(&self.config.model, self.config.seed, &self.device)
     }
 
-    /// The seeded encoder's tokens of one scene.
+    /// Returns the tokens of one scene, `[1, N, D]`, computed by the seeded encoder.
     pub fn lift(&self) -> Result<Tensor<3>, TrainError> {
         if let Some(lift) = self.lift.get() {
             return Ok(lift.clone());
@@ -152,11 +156,12 @@ impl BenchContext {
         Ok(self.lift.get_or_init(|| lift).clone())
     }
 
-    /// Where the f64 reference runs: GPUs have no f64 that can be relied on.
+    /// Returns the device of the f64 reference: flex for a GPU, which has no reliable f64.
     pub fn reference(&self) -> Result<Device, TrainError> {
         if self.is_cpu { Ok(self.device.clone()) } else { Ok(DeviceName::Flex.open()?) }
     }
 
+    /// Waits for the queued work of the device.
     pub fn sync(&self) -> Result<(), TrainError> {
         self.device.sync().map_err(|error| TrainError::Device { reason: error.to_string() })
     }

@@ -12,13 +12,13 @@ use crate::cases::context::BenchContext;
 use crate::cases::reference::{ToF64, module_in_f64};
 use crate::cases::task::Forward;
 
-/// Context views to tokens.
-pub struct Encode {
+/// Encoder: context views to tokens.
+pub struct EncodeCase {
     encoder: Encoder,
     context: Views,
 }
 
-impl Encode {
+impl EncodeCase {
     pub fn new(context: &BenchContext) -> Result<Self, TrainError> {
         let clip = context.clip(1);
         let views = upload_views(&[&clip.context], &context.device)?;
@@ -26,7 +26,7 @@ impl Encode {
     }
 }
 
-impl Forward for Encode {
+impl Forward for EncodeCase {
     fn forward(&self) -> Tensor<1> {
         self.encoder.forward(&self.context).flatten(0, 2)
     }
@@ -36,25 +36,25 @@ impl Forward for Encode {
     }
 }
 
-/// Tokens and clusters to condensed tokens.
-pub struct Condense {
+/// Condenser: tokens and clusters to condensed tokens.
+pub struct CondenseCase {
     condenser: Condenser,
     lift: Tensor<3>,
     clusters: Clusters,
     index: ClusterIndex,
 }
 
-impl Condense {
+impl CondenseCase {
     pub fn new(context: &BenchContext) -> Result<Self, TrainError> {
         let lift = context.lift()?;
         let count = context.num_storage_tokens()?;
-        let clusters = Clusters::new(vec![seeded_clusters(lift.dims()[1], count, context.seed(), 0)?])?;
+        let clusters = Clusters::new(vec![seeded_clusters(lift.dims()[1], count, context.config.seed, 0)?])?;
         let index = clusters.upload(&context.device);
         Ok(Self { condenser: context.model().condenser.valid(), lift, clusters, index })
     }
 }
 
-impl Forward for Condense {
+impl Forward for CondenseCase {
     fn forward(&self) -> Tensor<1> {
         self.condenser.forward(self.lift.clone(), &self.index).flatten(0, 2)
     }
@@ -66,8 +66,8 @@ impl Forward for Condense {
     }
 }
 
-/// The attention of every centroid to its members, on projections drawn at random.
-pub struct ClusterAttend {
+/// Attention of every centroid to its members, on random projections.
+pub struct ClusterAttentionCase {
     query: Tensor<3>,
     key_value: Tensor<3>,
     segment: Vec<i64>,
@@ -75,22 +75,22 @@ pub struct ClusterAttend {
     num_heads: usize,
 }
 
-impl ClusterAttend {
+impl ClusterAttentionCase {
     pub fn new(context: &BenchContext) -> Result<Self, TrainError> {
         let (count, dim) = (context.num_storage_tokens()?, context.config.model.dim);
         let num_members = context.num_tokens()? - count;
         if num_members == 0 {
-            return Err(context.bad_storage("all tokens are stored, and none is left to attend to"));
+            return Err(context.bad_storage("all tokens are stored, which leaves no cluster members: store fewer"));
         }
         // Logits with a deviation of about one: sqrt(3) makes uniform values of unit variance.
-        let drawn = |rows: usize, columns: usize, purpose: &str| {
-            seeded_uniform([1, rows, columns], context.seed(), purpose, &context.device).mul_scalar(3.0_f64.sqrt())
+        let random = |rows: usize, columns: usize, purpose: &str| {
+            seeded_uniform([1, rows, columns], context.config.seed, purpose, &context.device).mul_scalar(3.0_f64.sqrt())
         };
-        let mut rng = step_rng(context.seed(), 0, "bench segments");
+        let mut rng = step_rng(context.config.seed, 0, "bench segments");
         let segment: Vec<i64> = (0..num_members).map(|_| uniform_below(&mut rng, count) as i64).collect();
         Ok(Self {
-            query: drawn(count, dim, "bench query"),
-            key_value: drawn(num_members, 2 * dim, "bench key and value"),
+            query: random(count, dim, "bench query"),
+            key_value: random(num_members, 2 * dim, "bench key and value"),
             segment_index: upload(&segment, &context.device),
             segment,
             num_heads: context.config.model.num_heads,
@@ -102,7 +102,7 @@ fn upload(segment: &[i64], device: &Device) -> Tensor<1, Int> {
     Tensor::from_data(TensorData::new(segment.to_vec(), [segment.len()]), device)
 }
 
-impl Forward for ClusterAttend {
+impl Forward for ClusterAttentionCase {
     fn forward(&self) -> Tensor<1> {
         let Self { query, key_value, segment_index, num_heads, .. } = self;
         cluster_attention(query.clone(), key_value.clone(), segment_index.clone(), *num_heads).flatten(0, 2)
@@ -119,14 +119,14 @@ impl Forward for ClusterAttend {
     }
 }
 
-/// The first tokens of a scene, as many as are asked for, and cameras to pictures.
-pub struct Render {
+/// Renderer: the first tokens of a scene and cameras to images.
+pub struct RenderCase {
     renderer: Renderer,
     lift: Tensor<3>,
     targets: Cameras,
 }
 
-impl Render {
+impl RenderCase {
     pub fn new(context: &BenchContext, num_views: usize) -> Result<Self, TrainError> {
         let [_, _, dim] = context.lift()?.dims();
         let lift = context.lift()?.slice([0..1, 0..context.num_render_tokens()?, 0..dim]);
@@ -135,7 +135,7 @@ impl Render {
     }
 }
 
-impl Forward for Render {
+impl Forward for RenderCase {
     fn forward(&self) -> Tensor<1> {
         self.renderer.forward(self.lift.clone(), &self.targets).flatten(0, 4)
     }

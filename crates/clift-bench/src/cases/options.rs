@@ -1,4 +1,4 @@
-//! Timing options.
+//! Options of a benchmark.
 
 use std::path::PathBuf;
 
@@ -6,26 +6,33 @@ use clift_model::TokenCount;
 
 use crate::cases::case::BenchCase;
 
-/// Most tokens, over all scenes of a batch, of the smaller update whose gradient is compared with f64.
-///
-/// At full size f64 would take twice the memory of the update that is timed, and a few times as long.
+/// Most tokens, over all scenes of a batch, of an update whose gradient is compared with f64. At full size the f64
+/// reference would take twice the memory of the timed update and several times as long.
 pub const MAX_CHECKED_TOKENS: usize = 1024;
 
-/// What is timed, and how.
+/// Cases to time and their sizes.
 #[derive(Clone, Debug)]
 pub struct BenchOptions {
-    /// The rows; [`BenchCase::ALL`] gives them their order.
-    pub work: Vec<BenchCase>,
-    /// Repetitions that count, at least 1.
+    /// The cases, in any order; they run in that of [`BenchCase::ALL`].
+    pub cases: Vec<BenchCase>,
+    /// Timed repetitions, at least 1.
     pub repeats: usize,
-    /// Repetitions before them that do not.
+    /// Warm-up repetitions.
     pub warmup: usize,
     /// Whether results are compared with f64.
     pub error: bool,
-    /// Tokens that are stored.
+    /// Stored tokens of a scene.
     pub storage: TokenCount,
-    /// Tokens that a view is drawn from; `None` for all of a scene.
+    /// Tokens from which a view is rendered; `None` for all of a scene.
     pub render: Option<TokenCount>,
-    /// A safetensors file whose tensor `features`, `[N, D]` in f32, K-means clusters.
+    /// Input of K-means: a safetensors file with the tensor `features`, `[N, D]` in f32; `None` for the encoder's tokens.
     pub features: Option<PathBuf>,
+}
+
+impl BenchOptions {
+    /// One timed repetition of each case, without warm-up and f64 check, with all tokens stored.
+    pub fn new(cases: Vec<BenchCase>) -> Self {
+        let storage = TokenCount::Share(1.0);
+        Self { cases, repeats: 1, warmup: 0, error: false, storage, render: None, features: None }
+    }
 }

@@ -1,12 +1,12 @@
-//! The same computation in f64: weights and inputs cast, and how far a result is from it.
+//! The same computation with weights and inputs in f64, and the error of a result against that reference.
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{DType, Device, Tensor};
 use clift_model::{Cameras, Views};
 
-/// Something of which the f64 reference makes a copy.
+/// Inputs that can be copied to f64.
 pub trait ToF64 {
-    /// The same values in f64 on the reference device.
+    /// Returns the same values in f64 on the reference device.
     #[must_use]
     fn in_f64(&self, reference: &Device) -> Self;
 }
@@ -29,7 +29,7 @@ impl ToF64 for Views {
     }
 }
 
-/// A module without autodiff, with every parameter in f64; parameters keep their ids and whether they train.
+/// Returns a module without autodiff, with every parameter in f64. Parameters keep their ids and gradient flags.
 pub fn module_in_f64<M: Module>(module: &M, reference: &Device) -> M {
     struct Cast<'a>(&'a Device);
     impl ModuleMapper for Cast<'_> {
@@ -40,20 +40,21 @@ pub fn module_in_f64<M: Module>(module: &M, reference: &Device) -> M {
     module.valid().map(&mut Cast(reference))
 }
 
-/// Largest difference over the largest absolute value of `reference`: 0 for two tensors of zeros, NaN or infinite
-/// where a value is not finite.
+/// Returns the largest difference over the largest absolute value of `reference`: 0 for two tensors of zeros, NaN or
+/// infinite if a value is not finite.
 pub fn relative_error<const D: usize>(result: Tensor<D>, reference: Tensor<D>) -> f64 {
     let (result, reference) = (values(result), values(reference));
     assert_eq!(result.len(), reference.len(), "a result and its reference");
-    let largest = |values: &mut dyn Iterator<Item = f64>| {
-        // `f64::max` would pass over NaN.
-        values.map(f64::abs).fold(0.0_f64, |most, value| if value > most || value.is_nan() { value } else { most })
-    };
-    let difference = largest(&mut result.iter().zip(&reference).map(|(a, b)| a - b));
-    if difference == 0.0 { 0.0 } else { difference / largest(&mut reference.iter().copied()) }
+    let difference = largest_magnitude(result.iter().zip(&reference).map(|(a, b)| a - b));
+    if difference == 0.0 { 0.0 } else { difference / largest_magnitude(reference.into_iter()) }
 }
 
-/// Values in f64, row-major.
+/// Returns the largest absolute value, NaN if one is NaN, which `f64::max` would ignore.
+pub fn largest_magnitude(values: impl Iterator<Item = f64>) -> f64 {
+    values.map(f64::abs).fold(0.0, |most, value| if value > most || value.is_nan() { value } else { most })
+}
+
+/// Reads the values of a tensor as f64, row-major.
 pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f64> {
     tensor.into_data().convert::<f64>().try_to_vec::<f64>().expect("f64 after conversion")
 }
@@ -65,7 +66,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_error_is_relative_to_the_largest_value_and_nan_does_not_pass() {
+    fn error_is_relative_to_largest_value_and_keeps_nan() {
         let error = |a: [f32; 3], b: [f32; 3]| {
             let device = Device::flex();
             relative_error(Tensor::<1>::from_floats(a, &device), Tensor::<1>::from_floats(b, &device))
@@ -77,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn a_module_in_f64_has_the_same_parameters() {
+    fn module_in_f64_has_the_same_parameters() {
         struct IsF64(usize);
         impl burn::module::ModuleVisitor for IsF64 {
             fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {

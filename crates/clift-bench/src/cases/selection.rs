@@ -1,4 +1,4 @@
-//! The row of token selection: work of the host, on whole tokens.
+//! The row of token selection, which runs on the host.
 
 use burn::tensor::Device;
 use clift_data::{DVec3, step_rng};
@@ -9,20 +9,20 @@ use rand::RngExt;
 use crate::cases::context::BenchContext;
 use crate::cases::task::BenchTask;
 
-/// Half of a scene's stored tokens for one view, by the paper's rules.
-pub struct Selection {
+/// Algorithm 1 of the paper: half of a scene's stored tokens for one view.
+pub struct SelectionCase {
     selector: Selector,
     camera: ViewCamera,
     size: [usize; 2],
     num_render_tokens: usize,
 }
 
-impl Selection {
+impl SelectionCase {
     pub fn new(context: &BenchContext) -> Result<Self, TrainError> {
         let count = context.num_storage_tokens()?;
         let clip = context.clip(1);
-        let mut rng = step_rng(context.seed(), 0, "bench rays");
-        // Through every picture, somewhere.
+        let mut rng = step_rng(context.config.seed, 0, "bench rays");
+        // A random pixel of every context view in turn.
         let rays: Vec<TokenRay> = (0..count)
             .map(|token| {
                 let pose = clip.context.c2w[token % clip.context.num_views()];
@@ -43,14 +43,14 @@ impl Selection {
     }
 }
 
-impl BenchTask for Selection {
+impl BenchTask for SelectionCase {
     fn run(&mut self) -> Result<(), TrainError> {
         let [height, width] = self.size;
         self.selector.select(&self.camera, height, width, self.num_render_tokens)?;
         Ok(())
     }
 
-    /// Ids have none; that they are the right ones is tested against brute force in f64.
+    /// Returns no error: token ids are integers. The tests of clift-model compare them with a brute-force search.
     fn error(self: Box<Self>, _reference: &Device) -> Result<Option<f64>, TrainError> {
         Ok(None)
     }

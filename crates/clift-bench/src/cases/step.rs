@@ -1,4 +1,4 @@
-//! The rows of whole optimiser updates, by the same [`TrainState`] that trains.
+//! The rows of whole optimizer updates, made by the [`TrainState`] of training.
 
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
@@ -10,37 +10,37 @@ use clift_train::{
 };
 
 use crate::cases::context::BenchContext;
-use crate::cases::reference::{ToF64, module_in_f64, relative_error, values};
+use crate::cases::reference::{ToF64, largest_magnitude, module_in_f64, values};
 use crate::cases::task::BenchTask;
 
 /// Updates of one batch: forward, loss, backward, clipping, `AdamW`.
-pub struct StepTask {
+pub struct StepCase {
     stage: Stage,
-    /// Taken while it makes a step, and gone after one that failed.
-    learner: Option<TrainState>,
+    /// `None` during a step and after one that failed.
+    state: Option<TrainState>,
     batch: StageBatch,
     accumulate: usize,
     rate: f64,
     max_grad_norm: f64,
-    /// What the error is taken of.
+    /// Sizes of the update that is compared with f64.
     reduced: BenchContext,
 }
 
-impl StepTask {
+impl StepCase {
     pub fn new(context: &BenchContext, stage: Stage) -> Result<Self, TrainError> {
         let StageSettings { steps, batch_size, accumulate, optimizer, .. } = context.config.stage(stage);
-        let learner = TrainState {
+        let state = TrainState {
             model: freeze(stage, context.model()),
             optimizer: adamw(optimizer),
             device: context.device.clone().autodiff(),
-            // The network of a perceptual term is not this project's: the rows are of the model alone.
+            // Without the VGG network of a perceptual term.
             loss: Loss::default(),
             activation_checkpointing: context.config.activation_checkpointing,
             loss_scale: LossScale::of(context.config.precision),
         };
         Ok(Self {
             stage,
-            learner: Some(learner),
+            state: Some(state),
             batch: stage_batch(context, stage, batch_size)?,
             accumulate,
             rate: warm_up_cosine(1, optimizer.learning_rate, optimizer.warm_up_steps, steps),
@@ -50,29 +50,29 @@ impl StepTask {
     }
 }
 
-/// What an update of a stage works off at once.
+/// Makes one micro-batch of a stage.
 pub(crate) fn micro_batch(context: &BenchContext, stage: Stage) -> Result<StageBatch, TrainError> {
     let StageSettings { batch_size, accumulate, .. } = context.config.stage(stage);
     stage_batch(context, stage, batch_size.div_ceil(accumulate))
 }
 
-/// A batch that keeps every token (stage 1) or the stored ones (stage 2).
+/// Makes a batch with all tokens (stage 1) or with stored tokens (stage 2).
 fn stage_batch(context: &BenchContext, stage: Stage, batch_size: usize) -> Result<StageBatch, TrainError> {
     let stored = if stage == Stage::Stage2 { Some(context.num_storage_tokens()?) } else { None };
-    seeded_batch(context.shape(), batch_size, context.num_tokens()?, stored, context.seed())
+    seeded_batch(context.shape(), batch_size, context.num_tokens()?, stored, context.config.seed)
 }
 
-impl BenchTask for StepTask {
+impl BenchTask for StepCase {
     fn run(&mut self) -> Result<(), TrainError> {
-        let learner = self.learner.take().expect("no step failed before");
-        let (mut learner, update) = learner.step(&self.batch, self.accumulate, self.rate.into(), self.max_grad_norm)?;
-        let is_overflow = learner.adapt_loss_scale(&update);
-        self.learner = Some(learner);
-        // An update that overflows takes as long as one that does not.
+        let state = self.state.take().expect("no step failed before");
+        let (mut state, update) = state.step(&self.batch, self.accumulate, self.rate.into(), self.max_grad_norm)?;
+        let is_overflow = state.adapt_loss_scale(&update);
+        self.state = Some(state);
+        // An update that overflows takes as long as another one.
         if update.applied || is_overflow {
             return Ok(());
         }
-        let (reason, keys, checkpoint) = (StepAnomaly::NotFinite.to_string(), "made up".into(), "none".into());
+        let (reason, keys, checkpoint) = (StepAnomaly::NotFinite.to_string(), "seeded".into(), "none".into());
         Err(TrainError::Diverged { count: 1, step: 1, reason, keys, checkpoint })
     }
 
@@ -81,11 +81,7 @@ impl BenchTask for StepTask {
         let batch_size = reduced.config.stage(stage).batch_size;
         let batch = stage_batch(&reduced, stage, batch_size)?;
         let model = freeze(stage, reduced.model());
-        let ours = gradients(&model, &batch, DeviceBatch::upload(&batch, &reduced.device.clone().autodiff())?)?;
-        let copy = module_in_f64(&model, reference).train();
-        let shown = DeviceBatch::upload(&batch, &reference.clone().autodiff())?.in_f64(&reference.clone().autodiff());
-        let theirs = gradients(&copy, &batch, shown)?;
-        Ok(Some(largest_error(&model, &ours, &theirs)))
+        Ok(Some(update_error(&model, &batch, &reduced.device, reference, 0.0)?))
     }
 }
 
@@ -94,48 +90,75 @@ impl ToF64 for DeviceBatch {
         Self {
             context: self.context.in_f64(reference),
             targets: self.targets.in_f64(reference),
-            pictures: self.pictures.in_f64(reference),
+            target_images: self.target_images.in_f64(reference),
         }
     }
 }
 
-/// Loss of a batch and the gradient of every parameter, times [`loss_factor`].
+/// Returns the loss of a batch and the gradient of every parameter, multiplied by [`loss_factor`].
 pub(crate) fn gradients(
     model: &Clift,
     batch: &StageBatch,
-    shown: DeviceBatch,
+    device_batch: DeviceBatch,
 ) -> Result<(f64, GradientsParams), TrainError> {
-    let loss = render_loss(model, &shown, &batch.tokens, &Loss::default())?.total;
+    let loss = render_loss(model, &device_batch, &batch.tokens, &Loss::default())?.total;
     let grads = GradientsParams::from_grads(loss.clone().mul_scalar(loss_factor()).backward(), model);
     Ok((values(loss.inner())[0], grads))
 }
 
-/// What training in this thread's precision starts to multiply its loss by. A power of two, which changes no relative
-/// error; the f64 reference has it too.
+/// Returns the initial loss scale of this thread's precision. The f64 reference uses the same factor, a power of two, which
+/// changes no relative error.
 pub(crate) fn loss_factor() -> f64 {
     LossScale::of(Precision::current()).map_or(1.0, |scale| scale.factor())
 }
 
-/// The largest relative error: of the loss, and of each parameter's gradient against its own largest entry.
-fn largest_error(model: &Clift, result: &(f64, GradientsParams), reference: &(f64, GradientsParams)) -> f64 {
-    struct Compare<'a> {
+/// Returns the largest relative error of an update's loss and gradients against the same update in f64.
+///
+/// The error of a gradient is relative to the largest entry of its parameter, or to `least_share` of the largest entry of
+/// all parameters if that is larger: a gradient that is zero in exact arithmetic, such as that of a query with one key,
+/// is rounding noise.
+///
+/// # Errors
+/// Those of the model and of the device.
+pub(crate) fn update_error(
+    model: &Clift,
+    batch: &StageBatch,
+    device: &Device,
+    reference: &Device,
+    least_share: f64,
+) -> Result<f64, TrainError> {
+    struct Pairs<'a> {
         result: &'a GradientsParams,
         reference: &'a GradientsParams,
-        errors: Vec<f64>,
+        /// Largest difference and largest entry of every parameter.
+        found: Vec<(f64, f64)>,
     }
-    impl ModuleVisitor for Compare<'_> {
+    impl ModuleVisitor for Pairs<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             match (self.result.get::<D>(param.id), self.reference.get::<D>(param.id)) {
-                (Some(result), Some(reference)) => self.errors.push(relative_error(result, reference)),
+                (Some(result), Some(reference)) => {
+                    let (result, reference) = (values(result), values(reference));
+                    let difference = largest_magnitude(result.iter().zip(&reference).map(|(a, b)| a - b));
+                    self.found.push((difference, largest_magnitude(reference.into_iter())));
+                }
                 (None, None) => {}
-                // A gradient that only one of them has is wrong altogether.
-                (Some(_), None) | (None, Some(_)) => self.errors.push(f64::INFINITY),
+                // Only one side has a gradient.
+                (Some(_), None) | (None, Some(_)) => self.found.push((f64::INFINITY, 1.0)),
             }
         }
     }
-    let ((loss, result), (expected, reference)) = (result, reference);
-    let mut compare = Compare { result, reference, errors: vec![(loss - expected).abs() / expected.abs()] };
-    model.visit(&mut compare);
-    // `f64::max` would pass over NaN.
-    compare.errors.into_iter().fold(0.0, |most, error| if error > most || error.is_nan() { error } else { most })
+    let (loss, result) = gradients(model, batch, DeviceBatch::upload(batch, &device.clone().autodiff())?)?;
+    let copy = module_in_f64(model, reference).train();
+    let reference = reference.clone().autodiff();
+    let device_batch = DeviceBatch::upload(batch, &reference)?.in_f64(&reference);
+    let (expected, reference) = gradients(&copy, batch, device_batch)?;
+    let mut pairs = Pairs { result: &result, reference: &reference, found: Vec::new() };
+    model.visit(&mut pairs);
+    let least = least_share * largest_magnitude(pairs.found.iter().map(|(_, entry)| *entry));
+    let loss_error = (loss - expected).abs() / expected.abs().max(f64::MIN_POSITIVE);
+    let errors = pairs.found.iter().map(|(difference, entry)| match difference {
+        0.0 => 0.0,
+        difference => difference / entry.max(least),
+    });
+    Ok(largest_magnitude(errors.chain([loss_error])))
 }

@@ -1,37 +1,36 @@
-//! One row's work, ready to be repeated.
+//! The computation of a row, ready to be repeated.
 
 use burn::tensor::{Device, Tensor};
 use clift_train::TrainError;
 
 use crate::cases::reference::relative_error;
 
-/// One row's work with everything it needs.
+/// A computation with its networks and inputs.
 pub trait BenchTask {
-    /// Does the work once; what is queued on the device may go on.
+    /// Runs the computation once. Work queued on the device may still run afterwards.
     fn run(&mut self) -> Result<(), TrainError>;
 
-    /// Largest relative error against the same computation in f64 on the reference device, where the result is
-    /// numbers. Takes the task, so
-    /// that what only the timing needs is gone by then.
+    /// Returns the largest relative error against the same computation in f64 on the reference device; `None` for a
+    /// result that is not numeric. Consumes the task to free the tensors that only the timing needs.
     fn error(self: Box<Self>, reference: &Device) -> Result<Option<f64>, TrainError>;
 
-    /// By what the seconds of a repetition are divided.
+    /// Returns the divisor of the seconds of a repetition.
     fn num_views(&self) -> usize {
         1
     }
 
-    /// Sum of squared distances to the cluster means, of a clustering that has run.
+    /// Returns the sum of squared distances to the cluster means of a finished clustering.
     fn inertia(&self) -> Option<f64> {
         None
     }
 }
 
-/// A computation without gradient whose result is compared as it is.
+/// A computation without gradient, with a numeric result.
 pub trait Forward {
-    /// Computes the result as one row of numbers.
+    /// Computes the result, flattened.
     fn forward(&self) -> Tensor<1>;
 
-    /// The same computation on the same values in f64.
+    /// Returns the same computation on the same values in f64.
     #[must_use]
     fn in_f64(&self, reference: &Device) -> Self;
 

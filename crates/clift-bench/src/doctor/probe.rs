@@ -11,31 +11,31 @@ use clift_eval::{upload_cameras, upload_images, upload_views};
 use clift_model::{Clift, Clusters, DeviceName, KMeans, ModelConfig, Precision, SceneClusters};
 use clift_train::mse;
 
-/// What a device that works can do.
+/// Capabilities of a working device.
 #[derive(Clone, Debug)]
 pub struct DeviceCheck {
-    /// What the device calls itself.
+    /// Name of the adapter.
     pub adapter: String,
-    /// Floats it has.
+    /// Supported floating-point types.
     pub dtypes: Vec<&'static str>,
-    /// What the model gives on it.
+    /// Loss and gradient of the small model.
     pub gradient: Gradient,
-    /// Seconds of the second pass: the first compiles kernels.
+    /// Seconds of the second pass; the first one compiles kernels.
     pub seconds: f64,
 }
 
-/// The gradient of all weights of the small model.
+/// Loss of the small model and gradient of all weights.
 #[derive(Clone, Debug)]
 pub struct Gradient {
     /// The loss.
     pub loss: f64,
-    /// One number per weight.
+    /// One value per weight.
     pub values: Vec<f64>,
 }
 
 impl Gradient {
-    /// Largest difference, of loss or gradient, over the largest entry of `reference`; NaN for another number of
-    /// weights.
+    /// Returns the larger of two relative differences: of the loss, and of the gradient over its largest entry. NaN if the
+    /// number of weights differs.
     pub fn difference(&self, reference: &Self) -> f64 {
         if self.values.len() != reference.values.len() {
             return f64::NAN;
@@ -48,9 +48,12 @@ impl Gradient {
     }
 }
 
-/// Opens a device and trains a small model on it for one step; a panic becomes its message.
+/// Opens a device and computes one forward and backward pass of a small model.
+///
+/// # Errors
+/// The message of the error or of the panic.
 pub fn probe(name: DeviceName, precision: Precision) -> Result<DeviceCheck, String> {
-    caught(|| probe_device(name, precision)).unwrap_or_else(|panic| Err(format!("panicked: {panic}")))
+    catch_panic(|| probe_device(name, precision)).unwrap_or_else(|panic| Err(format!("panicked: {panic}")))
 }
 
 fn probe_device(name: DeviceName, precision: Precision) -> Result<DeviceCheck, String> {
@@ -79,7 +82,7 @@ fn adapter(_name: DeviceName, _device: &Device) -> String {
     "CPU".into()
 }
 
-/// Encodes, clusters, condenses and renders one synthetic clip, and goes back through all three networks.
+/// Encodes, clusters, condenses and renders one synthetic clip, and computes the gradient of all three networks.
 fn gradient(device: &Device) -> anyhow::Result<Gradient> {
     let clip = clip()?;
     let device = device.clone().autodiff();
@@ -94,7 +97,7 @@ fn gradient(device: &Device) -> anyhow::Result<Gradient> {
     let model = Clift::new(&config, 0, &device);
     let lift = model.encoder.forward(&upload_views(&[&clip.context], &device)?);
     let num_tokens = lift.dims()[1];
-    // K-means must run, but not decide: which token is nearest may hang on the last bit of a distance.
+    // The result of K-means is not used: the nearest token may depend on the last bit of a distance.
     let num_clusters = num_tokens / 4;
     KMeans::default().fit(lift.clone().inner(), num_clusters, &[0])?;
     let assignment = (0..num_tokens).map(|token| (token % num_clusters) as u32).collect();
@@ -117,7 +120,6 @@ struct Collect<'a> {
 impl ModuleVisitor for Collect<'_> {
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
         if let Some(grad) = param.val().grad(self.grads) {
-            // Without values the count differs from the reference's, which is reported.
             self.values.extend(grad.into_data().convert::<f64>().try_to_vec::<f64>().unwrap_or_default());
         }
     }
@@ -133,19 +135,21 @@ fn clip() -> anyhow::Result<Clip> {
 
 type Hook = Box<dyn Fn(&PanicHookInfo<'_>) + Sync + Send>;
 
-/// Runs `work`; a panic in it, or the first one of a thread it waits for, is returned as one line and not printed.
-pub fn caught<T>(work: impl FnOnce() -> T) -> Result<T, String> {
-    // The hook is one for the whole process.
+/// Runs `work` without printing panics.
+///
+/// # Errors
+/// The first line of the first panic, in `work` or in a thread of it.
+pub fn catch_panic<T>(work: impl FnOnce() -> T) -> Result<T, String> {
+    // A process has one panic hook.
     static HOOK: Mutex<()> = Mutex::new(());
-    let _only_one = HOOK.lock().unwrap_or_else(PoisonError::into_inner);
+    let _guard = HOOK.lock().unwrap_or_else(PoisonError::into_inner);
     let message = Arc::new(Mutex::new(None));
-    let noted = Arc::clone(&message);
+    let first = Arc::clone(&message);
     let former: Hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
         let text = info.payload_as_str().unwrap_or("no message").lines().next().unwrap_or_default().to_owned();
-        noted.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(text);
+        first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(text);
     }));
-    // What `work` leaves half done is dropped with it.
     let result = catch_unwind(AssertUnwindSafe(work));
     std::panic::set_hook(former);
     let message = message.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -157,13 +161,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_panic_becomes_its_first_line_and_the_next_work_goes_on() {
-        assert_eq!(caught(|| -> u8 { panic!("no adapter\nin sight") }), Err("no adapter".into()));
-        assert_eq!(caught(|| 3), Ok(3));
+    fn panic_is_returned_as_its_first_line() {
+        assert_eq!(catch_panic(|| -> u8 { panic!("no adapter\nin sight") }), Err("no adapter".into()));
+        assert_eq!(catch_panic(|| 3), Ok(3));
     }
 
     #[test]
-    fn the_difference_is_relative_to_the_largest_entry_and_counts_the_loss() {
+    fn difference_is_relative_and_includes_the_loss() {
         let gradient = |loss, values: &[f64]| Gradient { loss, values: values.to_vec() };
         let reference = gradient(2.0, &[4.0, 0.0]);
         assert_eq!(gradient(2.0, &[4.0, 1.0]).difference(&reference), 0.25);

@@ -1,25 +1,26 @@
 //! `clift plan`: parameters, memory and time of a run before it starts.
 //!
-//! Parameters and multiplications are counted. Memory is counted from what the hand-written operations keep. Seconds
-//! come from a shallow network, timed on the device, and the multiplications of the whole one.
+//! Parameters and multiply-accumulates are counted; memory is counted from the tensors that the operations store for the
+//! backward. Seconds are those of a shallow network, timed on the device and scaled to the multiply-accumulates of the whole.
 //! `docs/results/performance.md` compares plans with measured runs.
 
 use clift_data::SourceKind;
+use clift_eval::available_bytes;
 use clift_model::{DeviceName, ModelConfig, Parameters, Part, SceneSizes};
 use clift_train::{
-    Config, Stage, TrainError, available_bytes, batch_sizes, cluster_counts, eval_sizes, num_tokens, peak_bytes,
-    possible_sizes, scene, stored, trained_parts, typical_sizes,
+    Config, Stage, StageSettings, TrainError, cluster_counts, eval_sizes, num_tokens, peak_bytes, possible_sizes,
+    scene_with_all_tokens, scene_with_stored_tokens, typical_sizes,
 };
 use serde::Serialize;
 
 use crate::plan::calibration::{
-    InferenceRates, InferenceTimed, inference_rates, loading_s, macs_of, update_macs, update_rates,
+    InferenceRates, InferenceTimed, inference_rates, loading_s, part_macs, update_macs, update_rates,
 };
 
-/// What a run is going to take.
+/// Estimate of a run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Plan {
-    /// Where tensors are.
+    /// Device of the tensors.
     pub device: DeviceName,
     /// Threads of the CPU devices.
     pub threads: usize,
@@ -27,50 +28,50 @@ pub struct Plan {
     pub parameters: Parameters,
     /// Tokens of a training scene, fewest and most.
     pub num_tokens: [usize; 2],
-    /// Memory that the device has to give; `None` where the system does not tell.
+    /// Free memory of the device; `None` if the system does not report it.
     pub available_bytes: Option<u64>,
     /// Both stages, the cluster cache and the evaluation, in the order they run.
     pub parts: Vec<PartPlan>,
 }
 
-/// What one part of a run takes.
+/// Estimate of one part of a run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PartPlan {
     /// `stage1`, `clusters`, `stage2` or `eval`.
     pub part: &'static str,
-    /// What is counted: optimiser updates or scenes.
+    /// Counted unit: `step` or `scene_with_all_tokens`.
     pub unit: &'static str,
-    /// How many; `None` where only the data tells.
+    /// Number of units; `None` if it depends on the data.
     pub count: Option<u64>,
-    /// Parameters it trains.
+    /// Number of trained parameters.
     pub trained_parameters: u64,
-    /// Multiplications of one, on average, in units of 1e9; without K-means.
+    /// Mean multiply-accumulates of a unit in units of 1e9, without K-means.
     pub gmacs: f64,
-    /// Most memory of the process.
+    /// Peak memory of the process.
     pub peak_bytes: u64,
-    /// Seconds of one on the device, on average; `None` where it was not asked for.
+    /// Mean seconds of a unit on the device; `None` without timing.
     pub compute_s: Option<f64>,
-    /// Threads of this process at work meanwhile, on average; of updates alone.
+    /// Mean number of busy threads of this process during an update.
     pub busy_threads: Option<f64>,
-    /// Seconds of one on one thread that reads and decodes; `None` where it was not asked for or the data is not there.
+    /// Seconds that one thread takes to read and decode a unit; `None` without timing or without data.
     pub loading_s: Option<f64>,
-    /// Seconds from one to the next: both, as far as they do not overlap.
+    /// Seconds between two units: computation and loading as far as they do not overlap.
     pub seconds: Option<f64>,
 }
 
 impl PartPlan {
-    /// Seconds of all of them.
+    /// Returns the seconds of all units.
     pub fn total_s(&self) -> Option<f64> {
         Some(self.seconds? * self.count? as f64)
     }
 }
 
-/// Counts what a run of `config` takes; `is_timed` runs a short calibration on its device as well.
+/// Estimates a run of `config`; with `is_timed` after a short calibration on its device.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for values that cannot be, and what the device gives.
+/// [`TrainError::BadConfig`] for impossible values, and those of the device.
 pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
-    check(config)?;
+    check_plan(config)?;
     let parameters = Parameters::of(&config.model);
     let views = &config.data.views;
     let mut plan = Plan {
@@ -87,19 +88,20 @@ pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
     plan.parts.push(evaluation(config, is_timed)?);
     let per_view_s = if is_timed { loading_s(config) } else { None };
     for part in &mut plan.parts {
-        let (num_views, num_threads) = read_for(config, part.part);
+        let (num_views, num_threads) = views_and_threads(config, part.part);
         part.loading_s = per_view_s.map(|seconds| seconds * num_views);
         part.seconds = part.compute_s.map(|compute| {
             let is_cpu = matches!(config.device, DeviceName::Flex | DeviceName::Ndarray);
-            let idle = part.busy_threads.filter(|_| is_cpu).map(|busy| Idle { cores: plan.threads as f64, busy });
-            from_one_to_the_next(compute, part.loading_s.unwrap_or(0.0), num_threads, idle)
+            let shared =
+                part.busy_threads.filter(|_| is_cpu).map(|busy| SharedCores { cores: plan.threads as f64, busy });
+            seconds_per_unit(compute, part.loading_s.unwrap_or(0.0), num_threads, shared)
         });
     }
     Ok(plan)
 }
 
-/// Views that one step or scene of a part reads, on average, and the threads that read them beside the work.
-fn read_for(config: &Config, part: &str) -> (f64, usize) {
+/// Returns the mean number of views that a unit of a part reads, and the number of threads that read ahead.
+fn views_and_threads(config: &Config, part: &str) -> (f64, usize) {
     let views = &config.data.views;
     let contexts = f64::midpoint(views.min_context as f64, views.max_context as f64);
     let batch = |batch_size: usize| batch_size as f64 * (contexts + views.num_targets as f64);
@@ -111,49 +113,47 @@ fn read_for(config: &Config, part: &str) -> (f64, usize) {
     }
 }
 
-/// Cores that a CPU device shares with the threads that load ahead.
+/// Cores that a CPU device shares with the loading threads.
 #[derive(Clone, Copy, Debug)]
-struct Idle {
+struct SharedCores {
     cores: f64,
-    /// Those that the work itself keeps busy.
+    /// Cores that the computation keeps busy.
     busy: f64,
 }
 
-/// Seconds between two steps of which each takes `compute_s` on the device and `loading_s` on one of `num_threads`
-/// threads that load ahead, on cores that the work leaves idle where they are `shared`.
-fn from_one_to_the_next(compute_s: f64, loading_s: f64, num_threads: usize, shared: Option<Idle>) -> f64 {
+/// Returns the seconds between two units that each take `compute_s` on the device and `loading_s` on one of `num_threads`
+/// loading threads, which use the idle cores of `shared`.
+fn seconds_per_unit(compute_s: f64, loading_s: f64, num_threads: usize, shared: Option<SharedCores>) -> f64 {
     if num_threads == 0 {
         return compute_s + loading_s;
     }
-    let added_s = shared.map_or(0.0, |Idle { cores, busy }| {
+    let added_s = shared.map_or(0.0, |SharedCores { cores, busy }| {
         let fits_s = (cores - busy).max(0.0) * compute_s;
         (loading_s - fits_s).max(0.0) / cores
     });
     (compute_s + added_s).max(loading_s / num_threads as f64)
 }
 
-/// What [`Config::validate`] asks, but for where the data is: a plan needs none.
+/// Does [`Config::validate`] without requiring `data.root`.
 ///
 /// # Errors
 /// As [`Config::validate`].
-pub fn check(config: &Config) -> Result<(), TrainError> {
+pub fn check_plan(config: &Config) -> Result<(), TrainError> {
     let mut config = config.clone();
     config.data.root.get_or_insert_with(Default::default);
     config.validate()
 }
 
 fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool) -> Result<PartPlan, TrainError> {
-    let (batch_size, _) = batch_sizes(config, stage);
-    let steps = if stage == Stage::Stage2 { config.stage2.steps } else { config.stage1.steps };
+    let StageSettings { steps, batch_size, trained, .. } = config.stage(stage);
     let all = possible_sizes(config, stage)?;
     let macs_of_scene = all.iter().map(|scene| update_macs(config, stage, scene)).sum::<f64>() / all.len() as f64;
     let macs = batch_size as f64 * macs_of_scene;
-    let trained_parameters = parameters.of_parts(trained_parts(stage));
+    let trained_parameters = parameters.of_parts(trained);
     let rates = is_timed.then(|| update_rates(config, stage, &typical_sizes(config, stage)?)).transpose()?;
     let images = (batch_size * config.data.views.num_targets) as f64;
-    let compute_s = rates.map(|rates| {
-        macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_picture
-    });
+    let compute_s = rates
+        .map(|rates| macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_image);
     let part = PartPlan { trained_parameters, ..untimed(config, stage, macs)? };
     Ok(PartPlan { unit: "step", count: Some(steps), compute_s, busy_threads: rates.map(|rates| rates.busy), ..part })
 }
@@ -163,12 +163,13 @@ fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let num_context = usize::midpoint(views.min_context, views.max_context);
     let mut macs = 0.0;
     for num_context in views.min_context..=views.max_context {
-        macs += macs_of(&config.model, Part::Encoder, &scene(config, num_context, 0)?);
+        macs += part_macs(&config.model, Part::Encoder, &scene_with_all_tokens(config, num_context, 0)?);
     }
     macs /= (views.max_context - views.min_context + 1) as f64;
     let compute_s = if is_timed {
         let counts = cluster_counts(config, num_tokens(config, num_context)?)?;
-        let timed = InferenceTimed { num_context, num_targets: 1, counts: &probed(&counts), is_measured: false };
+        let timed =
+            InferenceTimed { num_context, num_targets: 1, counts: &timed_counts(&counts), with_evaluation: false };
         let rates = inference_rates(config, &timed)?;
         let kmeans = counts.iter().map(|&count| kmeans_s(&rates, count)).sum::<f64>() / counts.len() as f64;
         Some(macs * rates.encode_per_mac + kmeans)
@@ -188,32 +189,31 @@ fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
 fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     let eval = &config.eval;
     let num_targets = eval.num_targets;
-    let scene = scene(config, eval.num_context, num_targets)?;
+    let scene = scene_with_all_tokens(config, eval.num_context, num_targets)?;
     let counts = eval.storage.iter().map(|count| count.of(scene.num_tokens)).collect::<Result<Vec<_>, _>>()?;
     let sweep = eval_sizes(config);
-    // Multiplications of the encoder, and of all that is done with its tokens.
+    // Multiply-accumulates of the encoder, and of all that reads its tokens.
     let encode_and_rest = |model: &ModelConfig| {
         let mut rest = 0.0;
         for &count in &counts {
-            let scene = stored(scene, count);
+            let scene = scene_with_stored_tokens(scene, count);
             let rendered = sweep
                 .token_counts(count)
                 .into_iter()
-                .map(|num_render_tokens| macs_of(model, Part::Renderer, &SceneSizes { num_render_tokens, ..scene }));
-            rest += macs_of(model, Part::Condenser, &scene) + rendered.sum::<f64>();
+                .map(|num_render_tokens| part_macs(model, Part::Renderer, &SceneSizes { num_render_tokens, ..scene }));
+            rest += part_macs(model, Part::Condenser, &scene) + rendered.sum::<f64>();
         }
-        (macs_of(model, Part::Encoder, &scene), rest)
+        (part_macs(model, Part::Encoder, &scene), rest)
     };
     let (encoder, rest) = encode_and_rest(&config.model);
     let compute_s = if is_timed {
-        let timed = InferenceTimed { num_context: eval.num_context, num_targets, counts: &[], is_measured: true };
+        let timed = InferenceTimed { num_context: eval.num_context, num_targets, counts: &[], with_evaluation: true };
         let rates = inference_rates(config, &timed)?;
-        // What the timed network lacks of the whole one.
-        let (of_encoder, of_rest) = encode_and_rest(&rates.timed);
+        let (timed_encoder, timed_rest) = encode_and_rest(&rates.timed);
         Some(
-            rates.measuring_s
-                + (encoder - of_encoder).max(0.0) * rates.encode_per_mac
-                + (rest - of_rest).max(0.0) * rates.render_per_mac,
+            rates.evaluation_s
+                + (encoder - timed_encoder).max(0.0) * rates.encode_per_mac
+                + (rest - timed_rest).max(0.0) * rates.render_per_mac,
         )
     } else {
         None
@@ -222,7 +222,7 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     Ok(PartPlan { count, compute_s, ..untimed(config, Stage::Eval, encoder + rest)? })
 }
 
-/// What is counted of a part that works off scenes and trains nothing.
+/// Returns the counted values of a part that trains no parameters.
 fn untimed(config: &Config, part: Stage, macs: f64) -> Result<PartPlan, TrainError> {
     Ok(PartPlan {
         part: part.name(),
@@ -238,15 +238,15 @@ fn untimed(config: &Config, part: Stage, macs: f64) -> Result<PartPlan, TrainErr
     })
 }
 
-/// The smallest, the middle and the largest of some rising counts.
-fn probed(counts: &[usize]) -> Vec<usize> {
+/// Returns the smallest, the middle and the largest of ascending counts.
+fn timed_counts(counts: &[usize]) -> Vec<usize> {
     let Some(last) = counts.len().checked_sub(1) else { return Vec::new() };
     let mut probed = vec![counts[0], counts[last / 2], counts[last]];
     probed.dedup();
     probed
 }
 
-/// Seconds of K-means at a count, on the line between those that were timed.
+/// Interpolates the seconds of K-means between the timed counts.
 fn kmeans_s(rates: &InferenceRates, count: usize) -> f64 {
     let timed = &rates.kmeans;
     let Some(above) = timed.iter().position(|(probed, _)| *probed >= count) else {
@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plan_has_every_part_and_needs_no_data_and_no_time() {
+    fn untimed_plan_has_all_parts_without_data() {
         let mut config = config();
         config.data.source = SourceKind::Chunks;
         let plan = plan(&config, false).expect("valid");
@@ -286,33 +286,33 @@ mod tests {
     }
 
     #[test]
-    fn the_seconds_of_clustering_lie_on_a_line() {
+    fn kmeans_seconds_are_interpolated() {
         let rates = InferenceRates {
             encode_per_mac: 0.0,
             render_per_mac: 0.0,
             kmeans: vec![(10, 1.0), (20, 2.0)],
-            measuring_s: 0.0,
+            evaluation_s: 0.0,
             timed: ModelConfig::default(),
         };
         let seconds = [5, 10, 15, 20, 30].map(|count| kmeans_s(&rates, count));
         assert_eq!(seconds, [1.0, 1.0, 1.5, 2.0, 2.0]);
-        assert_eq!(probed(&[1, 2, 3, 4, 5]), [1, 3, 5]);
-        assert_eq!(probed(&[7]), [7]);
+        assert_eq!(timed_counts(&[1, 2, 3, 4, 5]), [1, 3, 5]);
+        assert_eq!(timed_counts(&[7]), [7]);
     }
 
     #[test]
-    fn loading_is_hidden_behind_the_work_as_far_as_threads_and_cores_allow() {
-        let busy = |busy| Some(Idle { cores: 2.0, busy });
-        assert_eq!(from_one_to_the_next(1.0, 0.5, 0, busy(2.0)), 1.5);
-        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, busy(2.0)), 1.25);
-        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, busy(1.75)), 1.125);
-        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, busy(1.0)), 1.0);
-        assert_eq!(from_one_to_the_next(1.0, 0.5, 1, None), 1.0);
-        assert_eq!(from_one_to_the_next(1.0, 9.0, 3, None), 3.0);
+    fn loading_overlaps_as_far_as_cores_allow() {
+        let busy = |busy| Some(SharedCores { cores: 2.0, busy });
+        assert_eq!(seconds_per_unit(1.0, 0.5, 0, busy(2.0)), 1.5);
+        assert_eq!(seconds_per_unit(1.0, 0.5, 1, busy(2.0)), 1.25);
+        assert_eq!(seconds_per_unit(1.0, 0.5, 1, busy(1.75)), 1.125);
+        assert_eq!(seconds_per_unit(1.0, 0.5, 1, busy(1.0)), 1.0);
+        assert_eq!(seconds_per_unit(1.0, 0.5, 1, None), 1.0);
+        assert_eq!(seconds_per_unit(1.0, 9.0, 3, None), 3.0);
     }
 
     #[test]
-    fn small_runs_are_timed_on_every_cpu_device() {
+    fn small_runs_are_timed_on_cpu_devices() {
         let mut config = config();
         (config.data.width, config.data.height) = (16, 16);
         (config.model.dim, config.model.num_heads, config.model.feed_forward_dim) = (16, 2, 24);
@@ -321,7 +321,7 @@ mod tests {
         for device in [DeviceName::Flex, DeviceName::Ndarray] {
             let plan = plan(&Config { device, ..config.clone() }, true).expect("runs");
             for part in plan.parts {
-                let seconds = part.seconds.expect("asked for");
+                let seconds = part.seconds.expect("timed");
                 assert!(seconds > 0.0 && seconds < 60.0, "{device} {}: {seconds}", part.part);
             }
         }

@@ -2,6 +2,8 @@
 
 use crate::system::machine::proc_field;
 
+use clift_model::DeviceName;
+
 /// Resets the peak to the current resident memory. Returns `None` where the system has no resettable peak.
 pub fn start_peak() -> Option<()> {
     release_free_memory();
@@ -25,8 +27,35 @@ fn release_free_memory() {
 
 /// Returns the peak of the resident memory since [`start_peak`], in bytes.
 pub fn peak_bytes() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    Some(proc_field(&status, "VmHWM")?.strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024)
+    field_bytes(Path::new("/proc/self/status"), "VmHWM:")
+}
+
+/// Returns the free memory of a CPU device: that of the system or of the process's control group, whichever is less.
+/// `None` for a GPU and on systems that do not report it.
+pub fn available_bytes(device: DeviceName) -> Option<u64> {
+    if !matches!(device, DeviceName::Flex | DeviceName::Ndarray) {
+        return None;
+    }
+    let system = field_bytes(Path::new("/proc/meminfo"), "MemAvailable:")?;
+    let number = |path: &str| std::fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
+    let group = number("/sys/fs/cgroup/memory.max").map(|most| {
+        let statistics = std::fs::read_to_string("/sys/fs/cgroup/memory.stat").unwrap_or_default();
+        let current = number("/sys/fs/cgroup/memory.current").unwrap_or(0);
+        most.saturating_sub(current.saturating_sub(reclaimable_bytes(&statistics)))
+    });
+    Some(group.unwrap_or(u64::MAX).min(system))
+}
+
+/// Returns the bytes of cached files in the statistics of a control group, which the system frees on demand.
+fn reclaimable_bytes(statistics: &str) -> u64 {
+    let value = statistics.lines().find_map(|line| line.strip_prefix("inactive_file "));
+    value.and_then(|bytes| bytes.trim().parse().ok()).unwrap_or(0)
+}
+
+fn field_bytes(path: &Path, name: &str) -> Option<u64> {
+    let text = std::fs::read_to_string(path).ok()?;
+    let value = text.lines().find_map(|line| line.strip_prefix(name))?;
+    Some(value.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024)
 }
 
 #[cfg(test)]
@@ -45,5 +74,22 @@ mod tests {
         start_peak();
         // Other tests allocate far less meanwhile.
         assert!(peak_bytes().is_some_and(|after| after < peak - BYTES / 2));
+    }
+
+    #[test]
+    fn free_memory_is_reported_for_cpu_devices() {
+        assert_eq!(available_bytes(DeviceName::Wgpu), None);
+        assert!(available_bytes(DeviceName::Flex).is_none_or(|bytes| bytes > 1 << 20));
+        assert_eq!(reclaimable_bytes("anon 7\ninactive_anon 3\ninactive_file 4096\nactive_file 5\n"), 4096);
+        assert_eq!(reclaimable_bytes(""), 0);
+    }
+
+    #[test]
+    fn a_file_without_the_field_gives_none() {
+        let file = tempfile::NamedTempFile::new().expect("a temporary file");
+        std::fs::write(file.path(), "VmRSS:\t  7 kB\nVmHWM:\t  12 kB\n").expect("writable");
+        assert_eq!(field_bytes(file.path(), "VmHWM:"), Some(12 * 1024));
+        assert_eq!(field_bytes(file.path(), "VmSwap:"), None);
+        assert_eq!(field_bytes(Path::new("no/such/file"), "VmHWM:"), None);
     }
 }

@@ -1,4 +1,4 @@
-//! The state of a stage on disk: a folder per step, written under a temporary name, synced and renamed.
+//! Checkpoints of a stage: a folder per step, written under a temporary name, synced and renamed.
 
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -29,28 +29,28 @@ pub struct Checkpoints {
 }
 
 impl Checkpoints {
-    /// Keeps checkpoints in `folder`, and as many as `retention` says.
+    /// Opens the checkpoints in `folder`; `retention` determines which are kept.
     pub fn new(folder: PathBuf, retention: CheckpointConfig) -> Self {
         Self { folder, retention, model: None }
     }
 
-    /// Notes in every checkpoint which network it is, and refuses those of another.
+    /// Stores the config of the network in every checkpoint, and refuses checkpoints of another network.
     #[must_use]
-    pub fn of(self, model: ModelConfig) -> Self {
+    pub fn with_model(self, model: ModelConfig) -> Self {
         Self { model: Some(model), ..self }
     }
 
-    /// Saves model, optimiser and progress, and removes the checkpoints that are kept no longer.
+    /// Saves model, optimizer and progress, and removes the checkpoints that are no longer kept.
     ///
     /// # Errors
-    /// [`TrainError::Io`]; older checkpoints are then untouched, and what was written of this one is removed.
-    pub fn save(&self, learner: &TrainState, progress: &Progress) -> Result<PathBuf, TrainError> {
+    /// [`TrainError::Io`]; older checkpoints are then unchanged, and files of this one are removed.
+    pub fn save(&self, train_state: &TrainState, progress: &Progress) -> Result<PathBuf, TrainError> {
         let path = self.path_of(progress.step);
         let temporary = path.with_extension("tmp");
-        remove_if_there(&temporary)?;
-        let written = self.write(learner, progress, &temporary, &path);
+        remove_if_present(&temporary)?;
+        let written = self.write(train_state, progress, &temporary, &path);
         if written.is_err() {
-            // A full disk needs the space; what even that leaves is removed by the next save.
+            // Frees the space on a full disk. The next save removes remaining files.
             drop(std::fs::remove_dir_all(&temporary));
         }
         written?;
@@ -60,7 +60,7 @@ impl Checkpoints {
 
     fn write(
         &self,
-        learner: &TrainState,
+        train_state: &TrainState,
         progress: &Progress,
         temporary: &Path,
         path: &Path,
@@ -68,54 +68,54 @@ impl Checkpoints {
         make_folder(temporary).map_err(TrainError::io("making a checkpoint", temporary))?;
         let failed =
             |name: &str, reason: String| TrainError::io(SAVING, &temporary.join(name))(std::io::Error::other(reason));
-        let record = learner.model.clone().into_record();
+        let record = train_state.model.clone().into_record();
         record.save(temporary.join(MODEL)).map_err(|error| failed(MODEL, error.to_string()))?;
-        let saved = learner.optimizer.save(temporary.join(OPTIMIZER));
+        let saved = train_state.optimizer.save(temporary.join(OPTIMIZER));
         saved.map_err(|error| failed(OPTIMIZER, error.to_string()))?;
         let mut files = BTreeMap::new();
         for name in [MODEL, OPTIMIZER] {
             let file = temporary.join(name);
             files.insert(name.to_owned(), Fingerprint::of(&file).map_err(TrainError::io(SAVING, &file))?);
         }
-        let (progress, model, loss_scale) = (progress.clone(), self.model.clone(), learner.loss_scale);
+        let (progress, model, loss_scale) = (progress.clone(), self.model.clone(), train_state.loss_scale);
         State { version: VERSION, progress, files, model, loss_scale }.write(temporary)?;
         if path.exists() {
-            // Only where somebody moved newer checkpoints away and trains those steps again.
+            // Exists only if newer checkpoints were moved away and these steps are trained again.
             std::fs::remove_dir_all(path).map_err(TrainError::io("replacing a checkpoint", path))?;
         }
         publish_folder(temporary, path).map_err(TrainError::io(SAVING, path))
     }
 
-    /// Writes what a validation has added to the progress into the checkpoint of its step, and removes the checkpoints
-    /// that are kept no longer.
+    /// Writes the progress after a validation to the checkpoint of its step, and removes the checkpoints that are no longer
+    /// kept.
     ///
     /// # Errors
-    /// [`TrainError::Io`] and [`TrainError::BadFile`]; the checkpoint is then as it was.
+    /// [`TrainError::Io`] and [`TrainError::BadFile`]; the checkpoint is then unchanged.
     pub fn update(&self, progress: &Progress) -> Result<(), TrainError> {
         let path = self.path_of(progress.step);
         State { progress: progress.clone(), ..State::read(&path)? }.write(&path)?;
         self.prune(progress)
     }
 
-    /// Loads the newest checkpoint into a learner; `None` when there is none.
+    /// Loads the newest checkpoint into `train_state`. Returns `None` without a checkpoint.
     ///
     /// # Errors
-    /// [`TrainError::Damaged`] for a damaged checkpoint: nothing is started over in silence.
-    pub fn resume(&self, learner: &mut TrainState) -> Result<Option<Progress>, TrainError> {
+    /// [`TrainError::Damaged`] for a damaged checkpoint.
+    pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<Progress>, TrainError> {
         let mut all = self.list()?;
         let Some(path) = all.pop() else { return Ok(None) };
-        let loaded = load(&path, self.model.as_ref(), learner).map_err(|source| {
+        let loaded = load_checkpoint(&path, self.model.as_ref(), train_state).map_err(|source| {
             let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let fix = match all.last() {
-                Some(older) => format!("move {} away to go on from {}", name(&path), name(older)),
-                None => "it is the only checkpoint of its stage; --fresh starts the run over".into(),
+                Some(older) => format!("remove {} to resume from {}", name(&path), name(older)),
+                None => "the stage has no other; start a new run with --fresh".into(),
             };
             TrainError::Damaged { source: Box::new(source), fix }
         });
         loaded.map(Some)
     }
 
-    /// The newest checkpoint.
+    /// Returns the path of the newest checkpoint.
     ///
     /// # Errors
     /// [`TrainError::Io`].
@@ -123,7 +123,7 @@ impl Checkpoints {
         Ok(self.list()?.pop())
     }
 
-    /// The step of the newest checkpoint.
+    /// Returns the step of the newest checkpoint.
     ///
     /// # Errors
     /// [`TrainError::Io`].
@@ -135,7 +135,7 @@ impl Checkpoints {
         self.folder.join(format!("step-{step:09}"))
     }
 
-    /// Complete checkpoints, oldest first.
+    /// Lists the complete checkpoints, oldest first.
     fn list(&self) -> Result<Vec<PathBuf>, TrainError> {
         if !self.folder.exists() {
             return Ok(Vec::new());
@@ -149,16 +149,16 @@ impl Checkpoints {
         Ok(found.into_iter().map(|(_, path)| path).collect())
     }
 
-    /// Removes the checkpoints that are kept no longer, and what a save that was killed has left.
+    /// Removes the checkpoints that are no longer kept, and unfinished saves.
     fn prune(&self, progress: &Progress) -> Result<(), TrainError> {
         for item in std::fs::read_dir(&self.folder).map_err(TrainError::io(LISTING, &self.folder))? {
             let path = item.map_err(TrainError::io(LISTING, &self.folder))?.path();
             if path.extension().is_some_and(|extension| extension == "tmp") {
-                remove_if_there(&path)?;
+                remove_if_present(&path)?;
             }
         }
         let steps: Vec<u64> = self.list()?.iter().filter_map(|path| step_of(path)).collect();
-        for step in surplus(&steps, &self.retention, progress.best) {
+        for step in steps_to_remove(&steps, &self.retention, progress.best) {
             let path = self.path_of(step);
             remove_folder(&path).map_err(TrainError::io("removing an old checkpoint", &path))?;
         }
@@ -166,8 +166,8 @@ impl Checkpoints {
     }
 }
 
-/// The steps, oldest first, that are neither among the last nor the best nor one of the regular ones.
-fn surplus(steps: &[u64], retention: &CheckpointConfig, best: Option<Best>) -> Vec<u64> {
+/// Returns the steps, oldest first, that are neither among the last nor the best nor a multiple of `keep_every`.
+fn steps_to_remove(steps: &[u64], retention: &CheckpointConfig, best: Option<Best>) -> Vec<u64> {
     let CheckpointConfig { keep, keep_every, keep_best, .. } = *retention;
     let is_kept = |step: u64| {
         let is_best = keep_best && best.is_some_and(|best| best.step == step);
@@ -180,23 +180,27 @@ fn step_of(path: &Path) -> Option<u64> {
     path.file_name()?.to_str()?.strip_prefix("step-")?.parse().ok()
 }
 
-fn remove_if_there(folder: &Path) -> Result<(), TrainError> {
+fn remove_if_present(folder: &Path) -> Result<(), TrainError> {
     if folder.exists() {
         std::fs::remove_dir_all(folder).map_err(TrainError::io("removing an unfinished save", folder))?;
     }
     Ok(())
 }
 
-fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut TrainState) -> Result<Progress, TrainError> {
+fn load_checkpoint(
+    folder: &Path,
+    expected: Option<&ModelConfig>,
+    train_state: &mut TrainState,
+) -> Result<Progress, TrainError> {
     let State { progress, files, model, loss_scale, .. } = State::read(folder)?;
     if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !files.contains_key(*name)) {
-        let reason = format!("it has no checksum of {name}");
+        let reason = format!("the checksum of {name} is missing");
         return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
     }
     if let (Some(model), Some(expected)) = (&model, expected)
         && model != expected
     {
-        let reason = format!("it holds another network ({model:?}) than the config's [model]");
+        let reason = format!("the network ({model:?}) differs from [model] of the config");
         return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
     }
     for (name, expected) in &files {
@@ -210,29 +214,28 @@ fn load(folder: &Path, expected: Option<&ModelConfig>, learner: &mut TrainState)
     let model = folder.join(MODEL);
     let bad_model = |reason: String| TrainError::bad_file("checkpoint", &model)(reason);
     let record = ModuleRecord::load(&model).map_err(|error| bad_model(error.to_string()))?;
-    // Burn 0.22 panics where a record holds integers, or optimiser tensors without parameter ids, and passes over what
-    // it does not know; the clone that is half loaded is dropped.
-    let loaded = catch_unwind(AssertUnwindSafe(|| learner.model.clone().try_load_record(record)));
-    let loaded = loaded.map_err(|_| bad_model("it holds tensors of another type than float".into()))?;
+    // Burn 0.22 panics for integer tensors and for optimizer tensors without parameter ids, and ignores unknown tensors.
+    let loaded = catch_unwind(AssertUnwindSafe(|| train_state.model.clone().try_load_record(record)));
+    let loaded = loaded.map_err(|_| bad_model("a tensor is not of a float type".into()))?;
     let loaded = loaded.map_err(|error| bad_model(format!("{error:?}")))?;
     if let Some((name, dtype)) = first_not_f32(&loaded) {
         return Err(bad_model(format!("{name} is {dtype:?}, not F32")));
     }
-    learner.model = loaded;
+    train_state.model = loaded;
     let optimizer = folder.join(OPTIMIZER);
     let record = OptimizerRecord::load(&optimizer).map_err(TrainError::bad_file("checkpoint", &optimizer))?;
     let num_tensors = record.len();
-    let loaded = catch_unwind(AssertUnwindSafe(|| learner.optimizer.clone().load_record(record)));
+    let loaded = catch_unwind(AssertUnwindSafe(|| train_state.optimizer.clone().load_record(record)));
     let whole = loaded.ok().filter(|loaded| loaded.to_record().len() == num_tensors);
-    let foreign = || TrainError::bad_file("checkpoint", &optimizer)("it is no record of this optimiser");
-    learner.optimizer = whole.ok_or_else(foreign)?;
+    let foreign = || TrainError::bad_file("checkpoint", &optimizer)("the file is no record of this optimizer");
+    train_state.optimizer = whole.ok_or_else(foreign)?;
     if loss_scale.is_some_and(|scale| !scale.is_possible()) {
-        let reason = "its loss scale is no power of two from 1 to 2^32";
+        let reason = "the loss scale is no power of two from 1 to 2^32";
         return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
     }
-    // The precision is the config's, which resuming compares.
-    if learner.loss_scale.is_some() && loss_scale.is_some() {
-        learner.loss_scale = loss_scale;
+    // The precision is that of the config.
+    if train_state.loss_scale.is_some() && loss_scale.is_some() {
+        train_state.loss_scale = loss_scale;
     }
     Ok(progress)
 }
@@ -244,12 +247,12 @@ mod tests {
 
     use super::*;
 
-    /// A learner and its first checkpoint below `root`.
+    /// Makes a state and its first checkpoint in `root`.
     fn saved(root: &Path) -> (TrainState, Checkpoints, PathBuf) {
         let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
         let device = burn::tensor::Device::flex().autodiff();
         let optimizer = crate::step::optimizer::adamw(&crate::config::config::OptimizerConfig::default());
-        let learner = TrainState {
+        let train_state = TrainState {
             model: clift_model::Clift::new(&config, 0, &device),
             optimizer,
             device,
@@ -258,81 +261,83 @@ mod tests {
             loss_scale: None,
         };
         let checkpoints = Checkpoints::new(root.into(), CheckpointConfig::default());
-        let step = checkpoints.save(&learner, &Progress { step: 1, ..Progress::default() }).expect("it can be saved");
-        (learner, checkpoints, step)
+        let step = checkpoints.save(&train_state, &Progress { step: 1, ..Progress::default() }).unwrap();
+        (train_state, checkpoints, step)
     }
 
-    /// Says in `state.json` that the file is as it is now.
-    fn sign(step: &Path, name: &str) {
-        let mut state = State::read(step).expect("it is well");
-        state.files.insert(name.into(), Fingerprint::of(&step.join(name)).expect("it can be read"));
-        state.write(step).expect("it can be written");
+    /// Writes the present checksum of a file to `state.json`.
+    fn update_checksum(step: &Path, name: &str) {
+        let mut state = State::read(step).unwrap();
+        state.files.insert(name.into(), Fingerprint::of(&step.join(name)).unwrap());
+        state.write(step).unwrap();
     }
 
     #[test]
-    fn an_optimizer_that_is_none_is_refused_and_so_is_a_file_without_checksum() {
-        let place = tempfile::tempdir().expect("a temporary folder");
-        let (mut learner, checkpoints, step) = saved(place.path());
+    fn foreign_optimizer_and_missing_checksum_are_refused() {
+        let place = tempfile::tempdir().unwrap();
+        let (mut train_state, checkpoints, step) = saved(place.path());
 
-        // The weights of a model under the optimiser's name, with a checksum that fits: found by damaging files.
-        std::fs::copy(step.join(MODEL), step.join(OPTIMIZER)).expect("it can be copied");
-        sign(&step, OPTIMIZER);
-        let refused = checkpoints.resume(&mut learner);
+        // Weights of the model in the file of the optimizer, with a matching checksum.
+        std::fs::copy(step.join(MODEL), step.join(OPTIMIZER)).unwrap();
+        update_checksum(&step, OPTIMIZER);
+        let refused = checkpoints.resume(&mut train_state);
         assert!(refused.is_err(), "{refused:?}");
 
-        let mut state = State::read(&step).expect("it is well");
+        let mut state = State::read(&step).unwrap();
         state.files.remove(MODEL);
-        state.write(&step).expect("it can be written");
-        let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
-        assert!(message.contains("it has no checksum of model.bpk"), "{message}");
+        state.write(&step).unwrap();
+        let message = checkpoints.resume(&mut train_state).unwrap_err().to_string();
+        assert!(message.contains("the checksum of model.bpk is missing"), "{message}");
+    }
+
+    /// Casts parameters to f64.
+    struct ToF64;
+    impl ModuleMapper for ToF64 {
+        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            param.map(|tensor| tensor.cast(DType::F64))
+        }
     }
 
     #[test]
-    fn weights_of_another_type_are_refused() {
-        let place = tempfile::tempdir().expect("a temporary folder");
-        let (mut learner, checkpoints, step) = saved(place.path());
+    fn weights_of_other_types_are_refused() {
+        let place = tempfile::tempdir().unwrap();
+        let (mut train_state, checkpoints, step) = saved(place.path());
         let path = step.join(MODEL);
 
-        // The type in the header of the first tensor, with a checksum that fits: found by damaging files.
-        let mut bytes = std::fs::read(&path).expect("it can be read");
+        // Another type in the header of the first tensor, with a matching checksum.
+        let mut bytes = std::fs::read(&path).unwrap();
         let at = bytes.windows(3).position(|window| window == b"F32").expect("a type");
         bytes[at] = b'I';
-        std::fs::write(&path, bytes).expect("it can be written");
-        sign(&step, MODEL);
-        let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
-        assert!(message.contains("tensors of another type than float"), "{message}");
+        std::fs::write(&path, bytes).unwrap();
+        update_checksum(&step, MODEL);
+        let message = checkpoints.resume(&mut train_state).unwrap_err().to_string();
+        assert!(message.contains("a tensor is not of a float type"), "{message}");
 
-        struct ToF64;
-        impl ModuleMapper for ToF64 {
-            fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-                param.map(|tensor| tensor.cast(DType::F64))
-            }
-        }
-        let wide = learner.model.valid().map(&mut ToF64);
-        wide.into_record().save(&path).expect("it can be written");
-        sign(&step, MODEL);
-        let message = checkpoints.resume(&mut learner).unwrap_err().to_string();
+        let wide = train_state.model.valid().map(&mut ToF64);
+        wide.into_record().save(&path).unwrap();
+        update_checksum(&step, MODEL);
+        let message = checkpoints.resume(&mut train_state).unwrap_err().to_string();
         assert!(message.contains("is F64, not F32"), "{message}");
     }
 
     #[test]
-    fn the_last_the_best_and_every_mth_are_kept() {
+    fn last_best_and_regular_checkpoints_are_kept() {
         let steps = [10, 20, 30, 40, 50, 60];
-        let gone = |keep, keep_every, keep_best, best: u64| {
+        let removed = |keep, keep_every, keep_best, best: u64| {
             let retention = CheckpointConfig { every: 10, keep, keep_every, keep_best };
-            surplus(&steps, &retention, Some(Best { step: best, psnr: 20.0 }))
+            steps_to_remove(&steps, &retention, Some(Best { step: best, psnr: 20.0 }))
         };
-        assert_eq!(gone(2, 0, false, 20), [10, 20, 30, 40]);
-        assert_eq!(gone(2, 0, true, 20), [10, 30, 40]);
-        assert_eq!(gone(1, 30, true, 20), [10, 40, 50]);
-        assert_eq!(gone(1, 30, true, 60), [10, 20, 40, 50], "the best is the last");
-        assert_eq!(gone(9, 0, false, 20), [0; 0]);
+        assert_eq!(removed(2, 0, false, 20), [10, 20, 30, 40]);
+        assert_eq!(removed(2, 0, true, 20), [10, 30, 40]);
+        assert_eq!(removed(1, 30, true, 20), [10, 40, 50]);
+        assert_eq!(removed(1, 30, true, 60), [10, 20, 40, 50], "the best is the last");
+        assert_eq!(removed(9, 0, false, 20), [0; 0]);
         let none = CheckpointConfig { keep: 1, ..CheckpointConfig::default() };
-        assert_eq!(surplus(&steps, &none, None).len(), 5);
+        assert_eq!(steps_to_remove(&steps, &none, None).len(), 5);
     }
 
     #[test]
-    fn only_whole_checkpoints_have_a_step() {
+    fn only_complete_checkpoints_have_a_step() {
         let step = |name: &str| step_of(Path::new(name));
         assert_eq!((step("a/step-000000017"), step("a/step-1000000000")), (Some(17), Some(1_000_000_000)));
         assert_eq!((step("a/step-000000017.tmp"), step("a/best")), (None, None));

@@ -1,4 +1,4 @@
-//! `state.json` of a checkpoint: where training goes on, and the checksums of the other files.
+//! `state.json` of a checkpoint: position in training, and checksums of the other files.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -14,9 +14,9 @@ use crate::error::TrainError;
 use crate::step::loss_scale::LossScale;
 use crate::step::step_guard::LossHistory;
 
-/// The version that is written.
+/// The written version.
 pub(crate) const VERSION: u32 = 3;
-/// Has the numbers of [`Progress`] as strings.
+/// Version with the numbers of [`Progress`] as strings.
 const STRING_VERSION: u32 = 2;
 
 /// Content of `state.json`.
@@ -25,12 +25,12 @@ const STRING_VERSION: u32 = 2;
 pub(crate) struct State {
     pub version: u32,
     pub progress: Progress,
-    /// The other files, by name.
+    /// Checksums of the other files, by name.
     pub files: BTreeMap<String, Fingerprint>,
-    /// Which network it is; absent in the oldest files.
+    /// Config of the network; absent in the oldest files.
     #[serde(default)]
     pub model: Option<ModelConfig>,
-    /// In training with f16 products.
+    /// Loss scale of training with f16 products.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub loss_scale: Option<LossScale>,
 }
@@ -43,8 +43,8 @@ pub(crate) struct Fingerprint {
     crc32: u32,
 }
 
-/// Position in training. With the weights and the optimiser state it determines the rest of the run: batches, schedules
-/// and random draws are functions of the seed and the step.
+/// Position in training. With the weights and the optimizer state it determines the rest of the run: batches, schedules
+/// and random streams are functions of the seed and the step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
@@ -68,7 +68,7 @@ pub struct Progress {
 pub struct Best {
     /// Its step.
     pub step: u64,
-    /// Mean PSNR of the held-out views, in dB.
+    /// Mean PSNR of the validation views in dB.
     #[serde(deserialize_with = "null_as_nan")]
     pub psnr: f64,
 }
@@ -95,7 +95,7 @@ impl State {
         if *version == STRING_VERSION {
             parse_numbers(&mut value["progress"]);
         } else if *version != VERSION {
-            return Err(format!("it has version {version}, this program reads {STRING_VERSION} and {VERSION}"));
+            return Err(format!("version {version}, this program reads {STRING_VERSION} and {VERSION}"));
         }
         let state: Self = serde_json::from_value(value).map_err(|error| error.to_string())?;
         Ok(Self { version: VERSION, ..state })
@@ -130,7 +130,7 @@ impl Fingerprint {
     /// Computes size and checksum of a file.
     ///
     /// # Errors
-    /// The operating system's.
+    /// Those of the operating system.
     pub fn of(path: &Path) -> std::io::Result<Self> {
         let mut file = File::open(path)?;
         let mut hasher = crc32fast::Hasher::new();
@@ -173,20 +173,16 @@ mod tests {
     }
 
     #[test]
-    fn every_bit_of_a_number_comes_back() {
+    fn numbers_round_trip_bit_for_bit() {
         for values in numbers().chunks(101) {
             let state = state(values, values[0]);
             let text = serde_json::to_vec(&state).unwrap();
             let read = State::parse(&text).unwrap();
             assert_eq!(read, state);
-            // The same bytes again, so also the sign of zero.
+            // The same bytes, so also the sign of zero.
             assert_eq!(serde_json::to_vec(&read).unwrap(), text);
             assert_eq!(read.progress.best.unwrap().psnr.to_bits(), values[0].to_bits());
         }
-    }
-
-    #[test]
-    fn a_psnr_that_is_nan_can_be_read() {
         let text = serde_json::to_vec(&state(&[], f64::NAN)).unwrap();
         assert!(State::parse(&text).unwrap().progress.best.unwrap().psnr.is_nan());
     }
@@ -210,11 +206,11 @@ mod tests {
         assert!(State::parse(version_2("NaN").as_bytes()).unwrap().progress.best.unwrap().psnr.is_nan());
         assert!(State::parse(version_2("one").as_bytes()).is_err());
         let message = State::parse(br#"{"version":4}"#).unwrap_err();
-        assert_eq!(message, "it has version 4, this program reads 2 and 3");
+        assert_eq!(message, "version 4, this program reads 2 and 3");
     }
 
     #[test]
-    fn a_fingerprint_sees_every_bit() {
+    fn fingerprint_changes_with_every_bit() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.bpk");
         let mut bytes = vec![7; 3_000_000];

@@ -1,6 +1,6 @@
-//! Clusters every training scene, once, with the frozen encoder: latent K-means, or tiles.
+//! Builds the cluster cache: latent K-means of the frozen encoder's tokens, or tiles, for every training scene.
 //!
-//! While a cache is made, a log keeps the finished entries, from which an interrupted build resumes.
+//! A log stores the finished entries; an interrupted build resumes from it.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,7 +17,7 @@ use crate::config::config::{ClustersConfig, Config};
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 
-/// What the cache of a run is made from.
+/// Inputs of the cluster cache of a run.
 pub struct ClusterBuilder<'a> {
     /// Settings of the run.
     pub config: &'a Config,
@@ -25,41 +25,40 @@ pub struct ClusterBuilder<'a> {
     pub reader: &'a ClipReader,
     /// The trained encoder, without autodiff.
     pub encoder: &'a Encoder,
-    /// Its hash.
+    /// Hash of the encoder's weights.
     pub encoder_hash: &'a str,
-    /// Where it lives.
+    /// Device of the encoder.
     pub device: &'a Device,
 }
 
 impl ClusterBuilder<'_> {
-    /// Clusters every training scene `num_passes` times, each time with one context set and one count
-    /// of the grid, and opens the result. What an interrupted call with the same encoder and settings has done is taken
-    /// over; the result is the same, byte for byte. Written to a temporary folder that is then renamed.
+    /// Clusters every training scene `num_passes` times, each time with one context set and one count of the grid, and opens
+    /// the cache. Resumes an interrupted build with the same encoder and settings; the bytes do not depend on interruptions.
+    /// The cache is written to a temporary folder, which is then renamed. Scenes that cannot be used are skipped.
     ///
     /// # Errors
-    /// Whatever the disk or the model gives, [`TrainError::NoScenes`] when no scene could be clustered, and
-    /// [`TrainError::Interrupted`]. A scene that does not fit its views is skipped and noted.
-    pub fn make(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
+    /// [`TrainError::NoScenes`] if no scene could be clustered, [`TrainError::Interrupted`], and those of disk and model.
+    pub fn build(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
         let Self { config, reader, encoder_hash, .. } = *self;
-        let origin = CacheKey { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };
-        let mut journal = ResumeLog::open(&folder.with_extension("tmp"), origin)?;
+        let cache_key = CacheKey { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };
+        let mut log = ResumeLog::open(&folder.with_extension("tmp"), cache_key)?;
 
         let total = reader.source.num_scenes();
         let num_scenes = if config.clusters.num_scenes == 0 { total } else { config.clusters.num_scenes.min(total) };
         let total_sets = (config.clusters.num_passes * num_scenes) as u64;
         let started = std::time::Instant::now();
-        let done = journal.num_sets();
+        let done = log.num_sets();
         sink.event(&Event::StageStarted { stage: Stage::Clusters, done, num_steps: total_sets });
         for set in done..total_sets {
             let (pass, scene) = (set / num_scenes as u64, set as usize % num_scenes);
             let key = reader.source.key(scene);
             match self.cluster_scene(pass, scene) {
-                Ok((context, clusters)) => journal.add(key, context, &clusters)?,
-                // A scene that does not fit its views is left out; a disk that fails is not a scene.
+                Ok((context, clusters)) => log.add(key, context, &clusters)?,
+                // A failing disk is not a problem of the scene.
                 Err(TrainError::Data(error)) if !matches!(error, DataError::Io { .. }) => {
                     let reason = error.to_string();
                     sink.event(&Event::Skipped { key: key.into(), reason: reason.clone() });
-                    journal.skip(key, &reason)?;
+                    log.skip(key, &reason)?;
                 }
                 Err(other) => return Err(other),
             }
@@ -69,7 +68,7 @@ impl ClusterBuilder<'_> {
             }
         }
         sink.event(&Event::StageFinished { stage: Stage::Clusters, elapsed_s: started.elapsed().as_secs_f64() });
-        journal.publish(folder, num_scenes)?;
+        log.publish(folder, num_scenes)?;
         ClusterCache::open(folder, config, encoder_hash)
     }
 
@@ -79,7 +78,7 @@ impl ClusterBuilder<'_> {
         let views = &config.data.views;
         let mut rng = item_rng(seed, pass, scene as u32, 0, "context and count");
         let num_context = views.min_context + uniform_below(&mut rng, views.max_context - views.min_context + 1);
-        // The gaps that stage 1 ends with.
+        // The gaps between contexts at the end of stage 1.
         let last_step = config.stage1.steps.min(views.warm_up_steps);
         let context = views.sample(reader.source.as_ref(), scene, last_step, num_context, &mut rng)?.context;
         let clip = reader.read(scene, &ViewIndices { context: context.clone(), target: Vec::new() })?;
@@ -88,7 +87,7 @@ impl ClusterBuilder<'_> {
         let count = grid[uniform_below(&mut rng, grid.len())].of(num_tokens)?;
         let clusters = match grouping {
             Grouping::Kmeans => {
-                // Before any norm of the tokens, as in the reference: stage 2 trains that norm, and the clusters stay.
+                // Tokens before the token norm, as in the reference: stage 2 trains this norm.
                 let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
                 let fit = kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
                 fit.clusters.scenes()[0].clone()

@@ -1,7 +1,7 @@
 //! The finished cluster cache of a run.
 //!
-//! A folder with `index.json` (what was clustered with which encoder) and `clusters.bin` (per entry the
-//! cluster of every token and the token of every cluster, little-endian u16).
+//! A folder with `index.json` (entries, encoder, settings) and `clusters.bin` (per entry the cluster of every token and the
+//! token of every cluster, little-endian u16).
 
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -25,15 +25,15 @@ impl ClusterCache {
     /// Opens the cache of a run.
     ///
     /// # Errors
-    /// [`TrainError::StaleClusters`] when it was made with another encoder or other settings,
-    /// [`TrainError::BadFile`] when it is damaged.
+    /// [`TrainError::StaleClusters`] if the cache was built with another encoder or other settings, [`TrainError::BadFile`] if
+    /// the files are damaged.
     pub fn open(folder: &Path, config: &Config, encoder: &str) -> Result<Self, TrainError> {
         let path = folder.join("index.json");
         let text = std::fs::read(&path).map_err(TrainError::io("reading the cluster cache", &path))?;
         let index: CacheIndex = serde_json::from_slice(&text).map_err(TrainError::bad_file("cluster cache", &path))?;
         let stale = |reason: String| TrainError::StaleClusters { reason, path: folder.into() };
         if index.version != VERSION {
-            return Err(stale(format!("it has version {}, this program writes {VERSION}", index.version)));
+            return Err(stale(format!("version {}, this program writes {VERSION}", index.version)));
         }
         if index.encoder != encoder {
             let short = |hash: &str| hash.chars().take(12).collect::<String>();
@@ -42,7 +42,7 @@ impl ClusterCache {
             return Err(stale(reason));
         }
         if index.settings != settings(config) {
-            return Err(stale("its data, sampler or K-means settings are not this run's".into()));
+            return Err(stale("the settings of data, sampler or K-means differ from those of this run".into()));
         }
         if let Some(entry) = index.entries.iter().find(|entry| !entry.is_possible()) {
             let CacheEntry { key, num_tokens, num_storage_tokens, .. } = entry;
@@ -59,12 +59,12 @@ impl ClusterCache {
         Ok(Self { folder: folder.into(), index })
     }
 
-    /// What was clustered.
+    /// Returns the clustered context sets.
     pub fn entries(&self) -> &[CacheEntry] {
         &self.index.entries
     }
 
-    /// Scenes that could not be clustered.
+    /// Returns the scenes that could not be clustered.
     pub fn skipped(&self) -> &SkipReport {
         &self.index.skipped
     }
@@ -72,7 +72,7 @@ impl ClusterCache {
     /// Reads the clusters of one entry.
     ///
     /// # Errors
-    /// [`TrainError::Io`], and [`clift_model::ModelError::BadClusters`] for indices that contradict each other.
+    /// [`TrainError::Io`], and [`clift_model::ModelError::BadClusters`] for inconsistent indices.
     pub fn read(&self, entry: &CacheEntry) -> Result<SceneClusters, TrainError> {
         let path = self.folder.join("clusters.bin");
         let mut bytes = vec![0; entry.num_bytes() as usize];
@@ -93,7 +93,7 @@ impl ClusterCache {
 mod tests {
     use super::*;
 
-    /// What a cache says whose only entry has such counts.
+    /// Opens a cache whose only entry has these counts, and returns the error message or "opened".
     fn opened(num_tokens: usize, num_storage_tokens: usize) -> String {
         let config = Config::default();
         let folder = tempfile::tempdir().expect("a temporary folder");
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_that_no_scene_has_are_refused_before_they_are_added_or_allocated() {
+    fn impossible_counts_are_refused_before_allocation() {
         assert_eq!(opened(1, 1), "opened");
         for (num_tokens, num_storage_tokens) in [(usize::MAX, 3), (1 << 62, 1 << 62), (0, 0), (1, 2), (2, 0)] {
             let message = opened(num_tokens, num_storage_tokens);

@@ -16,44 +16,45 @@ pub struct CacheEntry {
     pub key: String,
     /// Frames of the contexts.
     pub context: Vec<usize>,
-    /// Tokens of the scene.
+    /// Number of tokens of the scene.
     pub num_tokens: usize,
-    /// Clusters.
+    /// Number of clusters.
     pub num_storage_tokens: usize,
-    /// Where the entry starts in `clusters.bin`.
+    /// Offset of the entry in `clusters.bin`.
     pub offset_bytes: u64,
 }
 
-/// What `index.json` holds.
+/// Content of `index.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CacheIndex {
     pub version: u32,
     /// Hash of the encoder's weights.
     pub encoder: String,
-    /// The settings that decide the clusters, as JSON in a string, compared as text.
+    /// Settings that determine the clusters, as JSON in a string, compared as text.
     pub settings: String,
     pub skipped: SkipReport,
     pub entries: Vec<CacheEntry>,
 }
 
 impl CacheEntry {
-    /// Whether a scene can have so many tokens and clusters. No number is allocated or added up before.
+    /// Whether a scene can have these numbers of tokens and clusters. Checked before they are added or allocated.
     pub(crate) fn is_possible(&self) -> bool {
         (1..=MAX_TOKENS).contains(&self.num_tokens) && (1..=self.num_tokens).contains(&self.num_storage_tokens)
     }
 
+    /// Returns the size of the entry in `clusters.bin`.
     pub(crate) fn num_bytes(&self) -> u64 {
         (self.num_tokens as u64).saturating_add(self.num_storage_tokens as u64).saturating_mul(2)
     }
 }
 
-/// The settings that decide which clusters come out.
+/// Returns the settings that determine the clusters, as JSON.
 pub(crate) fn settings(config: &Config) -> String {
     let data = &config.data;
     let mut clusters = serde_json::json!(config.clusters);
     if config.clusters.grouping == Grouping::Tile {
-        // The former name: with the present one, existing caches would be stale.
+        // The former name, which existing caches have.
         clusters["grouping"] = "patch".into();
     }
     serde_json::json!({

@@ -1,7 +1,7 @@
-//! What is done of a cluster cache: a temporary folder that a killed process leaves and the next goes on with.
+//! Log of the finished entries of a cluster cache, from which an interrupted build resumes.
 //!
-//! Every set of contexts is a line of `journal.jsonl`, written after its bytes in `clusters.bin` and with a checksum of
-//! both. What a kill or a power cut tore is found by that and made again.
+//! Every context set is a line of `journal.jsonl`, written after its bytes in `clusters.bin` and with a checksum of both.
+//! Torn entries are found by their checksums and built again.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -20,25 +20,25 @@ const WRITING: &str = "writing the cluster cache";
 const DATA: &str = "clusters.bin";
 const JOURNAL: &str = "journal.jsonl";
 
-/// What a cache is made from: only with the same is it gone on with. The first line of the journal.
+/// Inputs of a cache build. A build resumes only if they are equal. First line of the log.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CacheKey {
     pub version: u32,
     /// Hash of the encoder's weights.
     pub encoder: String,
-    /// The settings that decide the clusters.
+    /// Settings that determine the clusters.
     pub settings: String,
 }
 
-/// A further line: what became of one set.
+/// A further line: the outcome of a context set.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Line {
-    /// Number of the set.
+    /// Index of the set.
     set: u64,
     outcome: Outcome,
-    /// Of number and outcome as they are written here, and of the set's bytes.
+    /// Checksum of index, outcome and bytes of the set.
     crc32: u32,
 }
 
@@ -58,11 +58,11 @@ impl Line {
     }
 }
 
-/// A cache that is being made.
+/// A cluster cache during its build.
 #[derive(Debug)]
 pub(crate) struct ResumeLog {
     folder: PathBuf,
-    origin: CacheKey,
+    cache_key: CacheKey,
     data: File,
     lines: File,
     entries: Vec<CacheEntry>,
@@ -70,14 +70,14 @@ pub(crate) struct ResumeLog {
 }
 
 impl ResumeLog {
-    /// Goes on in `folder`, or starts anew where it holds nothing of this origin.
+    /// Resumes the build in `folder`, or starts a new one if the folder has no log of `cache_key`.
     ///
     /// # Errors
     /// [`TrainError::Io`].
-    pub fn open(folder: &Path, origin: CacheKey) -> Result<Self, TrainError> {
-        let failed = |source| TrainError::io("taking up an unfinished cluster cache", folder)(source);
-        if let Some(journal) = Self::take_up(folder, &origin).map_err(failed)? {
-            return Ok(journal);
+    pub fn open(folder: &Path, cache_key: CacheKey) -> Result<Self, TrainError> {
+        let failed = |source| TrainError::io("resuming an unfinished cluster cache", folder)(source);
+        if let Some(log) = Self::resume(folder, &cache_key).map_err(failed)? {
+            return Ok(log);
         }
         if folder.exists() {
             std::fs::remove_dir_all(folder).map_err(TrainError::io("removing an unfinished cache", folder))?;
@@ -85,13 +85,13 @@ impl ResumeLog {
         make_folder(folder).map_err(TrainError::io("making the cluster cache", folder))?;
         let create = |name: &str| File::create(folder.join(name)).map_err(TrainError::io(WRITING, &folder.join(name)));
         let (data, lines) = (create(DATA)?, create(JOURNAL)?);
-        let mut journal = Self { folder: folder.into(), origin, data, lines, entries: Vec::new(), skipped: Vec::new() };
-        journal.write_line(&journal.origin.clone())?;
-        Ok(journal)
+        let mut log = Self { folder: folder.into(), cache_key, data, lines, entries: Vec::new(), skipped: Vec::new() };
+        log.write_line(&log.cache_key.clone())?;
+        Ok(log)
     }
 
-    /// Reads what an earlier process has done and cuts off what it left half done.
-    fn take_up(folder: &Path, origin: &CacheKey) -> std::io::Result<Option<Self>> {
+    /// Reads the finished sets of an earlier process and removes an unfinished one.
+    fn resume(folder: &Path, cache_key: &CacheKey) -> std::io::Result<Option<Self>> {
         let open = |name: &str| File::options().read(true).write(true).open(folder.join(name));
         let (Ok(mut data), Ok(mut lines)) = (open(DATA), open(JOURNAL)) else { return Ok(None) };
         let (mut entries, mut skipped) = (Vec::new(), Vec::new());
@@ -99,7 +99,7 @@ impl ResumeLog {
         let mut reader = BufReader::new(&lines);
         let mut text = Vec::new();
         reader.read_until(b'\n', &mut text)?;
-        if !serde_json::from_slice::<CacheKey>(&text).is_ok_and(|found| found == *origin && text.ends_with(b"\n")) {
+        if !serde_json::from_slice::<CacheKey>(&text).is_ok_and(|found| found == *cache_key && text.ends_with(b"\n")) {
             return Ok(None);
         }
         loop {
@@ -131,10 +131,10 @@ impl ResumeLog {
             file.set_len(length)?;
             file.seek(SeekFrom::Start(length))?;
         }
-        Ok(Some(Self { folder: folder.into(), origin: origin.clone(), data, lines, entries, skipped }))
+        Ok(Some(Self { folder: folder.into(), cache_key: cache_key.clone(), data, lines, entries, skipped }))
     }
 
-    /// How many sets are done.
+    /// Returns the number of finished sets.
     pub fn num_sets(&self) -> u64 {
         (self.entries.len() + self.skipped.len()) as u64
     }
@@ -142,9 +142,9 @@ impl ResumeLog {
     /// Adds the clusters of the next set.
     ///
     /// # Errors
-    /// [`TrainError::Io`], and [`TrainError::NoScenes`] for more tokens than 16 bits can name.
+    /// [`TrainError::Io`], and [`TrainError::NoScenes`] for more than [`MAX_TOKENS`] tokens.
     pub fn add(&mut self, key: &str, context: Vec<usize>, clusters: &SceneClusters) -> Result<(), TrainError> {
-        let bytes = encode(clusters)?;
+        let bytes = encode_clusters(clusters)?;
         let entry = CacheEntry {
             key: key.into(),
             context,
@@ -158,7 +158,7 @@ impl ResumeLog {
         Ok(())
     }
 
-    /// Notes that the next set could not be clustered.
+    /// Logs that the next set could not be clustered.
     ///
     /// # Errors
     /// [`TrainError::Io`].
@@ -179,53 +179,52 @@ impl ResumeLog {
         self.lines.write_all(format!("{text}\n").as_bytes()).map_err(TrainError::io(WRITING, &path))
     }
 
-    /// Writes the index of the finished cache and gives it its name. The journal is left out.
+    /// Writes the index of the finished cache, renames the folder to `path`, and removes the log.
     ///
     /// # Errors
     /// [`TrainError::Io`], and [`TrainError::NoScenes`] for an empty cache.
     pub fn publish(self, path: &Path, num_scenes: usize) -> Result<(), TrainError> {
-        let Self { folder, origin, data, lines, entries, skipped } = self;
+        let Self { folder, cache_key, data, lines, entries, skipped } = self;
         if entries.is_empty() {
-            // Kept, it would refuse the same scenes again after their files are mended.
             std::fs::remove_dir_all(&folder).map_err(TrainError::io("removing an empty cache", &folder))?;
             let reason = skipped.into_iter().next().map(|(_, reason)| reason).unwrap_or_default();
-            return Err(TrainError::NoScenes { reason: format!("none could be clustered; the first: {reason}") });
+            return Err(TrainError::NoScenes { reason: format!("none could be clustered; the first error: {reason}") });
         }
         let mut reasons: BTreeMap<String, String> = skipped.into_iter().collect();
-        // A scene that one pass could use is not left out.
+        // A scene is skipped only if no pass could use it.
         for entry in &entries {
             reasons.remove(&entry.key);
         }
-        let mut ledger = SkipReport::new(num_scenes);
+        let mut report = SkipReport::new(num_scenes);
         for (key, reason) in reasons {
-            ledger.skip(key, reason);
+            report.skip(key, reason);
         }
-        let CacheKey { version, encoder, settings } = origin;
-        let index = CacheIndex { version, encoder, settings, skipped: ledger, entries };
+        let CacheKey { version, encoder, settings } = cache_key;
+        let index = CacheIndex { version, encoder, settings, skipped: report, entries };
         let index_path = folder.join("index.json");
         let text = serde_json::to_vec(&index).map_err(TrainError::bad_file("cluster cache", &index_path))?;
         replace_file(&index_path, &text).map_err(TrainError::io(WRITING, &index_path))?;
         drop((data, lines));
         publish_folder(&folder, path).map_err(TrainError::io("renaming the cluster cache", path))?;
-        remove_journal(path)
+        remove_resume_log(path)
     }
 }
 
-/// Removes the journal of a finished cache; a kill may have left it there.
+/// Removes the log of a finished cache, which a killed process may have left.
 ///
 /// # Errors
 /// [`TrainError::Io`].
-pub(crate) fn remove_journal(cache: &Path) -> Result<(), TrainError> {
+pub(crate) fn remove_resume_log(cache: &Path) -> Result<(), TrainError> {
     let path = cache.join(JOURNAL);
     match std::fs::remove_file(&path) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            Err(TrainError::io("removing the journal of a finished cluster cache", &path)(error))
+            Err(TrainError::io("removing the log of a finished cluster cache", &path)(error))
         }
         _ => Ok(()),
     }
 }
 
-fn encode(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {
+fn encode_clusters(clusters: &SceneClusters) -> Result<Vec<u8>, TrainError> {
     let ids = clusters.assignment().iter().chain(clusters.centroid_index());
     ids.map(|&id| u16::try_from(id).map(u16::to_le_bytes))
         .collect::<Result<Vec<_>, _>>()
@@ -240,43 +239,49 @@ mod tests {
 
     use super::*;
 
-    fn origin() -> CacheKey {
+    fn cache_key() -> CacheKey {
         CacheKey { version: 1, encoder: "abc".into(), settings: "{}".into() }
     }
 
-    /// Sets of a scene whose tokens all belong to the first cluster or are it.
+    /// Makes a temporary folder, and returns it with the folder of a build in it.
+    fn new_build() -> (tempfile::TempDir, PathBuf) {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("clusters.tmp");
+        (place, folder)
+    }
+
+    /// Makes one cluster of all tokens.
     fn clusters(num_tokens: usize) -> SceneClusters {
         SceneClusters::new(vec![0; num_tokens], vec![0]).unwrap()
     }
 
-    /// Does the sets from where the journal stands, 8 in all: the third cannot be clustered, the others grow.
-    fn go_on(journal: &mut ResumeLog, until: u64) {
-        for set in journal.num_sets()..until {
+    /// Adds sets up to `until`: the third cannot be clustered, the others grow.
+    fn add_sets(log: &mut ResumeLog, until: u64) {
+        for set in log.num_sets()..until {
             let key = format!("scene {}", set % 4);
             if set == 2 {
-                journal.skip(&key, "too short").unwrap();
+                log.skip(&key, "too short").unwrap();
             } else {
-                journal.add(&key, vec![0, set as usize], &clusters(2 + set as usize)).unwrap();
+                log.add(&key, vec![0, set as usize], &clusters(2 + set as usize)).unwrap();
             }
         }
     }
 
     fn finished(place: &Path) -> [Vec<u8>; 2] {
-        let mut journal = ResumeLog::open(&place.join("clusters.tmp"), origin()).unwrap();
-        go_on(&mut journal, 8);
-        journal.publish(&place.join("clusters"), 4).unwrap();
-        assert_eq!(std::fs::read_dir(place.join("clusters")).unwrap().count(), 2, "the journal is gone");
+        let mut log = ResumeLog::open(&place.join("clusters.tmp"), cache_key()).unwrap();
+        add_sets(&mut log, 8);
+        log.publish(&place.join("clusters"), 4).unwrap();
+        assert_eq!(std::fs::read_dir(place.join("clusters")).unwrap().count(), 2, "without the log");
         assert!(!place.join("clusters.tmp").exists());
         [DATA, "index.json"].map(|name| std::fs::read(place.join("clusters").join(name)).unwrap())
     }
 
     #[test]
-    fn a_journal_cut_off_anywhere_gives_the_same_cache() {
+    fn log_cut_anywhere_gives_the_same_cache() {
         let whole = tempfile::tempdir().unwrap();
         let expected = finished(whole.path());
-        let place = tempfile::tempdir().unwrap();
-        let folder = place.path().join("clusters.tmp");
-        go_on(&mut ResumeLog::open(&folder, origin()).unwrap(), 6);
+        let (place, folder) = new_build();
+        add_sets(&mut ResumeLog::open(&folder, cache_key()).unwrap(), 6);
         let [data, lines] = [DATA, JOURNAL].map(|name| std::fs::read(folder.join(name)).unwrap());
         let mut taken_over = std::collections::BTreeSet::new();
         let ends = lines.iter().enumerate().filter(|(_, byte)| **byte == b'\n').flat_map(|(end, _)| [end, end + 1]);
@@ -286,35 +291,20 @@ mod tests {
                 std::fs::create_dir_all(&folder).unwrap();
                 std::fs::write(folder.join(JOURNAL), &lines[..length]).unwrap();
                 std::fs::write(folder.join(DATA), &data[..data_length]).unwrap();
-                taken_over.insert(ResumeLog::open(&folder, origin()).unwrap().num_sets());
+                taken_over.insert(ResumeLog::open(&folder, cache_key()).unwrap().num_sets());
                 assert_eq!(finished(place.path()), expected, "{length}, {data_length}");
                 std::fs::remove_dir_all(place.path().join("clusters")).unwrap();
             }
         }
-        assert!(taken_over.into_iter().eq(0..=6), "nothing that is whole is made again");
+        assert!(taken_over.into_iter().eq(0..=6), "complete sets are not built again");
     }
 
     #[test]
-    fn damaged_bytes_and_those_after_them_are_made_again() {
-        let whole = tempfile::tempdir().unwrap();
-        let expected = finished(whole.path());
-        let place = tempfile::tempdir().unwrap();
-        let folder = place.path().join("clusters.tmp");
-        go_on(&mut ResumeLog::open(&folder, origin()).unwrap(), 6);
-        let mut data = std::fs::read(folder.join(DATA)).unwrap();
-        data[7] ^= 1; // of the second set: the first has three numbers of two bytes
-        std::fs::write(folder.join(DATA), data).unwrap();
-        assert_eq!(ResumeLog::open(&folder, origin()).unwrap().num_sets(), 1);
-        assert_eq!(finished(place.path()), expected);
-    }
-
-    #[test]
-    fn what_is_taken_up_of_a_journal_damaged_anyhow_is_whole_and_the_first_of_it() {
-        let place = tempfile::tempdir().unwrap();
-        let folder = place.path().join("clusters.tmp");
-        go_on(&mut ResumeLog::open(&folder, origin()).unwrap(), 6);
+    fn sets_of_a_damaged_log_are_a_prefix() {
+        let (_place, folder) = new_build();
+        add_sets(&mut ResumeLog::open(&folder, cache_key()).unwrap(), 6);
         let files = [DATA, JOURNAL].map(|name| std::fs::read(folder.join(name)).unwrap());
-        let whole = ResumeLog::open(&folder, origin()).unwrap();
+        let whole = ResumeLog::open(&folder, cache_key()).unwrap();
         let mut taken_up = BTreeMap::new();
         for case in 0..2_000 {
             let mut rng = item_rng(0, 0, case, 0, "damage");
@@ -332,33 +322,32 @@ mod tests {
                 std::fs::create_dir_all(&folder).unwrap();
                 std::fs::write(folder.join(name), bytes).unwrap();
             }
-            let journal = ResumeLog::open(&folder, origin()).unwrap();
-            assert_eq!(journal.entries, whole.entries[..journal.entries.len()], "case {case}");
-            assert_eq!(journal.skipped, whole.skipped[..journal.skipped.len()], "case {case}");
+            let log = ResumeLog::open(&folder, cache_key()).unwrap();
+            assert_eq!(log.entries, whole.entries[..log.entries.len()], "case {case}");
+            assert_eq!(log.skipped, whole.skipped[..log.skipped.len()], "case {case}");
             let data = std::fs::read(folder.join(DATA)).unwrap();
             assert_eq!(data, files[0][..data.len()], "case {case}");
-            *taken_up.entry(journal.num_sets()).or_insert(0) += 1;
+            *taken_up.entry(log.num_sets()).or_insert(0) += 1;
         }
         assert!(taken_up.keys().copied().eq(0..=6) && taken_up[&6] > 200, "{taken_up:?}");
     }
 
     #[test]
-    fn a_journal_of_another_origin_is_not_gone_on_with() {
-        let place = tempfile::tempdir().unwrap();
-        let folder = place.path().join("clusters.tmp");
-        go_on(&mut ResumeLog::open(&folder, origin()).unwrap(), 3);
-        assert_eq!(ResumeLog::open(&folder, origin()).unwrap().num_sets(), 3);
-        let other = CacheKey { encoder: "abd".into(), ..origin() };
+    fn log_of_other_inputs_is_discarded() {
+        let (_place, folder) = new_build();
+        add_sets(&mut ResumeLog::open(&folder, cache_key()).unwrap(), 3);
+        assert_eq!(ResumeLog::open(&folder, cache_key()).unwrap().num_sets(), 3);
+        let other = CacheKey { encoder: "abd".into(), ..cache_key() };
         assert_eq!(ResumeLog::open(&folder, other).unwrap().num_sets(), 0);
-        assert_eq!(ResumeLog::open(&folder, origin()).unwrap().num_sets(), 0, "and what was there is gone");
+        assert_eq!(ResumeLog::open(&folder, cache_key()).unwrap().num_sets(), 0, "the former log was removed");
     }
 
     #[test]
-    fn a_cache_without_a_scene_is_refused_with_the_first_reason() {
+    fn empty_cache_is_refused_with_the_first_reason() {
         let place = tempfile::tempdir().unwrap();
-        let mut journal = ResumeLog::open(&place.path().join("clusters.tmp"), origin()).unwrap();
-        journal.skip("a", "too short").unwrap();
-        let message = journal.publish(&place.path().join("clusters"), 1).unwrap_err().to_string();
+        let mut log = ResumeLog::open(&place.path().join("clusters.tmp"), cache_key()).unwrap();
+        log.skip("a", "too short").unwrap();
+        let message = log.publish(&place.path().join("clusters"), 1).unwrap_err().to_string();
         assert!(message.contains("too short"), "{message}");
         assert_eq!(std::fs::read_dir(place.path()).unwrap().count(), 0);
     }

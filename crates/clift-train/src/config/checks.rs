@@ -1,4 +1,4 @@
-//! What no type can check of a config: ranges, and values that have to fit each other.
+//! Checks of a config beyond its types: ranges, and values that depend on each other.
 
 use clift_data::{DataConfig, DataError, SourceKind, Split};
 use clift_eval::PERCEPTUAL_MIN_SIZE_PX;
@@ -9,13 +9,13 @@ use crate::error::{TrainError, bad};
 use crate::events::Stage;
 
 impl Config {
-    /// Checks every value that no type can check.
+    /// Checks ranges, and values that depend on each other.
     ///
     /// # Errors
-    /// [`TrainError::BadConfig`] naming the key, the value and the fix.
+    /// [`TrainError::BadConfig`] with key, value and fix.
     pub fn validate(&self) -> Result<(), TrainError> {
         if self.run_dir.as_os_str().is_empty() {
-            return Err(bad("run_dir", "\"\"", "write the folder that is to receive the run"));
+            return Err(bad("run_dir", "\"\"", "write the directory of the run"));
         }
         self.model.validate()?;
         self.data.views.validate().map_err(in_section("data.views"))?;
@@ -64,7 +64,7 @@ impl Config {
         Ok(())
     }
 
-    /// Pictures are whole patches.
+    /// Checks that images consist of whole patches.
     fn validate_size(&self) -> Result<(), TrainError> {
         let patch_size = self.model.patch_size;
         for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
@@ -79,7 +79,7 @@ impl Config {
         Ok(())
     }
 
-    /// The weights themselves are only asked for where a run is trained: measuring one does not need them.
+    /// Checks weights and sizes of the loss. The VGG weights are checked when training starts.
     fn validate_loss(&self) -> Result<(), TrainError> {
         let weight = self.loss.perceptual_weight;
         if !(weight >= 0.0 && weight.is_finite()) {
@@ -88,20 +88,20 @@ impl Config {
         let DataConfig { width, height, .. } = self.data;
         if weight > 0.0 && width.min(height) < PERCEPTUAL_MIN_SIZE_PX {
             let fix = format!(
-                "its network needs pictures of {PERCEPTUAL_MIN_SIZE_PX} x {PERCEPTUAL_MIN_SIZE_PX}, these have {width} x {height}: write 0"
+                "VGG-19 needs images of at least {PERCEPTUAL_MIN_SIZE_PX} x {PERCEPTUAL_MIN_SIZE_PX}, not {width} x {height}: write 0"
             );
             return Err(bad("loss.perceptual_weight", weight, &fix));
         }
         Ok(())
     }
 
-    /// No scene has more tokens than can be kept, or fewer than the cluster cache asks for.
+    /// Checks the token counts of all possible scenes.
     fn validate_token_counts(&self) -> Result<(), TrainError> {
         let views = &self.data.views;
         let tokens_per_view = self.model.num_tokens(1, self.data.height, self.data.width)?;
         let most_tokens = views.max_context.saturating_mul(tokens_per_view);
         if most_tokens > MAX_TOKENS {
-            let fix = format!("{most_tokens} tokens; at most {MAX_TOKENS} are possible: fewer views or smaller ones");
+            let fix = format!("{most_tokens} tokens exceed {MAX_TOKENS}: write fewer or smaller views");
             return Err(bad("data.views.max_context", views.max_context, &fix));
         }
         let fewest_tokens = views.min_context * tokens_per_view;
@@ -114,7 +114,7 @@ impl Config {
             for (key, count) in counts {
                 let too_few = |views: usize| count.of(views * tokens_per_view).is_ok_and(|count| count < views);
                 if too_few(views.min_context) || too_few(views.max_context) {
-                    return Err(bad(key, count, "write at least a tile for every context view"));
+                    return Err(bad(key, count, "write at least one tile for every context view"));
                 }
             }
         }
@@ -129,7 +129,7 @@ fn validate_data(data: &DataConfig) -> Result<(), TrainError> {
         return validate_synthetic(data);
     }
     if data.root.is_none() {
-        return Err(bad("data.root", "missing", "write the folder that holds train/ and test/"));
+        return Err(bad("data.root", "missing", "write the folder with train/ and test/"));
     }
     data.filters.validate().map_err(in_section("data.filters"))
 }
@@ -145,7 +145,7 @@ fn validate_synthetic(data: &DataConfig) -> Result<(), TrainError> {
         return Err(bad("data.width, data.height", format!("{}, {}", data.width, data.height), &fix));
     }
     if synthetic.split != Split::default() {
-        let fix = "leave it out: a run trains on one split and measures on the other";
+        let fix = "remove the key: a run trains on one split and evaluates on the other";
         return Err(bad("data.synthetic.split", synthetic.split, fix));
     }
     Ok(())
@@ -164,7 +164,7 @@ impl OptimizerConfig {
         }
         if !(self.spike_factor == 0.0 || (self.spike_factor > 1.0 && self.spike_factor.is_finite())) {
             let key = format!("{stage}.optimizer.spike_factor");
-            return Err(bad(&key, self.spike_factor, "write 0 to look for no spikes, or a number above 1"));
+            return Err(bad(&key, self.spike_factor, "write 0 to disable spike detection, or a number above 1"));
         }
         in_range(&format!("{stage}.optimizer.max_bad_steps"), self.max_bad_steps as usize, 1, usize::MAX)
     }
@@ -178,10 +178,10 @@ fn in_range(key: &str, value: usize, least: usize, most: usize) -> Result<(), Tr
     Err(bad(key, value, &fix))
 }
 
-/// Names the key of a section's own refusal in full; for `map_err`.
+/// Adds the section to the key of an error; for `map_err`.
 fn in_section(section: &'static str) -> impl FnOnce(DataError) -> TrainError {
     move |error| match error {
-        // Such a problem says "is VALUE; FIX".
+        // The problem has the form "is VALUE; FIX".
         DataError::BadConfig { key, problem } => match problem.strip_prefix("is ").and_then(|is| is.split_once("; ")) {
             Some((value, fix)) => bad(&format!("{section}.{key}"), value, fix),
             None => DataError::BadConfig { key: format!("{section}.{key}"), problem }.into(),

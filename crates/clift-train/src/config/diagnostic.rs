@@ -1,4 +1,4 @@
-//! Points at the line of a configuration that is wrong, in the layout of a compiler's message.
+//! Error messages that show a line of a configuration with a caret, as compilers do.
 
 use std::ops::Range;
 use std::path::Path;
@@ -7,7 +7,7 @@ use codespan_reporting::diagnostic::{Diagnostic, Label};
 use codespan_reporting::files::SimpleFiles;
 use codespan_reporting::term::{self, Chars};
 
-/// The texts a configuration was read from, one after the other, so that one offset names a place in any of them.
+/// The texts of a configuration. Offsets count through all of them, one after the other.
 pub(crate) struct SourceText<'a> {
     /// The file and the overrides, by position in `texts`.
     files: SimpleFiles<String, &'a str>,
@@ -27,35 +27,35 @@ impl<'a> SourceText<'a> {
         Self { files, texts }
     }
 
-    /// The overrides with blanks in front, which move their spans behind the file's, so that one span names one place.
+    /// Returns the overrides with leading blanks, which shift their spans behind those of the file.
     pub(crate) fn padded_overrides(&self) -> Vec<String> {
         self.texts[1..].iter().map(|(start, text)| format!("{}{text}", " ".repeat(*start))).collect()
     }
 
-    /// Offset of the first byte of an override.
+    /// Returns the offset of the first byte of an override.
     pub(crate) fn override_start(&self, index: usize) -> usize {
         self.texts[index + 1].0
     }
 
-    /// Describes a mistake at a span of the texts.
+    /// Makes a diagnostic at a span of the texts.
     pub(crate) fn at(&self, span: Range<usize>, title: String, label: String) -> Diagnostic<usize> {
         let (id, range) = self.find(span);
         Diagnostic::error().with_message(title).with_label(Label::primary(id, range).with_message(label))
     }
 
-    /// Marks a further span of the texts.
+    /// Makes a label at a further span.
     pub(crate) fn mark(&self, span: Range<usize>, label: String) -> Label<usize> {
         let (id, range) = self.find(span);
         Label::secondary(id, range).with_message(label)
     }
 
-    /// Describes a mistake of the whole file.
+    /// Makes a diagnostic of the whole file.
     pub(crate) fn whole(&self, title: String) -> Diagnostic<usize> {
         let file = self.files.get(0).map(|file| format!("in {}", file.name()));
         Diagnostic::error().with_message(title).with_notes(file.into_iter().collect())
     }
 
-    /// The text that a span is in, and the place in that text.
+    /// Returns the text of a span, and the range in this text.
     fn find(&self, span: Range<usize>) -> (usize, Range<usize>) {
         let id = self.texts.partition_point(|(start, _)| *start <= span.start) - 1;
         let (start, text) = self.texts[id];
@@ -63,7 +63,7 @@ impl<'a> SourceText<'a> {
         (id, from..to.max(from))
     }
 
-    /// Prints a diagnostic without the word "error" in front.
+    /// Formats a diagnostic without the leading word "error".
     pub(crate) fn render(&self, diagnostic: &Diagnostic<usize>) -> String {
         let config = term::Config { chars: Chars::ascii(), ..term::Config::default() };
         let text = term::emit_into_string(&config, &self.files, diagnostic);
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn a_caret_is_under_each_character_of_the_place() {
+    fn carets_mark_each_character_of_the_span() {
         let file = "a = 1\r\nname = \"Größe\" # x\n";
         let start = file.find("\"Gr").unwrap();
         let expected = "bad name
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn a_span_at_or_beyond_the_end_still_has_a_caret() {
+    fn spans_beyond_the_end_are_clamped() {
         assert!(rendered("a = ", 4..4).contains("1 | a = \n  |     ^ too big"));
         assert!(rendered("a = ", 90..99).contains("a ="));
         assert!(rendered("", 0..0).contains("bad name"));

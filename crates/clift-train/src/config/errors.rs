@@ -1,4 +1,4 @@
-//! Says in plain words what is wrong with a configuration: unknown keys, missing ones, wrong values.
+//! Error messages for invalid configurations: unknown keys, missing keys, wrong values.
 
 use std::ops::Range;
 
@@ -11,7 +11,7 @@ use crate::config::diagnostic::SourceText;
 use crate::config::schema::{Keys, nearest};
 use crate::error::TrainError;
 
-/// Finds every key that the type does not know, in the order of the text.
+/// Finds every unknown key, in the order of the text.
 pub(crate) fn unknown_keys(keys: &Keys, root: &DeTable, sources: &SourceText) -> Vec<Diagnostic<usize>> {
     let mut found = Vec::new();
     collect_unknown(keys, keys, root, "", sources, &mut found);
@@ -28,7 +28,7 @@ fn collect_unknown(
     found: &mut Vec<(usize, Diagnostic<usize>)>,
 ) {
     if keys.fields.is_none() {
-        return; // a map, whose keys are free, or a value of the wrong type, which its own message explains
+        return; // a map with free keys, or a value of a wrong type, which has a message of its own
     }
     for (key, value) in table {
         let (name, below) = (key.get_ref().as_ref(), value.get_ref().as_table());
@@ -53,10 +53,10 @@ fn unknown_key(
     is_section: bool,
     sources: &SourceText,
 ) -> Diagnostic<usize> {
-    let place = if section.is_empty() { String::new() } else { format!(" in [{section}]") };
+    let location = if section.is_empty() { String::new() } else { format!(" in [{section}]") };
     let title = match (is_section, section.is_empty()) {
         (true, true) => format!("unknown section [{name}]"),
-        _ => format!("unknown key `{name}`{place}"),
+        _ => format!("unknown key `{name}`{location}"),
     };
     let elsewhere: Vec<String> = all.sections_with(name).iter().map(|section| format!("[{section}]")).collect();
     let label = match keys.nearest(name) {
@@ -71,7 +71,7 @@ fn unknown_key(
     sources.at(span, title, label).with_note(format!("help: {owner} has {known}"))
 }
 
-/// Turns the deserialiser's message into words, at the value it is about.
+/// Rewrites the message of the deserializer, and points at the value.
 pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &SourceText) -> Diagnostic<usize> {
     let message = error.message();
     let span = error.span();
@@ -94,14 +94,14 @@ pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sou
     let wrong = message.strip_prefix("invalid type: ").or_else(|| message.strip_prefix("invalid value: "));
     match wrong.and_then(|wrong| wrong.rsplit_once(", expected ")) {
         Some((got, expected)) => {
-            let label = format!("expected {}, got {}", expected_in_words(expected), got_in_words(got));
+            let label = format!("expected {}, got {}", describe_expected(expected), describe_found(got));
             sources.at(span, format!("wrong value{of_path}"), label)
         }
         None => sources.at(span, format!("wrong value{of_path}"), message.to_owned()),
     }
 }
 
-/// Finds a list that is longer than what was made of it: the deserialiser takes what it needs and forgets the rest.
+/// Finds a list longer than its field: the deserializer ignores further items.
 pub(crate) fn too_long<T: Serialize>(config: &T, root: &DeTable, sources: &SourceText) -> Option<Diagnostic<usize>> {
     let made = toml::Value::try_from(config).ok()?;
     find_too_long(made.as_table()?, root, "", sources)
@@ -127,8 +127,7 @@ fn find_too_long(
     })
 }
 
-/// Puts a value that was refused by its key where it stands, with the places of the other keys the refusal names.
-/// `None` for a refusal that names no key.
+/// Points an error at the value of its key, and marks the other keys that the error names. `None` for an error without key.
 pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &SourceText) -> Option<Diagnostic<usize>> {
     let (keys, fix) = match error {
         TrainError::BadConfig { key, fix, .. } => (key.as_str(), fix.as_str()),
@@ -156,7 +155,7 @@ pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &SourceT
     Some(diagnostic)
 }
 
-/// Words of a text that are made like dotted keys, each once.
+/// Returns the distinct dotted keys in a text.
 fn dotted_keys(text: &str) -> Vec<&str> {
     let is_part = |c: char| c.is_ascii_alphanumeric() || "_.".contains(c);
     let mut found: Vec<&str> = Vec::new();
@@ -168,7 +167,7 @@ fn dotted_keys(text: &str) -> Vec<&str> {
     found
 }
 
-/// The span of the value of a dotted key.
+/// Returns the span of the value of a dotted key.
 fn span_of(table: &DeTable, key: &str) -> Option<Range<usize>> {
     let (first, rest) = key.split_once('.').map_or((key, None), |(first, rest)| (first, Some(rest)));
     let value = table.get(first)?;
@@ -178,22 +177,24 @@ fn span_of(table: &DeTable, key: &str) -> Option<Range<usize>> {
     }
 }
 
-/// The dotted key whose name or value has exactly this span.
+/// Returns the dotted key whose name or value has this span.
 fn path_at(table: &DeTable, span: &Range<usize>) -> Option<String> {
     table.iter().find_map(|(key, value)| {
         let name = key.get_ref().as_ref();
-        if key.span() == *span || value.span() == *span || lists(value.get_ref(), span) {
+        if key.span() == *span || value.span() == *span || contains_span(value.get_ref(), span) {
             return Some(name.to_owned());
         }
         value.get_ref().as_table().and_then(|below| path_at(below, span)).map(|below| join(name, &below))
     })
 }
 
-fn lists(value: &DeValue, span: &Range<usize>) -> bool {
-    value.as_array().is_some_and(|items| items.iter().any(|item| item.span() == *span || lists(item.get_ref(), span)))
+fn contains_span(value: &DeValue, span: &Range<usize>) -> bool {
+    value
+        .as_array()
+        .is_some_and(|items| items.iter().any(|item| item.span() == *span || contains_span(item.get_ref(), span)))
 }
 
-fn expected_in_words(expected: &str) -> String {
+fn describe_expected(expected: &str) -> String {
     match expected {
         "usize" | "u64" | "u32" | "u16" | "u8" => "a whole number of 0 or more".to_owned(),
         "isize" | "i64" | "i32" | "i16" | "i8" => "a whole number".to_owned(),
@@ -206,7 +207,7 @@ fn expected_in_words(expected: &str) -> String {
     }
 }
 
-fn got_in_words(got: &str) -> String {
+fn describe_found(got: &str) -> String {
     match got.split_once(' ') {
         Some(("string", text)) => format!("the string {text}"),
         Some(("integer" | "floating", number)) => {

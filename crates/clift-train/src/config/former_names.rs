@@ -1,6 +1,4 @@
-//! Former names of keys and values: a configuration that has them is read, with a note.
-//!
-//! Aliases of serde would be listed among the known keys and values.
+//! Former names of keys and values, which are read with a note. (Aliases of serde would be listed as known keys.)
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
@@ -8,16 +6,15 @@ use toml::de::{DeTable, DeValue};
 use crate::config::overrides::Override;
 use crate::config::schema::Keys;
 
-/// Keys of the top level: the former name and the present one.
+/// Keys of the top level: former and present name.
 const KEYS: [(&str, &str); 1] = [("recompute", "activation_checkpointing")];
 
-/// Values: section, key, the former name and the present one.
+/// Values: section, key, former and present name.
 const VALUES: [(&str, &str, &str, &str); 1] = [("clusters", "grouping", "patch", "tile")];
 
-/// Gives every key and value of a configuration its present name. Returns what was renamed.
-///
-/// A former key beside its successor stays, and is refused as unknown.
-pub(crate) fn rename(root: &mut DeTable, keys: &Keys) -> Vec<Override> {
+/// Replaces former names of keys and values, and returns the changes. A former key beside the present one is kept, and
+/// refused as unknown.
+pub(crate) fn apply_former_names(root: &mut DeTable, keys: &Keys) -> Vec<Override> {
     let mut renamed = Vec::new();
     for (old, new) in KEYS {
         if keys.get(new).is_none() || root.contains_key(new) {
@@ -61,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn former_names_are_read_with_a_note_and_written_as_the_present_ones() {
+    fn former_names_are_read_with_a_note() {
         let file = format!("recompute = true\n{LEAST}grouping = \"patch\"\n");
         for (file, overrides) in [(file.as_str(), &[][..]), (LEAST, &["recompute=true", "clusters.grouping=patch"][..])]
         {
@@ -82,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn a_former_key_beside_its_successor_is_refused() {
+    fn former_key_beside_the_present_one_is_refused() {
         let message = parse(LEAST, &["recompute=true", "activation_checkpointing=false"]).unwrap_err().to_string();
         assert!(message.starts_with("unknown key `recompute`"), "{message}");
         assert!(message.contains("`activation_checkpointing`"), "{message}");

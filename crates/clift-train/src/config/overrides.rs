@@ -1,4 +1,4 @@
-//! `--set key=TOML`: what one says, and how it enters the file's table.
+//! `--set key=TOML`: parses overrides and merges them into the table of the file.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -9,16 +9,16 @@ use toml::de::{DeTable, DeValue};
 
 use crate::config::diagnostic::SourceText;
 
-/// What a `--set`, or a former name in the file, changed with respect to the file.
+/// Change of a key by `--set`, or of a former name in the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Override {
     /// Dotted key.
     pub key: String,
-    /// The file's value as TOML; `None` where the file left the default.
+    /// Value of the file as TOML; `None` if the file does not set the key.
     pub from: Option<String>,
-    /// The value now, as TOML.
+    /// New value as TOML.
     pub to: String,
-    /// Whether `key` is a former name, and `to` the present one.
+    /// Whether `key` is a former name, and `to` the present name.
     pub is_renamed: bool,
 }
 
@@ -38,7 +38,7 @@ impl fmt::Display for Override {
     }
 }
 
-/// The parts of a dotted key, and the value.
+/// Parts of a dotted key, and the value.
 type KeyValue<'t> = (Vec<Spanned<String>>, Spanned<DeValue<'t>>);
 
 /// Splits `key=TOML` into the key's parts and the value.
@@ -53,12 +53,13 @@ pub(crate) fn parse_override<'t>(
         return Err(Box::new(diagnostic.with_note("help: for example --set stage1.steps=100")));
     };
     let key_only = format!("{}=0", &text[..equals]);
-    let (key, _) = DeTable::parse(&key_only).map(|table| split(table.into_inner(), usize::MAX)).map_err(|error| {
-        sources.at(start..equals, "an override's key is not a dotted key".into(), error.message().into())
-    })?;
+    let (key, _) =
+        DeTable::parse(&key_only).map(|table| split_key(table.into_inner(), usize::MAX)).map_err(|error| {
+            sources.at(start..equals, "an override's key is not a dotted key".into(), error.message().into())
+        })?;
 
     let error = match DeTable::parse(text) {
-        Ok(table) => return Ok(split(table.into_inner(), key.len())),
+        Ok(table) => return Ok(split_key(table.into_inner(), key.len())),
         Err(error) => error,
     };
     let word = text[equals + 1..].trim();
@@ -77,13 +78,13 @@ pub(crate) fn parse_override<'t>(
 }
 
 /// Follows the only key of a table down to the value, at most `depth` keys deep.
-fn split(table: DeTable, depth: usize) -> KeyValue {
+fn split_key(table: DeTable, depth: usize) -> KeyValue {
     let mut value = Spanned::new(0..0, DeValue::Table(table));
     let mut key = Vec::new();
     while key.len() < depth {
         match value.into_inner() {
             DeValue::Table(table) if !table.is_empty() => {
-                let (part, below) = table.into_iter().next().expect("it is not empty");
+                let (part, below) = table.into_iter().next().expect("a table with a key");
                 key.push(Spanned::new(part.span(), part.into_inner().into_owned()));
                 value = below;
             }
@@ -96,8 +97,11 @@ fn split(table: DeTable, depth: usize) -> KeyValue {
     (key, value)
 }
 
-/// Puts a value in its place and gives back what was there, or the key that holds a value where a section must be.
-pub(crate) fn merge<'t>(
+/// Inserts a value and returns the former one.
+///
+/// # Errors
+/// The part of the key that is a value instead of a section.
+pub(crate) fn merge_value<'t>(
     base: &mut DeTable<'t>,
     key: &[Spanned<String>],
     value: Spanned<DeValue<'t>>,
@@ -113,7 +117,7 @@ pub(crate) fn merge<'t>(
         base.insert(name(), Spanned::new(first.span(), DeValue::Table(DeTable::new())));
     }
     match base.get_mut(first.get_ref().as_str()).map(Spanned::get_mut) {
-        Some(DeValue::Table(section)) => merge(section, rest, value),
+        Some(DeValue::Table(section)) => merge_value(section, rest, value),
         _ => Err(first.clone()),
     }
 }
@@ -123,7 +127,7 @@ pub(crate) fn dotted(key: &[Spanned<String>]) -> String {
 }
 
 /// Writes a value as TOML on one line.
-pub(crate) fn show(value: &DeValue) -> String {
+pub(crate) fn to_toml(value: &DeValue) -> String {
     let list = |items: Vec<String>| items.join(", ");
     match value {
         DeValue::String(text) => toml::Value::String(text.to_string()).to_string(),
@@ -131,9 +135,9 @@ pub(crate) fn show(value: &DeValue) -> String {
         DeValue::Float(float) => float.as_str().to_owned(),
         DeValue::Boolean(boolean) => boolean.to_string(),
         DeValue::Datetime(datetime) => datetime.to_string(),
-        DeValue::Array(items) => format!("[{}]", list(items.iter().map(|item| show(item.get_ref())).collect())),
+        DeValue::Array(items) => format!("[{}]", list(items.iter().map(|item| to_toml(item.get_ref())).collect())),
         DeValue::Table(table) => {
-            let entries = table.iter().map(|(key, value)| format!("{} = {}", key.get_ref(), show(value.get_ref())));
+            let entries = table.iter().map(|(key, value)| format!("{} = {}", key.get_ref(), to_toml(value.get_ref())));
             format!("{{ {} }}", list(entries.collect()))
         }
     }

@@ -1,17 +1,17 @@
-//! The keys a configuration type knows, asked of the type itself, and the nearest one to a mistake.
+//! Keys of a configuration type, derived from its deserialization, and the key nearest to a misspelled one.
 
 use serde::de::value::{Error, StrDeserializer};
 use serde::de::{DeserializeOwned, DeserializeSeed, Deserializer, Error as _, IntoDeserializer, MapAccess, Visitor};
 
-/// Keys of a struct and of the structs in it; a value that is no struct has none.
+/// Keys of a struct and of the structs in it; other values have none.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct Keys {
-    /// Each key with what it holds; `None` where any key may stand or none can.
+    /// Keys with the keys below them; `None` for maps and for values without keys.
     pub(crate) fields: Option<Vec<(&'static str, Keys)>>,
 }
 
 impl Keys {
-    /// Asks `T` for its keys. Deserialisation is started once per key and abandoned when it says what it expects.
+    /// Returns the keys of `T`. Starts one deserialization per key, which ends when a struct passes its field names.
     pub(crate) fn of<T: DeserializeOwned>() -> Self {
         Self::below::<T>(&mut Vec::new())
     }
@@ -39,12 +39,12 @@ impl Keys {
         self.fields.iter().flatten().map(|(name, _)| *name)
     }
 
-    /// The key most like `key`, if one is so near that it may be a slip.
+    /// Returns the key most similar to `key`, if similar enough for a typing error.
     pub(crate) fn nearest(&self, key: &str) -> Option<&'static str> {
         nearest(key, self.names())
     }
 
-    /// Sections below this one that know exactly `key`, as dotted paths.
+    /// Returns the sections below this one that have `key`, as dotted paths.
     pub(crate) fn sections_with(&self, key: &str) -> Vec<String> {
         let mut found = Vec::new();
         for (name, keys) in self.fields.iter().flatten() {
@@ -57,16 +57,16 @@ impl Keys {
     }
 }
 
-/// The candidate with the fewest typing slips, if those are at most a third of the word.
+/// Returns the candidate with the smallest edit distance, if that is at most a third of the word.
 pub(crate) fn nearest<'a>(word: &str, candidates: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     candidates
         .map(|candidate| (strsim::damerau_levenshtein(word, candidate), candidate))
-        .filter(|(slips, candidate)| *slips <= (word.len().max(candidate.len()) / 3).max(1))
-        .min_by_key(|(slips, _)| *slips)
+        .filter(|(distance, candidate)| *distance <= (word.len().max(candidate.len()) / 3).max(1))
+        .min_by_key(|(distance, _)| *distance)
         .map(|(_, candidate)| candidate)
 }
 
-/// Walks down `path` and notes the names of the struct found there.
+/// Deserializer that follows `path` and stores the field names of the struct at its end.
 struct Probe<'a> {
     path: &'a [&'static str],
     names: &'a mut Option<&'static [&'static str]>,
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn a_type_tells_its_keys_and_those_of_its_sections() {
+    fn keys_of_a_type_include_those_of_its_sections() {
         let keys = Keys::of::<Outer>();
         assert_eq!(keys.names().collect::<Vec<_>>(), ["seed", "inner", "free"]);
         assert_eq!(keys.get("inner").unwrap().names().collect::<Vec<_>>(), ["num_heads", "dim"]);
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_key_is_a_slip_away_or_none_is_named() {
+    fn nearest_key_is_within_the_edit_distance() {
         let near = |word| nearest(word, ["num_heads", "dim", "steps"].into_iter());
         assert_eq!(near("num_head"), Some("num_heads"));
         assert_eq!(near("step"), Some("steps"));

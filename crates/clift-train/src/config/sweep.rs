@@ -1,4 +1,4 @@
-//! A config as settings of an evaluation.
+//! Settings of an evaluation, taken from a config.
 
 use clift_data::derive_seed;
 use clift_eval::{Method, Sweep};
@@ -6,8 +6,8 @@ use clift_model::{DeviceName, TokenCount};
 
 use crate::config::config::Config;
 
-/// What an evaluation of a run does with every scene, without LPIPS and external methods.
-pub(crate) fn sweep(config: &Config, storage: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
+/// Returns the settings of an evaluation, without LPIPS and external methods.
+pub(crate) fn eval_sweep(config: &Config, storage: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
     let Config { seed, eval, clusters, model, device, .. } = config;
     Sweep {
         storage,

@@ -1,4 +1,4 @@
-//! The largest tensor of every part of a run, and the refusal of those that a device cannot hold.
+//! Largest tensor of every part of a run; refuses tensors that a device cannot hold.
 
 use burn::tensor::Device;
 use clift_model::{Part, SceneSizes, kmeans_values, largest_tensors, max_tensor_bytes};
@@ -6,46 +6,45 @@ use clift_model::{Part, SceneSizes, kmeans_values, largest_tensors, max_tensor_b
 use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::Stage;
-use crate::footprint::scene_sizes::{
-    VIEWS_PER_PASS, batch_sizes, cluster_counts, scene, set_accumulate, stored, trained_parts,
-};
+use crate::footprint::scene_sizes::{VIEWS_PER_PASS, cluster_counts, scene_with_all_tokens, scene_with_stored_tokens};
+use crate::stage::settings::StageSettings;
 
-/// Bytes of an f32; f16 operands are smaller copies of what is there in f32.
+/// Bytes of an f32 value; f16 operands are smaller copies of f32 tensors.
 const F32: u64 = 4;
 
-/// Maps of the first layers of both VGG networks, at the size of the picture.
+/// Channels of the first layers of both VGG networks, at the size of the image.
 const VGG_CHANNELS: u64 = 64;
 
 /// A tensor of a run.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LargestTensor {
-    /// The part of the run in which it is largest.
+    /// Part of the run.
     pub part: Stage,
-    /// Which one.
+    /// Description of the tensor.
     pub what: String,
-    /// Its bytes.
+    /// Size in bytes.
     pub bytes: u64,
 }
 
-/// The largest tensor of one part of a run, at the most views and tokens that it can draw.
+/// Returns the largest tensor of a part of a run, at the most views and tokens that can be sampled.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for sizes that cannot be.
+/// [`TrainError::BadConfig`] for impossible sizes.
 pub fn largest_tensor(config: &Config, part: Stage) -> Result<LargestTensor, TrainError> {
     let all = tensors(config, part)?;
     let (what, values) = all.into_iter().max_by_key(|(_, values)| *values).expect("every part has tensors");
     Ok(LargestTensor { part, what, bytes: values * F32 })
 }
 
-/// Refuses a run with a tensor that the open device cannot hold, with a setting that fits.
+/// Refuses a run with a tensor that the open device cannot hold.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`].
-pub fn check(config: &Config, device: &Device, parts: &[Stage]) -> Result<(), TrainError> {
-    max_tensor_bytes(device).map_or(Ok(()), |limit| check_limit(config, limit, parts))
+/// [`TrainError::BadConfig`] with a setting that fits.
+pub fn check_tensors(config: &Config, device: &Device, parts: &[Stage]) -> Result<(), TrainError> {
+    max_tensor_bytes(device).map_or(Ok(()), |limit| check_tensor_limit(config, limit, parts))
 }
 
-fn check_limit(config: &Config, limit: u64, parts: &[Stage]) -> Result<(), TrainError> {
+fn check_tensor_limit(config: &Config, limit: u64, parts: &[Stage]) -> Result<(), TrainError> {
     for &part in parts {
         let LargestTensor { what, bytes, .. } = largest_tensor(config, part)?;
         if bytes > limit {
@@ -55,18 +54,14 @@ fn check_limit(config: &Config, limit: u64, parts: &[Stage]) -> Result<(), Train
                 "{what} of {of} would be one tensor of {bytes} bytes, and {} takes at most {limit} in one: {fix}",
                 config.device
             );
-            return Err(TrainError::BadConfig { key: key.into(), value, fix });
+            return Err(TrainError::BadConfig { key, value, fix });
         }
     }
     Ok(())
 }
 
-/// The key to change, its value now, and the change.
-fn largest_fitting_setting(
-    config: &Config,
-    part: Stage,
-    limit: u64,
-) -> Result<(&'static str, String, String), TrainError> {
+/// Returns the key to change, its value, and the largest value that fits.
+fn largest_fitting_setting(config: &Config, part: Stage, limit: u64) -> Result<(String, String, String), TrainError> {
     let fits = |config: &Config| Ok::<_, TrainError>(largest_tensor(config, part)?.bytes <= limit);
     let mut smaller = config.clone();
     let set_views = |config: &mut Config, count: usize| {
@@ -77,17 +72,12 @@ fn largest_fitting_setting(
         config.data.views.max_context = count;
         config.data.views.min_context = config.data.views.min_context.min(count);
     };
-    let accumulate = match part {
-        Stage::Stage1 => Some(("stage1.accumulate", config.stage1.accumulate)),
-        Stage::Stage2 => Some(("stage2.accumulate", config.stage2.accumulate)),
-        Stage::Clusters | Stage::Eval => None,
-    };
-    if let Some((key, now)) = accumulate {
-        let (batch_size, _) = batch_sizes(config, part);
-        for parts in now..=batch_size {
-            set_accumulate(&mut smaller, part, parts);
+    let StageSettings { batch_size, accumulate, trained, .. } = config.stage(part);
+    if !trained.is_empty() {
+        for parts in accumulate..=batch_size {
+            smaller.set_accumulate(part, parts);
             if fits(&smaller)? {
-                return Ok((key, now.to_string(), format!("write {parts}")));
+                return Ok((format!("{}.accumulate", part.name()), accumulate.to_string(), format!("write {parts}")));
             }
         }
     }
@@ -95,16 +85,16 @@ fn largest_fitting_setting(
         Stage::Eval => ("eval.num_context", config.eval.num_context),
         _ => ("data.views.max_context", config.data.views.max_context),
     };
-    // With one scene at a time, where there are several.
-    let also = accumulate.map_or_else(String::new, |(key, _)| format!(" with {key} = {}", batch_sizes(config, part).0));
+    let also =
+        if trained.is_empty() { String::new() } else { format!(" with {}.accumulate = {batch_size}", part.name()) };
     for count in (1..now).rev() {
         set_views(&mut smaller, count);
         if fits(&smaller)? {
-            return Ok((key, now.to_string(), format!("write {count}{also}, or make pictures smaller")));
+            return Ok((key.into(), now.to_string(), format!("write {count}{also}, or choose smaller images")));
         }
     }
     let size = format!("{}, {}", config.data.width, config.data.height);
-    Ok(("data.width, data.height", size, "even one view does not fit: make pictures smaller".into()))
+    Ok(("data.width, data.height".into(), size, "even one view does not fit: choose smaller images".into()))
 }
 
 /// Lists the tensors that can be the largest of a part, with their numbers of values.
@@ -114,14 +104,14 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
         Stage::Eval => (eval.num_context, eval.num_targets.clamp(1, VIEWS_PER_PASS)),
         _ => (views.max_context, views.num_targets),
     };
-    let scene = scene(config, num_context, num_targets)?;
-    let num_scenes = if trained_parts(part).is_empty() { 1 } else { batch_sizes(config, part).1 };
+    let scene = scene_with_all_tokens(config, num_context, num_targets)?;
+    let num_scenes = config.stage(part).micro_batch_size();
     let of = |network: Part, scene: &SceneSizes| largest_tensors(&config.model, network, scene, num_scenes);
     let mut all = of(Part::Encoder, &scene);
     let counts = match part {
         Stage::Stage1 => Vec::new(),
         Stage::Stage2 | Stage::Clusters => cluster_counts(config, scene.num_tokens)?,
-        // Of an index, which may have fewer contexts or more, nothing is known here.
+        // An evaluation index may have other numbers of contexts.
         Stage::Eval => {
             eval.storage.iter().map(|count| count.of(scene.num_tokens)).collect::<Result<_, _>>().unwrap_or_default()
         }
@@ -131,13 +121,13 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
         all.push(("the distances of K-means".into(), kmeans_values(scene.num_tokens, most)));
     }
     if matches!(part, Stage::Stage2 | Stage::Eval) {
-        all.extend(of(Part::Condenser, &stored(scene, most)));
-        all.extend(of(Part::Renderer, &stored(scene, most)));
+        all.extend(of(Part::Condenser, &scene_with_stored_tokens(scene, most)));
+        all.extend(of(Part::Renderer, &scene_with_stored_tokens(scene, most)));
     }
     if part == Stage::Stage1 {
         let [low, high] = config.stage1.keep_tokens;
         let kept = ((scene.num_tokens as f64 * high) as usize).clamp(1, scene.num_tokens);
-        // Shares are drawn: with all tokens views share them, with all but one every view has a set of its own.
+        // Views share the tokens only if all are kept; with one token less, every view has its own subset.
         if low < 1.0 {
             let num_render_tokens = kept.min((scene.num_tokens - 1).max(1));
             all.extend(of(Part::Renderer, &SceneSizes { num_render_tokens, is_per_view: true, ..scene }));
@@ -147,7 +137,7 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
         }
     }
     let first_maps = (num_scenes * num_targets * config.data.width * config.data.height) as u64 * VGG_CHANNELS;
-    if !trained_parts(part).is_empty() && config.loss.perceptual_weight > 0.0 {
+    if !part.trained().is_empty() && config.loss.perceptual_weight > 0.0 {
         all.push(("the first maps of the perceptual loss".into(), first_maps));
     }
     if part == Stage::Eval && eval.lpips_path().is_some() {
@@ -177,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn the_papers_batch_is_largest_where_views_have_tokens_of_their_own() {
+    fn paper_batch_is_largest_with_tokens_per_view() {
         let mut config = paper();
         config.stage1.accumulate = 16;
         // 4 scenes x 6 views x 6,143 tokens x 2 x 768 values.
@@ -193,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_of_stage_two_the_clusters_and_the_evaluation() {
+    fn largest_tensors_of_the_later_parts() {
         let mut config = paper();
         config.stage2.accumulate = 80;
         config.clusters.grid = vec![TokenCount::Share(0.25), TokenCount::Share(1.0)];
@@ -212,10 +202,10 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_does_not_fit_is_refused_with_the_micro_batch_that_does() {
+    fn refusal_names_the_micro_batch_that_fits() {
         let config = paper();
         let limit = (1 << 31) - 4;
-        let message = check_limit(&config, limit, &PARTS).unwrap_err().to_string();
+        let message = check_tensor_limit(&config, limit, &PARTS).unwrap_err().to_string();
         // 64 scenes x 6 views at once; of 9 scenes it is 2.04e9 bytes, so 8 parts fit.
         let bytes = 64_u64 * 6 * 6143 * 2 * 768 * 4;
         let expected = format!(
@@ -225,22 +215,22 @@ mod tests {
         assert_eq!(message, expected);
         let mut fitting = config.clone();
         fitting.stage1.accumulate = 8;
-        check_limit(&fitting, limit, &[Stage::Stage1]).expect("what the message says");
+        check_tensor_limit(&fitting, limit, &[Stage::Stage1]).expect("the value of the message");
         fitting.stage1.accumulate = 7;
-        assert!(check_limit(&fitting, limit, &[Stage::Stage1]).is_err(), "and no less");
+        assert!(check_tensor_limit(&fitting, limit, &[Stage::Stage1]).is_err(), "and no less");
     }
 
     #[test]
-    fn where_one_scene_is_too_much_fewer_views_or_smaller_pictures_are_named() {
+    fn refusal_names_fewer_views_or_smaller_images() {
         let mut config = paper();
         config.stage1.accumulate = 64;
         // 6 x 5,119 x 2 x 768 values of five contexts.
         let limit = 6 * 5119 * 2 * 768 * 4;
-        let message = check_limit(&config, limit, &[Stage::Stage1]).unwrap_err().to_string();
+        let message = check_tensor_limit(&config, limit, &[Stage::Stage1]).unwrap_err().to_string();
         assert!(message.starts_with("`data.views.max_context` = 6:"), "{message}");
-        assert!(message.ends_with("write 5 with stage1.accumulate = 64, or make pictures smaller"), "{message}");
-        let message = check_limit(&config, 1000, &[Stage::Eval]).unwrap_err().to_string();
+        assert!(message.ends_with("write 5 with stage1.accumulate = 64, or choose smaller images"), "{message}");
+        let message = check_tensor_limit(&config, 1000, &[Stage::Eval]).unwrap_err().to_string();
         assert!(message.starts_with("`data.width, data.height` = 256, 256:"), "{message}");
-        check(&config, &Device::flex(), &PARTS).expect("memory alone is a CPU's limit");
+        check_tensors(&config, &Device::flex(), &PARTS).expect("memory alone is a CPU's limit");
     }
 }

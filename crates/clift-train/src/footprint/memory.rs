@@ -6,30 +6,31 @@ use clift_model::{InferenceSizes, Parameters, Segment, UpdateSizes, inference_by
 use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::Stage;
-use crate::footprint::machine::process_overhead_bytes;
 use crate::footprint::scene_sizes::{
-    PARTS, VIEWS_PER_PASS, batch_sizes, cluster_counts, eval_sizes, image_values, largest_sizes, measures_lpips,
-    num_tokens, set_accumulate, trained_parts,
+    PARTS, VIEWS_PER_PASS, cluster_counts, eval_sizes, image_values, largest_sizes, measures_lpips, num_tokens,
 };
 
-/// Returns the most memory of the process during a part of a run.
+/// Memory of a process besides its tensors: code, threads and buffers (docs/guide/training.md).
+const PROCESS_BYTES: u64 = 20 << 20;
+
+/// Returns the peak memory of the process during a part of a run.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for sizes that cannot be.
+/// [`TrainError::BadConfig`] for impossible sizes.
 pub fn peak_bytes(config: &Config, part: Stage) -> Result<u64, TrainError> {
     let bytes = match part {
         Stage::Stage1 | Stage::Stage2 => update(config, part)?,
         Stage::Clusters => inference_bytes(&config.model, &clusters(config)?),
         Stage::Eval => inference_bytes(&config.model, &evaluation(config)?),
     };
-    Ok(process_overhead_bytes() + bytes as u64)
+    Ok(PROCESS_BYTES + bytes as u64)
 }
 
-/// Describes the part of a run that needs most of those beyond the `available` memory, with a change that would help;
-/// `None` where all fit, or where the system does not show its memory.
+/// Describes the part of a run that exceeds the `available` memory the most, with a change of the config that fits;
+/// `None` if all parts fit or the available memory is unknown.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] for sizes that cannot be.
+/// [`TrainError::BadConfig`] for impossible sizes.
 pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<String>, TrainError> {
     let Some(available) = available else { return Ok(None) };
     let mut largest = None;
@@ -44,17 +45,16 @@ pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     let device = config.device;
     let needs =
-        format!("{name} needs about {:.1} GiB, and {:.1} GiB are there on {device}", gib(bytes), gib(available));
-    if trained_parts(part).is_empty() {
+        format!("{name} needs about {:.1} GiB, and {device} has {:.1} GiB available", gib(bytes), gib(available));
+    if part.trained().is_empty() {
         return Ok(Some(format!("{needs}: fewer context views, or smaller ones, would fit")));
     }
-    let (batch_size, _) = batch_sizes(config, part);
     let was_on = config.activation_checkpointing;
     for activation_checkpointing in [config.activation_checkpointing, true] {
         let mut config = Config { activation_checkpointing, ..config.clone() };
         let also = if activation_checkpointing && !was_on { "activation_checkpointing = true and " } else { "" };
-        for parts in 1..=batch_size {
-            set_accumulate(&mut config, part, parts);
+        for parts in 1..=config.stage(part).batch_size {
+            config.set_accumulate(part, parts);
             if peak_bytes(&config, part)? <= available {
                 return Ok(Some(format!("{needs}: {also}{name}.accumulate = {parts} would fit")));
             }
@@ -64,12 +64,13 @@ pub fn memory_warning(config: &Config, available: Option<u64>) -> Result<Option<
 }
 
 fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
-    let (batch_size, num_scenes) = batch_sizes(config, stage);
+    let settings = config.stage(stage);
+    let num_scenes = settings.micro_batch_size();
     let num_image_values = image_values(config);
     let vgg =
         (config.loss.perceptual_weight > 0.0).then(|| VggShape::VGG19.sizes(config.data.height, config.data.width));
-    // Layers are kept before and behind their ReLU; what the targets are in the network is there until the differences
-    // are; a convolution orders its input anew.
+    // Outputs of layers are stored before and after their ReLU, and features of the targets until the difference; a
+    // convolution copies its input into another order.
     let images = config.data.views.num_targets as f64;
     let loss = vgg.map_or_else(Segment::default, |vgg| Segment {
         kept: images * (2.0 * vgg.outputs + vgg.features),
@@ -78,17 +79,17 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         parameters: 0.0,
     });
     let sizes = UpdateSizes {
-        trained: trained_parts(stage),
+        trained: settings.trained,
         num_scenes,
-        is_accumulated: num_scenes < batch_size,
+        is_accumulated: num_scenes < settings.batch_size,
         activation_checkpointing: config.activation_checkpointing,
         scene: largest_sizes(config, stage)?,
         num_image_values,
         loss,
         loss_parameters: vgg.map_or(0.0, |vgg| vgg.parameters),
     };
-    // Batches prepared ahead, as bytes.
-    let waiting = (config.data.num_prefetch + 1) * batch_size * num_image_values;
+    // Prefetched batches, one byte per value.
+    let waiting = (config.data.num_prefetch + 1) * settings.batch_size * num_image_values;
     Ok(update_bytes(&config.model, &sizes) + waiting as f64)
 }
 
@@ -114,20 +115,20 @@ fn evaluation(config: &Config) -> Result<InferenceSizes, TrainError> {
     let all = num_tokens(config, eval.num_context)?;
     let stored = eval.storage.iter().map(|count| count.of(all)).collect::<Result<Vec<_>, _>>()?;
     let sweep = eval_sizes(config);
-    let num_drawn: usize = stored.iter().map(|&count| sweep.token_counts(count).len()).sum();
+    let num_rendered: usize = stored.iter().map(|&count| sweep.token_counts(count).len()).sum();
     let vgg = measures_lpips(config).then(|| VggShape::VGG16.sizes(config.data.height, config.data.width));
     Ok(InferenceSizes {
-        // Both stages have a renderer of their own.
+        // Each stage has a renderer.
         num_parameters: parameters.total + parameters.renderer,
         num_loaded: parameters.condenser + parameters.renderer,
         num_tokens: all,
         num_clusters: stored.iter().max().copied(),
         num_targets: eval.num_targets.min(VIEWS_PER_PASS),
         num_patches: num_tokens(config, 1)?,
-        // Images of every count and variant are held until the scene is measured.
-        num_image_values: eval.num_targets * (num_drawn + 3) * config.data.width * config.data.height * 3,
-        // What the images are in its layers, unit vectors of it, and one layer computed from another. Its file is whole
-        // in memory while its weights are taken out.
+        // Images of every count and method are kept until the metrics of the scene are computed.
+        num_image_values: eval.num_targets * (num_rendered + 3) * config.data.width * config.data.height * 3,
+        // Features of the images, their unit vectors, and input and output of a layer; or the file of weights while it is
+        // read.
         metric_working: vgg.map_or(0.0, |vgg| {
             let rendering = (eval.num_targets + 2) as f64 * vgg.features + 3.0 * vgg.widest;
             rendering.max(vgg.parameters)
@@ -141,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn too_much_memory_is_said_with_the_smallest_change_that_fits() {
+    fn warning_names_the_smallest_change_that_fits() {
         let mut config = Config { run_dir: "run".into(), ..Config::default() };
         (config.data.synthetic.width, config.data.synthetic.height) = (256, 256);
         config.data.views.max_context = 4;

@@ -5,6 +5,5 @@
 //! - `largest_tensor`: refuse tensors a device cannot hold
 
 pub(crate) mod largest_tensor;
-pub(crate) mod machine;
 pub(crate) mod memory;
 pub(crate) mod scene_sizes;

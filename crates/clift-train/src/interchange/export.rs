@@ -1,4 +1,4 @@
-//! A model to a file under the names of published checkpoints, for PyTorch.
+//! Exports a model under the names of published checkpoints, for PyTorch.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -13,7 +13,7 @@ use crate::error::TrainError;
 use crate::interchange::model_dir::{Parameter, require_absent, to_safetensors};
 use crate::interchange::record::ImportRecord;
 
-/// What kind of file is written.
+/// Format of an exported file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExportFormat {
     /// `{"state_dict": {..}, "clift": sizes}`, which `torch.load(path, weights_only=True)` reads.
@@ -22,22 +22,22 @@ pub enum ExportFormat {
     Safetensors,
 }
 
-/// What was written.
+/// Summary of an export.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Exported {
-    /// Tensors of the file.
+    /// Number of tensors.
     pub num_tensors: usize,
-    /// Values of all of them.
+    /// Number of values.
     pub num_values: usize,
-    /// Whether the condenser is among them.
+    /// Whether the file contains the condenser.
     pub has_condenser: bool,
 }
 
 /// Writes a model's weights under the keys of a published checkpoint, `transformer.` before each.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] where `out` exists, [`TrainError::BadFile`] for a weight file that is not the config's model,
-/// and whatever reading and writing give.
+/// [`TrainError::BadConfig`] if `out` exists, [`TrainError::BadFile`] if the weight file does not fit the config, and those of
+/// reading and writing.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
     require_absent(out)?;
     config.model.validate()?;
@@ -67,7 +67,7 @@ pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Pa
         tensors.push((format!("{PREFIX}{}", tensor.key), shape, values));
     }
     if let Some(path) = ours.keys().next() {
-        return Err(bad(format!("{path} has no place in a {} network", config.model.variant)));
+        return Err(bad(format!("{path} is no parameter of a {} network", config.model.variant)));
     }
     let exported = Exported {
         num_tensors: tensors.len(),
@@ -79,15 +79,15 @@ pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Pa
         ExportFormat::Safetensors => {
             let parameters: Vec<Parameter> =
                 tensors.into_iter().map(|(path, shape, values)| Parameter { path, shape, values }).collect();
-            let said = sizes(&config.model).map(|(name, size)| (name.to_owned(), size.to_string()));
-            let bytes = to_safetensors(&parameters, HashMap::from(said), out)?;
+            let metadata = sizes(&config.model).map(|(name, size)| (name.to_owned(), size.to_string()));
+            let bytes = to_safetensors(&parameters, HashMap::from(metadata), out)?;
             replace_file(out, &bytes).map_err(TrainError::io("writing the weights", out))?;
         }
     }
     Ok(exported)
 }
 
-/// What is said beside the tensors: no shape shows the heads.
+/// Returns the sizes to store: tensor shapes do not determine the number of heads.
 fn sizes(model: &ModelConfig) -> [(&'static str, usize); 6] {
     [
         ("dim", model.dim),
@@ -99,7 +99,7 @@ fn sizes(model: &ModelConfig) -> [(&'static str, usize); 6] {
     ]
 }
 
-/// The parameters of a weight file by path.
+/// Reads the parameters of a weight file by path.
 fn read_parameters(path: &Path) -> Result<BTreeMap<String, Parameter>, TrainError> {
     let bytes = std::fs::read(path).map_err(TrainError::io("reading the weights", path))?;
     let file = SafeTensors::deserialize(&bytes).map_err(TrainError::bad_file("weight file", path))?;

@@ -1,4 +1,4 @@
-//! A published checkpoint to a model directory: weights, config, and what came from where.
+//! Imports a published checkpoint as a model directory: weights, config and a record of the import.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -8,17 +8,17 @@ use clift_model::{InferredConfig, PublishedTensor, published_tensors};
 
 use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::interchange::keys::{Keys, shown};
+use crate::interchange::keys::{Keys, printable};
 use crate::interchange::model_dir::{self, Parameter};
 use crate::interchange::problems;
 use crate::interchange::record::{ImportOptions, ImportRecord, check_stop};
 
-/// Reads a checkpoint and writes a model directory: all of it or nothing.
+/// Reads a checkpoint and writes a model directory, completely or not at all.
 ///
 /// # Errors
-/// [`TrainError::BadFile`] where keys, shapes or number formats are not the network's, with all of them;
-/// [`TrainError::BadConfig`] for heads that cannot be and renames of nothing; [`TrainError::Abandoned`] once `stop`
-/// is set; whatever reading the file or writing the directory gives.
+/// [`TrainError::BadFile`] with all keys whose names, shapes or types do not fit the network, [`TrainError::BadConfig`] for an
+/// impossible number of heads and renames without effect, [`TrainError::Abandoned`] if `stop` is set, and those of reading
+/// and writing.
 pub fn import(
     file: &Path,
     out: &Path,
@@ -35,14 +35,17 @@ pub fn import(
     let expected = published_tensors(&model, has_condenser);
     let problems = problems::problems(&keys, &state, &expected, options);
     if !problems.is_empty() {
-        let told = problems::told(&keys, &state, &problems, &model, options);
-        return Err(TrainError::bad_file("checkpoint", file)(told));
+        let text = problems::describe(&keys, &state, &problems, &model, options);
+        return Err(TrainError::bad_file("checkpoint", file)(text));
     }
 
     let num_bytes: u64 = expected.iter().map(|tensor| 4 * tensor.shape.iter().product::<usize>() as u64).sum();
-    // Keys may share a storage, which a network's parameters do not.
+    // Parameters of a network share no storage, though keys of a file may.
     if num_bytes > state.num_bytes().saturating_mul(2) {
-        let reason = format!("its parameters take {num_bytes} bytes, more than twice the {} it has", state.num_bytes());
+        let reason = format!(
+            "the parameters take {num_bytes} bytes, more than twice the {} bytes of the file",
+            state.num_bytes()
+        );
         return Err(TrainError::bad_file("checkpoint", file)(reason));
     }
     let (mut parameters, mut mapping, mut convolutions, mut num_converted) = (vec![], vec![], vec![], 0);
@@ -72,44 +75,45 @@ pub fn import(
         passed_over: state.skipped_objects().clone(),
     };
     let config = model_dir::evaluation_config(model, out);
-    model_dir::write(out, &config, &parameters, &imported, stop)?;
+    model_dir::write_model_dir(out, &config, &parameters, &imported, stop)?;
     Ok((config, imported))
 }
 
-/// The heads that are given, or those that an export of this program says it has.
+/// Returns the given number of heads, or that stored by `clift export`.
 fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>, TrainError> {
-    let said = state.size("num_heads").and_then(|size| usize::try_from(size).ok());
-    match (options.num_heads, said) {
-        (Some(given), Some(said)) if given != said => {
-            let fix = format!("the checkpoint says it has {said}: leave the option out: {}", state.path().display());
+    let stored = state.size("num_heads").and_then(|size| usize::try_from(size).ok());
+    match (options.num_heads, stored) {
+        (Some(given), Some(stored)) if given != stored => {
+            let fix = format!("the checkpoint has {stored} heads: omit the option: {}", state.path().display());
             Err(TrainError::BadConfig { key: "--num-heads".into(), value: given.to_string(), fix })
         }
-        (given, said) => Ok(given.or(said)),
+        (given, stored) => Ok(given.or(stored)),
     }
 }
 
-/// What no shape shows must be right before anything else can be said.
+/// Checks the number of heads, which shapes do not determine, and the other sizes.
 fn check_sizes(sizes: &InferredConfig, keys: &Keys, state: &StateDict) -> Result<(), TrainError> {
     let InferredConfig { config: model, knows_heads, width_key, .. } = sizes;
     let file = state.path();
     let num_heads = model.num_heads;
     if !knows_heads || num_heads == 0 || !model.dim.is_multiple_of(num_heads) {
         let key = width_key.as_ref().map(|key| &keys.network[key]);
-        let from = key.and_then(|key| state.tensor(key).map(|(_, shape)| format!(" ({} is {shape:?})", shown(key))));
+        let from =
+            key.and_then(|key| state.tensor(key).map(|(_, shape)| format!(" ({} is {shape:?})", printable(key))));
         let (dim, from, file) = (model.dim, from.unwrap_or_default(), file.display());
         let (value, why) = if *knows_heads {
             (num_heads.to_string(), "")
         } else {
-            ("not given".into(), "no shape shows them, and width 768 alone is published, with 8: ")
+            ("not given".into(), "tensor shapes do not determine the number: ")
         };
-        let fix = format!("{why}give the heads of this network, a divisor of its width {dim}{from}: {file}");
+        let fix = format!("{why}give the number of heads, a divisor of the width {dim}{from}: {file}");
         return Err(TrainError::BadConfig { key: "--num-heads".into(), value, fix });
     }
     let bad_sizes = |error: clift_model::ModelError| TrainError::bad_file("checkpoint", file)(error);
     model.validate().map_err(bad_sizes)
 }
 
-/// The rows of a tensor that are parameters here.
+/// Splits a published tensor into parameters.
 fn parts<'a>(tensor: &'a PublishedTensor, values: &'a [f32]) -> impl Iterator<Item = Parameter> + 'a {
     let row_len: usize = tensor.shape[1..].iter().product();
     tensor.parts.iter().map(move |(path, rows)| {

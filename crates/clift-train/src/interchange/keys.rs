@@ -1,4 +1,4 @@
-//! The keys of a checkpoint: those of the network, under the names of `interchange`, and the others.
+//! Keys of a checkpoint: those of the network, under canonical names, and others.
 
 use std::collections::BTreeMap;
 
@@ -8,26 +8,30 @@ use clift_model::{CliftVariant, InferredConfig, PERCEPTUAL_PREFIX, PREFIX, canon
 use crate::error::TrainError;
 use crate::interchange::record::ImportOptions;
 
-/// Letters of a key that a message shows.
+/// Most characters of a key in a message.
 pub(crate) const MAX_SHOWN: usize = 160;
-/// Kinds of keys outside the network that are told apart.
+/// Most patterns of keys outside the network.
 const MAX_OUTSIDE: usize = 200;
 
 /// The keys of a checkpoint.
 pub(crate) struct Keys {
-    /// Those of the network: as `interchange` writes them, and as the file does.
+    /// Keys of the network: canonical name to name in the file.
     pub network: BTreeMap<String, String>,
-    /// What stands before them in the file.
+    /// Prefix of these keys in the file.
     pub prefix: &'static str,
-    /// Keys that start as the network's do, but for the prefix that the others have: as above.
+    /// Keys that look like those of the network but lack the prefix, as above.
     pub strays: BTreeMap<String, String>,
-    /// First parts of those that are known to be no part of the network, and how many of them there are.
+    /// First parts of keys that are known not to belong to the network, with their numbers.
     pub ignored: BTreeMap<String, usize>,
-    /// Patterns of those that have names of nothing that is known.
+    /// Patterns of unknown keys outside the network, with their numbers.
     pub outside: BTreeMap<String, usize>,
 }
 
 impl Keys {
+    /// Classifies the keys of a checkpoint after renaming.
+    ///
+    /// # Errors
+    /// [`TrainError::BadConfig`] for a rename without effect, [`TrainError::BadFile`] for two keys with one canonical name.
     pub fn of(state: &StateDict, options: &ImportOptions) -> Result<Self, TrainError> {
         let mut is_used = vec![false; options.renames.len()];
         let mut all = Vec::new();
@@ -43,11 +47,12 @@ impl Keys {
         }
         if let Some(((from, to), _)) = options.renames.iter().zip(&is_used).find(|(_, is_used)| !**is_used) {
             let first = all.first().map_or("none", |(_, key)| key);
-            let fix = format!("no key has {from:?} in it; the first is {}: {}", shown(first), state.path().display());
+            let fix =
+                format!("no key contains {from:?}; the first key is {}: {}", printable(first), state.path().display());
             return Err(TrainError::BadConfig { key: "--rename".into(), value: format!("{from}={to}"), fix });
         }
 
-        // A state dict saved on its own has no prefix.
+        // A state dict of the network alone has no prefix.
         let prefix = if all.iter().any(|(name, _)| name.starts_with(PREFIX)) { PREFIX } else { "" };
         let mut keys = Self {
             network: BTreeMap::new(),
@@ -61,13 +66,13 @@ impl Keys {
                 *keys.ignored.entry(PERCEPTUAL_PREFIX.trim_end_matches('.').into()).or_insert(0) += 1;
             } else if let Some(plain) = name.strip_prefix(prefix) {
                 if let Some(other) = keys.network.insert(plain.to_owned(), key.to_owned()) {
-                    let reason = format!("{} and {} are both {}", shown(&other), shown(key), shown(plain));
+                    let reason = format!("{} and {} are both {}", printable(&other), printable(key), printable(plain));
                     return Err(TrainError::bad_file("checkpoint", state.path())(reason));
                 }
             } else if starts_as_network(&name) {
                 keys.strays.insert(name, key.to_owned());
             } else {
-                let pattern = shown(&pattern(key));
+                let pattern = printable(&pattern(key));
                 let is_known = keys.outside.contains_key(&pattern) || keys.outside.len() < MAX_OUTSIDE;
                 *keys.outside.entry(if is_known { pattern } else { "others".into() }).or_insert(0) += 1;
             }
@@ -75,14 +80,14 @@ impl Keys {
         Ok(keys)
     }
 
-    /// The sizes that the shapes of the network's keys show.
+    /// Infers the sizes of the network from the shapes.
     pub fn sizes(&self, state: &StateDict, variant: CliftVariant, num_heads: Option<usize>) -> InferredConfig {
         let shape = |key: &str| state.tensor(key).map_or(&[][..], |(_, shape)| shape);
         infer_config(variant, num_heads, self.network.iter().map(|(name, key)| (name.as_str(), shape(key))))
     }
 }
 
-/// Whether a key without the network's prefix is probably the network's all the same.
+/// Whether a key without the prefix probably belongs to the network.
 fn starts_as_network(name: &str) -> bool {
     let first = name.split('.').next().unwrap_or_default();
     matches!(first, "encoder" | "decoder" | "squeezer" | "patch_to_image")
@@ -90,18 +95,18 @@ fn starts_as_network(name: &str) -> bool {
         || first.ends_with("_norm")
 }
 
-/// Whether a part of a key is the number of a layer.
+/// Whether a part of a key is a number.
 pub(crate) fn is_number(part: &str) -> bool {
     !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit())
 }
 
-/// A key with `N` for every number in it.
+/// Replaces every number in a key by `N`.
 pub(crate) fn pattern(key: &str) -> String {
     key.split('.').map(|part| if is_number(part) { "N" } else { part }).collect::<Vec<_>>().join(".")
 }
 
-/// A key of a file that may be hostile, for a terminal.
-pub(crate) fn shown(key: &str) -> String {
+/// Shortens and escapes a key of an untrusted file for a terminal.
+pub(crate) fn printable(key: &str) -> String {
     let short: String = key.chars().take(MAX_SHOWN).collect();
     let rest = if short.len() < key.len() { ".." } else { "" };
     format!("{}{rest}", short.escape_debug())

@@ -1,5 +1,4 @@
-//! A model directory: `model.safetensors` with `config.toml`, which says what network it is and how it is evaluated.
-//! That of an imported model has `import.json` too.
+//! A model directory: `model.safetensors`, `config.toml` with the network and its evaluation settings, and `import.json`.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -19,17 +18,17 @@ use crate::interchange::record::{ImportRecord, check_stop};
 /// A parameter on the host, in PyTorch's layout.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Parameter {
-    /// Its path in weight files.
+    /// Path in weight files.
     pub path: String,
-    /// Its shape.
+    /// Shape.
     pub shape: Vec<usize>,
-    /// Its values, row-major.
+    /// Values, row-major.
     pub values: Vec<f32>,
 }
 
-/// The settings under which the reference evaluates a published network.
+/// Returns the settings with which the reference evaluates a published network.
 pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
-    // Where `clift train` would write, given this config; evaluating sets its own.
+    // Run directory of `clift train` with this config.
     let run_dir = Path::new("runs").join(folder.file_name().unwrap_or("imported".as_ref()));
     let mut config = Config { run_dir, ..Config::default() };
     let data = &mut config.data;
@@ -38,7 +37,7 @@ pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
     match model.variant {
         CliftVariant::Paper => {}
         CliftVariant::ReleasedRe10k => {
-            (data.pose_rotation, data.pose_scale) = (PoseRotation::Quaternion, PoseScale::All)
+            (data.pose_rotation, data.pose_scale) = (PoseRotation::Quaternion, PoseScale::All);
         }
         CliftVariant::ReleasedDl3dv => {
             (data.width, data.height) = (448, 256);
@@ -50,7 +49,7 @@ pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
     config
 }
 
-/// Nothing that exists is written over, be it a link to nowhere.
+/// Refuses an output path that exists, also as a broken link.
 ///
 /// # Errors
 /// [`TrainError::BadConfig`].
@@ -58,11 +57,11 @@ pub fn require_absent(path: &Path) -> Result<(), TrainError> {
     if path.symlink_metadata().is_err() {
         return Ok(());
     }
-    let fix = "it exists already, and nothing is written over; write a name that is free".to_owned();
+    let fix = "the path exists and is not overwritten; write another one".to_owned();
     Err(TrainError::BadConfig { key: "-o".into(), value: path.display().to_string(), fix })
 }
 
-/// SHA-256 of a file, as 64 hexadecimal digits.
+/// Returns the SHA-256 of a file as 64 hexadecimal digits.
 pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
     let reading = "reading the checkpoint";
     let mut file = File::open(path).map_err(TrainError::io(reading, path))?;
@@ -76,9 +75,9 @@ pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
     Ok(hex::encode(sha.finalize()))
 }
 
-/// Writes a model directory under a temporary name, reads the model back as every command does, and renames it, unless
-/// `stop` is set before: then nothing is left.
-pub(crate) fn write(
+/// Writes a model directory under a temporary name, opens the model to check it, and renames the directory. Removes all
+/// files if `stop` is set before.
+pub(crate) fn write_model_dir(
     folder: &Path,
     config: &Config,
     parameters: &[Parameter],
@@ -95,7 +94,7 @@ pub(crate) fn write(
     builder.prefix(TEMPORARY);
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
-    // Dropped before it is renamed, it leaves nothing behind.
+    // Removed on drop.
     let temporary = std::fs::create_dir_all(above).and_then(|()| builder.tempdir_in(above));
     let temporary = temporary.map_err(TrainError::io(writing, above))?;
     let weights_path = temporary.path().join("model.safetensors");
@@ -116,11 +115,11 @@ pub(crate) fn write(
     check_stop(stop)?;
     require_absent(folder)?;
     publish_folder(temporary.path(), folder).map_err(TrainError::io(writing, folder))?;
-    let _ = temporary.keep(); // it has another name now
+    let _ = temporary.keep(); // the directory was renamed
     Ok(())
 }
 
-/// The bytes of a safetensors file, with what is said about it beside the format.
+/// Returns the bytes of a safetensors file with `metadata`.
 pub(crate) fn to_safetensors(
     parameters: &[Parameter],
     mut metadata: HashMap<String, String>,
@@ -136,6 +135,6 @@ pub(crate) fn to_safetensors(
         .collect();
     metadata.insert("format".into(), "clift-1".into());
     let file = safetensors::serialize(views.map_err(bad)?, Some(metadata)).map_err(bad)?;
-    // Equal weights are equal files.
+    // Equal weights give equal files.
     sorted_header(file).map_err(TrainError::bad_file("weight file", path))
 }

@@ -1,4 +1,4 @@
-//! What is wrong with the keys of a checkpoint, and how it is told: one line for all layers, each with the nearest name.
+//! Problems of the keys of a checkpoint, and their message: one line for equal keys of all layers, with the nearest name.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -6,20 +6,20 @@ use std::fmt::Write as _;
 use clift_data::{ElementType, StateDict};
 use clift_model::{CliftVariant, ModelConfig, PREFIX, PublishedTensor, canonical_key, published_tensors};
 
-use crate::interchange::keys::{Keys, MAX_SHOWN, is_number, pattern, shown};
+use crate::interchange::keys::{Keys, MAX_SHOWN, is_number, pattern, printable};
 use crate::interchange::record::ImportOptions;
 
-/// Lines of one kind; a network has about sixty patterns of keys.
+/// Most lines of one kind; a network has about sixty patterns of keys.
 const MAX_LISTED: usize = 200;
-/// Numbers of layers in one line.
+/// Most layer numbers in a line.
 const MAX_NUMBERS: usize = 64;
 
-/// What is wrong with one key.
+/// A problem of a key.
 pub(crate) struct Problem {
     kind: Kind,
-    /// The key as the file has it, or would.
+    /// The key in the file, or the expected key.
     key: String,
-    /// The same as `interchange` writes it.
+    /// The canonical name.
     name: String,
     /// Shapes and formats.
     detail: String,
@@ -39,7 +39,7 @@ enum Kind {
     Stray,
 }
 
-/// Compares a checkpoint with the tensors that a network has.
+/// Compares a checkpoint with the expected tensors of a network.
 pub(crate) fn problems(
     keys: &Keys,
     state: &StateDict,
@@ -77,17 +77,17 @@ pub(crate) fn problems(
         let mut detail = state.tensor(key).map_or_else(String::new, |(_, shape)| format!(" {shape:?}"));
         let full = format!("{prefix}{name}");
         if canonical_key(key) != full {
-            let _ = write!(detail, ", renamed {}", shown(&pattern(&full)));
+            let _ = write!(detail, ", renamed {}", printable(&pattern(&full)));
         }
         problems.push(Problem { kind, key: key.clone(), name: name.clone(), detail });
     }
     problems
 }
 
-/// Names by their pattern.
-struct Names<'a>(BTreeMap<String, BTreeSet<&'a str>>);
+/// Names by pattern.
+struct PatternNames<'a>(BTreeMap<String, BTreeSet<&'a str>>);
 
-impl<'a> Names<'a> {
+impl<'a> PatternNames<'a> {
     fn of(names: impl Iterator<Item = &'a str>) -> Self {
         let mut patterns: BTreeMap<_, BTreeSet<_>> = BTreeMap::new();
         for name in names {
@@ -96,17 +96,19 @@ impl<'a> Names<'a> {
         Self(patterns)
     }
 
-    /// The pattern with the fewest typing slips, if those are at most so many.
+    /// Returns the pattern with the smallest edit distance, if that is at most `most`.
     fn nearest(&self, name: &str, most: usize) -> Option<&str> {
         let short = |text: &str| text.chars().take(MAX_SHOWN).collect::<String>();
         let word = short(&pattern(name));
-        let slips = |candidate: &str| strsim::damerau_levenshtein(&word, &short(candidate));
-        let all = self.0.keys().take(MAX_LISTED).map(|candidate| (slips(candidate), candidate.as_str()));
-        all.filter(|(slips, _)| *slips <= most).min_by_key(|(slips, _)| *slips).map(|(_, candidate)| candidate)
+        let distance = |candidate: &str| strsim::damerau_levenshtein(&word, &short(candidate));
+        let all = self.0.keys().take(MAX_LISTED).map(|candidate| (distance(candidate), candidate.as_str()));
+        all.filter(|(distance, _)| *distance <= most)
+            .min_by_key(|(distance, _)| *distance)
+            .map(|(_, candidate)| candidate)
     }
 
-    /// The name of a pattern that has these numbers, the only one there is, or the pattern for many.
-    fn told(&self, found: &str, numbers: Option<&[&str]>) -> String {
+    /// Returns the name of a pattern with these numbers, or the only name, or the pattern.
+    fn name_of(&self, found: &str, numbers: Option<&[&str]>) -> String {
         let mut numbers = numbers.unwrap_or_default().iter();
         let part = |part| if part == "N" { numbers.next().copied().unwrap_or(part) } else { part };
         let filled = found.split('.').map(part).collect::<Vec<_>>().join(".");
@@ -119,8 +121,8 @@ impl<'a> Names<'a> {
     }
 }
 
-/// All that is wrong, for people.
-pub(crate) fn told(
+/// Formats all problems.
+pub(crate) fn describe(
     keys: &Keys,
     state: &StateDict,
     problems: &[Problem],
@@ -129,16 +131,16 @@ pub(crate) fn told(
 ) -> String {
     let ModelConfig { variant, dim, num_heads, num_encoder_blocks, num_renderer_blocks, .. } = model;
     let mut text = format!(
-        "it does not hold a {variant} network (width {dim}, {num_heads} heads, {num_encoder_blocks} + \
-         {num_renderer_blocks} layers); nothing was written"
+        "the checkpoint is no {variant} network (width {dim}, {num_heads} heads, {num_encoder_blocks} + \
+         {num_renderer_blocks} layers); no files were written"
     );
     let of_kinds = |kinds: &[Kind]| {
         let found = problems.iter().filter(|problem| kinds.contains(&problem.kind));
-        Names::of(found.map(|problem| problem.name.as_str()))
+        PatternNames::of(found.map(|problem| problem.name.as_str()))
     };
     let (missing, unknown, strays) = (of_kinds(&[Kind::Missing]), of_kinds(&[Kind::Unknown]), of_kinds(&[Kind::Stray]));
     let expected = published_tensors(model, true);
-    let expected = Names::of(expected.iter().map(|tensor| tensor.key.as_str()));
+    let expected = PatternNames::of(expected.iter().map(|tensor| tensor.key.as_str()));
     let mut lines: BTreeMap<(Kind, String, &str), Vec<&Problem>> = BTreeMap::new();
     for problem in problems {
         lines.entry((problem.kind, pattern(&problem.key), &problem.detail)).or_default().push(problem);
@@ -155,26 +157,27 @@ pub(crate) fn told(
             1 => (&first.key, String::new()),
             _ => (&pattern, format!(" (N = {})", layer_numbers(&found))),
         };
-        let _ = write!(text, "\n  {kind}: {}{detail}{numbers}", shown(key));
+        let _ = write!(text, "\n  {kind}: {}{detail}{numbers}", printable(key));
         let (own, most) = (numbers_of(&first.name), first.name.len() / 2);
         let prefixed = |name: String| format!("{}{name}", keys.prefix);
         let own = (found.len() == 1).then_some(&own[..]);
         let near = match kind {
-            // So near that it may be this one under another name; strays lack the prefix.
+            // Possibly this key under another name; strays lack the prefix.
             Kind::Missing => {
-                let near = |names: &Names| names.nearest(&first.name, most).map(|found| names.told(found, own));
+                let near =
+                    |names: &PatternNames| names.nearest(&first.name, most).map(|found| names.name_of(found, own));
                 near(&strays).or_else(|| near(&unknown).map(prefixed))
             }
             Kind::Unknown | Kind::Stray => {
-                let missing = missing.nearest(&first.name, most).map(|found| missing.told(found, own));
+                let missing = missing.nearest(&first.name, most).map(|found| missing.name_of(found, own));
                 let near = missing
-                    .or_else(|| expected.nearest(&first.name, usize::MAX).map(|found| expected.told(found, own)));
+                    .or_else(|| expected.nearest(&first.name, usize::MAX).map(|found| expected.name_of(found, own)));
                 near.map(prefixed)
             }
             _ => None,
         };
         if let Some(near) = near {
-            let _ = write!(text, "; nearest name: {}", shown(&near));
+            let _ = write!(text, "; nearest name: {}", printable(&near));
         }
     }
     for (kind, count) in counts.iter().filter(|(_, count)| **count > MAX_LISTED) {
@@ -185,7 +188,7 @@ pub(crate) fn told(
     text
 }
 
-/// What may be done about it.
+/// Suggests another variant or a rename.
 fn suggest_fix(keys: &Keys, state: &StateDict, options: &ImportOptions, has_unknown: bool) -> String {
     let fitting = CliftVariant::ALL.into_iter().filter(|other| *other != options.variant).find(|other| {
         let sizes = keys.sizes(state, *other, options.num_heads);
@@ -194,28 +197,28 @@ fn suggest_fix(keys: &Keys, state: &StateDict, options: &ImportOptions, has_unkn
             && problems(keys, state, &published_tensors(&sizes.config, sizes.has_condenser), &options).is_empty()
     });
     if let Some(other) = fitting {
-        return format!("\n  its keys and shapes are those of --variant {other}");
+        return format!("\n  keys and shapes match --variant {other}");
     }
-    // Renaming replaces wherever the text stands: only where no other key has it.
+    // A rename applies to every key that contains the text.
     let first = keys.strays.keys().next().and_then(|name| name.split('.').next());
     if let Some(first) = first.filter(|first| !keys.network.values().any(|key| key.contains(first))) {
-        let first = shown(first);
+        let first = printable(first);
         return format!(
-            "\n  --rename {first}=transformer.{first} makes such keys the network's, --rename {first}=other.{first} \
-             passes over them"
+            "\n  --rename {first}=transformer.{first} assigns these keys to the network, --rename {first}=other.{first} \
+             ignores them"
         );
     }
     let lead = keys.network.values().find_map(|key| key.split_once(&format!(".{PREFIX}")).map(|(lead, _)| lead));
-    if let Some(lead) = lead.filter(|_| keys.prefix.is_empty()).map(shown) {
-        return format!("\n  --rename {lead}.{PREFIX}={PREFIX} makes of its keys those that are expected");
+    if let Some(lead) = lead.filter(|_| keys.prefix.is_empty()).map(printable) {
+        return format!("\n  --rename {lead}.{PREFIX}={PREFIX} gives the keys their expected names");
     }
     if has_unknown {
-        return "\n  --rename FROM=TO replaces a part of its keys, as they stand here".into();
+        return "\n  --rename FROM=TO replaces a part of the keys listed here".into();
     }
     String::new()
 }
 
-/// The first number in each key.
+/// Lists the first number of each key.
 fn layer_numbers(found: &[&Problem]) -> String {
     let first =
         |problem: &&Problem| numbers_of(&problem.key).first().map(|number| (number.len(), (*number).to_owned()));

@@ -9,54 +9,57 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::TrainError;
 
-/// What the user gives beside a checkpoint.
+/// Options of an import.
 #[derive(Clone, Debug)]
 pub struct ImportOptions {
-    /// Which network it holds.
+    /// Architecture of the network.
     pub variant: CliftVariant,
-    /// Its heads, where neither a shape nor the file says them.
+    /// Number of heads, if neither the shapes nor the file determine it.
     pub num_heads: Option<usize>,
-    /// Whether parameters that are not in f32 are converted to it; they are an error otherwise.
+    /// Whether parameters of other types are converted to f32; otherwise they are an error.
     pub convert: bool,
-    /// Texts that are replaced in keys as the file has them, in this order: `(from, to)`.
+    /// Replacements in the keys of the file, in this order: `(from, to)`.
     pub renames: Vec<(String, String)>,
 }
 
-/// What an import did; `import.json` of the model directory.
+/// Record of an import: `import.json` of the model directory.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ImportRecord {
     /// Version of this file.
     pub version: u32,
-    /// Name of the checkpoint.
+    /// File name of the checkpoint.
     pub file: String,
-    /// SHA-256 of its bytes.
+    /// SHA-256 of the file.
     pub sha256: String,
-    /// The network.
+    /// Architecture of the network.
     pub variant: CliftVariant,
-    /// Whether it has a condenser, as a second-stage checkpoint has.
+    /// Whether the network has a condenser, as in checkpoints of the second stage.
     pub has_condenser: bool,
-    /// Projections that are 1x1 convolutions there; `clift export` writes them so.
+    /// Projections stored as 1x1 convolutions; `clift export` writes them likewise.
     pub convolutions: Vec<String>,
-    /// Parameters that were not in f32.
+    /// Number of parameters converted to f32.
     pub num_converted: usize,
-    /// Keys of the checkpoint, each with the parameters it became.
+    /// Keys of the checkpoint with the parameters made of them.
     pub parameters: Vec<(String, Vec<String>)>,
-    /// First parts of keys that are known to be no part of the network, each with how many keys there are.
+    /// First parts of keys that are known not to belong to the network, with their numbers.
     pub ignored: BTreeMap<String, usize>,
-    /// Keys that are neither that nor the network's, with `N` for numbers, each with how many there are.
+    /// Patterns of unknown keys outside the network, with their numbers.
     #[serde(default)]
     pub outside: BTreeMap<String, usize>,
-    /// Python classes and functions that were passed over, with the objects made of them.
+    /// Python classes and functions whose objects were skipped.
     pub passed_over: BTreeSet<String>,
 }
 
-/// Stops where the user has asked for it.
+/// Returns an error if `stop` is set.
+///
+/// # Errors
+/// [`TrainError::Abandoned`].
 pub(crate) fn check_stop(stop: &AtomicBool) -> Result<(), TrainError> {
-    if stop.load(Ordering::SeqCst) { Err(TrainError::Abandoned { work: "the import".into() }) } else { Ok(()) }
+    if stop.load(Ordering::SeqCst) { Err(TrainError::Abandoned { task: "importing".into() }) } else { Ok(()) }
 }
 
 impl ImportRecord {
-    /// Reads the record of a model directory; `None` for a model that was trained here.
+    /// Reads the record of a model directory; `None` for a model that was not imported.
     ///
     /// # Errors
     /// [`TrainError::BadFile`] for a damaged file.
@@ -68,7 +71,7 @@ impl ImportRecord {
         let text = std::fs::read(&path).map_err(TrainError::io("reading what was imported", &path))?;
         let imported: Self = serde_json::from_slice(&text).map_err(TrainError::bad_file("import.json", &path))?;
         if let Some(layer) = imported.convolutions.iter().find(|layer| !PROJECTIONS.contains(&layer.as_str())) {
-            let reason = format!("{layer:?} is no projection");
+            let reason = format!("unknown projection {layer:?}");
             return Err(TrainError::bad_file("import.json", &path)(reason));
         }
         Ok(Some(imported))

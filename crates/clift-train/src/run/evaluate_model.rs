@@ -1,4 +1,4 @@
-//! Evaluation of a model that is no run: an imported model, or a single weight file.
+//! Evaluation of a model without a run: an imported model or a weight file.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -14,17 +14,17 @@ use crate::run::validation::Validation;
 
 /// Evaluates a model with the data and settings of `config`, and writes the results to `folder`.
 ///
-/// A model with a condenser is measured on condensed tokens alone unless `stage1` is given, the model it was trained
-/// from, which renders the other methods. `systems` are measured beside it.
+/// A model with a condenser is measured on condensed tokens only, unless `stage1` is given: the model it was trained from,
+/// which renders the other methods. `external` methods are measured beside it.
 ///
 /// # Errors
 /// [`TrainError::BadFile`] when `stage1` has another encoder, [`TrainError::BadConfig`] for methods without
-/// weights, [`TrainError::Model`] for heads that are not the model's, and whatever data, models or evaluation give.
+/// weights, [`TrainError::Model`] for heads that are not the model's, and those of data, models and evaluation.
 pub fn evaluate_model(
     mut config: Config,
     model: &ModelPath,
     stage1: Option<&ModelPath>,
-    systems: &[ExternalMethod],
+    external: &[ExternalMethod],
     folder: &Path,
     stop: &AtomicBool,
     sink: &mut dyn Sink,
@@ -41,23 +41,23 @@ pub fn evaluate_model(
         return Err(TrainError::bad_file("stage-1 model", &path.weights)(reason));
     }
     if last.has_condenser && stage1.is_none() {
-        // Its renderer was trained on condensed tokens: what it makes of others is no baseline.
-        let asked = &mut config.eval.variants;
-        if asked.is_empty() {
-            asked.push(Method::Clift);
+        // Its renderer was trained on condensed tokens: other tokens would be no fair baseline.
+        let methods = &mut config.eval.variants;
+        if methods.is_empty() {
+            methods.push(Method::Clift);
         }
-        if let Some(variant) = asked.iter().find(|variant| **variant != Method::Clift) {
-            let fix = "give the first-stage model that draws it with --stage1".to_owned();
-            return Err(TrainError::BadConfig { key: "eval.variants".into(), value: variant.name().into(), fix });
+        if let Some(method) = methods.iter().find(|method| **method != Method::Clift) {
+            let fix = "give the stage-1 model, which renders this method, with --stage1".to_owned();
+            return Err(TrainError::BadConfig { key: "eval.variants".into(), value: method.name().into(), fix });
         }
     }
     if last.has_condenser {
         models.set_stage2(config.clusters.grouping, last);
     }
-    let OpenedSource { source, report: ledger, .. } = open_dataset(&config.data, Split::Test)?;
-    sink.event(&Event::Message(format!("{}: {ledger}", Split::Test)));
+    let OpenedSource { source, report, .. } = open_dataset(&config.data, Split::Test)?;
+    sink.event(&Event::Message(format!("{}: {report}", Split::Test)));
     let reader = ClipReader { source, options: config.data.clip_options() };
     let validation = Validation::new(&config, config.eval.clone(), reader, &device, sink)?;
     std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
-    validation.evaluate(&models, systems, folder, stop, sink)
+    validation.evaluate(&models, external, folder, stop, sink)
 }

@@ -1,8 +1,8 @@
-//! `--extend`: a stage of a run trained for more steps than it was started with.
+//! `--extend`: trains a stage of an existing run for more steps.
 //!
-//! The steps made so far stay as they are. Those to come have the learning rates of a run that has the new count: the rate
-//! jumps up to where that run's cosine is at the same step, and comes down to zero at the new end. The result is
-//! therefore not that of a run that had the count from the start; `run.json` says so.
+//! The steps made so far are kept. The following steps use the learning rates of a run with the new number of steps: the
+//! rate jumps to the cosine of that run and decays to zero at the new end. The result therefore differs from a run that
+//! had the new number from the start, and `run.json` records the extension.
 
 use std::path::Path;
 
@@ -13,33 +13,33 @@ use crate::config::config::CheckpointConfig;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 
-/// A step count that grows.
+/// A larger number of steps for a stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct StepExtension {
-    /// Which stage.
+    /// The stage.
     pub stage: Stage,
-    /// Its steps until now.
+    /// The former number of steps.
     pub from: u64,
-    /// Its steps from now on.
+    /// The new number of steps.
     pub to: u64,
 }
 
-/// What `run.json` says about one that was made.
+/// Record of an extension in `run.json`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ExtensionRecord {
     stage: Stage,
     from: u64,
     to: u64,
-    /// Steps that were made on the former schedule.
+    /// Number of steps made with the former schedule.
     at_step: u64,
 }
 
 impl StepExtension {
-    /// Prepares the stage of the run in `folder` to go on. Weights of a finished stage are kept under another name.
+    /// Prepares the stage of the run in `folder` for more steps. Weights of a finished stage are renamed.
     ///
     /// # Errors
-    /// [`TrainError::BadConfig`] where the stage cannot go on, [`TrainError::Io`].
+    /// [`TrainError::BadConfig`] if the stage cannot be continued, [`TrainError::Io`].
     pub fn apply(self, folder: &Path, sink: &mut dyn Sink) -> Result<ExtensionRecord, TrainError> {
         let Self { stage, from, to } = self;
         let refuse = |fix: String| {
@@ -49,8 +49,7 @@ impl StepExtension {
         let later = ["clusters", "stage2"].into_iter().find(|name| folder.join(name).exists());
         if let (Stage::Stage1, Some(later)) = (stage, later) {
             let fix = format!(
-                "{later}/ was made with the encoder that stage 1 has now; train on in a new run that starts from this one \
-                 (stage1.init_from)"
+                "{later}/ depends on the present encoder of stage 1; start a new run with stage1.init_from instead"
             );
             return Err(refuse(fix));
         }
@@ -59,16 +58,19 @@ impl StepExtension {
         let weights = own.join("model.safetensors");
         if weights.exists() {
             if newest.is_none() {
-                return Err(refuse(format!("{}/checkpoints, from which the stage would go on, is gone", stage.name())));
+                return Err(refuse(format!(
+                    "the stage has no checkpoint to resume from in {}/checkpoints",
+                    stage.name()
+                )));
             }
-            // Before the new count is written: a kill in between leaves a stage that makes these weights again.
+            // Before the new number is written: a process killed in between makes these weights again.
             let kept = own.join(format!("model-{from}-steps.safetensors"));
-            std::fs::rename(&weights, &kept).map_err(TrainError::io("keeping the former weights", &weights))?;
+            std::fs::rename(&weights, &kept).map_err(TrainError::io("renaming the former weights", &weights))?;
             sink.event(&Event::Message(format!("kept the weights of {from} steps as {}", kept.display())));
         }
         let at_step = newest.unwrap_or(0);
         sink.event(&Event::Message(format!(
-            "{} goes on for {to} steps instead of {from}: after step {at_step} with the learning rates of {to}",
+            "{} is extended from {from} to {to} steps: the steps after {at_step} use the learning rates of {to} steps",
             stage.name()
         )));
         Ok(ExtensionRecord { stage, from, to, at_step })

@@ -1,4 +1,4 @@
-//! Start of stage 1 from other weights.
+//! Initial weights of stage 1 from another model.
 
 use std::path::Path;
 
@@ -29,12 +29,12 @@ pub(crate) fn init_from(
     }
     let loaded = load_part(model, &Clift::stage1_part(), path)?;
     if loaded.applied.is_empty() {
-        let reason = "none of its tensors has a place in this model".to_owned();
+        let reason = "no tensor of the file fits this model".to_owned();
         return Err(TrainError::bad_file("weight file for stage1.init_from", path)(reason));
     }
     let list = |names: &[String]| if names.is_empty() { "none".into() } else { names.join(", ") };
     sink.event(&Event::Message(format!(
-        "loaded {} parameters from {}; new, not in the file: {}; unused in the file: {}",
+        "loaded {} parameters from {}; initialized, not in the file: {}; unused in the file: {}",
         loaded.applied.len(),
         path.display(),
         list(&loaded.missing),

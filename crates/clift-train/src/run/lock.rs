@@ -7,8 +7,8 @@ use std::path::Path;
 use crate::error::TrainError;
 use crate::events::{Event, Sink};
 
-/// Holds a run directory. The lock is the operating system's: it ends with the process, however that ends, and the
-/// file `lock` that stays behind means nothing.
+/// Lock of a run directory. The operating system releases the lock when the process ends; a remaining file `lock` has no
+/// effect.
 #[derive(Debug)]
 pub struct RunLock {
     file: File,
@@ -16,37 +16,35 @@ pub struct RunLock {
 
 impl Drop for RunLock {
     fn drop(&mut self) {
-        // The id of a process that is gone would mislead.
+        // Removes the process id.
         let _ = self.file.set_len(0);
     }
 }
 
 impl RunLock {
-    /// Takes the run in `folder`, which must exist.
-    ///
-    /// A file system without locks is used without one, and the sink is told.
+    /// Locks the run in the existing `folder`. A file system without locks gives a warning only.
     ///
     /// # Errors
-    /// [`TrainError::Locked`] while another process holds it, [`TrainError::Io`] where the file cannot be opened.
+    /// [`TrainError::Locked`] if another process has the lock, [`TrainError::Io`] if the file cannot be opened.
     pub fn take(folder: &Path, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         let path = folder.join("lock");
         let opened = File::options().read(true).write(true).create(true).truncate(false).open(&path);
         let mut file = opened.map_err(TrainError::io("opening the lock of the run directory", &path))?;
         match file.try_lock() {
             Ok(()) => {
-                // For the message of a process that is refused; the lock holds without it, on a full disk say.
+                // The process id is for error messages; the lock also works without it.
                 let _ = file.set_len(0).and_then(|()| write!(file, "{}", std::process::id()));
             }
             Err(TryLockError::WouldBlock) => {
                 let mut holder = String::new();
-                // Windows lets nobody read a locked file.
+                // Windows refuses to read a locked file.
                 let _ = file.rewind().and_then(|()| file.read_to_string(&mut holder));
                 let is_id = !holder.is_empty() && holder.bytes().all(|byte| byte.is_ascii_digit());
                 let holder = if is_id { format!("process {holder}") } else { "another process".into() };
                 return Err(TrainError::Locked { holder, path: folder.into() });
             }
             Err(TryLockError::Error(error)) => {
-                let text = format!("no lock on the run directory, start no second process in it: {error}");
+                let text = format!("the run directory cannot be locked, do not start a second process in it: {error}");
                 sink.event(&Event::Warning(text));
             }
         }
@@ -64,7 +62,7 @@ mod tests {
     }
 
     #[test]
-    fn a_second_lock_is_refused_with_the_holder_until_the_first_is_gone() {
+    fn second_lock_is_refused_with_the_process_id() {
         let folder = tempfile::tempdir().unwrap();
         let lock = RunLock::take(folder.path(), &mut Silent).unwrap();
         let error = RunLock::take(folder.path(), &mut Silent).unwrap_err();
@@ -73,15 +71,10 @@ mod tests {
         assert_eq!(path, folder.path());
         drop(lock);
         assert_eq!(std::fs::read(folder.path().join("lock")).unwrap(), b"");
-        RunLock::take(folder.path(), &mut Silent).unwrap();
-    }
-
-    #[test]
-    fn a_lock_file_that_a_dead_process_left_locks_nothing() {
-        let folder = tempfile::tempdir().unwrap();
+        // The id of a dead process has no effect.
         std::fs::write(folder.path().join("lock"), "4194303").unwrap();
         let _lock = RunLock::take(folder.path(), &mut Silent).unwrap();
         let id = std::fs::read_to_string(folder.path().join("lock")).unwrap();
-        assert_eq!(id, std::process::id().to_string(), "and the former id is gone");
+        assert_eq!(id, std::process::id().to_string());
     }
 }

@@ -1,4 +1,4 @@
-//! What a run writes step by step: `metrics.jsonl`, `bad_steps.jsonl` and `skipped.jsonl`.
+//! Logs of a run: `metrics.jsonl`, `bad_steps.jsonl` and `skipped.jsonl`.
 
 use std::collections::HashSet;
 use std::fs::{File, OpenOptions};
@@ -9,44 +9,10 @@ use clift_data::SkippedScene;
 use serde::{Deserialize, Serialize};
 
 use crate::error::TrainError;
-use crate::events::{Event, Sink, Stage, StepEvent};
+use crate::events::{Event, Sink, Stage};
 use crate::step::step_guard::SkippedStep;
 
-/// One line of `metrics.jsonl`. JSON holds no NaN and no infinity: such a number is `null`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct MetricsLine {
-    /// Updates so far in this stage, from 1.
-    pub step: u64,
-    /// Which stage.
-    pub stage: Stage,
-    /// Training loss of the batch.
-    pub loss: Option<f64>,
-    /// PSNR of the batch in dB.
-    pub psnr: Option<f64>,
-    /// Learning rate of the first parameter group.
-    pub lr: Option<f64>,
-    /// Global norm of the gradient before clipping.
-    pub grad_norm: Option<f64>,
-    /// Seconds of wall time.
-    pub step_s: Option<f64>,
-}
-
-impl From<&StepEvent> for MetricsLine {
-    fn from(event: &StepEvent) -> Self {
-        let finite = |value: f64| value.is_finite().then_some(value);
-        Self {
-            step: event.step,
-            stage: event.stage,
-            loss: finite(event.loss),
-            psnr: finite(event.psnr),
-            lr: finite(event.lr),
-            grad_norm: finite(event.grad_norm),
-            step_s: finite(event.step_s),
-        }
-    }
-}
-
-/// A file of JSON lines, one or none per step, each flushed: a killed run keeps all but the last.
+/// A file of JSON lines, at most one per step. Every line is flushed; a killed run loses at most the last one.
 #[derive(Debug)]
 pub struct StepLines {
     path: PathBuf,
@@ -56,14 +22,14 @@ pub struct StepLines {
 }
 
 impl StepLines {
-    /// Takes up the file of a run that goes on after `step` updates of `stage`; `0` for a stage that starts anew.
+    /// Opens the file of a run that resumes after `step` updates of `stage`, or starts the stage at 0.
     ///
-    /// Lines of later steps and stages are dropped, because they will be written again. So is a last line that was
-    /// torn by a kill. The shortened file replaces the old one by a rename, never half of it.
+    /// Lines of later steps and stages are dropped, since they will be written again, and so is a torn last line. The
+    /// shortened file replaces the old one by a rename.
     ///
     /// # Errors
-    /// The operating system's, and `InvalidData` with the line's number for a line before the last that names no
-    /// step: the file is then someone else's, and is left alone.
+    /// Those of the operating system, and `InvalidData` for a line before the last that has no step: such a file is not
+    /// changed.
     pub fn open(path: &Path, stage: Stage, step: u64) -> std::io::Result<Self> {
         if path.exists() {
             truncate_after(path, stage, step)?;
@@ -71,7 +37,7 @@ impl StepLines {
         Ok(Self { path: path.to_owned(), file: None, failure: None })
     }
 
-    /// Appends a line. A failure is kept for [`StepLines::check`]; nothing is written after it.
+    /// Appends a line. A failure is kept for [`StepLines::check`]; later lines are not written.
     pub fn write(&mut self, line: &impl Serialize) {
         if self.failure.is_none() {
             self.failure = self.try_write(line).err();
@@ -83,14 +49,14 @@ impl StepLines {
             Some(file) => file,
             none => none.insert(OpenOptions::new().create(true).append(true).open(&self.path)?),
         };
-        // One write a line: a kill tears at most the last one.
+        // One write per line: a kill tears at most the last one.
         file.write_all(format!("{}\n", serde_json::to_string(line)?).as_bytes())
     }
 
-    /// Says whether every line was written, and makes them survive a power cut.
+    /// Flushes all lines to the disk.
     ///
     /// # Errors
-    /// The first failure to write; lines after it were not tried.
+    /// The first failure to write a line.
     pub fn check(&mut self) -> std::io::Result<()> {
         if let Some(failure) = self.failure.take() {
             return Err(failure);
@@ -98,15 +64,15 @@ impl StepLines {
         self.file.as_ref().map_or(Ok(()), File::sync_data)
     }
 
-    /// Where the lines go.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 }
 
-/// What every line says about where it belongs.
+/// Stage and step of a line.
 #[derive(Deserialize)]
-struct Place {
+struct LinePosition {
     step: u64,
     stage: Stage,
 }
@@ -122,12 +88,12 @@ fn truncate_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
             break;
         }
         if let Some(number) = broken {
-            let reason = format!("line {number} is not of a step");
+            let reason = format!("line {number} has no step");
             return Err(std::io::Error::new(std::io::ErrorKind::InvalidData, reason));
         }
-        match serde_json::from_slice::<Place>(&line) {
-            // Without its end a line may be torn, even if what is there can be read.
-            Ok(place) if line.ends_with(b"\n") && (place.stage, place.step) <= (stage, step) => kept.extend(line),
+        match serde_json::from_slice::<LinePosition>(&line) {
+            // A line without newline may be torn even if it can be parsed.
+            Ok(found) if line.ends_with(b"\n") && (found.stage, found.step) <= (stage, step) => kept.extend(line),
             Ok(_) => is_whole = false,
             Err(_) => (is_whole, broken) = (false, Some(number)),
         }
@@ -135,20 +101,20 @@ fn truncate_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
     if is_whole { Ok(()) } else { clift_data::replace_file(path, &kept) }
 }
 
-/// A scene that training drew and could not use: one line of `skipped.jsonl`, at the first draw.
+/// A line of `skipped.jsonl`: a scene that could not be used, at its first step.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkipLine {
-    /// Update it was drawn for.
+    /// The step.
     pub step: u64,
-    /// Which stage.
+    /// The stage.
     pub stage: Stage,
-    /// The scene and why.
+    /// Scene and reason.
     #[serde(flatten)]
     pub skip: SkippedScene,
 }
 
-/// The files that a stage writes step by step, in front of another sink: a line per step in `metrics.jsonl`, one per
-/// step left out in `bad_steps.jsonl`, and one per scene left out in `skipped.jsonl`.
+/// The logs of a stage in front of another sink: a line per step in `metrics.jsonl`, per skipped step in `bad_steps.jsonl`,
+/// and per skipped scene in `skipped.jsonl`.
 pub struct RunLog<'a> {
     sink: &'a mut dyn Sink,
     metrics: StepLines,
@@ -159,7 +125,7 @@ pub struct RunLog<'a> {
 }
 
 impl<'a> RunLog<'a> {
-    /// Takes up the files in `run_dir` after `step` updates of `stage`, as [`StepLines::open`].
+    /// Opens the files in `run_dir` after `step` updates of `stage`, as [`StepLines::open`].
     ///
     /// # Errors
     /// [`TrainError::Io`].
@@ -173,7 +139,7 @@ impl<'a> RunLog<'a> {
         Ok(Self { sink, metrics: open("metrics.jsonl")?, bad_steps: open("bad_steps.jsonl")?, skips, skipped })
     }
 
-    /// Tells and notes a scene that `step` could not use, once for all steps.
+    /// Reports and logs a scene that `step` could not use, once per run.
     pub fn skip(&mut self, stage: Stage, step: u64, skip: &SkippedScene) {
         if self.skipped.insert(skip.key.clone()) {
             self.sink.event(&Event::Skipped { key: skip.key.clone(), reason: skip.reason.clone() });
@@ -181,12 +147,12 @@ impl<'a> RunLog<'a> {
         }
     }
 
-    /// Notes a step that was left out.
+    /// Logs a skipped step.
     pub fn bad_step(&mut self, line: &SkippedStep) {
         self.bad_steps.write(line);
     }
 
-    /// Says whether every line is on the disk. A checkpoint is only saved if so, or a resumed run would lack lines.
+    /// Flushes all lines to the disk. Must succeed before a checkpoint is saved, or a resumed run would lack lines.
     ///
     /// # Errors
     /// [`TrainError::Io`] with the first failure.
@@ -198,7 +164,7 @@ impl<'a> RunLog<'a> {
     }
 }
 
-/// Keys of the scenes that have a line.
+/// Reads the keys of the scenes that have a line.
 fn read_skips(path: &Path) -> std::io::Result<HashSet<String>> {
     if !path.exists() {
         return Ok(HashSet::new());
@@ -211,7 +177,7 @@ impl Sink for RunLog<'_> {
     fn event(&mut self, event: &Event) {
         self.sink.event(event);
         if let Event::Step(step) = event {
-            self.metrics.write(&MetricsLine::from(step));
+            self.metrics.write(step);
         }
     }
 }
@@ -219,14 +185,21 @@ impl Sink for RunLog<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::events::StepEvent;
+    use crate::step::step_guard::StepAnomaly;
 
-    fn step(stage: Stage, step: u64) -> Event {
-        let event =
-            StepEvent { stage, step, num_steps: 9, loss: 0.5, psnr: 20.0, lr: 1e-3, grad_norm: 2.0, step_s: 0.25 };
-        Event::Step(event)
-    }
+    const STEP: StepEvent = StepEvent {
+        step: 1,
+        stage: Stage::Stage1,
+        num_steps: 9,
+        loss: f64::NAN,
+        psnr: f64::INFINITY,
+        lr: 1e-3,
+        grad_norm: 2.0,
+        step_s: 0.25,
+    };
 
-    /// Counts what it is told.
+    /// Counts events.
     #[derive(Default)]
     struct Count(usize);
 
@@ -236,40 +209,60 @@ mod tests {
         }
     }
 
-    /// Writes to `metrics.jsonl` of a run.
+    /// Writes steps to `metrics.jsonl` of a run that resumes at `from`.
     fn write(path: &Path, from: (Stage, u64), steps: &[(Stage, u64)]) {
         let mut count = Count::default();
         let mut log = RunLog::open(path.parent().unwrap(), from.0, from.1, &mut count).unwrap();
-        for &(stage, number) in steps {
-            log.event(&step(stage, number));
+        for &(stage, step) in steps {
+            log.event(&Event::Step(StepEvent { step, stage, ..STEP }));
         }
         log.check().unwrap();
-        assert_eq!(count.0, steps.len(), "the other sink is told too");
+        assert_eq!(count.0, steps.len(), "events are passed on");
     }
 
     fn steps(path: &Path) -> Vec<(Stage, u64)> {
         let text = std::fs::read_to_string(path).unwrap();
-        let lines = text.lines().map(|line| serde_json::from_str::<MetricsLine>(line).unwrap());
+        let lines = text.lines().map(|line| serde_json::from_str::<LinePosition>(line).unwrap());
         lines.map(|line| (line.stage, line.step)).collect()
     }
 
     #[test]
-    fn a_line_holds_the_documented_names_and_null_for_what_is_not_finite() {
+    fn lines_have_documented_names_and_null_for_non_finite_values() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("metrics.jsonl");
         let mut count = Count::default();
-        let mut sink = RunLog::open(folder.path(), Stage::Stage1, 0, &mut count).unwrap();
-        sink.event(&Event::Message("not a step".into()));
-        let Event::Step(event) = step(Stage::Stage1, 1) else { panic!() };
-        sink.event(&Event::Step(StepEvent { psnr: f64::INFINITY, loss: f64::NAN, ..event }));
+        let mut log = RunLog::open(folder.path(), Stage::Stage1, 0, &mut count).unwrap();
+        log.event(&Event::Message("not a step".into()));
+        log.event(&Event::Step(STEP));
+        let bad = |step| SkippedStep {
+            step,
+            stage: Stage::Stage1,
+            reason: StepAnomaly::LossSpike,
+            loss: Some(2.0),
+            grad_norm: None,
+            median_loss: Some(0.5),
+            median_grad_norm: Some(1.0),
+            in_a_row: 1,
+            scenes: Vec::new(),
+        };
+        assert!(!folder.path().join("bad_steps.jsonl").exists(), "made by the first skipped step");
+        log.bad_step(&bad(3));
+        log.bad_step(&bad(5));
+        // Before `check`: every line is flushed. Resuming after step 4 drops the line of step 5.
+        RunLog::open(folder.path(), Stage::Stage1, 4, &mut Count::default()).unwrap();
+        let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
         assert_eq!(
-            std::fs::read_to_string(&path).unwrap(), // before `check`: the line is flushed
+            read("metrics.jsonl"),
             "{\"step\":1,\"stage\":\"stage1\",\"loss\":null,\"psnr\":null,\"lr\":0.001,\"grad_norm\":2.0,\"step_s\":0.25}\n"
+        );
+        assert_eq!(
+            read("bad_steps.jsonl"),
+            "{\"step\":3,\"stage\":\"stage1\",\"reason\":\"loss_spike\",\"loss\":2.0,\"grad_norm\":null,\
+             \"median_loss\":0.5,\"median_grad_norm\":1.0,\"in_a_row\":1,\"scenes\":[]}\n"
         );
     }
 
     #[test]
-    fn resuming_drops_the_lines_of_later_steps_and_stages() {
+    fn resuming_drops_later_steps_and_torn_lines() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
         let (one, two) = (Stage::Stage1, Stage::Stage2);
@@ -279,46 +272,39 @@ mod tests {
         write(&path, (one, 2), &[(one, 3)]);
         assert_eq!(steps(&path), [(one, 1), (one, 2), (one, 3)]);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
-    }
-
-    #[test]
-    fn a_last_line_torn_by_a_kill_is_dropped() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("metrics.jsonl");
-        write(&path, (Stage::Stage1, 0), &[(Stage::Stage1, 1)]);
-        let whole_but_its_end = "{\"step\":2,\"stage\":\"stage1\"}";
-        for torn in ["{\"step\":2,\"sta", "{\"step\":2,\"sta\n", "\u{0}\u{0}", whole_but_its_end] {
+        let without_newline = "{\"step\":2,\"stage\":\"stage1\"}";
+        for torn in ["{\"step\":2,\"sta", "{\"step\":2,\"sta\n", "\u{0}\u{0}", without_newline] {
             let whole = std::fs::read_to_string(&path).unwrap();
             std::fs::write(&path, whole + torn).unwrap();
-            write(&path, (Stage::Stage1, 5), &[]);
-            assert_eq!(steps(&path), [(Stage::Stage1, 1)]);
+            write(&path, (one, 5), &[]);
+            assert_eq!(steps(&path), [(one, 1), (one, 2), (one, 3)]);
         }
     }
 
     #[test]
-    fn a_file_of_something_else_is_left_alone() {
+    fn foreign_files_are_left_alone() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
         std::fs::write(&path, "a diary\nof days\n").unwrap();
         let error = StepLines::open(&path, Stage::Stage1, 0).unwrap_err();
-        assert_eq!(error.to_string(), "line 1 is not of a step");
+        assert_eq!(error.to_string(), "line 1 has no step");
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "a diary\nof days\n");
     }
 
     #[test]
-    fn a_failure_to_write_is_told_once_and_ends_the_file() {
+    fn write_failure_is_reported_and_ends_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("missing/metrics.jsonl");
         let mut lines = StepLines::open(&path, Stage::Stage1, 0).unwrap();
         lines.write(&1);
         std::fs::create_dir(folder.path().join("missing")).unwrap();
         lines.write(&2);
-        assert!(!path.exists(), "a file with a gap would look whole");
+        assert!(!path.exists(), "a file with a gap would look complete");
         assert_eq!(lines.check().unwrap_err().kind(), std::io::ErrorKind::NotFound);
     }
 
     #[test]
-    fn a_scene_that_is_left_out_is_told_and_saved_once_for_all_draws_and_resumptions() {
+    fn skipped_scenes_are_reported_once_across_resumptions() {
         let folder = tempfile::tempdir().unwrap();
         let skip = |key: &str, reason: &str| SkippedScene { key: key.into(), reason: reason.into() };
         let mut count = Count::default();
@@ -328,7 +314,7 @@ mod tests {
         log.skip(Stage::Stage1, 3, &skip("b", "torn"));
         log.check().unwrap();
         assert_eq!(count.0, 2);
-        // From step 2 on: what step 3 said is said again.
+        // Resumed after step 2: the line of step 3 is dropped and written again.
         let mut log = RunLog::open(folder.path(), Stage::Stage1, 2, &mut count).unwrap();
         log.skip(Stage::Stage1, 3, &skip("b", "torn"));
         log.skip(Stage::Stage1, 4, &skip("a", "torn"));
@@ -338,35 +324,6 @@ mod tests {
             std::fs::read_to_string(folder.path().join("skipped.jsonl")).unwrap(),
             "{\"step\":1,\"stage\":\"stage1\",\"key\":\"a\",\"reason\":\"torn\"}\n\
              {\"step\":3,\"stage\":\"stage1\",\"key\":\"b\",\"reason\":\"torn\"}\n"
-        );
-    }
-
-    #[test]
-    fn bad_steps_have_a_file_of_their_own_that_is_resumed_like_the_metrics() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("bad_steps.jsonl");
-        let bad = |step| SkippedStep {
-            step,
-            stage: Stage::Stage1,
-            reason: crate::step::step_guard::StepAnomaly::LossSpike,
-            loss: Some(2.0),
-            grad_norm: None,
-            median_loss: Some(0.5),
-            median_grad_norm: Some(1.0),
-            in_a_row: 1,
-            scenes: Vec::new(),
-        };
-        let mut count = Count::default();
-        let mut log = RunLog::open(folder.path(), Stage::Stage1, 0, &mut count).unwrap();
-        assert!(!path.exists(), "a run without bad steps has no such file");
-        log.bad_step(&bad(3));
-        log.bad_step(&bad(5));
-        log.check().unwrap();
-        RunLog::open(folder.path(), Stage::Stage1, 4, &mut count).unwrap();
-        assert_eq!(
-            std::fs::read_to_string(&path).unwrap(),
-            "{\"step\":3,\"stage\":\"stage1\",\"reason\":\"loss_spike\",\"loss\":2.0,\"grad_norm\":null,\
-             \"median_loss\":0.5,\"median_grad_norm\":1.0,\"in_a_row\":1,\"scenes\":[]}\n"
         );
     }
 }

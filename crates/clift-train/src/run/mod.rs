@@ -1,14 +1,15 @@
 //! A run directory from open to report.
 //!
-//! - `lock`: one process per run directory
-//! - `logs`: metrics, bad steps, skips as JSONL
+//! - `lock`: lock of a run directory
+//! - `logs`: metrics, skipped steps and scenes as JSONL
 //! - `extend`: `--extend`
 //! - `run_file`: run.json; same settings on resume
-//! - `stage_plan`: trained modules, start of a stage
-//! - `validation`: held-out views during training
+//! - `stage_plan`: settings, batches and folder of a stage
+//! - `validation`: validation and evaluation
 //! - `train_loop`: step, save, validate
 //! - `train_stage`: resume or start a stage
-//! - `init_from`: start from other weights
+//! - `init_from`: initial weights of stage 1
+//! - `evaluate_model`: evaluate a model without a run
 //! - `run`: a run: open, train, evaluate
 
 pub(crate) mod evaluate_model;

@@ -1,4 +1,4 @@
-//! A run: its directory, what it resumes, and the order of its stages.
+//! A run: its directory, resumption, and the order of its stages.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use clift_model::{
 
 use crate::cluster_cache::builder::ClusterBuilder;
 use crate::cluster_cache::cache::ClusterCache;
-use crate::cluster_cache::resume_log::remove_journal;
+use crate::cluster_cache::resume_log::remove_resume_log;
 use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
@@ -25,22 +25,22 @@ use crate::footprint::largest_tensor;
 use crate::footprint::scene_sizes::PARTS;
 use crate::run::init_from::init_from;
 use crate::run::lock::RunLock;
-use crate::run::run_file::{RunFile, compare, write_config};
+use crate::run::run_file::{RunFile, compare_settings, write_config};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
 use crate::run::validation::Validation;
 use crate::stage::stage1_batches::Stage1Batches;
 use crate::stage::stage2_batches::Stage2Batches;
 
-/// What the command line adds to a config.
+/// Options of a run beside its config.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RunOptions {
-    /// Do this stage alone.
+    /// Run only this stage.
     pub only: Option<Stage>,
-    /// Train and evaluate on the first scenes of the training data.
+    /// Train and evaluate on this number of training scenes.
     pub overfit: Option<usize>,
-    /// Start over: an existing run directory is moved aside.
+    /// Start a new run; the existing run directory is renamed.
     pub fresh: bool,
-    /// Take larger step counts than the run was started with.
+    /// Allow larger step counts than those of the existing run.
     pub extend: bool,
 }
 
@@ -51,51 +51,51 @@ pub struct Run {
     config: Config,
     overfit: Option<usize>,
     device: Device,
-    /// Of a run that is written to.
+    /// `None` for a run opened for evaluation.
     lock: Option<RunLock>,
 }
 
 impl Run {
-    /// Opens the run directory of a config, new or to be resumed, and writes the resolved config to it. No other process
-    /// can open it until the run is dropped.
+    /// Opens the run directory of a config, new or existing, and writes the resolved config to it. The directory is locked
+    /// until the run is dropped.
     ///
     /// # Errors
-    /// [`TrainError::OtherRun`] when the directory holds a run with other settings, [`TrainError::Locked`] when another
-    /// process works in it.
+    /// [`TrainError::OtherRun`] if the directory contains a run with other settings, [`TrainError::Locked`] if another process
+    /// uses it, and those of config, device and disk.
     pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         config.validate()?;
         let device = config.device.open()?;
         config.precision.check("precision", &device)?;
         config.eval.precision.check("eval.precision", &device)?;
-        largest_tensor::check(&config, &device, &PARTS)?;
-        // Missing weights are found now, not after days of training.
+        largest_tensor::check_tensors(&config, &device, &PARTS)?;
+        // Missing weights are reported now, not after days of training.
         config.loss.weights()?;
         if let Some(path) = config.eval.lpips_path().filter(|path| !path.is_file()) {
-            let fix = format!("there is no such file; `{LPIPS_COMMAND}` makes it, \"\" leaves LPIPS out");
+            let fix = format!("file not found; make it with `{LPIPS_COMMAND}`, or write \"\" to skip LPIPS");
             let value = path.display().to_string();
             return Err(TrainError::BadConfig { key: "eval.lpips_weights".into(), value, fix });
         }
         let folder = &config.run_dir;
         if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
-            let fix = "it starts a run over, which begins with stage 1: leave out one of the two";
+            let fix = "a new run starts with stage 1: omit --fresh or --only";
             return Err(TrainError::BadConfig { key: "--fresh".into(), value: "with --only".into(), fix: fix.into() });
         }
         if options.fresh && folder.exists() {
-            // Not from under a process that trains in it. Let go of before the move, which Windows refuses otherwise.
+            // Refuses a directory in use. Dropped before the rename, which Windows refuses otherwise.
             drop(RunLock::take(folder, sink)?);
             let moved = free_name(folder);
-            std::fs::rename(folder, &moved).map_err(TrainError::io("moving the former run aside", folder))?;
-            sink.event(&Event::Message(format!("moved the former run to {}", moved.display())));
+            std::fs::rename(folder, &moved).map_err(TrainError::io("renaming the existing run", folder))?;
+            sink.event(&Event::Message(format!("renamed the existing run to {}", moved.display())));
         }
         make_folder(folder).map_err(TrainError::io("making the run directory", folder))?;
         let lock = RunLock::take(folder, sink)?;
-        remove_leftovers(folder).map_err(TrainError::io("removing what a killed process left", folder))?;
-        // A run that failed before its first step, on a wrong path perhaps, has nothing that settings could contradict.
+        remove_leftovers(folder).map_err(TrainError::io("removing temporary files of a killed process", folder))?;
+        // A run that failed before its first stage may get other settings.
         let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
         let mut file = RunFile::new(options.overfit);
         if folder.join("config.toml").exists() && has_begun {
             let found = RunFile::read(folder)?;
-            let extensions = compare(folder, &found, &config, options.overfit, options.extend)?;
+            let extensions = compare_settings(folder, &found, &config, options.overfit, options.extend)?;
             file.extended = found.extended;
             for extension in extensions {
                 file.extended.push(extension.apply(folder, sink)?);
@@ -106,11 +106,11 @@ impl Run {
         Ok(Self { config, overfit: options.overfit, device, lock: Some(lock) })
     }
 
-    /// Opens a run that exists, to evaluate it.
+    /// Opens an existing run for evaluation.
     ///
     /// # Errors
-    /// [`TrainError::BadFile`] for a damaged `run.json`, [`TrainError::BadConfig`] for other heads than those of the run,
-    /// and what the device gives.
+    /// [`TrainError::BadFile`] for a damaged `run.json`, [`TrainError::Model`] for other heads than those of the run, and those
+    /// of the device.
     pub fn reopen(config: Config) -> Result<Self, TrainError> {
         config.validate()?;
         check_heads(&config.model, &config.run_dir)?;
@@ -119,12 +119,10 @@ impl Run {
         Ok(Self { config, overfit: run.overfit, device, lock: None })
     }
 
-    /// Does what is left of the run, or of one stage, and evaluates it. Returns the evaluation of a
-    /// whole run.
+    /// Trains the remaining steps of the run, or of one stage, and evaluates. Returns the evaluation of a whole run.
     ///
     /// # Errors
-    /// [`TrainError::Missing`] when `only` names a stage whose predecessor has not run, and whatever
-    /// the stages give.
+    /// [`TrainError::Missing`] if `only` is a stage whose predecessor has not run, and those of the stages.
     pub fn train(
         &self,
         only: Option<Stage>,
@@ -153,17 +151,15 @@ impl Run {
         validation.evaluate(&self.models(sink)?, &[], &self.folder("eval"), stop, sink).map(Some)
     }
 
-    /// Evaluates the run's weights, and other systems' pictures beside them, and writes the results to `folder`;
-    /// `beside` is another run of the same stage 1 whose stage 2 was trained on other groups of tokens, to be measured
-    /// on the same views.
+    /// Evaluates the run, and the images of `external` methods beside it, and writes the results to `folder`. `beside` is
+    /// another run with the same stage 1 whose stage 2 was trained on other groups of tokens, evaluated on the same views.
     ///
     /// # Errors
-    /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] when those of
-    /// stage 2 do not belong to them, [`TrainError::Locked`] when `folder` lies in a run that another process works in, and
-    /// whatever the evaluation gives.
+    /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] if stage 2 was trained on another
+    /// encoder, [`TrainError::Locked`] if `folder` is in a run directory that another process uses, and those of the evaluation.
     pub fn evaluate(
         &self,
-        systems: &[ExternalMethod],
+        external: &[ExternalMethod],
         folder: &Path,
         beside: Option<&Config>,
         stop: &AtomicBool,
@@ -176,16 +172,16 @@ impl Run {
         if let Some(other) = beside {
             if other.clusters.grouping == self.config.clusters.grouping {
                 let value = other.run_dir.display().to_string();
-                let fix = "its stage 2 was trained on the same groups of tokens: name a run with another \
+                let fix = "its stage 2 was trained on the same groups of tokens: choose a run with another \
                            clusters.grouping";
                 return Err(TrainError::BadConfig { key: "--with".into(), value, fix: fix.into() });
             }
             models.set_stage2(other.clusters.grouping, self.open_stage2(other, &models.stage1)?);
         }
-        self.validation(sink)?.evaluate(&models, systems, folder, stop, sink)
+        self.validation(sink)?.evaluate(&models, external, folder, stop, sink)
     }
 
-    /// The trained models: of both stages, or of stage 1 alone.
+    /// Opens the trained models of both stages, or of stage 1 only.
     fn models(&self, sink: &mut dyn Sink) -> Result<EvalModels, TrainError> {
         let weights = self.require_stage1(Stage::Eval)?;
         let path = ModelPath { dir: self.config.run_dir.clone(), weights };
@@ -193,12 +189,12 @@ impl Run {
         if self.weights(Stage::Stage2).exists() {
             models.set_stage2(self.config.clusters.grouping, self.open_stage2(&self.config, &models.stage1)?);
         } else {
-            sink.event(&Event::Message("stage 2 has not run: evaluating the stage-1 weights alone".into()));
+            sink.event(&Event::Message("stage 2 has not run: evaluating only the weights of stage 1".into()));
         }
         Ok(models)
     }
 
-    /// The model of stage 2 of `config`'s run, which must have been trained on the encoder of `stage1`.
+    /// Opens the stage-2 model of the run of `config`, which must be trained on the encoder of `stage1`.
     fn open_stage2(&self, config: &Config, stage1: &TrainedModel) -> Result<TrainedModel, TrainError> {
         let path = config.run_dir.join(Stage::Stage2.name()).join("model.safetensors");
         if !path.exists() {
@@ -208,17 +204,17 @@ impl Run {
         let found = ModelPath { dir: config.run_dir.clone(), weights: path.clone() };
         let model = TrainedModel::open(&found, &config.model, &self.device)?;
         if !model.has_condenser {
-            let reason = "the file holds no condenser".into();
+            let reason = "the file has no condenser".into();
             return Err(ModelError::Weights { action: "reading", reason, path }.into());
         }
         if model.has_encoder_of(stage1) { Ok(model) } else { Err(TrainError::OtherEncoder { path }) }
     }
 
-    /// The views that are measured, during training and after it.
+    /// Opens the validation and test views.
     fn validation(&self, sink: &mut dyn Sink) -> Result<Validation<'_>, TrainError> {
         let mut eval = self.config.eval.clone();
         if self.overfit.is_some() && eval.index.take().is_some() {
-            sink.event(&Event::Message("--overfit measures the scenes it trains on: eval.index is not used".into()));
+            sink.event(&Event::Message("--overfit evaluates the training scenes: eval.index is not used".into()));
         }
         // The test split, or the training scenes themselves under --overfit.
         let reader = self.reader(if self.overfit.is_some() { Split::Train } else { Split::Test }, sink)?;
@@ -284,7 +280,7 @@ impl Run {
         let folder = self.folder("clusters");
         let encoder_hash = &weights_hash(&model.encoder);
         if folder.exists() {
-            remove_journal(&folder)?;
+            remove_resume_log(&folder)?;
             return ClusterCache::open(&folder, &self.config, encoder_hash);
         }
         if only == Some(Stage::Stage2) {
@@ -297,10 +293,10 @@ impl Run {
         }
         let encoder = model.encoder.valid();
         ClusterBuilder { config: &self.config, reader, encoder: &encoder, encoder_hash, device: &self.device }
-            .make(&folder, stop, sink)
+            .build(&folder, stop, sink)
     }
 
-    /// The run's training weights on the autodiff device.
+    /// Makes a model with initial weights on the autodiff device.
     fn new_model(&self) -> Clift {
         Clift::new(&self.config.model, self.config.seed, &self.device.clone().autodiff())
     }
@@ -312,7 +308,7 @@ impl Run {
         Ok(model)
     }
 
-    /// The weights of stage 1, which `stage` needs.
+    /// Returns the path of the stage-1 weights, which `stage` needs.
     fn require_stage1(&self, stage: Stage) -> Result<PathBuf, TrainError> {
         let path = self.weights(Stage::Stage1);
         if path.exists() {
@@ -324,14 +320,13 @@ impl Run {
 
     fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
         let data = &self.config.data;
-        // Under --overfit the training scenes are measured: the same ones.
-        let OpenedSource { source, report: ledger, .. } = match split {
+        let OpenedSource { source, report, .. } = match split {
             Split::Train => open_training_dataset(data)?,
             Split::Test => open_dataset(data, split)?,
         };
-        sink.event(&Event::Message(format!("{split}: {ledger}")));
-        if ledger.has_skips() && self.config.run_dir.is_dir() {
-            write_skip_report(&ledger, &self.folder(&format!("skipped-{split}.json")))?;
+        sink.event(&Event::Message(format!("{split}: {report}")));
+        if report.has_skips() && self.config.run_dir.is_dir() {
+            write_skip_report(&report, &self.folder(&format!("skipped-{split}.json")))?;
         }
         let source: Arc<dyn SceneSource> = match self.overfit {
             Some(count) => Arc::new(SceneSubset::first(source, count)),
@@ -349,7 +344,7 @@ impl Run {
     }
 }
 
-/// `runs/tiny` becomes `runs/tiny.1`, or the first number that is free.
+/// Returns the first free name of `runs/tiny.1`, `runs/tiny.2`, .. for `runs/tiny`.
 fn free_name(folder: &Path) -> PathBuf {
     let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let mut number = 1;

@@ -1,4 +1,4 @@
-//! What a run was started with, and whether a command that resumes it asks for the same.
+//! `run.json`, and the comparison of a config with that of an existing run.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,32 +14,35 @@ use crate::run::extend::{ExtensionRecord, StepExtension};
 
 const VERSION: u32 = 1;
 
-/// Keys that may change between the start of a run and its resumption.
+/// Keys that may change when a run is resumed.
 const FREE_KEYS: [&str; 7] =
     ["run_dir", "device", "activation_checkpointing", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
 
-/// Keys that `--extend` may raise.
+/// Keys that `--extend` may increase.
 const STEP_COUNTS: [(&str, Stage); 2] = [("stage1.steps", Stage::Stage1), ("stage2.steps", Stage::Stage2)];
 
-/// What `run.json` holds.
+/// Content of `run.json`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct RunFile {
     version: u32,
-    /// How many scenes `--overfit` kept.
+    /// Number of scenes of `--overfit`.
     pub overfit: Option<usize>,
-    /// What `--extend` did, in order.
+    /// Extensions by `--extend`, in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub extended: Vec<ExtensionRecord>,
 }
 
 impl RunFile {
-    /// That of a new run.
+    /// Makes the file of a new run.
     pub fn new(overfit: Option<usize>) -> Self {
         Self { version: VERSION, overfit, extended: Vec::new() }
     }
 
-    /// Reads that of a run directory.
+    /// Reads `run.json` of a run directory.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`] and [`TrainError::BadFile`].
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
         let path = folder.join("run.json");
         let text = std::fs::read(&path).map_err(TrainError::io("reading the run file", &path))?;
@@ -51,7 +54,10 @@ impl RunFile {
         Ok(run)
     }
 
-    /// Writes it to a run directory.
+    /// Writes `run.json` to a run directory.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`].
     pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
         let path = folder.join("run.json");
         let json = serde_json::to_vec_pretty(self).map_err(TrainError::bad_file("run file", &path))?;
@@ -66,11 +72,11 @@ pub(crate) fn write_config(config: &Config) -> Result<(), TrainError> {
     replace_file(&path, text.as_bytes()).map_err(TrainError::io("writing the config", &path))
 }
 
-/// Compares a config with that of the run in `folder`. Returns the step counts that `extend` lets grow.
+/// Compares a config with that of the run in `folder`. Returns the larger step counts that `extend` allows.
 ///
 /// # Errors
-/// [`TrainError::OtherRun`] for any other difference in what shapes the result.
-pub(crate) fn compare(
+/// [`TrainError::OtherRun`] for any other difference in keys that affect the result.
+pub(crate) fn compare_settings(
     folder: &Path,
     found: &RunFile,
     config: &Config,
@@ -80,7 +86,7 @@ pub(crate) fn compare(
     let path = folder.join("config.toml");
     let text = std::fs::read_to_string(&path).map_err(TrainError::io("reading the run's config", &path))?;
     let bad = || TrainError::bad_file("config", &path);
-    // A key that an older version did not have yet has its default; one that this version does not have is a difference.
+    // Keys that an older version did not write have their defaults; keys unknown to this version are differences.
     let old = match parse_config::<Config>(&path, &text, &[]) {
         Ok((old, _)) => toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?,
         Err(_) => text.parse().map_err(|error: toml::de::Error| bad()(error.message().to_owned()))?,
@@ -110,18 +116,18 @@ pub(crate) fn compare(
         return Ok(extensions);
     }
     let is_all = !extend && differences.len() == extensions.len();
-    let or = if is_all { "train on with --extend (which changes the learning rates to come), " } else { "" };
+    let or = if is_all { "continue with --extend (which changes the following learning rates), " } else { "" };
     Err(TrainError::OtherRun { differences: differences.join("\n"), or, path: config.run_dir.clone() })
 }
 
-/// The difference in a key as one that `--extend` allows: a larger step count.
+/// Returns the difference of a key as an extension if it is a larger step count.
 fn extension(key: &str, from: Option<&String>, to: Option<&String>) -> Option<StepExtension> {
     let (_, stage) = *STEP_COUNTS.iter().find(|(name, _)| *name == key)?;
     let (from, to) = (from?.parse().ok()?, to?.parse().ok()?);
     (from < to).then_some(StepExtension { stage, from, to })
 }
 
-/// Dotted keys and their values as text.
+/// Returns dotted keys with their values as text.
 fn flatten(table: toml::Table) -> BTreeMap<String, String> {
     let mut flat = BTreeMap::new();
     let mut pending: Vec<(String, toml::Value)> = table.into_iter().collect();
@@ -140,11 +146,11 @@ fn flatten(table: toml::Table) -> BTreeMap<String, String> {
 mod tests {
     use super::*;
 
-    /// Compares `config` with a run that was started with another.
+    /// Compares `config` with an existing run of the config `old`.
     fn differ(old: &str, config: &Config, extend: bool) -> Result<Vec<StepExtension>, TrainError> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("config.toml"), old).unwrap();
-        compare(folder.path(), &RunFile::new(None), config, None, extend)
+        compare_settings(folder.path(), &RunFile::new(None), config, None, extend)
     }
 
     fn old() -> Config {
@@ -152,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_that_an_older_version_did_not_write_has_its_default() {
+    fn missing_keys_have_defaults_and_unknown_ones_differ() {
         let text = toml::to_string_pretty(&old()).unwrap();
         let shorter: String =
             text.lines().filter(|line| !line.starts_with("spike_factor")).collect::<Vec<_>>().join("\n");
@@ -162,10 +168,13 @@ mod tests {
         other.stage2.optimizer.spike_factor = 7.0;
         let message = differ(&shorter, &other, false).unwrap_err().to_string();
         assert!(message.contains("  stage2.optimizer.spike_factor: 100.0 -> 7.0\n"), "{message}");
+        let unknown = format!("wings = 2\n{text}");
+        let message = differ(&unknown, &old(), false).unwrap_err().to_string();
+        assert!(message.contains("  wings: 2 -> not set\n"), "{message}");
     }
 
     #[test]
-    fn a_run_with_former_names_is_resumed() {
+    fn run_with_former_names_is_resumed() {
         let mut tiles = old();
         tiles.clusters.grouping = clift_model::Grouping::Tile;
         let text = toml::to_string_pretty(&tiles).unwrap();
@@ -175,14 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_that_this_version_does_not_have_is_a_difference() {
-        let text = format!("wings = 2\n{}", toml::to_string_pretty(&old()).unwrap());
-        let message = differ(&text, &old(), false).unwrap_err().to_string();
-        assert!(message.contains("  wings: 2 -> not set\n"), "{message}");
-    }
-
-    #[test]
-    fn step_counts_grow_when_asked_for_and_never_shrink() {
+    fn step_counts_grow_only_with_extend() {
         let text = toml::to_string_pretty(&old()).unwrap();
         let mut longer = old();
         longer.stage2.steps += 10;

@@ -1,4 +1,4 @@
-//! The training loop: step, save, validate, until all steps are done or something comes in between.
+//! The training loop: step, save, validate, until the last step, an interrupt or an error.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -14,12 +14,12 @@ use crate::run::stage_plan::StagePlan;
 use crate::run::validation::Validation;
 use crate::stage::settings::StageSettings;
 use crate::step::batch::StageBatch;
-use crate::step::loss::psnr_of;
+use crate::step::loss::psnr_of_mse;
 use crate::step::schedule::warm_up_cosine;
 use crate::step::step_guard::{SkippedStep, SkippedStepScene, StepAnomaly};
 use crate::step::train_state::{TrainState, Update};
 
-/// A stage while it trains.
+/// A stage during training.
 pub(crate) struct TrainLoop<'a> {
     plan: &'a StagePlan<'a>,
     checkpoints: Checkpoints,
@@ -28,12 +28,12 @@ pub(crate) struct TrainLoop<'a> {
     saved: u64,
     validation: &'a Validation<'a>,
     stop: &'a AtomicBool,
-    /// What happens goes here.
+    /// Receiver of events.
     pub(crate) log: RunLog<'a>,
 }
 
 impl<'a> TrainLoop<'a> {
-    /// Goes on from `progress`, which is that of the newest checkpoint.
+    /// Resumes at `progress`, that of the newest checkpoint.
     pub fn new(
         plan: &'a StagePlan,
         checkpoints: Checkpoints,
@@ -45,32 +45,32 @@ impl<'a> TrainLoop<'a> {
         Self { plan, checkpoints, saved: progress.step, progress, validation, stop, log }
     }
 
-    /// Makes the steps that are left and returns the trained model.
-    pub fn run(&mut self, mut learner: TrainState) -> Result<Clift, TrainError> {
-        // A kill may have come between a checkpoint and the validation of its step.
-        self.validate_if_due(&learner)?;
+    /// Makes the remaining steps and returns the trained model.
+    pub fn run(&mut self, mut train_state: TrainState) -> Result<Clift, TrainError> {
+        // The process may have been killed between a checkpoint and the validation of its step.
+        self.validate_if_due(&train_state)?;
         for batch in self.plan.prefetch(self.progress.step) {
             let batch = match batch {
                 Ok(batch) => batch,
-                Err(error) => return Err(self.save_before(error, &learner)),
+                Err(error) => return Err(self.save_before(error, &train_state)),
             };
-            learner = self.step(learner, &batch)?;
+            train_state = self.step(train_state, &batch)?;
             let is_stopped = self.stop.load(Ordering::Relaxed);
             if is_stopped || self.is_checkpoint_due() {
-                self.save(&learner)?;
+                self.save(&train_state)?;
             }
             if is_stopped && !self.is_last() {
                 return Err(TrainError::Interrupted { step: self.progress.step });
             }
-            // After the save, which a validation that fails must not cost.
-            self.validate_if_due(&learner)?;
+            // After the save: a failing validation must not lose the step.
+            self.validate_if_due(&train_state)?;
         }
         self.log.check()?;
-        Ok(learner.model)
+        Ok(train_state.model)
     }
 
-    /// Makes the next step, or leaves it out.
-    fn step(&mut self, learner: TrainState, batch: &StageBatch) -> Result<TrainState, TrainError> {
+    /// Makes or skips the next step.
+    fn step(&mut self, train_state: TrainState, batch: &StageBatch) -> Result<TrainState, TrainError> {
         let started = Instant::now();
         for skip in &batch.skipped {
             self.log.skip(self.plan.settings.stage, self.progress.step + 1, skip);
@@ -79,30 +79,31 @@ impl<'a> TrainLoop<'a> {
         let step = self.progress.step + 1;
         let lr = warm_up_cosine(step, optimizer.learning_rate, optimizer.warm_up_steps, num_steps);
         let (rate, recent) = (self.plan.learning_rate(lr), &self.progress.recent);
-        let mut fault = None;
-        // Looked at before the update, so that a bad batch leaves no trace in the weights.
+        let mut anomaly = None;
+        // Checked before the update: a skipped step does not change the weights.
         let accept = |loss, grad_norm| {
-            fault = recent.fault(loss, grad_norm, optimizer);
-            fault.is_none()
+            anomaly = recent.anomaly(loss, grad_norm, optimizer);
+            anomaly.is_none()
         };
-        let (mut learner, update) = learner.step_if(batch, accumulate, rate, optimizer.max_grad_norm, accept)?;
+        let (mut train_state, update) =
+            train_state.step_if(batch, accumulate, rate, optimizer.max_grad_norm, accept)?;
         self.progress.step = step;
         self.report(update, lr, started);
-        if learner.adapt_loss_scale(&update) {
-            // Neither a good step nor a bad one: nothing is wrong with its batch.
-            let factor = learner.loss_scale.map_or(1.0, |scale| scale.factor());
-            let told = format!("step {step} left out: a gradient is beyond f16; the loss scale is {factor} now");
-            self.log.event(&Event::Message(told));
-            return Ok(learner);
+        if train_state.adapt_loss_scale(&update) {
+            // An overflow is no anomaly of the batch.
+            let factor = train_state.loss_scale.map_or(1.0, |scale| scale.factor());
+            let text = format!("skipped step {step}: a gradient overflowed in f16; the loss scale is now {factor}");
+            self.log.event(&Event::Message(text));
+            return Ok(train_state);
         }
-        match fault {
+        match anomaly {
             None => {
                 self.progress.bad_steps = 0;
                 self.progress.recent.push(update.loss, update.grad_norm);
             }
-            Some(fault) => self.leave_out(fault, update, batch)?,
+            Some(anomaly) => self.skip_step(anomaly, update, batch)?,
         }
-        Ok(learner)
+        Ok(train_state)
     }
 
     fn report(&mut self, update: Update, lr: f64, started: Instant) {
@@ -111,22 +112,25 @@ impl<'a> TrainLoop<'a> {
             step: self.progress.step,
             num_steps: self.plan.settings.steps,
             loss: update.loss,
-            psnr: psnr_of(update.mse),
+            psnr: psnr_of_mse(update.mse),
             lr,
             grad_norm: update.grad_norm,
             step_s: started.elapsed().as_secs_f64(),
         }));
     }
 
-    /// Counts and notes a step that made no update; too many in a row end the run.
-    fn leave_out(&mut self, fault: StepAnomaly, update: Update, batch: &StageBatch) -> Result<(), TrainError> {
+    /// Counts and logs a step without update.
+    ///
+    /// # Errors
+    /// [`TrainError::Diverged`] after `max_bad_steps` consecutive ones.
+    fn skip_step(&mut self, anomaly: StepAnomaly, update: Update, batch: &StageBatch) -> Result<(), TrainError> {
         self.progress.bad_steps += 1;
         self.progress.num_bad_steps += 1;
         let finite = |value: f64| value.is_finite().then_some(value);
         let line = SkippedStep {
             step: self.progress.step,
             stage: self.plan.settings.stage,
-            reason: fault,
+            reason: anomaly,
             loss: finite(update.loss),
             grad_norm: finite(update.grad_norm),
             median_loss: self.progress.recent.median_loss(),
@@ -138,56 +142,56 @@ impl<'a> TrainLoop<'a> {
         let keys = line.scenes.iter().map(|scene| scene.key.as_str()).collect::<Vec<_>>().join(", ");
         let Progress { step, bad_steps: count, .. } = self.progress;
         if count < self.plan.settings.optimizer.max_bad_steps {
-            self.log.event(&Event::Warning(format!("step {step} left out: {fault} (scenes {keys})")));
+            self.log.event(&Event::Warning(format!("skipped step {step}: {anomaly} (scenes {keys})")));
             return Ok(());
         }
         self.log.check()?;
         let checkpoint = self.newest_checkpoint();
-        Err(TrainError::Diverged { count, step, reason: fault.to_string(), keys, checkpoint })
+        Err(TrainError::Diverged { count, step, reason: anomaly.to_string(), keys, checkpoint })
     }
 
-    fn save(&mut self, learner: &TrainState) -> Result<(), TrainError> {
-        // Lines up to here would be missing for good.
+    fn save(&mut self, train_state: &TrainState) -> Result<(), TrainError> {
+        // A resumed run does not write the lines of these steps again.
         self.log.check()?;
-        let path = self.checkpoints.save(learner, &self.progress)?;
+        let path = self.checkpoints.save(train_state, &self.progress)?;
         self.saved = self.progress.step;
         self.log.event(&Event::Checkpoint { path });
         Ok(())
     }
 
-    /// Saves the steps made so far before the run ends with `error`, which is not theirs.
-    fn save_before(&mut self, error: TrainError, learner: &TrainState) -> TrainError {
+    /// Saves the steps made so far before the run ends with `error`, which they did not cause.
+    fn save_before(&mut self, error: TrainError, train_state: &TrainState) -> TrainError {
         if self.saved < self.progress.step
-            && let Err(second) = self.save(learner)
+            && let Err(second) = self.save(train_state)
         {
-            self.log.event(&Event::Warning(format!("and the steps so far are not saved: {second}")));
+            self.log.event(&Event::Warning(format!("saving the steps made so far failed: {second}")));
         }
         error
     }
 
-    /// Measures the held-out views where this step asks for it and has not been measured.
-    fn validate_if_due(&mut self, learner: &TrainState) -> Result<(), TrainError> {
+    /// Validates the step if it is due and was not validated before.
+    fn validate_if_due(&mut self, train_state: &TrainState) -> Result<(), TrainError> {
         let Progress { step, bad_steps, validated, .. } = self.progress;
         let is_due = self.is_last() || (is_multiple(step, self.plan.config.eval.every) && bad_steps == 0);
         if !is_due || validated == step {
             return Ok(());
         }
         let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
-        let model = learner.inference_model();
+        let model = train_state.inference_model();
         let psnr = self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
         if psnr.is_none() && self.stop.load(Ordering::Relaxed) {
             if self.saved < step {
-                self.save(learner)?;
+                self.save(train_state)?;
             }
             return Err(TrainError::Interrupted { step });
         }
-        // Where nothing could be measured, a resumed run tries again.
+        // Without a result, a resumed run validates again.
         let Some(psnr) = psnr else { return Ok(()) };
         self.progress.validated = step;
         if !self.is_checkpoint_due() {
             return Ok(());
         }
-        // Of the regular checkpoints only, not of those that a signal caused: the best is the same after any kill.
+        // Only regular checkpoints count, not those saved on an interrupt: the best is the same after any interruption.
         if self.progress.best.is_none_or(|best| psnr > best.psnr) {
             self.progress.best = Some(Best { step, psnr });
         }
@@ -207,10 +211,10 @@ impl<'a> TrainLoop<'a> {
         newest.map_or("none".into(), |path| path.display().to_string())
     }
 
-    /// Adds to an error where the stage stands and what there is to go on from.
+    /// Adds the last step and the newest checkpoint to an error.
     pub fn name_checkpoint(&self, error: TrainError) -> TrainError {
-        let says_so = matches!(error, TrainError::Interrupted { .. } | TrainError::Diverged { .. });
-        if says_so || self.progress.step == 0 {
+        let has_step = matches!(error, TrainError::Interrupted { .. } | TrainError::Diverged { .. });
+        if has_step || self.progress.step == 0 {
             return error;
         }
         TrainError::Stopped {

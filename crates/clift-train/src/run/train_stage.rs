@@ -1,4 +1,4 @@
-//! One stage, resumed or started, trained to its last step.
+//! Trains one stage, new or resumed, to its last step.
 
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
@@ -19,12 +19,11 @@ use crate::step::optimizer::adamw;
 use crate::step::train_state::TrainState;
 
 impl StagePlan<'_> {
-    /// Trains from where the stage stands and returns the model when all steps are done. `start` gives
-    /// the model to start from, and is called only where there is no checkpoint.
+    /// Trains the remaining steps and returns the model. `start` makes the initial model if there is no checkpoint.
     ///
     /// # Errors
-    /// [`TrainError::Interrupted`] after `stop` was set and the state saved, [`TrainError::Diverged`]
-    /// after too many bad steps, [`TrainError::Stopped`] with whatever data, model or disk give.
+    /// [`TrainError::Interrupted`] after `stop` was set and the state saved, [`TrainError::Diverged`] after too many skipped
+    /// steps, [`TrainError::Stopped`] with an error of data, model or disk.
     pub fn train(
         &self,
         start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
@@ -40,7 +39,7 @@ impl StagePlan<'_> {
         for term in loss.describe() {
             sink.event(&Event::Message(term));
         }
-        let mut learner = TrainState {
+        let mut train_state = TrainState {
             model,
             optimizer: adamw(optimizer),
             device: self.device.clone(),
@@ -48,15 +47,15 @@ impl StagePlan<'_> {
             activation_checkpointing: self.config.activation_checkpointing,
             loss_scale: LossScale::of(self.config.precision),
         };
-        let progress = checkpoints.resume(&mut learner)?.unwrap_or_default();
-        learner.model = freeze(stage, learner.model);
+        let progress = checkpoints.resume(&mut train_state)?.unwrap_or_default();
+        train_state.model = freeze(stage, train_state.model);
         make_folder(&self.folder).map_err(TrainError::io("making a folder", &self.folder))?;
         let run_dir = self.folder.parent().unwrap_or(&self.folder);
         let mut log = RunLog::open(run_dir, stage, progress.step, sink)?;
         log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
 
         let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
-        let model = training.run(learner).map_err(|error| training.name_checkpoint(error))?;
+        let model = training.run(train_state).map_err(|error| training.name_checkpoint(error))?;
         training.log.event(&Event::StageFinished { stage, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(model)
     }

@@ -1,4 +1,4 @@
-//! The evaluator of a run: validation during training, and the evaluation at its end.
+//! Validation during training, and evaluation after it.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,7 +13,7 @@ use clift_eval::{
 use clift_model::{Clift, TokenCount, TrainedModel};
 
 use crate::config::config::Config;
-use crate::config::sweep::sweep;
+use crate::config::sweep::eval_sweep;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
@@ -25,10 +25,10 @@ pub struct Validation<'a> {
 }
 
 impl<'a> Validation<'a> {
-    /// Chooses the scenes of `reader` and their views that `eval` names, to be measured on `device`.
+    /// Chooses the scenes and views of `reader` by `eval`, for an evaluation on `device`.
     ///
     /// # Errors
-    /// As [`Evaluator::new`], and what the device cannot hold.
+    /// As [`Evaluator::new`], and [`TrainError::BadConfig`] for tensors that the device cannot hold.
     pub fn new(
         config: &'a Config,
         eval: EvalConfig,
@@ -36,14 +36,14 @@ impl<'a> Validation<'a> {
         device: &Device,
         sink: &mut dyn Sink,
     ) -> Result<Self, TrainError> {
-        largest_tensor::check(config, device, &[Stage::Eval])?;
+        largest_tensor::check_tensors(config, device, &[Stage::Eval])?;
         let run_dir = &config.run_dir;
         let description = RunDescription {
             name: run_dir.file_name().unwrap_or(run_dir.as_os_str()).to_string_lossy().into_owned(),
             config: toml::to_string_pretty(config).map_err(TrainError::bad_file("config", run_dir))?,
             device: config.device.to_string(),
         };
-        let sweep = sweep(config, eval.storage.clone(), Vec::new());
+        let sweep = eval_sweep(config, eval.storage.clone(), Vec::new());
         let evaluator = Evaluator::new(eval, sweep, description, reader, device)?;
         if !evaluator.skip_report().skips.is_empty() {
             sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report())));
@@ -51,9 +51,9 @@ impl<'a> Validation<'a> {
         Ok(Self { config, evaluator })
     }
 
-    /// Measures a model without autodiff during training: all tokens in stage 1, one count of condensed ones in stage 2.
-    /// Writes the first sheet to `folder`. Returns the mean PSNR; none where nothing could be measured, and once `stop` is
-    /// set.
+    /// Measures a model without autodiff during training: with all tokens in stage 1, with one count of condensed tokens in
+    /// stage 2. Writes the first contact sheet to `folder`. Returns the mean PSNR in dB; `None` if no view could be measured
+    /// or `stop` is set.
     ///
     /// # Errors
     /// As [`Evaluator::measure`]; a scene that cannot be read is skipped.
@@ -102,31 +102,31 @@ impl<'a> Validation<'a> {
         Ok(point.psnr.filter(|psnr| psnr.is_finite()))
     }
 
-    /// Does [`Evaluator::evaluate`] as a stage of the run.
+    /// Evaluates models, and external methods beside them, and writes the results to `folder`.
     ///
     /// # Errors
     /// As [`Evaluator::evaluate`].
     pub fn evaluate(
         &self,
         models: &EvalModels,
-        systems: &[ExternalMethod],
+        external: &[ExternalMethod],
         folder: &Path,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
         let started = Instant::now();
         let mut progress = EvalEvents { stop, sink, is_stage: true };
-        let summary = self.evaluator.evaluate(models, systems, folder, &mut progress)?;
+        let summary = self.evaluator.evaluate(models, external, folder, &mut progress)?;
         sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
     }
 }
 
-/// The progress of an evaluation as events of a run.
+/// Reports the progress of an evaluation as events of a run.
 struct EvalEvents<'a> {
     stop: &'a AtomicBool,
     sink: &'a mut dyn Sink,
-    /// Whether the evaluation is a stage of its own; a validation is none, and its scenes are not counted.
+    /// Whether scenes are counted: in an evaluation, not in a validation.
     is_stage: bool,
 }
 

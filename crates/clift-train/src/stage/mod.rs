@@ -1,6 +1,6 @@
 //! Stage-specific settings and batches.
 //!
-//! - `settings`: steps, batch, optimiser per stage
+//! - `settings`: steps, batch, optimizer per stage
 //! - `stage1_batches`: random token subsets
 //! - `stage2_batches`: cached clusters
 

@@ -1,27 +1,16 @@
-//! The differences between the stages, in one place: steps, batch, learning rates, trained networks.
+//! Differences between the stages: steps, batch, learning rates, trained networks.
+
+use clift_model::Part;
 
 use crate::config::config::{Config, OptimizerConfig};
 use crate::events::Stage;
 
-/// A network with parameters.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum TapeSegment {
-    /// Context views to light-field tokens.
-    Encoder,
-    /// The norm of the light-field tokens.
-    TokenNorm,
-    /// Clusters of tokens to their centroids.
-    Condenser,
-    /// Tokens and a camera to an image.
-    Renderer,
-}
-
 /// Settings of a stage that makes updates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StageSettings<'a> {
-    /// Which stage.
+    /// The stage.
     pub stage: Stage,
-    /// Optimiser updates.
+    /// Number of optimizer updates.
     pub steps: u64,
     /// Scenes per update.
     pub batch_size: usize,
@@ -29,25 +18,32 @@ pub struct StageSettings<'a> {
     pub accumulate: usize,
     /// The update rule, with the learning rate of every trained network but the renderer.
     pub optimizer: &'a OptimizerConfig,
-    /// Learning rate of the renderer, as a factor of the optimiser's.
+    /// Learning rate of the renderer, as a factor of the optimizer's.
     pub renderer_lr_factor: f64,
-    /// Networks that are trained; the others are frozen.
-    pub trained: &'static [TapeSegment],
+    /// Trained networks; the others are frozen.
+    pub trained: &'static [Part],
 }
 
 impl Stage {
-    /// The networks that the stage trains.
-    pub fn trained(self) -> &'static [TapeSegment] {
+    /// Returns the networks that the stage trains.
+    pub fn trained(self) -> &'static [Part] {
         match self {
-            Self::Stage1 => &[TapeSegment::Encoder, TapeSegment::TokenNorm, TapeSegment::Renderer],
-            Self::Stage2 => &[TapeSegment::TokenNorm, TapeSegment::Condenser, TapeSegment::Renderer],
+            Self::Stage1 => &[Part::Encoder, Part::TokenNorm, Part::Renderer],
+            Self::Stage2 => &[Part::Condenser, Part::TokenNorm, Part::Renderer],
             Self::Clusters | Self::Eval => &[],
         }
     }
 }
 
+impl StageSettings<'_> {
+    /// Returns the most scenes of a micro-batch.
+    pub fn micro_batch_size(&self) -> usize {
+        self.batch_size.div_ceil(self.accumulate)
+    }
+}
+
 impl Config {
-    /// The settings of a stage. The cluster cache and the evaluation make no updates: no step, no trained network.
+    /// Returns the settings of a stage. The cluster cache and the evaluation have no steps and no trained network.
     pub fn stage(&self, stage: Stage) -> StageSettings<'_> {
         let Self { stage1, stage2, .. } = self;
         let settings = StageSettings {
@@ -94,8 +90,8 @@ mod tests {
         let [one, two] = [Stage::Stage1, Stage::Stage2].map(|stage| config.stage(stage));
         assert_eq!((one.steps, one.batch_size, one.renderer_lr_factor), (90_000, 64, 1.0));
         assert_eq!((two.steps, two.batch_size, two.renderer_lr_factor), (50_000, 80, 0.1));
-        assert!(one.trained.contains(&TapeSegment::Encoder) && !one.trained.contains(&TapeSegment::Condenser));
-        assert!(two.trained.contains(&TapeSegment::Condenser) && !two.trained.contains(&TapeSegment::Encoder));
+        assert!(one.trained.contains(&Part::Encoder) && !one.trained.contains(&Part::Condenser));
+        assert!(two.trained.contains(&Part::Condenser) && !two.trained.contains(&Part::Encoder));
         config.set_accumulate(Stage::Stage2, 5);
         assert_eq!((config.stage(Stage::Stage1).accumulate, config.stage(Stage::Stage2).accumulate), (1, 5));
     }

@@ -1,4 +1,4 @@
-//! Stage 1: encoder and renderer together, on random subsets of the tokens.
+//! Batches of stage 1: clips with random subsets of the tokens.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::step::batch::{StageBatch, TokenSelection};
 
-/// Makes the batches of stage 1: a pure function of (seed, step).
+/// Maker of the batches of stage 1, a pure function of (seed, step).
 pub struct Stage1Batches {
     clips: TrainingClips,
     keep_tokens: [f64; 2],
@@ -22,7 +22,7 @@ impl Stage1Batches {
     /// Prepares the batches of a run.
     ///
     /// # Errors
-    /// Whatever the sampler or the size of the pictures refuses.
+    /// Those of the sampler, and an image size that is no multiple of the patch size.
     pub fn new(config: &Config, reader: &ClipReader) -> Result<Self, TrainError> {
         let seed = derive_seed(config.seed, "stage1");
         let read = reader.clone();
@@ -40,7 +40,7 @@ impl Stage1Batches {
 
     /// Makes the batch of `step`, counted from 0.
     ///
-    /// The share of tokens is drawn once per step; every target view gets its own random subset.
+    /// The share of tokens is sampled once per step; every target view gets its own random subset.
     ///
     /// # Errors
     /// As [`TrainingClips::batch`].

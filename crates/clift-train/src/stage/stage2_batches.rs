@@ -1,4 +1,4 @@
-//! Stage 2: the condenser on cached clusters, with the encoder frozen and the renderer at a smaller rate.
+//! Batches of stage 2: clips with cached clusters.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,14 +15,14 @@ use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::step::batch::{StageBatch, TokenSelection};
 
-/// Attempts of one slot, repeated entries included, before the batch fails.
+/// Attempts per slot, repeated entries included, before the batch fails.
 const FILLER: SlotFiller = SlotFiller { min_attempts: 16, min_scenes: 0, max_attempts: 16 };
 
-/// Makes the batches of stage 2: a pure function of (seed, step) and the cluster cache.
+/// Maker of the batches of stage 2, a pure function of (seed, step) and the cluster cache.
 pub struct Stage2Batches {
     reader: ClipReader,
     cache: Arc<ClusterCache>,
-    /// Entries with equal numbers of tokens and of clusters: what one batch can hold.
+    /// Entries with equal numbers of tokens and of clusters, which a batch needs.
     groups: Vec<Vec<usize>>,
     batch_size: usize,
     num_targets: usize,
@@ -52,12 +52,12 @@ impl Stage2Batches {
         })
     }
 
-    /// Makes the batch of `step`, counted from 0: one token count for all, then scenes that have it.
+    /// Makes the batch of `step`, counted from 0: samples a group, then its entries.
     ///
     /// # Errors
-    /// [`TrainError::NoScenes`] when the entries tried for a slot all fail.
+    /// [`TrainError::NoScenes`] if all attempts for a slot fail.
     pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
-        let group = &self.groups[self.draw_group(step)];
+        let group = &self.groups[self.sample_group(step)];
         let (mut clips, mut clusters, mut skipped) = (Vec::new(), Vec::new(), Vec::new());
         for slot in 0..self.batch_size {
             let (clip, scene) = self.fill_slot(step, slot, group, &mut skipped)?;
@@ -67,15 +67,15 @@ impl Stage2Batches {
         Ok(StageBatch { clips, tokens: TokenSelection::Clusters(clusters), skipped })
     }
 
-    /// A group in proportion to its entries, so that every entry is equally likely.
-    fn draw_group(&self, step: u64) -> usize {
+    /// Samples a group in proportion to its size, so that all entries are equally likely.
+    fn sample_group(&self, step: u64) -> usize {
         let total = self.groups.iter().map(Vec::len).sum();
-        let mut place = uniform_below(&mut step_rng(self.seed, step, "token count"), total);
+        let mut index = uniform_below(&mut step_rng(self.seed, step, "token count"), total);
         for (i, group) in self.groups.iter().enumerate() {
-            if place < group.len() {
+            if index < group.len() {
                 return i;
             }
-            place -= group.len();
+            index -= group.len();
         }
         0
     }
@@ -87,17 +87,17 @@ impl Stage2Batches {
         group: &[usize],
         skipped: &mut Vec<SkippedScene>,
     ) -> Result<(Clip, SceneClusters), TrainError> {
-        // The entry is the first value of its attempt's stream, the targets are the following ones.
-        let draw = |attempt| {
+        // The entry is the first value of the stream of an attempt, the targets are the following ones.
+        let sample = |attempt| {
             let mut rng = item_rng(self.seed, step, slot as u32, attempt, "entry and targets");
             (group[uniform_below(&mut rng, group.len())], rng)
         };
         let read = |entry: usize, attempt| {
             let entry = &self.cache.entries()[entry];
             let skip = |error: TrainError| SkippedScene { key: entry.key.clone(), reason: error.to_string() };
-            self.read(entry, &mut draw(attempt).1).map_err(skip)
+            self.read(entry, &mut sample(attempt).1).map_err(skip)
         };
-        FILLER.fill(|attempt| draw(attempt).0, read, skipped).map_err(|NoUsableScene { attempts, last }| {
+        FILLER.fill(|attempt| sample(attempt).0, read, skipped).map_err(|NoUsableScene { attempts, last }| {
             let SkippedScene { key, reason } = last;
             TrainError::NoScenes { reason: format!("slot {slot} of step {step}, {attempts} tries; {key}: {reason}") }
         })
@@ -107,7 +107,7 @@ impl Stage2Batches {
         let source = &self.reader.source;
         let scene = source
             .find(&entry.key)
-            .ok_or_else(|| TrainError::NoScenes { reason: "the data does not have it any more".into() })?;
+            .ok_or_else(|| TrainError::NoScenes { reason: "the scene is not in the data".into() })?;
         let num_frames = source.num_frames(scene)?;
         let target = sample_targets(&entry.context, num_frames, self.num_targets, rng)?;
         let clip = self.reader.read(scene, &ViewIndices { context: entry.context.clone(), target })?;

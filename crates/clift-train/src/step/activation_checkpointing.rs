@@ -1,7 +1,7 @@
-//! Activation checkpointing: the backward of a step that stores only the input of every block and computes the rest again.
+//! Activation checkpointing: a backward pass that stores only the input of every block and recomputes the rest.
 //!
-//! Memory grows by one input per block instead of everything inside it, for one more forward. The
-//! gradients are those of the plain backward: the same operations on the same numbers.
+//! Memory per block is one input instead of all activations, for one more forward pass. The gradients equal those of the
+//! plain backward: the same operations on the same values.
 // B scenes, N tokens, T target views, Q patches of a view, D width
 
 use burn::module::{Module, ModuleVisitor, Param};
@@ -14,11 +14,11 @@ use crate::step::batch::TokenSelection;
 use crate::step::device_batch::DeviceBatch;
 use crate::step::loss::{Loss, LossParts};
 
-/// Adds the gradients of `share` times the loss of what is shown, and returns the loss.
+/// Adds the gradients of `share` times the loss of a batch to `accumulator`, and returns the loss.
 pub(crate) fn backward(
     model: &Clift,
-    shown: &DeviceBatch,
-    choice: &TokenSelection,
+    device_batch: &DeviceBatch,
+    selection: &TokenSelection,
     loss: &Loss,
     share: f64,
     accumulator: &mut GradientsAccumulator<Clift>,
@@ -26,56 +26,60 @@ pub(crate) fn backward(
     let mut add = |grads: Gradients| accumulator.accumulate(model, GradientsParams::from_grads(grads, model));
     let plain = model.valid();
 
-    // Forward without a tape: what every block starts from.
-    let context = Views { images: shown.context.images.clone().inner(), cameras: untracked(&shown.context.cameras) };
-    let targets = untracked(&shown.targets);
-    let (encoder_inputs, lift) = inputs(plain.encoder.embed(&context), plain.encoder.blocks(), EncoderBlock::forward);
-    let tokens = choice.apply(&plain.condenser, plain.lift_norm.forward(lift.clone()))?;
-    let (renderer_inputs, x) = inputs(plain.renderer.embed(&targets), plain.renderer.blocks(), |block, x| {
+    // Forward without autodiff: the inputs of the blocks.
+    let context = Views {
+        images: device_batch.context.images.clone().inner(),
+        cameras: untracked(&device_batch.context.cameras),
+    };
+    let targets = untracked(&device_batch.targets);
+    let (encoder_inputs, lift) =
+        block_inputs(plain.encoder.embed(&context), plain.encoder.blocks(), EncoderBlock::forward);
+    let tokens = selection.apply(&plain.condenser, plain.lift_norm.forward(lift.clone()))?;
+    let (renderer_inputs, x) = block_inputs(plain.renderer.embed(&targets), plain.renderer.blocks(), |block, x| {
         block.forward(x, tokens.project(block))
     });
 
-    // Backward, one tape after the other.
+    // Backward, one block after the other.
     let x = leaf(x);
-    let parts = loss.of(model.renderer.to_image(x.clone(), &shown.targets), shown.pictures.clone());
+    let parts = loss.of(model.renderer.to_image(x.clone(), &device_batch.targets), device_batch.target_images.clone());
     let mut grads = parts.total.clone().mul_scalar(share).backward();
     let parts = LossParts { total: parts.total.inner(), mse: parts.mse.inner() };
-    let mut grad_x = take(&x, &mut grads);
+    let mut grad_x = take_gradient(&x, &mut grads);
     add(grads);
 
     let mut grad_tokens: Option<Tensor<3>> = None;
     for (block, input) in model.renderer.blocks().iter().zip(renderer_inputs).rev() {
-        let (x, given) = (leaf(input), leaf(tokens.tokens().clone()));
-        let output = block.forward(x.clone(), tokens.with_tokens(given.clone()).project(block));
-        let mut grads = pull(output, grad_x);
-        grad_x = take(&x, &mut grads);
-        let grad = take(&given, &mut grads);
+        let (x, block_tokens) = (leaf(input), leaf(tokens.tokens().clone()));
+        let output = block.forward(x.clone(), tokens.with_tokens(block_tokens.clone()).project(block));
+        let mut grads = backward_from(output, grad_x);
+        grad_x = take_gradient(&x, &mut grads);
+        let grad = take_gradient(&block_tokens, &mut grads);
         grad_tokens = Some(match grad_tokens {
             Some(sum) => sum + grad,
             None => grad,
         });
         add(grads);
     }
-    add(pull(model.renderer.embed(&shown.targets), grad_x));
+    add(backward_from(model.renderer.embed(&device_batch.targets), grad_x));
     let Some(grad_tokens) = grad_tokens else {
-        return Ok(parts); // a renderer without blocks looks at no token
+        return Ok(parts); // a renderer without blocks reads no token
     };
 
     let lift = leaf(lift);
-    let output = choice.apply(&model.condenser, model.lift_norm.forward(lift.clone()))?.tokens().clone();
-    let mut grads = pull(output, grad_tokens);
-    let mut grad_x = take(&lift, &mut grads);
+    let output = selection.apply(&model.condenser, model.lift_norm.forward(lift.clone()))?.tokens().clone();
+    let mut grads = backward_from(output, grad_tokens);
+    let mut grad_x = take_gradient(&lift, &mut grads);
     add(grads);
     if !trains(&model.encoder) {
         return Ok(parts);
     }
     for (block, input) in model.encoder.blocks().iter().zip(encoder_inputs).rev() {
         let x = leaf(input);
-        let mut grads = pull(block.forward(x.clone()), grad_x);
-        grad_x = take(&x, &mut grads);
+        let mut grads = backward_from(block.forward(x.clone()), grad_x);
+        grad_x = take_gradient(&x, &mut grads);
         add(grads);
     }
-    add(pull(model.encoder.embed(&shown.context), grad_x));
+    add(backward_from(model.encoder.embed(&device_batch.context), grad_x));
     Ok(parts)
 }
 
@@ -83,8 +87,8 @@ fn untracked(cameras: &Cameras) -> Cameras {
     Cameras { c2w: cameras.c2w.clone().inner(), intrinsics: cameras.intrinsics.clone().inner(), ..*cameras }
 }
 
-/// What every block starts from, and the result of the last.
-fn inputs<B>(
+/// Returns the inputs of all blocks, and the output of the last.
+fn block_inputs<B>(
     first: Tensor<3>,
     blocks: &[B],
     forward: impl Fn(&B, Tensor<3>) -> Tensor<3>,
@@ -94,26 +98,26 @@ fn inputs<B>(
         let x = inputs[inputs.len() - 1].clone();
         inputs.push(forward(block, x));
     }
-    let last = inputs.pop().expect("the first is there");
+    let last = inputs.pop().expect("the first input");
     (inputs, last)
 }
 
-/// The start of a tape.
+/// Makes a leaf of the autodiff graph.
 fn leaf(x: Tensor<3>) -> Tensor<3> {
     x.autodiff().require_grad()
 }
 
-/// Gradients of everything behind `output` whose own gradient is `grad`.
-fn pull(output: Tensor<3>, grad: Tensor<3>) -> Gradients {
+/// Backpropagates from `output`, whose gradient is `grad`.
+fn backward_from(output: Tensor<3>, grad: Tensor<3>) -> Gradients {
     (output * grad.autodiff()).sum().backward()
 }
 
-/// The gradient of a leaf; zero where nothing came from it.
-fn take(leaf: &Tensor<3>, grads: &mut Gradients) -> Tensor<3> {
+/// Takes the gradient of a leaf, zeros if the leaf has none.
+fn take_gradient(leaf: &Tensor<3>, grads: &mut Gradients) -> Tensor<3> {
     leaf.grad_remove(grads).unwrap_or_else(|| leaf.clone().inner().zeros_like())
 }
 
-/// Whether any parameter is to get a gradient.
+/// Whether any parameter requires a gradient.
 fn trains<M: Module>(module: &M) -> bool {
     struct Any(bool);
     impl ModuleVisitor for Any {
@@ -136,13 +140,13 @@ mod tests {
     use crate::run::stage_plan::freeze;
     use crate::step::batch::StageBatch;
     use crate::step::device_batch::render_loss;
-    use crate::step::seeded_inputs::{Shape, seeded_batch, seeded_model};
+    use crate::step::seeded_inputs::{ClipShape, seeded_batch, seeded_model};
 
-    const SHAPE: Shape = Shape { num_context: 2, num_targets: 3, size: [16, 24] };
+    const SHAPE: ClipShape = ClipShape { num_context: 2, num_targets: 3, size: [16, 24] };
     /// 2 views of 2 x 3 patches.
     const NUM_TOKENS: usize = 12;
 
-    /// Every parameter's gradient from both ways.
+    /// Returns the gradient of every parameter by the plain and by the checkpointed backward.
     fn both(
         variant: CliftVariant,
         stage: Stage,
@@ -159,7 +163,7 @@ mod tests {
                 let [a, b] = self.grads.map(|grads| {
                     grads.get::<D>(param.id).map(|grad| grad.into_data().try_to_vec::<f32>().expect("f32"))
                 });
-                assert_eq!(a.is_some(), b.is_some(), "the same parameters get a gradient");
+                assert_eq!(a.is_some(), b.is_some(), "the same parameters have a gradient");
                 self.pairs.extend(a.zip(b));
             }
         }
@@ -174,11 +178,11 @@ mod tests {
             ..ModelConfig::default()
         };
         let model = freeze(stage, seeded_model(&config, 3, device));
-        let shown = DeviceBatch::upload(batch, &device.clone().autodiff()).expect("valid");
-        let plain_loss = render_loss(&model, &shown, &batch.tokens, loss).expect("valid").total;
+        let device_batch = DeviceBatch::upload(batch, &device.clone().autodiff()).expect("valid");
+        let plain_loss = render_loss(&model, &device_batch, &batch.tokens, loss).expect("valid").total;
         let plain = GradientsParams::from_grads(plain_loss.clone().mul_scalar(0.5).backward(), &model);
         let mut accumulator = GradientsAccumulator::new();
-        let parts = backward(&model, &shown, &batch.tokens, loss, 0.5, &mut accumulator).expect("valid");
+        let parts = backward(&model, &device_batch, &batch.tokens, loss, 0.5, &mut accumulator).expect("valid");
         assert!((parts.total.into_scalar::<f64>() - plain_loss.into_scalar::<f64>()).abs() < 1e-7);
         let again = accumulator.grads();
         let mut pairs = Pairs { grads: [&plain, &again], pairs: Vec::new() };
@@ -194,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_equal_those_of_the_plain_backward() {
+    fn gradients_equal_those_of_plain_backward() {
         let all = seeded_batch(SHAPE, 2, NUM_TOKENS, None, 1).expect("valid");
         let stored = seeded_batch(SHAPE, 2, NUM_TOKENS, Some(5), 1).expect("valid");
         let few = StageBatch { tokens: subsets(2), ..all.clone() };
@@ -209,8 +213,8 @@ mod tests {
                     if !variant.has_norms() {
                         assert_eq!(plain, again, "bit for bit");
                     }
-                    // Burn adds the gradients of a norm composed of its operations in the order of the whole tape. The
-                    // floor is for biases whose gradient is all but zero.
+                    // Burn adds the gradients of a composed norm in the order of the whole graph. The floor covers
+                    // biases with a gradient near zero.
                     let error = plain.iter().zip(&again).fold(0.0_f32, |error, (a, b)| error.max((a - b).abs()));
                     assert!(error <= 1e-5 * largest(&plain) + 1e-7 * scale, "{variant}: {error:e} of {scale:e}");
                 }

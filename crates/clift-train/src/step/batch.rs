@@ -7,18 +7,18 @@ use clift_model::{Clusters, Condenser, RenderTokens, SceneClusters};
 
 use crate::error::TrainError;
 
-/// What one update sees: clips with equal numbers of views, and which tokens the renderer is given.
+/// Clips of an update, with equal numbers of views, and the tokens from which they are rendered.
 #[derive(Clone, Debug)]
 pub struct StageBatch {
     /// One clip per slot.
     pub clips: Vec<Clip>,
-    /// The tokens, slot by slot.
+    /// Tokens of the renderer, per slot.
     pub tokens: TokenSelection,
-    /// Scenes left out on the way.
+    /// Scenes that were skipped while the batch was filled.
     pub skipped: Vec<SkippedScene>,
 }
 
-/// Which tokens the renderer is given.
+/// Tokens that the renderer receives.
 #[derive(Clone, Debug, PartialEq)]
 pub enum TokenSelection {
     /// Stage 1: a subset of the scene's tokens for every target view, `[slots][views][K]`.
@@ -30,7 +30,7 @@ pub enum TokenSelection {
 }
 
 impl StageBatch {
-    /// Cuts the batch into `count` parts of nearly equal size.
+    /// Splits the batch into `count` micro-batches of nearly equal size.
     pub(crate) fn parts(&self, count: usize) -> impl Iterator<Item = Self> + '_ {
         let batch_size = self.clips.len();
         (0..count).map(move |part| {
@@ -46,7 +46,7 @@ impl StageBatch {
 }
 
 impl TokenSelection {
-    /// What the renderer is given of a scene's tokens.
+    /// Selects the tokens of the renderer from the encoder's tokens, `[B, N, D]`.
     pub(crate) fn apply(&self, condenser: &Condenser, lift: Tensor<3>) -> Result<RenderTokens, TrainError> {
         Ok(match self {
             Self::All => lift.into(),

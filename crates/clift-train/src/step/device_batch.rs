@@ -9,38 +9,44 @@ use crate::error::TrainError;
 use crate::step::batch::{StageBatch, TokenSelection};
 use crate::step::loss::{Loss, LossParts};
 
-/// What a batch shows, on a device.
+/// The views of a batch on a device.
 pub struct DeviceBatch {
-    /// The given views.
+    /// Context views.
     pub context: Views,
-    /// Where the targets were taken from.
+    /// Cameras of the target views.
     pub targets: Cameras,
-    /// The targets, `[B, T, H, W, 3]`.
-    pub pictures: Tensor<5>,
+    /// Images of the target views, `[B, T, H, W, 3]` in `[0, 1]`.
+    pub target_images: Tensor<5>,
 }
 
 impl DeviceBatch {
     /// Copies the views of a batch to a device.
+    ///
+    /// # Errors
+    /// Those of [`upload_views`] for views of different sizes.
     pub fn upload(batch: &StageBatch, device: &Device) -> Result<Self, TrainError> {
         let contexts: Vec<_> = batch.clips.iter().map(|clip| &clip.context).collect();
         let targets: Vec<_> = batch.clips.iter().map(|clip| &clip.target).collect();
         Ok(Self {
             context: upload_views(&contexts, device)?,
             targets: upload_cameras(&targets, device)?,
-            pictures: upload_images(&targets, device)?,
+            target_images: upload_images(&targets, device)?,
         })
     }
 }
 
-/// Renders the targets and compares, on the tape.
+/// Renders the target views from selected tokens and returns the loss, with autodiff.
+///
+/// # Errors
+/// Those of clusters that do not fit the tokens.
 pub fn render_loss(
     model: &Clift,
-    shown: &DeviceBatch,
-    choice: &TokenSelection,
+    device_batch: &DeviceBatch,
+    selection: &TokenSelection,
     loss: &Loss,
 ) -> Result<LossParts, TrainError> {
-    let lift = model.encode(&shown.context); // [B, N, D]
-    let tokens = choice.apply(&model.condenser, lift)?;
-    let rendering = model.render(tokens, &shown.targets);
-    Ok(loss.of(rendering, shown.pictures.clone()))
+    let lift = model.encode(&device_batch.context); // [B, N, D]
+    let tokens = selection.apply(&model.condenser, lift)?;
+    let rendering = model.render(tokens, &device_batch.targets);
+    Ok(loss.of(rendering, device_batch.target_images.clone()))
 }

@@ -1,4 +1,4 @@
-//! The training loss (paper section 3.3): mean squared error, and a weighted perceptual term beside it.
+//! The training loss (paper section 3.3): mean squared error and weighted terms.
 
 use std::fmt;
 use std::sync::Arc;
@@ -9,15 +9,15 @@ use clift_eval::Perceptual;
 use crate::config::config::LossConfig;
 use crate::error::TrainError;
 
-/// A term of the training loss.
+/// A term of the training loss. `examples/custom_loss.rs` trains with a new one.
 pub trait ImageLoss: fmt::Debug + Send + Sync {
-    /// Computes the term, `[1]`, of renderings.
+    /// Computes the term, `[1]`, with autodiff.
     ///
     /// # Shapes
     /// - `rendering`, `target`: `[batch, views, height, width, 3]` in `[0, 1]`
     fn loss(&self, rendering: &Tensor<5>, target: &Tensor<5>) -> Tensor<1>;
 
-    /// A line about the term for the log of a run.
+    /// Describes the term for the log of a run.
     fn describe(&self) -> Option<String> {
         None
     }
@@ -43,43 +43,45 @@ impl ImageLoss for Perceptual {
     }
 }
 
-/// What a step minimises, the same in both stages: the mean squared error and weighted terms. The default has no
-/// further term.
+/// The minimized loss, the same in both stages: mean squared error plus weighted terms. The default has no further term.
 #[derive(Clone, Debug, Default)]
 pub struct Loss {
     terms: Vec<(f64, Arc<dyn ImageLoss>)>,
 }
 
-/// The loss of a batch, on the tape.
+/// The loss of a batch, with autodiff.
 #[derive(Clone, Debug)]
 pub struct LossParts {
-    /// What is minimised, `[1]`.
+    /// The minimized loss, `[1]`.
     pub total: Tensor<1>,
-    /// The mean squared error in it, `[1]`: what PSNR is of.
+    /// The mean squared error, `[1]`, from which PSNR is computed.
     pub mse: Tensor<1>,
 }
 
 impl Loss {
-    /// Makes the loss of a config, reading the network's weights where it has a perceptual term.
+    /// Makes the loss of a config; reads the VGG weights if there is a perceptual term.
     ///
     /// # Errors
     /// As [`LossConfig::weights`] and [`Perceptual::load`].
     pub fn load(config: &LossConfig, device: &Device) -> Result<Self, TrainError> {
-        let mut loss = Self::default();
-        if let Some(path) = config.weights()? {
-            // Constants of the loss: without autodiff.
-            let network = Perceptual::load(path, &device.clone().without_autodiff())?;
-            loss.terms.push((config.perceptual_weight, Arc::new(network)));
-        }
-        Ok(loss)
+        let Some(path) = config.weights()? else { return Ok(Self::default()) };
+        let network = Perceptual::load(path, &device.clone().without_autodiff())?;
+        Ok(Self::default().with_term(config.perceptual_weight, network))
     }
 
-    /// Lines about the terms for the log of a run.
+    /// Adds `weight` times a term.
+    #[must_use]
+    pub fn with_term(mut self, weight: f64, term: impl ImageLoss + 'static) -> Self {
+        self.terms.push((weight, Arc::new(term)));
+        self
+    }
+
+    /// Describes the terms for the log of a run.
     pub fn describe(&self) -> impl Iterator<Item = String> {
         self.terms.iter().filter_map(|(_, term)| term.describe())
     }
 
-    /// The loss of renderings.
+    /// Computes the loss of renderings.
     ///
     /// # Shapes
     /// - `rendering`, `target`: `[batch, views, height, width, 3]` in `[0, 1]`
@@ -90,7 +92,7 @@ impl Loss {
     }
 }
 
-/// Mean squared error over all values of all pictures.
+/// Computes the mean squared error over all values of all images.
 ///
 /// # Shapes
 /// - `rendering`, `target`: `[batch, views, height, width, 3]` in `[0, 1]`
@@ -99,7 +101,7 @@ pub fn mse(rendering: Tensor<5>, target: Tensor<5>) -> Tensor<1> {
     (rendering - target).square().mean()
 }
 
-/// PSNR in dB of a mean squared error of values in `[0, 1]`.
-pub fn psnr_of(mse: f64) -> f64 {
+/// Returns the PSNR in dB of a mean squared error of values in `[0, 1]`.
+pub fn psnr_of_mse(mse: f64) -> f64 {
     -10.0 * mse.log10()
 }

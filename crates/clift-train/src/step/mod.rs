@@ -4,11 +4,11 @@
 //! - `device_batch`: a batch on a device; its loss
 //! - `loss`: MSE and perceptual term
 //! - `loss_scale`: loss scaling for f16
-//! - `optimizer`: AdamW, gradient norm and clipping
+//! - `optimizer`: `AdamW`, gradient norm and clipping
 //! - `schedule`: warm-up and cosine
 //! - `seeded_inputs`: batches and weights from a seed, for tests and benchmarks
 //! - `activation_checkpointing`: backward from stored block inputs
-//! - `train_state`: model, optimiser, one update
+//! - `train_state`: model, optimizer, one update
 //! - `step_guard`: skip anomalous steps
 
 pub(crate) mod activation_checkpointing;

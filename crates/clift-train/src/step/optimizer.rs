@@ -1,4 +1,4 @@
-//! AdamW, the global gradient norm, and what is done with gradients before an update.
+//! AdamW, global gradient norm and clipping.
 
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
@@ -6,7 +6,7 @@ use burn::tensor::Tensor;
 
 use crate::config::config::OptimizerConfig;
 
-/// AdamW with the reference's moments (0.9, 0.95) and epsilon 1e-8, decaying every parameter.
+/// Makes AdamW with the moments (0.9, 0.95) and epsilon 1e-8 of the reference. Weight decay applies to every parameter.
 pub fn adamw(config: &OptimizerConfig) -> ModuleOptimizer {
     AdamWConfig::new()
         .with_beta_1(0.9)
@@ -16,12 +16,12 @@ pub fn adamw(config: &OptimizerConfig) -> ModuleOptimizer {
         .init()
 }
 
-/// Norm of all gradients of a module together, on the host.
+/// Returns the norm of all gradients of a module, on the host.
 pub fn global_norm<M: Module>(module: &M, grads: &GradientsParams) -> f64 {
     norm_on_device(module, grads).map_or(0.0, Tensor::into_scalar::<f64>)
 }
 
-/// Norm of all gradients of a module together, `[1]`, on their device; `None` where there is none.
+/// Returns the norm of all gradients of a module, `[1]`, on their device; `None` without gradients.
 pub fn norm_on_device<M: Module>(module: &M, grads: &GradientsParams) -> Option<Tensor<1>> {
     struct Squares<'a> {
         grads: &'a GradientsParams,
@@ -41,17 +41,17 @@ pub fn norm_on_device<M: Module>(module: &M, grads: &GradientsParams) -> Option<
 
 /// Scales all gradients of a module by `max_norm / norm` where `norm` is larger.
 pub fn clip_global_norm<M: Module>(module: &M, grads: GradientsParams, norm: f64, max_norm: f64) -> GradientsParams {
-    scale(module, grads, clip_factor(norm, max_norm))
+    scale_gradients(module, grads, clip_factor(norm, max_norm))
 }
 
-/// What gradients of a global norm are multiplied by to be within `max_norm`.
+/// Returns the factor that clips gradients with global norm `norm` to `max_norm`.
 pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
     // PyTorch's guard against a norm of zero.
     (max_norm / (norm + 1e-6)).min(1.0)
 }
 
 /// Multiplies all gradients of a module by a factor.
-pub fn scale<M: Module>(module: &M, grads: GradientsParams, factor: f64) -> GradientsParams {
+pub fn scale_gradients<M: Module>(module: &M, grads: GradientsParams, factor: f64) -> GradientsParams {
     struct Scale {
         grads: GradientsParams,
         factor: f64,
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn five_updates_equal_pytorchs() {
+    fn five_updates_equal_pytorch() {
         let fixture = Fixture::open();
         let device = Device::flex();
         // Parameters that train live with autodiff, their gradients without.
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn clipping_equals_pytorchs_above_and_below_the_limit() {
+    fn clipping_equals_pytorch() {
         let fixture = Fixture::open();
         let device = Device::flex();
         let model = toy(&fixture, &device);

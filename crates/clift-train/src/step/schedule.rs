@@ -1,12 +1,10 @@
-//! The learning rate of each step.
+//! Learning rate of each step.
 
-/// Where the warm-up starts from.
+/// Learning rate at the start of the warm-up.
 const START: f64 = 1e-8;
 
-/// Gives the learning rate of `step` = 1, 2, ..: a line from 1e-8 to `base` over the warm-up, then half a
-/// cosine down to 0 at step `num_steps`.
-///
-/// A run no longer than its warm-up never leaves the line; beyond `num_steps` the rate stays 0.
+/// Returns the learning rate of `step` = 1, 2, ..: linear from 1e-8 to `base` during the warm-up, then half a cosine down to
+/// 0 at `num_steps` and later.
 pub fn warm_up_cosine(step: u64, base: f64, num_warm_up_steps: u64, num_steps: u64) -> f64 {
     if step <= num_warm_up_steps {
         return START + (base - START) * step as f64 / num_warm_up_steps as f64;
@@ -23,7 +21,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_rates_are_those_of_the_pytorch_twin() {
+    fn rates_equal_those_of_pytorch() {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data-fixtures/reference/adamw.safetensors");
         let bytes = std::fs::read(path).unwrap();
         let fixture = SafeTensors::deserialize(&bytes).unwrap();
@@ -36,14 +34,14 @@ mod tests {
     }
 
     #[test]
-    fn the_warm_up_ends_at_the_base_rate_and_the_run_at_zero() {
+    fn warm_up_ends_at_base_rate_and_run_at_zero() {
         assert_eq!(warm_up_cosine(2500, 4e-4, 2500, 90_000), 4e-4);
         assert!(warm_up_cosine(90_000, 4e-4, 2500, 90_000).abs() < 1e-20);
         assert_eq!(warm_up_cosine(90_001, 4e-4, 2500, 90_000), warm_up_cosine(90_000, 4e-4, 2500, 90_000));
     }
 
     #[test]
-    fn a_run_without_warm_up_or_shorter_than_it_has_finite_rates() {
+    fn short_runs_have_finite_rates() {
         assert!(warm_up_cosine(1, 1e-3, 0, 30) < 1e-3);
         assert!(warm_up_cosine(30, 1e-3, 100, 30) < 1e-3);
         assert!(warm_up_cosine(101, 1e-3, 100, 30).is_finite());

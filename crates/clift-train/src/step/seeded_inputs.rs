@@ -1,4 +1,4 @@
-//! Seeded inputs that need no data: posed pictures, features, clusters, weights.
+//! Inputs from a seed for tests and benchmarks: posed images, clusters, batches, weights.
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -9,9 +9,9 @@ use rand::{Rng, RngExt};
 use crate::error::TrainError;
 use crate::step::batch::{StageBatch, TokenSelection};
 
-/// How many pictures of which size an item has.
+/// Numbers and size of the views of a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Shape {
+pub struct ClipShape {
     /// Context views.
     pub num_context: usize,
     /// Target views.
@@ -20,11 +20,11 @@ pub struct Shape {
     pub size: [usize; 2],
 }
 
-/// One scene: waves of colour with noise, seen by cameras along an arc.
-pub fn seeded_clip(shape: Shape, seed: u64, slot: usize) -> Clip {
+/// Makes a scene: noisy colour waves, seen by cameras along an arc.
+pub fn seeded_clip(shape: ClipShape, seed: u64, slot: usize) -> Clip {
     let mut rng = item_rng(seed, 0, slot as u32, 0, "bench pictures");
-    let Shape { num_context, num_targets, size } = shape;
-    // Targets lie between the contexts.
+    let ClipShape { num_context, num_targets, size } = shape;
+    // Targets between the contexts.
     let along = |count: usize, view: usize| (2 * view + 1) as f64 / count as f64 - 1.0;
     let context = (0..num_context).map(|view| along(num_context, view)).collect();
     let target = (0..num_targets).map(|view| 0.9 * along(num_targets, view)).collect();
@@ -32,12 +32,12 @@ pub fn seeded_clip(shape: Shape, seed: u64, slot: usize) -> Clip {
     Clip { key: format!("bench-{slot}"), context, target: views(target, size, &mut rng) }
 }
 
-/// Views at places in `[-1, 1]` of the arc.
-fn views(places: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -> ClipViews {
+/// Makes views at positions in `[-1, 1]` of the arc.
+fn views(positions: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -> ClipViews {
     let focal = width as f64;
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: focal / 2.0, cy: height as f64 / 2.0 };
-    let mut images = Vec::with_capacity(places.len() * height * width * 3);
-    for _ in &places {
+    let mut images = Vec::with_capacity(positions.len() * height * width * 3);
+    for _ in &positions {
         let waves: [[f64; 3]; 3] = std::array::from_fn(|_| std::array::from_fn(|_| rng.random_range(0.0..0.4)));
         for row in 0..height {
             for column in 0..width {
@@ -48,24 +48,24 @@ fn views(places: Vec<f64>, [height, width]: [usize; 2], rng: &mut impl Rng) -> C
             }
         }
     }
-    let num_views = places.len();
+    let num_views = positions.len();
     ClipViews {
         width,
         height,
         images,
-        c2w: places.into_iter().map(pose).collect(),
+        c2w: positions.into_iter().map(pose).collect(),
         intrinsics: vec![intrinsics; num_views],
         frame_index: (0..num_views).collect(),
     }
 }
 
-/// The camera at a place of the arc, turned towards its middle.
-fn pose(place: f64) -> Pose {
-    let rotation = DMat3::from_rotation_y(-0.5 * place);
-    Pose { rotation, translation: DVec3::new(place, 0.0, 0.25 * place * place) }
+/// Returns the pose at a position of the arc, turned towards its centre.
+fn pose(position: f64) -> Pose {
+    let rotation = DMat3::from_rotation_y(-0.5 * position);
+    Pose { rotation, translation: DVec3::new(position, 0.0, 0.25 * position * position) }
 }
 
-/// Clusters drawn at random: every cluster has its own token, every other token any cluster.
+/// Makes random clusters: every cluster has one token of its own, the other tokens have any cluster.
 pub fn seeded_clusters(
     num_tokens: usize,
     num_clusters: usize,
@@ -81,9 +81,9 @@ pub fn seeded_clusters(
     Ok(SceneClusters::new(assignment, centroid_index)?)
 }
 
-/// A batch of stage 1 that keeps every token, or of stage 2 where there is a number of stored tokens.
+/// Makes a batch of stage 1 with all tokens, or of stage 2 if `num_storage_tokens` is given.
 pub fn seeded_batch(
-    shape: Shape,
+    shape: ClipShape,
     batch_size: usize,
     num_tokens: usize,
     num_storage_tokens: Option<usize>,
@@ -100,15 +100,15 @@ pub fn seeded_batch(
     Ok(StageBatch { clips, tokens, skipped: Vec::new() })
 }
 
-/// Uniform values in `[-1, 1)`.
+/// Samples uniform values in `[-1, 1)`.
 pub fn seeded_uniform<const D: usize>(shape: [usize; D], seed: u64, purpose: &str, device: &Device) -> Tensor<D> {
     let mut rng = step_rng(seed, 0, purpose);
     let values: Vec<f32> = (0..shape.iter().product()).map(|_| rng.random_range(-1.0..1.0)).collect();
     Tensor::from_data(TensorData::new(values, shape), device)
 }
 
-/// A model on an autodiff device with the seed's initial weights, except that the condenser's gates are open:
-/// they start at zero, and behind a closed gate every result and every gradient is zero, in any arithmetic.
+/// Makes a model with seeded initial weights on the autodiff device. The gates of the condenser get random weights: their
+/// initial zeros would make all results and gradients behind them zero.
 pub fn seeded_model(config: &ModelConfig, seed: u64, device: &Device) -> Clift {
     struct OpenGates {
         seed: u64,
@@ -129,7 +129,6 @@ pub fn seeded_model(config: &ModelConfig, seed: u64, device: &Device) -> Clift {
             param.map(|weight| {
                 let bound = 1.0 / (weight.dims()[0] as f64).sqrt();
                 let opened = seeded_uniform(weight.dims(), self.seed, &purpose, &weight.device()).mul_scalar(bound);
-                // A leaf again, as parameters are.
                 opened.detach().require_grad()
             })
         }
@@ -145,28 +144,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_clip_has_its_views_rigid_poses_and_the_same_bytes_for_a_seed() {
-        let shape = Shape { num_context: 3, num_targets: 2, size: [8, 16] };
+    fn seeded_clips_are_valid_and_reproducible() {
+        let shape = ClipShape { num_context: 3, num_targets: 2, size: [8, 16] };
         let clip = seeded_clip(shape, 5, 1);
         assert_eq!((clip.context.num_views(), clip.target.num_views()), (3, 2));
         assert_eq!(clip.context.images.len(), 3 * 8 * 16 * 3);
         assert!(clip.context.c2w.iter().all(|pose| pose.orthonormality_defect() < 1e-12));
         assert!(clip.context.c2w.windows(2).all(|pair| pair[0] != pair[1]), "views differ");
-        assert_eq!(clip, super::seeded_clip(shape, 5, 1));
-        assert_ne!(clip.context.images, super::seeded_clip(shape, 6, 1).context.images);
+        assert_eq!(clip, seeded_clip(shape, 5, 1));
+        assert_ne!(clip.context.images, seeded_clip(shape, 6, 1).context.images);
     }
 
     #[test]
-    fn drawn_clusters_are_valid_at_every_count() {
-        for count in [1, 2, 7, 12] {
-            let scene = seeded_clusters(12, count, 0, 0).expect("valid");
-            assert_eq!(scene.centroid_index().len(), count);
-        }
-        assert_eq!(seeded_clusters(12, 12, 0, 0).expect("valid"), SceneClusters::identity(12));
-    }
-
-    #[test]
-    fn no_weight_matrix_is_zero_and_all_train() {
+    fn no_weight_matrix_is_zero() {
         struct NotZero(usize);
         impl ModuleVisitor for NotZero {
             fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {

@@ -1,4 +1,4 @@
-//! Steps that are left out: what makes a step bad, and the file that names them.
+//! Skipped steps: detection of anomalies, and the lines of `bad_steps.jsonl`.
 
 use std::collections::VecDeque;
 
@@ -9,12 +9,12 @@ use crate::config::config::OptimizerConfig;
 use crate::events::Stage;
 use crate::step::batch::StageBatch;
 
-/// Steps whose loss and gradient norm a new one is compared with.
+/// Number of good steps with which a step is compared.
 const WINDOW: usize = 101;
-/// Fewer than these have no median worth the name: the first steps of a run are wild.
+/// Fewest steps for a median: losses vary widely in the first steps of a run.
 const MIN_STEPS: usize = 20;
 
-/// Why a step was left out.
+/// Reason for skipping a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, strum::Display)]
 #[serde(rename_all = "snake_case")]
 pub enum StepAnomaly {
@@ -29,7 +29,7 @@ pub enum StepAnomaly {
     GradNormSpike,
 }
 
-/// Loss and gradient norm of the last good steps. Part of a checkpoint, so that a resumed run judges as it would have.
+/// Loss and gradient norm of the last good steps. Part of a checkpoint: a resumed run makes the same decisions.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LossHistory {
@@ -38,8 +38,8 @@ pub struct LossHistory {
 }
 
 impl LossHistory {
-    /// What is wrong with a step, before its update.
-    pub fn fault(&self, loss: f64, grad_norm: f64, optimizer: &OptimizerConfig) -> Option<StepAnomaly> {
+    /// Returns the anomaly of a step, checked before its update.
+    pub fn anomaly(&self, loss: f64, grad_norm: f64, optimizer: &OptimizerConfig) -> Option<StepAnomaly> {
         if !(loss.is_finite() && grad_norm.is_finite()) {
             return Some(StepAnomaly::NotFinite);
         }
@@ -51,7 +51,7 @@ impl LossHistory {
         is_spike(grad_norm, self.median_grad_norm()).then_some(StepAnomaly::GradNormSpike)
     }
 
-    /// Takes a good step into account; bad ones must not raise the bar for those after them.
+    /// Adds a good step. Skipped steps are not added, since they would raise the medians.
     pub fn push(&mut self, loss: f64, grad_norm: f64) {
         for (window, value) in [(&mut self.losses, loss), (&mut self.grad_norms, grad_norm)] {
             if window.len() == WINDOW {
@@ -61,46 +61,46 @@ impl LossHistory {
         }
     }
 
-    /// Median loss of the window, once there are enough steps.
+    /// Returns the median loss of the window; `None` for fewer than 20 steps.
     pub fn median_loss(&self) -> Option<f64> {
         median(&self.losses)
     }
 
-    /// Median gradient norm of the window, once there are enough steps.
+    /// Returns the median gradient norm of the window; `None` for fewer than 20 steps.
     pub fn median_grad_norm(&self) -> Option<f64> {
         median(&self.grad_norms)
     }
 }
 
-/// The upper median, which is one of the values: no rounding.
+/// Returns the upper median, which is one of the values, without rounding.
 fn median(window: &VecDeque<f64>) -> Option<f64> {
     (window.len() >= MIN_STEPS).then(|| upper_median(&window.iter().copied().collect::<Vec<_>>()))
 }
 
-/// A line of `bad_steps.jsonl`. JSON holds no NaN and no infinity: such a number is `null`.
+/// A line of `bad_steps.jsonl`. NaN and infinity are written as `null`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SkippedStep {
-    /// The step that was left out, from 1.
+    /// The skipped step, from 1.
     pub step: u64,
-    /// Which stage.
+    /// The stage.
     pub stage: Stage,
-    /// Why.
+    /// The reason.
     pub reason: StepAnomaly,
     /// Loss of the batch.
     pub loss: Option<f64>,
     /// Global norm of the gradient before clipping.
     pub grad_norm: Option<f64>,
-    /// Median loss of the good steps before; `null` for fewer than 20.
+    /// Median loss of the good steps before; `null` for fewer than 20 steps.
     pub median_loss: Option<f64>,
     /// Median gradient norm of the good steps before.
     pub median_grad_norm: Option<f64>,
-    /// How many steps in a row were left out, this one included.
+    /// Number of consecutive skipped steps, including this one.
     pub in_a_row: u32,
-    /// What the batch was made of.
+    /// Scenes of the batch.
     pub scenes: Vec<SkippedStepScene>,
 }
 
-/// One clip of a batch that was left out.
+/// A clip of a skipped batch.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkippedStepScene {
     /// Key of the scene.
@@ -112,7 +112,7 @@ pub struct SkippedStepScene {
 }
 
 impl SkippedStepScene {
-    /// The clips of a batch.
+    /// Lists the clips of a batch.
     pub fn all(batch: &StageBatch) -> Vec<Self> {
         let scene = |clip: &clift_data::Clip| Self {
             key: clip.key.clone(),
@@ -138,27 +138,27 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_is_bad_from_the_first_step_on() {
+    fn non_finite_values_are_anomalies_from_the_first_step() {
         let recent = LossHistory::default();
         for (loss, norm) in [(f64::NAN, 1.0), (1.0, f64::INFINITY), (f64::NEG_INFINITY, f64::NAN)] {
-            assert_eq!(recent.fault(loss, norm, &with_factor(0.0)), Some(StepAnomaly::NotFinite));
+            assert_eq!(recent.anomaly(loss, norm, &with_factor(0.0)), Some(StepAnomaly::NotFinite));
         }
-        assert_eq!(recent.fault(1e300, 1e300, &with_factor(2.0)), None, "there is nothing to compare with");
+        assert_eq!(recent.anomaly(1e300, 1e300, &with_factor(2.0)), None, "without history there are no spikes");
     }
 
     #[test]
-    fn a_spike_is_more_than_the_factor_times_the_median() {
+    fn spikes_exceed_the_factor_times_the_median() {
         let recent = after((1..=21).map(|i| (f64::from(i), 2.0 * f64::from(i))));
-        let fault = |loss, norm, factor| recent.fault(loss, norm, &with_factor(factor));
+        let anomaly = |loss, norm, factor| recent.anomaly(loss, norm, &with_factor(factor));
         assert_eq!((recent.median_loss(), recent.median_grad_norm()), (Some(11.0), Some(22.0)));
-        assert_eq!(fault(33.0, 66.0, 3.0), None, "exactly the factor");
-        assert_eq!(fault(33.1, 66.0, 3.0), Some(StepAnomaly::LossSpike));
-        assert_eq!(fault(33.0, 66.1, 3.0), Some(StepAnomaly::GradNormSpike));
-        assert_eq!(fault(1e30, 1e30, 0.0), None, "0 looks for none");
+        assert_eq!(anomaly(33.0, 66.0, 3.0), None, "exactly the factor");
+        assert_eq!(anomaly(33.1, 66.0, 3.0), Some(StepAnomaly::LossSpike));
+        assert_eq!(anomaly(33.0, 66.1, 3.0), Some(StepAnomaly::GradNormSpike));
+        assert_eq!(anomaly(1e30, 1e30, 0.0), None, "0 looks for none");
     }
 
     #[test]
-    fn nineteen_steps_have_no_median_and_old_ones_are_forgotten() {
+    fn median_needs_20_steps_of_the_last_101() {
         assert_eq!(after(vec![(1.0, 1.0); 19]).median_loss(), None);
         assert_eq!(after(vec![(1.0, 1.0); 20]).median_loss(), Some(1.0));
         let steps = (0..202).map(|i| if i < 101 { (1.0, 1.0) } else { (7.0, 8.0) });

@@ -1,4 +1,4 @@
-//! One optimiser update, the same for both stages.
+//! One optimizer update, the same for both stages.
 
 use burn::module::Module;
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
@@ -12,28 +12,28 @@ use crate::step::batch::StageBatch;
 use crate::step::device_batch::{DeviceBatch, render_loss};
 use crate::step::loss::{Loss, LossParts};
 use crate::step::loss_scale::LossScale;
-use crate::step::optimizer::{clip_factor, norm_on_device, scale};
+use crate::step::optimizer::{clip_factor, norm_on_device, scale_gradients};
 
-/// A model with its optimiser on an autodiff device.
+/// A model with its optimizer on an autodiff device.
 pub struct TrainState {
-    /// What is trained.
+    /// The trained model.
     pub model: Clift,
-    /// Its optimiser.
+    /// Its optimizer.
     pub optimizer: ModuleOptimizer,
-    /// Where it is trained.
+    /// The autodiff device.
     pub device: Device,
-    /// What is minimised.
+    /// The minimized loss.
     pub loss: Loss,
-    /// Whether the backward computes every block again instead of keeping what is inside it.
+    /// Whether the backward recomputes every block instead of storing its activations.
     pub activation_checkpointing: bool,
-    /// Of training with f16 products; `None` for f32.
+    /// Loss scale of training with f16 products; `None` for f32.
     pub loss_scale: Option<LossScale>,
 }
 
-/// What an update did.
+/// Result of an update.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Update {
-    /// What is minimised, of the batch.
+    /// Loss of the batch.
     pub loss: f64,
     /// Mean squared error of the batch.
     pub mse: f64,
@@ -44,7 +44,8 @@ pub struct Update {
 }
 
 impl TrainState {
-    /// Makes one update from a batch, worked off in `accumulate` parts, unless its loss or gradient is not finite.
+    /// Makes one update from a batch in `accumulate` micro-batches. An update with a loss or gradient that is not finite is
+    /// not applied.
     ///
     /// # Errors
     /// As [`TrainState::step_if`].
@@ -58,12 +59,12 @@ impl TrainState {
         self.step_if(batch, accumulate, rate, max_grad_norm, |loss, norm| loss.is_finite() && norm.is_finite())
     }
 
-    /// Makes one update from a batch if `accept` of its loss and gradient norm says so.
+    /// Makes one update from a batch and applies it if `accept(loss, grad_norm)`.
     ///
-    /// Takes the learner and gives it back, so that the update writes the weights in place.
+    /// Consumes and returns the state, so that the update writes the weights in place.
     ///
     /// # Errors
-    /// Whatever the model refuses.
+    /// Those of the model and of the device.
     pub fn step_if(
         self,
         batch: &StageBatch,
@@ -80,18 +81,18 @@ impl TrainState {
         let mut read = HostReads::default();
         for part in batch.parts(accumulate) {
             let share = part.clips.len() as f64 / batch.clips.len() as f64;
-            let shown = DeviceBatch::upload(&part, &device)?;
+            let device_batch = DeviceBatch::upload(&part, &device)?;
             let parts = if activation_checkpointing {
                 activation_checkpointing::backward(
                     &model,
-                    &shown,
+                    &device_batch,
                     &part.tokens,
                     &loss,
                     share * factor,
                     &mut accumulator,
                 )?
             } else {
-                let LossParts { total, mse } = render_loss(&model, &shown, &part.tokens, &loss)?;
+                let LossParts { total, mse } = render_loss(&model, &device_batch, &part.tokens, &loss)?;
                 let grads = total.clone().mul_scalar(share * factor).backward();
                 accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
                 LossParts { total: total.inner(), mse: mse.inner() }
@@ -101,19 +102,18 @@ impl TrainState {
         let grads = accumulator.grads();
         let Read { loss: total, mse, grad_norm } = read.finish(norm_on_device(&model, &grads))?;
         let grad_norm = grad_norm / factor;
-        // Looked at before the update, so that a bad batch leaves no trace in the weights.
         let applied = accept(total, grad_norm);
         let model = if applied {
-            let grads = scale(&model, grads, clip_factor(grad_norm, max_grad_norm) / factor);
+            let grads = scale_gradients(&model, grads, clip_factor(grad_norm, max_grad_norm) / factor);
             optimizer.step(rate, model, grads)
         } else {
             model
         };
-        let learner = Self { model, optimizer, device, loss, activation_checkpointing, loss_scale };
-        Ok((learner, Update { loss: total, mse, grad_norm, applied }))
+        let state = Self { model, optimizer, device, loss, activation_checkpointing, loss_scale };
+        Ok((state, Update { loss: total, mse, grad_norm, applied }))
     }
 
-    /// Adapts the loss scale to what an update has shown, and says whether it overflowed.
+    /// Adapts the loss scale after an update. Returns whether the update overflowed.
     pub fn adapt_loss_scale(&mut self, update: &Update) -> bool {
         let Some(scale) = &mut self.loss_scale else { return false };
         let is_overflow = !update.applied && scale.is_overflow(update.loss, update.grad_norm);
@@ -125,14 +125,14 @@ impl TrainState {
         is_overflow
     }
 
-    /// The model on its device without autodiff.
+    /// Returns the model without autodiff.
     pub fn inference_model(&self) -> Clift {
         self.model.valid()
     }
 }
 
-/// The numbers that an update needs on the host. They stay on the device until all are there: every read waits for the
-/// work before it, and leaves a GPU without any until the host has queued more.
+/// Values of an update that the host needs. They are read together at the end, because each read waits for the queued work
+/// and leaves a GPU idle.
 #[derive(Default)]
 struct HostReads {
     shares: Vec<f64>,
@@ -140,7 +140,7 @@ struct HostReads {
     values: Vec<Tensor<1>>,
 }
 
-/// What [`HostReads`] gives.
+/// The values of [`HostReads`].
 struct Read {
     loss: f64,
     mse: f64,
@@ -153,13 +153,14 @@ impl HostReads {
         self.values.extend([parts.total, parts.mse]);
     }
 
-    /// Losses of the whole batch, and the norm, which is zero where nothing is trained.
+    /// Reads the losses of the whole batch and the gradient norm, 0 without gradients.
     fn finish(mut self, grad_norm: Option<Tensor<1>>) -> Result<Read, TrainError> {
         self.values.extend(grad_norm);
         let values = Tensor::cat(self.values, 0).try_into_vec_as::<f64>();
         let values = values.map_err(|error| TrainError::Device { reason: error.to_string() })?;
         let (parts, norm) = values.split_at(2 * self.shares.len());
-        let of = |place: usize| parts.iter().skip(place).step_by(2).zip(&self.shares).map(|(v, share)| share * v).sum();
+        let of =
+            |offset: usize| parts.iter().skip(offset).step_by(2).zip(&self.shares).map(|(v, share)| share * v).sum();
         Ok(Read { loss: of(0), mse: of(1), grad_norm: norm.first().copied().unwrap_or(0.0) })
     }
 }

@@ -1,21 +1,19 @@
-//! A hard case and its bound.
+//! A hard case, its bound and its outcome.
 
 use burn::tensor::Device;
 use clift_train::TrainError;
 
-use crate::doctor::stability::{attention, clusters, poses, tokens, training, updates};
-
-/// How large the cases are.
+/// Size of the cases.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Size {
-    /// For tests: seconds for all of them.
+pub enum CaseSize {
+    /// For tests: all cases take seconds.
     Small,
-    /// For the table: minutes.
+    /// For the table: all cases take minutes.
     Full,
 }
 
-impl Size {
-    /// One of two numbers.
+impl CaseSize {
+    /// Returns the value of this size.
     pub(crate) fn pick<T>(self, small: T, full: T) -> T {
         match self {
             Self::Small => small,
@@ -24,71 +22,58 @@ impl Size {
     }
 }
 
-/// Where a case is computed, and where its f64 reference.
+/// Devices of a case and of its f64 reference.
 #[derive(Clone, Debug)]
 pub struct CaseDevices {
-    /// Without autodiff.
+    /// Device of the case, without autodiff.
     pub device: Device,
-    /// Flex, whose f64 goes through the composed operations, not through the kernels for f32.
+    /// Flex: its f64 uses the composed operations instead of the f32 kernels.
     pub reference: Device,
-    /// How large.
-    pub size: Size,
+    /// Size of the case.
+    pub size: CaseSize,
 }
 
-/// What a case came to.
+/// Result of a case.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Outcome {
-    /// The largest difference from f64, over the largest value unless the bound's reason says otherwise.
+    /// Largest difference from f64, relative to the largest value unless the case has another reason.
     Error(f64),
-    /// The input was refused, with these words.
+    /// The input was refused with this message.
     Refused(String),
 }
 
-/// What a case has to come to.
+/// Required result of a case.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Bound {
-    /// At most this error.
+    /// An error of at most this value.
     Most(f64),
-    /// A refusal that says this.
+    /// A refusal whose message contains this text.
     Refused(&'static str),
 }
 
+/// Computation of a case on its devices.
+pub(crate) type RunCase = fn(&CaseDevices) -> Result<Outcome, TrainError>;
+
 /// One hard case.
 #[derive(Clone, Copy, Debug)]
-pub struct Case {
-    /// What is hard.
+pub struct StabilityCase {
+    /// What is extreme about the input.
     pub name: &'static str,
     /// What could break.
     pub breaks: &'static str,
-    /// What it has to come to.
+    /// The required result.
     pub bound: Bound,
-    /// Why that.
+    /// Reason for the bound.
     pub reason: &'static str,
-    pub(crate) run: fn(&CaseDevices) -> Result<Outcome, TrainError>,
+    pub(crate) run: RunCase,
 }
 
-impl Case {
-    /// All cases, in the order of the table.
-    pub fn all() -> impl Iterator<Item = Self> {
-        [updates::CASES, poses::CASES, clusters::CASES, attention::CASES, training::CASES, tokens::CASES]
-            .into_iter()
-            .flatten()
-            .copied()
-    }
-
-    /// Computes it.
-    ///
-    /// # Errors
-    /// Whatever data or model refuse where the case does not expect it.
-    pub fn run(&self, place: &CaseDevices) -> Result<Outcome, TrainError> {
-        (self.run)(place)
-    }
-
-    /// Whether an outcome is what it has to be.
-    pub fn holds(&self, outcome: &Outcome) -> bool {
+impl StabilityCase {
+    /// Whether an outcome is within the bound.
+    pub fn is_within_bound(&self, outcome: &Outcome) -> bool {
         match (self.bound, outcome) {
             (Bound::Most(most), Outcome::Error(error)) => *error <= most,
-            (Bound::Refused(words), Outcome::Refused(said)) => said.contains(words),
+            (Bound::Refused(words), Outcome::Refused(message)) => message.contains(words),
             _ => false,
         }
     }
@@ -96,16 +81,16 @@ impl Case {
 
 /// One case on every device.
 #[derive(Clone, Debug)]
-pub struct Row {
+pub struct StabilityRow {
     /// The case.
-    pub case: Case,
-    /// What it came to, or why it failed, device by device.
+    pub case: StabilityCase,
+    /// Outcome or error message per device.
     pub outcomes: Vec<Result<Outcome, String>>,
 }
 
-impl Row {
-    /// Whether the case holds on every device.
-    pub fn holds(&self) -> bool {
-        self.outcomes.iter().all(|outcome| outcome.as_ref().is_ok_and(|outcome| self.case.holds(outcome)))
+impl StabilityRow {
+    /// Whether the case is within its bound on every device.
+    pub fn is_within_bound(&self) -> bool {
+        self.outcomes.iter().all(|outcome| outcome.as_ref().is_ok_and(|outcome| self.case.is_within_bound(outcome)))
     }
 }

@@ -1,9 +1,8 @@
 //! Hard cases against f64.
 //!
 //! - `case`: a hard case and its bound
-//! - `compare`: an update against f64
 //! - `attention`: long and extreme attention
-//! - `updates`: updates on hard views
+//! - `updates`: updates on extreme views
 //! - `clusters`: degenerate clusters
 //! - `poses`: far and close cameras
 //! - `tokens`: rounded tokens
@@ -13,7 +12,6 @@
 pub(crate) mod attention;
 pub(crate) mod case;
 pub(crate) mod clusters;
-pub(crate) mod compare;
 pub(crate) mod poses;
 pub(crate) mod suite;
 pub(crate) mod tokens;

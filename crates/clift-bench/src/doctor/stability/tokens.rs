@@ -1,4 +1,4 @@
-//! Tokens that are stored in 16 and 8 bits.
+//! Tokens stored in 16 and 8 bits.
 
 use burn::module::Module;
 use burn::tensor::{Tensor, TensorData};
@@ -6,34 +6,33 @@ use clift_eval::{upload_cameras, upload_views};
 use clift_model::{ModelError, TokenFormat};
 use clift_train::{TrainError, seeded_clip, seeded_model};
 
-use crate::cases::reference::{ToF64, module_in_f64, values};
-use crate::doctor::stability::case::{Bound, Case, CaseDevices, Outcome};
-use crate::doctor::stability::compare::most;
+use crate::cases::reference::{ToF64, largest_magnitude, module_in_f64, values};
+use crate::doctor::stability::case::{Bound, CaseDevices, Outcome, StabilityCase};
 use crate::doctor::stability::updates::{network, shape};
 
-pub(crate) const CASES: &[Case] = &[
-    Case {
+pub(crate) const CASES: &[StabilityCase] = &[
+    StabilityCase {
         name: "tokens in f32",
         breaks: "the way to a file and back",
         bound: Bound::Most(1e-5),
         reason: "nothing is rounded; of pictures, whose values are below 1",
-        run: |place| drawn(place, TokenFormat::F32),
+        run: |devices| render_error(devices, TokenFormat::F32),
     },
-    Case {
+    StabilityCase {
         name: "tokens in f16",
         breaks: "colours of a renderer that was not trained with them",
         bound: Bound::Most(2e-3),
         reason: "values are rounded by 5e-4, and half a grey level is 2e-3",
-        run: |place| drawn(place, TokenFormat::F16),
+        run: |devices| render_error(devices, TokenFormat::F16),
     },
-    Case {
+    StabilityCase {
         name: "tokens in int8",
         breaks: "the same",
         bound: Bound::Most(2e-2),
         reason: "values are rounded by 1/254 of a token's largest",
-        run: |place| drawn(place, TokenFormat::Int8),
+        run: |devices| render_error(devices, TokenFormat::Int8),
     },
-    Case {
+    StabilityCase {
         name: "tokens beyond 65,504 in f16",
         breaks: "infinities in a file",
         bound: Bound::Refused("largest 16-bit float is 65504"),
@@ -44,7 +43,7 @@ pub(crate) const CASES: &[Case] = &[
             Ok(_) => Ok(Outcome::Error(0.0)),
         },
     },
-    Case {
+    StabilityCase {
         name: "tokens of 1e-30 and 1e30 in int8",
         breaks: "the scale's inverse",
         bound: Bound::Most(4e-3),
@@ -54,25 +53,27 @@ pub(crate) const CASES: &[Case] = &[
             let rounded = TokenFormat::Int8.round(&tokens, 2)?;
             let largest = [1e-30_f64, 1e-30, 1e30, 1e30];
             let errors = rounded.iter().zip(tokens).zip(largest);
-            Ok(Outcome::Error(most(errors.map(|((a, b), largest)| (f64::from(*a) - f64::from(b)) / largest))))
+            Ok(Outcome::Error(largest_magnitude(
+                errors.map(|((a, b), largest)| (f64::from(*a) - f64::from(b)) / largest),
+            )))
         },
     },
 ];
 
-/// The largest difference of a picture drawn from rounded tokens from one drawn in f64 from those that are not.
-fn drawn(place: &CaseDevices, storage: TokenFormat) -> Result<Outcome, TrainError> {
-    let config = network(place);
-    let networks = seeded_model(&config, 0, &place.device).valid();
-    let clip = seeded_clip(shape(place, 4), 0, 0);
-    let lift = networks.encoder.forward(&upload_views(&[&clip.context], &place.device)?);
+/// Returns the largest difference between an image rendered from rounded tokens and one rendered in f64 from exact ones.
+fn render_error(devices: &CaseDevices, storage: TokenFormat) -> Result<Outcome, TrainError> {
+    let config = network(devices);
+    let networks = seeded_model(&config, 0, &devices.device).valid();
+    let clip = seeded_clip(shape(devices, 4), 0, 0);
+    let lift = networks.encoder.forward(&upload_views(&[&clip.context], &devices.device)?);
     let shape = lift.dims();
     let tokens: Vec<f32> = values(lift.clone()).into_iter().map(|value| value as f32).collect();
     let rounded = TensorData::new(storage.round(&tokens, config.dim)?, shape);
-    let rounded: Tensor<3> = Tensor::from_data(rounded, &place.device);
-    let cameras = upload_cameras(&[&clip.target], &place.device)?;
-    let ours = networks.renderer.forward(rounded, &cameras);
-    let renderer = module_in_f64(&networks.renderer, &place.reference);
-    let theirs = renderer.forward(lift.in_f64(&place.reference), &cameras.in_f64(&place.reference));
-    let pairs = values(ours).into_iter().zip(values(theirs));
-    Ok(Outcome::Error(most(pairs.map(|(a, b)| a - b))))
+    let rounded: Tensor<3> = Tensor::from_data(rounded, &devices.device);
+    let cameras = upload_cameras(&[&clip.target], &devices.device)?;
+    let rendering = networks.renderer.forward(rounded, &cameras);
+    let renderer = module_in_f64(&networks.renderer, &devices.reference);
+    let expected = renderer.forward(lift.in_f64(&devices.reference), &cameras.in_f64(&devices.reference));
+    let pairs = values(rendering).into_iter().zip(values(expected));
+    Ok(Outcome::Error(largest_magnitude(pairs.map(|(a, b)| a - b))))
 }

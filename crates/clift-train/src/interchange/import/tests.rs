@@ -25,7 +25,7 @@ const CHECKPOINTS: [(&str, CliftVariant, Option<usize>); 5] = [
     ("paper", CliftVariant::Paper, Some(3)),
 ];
 
-/// An import that nobody interrupts.
+/// Imports without interrupt.
 fn import(file: &Path, out: &Path, options: &ImportOptions) -> Result<(Config, ImportRecord), TrainError> {
     crate::interchange::import::import(file, out, options, &AtomicBool::new(false))
 }
@@ -38,7 +38,7 @@ fn options(variant: CliftVariant, num_heads: Option<usize>) -> ImportOptions {
     ImportOptions { variant, num_heads, convert: false, renames: Vec::new() }
 }
 
-/// What the twin was given and what it computed.
+/// Inputs and outputs of the PyTorch twin.
 struct Reference(Vec<u8>);
 
 impl Reference {
@@ -90,7 +90,7 @@ impl Reference {
     }
 }
 
-/// Expects the features, condensed tokens and pictures of the twin from an imported model, on every CPU device.
+/// Compares features, condensed tokens and images of an imported model with those of the twin, on every CPU device.
 fn assert_computes(folder: &Path, name: &str) {
     let reference = Reference::open(name);
     let (mut config, _) = read_config::<Config>(&folder.join("config.toml"), &[]).unwrap();
@@ -119,7 +119,7 @@ fn assert_computes(folder: &Path, name: &str) {
             tokens = network.compress(tokens, &Clusters::new(vec![scene]).unwrap().upload(device));
             reference.assert_close("output.clift", &tokens);
         } else {
-            assert!(reference.values("output.clift").is_none(), "{name} has lost its condenser");
+            assert!(reference.values("output.clift").is_none(), "{name}: the condenser is missing");
         }
         let rendering = network.render(tokens, &reference.cameras("target", device));
         reference.assert_close("output.rendering", &rendering);
@@ -152,12 +152,14 @@ fn checkpoints_compute_as_the_twin_and_round_trip() {
 
         let exported = place.path().join("out.ckpt");
         let model = ModelPath::find(&folder).unwrap();
-        let told = export(&config, &model, ExportFormat::Pytorch, &exported).unwrap();
-        assert_eq!(told.has_condenser, imported.has_condenser);
+        let summary = export(&config, &model, ExportFormat::Pytorch, &exported).unwrap();
+        assert_eq!(summary.has_condenser, imported.has_condenser);
         let (original, written) = (network(&file), network(&exported));
         assert_eq!(written.keys().collect::<Vec<_>>(), original.keys().collect::<Vec<_>>(), "{name}");
         assert!(written == original, "{name}: shapes or values differ");
-        // The export says its heads.
+        // The export stores the number of heads.
+        let other = import(&exported, &again, &options(variant, Some(config.model.num_heads + 2)));
+        assert_says(&other.unwrap_err().to_string(), &["`--num-heads` = ", "omit the option", "out.ckpt"]);
         let (_, imported_again) = import(&exported, &again, &options(variant, None)).unwrap();
         assert_eq!(imported_again.convolutions, imported.convolutions);
         assert_computes(&again, name);
@@ -166,9 +168,9 @@ fn checkpoints_compute_as_the_twin_and_round_trip() {
         export(&config, &model, ExportFormat::Safetensors, &exported).unwrap();
         let bytes = std::fs::read(&exported).unwrap();
         let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
-        let said = header.metadata().clone().unwrap();
-        assert_eq!(said["num_heads"], config.model.num_heads.to_string());
-        assert_eq!(said["dim"], config.model.dim.to_string());
+        let metadata = header.metadata().clone().unwrap();
+        assert_eq!(metadata["num_heads"], config.model.num_heads.to_string());
+        assert_eq!(metadata["dim"], config.model.dim.to_string());
         let third = place.path().join("third.safetensors");
         export(&config, &model, ExportFormat::Safetensors, &third).unwrap();
         assert!(std::fs::read(&third).unwrap() == bytes, "equal weights are equal files");
@@ -185,7 +187,7 @@ fn checkpoints_compute_as_the_twin_and_round_trip() {
     }
 }
 
-/// A checkpoint with changed tensors, imported: the message, with the promise that nothing was written.
+/// Imports a checkpoint with changed tensors and returns the error message.
 fn refusal(change: impl Fn(&mut BTreeMap<String, (Vec<usize>, Vec<f32>)>), options: &ImportOptions) -> String {
     let place = tempfile::tempdir().unwrap();
     let file = place.path().join("changed.ckpt");
@@ -206,7 +208,7 @@ fn refused(file: &Path, place: &Path, options: &ImportOptions) -> String {
     let before: Vec<_> = std::fs::read_dir(place).unwrap().map(|item| item.unwrap().file_name()).collect();
     let message = import(file, &place.join("model"), options).unwrap_err().to_string();
     let after: Vec<_> = std::fs::read_dir(place).unwrap().map(|item| item.unwrap().file_name()).collect();
-    assert_eq!(before, after, "nothing is written, and nothing is left behind");
+    assert_eq!(before, after, "no files are written");
     assert!(message.contains(file.file_name().unwrap().to_str().unwrap()), "{message}");
     message
 }
@@ -256,7 +258,7 @@ fn heads_must_divide_the_width() {
     assert_says(
         &import(None),
         &[
-            "`--num-heads` = not given: no shape shows them, and width 768 alone is published, with 8",
+            "`--num-heads` = not given: tensor shapes do not determine the number",
             "a divisor of its width 15 (transformer.decoder.layers.0.",
             "re10k.ckpt",
         ],
@@ -332,18 +334,6 @@ fn truncated_damaged_and_hostile_files_are_refused() {
 }
 
 #[test]
-fn exports_store_heads_and_refuse_others() {
-    let place = tempfile::tempdir().unwrap();
-    let [folder, again] = ["model", "again"].map(|name| place.path().join(name));
-    let (config, _) = import(&fixture("re10k.ckpt"), &folder, &re10k()).unwrap();
-    let file = place.path().join("out.ckpt");
-    export(&config, &ModelPath::find(&folder).unwrap(), ExportFormat::Pytorch, &file).unwrap();
-    let message = import(&file, &again, &options(CliftVariant::ReleasedRe10k, Some(5))).unwrap_err().to_string();
-    assert_says(&message, &["`--num-heads` = 5: the checkpoint says it has 3", "out.ckpt"]);
-    assert!(!again.exists());
-}
-
-#[test]
 fn an_interrupted_import_leaves_nothing() {
     let place = tempfile::tempdir().unwrap();
     let (folder, stop) = (place.path().join("model"), AtomicBool::new(true));
@@ -352,7 +342,7 @@ fn an_interrupted_import_leaves_nothing() {
     // While it writes, too.
     let kept = place.path().join("kept");
     let (config, imported) = import(&fixture("re10k.ckpt"), &kept, &re10k()).unwrap();
-    let stopped = model_dir::write(&folder, &config, &[], &imported, &stop);
+    let stopped = model_dir::write_model_dir(&folder, &config, &[], &imported, &stop);
     assert!(matches!(stopped, Err(TrainError::Abandoned { .. })));
     let left: Vec<_> = std::fs::read_dir(place.path()).unwrap().map(|item| item.unwrap().file_name()).collect();
     assert_eq!(left, ["kept"]);
@@ -364,6 +354,6 @@ fn nothing_that_exists_is_written_over() {
     let folder = place.path().join("model");
     std::fs::create_dir(&folder).unwrap();
     let message = import(&fixture("re10k.ckpt"), &folder, &re10k()).unwrap_err().to_string();
-    assert_says(&message, &["`-o` = ", "it exists already"]);
+    assert_says(&message, &["`-o` = ", "the path exists"]);
     assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 0);
 }

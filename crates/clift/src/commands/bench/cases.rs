@@ -3,8 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use clift_bench::{BenchCase, BenchEvent, BenchOptions, BenchRow, MAX_CHECKED_TOKENS, Report, run_bench};
+use clift_bench::BenchCase;
+use clift_bench::BenchEvent;
+use clift_bench::BenchOptions;
+use clift_bench::BenchRow;
+use clift_bench::MAX_CHECKED_TOKENS;
+use clift_bench::run_bench;
 use clift_model::Precision;
+use clift_bench::BenchReport;
 
 use crate::commands::bench::data::BenchDataArgs;
 use crate::commands::bench::precision::BenchPrecisionArgs;
@@ -30,7 +36,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
         }
         BenchEvent::Finished(row) => {
             if let Some(counter) = &counter {
-                counter.note(&format!("{}: {}", row.work, seconds(row.median_s)));
+                counter.note(&format!("{}: {}", row.case, seconds(row.median_s)));
             }
         }
     });
@@ -54,9 +60,9 @@ fn remarks(rows: &[BenchRow]) -> Vec<String> {
     let has = |test: &dyn Fn(&BenchRow) -> bool| rows.iter().any(test);
     let inertia = rows.iter().find_map(|row| row.inertia);
     let mut remarks: Vec<String> = [
-        has(&|row| row.work == BenchCase::Render8Views).then(|| "render_8_views: seconds per view".into()),
+        has(&|row| row.case == BenchCase::Render8Views).then(|| "render_8_views: seconds per view".into()),
         inertia.map(|inertia| format!("kmeans: inertia {inertia:.6e}; the error is that of the inertia")),
-        has(&|row| row.max_rel_error.is_some() && row.work.is_checked_reduced())
+        has(&|row| row.max_rel_error.is_some() && row.case.is_checked_reduced())
             .then(|| format!("* error of loss and gradients, with at most {MAX_CHECKED_TOKENS} tokens")),
         has(&|row| row.max_rel_error.is_none()).then(|| "- not compared with f64".into()),
     ]
@@ -70,14 +76,14 @@ fn remarks(rows: &[BenchRow]) -> Vec<String> {
 }
 
 fn cells(row: &BenchRow) -> [String; 5] {
-    let mark = if row.work.is_checked_reduced() { " *" } else { "" };
+    let mark = if row.case.is_checked_reduced() { " *" } else { "" };
     let error = match row.max_rel_error {
         None => "-".into(),
         Some(error) if error.is_finite() => format!("{error:.1e}{mark}"),
         Some(_) => format!("not finite{mark}"),
     };
     let peak = row.peak_bytes.map_or_else(|| "unknown".into(), memory_size);
-    [row.work.to_string(), seconds(row.median_s), seconds(row.p95_s), peak, error]
+    [row.case.to_string(), seconds(row.median_s), seconds(row.p95_s), peak, error]
 }
 
 /// Measurements other than the cases of a config.
@@ -117,10 +123,10 @@ mod tests {
 
     use super::*;
 
-    fn row(work: BenchCase, median_s: f64, peak_bytes: Option<u64>, max_rel_error: Option<f64>) -> BenchRow {
-        let inertia = (work == BenchCase::Kmeans).then_some(1234.5);
+    fn row(case: BenchCase, median_s: f64, peak_bytes: Option<u64>, max_rel_error: Option<f64>) -> BenchRow {
+        let inertia = (case == BenchCase::Kmeans).then_some(1234.5);
         BenchRow {
-            work,
+            case,
             median_s,
             p95_s: median_s * 2.0,
             peak_bytes,

@@ -2,7 +2,10 @@
 
 use std::path::PathBuf;
 
-use clift_bench::{PrecisionReport, PrecisionRow, WORKS, compare_precision};
+use clift_bench::PrecisionReport;
+use clift_bench::PrecisionRow;
+use clift_bench::compare_precision;
+use clift_bench::PRECISION_CASES;
 
 use crate::commands::bench::timing_args::TimingArgs;
 use crate::interrupt;
@@ -23,7 +26,7 @@ pub struct BenchPrecisionArgs {
 pub fn run(args: &BenchPrecisionArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
     let config = timing.config.read(&args.config, |_| Ok(()))?;
-    let report = compare_precision(&config, &timing.options(&WORKS), &*interrupt::flag()?)?;
+    let report = compare_precision(&config, &timing.options(&PRECISION_CASES), &*interrupt::flag()?)?;
     print_result(&report_text(&report))?;
     timing.json.write(&report)
 }
@@ -44,7 +47,7 @@ fn cells(row: &PrecisionRow) -> [String; 7] {
         (None, None) => dash(),
     };
     let [f32_time, f16_time] = [row.f32_s, row.f16_s].map(seconds);
-    [row.work.to_string(), f32_time, f16_time, format!("{:.2}", row.ratio), format!("{:.1e}", row.error), loss, psnr]
+    [row.case.to_string(), f32_time, f16_time, format!("{:.2}", row.ratio), format!("{:.1e}", row.error), loss, psnr]
 }
 
 #[cfg(test)]
@@ -56,8 +59,8 @@ mod tests {
 
     #[test]
     fn table_has_speed_beside_error() {
-        let row = |work, loss, psnr_to_f32| PrecisionRow {
-            work,
+        let row = |case, loss, psnr_to_f32| PrecisionRow {
+            case,
             f32_s: 0.5,
             f16_s: 0.25,
             ratio: 0.5,

@@ -11,7 +11,7 @@ pub fn adapter_text() -> Option<String> {
         return None;
     }
     // Drivers may panic.
-    Some(match clift_bench::caught(adapters) {
+    Some(match clift_bench::catch_panic(adapters) {
         Ok(found) if found.is_empty() => "\nno adapter for wgpu; install a Vulkan driver".into(),
         Ok(found) => format!("\n{}", adapter_table(&found)),
         Err(panic) => format!("\nno adapter for wgpu: the driver panicked: {panic}"),

@@ -1,7 +1,7 @@
 //! `clift doctor --stability`.
 
 use anyhow::Context;
-use clift_bench::{Size, StabilityRow, run_stability, stability_markdown, stability_text};
+use clift_bench::{CaseSize, StabilityRow, outcome_text, run_stability, stability_markdown};
 use clift_data::replace_file;
 use clift_model::DeviceName;
 
@@ -14,14 +14,14 @@ use crate::output::stdout::{print_note, print_result};
 /// If an error exceeds its bound.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
-    let size = if args.small { Size::Small } else { Size::Full };
+    let size = if args.small { CaseSize::Small } else { CaseSize::Full };
     let rows = run_stability(&devices, size, &mut |row| print_note(&line(&devices, row)))?;
     if let Some(path) = &args.markdown {
         let text = format!("{}\n{}\n", markdown_head(args.small), stability_markdown(&devices, &rows));
         replace_file(path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
         print_result(&format!("table: {}", path.display()))?;
     }
-    let failed = rows.iter().filter(|row| !row.holds()).count();
+    let failed = rows.iter().filter(|row| !row.is_within_bound()).count();
     print_result(&format!("{} of {} cases within bounds on {}", rows.len() - failed, rows.len(), names(&devices)))?;
     anyhow::ensure!(failed == 0, "{failed} cases exceed their bound");
     Ok(())
@@ -33,7 +33,7 @@ fn names(devices: &[DeviceName]) -> String {
 
 fn line(devices: &[DeviceName], row: &StabilityRow) -> String {
     let outcomes = devices.iter().zip(&row.outcomes);
-    let outcomes = outcomes.map(|(device, outcome)| format!("{device} {}", stability_text(row, outcome)));
+    let outcomes = outcomes.map(|(device, outcome)| format!("{device} {}", outcome_text(row, outcome)));
     format!("{}: {}", row.case.name, outcomes.collect::<Vec<_>>().join(", "))
 }
 

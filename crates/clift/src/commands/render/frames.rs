@@ -50,8 +50,8 @@ pub fn write_frames(
     for some in views.chunks(renderer.frames_per_call(height, width)) {
         let first = render_s.len();
         if stop.load(Ordering::Relaxed) {
-            let work = format!("frame {first} of {}", views.len());
-            return Err(TrainError::Abandoned { work }.into());
+            let task = format!("rendering frame {first} of {}", views.len());
+            return Err(TrainError::Abandoned { task }.into());
         }
         let rendered = renderer.render(some, height, width, num_render_tokens);
         for view in rendered.with_context(|| format!("rendering frames {first} to {}", first + some.len() - 1))? {

@@ -4,11 +4,11 @@ use anyhow::Context;
 use clift_data::{
     Intrinsics, PathView, Pose, PoseNormalization, StagedDir, interpolate_path, mean_intrinsics, orbit_path, read_poses,
 };
+use clift_eval::available_bytes;
 use clift_model::{
     DeviceName, MAX_SIDE_PX, ModelError, ModelPath, RenderBudget, Scene, SceneRenderer, ViewCamera, frames_per_call,
     load_renderer, render_bytes,
 };
-use clift_train::available_bytes;
 use serde::Serialize;
 
 use crate::commands::render::args::{CameraPath, RenderArgs};

@@ -1,4 +1,4 @@
-//! Keys that are missing, unknown, elsewhere or under other names.
+//! Missing, unknown, stray and renamed keys.
 
 use super::*;
 
@@ -15,23 +15,23 @@ fn missing_and_unknown_keys_list_nearest_names() {
     assert_says(
         &message,
         &[
-            "it does not hold a released-re10k network (width 15, 3 heads, 1 + 2 layers); nothing was written",
+            "the checkpoint is no released-re10k network (width 15, 3 heads, 1 + 2 layers); no files were written",
             "missing: transformer.encoder.layers.0.norm1.weight [15]; nearest name: transformer.encoder.layers.0.norm_1.weight",
             "unknown: transformer.encoder.layers.0.norm_1.weight [15]; nearest name: transformer.encoder.layers.0.norm1.weight",
             "unknown: transformer.extra.deep.bias [2]; nearest name: transformer.",
             "--rename FROM=TO",
         ],
     );
-    // A whole layer that is left out in the middle is missing, not a smaller network, and every key of it is told.
+    // A missing layer is not taken for a smaller network: all its keys are listed.
     let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("decoder.layers.0")), &re10k());
     assert_says(&message, &["missing: transformer.decoder.layers.0.self_attn.in_proj_weight [45, 15]"]);
     assert_eq!(message.matches("missing: transformer.decoder.layers.0.").count(), 18, "{message}");
-    // A condenser that is not whole is no first-stage checkpoint.
+    // An incomplete condenser is not taken for a first-stage checkpoint.
     let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("squeezer.linear1")), &re10k());
     let [weight, bias] =
         ["weight [15, 15]", "bias [15]"].map(|rest| format!("missing: transformer.squeezer.linear1.{rest}"));
     assert_says(&message, &[&weight, &bias]);
-    // What differs in every layer is one line, and a name that is like no missing one has a nearest all the same.
+    // Equal problems of all layers are one line; a name unlike all missing ones also has a nearest name.
     let rename = |from: &str, to: &str| {
         let change = |tensors: &mut BTreeMap<String, (Vec<usize>, Vec<f32>)>| {
             *tensors = tensors.iter().map(|(key, tensor)| (key.replace(from, to), tensor.clone())).collect();
@@ -126,7 +126,7 @@ fn network_keys_outside_the_prefix_are_refused() {
             "missing: transformer.output_norm.bias [15]; nearest name: output_norm.bias\n",
         ],
     );
-    // The network has an encoder too: a rename would take it away.
+    // The rename would also apply to the encoder of the network.
     let message = outside("encoder.layers.0.norm1");
     assert_says(&message, &["beside transformer.: encoder.layers.0.norm1.bias [15]", "--rename FROM=TO"]);
     assert!(!message.contains("--rename encoder="), "{message}");
@@ -179,7 +179,7 @@ fn renames_apply_to_whole_keys_or_fail() {
         import(&file, &out, &ImportOptions { renames, ..re10k() })
     };
     let message = renamed(&[("net.", "transformer."), ("net.encoder", "encoder")]).unwrap_err().to_string();
-    assert_says(&message, &["`--rename` = net.encoder=encoder: no key has \"net.encoder\" in it", "changed.ckpt"]);
+    assert_says(&message, &["`--rename` = net.encoder=encoder: no key contains \"net.encoder\"", "changed.ckpt"]);
     let message = renamed(&[("net.output_norm", "transformer.output")]).unwrap_err().to_string();
     assert_says(&message, &["unknown: net.output_norm.weight [15], renamed transformer.output.weight"]);
     renamed(&[("net.", "transformer.")]).unwrap();

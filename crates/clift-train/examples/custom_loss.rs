@@ -1,0 +1,53 @@
+//! Trains a small network with an own loss term: the difference of horizontal image gradients.
+//!
+//! `cargo run --release -p clift-train --example custom_loss`
+
+use burn::tensor::Tensor;
+use clift_model::{DeviceName, ModelConfig};
+use clift_train::{
+    ClipShape, ImageLoss, Loss, OptimizerConfig, TrainError, TrainState, adamw, psnr_of_mse, seeded_batch, seeded_model,
+};
+
+/// Mean absolute difference of the horizontal gradients of rendering and target.
+#[derive(Debug)]
+struct EdgeLoss;
+
+impl ImageLoss for EdgeLoss {
+    // Images are `[batch, views, height, width, 3]` in `[0, 1]`.
+    fn loss(&self, rendering: &Tensor<5>, target: &Tensor<5>) -> Tensor<1> {
+        let gradient = |images: &Tensor<5>| {
+            let width = images.dims()[3];
+            images.clone().narrow(3, 1, width - 1) - images.clone().narrow(3, 0, width - 1)
+        };
+        (gradient(rendering) - gradient(target)).abs().mean()
+    }
+}
+
+fn main() -> Result<(), TrainError> {
+    let model = ModelConfig {
+        dim: 32,
+        num_heads: 4,
+        feed_forward_dim: 64,
+        num_encoder_blocks: 2,
+        num_renderer_blocks: 2,
+        ..ModelConfig::default()
+    };
+    let device = DeviceName::Flex.open()?;
+    let mut state = TrainState {
+        model: seeded_model(&model, 0, &device),
+        optimizer: adamw(&OptimizerConfig::default()),
+        device: device.autodiff(),
+        loss: Loss::default().with_term(0.1, EdgeLoss),
+        activation_checkpointing: false,
+        loss_scale: None,
+    };
+    // Two scenes of two context and two target views; the renderer receives all tokens, as in stage 1.
+    let shape = ClipShape { num_context: 2, num_targets: 2, size: [32, 32] };
+    let batch = seeded_batch(shape, 2, model.num_tokens(2, 32, 32)?, None, 0)?;
+    for step in 1..=20 {
+        let (next, update) = state.step(&batch, 1, 1e-3.into(), 1.0)?;
+        state = next;
+        println!("step {step}: loss {:.4}, PSNR {:.2} dB", update.loss, psnr_of_mse(update.mse));
+    }
+    Ok(())
+}
