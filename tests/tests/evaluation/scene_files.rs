@@ -78,7 +78,7 @@ fn drawn(
     let renderer = load_renderer(&scene, weights, &device).expect("its renderer");
     let mut viewer = SceneRenderer::new(&scene, renderer, preset.rules(), &device).expect("its tokens");
     let views = view_cameras(&clip.target);
-    let frames = viewer.draw(&views, clip.target.height, clip.target.width, num_render_tokens).expect("draws");
+    let frames = viewer.render(&views, clip.target.height, clip.target.width, num_render_tokens).expect("draws");
     frames.into_iter().map(|frame| frame.pixels).collect()
 }
 
@@ -220,7 +220,7 @@ fn paths_render_to_frames_and_animation_by_count() {
     let device = burn::tensor::Device::flex();
     let renderer = load_renderer(&scene, &place.at("run/stage2/model.safetensors"), &device).unwrap();
     let mut viewer = SceneRenderer::new(&scene, renderer, SelectionPreset::Paper.rules(), &device).unwrap();
-    let first = viewer.draw(&scene.context[..1], 16, 16, 8).unwrap().remove(0);
+    let first = viewer.render(&scene.context[..1], 16, 16, 8).unwrap().remove(0);
     let first = Canvas::from_unit(&first.pixels, 16, 16).unwrap();
     let written = image::open(place.at("all/frame-00000.png")).unwrap().into_rgb8();
     let difference = first.as_rgb8().iter().zip(written.as_raw()).map(|(a, b)| a.abs_diff(*b)).max();
@@ -273,10 +273,10 @@ fn what_cannot_be_drawn_says_what_to_do() {
 
     place.truncate("room.clift");
     clift(render_args(&place, "room.clift", "again", &orbit))
-        .fails_with(1, &["cannot use the scene: it is cut off", "copy it again"]);
+        .fails_with(1, &["cannot use the scene: the file is truncated", "copy it again"]);
     let weights = place.at("moved/stage2/model.safetensors").display().to_string();
     clift(["render", weights.as_str(), "--path", "orbit", "--out", "again"])
-        .fails_with(1, &["its header does not say that it is a scene"]);
+        .fails_with(1, &["its header lacks the scene format"]);
 }
 
 #[cfg(unix)]
@@ -312,9 +312,9 @@ fn scene_files_overwrite_only_scene_files() {
         |name: &str, flags: &[&str]| clift(encode_args(&place, "run", name, &[&["--scene", KEY][..], flags].concat()));
     let weights = place.bytes("run/stage1/model.safetensors");
     encode("run/stage1/model.safetensors", &[])
-        .fails_with(2, &["the file there is no scene, and only scenes are written over"]);
+        .fails_with(2, &["the existing file is no scene, and only scenes are overwritten"]);
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
-    encode("no/room.clift", &[]).fails_with(2, &["there is no folder "]);
+    encode("no/room.clift", &[]).fails_with(2, &["no folder "]);
     encode("room.clift", &[]).ok();
     encode("room.clift", &["--storage", "8"]).ok();
     assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);

@@ -129,7 +129,9 @@ fn self_attention(place: &Place, variant: CliftVariant) -> Values {
 fn decoder_block(place: &Place, variant: CliftVariant) -> Values {
     let block = place.module(|init| DecoderBlock::new(&network(variant), init));
     let inputs = [place.random([BATCH * VIEWS, 6, DIM], 1), place.tokens(2)];
-    place.differentiate(&block, inputs, |block, [x, tokens]| block.forward(x, block.memory(tokens)).flatten(0, 2))
+    place.differentiate(&block, inputs, |block, [x, tokens]| {
+        block.forward(x, block.project_tokens(tokens)).flatten(0, 2)
+    })
 }
 
 fn render(place: &Place, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {

@@ -91,7 +91,7 @@ fn draw(place: &Place, storage: TokenFormat) -> Values {
     let path = [0.0, 0.3, 0.8].map(between);
     let mut values = Values::default();
     for (name, count) in [("all tokens", STORED), ("four tokens", 4)] {
-        let frames = viewer.draw(&path, SIZE[0], SIZE[1], count).expect("finite pictures");
+        let frames = viewer.render(&path, SIZE[0], SIZE[1], count).expect("finite pictures");
         let chosen = frames.iter().flat_map(|frame| frame.tokens.iter().flatten()).map(|&id| f64::from(id)).collect();
         let pixels = frames.iter().flat_map(|frame| &frame.pixels).map(|&pixel| f64::from(pixel)).collect();
         values.forward.extend([(format!("{name}, chosen"), chosen), (format!("{name}, pixels"), pixels)]);

@@ -1,5 +1,5 @@
-//! The largest tensors of a network. A GPU has a limit for one beside that of its memory: a tensor is one buffer, and a
-//! shader sees at most `max_storage_buffer_binding_size` of it (below 2 GiB on Vulkan and Direct3D 12).
+//! The largest tensors of a network. A tensor is one buffer, of which a GPU's shader sees at most
+//! `max_storage_buffer_binding_size` (below 2 GiB on Vulkan and Direct3D 12).
 
 use crate::cost::scene_sizes::SceneSizes;
 use crate::network::config::ModelConfig;
@@ -7,7 +7,7 @@ use crate::network::layers::{Layer, LayerKind, Part, Sequence};
 use crate::ops::attention::composed::MAX_SCORES;
 use crate::tokens::kmeans::seeding::MAX_TABLE_LEN;
 
-/// Lists the tensors that can be the largest of one network at work on equal scenes: what each is, and its number of
+/// Lists the tensors of one network that can be its largest, for a batch of equal scenes: description and number of
 /// values.
 pub fn largest_tensors(config: &ModelConfig, part: Part, sizes: &SceneSizes, num_scenes: usize) -> Vec<(String, u64)> {
     let layers = config.layers();
@@ -15,7 +15,7 @@ pub fn largest_tensors(config: &ModelConfig, part: Part, sizes: &SceneSizes, num
     tensors.collect()
 }
 
-/// Returns the largest tensor of a layer, if no other layer of its block has a larger one.
+/// Returns the largest tensor of a layer; `None` for layers whose block always has a larger one.
 fn tensor(layer: &Layer, sizes: &SceneSizes, num_scenes: usize) -> Option<(String, u64)> {
     let network = match layer.part {
         Part::Encoder => "encoder",
@@ -47,15 +47,15 @@ fn tensor(layer: &Layer, sizes: &SceneSizes, num_scenes: usize) -> Option<(Strin
     })
 }
 
-/// Scores that exist at once: those of a chunk of queries, at least one.
+/// Number of scores in memory at once: those of a chunk of queries, at least of one query.
 fn scores(num_queries: u64, heads: usize, keys: Sequence, sizes: &SceneSizes, scenes: u64) -> u64 {
     let groups = scenes * sizes.num_groups(keys);
-    let of_query = (groups * heads as u64 * sizes.group_len(keys)).max(1);
-    of_query * (MAX_SCORES as u64 / of_query).clamp(1, (num_queries / groups.max(1)).max(1))
+    let scores_per_query = (groups * heads as u64 * sizes.group_len(keys)).max(1);
+    scores_per_query * (MAX_SCORES as u64 / scores_per_query).clamp(1, (num_queries / groups.max(1)).max(1))
 }
 
-/// Returns the number of distances in the largest tensor of latent K-means: all pairs of tokens, or of tokens and
-/// clusters where that table would be too large.
+/// Returns the number of distances in the largest tensor of latent K-means: all pairs of tokens, or pairs of token and
+/// cluster if the former exceed `MAX_TABLE_LEN`.
 pub fn kmeans_values(num_tokens: usize, num_clusters: usize) -> u64 {
     let table = num_tokens.saturating_mul(num_tokens);
     let values = if table <= MAX_TABLE_LEN { table } else { num_tokens * num_clusters };

@@ -1,4 +1,4 @@
-//! Multiply-accumulates of the networks, and the conventions of counting them.
+//! Multiply-accumulates of the networks, and conventions to count them.
 
 use std::str::FromStr;
 
@@ -10,25 +10,24 @@ use crate::names::parse_value;
 use crate::network::config::ModelConfig;
 use crate::network::layers::{Layer, LayerKind, Part, Rows};
 
-/// Multiply-accumulates of a forward pass of one scene. Norms, activations, softmax and the rays of pixels are not
-/// counted.
+/// Multiply-accumulates of a forward pass of one scene, without activations, softmax and the rays of pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Macs {
-    /// Of linear layers.
+    /// Multiply-accumulates of linear layers.
     pub linear: u64,
-    /// Of scores (`Q K^T`) and weighted sums (`A V`).
+    /// Multiply-accumulates of scores (`Q K^T`) and weighted sums (`A V`).
     pub attention: u64,
     /// Values that layer norms normalise.
     pub normalised: u64,
 }
 
-/// How an amount of work is told.
+/// Convention for the cost of a forward pass.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "lowercase")]
 pub enum FlopConvention {
-    /// As the paper's numbers come out (render-budget table): one per multiply-accumulate of linear layers, attention
-    /// left out, and five per value of `3 L + 2` layer norms. The first two are what fvcore counts where attention is
-    /// one fused operation; the number of norms is fitted to the five printed values (`3 L + 1` are there).
+    /// The paper's render-budget table: one per multiply-accumulate of linear layers, none for attention, five per value
+    /// of `3 L + 2` layer norms. fvcore counts linear layers and fused attention so; the number of norms is fitted to the
+    /// five printed values (the network has `3 L + 1`).
     Paper,
     /// Multiply-accumulates, attention included.
     #[default]
@@ -38,15 +37,15 @@ pub enum FlopConvention {
 }
 
 impl FlopConvention {
-    /// All conventions.
+    /// All conventions, in the order of messages and help texts.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// Returns the name as it is typed.
+    /// Returns the name on the command line.
     pub fn name(self) -> &'static str {
         self.into()
     }
 
-    /// The unit of a thousand million of it.
+    /// Returns the unit of 1e9 counts.
     pub const fn unit(self) -> &'static str {
         match self {
             Self::Paper => "GFLOPs (paper)",
@@ -65,7 +64,7 @@ impl FromStr for FlopConvention {
 }
 
 impl Macs {
-    /// The amount of work in a convention.
+    /// Returns the cost in a convention.
     pub fn count(self, convention: FlopConvention) -> u64 {
         match convention {
             FlopConvention::Paper => self.linear + 5 * self.normalised,
@@ -76,7 +75,7 @@ impl Macs {
 }
 
 impl Layer {
-    /// Returns the work of this layer in a forward pass of one scene.
+    /// Returns the cost of this layer in a forward pass of one scene.
     fn macs(&self, sizes: &SceneSizes) -> Macs {
         if self.rows == [Rows::GatheringTokens] && sizes.num_rows(&[Rows::Members]) == 0 {
             return Macs::default();
@@ -96,7 +95,7 @@ impl Layer {
 }
 
 impl ModelConfig {
-    /// Returns the work of one network on a scene.
+    /// Returns the cost of one network for a scene.
     pub fn macs(&self, part: Part, sizes: &SceneSizes) -> Macs {
         let layers = self.layers();
         let macs = layers.iter().filter(|layer| layer.part == part).map(|layer| layer.macs(sizes));
@@ -107,28 +106,28 @@ impl ModelConfig {
         })
     }
 
-    /// Returns the work of rendering one view alone from `num_render_tokens` tokens, their keys and values included.
+    /// Returns the cost of rendering one view from `num_render_tokens` tokens, with the projection of keys and values.
     ///
     /// # Errors
-    /// [`ModelError::NotDivisible`] when a side is not a positive multiple of the patch.
+    /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn render_macs(&self, height: usize, width: usize, num_render_tokens: usize) -> Result<Macs, ModelError> {
         let num_patches = self.num_tokens(1, height, width)?;
         let mut macs = self.macs(Part::Renderer, &SceneSizes::new(num_render_tokens, 1, num_patches));
-        // The norm that the paper counts and the network does not have.
+        // The paper counts one norm more than the network has.
         macs.normalised += (num_patches * self.dim) as u64;
         Ok(macs)
     }
 
-    /// Returns the work of encoding a scene of `num_views` context views.
+    /// Returns the cost of encoding a scene of `num_views` context views.
     ///
     /// # Errors
-    /// [`ModelError::NotDivisible`] when a side is not a positive multiple of the patch.
+    /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn encode_macs(&self, num_views: usize, height: usize, width: usize) -> Result<Macs, ModelError> {
         let num_tokens = self.num_tokens(num_views, height, width)?;
         Ok(self.macs(Part::Encoder, &SceneSizes::new(num_tokens, 0, 0)))
     }
 
-    /// Returns the work of condensing `num_tokens` tokens into `num_storage_tokens`.
+    /// Returns the cost of condensing `num_tokens` tokens into `num_storage_tokens`.
     pub fn condense_macs(&self, num_tokens: usize, num_storage_tokens: usize) -> Macs {
         let num_storage_tokens = Some(num_storage_tokens);
         self.macs(Part::Condenser, &SceneSizes { num_storage_tokens, ..SceneSizes::new(num_tokens, 0, 0) })
@@ -147,7 +146,7 @@ mod tests {
     use crate::views::upload::{Cameras, Views};
 
     #[test]
-    fn the_papers_numbers_come_out_to_the_printed_digits() {
+    fn paper_convention_gives_the_printed_numbers() {
         let config = ModelConfig::default();
         let printed = [(4096, "70.6", 1), (3072, "63.3", 1), (2048, "56.1", 1), (1024, "48.9", 1), (512, "45.23", 2)];
         for (tokens, expected, decimals) in printed {
@@ -157,22 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn the_full_size_networks_cost_what_the_formulas_say() {
-        let config = ModelConfig::default();
-        for tokens in [4096_u64, 512, 1] {
-            let macs = config.render_macs(256, 256, tokens as usize).unwrap();
-            assert_eq!(macs.linear, 41_523_609_600 + 7_077_888 * tokens);
-            assert_eq!(macs.attention, 9_663_676_416 + 9_437_184 * tokens);
-            assert_eq!(macs.count(FlopConvention::Flops), 2 * macs.count(FlopConvention::Macs));
-        }
-        let giga = |macs: Macs| (macs.count(FlopConvention::Macs) as f64 / 1e8).round() / 10.0;
-        assert_eq!(giga(config.render_macs(256, 448, 7168).unwrap()), 271.4);
-        assert_eq!(giga(config.encode_macs(4, 256, 256).unwrap()), 291.7);
-        assert!(config.render_macs(250, 256, 1).is_err());
-    }
-
-    #[test]
-    fn a_real_forward_multiplies_as_often_as_convention_macs_says() {
+    fn macs_equal_those_counted_in_a_forward_pass() {
         let device = Device::flex();
         for config in small_configs() {
             let model = Clift::new(&config, 0, &device);
@@ -205,8 +189,8 @@ mod tests {
                     let expected = config.render_macs(height, width, count).unwrap();
                     model.renderer.forward(tokens.clone(), &cameras(1));
                     assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "renderer, {count} tokens");
-                    model.renderer.draw(&model.renderer.memory(&tokens), &cameras(1));
-                    assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "prepared, {count} tokens");
+                    model.renderer.render_cached(&model.renderer.project_tokens(&tokens), &cameras(1));
+                    assert_eq!(mac_counter::take(), (expected.linear, expected.attention), "cached, {count} tokens");
 
                     model.renderer.forward(tokens, &cameras(3));
                     let sizes = SceneSizes::new(count, 3, config.num_tokens(1, height, width).unwrap());

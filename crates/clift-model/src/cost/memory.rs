@@ -1,5 +1,5 @@
-//! Bytes of tensors that the networks need, counted from what the hand-written operations save (docs/plan.md).
-// In f32 values: x = N D of a block's own rows
+//! Peak bytes of tensors, from the inputs that the hand-written operations save for the backward (docs/plan.md).
+// x = N D: f32 values of the rows of a block
 
 use crate::cost::largest_tensor::kmeans_values;
 use crate::cost::parameters::Parameters;
@@ -10,25 +10,25 @@ use crate::network::layers::{Layer, LayerKind, Part, Rows};
 /// Bytes of an f32.
 const F32: f64 = 4.0;
 
-/// Bytes of the C library's heap for a byte that a backward pass keeps: freed pieces below 32 MiB stay in the heap.
-/// Measured at 1.05 to 1.22 (docs/plan.md).
+/// Bytes of the C library's heap per byte that a backward pass keeps: the heap holds on to freed pieces below 32 MiB.
+/// Measured: 1.05 to 1.22 (docs/plan.md).
 const HEAP: f64 = 1.2;
 
-/// A segment of a forward and backward pass of one scene; numbers of f32 values.
+/// Numbers of f32 values in a segment of a forward and backward pass of one scene.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Segment {
-    /// Kept from the forward until the segment's backward is done.
+    /// Kept from the forward to the end of the segment's backward.
     pub kept: f64,
-    /// Needed on top while its backward runs: gradients on their way, and what is recomputed.
+    /// Needed in addition during the backward: gradients and recomputed values.
     pub working: f64,
-    /// Needed on top while its forward runs.
+    /// Needed in addition during the forward.
     pub forward: f64,
-    /// Parameters whose gradients it leaves behind.
+    /// Parameters, whose gradients stay after the backward.
     pub parameters: f64,
 }
 
-/// Returns the most values alive at once, of segments at work on `num_scenes` scenes: the forward adds what is kept; the
-/// backward, from the end, gives it back and leaves gradients of parameters.
+/// Returns the most values alive at once in an update of `num_scenes` scenes. The forward accumulates the kept values; the
+/// backward, from the last segment to the first, frees them and accumulates the gradients of parameters.
 fn peak(segments: &[Segment], num_scenes: usize) -> f64 {
     let scenes = num_scenes as f64;
     let (mut kept, mut most) = (0.0_f64, 0.0_f64);
@@ -48,25 +48,25 @@ fn peak(segments: &[Segment], num_scenes: usize) -> f64 {
 /// Sizes of one micro-batch of an update.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct UpdateSizes {
-    /// Networks that are trained; the condenser runs only if it is among them.
+    /// Trained networks; the condenser runs only if it is trained.
     pub trained: &'static [Part],
     /// Scenes of the micro-batch.
     pub num_scenes: usize,
     /// Whether the gradients of several micro-batches are summed.
     pub is_accumulated: bool,
-    /// Whether every block keeps its input alone and recomputes the rest.
-    pub recompute: bool,
-    /// One scene.
+    /// Whether every block stores only its input and recomputes the rest.
+    pub activation_checkpointing: bool,
+    /// Sizes of one scene.
     pub scene: SceneSizes,
-    /// Values of a scene's images, context and target.
+    /// Values of a scene's context and target images.
     pub num_image_values: usize,
-    /// The network of a perceptual loss on a scene's target views, zeros without one.
+    /// Network of the perceptual loss on a scene's target views; zeros without one.
     pub loss: Segment,
-    /// The weights of that network.
+    /// Parameters of the network of the perceptual loss.
     pub loss_parameters: f64,
 }
 
-/// Returns the most bytes of tensors alive during an update, weights and optimizer included.
+/// Returns the peak bytes of tensors during an update, with weights and optimizer.
 pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
     let layers = config.layers();
     let parameters = Parameters::of(config);
@@ -80,29 +80,29 @@ pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
     };
     let in_blocks = layers.iter().filter(|layer| layer.block.is_some());
     let largest_matrix = in_blocks.map(matrix_len).max().unwrap_or_default() as f64;
-    // Gradients, and a few copies of the largest matrix of a block on the way to its update.
+    // Gradients, and the copies of a block's largest matrix during its update.
     let optimizer = trained + 5.0 * largest_matrix;
-    // Weights, and two moments of those that train.
-    let standing = parameters.total as f64 + sizes.loss_parameters + 2.0 * trained;
-    F32 * (standing + backward.max(optimizer))
+    // Weights, and two moments of the trained ones.
+    let weights = parameters.total as f64 + sizes.loss_parameters + 2.0 * trained;
+    F32 * (weights + backward.max(optimizer))
 }
 
 /// Returns the segments of a scene's share of an update, in the order of its forward pass.
 fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<Segment> {
-    let UpdateSizes { trained, recompute, scene, .. } = *sizes;
+    let UpdateSizes { trained, activation_checkpointing, scene, .. } = *sizes;
     let values = |rows: &[Rows]| scene.num_rows(rows) as f64 * config.dim as f64;
     let of_part = |part: Part| {
         let groups = layers.chunk_by(|a, b| (a.part, a.block) == (b.part, b.block));
         let groups = groups.filter(move |layers| layers[0].part == part);
-        groups.map(move |layers| segment(config, layers, &scene, trained.contains(&part), recompute))
+        groups.map(move |layers| segment(config, layers, &scene, trained.contains(&part), activation_checkpointing))
     };
     let keep = |kept: f64| Segment { kept, ..Segment::default() };
     let mut segments: Vec<Segment> = of_part(Part::Encoder).collect();
-    // The tokens themselves are kept by the first who reads them.
+    // The first reader of the tokens keeps them.
     let mut tokens = values(&[Rows::ContextPatches]);
     segments.push(keep(tokens));
     if trained.contains(&Part::Condenser) {
-        // Members are gathered for all blocks; a condenser of all tokens reads those that are kept already.
+        // Members are gathered once for all blocks; a condenser whose keys are all tokens gathers none.
         let gathers_members = layers.iter().any(|layer| layer.rows == [Rows::Members]);
         segments.push(keep(if gathers_members { values(&[Rows::Members]) } else { 0.0 }));
         segments.extend(of_part(Part::Condenser));
@@ -111,7 +111,7 @@ fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<
     }
     let projected = values(&[Rows::RenderTokens]);
     if projected < tokens {
-        // Subsets smaller than the scene are gathered first, and shared by all blocks.
+        // Subsets that are smaller than the scene are gathered once for all blocks.
         segments.push(Segment { kept: projected, working: tokens, ..Segment::default() });
     }
     segments.extend(of_part(Part::Renderer));
@@ -119,14 +119,20 @@ fn segments(config: &ModelConfig, layers: &[Layer], sizes: &UpdateSizes) -> Vec<
     segments
 }
 
-/// Returns the segment of one block, or of consecutive layers outside the blocks. What it keeps follows from its
-/// layers; what it needs on top is a formula of its kind, compared with measured peaks.
-fn segment(config: &ModelConfig, layers: &[Layer], scene: &SceneSizes, is_trained: bool, recompute: bool) -> Segment {
+/// Returns the segment of one block, or of consecutive layers outside the blocks. The kept values follow from the layers;
+/// the additional ones from a formula per kind of block, which agrees with measured peaks.
+fn segment(
+    config: &ModelConfig,
+    layers: &[Layer],
+    scene: &SceneSizes,
+    is_trained: bool,
+    activation_checkpointing: bool,
+) -> Segment {
     let first = &layers[0];
     let values = |count: u64, width: usize| (count * width as u64) as f64;
     let x = values(scene.num_rows(first.rows), config.dim);
     let (mut saved, mut head_norms, mut hidden) = (0.0, 0.0, 0.0);
-    // Needed for keys and values of other rows: while the backward runs, and while the forward runs.
+    // For keys and values of other rows: needed in the backward, and in the forward.
     let (mut cross_working, mut cross_forward) = (0.0, 0.0);
     for layer in layers {
         let rows = scene.num_rows(layer.rows);
@@ -137,7 +143,7 @@ fn segment(config: &ModelConfig, layers: &[Layer], scene: &SceneSizes, is_traine
                 hidden
             }
             LayerKind::HeadNorm { width, heads } => {
-                // As measured: before and after, and beside the values of attention.
+                // Measured: the values before and after, and half of them again.
                 head_norms += 2.5 * values(rows, width * heads);
                 0.0
             }
@@ -146,8 +152,7 @@ fn segment(config: &ModelConfig, layers: &[Layer], scene: &SceneSizes, is_traine
                 if matches!(layer.kind, LayerKind::ClusterAttention { .. }) {
                     (cross_working, cross_forward) = (3.0 * x + 1.5 * gathered, gathered / 2.0);
                 } else if keys != layer.rows {
-                    // The gradient of what the views gathered, of what was projected, and of the tokens, added up over
-                    // the blocks.
+                    // Gradients of the gathered rows, of the projected rows, and of the tokens, summed over the blocks.
                     let projected = 2.0 * values(scene.num_rows(keys), width);
                     (cross_working, cross_forward) = (3.0 * x + gathered + 2.0 * projected, projected);
                 }
@@ -162,59 +167,59 @@ fn segment(config: &ModelConfig, layers: &[Layer], scene: &SceneSizes, is_traine
         Some(_) if !is_trained => Segment { forward: forward_values(config, x) + x, ..Segment::default() },
         Some(_) => {
             let kept = saved + head_norms;
-            // The gradients of the sum and of the hidden values, and the norm recomputed.
+            // Gradients of the residual stream and of the hidden values, and the recomputed norm.
             let working = (2.0 * x + hidden).max(cross_working - hidden);
             let forward = saved + hidden + cross_forward;
-            let (kept, working) = if recompute { (x, working + kept) } else { (kept, working) };
+            let (kept, working) = if activation_checkpointing { (x, working + kept) } else { (kept, working) };
             Segment { kept, working, forward, parameters }
         }
-        // Patches are gathered from images and rays, 15 values a pixel on the way.
+        // Patches are gathered from images and rays, with 15 values per pixel in between.
         None if matches!(first.kind, LayerKind::Linear { .. }) => {
             let forward = saved * 2.5 + x;
             let (kept, parameters) = if is_trained { (saved, parameters) } else { (0.0, 0.0) };
             Segment { kept, working: x, forward, parameters }
         }
-        // The norm's input, the sigmoid's result, the difference; images and their gradients in two orders.
+        // Input of the norm, result of the sigmoid, difference; images and their gradients in two orders.
         None => Segment { kept: saved + 2.0 * rgb, working: 2.0 * x + 3.0 * rgb, forward: 4.0 * rgb, parameters },
     }
 }
 
-/// Values alive in a block's forward without a tape, beside its input of `x` values.
+/// Values alive in a block's forward without autodiff, besides its input of `x` values.
 fn forward_values(config: &ModelConfig, x: f64) -> f64 {
-    // The norm's result and the three projections, or the hidden values before and after their GELU.
+    // Result of the norm and three projections, or the hidden values before and after GELU.
     x * (2.0 * config.feed_forward_dim as f64 / config.dim as f64).max(4.0)
 }
 
 /// Sizes of encoding, clustering and rendering one scene without gradients.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InferenceSizes {
-    /// Weights of all networks in memory.
+    /// Parameters of all networks in memory.
     pub num_parameters: u64,
-    /// Weights that are read from a file into a network that exists already.
+    /// Parameters read from a file into an existing network.
     pub num_loaded: u64,
     /// Encoder tokens.
     pub num_tokens: usize,
-    /// Most clusters of K-means; `None` without K-means.
+    /// Largest number of clusters; `None` without K-means.
     pub num_clusters: Option<usize>,
-    /// Target views that are rendered at once.
+    /// Target views rendered at once.
     pub num_targets: usize,
-    /// Patches of a view.
+    /// Patches per view.
     pub num_patches: usize,
     /// Values of all images of the scene.
     pub num_image_values: usize,
-    /// Most values of a metric's network at work, beside its weights.
+    /// Peak values of a metric's network, without its parameters.
     pub metric_working: f64,
-    /// Weights of a metric's network.
+    /// Parameters of a metric's network.
     pub metric_parameters: f64,
 }
 
-/// Returns the most bytes of tensors alive while a scene is encoded, clustered and rendered.
+/// Returns the peak bytes of tensors while a scene is encoded, clustered and rendered.
 pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
     let values = |rows: usize| (rows * config.dim) as f64;
     let x = values(sizes.num_tokens);
     let patches = (sizes.num_tokens * config.context_patch_len()) as f64;
     let encode = (x + forward_values(config, x)).max(2.5 * patches + x);
-    // The tokens about their mean, and distances.
+    // Centred tokens and distances.
     let distances = |num_clusters| 2.0 * x + kmeans_values(sizes.num_tokens, num_clusters) as f64;
     let kmeans = sizes.num_clusters.map_or(0.0, distances);
     let render = match sizes.num_targets {
@@ -222,21 +227,21 @@ pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
         num_targets => render_values(config, x, values(num_targets * sizes.num_patches)),
     };
     let working = sizes.num_image_values as f64 + encode.max(kmeans).max(render).max(sizes.metric_working);
-    // A file's bytes are there until its tensors are, and both until they have replaced others.
+    // While a file is loaded, its bytes and its tensors are in memory.
     let working = working.max(2.0 * sizes.num_loaded as f64);
     F32 * (sizes.num_parameters as f64 + sizes.metric_parameters + working)
 }
 
-/// Returns the most bytes of tensors alive, weights aside, while views of `num_patches` patches in all are rendered
-/// from `num_render_tokens` tokens.
+/// Returns the peak bytes of tensors, without weights, while views of `num_patches` patches in total are rendered from
+/// `num_render_tokens` tokens.
 pub fn render_bytes(config: &ModelConfig, num_render_tokens: usize, num_patches: usize) -> u64 {
     let values = |rows: usize| (rows * config.dim) as f64;
     let image = (num_patches * config.rgb_patch_len()) as f64;
-    // The rays of the pixels are twice the image; it is unfolded from patches, and copied to the host.
+    // Rays of the pixels (twice the image), patches, image, and its copy on the host.
     (F32 * (render_values(config, values(num_render_tokens), values(num_patches)) + 5.0 * image)) as u64
 }
 
-/// Keys and values of one block for tokens of `x` values, and the hidden values of views of `y`.
+/// Values of one block: keys and values of tokens of `x` values, and the forward of views of `y` values.
 fn render_values(config: &ModelConfig, x: f64, y: f64) -> f64 {
     3.0 * x + y + forward_values(config, y)
 }
@@ -245,14 +250,14 @@ fn render_values(config: &ModelConfig, x: f64, y: f64) -> f64 {
 mod tests {
     use super::*;
 
-    fn update(trained: &'static [Part], recompute: bool) -> UpdateSizes {
+    fn update(trained: &'static [Part], activation_checkpointing: bool) -> UpdateSizes {
         let scene = SceneSizes::new(4096, 1, 1024);
         let stored = SceneSizes { num_storage_tokens: Some(1024), num_render_tokens: 1024, ..scene };
         UpdateSizes {
             trained,
             num_scenes: 1,
             is_accumulated: false,
-            recompute,
+            activation_checkpointing,
             scene: if trained == STAGE2 { stored } else { scene },
             num_image_values: 5 * 256 * 256 * 3,
             loss: Segment::default(),
@@ -264,27 +269,20 @@ mod tests {
     const STAGE2: &[Part] = &[Part::Condenser, Part::Renderer];
 
     #[test]
-    fn the_papers_update_is_within_fifteen_percent_of_its_measured_peak() {
-        // docs/performance.md, full size, batch 1; a process of this program holds 26 MB besides its tensors.
+    fn update_bytes_are_within_15_percent_of_measured_peaks() {
+        // docs/performance.md, full size, batch 1; the process holds 26 MB besides its tensors.
         let config = ModelConfig::default();
-        for (trained, recompute, measured) in [(STAGE1, false, 2.26e9), (STAGE1, true, 1.72e9), (STAGE2, false, 1.43e9)]
+        for (trained, checkpointing, measured) in
+            [(STAGE1, false, 2.26e9), (STAGE1, true, 1.72e9), (STAGE2, false, 1.43e9)]
         {
-            let counted = update_bytes(&config, &update(trained, recompute)) + 26e6;
-            let error = (counted / measured - 1.0).abs();
-            assert!(error < 0.15, "{trained:?} {recompute}: {counted:.3e} for {measured:.3e}");
+            let one = update(trained, checkpointing);
+            let predicted = update_bytes(&config, &one) + 26e6;
+            let error = (predicted / measured - 1.0).abs();
+            assert!(error < 0.15, "{trained:?} {checkpointing}: {predicted:.3e} for {measured:.3e}");
+            for more in [UpdateSizes { num_scenes: 2, ..one }, UpdateSizes { is_accumulated: true, ..one }] {
+                assert!(update_bytes(&config, &more) > update_bytes(&config, &one), "{more:?}");
+            }
         }
-    }
-
-    #[test]
-    fn memory_grows_with_scenes_and_shrinks_with_recomputed_blocks() {
-        let config = ModelConfig::default();
-        let one = update(STAGE1, false);
-        let two = UpdateSizes { num_scenes: 2, ..one };
-        let again = UpdateSizes { num_scenes: 2, ..update(STAGE1, true) };
-        let bytes = |sizes: &UpdateSizes| update_bytes(&config, sizes);
-        assert!(bytes(&two) > 1.3 * bytes(&one));
-        assert!(bytes(&again) < 0.7 * bytes(&two));
-        assert!(bytes(&UpdateSizes { is_accumulated: true, ..one }) > bytes(&one));
     }
 
     #[test]
@@ -308,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn the_peak_is_where_the_kept_the_working_and_the_gradients_are_most() {
+    fn peak_is_the_largest_sum_of_kept_working_and_gradients() {
         let segment = |kept, working, forward, parameters| Segment { kept, working, forward, parameters };
         assert_eq!(peak(&[], 1), 0.0);
         // At the start of the backward.

@@ -1,10 +1,5 @@
-//! Cost of a network, derived from `network/layers`.
-//!
-//! - `scene_sizes`: counts of tokens, views, patches
-//! - `parameters`: parameters per network
-//! - `macs`: multiply-accumulates and conventions
-//! - `memory`: saved activations and peak bytes
-//! - `largest_tensor`: largest tensor of each network
+//! Costs of a network, derived from its layers (`network/layers`): `parameters`; multiply-accumulates in `macs`; peak bytes
+//! in `memory`; and the `largest_tensor`, which some GPUs limit. `scene_sizes` counts the rows of the layers' inputs.
 
 pub(crate) mod largest_tensor;
 pub(crate) mod macs;

@@ -1,27 +1,27 @@
-//! Parameters per network.
+//! Number of parameters of each network.
 
 use serde::Serialize;
 
 use crate::network::config::ModelConfig;
 use crate::network::layers::{Layer, Part};
 
-/// Parameters of the networks.
+/// Number of parameters of each network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Parameters {
-    /// Of the encoder.
+    /// Parameters of the encoder.
     pub encoder: u64,
-    /// Of the token norm, 0 in variants without one.
+    /// Parameters of the token norm, 0 in variants without one.
     pub lift_norm: u64,
-    /// Of the condenser.
+    /// Parameters of the condenser.
     pub condenser: u64,
-    /// Of the renderer.
+    /// Parameters of the renderer.
     pub renderer: u64,
-    /// Of all.
+    /// Parameters of all networks.
     pub total: u64,
 }
 
 impl Parameters {
-    /// Counts them.
+    /// Counts the parameters of a config.
     pub fn of(config: &ModelConfig) -> Self {
         let layers = config.layers();
         let count = |part| layers.iter().filter(|layer| layer.part == part).map(Layer::num_parameters).sum();
@@ -34,7 +34,7 @@ impl Parameters {
         }
     }
 
-    /// Returns those of some networks together.
+    /// Returns the number of parameters of some networks together.
     pub fn of_parts(&self, parts: &[Part]) -> u64 {
         let count = |part: &Part| match part {
             Part::Encoder => self.encoder,

@@ -1,4 +1,4 @@
-//! Counts of the tokens, patches and views of a scene.
+//! Numbers of tokens, patches and views of a scene, and the rows of a layer's input.
 
 use crate::network::layers::Rows;
 
@@ -7,15 +7,15 @@ use crate::network::layers::Rows;
 pub struct SceneSizes {
     /// Encoder tokens.
     pub num_tokens: usize,
-    /// Stored tokens; `None` without a condenser.
+    /// Storage tokens; `None` without a condenser.
     pub num_storage_tokens: Option<usize>,
-    /// Tokens that a view is rendered from.
+    /// Tokens from which a view is rendered.
     pub num_render_tokens: usize,
-    /// Whether every target view has render tokens of its own.
+    /// Whether every target view has its own render tokens.
     pub is_per_view: bool,
     /// Target views.
     pub num_targets: usize,
-    /// Patches of a view.
+    /// Patches per view.
     pub num_patches: usize,
 }
 
@@ -32,14 +32,14 @@ impl SceneSizes {
         }
     }
 
-    /// Tokens that keys and values are projected from: those of the scene, or the subsets of its views if those are
+    /// Tokens from which keys and values are projected: those of the scene, or the subsets of its views, whichever are
     /// fewer.
     fn num_projected(&self) -> usize {
         let all = self.num_storage_tokens.unwrap_or(self.num_tokens);
         if self.is_per_view { all.min(self.num_targets * self.num_render_tokens) } else { self.num_render_tokens }
     }
 
-    /// Groups of rows: attention stays inside a group. Several for views, which do not attend to each other.
+    /// Number of groups of rows. Attention stays inside a group: target views do not attend to each other.
     pub(crate) fn num_groups(&self, rows: &[Rows]) -> u64 {
         let is_per_view = |rows: &Rows| match rows {
             Rows::TargetPatches => true,
@@ -49,7 +49,7 @@ impl SceneSizes {
         if rows.iter().any(is_per_view) { self.num_targets as u64 } else { 1 }
     }
 
-    /// Rows of one group.
+    /// Number of rows of one group.
     pub(crate) fn group_len(&self, rows: &[Rows]) -> u64 {
         let stored = self.num_storage_tokens.unwrap_or(0);
         let len = |rows: &Rows| match rows {
@@ -62,12 +62,12 @@ impl SceneSizes {
         rows.iter().map(len).sum::<usize>() as u64
     }
 
-    /// Rows of all groups, as attention reads them.
+    /// Number of rows of all groups, which attention reads.
     pub(crate) fn num_gathered(&self, rows: &[Rows]) -> u64 {
         self.num_groups(rows) * self.group_len(rows)
     }
 
-    /// Rows that a layer processes. Keys and values of render tokens are projected before views gather theirs.
+    /// Number of rows of a layer's input. Keys and values of render tokens are projected before views gather theirs.
     pub(crate) fn num_rows(&self, rows: &[Rows]) -> u64 {
         if rows == [Rows::RenderTokens] { self.num_projected() as u64 } else { self.num_gathered(rows) }
     }

@@ -1,11 +1,11 @@
-//! The network that a config names.
+//! The variants of the network, by name.
 
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
 
 use crate::names::{names, parse};
 
-/// Which published network the blocks follow.
+/// Variant of the network: the paper's, or one of the released code's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
@@ -13,29 +13,29 @@ pub enum CliftVariant {
     /// The paper's equations: pre-norm blocks, two condenser blocks (paper section 3).
     #[default]
     Paper,
-    /// The released code's network for `RealEstate10K`: one condenser block, a pre-norm decoder layer with `ReLU` whose
-    /// keys and values are the raw tokens of the cluster with its centroid, and one gate with a bias behind it.
+    /// The released code's network for `RealEstate10K`. Its condenser is one pre-norm decoder layer with `ReLU`, whose keys
+    /// and values are all tokens of the cluster without a norm, followed by a gate with bias.
     ReleasedRe10k,
-    /// The released code's network for DL3DV: as [`CliftVariant::ReleasedRe10k`], with an RMS norm of every head's queries
-    /// and keys in all attention, and a layer norm behind the encoder.
+    /// The released code's network for DL3DV: [`CliftVariant::ReleasedRe10k`] with an RMS norm of every head's queries and
+    /// keys in all attention, and a layer norm after the encoder.
     ReleasedDl3dv,
 }
 
 impl CliftVariant {
-    /// All variants, in the order they are listed to a user.
+    /// All variants, in the order of messages and help texts.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// Returns the name as it is typed.
+    /// Returns the name in configs and on the command line.
     pub fn as_str(self) -> &'static str {
         self.into()
     }
 
-    /// Whether the condenser is the released code's.
+    /// Whether the network has the released code's condenser.
     pub fn is_released(self) -> bool {
         self != Self::Paper
     }
 
-    /// Whether queries and keys are normalised head by head, and tokens behind the encoder.
+    /// Whether the heads of queries and keys and the encoder's tokens have norms.
     pub fn has_norms(self) -> bool {
         self == Self::ReleasedDl3dv
     }

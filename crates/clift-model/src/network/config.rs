@@ -1,4 +1,4 @@
-//! The shape of the network, as the `[model]` section of a config holds it.
+//! Sizes of the networks: the `[model]` section of a config.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +9,7 @@ use crate::network::architecture::CliftVariant;
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "ModelSection")]
 pub struct ModelConfig {
-    /// Which published network the blocks follow.
+    /// Variant of the network.
     pub variant: CliftVariant,
     /// Width of a token.
     pub dim: usize,
@@ -21,51 +21,36 @@ pub struct ModelConfig {
     pub num_encoder_blocks: usize,
     /// Decoder blocks of the renderer.
     pub num_renderer_blocks: usize,
-    /// Side of a square patch in pixels: one token per patch.
+    /// Side of a patch in pixels; every patch is one token.
     pub patch_size: usize,
     /// The condenser of stage 2.
     pub condenser: CondenserConfig,
 }
 
-/// The neural condenser (paper section 3.2, equations 1-4).
+/// Sizes of the neural condenser (paper section 3.2, equations 1 to 4).
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct CondenserConfig {
-    /// Condenser blocks; the paper has two, the released networks one.
+    /// Condenser blocks: two in the paper, one in the released networks.
     pub num_blocks: usize,
-    /// Whether each step inside a block adds to its input ("Add & `LayerNorm`" of the paper's text),
-    /// or replaces it, as equations 1-3 print it.
+    /// Whether each step of a block adds its input to its output ("Add & `LayerNorm`" of the paper's text), or returns the
+    /// output alone, as equations 1 to 3 print it.
     pub residual: bool,
 }
 
 impl Default for ModelConfig {
     fn default() -> Self {
-        Self {
-            variant: CliftVariant::Paper,
-            dim: 768,
-            num_heads: 8,
-            feed_forward_dim: 2048,
-            num_encoder_blocks: 6,
-            num_renderer_blocks: 6,
-            patch_size: 8,
-            condenser: CondenserConfig::default(),
-        }
-    }
-}
-
-impl Default for CondenserConfig {
-    fn default() -> Self {
-        Self::of(CliftVariant::Paper)
+        ModelSection::default().into()
     }
 }
 
 impl CondenserConfig {
-    /// That of a variant.
+    /// Returns the condenser of a variant.
     pub fn of(variant: CliftVariant) -> Self {
         Self { num_blocks: if variant.is_released() { 1 } else { 2 }, residual: true }
     }
 }
 
-/// [`ModelConfig`] as a file holds it: what the file leaves out of the condenser depends on the variant.
+/// [`ModelConfig`] in a file. Defaults of the condenser depend on the variant.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct ModelSection {
@@ -79,7 +64,7 @@ struct ModelSection {
     condenser: CondenserSection,
 }
 
-/// [`CondenserConfig`] as a file holds it.
+/// [`CondenserConfig`] in a file.
 #[derive(Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct CondenserSection {
@@ -89,24 +74,14 @@ struct CondenserSection {
 
 impl Default for ModelSection {
     fn default() -> Self {
-        let ModelConfig {
-            variant,
-            dim,
-            num_heads,
-            feed_forward_dim,
-            num_encoder_blocks,
-            num_renderer_blocks,
-            patch_size,
-            condenser: _,
-        } = ModelConfig::default();
         Self {
-            variant,
-            dim,
-            num_heads,
-            feed_forward_dim,
-            num_encoder_blocks,
-            num_renderer_blocks,
-            patch_size,
+            variant: CliftVariant::Paper,
+            dim: 768,
+            num_heads: 8,
+            feed_forward_dim: 2048,
+            num_encoder_blocks: 6,
+            num_renderer_blocks: 6,
+            patch_size: 8,
             condenser: CondenserSection::default(),
         }
     }
@@ -114,7 +89,7 @@ impl Default for ModelSection {
 
 impl From<ModelSection> for ModelConfig {
     fn from(section: ModelSection) -> Self {
-        let usual = CondenserConfig::of(section.variant);
+        let defaults = CondenserConfig::of(section.variant);
         Self {
             variant: section.variant,
             dim: section.dim,
@@ -124,33 +99,33 @@ impl From<ModelSection> for ModelConfig {
             num_renderer_blocks: section.num_renderer_blocks,
             patch_size: section.patch_size,
             condenser: CondenserConfig {
-                num_blocks: section.condenser.num_blocks.unwrap_or(usual.num_blocks),
-                residual: section.condenser.residual.unwrap_or(usual.residual),
+                num_blocks: section.condenser.num_blocks.unwrap_or(defaults.num_blocks),
+                residual: section.condenser.residual.unwrap_or(defaults.residual),
             },
         }
     }
 }
 
 impl ModelConfig {
-    /// Values of one context patch: RGB and six ray coordinates per pixel (576 for 8 x 8).
+    /// Returns the values of one context patch: RGB and six ray coordinates per pixel (576 for 8 x 8).
     pub fn context_patch_len(&self) -> usize {
         self.patch_size * self.patch_size * 9
     }
 
-    /// Values of one target patch: six ray coordinates per pixel (384 for 8 x 8).
+    /// Returns the values of one target patch: six ray coordinates per pixel (384 for 8 x 8).
     pub fn ray_patch_len(&self) -> usize {
         self.patch_size * self.patch_size * 6
     }
 
-    /// Values of one rendered patch: RGB per pixel (192 for 8 x 8).
+    /// Returns the values of one rendered patch: RGB per pixel (192 for 8 x 8).
     pub fn rgb_patch_len(&self) -> usize {
         self.patch_size * self.patch_size * 3
     }
 
-    /// How many tokens `num_views` views of `width` by `height` pixels give.
+    /// Returns the number of tokens of `num_views` views of `width` by `height` pixels.
     ///
     /// # Errors
-    /// [`ModelError::NotDivisible`] when a side is not a positive multiple of the patch.
+    /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn num_tokens(&self, num_views: usize, height: usize, width: usize) -> Result<usize, ModelError> {
         let patch_size = self.patch_size;
         if height == 0 || width == 0 || !height.is_multiple_of(patch_size) || !width.is_multiple_of(patch_size) {
@@ -162,57 +137,44 @@ impl ModelConfig {
     /// Checks every value against its range.
     ///
     /// # Errors
-    /// [`ModelError::BadConfig`] naming the key, the value and the fix.
+    /// [`ModelError::BadConfig`] with the key, the value and a valid value.
     pub fn validate(&self) -> Result<(), ModelError> {
-        let positive = [
-            ("model.dim", self.dim),
-            ("model.num_heads", self.num_heads),
-            ("model.feed_forward_dim", self.feed_forward_dim),
-            ("model.num_encoder_blocks", self.num_encoder_blocks),
-            ("model.num_renderer_blocks", self.num_renderer_blocks),
-            ("model.patch_size", self.patch_size),
-            ("model.condenser.num_blocks", self.condenser.num_blocks),
-        ];
-        for (key, value) in positive {
+        let bad = |key, value: String, fix| Err(ModelError::BadConfig { key, value, fix });
+        for (key, value, most) in [
+            ("model.dim", self.dim, 1 << 16),
+            ("model.num_heads", self.num_heads, 1 << 10),
+            ("model.feed_forward_dim", self.feed_forward_dim, 1 << 18),
+            ("model.num_encoder_blocks", self.num_encoder_blocks, 1 << 10),
+            ("model.num_renderer_blocks", self.num_renderer_blocks, 1 << 10),
+            ("model.patch_size", self.patch_size, 256),
+            ("model.condenser.num_blocks", self.condenser.num_blocks, 64),
+        ] {
             if value == 0 {
-                return Err(ModelError::BadConfig { key, value: value.to_string(), fix: "write at least 1".into() });
+                return bad(key, value.to_string(), "write at least 1".into());
             }
-        }
-        for ((key, value), most) in positive.into_iter().zip([1 << 16, 1 << 10, 1 << 18, 1 << 10, 1 << 10, 256, 64]) {
             if value > most {
-                let fix = format!("write at most {most}");
-                return Err(ModelError::BadConfig { key, value: value.to_string(), fix });
+                return bad(key, value.to_string(), format!("write at most {most}"));
             }
         }
-        if !self.dim.is_multiple_of(self.num_heads) {
-            return Err(ModelError::BadConfig {
-                key: "model.num_heads",
-                value: self.num_heads.to_string(),
-                fix: format!(
-                    "write a divisor of model.dim = {}, such as {}",
-                    self.dim,
-                    near_divisors(self.dim, self.num_heads)
-                ),
-            });
+        let Self { dim, num_heads, variant, .. } = *self;
+        if !dim.is_multiple_of(num_heads) {
+            let fix = format!("write a divisor of model.dim = {dim}, such as {}", near_divisors(dim, num_heads));
+            return bad("model.num_heads", num_heads.to_string(), fix);
         }
         let CondenserConfig { num_blocks, residual } = self.condenser;
-        if self.variant.is_released() && num_blocks != 1 {
-            let fix = format!("model.variant = \"{}\" has one: leave the key out", self.variant);
-            return Err(ModelError::BadConfig {
-                key: "model.condenser.num_blocks",
-                value: num_blocks.to_string(),
-                fix,
-            });
+        if variant.is_released() && num_blocks != 1 {
+            let fix = format!("model.variant = \"{variant}\" has one: leave the key out");
+            return bad("model.condenser.num_blocks", num_blocks.to_string(), fix);
         }
-        if self.variant.is_released() && !residual {
-            let fix = format!("the block of model.variant = \"{}\" has residuals: leave the key out", self.variant);
-            return Err(ModelError::BadConfig { key: "model.condenser.residual", value: residual.to_string(), fix });
+        if variant.is_released() && !residual {
+            let fix = format!("the block of model.variant = \"{variant}\" has residuals: leave the key out");
+            return bad("model.condenser.residual", residual.to_string(), fix);
         }
         Ok(())
     }
 }
 
-/// The divisors of `number` next to `wrong`, in words.
+/// Returns the divisors of `number` next to `wrong` as text.
 fn near_divisors(number: usize, wrong: usize) -> String {
     let divides = |candidate: &usize| number.is_multiple_of(*candidate);
     let below = (1..wrong.min(number + 1)).rev().find(divides);
@@ -226,16 +188,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_default_is_the_papers_network() {
-        let config = ModelConfig::default();
-        config.validate().expect("the default is valid");
-        assert_eq!([config.context_patch_len(), config.ray_patch_len(), config.rgb_patch_len()], [576, 384, 192]);
-        assert_eq!(config.num_tokens(4, 256, 256).expect("divides"), 4096);
-        assert_eq!(config.num_tokens(4, 256, 448).expect("divides"), 7168);
-    }
-
-    #[test]
-    fn one_key_chooses_a_released_network_and_contradictions_are_refused() {
+    fn the_variant_sets_the_condenser_and_contradictions_are_errors() {
         let parse = |text: &str| serde_json::from_str::<ModelConfig>(text).expect("a model section");
         for variant in CliftVariant::ALL {
             let config = parse(&format!("{{\"variant\": \"{variant}\"}}"));
@@ -243,7 +196,7 @@ mod tests {
                 (config.variant, config.condenser.num_blocks),
                 (variant, if variant.is_released() { 1 } else { 2 })
             );
-            config.validate().expect("one key is enough");
+            config.validate().expect("the variant alone is valid");
             assert_eq!(parse(&serde_json::to_string(&config).expect("JSON")), config);
         }
         assert_eq!(parse("{}"), ModelConfig::default());
@@ -260,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn heads_that_do_not_divide_the_width_are_refused_by_name() {
+    fn heads_that_do_not_divide_the_width_are_an_error() {
         let message = ModelConfig { num_heads: 7, ..ModelConfig::default() }.validate().unwrap_err().to_string();
         assert_eq!(message, "`model.num_heads` = 7: write a divisor of model.dim = 768, such as 6 or 8");
         let message = ModelConfig { num_heads: 800, ..ModelConfig::default() }.validate().unwrap_err().to_string();
@@ -268,9 +221,10 @@ mod tests {
     }
 
     #[test]
-    fn an_image_that_is_not_whole_patches_is_refused() {
+    fn an_image_of_partial_patches_is_an_error() {
         let error = ModelConfig::default().num_tokens(1, 250, 256).unwrap_err();
         assert_eq!(error.to_string(), "an image of 256 x 250 does not divide into patches of 8 x 8");
         assert!(ModelConfig::default().num_tokens(1, 0, 256).is_err());
+        assert_eq!(ModelConfig::default().num_tokens(4, 256, 448).expect("divides"), 7168);
     }
 }

@@ -1,4 +1,4 @@
-//! The multi-view encoder: posed pictures to light-field tokens (paper section 3.1).
+//! The multi-view encoder: context views to light-field tokens (paper section 3.1).
 // B scenes, V views, N tokens, D width
 
 use burn::module::Module;
@@ -13,8 +13,8 @@ use crate::views::patch::patchify;
 use crate::views::rays::plucker;
 use crate::views::upload::Views;
 
-/// Patch embedding and self-attention over all tokens of all views. The result is not normalised: K-means, condenser
-/// and renderer all work on the raw residual stream, but for the variant with a [`LiftNorm`](crate::network::blocks::norms::LiftNorm).
+/// Patch embedding and self-attention over the tokens of all views. The result is the residual stream without a norm;
+/// one variant applies a [`LiftNorm`](crate::LiftNorm) to it.
 #[derive(Module, Debug)]
 pub struct Encoder {
     patch_embed: Linear,
@@ -41,13 +41,13 @@ impl Encoder {
         self.blocks.iter().fold(self.embed(context), |tokens, block| block.forward(tokens))
     }
 
-    /// What the first block starts from: the embedded patches, in the result's shape.
+    /// Embeds patches and rays: the input of the first block, in the shape of [`forward`](Self::forward)'s result.
     pub fn embed(&self, context: &Views) -> Tensor<3> {
         let pixels = Tensor::cat(vec![context.images.clone(), plucker(&context.cameras)], 4); // [B, V, H, W, 9]
         linear_in_f32(&self.patch_embed, patchify(pixels, self.patch_size))
     }
 
-    /// The blocks after [`embed`](Self::embed).
+    /// Returns the blocks after [`embed`](Self::embed).
     pub fn blocks(&self) -> &[EncoderBlock] {
         &self.blocks
     }

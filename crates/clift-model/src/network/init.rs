@@ -1,8 +1,8 @@
-//! Initial weights, drawn on the host: a seed gives the same network on every device.
+//! Initial weights, sampled on the host: a seed gives the same network on every device.
 //!
-//! The distributions are PyTorch's: linear layers uniform in `+-1/sqrt(inputs)`, packed attention
-//! projections Xavier-uniform with zero bias. Departs from the released code, whose blocks start as
-//! copies of each other: here each is drawn on its own.
+//! The distributions are PyTorch's: linear layers uniform in `+-1/sqrt(inputs)`, packed attention projections
+//! Xavier-uniform with zero bias. All blocks of the released code start with the same weights; here every block has its
+//! own.
 
 use burn::module::Param;
 use burn::nn::{LayerNorm, LayerNormConfig, Linear, RmsNorm, RmsNormConfig};
@@ -10,7 +10,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Makes layers on a device, in a fixed order, from one stream of random numbers.
+/// A source of initialised layers on a device. All layers share one stream of random numbers.
 #[derive(Debug)]
 pub struct Init {
     device: Device,
@@ -23,41 +23,41 @@ impl Init {
         Self { device: device.clone(), rng: ChaCha8Rng::seed_from_u64(seed) }
     }
 
-    /// A linear layer with bias, both uniform in `+-1/sqrt(inputs)`.
+    /// Makes a linear layer with bias, both uniform in `+-1/sqrt(inputs)`.
     pub fn linear(&mut self, inputs: usize, outputs: usize) -> Linear {
         let bound = 1.0 / (inputs as f64).sqrt();
         Linear { weight: self.uniform([inputs, outputs], bound), bias: Some(self.uniform([outputs], bound)) }
     }
 
-    /// A packed attention projection of `parts` matrices `[dim, dim]`, Xavier-uniform over the
-    /// `[dim, 3 dim]` matrix they are part of, with zero bias.
+    /// Makes a packed attention projection of `parts` matrices `[dim, dim]`: Xavier-uniform for the whole `[dim, 3 dim]`
+    /// matrix of queries, keys and values, with zero bias.
     pub fn attention_in(&mut self, dim: usize, parts: usize) -> Linear {
         let bound = (6.0 / (4 * dim) as f64).sqrt();
         Linear { weight: self.uniform([dim, parts * dim], bound), bias: Some(self.zeros([parts * dim])) }
     }
 
-    /// The projection after attention: uniform weight, zero bias.
+    /// Makes the projection after attention: uniform weight, zero bias.
     pub fn attention_out(&mut self, dim: usize) -> Linear {
         let bound = 1.0 / (dim as f64).sqrt();
         Linear { weight: self.uniform([dim, dim], bound), bias: Some(self.zeros([dim])) }
     }
 
-    /// A linear layer without bias that starts as zero (`W_z` of paper equation 4).
+    /// Makes a linear layer of zeros without bias (`W_z` of equation 4).
     pub fn zero_linear(&mut self, inputs: usize, outputs: usize) -> Linear {
         Linear { weight: self.zeros([inputs, outputs]), bias: None }
     }
 
-    /// A linear layer with bias, both zero at the start: the gate of the released condensers.
+    /// Makes a linear layer of zeros with bias: the gate of the released condensers.
     pub fn zero_linear_with_bias(&mut self, inputs: usize, outputs: usize) -> Linear {
         Linear { bias: Some(self.zeros([outputs])), ..self.zero_linear(inputs, outputs) }
     }
 
-    /// An RMS norm with epsilon 1e-5.
+    /// Makes an RMS norm with epsilon 1e-5.
     pub fn rms_norm(&mut self, dim: usize) -> RmsNorm {
         RmsNormConfig::new(dim).init(&self.device)
     }
 
-    /// A layer norm with epsilon 1e-5.
+    /// Makes a layer norm with epsilon 1e-5.
     pub fn layer_norm(&mut self, dim: usize) -> LayerNorm {
         LayerNormConfig::new(dim).init(&self.device)
     }
@@ -79,7 +79,7 @@ mod tests {
     use crate::testing::{devices, to_vec};
 
     #[test]
-    fn a_seed_gives_the_same_weights_on_every_device_and_another_seed_others() {
+    fn weights_depend_on_the_seed_and_not_on_the_device() {
         let weights = |seed, device: &Device| to_vec(Init::new(seed, device).linear(16, 8).weight.val());
         let all: Vec<_> = devices().iter().map(|device| weights(7, device)).collect();
         assert!(all.windows(2).all(|pair| pair[0] == pair[1]));

@@ -1,7 +1,7 @@
-//! ONE description of the networks: every layer with its path, sizes and the rows it processes.
+//! The one description of the networks: every layer with its path, its sizes and the rows of its input.
 //!
-//! Derived from it: parameter names and counts, multiply-accumulates, memory, largest tensors, published names. A new
-//! network is one function that lists its layers.
+//! Parameter names and counts, multiply-accumulates, memory, largest tensors and published names are derived from this
+//! list. A new network adds one function that lists its layers.
 
 use crate::network::config::ModelConfig;
 
@@ -10,16 +10,16 @@ use crate::network::config::ModelConfig;
 pub struct Layer {
     /// Path of its module, such as `encoder.blocks.0.attn.in_proj`.
     pub path: String,
-    /// The network it belongs to.
+    /// The network of the layer.
     pub part: Part,
     /// Index of its transformer block; `None` outside the blocks.
     pub block: Option<usize>,
-    /// What it computes.
+    /// Operation and width.
     pub kind: LayerKind,
-    /// What it processes.
+    /// Rows of the input.
     pub rows: Sequence,
-    /// Whether it saves its input for the backward. A linear layer behind a norm or an activation does not: its input
-    /// is recomputed. Nor does a layer that reads memory tokens: all blocks share one copy of them.
+    /// Whether the layer saves its input for the backward. A linear layer after a norm or an activation recomputes its
+    /// input; layers that project a scene's tokens share one copy of them.
     pub saves_input: bool,
 }
 
@@ -28,9 +28,9 @@ pub struct Layer {
 pub enum Part {
     /// Context views to light-field tokens.
     Encoder,
-    /// The norm between the encoder and the readers of its tokens.
+    /// Norm of the encoder's tokens.
     TokenNorm,
-    /// All tokens to stored ones.
+    /// Encoder tokens to storage tokens.
     Condenser,
     /// Tokens and a camera to an image.
     Renderer,
@@ -39,42 +39,42 @@ pub enum Part {
 /// Rows of a layer's input, counted by [`SceneSizes`](crate::cost::scene_sizes::SceneSizes).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rows {
-    /// Patches of all context views, and the tokens made of them.
+    /// Patches of all context views, and their tokens.
     ContextPatches,
-    /// Tokens that are no centroid.
+    /// Tokens that are not centroids.
     Members,
     /// Centroids.
     StoredTokens,
     /// Centroids in cross-attention, which the condenser skips without members.
     GatheringTokens,
-    /// Tokens that a view is rendered from.
+    /// Tokens from which a view is rendered.
     RenderTokens,
     /// Patches of the target views.
     TargetPatches,
 }
 
-/// Rows that are processed as one sequence, usually of one kind.
+/// Rows that form one sequence, usually of one kind.
 pub type Sequence = &'static [Rows];
 
-/// What a layer computes, with its columns: all heads together, but for the norm of a head.
+/// Operation of a layer with its width: of all heads together, except in [`LayerKind::HeadNorm`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LayerKind {
     /// Matrix product.
     Linear { inputs: usize, outputs: usize, bias: bool },
     /// Layer norm with scale and shift.
     LayerNorm { width: usize },
-    /// RMS norm of every head of queries or keys, with one scale for all heads.
+    /// RMS norm of every head of queries or keys; the heads share one scale.
     HeadNorm { width: usize, heads: usize },
-    /// Softmax attention of every row to every key of its group.
+    /// Softmax attention of every row to all keys of its group.
     Attention { width: usize, heads: usize, keys: Sequence },
-    /// Softmax attention of a centroid to the keys of its cluster: each key belongs to one centroid.
+    /// Softmax attention of every centroid to the keys of its cluster; each key belongs to one centroid.
     ClusterAttention { width: usize, keys: Sequence },
     /// GELU or `ReLU` between the layers of a feed-forward network.
     Activation { width: usize },
 }
 
 impl Layer {
-    /// Parameters in a weight file: path and shape, linear weights `[outputs, inputs]`.
+    /// Returns path and shape of every parameter in a weight file; linear weights are `[outputs, inputs]`.
     pub fn parameters(&self) -> Vec<(String, Vec<usize>)> {
         let shapes = match self.kind {
             LayerKind::Linear { inputs, outputs, bias: true } => vec![vec![outputs, inputs], vec![outputs]],
@@ -87,15 +87,15 @@ impl Layer {
         paths.into_iter().zip(shapes).collect()
     }
 
-    /// Number of parameters.
+    /// Returns the number of parameters.
     pub fn num_parameters(&self) -> u64 {
         self.parameters().iter().map(|(_, shape)| shape.iter().product::<usize>() as u64).sum()
     }
 }
 
 impl ModelConfig {
-    /// Lists every layer. Parameters stand in the order of published checkpoints: encoder, token norm, renderer,
-    /// condenser; in a block of PyTorch attention, feed-forward network, norms.
+    /// Lists every layer in the order of published checkpoints: encoder, token norm, renderer, condenser; within a block
+    /// attention, feed-forward network, norms.
     pub(crate) fn layers(&self) -> Vec<Layer> {
         clift_layers(self)
     }
@@ -150,7 +150,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
         if residual {
             list.norm("norm_cross", GATHERING);
         }
-        // The members are the same in every block.
+        // All blocks share one copy of the members.
         list.push("norm_memory", LayerKind::LayerNorm { width: dim }, MEMBERS, false);
         list.norm("norm_ff", STORED);
         list.cross_attention(GATHERING, !residual, MEMBERS);
@@ -160,7 +160,7 @@ fn clift_layers(config: &ModelConfig) -> Vec<Layer> {
     list.layers
 }
 
-/// Layers so far, and where the next ones belong.
+/// The layers listed so far, and the network, block and path of the next ones.
 struct LayerList<'a> {
     config: &'a ModelConfig,
     path: String,
@@ -187,7 +187,7 @@ impl LayerList<'_> {
         self.push(name, LayerKind::LayerNorm { width: self.config.dim }, rows, true);
     }
 
-    /// Attention behind a norm, with one packed projection.
+    /// Adds self-attention after a norm, with one packed projection.
     fn self_attention(&mut self, name: &str, rows: Sequence) {
         let ModelConfig { dim, num_heads, .. } = *self.config;
         self.linear(&format!("{name}.in_proj"), [dim, 3 * dim], rows, false);
@@ -195,7 +195,7 @@ impl LayerList<'_> {
         self.attention_output(name, rows, rows);
     }
 
-    /// Attention to memory tokens: in the condenser to those of a cluster.
+    /// Adds cross-attention: in the condenser to the tokens of a cluster, in the renderer to all.
     fn cross_attention(&mut self, rows: Sequence, saves_query: bool, keys: Sequence) {
         let ModelConfig { dim: width, num_heads: heads, .. } = *self.config;
         let (name, kind) = match self.part {
@@ -218,7 +218,7 @@ impl LayerList<'_> {
         }
     }
 
-    /// Two layers behind a norm.
+    /// Adds the two layers of a feed-forward network.
     fn feed_forward(&mut self, rows: Sequence) {
         let ModelConfig { dim, feed_forward_dim: hidden, .. } = *self.config;
         self.linear("feed_forward.up", [dim, hidden], rows, false);
@@ -226,7 +226,7 @@ impl LayerList<'_> {
         self.linear("feed_forward.down", [hidden, dim], rows, false);
     }
 
-    /// PyTorch's pre-norm decoder layer.
+    /// Adds PyTorch's pre-norm decoder layer.
     fn decoder_block(&mut self, rows: Sequence, keys: Sequence) {
         self.self_attention("self_attn", rows);
         self.cross_attention(rows, false, keys);
@@ -248,7 +248,7 @@ mod tests {
     use crate::cost::parameters::Parameters;
     use crate::network::clift::Clift;
     use crate::testing::small_configs;
-    use crate::weights::file;
+    use crate::weights::file::save_weights;
 
     #[test]
     fn layers_are_those_of_the_built_module() {
@@ -256,7 +256,7 @@ mod tests {
         let path = folder.path().join("model.safetensors");
         for config in small_configs() {
             let model = Clift::new(&config, 0, &Device::flex());
-            file::save_weights(&model, &path).expect("writes");
+            save_weights(&model, &path).expect("writes");
             let bytes = std::fs::read(&path).expect("reads");
             let file = safetensors::SafeTensors::deserialize(&bytes).expect("valid");
             let built: BTreeMap<String, Vec<usize>> =

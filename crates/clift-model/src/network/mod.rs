@@ -1,17 +1,12 @@
 //! The networks, one per file.
 //!
-//! - `architecture`: architecture and variant, by name
-//! - `config`: ModelConfig, checked
-//! - `layers`: ONE description of all layers
-//! - `init`: initial weights from a seed
-//! - `encoder`: context views to light-field tokens
-//! - `condenser`: equations 1 to 4
-//! - `released_condenser`: condenser of the published checkpoints
-//! - `render_tokens`: tokens per view; cached keys and values
-//! - `renderer`: tokens and a camera to an image
-//! - `scene_model`: trait of every architecture
-//! - `clift`: encoder, condenser and renderer together
-//! - `blocks`: layers of the networks
+//! Read in this order: `architecture` and `config` name a network and its sizes; `encoder` makes light-field tokens of
+//! context views; `condenser` (equations 1 to 4) writes every cluster of tokens into its centroid, and
+//! `released_condenser` is the one of the published checkpoints; `render_tokens` holds the tokens of target views, and
+//! `renderer` decodes images from them; `clift` joins the three networks behind the interface of `scene_model`.
+//!
+//! `blocks` holds the transformer layers, `init` their initial weights, and `layers` the description of every layer
+//! from which costs and parameter names are derived.
 
 pub(crate) mod architecture;
 pub(crate) mod blocks;

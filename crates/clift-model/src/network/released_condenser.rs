@@ -13,11 +13,10 @@ use crate::ops::cluster_attention::operation::cluster_attention;
 use crate::ops::linear::linear;
 use crate::tokens::clusters::ClusterIndex;
 
-/// One pre-norm decoder layer from the centroids to the tokens, each to those of its own cluster alone, and a gate.
+/// One pre-norm decoder layer, in which each centroid attends to the tokens of its cluster, and a gate.
 ///
-/// Departs from the paper as the published weights do: one block; residuals around all three parts; keys and values
-/// are the tokens as they are, the centroid among them, so that a cluster of one attends to itself; `ReLU`; the gate
-/// has a bias.
+/// The published weights depart from the paper: one block; residuals around all three parts; keys and values are all
+/// tokens without a norm, so that a cluster of one token attends to itself; `ReLU`; a gate with bias.
 #[derive(Module, Debug)]
 pub(crate) struct ReleasedCondenser {
     norm_self: LayerNorm,
@@ -44,23 +43,25 @@ impl ReleasedCondenser {
         }
     }
 
-    /// Opens the gate, so that the rest does something.
+    /// Replaces the zeros of the gate by random weights.
     #[cfg(test)]
-    pub fn open(&mut self, init: &mut Init) {
+    pub fn randomize_gate(&mut self, init: &mut Init) {
         let dim = self.gate.weight.dims()[0];
         self.gate = init.linear(dim, dim);
     }
 
+    /// Compresses every cluster of tokens into its centroid.
+    ///
     /// # Shapes
     /// - `centroids` and the result: `[batch, num_storage_tokens, dim]`
     /// - `lift`: `[batch, num_tokens, dim]`
     pub fn forward(&self, centroids: Tensor<3>, lift: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
         let x = centroids.clone() + self.self_attn.forward(&self.norm_self, centroids.clone());
 
-        let key_value = self.cluster_attn.project_memory(None, lift);
+        let key_value = self.cluster_attn.project_key_value(None, lift);
         let query = self.cluster_attn.project_query(Some(&self.norm_cross), x.clone());
-        let found = cluster_attention(query, key_value, clusters.segment.clone(), self.cluster_attn.num_heads());
-        let x = x + self.cluster_attn.project_out(found);
+        let attended = cluster_attention(query, key_value, clusters.segment.clone(), self.cluster_attn.num_heads());
+        let x = x + self.cluster_attn.project_out(attended);
 
         let x = x.clone() + self.feed_forward.forward(&self.norm_ff, x);
         centroids + linear(&self.gate, x)

@@ -1,4 +1,4 @@
-//! Tokens per view; cached keys and values.
+//! The tokens of target views, and the cached keys and values of a scene.
 
 use burn::tensor::{Int, Tensor, TensorData};
 
@@ -7,49 +7,44 @@ use crate::network::blocks::block::DecoderBlock;
 /// Keys and values of a scene's tokens in every block of a renderer.
 #[derive(Clone, Debug)]
 pub struct KeyValueCache {
-    /// Each `[batch, num_render_tokens, 2 dim]`.
+    /// One tensor per block, `[batch, num_render_tokens, 2 dim]`.
     pub(crate) blocks: Vec<Tensor<3>>,
     pub(crate) num_render_tokens: usize,
 }
 
 impl KeyValueCache {
-    /// How many tokens it is of.
-    pub fn num_render_tokens(&self) -> usize {
-        self.num_render_tokens
-    }
-
-    /// The memory of some of the tokens, by their places.
+    /// Returns the keys and values of some tokens, given by their indices.
     #[must_use]
     pub fn select(&self, tokens: &[u32]) -> Self {
         let Some(first) = self.blocks.first() else {
             return self.clone();
         };
-        let places: Vec<i64> = tokens.iter().map(|&token| i64::from(token)).collect();
-        let places = Tensor::<1, Int>::from_data(TensorData::new(places, [tokens.len()]), &first.device());
-        let blocks = self.blocks.iter().map(|memory| memory.clone().select(1, places.clone())).collect();
+        let indices: Vec<i64> = tokens.iter().map(|&token| i64::from(token)).collect();
+        let indices = Tensor::<1, Int>::from_data(TensorData::new(indices, [tokens.len()]), &first.device());
+        let blocks = self.blocks.iter().map(|key_value| key_value.clone().select(1, indices.clone())).collect();
         Self { blocks, num_render_tokens: tokens.len() }
     }
 }
 
-/// The tokens that target views are drawn from.
+/// The tokens from which target views are rendered.
 #[derive(Clone, Debug)]
 pub struct RenderTokens {
     /// `[batch, num_tokens, dim]`
     tokens: Tensor<3>,
-    /// Where every target view has a set of its own: its rows among the tokens of all scenes, `[groups, R]`.
+    /// With one token set per target view: the rows of each set in the tokens of all scenes, `[groups, R]`.
     rows: Option<Tensor<2, Int>>,
 }
 
 impl From<Tensor<3>> for RenderTokens {
-    /// One set per scene, `[batch, num_render_tokens, dim]`, or per target view, `[batch * views, ..]`.
+    /// Takes one set per scene, `[batch, num_render_tokens, dim]`, or per target view, `[batch * views, ..]`.
     fn from(tokens: Tensor<3>) -> Self {
         Self { tokens, rows: None }
     }
 }
 
 impl RenderTokens {
-    /// For every target view of every scene its own equally large subset of the scene's tokens:
-    /// `subsets[scene][view]` are token ids.
+    /// Selects a subset of the scene's tokens for every target view; all subsets have the same size.
+    /// `subsets[scene][view]` are token indices.
     ///
     /// # Shapes
     /// - `tokens`: `[batch, num_tokens, dim]`
@@ -65,28 +60,28 @@ impl RenderTokens {
         let count = rows.len();
         let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [count]), &tokens.device());
         let rows = rows.reshape([groups, count / groups]);
-        // Keys and values are projected for what there is less of: the tokens, or the subsets together.
+        // Keys and values are projected from whichever has fewer rows: the tokens, or all subsets together.
         if count < batch * num_tokens { gather(tokens, rows).into() } else { Self { tokens, rows: Some(rows) } }
     }
 
-    /// The same sets of other tokens in the same places, on the tape where those are.
+    /// Returns the same sets of other tokens, tracked by autodiff if `tokens` is.
     #[must_use]
     pub fn with_tokens(&self, tokens: Tensor<3>) -> Self {
         let rows = self.rows.clone().map(|rows| if tokens.is_autodiff() { rows.autodiff() } else { rows });
         Self { tokens, rows }
     }
 
-    /// The tokens that keys and values are projected from.
+    /// Returns the tokens that keys and values are projected from.
     pub fn tokens(&self) -> &Tensor<3> {
         &self.tokens
     }
 
-    /// Keys and values of every set, `[groups, num_render_tokens, 2 dim]`.
-    pub fn memory(&self, block: &DecoderBlock) -> Tensor<3> {
-        let memory = block.memory(self.tokens.clone());
+    /// Projects the keys and values of every set for a block, `[groups, num_render_tokens, 2 dim]`.
+    pub fn project(&self, block: &DecoderBlock) -> Tensor<3> {
+        let key_value = block.project_tokens(self.tokens.clone());
         match &self.rows {
-            Some(rows) => gather(memory, rows.clone()),
-            None => memory,
+            Some(rows) => gather(key_value, rows.clone()),
+            None => key_value,
         }
     }
 }

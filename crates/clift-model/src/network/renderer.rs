@@ -1,4 +1,4 @@
-//! The neural renderer: tokens and a camera to a picture (paper section 3.3).
+//! The neural renderer: tokens and a camera to an image (paper section 3.3).
 // B scenes, T target views, G sets of tokens, Q patches of a view, R render tokens, D width
 
 use burn::module::Module;
@@ -15,7 +15,7 @@ use crate::views::patch::{patchify, unpatchify};
 use crate::views::rays::plucker;
 use crate::views::upload::Cameras;
 
-/// A transformer decoder whose queries are the target's ray patches.
+/// A transformer decoder whose queries are the ray patches of a target view.
 #[derive(Module, Debug)]
 pub struct Renderer {
     ray_embed: Linear,
@@ -27,11 +27,6 @@ pub struct Renderer {
 }
 
 impl Renderer {
-    /// Side of a patch in pixels.
-    pub const fn patch_size(&self) -> usize {
-        self.patch_size
-    }
-
     /// Makes a renderer of the sizes of `config`.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         Self {
@@ -43,38 +38,45 @@ impl Renderer {
         }
     }
 
-    /// Draws target views from tokens. Views are independent of each other.
+    /// Returns the side of a patch in pixels.
+    pub const fn patch_size(&self) -> usize {
+        self.patch_size
+    }
+
+    /// Renders target views from tokens. Views are independent of each other.
     ///
     /// # Shapes
-    /// - `tokens`: one set per scene, shared by all its target views, or one set per target view
+    /// - `tokens`: one set per scene, shared by its target views, or one set per target view
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn forward(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
         let tokens = tokens.into();
         let x = self.embed(targets);
-        let x = self.blocks.iter().fold(x, |x, block| block.forward(x, tokens.memory(block)));
-        self.picture(x, targets)
+        let x = self.blocks.iter().fold(x, |x, block| block.forward(x, tokens.project(block)));
+        self.to_image(x, targets)
     }
 
-    /// Keys and values of a scene's tokens in every block, for drawing it many times.
+    /// Projects a scene's tokens to keys and values in every block, for rendering many views of the scene.
     ///
     /// # Shapes
     /// - `tokens`: `[batch, num_render_tokens, dim]`
-    pub fn memory(&self, tokens: &Tensor<3>) -> KeyValueCache {
-        let blocks = self.blocks.iter().map(|block| block.memory(tokens.clone())).collect();
+    pub fn project_tokens(&self, tokens: &Tensor<3>) -> KeyValueCache {
+        let blocks = self.blocks.iter().map(|block| block.project_tokens(tokens.clone())).collect();
         KeyValueCache { blocks, num_render_tokens: tokens.dims()[1] }
     }
 
-    /// Draws target views as [`forward`](Self::forward) does, from what [`memory`](Self::memory) prepared.
+    /// Renders target views as [`forward`](Self::forward) does, from the keys and values of
+    /// [`project_tokens`](Self::project_tokens).
     ///
     /// # Shapes
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
-    pub fn draw(&self, memory: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
+    pub fn render_cached(&self, cache: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
         let x = self.embed(targets);
-        let x = self.blocks.iter().zip(&memory.blocks).fold(x, |x, (block, memory)| block.forward(x, memory.clone()));
-        self.picture(x, targets)
+        let blocks = self.blocks.iter().zip(&cache.blocks);
+        let x = blocks.fold(x, |x, (block, key_value)| block.forward(x, key_value.clone()));
+        self.to_image(x, targets)
     }
 
-    /// What the first block starts from: the embedded rays of every patch, `[batch * views, num_queries, dim]`.
+    /// Embeds the rays of every patch: the input of the first block, `[batch * views, num_queries, dim]`.
     pub fn embed(&self, targets: &Cameras) -> Tensor<3> {
         let [batch, views] = targets.dims();
         let rays = linear_in_f32(&self.ray_embed, patchify(plucker(targets), self.patch_size)); // [B, TQ, D]
@@ -82,17 +84,17 @@ impl Renderer {
         rays.reshape([batch * views, queries / views, dim])
     }
 
-    /// The blocks between [`embed`](Self::embed) and [`picture`](Self::picture).
+    /// Returns the blocks between [`embed`](Self::embed) and [`to_image`](Self::to_image).
     pub fn blocks(&self) -> &[DecoderBlock] {
         &self.blocks
     }
 
-    /// The picture in what the last block gives.
+    /// Decodes the output of the last block into images.
     ///
     /// # Shapes
     /// - `x`: `[batch * views, num_queries, dim]`
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
-    pub fn picture(&self, x: Tensor<3>, targets: &Cameras) -> Tensor<5> {
+    pub fn to_image(&self, x: Tensor<3>, targets: &Cameras) -> Tensor<5> {
         let [batch, views] = targets.dims();
         let patches = sigmoid(norm_linear(&self.output_norm, &self.to_pixels, x));
         let [_, num_queries, values] = patches.dims();
@@ -108,7 +110,7 @@ mod tests {
     use super::*;
     use crate::testing::{assert_close, devices, random};
 
-    fn setting(device: &Device) -> (Renderer, Tensor<3>, Cameras) {
+    fn inputs(device: &Device) -> (Renderer, Tensor<3>, Cameras) {
         let config = ModelConfig { dim: 16, num_heads: 4, feed_forward_dim: 24, ..ModelConfig::default() };
         let renderer = Renderer::new(&config, &mut Init::new(0, device));
         let tokens = random([2, 10, 16], 1, device).cast(DType::F32);
@@ -120,17 +122,8 @@ mod tests {
     }
 
     #[test]
-    fn a_prepared_scene_is_drawn_as_an_unprepared_one() {
-        for device in devices() {
-            let (renderer, tokens, cameras) = setting(&device);
-            let drawn = renderer.draw(&renderer.memory(&tokens), &cameras);
-            assert_close(&drawn, &renderer.forward(tokens, &cameras), 0.0);
-        }
-    }
-
-    #[test]
-    fn subsets_per_view_are_drawn_as_their_tokens_alone_with_the_same_gradients() {
-        // Few tokens of each view: gathered before the projection. Many: after it.
+    fn view_subsets_equal_their_tokens_alone_with_gradients() {
+        // Few tokens per view are gathered before the projection, many after it.
         for count in [2, 7] {
             let subsets: Vec<Vec<Vec<u32>>> = (0..2)
                 .map(|scene| (0..3).map(|view| (0..count).map(|i| (3 * i + view + scene) % 10).collect()).collect())
@@ -138,7 +131,7 @@ mod tests {
             let ids: Vec<i32> = subsets.iter().flatten().flatten().map(|&id| id as i32).collect();
             for device in devices() {
                 let device = device.autodiff();
-                let (renderer, tokens, cameras) = setting(&device);
+                let (renderer, tokens, cameras) = inputs(&device);
                 let results = |alone: bool| {
                     let tokens = tokens.clone().detach().require_grad();
                     let images = if alone {

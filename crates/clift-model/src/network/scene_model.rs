@@ -8,10 +8,9 @@ use crate::views::upload::{Cameras, Views};
 
 /// A network that encodes context views into tokens and renders target views from tokens.
 ///
-/// Evaluation, encoding and training use a network through this interface, so that they work with every architecture.
+/// Evaluation, encoding and training use networks through this interface, so that they work with every architecture.
 pub trait SceneModel {
-    /// Returns the encoder's output. Stage 2 freezes the encoder, so the models of both stages of a run have equal
-    /// features.
+    /// Returns the encoder's output. Stage 2 freezes the encoder, so that both stages of a run have equal features.
     ///
     /// # Shapes
     /// - returns `[batch, num_tokens, dim]`

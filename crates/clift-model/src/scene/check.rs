@@ -1,4 +1,4 @@
-//! What a scene must be before it is written or drawn. Files come from anywhere: nothing is taken on trust.
+//! Rules of a valid scene, checked before a scene is written and after it is read, because files may be hostile.
 
 use crate::scene::scene::{HEADER_BYTES, Scene};
 use crate::views::camera::ViewCamera;
@@ -6,50 +6,59 @@ use crate::views::camera::ViewCamera;
 /// Most context views of a scene.
 const MAX_VIEWS: usize = 1024;
 
-/// Longest side of a context view, and of a picture that is drawn, in pixels.
+/// Longest side of a context view or a rendered image in pixels.
 pub const MAX_SIDE_PX: usize = 1 << 14;
 
-/// Most patches of all context views; the encoder has a token for each.
+/// Most patches of all context views. Every patch is one encoder token.
 const MAX_PATCHES: usize = 1 << 20;
 
-/// Largest coordinate of a context camera: normalised ones reach 1, or less where targets are counted too.
+/// Largest coordinate of a context camera; those of normalised cameras are at most 1.
 const MAX_COORDINATE: f64 = 1e3;
 
-/// Largest error of `R^T R` in a pose, as the readers of captures allow.
+/// Largest error of `R^T R` in a pose, as in the readers of data sets.
 const MAX_ROTATION_ERROR: f64 = 1e-2;
 
 impl Scene {
-    /// Says what is wrong with the scene, if anything.
+    /// Checks every field of the scene.
+    ///
+    /// # Errors
+    /// A message about the first invalid field.
     pub(crate) fn check(&self) -> Result<(), String> {
         self.model.validate().map_err(|error| error.to_string())?;
         let views = self.context.len();
         if !(1..=MAX_VIEWS).contains(&views) || self.context_frames.len() != views {
             let frames = self.context_frames.len();
             return Err(format!(
-                "it has {views} context cameras and {frames} frame numbers, expected 1 to {MAX_VIEWS}"
+                "{views} context cameras and {frames} frame numbers, expected equal numbers from 1 to {MAX_VIEWS}"
             ));
         }
         if self.height.max(self.width) > MAX_SIDE_PX {
-            return Err(format!("its views are {} x {}, larger than {MAX_SIDE_PX}", self.width, self.height));
+            return Err(format!(
+                "context views of {} x {} pixels, expected at most {MAX_SIDE_PX} a side",
+                self.width, self.height
+            ));
         }
         let num_patches = self.model.num_tokens(views, self.height, self.width).map_err(|error| error.to_string())?;
         if num_patches > MAX_PATCHES {
-            return Err(format!("its views have {num_patches} patches, more than {MAX_PATCHES}"));
+            return Err(format!("{num_patches} patches of context views, expected at most {MAX_PATCHES}"));
         }
         self.check_tokens(num_patches)?;
         for (view, camera) in self.context.iter().enumerate() {
-            check_camera(camera).map_err(|what| format!("context camera {view} {what}"))?;
+            check_camera(camera).map_err(|reason| format!("context camera {view}: {reason}"))?;
         }
-        check_pose(&self.world.mean_c2w).map_err(|what| format!("the mean pose {what}"))?;
+        check_pose(&self.world.mean_c2w).map_err(|reason| format!("mean pose: {reason}"))?;
         if !(self.world.scale > 0.0 && self.world.scale.is_finite()) {
-            return Err(format!("the scale of its poses is {}", self.world.scale));
+            return Err(format!("pose scale {}, expected a positive number", self.world.scale));
         }
         let is_hash = self.renderer_hash.len() == 64 && self.renderer_hash.bytes().all(|c| c.is_ascii_hexdigit());
         if !is_hash {
-            return Err(format!("the hash of its renderer is not 64 hexadecimal digits: {:?}", self.renderer_hash));
+            return Err(format!("renderer hash {:?}, expected 64 hexadecimal digits", self.renderer_hash));
         }
         if self.key.len() + self.model_path.len() > HEADER_BYTES {
-            return Err(format!("its key and path are longer than a header: {} bytes", self.key.len()));
+            return Err(format!(
+                "key and model path of {} bytes, longer than a header of {HEADER_BYTES} bytes",
+                self.key.len() + self.model_path.len()
+            ));
         }
         Ok(())
     }
@@ -57,20 +66,20 @@ impl Scene {
     fn check_tokens(&self, num_patches: usize) -> Result<(), String> {
         let (count, dim) = (self.num_tokens(), self.model.dim);
         if !(1..=num_patches).contains(&count) {
-            return Err(format!("it has {count} tokens of {num_patches} patches"));
+            return Err(format!("{count} tokens, expected 1 to {num_patches}, the number of patches"));
         }
         if self.tokens.len() != count * dim {
-            return Err(format!("{count} tokens of width {dim} have {} values", self.tokens.len()));
+            return Err(format!("{} values of {count} tokens of width {dim}", self.tokens.len()));
         }
         if let Some(position) = self.tokens.iter().position(|value| !value.is_finite()) {
-            return Err(format!("token {} holds {}", position / dim, self.tokens[position]));
+            return Err(format!("token {} contains {}", position / dim, self.tokens[position]));
         }
         let mut seen = vec![false; num_patches];
         for (token, &id) in self.token_ids.iter().enumerate() {
             match seen.get_mut(id as usize) {
                 Some(seen) if !*seen => *seen = true,
-                Some(_) => return Err(format!("token {token} is of patch {id}, as another is")),
-                None => return Err(format!("token {token} is of patch {id} of {num_patches}")),
+                Some(_) => return Err(format!("two tokens of patch {id}, the second is token {token}")),
+                None => return Err(format!("token {token} of patch {id}, expected less than {num_patches}")),
             }
         }
         Ok(())
@@ -80,33 +89,33 @@ impl Scene {
 fn check_camera(camera: &ViewCamera) -> Result<(), String> {
     let [fx, fy, cx, cy] = camera.intrinsics;
     if !(fx > 0.0 && fy > 0.0 && [fx, fy, cx, cy].iter().all(|value| value.is_finite())) {
-        return Err(format!("has the intrinsics {:?}", camera.intrinsics));
+        return Err(format!("intrinsics {:?}, expected finite values and positive focal lengths", camera.intrinsics));
     }
     check_pose(&camera.c2w)?;
     let centre = [3, 7, 11].map(|i| camera.c2w[i]);
     if centre.iter().any(|value| value.abs() > MAX_COORDINATE) {
-        return Err(format!("stands at {centre:?}, which no normalised camera does"));
+        return Err(format!("position {centre:?}, expected coordinates up to {MAX_COORDINATE}"));
     }
     Ok(())
 }
 
 fn check_pose(c2w: &[f64; 16]) -> Result<(), String> {
     if let Some(value) = c2w.iter().find(|value| !value.is_finite()) {
-        return Err(format!("holds {value}"));
+        return Err(format!("the pose contains {value}"));
     }
     let product = |i: usize, j: usize| (0..3).map(|k| c2w[4 * k + i] * c2w[4 * k + j]).sum::<f64>();
-    let error = |i: usize, j: usize| (product(i, j) - f64::from(u8::from(i == j))).abs();
-    let worst = (0..9).map(|entry| error(entry / 3, entry % 3)).fold(0.0, f64::max);
+    let deviation = |i: usize, j: usize| (product(i, j) - f64::from(u8::from(i == j))).abs();
+    let error = (0..9).map(|entry| deviation(entry / 3, entry % 3)).fold(0.0, f64::max);
     if c2w[12..] != [0.0, 0.0, 0.0, 1.0] {
-        return Err(format!("is no pose: its last row is {:?}, expected [0, 0, 0, 1]", &c2w[12..]));
+        return Err(format!("last row {:?} of the pose, expected [0, 0, 0, 1]", &c2w[12..]));
     }
-    if worst > MAX_ROTATION_ERROR {
-        return Err(format!("is no pose: its rotation is off an orthonormal one by {worst:.1e}"));
+    if error > MAX_ROTATION_ERROR {
+        return Err(format!("the rotation differs from an orthonormal matrix by {error:.1e}"));
     }
     let row = |i: usize| [c2w[4 * i], c2w[4 * i + 1], c2w[4 * i + 2]];
     let ([a, b, c], [d, e, f], [x, y, z]) = (row(0), row(1), row(2));
     if (b * f - c * e) * x + (c * d - a * f) * y + (a * e - b * d) * z < 0.0 {
-        return Err("is no pose: its rotation mirrors".to_owned());
+        return Err("the rotation mirrors".to_owned());
     }
     Ok(())
 }

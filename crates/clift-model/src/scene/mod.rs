@@ -1,12 +1,8 @@
 //! The scene file, and rendering from it.
 //!
-//! - `scene`: a stored scene and its format
-//! - `check`: validity rules of a scene
-//! - `read`: scene files in, bounded
-//! - `write`: scene files out
-//! - `token_format`: f32, f16, int8 tokens
-//! - `scene_renderer`: interactive rendering on a device
-//! - `render_budget`: time per frame against tokens
+//! `scene` holds a stored scene and documents the bytes of its file; `check` the rules of a valid scene; `read` and
+//! `write` the file itself, with the tokens in a `token_format`. `scene_renderer` renders frames of a scene on a device,
+//! and `render_budget` measures how many tokens a time per frame allows.
 
 pub(crate) mod check;
 pub(crate) mod read;

@@ -1,4 +1,4 @@
-//! Time per frame against the number of rendered tokens, measured on a device: what a budget in milliseconds buys.
+//! Time per frame against the number of rendered tokens, measured on a device.
 
 use std::time::Instant;
 
@@ -6,34 +6,35 @@ use crate::error::ModelError;
 use crate::scene::scene_renderer::SceneRenderer;
 use crate::views::camera::ViewCamera;
 
-/// Parts of the stored tokens that are timed, in sixteenths; all of them are timed beside.
+/// Timed shares of the storage tokens, in sixteenths, besides all tokens.
 const SIXTEENTHS: [usize; 5] = [1, 2, 4, 8, 12];
 
-/// Draws of one count, after one that is not timed: at least two, at most so many, and no more after so many seconds.
-const MAX_DRAWS: usize = 7;
+/// Most timed repetitions of one token count.
+const MAX_REPETITIONS: usize = 7;
+/// Seconds after which two repetitions are enough.
 const ENOUGH_S: f64 = 1.0;
 
-/// Time per frame, from the choice of tokens to pixels on the host.
+/// Measured times per frame, from token selection to pixels on the host.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RenderBudget {
-    /// Tokens and seconds, by tokens: what was measured of frames drawn from a part of the tokens.
+    /// Number of tokens and seconds per frame, for subsets of the tokens in ascending order.
     pub some: Vec<(usize, f64)>,
-    /// All tokens and seconds, where frames are drawn several at a time and tokens need no choosing.
+    /// Number of all tokens and seconds per frame, without selection and with several frames per call.
     pub all: (usize, f64),
 }
 
 impl RenderBudget {
-    /// Times frames of a few counts.
+    /// Measures the time per frame for a few token counts.
     ///
     /// # Errors
-    /// As [`SceneRenderer::draw`].
+    /// As [`SceneRenderer::render`].
     pub fn measure(
-        viewer: &mut SceneRenderer,
+        renderer: &mut SceneRenderer,
         view: &ViewCamera,
         height: usize,
         width: usize,
     ) -> Result<Self, ModelError> {
-        let num_storage_tokens = viewer.num_storage_tokens();
+        let num_storage_tokens = renderer.num_storage_tokens();
         let mut counts: Vec<usize> = SIXTEENTHS
             .iter()
             .map(|part| (num_storage_tokens * part / 16).max(1))
@@ -43,18 +44,19 @@ impl RenderBudget {
         counts.dedup();
         let mut some = Vec::new();
         for count in counts {
-            some.push((count, median_s(viewer, &[*view], height, width, count)?));
+            some.push((count, median_s(renderer, &[*view], height, width, count)?));
         }
-        let views = vec![*view; viewer.frames_per_call(height, width)];
-        let all = (num_storage_tokens, median_s(viewer, &views, height, width, num_storage_tokens)?);
-        viewer.reset();
+        let views = vec![*view; renderer.frames_per_call(height, width)];
+        let all = (num_storage_tokens, median_s(renderer, &views, height, width, num_storage_tokens)?);
+        renderer.reset();
         Ok(Self { some, all })
     }
 
-    /// The most tokens whose frames take at most `budget_s` seconds; `None` if not even the fewest that were timed do.
+    /// Returns the largest number of tokens whose frames take at most `budget_s` seconds; `None` if the smallest measured
+    /// number takes longer.
     ///
-    /// Between measured counts time is a straight line, and fewer tokens never take more time than more do: what an
-    /// earlier count seems to cost beyond that is the machine's doing.
+    /// Time is interpolated linearly between measured numbers. A number that was measured slower than a larger one counts
+    /// as fast as the larger one, because the difference is noise.
     pub fn most_tokens(&self, budget_s: f64) -> Option<usize> {
         if self.all.1 <= budget_s {
             return Some(self.all.0);
@@ -71,7 +73,7 @@ impl RenderBudget {
             } else {
                 let (fewer, earlier) = before?;
                 let share = (budget_s - earlier) / (seconds - earlier);
-                // The small excess keeps a whole number from being rounded down to the one before.
+                // 1e-9 keeps a rounding error from truncating a whole number to the number below.
                 return Some(fewer + ((count - fewer) as f64 * share + 1e-9) as usize);
             }
             before = Some((count, seconds));
@@ -79,26 +81,26 @@ impl RenderBudget {
         best
     }
 
-    /// The shortest time that was measured.
+    /// Returns the shortest measured time per frame in seconds.
     pub fn least_s(&self) -> f64 {
         self.some.iter().chain([&self.all]).map(|(_, seconds)| *seconds).fold(f64::INFINITY, f64::min)
     }
 }
 
-/// Median seconds per frame.
+/// Measures the median seconds per frame after one warm-up call.
 fn median_s(
-    viewer: &mut SceneRenderer,
+    renderer: &mut SceneRenderer,
     views: &[ViewCamera],
     height: usize,
     width: usize,
     count: usize,
 ) -> Result<f64, ModelError> {
-    viewer.draw(views, height, width, count)?;
+    renderer.render(views, height, width, count)?;
     let mut seconds = Vec::new();
     let started = Instant::now();
-    while seconds.len() < 2 || (seconds.len() < MAX_DRAWS && started.elapsed().as_secs_f64() < ENOUGH_S) {
+    while seconds.len() < 2 || (seconds.len() < MAX_REPETITIONS && started.elapsed().as_secs_f64() < ENOUGH_S) {
         let now = Instant::now();
-        viewer.draw(views, height, width, count)?;
+        renderer.render(views, height, width, count)?;
         seconds.push(now.elapsed().as_secs_f64() / views.len() as f64);
     }
     seconds.sort_by(f64::total_cmp);
@@ -110,46 +112,34 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_budget_between_two_measured_counts_buys_its_share_of_the_tokens_between() {
-        let times = RenderBudget { some: vec![(16, 0.010), (64, 0.022), (128, 0.030)], all: (256, 0.050) };
-        for (budget_s, expected) in [
-            (0.009, None),
-            (0.010, Some(16)),
-            (0.016, Some(40)),
-            (0.0219, Some(63)),
-            (0.030, Some(128)),
-            (0.049, Some(128)),
-            (0.050, Some(256)),
+    fn most_tokens_interpolates_measured_times() {
+        let plain = RenderBudget { some: vec![(16, 0.010), (64, 0.022), (128, 0.030)], all: (256, 0.050) };
+        // 64 tokens took 12 ms, so that 16 tokens count as fast.
+        let noisy = RenderBudget { some: vec![(8, 0.010), (16, 0.020), (64, 0.012), (128, 0.030)], all: (256, 0.050) };
+        let first = RenderBudget { some: vec![(1, 0.0019), (2, 0.0015), (4, 0.0016)], all: (16, 0.0017) };
+        // Several frames of all tokens per call are cheaper than single frames of some.
+        let all = RenderBudget { some: vec![(16, 0.010), (64, 0.012)], all: (256, 0.008) };
+        let one = RenderBudget { some: Vec::new(), all: (1, 0.01) };
+        for (times, budget_s, expected) in [
+            (&plain, 0.009, None),
+            (&plain, 0.010, Some(16)),
+            (&plain, 0.016, Some(40)),
+            (&plain, 0.0219, Some(63)),
+            (&plain, 0.030, Some(128)),
+            (&plain, 0.049, Some(128)),
+            (&plain, 0.050, Some(256)),
+            (&noisy, 0.011, Some(12)),
+            (&noisy, 0.012, Some(64)),
+            (&noisy, 0.021, Some(96)),
+            (&first, first.least_s(), Some(2)),
+            (&all, 0.009, Some(256)),
+            (&one, 0.02, Some(1)),
+            (&one, 0.001, None),
         ] {
             assert_eq!(times.most_tokens(budget_s), expected, "{budget_s}");
         }
-        assert_eq!(times.least_s(), 0.010);
-    }
-
-    #[test]
-    fn a_count_that_was_slow_by_chance_hides_no_larger_one_that_fits() {
-        // 64 tokens took 12 ms, so that 16 take no more, whatever the clock said then.
-        let times = RenderBudget { some: vec![(8, 0.010), (16, 0.020), (64, 0.012), (128, 0.030)], all: (256, 0.050) };
-        assert_eq!(times.most_tokens(0.011), Some(12));
-        assert_eq!(times.most_tokens(0.012), Some(64));
-        assert_eq!(times.most_tokens(0.021), Some(96));
-        // The shortest time that is named can be had, wherever it was measured.
-        let first = RenderBudget { some: vec![(1, 0.0019), (2, 0.0015), (4, 0.0016)], all: (16, 0.0017) };
-        assert_eq!(first.most_tokens(first.least_s()), Some(2));
-        let mut last = 0;
-        for step in 0..100 {
-            let count = times.most_tokens(0.0006 * f64::from(step)).unwrap_or(0);
-            assert!(count >= last, "a larger budget never buys fewer");
-            last = count;
-        }
-    }
-
-    #[test]
-    fn all_tokens_are_taken_where_drawing_several_frames_at_once_makes_them_cheaper_than_some() {
-        let times = RenderBudget { some: vec![(16, 0.010), (64, 0.012)], all: (256, 0.008) };
-        assert_eq!(times.most_tokens(0.009), Some(256));
-        assert_eq!(times.least_s(), 0.008);
-        let one = RenderBudget { some: Vec::new(), all: (1, 0.01) };
-        assert_eq!((one.most_tokens(0.02), one.most_tokens(0.001)), (Some(1), None));
+        assert_eq!([&plain, &first, &all].map(RenderBudget::least_s), [0.010, 0.0015, 0.008]);
+        let counts = (0..100).map(|step| noisy.most_tokens(0.0006 * f64::from(step)).unwrap_or(0));
+        assert!(counts.is_sorted(), "a larger budget never allows fewer tokens");
     }
 }

@@ -1,4 +1,4 @@
-//! Scenes to files.
+//! Writes scene files.
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -10,7 +10,7 @@ use crate::files::{folder_of, replace};
 use crate::scene::scene::{FORMAT, HEADER_BYTES, Scene, VERSION, dtype_name};
 use crate::scene::token_format::TokenFormat;
 
-/// Where nothing is lost by writing a scene: a folder that exists, and in it nothing of the name or a scene.
+/// Checks that a scene can be written to a path without loss: the folder exists, and the path is free or a scene file.
 ///
 /// # Errors
 /// [`ModelError::SceneFile`].
@@ -20,36 +20,37 @@ pub fn check_output_path(path: &Path) -> Result<(), ModelError> {
     };
     let folder = folder_of(path);
     if !folder.is_dir() {
-        return refuse(&format!("there is no folder {}", folder.display()), WRITABLE_FOLDER);
+        return refuse(&format!("no folder {}", folder.display()), WRITABLE_FOLDER);
     }
     match std::fs::symlink_metadata(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
         Err(error) => refuse(&error.to_string(), WRITABLE_FOLDER),
-        Ok(found) if !found.is_file() => refuse("what has the name is no regular file", OTHER_NAME),
+        Ok(found) if !found.is_file() => refuse("the existing item is no regular file", OTHER_NAME),
         Ok(_) if is_scene(path) => Ok(()),
-        Ok(_) => refuse("the file there is no scene, and only scenes are written over", OTHER_NAME),
+        Ok(_) => refuse("the existing file is no scene, and only scenes are overwritten", OTHER_NAME),
     }
 }
 
-/// Whether a file says in its header that it is a scene, of any version, whole or not.
+/// Whether the header of a file has the format of scenes; the version does not matter, and the file may be truncated.
 fn is_scene(path: &Path) -> bool {
     let mut start = Vec::new();
     let read = File::open(path).and_then(|file| file.take(8 + HEADER_BYTES as u64).read_to_end(&mut start));
-    let says = format!("\"format\":\"{FORMAT}\"");
-    read.is_ok() && start.windows(says.len()).any(|part| part == says.as_bytes())
+    let field = format!("\"format\":\"{FORMAT}\"");
+    read.is_ok() && start.windows(field.len()).any(|part| part == field.as_bytes())
 }
 
 const WRITABLE_FOLDER: &str = "choose a folder that exists and can be written to";
 const OTHER_NAME: &str = "choose another name";
 
 impl Scene {
-    /// Writes the scene to a temporary name beside `path` that is then renamed: no reader sees half a file.
+    /// Writes the scene to a temporary file in the folder of `path`, then renames the file: a file under its final name is
+    /// complete.
     ///
     /// # Errors
-    /// [`ModelError::SceneFile`], for what [`check_output_path`] refuses too, and [`ModelError::BadConfig`] for tokens that
-    /// `storage` cannot hold.
-    pub fn write(&self, path: &Path, storage: TokenFormat) -> Result<(), ModelError> {
-        let bytes = self.to_bytes(path, storage)?;
+    /// [`ModelError::SceneFile`] for an invalid scene and as [`check_output_path`], [`ModelError::BadConfig`] for tokens
+    /// beyond the range of `format`.
+    pub fn write(&self, path: &Path, format: TokenFormat) -> Result<(), ModelError> {
+        let bytes = self.to_bytes(path, format)?;
         check_output_path(path)?;
         replace(path, &bytes).map_err(|error| ModelError::SceneFile {
             action: "write",
@@ -59,7 +60,7 @@ impl Scene {
         })
     }
 
-    fn to_bytes(&self, path: &Path, storage: TokenFormat) -> Result<Vec<u8>, ModelError> {
+    fn to_bytes(&self, path: &Path, format: TokenFormat) -> Result<Vec<u8>, ModelError> {
         let refuse = |reason| ModelError::SceneFile {
             action: "write",
             reason,
@@ -67,7 +68,7 @@ impl Scene {
             path: path.into(),
         };
         self.check().map_err(refuse)?;
-        let (tokens, scales) = storage.encode(&self.tokens, self.model.dim)?;
+        let (tokens, scales) = format.encode(&self.tokens, self.model.dim)?;
         let (count, views) = (self.num_tokens(), self.context.len());
         let f64_bytes = |values: &mut dyn Iterator<Item = f64>| values.flat_map(f64::to_le_bytes).collect::<Vec<u8>>();
         let f32_bytes = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
@@ -90,7 +91,7 @@ impl Scene {
         }
         tensors.push(("context_frames", "U32", vec![views], u32_bytes(&self.context_frames)));
         tensors.push(("token_ids", "U32", vec![count], u32_bytes(&self.token_ids)));
-        tensors.push(("tokens", dtype_name(storage), vec![count, self.model.dim], tokens));
+        tensors.push(("tokens", dtype_name(format), vec![count, self.model.dim], tokens));
 
         let mut header = self.metadata().map_err(refuse)?;
         let mut start = 0;
@@ -107,7 +108,7 @@ impl Scene {
             let most = HEADER_BYTES - (header.len() - self.key.len() - self.model_path.len()).min(HEADER_BYTES);
             return Err(ModelError::SceneFile {
                 action: "write",
-                reason: format!("the path of its model and its key are together longer than {most} bytes"),
+                reason: format!("the scene's key and model path together are longer than {most} bytes"),
                 fix: "give the model by a shorter path",
                 path: path.into(),
             });
@@ -121,8 +122,8 @@ impl Scene {
         Ok(bytes)
     }
 
-    /// The header up to the first tensor. Written by hand: safetensors orders metadata at random, and equal scenes
-    /// are equal files.
+    /// Returns the header up to the first tensor. Equal scenes must be equal files, and the safetensors crate writes metadata
+    /// in random order.
     fn metadata(&self) -> Result<String, String> {
         let json = |text: &str| serde_json::to_string(text).map_err(|error| error.to_string());
         let model = serde_json::to_string(&self.model).map_err(|error| error.to_string())?;

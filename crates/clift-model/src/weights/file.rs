@@ -1,4 +1,4 @@
-//! Weight files: safetensors in PyTorch's layout.
+//! Weight files: safetensors with PyTorch's names and layout.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -9,46 +9,46 @@ use burn::module::Module;
 use burn::store::{
     ApplyError, BurnToPyTorchAdapter, ModuleSnapshot, PathFilter, PyTorchToBurnAdapter, SafetensorsStore,
 };
-use burn::tensor::DType;
+use burn::tensor::{DType, TensorData};
 
 use crate::error::ModelError;
 use crate::files::{TEMPORARY, folder_of, publish};
 use crate::weights::hash::visit;
 
-/// Which parameters of a file went into a module.
+/// The parameters that were read from a file into a module, and those that were not.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LoadReport {
-    /// Parameters that were set from the file.
+    /// Parameters read from the file.
     pub applied: Vec<String>,
-    /// Parameters of the module that the file lacks; they keep their values.
+    /// Parameters of the module that are not in the file; they keep their values.
     pub missing: Vec<String>,
-    /// Tensors of the file that the module has no place for.
+    /// Tensors of the file that are not parameters of the module.
     pub unused: Vec<String>,
 }
 
 impl LoadReport {
-    /// Demands that file and module hold the same parameters.
+    /// Checks that file and module have the same parameters.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] with the first few names that differ.
+    /// [`ModelError::Weights`] with the first three missing and unused names.
     pub fn require_all(&self, path: &Path) -> Result<(), ModelError> {
         if self.missing.is_empty() && self.unused.is_empty() {
             return Ok(());
         }
-        let some = |names: &[String]| names.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
+        let first_few = |names: &[String]| names.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
         let reason = format!(
-            "the file does not hold this model: {} parameters missing ({}), {} without a place ({})",
+            "the file belongs to another model: {} missing parameters ({}), {} unused tensors ({})",
             self.missing.len(),
-            some(&self.missing),
+            first_few(&self.missing),
             self.unused.len(),
-            some(&self.unused)
+            first_few(&self.unused)
         );
         Err(ModelError::Weights { action: "reading", reason, path: path.into() })
     }
 }
 
-/// Writes the parameters of a module under the names and in the layout PyTorch gives them
-/// (linear weights `[outputs, inputs]`), to a temporary name that is then renamed. Equal weights are equal files.
+/// Writes the parameters of a module with PyTorch's names and layout (linear weights `[outputs, inputs]`). Equal weights
+/// are equal files, and a file under its final name is complete.
 ///
 /// # Errors
 /// [`ModelError::Weights`].
@@ -56,14 +56,14 @@ pub fn save_weights<M: Module>(module: &M, path: &Path) -> Result<(), ModelError
     save_part(module, &PathFilter::all(), path)
 }
 
-/// Does [`save_weights`] for the parameters whose paths match `part`. The file equals that of a module without the others.
+/// Writes the parameters whose paths match `part`, as [`save_weights`].
 ///
 /// # Errors
 /// As [`save_weights`].
 pub fn save_part<M: Module>(module: &M, part: &PathFilter, path: &Path) -> Result<(), ModelError> {
     let error = |reason: String| ModelError::Weights { action: "writing", reason, path: path.into() };
-    // The store and the crate below it have temporary names of their own, which a kill leaves behind: in a folder whose
-    // name is known. On an error it goes, as on a full disk it must.
+    // The store's own temporary files survive a kill. In a temporary folder, they are deleted on errors, and leftovers are
+    // recognised by its name.
     let folder = tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(folder_of(path));
     let folder = folder.map_err(|e| error(e.to_string()))?;
     let temporary = folder.path().join("model.safetensors");
@@ -77,8 +77,8 @@ pub fn save_part<M: Module>(module: &M, part: &PathFilter, path: &Path) -> Resul
     sorted.and_then(|()| publish(&temporary, path)).map_err(|e| error(e.to_string()))
 }
 
-/// Writes a safetensors header anew with its keys sorted: Burn's store orders them at random, file by file. The
-/// tensors' bytes stay where they are.
+/// Rewrites a safetensors header with sorted keys, which Burn's store writes in random order. The bytes of the tensors stay
+/// in place.
 fn sort_header(file: &mut (impl Read + Write + Seek)) -> std::io::Result<()> {
     let mut length = [0; 8];
     file.read_exact(&mut length)?;
@@ -88,14 +88,14 @@ fn sort_header(file: &mut (impl Read + Write + Seek)) -> std::io::Result<()> {
     let entries: BTreeMap<String, BTreeMap<String, serde_json::Value>> = serde_json::from_slice(&header)?;
     let mut sorted = serde_json::to_vec(&entries)?;
     if sorted.len() > header.len() {
-        return Err(std::io::Error::other("the header has no room for itself with its keys sorted"));
+        return Err(std::io::Error::other("the header with sorted keys is longer than the header"));
     }
     sorted.resize(header.len(), b' ');
     file.seek(SeekFrom::Start(8))?;
     file.write_all(&sorted)
 }
 
-/// Sorts the header of a safetensors file that is still in memory.
+/// Sorts the keys of the header of a safetensors file in memory.
 ///
 /// # Errors
 /// For bytes that are no safetensors file.
@@ -104,27 +104,26 @@ pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads parameters written by [`save_weights`] into a module and says which.
+/// Reads parameters written by [`save_weights`] into a module.
 ///
 /// # Errors
-/// [`ModelError::Weights`] when the file cannot be read, a shape differs, or a value is not finite or no 32-bit
-/// float.
-pub fn load<M: Module>(module: &mut M, path: &Path) -> Result<LoadReport, ModelError> {
+/// [`ModelError::Weights`] if the file cannot be read, a shape differs, or a value is not finite or no 32-bit float.
+pub fn load_weights<M: Module>(module: &mut M, path: &Path) -> Result<LoadReport, ModelError> {
     load_part(module, &PathFilter::all(), path)
 }
 
-/// Does [`load`] for the parameters whose paths match `part`. Tensors of the file that do not match are unused.
+/// Reads the parameters whose paths match `part`, as [`load_weights`]. Other tensors of the file are unused.
 ///
 /// # Errors
-/// As [`load`].
+/// As [`load_weights`].
 pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> Result<LoadReport, ModelError> {
     read(module, SafetensorsStore::from_file(path).filter(part.clone()), part, path)
 }
 
-/// Reads the module `name` of a larger one, such as the `renderer` of a whole model, without the others.
+/// Reads one module of a larger one from its file, such as the `renderer` of a whole model.
 ///
 /// # Errors
-/// As [`load`].
+/// As [`load_weights`].
 pub fn load_module<M: Module>(module: &mut M, name: &str, path: &Path) -> Result<LoadReport, ModelError> {
     let store = SafetensorsStore::from_file(path).with_key_remapping(format!("^{name}\\."), "");
     read(module, store, &PathFilter::all(), path)
@@ -138,20 +137,20 @@ fn read<M: Module>(
 ) -> Result<LoadReport, ModelError> {
     let error = |reason: String| ModelError::Weights { action: "reading", reason, path: path.into() };
     if !path.is_file() {
-        return Err(error("there is no such file".into()));
+        return Err(error("no such file".into()));
     }
     let mut store = store.with_from_adapter(PyTorchToBurnAdapter).validate(false).allow_partial(true);
     let result = module.load_from(&mut store).map_err(|e| error(e.to_string()))?;
     if let Some(first) = result.errors.first() {
-        return Err(error(told(first)));
+        return Err(error(describe(first)));
     }
     if let Some((name, dtype)) = first_not_f32(module) {
-        return Err(error(format!("{name} is {dtype:?}, not F32")));
+        return Err(error(format!("{name} is {dtype:?}, expected F32")));
     }
-    if let Some(name) = first_non_finite(module) {
-        return Err(error(format!("{name} is not finite")));
+    if let Some((name, _)) = first(module, |data| data.iter::<f32>().any(|value| !value.is_finite())) {
+        return Err(error(format!("{name} contains values that are not finite")));
     }
-    // Burn counts an absent parameter as missing whether it matches or not.
+    // Burn also reports absent parameters that do not match the filter.
     let missing = result.missing.iter().filter(|(name, _)| part.matches(name));
     let missing = missing.map(|(name, _)| name_in_file(name)).collect();
     let mut unused = result.unused;
@@ -160,7 +159,7 @@ fn read<M: Module>(
     Ok(LoadReport { applied: result.applied, missing, unused })
 }
 
-/// The name that a parameter of a module has in a file: Burn calls those of norms otherwise.
+/// Returns the name of a parameter in a file. Burn names the parameters of norms differently.
 fn name_in_file(path: &str) -> String {
     for (here, there) in [(".gamma", ".weight"), (".beta", ".bias")] {
         if let Some(module) = path.strip_suffix(here) {
@@ -170,34 +169,28 @@ fn name_in_file(path: &str) -> String {
     path.to_owned()
 }
 
-/// Why a tensor was not taken, with shapes as files hold them: Burn keeps the weights of linear layers, which are all
-/// matrices there are, as `[inputs, outputs]`.
-fn told(error: &ApplyError) -> String {
+/// Describes an error with the shapes of files. All matrices are weights of linear layers, which Burn keeps as
+/// `[inputs, outputs]`.
+fn describe(error: &ApplyError) -> String {
     let ApplyError::ShapeMismatch { path, expected, found } = error else { return error.to_string() };
     let [expected, found] = [expected, found].map(|shape| {
         let mut sizes = shape.to_vec();
-        sizes.reverse(); // of a vector, nothing
+        sizes.reverse();
         sizes
     });
     format!("{} is {found:?}, expected {expected:?}", name_in_file(path))
 }
 
-/// Path of the first parameter with a NaN or an infinity.
-pub fn first_non_finite<M: Module>(module: &M) -> Option<String> {
-    let mut found = None;
-    visit(module, |name, _, data| {
-        if found.is_none() && data.iter::<f32>().any(|value| !value.is_finite()) {
-            found = Some(name.to_owned());
-        }
-    });
-    found
+/// Returns path and type of the first parameter that is no 32-bit float.
+pub fn first_not_f32<M: Module>(module: &M) -> Option<(String, DType)> {
+    first(module, |data| data.dtype() != DType::F32)
 }
 
-/// Path and type of the first parameter that does not hold 32-bit floats.
-pub fn first_not_f32<M: Module>(module: &M) -> Option<(String, DType)> {
+/// Returns path and type of the first parameter whose values fulfil a condition.
+fn first<M: Module>(module: &M, condition: impl Fn(&TensorData) -> bool) -> Option<(String, DType)> {
     let mut found = None;
     visit(module, |name, _, data| {
-        if found.is_none() && data.dtype() != DType::F32 {
+        if found.is_none() && condition(data) {
             found = Some((name.to_owned(), data.dtype()));
         }
     });
@@ -206,107 +199,67 @@ pub fn first_not_f32<M: Module>(module: &M) -> Option<(String, DType)> {
 
 #[cfg(test)]
 mod tests {
-    use crate::weights::hash::weights_hash;
     use burn::tensor::Device;
 
     use super::*;
+    use crate::network::architecture::CliftVariant;
     use crate::network::clift::Clift;
-    use crate::network::config::ModelConfig;
+    use crate::testing::small_config;
+    use crate::weights::hash::weights_hash;
 
     fn model(seed: u64) -> Clift {
-        let config = ModelConfig {
-            dim: 16,
-            num_heads: 2,
-            feed_forward_dim: 24,
-            num_encoder_blocks: 1,
-            num_renderer_blocks: 1,
-            ..ModelConfig::default()
-        };
-        Clift::new(&config, seed, &Device::flex())
+        Clift::new(&small_config(CliftVariant::Paper), seed, &Device::flex())
     }
 
     #[test]
-    fn weights_survive_a_file_to_the_bit() {
-        let directory = tempfile::tempdir().expect("a temporary directory");
-        let path = directory.path().join("model.safetensors");
-        save_weights(&model(1), &path).expect("writes");
-        let mut other = model(2);
-        assert_ne!(weights_hash(&other), weights_hash(&model(1)));
-        load(&mut other, &path).expect("reads").require_all(&path).expect("the same model");
-        assert_eq!(weights_hash(&other), weights_hash(&model(1)));
-        // Nothing else is left, and whoever may read other files may read it.
-        let usual = directory.path().join("usual");
-        File::create(&usual).expect("writes");
-        let permissions = |path: &Path| std::fs::metadata(path).expect("there").permissions();
-        assert_eq!(permissions(&path), permissions(&usual));
-        assert_eq!(std::fs::read_dir(directory.path()).expect("a folder").count(), 2);
-    }
-
-    #[test]
-    fn a_file_of_another_model_is_named_with_what_differs() {
-        let directory = tempfile::tempdir().expect("a temporary directory");
-        let path = directory.path().join("model.safetensors");
-        save_weights(&model(1).encoder, &path).expect("writes");
-        let loaded = load(&mut model(2), &path).expect("nothing fits, nothing breaks");
-        let message = loaded.require_all(&path).unwrap_err().to_string();
-        assert!(message.contains("86 parameters missing (condenser.blocks.0"), "{message}");
-    }
-
-    #[test]
-    fn equal_weights_are_equal_files_in_a_header_that_others_read() {
-        let directory = tempfile::tempdir().expect("a temporary directory");
-        let files: Vec<Vec<u8>> = (0..4)
-            .map(|i| {
-                let path = directory.path().join(format!("{i}.safetensors"));
-                save_weights(&model(1), &path).expect("writes");
-                std::fs::read(path).expect("reads")
-            })
-            .collect();
-        // Of three keys in any order, four files would agree once in 216 times.
+    fn equal_weights_are_equal_files_that_read_back_exactly() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let paths = [0, 1, 2, 3].map(|i| folder.path().join(format!("{i}.safetensors")));
+        let files = paths.each_ref().map(|path| {
+            save_weights(&model(1), path).expect("writes");
+            std::fs::read(path).expect("reads")
+        });
+        // Three keys in random order are equal in four files once in 216 times.
         assert!(files.iter().all(|bytes| *bytes == files[0]));
         let (_, header) = safetensors::SafeTensors::read_metadata(&files[0]).expect("valid");
         let metadata = header.metadata().as_ref().expect("there");
         assert!(metadata.len() >= 2 && metadata["format"] == "clift-1", "{metadata:?}");
-        assert_eq!(std::fs::read_dir(directory.path()).expect("a folder").count(), 4, "nothing else is left");
+
+        let mut other = model(2);
+        assert_ne!(weights_hash(&other), weights_hash(&model(1)));
+        load_weights(&mut other, &paths[0]).expect("reads").require_all(&paths[0]).expect("the same model");
+        assert_eq!(weights_hash(&other), weights_hash(&model(1)));
+        assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 4, "no temporary file is left");
+        let plain = folder.path().join("plain");
+        File::create(&plain).expect("writes");
+        let permissions = |path: &Path| std::fs::metadata(path).expect("there").permissions();
+        assert_eq!(permissions(&paths[0]), permissions(&plain));
     }
 
     #[test]
-    fn names_and_shapes_in_messages_are_those_of_the_file() {
-        let directory = tempfile::tempdir().expect("a temporary directory");
-        let path = directory.path().join("model.safetensors");
+    fn errors_have_the_names_and_shapes_of_the_file() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("model.safetensors");
+        assert!(load_weights(&mut model(1), &path).unwrap_err().to_string().contains("no such file"));
         save_weights(&model(1).encoder, &path).expect("writes");
-        let missing = load(&mut model(2), &path).expect("nothing fits, nothing breaks").missing;
+        let loaded = load_weights(&mut model(2), &path).expect("a file without a matching name is no error");
+        let message = loaded.require_all(&path).unwrap_err().to_string();
+        assert!(message.contains(" missing parameters (condenser.blocks.0"), "{message}");
+        let missing = loaded.missing;
         assert!(missing.iter().any(|name| name == "renderer.output_norm.weight"), "{missing:?}");
         assert!(!missing.iter().any(|name| name.contains(".gamma") || name.contains(".beta")), "{missing:?}");
 
         save_weights(&model(1), &path).expect("writes");
-        let config = ModelConfig {
-            dim: 16,
-            num_heads: 2,
-            feed_forward_dim: 20,
-            num_encoder_blocks: 1,
-            num_renderer_blocks: 1,
-            ..ModelConfig::default()
-        };
+        let mut config = small_config(CliftVariant::Paper);
+        config.feed_forward_dim = 20;
         let mut narrow = Clift::new(&config, 0, &Device::flex());
-        let message = load(&mut narrow, &path).unwrap_err().to_string();
-        let file = std::fs::read(&path).expect("reads");
-        let file = safetensors::SafeTensors::deserialize(&file).expect("valid");
-        let name = file.names().into_iter().find(|name| message.contains(&format!("{name} is "))).expect("its name");
-        let got = format!("{name} is {:?}, expected ", file.tensor(name).expect("there").shape());
-        assert!(message.contains(&got), "{got}\nis not in\n{message}");
-        let shapes = ["is [24], expected [20]", "is [24, 16], expected [20, 16]", "is [16, 24], expected [16, 20]"];
+        let message = load_weights(&mut narrow, &path).unwrap_err().to_string();
+        let shapes =
+            ["bias is [22], expected [20]", "is [22, 15], expected [20, 15]", "is [15, 22], expected [15, 20]"];
         assert!(shapes.iter().any(|shapes| message.contains(shapes)), "{message}");
-    }
 
-    #[test]
-    fn truncated_and_missing_files_are_errors() {
-        let directory = tempfile::tempdir().expect("a temporary directory");
-        let path = directory.path().join("model.safetensors");
-        assert!(load(&mut model(1), &path).unwrap_err().to_string().contains("no such file"));
-        save_weights(&model(1), &path).expect("writes");
         let bytes = std::fs::read(&path).expect("reads");
         std::fs::write(&path, &bytes[..bytes.len() / 2]).expect("writes");
-        assert!(load(&mut model(1), &path).is_err());
+        assert!(load_weights(&mut model(1), &path).is_err(), "a truncated file");
     }
 }

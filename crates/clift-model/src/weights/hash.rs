@@ -1,4 +1,4 @@
-//! SHA-256 of a set of weights.
+//! SHA-256 of the weights of a module.
 
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Tensor, TensorData};
@@ -7,8 +7,8 @@ use sha2::{Digest, Sha256};
 use crate::network::config::ModelConfig;
 use crate::network::renderer::Renderer;
 
-/// Hash of all parameters of a module: their paths, shapes and values, as 64 hexadecimal digits.
-/// Equal weights have equal hashes on every device.
+/// Hashes paths, shapes and values of all parameters of a module; returns 64 hexadecimal digits. Equal weights have equal
+/// hashes on every device.
 pub fn weights_hash<M: Module>(module: &M) -> String {
     let mut sha = Sha256::new();
     visit(module, |name, shape, data| {
@@ -21,8 +21,8 @@ pub fn weights_hash<M: Module>(module: &M) -> String {
     hex::encode(sha.finalize())
 }
 
-/// [`weights_hash`] of a renderer's weights together with the settings that rendering depends on and no shape shows: variant
-/// and heads.
+/// Hashes a renderer's weights ([`weights_hash`]) together with variant and number of heads, which tensor shapes do not
+/// determine.
 pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
     let ModelConfig { variant, num_heads, .. } = config;
     hex::encode(Sha256::digest(format!("{variant} {num_heads} {}", weights_hash(renderer))))

@@ -1,11 +1,8 @@
-//! Weight files, published names, trained models.
+//! Weight files, published names, and trained models.
 //!
-//! - `file`: safetensors in PyTorch's layout
-//! - `hash`: SHA-256 of a set of weights
-//! - `published_keys`: parameter names of published checkpoints
-//! - `published_sizes`: network sizes inferred from shapes
-//! - `model_path`: find a run's weights and config
-//! - `trained_model`: a trained model, ready to use
+//! `file` reads and writes safetensors in PyTorch's layout; `hash` identifies a set of weights; `model_path` finds the
+//! weights and config of a run, and `trained_model` opens them. `published_keys` maps parameter names to those of
+//! published checkpoints, and `published_sizes` infers the sizes of a network from the shapes in a checkpoint.
 
 pub(crate) mod file;
 pub(crate) mod hash;

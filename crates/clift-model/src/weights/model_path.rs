@@ -1,4 +1,4 @@
-//! Where a trained model is: the weights of a run or of a model directory, and the config beside them.
+//! The paths of a trained model: its weight file and the directory of its config.
 
 use std::fs::File;
 use std::io::Read;
@@ -13,21 +13,21 @@ use crate::tokens::kind::TokenKind;
 pub struct ModelPath {
     /// The directory with `config.toml`.
     pub dir: PathBuf,
-    /// The weights: those of the last finished stage, unless a file was given.
+    /// The weight file: the given one, or that of the last finished stage.
     pub weights: PathBuf,
 }
 
 impl ModelPath {
-    /// Finds the weights of a run directory, a stage folder (`RUN/stage2`), a model directory, or a weight file in one
-    /// of these.
+    /// Finds the weights of a run directory, a stage folder (`RUN/stage2`) or a model directory; or the config of a weight
+    /// file in one of these.
     ///
     /// # Errors
-    /// [`ModelError::NoModel`] where no weights are found, [`ModelError::NoConfig`] for a weight file without a config,
+    /// [`ModelError::NoModel`] if no weights are found, [`ModelError::NoConfig`] for a weight file without a config,
     /// [`ModelError::NotImported`] for a PyTorch checkpoint.
     pub fn find(path: &Path) -> Result<Self, ModelError> {
         let inside = path.join(WEIGHTS);
         if path.is_dir() && inside.is_file() {
-            // The folder of a stage has no config of its own.
+            // The config of a stage folder is in the run directory.
             let has_config = path.join("config.toml").is_file();
             return if has_config { Ok(Self { dir: path.into(), weights: inside }) } else { Self::find(&inside) };
         }
@@ -48,8 +48,8 @@ impl ModelPath {
         Ok(Self { dir: dir.into(), weights: path.into() })
     }
 
-    /// Returns the weight file that renders tokens of a kind: of stage 1 or 2 of a run directory, the only one of a model
-    /// directory, or `path` itself if it is no directory. The file need not exist.
+    /// Returns the weight file that renders tokens of a kind: that of stage 1 or 2 of a run directory, that of a model
+    /// directory, or `path` itself if `path` is no directory. The file need not exist.
     pub fn for_tokens(path: &Path, kind: TokenKind) -> PathBuf {
         let inside = path.join(WEIGHTS);
         match (path.is_dir(), inside.is_file()) {
@@ -70,7 +70,7 @@ impl ModelPath {
 
 const WEIGHTS: &str = "model.safetensors";
 
-/// The weights of a run's stage that makes tokens of a kind.
+/// Returns the weight file of the stage of a run that makes tokens of a kind.
 fn weights_of(run: &Path, kind: TokenKind) -> PathBuf {
     let stage = match kind {
         TokenKind::Clift => "stage2",
@@ -79,7 +79,7 @@ fn weights_of(run: &Path, kind: TokenKind) -> PathBuf {
     run.join(stage).join(WEIGHTS)
 }
 
-/// Refuses a PyTorch file, recognised by its extension or as a ZIP archive, where a weight file is expected.
+/// Returns an error for a PyTorch checkpoint, recognised by its extension or as a ZIP archive.
 ///
 /// # Errors
 /// [`ModelError::NotImported`].
@@ -97,8 +97,8 @@ pub fn refuse_checkpoint(path: &Path) -> Result<(), ModelError> {
     Ok(())
 }
 
-/// Refuses weights of a run or model directory for a network with another number of heads, if the directory has a config.
-/// Tensor shapes do not determine the number of heads; a wrong number would silently change the output.
+/// Checks that a network has the number of heads in the config of its weights' directory, if there is one. Tensor shapes do
+/// not determine the number of heads; a wrong number would silently change the output.
 ///
 /// # Errors
 /// [`ModelError::BadConfig`] for other heads, [`ModelError::BadConfigFile`] for a config that cannot be read.
@@ -106,7 +106,8 @@ pub fn check_heads(model: &ModelConfig, dir: &Path) -> Result<(), ModelError> {
     let Some(ModelConfig { num_heads, .. }) = read_config(dir)? else { return Ok(()) };
     if model.num_heads != num_heads {
         let path = dir.join("config.toml");
-        let fix = format!("the weights are those of a network with {num_heads} heads: write that: {}", path.display());
+        let fix =
+            format!("the weights belong to a network with {num_heads} heads; write {num_heads}: {}", path.display());
         return Err(ModelError::BadConfig { key: "model.num_heads", value: model.num_heads.to_string(), fix });
     }
     Ok(())
@@ -133,9 +134,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_gives_its_last_stage_and_a_file_its_run() {
-        let place = tempfile::tempdir().unwrap();
-        let run = place.path().join("run");
+    fn runs_lead_to_their_last_stage_and_files_to_their_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = folder.path().join("run");
         let touch = |name: &str| {
             std::fs::create_dir_all(run.join(name).parent().unwrap()).unwrap();
             std::fs::write(run.join(name), "").unwrap();
@@ -158,15 +159,15 @@ mod tests {
         assert_eq!(ModelPath::for_tokens(&run, TokenKind::Kmeans), stage1);
         assert_eq!(ModelPath::for_tokens(&stage2, TokenKind::Clift), stage2);
 
-        let alone = place.path().join("alone.safetensors");
+        let alone = folder.path().join("alone.safetensors");
         let message = ModelPath::find(&alone).unwrap_err().to_string();
         assert!(message.starts_with("no trained model at "), "{message}");
         std::fs::write(&alone, "").unwrap();
         let message = ModelPath::find(&alone).unwrap_err().to_string();
         assert!(message.contains("no config.toml next to") && !message.contains("  "), "{message}");
-        // A checkpoint, by its name or by its start.
+        // A checkpoint, recognised by its name or by its first bytes.
         for (name, bytes) in [("run/stage1/last.ckpt", "damaged"), ("alone.bin", "PK\u{3}\u{4}")] {
-            let path = place.path().join(name);
+            let path = folder.path().join(name);
             std::fs::write(&path, bytes).unwrap();
             let message = ModelPath::find(&path).unwrap_err().to_string();
             assert!(message.contains(&format!("run `clift import {}", path.display())), "{message}");
@@ -174,16 +175,16 @@ mod tests {
     }
 
     #[test]
-    fn other_heads_than_a_directory_says_are_refused() {
-        let place = tempfile::tempdir().unwrap();
+    fn heads_must_equal_those_of_the_config() {
+        let folder = tempfile::tempdir().unwrap();
         let check = |text: &str, num_heads| {
-            std::fs::write(place.path().join("config.toml"), text).unwrap();
+            std::fs::write(folder.path().join("config.toml"), text).unwrap();
             let model = ModelConfig { num_heads, ..ModelConfig::default() };
-            check_heads(&model, place.path()).map_err(|error| error.to_string())
+            check_heads(&model, folder.path()).map_err(|error| error.to_string())
         };
         assert_eq!(check("[model]\nnum_heads = 4\n[data]\nof_a_later_version = 1", 4), Ok(()));
         assert_eq!(check("seed = 3", 8), Ok(()), "the default");
-        check_heads(&ModelConfig::default(), &place.path().join("none")).unwrap();
+        check_heads(&ModelConfig::default(), &folder.path().join("none")).unwrap();
         let message = check("[model]\nnum_heads = 4", 8).unwrap_err();
         assert!(message.contains("`model.num_heads` = 8: ") && message.contains("with 4 heads"), "{message}");
     }

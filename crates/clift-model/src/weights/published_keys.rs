@@ -1,38 +1,38 @@
-//! The names that the parameters have in published checkpoints and in the PyTorch twin, and those they have here.
+//! Parameter names of published checkpoints and the PyTorch twin, mapped to parameter paths of this crate.
 //!
-//! A key of a checkpoint is one tensor there and one or two parameters here: PyTorch packs the projections of
-//! cross-attention into one matrix. Shapes are PyTorch's, linear weights `[outputs, inputs]`.
+//! A tensor of a checkpoint is one or two parameters of this crate: PyTorch packs the projections of cross-attention into
+//! one matrix. Shapes are PyTorch's, linear weights `[outputs, inputs]`.
 
 use std::ops::Range;
 
 use crate::network::config::ModelConfig;
 use crate::network::layers::Part;
 
-/// Below which prefix a training program's checkpoint keeps the network.
+/// Prefix of the network's keys in a checkpoint of the published training program.
 pub const PREFIX: &str = "transformer.";
 
-/// Keys of a checkpoint that are known to be no part of the network: the network of its perceptual loss.
+/// Prefix of the keys of the perceptual loss, which is no part of the network.
 pub const PERCEPTUAL_PREFIX: &str = "perceptual_loss.";
 
-/// Layers that may be convolutions of one pixel in a checkpoint, `[outputs, inputs, 1, 1]`.
+/// Layers that may be 1 x 1 convolutions in a checkpoint, `[outputs, inputs, 1, 1]`.
 pub const PROJECTIONS: [&str; 3] = ["linear_input", "linear_target", "patch_to_image.0"];
 
-/// Which of those are, in what is exported from a model that was not imported.
+/// Layers that are exported as 1 x 1 convolutions if the model was not imported.
 pub const CONVOLUTIONS: [&str; 2] = ["linear_input", "linear_target"];
 
 /// One tensor of a checkpoint.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PublishedTensor {
-    /// Its key, without a prefix.
+    /// Key without a prefix.
     pub key: String,
-    /// Its shape.
+    /// Shape in the checkpoint.
     pub shape: Vec<usize>,
-    /// What it is here: paths in weight files, each with its rows of the tensor.
+    /// Paths of its parameters in weight files, each with its rows of the tensor.
     pub parts: Vec<(String, Range<usize>)>,
 }
 
 impl PublishedTensor {
-    /// Whether a shape is this tensor's, where a projection may be a convolution of one pixel.
+    /// Whether a shape is this tensor's; a projection may be a 1 x 1 convolution.
     pub fn fits(&self, shape: &[u64]) -> bool {
         let shape = match shape {
             [outer @ .., 1, 1] if outer.len() == 2 && is_projection(&self.key) => outer,
@@ -42,12 +42,12 @@ impl PublishedTensor {
     }
 }
 
-/// Whether a key is the weight of a layer that may be a convolution.
+/// Whether a key is the weight of one of the [`PROJECTIONS`].
 pub fn is_projection(key: &str) -> bool {
     key.strip_suffix(".weight").is_some_and(|layer| PROJECTIONS.contains(&layer))
 }
 
-/// Paths of modules, and the start of their keys; the first that fits is taken.
+/// Paths of modules and the start of their keys. The first matching path counts.
 const MODULES: [(&str, &str); 10] = [
     ("encoder.patch_embed", "linear_input"),
     ("encoder.blocks", "encoder.layers"),
@@ -61,13 +61,13 @@ const MODULES: [(&str, &str); 10] = [
     ("condenser.blocks", "squeezer.blocks"),
 ];
 
-/// Layers inside a block that follows PyTorch's transformer layers.
+/// Path segments of layers in a block, and those of PyTorch's transformer layers.
 const LAYERS: [(&str, &str); 13] = [
     (".attn.", ".self_attn."),
     (".cross_attn.", ".multihead_attn."),
     (".cluster_attn.", ".multihead_attn."),
     (".in_proj.", ".in_proj_"),
-    // One packed matrix there, queries apart from keys and values here.
+    // PyTorch packs queries, keys and values into one matrix.
     (".q_proj.", ".in_proj_"),
     (".kv_proj.", ".in_proj_"),
     (".qk_norm.query.", ".q_norm."),
@@ -79,13 +79,13 @@ const LAYERS: [(&str, &str); 13] = [
     (".norm_cross.", ".norm2."),
 ];
 
-/// Lists every tensor of a model's checkpoint, with or without the condenser.
+/// Lists all tensors of a model's checkpoint, with or without the condenser.
 pub fn published_tensors(config: &ModelConfig, has_condenser: bool) -> Vec<PublishedTensor> {
     let mut list: Vec<PublishedTensor> = Vec::new();
     for layer in config.layers().iter().filter(|layer| has_condenser || layer.part != Part::Condenser) {
         for (path, shape) in layer.parameters() {
             let key = published_key(&path);
-            // Weight and bias of the queries come right before those of the keys and values.
+            // Weight and bias of the queries immediately precede those of the keys and values.
             if let Some(packed) = list.iter_mut().rev().take(2).find(|tensor| tensor.key == key) {
                 let first = packed.shape[0];
                 packed.shape[0] += shape[0];
@@ -99,13 +99,13 @@ pub fn published_tensors(config: &ModelConfig, has_condenser: bool) -> Vec<Publi
     list
 }
 
-/// Returns the key of a parameter in a checkpoint: its path where no rule fits.
+/// Returns the key of a parameter in a checkpoint; its path if no module matches.
 fn published_key(path: &str) -> String {
     let mut modules = MODULES.iter();
     let found = modules.find_map(|(module, key)| path.strip_prefix(module).map(|layer| (key, layer.to_owned())));
     let Some((module, mut layer)) = found else { return path.to_owned() };
     if path.starts_with("condenser.blocks") {
-        // The paper's block has the names of this project.
+        // The twin names the layers of the paper's block as this crate does.
         layer = layer.replace(".in_proj.", ".in_proj_");
     } else {
         let norm_ff = (".norm_ff.", if path.starts_with("encoder") { ".norm2." } else { ".norm3." });
@@ -116,8 +116,8 @@ fn published_key(path: &str) -> String {
     format!("{module}{layer}")
 }
 
-/// A key as this module writes it: without what a compiled or distributed model adds to names, and with one name for
-/// the norms of queries and keys, whose name in published checkpoints is not known.
+/// Returns a key in the form of [`PublishedTensor::key`]: without the segments that compiled and distributed models add,
+/// and with one name for the norms of queries and keys, whose published name is unknown.
 pub fn canonical_key(key: &str) -> String {
     let mut parts: Vec<&str> = key.split('.').filter(|part| !matches!(*part, "_orig_mod" | "module")).collect();
     if let [.., norm, last] = &mut parts[..] {
@@ -142,35 +142,13 @@ pub fn canonical_key(key: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
     use super::*;
     use crate::network::architecture::CliftVariant;
     use crate::network::config::CondenserConfig;
-    use crate::network::layers::Layer;
-    use crate::testing::{small_config, small_configs};
+    use crate::testing::small_config;
 
     #[test]
-    fn every_parameter_is_in_one_tensor_with_its_shape() {
-        for config in small_configs() {
-            let mut expected: BTreeMap<_, _> = config.layers().iter().flat_map(Layer::parameters).collect();
-            for tensor in published_tensors(&config, true) {
-                let mut next = 0;
-                for (path, rows) in tensor.parts {
-                    assert_eq!(rows.start, next, "{}", tensor.key);
-                    next = rows.end;
-                    let mut shape = tensor.shape.clone();
-                    shape[0] = rows.len();
-                    assert_eq!(expected.remove(&path), Some(shape), "{path}");
-                }
-                assert_eq!(next, tensor.shape[0], "{}", tensor.key);
-            }
-            assert!(expected.is_empty(), "{config:?}: {:?}", expected.keys());
-        }
-    }
-
-    #[test]
-    fn the_published_network_has_the_published_number_of_parameters() {
+    fn parameter_counts_equal_the_published_ones() {
         let count = |variant, condenser| {
             let config = ModelConfig { variant, condenser: CondenserConfig::of(variant), ..ModelConfig::default() };
             published_tensors(&config, condenser)
@@ -189,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_tools_add_are_taken_off() {
+    fn canonical_keys_lack_the_segments_of_wrappers() {
         assert_eq!(canonical_key("_orig_mod.encoder.layers.0.norm1.weight"), "encoder.layers.0.norm1.weight");
         assert_eq!(
             canonical_key("encoder.layers.0.self_attn.query_norm.scale"),
@@ -199,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn a_projection_may_be_a_convolution_and_nothing_else_may() {
+    fn only_projections_may_be_convolutions() {
         let all = published_tensors(&small_config(CliftVariant::ReleasedRe10k), true);
         let fits = |key: &str, shape: &[u64]| all.iter().find(|tensor| tensor.key == key).expect("known").fits(shape);
         assert!(fits("linear_input.weight", &[15, 576]) && fits("linear_input.weight", &[15, 576, 1, 1]));

@@ -1,6 +1,7 @@
-//! The sizes of a network, read off the keys and shapes of its checkpoint.
+//! The sizes of a network, inferred from the keys and shapes of its checkpoint.
 //!
-//! Every tensor that shows a size has a vote: one that is misshapen does not make misshapen all others.
+//! Every tensor dimension that depends on a size votes for the size, so that one tensor with a wrong shape does not change
+//! the result.
 // D width, F hidden width, E width of a head
 
 use std::collections::BTreeMap;
@@ -9,24 +10,24 @@ use crate::network::architecture::CliftVariant;
 use crate::network::config::{CondenserConfig, ModelConfig};
 use crate::weights::published_keys::{is_projection, published_tensors};
 
-/// What stands before the number of a layer.
+/// Key prefixes before the number of a layer.
 const LAYERS: [&str; 3] = ["encoder.layers.", "decoder.layers.", "squeezer.blocks."];
 
-/// What a checkpoint shows of its network.
+/// Sizes of a network, inferred from its checkpoint.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct InferredConfig {
-    /// The network. What the checkpoint does not show has the published size: comparing with [`published_tensors`] then names what
-    /// is missing.
+    /// Sizes of the network; the published size where the checkpoint lacks the tensors. A comparison with
+    /// [`published_tensors`] then lists the missing tensors.
     pub config: ModelConfig,
-    /// Whether it has a condenser.
+    /// Whether the checkpoint has a condenser.
     pub has_condenser: bool,
-    /// Whether the heads are known: given, shown by norms, or those of the published width.
+    /// Whether the number of heads is known: given, inferred from norms, or implied by the published width.
     pub knows_heads: bool,
-    /// The first of the keys that show the width.
+    /// The first key that voted for the width.
     pub width_key: Option<String>,
 }
 
-/// How often each size was seen, and where first.
+/// Number of votes for each size, and the key of the first.
 #[derive(Default)]
 struct Votes(BTreeMap<usize, (usize, String)>);
 
@@ -35,14 +36,14 @@ impl Votes {
         self.0.entry(size).or_insert_with(|| (0, key.to_owned())).0 += 1;
     }
 
-    /// The most frequent, the smaller of two.
+    /// Returns the size with the most votes, the smaller of two with equal votes, and its first key.
     fn winner(&self) -> Option<(usize, &str)> {
         let (size, (_, key)) = self.0.iter().rev().max_by_key(|(_, (count, _))| *count)?;
         Some((*size, key))
     }
 }
 
-/// A network whose sizes no two kinds of dimensions share, so that a dimension of it says what it is.
+/// Returns a network whose sizes differ, so that every dimension of a tensor identifies the size.
 fn probe(variant: CliftVariant) -> ModelConfig {
     ModelConfig {
         variant,
@@ -56,9 +57,9 @@ fn probe(variant: CliftVariant) -> ModelConfig {
     }
 }
 
-/// Reads the sizes off keys without prefix and their shapes, which are empty for what is no tensor.
+/// Infers the sizes of a network from keys without prefix and their shapes, which are empty for values that are no tensors.
 ///
-/// `num_heads` is asked for because no shape shows it, but for the variant that normalises heads.
+/// Shapes determine the number of heads only in the variant with norms of heads; `num_heads` gives it for the others.
 pub fn infer_config<'a>(
     variant: CliftVariant,
     num_heads: Option<usize>,
@@ -108,7 +109,7 @@ pub fn infer_config<'a>(
     }
 
     let published = ModelConfig::default();
-    // A layer counts with half of the keys that the fullest has: a stray key does not make one.
+    // A layer counts if it has at least half of the keys of the layer with the most: single stray keys do not count.
     let [encoder, renderer, condenser] = layers.map(|counts| {
         let most = counts.values().copied().max().unwrap_or(0);
         let last = counts.iter().rev().find(|(_, count)| **count * 2 >= most);
@@ -128,8 +129,8 @@ pub fn infer_config<'a>(
         config.condenser.num_blocks = condenser.unwrap_or(config.condenser.num_blocks);
         config.condenser.residual = !has_condenser || has_norm_cross;
     }
-    let shown = head.winner().map(|(size, _)| size).filter(|size| *size > 0 && config.dim.is_multiple_of(*size));
-    let num_heads = num_heads.or(shown.map(|size| config.dim / size));
+    let inferred = head.winner().map(|(size, _)| size).filter(|size| *size > 0 && config.dim.is_multiple_of(*size));
+    let num_heads = num_heads.or(inferred.map(|size| config.dim / size));
     let knows_heads = num_heads.is_some() || config.dim == published.dim;
     config.num_heads = num_heads.unwrap_or(published.num_heads);
     InferredConfig { config, has_condenser, knows_heads, width_key: width.winner().map(|(_, key)| key.to_owned()) }
@@ -152,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn sizes_are_read_off_shapes() {
+    fn sizes_are_inferred_from_shapes() {
         for variant in CliftVariant::ALL {
             for residual in [true, false] {
                 for with_condenser in [true, false] {
@@ -167,31 +168,13 @@ mod tests {
     }
 
     #[test]
-    fn the_kinds_of_dimensions_of_the_probe_are_told_apart() {
-        for variant in CliftVariant::ALL {
-            let probe = probe(variant);
-            for tensor in published_tensors(&probe, true) {
-                for size in tensor.shape {
-                    let kinds = [
-                        size == probe.feed_forward_dim,
-                        size == probe.dim / probe.num_heads,
-                        size.is_multiple_of(probe.dim),
-                        size.is_multiple_of(probe.patch_size.pow(2)),
-                    ];
-                    assert_eq!(kinds.into_iter().filter(|is| *is).count(), 1, "{}: {size}", tensor.key);
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn one_misshapen_tensor_does_not_change_the_sizes() {
+    fn one_wrong_shape_does_not_change_the_sizes() {
         for variant in CliftVariant::ALL {
             let config = small_config(variant);
             let all = shapes(&config, true);
             for key in all.keys() {
                 let mut changed = all.clone();
-                for size in changed.get_mut(key).expect("it is there") {
+                for size in changed.get_mut(key).expect("a key of the checkpoint") {
                     *size = *size * 4 + 36;
                 }
                 let got = read(variant, Some(3), &changed);
@@ -201,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stray_key_makes_no_layer_and_a_missing_layer_no_smaller_network() {
+    fn stray_keys_and_missing_layers_do_not_change_the_sizes() {
         let config = small_config(CliftVariant::ReleasedRe10k);
         let mut stray = shapes(&config, true);
         stray.insert("decoder.layers.3.norm1.weight".into(), vec![15]);
@@ -213,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn heads_are_known_where_norms_or_the_published_width_show_them() {
+    fn heads_follow_from_norms_or_the_published_width() {
         let knows = |variant, dim| {
             let config = ModelConfig { dim, ..small_config(variant) };
             let got = read(variant, None, &shapes(&config, true));

@@ -81,7 +81,7 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         trained: trained_parts(stage),
         num_scenes,
         is_accumulated: num_scenes < batch_size,
-        recompute: config.activation_checkpointing,
+        activation_checkpointing: config.activation_checkpointing,
         scene: largest_sizes(config, stage)?,
         num_image_values,
         loss,

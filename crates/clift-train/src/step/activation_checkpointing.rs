@@ -32,12 +32,12 @@ pub(crate) fn backward(
     let (encoder_inputs, lift) = inputs(plain.encoder.embed(&context), plain.encoder.blocks(), EncoderBlock::forward);
     let tokens = choice.apply(&plain.condenser, plain.lift_norm.forward(lift.clone()))?;
     let (renderer_inputs, x) = inputs(plain.renderer.embed(&targets), plain.renderer.blocks(), |block, x| {
-        block.forward(x, tokens.memory(block))
+        block.forward(x, tokens.project(block))
     });
 
     // Backward, one tape after the other.
     let x = leaf(x);
-    let parts = loss.of(model.renderer.picture(x.clone(), &shown.targets), shown.pictures.clone());
+    let parts = loss.of(model.renderer.to_image(x.clone(), &shown.targets), shown.pictures.clone());
     let mut grads = parts.total.clone().mul_scalar(share).backward();
     let parts = LossParts { total: parts.total.inner(), mse: parts.mse.inner() };
     let mut grad_x = take(&x, &mut grads);
@@ -46,7 +46,7 @@ pub(crate) fn backward(
     let mut grad_tokens: Option<Tensor<3>> = None;
     for (block, input) in model.renderer.blocks().iter().zip(renderer_inputs).rev() {
         let (x, given) = (leaf(input), leaf(tokens.tokens().clone()));
-        let output = block.forward(x.clone(), tokens.with_tokens(given.clone()).memory(block));
+        let output = block.forward(x.clone(), tokens.with_tokens(given.clone()).project(block));
         let mut grads = pull(output, grad_x);
         grad_x = take(&x, &mut grads);
         let grad = take(&given, &mut grads);

@@ -36,7 +36,7 @@ pub(crate) const CASES: &[Case] = &[
     Case {
         name: "tokens beyond 65,504 in f16",
         breaks: "infinities in a file",
-        bound: Bound::Refused("beyond 65504"),
+        bound: Bound::Refused("largest 16-bit float is 65504"),
         reason: "f16 ends there",
         run: |_| match TokenFormat::F16.round(&[1.0, 7e4], 2) {
             Err(error @ ModelError::BadConfig { .. }) => Ok(Outcome::Refused(error.to_string())),

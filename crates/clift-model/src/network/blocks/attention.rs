@@ -1,4 +1,4 @@
-//! Attention with its projections.
+//! Self- and cross-attention layers: projections, norms of queries and keys, and heads.
 
 use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
@@ -27,19 +27,19 @@ impl SelfAttention {
         Self {
             in_proj: init.attention_in(dim, 3),
             out_proj: init.attention_out(dim),
-            qk_norm: QkNorm::of(config, init),
+            qk_norm: QkNorm::new(config, init),
             num_heads,
         }
     }
 
-    /// Mixes the normalised tokens of the same scene.
+    /// Applies `norm`, then attention among the tokens of a scene.
     ///
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
     pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
         let packed = norm_linear(norm, &self.in_proj, x);
         let packed = match &self.qk_norm {
-            Some(qk_norm) => qk_norm.packed(packed),
+            Some(qk_norm) => qk_norm.query_key_value(packed),
             None => packed,
         };
         linear(&self.out_proj, self_sdpa(packed, self.num_heads))
@@ -65,30 +65,30 @@ impl CrossAttention {
             q_proj: init.attention_in(dim, 1),
             kv_proj: init.attention_in(dim, 2),
             out_proj: init.attention_out(dim),
-            qk_norm: QkNorm::of(config, init),
+            qk_norm: QkNorm::new(config, init),
             num_heads,
         }
     }
 
-    /// Queries, `[batch, num_queries, dim]`.
+    /// Projects queries, `[batch, num_queries, dim]`.
     pub(crate) fn project_query(&self, norm: Option<&LayerNorm>, x: Tensor<3>) -> Tensor<3> {
         let query = project(norm, &self.q_proj, x);
         match &self.qk_norm {
-            Some(qk_norm) => qk_norm.queries(query),
+            Some(qk_norm) => qk_norm.query(query),
             None => query,
         }
     }
 
-    /// Keys and values side by side, `[batch, num_keys, 2 dim]`. They depend on the tokens alone.
-    pub(crate) fn project_memory(&self, norm: Option<&LayerNorm>, memory: Tensor<3>) -> Tensor<3> {
-        let key_value = project(norm, &self.kv_proj, memory);
+    /// Projects tokens to keys and values side by side, `[batch, num_keys, 2 dim]`.
+    pub(crate) fn project_key_value(&self, norm: Option<&LayerNorm>, tokens: Tensor<3>) -> Tensor<3> {
+        let key_value = project(norm, &self.kv_proj, tokens);
         match &self.qk_norm {
-            Some(qk_norm) => qk_norm.keys_beside_values(key_value),
+            Some(qk_norm) => qk_norm.key_value(key_value),
             None => key_value,
         }
     }
 
-    /// The projection after the heads.
+    /// Projects the concatenated heads.
     pub(crate) fn project_out(&self, x: Tensor<3>) -> Tensor<3> {
         linear(&self.out_proj, x)
     }

@@ -11,7 +11,7 @@ use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::ops::attention::sdpa::cross_sdpa;
 
-/// Self-attention and feed-forward, each normalised before and added after.
+/// Self-attention and feed-forward network, each with a norm before and a residual connection.
 #[derive(Module, Debug)]
 pub struct EncoderBlock {
     norm_attn: LayerNorm,
@@ -31,7 +31,7 @@ impl EncoderBlock {
         }
     }
 
-    /// Mixes the tokens of a scene.
+    /// Updates the tokens of a scene.
     ///
     /// # Shapes
     /// - `x` and the result: `[batch, num_tokens, dim]`
@@ -41,8 +41,8 @@ impl EncoderBlock {
     }
 }
 
-/// Self-attention among the patches of a target view, cross-attention from the scene's tokens and
-/// feed-forward, each normalised before and added after. The tokens are not normalised.
+/// Self-attention among the patches of a target view, cross-attention to the scene's tokens and feed-forward network, each
+/// with a norm before and a residual connection. The scene's tokens have no norm.
 #[derive(Module, Debug)]
 pub struct DecoderBlock {
     norm_self: LayerNorm,
@@ -66,31 +66,31 @@ impl DecoderBlock {
         }
     }
 
-    /// What cross-attention needs of a scene's tokens: it does not depend on the views that are drawn.
+    /// Projects a scene's tokens to the keys and values of cross-attention, which are the same for all views.
     ///
     /// # Shapes
     /// - `tokens`: `[groups, num_render_tokens, dim]`
     /// - returns `[groups, num_render_tokens, 2 dim]`, keys and values side by side
-    pub fn memory(&self, tokens: Tensor<3>) -> Tensor<3> {
-        self.cross_attn.project_memory(None, tokens)
+    pub fn project_tokens(&self, tokens: Tensor<3>) -> Tensor<3> {
+        self.cross_attn.project_key_value(None, tokens)
     }
 
-    /// Updates the patches of target views from the [`memory`](Self::memory) of their scenes. Views of
-    /// one group are consecutive and share its keys and values; they do not see each other.
+    /// Updates the patches of target views from the keys and values of [`project_tokens`](Self::project_tokens). The views
+    /// of a group are consecutive and share its keys and values; they do not attend to each other.
     ///
     /// # Shapes
     /// - `x` and the result: `[views, num_queries, dim]`
-    /// - `memory`: `[groups, num_render_tokens, 2 dim]`
-    pub fn forward(&self, x: Tensor<3>, memory: Tensor<3>) -> Tensor<3> {
+    /// - `key_value`: `[groups, num_render_tokens, 2 dim]`
+    pub fn forward(&self, x: Tensor<3>, key_value: Tensor<3>) -> Tensor<3> {
         let [views, num_queries, dim] = x.dims();
-        let [groups, _, _] = memory.dims();
+        let [groups, _, _] = key_value.dims();
         let x = x.clone() + self.self_attn.forward(&self.norm_self, x);
 
-        // Cross-attention treats queries one by one, so all views of a group go in one row of queries.
+        // Queries are independent of each other, so that the views of a group form one sequence of queries.
         let query = self.cross_attn.project_query(Some(&self.norm_cross), x.clone());
         let query = query.reshape([groups, views / groups * num_queries, dim]); // [T, Q, D] -> [G, TQ / G, D]
-        let found = cross_sdpa(query, memory, self.cross_attn.num_heads()).reshape([views, num_queries, dim]);
-        let x = x + self.cross_attn.project_out(found);
+        let attended = cross_sdpa(query, key_value, self.cross_attn.num_heads()).reshape([views, num_queries, dim]);
+        let x = x + self.cross_attn.project_out(attended);
 
         x.clone() + self.feed_forward.forward(&self.norm_ff, x)
     }
@@ -98,75 +98,42 @@ impl DecoderBlock {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::Device;
-
     use super::*;
-    use crate::testing::{Fixture, assert_close, devices, load_weights, random, weight_gradients};
+    use crate::testing::{Fixture, assert_close, devices, load_weights, weight_gradients};
 
-    fn config() -> ModelConfig {
-        ModelConfig { dim: 16, num_heads: 4, feed_forward_dim: 24, ..ModelConfig::default() }
-    }
-
-    // f32 through a block of 16 columns against f64.
-    const OUTPUT: f64 = 5e-6;
-    const GRADIENT: f64 = 2e-5;
-
-    #[test]
-    fn encoder_block_equals_pytorchs_with_gradients() {
-        let fixture = Fixture::open("encoder_block");
+    /// Expects output and gradients of a block of width 16 in f32 to equal those of PyTorch in f64.
+    fn assert_equals_pytorch<M: Module>(
+        name: &str,
+        input_names: &[&str],
+        new: fn(&ModelConfig, &mut Init) -> M,
+        forward: fn(&M, &[Tensor<3>]) -> Tensor<3>,
+    ) {
+        let config = ModelConfig { dim: 16, num_heads: 4, feed_forward_dim: 24, ..ModelConfig::default() };
+        let fixture = Fixture::open(name);
         for device in devices() {
             let device = device.autodiff();
-            let block = load_weights(EncoderBlock::new(&config(), &mut Init::new(0, &device)), &fixture, "weight.");
-            let x = fixture.tensor::<3>("input.x", &device).require_grad();
-            let output = block.forward(x.clone());
-            assert_close(&output.clone().inner(), &fixture.tensor::<3>("output.x", &device).inner(), OUTPUT);
-            let grads = (output * fixture.tensor("input.cotangent", &device)).sum().backward();
-            let expected = fixture.tensor::<3>("grad.input.x", &device).inner();
-            assert_close(&x.grad(&grads).expect("tracked"), &expected, GRADIENT);
-            weight_gradients(&block, &grads, &fixture, "grad.weight.", GRADIENT);
-        }
-    }
-
-    #[test]
-    fn decoder_block_equals_pytorchs_with_gradients() {
-        let fixture = Fixture::open("decoder_block");
-        for device in devices() {
-            let device = device.autodiff();
-            let block = load_weights(DecoderBlock::new(&config(), &mut Init::new(0, &device)), &fixture, "weight.");
-            let x = fixture.tensor::<3>("input.x", &device).require_grad();
-            let memory = fixture.tensor::<3>("input.memory", &device).require_grad();
-            let output = block.forward(x.clone(), block.memory(memory.clone()));
-            assert_close(&output.clone().inner(), &fixture.tensor::<3>("output.x", &device).inner(), OUTPUT);
-            let grads = (output * fixture.tensor("input.cotangent", &device)).sum().backward();
-            for (name, input) in [("x", x), ("memory", memory)] {
-                let expected = fixture.tensor::<3>(&format!("grad.input.{name}"), &device).inner();
-                assert_close(&input.grad(&grads).expect("tracked"), &expected, GRADIENT);
+            let tensor = |name: &str| fixture.tensor::<3>(name, &device);
+            let block = load_weights(new(&config, &mut Init::new(0, &device)), &fixture, "weight.");
+            let inputs = input_names.iter().map(|name| tensor(&format!("input.{name}")).require_grad());
+            let inputs: Vec<Tensor<3>> = inputs.collect();
+            let output = forward(&block, &inputs);
+            assert_close(&output.clone().inner(), &tensor("output.x").inner(), 5e-6);
+            let grads = (output * tensor("input.cotangent")).sum().backward();
+            for (name, input) in input_names.iter().zip(inputs) {
+                let expected = tensor(&format!("grad.input.{name}")).inner();
+                assert_close(&input.grad(&grads).expect("tracked"), &expected, 2e-5);
             }
-            weight_gradients(&block, &grads, &fixture, "grad.weight.", GRADIENT);
+            weight_gradients(&block, &grads, &fixture, "grad.weight.", 2e-5);
         }
     }
 
     #[test]
-    fn views_that_share_tokens_render_as_they_would_alone() {
-        let device = Device::flex();
-        let block = DecoderBlock::new(&config(), &mut Init::new(0, &device));
-        let to_f32 = |x: Tensor<3>| x.cast(burn::tensor::DType::F32);
-        let x = to_f32(random([6, 5, 16], 1, &device)); // two scenes of three views
-        let tokens = to_f32(random([2, 7, 16], 2, &device));
-        let together = block.forward(x.clone(), block.memory(tokens.clone()));
-        for view in 0..6 {
-            let alone =
-                block.forward(x.clone().narrow(0, view, 1), block.memory(tokens.clone().narrow(0, view / 3, 1)));
-            assert_close(&together.clone().narrow(0, view, 1), &alone, 1e-6);
-        }
-    }
-
-    #[test]
-    fn identical_tokens_stay_identical() {
-        let device = Device::flex();
-        let block = EncoderBlock::new(&config(), &mut Init::new(0, &device));
-        let x = random([1, 1, 16], 3, &device).cast(burn::tensor::DType::F32).expand([1, 9, 16]);
-        let output = block.forward(x);
-        assert_close(&output, &output.clone().narrow(1, 0, 1).expand([1, 9, 16]), 1e-6);
+    fn blocks_equal_pytorch_with_gradients() {
+        assert_equals_pytorch("encoder_block", &["x"], EncoderBlock::new, |block, inputs| {
+            block.forward(inputs[0].clone())
+        });
+        assert_equals_pytorch("decoder_block", &["x", "memory"], DecoderBlock::new, |block, inputs| {
+            block.forward(inputs[0].clone(), block.project_tokens(inputs[1].clone()))
+        });
     }
 }

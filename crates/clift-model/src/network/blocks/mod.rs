@@ -1,9 +1,5 @@
-//! Layers of the networks.
-//!
-//! - `norms`: QK norm and token norm
-//! - `attention`: self- and cross-attention layers
-//! - `feed_forward`: feed-forward layer
-//! - `block`: pre-norm encoder and decoder blocks
+//! Layers of the networks: `norms` of tokens, queries and keys; `attention` and `feed_forward` layers; and in `block` the
+//! pre-norm encoder and decoder blocks that are made of them.
 
 pub(crate) mod attention;
 pub(crate) mod block;

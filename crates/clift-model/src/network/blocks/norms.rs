@@ -1,4 +1,4 @@
-//! What stands between the encoder and those who read its tokens.
+//! The norm of the encoder's tokens, and the norms of queries and keys.
 
 use burn::module::Module;
 use burn::nn::{LayerNorm, RmsNorm};
@@ -7,25 +7,25 @@ use burn::tensor::Tensor;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 
-/// A layer norm of the encoder's tokens in the released DL3DV network, nothing in the others. The encoder is frozen
-/// in stage 2, this norm is trained in both.
+/// A layer norm of the encoder's tokens in the released DL3DV network, the identity in the others. Stage 2 freezes the
+/// encoder; both stages train this norm.
 #[derive(Module, Debug)]
 pub struct LiftNorm {
     norm: Option<LayerNorm>,
 }
 
 impl LiftNorm {
-    /// Makes what the variant has.
+    /// Makes the norm of the variant.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         Self { norm: config.variant.has_norms().then(|| init.layer_norm(config.dim)) }
     }
 
-    /// Whether tokens are changed at all.
+    /// Whether the variant has a norm.
     pub fn is_norm(&self) -> bool {
         self.norm.is_some()
     }
 
-    /// The tokens that K-means, condenser and renderer read.
+    /// Returns the tokens that K-means, condenser and renderer read.
     ///
     /// # Shapes
     /// - `lift` and the result: `[batch, num_tokens, dim]`
@@ -37,8 +37,8 @@ impl LiftNorm {
     }
 }
 
-/// Two norms over the columns of a head, `x / sqrt(mean(x^2) + 1e-5) * gamma`, each with one gamma `[head width]`
-/// for all heads.
+/// RMS norms of the heads of queries and keys, `x / sqrt(mean(x^2) + 1e-5) * gamma`; the heads share one gamma
+/// `[head width]`.
 #[derive(Module, Debug)]
 pub struct QkNorm {
     query: RmsNorm,
@@ -46,8 +46,8 @@ pub struct QkNorm {
 }
 
 impl QkNorm {
-    /// The norms of an attention layer, for variants that have them.
-    pub fn of(config: &ModelConfig, init: &mut Init) -> Option<Self> {
+    /// Makes the norms of an attention layer; `None` in variants without them.
+    pub fn new(config: &ModelConfig, init: &mut Init) -> Option<Self> {
         config.variant.has_norms().then(|| {
             let head_width = config.dim / config.num_heads;
             Self { query: init.rms_norm(head_width), key: init.rms_norm(head_width) }
@@ -55,78 +55,35 @@ impl QkNorm {
     }
 
     /// Normalises queries, `[batch, count, dim]`.
-    pub(crate) fn queries(&self, query: Tensor<3>) -> Tensor<3> {
+    pub(crate) fn query(&self, query: Tensor<3>) -> Tensor<3> {
         per_head(&self.query, query)
     }
 
-    /// Normalises the keys of keys and values side by side, `[batch, count, 2 dim]`.
-    pub(crate) fn keys_beside_values(&self, key_value: Tensor<3>) -> Tensor<3> {
-        let [key, value] = parts(&key_value);
+    /// Normalises the keys of packed keys and values, `[batch, count, 2 dim]`.
+    pub(crate) fn key_value(&self, key_value: Tensor<3>) -> Tensor<3> {
+        let [key, value] = split(&key_value);
         Tensor::cat(vec![per_head(&self.key, key), value], 2)
     }
 
-    /// Normalises the first two of queries, keys and values side by side, `[batch, count, 3 dim]`.
-    pub(crate) fn packed(&self, query_key_value: Tensor<3>) -> Tensor<3> {
-        let [query, key, value] = parts(&query_key_value);
+    /// Normalises the queries and keys of packed queries, keys and values, `[batch, count, 3 dim]`.
+    pub(crate) fn query_key_value(&self, query_key_value: Tensor<3>) -> Tensor<3> {
+        let [query, key, value] = split(&query_key_value);
         Tensor::cat(vec![per_head(&self.query, query), per_head(&self.key, key), value], 2)
     }
 }
 
-/// Cuts the columns into equal parts.
-fn parts<const COUNT: usize>(x: &Tensor<3>) -> [Tensor<3>; COUNT] {
+/// Splits the columns into equal parts.
+fn split<const COUNT: usize>(x: &Tensor<3>) -> [Tensor<3>; COUNT] {
     let [_batch, _count, columns] = x.dims();
     let width = columns / COUNT;
     std::array::from_fn(|part| x.clone().narrow(2, part * width, width))
 }
 
-/// Unlike Burn's own forward, squares are taken in the type of `x`, so that f64 stays f64.
+/// Normalises every head. Burn's own forward computes the squares in f32; this one keeps the type of `x`.
 fn per_head(norm: &RmsNorm, x: Tensor<3>) -> Tensor<3> {
     let [batch, count, dim] = x.dims();
     let [head_width] = norm.gamma.dims();
     let x = x.reshape([batch, count, dim / head_width, head_width]); // [B, N, H, E]
     let scale = (x.clone().square().mean_dim(3) + norm.epsilon).sqrt();
     (x / scale * norm.gamma.val().reshape([1, 1, 1, head_width])).reshape([batch, count, dim])
-}
-
-#[cfg(test)]
-mod qk_norm_tests {
-    use super::*;
-    use crate::network::architecture::CliftVariant;
-    use crate::testing::{check_gradients, cpu_devices, devices, random, to_vec};
-
-    fn config() -> ModelConfig {
-        ModelConfig { variant: CliftVariant::ReleasedDl3dv, dim: 6, num_heads: 3, ..ModelConfig::default() }
-    }
-
-    #[test]
-    fn every_head_has_a_mean_square_of_one_and_values_stay_as_they_are() {
-        for device in devices() {
-            let norm = QkNorm::of(&config(), &mut Init::new(0, &device)).expect("DL3DV has one");
-            let x = random([2, 5, 18], 1, &device).cast(burn::tensor::DType::F32) * 30.0;
-            let (before, after) = (to_vec(x.clone()), to_vec(norm.packed(x)));
-            for (before, after) in before.chunks(18).zip(after.chunks(18)) {
-                for head in after[..12].chunks(2) {
-                    let mean_square = head.iter().map(|value| value * value).sum::<f64>() / 2.0;
-                    assert!((mean_square - 1.0).abs() < 1e-3, "{head:?}"); // epsilon against squares of about 300
-                }
-                assert_eq!(before[12..], after[12..]);
-            }
-        }
-    }
-
-    #[test]
-    fn gradients_equal_central_differences_in_f64() {
-        for device in cpu_devices() {
-            let norm = QkNorm::of(&config(), &mut Init::new(0, &device)).expect("DL3DV has one");
-            let gamma = random([2], 5, &device) + 2.0;
-            let forward = |x: Tensor<3>| {
-                let mut norm = norm.clone();
-                let gamma = if x.is_autodiff() { gamma.clone().autodiff() } else { gamma.clone() };
-                norm.query.gamma = burn::module::Param::from_tensor(gamma.clone());
-                norm.key.gamma = burn::module::Param::from_tensor(gamma * 0.5);
-                norm.packed(x)
-            };
-            check_gradients([random([2, 3, 18], 1, &device)], |[x]| forward(x), 1e-6);
-        }
-    }
 }

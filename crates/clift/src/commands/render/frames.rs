@@ -54,7 +54,7 @@ pub fn write_frames(
             let work = format!("frame {first} of {}", views.len());
             return Err(TrainError::Abandoned { work }.into());
         }
-        let drawn = viewer.draw(some, height, width, num_render_tokens);
+        let drawn = viewer.render(some, height, width, num_render_tokens);
         for drawn in drawn.with_context(|| format!("drawing frames {first} to {}", first + some.len() - 1))? {
             let picture = Canvas::from_unit(&drawn.pixels, height, width)?;
             picture.write_png(&folder.join(format!("frame-{:05}.png", render_s.len())))?;
