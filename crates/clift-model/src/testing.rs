@@ -102,7 +102,7 @@ impl Fixture {
 
     /// Returns the shape of a tensor.
     pub fn shape(&self, name: &str) -> Vec<usize> {
-        self.data(name).shape.to_vec()
+        self.data(name).shape().to_vec()
     }
 
     fn data(&self, name: &str) -> TensorData {
@@ -140,8 +140,8 @@ pub fn output_and_gradients<const COUNT: usize>(
     (output.inner(), gradients)
 }
 
-/// Asserts that output and gradients of `f` in f32, which takes the native kernels on flex, equal those in f64, which
-/// takes the composed operations. Results that are zero in f64 are not compared.
+/// Asserts that output and gradients of `f` in f32 (native kernels on flex) equal the results in f64 (composed
+/// operations). Results that are zero in f64 are not compared.
 #[track_caller]
 pub fn check_native<const COUNT: usize>(
     inputs: [Tensor<3>; COUNT],

@@ -1,8 +1,8 @@
-//! Peak resident memory of the process, on Linux.
-
-use crate::system::machine::proc_field;
+//! Peak and free memory, on Linux.
 
 use clift_model::DeviceName;
+
+use crate::system::machine::proc_field;
 
 /// Resets the peak to the current resident memory. Returns `None` where the system has no resettable peak.
 pub fn start_peak() -> Option<()> {
@@ -27,7 +27,7 @@ fn release_free_memory() {
 
 /// Returns the peak of the resident memory since [`start_peak`], in bytes.
 pub fn peak_bytes() -> Option<u64> {
-    field_bytes(Path::new("/proc/self/status"), "VmHWM:")
+    field_bytes("/proc/self/status", "VmHWM")
 }
 
 /// Returns the free memory of a CPU device: that of the system or of the process's control group, whichever is less.
@@ -36,7 +36,7 @@ pub fn available_bytes(device: DeviceName) -> Option<u64> {
     if !matches!(device, DeviceName::Flex | DeviceName::Ndarray) {
         return None;
     }
-    let system = field_bytes(Path::new("/proc/meminfo"), "MemAvailable:")?;
+    let system = field_bytes("/proc/meminfo", "MemAvailable")?;
     let number = |path: &str| std::fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
     let group = number("/sys/fs/cgroup/memory.max").map(|most| {
         let statistics = std::fs::read_to_string("/sys/fs/cgroup/memory.stat").unwrap_or_default();
@@ -52,10 +52,9 @@ fn reclaimable_bytes(statistics: &str) -> u64 {
     value.and_then(|bytes| bytes.trim().parse().ok()).unwrap_or(0)
 }
 
-fn field_bytes(path: &Path, name: &str) -> Option<u64> {
+fn field_bytes(path: &str, name: &str) -> Option<u64> {
     let text = std::fs::read_to_string(path).ok()?;
-    let value = text.lines().find_map(|line| line.strip_prefix(name))?;
-    Some(value.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024)
+    Some(proc_field(&text, name)?.strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024)
 }
 
 #[cfg(test)]
@@ -82,14 +81,5 @@ mod tests {
         assert!(available_bytes(DeviceName::Flex).is_none_or(|bytes| bytes > 1 << 20));
         assert_eq!(reclaimable_bytes("anon 7\ninactive_anon 3\ninactive_file 4096\nactive_file 5\n"), 4096);
         assert_eq!(reclaimable_bytes(""), 0);
-    }
-
-    #[test]
-    fn a_file_without_the_field_gives_none() {
-        let file = tempfile::NamedTempFile::new().expect("a temporary file");
-        std::fs::write(file.path(), "VmRSS:\t  7 kB\nVmHWM:\t  12 kB\n").expect("writable");
-        assert_eq!(field_bytes(file.path(), "VmHWM:"), Some(12 * 1024));
-        assert_eq!(field_bytes(file.path(), "VmSwap:"), None);
-        assert_eq!(field_bytes(Path::new("no/such/file"), "VmHWM:"), None);
     }
 }

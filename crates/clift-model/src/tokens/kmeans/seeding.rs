@@ -56,8 +56,8 @@ impl Pool {
         let mut owner = vec![0; num_tokens];
         for round in 1..=NUM_ROUNDS {
             let weighted = WeightedIndices::new(nearest.iter().map(|&distance| f64::from(distance)));
-            let wanted = pool_len * round / NUM_ROUNDS;
-            let mut sampled: Vec<usize> = (tokens.len()..wanted).filter_map(|_| weighted.sample(rng)).collect();
+            let target_len = pool_len * round / NUM_ROUNDS;
+            let mut sampled: Vec<usize> = (tokens.len()..target_len).filter_map(|_| weighted.sample(rng)).collect();
             sampled.sort_unstable();
             sampled.dedup();
             let rows = samples.distances(&sampled);
@@ -95,9 +95,9 @@ impl Pool {
                 WeightedIndices::new(self.tokens.iter().zip(&self.weights).map(|(&t, w)| w * f64::from(nearest[t])));
             let indices: Vec<usize> = (0..num_samples).filter_map(|_| weighted.sample(rng)).collect();
             // Threads do not pay off for few tokens.
-            let at_once = PARALLEL_LEN.div_ceil(self.num_tokens);
+            let min_len = PARALLEL_LEN.div_ceil(self.num_tokens);
             let sum = |&index: &usize| (sum_of_smaller(self.row(index), &nearest), index);
-            let sums: Vec<(f32, usize)> = indices.par_iter().with_min_len(at_once).map(sum).collect();
+            let sums: Vec<(f32, usize)> = indices.par_iter().with_min_len(min_len).map(sum).collect();
             let Some(&(_, index)) = sums.iter().reduce(|best, next| if next.0 < best.0 { next } else { best }) else {
                 break;
             };
@@ -158,8 +158,8 @@ mod tests {
 
     /// Returns tokens around 40 points, `[400, 5]`.
     fn clustered(device: &Device) -> Tensor<2> {
-        let indices = random([40, 5], 21, device).cast(DType::F32) * 4.0;
-        indices.repeat_dim(0, 10) + random([400, 5], 22, device).cast(DType::F32) * 0.3
+        let points = random([40, 5], 21, device).cast(DType::F32) * 4.0;
+        points.repeat_dim(0, 10) + random([400, 5], 22, device).cast(DType::F32) * 0.3
     }
 
     /// Returns the sum of squared distances to the nearest center.

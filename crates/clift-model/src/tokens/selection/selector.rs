@@ -35,7 +35,7 @@ pub struct Selector {
 
 /// Unit directions, one array per coordinate for vectorization.
 #[derive(Clone, Debug)]
-pub(crate) struct Directions {
+struct Directions {
     x: Vec<f32>,
     y: Vec<f32>,
     z: Vec<f32>,
