@@ -23,7 +23,8 @@ pub struct Condenser {
     released: Option<ReleasedCondenser>,
 }
 
-/// One round of equations 1 to 4.
+/// One round of equations 1 to 4 on the centroids `c` and the members `m` of each cluster: `eq1 = self_attention(c)`,
+/// `eq2 = cluster_attention(eq1, m)`, `eq3 = feed_forward(eq2)`; the result is `c + W_z eq3`.
 #[derive(Module, Debug)]
 struct CondenserBlock {
     norm_self: LayerNorm,
