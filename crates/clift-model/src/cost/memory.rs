@@ -1,4 +1,4 @@
-//! Peak bytes of tensors, from the inputs that the hand-written operations save for the backward (docs/plan.md).
+//! Peak bytes of tensors, from the inputs that the hand-written operations save for the backward (docs/guide/training.md).
 // x = N D: f32 values of the rows of a block
 
 use crate::cost::largest_tensor::kmeans_values;
@@ -11,7 +11,7 @@ use crate::network::layers::{Layer, LayerKind, Part, Rows};
 const F32: f64 = 4.0;
 
 /// Bytes of the C library's heap per byte that a backward pass keeps: the heap holds on to freed pieces below 32 MiB.
-/// Measured: 1.05 to 1.22 (docs/plan.md).
+/// Measured: 1.05 to 1.22 (docs/guide/training.md).
 const HEAP: f64 = 1.2;
 
 /// Numbers of f32 values in a segment of a forward and backward pass of one scene.
@@ -270,7 +270,7 @@ mod tests {
 
     #[test]
     fn update_bytes_are_within_15_percent_of_measured_peaks() {
-        // docs/performance.md, full size, batch 1; the process holds 26 MB besides its tensors.
+        // docs/results/performance.md, full size, batch 1; the process holds 26 MB besides its tensors.
         let config = ModelConfig::default();
         for (trained, checkpointing, measured) in
             [(STAGE1, false, 2.26e9), (STAGE1, true, 1.72e9), (STAGE2, false, 1.43e9)]
