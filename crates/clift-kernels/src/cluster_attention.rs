@@ -1,4 +1,4 @@
-//! Attention of every segment's query to the members of that segment: one score per member and head.
+//! Attention of the query of every segment to the members of that segment: one score per member and head.
 // S segments, M members, H heads, E width of a head, D = HE
 
 use rayon::prelude::*;
@@ -7,9 +7,9 @@ use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
-/// Sizes, and which member belongs where.
+/// Sizes of a cluster attention, and the members of every segment.
 #[derive(Clone, Debug)]
-pub struct Segments {
+pub struct ClusterSegments {
     num_heads: usize,
     head_width: usize,
     /// Members of segment `s` are `order[bounds[s]..bounds[s + 1]]`.
@@ -17,11 +17,11 @@ pub struct Segments {
     order: Vec<usize>,
 }
 
-impl Segments {
-    /// Sorts members into `num_segments` segments; `segment` has one number per member.
+impl ClusterSegments {
+    /// Groups members by segment; `segment` yields the segment of every member, in `0..num_segments`.
     ///
     /// # Panics
-    /// When a number is not that of a segment.
+    /// If a segment is out of range.
     pub fn new(
         [num_segments, num_heads, head_width]: [usize; 3],
         segment: impl Iterator<Item = usize> + Clone,
@@ -61,32 +61,36 @@ impl Segments {
     }
 }
 
-/// Segments a task works on.
-const SEGMENTS_OF_A_TASK: usize = 16;
+/// Segments per task.
+const SEGMENTS_PER_TASK: usize = 16;
 
-/// Computes `sum_i softmax_i(q_s k_i / sqrt(head width)) v_i` per head over the members of a segment,
-/// zeros for a segment without any.
+/// Computes `sum_i softmax_i(q_s k_i / sqrt(head width)) v_i` per head over the members of every segment; zeros for a
+/// segment without members.
 ///
-/// `query` and `output` are `[segments, dim]`, `key_value` is `[members, 2 dim]`, and `weights`,
-/// `[members, num_heads]`, receives the softmax, which [`backward`] needs.
-pub fn forward(
+/// # Shapes
+/// - `query` and `output`: `[segments, dim]`, `key_value`: `[members, 2 dim]`
+/// - `weights`: `[members, num_heads]`, receives the softmax, an input of [`cluster_attention_backward`]
+pub fn cluster_attention_forward(
     set: InstructionSet,
-    segments: &Segments,
+    segments: &ClusterSegments,
     [query, key_value]: [&[f32]; 2],
     output: &mut [f32],
     weights: &mut [f32],
 ) {
     let (dim, members) = (segments.dim(), segments.order.len());
-    assert!(query.len() == segments.len() * dim && output.len() == query.len(), "rows of all segments");
-    assert!(key_value.len() == members * 2 * dim && weights.len() == members * segments.num_heads, "rows of members");
+    assert!(query.len() == segments.len() * dim && output.len() == query.len(), "query and output are [segments, dim]");
+    assert!(
+        key_value.len() == members * 2 * dim && weights.len() == members * segments.num_heads,
+        "rows of all members"
+    );
     let weights = SharedSlice::new(weights);
-    output.par_chunks_mut(SEGMENTS_OF_A_TASK * dim).enumerate().for_each(|(task, output)| {
-        set.run(Forward { segments, query, key_value, first: task * SEGMENTS_OF_A_TASK, output, weights: &weights });
+    output.par_chunks_mut(SEGMENTS_PER_TASK * dim).enumerate().for_each(|(task, output)| {
+        set.run(Forward { segments, query, key_value, first: task * SEGMENTS_PER_TASK, output, weights: &weights });
     });
 }
 
 struct Forward<'a> {
-    segments: &'a Segments,
+    segments: &'a ClusterSegments,
     query: &'a [f32],
     key_value: &'a [f32],
     first: usize,
@@ -130,7 +134,7 @@ impl Kernel for Forward<'_> {
     }
 }
 
-/// Softmax over every `step`th value from `start` on.
+/// Applies softmax to every `step`th value, starting with `start`.
 fn softmax(values: &mut [f32], start: usize, step: usize) {
     let values = values.get_mut(start..).unwrap_or_default();
     let highest = values.iter().step_by(step).fold(f32::NEG_INFINITY, |a, &b| if a > b { a } else { b });
@@ -142,29 +146,29 @@ fn softmax(values: &mut [f32], start: usize, step: usize) {
     values.iter_mut().step_by(step).for_each(|value| *value /= total);
 }
 
-/// Computes the gradients of queries and of keys and values from that of the output.
+/// Computes the gradients of `query` and `key_value` from the gradient of the output.
 ///
-/// With `g` the output's gradient of the member's segment: `dV_i = p_i g`,
+/// With `g` the output gradient of the member's segment: `dV_i = p_i g`,
 /// `dS_i = p_i (g v_i - sum_j p_j g v_j)`, `dK_i = s dS_i q`, `dQ = s sum_i dS_i k_i`.
-pub fn backward(
+pub fn cluster_attention_backward(
     set: InstructionSet,
-    segments: &Segments,
+    segments: &ClusterSegments,
     [query, key_value, weights, grad]: [&[f32]; 4],
     [grad_query, grad_key_value]: [&mut [f32]; 2],
 ) {
     let (dim, members) = (segments.dim(), segments.order.len());
     assert!(query.len() == segments.len() * dim && grad.len() == query.len() && grad_query.len() == query.len());
     assert!(key_value.len() == members * 2 * dim && weights.len() == members * segments.num_heads);
-    assert_eq!(grad_key_value.len(), key_value.len(), "rows of members");
+    assert_eq!(grad_key_value.len(), key_value.len(), "rows of all members");
     let grad_key_value = SharedSlice::new(grad_key_value);
-    grad_query.par_chunks_mut(SEGMENTS_OF_A_TASK * dim).enumerate().for_each(|(task, grad_query)| {
+    grad_query.par_chunks_mut(SEGMENTS_PER_TASK * dim).enumerate().for_each(|(task, grad_query)| {
         set.run(Backward {
             segments,
             query,
             key_value,
             weights,
             grad,
-            first: task * SEGMENTS_OF_A_TASK,
+            first: task * SEGMENTS_PER_TASK,
             grad_query,
             grad_key_value: &grad_key_value,
         });
@@ -172,7 +176,7 @@ pub fn backward(
 }
 
 struct Backward<'a> {
-    segments: &'a Segments,
+    segments: &'a ClusterSegments,
     query: &'a [f32],
     key_value: &'a [f32],
     weights: &'a [f32],
@@ -237,7 +241,7 @@ fn dot<S: Simd>(simd: S, a: &[f32], b: &[f32]) -> f32 {
     simd.sum(total)
 }
 
-/// `to += factor * from`
+/// Computes `to += factor * from`.
 #[inline(always)]
 fn add_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
     let factor = simd.splat(factor);
@@ -246,7 +250,7 @@ fn add_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
     }
 }
 
-/// `to = factor * from`
+/// Computes `to = factor * from`.
 #[inline(always)]
 fn set_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
     let factor = simd.splat(factor);
@@ -260,7 +264,7 @@ mod tests {
     use super::*;
     use crate::testing::{assert_close, random};
 
-    /// Output and gradients of queries and of keys and values in f64.
+    /// Computes output and gradients of `query` and `key_value` in f64.
     fn reference(sizes: [usize; 3], segment: &[usize], [q, kv, grad]: [&[f32]; 3]) -> [Vec<f64>; 3] {
         let [num_segments, heads, width] = sizes;
         let dim = heads * width;
@@ -297,19 +301,19 @@ mod tests {
     fn check(sizes: [usize; 3], num_members: usize) {
         let [num_segments, heads, width] = sizes;
         let dim = heads * width;
-        // Uneven, some empty, in no order.
+        // Segments of unequal size, some empty, members in mixed order.
         let segment: Vec<usize> = (0..num_members).map(|i| i * i * 7 % (num_segments + 2) % num_segments).collect();
         let (q, kv, grad) =
             (random(num_segments * dim, 1), random(num_members * 2 * dim, 2), random(num_segments * dim, 3));
         let expected = reference(sizes, &segment, [&q, &kv, &grad]);
-        let segments = Segments::new(sizes, segment.iter().copied());
+        let segments = ClusterSegments::new(sizes, segment.iter().copied());
         for set in InstructionSet::available() {
             let mut output = vec![f32::NAN; q.len()];
             let mut weights = vec![f32::NAN; num_members * heads];
-            forward(set, &segments, [&q, &kv], &mut output, &mut weights);
+            cluster_attention_forward(set, &segments, [&q, &kv], &mut output, &mut weights);
             assert_close(&output, &expected[0], 1e-5);
             let (mut grad_q, mut grad_kv) = (vec![f32::NAN; q.len()], vec![f32::NAN; kv.len()]);
-            backward(set, &segments, [&q, &kv, &weights, &grad], [&mut grad_q, &mut grad_kv]);
+            cluster_attention_backward(set, &segments, [&q, &kv, &weights, &grad], [&mut grad_q, &mut grad_kv]);
             assert_close(&grad_q, &expected[1], 1e-5);
             assert_close(&grad_kv, &expected[2], 1e-5);
         }

@@ -1,15 +1,16 @@
-//! Layer normalisation of rows and its gradient.
+//! Layer normalization of rows and its gradient; sums over rows.
 // N rows, D columns
 
 use rayon::prelude::*;
 
+use crate::primitives::elementwise::PIECE;
 use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
-/// `output = (x - mean) / sqrt(variance + epsilon) * gamma + beta`, row by row; `statistics`, if
-/// wanted, receives every row's mean and the inverse of its root, which [`backward`] needs.
-pub fn forward(
+/// Computes `output = (x - mean) / sqrt(variance + epsilon) * gamma + beta` per row. `statistics` receives the mean and
+/// `1 / sqrt(variance + epsilon)` of every row, an input of [`layer_norm_backward`].
+pub fn layer_norm_forward(
     set: InstructionSet,
     epsilon: f32,
     [x, gamma, beta]: [&[f32]; 3],
@@ -18,18 +19,18 @@ pub fn forward(
 ) {
     let dim = gamma.len();
     assert!(dim > 0 && beta.len() == dim && x.len() == statistics.len() * dim && output.len() == x.len());
-    let rows = rows_of_a_piece(dim);
+    let rows = rows_per_piece(dim);
     let pieces = x.par_chunks(rows * dim).zip(output.par_chunks_mut(rows * dim)).zip(statistics.par_chunks_mut(rows));
     pieces.for_each(|((x, output), statistics)| {
         set.run(Forward { epsilon, x, gamma, beta, output, statistics });
     });
 }
 
-/// The gradients of `x`, `gamma` and `beta` from that of the output.
+/// Computes the gradients of `x`, `gamma` and `beta` from the gradient of the output.
 ///
 /// With `y = (x - mean) r` and `g = grad * gamma`: `dx = r (g - mean(g) - y mean(g y))`,
 /// `dgamma = sum(grad * y)` and `dbeta = sum(grad)` over rows.
-pub fn backward(
+pub fn layer_norm_backward(
     set: InstructionSet,
     [x, gamma, grad]: [&[f32]; 3],
     statistics: &[[f32; 2]],
@@ -38,8 +39,8 @@ pub fn backward(
     let dim = gamma.len();
     assert!(dim > 0 && grad_gamma.len() == dim && grad_beta.len() == dim && x.len() == statistics.len() * dim);
     assert!(grad.len() == x.len() && grad_x.len() == x.len());
-    // By shape, so that sums do not depend on the number of threads.
-    let rows = statistics.len().div_ceil(MAX_PARTS).max(rows_of_a_piece(dim));
+    // Divided by shape, so that sums do not depend on the number of threads.
+    let rows = statistics.len().div_ceil(MAX_PARTS).max(rows_per_piece(dim));
     let parts = statistics.len().div_ceil(rows);
     let mut sums = vec![0.0; 2 * parts * dim];
     let pieces = x
@@ -61,11 +62,11 @@ pub fn backward(
     }
 }
 
-/// Parts of the rows that are summed on their own.
+/// Most parts of the rows that are summed separately.
 const MAX_PARTS: usize = 64;
 
-fn rows_of_a_piece(dim: usize) -> usize {
-    crate::primitives::elementwise::PIECE.div_ceil(dim)
+fn rows_per_piece(dim: usize) -> usize {
+    PIECE.div_ceil(dim)
 }
 
 struct Forward<'a> {
@@ -87,8 +88,8 @@ impl Kernel for Forward<'_> {
         let rows = x.chunks_exact(dim).zip(output.chunks_exact_mut(dim)).zip(statistics);
         for ((x, output), statistics) in rows {
             let mean = sum(simd, x) / dim as f32;
-            let spread = sum_of_squares(simd, x, mean) / dim as f32;
-            let inverse = 1.0 / (spread + epsilon).sqrt();
+            let variance = sum_of_squares(simd, x, mean) / dim as f32;
+            let inverse = 1.0 / (variance + epsilon).sqrt();
             *statistics = [mean, inverse];
             let (mean, inverse) = (simd.splat(mean), simd.splat(inverse));
             for start in (0..dim).step_by(S::LANES) {
@@ -106,7 +107,7 @@ struct Backward<'a> {
     grad: &'a [f32],
     grad_x: &'a mut [f32],
     statistics: &'a [[f32; 2]],
-    /// Of gamma's gradient and of beta's.
+    /// Sums of the gradients of gamma, then of beta.
     sums: &'a mut [f32],
 }
 
@@ -125,7 +126,7 @@ impl Kernel for Backward<'_> {
             let mut total_normal = simd.splat(0.0);
             for start in (0..dim).step_by(S::LANES) {
                 let grad = simd.read(&grad[start..]);
-                // Past the end gamma and grad read as zero.
+                // Beyond the last column gamma and grad are read as zeros.
                 let normal = simd.mul(simd.sub(simd.read(&x[start..]), mean), inverse);
                 let product = simd.mul(grad, normal);
                 let gamma = simd.read(&gamma[start..]);
@@ -158,7 +159,7 @@ fn sum<S: Simd>(simd: S, values: &[f32]) -> f32 {
     simd.sum(total)
 }
 
-/// Sum of `(value - mean)^2`.
+/// Returns the sum of `(value - mean)^2`.
 #[inline(always)]
 fn sum_of_squares<S: Simd>(simd: S, values: &[f32], mean: f32) -> f32 {
     let full = values.len() / S::LANES * S::LANES;
@@ -171,16 +172,16 @@ fn sum_of_squares<S: Simd>(simd: S, values: &[f32], mean: f32) -> f32 {
     values[full..].iter().fold(simd.sum(total), |total, value| total + (value - mean).powi(2))
 }
 
-/// `to[c] = sum over rows of x[.., c]`: the gradient of a bias.
+/// Sums the columns of `x`, `to[c] = sum over rows of x[.., c]`: the gradient of a bias.
 pub fn sum_rows(set: InstructionSet, x: &[f32], to: &mut [f32]) {
     let dim = to.len();
     let count = x.len() / dim;
-    assert!(dim > 0 && x.len() == count * dim, "whole rows");
-    let rows = count.div_ceil(MAX_PARTS).max(rows_of_a_piece(dim));
+    assert!(dim > 0 && x.len() == count * dim, "x has whole rows");
+    let rows = count.div_ceil(MAX_PARTS).max(rows_per_piece(dim));
     let mut sums = vec![0.0; count.div_ceil(rows) * dim];
     let parts = SharedSlice::new(&mut sums);
     x.par_chunks(rows * dim).enumerate().for_each(|(part, x)| {
-        // SAFETY: every part has its own.
+        // SAFETY: every task has its own part.
         let to = unsafe { parts.part(part * dim, dim) };
         set.run(SumRows { x, to });
     });
@@ -224,8 +225,8 @@ mod tests {
             let wide = |values: &[f32]| values[row * dim..][..dim].iter().map(|&v| f64::from(v)).collect::<Vec<_>>();
             let (x, grad) = (wide(&x), wide(&grad));
             let mean = mean_of(&x);
-            let spread = mean_of(&x.iter().map(|value| (value - mean).powi(2)).collect::<Vec<_>>());
-            let inverse = 1.0 / (spread + epsilon).sqrt();
+            let variance = mean_of(&x.iter().map(|value| (value - mean).powi(2)).collect::<Vec<_>>());
+            let inverse = 1.0 / (variance + epsilon).sqrt();
             let normal: Vec<f64> = x.iter().map(|value| (value - mean) * inverse).collect();
             let slope: Vec<f64> = grad.iter().zip(&gamma).map(|(grad, &gamma)| grad * f64::from(gamma)).collect();
             let along = mean_of(&slope.iter().zip(&normal).map(|(slope, normal)| slope * normal).collect::<Vec<_>>());
@@ -239,11 +240,11 @@ mod tests {
         for set in InstructionSet::available() {
             let mut output = vec![f32::NAN; rows * dim];
             let mut statistics = vec![[f32::NAN; 2]; rows];
-            forward(set, epsilon as f32, [&x, &gamma, &beta], &mut output, &mut statistics);
+            layer_norm_forward(set, epsilon as f32, [&x, &gamma, &beta], &mut output, &mut statistics);
             assert_close(&output, &expected[0], 1e-5);
             let mut grads = [rows * dim, dim, dim].map(|len| vec![f32::NAN; len]);
             let [grad_x, grad_gamma, grad_beta] = &mut grads;
-            backward(set, [&x, &gamma, &grad], &statistics, [grad_x, grad_gamma, grad_beta]);
+            layer_norm_backward(set, [&x, &gamma, &grad], &statistics, [grad_x, grad_gamma, grad_beta]);
             for (got, expected) in grads.iter().zip(&expected[1..]) {
                 assert_close(got, expected, 1e-5);
             }

@@ -1,12 +1,25 @@
-//! CPU kernels of clift: slices in, slices out, without Burn.
+//! CPU kernels of clift on f32 slices, forward and backward, without Burn.
 //!
-//! Each kernel is written once over `simd::Simd` and compiled for every [`InstructionSet`]; the one
-//! to use is chosen at run time. Work is split by shape and never by the number of threads, so a
-//! result does not depend on how many there are.
+//! Every kernel is written once and compiled for every [`InstructionSet`]; the set is chosen at run time. Tasks are
+//! divided by shape alone, so that results do not depend on the number of threads. Tensors of other types than f32 take
+//! the composed operations of `clift-model`.
 //!
-//! All values are f32: other types take the composed operations of `clift-model`.
+//! ```
+//! use clift_kernels::{InstructionSet, linear_forward, sum_rows};
+//!
+//! let [rows, inputs, outputs] = [2, 3, 1];
+//! let (x, weight, bias) = ([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 0.0, -1.0], [0.5]);
+//! let mut output = [0.0; 2];
+//! linear_forward([rows, inputs, outputs], [&x, &weight, &bias], &mut output);
+//! assert_eq!(output, [-1.5, -1.5]);
+//!
+//! // The gradient of the bias under an output gradient of ones.
+//! let mut grad_bias = [0.0];
+//! sum_rows(InstructionSet::detected(), &[1.0, 1.0], &mut grad_bias);
+//! assert_eq!(grad_bias, [2.0]);
+//! ```
 
-#![expect(clippy::inline_always, reason = "only what is inlined into a kernel is compiled with its instructions")]
+#![expect(clippy::inline_always, reason = "only code inlined into a kernel is compiled with the kernel's instructions")]
 
 mod attention;
 mod cluster_attention;
@@ -18,11 +31,15 @@ mod simd;
 #[cfg(test)]
 mod testing;
 
-pub use attention::backward::{BackwardInputs, backward as attention_backward};
-pub use attention::forward::forward as attention_forward;
-pub use attention::shapes::{Gradients, Sizes, StridedRows};
-pub use cluster_attention::{Segments, backward as cluster_attention_backward, forward as cluster_attention_forward};
-pub use gelu::{backward as gelu_backward, forward as gelu_forward};
-pub use layer_norm::{backward as layer_norm_backward, forward as layer_norm_forward, sum_rows};
-pub use linear::forward as linear_forward;
+// Choice of the instruction set
 pub use simd::dispatch::{InstructionSet, InstructionSetError};
+// Softmax attention
+pub use attention::backward::{BackwardInputs, attention_backward};
+pub use attention::forward::attention_forward;
+pub use attention::shapes::{AttentionGradients, AttentionSizes, StridedRows};
+// Attention inside clusters
+pub use cluster_attention::{ClusterSegments, cluster_attention_backward, cluster_attention_forward};
+// Layers
+pub use gelu::{gelu_backward, gelu_forward};
+pub use layer_norm::{layer_norm_backward, layer_norm_forward, sum_rows};
+pub use linear::linear_forward;

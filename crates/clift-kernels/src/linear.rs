@@ -6,15 +6,15 @@ use rayon::prelude::*;
 
 use crate::primitives::elementwise::PIECE;
 
-/// Below so many products threads cost more than they bring.
+/// Fewest multiply-accumulates that are divided among threads.
 const PARALLEL: usize = 1 << 20;
 
-/// `output[N, O] = x[N, I] weight[I, O] + bias[O]`, all contiguous.
-pub fn forward([rows, inputs, outputs]: [usize; 3], [x, weight, bias]: [&[f32]; 3], output: &mut [f32]) {
-    assert_eq!(x.len(), rows * inputs, "x has its values");
-    assert_eq!(weight.len(), inputs * outputs, "the weight has its values");
-    assert_eq!(bias.len(), outputs, "a value of bias for every output");
-    assert_eq!(output.len(), rows * outputs, "the result has its place");
+/// Computes `output[N, O] = x[N, I] weight[I, O] + bias[O]`, all contiguous.
+pub fn linear_forward([rows, inputs, outputs]: [usize; 3], [x, weight, bias]: [&[f32]; 3], output: &mut [f32]) {
+    assert_eq!(x.len(), rows * inputs, "x is [rows, inputs]");
+    assert_eq!(weight.len(), inputs * outputs, "weight is [inputs, outputs]");
+    assert_eq!(bias.len(), outputs, "bias is [outputs]");
+    assert_eq!(output.len(), rows * outputs, "output is [rows, outputs]");
     if output.is_empty() {
         return;
     }
@@ -31,7 +31,7 @@ pub fn forward([rows, inputs, outputs]: [usize; 3], [x, weight, bias]: [&[f32]; 
             output.as_mut_ptr(),
             1,
             outputs as isize,
-            true, // the bias is there already
+            true, // adds to the bias
             x.as_ptr(),
             1,
             inputs as isize,
@@ -65,7 +65,7 @@ mod tests {
                 })
                 .collect();
             let mut output = vec![f32::NAN; rows * outputs];
-            forward([rows, inputs, outputs], [&x, &weight, &bias], &mut output);
+            linear_forward([rows, inputs, outputs], [&x, &weight, &bias], &mut output);
             assert_close(&output, &expected, 1e-5);
         }
     }

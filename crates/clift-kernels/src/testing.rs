@@ -1,6 +1,6 @@
-//! What the tests share: random values and comparison.
+//! Random values and comparisons for the unit tests.
 
-/// Uniform values in `[-1, 1)` from a seed.
+/// Samples uniform values in `[-1, 1)` from a seed.
 pub fn random(count: usize, seed: u64) -> Vec<f32> {
     let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
     let mut next = move || {
@@ -15,7 +15,7 @@ pub fn random(count: usize, seed: u64) -> Vec<f32> {
     (0..count).map(|_| next()).collect()
 }
 
-/// Asserts that values equal the expected ones to `tolerance` of the largest of those.
+/// Asserts that values equal the expected values to `tolerance` of the largest expected magnitude.
 #[track_caller]
 pub fn assert_close(got: &[f32], expected: &[f64], tolerance: f64) {
     assert_eq!(got.len(), expected.len());

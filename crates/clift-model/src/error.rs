@@ -1,140 +1,140 @@
-//! What can go wrong with a model, its input or its weights, one documented variant per failure.
+//! Errors of models, their inputs and their files.
 
 use std::path::PathBuf;
 
-/// A failure of this crate. A message says what, where, expected and got, with the path last.
+/// Errors of this crate: one variant per cause, the path last in the message.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ModelError {
-    /// A configuration value is out of its range.
+    /// Configuration value out of range.
     #[error("`{key}` = {value}: {fix}")]
     BadConfig {
         /// Dotted key, as in the TOML file.
         key: &'static str,
         /// The value found.
         value: String,
-        /// What to write instead.
+        /// The remedy.
         fix: String,
     },
-    /// A host array does not have the length its shape asks for.
-    #[error("{what}: expected {expected} values for the shape, got {got}")]
+    /// Host array whose length differs from the product of its shape.
+    #[error("{name}: expected {expected} values for the shape, got {got}")]
     WrongLength {
-        /// Which array.
-        what: &'static str,
+        /// Name of the array.
+        name: &'static str,
         /// Product of the shape.
         expected: usize,
         /// Length of the array.
         got: usize,
     },
-    /// A host array holds a NaN or an infinity.
-    #[error("{what} holds {value} at position {position}")]
+    /// Host array that holds a NaN or an infinity.
+    #[error("{name} holds {value} at position {position}")]
     NotFinite {
-        /// Which array.
-        what: &'static str,
+        /// Name of the array.
+        name: &'static str,
         /// The value found.
         value: f32,
         /// Its index in the array.
         position: usize,
     },
-    /// An image does not divide into patches.
+    /// Image whose sides are no multiples of the patch size.
     #[error("an image of {width} x {height} does not divide into patches of {patch_size} x {patch_size}")]
     NotDivisible {
-        /// Columns.
+        /// Width in pixels.
         width: usize,
-        /// Rows.
+        /// Height in pixels.
         height: usize,
-        /// Side of a patch.
+        /// Side of a patch in pixels.
         patch_size: usize,
     },
-    /// Cluster indices contradict each other.
-    #[error("bad clusters: {what}")]
+    /// Invalid cluster indices.
+    #[error("bad clusters: {reason}")]
     BadClusters {
-        /// The contradiction, with the indices that show it.
-        what: String,
+        /// The contradiction and its indices.
+        reason: String,
     },
-    /// A token's ray is not finite, or its direction has no length.
-    #[error("the ray of token {token} cannot be used: from {origin:?} along {direction:?}")]
+    /// Ray of a token that is not finite, or whose direction has length zero.
+    #[error("invalid ray of token {token}: origin {origin:?}, direction {direction:?}")]
     BadRay {
-        /// Position of the token.
+        /// Index of the token.
         token: usize,
-        /// Where the ray starts.
+        /// Origin of the ray.
         origin: [f64; 3],
-        /// Where it goes.
+        /// Direction of the ray.
         direction: [f64; 3],
     },
-    /// A device name is unknown, or this build does not have it.
+    /// Unknown device name, or a device that cannot be opened.
     #[error("device `{name}`: {reason}")]
     NoDevice {
-        /// The name asked for.
+        /// The device name.
         name: String,
-        /// Why it cannot be had, and what would help.
+        /// The cause and the remedy.
         reason: String,
     },
-    /// A picture could not be read back from its device.
-    #[error("reading a picture from its device failed: {reason}")]
+    /// Failure to read values back from a device.
+    #[error("reading values from the device failed: {reason}")]
     Device {
-        /// The device's reason.
+        /// The error of the device.
         reason: String,
     },
-    /// A scene file could not be written, or is not one to draw from.
+    /// Scene file that cannot be written, or that is damaged or of another format.
     #[error("cannot {action} the scene: {reason}; {fix}: {path}", path = path.display())]
     SceneFile {
-        /// What was being done ("use", "write").
+        /// The operation: `use` or `write`.
         action: &'static str,
-        /// Why it cannot.
+        /// The cause.
         reason: String,
-        /// What to do about it.
+        /// The remedy.
         fix: &'static str,
-        /// The file.
+        /// The scene file.
         path: PathBuf,
     },
-    /// A scene is to be drawn with weights it was not made for.
+    /// Weights of another renderer than the one the scene was encoded for.
     #[error("the scene was made for the renderer {expected:.12}, this one is {got:.12}; give the run it was encoded with (--model RUN): {path}", path = path.display())]
     OtherRenderer {
         /// Hash in the scene.
         expected: String,
         /// Hash of the weights.
         got: String,
-        /// The weights.
+        /// The weight file.
         path: PathBuf,
     },
-    /// A weight file could not be read or written.
+    /// Failure to read or write a weight file.
     #[error("{action} the weights failed: {reason}: {path}", path = path.display())]
     Weights {
-        /// What was being done ("reading", "writing").
+        /// The operation: `reading` or `writing`.
         action: &'static str,
-        /// The reason.
+        /// The cause.
         reason: String,
-        /// The file.
+        /// The weight file.
         path: PathBuf,
     },
-    /// No weights are found where a trained model is expected.
+    /// Path without the weights of a trained model.
     #[error("no trained model at {path}; run `clift train` first", path = path.display())]
     NoModel {
-        /// The weight file that was looked for.
+        /// The expected weight file.
         path: PathBuf,
     },
-    /// A weight file lies away from the run that made it.
+    /// Weight file without the config of its run.
     #[error(
-        "there is no config.toml beside it or above it, which says what model it holds; give the run directory, or \
-         RUN/stage2/model.safetensors: {path}",
+        "no config.toml next to {path} or in its parent directory: the network's sizes are unknown; give the run \
+         directory or RUN/stage2/model.safetensors",
         path = path.display()
     )]
     NoConfig {
         /// The weight file.
         path: PathBuf,
     },
-    /// The config beside a weight file could not be read.
+    /// Failure to read the config of a trained model.
     #[error("reading the configuration failed: {reason}: {path}", path = path.display())]
     BadConfigFile {
-        /// The reason.
+        /// The cause.
         reason: String,
-        /// The config.
+        /// The config file.
         path: PathBuf,
     },
-    /// A PyTorch checkpoint was given where a model of this program is expected.
+    /// PyTorch checkpoint in place of a trained model of clift.
     #[error(
-        "a checkpoint of PyTorch must be imported first: run `clift import {path} --variant released-re10k -o DIR` (or \
+        "a PyTorch checkpoint must be imported first; run `clift import {path} --variant released-re10k -o DIR` (or \
          another variant) and give DIR instead: {path}",
         path = path.display()
     )]
@@ -142,12 +142,12 @@ pub enum ModelError {
         /// The checkpoint.
         path: PathBuf,
     },
-    /// A scene does not have that number or share of tokens.
+    /// Token count that is malformed or that the scene does not have.
     #[error("`{text}` tokens: {reason}")]
     BadTokenCount {
         /// The value found.
         text: String,
-        /// Why the scene does not have it, and what it has.
+        /// The cause, with the tokens of the scene.
         reason: String,
     },
 }

@@ -4,15 +4,15 @@ use std::fs::File;
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 
-/// Start of every temporary name, so that the leftovers of a killed process can be recognised.
+/// Prefix of temporary file names, which identifies files left by a killed process.
 pub(crate) const TEMPORARY: &str = ".clift-";
 
-/// The folder that holds `path`.
+/// Returns the folder of a file.
 pub(crate) fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Replaces the file at `path` with `bytes`. The umask decides who may read the file.
+/// Replaces the file at `path` with `bytes`. Permissions follow the umask.
 pub(crate) fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY);
@@ -27,7 +27,7 @@ pub(crate) fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
 
 /// Renames the finished file `temporary` to `path`, with the permissions that a new file would have.
 pub(crate) fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
-    // Opened for writing, because Windows syncs no other file.
+    // Windows syncs only files that are open for writing.
     let file = File::options().write(true).open(temporary)?;
     let usual = File::create(temporary.with_extension("usual"))?.metadata()?.permissions();
     file.set_permissions(usual)?;
@@ -36,10 +36,10 @@ pub(crate) fn publish(temporary: &Path, path: &Path) -> std::io::Result<()> {
     sync_folder(path)
 }
 
-/// Makes the name of a file survive a power cut, on systems that can sync a folder.
+/// Syncs the folder of a file, so that the file's name survives a power failure, on systems that can sync folders.
 fn sync_folder(path: &Path) -> std::io::Result<()> {
     if cfg!(windows) {
-        return Ok(()); // Windows opens no folders
+        return Ok(()); // Windows does not open folders
     }
     match File::open(folder_of(path))?.sync_all() {
         Err(error) if matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported) => Ok(()),

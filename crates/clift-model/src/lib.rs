@@ -1,10 +1,31 @@
-//! Compressive light-field tokens in Burn: the paper, tensors in, tensors out.
+//! Compressive light-field tokens (CLiFT, `NeurIPS` 2025) in Burn: tensors in, tensors out.
 //!
-//! Posed context views become light-field tokens ([`Encoder`]), latent K-means ([`KMeans`]) picks
-//! `num_storage_tokens` of them, the neural [`Condenser`] writes the rest into those, and the
-//! [`Renderer`] draws a target view from the result. [`Clift`] holds the three networks.
+//! The [`Encoder`] turns posed context views into light-field tokens, latent K-means ([`KMeans`]) groups the tokens, and
+//! the [`Condenser`] writes every group into its centroid. To render, the [`Selector`] selects the tokens nearest to a
+//! target camera and the [`Renderer`] decodes an image from the selected tokens. [`Clift`] holds the three networks.
 //!
-//! Modules take a [`burn::tensor::Device`]; all devices are named in [`device`].
+//! ```
+//! use clift_model::{Cameras, Clift, DeviceName, KMeans, ModelConfig, SceneModel, Views};
+//!
+//! let device = DeviceName::Flex.open()?;
+//! let config = ModelConfig { dim: 16, num_heads: 2, feed_forward_dim: 32, ..ModelConfig::default() };
+//! let model = Clift::new(&config, 0, &device);
+//!
+//! // One scene of two gray views of 16 x 16 pixels, both at the origin.
+//! let shape = [1, 2, 16, 16];
+//! let pose = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+//! let intrinsics = [16.0, 16.0, 8.0, 8.0];
+//! let views = Views::upload(&[128; 2 * 16 * 16 * 3], &pose.repeat(2), &intrinsics.repeat(2), shape, &device)?;
+//!
+//! // All 8 tokens of the scene, condensed into 4 and rendered from the second camera's pose.
+//! let tokens = model.encode(&views);
+//! let clusters = KMeans::default().fit(tokens.clone(), 4, &[0])?.clusters.upload(&device);
+//! let tokens = model.compress(tokens, &clusters);
+//! let target = Cameras::upload(&pose, &intrinsics, [1, 1, 16, 16], &device)?;
+//! let image = model.render(tokens, &target);
+//! assert_eq!(image.dims(), [1, 1, 16, 16, 3]);
+//! # Ok::<(), clift_model::ModelError>(())
+//! ```
 
 mod cost;
 mod device;
@@ -20,41 +41,20 @@ mod tokens;
 mod views;
 mod weights;
 
-pub use clift_kernels::InstructionSet;
-pub use cost::largest_tensor::{kmeans_values, largest_tensors};
-pub use cost::macs::{FlopConvention, Macs};
-pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, render_bytes, update_bytes};
-pub use cost::parameters::Parameters;
-pub use cost::scene_sizes::SceneSizes;
-pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tensor_bytes};
-pub use device::name::DeviceName;
+// Errors, and enums by name
 pub use error::ModelError;
 pub use names::parse_value;
-pub use network::architecture::CliftVariant;
-pub use network::blocks::attention::SelfAttention;
-pub use network::blocks::block::{DecoderBlock, EncoderBlock};
-pub use network::blocks::feed_forward::{Activation, FeedForward};
-pub use network::blocks::norms::LiftNorm;
-pub use network::clift::Clift;
-pub use network::condenser::Condenser;
-pub use network::config::{CondenserConfig, ModelConfig};
-pub use network::encoder::Encoder;
-pub use network::init::Init;
-pub use network::layers::Part;
-pub use network::render_tokens::{KeyValueCache, RenderTokens};
-pub use network::renderer::Renderer;
-pub use network::scene_model::SceneModel;
-pub use ops::attention::composed::MAX_SCORES;
-pub use ops::attention::sdpa::{cross_sdpa, self_sdpa};
-pub use ops::cluster_attention::operation::cluster_attention;
-pub use ops::linear::{gelu_linear, linear, norm_linear};
+// Devices
+pub use clift_kernels::InstructionSet;
+pub use device::adapter::{ADAPTER_VARIABLE, Adapter, Limits, adapters, max_tensor_bytes};
+pub use device::name::DeviceName;
 pub use ops::precision::Precision;
-pub use scene::check::MAX_SIDE_PX;
-pub use scene::render_budget::RenderBudget;
-pub use scene::scene::{Scene, SceneNormalization, scene_file_bytes};
-pub use scene::scene_renderer::{RenderedView, SceneRenderer, frames_per_call, load_renderer};
-pub use scene::token_format::TokenFormat;
-pub use scene::write::check_output_path;
+// Images and cameras
+pub use views::camera::ViewCamera;
+pub use views::patch::{patchify, unpatchify};
+pub use views::rays::plucker;
+pub use views::upload::{Cameras, Views, upload_images};
+// Tokens: counts, clusters, selection
 pub use tokens::clusters::{ClusterIndex, Clusters, SceneClusters};
 pub use tokens::count::TokenCount;
 pub use tokens::kind::TokenKind;
@@ -63,10 +63,33 @@ pub use tokens::selection::rules::{SelectionPreset, SelectionRules};
 pub use tokens::selection::selector::Selector;
 pub use tokens::selection::token_ray::TokenRay;
 pub use tokens::tiles::{Grouping, tile_clusters};
-pub use views::camera::ViewCamera;
-pub use views::patch::{patchify, unpatchify};
-pub use views::rays::plucker;
-pub use views::upload::{Cameras, Views, upload_images};
+// Networks
+pub use network::architecture::CliftVariant;
+pub use network::clift::Clift;
+pub use network::condenser::Condenser;
+pub use network::config::{CondenserConfig, ModelConfig};
+pub use network::encoder::Encoder;
+pub use network::init::Init;
+pub use network::render_tokens::{KeyValueCache, RenderTokens};
+pub use network::renderer::Renderer;
+pub use network::scene_model::SceneModel;
+// Layers and operations of the networks
+pub use network::blocks::attention::SelfAttention;
+pub use network::blocks::block::{DecoderBlock, EncoderBlock};
+pub use network::blocks::feed_forward::{Activation, FeedForward};
+pub use network::blocks::norms::LiftNorm;
+pub use ops::attention::composed::MAX_SCORES;
+pub use ops::attention::sdpa::{cross_sdpa, self_sdpa};
+pub use ops::cluster_attention::operation::cluster_attention;
+pub use ops::linear::{gelu_linear, linear, norm_linear};
+// Parameters, multiply-accumulates and memory of a network
+pub use cost::largest_tensor::{kmeans_values, largest_tensors};
+pub use cost::macs::{FlopConvention, Macs};
+pub use cost::memory::{InferenceSizes, Segment, UpdateSizes, inference_bytes, render_bytes, update_bytes};
+pub use cost::parameters::Parameters;
+pub use cost::scene_sizes::SceneSizes;
+pub use network::layers::Part;
+// Weight files and trained models
 pub use weights::file::{first_not_f32, load_part, save_part, save_weights, sorted_header};
 pub use weights::hash::weights_hash;
 pub use weights::model_path::{ModelPath, check_heads, refuse_checkpoint};
@@ -75,3 +98,10 @@ pub use weights::published_keys::{
 };
 pub use weights::published_sizes::{InferredConfig, infer_config};
 pub use weights::trained_model::TrainedModel;
+// Scene files, and rendering from them
+pub use scene::check::MAX_SIDE_PX;
+pub use scene::render_budget::RenderBudget;
+pub use scene::scene::{Scene, SceneNormalization, scene_file_bytes};
+pub use scene::scene_renderer::{RenderedView, SceneRenderer, frames_per_call, load_renderer};
+pub use scene::token_format::TokenFormat;
+pub use scene::write::check_output_path;

@@ -1,10 +1,10 @@
-//! Enums by the names of their variants, as a config or the command line gives them.
+//! Enums by the names of their variants, for configs and the command line.
 
 use strum::VariantArray;
 
 use crate::error::ModelError;
 
-/// An enum whose variants have names: strum derives `VariantArray` and `IntoStaticStr`.
+/// An enum with named variants, by strum's derives `VariantArray` and `IntoStaticStr`.
 pub trait Named: Copy + VariantArray + Into<&'static str> {}
 
 impl<T: Copy + VariantArray + Into<&'static str>> Named for T {}
@@ -14,15 +14,15 @@ pub fn names<T: Named>() -> String {
     T::VARIANTS.iter().map(|&variant| variant.into()).collect::<Vec<&str>>().join(", ")
 }
 
-/// Finds the variant of a name.
+/// Returns the variant with a name.
 pub fn parse<T: Named>(name: &str) -> Option<T> {
     T::VARIANTS.iter().copied().find(|&variant| variant.into() == name)
 }
 
-/// Finds the variant of a name that `key` was given.
+/// Returns the variant with a name, the value of `key`.
 ///
 /// # Errors
-/// [`ModelError::BadConfig`] with all names.
+/// [`ModelError::BadConfig`] with all names, for an unknown name.
 pub fn parse_value<T: Named>(key: &'static str, name: &str) -> Result<T, ModelError> {
     parse(name).ok_or_else(|| ModelError::BadConfig {
         key,

@@ -1,4 +1,4 @@
-//! What the inline tests share: the devices to run on, the fixtures, and comparisons.
+//! Devices, fixtures, gradient checks and comparisons for the unit tests.
 
 use std::path::PathBuf;
 
@@ -9,17 +9,17 @@ use crate::device::name::DeviceName;
 use crate::network::architecture::CliftVariant;
 use crate::network::config::{CondenserConfig, ModelConfig};
 
-/// Every device of this build that opens: flex, ndarray, and wgpu where an adapter is found.
+/// Opens every device of this build: flex, ndarray, and wgpu if an adapter exists.
 pub fn devices() -> Vec<Device> {
     DeviceName::ALL.into_iter().filter(|name| name.is_built()).filter_map(|name| name.open().ok()).collect()
 }
 
-/// The CPU devices, which have f64.
+/// Opens the CPU devices, which support f64.
 pub fn cpu_devices() -> Vec<Device> {
     [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().expect("a CPU device")).into()
 }
 
-/// A small network of a variant, whose sizes differ from each other.
+/// Returns a small network of a variant; all sizes differ.
 pub fn small_config(variant: CliftVariant) -> ModelConfig {
     ModelConfig {
         variant,
@@ -33,19 +33,19 @@ pub fn small_config(variant: CliftVariant) -> ModelConfig {
     }
 }
 
-/// Those of all variants, and the paper's without residuals.
+/// Returns [`small_config`] of all variants, and of the paper without residuals.
 pub fn small_configs() -> Vec<ModelConfig> {
     let mut literal = small_config(CliftVariant::Paper);
     literal.condenser.residual = false;
     CliftVariant::ALL.map(small_config).into_iter().chain([literal]).collect()
 }
 
-/// Values in f64, row-major.
+/// Returns the values in f64, row-major.
 pub fn to_vec<const D: usize>(tensor: Tensor<D>) -> Vec<f64> {
     tensor.into_data().convert::<f64>().try_to_vec::<f64>().expect("f64 after conversion")
 }
 
-/// Largest absolute difference over the largest absolute expected value.
+/// Returns the largest absolute difference, relative to the largest absolute expected value.
 pub fn relative_error<const D: usize>(got: &Tensor<D>, expected: &Tensor<D>) -> f64 {
     assert_eq!(got.dims(), expected.dims(), "shapes differ");
     let (got, expected) = (to_vec(got.clone()), to_vec(expected.clone()));
@@ -74,58 +74,51 @@ impl Fixture {
         Self { bytes }
     }
 
-    /// Where a fixture lies.
+    /// Returns the path of a fixture.
     pub fn path(name: &str) -> PathBuf {
         PathBuf::from(env!("CARGO_MANIFEST_DIR")).join(format!("../../data-fixtures/reference/{name}.safetensors"))
     }
 
-    /// Names of all tensors that start with `prefix`, without it.
+    /// Returns the names of all tensors that start with `prefix`, without the prefix.
     pub fn names(&self, prefix: &str) -> Vec<String> {
         let file = SafeTensors::deserialize(&self.bytes).expect("a fixture is valid");
         file.names().into_iter().filter_map(|name| name.strip_prefix(prefix)).map(String::from).collect()
     }
 
-    /// A float tensor in f32.
+    /// Reads a float tensor in f32.
     pub fn tensor<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
-        Tensor::from_data(TensorData::new(self.values(name).1, self.shape(name)), (device, DType::F32))
+        Tensor::from_data(self.data(name), (device, DType::F32))
     }
 
-    /// A float tensor in f64.
+    /// Reads a float tensor in f64.
     pub fn tensor_f64<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
-        Tensor::from_data(TensorData::new(self.values(name).1, self.shape(name)), (device, DType::F64))
+        Tensor::from_data(self.data(name), (device, DType::F64))
     }
 
-    /// Integers.
+    /// Reads integers.
     pub fn integers(&self, name: &str) -> Vec<i64> {
-        self.values(name).0
+        self.data(name).try_to_vec().expect("a tensor of i64")
     }
 
-    /// Shape of a tensor.
+    /// Returns the shape of a tensor.
     pub fn shape(&self, name: &str) -> Vec<usize> {
-        let file = SafeTensors::deserialize(&self.bytes).expect("a fixture is valid");
-        file.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}")).shape().to_vec()
+        self.data(name).shape().to_vec()
     }
 
-    fn values(&self, name: &str) -> (Vec<i64>, Vec<f64>) {
+    fn data(&self, name: &str) -> TensorData {
         let file = SafeTensors::deserialize(&self.bytes).expect("a fixture is valid");
         let view = file.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}"));
-        let data = view.data();
-        let floats = |values: Vec<f64>| (Vec::new(), values);
-        match view.dtype() {
-            Dtype::F32 => {
-                floats(data.as_chunks::<4>().0.iter().map(|bytes| f64::from(f32::from_le_bytes(*bytes))).collect())
-            }
-            Dtype::F64 => floats(data.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect()),
-            Dtype::I64 => {
-                (data.as_chunks::<8>().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect(), Vec::new())
-            }
+        let dtype = match view.dtype() {
+            Dtype::F32 => DType::F32,
+            Dtype::F64 => DType::F64,
+            Dtype::I64 => DType::I64,
             other => panic!("{name} is {other:?}"),
-        }
+        };
+        TensorData::from_bytes_vec(view.data().to_vec(), view.shape(), dtype)
     }
 }
 
-/// Uniform values in `[-1, 1)` from a seed, the same on every device; f64 where the device is a CPU
-/// device, f32 otherwise.
+/// Samples uniform values in `[-1, 1)` from a seed, equal on every device; f64 on CPU devices, f32 on others.
 pub fn random<const D: usize>(shape: [usize; D], seed: u64, device: &Device) -> Tensor<D> {
     use rand::{RngExt, SeedableRng};
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
@@ -134,24 +127,57 @@ pub fn random<const D: usize>(shape: [usize; D], seed: u64, device: &Device) -> 
     Tensor::from_data(TensorData::new(values, shape), (device, dtype))
 }
 
-/// Asserts that the gradient of `f` under a random cotangent equals central differences in f64,
-/// to `tolerance` of its largest entry.
+/// Returns the output of `f` and the gradients of the inputs under a cotangent; zeros for an input without a gradient.
+pub fn output_and_gradients<const COUNT: usize>(
+    inputs: [Tensor<3>; COUNT],
+    cotangent: Tensor<3>,
+    f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
+) -> (Tensor<3>, [Tensor<3>; COUNT]) {
+    let tracked = inputs.map(|input| input.autodiff().require_grad());
+    let output = f(tracked.clone());
+    let grads = (output.clone() * cotangent.autodiff()).sum().backward();
+    let gradients = tracked.map(|input| input.grad(&grads).unwrap_or_else(|| input.inner().zeros_like()));
+    (output.inner(), gradients)
+}
+
+/// Asserts that output and gradients of `f` in f32 (native kernels on flex) equal the results in f64 (composed
+/// operations). Results that are zero in f64 are not compared.
+#[track_caller]
+pub fn check_native<const COUNT: usize>(
+    inputs: [Tensor<3>; COUNT],
+    cotangent: Tensor<3>,
+    f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
+    tolerance: f64,
+) {
+    let inputs = inputs.map(|input| input.cast(DType::F32));
+    let cotangent = cotangent.cast(DType::F32);
+    let (output, grads) = output_and_gradients(inputs.clone(), cotangent.clone(), &f);
+    let wide = inputs.map(|input| input.cast(DType::F64));
+    let (expected, expected_grads) = output_and_gradients(wide, cotangent.cast(DType::F64), &f);
+    assert_close(&output.cast(DType::F64), &expected, tolerance);
+    for (grad, expected) in grads.into_iter().zip(&expected_grads) {
+        if expected.clone().abs().max().into_scalar::<f64>() > 1e-12 {
+            assert_close(&grad.cast(DType::F64), expected, tolerance);
+        }
+    }
+}
+
+/// Asserts that the gradients of `f` under a random cotangent equal central differences in f64, to `tolerance` of the
+/// largest entry.
 ///
-/// The step 1e-5 leaves an error of about 1e-10 from the third derivative and 1e-11 from rounding.
+/// The step of 1e-5 causes an error of about 1e-10 from the third derivative and 1e-11 from rounding.
 #[track_caller]
 pub fn check_gradients<const COUNT: usize>(
     inputs: [Tensor<3>; COUNT],
     f: impl Fn([Tensor<3>; COUNT]) -> Tensor<3>,
     tolerance: f64,
 ) {
-    let tracked = inputs.clone().map(|input| input.autodiff().require_grad());
-    let output = f(tracked.clone());
-    let cotangent = random(output.dims(), 99, &inputs[0].device());
-    let grads = (output * cotangent.clone().autodiff()).sum().backward();
+    let cotangent = random(f(inputs.clone()).dims(), 99, &inputs[0].device());
+    let (_, gradients) = output_and_gradients(inputs.clone(), cotangent.clone(), &f);
     let loss = |inputs: [Tensor<3>; COUNT]| to_vec((f(inputs) * cotangent.clone()).sum())[0];
     let step = 1e-5;
-    for position in 0..COUNT {
-        let analytic = to_vec(tracked[position].grad(&grads).expect("every input is tracked"));
+    for (position, gradient) in gradients.into_iter().enumerate() {
+        let analytic = to_vec(gradient);
         let shape = inputs[position].dims();
         let values = to_vec(inputs[position].clone());
         let moved = |index: usize, by: f64| {
@@ -171,8 +197,8 @@ pub fn check_gradients<const COUNT: usize>(
     }
 }
 
-/// Loads the tensors of a fixture whose names start with `prefix` into a module, in PyTorch's
-/// layout, and demands that every one is used and none is missing.
+/// Loads the tensors of a fixture whose names start with `prefix` into a module, in PyTorch's layout; asserts that every
+/// tensor is used and none is missing.
 pub fn load_weights<M: burn::module::Module>(mut module: M, fixture: &Fixture, prefix: &str) -> M {
     use burn::store::{ModuleSnapshot, PyTorchToBurnAdapter, SafetensorsStore};
     let mut store = SafetensorsStore::from_bytes(Some(fixture.bytes.clone()))

@@ -361,6 +361,5 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     clift(["encode", &stage, mini.to_str().unwrap(), "-o", &out]).ok();
     std::fs::copy(&file, place.at("alone.safetensors")).unwrap();
     let alone = place.at("alone.safetensors").display().to_string();
-    clift(["encode", &alone, mini.to_str().unwrap(), "-o", &out])
-        .fails_with(2, &["no config.toml beside it or above it"]);
+    clift(["encode", &alone, mini.to_str().unwrap(), "-o", &out]).fails_with(2, &["no config.toml next to"]);
 }

@@ -170,10 +170,7 @@ fn an_instruction_set_that_is_none_is_refused() {
     let output = command.output().expect("the binary under test starts");
     let message = String::from_utf8(output.stderr).expect("it prints UTF-8");
     assert_eq!(output.status.code(), Some(2), "{message}");
-    assert!(
-        message.contains("`CLIFT_INSTRUCTION_SET` = avx9: it is no instruction set; it can be one of "),
-        "{message}"
-    );
+    assert!(message.contains("`CLIFT_INSTRUCTION_SET` = avx9: unknown instruction set; use one of "), "{message}");
     assert!(!place.at("run").exists());
 }
 

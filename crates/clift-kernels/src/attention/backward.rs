@@ -1,11 +1,11 @@
-//! The backward pass.
+//! Blockwise attention, backward.
 
 use std::ops::Range;
 
 use rayon::prelude::*;
 
 use crate::attention::shapes::{
-    Gradients, HeadBlocks, QUERY_BLOCK, ROW_PADDING, Sizes, StridedRows, copy_padded, copy_transposed,
+    AttentionGradients, AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows, copy_padded, copy_transposed,
 };
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
 use crate::primitives::scratch::{Scratch, cut};
@@ -13,10 +13,11 @@ use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
-/// Keys in a block: there are two blocks of scores and two of gradients.
+/// Keys per block: a task holds a block of scores and one of their gradients.
 const BACKWARD_KEYS: usize = 256;
 
-/// What [`backward`] reads: the inputs and the results of [`forward`](crate::attention::forward::forward), and the output's gradient.
+/// Inputs of [`attention_backward`]: inputs and results of [`attention_forward`](crate::attention_forward), and the
+/// gradient of the output.
 #[derive(Clone, Copy, Debug)]
 pub struct BackwardInputs<'a> {
     /// Queries.
@@ -27,7 +28,7 @@ pub struct BackwardInputs<'a> {
     pub value: StridedRows<'a>,
     /// Output of the forward pass.
     pub output: StridedRows<'a>,
-    /// Row sums of the forward pass, `[batch, num_heads, num_queries]`.
+    /// Log sums of the forward pass, `[batch, num_heads, num_queries]`.
     pub log_sum: &'a [f32],
     /// Gradient of the output.
     pub grad_output: StridedRows<'a>,
@@ -36,40 +37,45 @@ pub struct BackwardInputs<'a> {
 /// Computes the gradients of queries, keys and values.
 ///
 /// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`, `dQ = s dS K`,
-/// `dK = s dS^T Q`; the scores are computed again, a block at a time.
-pub fn backward(set: InstructionSet, sizes: Sizes, saved: BackwardInputs<'_>, to: Gradients<'_>) {
-    let Sizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
+/// `dK = s dS^T Q`. The scores are computed again, a block at a time.
+pub fn attention_backward(
+    set: InstructionSet,
+    sizes: AttentionSizes,
+    inputs: BackwardInputs<'_>,
+    gradients: AttentionGradients<'_>,
+) {
+    let AttentionSizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
     let dim = sizes.dim();
-    assert_eq!(saved.log_sum.len(), batch * num_heads * num_queries, "a sum for every row of scores");
-    match to {
-        Gradients::Packed(packed) => {
+    assert_eq!(inputs.log_sum.len(), batch * num_heads * num_queries, "one log sum per row of scores");
+    match gradients {
+        AttentionGradients::Packed(packed) => {
             assert!(packed.len() == batch * num_queries * 3 * dim && num_keys == num_queries);
             let packed = SharedSlice::new(packed);
             let part = |part| HeadBlocks { values: &packed, count: num_queries, width: 3 * dim, first: part * dim };
-            backward_into(set, sizes, saved, [part(0), part(1), part(2)]);
+            backward_into(set, sizes, inputs, [part(0), part(1), part(2)]);
         }
-        Gradients::Separate { query, key_value } => {
+        AttentionGradients::Separate { query, key_value } => {
             assert!(query.len() == batch * num_queries * dim && key_value.len() == batch * num_keys * 2 * dim);
             let (query, key_value) = (SharedSlice::new(query), SharedSlice::new(key_value));
             let part = |part| HeadBlocks { values: &key_value, count: num_keys, width: 2 * dim, first: part * dim };
             let query = HeadBlocks { values: &query, count: num_queries, width: dim, first: 0 };
-            backward_into(set, sizes, saved, [query, part(0), part(1)]);
+            backward_into(set, sizes, inputs, [query, part(0), part(1)]);
         }
     }
 }
 
-/// The three parts must not overlap.
+/// Writes the gradients to three parts, which must not overlap.
 fn backward_into(
     set: InstructionSet,
-    sizes: Sizes,
-    saved: BackwardInputs<'_>,
+    sizes: AttentionSizes,
+    inputs: BackwardInputs<'_>,
     [grad_query, grad_key, grad_value]: [HeadBlocks<'_>; 3],
 ) {
-    let Sizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
+    let AttentionSizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
     let blocks = num_keys.div_ceil(BACKWARD_KEYS);
     let parts = sizes.parts(blocks);
     let tasks = sizes.batch * num_heads * parts;
-    // A part of the keys gives a part of every query's gradient.
+    // Every part of the keys contributes to the gradients of all queries.
     let partial: Vec<Vec<f32>> = (0..tasks)
         .into_par_iter()
         .map(|task| {
@@ -77,7 +83,7 @@ fn backward_into(
             let bound = |part: usize| (part * blocks / parts * BACKWARD_KEYS).min(num_keys);
             set.run(BackwardTask {
                 sizes,
-                saved,
+                inputs,
                 grad_key,
                 grad_value,
                 scene: head / num_heads,
@@ -99,8 +105,8 @@ fn backward_into(
 }
 
 struct BackwardTask<'a> {
-    sizes: Sizes,
-    saved: BackwardInputs<'a>,
+    sizes: AttentionSizes,
+    inputs: BackwardInputs<'a>,
     grad_key: HeadBlocks<'a>,
     grad_value: HeadBlocks<'a>,
     scene: usize,
@@ -109,13 +115,13 @@ struct BackwardTask<'a> {
 }
 
 impl<'a> Kernel for BackwardTask<'a> {
-    /// Gradients of all queries from these keys before scaling, in rows of the padded head width.
+    /// Unscaled gradients of all queries from the task's keys, in rows of the padded head width.
     type Output = Vec<f32>;
 
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> Vec<f32> {
-        let Self { sizes, saved, grad_key, grad_value, scene, head, keys } = self;
-        let Sizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
+        let Self { sizes, inputs, grad_key, grad_value, scene, head, keys } = self;
+        let AttentionSizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
         let (width, panel) = (padded::<S>(head_width), panel_width::<S>());
         let block = num_keys.min(BACKWARD_KEYS);
         let score_row = block.next_multiple_of(panel) + ROW_PADDING;
@@ -136,20 +142,20 @@ impl<'a> Kernel for BackwardTask<'a> {
         let mut scratch = Scratch::take(lens.iter().sum());
         let [queries, grads, delta, keys_t, values_t, key_rows, key_sums, value_sums, weights, slopes] =
             cut(&mut scratch, lens);
-        copy_padded(queries, width, (0..num_queries).map(|row| head_of(&saved.query, row)));
-        copy_padded(grads, width, (0..num_queries).map(|row| head_of(&saved.grad_output, row)));
+        copy_padded(queries, width, (0..num_queries).map(|row| head_of(&inputs.query, row)));
+        copy_padded(grads, width, (0..num_queries).map(|row| head_of(&inputs.grad_output, row)));
         for (row, to) in delta.iter_mut().enumerate() {
-            let pairs = head_of(&saved.output, row).iter().zip(head_of(&saved.grad_output, row));
+            let pairs = head_of(&inputs.output, row).iter().zip(head_of(&inputs.grad_output, row));
             *to = pairs.map(|(a, b)| a * b).sum();
         }
-        let log_sum = &saved.log_sum[(scene * num_heads + head) * num_queries..][..num_queries];
+        let log_sum = &inputs.log_sum[(scene * num_heads + head) * num_queries..][..num_queries];
 
         for first_key in keys.clone().step_by(BACKWARD_KEYS) {
             let count = BACKWARD_KEYS.min(keys.end - first_key);
             let rows = first_key..first_key + count;
-            copy_transposed(keys_t, panel, head_width, rows.clone().map(|row| head_of(&saved.key, row)));
-            copy_transposed(values_t, panel, head_width, rows.clone().map(|row| head_of(&saved.value, row)));
-            copy_padded(key_rows, width, rows.clone().map(|row| head_of(&saved.key, row)));
+            copy_transposed(keys_t, panel, head_width, rows.clone().map(|row| head_of(&inputs.key, row)));
+            copy_transposed(values_t, panel, head_width, rows.clone().map(|row| head_of(&inputs.value, row)));
+            copy_padded(key_rows, width, rows.clone().map(|row| head_of(&inputs.key, row)));
             key_sums.fill(0.0);
             value_sums.fill(0.0);
             for start in (0..num_queries).step_by(QUERY_BLOCK) {
@@ -180,13 +186,13 @@ impl<'a> Kernel for BackwardTask<'a> {
                 multiply(simd, [rows, count, head_width], by_query, plain(key_rows), to, true);
             }
             for row in 0..count {
-                let place = [scene, first_key + row, head];
+                let index = [scene, first_key + row, head];
                 let key_row = key_sums[row * width..][..head_width].iter().map(|sum| sum * sizes.scale());
                 let value_row = value_sums[row * width..][..head_width].iter().copied();
                 // SAFETY: no other task has this key of this head.
                 unsafe {
-                    grad_key.write(place, key_row);
-                    grad_value.write(place, value_row);
+                    grad_key.write(index, key_row);
+                    grad_value.write(index, value_row);
                 }
             }
         }
@@ -194,7 +200,7 @@ impl<'a> Kernel for BackwardTask<'a> {
     }
 }
 
-/// Turns a row of scores into weights `P`, and the weights' gradients beside it into the scores'.
+/// Replaces a row of scores by the weights `P`, and the row of the weights' gradients by the scores' gradients.
 #[inline(always)]
 fn score_gradients<S: Simd>(simd: S, (scores, slopes): (&mut [f32], &mut [f32]), scale: f32, log_sum: f32, delta: f32) {
     let (factor, shift, delta) = (simd.splat(scale), simd.splat(-log_sum), simd.splat(delta));

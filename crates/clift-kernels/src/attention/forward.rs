@@ -1,11 +1,11 @@
-//! The forward pass.
+//! Blockwise attention, forward.
 
 use std::ops::Range;
 
 use rayon::prelude::*;
 
 use crate::attention::shapes::{
-    HeadBlocks, QUERY_BLOCK, ROW_PADDING, Sizes, StridedRows, copy_padded, copy_transposed,
+    AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows, copy_padded, copy_transposed,
 };
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
 use crate::primitives::scratch::{Scratch, cut};
@@ -13,21 +13,23 @@ use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
 
-/// Keys in a block: scores of a block take 200 KB.
+/// Keys per block: the scores of a block take 200 KB.
 const FORWARD_KEYS: usize = 512;
 
 /// Computes `softmax(q k^T / sqrt(head width)) v` per head.
 ///
-/// `output` is `[batch, num_queries, dim]`; `log_sum`, if wanted, is `[batch, num_heads, num_queries]` and
-/// receives each row's `log2(sum(2^(score * log2(e))))`, which [`backward`](crate::attention::backward::backward) needs.
-pub fn forward(
+/// # Shapes
+/// - `output`: `[batch, num_queries, dim]`
+/// - `log_sum`: `[batch, num_heads, num_queries]`, receives `log2(sum(2^(score * log2(e))))` of every row of scores,
+///   an input of [`attention_backward`](crate::attention_backward)
+pub fn attention_forward(
     set: InstructionSet,
-    sizes: Sizes,
+    sizes: AttentionSizes,
     [query, key, value]: [StridedRows<'_>; 3],
     output: &mut [f32],
     log_sum: Option<&mut [f32]>,
 ) {
-    assert_eq!(output.len(), sizes.batch * sizes.num_queries * sizes.dim(), "a row for every query");
+    assert_eq!(output.len(), sizes.batch * sizes.num_queries * sizes.dim(), "output has one row per query");
     if sizes.num_keys == 0 {
         output.fill(0.0);
         return;
@@ -55,7 +57,7 @@ pub fn forward(
 }
 
 struct Forward<'a> {
-    sizes: Sizes,
+    sizes: AttentionSizes,
     query: StridedRows<'a>,
     key: StridedRows<'a>,
     value: StridedRows<'a>,
@@ -72,7 +74,7 @@ impl Kernel for Forward<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { sizes, query, key, value, output, log_sum, scene, head, queries } = self;
-        let Sizes { num_keys, head_width, .. } = sizes;
+        let AttentionSizes { num_keys, head_width, .. } = sizes;
         let (width, panel) = (padded::<S>(head_width), panel_width::<S>());
         let score_row = num_keys.min(FORWARD_KEYS).next_multiple_of(panel) + ROW_PADDING;
         let lens = [
@@ -121,9 +123,9 @@ impl Kernel for Forward<'_> {
                 unsafe { output.write([scene, start + row, head], result) };
             }
             if let Some(log_sum) = log_sum {
-                let place = (scene * sizes.num_heads + head) * sizes.num_queries + start;
+                let first = (scene * sizes.num_heads + head) * sizes.num_queries + start;
                 // SAFETY: no other task has this query of this head.
-                let to = unsafe { log_sum.part(place, rows) };
+                let to = unsafe { log_sum.part(first, rows) };
                 for (row, to) in to.iter_mut().enumerate() {
                     *to = highest[row] + total[row].log2();
                 }
@@ -132,8 +134,8 @@ impl Kernel for Forward<'_> {
     }
 }
 
-/// Turns a row of scores into `2^(score * scale - highest)` with the highest scaled score so far, adds
-/// them to `total`, and returns the factor that brings what was summed before to the new height.
+/// Replaces a row of scores by `2^(score * scale - highest)` with the highest scaled score so far, adds the results to
+/// `total`, and returns the factor that rescales earlier sums to the new highest score.
 #[inline(always)]
 fn exponentials<S: Simd>(simd: S, scores: &mut [f32], scale: f32, highest: &mut f32, total: &mut f32) -> f32 {
     let full = scores.len() / S::LANES * S::LANES;
@@ -142,11 +144,11 @@ fn exponentials<S: Simd>(simd: S, scores: &mut [f32], scale: f32, highest: &mut 
         largest = simd.max(largest, simd.read(chunk));
     }
     let largest = scores[full..].iter().fold(simd.largest(largest), |a, &b| if a > b { a } else { b });
-    let before = *highest;
-    let height = if before > largest * scale { before } else { largest * scale };
-    let shrink = if before == height { 1.0 } else { (before - height).exp2() };
+    let former = *highest;
+    let raised = if former > largest * scale { former } else { largest * scale };
+    let shrink = if former == raised { 1.0 } else { (former - raised).exp2() };
 
-    let (factor, shift) = (simd.splat(scale), simd.splat(-height));
+    let (factor, shift) = (simd.splat(scale), simd.splat(-raised));
     let mut sum = simd.splat(0.0);
     for chunk in scores[..full].chunks_exact_mut(S::LANES) {
         let weight = simd.exp2(simd.mul_add(simd.read(chunk), factor, shift));
@@ -156,7 +158,7 @@ fn exponentials<S: Simd>(simd: S, scores: &mut [f32], scale: f32, highest: &mut 
     let rest = &mut scores[full..];
     let weight = simd.exp2(simd.mul_add(simd.read(rest), factor, shift));
     simd.write(rest, weight);
-    *highest = height;
+    *highest = raised;
     *total = *total * shrink + simd.sum(sum) + rest.iter().sum::<f32>();
     shrink
 }

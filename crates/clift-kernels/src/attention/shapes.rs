@@ -1,84 +1,83 @@
-//! Scaled dot-product attention without a score matrix: blocks of queries against blocks of keys,
-//! all in the cache (the scheme of Dao et al. 2022, "`FlashAttention`").
-//!
-//! Heads are read where they lie, by stride, in rows that may be part of wider ones (packed
-//! projections); each task copies its head once into a contiguous block.
+//! Sizes, strided rows and blocks of a head.
 // B scenes, H heads, Q queries, K keys, E width of a head
 
 use crate::primitives::shared_slice::SharedSlice;
 
-/// Sizes of one attention.
+/// Sizes of an attention.
 #[derive(Clone, Copy, Debug)]
-pub struct Sizes {
-    /// Scenes.
+pub struct AttentionSizes {
+    /// Number of scenes.
     pub batch: usize,
-    /// Queries of a scene.
+    /// Queries per scene.
     pub num_queries: usize,
-    /// Keys of a scene.
+    /// Keys per scene.
     pub num_keys: usize,
-    /// Heads.
+    /// Number of heads.
     pub num_heads: usize,
-    /// Width of a head.
+    /// Width of one head.
     pub head_width: usize,
 }
 
-impl Sizes {
+impl AttentionSizes {
+    /// Returns the width of all heads together.
     pub(crate) fn dim(&self) -> usize {
         self.num_heads * self.head_width
     }
 
+    /// Returns the factor of the scores, `1 / sqrt(head_width)`.
     pub(crate) fn scale(&self) -> f32 {
         (1.0 / (self.head_width as f64).sqrt()) as f32
     }
 
-    /// How many parts a head's work is cut into, so that 16 threads find work. A matter of shape
-    /// alone, because sums over parts depend on it.
+    /// Returns the number of parts that the blocks of one head are divided into, enough for 16 threads. Depends on
+    /// the shape alone, because sums over parts depend on it.
     pub(crate) fn parts(&self, blocks: usize) -> usize {
         16_usize.div_ceil((self.batch * self.num_heads).max(1)).clamp(1, blocks.max(1))
     }
 }
 
-/// Rows of tokens inside a slice that may hold more: `[batch, count, dim]` with strides.
+/// Rows of tokens in a slice, `[batch, count, dim]` with strides.
 #[derive(Clone, Copy, Debug)]
 pub struct StridedRows<'a> {
-    /// From the first value on.
+    /// Values, starting with the first row of the first scene.
     pub values: &'a [f32],
-    /// Distance of two scenes.
+    /// Values from one scene to the next.
     pub batch_stride: usize,
-    /// Distance of two rows.
+    /// Values from one row to the next.
     pub row_stride: usize,
 }
 
 impl<'a> StridedRows<'a> {
-    /// One head of one row.
-    pub(crate) fn head(&self, sizes: &Sizes, scene: usize, row: usize, head: usize) -> &'a [f32] {
+    /// Returns one head of one row.
+    pub(crate) fn head(&self, sizes: &AttentionSizes, scene: usize, row: usize, head: usize) -> &'a [f32] {
         let start = scene * self.batch_stride + row * self.row_stride + head * sizes.head_width;
         &self.values[start..start + sizes.head_width]
     }
 }
 
-/// Where [`backward`] puts its gradients, in contiguous rows.
+/// Destination of the gradients of an attention, in contiguous rows.
 #[derive(Debug)]
-pub enum Gradients<'a> {
-    /// Those of queries, keys and values side by side: `[batch, num_queries, 3 dim]`.
+pub enum AttentionGradients<'a> {
+    /// Gradients of queries, keys and values side by side: `[batch, num_queries, 3 dim]`.
     Packed(&'a mut [f32]),
-    /// Those of the queries on their own.
+    /// Gradients of the queries apart from those of keys and values.
     Separate {
-        /// `[batch, num_queries, dim]`
+        /// Gradients of the queries, `[batch, num_queries, dim]`.
         query: &'a mut [f32],
-        /// Those of keys and values side by side: `[batch, num_keys, 2 dim]`
+        /// Gradients of keys and values side by side: `[batch, num_keys, 2 dim]`.
         key_value: &'a mut [f32],
     },
 }
 
-/// Heads of contiguous rows that several threads write, each its own.
+/// Contiguous rows that several threads write, each thread its own heads.
 #[derive(Clone, Copy)]
 pub(crate) struct HeadBlocks<'a> {
     pub(crate) values: &'a SharedSlice<'a>,
-    /// Rows of a scene.
+    /// Rows per scene.
     pub(crate) count: usize,
-    /// Values of a row, and where in it the first head starts.
+    /// Values per row.
     pub(crate) width: usize,
+    /// Position of the first head in a row.
     pub(crate) first: usize,
 }
 
@@ -86,18 +85,18 @@ impl HeadBlocks<'_> {
     /// Writes one head of one row.
     ///
     /// # Safety
-    /// No other thread may write or read the same head of the same row.
+    /// No other thread may read or write this head of this row at the same time.
     pub(crate) unsafe fn write(&self, [scene, row, head]: [usize; 3], values: impl ExactSizeIterator<Item = f32>) {
         let start = (scene * self.count + row) * self.width + self.first + head * values.len();
-        // SAFETY: the caller's.
+        // SAFETY: by the caller's promise.
         let place = unsafe { self.values.part(start, values.len()) };
         place.iter_mut().zip(values).for_each(|(to, value)| *to = value);
     }
 }
 
-/// Queries in a block.
+/// Queries per block.
 pub(crate) const QUERY_BLOCK: usize = 96;
-/// Added to the length of a row of scores: rows a power of two apart would share cache sets.
+/// Padding of a row of scores: rows a power of two apart would share cache sets.
 pub(crate) const ROW_PADDING: usize = 16;
 
 /// Copies rows one after the other, each followed by zeros up to `width`.
@@ -123,7 +122,7 @@ pub(crate) fn copy_transposed<'a>(
             to.fill(0.0);
         }
         for column in 0..columns {
-            let row = rows.next().expect("the iterator has as many");
+            let row = rows.next().expect("the iterator reports its length");
             for (to, &value) in to[column..].iter_mut().step_by(panel).zip(row) {
                 *to = value;
             }

@@ -1,41 +1,42 @@
-//! Products of small matrices that stay in the cache, which attention is made of.
+//! Products of matrices that stay in the cache, the building block of attention.
 // M rows, K inner, N columns
 
 use crate::simd::vector::{Simd, Tile};
 
-/// A matrix inside a slice. Columns need not be neighbours.
+/// The left factor, a strided matrix in a slice.
 #[derive(Clone, Copy)]
 pub(crate) struct Left<'a> {
     pub values: &'a [f32],
+    /// Values from one row to the next.
     pub row: usize,
+    /// Values from one column to the next.
     pub step: usize,
 }
 
-/// The right factor, cut into panels of columns that the register tile reads row by row. In a panel
-/// the columns are neighbours.
+/// The right factor, divided into panels of contiguous columns that the register tile reads row by row.
 #[derive(Clone, Copy)]
 pub(crate) struct Right<'a> {
     pub values: &'a [f32],
-    /// Distance of two rows inside a panel.
+    /// Values from one row of a panel to the next.
     pub step: usize,
-    /// Distance of two panels.
+    /// Values from one panel to the next.
     pub panel: usize,
 }
 
-/// Columns of a full panel.
+/// Returns the columns of a full panel.
 #[inline(always)]
 pub(crate) fn panel_width<S: Simd>() -> usize {
     S::LANES * S::TILE_VECTORS
 }
 
-/// `columns` rounded up to whole vectors.
+/// Rounds `columns` up to whole vectors.
 #[inline(always)]
 pub(crate) fn padded<S: Simd>(columns: usize) -> usize {
     columns.next_multiple_of(S::LANES)
 }
 
-/// `C[rows, columns] = A[rows, inner] B[inner, columns]`, or added to C. Whole vectors of columns are
-/// computed: B must have and C must have room for [`padded`] columns.
+/// Computes `C[rows, columns] = A[rows, inner] B[inner, columns]`, or adds the product to C. Whole vectors of columns are
+/// computed: B and C must have [`padded`] columns.
 #[inline(always)]
 pub(crate) fn multiply<S: Simd>(
     simd: S,
@@ -46,15 +47,15 @@ pub(crate) fn multiply<S: Simd>(
     accumulate: bool,
 ) {
     if rows == 0 || columns == 0 || inner == 0 {
-        assert!(accumulate || rows == 0 || columns == 0, "an empty sum would have to be written");
+        assert!(accumulate || rows == 0 || columns == 0, "an empty product cannot overwrite C");
         return;
     }
     let (columns, width) = (padded::<S>(columns), panel_width::<S>());
     let last_panel = (columns - 1) / width;
     let last_columns = columns - last_panel * width;
-    assert!(a.values.len() > (rows - 1) * a.row + (inner - 1) * a.step, "A has its rows");
-    assert!(b.values.len() >= last_panel * b.panel + (inner - 1) * b.step + last_columns, "B has its panels");
-    assert!(c.len() >= (rows - 1) * c_row + columns, "C has its rows");
+    assert!(a.values.len() > (rows - 1) * a.row + (inner - 1) * a.step, "A has `rows` rows");
+    assert!(b.values.len() >= last_panel * b.panel + (inner - 1) * b.step + last_columns, "B has all panels");
+    assert!(c.len() >= (rows - 1) * c_row + columns, "C has `rows` rows");
     for panel in 0..=last_panel {
         let vectors = if panel == last_panel { last_columns / S::LANES } else { S::TILE_VECTORS };
         let mut row = 0;
@@ -84,7 +85,7 @@ pub(crate) fn multiply<S: Simd>(
 /// As [`Tile::run`].
 #[inline(always)]
 unsafe fn run_tile<S: Simd>(simd: S, tile: Tile, rows: usize, vectors: usize) -> usize {
-    // SAFETY: the caller's.
+    // SAFETY: by the caller's promise.
     unsafe {
         if vectors == S::TILE_VECTORS {
             if rows >= S::TILE_ROWS {

@@ -1,9 +1,9 @@
 //! Building blocks of the kernels.
 //!
-//! - `matmul`: matrix products that stay in cache
-//! - `elementwise`: map and combine, vector by vector
-//! - `scratch`: per-thread reusable buffers
-//! - `shared_slice`: one slice, disjoint parallel writes
+//! - `matmul`: matrix products that stay in the cache
+//! - `elementwise`: elementwise functions, one vector at a time
+//! - `scratch`: reusable buffers, one per thread
+//! - `shared_slice`: disjoint parallel writes to one slice
 
 pub(crate) mod elementwise;
 pub(crate) mod matmul;

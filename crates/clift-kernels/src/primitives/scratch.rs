@@ -1,3 +1,5 @@
+//! Reusable buffers, one per thread.
+
 use std::cell::RefCell;
 use std::ops::{Deref, DerefMut};
 
@@ -5,11 +7,10 @@ thread_local! {
     static KEPT: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
 }
 
-/// A slice that this thread keeps for the next user: big temporary allocations cost page faults
-/// every time. Its values are whatever the last user left.
+/// A buffer that this thread keeps for its next kernel, because large temporary allocations cost page faults. The values
+/// are those of the last kernel.
 ///
-/// A guard rather than a closure's argument: code in a closure is not compiled with the instructions
-/// of the function around it.
+/// A guard instead of a closure: code in a closure is not compiled with the instructions of the enclosing function.
 pub(crate) struct Scratch {
     values: Vec<f32>,
     len: usize,
@@ -45,7 +46,7 @@ impl DerefMut for Scratch {
     }
 }
 
-/// Cuts a slice into parts of the given lengths.
+/// Splits a slice into parts of the given lengths.
 pub(crate) fn cut<const COUNT: usize>(mut slice: &mut [f32], lens: [usize; COUNT]) -> [&mut [f32]; COUNT] {
     lens.map(|len| {
         let (part, rest) = std::mem::take(&mut slice).split_at_mut(len);

@@ -1,13 +1,15 @@
+//! Disjoint parallel writes to one slice.
+
 use std::marker::PhantomData;
 
-/// A slice that several threads write at once, each its own places.
+/// A slice that several threads write at once, each thread its own part.
 pub(crate) struct SharedSlice<'a> {
     start: *mut f32,
     len: usize,
     slice: PhantomData<&'a mut [f32]>,
 }
 
-// SAFETY: it stands for a `&mut [f32]`; who writes through it promises to write places of their own.
+// SAFETY: stands for a `&mut [f32]`, and the callers of `part` promise disjoint parts.
 unsafe impl Send for SharedSlice<'_> {}
 // SAFETY: as above.
 unsafe impl Sync for SharedSlice<'_> {}
@@ -17,11 +19,11 @@ impl<'a> SharedSlice<'a> {
         Self { start: slice.as_mut_ptr(), len: slice.len(), slice: PhantomData }
     }
 
-    /// A part of the slice.
+    /// Returns a part of the slice.
     ///
     /// # Safety
-    /// No other part that is alive at the same time may overlap it.
-    #[expect(clippy::mut_from_ref, reason = "the point of the type: parts are disjoint by the caller's promise")]
+    /// Parts that exist at the same time must not overlap.
+    #[expect(clippy::mut_from_ref, reason = "parts are disjoint by the caller's promise")]
     pub(crate) unsafe fn part(&self, start: usize, len: usize) -> &mut [f32] {
         assert!(start <= self.len && len <= self.len - start, "the part lies inside the slice");
         // SAFETY: inside the slice, and disjoint by the caller's promise.

@@ -1,8 +1,9 @@
+//! AVX2 and FMA vectors.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx2` proves that the processor has AVX2 and FMA")]
 
-use crate::simd::vector::{Simd, Tile};
+use crate::simd::vector::{Simd, Tile, binary_intrinsics};
 
-#[allow(clippy::wildcard_imports, reason = "intrinsics carry their own prefix; tests are let off")]
+#[allow(clippy::wildcard_imports, reason = "names of intrinsics have a prefix; Clippy exempts tests")]
 use std::arch::x86_64::*;
 
 /// AVX2 with FMA: 8 lanes, 16 registers.
@@ -10,7 +11,7 @@ use std::arch::x86_64::*;
 pub struct Avx2(());
 
 impl Avx2 {
-    /// Makes the proof.
+    /// Creates the proof that the processor has the instructions.
     ///
     /// # Safety
     /// The processor must have AVX2 and FMA.
@@ -37,33 +38,13 @@ impl Simd for Avx2 {
     unsafe fn store(self, to: *mut f32, value: __m256) {
         unsafe { _mm256_storeu_ps(to, value) }
     }
-    #[inline(always)]
-    fn add(self, a: __m256, b: __m256) -> __m256 {
-        unsafe { _mm256_add_ps(a, b) }
-    }
-    #[inline(always)]
-    fn sub(self, a: __m256, b: __m256) -> __m256 {
-        unsafe { _mm256_sub_ps(a, b) }
-    }
-    #[inline(always)]
-    fn mul(self, a: __m256, b: __m256) -> __m256 {
-        unsafe { _mm256_mul_ps(a, b) }
-    }
-    #[inline(always)]
-    fn div(self, a: __m256, b: __m256) -> __m256 {
-        unsafe { _mm256_div_ps(a, b) }
+    binary_intrinsics! {
+        add = _mm256_add_ps, sub = _mm256_sub_ps, mul = _mm256_mul_ps,
+        div = _mm256_div_ps, max = _mm256_max_ps, min = _mm256_min_ps,
     }
     #[inline(always)]
     fn mul_add(self, a: __m256, b: __m256, c: __m256) -> __m256 {
         unsafe { _mm256_fmadd_ps(a, b, c) }
-    }
-    #[inline(always)]
-    fn max(self, a: __m256, b: __m256) -> __m256 {
-        unsafe { _mm256_max_ps(a, b) }
-    }
-    #[inline(always)]
-    fn min(self, a: __m256, b: __m256) -> __m256 {
-        unsafe { _mm256_min_ps(a, b) }
     }
     #[inline(always)]
     fn select_negative(self, condition: __m256, yes: __m256, no: __m256) -> __m256 {

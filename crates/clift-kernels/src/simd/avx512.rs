@@ -1,8 +1,9 @@
+//! AVX-512 vectors.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "a value of `Avx512` proves that the processor has AVX-512")]
 
-use crate::simd::vector::{Simd, Tile};
+use crate::simd::vector::{Simd, Tile, binary_intrinsics};
 
-#[allow(clippy::wildcard_imports, reason = "intrinsics carry their own prefix; tests are let off")]
+#[allow(clippy::wildcard_imports, reason = "names of intrinsics have a prefix; Clippy exempts tests")]
 use std::arch::x86_64::*;
 
 /// AVX-512: 16 lanes, 32 registers.
@@ -10,7 +11,7 @@ use std::arch::x86_64::*;
 pub struct Avx512(());
 
 impl Avx512 {
-    /// Makes the proof.
+    /// Creates the proof that the processor has the instructions.
     ///
     /// # Safety
     /// The processor must have AVX-512 F, VL, BW and DQ.
@@ -37,33 +38,13 @@ impl Simd for Avx512 {
     unsafe fn store(self, to: *mut f32, value: __m512) {
         unsafe { _mm512_storeu_ps(to, value) }
     }
-    #[inline(always)]
-    fn add(self, a: __m512, b: __m512) -> __m512 {
-        unsafe { _mm512_add_ps(a, b) }
-    }
-    #[inline(always)]
-    fn sub(self, a: __m512, b: __m512) -> __m512 {
-        unsafe { _mm512_sub_ps(a, b) }
-    }
-    #[inline(always)]
-    fn mul(self, a: __m512, b: __m512) -> __m512 {
-        unsafe { _mm512_mul_ps(a, b) }
-    }
-    #[inline(always)]
-    fn div(self, a: __m512, b: __m512) -> __m512 {
-        unsafe { _mm512_div_ps(a, b) }
+    binary_intrinsics! {
+        add = _mm512_add_ps, sub = _mm512_sub_ps, mul = _mm512_mul_ps,
+        div = _mm512_div_ps, max = _mm512_max_ps, min = _mm512_min_ps,
     }
     #[inline(always)]
     fn mul_add(self, a: __m512, b: __m512, c: __m512) -> __m512 {
         unsafe { _mm512_fmadd_ps(a, b, c) }
-    }
-    #[inline(always)]
-    fn max(self, a: __m512, b: __m512) -> __m512 {
-        unsafe { _mm512_max_ps(a, b) }
-    }
-    #[inline(always)]
-    fn min(self, a: __m512, b: __m512) -> __m512 {
-        unsafe { _mm512_min_ps(a, b) }
     }
     #[inline(always)]
     fn select_negative(self, condition: __m512, yes: __m512, no: __m512) -> __m512 {

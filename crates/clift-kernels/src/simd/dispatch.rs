@@ -1,20 +1,16 @@
+//! The choice of the instruction set, and running a kernel with it.
+
 use std::fmt;
 use std::sync::OnceLock;
 
-use crate::simd::portable::Portable;
-use crate::simd::vector::Simd;
-
 #[cfg(target_arch = "x86_64")]
-use crate::simd::avx2::Avx2;
+use crate::simd::{avx2::Avx2, avx512::Avx512};
+use crate::simd::{portable::Portable, vector::Simd};
 
-#[cfg(target_arch = "x86_64")]
-use crate::simd::avx512::Avx512;
-
-/// What a kernel is compiled for. The variants exist on every processor; [`InstructionSet::available`]
-/// says which can run.
+/// Instructions that a kernel is compiled for. [`InstructionSet::available`] lists those that the processor runs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InstructionSet {
-    /// Whatever the compiler's baseline has.
+    /// The baseline of the compiler's target.
     Portable,
     /// x86-64 with AVX2 and FMA.
     Avx2,
@@ -22,26 +18,26 @@ pub enum InstructionSet {
     Avx512,
 }
 
-/// A value of [`InstructionSet::VARIABLE`] that cannot be followed.
+/// An invalid value of [`InstructionSet::VARIABLE`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct InstructionSetError {
-    /// What it holds.
+    /// The value found.
     pub text: String,
-    /// Whether it is an instruction set, which this processor lacks.
+    /// Whether the value is the name of an instruction set that this processor lacks.
     pub is_known: bool,
 }
 
 impl fmt::Display for InstructionSetError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let names = InstructionSet::available().map(InstructionSet::name).collect::<Vec<_>>().join(", ");
-        let why = if self.is_known { "this processor does not have it" } else { "it is no instruction set" };
-        write!(f, "{why}; it can be one of {names}, or left out for the first of them")
+        let reason = if self.is_known { "not supported by this processor" } else { "unknown instruction set" };
+        write!(f, "{reason}; use one of {names}, or unset the variable for the first of them")
     }
 }
 
 impl std::error::Error for InstructionSetError {}
 
-/// Work that is generic over the instruction set. `run` must be `#[inline(always)]`.
+/// A computation that is generic over the instruction set. `run` must be `#[inline(always)]`.
 pub(crate) trait Kernel {
     type Output;
 
@@ -49,31 +45,28 @@ pub(crate) trait Kernel {
 }
 
 impl InstructionSet {
-    /// All of them, the widest first.
+    /// All instruction sets, widest first.
     pub const ALL: [Self; 3] = [Self::Avx512, Self::Avx2, Self::Portable];
 
-    /// The environment variable that forces an instruction set: `avx512`, `avx2` or `portable`.
+    /// Environment variable that forces an instruction set: `avx512`, `avx2` or `portable`.
     pub const VARIABLE: &str = "CLIFT_INSTRUCTION_SET";
 
-    /// The one to use: what [`InstructionSet::VARIABLE`] names, or else the widest that the processor has. Read once
-    /// per process.
-    ///
-    /// A kernel cannot refuse what is not there, so that it takes the widest then, too: a program asks
-    /// [`InstructionSet::forced`] at its start.
+    /// Returns the set that [`InstructionSet::VARIABLE`] forces, or else the widest available. The variable is read once
+    /// per process. An invalid value is ignored here; programs report it by calling [`InstructionSet::forced`] at start.
     pub fn detected() -> Self {
         static DETECTED: OnceLock<InstructionSet> = OnceLock::new();
         *DETECTED.get_or_init(|| Self::forced().ok().flatten().unwrap_or_else(Self::widest))
     }
 
-    /// The widest that this processor can run.
+    /// Returns the widest set that this processor runs.
     pub fn widest() -> Self {
         Self::available().next().unwrap_or(Self::Portable)
     }
 
-    /// What [`InstructionSet::VARIABLE`] names; `None` where it is not set or empty.
+    /// Returns the set that [`InstructionSet::VARIABLE`] forces; `None` if the variable is unset or empty.
     ///
     /// # Errors
-    /// The text and what it may be, where it names no instruction set that this processor has.
+    /// [`InstructionSetError`] if the value is not the name of an available instruction set.
     pub fn forced() -> Result<Option<Self>, InstructionSetError> {
         match std::env::var_os(Self::VARIABLE) {
             None => Ok(None),
@@ -90,12 +83,12 @@ impl InstructionSet {
         if known.is_available() { Ok(Some(known)) } else { Err(bad(true)) }
     }
 
-    /// Those that this processor can run, the widest first.
+    /// Iterates over the sets that this processor runs, widest first.
     pub fn available() -> impl Iterator<Item = Self> {
         Self::ALL.into_iter().filter(|set| set.is_available())
     }
 
-    /// The name in lower case.
+    /// Returns the name in lower case.
     pub fn name(self) -> &'static str {
         match self {
             Self::Portable => "portable",
@@ -127,10 +120,10 @@ impl InstructionSet {
     /// Runs a kernel compiled for this instruction set, on this thread.
     ///
     /// # Panics
-    /// When the processor does not have it.
+    /// If the processor lacks it.
     #[cfg(target_arch = "x86_64")]
     pub(crate) fn run<K: Kernel>(self, kernel: K) -> K::Output {
-        assert!(self.is_available(), "this processor has no {}", self.name());
+        assert!(self.is_available(), "this processor lacks {}", self.name());
         match self {
             Self::Portable => kernel.run(Portable),
             // SAFETY: checked above.
@@ -143,7 +136,7 @@ impl InstructionSet {
     /// Runs a kernel compiled for this instruction set, on this thread.
     #[cfg(not(target_arch = "x86_64"))]
     pub(crate) fn run<K: Kernel>(self, kernel: K) -> K::Output {
-        assert!(self.is_available(), "this processor has no {}", self.name());
+        assert!(self.is_available(), "this processor lacks {}", self.name());
         kernel.run(Portable)
     }
 }
@@ -151,14 +144,14 @@ impl InstructionSet {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 fn run_avx2<K: Kernel>(kernel: K) -> K::Output {
-    // SAFETY: this function is compiled for, and so only called on, such a processor.
+    // SAFETY: this function is only called on a processor with these instructions.
     kernel.run(unsafe { Avx2::new() })
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
 fn run_avx512<K: Kernel>(kernel: K) -> K::Output {
-    // SAFETY: this function is compiled for, and so only called on, such a processor.
+    // SAFETY: this function is only called on a processor with these instructions.
     kernel.run(unsafe { Avx512::new() })
 }
 
@@ -167,7 +160,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_asked_for_is_taken_or_refused_by_name() {
+    fn names_of_available_sets_parse_and_others_are_refused() {
         assert_eq!(InstructionSet::parse(""), Ok(None));
         assert_eq!(InstructionSet::parse("portable"), Ok(Some(InstructionSet::Portable)));
         for set in InstructionSet::ALL {
@@ -175,7 +168,7 @@ mod tests {
             assert_eq!(parsed.is_ok(), set.is_available(), "{}", set.name());
         }
         let message = InstructionSet::parse("AVX2").unwrap_err().to_string();
-        assert!(message.starts_with("it is no instruction set; it can be one of "), "{message}");
+        assert!(message.starts_with("unknown instruction set; use one of "), "{message}");
         assert!(message.contains("portable"), "{message}");
     }
 }

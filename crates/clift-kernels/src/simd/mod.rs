@@ -1,10 +1,10 @@
-//! One trait for vectors, four instruction sets.
+//! Vectors of f32: one trait, one implementation per instruction set.
 //!
-//! - `vector`: Simd trait and its register tile
-//! - `portable`: plain Rust vectors
-//! - `avx2`: AVX2 and FMA vectors
-//! - `avx512`: AVX-512 vectors
-//! - `dispatch`: choose the instruction set, run a kernel
+//! - `vector`: the trait `Simd` and the register tile of matrix products
+//! - `portable`: vectors in plain Rust
+//! - `avx2`: AVX2 and FMA
+//! - `avx512`: AVX-512
+//! - `dispatch`: the choice of the instruction set, and running a kernel with it
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx2;

@@ -1,6 +1,8 @@
+//! Vectors in plain Rust.
+
 use crate::simd::vector::{Simd, Tile};
 
-/// Plain Rust in arrays of eight, for the compiler to vectorise with what every processor has.
+/// Arrays of eight values in plain Rust, which the compiler vectorizes with baseline instructions.
 #[derive(Clone, Copy, Debug)]
 pub struct Portable;
 
@@ -18,12 +20,12 @@ impl Simd for Portable {
     }
     #[inline(always)]
     unsafe fn load(self, from: *const f32) -> Self::V {
-        // SAFETY: the caller's; arrays of f32 have its alignment.
+        // SAFETY: by the caller's promise; arrays of f32 have the alignment of f32.
         unsafe { from.cast::<Self::V>().read() }
     }
     #[inline(always)]
     unsafe fn store(self, to: *mut f32, value: Self::V) {
-        // SAFETY: the caller's; arrays of f32 have its alignment.
+        // SAFETY: by the caller's promise; arrays of f32 have the alignment of f32.
         unsafe { to.cast::<Self::V>().write(value) }
     }
     #[inline(always)]
@@ -44,7 +46,7 @@ impl Simd for Portable {
     }
     #[inline(always)]
     fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V {
-        // `f32::mul_add` would be a call to a library function.
+        // `f32::mul_add` compiles to a library call.
         std::array::from_fn(|i| a[i] * b[i] + c[i])
     }
     #[inline(always)]
@@ -61,7 +63,7 @@ impl Simd for Portable {
     }
     #[inline(always)]
     fn round(self, a: Self::V) -> Self::V {
-        // Adding and taking away 1.5 * 2^23 leaves the nearest integer, for |a| < 2^22.
+        // Adding and subtracting 1.5 * 2^23 rounds to the nearest integer for |a| < 2^22.
         const SHIFT: f32 = 12_582_912.0;
         a.map(|a| (a + SHIFT) - SHIFT)
     }
@@ -79,7 +81,7 @@ impl Simd for Portable {
     }
     #[inline(always)]
     unsafe fn full_tile(self, tile: Tile) {
-        // SAFETY: the caller's.
+        // SAFETY: by the caller's promise.
         unsafe { tile.run::<Self, 4, 1>(self) }
     }
 }

@@ -1,12 +1,12 @@
-//! Vectors of f32 of one instruction set, behind one trait.
+//! The trait [`Simd`] and the register tile of matrix products.
 //!
-//! A value of a type that implements [`Simd`] is the proof that the processor has its instructions,
-//! which makes the arithmetic safe to call. Everything that is generic over [`Simd`] must be
-//! `#[inline(always)]`: only code inlined into `InstructionSet::run` is compiled with the instructions.
+//! A value of a type that implements [`Simd`] proves that the processor has the instructions, which makes the arithmetic
+//! safe to call. Functions that are generic over [`Simd`] must be `#[inline(always)]`: only code inlined into
+//! `InstructionSet::run` is compiled with the instructions.
 
 /// Arithmetic on vectors of [`Simd::LANES`] values.
 pub trait Simd: Copy + Send + Sync + 'static {
-    /// Values in a vector.
+    /// Values per vector.
     const LANES: usize;
     /// Rows of the register tile of a matrix product.
     const TILE_ROWS: usize;
@@ -15,17 +15,17 @@ pub trait Simd: Copy + Send + Sync + 'static {
     /// A vector.
     type V: Copy;
 
-    /// The same value in every lane.
+    /// Returns a vector with the same value in every lane.
     fn splat(self, value: f32) -> Self::V;
     /// Reads [`Simd::LANES`] values.
     ///
     /// # Safety
-    /// They must be readable at `from`.
+    /// The values must be readable at `from`.
     unsafe fn load(self, from: *const f32) -> Self::V;
     /// Writes [`Simd::LANES`] values.
     ///
     /// # Safety
-    /// They must be writable at `to`.
+    /// The values must be writable at `to`.
     unsafe fn store(self, to: *mut f32, value: Self::V);
     /// `a + b`
     fn add(self, a: Self::V, b: Self::V) -> Self::V;
@@ -35,7 +35,7 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn mul(self, a: Self::V, b: Self::V) -> Self::V;
     /// `a / b`
     fn div(self, a: Self::V, b: Self::V) -> Self::V;
-    /// `a * b + c`, in one rounding where the processor can.
+    /// `a * b + c`, with a single rounding if the processor has FMA.
     fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V;
     /// The larger value; `b` where one of the two is NaN.
     fn max(self, a: Self::V, b: Self::V) -> Self::V;
@@ -45,20 +45,20 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn select_negative(self, condition: Self::V, yes: Self::V, no: Self::V) -> Self::V;
     /// The nearest integer, ties to even.
     fn round(self, a: Self::V) -> Self::V;
-    /// `a * 2^n` for integers `n` in `-126..=127`; zero or as it should be for -127.
+    /// `a * 2^n` for integers `n` in `-126..=127`; for -127 zero or the exact result.
     fn scale_by_power(self, a: Self::V, n: Self::V) -> Self::V;
     /// The sum of all lanes.
     fn sum(self, a: Self::V) -> f32;
     /// The largest lane.
     fn largest(self, a: Self::V) -> f32;
-    /// The full register tile of a matrix product: [`Simd::TILE_ROWS`] rows of
+    /// Computes the full register tile of a matrix product: [`Simd::TILE_ROWS`] rows of
     /// [`Simd::TILE_VECTORS`] vectors.
     ///
     /// # Safety
     /// As [`Tile::run`].
     unsafe fn full_tile(self, tile: Tile);
 
-    /// Reads a full vector from the front of a slice, or what there is and zeros.
+    /// Reads a vector from the start of a slice; missing values are zero.
     #[inline(always)]
     fn read(self, from: &[f32]) -> Self::V {
         if from.len() >= Self::LANES {
@@ -71,7 +71,7 @@ pub trait Simd: Copy + Send + Sync + 'static {
         unsafe { self.load(padded.as_ptr()) }
     }
 
-    /// Writes a full vector to the front of a slice, or as much of it as fits.
+    /// Writes a vector to the start of a slice; values beyond its end are dropped.
     #[inline(always)]
     fn write(self, to: &mut [f32], value: Self::V) {
         if to.len() >= Self::LANES {
@@ -85,10 +85,11 @@ pub trait Simd: Copy + Send + Sync + 'static {
         to.copy_from_slice(&padded[..count]);
     }
 
-    /// `2^a`, to 2e-7. Below `2^-126` it is no more than that, and not always zero; at most `2^127`. NaN stays NaN.
+    /// `2^a` with a relative error of 2e-7. Results below `2^-126` are between zero and that value, results above `2^127`
+    /// become `2^127`. NaN stays NaN.
     #[inline(always)]
     fn exp2(self, a: Self::V) -> Self::V {
-        // Coefficients of Cephes' exp2f.
+        // Coefficients of exp2f in Cephes.
         const COEFFICIENTS: [f32; 6] =
             [1.535_336_2e-4, 1.339_887_5e-3, 9.618_437e-3, 5.550_332_5e-2, 2.402_264_8e-1, std::f32::consts::LN_2];
         let bounded = self.min(self.splat(127.0), self.max(self.splat(-127.0), a));
@@ -103,29 +104,29 @@ pub trait Simd: Copy + Send + Sync + 'static {
     }
 }
 
-/// The longest vector of any instruction set.
+/// Most lanes of any instruction set.
 pub(crate) const MAX_LANES: usize = 16;
 
-/// One register tile: `C[M, N] = A[M, K] B[K, N]`, with `C` added to if `accumulate`.
+/// A register tile: `C[M, N] = A[M, K] B[K, N]`, or `C += A B` if `accumulate`.
 #[derive(Clone, Copy, Debug)]
 pub struct Tile {
     /// Inner size.
     pub inner: usize,
     /// First value of A.
     pub a: *const f32,
-    /// Distance of two rows of A.
+    /// Values from one row of A to the next.
     pub a_row: usize,
-    /// Distance of two columns of A.
+    /// Values from one column of A to the next.
     pub a_step: usize,
-    /// First value of B; its columns are neighbours.
+    /// First value of B; columns are contiguous.
     pub b: *const f32,
-    /// Distance of two rows of B.
+    /// Values from one row of B to the next.
     pub b_step: usize,
-    /// First value of C; its columns are neighbours.
+    /// First value of C; columns are contiguous.
     pub c: *mut f32,
-    /// Distance of two rows of C.
+    /// Values from one row of C to the next.
     pub c_row: usize,
-    /// Whether to add to C.
+    /// Whether the product is added to C.
     pub accumulate: bool,
 }
 
@@ -133,7 +134,7 @@ impl Tile {
     /// Computes `ROWS` rows of `VECTORS` vectors, all in registers.
     ///
     /// # Safety
-    /// All values of A, B and C that the sizes name must be readable, C's writable.
+    /// All values of A, B and C in the range of the sizes must be readable, those of C writable.
     #[inline(always)]
     #[expect(clippy::needless_range_loop, reason = "both loops unroll over constants")]
     pub unsafe fn run<S: Simd, const ROWS: usize, const VECTORS: usize>(self, simd: S) {
@@ -162,16 +163,14 @@ impl Tile {
             }
         }
     }
-}
 
-impl Tile {
-    /// `ROWS` rows of [`Simd::TILE_VECTORS`] vectors.
+    /// Computes `ROWS` rows of [`Simd::TILE_VECTORS`] vectors.
     ///
     /// # Safety
     /// As [`Tile::run`].
     #[inline(always)]
     pub(crate) unsafe fn run_vectors<S: Simd, const ROWS: usize>(self, simd: S) {
-        // SAFETY: the caller's.
+        // SAFETY: by the caller's promise.
         unsafe {
             match S::TILE_VECTORS {
                 1 => self.run::<S, ROWS, 1>(simd),
@@ -180,3 +179,16 @@ impl Tile {
         }
     }
 }
+
+/// Implements methods `fn name(self, a, b)` of [`Simd`] by intrinsics.
+#[cfg(target_arch = "x86_64")]
+macro_rules! binary_intrinsics {
+    ($($name:ident = $intrinsic:ident),* $(,)?) => {$(
+        #[inline(always)]
+        fn $name(self, a: Self::V, b: Self::V) -> Self::V {
+            unsafe { $intrinsic(a, b) }
+        }
+    )*};
+}
+#[cfg(target_arch = "x86_64")]
+pub(crate) use binary_intrinsics;

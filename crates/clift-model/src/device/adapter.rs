@@ -1,110 +1,109 @@
-//! The adapters of this machine, GPUs and software that stands in for them, as their graphics API describes them; what
-//! one tensor may take there.
+//! Adapters of the graphics API, GPUs and software renderers, and their limits.
 
 use burn::tensor::Device;
 
-/// Environment variable that chooses among several adapters, by what [`Adapter::selector`] says. `CubeCL` reads it.
+/// Environment variable that selects an adapter by its [`Adapter::selector`]. `CubeCL` reads the variable.
 pub const ADAPTER_VARIABLE: &str = "CUBECL_WGPU_DEFAULT_DEVICE";
 
-/// An adapter of the graphics API that the device `wgpu` takes.
+/// An adapter of the graphics API of the device `wgpu`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Adapter {
-    /// What it calls itself.
+    /// Name of the adapter.
     pub name: String,
     /// `discrete GPU`, `integrated GPU`, `virtual GPU`, `software` or `other`.
     pub kind: &'static str,
     /// The graphics API: `Vulkan`, `Metal`, `Dx12` or `Gl`.
     pub api: String,
-    /// Name and version of the driver, as far as it tells them.
+    /// Name and version of the driver, if known.
     pub driver: String,
-    /// The value of [`ADAPTER_VARIABLE`] that chooses it.
+    /// The value of [`ADAPTER_VARIABLE`] that selects this adapter.
     pub selector: String,
-    /// Whether the device `wgpu` is this one.
+    /// Whether the device `wgpu` is this adapter.
     pub is_used: bool,
-    /// What it allows.
+    /// Limits of the adapter.
     pub limits: Limits,
-    /// Whether shaders may compute in f16 and keep it in buffers.
+    /// Whether shaders support f16 in arithmetic and buffers.
     pub has_f16: bool,
 }
 
-/// The limits of an adapter that matter here. `CubeCL` asks for all of what an adapter has, not for WebGPU's defaults.
+/// Limits of an adapter. `CubeCL` requests the limits of the adapter, not the defaults of WebGPU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Most bytes of a buffer that a shader sees at once.
+    /// Most bytes of a storage buffer binding.
     pub max_binding_bytes: u64,
     /// Most bytes of a buffer.
     pub max_buffer_bytes: u64,
-    /// Most threads of a workgroup.
+    /// Most threads per workgroup.
     pub max_workgroup_threads: u32,
-    /// Most bytes that the threads of a workgroup share.
+    /// Most bytes of shared memory per workgroup.
     pub max_workgroup_bytes: u32,
-    /// Most workgroups along one side of a launch.
+    /// Most workgroups per dimension of a launch.
     pub max_workgroups: u32,
 }
 
 impl Limits {
-    /// Most bytes of one tensor: it lies in one buffer and is bound as a whole.
+    /// Returns the most bytes of one tensor, which is bound as a single buffer.
     pub fn max_tensor_bytes(&self) -> u64 {
         self.max_binding_bytes.min(self.max_buffer_bytes)
     }
 }
 
-/// Most bytes of one tensor on an open device; `None` where memory is the only limit.
+/// Returns the most bytes of one tensor on an open device; `None` if memory is the only limit.
 #[cfg(feature = "wgpu")]
 pub fn max_tensor_bytes(device: &Device) -> Option<u64> {
     match device.clone().without_autodiff().as_dispatch() {
-        // The least of both limits of the adapter, which is what the allocator refuses beyond.
+        // The smaller of both limits of the adapter; the allocator refuses larger buffers.
         burn::backend::DispatchDevice::Cube(device) => Some(device.client().properties().memory.max_page_size),
         _ => None,
     }
 }
 
-/// Most bytes of one tensor on an open device; `None` where memory is the only limit.
+/// Returns the most bytes of one tensor on an open device; `None` if memory is the only limit.
 #[cfg(not(feature = "wgpu"))]
 pub fn max_tensor_bytes(_device: &Device) -> Option<u64> {
     None
 }
 
-/// All adapters that the device `wgpu` can be; none in a build without it.
+/// Returns no adapters: this build does not contain the device `wgpu`.
 #[cfg(not(feature = "wgpu"))]
 pub fn adapters() -> Vec<Adapter> {
     Vec::new()
 }
 
 #[cfg(feature = "wgpu")]
-pub use found::adapters;
+pub use available::adapters;
 
 #[cfg(feature = "wgpu")]
-mod found {
+mod available {
     use burn::backend::wgpu::graphics::AutoGraphicsApi;
     use burn_cubecl::cubecl::future::block_on;
     use wgpu::{DeviceType, Instance, InstanceDescriptor, PowerPreference, RequestAdapterOptions};
 
     use super::{ADAPTER_VARIABLE, Adapter, Limits};
 
-    /// All adapters that the device `wgpu` can be: those of the first graphics API that has a GPU, or else of the first
-    /// that has any.
+    /// Returns the adapters that the device `wgpu` can use: those of the first graphics API with a GPU, or else of the
+    /// first with any adapter.
     pub fn adapters() -> Vec<Adapter> {
         let mut software = Vec::new();
         for api in AutoGraphicsApi::chain() {
-            let found = of_api(api);
-            if found.iter().any(|adapter| adapter.kind != kind(DeviceType::Cpu)) {
-                return found;
+            let available = adapters_of_api(api);
+            if available.iter().any(|adapter| adapter.kind != kind(DeviceType::Cpu)) {
+                return available;
             }
             if software.is_empty() {
-                software = found;
+                software = available;
             }
         }
         software
     }
 
-    fn of_api(api: wgpu::Backend) -> Vec<Adapter> {
+    fn adapters_of_api(api: wgpu::Backend) -> Vec<Adapter> {
         let instance = Instance::new(InstanceDescriptor {
             backends: api.into(),
             ..InstanceDescriptor::new_without_display_handle()
         });
         let all = block_on(instance.enumerate_adapters(api.into()));
-        // As CubeCL asks where no variable says otherwise.
+        // The request of CubeCL without the environment variable.
         let options =
             RequestAdapterOptions { power_preference: PowerPreference::HighPerformance, ..Default::default() };
         let preferred = block_on(instance.request_adapter(&options)).ok().map(|adapter| adapter.get_info());
@@ -141,8 +140,8 @@ mod found {
         adapters
     }
 
-    fn kind(of: DeviceType) -> &'static str {
-        match of {
+    fn kind(device_type: DeviceType) -> &'static str {
+        match device_type {
             DeviceType::DiscreteGpu => "discrete GPU",
             DeviceType::IntegratedGpu => "integrated GPU",
             DeviceType::VirtualGpu => "virtual GPU",
@@ -151,14 +150,9 @@ mod found {
         }
     }
 
-    /// Adapters are numbered within their kind; of software there is one.
-    fn selector(of: DeviceType, number: usize) -> String {
-        match of {
-            DeviceType::DiscreteGpu => format!("DiscreteGpu({number})"),
-            DeviceType::IntegratedGpu => format!("IntegratedGpu({number})"),
-            DeviceType::VirtualGpu => format!("VirtualGpu({number})"),
-            DeviceType::Cpu => "Cpu".into(),
-            DeviceType::Other => format!("Other({number})"),
-        }
+    /// Returns the selector of the `number`-th adapter of a type, in `CubeCL`'s syntax.
+    fn selector(device_type: DeviceType, number: usize) -> String {
+        // Software has no number.
+        if device_type == DeviceType::Cpu { "Cpu".into() } else { format!("{device_type:?}({number})") }
     }
 }

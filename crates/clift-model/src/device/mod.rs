@@ -1,7 +1,7 @@
-//! Devices and their capabilities.
+//! Devices by name, and their limits.
 //!
-//! - `name`: open a device by name
 //! - `adapter`: GPU adapters and their limits
+//! - `name`: device names, and opening a device
 
 pub(crate) mod adapter;
 pub(crate) mod name;

@@ -1,4 +1,4 @@
-//! Every device this project runs on, by the name a config or a command line gives it.
+//! Device names, and opening a device.
 
 use burn::tensor::Device;
 use clift_kernels::{InstructionSet, InstructionSetError};
@@ -8,7 +8,7 @@ use strum::{Display, IntoStaticStr, VariantArray};
 use crate::error::ModelError;
 use crate::names::{names, parse};
 
-/// A device by name.
+/// A device, by its name in configs and on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
@@ -16,17 +16,17 @@ pub enum DeviceName {
     /// Burn's CPU backend, the default.
     #[default]
     Flex,
-    /// The older CPU backend: a second opinion for numerical tests.
+    /// Burn's older CPU backend, an independent reference for numerical tests.
     Ndarray,
     /// Any GPU through WebGPU (Vulkan, Metal, DX12); needs the cargo feature `wgpu`.
     Wgpu,
 }
 
 impl DeviceName {
-    /// All names, in the order they are listed to a user.
+    /// All devices, in the order of help texts.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// Returns the name as it is typed.
+    /// Returns the name in configs and on the command line.
     pub fn as_str(self) -> &'static str {
         self.into()
     }
@@ -42,9 +42,8 @@ impl DeviceName {
     /// Opens the device, without autodiff.
     ///
     /// # Errors
-    /// [`ModelError::NoDevice`] when this build does not contain it (the message says how to build
-    /// one that does) or no adapter is found; [`ModelError::BadConfig`] when the environment asks `flex` for an
-    /// instruction set that the processor does not have.
+    /// [`ModelError::NoDevice`] if this build does not contain the device or no adapter is found;
+    /// [`ModelError::BadConfig`] for an invalid value of [`InstructionSet::VARIABLE`].
     pub fn open(self) -> Result<Device, ModelError> {
         match self {
             Self::Flex => {
@@ -56,7 +55,7 @@ impl DeviceName {
                 InstructionSet::forced().map_err(bad)?;
                 Ok(Device::flex())
             }
-            // Upstream retires this backend in favour of flex; it stays as an independent check.
+            // Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference.
             #[allow(deprecated)]
             Self::Ndarray => Ok(Device::ndarray()),
             Self::Wgpu => open_wgpu(),
@@ -70,7 +69,7 @@ impl std::str::FromStr for DeviceName {
     fn from_str(name: &str) -> Result<Self, ModelError> {
         parse(name).ok_or_else(|| ModelError::NoDevice {
             name: name.into(),
-            reason: format!("unknown; the names are {}", names::<Self>()),
+            reason: format!("unknown; use one of {}", names::<Self>()),
         })
     }
 }
@@ -90,7 +89,7 @@ fn open_wgpu() -> Result<Device, ModelError> {
     use burn::tensor::{DeviceKind, DeviceType};
 
     use crate::device::adapter::{ADAPTER_VARIABLE, adapters};
-    // Asking wgpu for a device where there is no adapter panics, so look first.
+    // wgpu panics when it opens a device without an adapter.
     let num_adapters = std::panic::catch_unwind(|| Device::enumerate(DeviceType::Wgpu).into_vec().len()).unwrap_or(0);
     if num_adapters == 0 {
         return Err(ModelError::NoDevice {
@@ -98,12 +97,13 @@ fn open_wgpu() -> Result<Device, ModelError> {
             reason: "no adapter was found; install a Vulkan driver (for software rendering: Mesa's lavapipe)".into(),
         });
     }
-    // It panics as well where the environment names an adapter that is not there.
+    // wgpu also panics if the environment variable selects an adapter that does not exist.
     if let Ok(chosen) = std::env::var(ADAPTER_VARIABLE) {
         let adapters = std::panic::catch_unwind(adapters).unwrap_or_default();
         if !adapters.iter().any(|adapter| adapter.is_used) {
             let known: Vec<_> = adapters.iter().map(|adapter| adapter.selector.as_str()).collect();
-            let reason = format!("{ADAPTER_VARIABLE} is `{chosen}`; the adapters here are {}", known.join(", "));
+            let reason =
+                format!("{ADAPTER_VARIABLE} is `{chosen}`, which is not found; the adapters are {}", known.join(", "));
             return Err(ModelError::NoDevice { name: "wgpu".into(), reason });
         }
     }
@@ -115,14 +115,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_unknown_name_lists_the_known() {
+    fn an_unknown_name_is_refused_with_all_names() {
         let message = "cuda".parse::<DeviceName>().unwrap_err().to_string();
-        assert_eq!(message, "device `cuda`: unknown; the names are flex, ndarray, wgpu");
+        assert_eq!(message, "device `cuda`: unknown; use one of flex, ndarray, wgpu");
     }
 
     #[cfg(not(feature = "wgpu"))]
     #[test]
-    fn a_build_without_wgpu_says_how_to_get_it() {
+    fn a_build_without_wgpu_names_the_feature() {
         let message = DeviceName::Wgpu.open().unwrap_err().to_string();
         assert!(message.contains("--features wgpu"), "{message}");
     }

@@ -1,12 +1,12 @@
-//! What our own differentiable operations share.
+//! Gradients of an operation with a hand-written backward.
 
 use burn::backend::Backend;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::Ops;
 use burn::backend::tensor::FloatTensor;
 
-/// Takes the gradient of an operation's output, computes those of its inputs from the saved state, and
-/// hands them to the inputs. `gradients` is told which inputs want one and may leave out the others.
+/// Takes the gradient of an operation's output and registers the gradients of its inputs, which `gradients` computes from
+/// the saved state. `gradients` receives one flag per input and may skip inputs without gradient.
 pub(crate) fn register<B: Backend, S, const N: usize>(
     ops: Ops<S, N>,
     grads: &mut Gradients,
@@ -15,8 +15,8 @@ pub(crate) fn register<B: Backend, S, const N: usize>(
     S: Clone + Send + std::fmt::Debug + 'static,
 {
     let grad_output = grads.consume::<B>(&ops.node);
-    let wanted = ops.parents.each_ref().map(Option::is_some);
-    for (parent, gradient) in ops.parents.into_iter().zip(gradients(ops.state, grad_output, wanted)) {
+    let needed = ops.parents.each_ref().map(Option::is_some);
+    for (parent, gradient) in ops.parents.into_iter().zip(gradients(ops.state, grad_output, needed)) {
         if let (Some(node), Some(gradient)) = (parent, gradient) {
             grads.register::<B>(node.id, gradient);
         }

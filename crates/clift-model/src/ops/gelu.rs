@@ -1,5 +1,8 @@
-//! GELU with exact gradient, per backend.
-#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+//! GELU with exact gradient on every backend.
+#![expect(
+    deprecated,
+    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
+)]
 
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, Flex, NdArray, TensorMetadata};
@@ -7,26 +10,25 @@ use clift_kernels::{InstructionSet, gelu_backward, gelu_forward};
 
 use crate::ops::flex::{contiguous, is_native, tensor, values, values_mut};
 
-/// GELU on a device, `x * Phi(x)` with the normal distribution function `Phi` (erf, not the tanh
-/// approximation), and its exact gradient: Burn 0.22 differentiates the approximation on GPUs.
-/// The bodies here run on every device.
+/// GELU, `x * Phi(x)` with the normal distribution function `Phi` (erf, not the tanh approximation), and its exact
+/// gradient; Burn 0.22 differentiates the approximation on GPUs. The default implementations run on every backend.
 pub trait GeluKernels: Backend {
-    /// `x * Phi(x)`
+    /// Computes `x * Phi(x)`.
     fn gelu_output(x: FloatTensor<Self>) -> FloatTensor<Self> {
-        output::<Self>(x)
+        composed_output::<Self>(x)
     }
 
-    /// `grad * (Phi(x) + x * phi(x))` with the normal density `phi`.
+    /// Computes `grad * (Phi(x) + x * phi(x))` with the normal density `phi`.
     fn gelu_grad(x: FloatTensor<Self>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
-        backward::<Self>(x, grad)
+        composed_grad::<Self>(x, grad)
     }
 }
 
-fn output<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
+fn composed_output<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     B::float_mul(x.clone(), normal_cdf::<B>(x))
 }
 
-pub(crate) fn backward<B: Backend>(x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
+fn composed_grad<B: Backend>(x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
     let density = B::float_exp(B::float_mul_scalar(B::float_mul(x.clone(), x.clone()), (-0.5).into()));
     let density = B::float_mul_scalar(density, (1.0 / (2.0 * std::f64::consts::PI).sqrt()).into());
     let slope = B::float_add(normal_cdf::<B>(x.clone()), B::float_mul(x, density));
@@ -41,7 +43,7 @@ fn normal_cdf<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
 impl GeluKernels for Flex {
     fn gelu_output(x: FloatTensor<Self>) -> FloatTensor<Self> {
         if !is_native(&x) {
-            return output::<Self>(x);
+            return composed_output::<Self>(x);
         }
         let mut to = vec![0.0; x.shape().num_elements()];
         let shape = x.shape();
@@ -51,7 +53,7 @@ impl GeluKernels for Flex {
 
     fn gelu_grad(x: FloatTensor<Self>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
         if !is_native(&x) {
-            return backward::<Self>(x, grad);
+            return composed_grad::<Self>(x, grad);
         }
         let mut grad = contiguous(grad);
         gelu_backward(InstructionSet::detected(), values(&contiguous(x)), values_mut(&mut grad));

@@ -1,6 +1,9 @@
-//! Layer normalisation on a device, in both directions. Every norm of the model stands before a linear
-//! layer: [`linear_of_norm`](crate::ops::linear::norm_linear) is the operation.
-#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+//! Layer normalization and its gradient on every backend. Every norm of the model precedes a linear layer;
+//! [`norm_linear`](crate::ops::linear::norm_linear) is the operation of both.
+#![expect(
+    deprecated,
+    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
+)]
 // B scenes, N tokens, D width
 
 use burn::backend::tensor::FloatTensor;
@@ -13,41 +16,41 @@ use crate::ops::flex::{contiguous, is_native, tensor, values};
 /// Added to the variance, as in PyTorch.
 pub const EPSILON: f64 = 1e-5;
 
-/// `(x - mean) / sqrt(variance + 1e-5) * gamma + beta` over the last dimension, and its gradient. The
-/// bodies here run on every device.
+/// `(x - mean) / sqrt(variance + 1e-5) * gamma + beta` over the last dimension, and its gradient. The default
+/// implementations run on every backend.
 pub trait LayerNormKernels: Backend {
-    /// The result, and what [`LayerNormKernels::norm_backward`] can use besides the inputs.
+    /// Computes the output, and [`NormState::statistics`] if the native kernel runs.
     fn norm_output(
         x: FloatTensor<Self>,
         gamma: FloatTensor<Self>,
         beta: FloatTensor<Self>,
     ) -> (FloatTensor<Self>, Option<FloatTensor<Self>>) {
-        (output::<Self>(x, gamma, beta), None)
+        (composed_output::<Self>(x, gamma, beta), None)
     }
 
-    /// The gradients of `x`, `gamma` and `beta`.
+    /// Computes the gradients of `x`, `gamma` and `beta`.
     fn norm_backward(state: NormState<FloatTensor<Self>>, grad: FloatTensor<Self>) -> [FloatTensor<Self>; 3] {
-        backward::<Self>(state, grad)
+        composed_backward::<Self>(state, grad)
     }
 }
 
-/// What the backward needs.
+/// Inputs and saved results of the forward pass, for the backward.
 #[derive(Clone, Debug)]
 pub struct NormState<T> {
-    /// `[B, N, D]`
+    /// Input, `[B, N, D]`.
     pub x: T,
-    /// `[D]`
+    /// Scale, `[D]`.
     pub gamma: T,
-    /// Mean and inverse deviation of every row, `[BN, 2]`, where the device saved them.
+    /// Mean and inverse deviation of every row, `[BN, 2]`, if the native kernel computed them.
     pub statistics: Option<T>,
 }
 
-/// `(x - mean) / deviation` and `1 / deviation`.
+/// Returns `(x - mean) / deviation` and `1 / deviation`.
 fn normal<B: Backend>(x: FloatTensor<B>) -> (FloatTensor<B>, FloatTensor<B>) {
-    let centred = B::float_sub(x.clone(), mean::<B>(x));
-    let variance = mean::<B>(B::float_mul(centred.clone(), centred.clone()));
+    let centered = B::float_sub(x.clone(), mean::<B>(x));
+    let variance = mean::<B>(B::float_mul(centered.clone(), centered.clone()));
     let inverse = B::float_recip(B::float_sqrt(B::float_add_scalar(variance, EPSILON.into())));
-    (B::float_mul(centred, inverse.clone()), inverse)
+    (B::float_mul(centered, inverse.clone()), inverse)
 }
 
 /// `[B, N, D] -> [B, N, 1]`
@@ -62,13 +65,13 @@ fn row<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     B::float_reshape(x, Shape::new([1, 1, dim]))
 }
 
-fn output<B: Backend>(x: FloatTensor<B>, gamma: FloatTensor<B>, beta: FloatTensor<B>) -> FloatTensor<B> {
+fn composed_output<B: Backend>(x: FloatTensor<B>, gamma: FloatTensor<B>, beta: FloatTensor<B>) -> FloatTensor<B> {
     B::float_add(B::float_mul(normal::<B>(x).0, row::<B>(gamma)), row::<B>(beta))
 }
 
-/// With `y` the normalised rows and `g = dO gamma`: `dx = (g - mean(g) - y mean(g y)) / deviation`,
+/// Computes the gradients. With `y` the normalized rows and `g = dO gamma`: `dx = (g - mean(g) - y mean(g y)) / deviation`,
 /// `dgamma = sum(dO y)`, `dbeta = sum(dO)`.
-fn backward<B: Backend>(state: NormState<FloatTensor<B>>, grad: FloatTensor<B>) -> [FloatTensor<B>; 3] {
+fn composed_backward<B: Backend>(state: NormState<FloatTensor<B>>, grad: FloatTensor<B>) -> [FloatTensor<B>; 3] {
     let NormState { x, gamma, .. } = state;
     let [batch, count, dim] = x.shape().dims();
     let (normal, inverse) = normal::<B>(x);
@@ -91,7 +94,7 @@ impl LayerNormKernels for Flex {
         beta: FloatTensor<Self>,
     ) -> (FloatTensor<Self>, Option<FloatTensor<Self>>) {
         if !is_native(&x) {
-            return (output::<Self>(x, gamma, beta), None);
+            return (composed_output::<Self>(x, gamma, beta), None);
         }
         let [batch, count, dim] = x.shape().dims();
         let [x, gamma, beta] = [x, gamma, beta].map(contiguous);
@@ -105,7 +108,7 @@ impl LayerNormKernels for Flex {
 
     fn norm_backward(state: NormState<FloatTensor<Self>>, grad: FloatTensor<Self>) -> [FloatTensor<Self>; 3] {
         let Some(statistics) = &state.statistics else {
-            return backward::<Self>(state, grad);
+            return composed_backward::<Self>(state, grad);
         };
         let [batch, count, dim] = state.x.shape().dims();
         let [x, gamma, grad] = [state.x, state.gamma, grad].map(contiguous);
@@ -124,13 +127,15 @@ impl LayerNormKernels for burn::backend::Cube {}
 #[cfg(test)]
 mod tests {
     use burn::module::Param;
-    use burn::nn::{LayerNormConfig, Linear};
+    use burn::nn::Linear;
     use burn::tensor::{DType, Device, Tensor};
 
     use crate::ops::linear::norm_then_linear;
-    use crate::testing::{assert_close, check_gradients, cpu_devices, devices, random};
+    use crate::testing::{
+        assert_close, check_gradients, check_native, cpu_devices, devices, output_and_gradients, random,
+    };
 
-    /// The norm on its own, before a layer that changes nothing; gamma and beta as `[1, 1, D]`.
+    /// Applies a norm before an identity layer; gamma and beta are `[1, 1, D]`.
     fn norm(x: Tensor<3>, gamma: Tensor<3>, beta: Tensor<3>) -> Tensor<3> {
         let [_, _, dim] = x.dims();
         let (device, dtype) = (x.device(), x.dtype());
@@ -142,18 +147,6 @@ mod tests {
     }
 
     #[test]
-    fn equals_burns_own_layer() {
-        for device in devices() {
-            let [gamma, beta] = [1, 2].map(|seed| random([1, 1, 12], seed, &device).cast(DType::F32));
-            let mut layer = LayerNormConfig::new(12).init(&device);
-            layer.gamma = Param::from_tensor(gamma.clone().reshape([12]));
-            layer.beta = Some(Param::from_tensor(beta.clone().reshape([12])));
-            let x = random([2, 5, 12], 3, &device).cast(DType::F32);
-            assert_close(&norm(x.clone(), gamma, beta), &layer.forward(x), 2e-6);
-        }
-    }
-
-    #[test]
     fn gradients_equal_central_differences_in_f64() {
         for device in cpu_devices() {
             let inputs = [random([2, 5, 8], 1, &device), random([1, 1, 8], 2, &device), random([1, 1, 8], 3, &device)];
@@ -162,32 +155,23 @@ mod tests {
     }
 
     #[test]
-    fn gradients_of_the_native_kernel_equal_f64() {
-        let device = Device::flex().autodiff();
-        let gradients = |dtype: DType| {
-            let make =
-                |shape: [usize; 3], seed| random(shape, seed, &device).cast(DType::F32).cast(dtype).require_grad();
-            let inputs = [make([3, 7, 37], 1), make([1, 1, 37], 2), make([1, 1, 37], 3)];
-            let cotangent = random([3, 7, 37], 4, &device).cast(DType::F32).cast(dtype);
-            let [x, gamma, beta] = inputs.clone();
-            let grads = (norm(x, gamma, beta) * cotangent).sum().backward();
-            inputs.map(|input| input.grad(&grads).expect("tracked").cast(DType::F64))
-        };
-        for (native, reference) in gradients(DType::F32).iter().zip(&gradients(DType::F64)) {
-            assert_close(native, reference, 1e-5);
-        }
+    fn native_kernels_equal_f64() {
+        let device = Device::flex();
+        let inputs =
+            [([3, 7, 37], 1), ([1, 1, 37], 2), ([1, 1, 37], 3)].map(|(shape, seed)| random(shape, seed, &device));
+        check_native(inputs, random([3, 7, 37], 4, &device), |[x, gamma, beta]| norm(x, gamma, beta), 1e-5);
     }
 
     #[test]
     fn a_constant_row_gives_beta_and_finite_gradients() {
         for device in devices() {
-            let device = device.autodiff();
             let [gamma, beta] = [1, 2].map(|seed| random([1, 1, 12], seed, &device).cast(DType::F32));
-            let x = (Tensor::<3>::ones([1, 2, 12], &device) * 3.0).require_grad();
-            let output = norm(x.clone(), gamma, beta.clone());
-            assert_close(&output.clone().inner(), &beta.inner().expand([1, 2, 12]), 1e-4);
-            let gradient = x.grad(&output.square().sum().backward()).expect("tracked");
-            assert!(gradient.is_finite().all().into_scalar::<bool>());
+            let x = Tensor::<3>::full([1, 2, 12], 3.0, &device);
+            let cotangent = random([1, 2, 12], 3, &device).cast(DType::F32);
+            let inputs = [x, gamma, beta.clone()];
+            let (output, grads) = output_and_gradients(inputs, cotangent, |[x, gamma, beta]| norm(x, gamma, beta));
+            assert_close(&output, &beta.expand([1, 2, 12]), 1e-4);
+            assert!(grads.into_iter().all(|grad| grad.is_finite().all().into_scalar::<bool>()));
         }
     }
 }

@@ -1,9 +1,11 @@
-//! Linear layers as one operation: on their own, behind a GELU, or behind a layer norm.
+//! Linear layers as one operation, alone or fused with a preceding GELU or layer norm.
 //!
-//! What stands before the layer is not kept for the backward but computed again from its input, one
-//! pass: a GELU's result is the widest activation of a transformer block, and every block has two or
-//! three norms.
-#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+//! The result of the GELU or norm is not kept for the backward but computed again from its input: the GELU's result is
+//! the widest activation of a transformer block, and every block has two or three norms.
+#![expect(
+    deprecated,
+    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
+)]
 // B scenes, N rows of a scene, I inputs, O outputs
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
@@ -23,70 +25,70 @@ use crate::ops::layer_norm::{LayerNormKernels, NormState};
 use crate::ops::mac_counter;
 use crate::ops::precision::{MatmulKernels, Precision};
 
-/// `x W + b` of a layer with a bias.
+/// Computes `x W + b`.
 ///
 /// # Shapes
 /// - `x`: `[batch, count, inputs]`
 /// - returns `[batch, count, outputs]`
 ///
 /// # Panics
-/// When the layer has no bias.
+/// If the layer has no bias.
 pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, Prologue { gelu: false, precision: Precision::current() })
 }
 
-/// [`linear`] in f32 whatever the precision of this thread: for layers that take rays.
+/// Computes [`linear`] in f32, independent of the precision of this thread: for layers whose inputs are rays.
 ///
 /// # Shapes
 /// - `x`: `[batch, count, inputs]`
 /// - returns `[batch, count, outputs]`
 ///
 /// # Panics
-/// When the layer has no bias.
+/// If the layer has no bias.
 pub fn linear_in_f32(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, Prologue { gelu: false, precision: Precision::F32 })
 }
 
-/// `gelu(x) W + b` with `gelu(x) = x Phi(x)` and the normal distribution function `Phi`.
+/// Computes `gelu(x) W + b` with `gelu(x) = x Phi(x)` and the normal distribution function `Phi`.
 ///
 /// # Shapes
 /// - `x`: `[batch, count, inputs]`
 /// - returns `[batch, count, outputs]`
 ///
 /// # Panics
-/// When the layer has no bias.
+/// If the layer has no bias.
 pub fn gelu_linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, Prologue { gelu: true, precision: Precision::current() })
 }
 
-/// `norm(x) W + b` with `norm(x) = (x - mean) / sqrt(variance + 1e-5) * gamma + beta` over a row.
+/// Computes `norm(x) W + b` with `norm(x) = (x - mean) / sqrt(variance + 1e-5) * gamma + beta` per row.
 ///
 /// # Shapes
 /// - `x`: `[batch, count, inputs]`
 /// - returns `[batch, count, outputs]`
 ///
 /// # Panics
-/// When the norm or the layer has no bias.
+/// If the norm or the layer has no bias.
 pub fn norm_linear(norm: &LayerNorm, layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     norm_then_linear(x, norm.gamma.val(), norm.beta.as_ref().expect("the norm has a bias").val(), layer)
 }
 
-/// What is done before a layer's bias is added.
+/// The computation before the bias of a layer is added.
 #[derive(Clone, Copy, Debug)]
 pub struct Prologue {
     /// Whether the input goes through a GELU.
     gelu: bool,
-    /// What the product is computed in.
+    /// Precision of the product's operands.
     precision: Precision,
 }
 
-fn apply(layer: &Linear, x: Tensor<3>, before: Prologue) -> Tensor<3> {
+fn apply(layer: &Linear, x: Tensor<3>, prologue: Prologue) -> Tensor<3> {
     let (weight, bias) = parameters(layer, &x);
     let [x, weight, bias] = [x.into_dispatch(), weight.into_dispatch(), bias.into_dispatch()];
-    Tensor::from_dispatch(<Dispatch as LinearOps>::linear_layer(x, weight, bias, before))
+    Tensor::from_dispatch(<Dispatch as LinearOps>::linear_layer(x, weight, bias, prologue))
 }
 
-/// [`norm_linear`] with the norm's parameters as tensors.
+/// Computes [`norm_linear`] with the parameters of the norm as tensors.
 pub(crate) fn norm_then_linear(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>, layer: &Linear) -> Tensor<3> {
     let (weight, bias) = parameters(layer, &x);
     let [inputs, _outputs] = weight.dims();
@@ -102,7 +104,7 @@ pub(crate) fn norm_then_linear(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>, 
     ))
 }
 
-/// Weight and bias of a layer that takes `x`.
+/// Returns weight and bias of a layer with input `x`, and counts its multiply-accumulates.
 fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
     let weight = layer.weight.val();
     let bias = layer.bias.as_ref().expect("the layer has a bias").val();
@@ -112,7 +114,7 @@ fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
     (weight, bias)
 }
 
-/// The operations behind [`linear`], [`gelu_linear`] and [`norm_linear`] on a device.
+/// The operations of [`linear`], [`gelu_linear`] and [`norm_linear`] on a backend.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait LinearOps: Backend {
     /// See [`linear`] and [`gelu_linear`].
@@ -120,7 +122,7 @@ pub trait LinearOps: Backend {
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
-        before: Prologue,
+        prologue: Prologue,
     ) -> FloatTensor<Self>;
 
     /// See [`norm_linear`].
@@ -134,25 +136,25 @@ pub trait LinearOps: Backend {
     ) -> FloatTensor<Self>;
 }
 
-/// The parts of the operation on a device. The bodies here run on every one of them.
+/// Parts of the operations on a backend. The default implementations run on every backend.
 pub trait LinearKernels: GeluKernels + LayerNormKernels + MatmulKernels {
-    /// `x W + b`: `[B, N, I] -> [B, N, O]`
+    /// Computes `x W + b`: `[B, N, I] -> [B, N, O]`.
     fn linear_output(
         precision: Precision,
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
     ) -> FloatTensor<Self> {
-        output::<Self>(precision, x, weight, bias)
+        composed_output::<Self>(precision, x, weight, bias)
     }
 
-    /// Sum over rows: `[B, N, O] -> [O]`
+    /// Sums over rows: `[B, N, O] -> [O]`.
     fn sum_rows(x: FloatTensor<Self>) -> FloatTensor<Self> {
-        sum::<Self>(x)
+        composed_sum_rows::<Self>(x)
     }
 }
 
-fn output<B: MatmulKernels>(
+fn composed_output<B: MatmulKernels>(
     precision: Precision,
     x: FloatTensor<B>,
     weight: FloatTensor<B>,
@@ -160,12 +162,12 @@ fn output<B: MatmulKernels>(
 ) -> FloatTensor<B> {
     let [batch, count, _] = x.shape().dims();
     let [_, outputs] = weight.shape().dims();
-    let product = B::product(precision, rows::<B>(x), weight); // [BN, O]
+    let product = B::matmul(precision, rows::<B>(x), weight); // [BN, O]
     let bias = B::float_expand(B::float_reshape(bias, Shape::new([1, outputs])), product.shape());
     B::float_reshape(B::float_add(product, bias), Shape::new([batch, count, outputs]))
 }
 
-fn sum<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
+fn composed_sum_rows<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     let x = rows::<B>(x);
     let [_, outputs] = x.shape().dims();
     B::float_reshape(B::float_sum_dim(x, 0), Shape::new([outputs]))
@@ -185,7 +187,7 @@ impl LinearKernels for Flex {
         bias: FloatTensor<Self>,
     ) -> FloatTensor<Self> {
         if !is_native(&x) || precision != Precision::F32 {
-            return output::<Self>(precision, x, weight, bias);
+            return composed_output::<Self>(precision, x, weight, bias);
         }
         let [batch, count, inputs] = x.shape().dims();
         let [_, outputs] = weight.shape().dims();
@@ -198,7 +200,7 @@ impl LinearKernels for Flex {
 
     fn sum_rows(x: FloatTensor<Self>) -> FloatTensor<Self> {
         if !is_native(&x) {
-            return sum::<Self>(x);
+            return composed_sum_rows::<Self>(x);
         }
         let [_, _, outputs] = x.shape().dims();
         let mut sum = vec![0.0; outputs];
@@ -215,9 +217,9 @@ fn forward<B: LinearKernels>(
     x: FloatTensor<B>,
     weight: FloatTensor<B>,
     bias: FloatTensor<B>,
-    before: Prologue,
+    prologue: Prologue,
 ) -> FloatTensor<B> {
-    B::linear_output(before.precision, if before.gelu { B::gelu_output(x) } else { x }, weight, bias)
+    B::linear_output(prologue.precision, if prologue.gelu { B::gelu_output(x) } else { x }, weight, bias)
 }
 
 macro_rules! linear_ops {
@@ -227,9 +229,9 @@ macro_rules! linear_ops {
                 x: FloatTensor<Self>,
                 weight: FloatTensor<Self>,
                 bias: FloatTensor<Self>,
-                before: Prologue,
+                prologue: Prologue,
             ) -> FloatTensor<Self> {
-                forward::<Self>(x, weight, bias, before)
+                forward::<Self>(x, weight, bias, prologue)
             }
 
             fn norm_then_linear(
@@ -256,16 +258,16 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
         bias: FloatTensor<Self>,
-        before: Prologue,
+        prologue: Prologue,
     ) -> FloatTensor<Self> {
         let ((x, x_node), (weight, weight_node), (bias, bias_node)) =
             (x.into_parts(), weight.into_parts(), bias.into_parts());
         match LinearBackward.prepare::<C>([x_node, weight_node, bias_node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let output = forward::<B>(x.clone(), weight.clone(), bias, before);
-                prep.finish(LinearState { x, weight, before }, output)
+                let output = forward::<B>(x.clone(), weight.clone(), bias, prologue);
+                prep.finish(LinearState { x, weight, prologue }, output)
             }
-            OpsKind::UnTracked(prep) => prep.finish(forward::<B>(x, weight, bias, before)),
+            OpsKind::UnTracked(prep) => prep.finish(forward::<B>(x, weight, bias, prologue)),
         }
     }
 
@@ -302,7 +304,7 @@ struct LinearBackward;
 struct LinearState<T> {
     x: T,
     weight: T,
-    before: Prologue,
+    prologue: Prologue,
 }
 
 impl<B: LinearKernels> Backward<B, 3> for LinearBackward {
@@ -310,9 +312,9 @@ impl<B: LinearKernels> Backward<B, 3> for LinearBackward {
 
     /// With `a = x` or `gelu(x)`: `dW = a^T dO`, `db = sum dO`, `da = dO W^T`.
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 3>(ops, grads, |LinearState { x, weight, before }, grad, wanted| {
-            let Prologue { gelu, precision } = before;
-            let [of_x, of_weight, of_bias] = wanted;
+        register::<B, _, 3>(ops, grads, |LinearState { x, weight, prologue }, grad, needed| {
+            let Prologue { gelu, precision } = prologue;
+            let [of_x, of_weight, of_bias] = needed;
             let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
             let grad_weight = of_weight.then(|| {
                 let activation = if gelu { B::gelu_output(x.clone()) } else { x.clone() };
@@ -341,10 +343,10 @@ struct NormLinearState<T> {
 impl<B: LinearKernels> Backward<B, 5> for NormLinearBackward {
     type State = NormLinearState<FloatTensor<B>>;
 
-    /// As for [`LinearBackward`] with `a = norm(x)`, and `da` handed on through the norm.
+    /// As for [`LinearBackward`] with `a = norm(x)`, and `da` passed on to the norm.
     fn backward(self, ops: Ops<Self::State, 5>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
-        register::<B, _, 5>(ops, grads, |NormLinearState { norm, beta, weight, precision }, grad, wanted| {
-            let [of_x, of_gamma, of_beta, of_weight, of_bias] = wanted;
+        register::<B, _, 5>(ops, grads, |NormLinearState { norm, beta, weight, precision }, grad, needed| {
+            let [of_x, of_gamma, of_beta, of_weight, of_bias] = needed;
             let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
             let grad_weight = of_weight.then(|| {
                 let (normal, _statistics) = B::norm_output(norm.x.clone(), norm.gamma.clone(), beta);
@@ -362,7 +364,7 @@ impl<B: LinearKernels> Backward<B, 5> for NormLinearBackward {
 
 /// `x^T grad`: `[I, O]`
 fn grad_of_weight<B: MatmulKernels>(precision: Precision, x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
-    B::product(precision, B::float_swap_dims(rows::<B>(x), 0, 1), rows::<B>(grad))
+    B::matmul(precision, B::float_swap_dims(rows::<B>(x), 0, 1), rows::<B>(grad))
 }
 
 /// `grad W^T`: `[B, N, O] -> [B, N, I]`
@@ -373,6 +375,6 @@ fn grad_of_input<B: MatmulKernels>(
 ) -> FloatTensor<B> {
     let [batch, count, _] = grad.shape().dims();
     let [inputs, _] = weight.shape().dims();
-    let product = B::product(precision, rows::<B>(grad), B::float_swap_dims(weight, 0, 1));
+    let product = B::matmul(precision, rows::<B>(grad), B::float_swap_dims(weight, 0, 1));
     B::float_reshape(product, Shape::new([batch, count, inputs]))
 }

@@ -1,4 +1,4 @@
-//! Counts the multiply-accumulates that ran on a thread, in tests only: layers and attention report theirs here.
+//! Counts the multiply-accumulates of layers and attention on a thread, in tests only.
 
 use std::cell::Cell;
 
@@ -7,14 +7,14 @@ thread_local! {
     static ATTENTION: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Adds a product of `rows` rows of `inputs` values by a matrix of `outputs` columns.
+/// Adds a product of `[rows, inputs]` by `[inputs, outputs]`.
 pub fn add_linear(rows: usize, inputs: usize, outputs: usize) {
     if cfg!(test) {
         LINEAR.set(LINEAR.get() + (rows * inputs * outputs) as u64);
     }
 }
 
-/// Adds scores and weighted sums of `pairs` pairs of a query and a key; `dim` is the width of all heads together.
+/// Adds the scores and weighted sums of `pairs` query-key pairs; `dim` is the width of all heads together.
 pub fn add_attention(pairs: usize, dim: usize) {
     if cfg!(test) {
         ATTENTION.set(ATTENTION.get() + (2 * pairs * dim) as u64);

@@ -1,14 +1,17 @@
-//! Operations with a hand-written backward.
+//! Operations with a hand-written backward: native kernels on `flex`, composed of Burn's operations on other backends.
 //!
-//! - `autodiff`: register gradients of own operations
-//! - `flex`: Burn CPU tensors as f32 slices
-//! - `mac_counter`: count multiply-accumulates in tests
-//! - `precision`: f32 or f16 operands, per scope
-//! - `gelu`: GELU with exact gradient, per backend
-//! - `layer_norm`: layer norm on every backend
-//! - `linear`: linear layer, fused with norm or GELU
-//! - `attention`: softmax attention as one operation
-//! - `cluster_attention`: attention inside clusters, linear in N
+//! Shared parts:
+//! - `autodiff`: gradients of an operation for its inputs
+//! - `flex`: tensors of Burn's CPU backend as f32 slices
+//! - `mac_counter`: multiply-accumulates, counted in tests
+//! - `precision`: f32 or f16 operands of matrix products, per scope
+//!
+//! Operations:
+//! - `gelu`: GELU with exact gradient
+//! - `layer_norm`: layer normalization
+//! - `linear`: linear layer, alone or fused with a layer norm or GELU
+//! - `attention`: softmax attention
+//! - `cluster_attention`: attention inside clusters, linear in the number of tokens
 
 pub(crate) mod attention;
 pub(crate) mod autodiff;

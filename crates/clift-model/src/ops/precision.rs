@@ -1,13 +1,15 @@
-//! The numbers that matrix products are computed in: f32, or f16 where the device has it.
+//! Precision of the operands of matrix products: f32, or f16 on devices with f16.
 //!
-//! Only the two operands of a product become f16: those of linear layers and of attention, in both directions. Weights,
-//! results, sums, norms, softmax, GELU, loss, gradients and optimiser stay f32. The first layers, which take rays, and
-//! the gates of the condenser stay f32 altogether.
+//! Only the two operands of a product become f16, in linear layers and attention, forward and backward. Weights, results,
+//! sums, norms, softmax, GELU, loss, gradients and optimizer state stay f32, as do the first layers, whose inputs are
+//! rays, and the gates of the condenser.
 //!
-//! The precision holds for a scope of a thread, as autocasting does elsewhere: [`Precision::scope`] around a forward
-//! pass is all that a caller writes. An operation asks once, when it is called, and its backward computes as its forward
-//! did.
-#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+//! The precision applies to a scope of a thread, like autocast in PyTorch: callers hold [`Precision::scope`] during the
+//! forward pass. An operation reads the precision once; its backward uses that of its forward.
+#![expect(
+    deprecated,
+    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
+)]
 
 use std::cell::Cell;
 use std::marker::PhantomData;
@@ -21,15 +23,15 @@ use strum::{Display, IntoStaticStr, VariantArray};
 use crate::error::ModelError;
 use crate::names::parse;
 
-/// What the operands of matrix products are.
+/// Type of the operands of matrix products.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
 pub enum Precision {
-    /// 24 bits of fraction.
+    /// 24 bits of significand.
     #[default]
     F32,
-    /// 11 bits of fraction, from 6e-8 to 65504: half the bytes, and on most GPUs a multiple of the speed.
+    /// 11 bits of significand, from 6e-8 to 65504: half the bytes, and on most GPUs a multiple of the speed.
     F16,
 }
 
@@ -38,42 +40,42 @@ thread_local! {
 }
 
 impl Precision {
-    /// That of this thread now.
+    /// Returns the current precision of this thread.
     pub fn current() -> Self {
         CURRENT.get()
     }
 
-    /// Sets that of this thread until the result is dropped.
-    #[must_use = "it holds until this is dropped"]
+    /// Sets the precision of this thread until the returned scope is dropped.
+    #[must_use = "the precision applies until the scope is dropped"]
     pub fn scope(self) -> PrecisionScope {
-        PrecisionScope { former: CURRENT.replace(self), of_this_thread: PhantomData }
+        PrecisionScope { former: CURRENT.replace(self), not_send: PhantomData }
     }
 
-    /// Returns the name as it is typed.
+    /// Returns the name in configs and on the command line.
     pub fn as_str(self) -> &'static str {
         self.into()
     }
 
-    /// Refuses f16, which `key` asks for, on a device without it.
+    /// Checks that the device supports the precision, the value of `key`.
     ///
     /// # Errors
-    /// [`ModelError::BadConfig`] with what the device lacks.
+    /// [`ModelError::BadConfig`] for f16 on a device without f16, or whose f16 hides overflows.
     pub fn check(self, key: &'static str, device: &Device) -> Result<(), ModelError> {
         if self == Self::F32 {
             return Ok(());
         }
-        let refused = |why: &str| {
-            let fix = format!("{why} (`clift doctor` lists what devices have): write \"f32\"");
+        let refuse = |reason: &str| {
+            let fix = format!("{reason}; write \"f32\" (`clift doctor` lists the features of devices)");
             Err(ModelError::BadConfig { key, value: "f16".into(), fix })
         };
         let device = device.clone().without_autodiff();
         if !device.supports_dtype(DType::F16) {
-            return refused("the device has no f16; of a GPU it takes the feature SHADER_F16");
+            return refuse("the device has no f16 (on a GPU, the feature SHADER_F16)");
         }
-        // A product that is too large must be seen to be: loss scaling looks for it. WGSL leaves this to the driver.
+        // Loss scaling detects overflows by infinities; WGSL leaves the result of an overflow to the driver.
         let large = Tensor::<1>::full([1], 1e6, &device).cast(DType::F16).cast(DType::F32);
         if large.into_scalar::<f32>().is_finite() {
-            return refused("the device rounds numbers beyond 65504 to finite ones, which hides overflows");
+            return refuse("the device rounds values above 65504 to finite values, which hides overflows");
         }
         Ok(())
     }
@@ -87,11 +89,11 @@ impl std::str::FromStr for Precision {
     }
 }
 
-/// Sets the former precision of its thread when it is dropped.
+/// Restores the former precision of the thread when dropped.
 #[derive(Debug)]
 pub struct PrecisionScope {
     former: Precision,
-    of_this_thread: PhantomData<*const ()>,
+    not_send: PhantomData<*const ()>,
 }
 
 impl Drop for PrecisionScope {
@@ -100,18 +102,18 @@ impl Drop for PrecisionScope {
     }
 }
 
-/// Matrix products of f32 tensors on a device. The bodies here run on every one of them.
+/// Matrix products on a backend. The default implementations run on every backend.
 pub trait MatmulKernels: Backend {
-    /// The product, in the type of its operands. Tensors of another type than f32 (f64, in tests) are left as they are.
-    fn product(precision: Precision, lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
+    /// Multiplies matrices; f32 operands are rounded to `precision`, operands of another type (f64, in tests) are not.
+    fn matmul(precision: Precision, lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
         if precision == Precision::F32 || lhs.dtype() != DType::F32 {
             return Self::float_matmul(lhs, rhs);
         }
-        Self::product_of_halves(Self::float_cast(lhs, FloatDType::F16), Self::float_cast(rhs, FloatDType::F16))
+        Self::matmul_f16(Self::float_cast(lhs, FloatDType::F16), Self::float_cast(rhs, FloatDType::F16))
     }
 
-    /// The product of two f16 tensors in f32. Here it is rounded to f16 between, as most backends give it.
-    fn product_of_halves(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
+    /// Multiplies f16 matrices and returns f32; this implementation rounds the product to f16 first, as most backends do.
+    fn matmul_f16(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
         Self::float_cast(Self::float_matmul(lhs, rhs), FloatDType::F32)
     }
 }
@@ -121,10 +123,10 @@ impl MatmulKernels for NdArray {}
 
 #[cfg(feature = "wgpu")]
 impl MatmulKernels for burn::backend::Cube {
-    /// Sums are f32 in the kernels, and are written as such.
-    fn product_of_halves(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
+    /// The kernels accumulate in f32 and write f32.
+    fn matmul_f16(lhs: FloatTensor<Self>, rhs: FloatTensor<Self>) -> FloatTensor<Self> {
         use burn_cubecl::kernel::matmul::{MatmulStrategy, matmul};
-        matmul(lhs, rhs, None, MatmulStrategy::default(), DType::F32).expect("a product that f32 operands have as well")
+        matmul(lhs, rhs, None, MatmulStrategy::default(), DType::F32).expect("f32 operands of these shapes multiply")
     }
 }
 
@@ -133,14 +135,18 @@ mod tests {
     use super::*;
     use crate::testing::{devices, random, to_vec};
 
+    fn devices_with_f16() -> impl Iterator<Item = Device> {
+        devices().into_iter().filter(|device| Precision::F16.check("precision", device).is_ok())
+    }
+
     #[test]
-    fn a_scope_ends_where_it_is_dropped_and_holds_for_one_thread() {
+    fn a_scope_applies_to_one_thread_until_dropped() {
         assert_eq!(Precision::current(), Precision::F32);
         {
-            let _half = Precision::F16.scope();
+            let _f16 = Precision::F16.scope();
             assert_eq!(Precision::current(), Precision::F16);
             {
-                let _single = Precision::F32.scope();
+                let _f32 = Precision::F32.scope();
                 assert_eq!(Precision::current(), Precision::F32);
             }
             assert_eq!(Precision::current(), Precision::F16);
@@ -159,7 +165,7 @@ mod tests {
         assert!(Precision::F16.check("precision", &Device::flex()).is_ok());
     }
 
-    /// Output and gradients of a chain that has every operation.
+    /// Returns output and gradients of a chain of all operations.
     fn results(device: &Device, precision: Precision, dtype: DType) -> Vec<Vec<f64>> {
         use burn::module::Param;
         use burn::nn::{LayerNorm, LayerNormConfig, Linear};
@@ -168,8 +174,7 @@ mod tests {
         use crate::ops::linear::{gelu_linear, linear, norm_linear};
 
         let device = device.clone().autodiff();
-        // On a device with f64 as well: the same numbers on all.
-        let draw = |shape: [usize; 3], seed: u64| random(shape, seed, &device).cast(dtype).detach();
+        let sample = |shape: [usize; 3], seed: u64| random(shape, seed, &device).cast(dtype).detach();
         let layer = |weight: &Tensor<3>| {
             let [_, inputs, outputs] = weight.dims();
             let bias = Tensor::zeros([outputs], (&device, dtype));
@@ -178,9 +183,9 @@ mod tests {
                 bias: Some(Param::from_tensor(bias)),
             }
         };
-        let x = draw([2, 9, 16], 1).require_grad();
+        let x = sample([2, 9, 16], 1).require_grad();
         let weights = [[1, 16, 48], [1, 16, 16], [1, 16, 32], [1, 16, 16]];
-        let weights: Vec<_> = weights.into_iter().zip(2..).map(|(shape, seed)| draw(shape, seed)).collect();
+        let weights: Vec<_> = weights.into_iter().zip(2..).map(|(shape, seed)| sample(shape, seed)).collect();
         let layers: Vec<_> = weights.iter().map(layer).collect();
         let mut norm: LayerNorm = LayerNormConfig::new(16).init(&device);
         norm.gamma = Param::from_tensor(norm.gamma.val().cast(dtype).detach());
@@ -191,13 +196,13 @@ mod tests {
             let query = gelu_linear(&layers[1], mixed.clone());
             linear(&layers[3], cross_sdpa(query, linear(&layers[2], mixed), 4))
         };
-        assert_eq!(output.dtype(), dtype, "results are no halves");
+        assert_eq!(output.dtype(), dtype, "results are not f16");
         let cotangent = random([2, 9, 16], 9, &device).cast(dtype);
-        // Outside of the scope: a backward computes as its forward did.
+        // Outside the scope: a backward has the precision of its forward.
         let grads = (output.clone() * cotangent).sum().backward();
         let gradient = |grad: Option<Tensor<2>>| {
             let grad = grad.expect("tracked");
-            assert_eq!(grad.dtype(), dtype, "gradients are no halves");
+            assert_eq!(grad.dtype(), dtype, "gradients are not f16");
             to_vec(grad)
         };
         let mut all = vec![to_vec(output.inner())];
@@ -207,10 +212,10 @@ mod tests {
     }
 
     #[test]
-    fn outputs_and_gradients_are_off_as_halves_are_off() {
+    fn f16_errors_of_outputs_and_gradients_match_11_bits() {
         let expected = results(&Device::flex(), Precision::F16, DType::F64);
         let exact = results(&Device::flex(), Precision::F32, DType::F64);
-        assert_eq!(expected, exact, "f64 is never narrowed");
+        assert_eq!(expected, exact, "f64 is not rounded");
         let errors = |found: &[Vec<f64>]| -> Vec<f64> {
             let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>().sqrt();
             let error = |(found, expected): (&Vec<f64>, &Vec<f64>)| {
@@ -218,21 +223,21 @@ mod tests {
             };
             found.iter().zip(&expected).map(error).collect()
         };
-        for device in devices().into_iter().filter(|device| Precision::F16.check("precision", device).is_ok()) {
-            let single = errors(&results(&device, Precision::F32, DType::F32));
-            let half = errors(&results(&device, Precision::F16, DType::F32));
-            for (i, (half, single)) in half.iter().zip(&single).enumerate() {
-                // A half has 13 bits less. Errors of a few numbers are a matter of luck.
-                let ratio = half / single;
-                assert!((200.0..40_000.0).contains(&ratio), "{i}: {half:.1e} and {single:.1e}");
-                assert!(*half < 3e-2, "{i}: {half:.1e}");
+        for device in devices_with_f16() {
+            let f32 = errors(&results(&device, Precision::F32, DType::F32));
+            let f16 = errors(&results(&device, Precision::F16, DType::F32));
+            for (i, (f16, f32)) in f16.iter().zip(&f32).enumerate() {
+                // f16 has 13 bits less than f32; the error of few values varies widely.
+                let ratio = f16 / f32;
+                assert!((200.0..40_000.0).contains(&ratio), "{i}: {f16:.1e} and {f32:.1e}");
+                assert!(*f16 < 3e-2, "{i}: {f16:.1e}");
             }
         }
     }
 
     #[test]
     fn large_scores_stay_finite() {
-        for device in devices().into_iter().filter(|device| Precision::F16.check("precision", device).is_ok()) {
+        for device in devices_with_f16() {
             let _scope = Precision::F16.scope();
             // Scores of 50 x 100 x 4.
             let query = Tensor::<3>::full([1, 2, 4], 100.0, &device);

@@ -143,7 +143,7 @@ impl SceneRenderer {
         let pixels = images.try_to_vec::<f32>().map_err(|error| ModelError::Device { reason: format!("{error:?}") })?;
         let render_s = started.elapsed().as_secs_f64() / views.len() as f64;
         if let Some(position) = pixels.iter().position(|value| !value.is_finite()) {
-            return Err(ModelError::NotFinite { what: "a rendering", value: pixels[position], position });
+            return Err(ModelError::NotFinite { name: "a rendering", value: pixels[position], position });
         }
         let frames = pixels.chunks_exact(height * width * 3);
         Ok(frames

@@ -1,11 +1,11 @@
-//! Which token belongs to which cluster, on the host and as indices on a device.
+//! The cluster of every token, on the host and as indices on a device.
 // B scenes, N tokens, S centroids, M = N - S members
 
 use burn::tensor::{Bool, Device, Int, Tensor, TensorData};
 
 use crate::error::ModelError;
 
-/// Clusters of one scene. Every cluster holds its centroid; none is empty.
+/// Clusters of one scene. Every cluster contains its centroid; no cluster is empty.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SceneClusters {
     assignment: Vec<u32>,
@@ -13,48 +13,48 @@ pub struct SceneClusters {
 }
 
 impl SceneClusters {
-    /// Checks and takes the clusters of one scene.
+    /// Checks the clusters of one scene.
     ///
     /// # Shapes
     /// - `assignment`: cluster of every token, `[num_tokens]`
-    /// - `centroid_index`: token that stands for every cluster, `[num_storage_tokens]`
+    /// - `centroid_index`: centroid token of every cluster, `[num_storage_tokens]`
     ///
     /// # Errors
-    /// [`ModelError::BadClusters`] when an index is out of range or a centroid is not in its cluster.
+    /// [`ModelError::BadClusters`] for an index out of range or a centroid outside its cluster.
     pub fn new(assignment: Vec<u32>, centroid_index: Vec<u32>) -> Result<Self, ModelError> {
         let (tokens, clusters) = (assignment.len(), centroid_index.len());
         if let Some(token) = assignment.iter().position(|&cluster| cluster as usize >= clusters) {
-            let what = format!("token {token} is in cluster {} of {clusters}", assignment[token]);
-            return Err(ModelError::BadClusters { what });
+            let reason = format!("token {token} is in cluster {} of {clusters}", assignment[token]);
+            return Err(ModelError::BadClusters { reason });
         }
         for (cluster, &token) in centroid_index.iter().enumerate() {
             match assignment.get(token as usize) {
                 Some(&own) if own as usize == cluster => {}
                 Some(own) => {
-                    let what = format!("token {token}, the centroid of cluster {cluster}, is in cluster {own}");
-                    return Err(ModelError::BadClusters { what });
+                    let reason = format!("token {token}, the centroid of cluster {cluster}, is in cluster {own}");
+                    return Err(ModelError::BadClusters { reason });
                 }
                 None => {
-                    let what = format!("the centroid of cluster {cluster} is token {token} of {tokens}");
-                    return Err(ModelError::BadClusters { what });
+                    let reason = format!("the centroid of cluster {cluster} is token {token} of {tokens}");
+                    return Err(ModelError::BadClusters { reason });
                 }
             }
         }
         Ok(Self { assignment, centroid_index })
     }
 
-    /// Every token its own cluster: what `num_storage_tokens = num_tokens` means.
+    /// Returns clusters of one token each, for `num_storage_tokens = num_tokens`.
     pub fn identity(num_tokens: usize) -> Self {
         let index: Vec<u32> = (0..num_tokens as u32).collect();
         Self { assignment: index.clone(), centroid_index: index }
     }
 
-    /// Cluster of every token, `[num_tokens]`.
+    /// Returns the cluster of every token, `[num_tokens]`.
     pub fn assignment(&self) -> &[u32] {
         &self.assignment
     }
 
-    /// Token that stands for every cluster, `[num_storage_tokens]`.
+    /// Returns the centroid token of every cluster, `[num_storage_tokens]`.
     pub fn centroid_index(&self) -> &[u32] {
         &self.centroid_index
     }
@@ -67,28 +67,28 @@ pub struct Clusters {
 }
 
 impl Clusters {
-    /// Puts scenes together.
+    /// Combines scenes into a batch.
     ///
     /// # Errors
-    /// [`ModelError::BadClusters`] when there is none, or their counts differ.
+    /// [`ModelError::BadClusters`] without scenes, or if their counts differ.
     pub fn new(scenes: Vec<SceneClusters>) -> Result<Self, ModelError> {
         let counts = |scene: &SceneClusters| (scene.assignment.len(), scene.centroid_index.len());
         let Some(first) = scenes.first().map(counts) else {
-            return Err(ModelError::BadClusters { what: "a batch without scenes".into() });
+            return Err(ModelError::BadClusters { reason: "a batch without scenes".into() });
         };
         if let Some(other) = scenes.iter().map(counts).find(|&other| other != first) {
-            let what = format!("a batch with {first:?} and {other:?} (tokens, centroids)");
-            return Err(ModelError::BadClusters { what });
+            let reason = format!("a batch with {first:?} and {other:?} (tokens, centroids)");
+            return Err(ModelError::BadClusters { reason });
         }
         Ok(Self { scenes })
     }
 
-    /// The scenes.
+    /// Returns the clusters of every scene.
     pub fn scenes(&self) -> &[SceneClusters] {
         &self.scenes
     }
 
-    /// Copies the indices to a device in the forms the condenser reads.
+    /// Copies the indices to a device, in the layout of the condenser.
     pub fn upload(&self, device: &Device) -> ClusterIndex {
         let batch = self.scenes.len();
         let num_tokens = self.scenes[0].assignment.len();
@@ -97,13 +97,13 @@ impl Clusters {
         let mut centroid = Vec::with_capacity(batch * num_storage_tokens);
         let mut member = Vec::with_capacity(batch * num_members);
         let mut segment = Vec::with_capacity(batch * num_members);
-        let mut everyone = Vec::with_capacity(batch * num_tokens);
+        let mut all_segments = Vec::with_capacity(batch * num_tokens);
         let mut singleton = vec![true; batch * num_storage_tokens];
         for (scene, clusters) in self.scenes.iter().enumerate() {
             centroid
                 .extend(clusters.centroid_index.iter().map(|&token| (scene * num_tokens) as i64 + i64::from(token)));
             for (token, &cluster) in clusters.assignment.iter().enumerate() {
-                everyone.push((scene * num_storage_tokens) as i64 + i64::from(cluster));
+                all_segments.push((scene * num_storage_tokens) as i64 + i64::from(cluster));
                 if clusters.centroid_index[cluster as usize] as usize != token {
                     let row = scene * num_storage_tokens + cluster as usize;
                     member.push((scene * num_tokens + token) as i64);
@@ -122,7 +122,7 @@ impl Clusters {
             num_tokens,
             num_storage_tokens,
             centroid: index(centroid),
-            segment: index(everyone),
+            segment: index(all_segments),
             members: (num_members > 0).then(|| Members { token: index(member), segment: index(segment) }),
             singleton: has_singletons.then(|| {
                 Tensor::<3, Bool>::from_data(TensorData::new(singleton, [batch, num_storage_tokens, 1]), device)
@@ -142,23 +142,23 @@ pub struct ClusterIndex {
     pub(crate) centroid: Tensor<1, Int>,
     /// Centroid row of every token, centroids included, `[B * N]`.
     pub(crate) segment: Tensor<1, Int>,
-    /// The tokens that are not centroids, if there are any.
+    /// Tokens that are not centroids; `None` without such tokens.
     pub(crate) members: Option<Members>,
-    /// Clusters of one token, `[B, S, 1]`, if there are any.
+    /// Whether a cluster has one token, `[B, S, 1]`; `None` without such clusters.
     pub(crate) singleton: Option<Tensor<3, Bool>>,
 }
 
 /// Tokens that are not centroids.
 #[derive(Clone, Debug)]
 pub(crate) struct Members {
-    /// Their token rows, `[B * M]`.
+    /// Token row of every member, `[B * M]`.
     pub token: Tensor<1, Int>,
-    /// The centroid row each belongs to, `[B * M]`.
+    /// Centroid row of every member, `[B * M]`.
     pub segment: Tensor<1, Int>,
 }
 
 impl ClusterIndex {
-    /// The centroids' rows of a set of tokens.
+    /// Selects the rows of the centroids.
     ///
     /// # Shapes
     /// - `tokens`: `[batch, num_tokens, dim]`
@@ -167,10 +167,14 @@ impl ClusterIndex {
         self.gather(tokens, &self.centroid)
     }
 
-    /// Rows `index` of the tokens of all scenes: `[B, N, D] -> [B, rows / B, D]`.
+    /// Selects rows `index` of the tokens of all scenes: `[B, N, D] -> [B, rows / B, D]`.
     pub(crate) fn gather(&self, tokens: Tensor<3>, index: &Tensor<1, Int>) -> Tensor<3> {
         let [batch, num_tokens, dim] = tokens.dims();
-        assert_eq!([batch, num_tokens], [self.batch, self.num_tokens], "[batch, num_tokens] of tokens and clusters");
+        assert_eq!(
+            [batch, num_tokens],
+            [self.batch, self.num_tokens],
+            "tokens and clusters have equal [batch, num_tokens]"
+        );
         let [rows] = index.dims();
         tokens.reshape([batch * num_tokens, dim]).select(0, index.clone()).reshape([batch, rows / batch, dim])
     }
@@ -182,7 +186,7 @@ mod tests {
     use crate::testing::to_vec;
 
     #[test]
-    fn contradicting_indices_are_refused_with_the_indices() {
+    fn inconsistent_indices_are_refused() {
         let message = |assignment: &[u32], centroids: &[u32]| {
             SceneClusters::new(assignment.into(), centroids.into()).unwrap_err().to_string()
         };
@@ -196,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn gathering_takes_each_scenes_own_rows() {
+    fn gathering_selects_the_rows_of_each_scene() {
         let device = Device::flex();
         let clusters = Clusters::new(vec![
             SceneClusters::new(vec![0, 1, 0], vec![2, 1]).expect("valid"),

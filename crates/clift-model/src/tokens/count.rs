@@ -1,4 +1,4 @@
-//! How many tokens: a number, or a share of what a scene has.
+//! A number or share of tokens.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,21 +7,20 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::error::ModelError;
 
-/// A count of tokens (`256`) or a share of all of them (`"1/16"`, `0.0625`), as a config and the
-/// command line give it.
+/// A number of tokens (`256`) or a share of all tokens (`"1/16"`, `0.0625`) in configs and on the command line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum TokenCount {
-    /// So many.
+    /// Number of tokens, at least one.
     Count(usize),
-    /// A part in `(0, 1]` of all, rounded down but at least one.
+    /// Share of all tokens in `(0, 1]`, rounded down to at least one token.
     Share(f64),
 }
 
 impl TokenCount {
-    /// The number of tokens of a scene that has `num_tokens`.
+    /// Returns the number of tokens for a scene of `num_tokens`.
     ///
     /// # Errors
-    /// [`ModelError::BadTokenCount`] when a scene does not have that many.
+    /// [`ModelError::BadTokenCount`] if the scene has fewer tokens.
     pub fn of(self, num_tokens: usize) -> Result<usize, ModelError> {
         match self {
             _ if num_tokens == 0 => Err(ModelError::BadTokenCount {
@@ -29,7 +28,7 @@ impl TokenCount {
                 reason: "a scene without views has no tokens".into(),
             }),
             Self::Count(count) if (1..=num_tokens).contains(&count) => Ok(count),
-            // The small excess keeps 3 of 48 from becoming 2 through 0.0625 * 48 = 2.9999...
+            // The summand corrects rounding: 0.0625 * 48 may be 2.9999...
             Self::Share(share) => Ok(((num_tokens as f64 * share + 1e-9) as usize).clamp(1, num_tokens)),
             Self::Count(count) => Err(ModelError::BadTokenCount {
                 text: count.to_string(),
@@ -91,7 +90,7 @@ impl<'de> Deserialize<'de> for TokenCount {
             Text(String),
         }
         match Written::deserialize(deserializer)? {
-            // A float is a share even where it is whole: 1.0 is all tokens, not one.
+            // A float is a share even if it is an integer: 1.0 is all tokens, not one.
             Written::Share(share) if share > 0.0 && share <= 1.0 => return Ok(Self::Share(share)),
             Written::Share(share) => share.to_string().parse(),
             Written::Count(count) => count.to_string().parse(),
@@ -120,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_count_says_what_is() {
+    fn invalid_counts_are_refused_with_the_remedy() {
         for (text, part) in [("0", "at least one"), ("3/2", "(0, 1]"), ("x", "write a count"), ("1/x", "as 1/16")] {
             let message = text.parse::<TokenCount>().unwrap_err().to_string();
             assert!(message.contains(part), "{message}");
@@ -131,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn json_round_trips_and_one_point_zero_is_everything() {
+    fn json_round_trips_and_1_0_means_all_tokens() {
         let list: Vec<TokenCount> = serde_json::from_str(r#"[16, "1/4", 0.5, 1.0, 1]"#).expect("valid");
         assert_eq!(list[3].of(64).expect("all"), 64);
         assert_eq!(list[4].of(64).expect("one"), 1);

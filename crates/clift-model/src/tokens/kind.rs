@@ -1,14 +1,14 @@
-//! Condensed or K-means tokens.
+//! Condensed tokens or K-means tokens.
 
 use strum::{Display, IntoStaticStr, VariantArray};
 
-/// What the tokens of a scene are.
+/// The kind of the tokens of a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "lowercase")]
 pub enum TokenKind {
-    /// Condensed tokens: drawn with the renderer of stage 2.
+    /// Condensed tokens, rendered with the renderer of stage 2.
     Clift,
-    /// The tokens nearest to the K-means centres: drawn with the renderer of stage 1.
+    /// The tokens nearest to the K-means centers, rendered with the renderer of stage 1.
     Kmeans,
 }
 

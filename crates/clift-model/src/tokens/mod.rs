@@ -1,11 +1,11 @@
 //! Counts, groups and subsets of tokens.
 //!
-//! - `count`: token count: number or share
-//! - `kind`: condensed or K-means tokens
-//! - `clusters`: cluster of every token, checked
+//! - `count`: a number or share of tokens
+//! - `kind`: condensed tokens or K-means tokens
+//! - `clusters`: the cluster of every token, on the host and on a device
+//! - `kmeans`: latent K-means, the grouping of the paper
 //! - `tiles`: rectangular tiles, the baseline grouping
-//! - `kmeans`: latent K-means
-//! - `selection`: Algorithm 1: tokens for a view
+//! - `selection`: the tokens for a target view (Algorithm 1)
 
 pub(crate) mod clusters;
 pub(crate) mod count;

@@ -1,11 +1,11 @@
-//! One camera on the host, and the ray of any point of its picture.
+//! A pinhole camera on the host, and the ray of any point of its image.
 
 use burn::tensor::Device;
 
 use crate::error::ModelError;
 use crate::views::upload::Cameras;
 
-/// A pinhole camera in a scene's normalised frame, OpenCV axes.
+/// A pinhole camera in the normalized frame of a scene, OpenCV axes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ViewCamera {
     /// Camera to world, 4 x 4, row-major.
@@ -15,23 +15,23 @@ pub struct ViewCamera {
 }
 
 impl ViewCamera {
-    /// The camera's centre.
+    /// Returns the center of the camera.
     pub fn origin(&self) -> [f64; 3] {
         [3, 7, 11].map(|i| self.c2w[i])
     }
 
-    /// Direction of unit length through column `x`, row `y` of the picture, both in pixels; pixel (i, j)
-    /// has its centre at (i + 0.5, j + 0.5).
+    /// Returns the unit direction through column `x` and row `y` of the image, in pixels; the center of pixel (i, j) is
+    /// (i + 0.5, j + 0.5).
     pub fn direction(&self, x: f64, y: f64) -> [f64; 3] {
         let [fx, fy, cx, cy] = self.intrinsics;
         let ray = [(x - cx) / fx, (y - cy) / fy, 1.0];
-        // At least 1, so it needs no guard.
+        // The third coordinate is 1, so that the length is at least 1.
         let length = ray.iter().map(|v| v * v).sum::<f64>().sqrt();
         [0, 4, 8].map(|row| (0..3).map(|i| self.c2w[row + i] * ray[i]).sum::<f64>() / length)
     }
 
-    /// The same view in a picture of another size. Focal lengths scale with the height, so that the vertical field
-    /// of view stays; the principal point keeps its place relative to the middle.
+    /// Returns the camera for an image of another size. Focal lengths scale with the height, which preserves the vertical
+    /// field of view; the offset of the principal point from the image center scales likewise.
     ///
     /// `from` and `to` are `[height, width]` in pixels.
     #[must_use]
@@ -46,7 +46,7 @@ impl ViewCamera {
 }
 
 impl Cameras {
-    /// Copies views of one scene to a device.
+    /// Copies the cameras of one scene to a device.
     ///
     /// # Errors
     /// As [`Cameras::upload`].
@@ -63,7 +63,7 @@ mod tests {
     use crate::testing::to_vec;
     use crate::views::rays::plucker;
 
-    /// Turned by 0.3 about y, at (0.5, -0.2, 0.1).
+    /// Returns a camera at (0.5, -0.2, 0.1), rotated by 0.3 about y.
     fn camera() -> ViewCamera {
         let (sin, cos) = 0.3_f64.sin_cos();
         ViewCamera {
@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn directions_and_origin_are_those_of_the_models_rays() {
+    fn origin_and_directions_equal_the_plucker_rays() {
         let cameras = Cameras::of_views(&[camera()], 8, 16, &Device::flex()).expect("valid");
         let rays = to_vec(plucker(&cameras)); // [1, 1, 8, 16, 6]
         let [x, y, z] = camera().origin();
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn a_larger_picture_keeps_the_vertical_field_of_view_and_sees_more_to_the_sides() {
+    fn resizing_preserves_the_vertical_field_of_view() {
         let large = camera().resized([8, 16], [16, 48]);
         assert_eq!(large.intrinsics, [40.0, 44.0, 25.0, 8.0]);
         assert_eq!(camera().resized([8, 16], [8, 16]), camera());

@@ -1,8 +1,8 @@
-//! Images and cameras as tensors.
+//! Images and cameras as tensors: the inputs of the encoder.
 //!
-//! - `upload`: images and cameras onto a device
-//! - `camera`: one pinhole camera on the host
-//! - `rays`: Plücker ray of every pixel
+//! - `upload`: copies images and cameras to a device
+//! - `camera`: a pinhole camera on the host, and its rays
+//! - `rays`: Plücker coordinates of every pixel
 //! - `patch`: images to patch vectors and back
 
 pub(crate) mod camera;

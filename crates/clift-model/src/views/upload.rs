@@ -1,29 +1,29 @@
-//! Posed views on a device: the one place where host data meets Burn.
+//! Copies images and cameras to a device.
 // B scenes, V views, H rows, W columns
 
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::error::ModelError;
 
-/// Cameras of several views of several scenes, in the scene's normalised frame.
+/// Cameras of several views of several scenes, in the normalized frame of each scene.
 #[derive(Clone, Debug)]
 pub struct Cameras {
-    /// Rows of every view, in pixels.
+    /// Height of every view in pixels.
     pub height: usize,
-    /// Columns of every view, in pixels.
+    /// Width of every view in pixels.
     pub width: usize,
-    /// Camera to world, OpenCV axes, `[batch, views, 4, 4]`.
+    /// Camera-to-world poses, OpenCV axes, `[batch, views, 4, 4]`.
     pub c2w: Tensor<4>,
     /// `fx, fy, cx, cy` in pixels, `[batch, views, 4]`.
     pub intrinsics: Tensor<3>,
 }
 
-/// Posed pictures of several scenes.
+/// Images with cameras, of several scenes.
 #[derive(Clone, Debug)]
 pub struct Views {
     /// RGB in `[0, 1]`, `[batch, views, height, width, 3]`.
     pub images: Tensor<5>,
-    /// Where they were taken from.
+    /// The camera of every image.
     pub cameras: Cameras,
 }
 
@@ -50,7 +50,7 @@ impl Cameras {
         })
     }
 
-    /// `[batch, views]`.
+    /// Returns `[batch, views]`.
     pub fn dims(&self) -> [usize; 2] {
         let [batch, views, _, _] = self.c2w.dims();
         [batch, views]
@@ -58,7 +58,7 @@ impl Cameras {
 }
 
 impl Views {
-    /// Copies 8-bit pictures and their cameras to a device, pictures scaled to `[0, 1]`.
+    /// Copies 8-bit images and their cameras to a device; pixels are scaled to `[0, 1]`.
     ///
     /// # Shapes
     /// - `images`: `[batch, views, height, width, 3]`; the others as [`Cameras::upload`]
@@ -77,7 +77,7 @@ impl Views {
     }
 }
 
-/// Copies 8-bit pictures to a device as RGB in `[0, 1]`.
+/// Copies 8-bit images to a device as RGB in `[0, 1]`.
 ///
 /// # Shapes
 /// - `images` and the result: `[batch, views, height, width, 3]`, with `shape` = `[batch, views, height, width]`
@@ -91,13 +91,13 @@ pub fn upload_images(images: &[u8], shape: [usize; 4], device: &Device) -> Resul
     Ok(Tensor::from_data(TensorData::new(values, [batch, views, height, width, 3]), device))
 }
 
-fn check_length(what: &'static str, got: usize, expected: usize) -> Result<(), ModelError> {
-    if got == expected { Ok(()) } else { Err(ModelError::WrongLength { what, expected, got }) }
+fn check_length(name: &'static str, got: usize, expected: usize) -> Result<(), ModelError> {
+    if got == expected { Ok(()) } else { Err(ModelError::WrongLength { name, expected, got }) }
 }
 
-fn check_finite(what: &'static str, values: &[f32]) -> Result<(), ModelError> {
+fn check_finite(name: &'static str, values: &[f32]) -> Result<(), ModelError> {
     match values.iter().position(|value| !value.is_finite()) {
-        Some(position) => Err(ModelError::NotFinite { what, value: values[position], position }),
+        Some(position) => Err(ModelError::NotFinite { name, value: values[position], position }),
         None => Ok(()),
     }
 }
@@ -107,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn arrays_that_do_not_fit_their_shape_or_are_not_finite_are_refused() {
+    fn wrong_lengths_and_nan_are_refused() {
         let device = Device::flex();
         let error = Cameras::upload(&[0.0; 15], &[0.0; 4], [1, 1, 8, 8], &device).unwrap_err();
         assert_eq!(error.to_string(), "c2w: expected 16 values for the shape, got 15");

@@ -164,7 +164,7 @@ mod tests {
         assert!(message.starts_with("no trained model at "), "{message}");
         std::fs::write(&alone, "").unwrap();
         let message = ModelPath::find(&alone).unwrap_err().to_string();
-        assert!(message.contains("no config.toml beside it or above it") && !message.contains("  "), "{message}");
+        assert!(message.contains("no config.toml next to") && !message.contains("  "), "{message}");
         // A checkpoint, recognised by its name or by its first bytes.
         for (name, bytes) in [("run/stage1/last.ckpt", "damaged"), ("alone.bin", "PK\u{3}\u{4}")] {
             let path = folder.path().join(name);

@@ -1,17 +1,17 @@
 use super::*;
-use crate::attention::forward::forward;
+use crate::attention::forward::attention_forward;
 use crate::simd::dispatch::InstructionSet;
 use crate::testing::{assert_close, random};
 
-/// Contiguous rows.
-fn rows(values: &[f32], sizes: &Sizes, count: usize) -> StridedRows<'static> {
+/// Returns contiguous rows.
+fn rows(values: &[f32], sizes: &AttentionSizes, count: usize) -> StridedRows<'static> {
     let values: &'static [f32] = values.to_vec().leak();
     StridedRows { values, batch_stride: count * sizes.dim(), row_stride: sizes.dim() }
 }
 
-/// Output and gradients of queries, keys and values in f64, as the formulas are printed.
-fn reference(sizes: &Sizes, [q, k, v, grad]: [&[f32]; 4]) -> [Vec<f64>; 4] {
-    let Sizes { batch, num_queries, num_keys, num_heads, head_width } = *sizes;
+/// Computes output and gradients of queries, keys and values in f64, as in the paper's formulas.
+fn reference(sizes: &AttentionSizes, [q, k, v, grad]: [&[f32]; 4]) -> [Vec<f64>; 4] {
+    let AttentionSizes { batch, num_queries, num_keys, num_heads, head_width } = *sizes;
     let dim = sizes.dim();
     let scale = 1.0 / (head_width as f64).sqrt();
     let mut results = [q.len(), q.len(), k.len(), v.len()].map(|len| vec![0.0_f64; len]);
@@ -43,27 +43,32 @@ fn reference(sizes: &Sizes, [q, k, v, grad]: [&[f32]; 4]) -> [Vec<f64>; 4] {
     results
 }
 
-/// The gradients of queries, keys and values, unpacked.
-fn gradients(set: InstructionSet, sizes: Sizes, saved: BackwardInputs<'_>) -> [Vec<f32>; 3] {
-    let Sizes { batch, num_queries, num_keys, .. } = sizes;
+/// Computes the gradients of queries, keys and values and unpacks them.
+fn gradients(set: InstructionSet, sizes: AttentionSizes, saved: BackwardInputs<'_>) -> [Vec<f32>; 3] {
+    let AttentionSizes { batch, num_queries, num_keys, .. } = sizes;
     let dim = sizes.dim();
     let part = |packed: &[f32], parts: usize, part: usize| {
         packed.chunks_exact(parts * dim).flat_map(|row| row[part * dim..(part + 1) * dim].to_vec()).collect()
     };
     let mut query = vec![f32::NAN; batch * num_queries * dim];
     let mut key_value = vec![f32::NAN; batch * num_keys * 2 * dim];
-    backward(set, sizes, saved, Gradients::Separate { query: &mut query, key_value: &mut key_value });
+    attention_backward(
+        set,
+        sizes,
+        saved,
+        AttentionGradients::Separate { query: &mut query, key_value: &mut key_value },
+    );
     let separate = [query, part(&key_value, 2, 0), part(&key_value, 2, 1)];
     if num_queries == num_keys {
         let mut packed = vec![f32::NAN; batch * num_queries * 3 * dim];
-        backward(set, sizes, saved, Gradients::Packed(&mut packed));
+        attention_backward(set, sizes, saved, AttentionGradients::Packed(&mut packed));
         assert_eq!([0, 1, 2].map(|i| part(&packed, 3, i)), separate);
     }
     separate
 }
 
-fn check(sizes: Sizes, spread: f32) {
-    let Sizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
+fn check(sizes: AttentionSizes, spread: f32) {
+    let AttentionSizes { batch, num_queries, num_keys, num_heads, .. } = sizes;
     let make = |count: usize, seed: u64| random(batch * count * sizes.dim(), seed);
     let mut q = make(num_queries, 1);
     for value in &mut q {
@@ -76,7 +81,7 @@ fn check(sizes: Sizes, spread: f32) {
         let mut log_sum = vec![f32::NAN; batch * num_heads * num_queries];
         let [query, key, value] =
             [rows(&q, &sizes, num_queries), rows(&k, &sizes, num_keys), rows(&v, &sizes, num_keys)];
-        forward(set, sizes, [query, key, value], &mut output, Some(&mut log_sum));
+        attention_forward(set, sizes, [query, key, value], &mut output, Some(&mut log_sum));
         assert_close(&output, &expected[0], 1e-5);
         let saved = BackwardInputs {
             query,
@@ -100,7 +105,7 @@ fn check(sizes: Sizes, spread: f32) {
 
 #[test]
 fn every_instruction_set_equals_f64_at_odd_shapes() {
-    let sizes = |batch, num_queries, num_keys, num_heads, head_width| Sizes {
+    let sizes = |batch, num_queries, num_keys, num_heads, head_width| AttentionSizes {
         batch,
         num_queries,
         num_keys,

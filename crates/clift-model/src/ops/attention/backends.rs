@@ -1,27 +1,31 @@
-//! Attention on Burn's CPU backend: f32 by the kernels of `clift-kernels`, straight from the packed
-//! projections and into packed gradients.
-#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+//! The implementation of every backend: on flex and in f32 the native kernels, which read packed projections and write
+//! packed gradients; elsewhere attention in chunks of queries.
+#![expect(
+    deprecated,
+    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
+)]
 
 use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Flex, NdArray, TensorMetadata};
 use clift_kernels::{
-    BackwardInputs, Gradients, InstructionSet, Sizes, StridedRows, attention_backward, attention_forward,
+    AttentionGradients, AttentionSizes, BackwardInputs, InstructionSet, StridedRows, attention_backward,
+    attention_forward,
 };
 
-use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv, composed_backward, forward, split};
+use crate::ops::attention::composed::{AttentionOutput, HeadConfig, Qkv, composed_backward, composed_forward};
 use crate::ops::flex::{contiguous, is_native, tensor, values};
 use crate::ops::precision::{MatmulKernels, Precision};
 
 impl AttentionKernels for Flex {
     fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
         if !inputs.is_native() || heads.precision != Precision::F32 {
-            return AttentionOutput { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None };
+            return composed_forward::<Self>(inputs, heads);
         }
         let HeadConfig { num_heads, .. } = heads;
         let inputs = inputs.clone().contiguous();
         let sizes = inputs.sizes(num_heads);
-        let Sizes { batch, num_queries, head_width, .. } = sizes;
+        let AttentionSizes { batch, num_queries, head_width, .. } = sizes;
         let dim = num_heads * head_width;
         let mut output = vec![0.0; batch * num_queries * dim];
         let mut log_sum = vec![0.0; batch * num_heads * num_queries];
@@ -37,12 +41,12 @@ impl AttentionKernels for Flex {
         grad_output: FloatTensor<Self>,
     ) -> Qkv<FloatTensor<Self>> {
         let Some(log_sum) = attended.log_sum else {
-            return composed_backward::<Self>(inputs, attended.output, heads, grad_output);
+            return composed_backward::<Self>(&inputs, attended.output, heads, grad_output);
         };
         let HeadConfig { num_heads, .. } = heads;
         let inputs = inputs.contiguous();
         let sizes = inputs.sizes(num_heads);
-        let Sizes { batch, num_queries, num_keys, head_width, .. } = sizes;
+        let AttentionSizes { batch, num_queries, num_keys, head_width, .. } = sizes;
         let dim = num_heads * head_width;
         let [output, grad_output] = [attended.output, grad_output].map(contiguous);
         let [query, key, value] = inputs.rows(dim);
@@ -52,13 +56,13 @@ impl AttentionKernels for Flex {
         match inputs {
             Qkv::Packed(_) => {
                 let mut grad = vec![0.0; batch * num_queries * 3 * dim];
-                attention_backward(set, sizes, saved, Gradients::Packed(&mut grad));
+                attention_backward(set, sizes, saved, AttentionGradients::Packed(&mut grad));
                 Qkv::Packed(tensor(grad, [batch, num_queries, 3 * dim]))
             }
             Qkv::Separate { .. } => {
                 let mut query = vec![0.0; batch * num_queries * dim];
                 let mut key_value = vec![0.0; batch * num_keys * 2 * dim];
-                let to = Gradients::Separate { query: &mut query, key_value: &mut key_value };
+                let to = AttentionGradients::Separate { query: &mut query, key_value: &mut key_value };
                 attention_backward(set, sizes, saved, to);
                 let query = tensor(query, [batch, num_queries, dim]);
                 Qkv::Separate { query, key_value: tensor(key_value, [batch, num_keys, 2 * dim]) }
@@ -84,17 +88,17 @@ impl Qkv<FlexTensor> {
         }
     }
 
-    fn sizes(&self, num_heads: usize) -> Sizes {
+    fn sizes(&self, num_heads: usize) -> AttentionSizes {
         let (query, key_value, parts) = match self {
             Self::Packed(packed) => (packed, packed, 3),
             Self::Separate { query, key_value } => (query, key_value, 1),
         };
         let [batch, num_queries, width] = query.shape().dims();
         let [_, num_keys, _] = key_value.shape().dims();
-        Sizes { batch, num_queries, num_keys, num_heads, head_width: width / parts / num_heads }
+        AttentionSizes { batch, num_queries, num_keys, num_heads, head_width: width / parts / num_heads }
     }
 
-    /// Rows of queries, keys and values.
+    /// Returns the rows of queries, keys and values.
     fn rows(&self, dim: usize) -> [StridedRows<'_>; 3] {
         match self {
             Self::Packed(packed) => [0, 1, 2].map(|part| columns(packed, part * dim)),
@@ -103,27 +107,27 @@ impl Qkv<FlexTensor> {
     }
 }
 
-/// Rows of a contiguous tensor from a column on.
+/// Returns the rows of a contiguous tensor, starting with column `first`.
 fn columns(x: &FlexTensor, first: usize) -> StridedRows<'_> {
     let [_, count, width] = x.shape().dims();
     StridedRows { values: values(x).get(first..).unwrap_or_default(), batch_stride: count * width, row_stride: width }
 }
 
-/// Both directions of attention on a device. The bodies here run on every one of them.
+/// Attention and its gradients on a backend. The default implementations run on every backend.
 pub trait AttentionKernels: MatmulKernels {
-    /// The output, and what the backward can use besides it.
+    /// Computes the output, and the log sums if the native kernel runs.
     fn attend(inputs: &Qkv<FloatTensor<Self>>, heads: HeadConfig) -> AttentionOutput<FloatTensor<Self>> {
-        AttentionOutput { output: forward::<Self>(split::<Self>(inputs), heads), log_sum: None }
+        composed_forward::<Self>(inputs, heads)
     }
 
-    /// The gradients of the inputs from that of the output.
+    /// Computes the gradients of the inputs from the gradient of the output.
     fn attend_backward(
         inputs: Qkv<FloatTensor<Self>>,
         attended: AttentionOutput<FloatTensor<Self>>,
         heads: HeadConfig,
         grad_output: FloatTensor<Self>,
     ) -> Qkv<FloatTensor<Self>> {
-        composed_backward::<Self>(inputs, attended.output, heads, grad_output)
+        composed_backward::<Self>(&inputs, attended.output, heads, grad_output)
     }
 }
 

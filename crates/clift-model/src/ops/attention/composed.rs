@@ -1,4 +1,4 @@
-//! Attention in query chunks, any backend.
+//! Attention in chunks of queries, on any backend.
 
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, TensorMetadata};
@@ -6,7 +6,7 @@ use burn::tensor::{Shape, Slice};
 
 use crate::ops::precision::{MatmulKernels, Precision};
 
-/// How attention is computed.
+/// Number of heads and precision of an attention.
 #[derive(Clone, Copy, Debug)]
 pub struct HeadConfig {
     pub(crate) num_heads: usize,
@@ -14,37 +14,37 @@ pub struct HeadConfig {
 }
 
 impl HeadConfig {
-    /// So many heads, in the precision of this thread now.
+    /// Takes the current precision of this thread.
     pub(crate) fn now(num_heads: usize) -> Self {
         Self { num_heads, precision: Precision::current() }
     }
 }
 
-/// Queries, keys and values as the projections leave them.
+/// Queries, keys and values, as the projections return them.
 #[derive(Clone, Debug)]
 pub enum Qkv<T> {
-    /// All three side by side: `[B, N, 3D]`.
+    /// Queries, keys and values side by side: `[B, N, 3D]`.
     Packed(T),
-    /// Queries on their own.
+    /// Queries apart from keys and values.
     Separate {
-        /// `[B, Q, D]`
+        /// Queries, `[B, Q, D]`.
         query: T,
-        /// Keys and values side by side: `[B, K, 2D]`
+        /// Keys and values side by side: `[B, K, 2D]`.
         key_value: T,
     },
 }
 
-/// What attention found.
+/// Result of an attention.
 #[derive(Clone, Debug)]
 pub struct AttentionOutput<T> {
-    /// `[B, Q, D]`
+    /// Output, `[B, Q, D]`.
     pub output: T,
-    /// Logarithm of the sum of every row of scores, `[B, H, Q]`, where the device saved it.
+    /// Logarithm of the sum of every row of scores, `[B, H, Q]`, if the native kernel computed it.
     pub log_sum: Option<T>,
 }
 
-/// Queries, keys and values, each `[B, N, D]`.
-pub(crate) fn split<B: Backend>(inputs: &Qkv<FloatTensor<B>>) -> [FloatTensor<B>; 3] {
+/// Splits into queries, keys and values, each `[B, N, D]`.
+fn split<B: Backend>(inputs: &Qkv<FloatTensor<B>>) -> [FloatTensor<B>; 3] {
     let part = |packed: &FloatTensor<B>, parts: usize, part: usize| {
         let [batch, count, width] = packed.shape().dims();
         let dim = width / parts;
@@ -56,53 +56,44 @@ pub(crate) fn split<B: Backend>(inputs: &Qkv<FloatTensor<B>>) -> [FloatTensor<B>
     }
 }
 
-pub(crate) fn composed_backward<B: MatmulKernels>(
-    inputs: Qkv<FloatTensor<B>>,
-    output: FloatTensor<B>,
-    heads: HeadConfig,
-    grad_output: FloatTensor<B>,
-) -> Qkv<FloatTensor<B>> {
-    let [query, key, value] = backward::<B>(split::<B>(&inputs), output, heads, grad_output);
-    match inputs {
-        Qkv::Packed(_) => Qkv::Packed(B::float_cat(vec![query, key, value], 2)),
-        Qkv::Separate { .. } => Qkv::Separate { query, key_value: B::float_cat(vec![key, value], 2) },
-    }
-}
-
-/// Scores held at once, over all scenes and heads: 64 MiB in f32. A scene of 4,096 tokens with 8
-/// heads is then worked off in chunks of 512 queries.
+/// Most scores in memory at once, over all scenes and heads: 64 MiB in f32. A scene of 4,096 tokens with 8 heads takes 8
+/// chunks of 512 queries.
 pub const MAX_SCORES: usize = 1 << 24;
 
-/// Ranges of queries whose scores fit [`MAX_SCORES`] together.
+/// Divides the queries into ranges of at most [`MAX_SCORES`] scores each.
 pub(crate) fn query_chunks(batch: usize, num_heads: usize, num_queries: usize, num_keys: usize) -> Vec<(usize, usize)> {
     let chunk = (MAX_SCORES / (batch * num_heads * num_keys).max(1)).clamp(1, num_queries.max(1));
     (0..num_queries).step_by(chunk).map(|start| (start, (start + chunk).min(num_queries))).collect()
 }
 
-pub(crate) fn forward<B: MatmulKernels>(
-    [query, key, value]: [FloatTensor<B>; 3],
+/// Computes `softmax(s q k^T) v` per head, a chunk of queries at a time.
+pub(crate) fn composed_forward<B: MatmulKernels>(
+    inputs: &Qkv<FloatTensor<B>>,
     HeadConfig { num_heads, precision }: HeadConfig,
-) -> FloatTensor<B> {
+) -> AttentionOutput<FloatTensor<B>> {
+    let [query, key, value] = split::<B>(inputs);
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
     let query = split_heads::<B>(B::float_mul_scalar(query, scale(dim, num_heads).into()), num_heads);
     let key_t = B::float_swap_dims(split_heads::<B>(key, num_heads), 2, 3); // [B, H, E, K]
     let value = split_heads::<B>(value, num_heads);
     let chunks = query_chunks(batch, num_heads, num_queries, num_keys).into_iter().map(|range| {
-        let scores = B::product(precision, rows::<B>(&query, range), key_t.clone()); // [B, H, chunk, K]
-        B::product(precision, B::softmax(scores, 3), value.clone())
+        let scores = B::matmul(precision, rows::<B>(&query, range), key_t.clone()); // [B, H, chunk, K]
+        B::matmul(precision, B::softmax(scores, 3), value.clone())
     });
-    merge_heads::<B>(concat::<B>(chunks.collect()))
+    AttentionOutput { output: merge_heads::<B>(concat::<B>(chunks.collect())), log_sum: None }
 }
 
-/// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`,
-/// `dQ = s dS K`, `dK = s dS^T Q`, a chunk of queries at a time.
-pub(crate) fn backward<B: MatmulKernels>(
-    [query, key, value]: [FloatTensor<B>; 3],
+/// Computes the gradients of the inputs, a chunk of queries at a time.
+///
+/// With `P = softmax(s q k^T)`: `dV = P^T dO`, `dS = P * (dO V^T - rowsum(dO * O))`, `dQ = s dS K`, `dK = s dS^T Q`.
+pub(crate) fn composed_backward<B: MatmulKernels>(
+    inputs: &Qkv<FloatTensor<B>>,
     output: FloatTensor<B>,
     HeadConfig { num_heads, precision }: HeadConfig,
     grad_output: FloatTensor<B>,
-) -> [FloatTensor<B>; 3] {
+) -> Qkv<FloatTensor<B>> {
+    let [query, key, value] = split::<B>(inputs);
     let [batch, num_queries, dim] = query.shape().dims();
     let num_keys = key.shape()[1];
     let head_width = dim / num_heads;
@@ -125,13 +116,13 @@ pub(crate) fn backward<B: MatmulKernels>(
     for range in query_chunks(batch, num_heads, num_queries, num_keys) {
         let query = rows::<B>(&query, range);
         let grad_output = rows::<B>(&grad_output, range);
-        let weights = B::softmax(B::product(precision, query.clone(), key_t.clone()), 3);
-        let grad_weights = B::product(precision, grad_output.clone(), value_t.clone());
+        let weights = B::softmax(B::matmul(precision, query.clone(), key_t.clone()), 3);
+        let grad_weights = B::matmul(precision, grad_output.clone(), value_t.clone());
         let grad_scores = B::float_mul(weights.clone(), B::float_sub(grad_weights, rows::<B>(&delta, range)));
-        let grad_value = B::product(precision, B::float_swap_dims(weights, 2, 3), grad_output);
-        // The query carries the scale already.
-        let grad_key = B::product(precision, B::float_swap_dims(grad_scores.clone(), 2, 3), query);
-        grad_query.push(B::product(precision, grad_scores, key.clone()));
+        let grad_value = B::matmul(precision, B::float_swap_dims(weights, 2, 3), grad_output);
+        // The query is already scaled.
+        let grad_key = B::matmul(precision, B::float_swap_dims(grad_scores.clone(), 2, 3), query);
+        grad_query.push(B::matmul(precision, grad_scores, key.clone()));
         grad_key_value = Some(match grad_key_value {
             None => (grad_key, grad_value),
             Some((key_sum, value_sum)) => (B::float_add(key_sum, grad_key), B::float_add(value_sum, grad_value)),
@@ -139,7 +130,13 @@ pub(crate) fn backward<B: MatmulKernels>(
     }
     let (grad_key, grad_value) = grad_key_value.expect("attention has at least one query");
     let grad_query = B::float_mul_scalar(merge_heads::<B>(concat::<B>(grad_query)), scale.into());
-    [grad_query, merge_heads::<B>(grad_key), merge_heads::<B>(grad_value)]
+    let (grad_key, grad_value) = (merge_heads::<B>(grad_key), merge_heads::<B>(grad_value));
+    match inputs {
+        Qkv::Packed(_) => Qkv::Packed(B::float_cat(vec![grad_query, grad_key, grad_value], 2)),
+        Qkv::Separate { .. } => {
+            Qkv::Separate { query: grad_query, key_value: B::float_cat(vec![grad_key, grad_value], 2) }
+        }
+    }
 }
 
 fn scale(dim: usize, num_heads: usize) -> f64 {
@@ -158,7 +155,7 @@ fn merge_heads<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     B::float_reshape(B::float_swap_dims(x, 1, 2), Shape::new([batch, count, num_heads * head_width]))
 }
 
-/// Rows `start..end` of every head.
+/// Returns rows `start..end` of every head.
 fn rows<B: Backend>(x: &FloatTensor<B>, (start, end): (usize, usize)) -> FloatTensor<B> {
     let [batch, num_heads, count, width] = x.shape().dims();
     if (start, end) == (0, count) {

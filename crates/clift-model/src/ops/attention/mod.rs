@@ -1,8 +1,8 @@
-//! Softmax attention as one operation.
+//! Softmax attention as one operation, with memory linear in the number of tokens.
 //!
-//! - `composed`: attention in query chunks, any backend
-//! - `backends`: native CPU kernels or composed
-//! - `sdpa`: attention operation with its own backward
+//! - `composed`: attention in chunks of queries, on any backend
+//! - `backends`: the implementation of every backend, native or composed
+//! - `sdpa`: the operation and its backward
 
 pub(crate) mod backends;
 pub(crate) mod composed;

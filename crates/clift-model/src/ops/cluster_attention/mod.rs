@@ -1,7 +1,7 @@
-//! Attention inside clusters, linear in N.
+//! Attention inside clusters (paper, equation 2), linear in the number of tokens.
 //!
-//! - `operation`: cluster attention with its own backward
-//! - `native`: the CPU kernel behind it
+//! - `operation`: the operation and its backward, on any backend
+//! - `native`: the CPU kernel on flex
 
 pub(crate) mod native;
 pub(crate) mod operation;

@@ -1,18 +1,20 @@
-//! Intra-cluster attention on Burn's CPU backend: f32 by the kernel of `clift-kernels`.
+//! The CPU kernel on flex, in f32.
 
 use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Flex, TensorMetadata};
 use burn::tensor::DType;
-use clift_kernels::{InstructionSet, Segments, cluster_attention_backward, cluster_attention_forward};
+use clift_kernels::{ClusterSegments, InstructionSet, cluster_attention_backward, cluster_attention_forward};
 
-use crate::ops::cluster_attention::operation::{ClusterAttentionKernels, ClusterInputs, backward, forward};
+use crate::ops::cluster_attention::operation::{
+    ClusterAttentionKernels, ClusterInputs, composed_backward, composed_forward,
+};
 use crate::ops::flex::{contiguous, is_native, tensor, values};
 
 impl ClusterAttentionKernels for Flex {
     fn attend_clusters(inputs: &ClusterInputs<Self>) -> [FloatTensor<Self>; 2] {
         let Some(segments) = segments(inputs) else {
-            return forward::<Self>(inputs);
+            return composed_forward::<Self>(inputs);
         };
         let shape = inputs.query.shape();
         let num_members = inputs.segment.shape()[0];
@@ -30,7 +32,7 @@ impl ClusterAttentionKernels for Flex {
         grad_output: FloatTensor<Self>,
     ) -> [FloatTensor<Self>; 2] {
         let Some(segments) = segments(&inputs) else {
-            return backward::<Self>(inputs, results, grad_output);
+            return composed_backward::<Self>(inputs, results, grad_output);
         };
         let (query_shape, member_shape) = (inputs.query.shape(), inputs.key_value.shape());
         let [_, weights] = results;
@@ -43,8 +45,8 @@ impl ClusterAttentionKernels for Flex {
     }
 }
 
-/// Which member belongs to which segment; nothing where the kernel does not apply.
-fn segments(inputs: &ClusterInputs<Flex>) -> Option<Segments> {
+/// Groups members by segment; `None` for tensors that the kernel does not accept.
+fn segments(inputs: &ClusterInputs<Flex>) -> Option<ClusterSegments> {
     let [batch, num_segments, dim] = inputs.query.shape().dims();
     let sizes = [batch * num_segments, inputs.num_heads, dim / inputs.num_heads];
     let segment: FlexTensor = contiguous(inputs.segment.clone());
@@ -54,12 +56,8 @@ fn segments(inputs: &ClusterInputs<Flex>) -> Option<Segments> {
         return None;
     }
     match segment.dtype() {
-        DType::I64 => {
-            Some(Segments::new(sizes, segment.storage::<i64>()[range].iter().map(|&segment| segment as usize)))
-        }
-        DType::I32 => {
-            Some(Segments::new(sizes, segment.storage::<i32>()[range].iter().map(|&segment| segment as usize)))
-        }
+        DType::I64 => Some(ClusterSegments::new(sizes, segment.storage::<i64>()[range].iter().map(|&s| s as usize))),
+        DType::I32 => Some(ClusterSegments::new(sizes, segment.storage::<i32>()[range].iter().map(|&s| s as usize))),
         _ => None,
     }
 }

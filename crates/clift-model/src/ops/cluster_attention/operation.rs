@@ -1,8 +1,11 @@
-//! Attention of every centroid to the tokens of its own cluster, linear in the number of tokens.
+//! Attention of every centroid to the tokens of its cluster (paper, equation 2), linear in the number of tokens.
 //!
-//! A token is a key for one centroid only, so the scores are one number per token and head and the
-//! softmax runs over segments: never a `[centroids, tokens]` mask.
-#![expect(deprecated, reason = "upstream retires ndarray in favour of flex; it stays as an independent check")]
+//! A token is a key of one centroid only: there is one score per token and head, the softmax runs over segments, and no
+//! `[centroids, tokens]` mask exists.
+#![expect(
+    deprecated,
+    reason = "Burn deprecates ndarray in favor of flex; clift keeps ndarray as an independent reference"
+)]
 // B scenes, S centroids, M members, D width, H heads, E = D/H width of a head
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
@@ -16,14 +19,14 @@ use burn::tensor::{FloatDType, Int, Shape, Slice, Tensor, assert_shape};
 use crate::ops::autodiff::register;
 use crate::ops::mac_counter;
 
-/// Attention from every centroid to its members: `o_s = sum_i softmax_i(q_s k_i / sqrt(head width)) v_i`
-/// over the `i` whose segment is `s`. A centroid without members gets zeros.
+/// Computes attention of every centroid to its members: `o_s = sum_i softmax_i(q_s k_i / sqrt(head width)) v_i`
+/// over the members `i` of segment `s`; zeros for a centroid without members.
 ///
-/// Its gradient is exact and first order. Scores are shifted by their segment's maximum.
+/// The gradient is exact and of first order. Scores are shifted by the maximum of their segment.
 ///
 /// # Shapes
 /// - `query`: `[batch, num_segments, dim]`
-/// - `key_value`: `[batch, num_members, 2 dim]`, the two side by side
+/// - `key_value`: `[batch, num_members, 2 dim]`, keys and values side by side
 /// - `segment`: `[batch * num_members]`, `scene * num_segments + cluster` of every member
 /// - returns `[batch, num_segments, dim]`
 pub fn cluster_attention(
@@ -46,7 +49,7 @@ pub fn cluster_attention(
     ))
 }
 
-/// The operation behind [`cluster_attention`] on a device.
+/// The operation of [`cluster_attention`] on a backend.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait ClusterAttentionOps: Backend {
     /// See [`cluster_attention`].
@@ -58,24 +61,24 @@ pub trait ClusterAttentionOps: Backend {
     ) -> FloatTensor<Self>;
 }
 
-/// Both directions of the operation on a device. The bodies here run on every one of them.
+/// The operation and its gradients on a backend. The default implementations run on every backend.
 pub trait ClusterAttentionKernels: Backend {
-    /// Output `[B, S, D]` and weights `[BM, H, 1]`.
+    /// Computes the output `[B, S, D]` and the weights `[BM, H, 1]`.
     fn attend_clusters(inputs: &ClusterInputs<Self>) -> [FloatTensor<Self>; 2] {
-        forward::<Self>(inputs)
+        composed_forward::<Self>(inputs)
     }
 
-    /// The gradients of queries and of keys and values from the weights and the output's gradient.
+    /// Computes the gradients of `query` and `key_value` from the saved results and the gradient of the output.
     fn attend_clusters_backward(
         inputs: ClusterInputs<Self>,
         results: [FloatTensor<Self>; 2],
         grad_output: FloatTensor<Self>,
     ) -> [FloatTensor<Self>; 2] {
-        backward::<Self>(inputs, results, grad_output)
+        composed_backward::<Self>(inputs, results, grad_output)
     }
 }
 
-/// What [`cluster_attention`] is given.
+/// Inputs of [`cluster_attention`].
 #[derive(Clone, Debug)]
 pub struct ClusterInputs<B: Backend> {
     pub(crate) query: FloatTensor<B>,
@@ -141,7 +144,7 @@ impl<B: ClusterAttentionKernels> Backward<B, 2> for ClusterBackward {
     }
 }
 
-/// Keys and values, each `[BM, H, E]`.
+/// Splits into keys and values, each `[BM, H, E]`.
 fn split<B: Backend>(key_value: FloatTensor<B>, num_heads: usize) -> [FloatTensor<B>; 2] {
     let [batch, count, width] = key_value.shape().dims();
     let dim = width / 2;
@@ -151,7 +154,7 @@ fn split<B: Backend>(key_value: FloatTensor<B>, num_heads: usize) -> [FloatTenso
     })
 }
 
-pub(crate) fn forward<B: Backend>(inputs: &ClusterInputs<B>) -> [FloatTensor<B>; 2] {
+pub(crate) fn composed_forward<B: Backend>(inputs: &ClusterInputs<B>) -> [FloatTensor<B>; 2] {
     let ClusterInputs { query, key_value, segment, num_heads } = inputs.clone();
     let [batch, num_segments, dim] = query.shape().dims();
     let segments = batch * num_segments;
@@ -162,7 +165,7 @@ pub(crate) fn forward<B: Backend>(inputs: &ClusterInputs<B>) -> [FloatTensor<B>;
     let [key, value] = split::<B>(key_value, num_heads); // [BM, H, E]
     let scores = dot::<B>(B::float_select(query, 0, segment.clone()), key); // [BM, H, 1]
 
-    // Every segment's maximum. The lowest finite value stands in for segments without members.
+    // The maximum of every segment; the lowest finite value for segments without members.
     let (device, dtype) = (scores.device(), FloatDType::from(scores.dtype()));
     let per_segment = Shape::new([segments, num_heads, 1]);
     let lowest = B::float_full(per_segment.clone(), f64::from(f32::MIN).into(), &device, dtype);
@@ -171,7 +174,7 @@ pub(crate) fn forward<B: Backend>(inputs: &ClusterInputs<B>) -> [FloatTensor<B>;
     let exponential = B::float_exp(shifted);
     let zeros = B::float_zeros(per_segment, &device, dtype);
     let total = B::float_select_assign(zeros, 0, segment.clone(), exponential.clone(), IndexingUpdateOp::Add);
-    // Every total that is read has a member at its maximum, so it is at least one.
+    // Every total that is read has a member with the maximal score, so that the total is at least one.
     let weights = B::float_div(exponential, B::float_select(total, 0, segment.clone()));
 
     let weighted = B::float_mul(value, weights.clone());
@@ -180,9 +183,9 @@ pub(crate) fn forward<B: Backend>(inputs: &ClusterInputs<B>) -> [FloatTensor<B>;
     [B::float_reshape(output, Shape::new([batch, num_segments, dim])), weights]
 }
 
-/// With `g_i = dO[segment i]`: `dV_i = p_i g_i`, `dS_i = p_i (g_i v_i - rowsum(dO * O)[segment i])`,
+/// Computes the gradients. With `g_i = dO[segment i]`: `dV_i = p_i g_i`, `dS_i = p_i (g_i v_i - rowsum(dO * O)[segment i])`,
 /// `dK_i = s dS_i q[segment i]`, `dQ_s = s sum_i dS_i k_i`.
-pub(crate) fn backward<B: Backend>(
+pub(crate) fn composed_backward<B: Backend>(
     inputs: ClusterInputs<B>,
     [output, weights]: [FloatTensor<B>; 2],
     grad_output: FloatTensor<B>,
@@ -225,10 +228,10 @@ fn dot<B: Backend>(a: FloatTensor<B>, b: FloatTensor<B>) -> FloatTensor<B> {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::Device;
+    use burn::tensor::{DType, Device};
 
     use super::*;
-    use crate::testing::{assert_close, check_gradients, cpu_devices, devices, random, to_vec};
+    use crate::testing::{assert_close, check_gradients, check_native, cpu_devices, devices, random, to_vec};
 
     fn cluster_attention(
         query: Tensor<3>,
@@ -240,71 +243,45 @@ mod tests {
         super::cluster_attention(query, Tensor::cat(vec![key, value], 2), segment, num_heads)
     }
 
-    /// Seven members, four segments in each of two scenes: uneven, a singleton, an empty one.
+    /// Seven members and four segments per scene, two scenes: unequal sizes, one singleton, one empty segment.
     const SEGMENTS: [i64; 14] = [0, 0, 2, 0, 1, 2, 0, 5, 7, 7, 5, 4, 5, 4];
 
     fn segments(device: &Device) -> Tensor<1, Int> {
         Tensor::from_ints(SEGMENTS, device)
     }
 
-    /// The same attention, written as a loop over centroids.
-    fn reference(q: &Tensor<3>, k: &Tensor<3>, v: &Tensor<3>, num_heads: usize) -> Vec<f64> {
-        let [batch, num_segments, dim] = q.dims();
-        let (q, k, v) = (to_vec(q.clone()), to_vec(k.clone()), to_vec(v.clone()));
-        let width = dim / num_heads;
-        let mut output = vec![0.0; batch * num_segments * dim];
-        for segment in 0..batch * num_segments {
-            let members: Vec<usize> = (0..SEGMENTS.len()).filter(|&i| SEGMENTS[i] == segment as i64).collect();
-            for head in 0..num_heads {
-                let columns = head * width..(head + 1) * width;
-                let scores: Vec<f64> = members
-                    .iter()
-                    .map(|i| columns.clone().map(|c| q[segment * dim + c] * k[i * dim + c]).sum::<f64>())
-                    .map(|dot| dot / (width as f64).sqrt())
-                    .collect();
-                let maximum = scores.iter().copied().fold(f64::MIN, f64::max);
-                let total: f64 = scores.iter().map(|score| (score - maximum).exp()).sum();
-                for (i, score) in members.iter().zip(&scores) {
-                    let weight = (score - maximum).exp() / total;
-                    columns.clone().for_each(|c| output[segment * dim + c] += weight * v[i * dim + c]);
-                }
-            }
-        }
-        output
+    fn inputs(device: &Device) -> [Tensor<3>; 3] {
+        [(4, 1), (7, 2), (7, 3)].map(|(count, seed)| random([2, count, 8], seed, device))
     }
 
-    #[test]
-    fn output_equals_a_loop_over_centroids_and_empty_clusters_give_zeros() {
-        for device in devices() {
-            let [q, k, v] = [(4, 1), (7, 2), (7, 3)].map(|(count, seed)| random([2, count, 8], seed, &device));
-            let f32_device = q.clone().cast(burn::tensor::DType::F32);
-            let [k, v] = [k, v].map(|x| x.cast(burn::tensor::DType::F32));
-            let output = to_vec(cluster_attention(f32_device.clone(), k.clone(), v.clone(), segments(&device), 2));
-            for (got, expected) in output.iter().zip(reference(&f32_device, &k, &v, 2)) {
-                assert!((got - expected).abs() < 1e-6, "{got} against {expected}");
-            }
-            assert!(output[3 * 8..4 * 8].iter().all(|&value| value == 0.0), "segment 3 has no members");
-        }
+    fn attend([q, k, v]: [Tensor<3>; 3]) -> Tensor<3> {
+        let segments = segments(&q.device());
+        cluster_attention(q, k, v, segments, 2)
     }
 
     #[test]
     fn gradients_equal_central_differences_in_f64() {
         for device in cpu_devices() {
-            let inputs = [random([2, 4, 8], 1, &device), random([2, 7, 8], 2, &device), random([2, 7, 8], 3, &device)];
-            let segments = segments(&device);
-            check_gradients(
-                inputs,
-                |[q, k, v]| {
-                    let segments = if q.is_autodiff() { segments.clone().autodiff() } else { segments.clone() };
-                    cluster_attention(q, k, v, segments, 2)
-                },
-                1e-6,
-            );
+            check_gradients(inputs(&device), attend, 1e-6);
         }
     }
 
     #[test]
-    fn extreme_logits_in_one_cluster_do_not_touch_another() {
+    fn native_kernels_equal_the_composed_operation() {
+        let device = Device::flex();
+        check_native(inputs(&device), random([2, 4, 8], 4, &device), attend, 1e-5);
+    }
+
+    #[test]
+    fn a_segment_without_members_gives_zeros() {
+        for device in devices() {
+            let output = to_vec(attend(inputs(&device).map(|x| x.cast(DType::F32))));
+            assert!(output[3 * 8..4 * 8].iter().all(|&value| value == 0.0), "segment 3 has no members");
+        }
+    }
+
+    #[test]
+    fn extreme_logits_of_a_cluster_leave_others_unchanged() {
         for device in devices() {
             let q = Tensor::<3>::from_floats([[[1e4, 0.0], [1e-3, 0.0]]], &device);
             let k = Tensor::<3>::from_floats([[[1.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [1.0, 0.0]]], &device);

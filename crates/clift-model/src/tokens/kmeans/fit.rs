@@ -1,8 +1,8 @@
-//! Latent K-means: which tokens a scene keeps (paper section 3.2).
+//! Settings, result and iterations of latent K-means (paper section 3.2).
 //!
-//! Distances are matrix products on the device; random numbers are drawn on the host, so a seed gives the
-//! same clusters on every run. The host sees one assignment and one distance per token and iteration: it
-//! finds empty clusters and decides when to stop.
+//! Distances are matrix products on the device. Random numbers come from the host, so that a seed gives the same clusters
+//! on every run. The host reads one assignment and one distance per token and iteration, reseeds empty clusters and
+//! decides when to stop.
 // B scenes, N tokens, S clusters, D width
 
 use burn::tensor::Tensor;
@@ -20,7 +20,7 @@ use crate::tokens::kmeans::seeding;
 pub struct KMeans {
     /// Most Lloyd iterations.
     pub max_iterations: usize,
-    /// A scene is done when an iteration lowers its inertia by less than this fraction.
+    /// Relative decrease of the inertia per iteration below which a scene stops.
     pub tolerance: f64,
 }
 
@@ -33,32 +33,32 @@ impl Default for KMeans {
 /// Result of [`KMeans::fit`].
 #[derive(Clone, Debug)]
 pub struct KMeansFit {
-    /// The clusters of every scene; the centroid of each is the sample nearest to its mean.
+    /// Clusters of every scene; the centroid is the token nearest to the mean.
     pub clusters: Clusters,
-    /// Sum of squared distances of all tokens to their cluster's mean, per scene.
+    /// Sum of squared distances of the tokens to the means of their clusters, per scene.
     pub inertia: Vec<f64>,
     /// Lloyd iterations of the slowest scene.
     pub iterations: usize,
 }
 
 impl KMeansFit {
-    /// Share of a scene's [`total_variance`] that its clusters leave within them, 0 for a scene of equal tokens.
+    /// Returns the share of a scene's [`total_variance`] within clusters; 0 for a scene of equal tokens.
     pub fn error(&self, scene: usize, total_variance: f64) -> f64 {
         if total_variance > 0.0 { self.inertia[scene] / total_variance } else { 0.0 }
     }
 }
 
-/// Sum of squared distances of the tokens to their mean, per scene: the inertia of a single cluster.
+/// Computes the sum of squared distances of the tokens to their mean, per scene: the inertia of a single cluster.
 ///
 /// # Shapes
 /// - `tokens`: `[batch, num_tokens, dim]`
 ///
 /// # Errors
-/// [`ModelError::Device`] when the device does not give its values back.
+/// [`ModelError::Device`] if the values cannot be read from the device.
 pub fn total_variance(tokens: &Tensor<3>) -> Result<Vec<f64>, ModelError> {
     let [batch, num_tokens, _] = tokens.dims();
     let centred = tokens.clone() - tokens.clone().mean_dim(1);
-    // Summed in f64 on the host: thousands of squares of unlike size.
+    // Summed in f64 on the host: squares of thousands of tokens differ in magnitude.
     let squares = centred.square().sum_dim(2).reshape([batch * num_tokens]); // [B, N, D] -> [B * N]
     let squares = squares
         .into_data()
@@ -69,31 +69,29 @@ pub fn total_variance(tokens: &Tensor<3>) -> Result<Vec<f64>, ModelError> {
 }
 
 impl KMeans {
-    /// Clusters the tokens of every scene into `num_clusters` groups, none of them empty.
-    ///
-    /// With `num_clusters = num_tokens` every token is its own cluster and nothing is computed.
+    /// Groups the tokens of every scene into `num_clusters` clusters, none of them empty. For
+    /// `num_clusters = num_tokens` every token is a cluster.
     ///
     /// # Shapes
-    /// - `tokens`: `[batch, num_tokens, dim]`; `seeds`: one per scene, so that a scene's clusters do
-    ///   not depend on the scenes beside it
+    /// - `tokens`: `[batch, num_tokens, dim]`; `seeds`: one per scene, so that the clusters of a scene do not depend on
+    ///   the rest of the batch
     ///
     /// # Errors
-    /// [`ModelError::BadClusters`] when `num_clusters` is not in `1..=num_tokens` or a token is not
-    /// finite.
+    /// [`ModelError::BadClusters`] if `num_clusters` is not in `1..=num_tokens` or a token is not finite.
     pub fn fit(&self, tokens: Tensor<3>, num_clusters: usize, seeds: &[u64]) -> Result<KMeansFit, ModelError> {
         let [batch, num_tokens, dim] = tokens.dims();
         assert_eq!(seeds.len(), batch, "one seed per scene");
         if !(1..=num_tokens).contains(&num_clusters) {
-            return Err(ModelError::BadClusters { what: format!("{num_clusters} clusters of {num_tokens} tokens") });
+            return Err(ModelError::BadClusters { reason: format!("{num_clusters} clusters of {num_tokens} tokens") });
         }
         if num_clusters == num_tokens {
             let clusters = Clusters::new(vec![SceneClusters::identity(num_tokens); batch])?;
             return Ok(KMeansFit { clusters, inertia: vec![0.0; batch], iterations: 0 });
         }
-        // Refused before any scene is clustered.
+        // All scenes are checked before the first is clustered.
         let scenes = tokens.split(1, 0).into_iter().enumerate().map(|(scene, tokens)| {
-            let what = || format!("a token of scene {scene} is not finite");
-            Samples::new(tokens.reshape([num_tokens, dim])).ok_or_else(|| ModelError::BadClusters { what: what() })
+            let not_finite = || ModelError::BadClusters { reason: format!("a token of scene {scene} is not finite") };
+            Samples::new(tokens.reshape([num_tokens, dim])).ok_or_else(not_finite)
         });
         let scenes = scenes.collect::<Result<Vec<_>, _>>()?;
         let (mut clusters, mut inertia, mut iterations) = (Vec::new(), Vec::new(), 0);
@@ -106,14 +104,14 @@ impl KMeans {
         Ok(KMeansFit { clusters: Clusters::new(clusters)?, inertia, iterations })
     }
 
-    /// Clusters of one scene and how many iterations they took.
+    /// Returns the clusters of one scene and the number of iterations.
     fn lloyd(&self, samples: &Samples, num_clusters: usize, seed: u64) -> (Labels, usize) {
         let start = seeding::seed(samples, num_clusters, seed, seeding::MAX_TABLE_LEN);
         let mut labels = samples.assign(samples.select(&start));
-        labels.fill_empty(num_clusters);
+        labels.reseed_empty(num_clusters);
         for iteration in 1..=self.max_iterations {
             let mut next = samples.assign(samples.means(&labels, num_clusters));
-            next.fill_empty(num_clusters);
+            next.reseed_empty(num_clusters);
             let settled = next.assignment == labels.assignment
                 || labels.inertia() - next.inertia() <= self.tolerance * labels.inertia();
             labels = next;
@@ -144,19 +142,7 @@ mod tests {
         }
     }
 
-    /// Cluster numbers in the order in which the tokens meet them.
-    fn renumbered(assignment: &[u32]) -> Vec<usize> {
-        let mut met = Vec::new();
-        let number = |cluster: &u32| {
-            met.iter().position(|other| other == cluster).unwrap_or_else(|| {
-                met.push(*cluster);
-                met.len() - 1
-            })
-        };
-        assignment.iter().map(number).collect()
-    }
-
-    /// Squared distance of every token to the mean of every cluster, in f64: `[N][S]`.
+    /// Computes the squared distance of every token to the mean of every cluster in f64, `[N][S]`.
     fn brute_force(tokens: &[Vec<f64>], assignment: &[u32], num_clusters: usize) -> Vec<Vec<f64>> {
         let mut means = vec![vec![0.0; tokens[0].len()]; num_clusters];
         for (cluster, mean) in means.iter_mut().enumerate() {
@@ -169,7 +155,7 @@ mod tests {
         tokens.iter().map(|token| means.iter().map(|mean| distance(token, mean)).collect()).collect()
     }
 
-    /// Mean and standard error.
+    /// Returns mean and standard error.
     fn statistics(values: &[f64]) -> (f64, f64) {
         let count = values.len() as f64;
         let mean = values.iter().sum::<f64>() / count;
@@ -178,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn inertia_is_within_one_percent_of_scikit_learns() {
+    fn inertia_is_within_one_percent_of_scikit_learn() {
         let fixture = Fixture::open("kmeans");
         for set in ["blobs", "encoder_like"] {
             let reference: Tensor<2> = fixture.tensor_f64(&format!("output.{set}_inertia"), &Device::flex());
@@ -197,7 +183,7 @@ mod tests {
                         })
                         .collect();
                     let ((ours, our_error), (theirs, their_error)) = (statistics(&inertia), statistics(reference));
-                    // One start each ends in one of many local minima: 1.5 % standard error at eight blobs.
+                    // Every start ends in one of many local minima: 1.5 % standard error for eight blobs.
                     let bound = theirs * 1.01 + 2.0 * our_error.hypot(their_error);
                     assert!(ours <= bound, "{set}, {num_clusters}: {ours} against {theirs}");
                 }
@@ -206,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_fixes_the_clusters_whatever_scenes_stand_beside() {
+    fn clusters_depend_on_the_seed_alone() {
         for device in devices() {
             let tokens = random([3, 60, 8], 5, &device).cast(burn::tensor::DType::F32);
             let all = KMeans::default().fit(tokens.clone(), 7, &[1, 2, 3]).expect("fits");
@@ -218,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn one_cluster_and_as_many_as_tokens() {
+    fn counts_from_one_to_all_tokens_and_zero_iterations() {
         for device in devices() {
             let tokens = random([2, 9, 4], 6, &device).cast(burn::tensor::DType::F32);
             let one = KMeans::default().fit(tokens.clone(), 1, &[0, 1]).expect("fits");
@@ -229,26 +215,30 @@ mod tests {
             assert_eq!(all.clusters.scenes()[1], SceneClusters::identity(9));
             let most = KMeans::default().fit(tokens.clone(), 8, &[0, 1]).expect("fits");
             assert_valid(&most, 8);
+            let start =
+                KMeans { max_iterations: 0, ..KMeans::default() }.fit(tokens.clone(), 6, &[0, 1]).expect("fits");
+            assert_valid(&start, 6);
+            assert_eq!(start.iterations, 0);
             assert!(KMeans::default().fit(tokens.clone(), 0, &[0, 1]).is_err());
             assert!(KMeans::default().fit(tokens, 10, &[0, 1]).is_err());
         }
     }
 
     #[test]
-    fn duplicate_tokens_still_give_as_many_distinct_centroids() {
+    fn duplicate_tokens_give_distinct_centroids() {
         for device in devices() {
             let tokens = Tensor::<3>::ones([1, 12, 4], &device);
             assert_valid(&KMeans::default().fit(tokens.clone(), 5, &[0]).expect("fits"), 5);
-            // Two places only, eight clusters.
+            // Two distinct tokens, eight clusters.
             let tokens = Tensor::cat(vec![tokens.clone(), tokens * 3.0], 1);
             let fit = KMeans::default().fit(tokens, 8, &[0]).expect("fits");
             assert_valid(&fit, 8);
-            assert!(fit.inertia[0] < 1e-4, "no cluster joins the two places: {}", fit.inertia[0]);
+            assert!(fit.inertia[0] < 1e-4, "no cluster contains both: {}", fit.inertia[0]);
         }
     }
 
     #[test]
-    fn a_fit_run_to_its_end_is_a_local_optimum_of_the_inertia_it_reports() {
+    fn a_converged_fit_is_a_local_optimum() {
         let kmeans = KMeans { max_iterations: 1000, tolerance: -1.0 };
         for device in cpu_devices() {
             let tokens = random([1, 200, 6], 12, &device);
@@ -272,22 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn well_separated_tokens_are_told_apart_on_every_device_in_f32_and_f64() {
-        let expected: Vec<usize> = (0..90).map(|token| token % 9).collect();
-        for device in devices() {
-            let corner = Tensor::<3>::from_floats([[[0.0, 0.0], [0.0, 50.0], [90.0, 0.0]]], &device);
-            let corners = Tensor::cat(vec![corner.clone(), corner.clone() - 400.0, corner + 300.0], 1);
-            let noise = random([1, 90, 2], 13, &device);
-            let tokens = corners.repeat_dim(1, 10).cast(noise.dtype()) + noise;
-            for dtype in [tokens.dtype(), burn::tensor::DType::F32] {
-                let fit = KMeans::default().fit(tokens.clone().cast(dtype), 9, &[7]).expect("fits");
-                assert_eq!(renumbered(fit.clusters.scenes()[0].assignment()), expected, "{dtype:?}");
-            }
-        }
-    }
-
-    #[test]
-    fn a_far_outlier_takes_one_cluster_and_leaves_the_others_alone() {
+    fn a_far_outlier_is_a_cluster_of_its_own() {
         for device in devices() {
             let near = random([1, 100, 4], 14, &device).cast(burn::tensor::DType::F32);
             let far = Tensor::<3>::full([1, 1, 4], 1e4, &device);
@@ -302,19 +277,9 @@ mod tests {
     }
 
     #[test]
-    fn no_iteration_allowed_still_gives_clusters() {
+    fn a_shift_of_all_tokens_preserves_clusters() {
         for device in devices() {
-            let tokens = random([1, 30, 4], 15, &device).cast(burn::tensor::DType::F32);
-            let fit = KMeans { max_iterations: 0, ..KMeans::default() }.fit(tokens, 6, &[0]).expect("fits");
-            assert_valid(&fit, 6);
-            assert_eq!(fit.iterations, 0);
-        }
-    }
-
-    #[test]
-    fn tokens_far_from_the_origin_cluster_as_they_do_near_it() {
-        for device in devices() {
-            // Eighths are exact at 4096, so both sets are the same up to the shift.
+            // Multiples of 1/8 are exact at 4096: both sets are equal up to the shift.
             let near = (random([1, 40, 4], 8, &device).cast(burn::tensor::DType::F32) * 64.0).round() / 8.0;
             let fit = |tokens| KMeans::default().fit(tokens, 5, &[3]).expect("fits").clusters;
             assert_eq!(fit(near.clone()), fit(near + 4096.0));
@@ -322,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_that_is_not_finite_is_refused_with_its_scene() {
+    fn non_finite_tokens_are_refused() {
         for device in devices() {
             for bad in [f32::NAN, f32::INFINITY, f32::MAX] {
                 let tokens = Tensor::<3>::from_floats([[[0.0], [1.0], [2.0]], [[0.0], [1.0], [bad]]], &device);
@@ -333,8 +298,8 @@ mod tests {
     }
 
     #[test]
-    fn the_error_is_the_variance_within_clusters_over_the_total() {
-        // Tokens of two values at two places, far apart, with a little noise.
+    fn error_is_the_share_of_variance_within_clusters() {
+        // Two distant groups of tokens with small noise.
         let rows: Vec<[f64; 2]> =
             (0..64).map(|i| [f64::from(i % 2) * 10.0, f64::from(i * 7919 % 101) * 1e-3]).collect();
         let values: Vec<f32> = rows.iter().flatten().map(|&value| value as f32).collect();

@@ -1,28 +1,28 @@
-//! What the host knows of a scene after an assignment.
+//! Assignments of the tokens of one scene, on the host.
 
 use crate::error::ModelError;
 use crate::tokens::clusters::SceneClusters;
 
-/// Share of a squared distance that is rounding: sums in another order, as another device has them, move it by less.
+/// Relative rounding error of squared distances: the order of summation, which depends on the device, changes them by less.
 pub(crate) const ROUNDING: f64 = 1e-4;
 
 /// The cluster of every token of one scene.
 #[derive(Clone, Debug)]
 pub(crate) struct Labels {
     pub assignment: Vec<u32>,
-    /// Squared distance of every token to its cluster's mean.
+    /// Squared distance of every token to the mean of its cluster.
     pub distance: Vec<f64>,
 }
 
 impl Labels {
-    /// Sum of all squared distances.
+    /// Returns the sum of all squared distances.
     pub fn inertia(&self) -> f64 {
         self.distance.iter().sum()
     }
 
-    /// Gives every empty cluster the token farthest from its own mean, out of clusters that can spare
-    /// one. Lower ids first on ties.
-    pub fn fill_empty(&mut self, num_clusters: usize) {
+    /// Moves the token farthest from its mean, from a cluster of at least two tokens, to every empty cluster. Ties go to
+    /// the lower index.
+    pub fn reseed_empty(&mut self, num_clusters: usize) {
         let mut counts = vec![0_usize; num_clusters];
         self.assignment.iter().for_each(|&cluster| counts[cluster as usize] += 1);
         if !counts.contains(&0) {
@@ -35,7 +35,7 @@ impl Labels {
             if counts[cluster] > 0 {
                 continue;
             }
-            // There are at least as many tokens as clusters, so one of them can be spared.
+            // A candidate exists: there are at least as many tokens as clusters.
             let Some(token) = candidates.find(|&token| counts[self.assignment[token] as usize] > 1) else { break };
             counts[self.assignment[token] as usize] -= 1;
             counts[cluster] = 1;
@@ -44,8 +44,8 @@ impl Labels {
         }
     }
 
-    /// Keeps the sample nearest to every mean; the lower id where rounding alone would decide. The two of a pair are
-    /// equally near, and without that a scene would depend on the device that encoded it.
+    /// Returns the clusters with the token nearest to every mean as centroid. If distances are equal up to [`ROUNDING`],
+    /// as in clusters of two tokens, the lower index is the centroid, so that scenes do not depend on the device.
     pub fn nearest_samples(&self, num_clusters: usize) -> Result<SceneClusters, ModelError> {
         let mut nearest: Vec<Option<usize>> = vec![None; num_clusters];
         for (token, &cluster) in self.assignment.iter().enumerate() {
@@ -64,13 +64,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_lower_of_a_pair_is_kept_however_its_distances_are_rounded() {
+    fn ties_within_rounding_go_to_the_lower_index() {
         let centroids = |distance: [f64; 5]| {
             let labels = Labels { assignment: vec![0, 1, 0, 1, 1], distance: distance.to_vec() };
             labels.nearest_samples(2).expect("valid clusters").centroid_index().to_vec()
         };
         assert_eq!(centroids([2.0, 3.0, 2.0, 1.0, 1.5]), [0, 3]);
         assert_eq!(centroids([2.000_02, 3.0, 1.999_98, 1.000_01, 1.0]), [0, 3]);
-        assert_eq!(centroids([2.01, 3.0, 1.99, 1.0, 0.99]), [2, 4], "what is nearer is nearer");
+        assert_eq!(centroids([2.01, 3.0, 1.99, 1.0, 0.99]), [2, 4], "differences above rounding decide");
     }
 }

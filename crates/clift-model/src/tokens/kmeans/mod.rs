@@ -1,9 +1,9 @@
-//! Latent K-means.
+//! Latent K-means (paper section 3.2): Lloyd iterations after a greedy k-means++ start.
 //!
-//! - `fit`: Lloyd iterations
-//! - `seeding`: greedy k-means++ start
-//! - `samples`: distances and means on the device
-//! - `labels`: assignment on the host
+//! - `fit`: settings, result and iterations
+//! - `seeding`: the initial centers
+//! - `samples`: distances and means, on the device
+//! - `labels`: assignments, on the host
 
 pub(crate) mod fit;
 pub(crate) mod labels;

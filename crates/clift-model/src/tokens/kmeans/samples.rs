@@ -1,25 +1,25 @@
-//! The tokens of one scene, and what K-means asks the device about them.
+//! The tokens of one scene: distances and means, on the device.
 
 use burn::tensor::{DType, Device, IndexingUpdateOp, Int, Tensor, TensorData, Transaction};
 use rayon::prelude::*;
 
 use crate::tokens::kmeans::labels::Labels;
 
-/// Distances computed at once for the table on the host: 4 MiB in f32, which stay in a cache on the way.
+/// Distances per matrix product for the table on the host: 4 MiB in f32, which fit into a cache.
 const BLOCK_LEN: usize = 1 << 20;
 
 /// The tokens of one scene with their squared lengths.
 pub(crate) struct Samples {
-    /// `[N, D]`, about their mean.
+    /// Tokens minus their mean, `[N, D]`.
     tokens: Tensor<2>,
     /// Squared lengths, `[N]`.
     squares: Vec<f64>,
 }
 
 impl Samples {
-    /// Takes the tokens of a scene, `[N, D]`; `None` when a squared length is not finite in f32.
+    /// Centers the tokens of a scene, `[N, D]`; `None` if a squared length is not finite in f32.
     pub fn new(tokens: Tensor<2>) -> Option<Self> {
-        // Distances are differences of squares: taken about the mean they lose the fewest digits.
+        // Distances are differences of squares, most accurate for centered tokens.
         let tokens = tokens.clone() - tokens.mean_dim(0);
         let squares = floats(tokens.clone().square().sum_dim(1).into_data());
         squares.iter().all(|&square| (square as f32).is_finite()).then_some(Self { tokens, squares })
@@ -33,7 +33,7 @@ impl Samples {
         self.tokens.device()
     }
 
-    /// These tokens, `[ids.len(), D]`.
+    /// Selects tokens, `[ids.len(), D]`.
     pub fn select(&self, ids: &[usize]) -> Tensor<2> {
         let ids: Vec<i64> = ids.iter().map(|&id| id as i64).collect();
         self.tokens.clone().select(0, self.index(ids))
@@ -44,7 +44,7 @@ impl Samples {
         Tensor::from_data(TensorData::new(ids, [count]), &self.device())
     }
 
-    /// Squared distances `|x|^2 - 2 x y + |y|^2` of these tokens to all, on the host: `[ids.len(), N]`.
+    /// Computes the squared distances `|x|^2 - 2 x y + |y|^2` of some tokens to all, on the host: `[ids.len(), N]`.
     pub fn distances(&self, ids: &[usize]) -> Vec<f32> {
         let squares: Vec<f32> = self.squares.iter().map(|&square| square as f32).collect();
         let (count, rows) = (self.len(), (BLOCK_LEN / self.len()).max(1));
@@ -65,10 +65,10 @@ impl Samples {
         distances
     }
 
-    /// The nearest mean of every token; the lower one on ties. The host waits for the device once.
+    /// Assigns every token to the nearest mean, ties to the lower index, with one transfer from the device.
     pub fn assign(&self, means: Tensor<2>) -> Labels {
         let squares = means.clone().square().sum_dim(1).transpose(); // [1, S]
-        // The token's own square is the same for all means, so the smallest is found without it.
+        // The square of the token is equal for all means and added on the host.
         let scores = self.tokens.clone().matmul(means.mul_scalar(-2.0).transpose()) + squares; // [N, S]
         let (score, cluster) = scores.min_dim_with_indices(1);
         let mut read = Transaction::default().register(score).register(cluster).execute().into_iter();
@@ -79,7 +79,7 @@ impl Samples {
         Labels { assignment, distance }
     }
 
-    /// Mean of the tokens of every cluster, `[S, D]`; none is empty.
+    /// Computes the mean of every cluster, `[S, D]`; no cluster may be empty.
     pub fn means(&self, labels: &Labels, num_clusters: usize) -> Tensor<2> {
         let mut counts = vec![0.0_f64; num_clusters];
         labels.assignment.iter().for_each(|&cluster| counts[cluster as usize] += 1.0);

@@ -1,9 +1,8 @@
-//! Where K-means starts: greedy k-means++ (Arthur and Vassilvitskii 2007) that reads a table of distances.
+//! Initial centers of K-means: greedy k-means++ (Arthur and Vassilvitskii 2007) on a table of distances.
 //!
-//! A start is thousands of small steps one after another, each a draw that depends on the one before. The
-//! device therefore only computes the table, in a few matrix products; the steps read it on the host, where
-//! many draws per step cost little. A scene too large for the table of all pairs first draws a pool of
-//! tokens that may become centers, with the rounds of k-means|| (Bahmani et al. 2012).
+//! Seeding is a sequence of thousands of small steps, each of which depends on the previous sample. The device therefore
+//! computes only the table, in a few matrix products; the steps run on the host. A scene too large for the table of all
+//! pairs first samples a pool of candidates, in the rounds of k-means|| (Bahmani et al. 2012).
 // N tokens, S clusters, P tokens in the pool
 
 use rand::{RngExt, SeedableRng};
@@ -12,30 +11,30 @@ use rayon::prelude::*;
 
 use crate::tokens::kmeans::samples::Samples;
 
-/// Most entries of the table, unless twice the clusters need more (256 MiB in f32).
+/// Most entries of the table (256 MiB in f32), unless a pool of twice the clusters needs more.
 pub(crate) const MAX_TABLE_LEN: usize = 1 << 26;
 
-/// Rounds that draw the pool; Bahmani et al. find no gain in more.
+/// Rounds of sampling the pool; Bahmani et al. find no gain in more rounds.
 const NUM_ROUNDS: usize = 5;
 
-/// Distances a thread sums up at least.
+/// Fewest distances that one thread sums.
 const PARALLEL_LEN: usize = 1 << 15;
 
-/// Draws `num_clusters` tokens to start from, fewer when there are not as many different ones.
+/// Samples `num_clusters` initial centers; fewer if there are fewer distinct tokens.
 pub(crate) fn seed(samples: &Samples, num_clusters: usize, seed: u64, max_table_len: usize) -> Vec<usize> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let pool_len = (max_table_len / samples.len()).max(2 * num_clusters);
-    let pool = if pool_len < samples.len() { Pool::draw(samples, pool_len, &mut rng) } else { Pool::all(samples) };
+    let pool = if pool_len < samples.len() { Pool::sample(samples, pool_len, &mut rng) } else { Pool::all(samples) };
     pool.centers(num_clusters, &mut rng)
 }
 
-/// The tokens that may become centers.
+/// Candidates for centers.
 struct Pool {
-    /// `[P]`, each once.
+    /// Distinct tokens, `[P]`.
     tokens: Vec<usize>,
-    /// How many tokens each stands for, `[P]`.
+    /// Number of tokens nearest to each candidate, `[P]`.
     weights: Vec<f64>,
-    /// Squared distances to all tokens, `[P, N]`.
+    /// Squared distances of the candidates to all tokens, `[P, N]`.
     distances: Vec<f32>,
     num_tokens: usize,
 }
@@ -47,74 +46,74 @@ impl Pool {
         Self { distances: samples.distances(&tokens), weights: vec![1.0; num_tokens], tokens, num_tokens }
     }
 
-    /// At most `pool_len` tokens, far from each other: each round draws with probability proportional to
-    /// the squared distance to the tokens of the rounds before.
-    fn draw(samples: &Samples, pool_len: usize, rng: &mut ChaCha8Rng) -> Self {
+    /// Samples at most `pool_len` candidates; each round samples with probability proportional to the squared distance to
+    /// the candidates of earlier rounds.
+    fn sample(samples: &Samples, pool_len: usize, rng: &mut ChaCha8Rng) -> Self {
         let num_tokens = samples.len();
         let mut tokens = vec![rng.random_range(0..num_tokens)];
         let mut distances = samples.distances(&tokens);
         let mut nearest = distances.clone();
         let mut owner = vec![0; num_tokens];
         for round in 1..=NUM_ROUNDS {
-            let draws = Draws::new(nearest.iter().map(|&distance| f64::from(distance)));
-            let wanted = pool_len * round / NUM_ROUNDS;
-            let mut drawn: Vec<usize> = (tokens.len()..wanted).filter_map(|_| draws.draw(rng)).collect();
-            drawn.sort_unstable();
-            drawn.dedup();
-            let rows = samples.distances(&drawn);
-            for (row, place) in rows.chunks_exact(num_tokens).zip(tokens.len()..) {
+            let weighted = WeightedIndices::new(nearest.iter().map(|&distance| f64::from(distance)));
+            let target_len = pool_len * round / NUM_ROUNDS;
+            let mut sampled: Vec<usize> = (tokens.len()..target_len).filter_map(|_| weighted.sample(rng)).collect();
+            sampled.sort_unstable();
+            sampled.dedup();
+            let rows = samples.distances(&sampled);
+            for (row, index) in rows.chunks_exact(num_tokens).zip(tokens.len()..) {
                 for ((nearest, owner), &distance) in nearest.iter_mut().zip(&mut owner).zip(row) {
                     if distance < *nearest {
-                        (*nearest, *owner) = (distance, place);
+                        (*nearest, *owner) = (distance, index);
                     }
                 }
             }
-            tokens.extend(drawn);
+            tokens.extend(sampled);
             distances.extend(rows);
         }
         let mut weights = vec![0.0; tokens.len()];
-        for place in owner {
-            weights[place] += 1.0;
+        for index in owner {
+            weights[index] += 1.0;
         }
         Self { tokens, weights, distances, num_tokens }
     }
 
-    fn row(&self, place: usize) -> &[f32] {
-        &self.distances[place * self.num_tokens..][..self.num_tokens]
+    fn row(&self, index: usize) -> &[f32] {
+        &self.distances[index * self.num_tokens..][..self.num_tokens]
     }
 
-    /// Each step draws tokens of the pool with probability proportional to weight and squared distance to
-    /// the centers so far, and keeps the one that lowers the sum of all tokens' squared distances the most.
+    /// Selects centers one by one: each step samples candidates with probability proportional to the weight times the
+    /// squared distance to the centers so far, and adds the candidate with the smallest resulting inertia.
     fn centers(&self, num_clusters: usize, rng: &mut ChaCha8Rng) -> Vec<usize> {
-        // Twice as many as scikit-learn draws: the distances are there already, and a better start saves
-        // iterations.
-        let num_draws = 2 * (2 + (num_clusters as f64).ln() as usize);
-        let Some(first) = Draws::new(self.weights.iter().copied()).draw(rng) else { return Vec::new() };
+        // Twice the samples of scikit-learn: the distances are in the table, and a better start saves iterations.
+        let num_samples = 2 * (2 + (num_clusters as f64).ln() as usize);
+        let Some(first) = WeightedIndices::new(self.weights.iter().copied()).sample(rng) else { return Vec::new() };
         let mut centers = vec![self.tokens[first]];
         let mut nearest = self.row(first).to_vec();
         while centers.len() < num_clusters {
-            let draws = Draws::new(self.tokens.iter().zip(&self.weights).map(|(&t, w)| w * f64::from(nearest[t])));
-            let places: Vec<usize> = (0..num_draws).filter_map(|_| draws.draw(rng)).collect();
-            // Few tokens are summed sooner than threads are woken.
-            let at_once = PARALLEL_LEN.div_ceil(self.num_tokens);
-            let sum = |&place: &usize| (sum_of_smaller(self.row(place), &nearest), place);
-            let sums: Vec<(f32, usize)> = places.par_iter().with_min_len(at_once).map(sum).collect();
-            let Some(&(_, place)) = sums.iter().reduce(|best, next| if next.0 < best.0 { next } else { best }) else {
+            let weighted =
+                WeightedIndices::new(self.tokens.iter().zip(&self.weights).map(|(&t, w)| w * f64::from(nearest[t])));
+            let indices: Vec<usize> = (0..num_samples).filter_map(|_| weighted.sample(rng)).collect();
+            // Threads do not pay off for few tokens.
+            let min_len = PARALLEL_LEN.div_ceil(self.num_tokens);
+            let sum = |&index: &usize| (sum_of_smaller(self.row(index), &nearest), index);
+            let sums: Vec<(f32, usize)> = indices.par_iter().with_min_len(min_len).map(sum).collect();
+            let Some(&(_, index)) = sums.iter().reduce(|best, next| if next.0 < best.0 { next } else { best }) else {
                 break;
             };
-            centers.push(self.tokens[place]);
-            nearest.iter_mut().zip(self.row(place)).for_each(|(nearest, &distance)| *nearest = nearest.min(distance));
+            centers.push(self.tokens[index]);
+            nearest.iter_mut().zip(self.row(index)).for_each(|(nearest, &distance)| *nearest = nearest.min(distance));
         }
         centers
     }
 }
 
-/// Draws places with probability proportional to their weights.
-struct Draws {
+/// Samples indices with probability proportional to their weights.
+struct WeightedIndices {
     cumulative: Vec<f64>,
 }
 
-impl Draws {
+impl WeightedIndices {
     fn new(weights: impl Iterator<Item = f64>) -> Self {
         let cumulative = weights.scan(0.0, |sum, weight| {
             *sum += weight;
@@ -123,17 +122,16 @@ impl Draws {
         Self { cumulative: cumulative.collect() }
     }
 
-    /// `None` when all weights are zero.
-    fn draw(&self, rng: &mut ChaCha8Rng) -> Option<usize> {
+    /// Samples an index; `None` if all weights are zero.
+    fn sample(&self, rng: &mut ChaCha8Rng) -> Option<usize> {
         let total = self.cumulative.last().copied().filter(|&total| total > 0.0)?;
         let threshold = rng.random_range(0.0..1.0_f64) * total;
-        let place = self.cumulative.partition_point(|&sum| sum <= threshold);
-        Some(place.min(self.cumulative.len() - 1))
+        let index = self.cumulative.partition_point(|&sum| sum <= threshold);
+        Some(index.min(self.cumulative.len() - 1))
     }
 }
 
-/// Sum over all places of the smaller of two values. Sixteen sums side by side, because the compiler may
-/// not reorder a single one to use vector registers.
+/// Returns the sum of `min(a[i], b[i])`. Sixteen partial sums let the compiler use vector registers.
 fn sum_of_smaller(a: &[f32], b: &[f32]) -> f32 {
     let smaller = |a: f32, b: f32| if a < b { a } else { b };
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<16>(), b.as_chunks::<16>());
@@ -158,13 +156,13 @@ mod tests {
         Samples::new(tokens.clone()).expect("finite")
     }
 
-    /// Points around 40 places, `[400, 5]`.
+    /// Returns tokens around 40 points, `[400, 5]`.
     fn clustered(device: &Device) -> Tensor<2> {
-        let places = random([40, 5], 21, device).cast(DType::F32) * 4.0;
-        places.repeat_dim(0, 10) + random([400, 5], 22, device).cast(DType::F32) * 0.3
+        let points = random([40, 5], 21, device).cast(DType::F32) * 4.0;
+        points.repeat_dim(0, 10) + random([400, 5], 22, device).cast(DType::F32) * 0.3
     }
 
-    /// Sum of squared distances to the nearest of some tokens.
+    /// Returns the sum of squared distances to the nearest center.
     fn potential(samples: &Samples, centers: &[usize]) -> f64 {
         let rows = samples.distances(centers);
         let nearest = |token| rows[token..].iter().step_by(samples.len()).copied().fold(f32::INFINITY, f32::min);
@@ -172,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_holds_the_distances() {
+    fn table_entries_are_squared_distances() {
         for device in devices() {
             let tokens = random([70, 9], 20, &device).cast(DType::F32);
             let ids = [3, 69, 0, 41];
@@ -189,10 +187,10 @@ mod tests {
     }
 
     #[test]
-    fn centers_are_different_tokens_and_better_than_random_ones() {
+    fn centers_are_distinct_and_better_than_random() {
         for device in cpu_devices() {
             let samples = samples(&clustered(&device));
-            // The whole table, and pools of 160 and 80 of 400 tokens.
+            // The table of all pairs, and pools of 160 and 80 of 400 tokens.
             for max_table_len in [MAX_TABLE_LEN, 160 * 400, 0] {
                 let mut sums = [0.0; 2];
                 for start in 0..10 {
@@ -211,23 +209,23 @@ mod tests {
     }
 
     #[test]
-    fn a_drawn_pool_starts_as_well_as_the_whole_table() {
+    fn a_sampled_pool_is_as_good_as_all_tokens() {
         for device in cpu_devices() {
             let samples = samples(&random([600, 8], 23, &device).cast(DType::F32));
             let mean = |max_table_len| {
                 let one = |start| potential(&samples, &seed(&samples, 50, start, max_table_len));
                 (0..20).map(one).sum::<f64>() / 20.0
             };
-            let (whole, drawn) = (mean(MAX_TABLE_LEN), mean(200 * 600));
-            assert!(drawn < 1.03 * whole, "{drawn} against {whole}");
+            let (whole, sampled) = (mean(MAX_TABLE_LEN), mean(200 * 600));
+            assert!(sampled < 1.03 * whole, "{sampled} against {whole}");
         }
     }
 
     #[test]
-    fn a_pool_holds_each_token_once_and_stands_for_all() {
+    fn a_pool_has_distinct_tokens_and_weights_of_all() {
         let device = Device::flex();
         let samples = samples(&clustered(&device));
-        let pool = Pool::draw(&samples, 100, &mut ChaCha8Rng::seed_from_u64(3));
+        let pool = Pool::sample(&samples, 100, &mut ChaCha8Rng::seed_from_u64(3));
         let mut tokens = pool.tokens.clone();
         tokens.sort_unstable();
         tokens.dedup();
@@ -235,7 +233,7 @@ mod tests {
         assert!((80..=100).contains(&tokens.len()), "{} tokens", tokens.len());
         assert_eq!(pool.distances, samples.distances(&pool.tokens));
         let nearest_to = |token: usize| {
-            let distance = |&place: &usize| pool.row(place)[token];
+            let distance = |&index: &usize| pool.row(index)[token];
             (0..pool.tokens.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))).expect("a pool is not empty")
         };
         let mut weights = vec![0.0; pool.tokens.len()];
@@ -244,36 +242,36 @@ mod tests {
     }
 
     #[test]
-    fn fewer_places_than_clusters_give_fewer_centers() {
+    fn few_distinct_tokens_give_fewer_centers() {
         for max_table_len in [MAX_TABLE_LEN, 0] {
             let tokens = Tensor::<2>::from_floats([[1.0, 0.0], [-1.0, 0.0], [0.0, 3.0]], &Device::flex());
             let samples = samples(&tokens.repeat_dim(0, 20));
             let centers = seed(&samples, 7, 5, max_table_len);
-            let mut places: Vec<usize> = centers.iter().map(|token| token % 3).collect();
-            places.sort_unstable();
-            places.dedup();
-            assert_eq!(places, [0, 1, 2]);
+            let mut indices: Vec<usize> = centers.iter().map(|token| token % 3).collect();
+            indices.sort_unstable();
+            indices.dedup();
+            assert_eq!(indices, [0, 1, 2]);
         }
     }
 
     #[test]
-    fn draws_follow_the_weights() {
+    fn samples_follow_the_weights() {
         let weights = [0.0, 3.0, 0.0, 1.0, 4.0, 0.0];
-        let draws = Draws::new(weights.into_iter());
+        let weighted = WeightedIndices::new(weights.into_iter());
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let mut counts = [0.0; 6];
-        (0..80_000).for_each(|_| counts[draws.draw(&mut rng).expect("some weight is positive")] += 1e-4);
+        (0..80_000).for_each(|_| counts[weighted.sample(&mut rng).expect("some weight is positive")] += 1e-4);
         for (count, weight) in counts.into_iter().zip(weights) {
             // Five standard deviations: the largest is 0.014.
             assert!((count - weight).abs() < 0.07, "{count} against {weight}");
             assert!(weight > 0.0 || count == 0.0);
         }
-        assert_eq!(Draws::new([0.0; 3].into_iter()).draw(&mut rng), None);
-        assert_eq!(Draws::new(std::iter::empty()).draw(&mut rng), None);
+        assert_eq!(WeightedIndices::new([0.0; 3].into_iter()).sample(&mut rng), None);
+        assert_eq!(WeightedIndices::new(std::iter::empty()).sample(&mut rng), None);
     }
 
     #[test]
-    fn the_sum_of_the_smaller_takes_every_place() {
+    fn sum_of_smaller_adds_every_index() {
         for len in [0, 1, 15, 16, 17, 100] {
             let a: Vec<f32> = (0..len).map(|i| (i * 7 % 11) as f32).collect();
             let b: Vec<f32> = (0..len).map(|i| (i * 5 % 13) as f32).collect();

@@ -1,8 +1,8 @@
-//! Algorithm 1: tokens for a view.
+//! Selection of the tokens for a target view (paper section 3.3, Algorithm 1).
 //!
-//! - `token_ray`: ray of a stored token
-//! - `rules`: published presets and their numbers
-//! - `selector`: Algorithm 1: nearest tokens of a view
+//! - `token_ray`: the ray of a stored token
+//! - `rules`: weights and grid of the selection, by preset
+//! - `selector`: the algorithm, frame by frame
 
 pub(crate) mod rules;
 pub(crate) mod selector;

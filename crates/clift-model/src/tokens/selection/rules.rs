@@ -1,4 +1,4 @@
-//! Published presets and their numbers.
+//! Weights and grid of the token selection, by preset.
 
 use std::str::FromStr;
 
@@ -8,27 +8,26 @@ use crate::error::ModelError;
 use crate::names::parse_value;
 use crate::views::camera::ViewCamera;
 
-/// Side of a cell of the target's grid, in pixels.
-pub const CELL_PX: f64 = 16.0;
+/// Side of a grid cell of the target view in pixels.
+const CELL_PX: f64 = 16.0;
 
-/// Cells along the shorter side where they scale with the picture: those of 256 pixels.
-pub const SCALED_CELLS: f64 = 16.0;
+/// Cells along the shorter side of the image with scaled cells, as in an image of 256 pixels.
+const SCALED_CELLS: f64 = 16.0;
 
-/// Cells beyond each edge of the picture.
-pub const MARGIN_CELLS: usize = 4;
+/// Cells beyond each edge of the image.
+const MARGIN_CELLS: usize = 4;
 
-/// A published set of rules.
+/// A named set of rules.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "lowercase")]
 pub enum SelectionPreset {
-    /// Algorithm 1 as printed: the nearest tokens of every cell, momentum, and a bonus for tokens of the previous
-    /// frame.
+    /// Algorithm 1 of the paper: the nearest tokens of every cell, momentum, and a bonus for tokens of the previous frame.
     Paper,
-    /// Tokens nearest to any cell, frame by frame: what the released code's table of render budgets uses.
+    /// Tokens nearest to any cell, independent of the previous frame: the rules of the render budgets in the released code.
     Global,
-    /// As the paper's, with cells that scale with the picture: the same at 256 pixels. Around a picture of 32 pixels,
-    /// four cells of 16 are four fifths of the grid's width, and most tokens go to what is not seen. A camera that turns
-    /// by more than a cell from one frame to the next has been cut: that frame starts without momentum and bonus.
+    /// Algorithm 1 with cells that scale with the image, equal to [`SelectionPreset::Paper`] at 256 pixels: for an image
+    /// of 32 pixels, margins of four 16-pixel cells are four fifths of the grid's width and most tokens would lie outside
+    /// the view. A camera that turns by more than a cell between frames is a cut, which starts without momentum and bonus.
     #[default]
     Scaled,
 }
@@ -37,12 +36,12 @@ impl SelectionPreset {
     /// All presets.
     pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
 
-    /// Returns the name as it is typed.
+    /// Returns the name in configs and on the command line.
     pub fn name(self) -> &'static str {
         self.into()
     }
 
-    /// The rules behind the name.
+    /// Returns the rules of the preset.
     pub fn rules(self) -> SelectionRules {
         match self {
             Self::Paper => SelectionRules::default(),
@@ -62,23 +61,23 @@ impl FromStr for SelectionPreset {
     }
 }
 
-/// How near a token is to a cell, how many each cell is given, and how large it is. The default is the paper's.
+/// Distance of tokens to grid cells, tokens per cell, and the size of cells. The default is Algorithm 1 of the paper.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SelectionRules {
     /// Weight of the angle between the rays of token and cell, in radians.
     pub angle_weight: f32,
-    /// Weight of the distance between the cameras of token and target, in normalised units.
+    /// Weight of the distance between the cameras of token and target, in normalized units.
     pub distance_weight: f32,
-    /// Taken off the distance of a token that the previous frame was drawn from.
+    /// Subtracted from the distance of a token selected for the previous frame.
     pub previous_bonus: f32,
-    /// Share of the previous frame's distances in this frame's, in `[0, 1)`.
+    /// Weight of the distances of the previous frame, in `[0, 1)`.
     pub momentum: f32,
-    /// Whether every cell is given its `R / Q` nearest tokens before the rest is given to the nearest of all.
+    /// Whether every cell selects its `R / Q` nearest tokens before the remaining tokens are the nearest to any cell.
     pub per_cell: bool,
-    /// Whether a cell is a sixteenth of the picture's shorter side instead of 16 pixels.
+    /// Whether the side of a cell is 1/16 of the shorter side of the image instead of 16 pixels.
     pub scaled_cells: bool,
-    /// Whether a frame whose camera has turned by more than a cell starts without momentum and bonus. Departs from the
-    /// paper, whose frames are those of a video: smoothed over a jump, distances are those of no view.
+    /// Whether a frame whose camera turned by more than a cell starts without momentum and bonus. Departs from the paper,
+    /// whose frames are consecutive frames of a video: distances smoothed over a cut belong to no view.
     pub cuts: bool,
 }
 
@@ -97,27 +96,26 @@ impl Default for SelectionRules {
 }
 
 impl SelectionRules {
-    /// Side of a cell of the target's grid, in pixels.
+    /// Returns the side of a cell in pixels.
     fn cell_px(&self, height: usize, width: usize) -> f64 {
         if self.scaled_cells { height.min(width).max(1) as f64 / SCALED_CELLS } else { CELL_PX }
     }
 
-    /// Rows and columns of the target's grid: cells that cover the picture, and a margin of four.
-    pub fn grid(&self, height: usize, width: usize) -> [usize; 2] {
+    /// Returns rows and columns of the grid: cells that cover the image, and a margin of four cells.
+    pub(crate) fn grid(&self, height: usize, width: usize) -> [usize; 2] {
         let cell_px = self.cell_px(height, width);
         [height, width].map(|side| (side as f64 / cell_px).ceil() as usize + 2 * MARGIN_CELLS)
     }
 
-    /// Directions through the centres of the cells of the target's grid, row by row; margin cells lie outside the
-    /// picture.
+    /// Returns the directions through the centers of the grid cells, row by row; margin cells lie outside the image.
     ///
     /// # Shapes
     /// - returns `[rows * columns]` unit directions with `[rows, columns]` of [`SelectionRules::grid`]
-    pub fn cell_directions(&self, camera: &ViewCamera, height: usize, width: usize) -> Vec<[f64; 3]> {
+    pub(crate) fn cell_directions(&self, camera: &ViewCamera, height: usize, width: usize) -> Vec<[f64; 3]> {
         let [rows, columns] = self.grid(height, width);
         let cell_px = self.cell_px(height, width);
-        let centre = |cell: usize| (cell as f64 - MARGIN_CELLS as f64 + 0.5) * cell_px;
+        let center = |cell: usize| (cell as f64 - MARGIN_CELLS as f64 + 0.5) * cell_px;
         let cells = (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column)));
-        cells.map(|(row, column)| camera.direction(centre(column), centre(row))).collect()
+        cells.map(|(row, column)| camera.direction(center(column), center(row))).collect()
     }
 }

@@ -1,9 +1,7 @@
-//! Token selection: which stored tokens a target view is drawn from (paper section 3.3, Algorithm 1).
+//! Selection of the tokens for a target view (paper section 3.3, Algorithm 1), on the host.
 //!
-//! Plain arrays on the host, no tensors. Where the printed algorithm leaves a choice open: the second step
-//! fills up with tokens that the first did not take, a first step that takes too many keeps the nearest, the
-//! bonus for the previous frame belongs to a token and not to its view, and of equally near tokens the one
-//! with the lower id comes first.
+//! Choices that the paper leaves open: the second step adds only tokens that the first step did not select, the bonus of
+//! the previous frame belongs to a token and not to its view, and ties go to the lower id.
 // S stored tokens, R rendered tokens, Q cells of the target's grid
 
 use rayon::prelude::*;
@@ -13,13 +11,13 @@ use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::token_ray::TokenRay;
 use crate::views::camera::ViewCamera;
 
-/// Distances are worked out for this many cells by one task at least.
+/// Fewest cells per task.
 const CELLS_PER_TASK: usize = 16;
 
-/// Distances of a row that are looked over at once for one small enough.
+/// Distances of a row whose minimum is compared with the limit at once.
 const GROUP: usize = 32;
 
-/// Selects the tokens of one frame after the other, and remembers what the next frame needs of the last.
+/// Selects tokens frame by frame, with the state of the previous frame.
 #[derive(Clone, Debug)]
 pub struct Selector {
     rules: SelectionRules,
@@ -27,29 +25,29 @@ pub struct Selector {
     directions: Directions,
     /// Rows and columns of the previous frame's grid.
     grid: [usize; 2],
-    /// Smoothed distances of the previous frame, `[Q][S]`; rows are empty without momentum.
+    /// Smoothed distances of the previous frame, `[Q][S]`; empty rows without momentum.
     field: Vec<Vec<f32>>,
-    /// Whether the previous frame was drawn from a token; empty before the first frame.
+    /// Whether a token was selected for the previous frame; empty before the first frame.
     previous: Vec<bool>,
-    /// The way the previous frame's camera looked.
+    /// Viewing direction of the previous frame.
     forward: Option<[f64; 3]>,
 }
 
-/// Unit directions by coordinate, so that a row of distances is made several at a time.
+/// Unit directions, one array per coordinate for vectorization.
 #[derive(Clone, Debug)]
-pub(crate) struct Directions {
+struct Directions {
     x: Vec<f32>,
     y: Vec<f32>,
     z: Vec<f32>,
 }
 
-/// What the cells of a task found.
+/// Nearest tokens of the cells of a task.
 struct Nearest {
     /// Smallest distance of every token to a cell.
     distance: Vec<f32>,
-    /// Whether a token is among the nearest of a cell.
-    taken: Vec<bool>,
-    /// The row of a cell, where it is not kept.
+    /// Whether a cell selected the token.
+    selected: Vec<bool>,
+    /// Distances of one cell, if the field is not kept.
     row: Vec<f32>,
     candidates: Vec<(f32, u32)>,
 }
@@ -58,7 +56,7 @@ impl Selector {
     /// Prepares the tokens of a scene.
     ///
     /// # Errors
-    /// [`ModelError::BadRay`] for a ray that is not finite or has no direction.
+    /// [`ModelError::BadRay`] for a ray that is not finite or whose direction has length zero.
     pub fn new(rules: SelectionRules, rays: &[TokenRay]) -> Result<Self, ModelError> {
         let mut directions = Directions { x: Vec::new(), y: Vec::new(), z: Vec::new() };
         for (token, ray) in rays.iter().enumerate() {
@@ -83,13 +81,12 @@ impl Selector {
         self.forward = None;
     }
 
-    /// Chooses exactly `min(num_render_tokens, num_storage_tokens)` tokens for the next frame, a view of `height` by
-    /// `width` pixels. A frame of another size than the one before starts without momentum.
-    ///
-    /// Returns ids in ascending order.
+    /// Selects exactly `min(num_render_tokens, num_storage_tokens)` tokens for the next frame, a view of `height` by
+    /// `width` pixels, and returns their ids in ascending order. A frame of another size than the previous frame starts
+    /// without momentum.
     ///
     /// # Errors
-    /// [`ModelError::BadConfig`] for no tokens, [`ModelError::NotFinite`] for a camera that is not finite.
+    /// [`ModelError::BadConfig`] for zero tokens, [`ModelError::NotFinite`] for a camera that is not finite.
     pub fn select(
         &mut self,
         camera: &ViewCamera,
@@ -104,9 +101,9 @@ impl Selector {
         let cells = self.rules.cell_directions(camera, height, width);
         let mut values = cells.iter().flatten().chain(camera.c2w.iter()).enumerate();
         if let Some((position, &value)) = values.find(|(_, value)| !value.is_finite()) {
-            return Err(ModelError::NotFinite { what: "the target's camera", value: value as f32, position });
+            return Err(ModelError::NotFinite { name: "the target's camera", value: value as f32, position });
         }
-        self.notice_cut(&cells, self.rules.grid(height, width));
+        self.detect_cut(&cells, self.rules.grid(height, width));
         let num_storage_tokens = self.origins.len();
         let num_render_tokens = num_render_tokens.min(num_storage_tokens);
         let per_cell = if self.rules.per_cell { num_render_tokens / cells.len() } else { 0 };
@@ -119,8 +116,8 @@ impl Selector {
         Ok(chosen)
     }
 
-    /// Forgets the previous frame where the camera has turned by more than the cell in the middle spans.
-    fn notice_cut(&mut self, cells: &[[f64; 3]], [rows, columns]: [usize; 2]) {
+    /// Forgets the previous frame if the camera turned by more than the angle of the central cell.
+    fn detect_cut(&mut self, cells: &[[f64; 3]], [rows, columns]: [usize; 2]) {
         let middle = rows / 2 * columns + columns / 2;
         let forward = cells[middle];
         let angle = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>().clamp(-1.0, 1.0).acos();
@@ -131,7 +128,7 @@ impl Selector {
         self.forward = Some(forward);
     }
 
-    /// Distances of all tokens to all cells, the nearest of each cell, and the smoothed field for the next frame.
+    /// Updates the smoothed distances of all tokens to all cells and returns the nearest tokens.
     fn measure(&mut self, cells: &[[f64; 3]], grid: [usize; 2], target: [f64; 3], per_cell: usize) -> Nearest {
         let num_tokens = self.origins.len();
         let SelectionRules { angle_weight, momentum, .. } = self.rules;
@@ -151,7 +148,7 @@ impl Selector {
             for (nearest, &distance) in found.distance.iter_mut().zip(row.iter()) {
                 *nearest = if distance < *nearest { distance } else { *nearest };
             }
-            found.take_smallest(row, per_cell);
+            found.select_nearest(row, per_cell);
             found.row = scratch;
             found
         };
@@ -160,7 +157,7 @@ impl Selector {
         cells.fold(none, weigh).reduce(none, Nearest::merge)
     }
 
-    /// The part of a token's distance that is the same for all cells.
+    /// Returns the part of every token's distance that is equal for all cells.
     fn offsets(&self, target: [f64; 3]) -> Vec<f32> {
         let SelectionRules { distance_weight, previous_bonus, .. } = self.rules;
         let offset = |(token, origin): (usize, &[f64; 3])| {
@@ -177,7 +174,7 @@ impl Directions {
     fn add_distances(&self, cell: [f32; 3], angle_weight: f32, offsets: &[f32], momentum: f32, row: &mut [f32]) {
         let Self { x, y, z } = self;
         let (count, keep) = (row.len(), 1.0 - momentum);
-        // Equal lengths that the compiler can see, so that it leaves out the checks and works on several at once.
+        // Slices of visibly equal length let the compiler omit bounds checks and vectorize.
         let (x, y, z, offsets) = (&x[..count], &y[..count], &z[..count], &offsets[..count]);
         for i in 0..count {
             let (dx, dy, dz) = (x[i] - cell[0], y[i] - cell[1], z[i] - cell[2]);
@@ -187,13 +184,13 @@ impl Directions {
     }
 }
 
-/// Angle in radians between two unit vectors whose difference has this squared length. From the difference rather
-/// than from the inner product, whose rounding alone turns equal directions by 3e-4.
+/// Returns the angle in radians between two unit vectors, given the squared length of their difference. The inner product
+/// instead would have a rounding error of 3e-4 for equal directions.
 ///
-/// Abramowitz and Stegun 4.4.46 with `x = 1 - u / 2`, and its mirror image beyond a right angle: good to 1e-6, a
-/// thousandth of a pixel's angle, and made of operations that processors do on several numbers at once.
+/// Abramowitz and Stegun 4.4.46 with `x = 1 - u / 2`, mirrored beyond a right angle: an error of 1e-6, about a thousandth of
+/// a pixel, and operations that vectorize.
 #[inline]
-pub(crate) fn angle(squared_chord: f32) -> f32 {
+fn angle(squared_chord: f32) -> f32 {
     let is_acute = squared_chord <= 2.0;
     let u = if is_acute { squared_chord } else { (4.0 - squared_chord).max(0.0) };
     let x = 1.0 - 0.5 * u;
@@ -201,13 +198,13 @@ pub(crate) fn angle(squared_chord: f32) -> f32 {
     for coefficient in [0.006_670_09, -0.017_088_126, 0.030_891_88, -0.050_174_303, 0.088_978_99, -0.214_598_8] {
         sum = sum * x + coefficient;
     }
-    // Half of pi rather than the printed 1.5707963050, 2e-8 less: both branches meet at a right angle.
+    // Half of pi instead of the book's 1.5707963050, so that both branches meet at a right angle.
     sum = sum * x + std::f32::consts::FRAC_PI_2;
     let angle = (0.5 * u).sqrt() * sum;
     if is_acute { angle } else { std::f32::consts::PI - angle }
 }
 
-/// By distance, then by id.
+/// Orders by distance, then by id.
 fn nearer((a, first): (f32, u32), (b, second): (f32, u32)) -> std::cmp::Ordering {
     a.total_cmp(&b).then(first.cmp(&second))
 }
@@ -224,7 +221,7 @@ impl Nearest {
     fn none(num_tokens: usize, keeps_field: bool) -> Self {
         Self {
             distance: vec![f32::INFINITY; num_tokens],
-            taken: vec![false; num_tokens],
+            selected: vec![false; num_tokens],
             row: if keeps_field { Vec::new() } else { vec![0.0; num_tokens] },
             candidates: Vec::new(),
         }
@@ -234,20 +231,20 @@ impl Nearest {
         for (a, b) in self.distance.iter_mut().zip(&other.distance) {
             *a = if *b < *a { *b } else { *a };
         }
-        for (a, b) in self.taken.iter_mut().zip(&other.taken) {
+        for (a, b) in self.selected.iter_mut().zip(&other.selected) {
             *a |= *b;
         }
         self
     }
 
-    /// Takes the `count` tokens nearest to a cell (Algorithm 1, the patch step).
-    fn take_smallest(&mut self, row: &[f32], count: usize) {
+    /// Selects the `count` tokens nearest to a cell (Algorithm 1, first step).
+    fn select_nearest(&mut self, row: &[f32], count: usize) {
         if count == 0 {
             return;
         }
         let candidates = &mut self.candidates;
         candidates.clear();
-        // Tokens farther than `count` others that were seen already need no look, and most groups hold no other.
+        // Tokens farther than `count` others are skipped, in most cases a group at a time.
         let mut limit = f32::INFINITY;
         for (group, distances) in row.chunks(GROUP).enumerate() {
             let nearest = distances.iter().fold(f32::INFINITY, |least, &d| if d < least { d } else { least });
@@ -266,24 +263,21 @@ impl Nearest {
         }
         keep_nearest(candidates, count);
         for &(_, token) in candidates.iter() {
-            self.taken[token as usize] = true;
+            self.selected[token as usize] = true;
         }
     }
 
-    /// Exactly `count` tokens: of those taken by cells the nearest, or all and then the nearest others.
+    /// Returns exactly `count` ids: the tokens selected by cells, at most `count`, and the nearest of the others (Algorithm
+    /// 1, second step).
     fn choose(&self, count: usize) -> Vec<u32> {
-        let listed = |taken: bool| {
-            let tokens = (0..self.distance.len()).filter(move |&token| self.taken[token] == taken);
+        let listed = |selected: bool| {
+            let tokens = (0..self.distance.len()).filter(move |&token| self.selected[token] == selected);
             tokens.map(|token| (self.distance[token], token as u32)).collect::<Vec<_>>()
         };
         let mut chosen = listed(true);
-        if chosen.len() >= count {
-            keep_nearest(&mut chosen, count);
-        } else {
-            let mut rest = listed(false);
-            keep_nearest(&mut rest, count - chosen.len());
-            chosen.append(&mut rest);
-        }
+        let mut rest = listed(false);
+        keep_nearest(&mut rest, count - chosen.len());
+        chosen.append(&mut rest);
         let mut ids: Vec<u32> = chosen.into_iter().map(|(_, token)| token).collect();
         ids.sort_unstable();
         ids
