@@ -1,4 +1,4 @@
-//! Peak bytes of tensors, from the inputs that the hand-written operations save for the backward (docs/plan.md).
+//! Peak bytes of tensors, from the inputs that the hand-written operations save for the backward (docs/guide/training.md).
 // x = N D: f32 values of the rows of a block
 
 use crate::cost::largest_tensor::kmeans_values;

@@ -23,7 +23,8 @@ pub struct Condenser {
     released: Option<ReleasedCondenser>,
 }
 
-/// One round of equations 1 to 4.
+/// One round of equations 1 to 4 on the centroids `c` and the members `m` of each cluster: `eq1 = self_attention(c)`,
+/// `eq2 = cluster_attention(eq1, m)`, `eq3 = feed_forward(eq2)`; the result is `c + W_z eq3`.
 #[derive(Module, Debug)]
 struct CondenserBlock {
     norm_self: LayerNorm,
@@ -188,7 +189,7 @@ mod tests {
             for device in cpu_devices() {
                 let mut init = Init::new(5, &device);
                 let mut condenser = Condenser::new(&config(variant), &mut init);
-                condenser.released.as_mut().expect("a released network").randomize_gate(&mut init);
+                condenser.released.as_mut().expect("a released network").gate = init.linear(16, 16);
                 let condenser = Module::map(condenser, &mut ToF64);
                 // Cluster 2 has one token, which attends to itself.
                 let scene = SceneClusters::new(vec![0, 1, 1, 2, 1], vec![0, 4, 3]).expect("valid");

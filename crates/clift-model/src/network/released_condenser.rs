@@ -26,7 +26,7 @@ pub(crate) struct ReleasedCondenser {
     norm_ff: LayerNorm,
     feed_forward: FeedForward,
     /// `W_z` and `b_z`, zero at the start.
-    gate: Linear,
+    pub(super) gate: Linear,
 }
 
 impl ReleasedCondenser {
@@ -41,13 +41,6 @@ impl ReleasedCondenser {
             feed_forward: FeedForward::with(Activation::Relu, dim, config.feed_forward_dim, init),
             gate: init.zero_linear_with_bias(dim, dim),
         }
-    }
-
-    /// Replaces the zeros of the gate by random weights.
-    #[cfg(test)]
-    pub fn randomize_gate(&mut self, init: &mut Init) {
-        let dim = self.gate.weight.dims()[0];
-        self.gate = init.linear(dim, dim);
     }
 
     /// Compresses every cluster of tokens into its centroid.

@@ -7,6 +7,7 @@
 pub(crate) mod check;
 pub(crate) mod read;
 pub(crate) mod render_budget;
+#[allow(clippy::module_inception)] // the file of the type `Scene`
 pub(crate) mod scene;
 pub(crate) mod scene_renderer;
 pub(crate) mod token_format;

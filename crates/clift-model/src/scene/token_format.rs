@@ -50,22 +50,13 @@ impl TokenFormat {
         self.into()
     }
 
-    /// Returns the bytes of one value.
-    pub const fn bytes_per_value(self) -> usize {
-        match self {
-            Self::F32 => 4,
-            Self::F16 => 2,
-            Self::Int8 => 1,
-        }
-    }
-
-    /// Returns the bytes of one token's values, and its scale if the format has one.
+    /// Returns the bytes of one token of width `dim`, with its scale if the format has one.
     pub const fn bytes_per_token(self, dim: usize) -> usize {
-        let scale = match self {
-            Self::Int8 => 4,
-            _ => 0,
-        };
-        dim * self.bytes_per_value() + scale
+        match self {
+            Self::F32 => 4 * dim,
+            Self::F16 => 2 * dim,
+            Self::Int8 => dim + 4,
+        }
     }
 
     /// Rounds tokens `[S, D]` as writing and reading a file does.

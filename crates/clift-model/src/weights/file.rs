@@ -104,18 +104,11 @@ pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads parameters written by [`save_weights`] into a module.
+/// Reads the parameters whose paths match `part`, as [`save_weights`] and [`save_part`] write them, into a module. Other
+/// tensors of the file are unused.
 ///
 /// # Errors
 /// [`ModelError::Weights`] if the file cannot be read, a shape differs, or a value is not finite or no 32-bit float.
-pub fn load_weights<M: Module>(module: &mut M, path: &Path) -> Result<LoadReport, ModelError> {
-    load_part(module, &PathFilter::all(), path)
-}
-
-/// Reads the parameters whose paths match `part`, as [`load_weights`]. Other tensors of the file are unused.
-///
-/// # Errors
-/// As [`load_weights`].
 pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> Result<LoadReport, ModelError> {
     read(module, SafetensorsStore::from_file(path).filter(part.clone()), part, path)
 }
@@ -123,7 +116,7 @@ pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> R
 /// Reads one module of a larger one from its file, such as the `renderer` of a whole model.
 ///
 /// # Errors
-/// As [`load_weights`].
+/// As [`load_part`].
 pub fn load_module<M: Module>(module: &mut M, name: &str, path: &Path) -> Result<LoadReport, ModelError> {
     let store = SafetensorsStore::from_file(path).with_key_remapping(format!("^{name}\\."), "");
     read(module, store, &PathFilter::all(), path)
@@ -212,6 +205,10 @@ mod tests {
         Clift::new(&small_config(CliftVariant::Paper), seed, &Device::flex())
     }
 
+    fn load(module: &mut Clift, path: &Path) -> Result<LoadReport, ModelError> {
+        load_part(module, &PathFilter::all(), path)
+    }
+
     #[test]
     fn equal_weights_are_equal_files_that_read_back_exactly() {
         let folder = tempfile::tempdir().expect("a temporary folder");
@@ -228,7 +225,7 @@ mod tests {
 
         let mut other = model(2);
         assert_ne!(weights_hash(&other), weights_hash(&model(1)));
-        load_weights(&mut other, &paths[0]).expect("reads").require_all(&paths[0]).expect("the same model");
+        load(&mut other, &paths[0]).expect("reads").require_all(&paths[0]).expect("the same model");
         assert_eq!(weights_hash(&other), weights_hash(&model(1)));
         assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 4, "no temporary file is left");
         let plain = folder.path().join("plain");
@@ -241,9 +238,9 @@ mod tests {
     fn errors_have_the_names_and_shapes_of_the_file() {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let path = folder.path().join("model.safetensors");
-        assert!(load_weights(&mut model(1), &path).unwrap_err().to_string().contains("no such file"));
+        assert!(load(&mut model(1), &path).unwrap_err().to_string().contains("no such file"));
         save_weights(&model(1).encoder, &path).expect("writes");
-        let loaded = load_weights(&mut model(2), &path).expect("a file without a matching name is no error");
+        let loaded = load(&mut model(2), &path).expect("a file without a matching name is no error");
         let message = loaded.require_all(&path).unwrap_err().to_string();
         assert!(message.contains(" missing parameters (condenser.blocks.0"), "{message}");
         let missing = loaded.missing;
@@ -254,13 +251,13 @@ mod tests {
         let mut config = small_config(CliftVariant::Paper);
         config.feed_forward_dim = 20;
         let mut narrow = Clift::new(&config, 0, &Device::flex());
-        let message = load_weights(&mut narrow, &path).unwrap_err().to_string();
+        let message = load(&mut narrow, &path).unwrap_err().to_string();
         let shapes =
             ["bias is [22], expected [20]", "is [22, 15], expected [20, 15]", "is [15, 22], expected [15, 20]"];
         assert!(shapes.iter().any(|shapes| message.contains(shapes)), "{message}");
 
         let bytes = std::fs::read(&path).expect("reads");
         std::fs::write(&path, &bytes[..bytes.len() / 2]).expect("writes");
-        assert!(load_weights(&mut model(1), &path).is_err(), "a truncated file");
+        assert!(load(&mut model(1), &path).is_err(), "a truncated file");
     }
 }

@@ -22,7 +22,7 @@ pub struct InferredConfig {
     /// Whether the checkpoint has a condenser.
     pub has_condenser: bool,
     /// Whether the number of heads is known: given, inferred from norms, or implied by the published width.
-    pub knows_heads: bool,
+    pub has_num_heads: bool,
     /// The first key that voted for the width.
     pub width_key: Option<String>,
 }
@@ -131,9 +131,9 @@ pub fn infer_config<'a>(
     }
     let inferred = head.winner().map(|(size, _)| size).filter(|size| *size > 0 && config.dim.is_multiple_of(*size));
     let num_heads = num_heads.or(inferred.map(|size| config.dim / size));
-    let knows_heads = num_heads.is_some() || config.dim == published.dim;
+    let has_num_heads = num_heads.is_some() || config.dim == published.dim;
     config.num_heads = num_heads.unwrap_or(published.num_heads);
-    InferredConfig { config, has_condenser, knows_heads, width_key: width.winner().map(|(_, key)| key.to_owned()) }
+    InferredConfig { config, has_condenser, has_num_heads, width_key: width.winner().map(|(_, key)| key.to_owned()) }
 }
 
 #[cfg(test)]
@@ -161,7 +161,7 @@ mod tests {
                     config.condenser.residual = residual || variant != CliftVariant::Paper || !with_condenser;
                     let heads = (!variant.has_norms()).then_some(3);
                     let got = read(variant, heads, &shapes(&config, with_condenser));
-                    assert_eq!((got.config, got.has_condenser, got.knows_heads), (config, with_condenser, true));
+                    assert_eq!((got.config, got.has_condenser, got.has_num_heads), (config, with_condenser, true));
                 }
             }
         }
@@ -200,7 +200,7 @@ mod tests {
         let knows = |variant, dim| {
             let config = ModelConfig { dim, ..small_config(variant) };
             let got = read(variant, None, &shapes(&config, true));
-            (got.knows_heads, got.config.num_heads)
+            (got.has_num_heads, got.config.num_heads)
         };
         assert_eq!(knows(CliftVariant::ReleasedDl3dv, 15), (true, 3));
         assert_eq!(knows(CliftVariant::ReleasedRe10k, 768), (true, 8));

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use burn::module::Module;
+use burn::store::PathFilter;
 use burn::tensor::Device;
 
 use crate::error::ModelError;
@@ -10,7 +11,7 @@ use crate::network::clift::{Clift, is_condenser};
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::renderer::Renderer;
-use crate::weights::file::{load_module, load_weights};
+use crate::weights::file::{load_module, load_part};
 use crate::weights::hash::{renderer_hash, weights_hash};
 use crate::weights::model_path::{ModelPath, check_heads};
 
@@ -36,7 +37,7 @@ impl TrainedModel {
     pub fn open(path: &ModelPath, config: &ModelConfig, device: &Device) -> Result<Self, ModelError> {
         check_heads(config, &path.dir)?;
         let mut network = Clift::new(config, 0, device);
-        let mut loaded = load_weights(&mut network, &path.weights)?;
+        let mut loaded = load_part(&mut network, &PathFilter::all(), &path.weights)?;
         let has_condenser = loaded.applied.iter().any(|name| is_condenser(name));
         if !has_condenser {
             loaded.missing.retain(|name| !is_condenser(name));
@@ -101,7 +102,7 @@ mod tests {
     use super::*;
     use crate::network::architecture::CliftVariant;
     use crate::testing::small_config;
-    use crate::weights::file::{load_part, save_part, save_weights};
+    use crate::weights::file::{save_part, save_weights};
 
     #[test]
     fn both_stages_open_and_stage_1_has_no_condenser() {

@@ -93,15 +93,15 @@ fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>
 
 /// Checks the number of heads, which shapes do not determine, and the other sizes.
 fn check_sizes(sizes: &InferredConfig, keys: &Keys, state: &StateDict) -> Result<(), TrainError> {
-    let InferredConfig { config: model, knows_heads, width_key, .. } = sizes;
+    let InferredConfig { config: model, has_num_heads, width_key, .. } = sizes;
     let file = state.path();
     let num_heads = model.num_heads;
-    if !knows_heads || num_heads == 0 || !model.dim.is_multiple_of(num_heads) {
+    if !has_num_heads || num_heads == 0 || !model.dim.is_multiple_of(num_heads) {
         let key = width_key.as_ref().map(|key| &keys.network[key]);
         let from =
             key.and_then(|key| state.tensor(key).map(|(_, shape)| format!(" ({} is {shape:?})", printable(key))));
         let (dim, from, file) = (model.dim, from.unwrap_or_default(), file.display());
-        let (value, why) = if *knows_heads {
+        let (value, why) = if *has_num_heads {
             (num_heads.to_string(), "")
         } else {
             ("not given".into(), "tensor shapes do not determine the number: ")
