@@ -7,8 +7,8 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use clift_data::{
-    ClipReader, DataError, DatasetRoot, EvaluationIndex, OpenedSource, SceneSource, SceneSubset, SkipReport,
-    SourceInfo, SourceKind, Split, open_dataset, open_source,
+    ClipReader, DataError, DatasetRoot, EvaluationIndex, IndexCensus, OpenedSource, SceneSource, SceneSubset,
+    SkipReport, SourceInfo, SourceKind, Split, open_dataset, open_source,
 };
 use clift_eval::evaluation_items;
 use clift_train::{Config, read_config};
@@ -56,7 +56,7 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
 
 /// Prints what an evaluation index asks for.
 fn of_index(args: &InfoArgs) -> anyhow::Result<()> {
-    let census = EvaluationIndex::read(&args.path)?.census();
+    let census = IndexCensus::new(&EvaluationIndex::read(&args.path)?);
     print_result(&format!("{census}\n"))?;
     if let Some(path) = &args.json {
         let text = serde_json::to_vec_pretty(&census).context("writing the counts as JSON")?;
