@@ -1,4 +1,4 @@
-//! Decodes an image, rescales and crops it as training does, and writes it as PNG; `scripts/check/check_pillow.py` compares.
+//! Decodes, rescales and crops images as training does, and writes them as PNG for `scripts/check/check_pillow.py`.
 //!
 //!     cargo run --release -p clift-data --example fit_frame -- 256x256 IN.jpg OUT.png [IN OUT ..]
 
@@ -8,13 +8,13 @@ use clift_data::{IntrinsicsNorm, decode_image, encode_png, fit_image};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut words = std::env::args().skip(1);
-    let size = words.next().ok_or("write the size first, as 256x256")?;
-    let (width, height) = size.split_once('x').ok_or("write the size as 256x256")?;
+    let size = words.next().ok_or("usage: fit_frame 256x256 IN.jpg OUT.png [IN OUT ..]")?;
+    let (width, height) = size.split_once('x').ok_or("the size is not of the form 256x256")?;
     let (width, height) = (width.parse()?, height.parse()?);
-    let middle = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
+    let centred = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
     while let (Some(from), Some(to)) = (words.next(), words.next()) {
         let frame = decode_image(&std::fs::read(&from)?, &from, 0)?;
-        let (fitted, _) = fit_image(&frame, middle, width, height, false)?;
+        let (fitted, _) = fit_image(&frame, centred, width, height, false)?;
         std::fs::write(to, encode_png(&fitted)?)?;
     }
     Ok(())

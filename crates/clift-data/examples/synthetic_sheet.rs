@@ -1,4 +1,4 @@
-//! Draws a contact sheet of synthetic scenes: a row per scene, frames spread evenly along its camera path.
+//! Renders a contact sheet of synthetic scenes: a row per scene, with frames spread evenly along the camera path.
 //!
 //! ```text
 //! cargo run --release -p clift-data --example synthetic_sheet -- sheet.png [size] [rows] [columns] [first scene]
@@ -13,7 +13,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
     let path = arguments.next().ok_or("usage: synthetic_sheet OUT.png [size] [rows] [columns] [first scene]")?;
     let numbers = arguments.map(|argument| argument.parse()).collect::<Result<Vec<usize>, _>>()?;
-    let number = |place: usize, default: usize| numbers.get(place).copied().unwrap_or(default);
+    let number = |index: usize, default: usize| numbers.get(index).copied().unwrap_or(default);
     let (size, rows, columns, first) = (number(0, 256), number(1, 4), number(2, 4), number(3, 0));
 
     let source = SyntheticSource::new(SyntheticConfig { width: size, height: size, ..Default::default() })?;
@@ -24,7 +24,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         for column in 0..columns {
             let frame = source.frame(first + row, column * last_frame / (columns - 1).max(1))?;
             let tile =
-                image::RgbImage::from_raw(size as u32, size as u32, frame.rgb).ok_or("a frame has a wrong size")?;
+                image::RgbImage::from_raw(size as u32, size as u32, frame.rgb).ok_or("a frame has another size")?;
             image::imageops::replace(&mut sheet, &tile, (column * size) as i64, (row * size) as i64);
         }
     }

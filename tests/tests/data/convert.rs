@@ -35,7 +35,7 @@ fn conversion_into_other_data_is_refused_unwritten() {
         1,
         &[
             "its files were made as: chunks of 100000000 bytes, PNG",
-            "asked for are: a file per scene, PNG; give the same options or choose",
+            "requested: a file per scene, PNG; use the same options or choose",
         ],
     );
 

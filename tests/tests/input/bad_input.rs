@@ -128,7 +128,7 @@ fn an_index_of_other_scenes_fails_before_training() {
     for (text, expected) in [
         (
             r#"{"00000000000000b1": {"context": [0, 9], "target": [1]}}"#,
-            "it asks for frame 9 of scene 00000000000000b1",
+            "frame 9 of scene 00000000000000b1 does not exist",
         ),
         (r#"{"00000000000000b1": {"context": [0, 2]}}"#, "has 2 context and 0 target frames"),
         ("[]", "bad index: expected {key: "),

@@ -1,4 +1,4 @@
-//! Cameras and poses in f64.
+//! Cameras and poses in f64, OpenCV axes. Read `pose` and `camera` first.
 //!
 //! - `pose`: rigid poses on glam, conventions
 //! - `camera`: intrinsics and cameras

@@ -1,4 +1,4 @@
-//! 8-bit images.
+//! 8-bit images: decoding, resampling and cropping. `fit` is what a training frame passes through.
 //!
 //! - `rgb_image`: a decoded 8-bit RGB image
 //! - `codec`: JPEG and PNG in and out

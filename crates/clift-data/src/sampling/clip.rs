@@ -1,12 +1,12 @@
-//! What the readers give and the model takes: frames, views, clips.
+//! View indices, posed views and clips.
 
 use crate::geometry::camera::Intrinsics;
 use crate::geometry::pose::Pose;
 
-/// Which frames of a scene are given and which are to be rendered: list positions, not time stamps.
+/// Context and target frames of a scene, as positions in the list of frames.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ViewIndices {
-    /// Frames the encoder sees.
+    /// Frames for the encoder.
     pub context: Vec<usize>,
     /// Frames to render.
     pub target: Vec<usize>,
@@ -25,12 +25,12 @@ pub struct ClipViews {
     pub c2w: Vec<Pose>,
     /// Intrinsics in pixels, one per view.
     pub intrinsics: Vec<Intrinsics>,
-    /// Frame of the scene each view is.
+    /// Frame of the scene, one per view.
     pub frame_index: Vec<usize>,
 }
 
 impl ClipViews {
-    /// How many views there are.
+    /// Returns the number of views.
     pub fn num_views(&self) -> usize {
         self.c2w.len()
     }
@@ -41,8 +41,8 @@ impl ClipViews {
 pub struct Clip {
     /// Key of the scene.
     pub key: String,
-    /// Given views.
+    /// Context views.
     pub context: ClipViews,
-    /// Views to render, with their ground truth.
+    /// Target views with their ground-truth images.
     pub target: ClipViews,
 }

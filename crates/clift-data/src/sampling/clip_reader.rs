@@ -1,4 +1,4 @@
-//! From a scene and a list of frames to a clip at the model's size, in the scene's normalised frame.
+//! Reads frames of a scene as a clip at the model's size, with normalised poses.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -11,68 +11,68 @@ use crate::image::rgb_image::RgbImage;
 use crate::sampling::clip::{Clip, ClipViews, ViewIndices};
 use crate::scene_source::SceneSource;
 
-/// How frames and poses are prepared.
+/// Options for the preparation of frames and poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ClipOptions {
     /// Columns of every view.
     pub width: usize,
     /// Rows of every view.
     pub height: usize,
-    /// How the mean orientation of the contexts is taken.
+    /// Computation of the mean orientation of the contexts.
     pub pose_rotation: PoseRotation,
-    /// Which cameras set the scale.
+    /// Cameras that determine the scale.
     pub pose_scale: PoseScale,
-    /// Whether the principal point follows the crop exactly; published numbers are made without.
+    /// Whether the principal point moves exactly with the crop; `false` in published results.
     pub exact_principal_point: bool,
 }
 
 /// Reads clips from a source.
 #[derive(Clone)]
 pub struct ClipReader {
-    /// Where scenes come from.
+    /// Source of the scenes.
     pub source: Arc<dyn SceneSource>,
-    /// How views are prepared.
+    /// Preparation of the views.
     pub options: ClipOptions,
 }
 
 impl ClipReader {
-    /// Reads the frames of `views` (each distinct one once), fits them to the configured size and normalises the
-    /// poses by the contexts.
+    /// Reads each distinct frame of `views` once, fits the frames to the configured size, and normalises the poses by
+    /// the contexts.
     ///
     /// # Errors
-    /// [`DataError::NoSuchFrame`] for a position the scene does not have; whatever reading cameras or frames, fitting
-    /// ([`DataError::Upscale`]) or normalising ([`DataError::ZeroBaseline`]) gives; [`DataError::InFrame`] around
-    /// [`DataError::BadCamera`] for a camera that is too far from the contexts.
+    /// [`DataError::NoSuchFrame`] for a position beyond the scene, [`DataError::InFrame`] around
+    /// [`DataError::BadCamera`] for a camera too far from the contexts, and the errors of reading cameras and frames, of
+    /// fitting ([`DataError::Upscale`]) and of normalising ([`DataError::ZeroBaseline`]).
     pub fn read(&self, scene: usize, views: &ViewIndices) -> Result<Clip, DataError> {
         let key = self.source.key(scene);
         let cameras = self.source.cameras(scene)?;
-        let wanted = views.context.iter().chain(&views.target);
-        if let Some(&frame) = wanted.clone().find(|frame| **frame >= cameras.len()) {
+        let frames = views.context.iter().chain(&views.target);
+        if let Some(&frame) = frames.clone().find(|frame| **frame >= cameras.len()) {
             return Err(DataError::NoSuchFrame { key: key.to_owned(), frame, num_frames: cameras.len() });
         }
         let poses = |frames: &[usize]| frames.iter().map(|frame| cameras[*frame].c2w).collect::<Vec<_>>();
         let (context, target) = (poses(&views.context), poses(&views.target));
         let ClipOptions { pose_rotation, pose_scale, .. } = self.options;
-        let scene_frame =
+        let normalization =
             PoseNormalization::find(key, &context, &target, pose_rotation, pose_scale).map_err(|error| {
-                // The normaliser counts through the views it was given; say which frame of the scene that is.
+                // Convert the position in the list of views to the frame of the scene.
                 match error {
                     DataError::InFrame { key, frame, source } => {
-                        let frame = wanted.clone().nth(frame).copied().unwrap_or(frame);
+                        let frame = frames.clone().nth(frame).copied().unwrap_or(frame);
                         DataError::InFrame { key, frame, source }
                     }
                     other => other,
                 }
             })?;
-        for &frame in wanted.clone() {
-            check_near(&scene_frame.normalize(cameras[frame].c2w)).map_err(|source| DataError::InFrame {
+        for &frame in frames.clone() {
+            check_near(&normalization.normalize(cameras[frame].c2w)).map_err(|source| DataError::InFrame {
                 key: key.to_owned(),
                 frame,
                 source: Box::new(source),
             })?;
         }
         let mut fitted = HashMap::new();
-        for &frame in wanted {
+        for &frame in frames {
             if let std::collections::hash_map::Entry::Vacant(entry) = fitted.entry(frame) {
                 entry.insert(self.fitted(scene, frame, &cameras[frame])?);
             }
@@ -81,7 +81,7 @@ impl ClipReader {
             width: self.options.width,
             height: self.options.height,
             images: frames.iter().flat_map(|frame| &fitted[frame].0.rgb).copied().collect(),
-            c2w: frames.iter().map(|frame| scene_frame.normalize(cameras[*frame].c2w)).collect(),
+            c2w: frames.iter().map(|frame| normalization.normalize(cameras[*frame].c2w)).collect(),
             intrinsics: frames.iter().map(|frame| fitted[frame].1).collect(),
             frame_index: frames.to_vec(),
         };
@@ -119,7 +119,7 @@ mod tests {
         exact_principal_point: false,
     };
 
-    /// Reads the fixture's test scene, with the pose of frame 4 replaced and the decoded frames counted.
+    /// Returns a reader of the fixture's test scene with another pose of frame 4, and the count of decoded frames.
     fn reader(frame_4: Option<Pose>, options: ClipOptions) -> (ClipReader, Arc<AtomicUsize>) {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
         let chunks = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clip_holds_its_views_in_the_order_asked_for_and_decodes_each_frame_once() {
+    fn views_keep_their_order_and_frames_are_decoded_once() {
         let (reader, num_decoded) = reader(None, OPTIONS);
         let clip = reader.read(0, &views(&[7, 0, 2], &[2, 2, 5])).unwrap();
         assert_eq!(num_decoded.load(Ordering::Relaxed), 4);
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn context_centres_span_one_and_targets_follow_their_frame() {
+    fn contexts_reach_to_one_and_targets_lie_between() {
         let (reader, _) = reader(None, OPTIONS);
         let clip = reader.read(0, &views(&[0, 7], &[3])).unwrap();
         let [first, last] = [0, 1].map(|view| clip.context.c2w[view].translation);
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_that_is_not_finite_names_scene_and_frame() {
+    fn non_finite_pose_names_scene_and_frame() {
         let broken = Pose { translation: [0.0, f64::NAN, 0.0].into(), ..Pose::IDENTITY };
         let (reader, _) = reader(Some(broken), OPTIONS);
         let message = reader.read(0, &views(&[0, 7], &[3, 4])).unwrap_err().to_string();
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clip_of_one_place_a_missing_frame_and_a_large_size_are_errors() {
+    fn equal_centres_missing_frames_and_upscaling_are_errors() {
         let message = |context: &[usize], width: usize| {
             let (reader, _) = reader(None, ClipOptions { width, ..OPTIONS });
             reader.read(0, &views(context, &[1])).unwrap_err().to_string()

@@ -1,4 +1,4 @@
-//! Evaluation indices: which frames of which scenes are given and which are measured.
+//! Evaluation indices: context and target frames of the evaluated scenes.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -12,11 +12,11 @@ use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkipReport;
 
-/// An index as published: `{key: {"context": [..], "target": [..]} | null | {}}`, in the order of the file.
+/// An evaluation index in the published form `{key: {"context": [..], "target": [..]} | null | {}}`, in file order.
 #[derive(Clone, Debug)]
 pub struct EvaluationIndex {
     path: PathBuf,
-    /// Every key with its views; `None` for null and empty entries.
+    /// Every key with its views, `None` for null and empty entries.
     entries: Vec<(String, Option<ViewIndices>)>,
     positions: HashMap<String, usize>,
 }
@@ -24,9 +24,9 @@ pub struct EvaluationIndex {
 /// One scene to evaluate.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EvaluationItem {
-    /// Position in the source.
+    /// Position of the scene in the source.
     pub scene: usize,
-    /// Frames, checked against the scene.
+    /// Context and target frames, all within the scene.
     pub views: ViewIndices,
 }
 
@@ -34,8 +34,8 @@ impl EvaluationIndex {
     /// Reads an index file.
     ///
     /// # Errors
-    /// [`DataError::Io`], or [`DataError::BadIndex`] for another form, a doubled key, or an entry with contexts but no
-    /// targets or the reverse.
+    /// [`DataError::Io`], and [`DataError::BadIndex`] for another form, a repeated key, and an entry with only contexts
+    /// or only targets.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let text = std::fs::read(path).map_err(DataError::io("reading the evaluation index", path))?;
         let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
@@ -55,28 +55,28 @@ impl EvaluationIndex {
                 Some((context, target)) => Some(ViewIndices { context, target }),
             };
             if positions.insert(key.clone(), entries.len()).is_some() {
-                return Err(bad(format!("scene {key} comes twice")));
+                return Err(bad(format!("scene {key} is listed twice")));
             }
             entries.push((key, views));
         }
         Ok(Self { path: path.to_path_buf(), entries, positions })
     }
 
-    /// How many keys there are, null and empty entries included.
+    /// Returns the number of keys, null and empty entries included.
     pub fn num_keys(&self) -> usize {
         self.entries.len()
     }
 
-    /// The entries that have views, in the order of the file.
+    /// Iterates over the entries with views, in file order.
     pub fn usable(&self) -> impl Iterator<Item = (&str, &ViewIndices)> {
         self.entries.iter().filter_map(|(key, views)| Some((key.as_str(), views.as_ref()?)))
     }
 
-    /// What is evaluated of `key`, a scene of `num_frames` frames; `None` for a null or empty entry.
+    /// Returns the views of scene `key`, which has `num_frames` frames; `None` for a null or empty entry.
     ///
     /// # Errors
-    /// [`DataError::MissingIndexKey`] if the index does not have the key, [`DataError::BadIndex`] if it asks for a
-    /// frame that the scene does not have.
+    /// [`DataError::MissingIndexKey`] for a key that is not in the index, [`DataError::BadIndex`] for a frame beyond the
+    /// end of the scene.
     pub fn views(&self, key: &str, num_frames: usize) -> Result<Option<&ViewIndices>, DataError> {
         let position = self.positions.get(key);
         let position =
@@ -86,9 +86,10 @@ impl EvaluationIndex {
         Ok(Some(views))
     }
 
-    /// The first `limit` scenes of `source` to evaluate (0: all), in the order of the file, and what is left out on
-    /// the way: null entries, empty entries, keys that the source does not have, scenes whose cameras cannot be read
-    /// and those that lack a frame. The report counts the entries that were looked at.
+    /// Selects the first `limit` evaluable scenes of `source` (0: all), in file order.
+    ///
+    /// The report lists the skipped entries: null or empty ones, keys that the source does not have, scenes with
+    /// unreadable cameras, and scenes with too few frames. `num_scenes` of the report counts the examined entries.
     pub fn select(&self, source: &dyn SceneSource, limit: usize) -> (Vec<EvaluationItem>, SkipReport) {
         let mut report = SkipReport::default();
         let mut items = Vec::new();
@@ -116,7 +117,7 @@ impl EvaluationIndex {
     fn check_frames(&self, key: &str, views: &ViewIndices, num_frames: usize) -> Result<(), DataError> {
         match views.context.iter().chain(&views.target).find(|frame| **frame >= num_frames) {
             Some(frame) => Err(DataError::BadIndex {
-                what: format!("it asks for frame {frame} of scene {key}, which has {num_frames} frames"),
+                what: format!("frame {frame} of scene {key} does not exist, the scene has {num_frames} frames"),
                 path: self.path.clone(),
             }),
             None => Ok(()),
@@ -124,10 +125,10 @@ impl EvaluationIndex {
     }
 }
 
-/// A JSON map in the order of the file.
+/// A JSON map in file order.
 struct IndexFile(Vec<(String, Option<Entry>)>);
 
-/// Frames of one scene; published indices carry further fields, which are ignored.
+/// Frames of one scene. Further fields of published indices are ignored.
 #[derive(Deserialize)]
 struct Entry {
     #[serde(default)]
@@ -158,20 +159,21 @@ impl<'de> Deserialize<'de> for IndexFile {
     }
 }
 
-/// Contexts from the first to the last of `num_frames` frames, and targets spread over the frames between them;
-/// `None` for fewer frames than views, or fewer than 2 contexts.
+/// Spreads contexts evenly from the first to the last of `num_frames` frames, and targets over the other frames.
+///
+/// Returns `None` for fewer frames than views, and for fewer than 2 contexts.
 pub fn even_views(num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
     let num_views = num_context.checked_add(num_targets)?;
     if num_context < 2 || num_frames < num_views {
         return None;
     }
-    let spread = |place: usize, count: usize, of: usize| (place * (of - 1) + (count - 1) / 2) / (count - 1);
-    let context: Vec<usize> = (0..num_context).map(|place| spread(place, num_context, num_frames)).collect();
+    let spread = |view: usize, count: usize, of: usize| (view * (of - 1) + (count - 1) / 2) / (count - 1);
+    let context: Vec<usize> = (0..num_context).map(|view| spread(view, num_context, num_frames)).collect();
     let rest: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();
-    // With two to spare the ends are left out, which lie next to a context.
+    // With two frames to spare, the outermost ones, next to a context, are no targets.
     let has_spare = rest.len() >= num_targets + 2;
-    let place = |target: usize| if has_spare { spread(target + 1, num_targets + 2, rest.len()) } else { target };
-    let target = (0..num_targets).map(|target| rest[place(target)]).collect();
+    let position = |target: usize| if has_spare { spread(target + 1, num_targets + 2, rest.len()) } else { target };
+    let target = (0..num_targets).map(|target| rest[position(target)]).collect();
     Some(ViewIndices { context, target })
 }
 
@@ -193,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn views_run_from_the_first_to_the_last_frame_and_targets_are_no_contexts() {
+    fn even_views_span_the_scene_and_targets_are_no_contexts() {
         for num_frames in 7..200 {
             let ViewIndices { context, target } = even_views(num_frames, 4, 3).unwrap();
             assert_eq!((context[0], context[3]), (0, num_frames - 1));
@@ -207,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn null_and_empty_entries_are_kept_apart_from_usable_ones_in_file_order() {
+    fn null_and_empty_entries_have_no_views() {
         let index = index(
             r#"{"c": {"context": [5, 1], "target": [2, 2], "overlap": 0.5}, "b": null, "d": {}, "a": {"context": [0], "target": [0]}}"#,
         )
@@ -218,33 +220,23 @@ mod tests {
         assert_eq!(index.views("c", 6).unwrap(), Some(&views));
         assert_eq!(index.views("b", 6).unwrap(), None);
         assert_eq!(index.views("d", 6).unwrap(), None);
+        let missing = index.views("00ff", 9).unwrap_err().to_string();
+        assert!(missing.starts_with("scene 00ff is not in the evaluation index: "), "{missing}");
+        let message = index.views("c", 5).unwrap_err().to_string();
+        assert!(message.contains("frame 5 of scene c does not exist, the scene has 5 frames"), "{message}");
     }
 
     #[test]
-    fn a_key_that_is_missing_is_an_error_that_names_key_and_file() {
-        let message = index(r#"{"a": null}"#).unwrap().views("00ff", 9).unwrap_err().to_string();
-        assert!(message.starts_with("scene 00ff is not in the evaluation index: "), "{message}");
-        assert!(message.ends_with("index.json"), "{message}");
-    }
-
-    #[test]
-    fn a_frame_that_the_scene_does_not_have_is_an_error() {
-        let index = index(r#"{"a": {"context": [0, 5], "target": [1]}}"#).unwrap();
-        let message = index.views("a", 5).unwrap_err().to_string();
-        assert!(message.contains("it asks for frame 5 of scene a, which has 5 frames"), "{message}");
-    }
-
-    #[test]
-    fn other_forms_are_refused_with_the_reason() {
+    fn invalid_forms_are_refused_with_the_reason() {
         let message = |json: &str| index(json).unwrap_err().to_string();
         assert!(message("[]").contains("expected {key:"), "{}", message("[]"));
         assert!(message(r#"{"a": {"context": [-1], "target": [1]}}"#).contains("-1"));
         assert!(message(r#"{"a": {"context": [1]}}"#).contains("scene a has 1 context and 0 target frames"));
-        assert!(message(r#"{"a": null, "a": null}"#).contains("scene a comes twice"));
+        assert!(message(r#"{"a": null, "a": null}"#).contains("scene a is listed twice"));
     }
 
     #[test]
-    fn selecting_counts_what_is_left_out() {
+    fn skipped_entries_are_counted() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
         let source = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
         let (items, report) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&source, 0);
@@ -259,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn an_entry_that_cannot_be_used_does_not_stop_the_rest_and_a_limit_ends_the_search() {
+    fn unusable_entries_are_skipped_up_to_the_limit() {
         let config = SyntheticConfig { num_scenes: 5, num_frames: 8, ..Default::default() };
         let broken = || DataError::BadCamera { what: "the pose holds NaN".into() };
         let source = TestSource::new(SyntheticSource::new(config).unwrap())
@@ -275,7 +267,7 @@ mod tests {
 
         let (items, report) = index.select(&source, 0);
         assert_eq!((scenes(&items), report.num_scenes), (vec![2, 3, 4], 5));
-        assert!(report.skips[0].reason.contains("asks for frame 8 of scene"), "{report}");
+        assert!(report.skips[0].reason.contains("frame 8 of scene"), "{report}");
         assert_eq!(report.skips[1].reason, "bad camera: the pose holds NaN");
 
         let (items, report) = index.select(&source, 2);

@@ -1,4 +1,4 @@
-//! Mirrored clips: left and right exchanged in images, cameras and rays.
+//! Mirrored clips: left and right exchanged in images and cameras.
 
 use glam::{DMat3, DVec3};
 
@@ -7,14 +7,13 @@ use crate::geometry::pose::Pose;
 use crate::sampling::clip::{Clip, ClipViews};
 
 impl Clip {
-    /// Exchanges left and right in all views and in the world: image columns are reversed, poses become `S c2w S` with
-    /// `S = diag(-1, 1, 1)`, principal points move from `cx` to `width - cx`.
+    /// Returns the mirrored clip: image columns are reversed, poses become `S c2w S` with `S = diag(-1, 1, 1)`, and
+    /// principal points move from `cx` to `width - cx`.
     ///
-    /// A point at `x` of a view is then at `width - x`, a ray `[moment, direction]` becomes `[-S moment, S direction]`,
-    /// and the clip of mirrored frames, normalised, is the mirrored normalised clip.
+    /// A ray `[moment, direction]` becomes `[-S moment, S direction]`. Mirroring commutes with normalisation.
     ///
-    // Departs from pixelSplat, which flips before it rescales and crops: with an odd margin its crop then shows another
-    // column of pixels. Its intrinsics do not change, which is right for a principal point at the centre only.
+    // Departs from pixelSplat, which flips before it rescales and crops: for an odd margin its crop is shifted by one
+    // column. Its intrinsics stay, which is correct only for a principal point at the centre.
     #[must_use]
     pub fn flipped(&self) -> Self {
         Self { key: self.key.clone(), context: self.context.flipped(), target: self.target.flipped() }
@@ -41,7 +40,7 @@ impl ClipViews {
     }
 }
 
-/// `S pose S` with `S = diag(-1, 1, 1)`.
+/// Returns `S pose S` with `S = diag(-1, 1, 1)`.
 fn mirrored_pose(Pose { rotation, translation }: Pose) -> Pose {
     let mirror = DVec3::new(-1.0, 1.0, 1.0);
     let [x, y, z] = [rotation.x_axis, rotation.y_axis, rotation.z_axis];
@@ -53,8 +52,6 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::error::DataError;
-    use crate::geometry::camera::Camera;
     use crate::geometry::normalization::{PoseRotation, PoseScale};
     use crate::image::rgb_image::RgbImage;
     use crate::sampling::clip::ViewIndices;
@@ -62,37 +59,25 @@ mod tests {
     use crate::scene_source::SceneSource;
     use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::source::SyntheticSource;
+    use crate::testing::TestSource;
 
-    /// A source in a mirror: flipped frames, and the cameras that took them.
-    struct Mirrored(SyntheticSource);
-
-    impl SceneSource for Mirrored {
-        fn num_scenes(&self) -> usize {
-            self.0.num_scenes()
-        }
-        fn key(&self, scene: usize) -> &str {
-            self.0.key(scene)
-        }
-        fn find(&self, key: &str) -> Option<usize> {
-            self.0.find(key)
-        }
-        fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-            let mut cameras = self.0.cameras(scene)?;
+    /// A source with mirrored frames and cameras.
+    fn mirrored(source: SyntheticSource) -> TestSource {
+        let mirrored = TestSource::new(source).with_cameras(|_, mut cameras| {
             for camera in &mut cameras {
                 camera.c2w = mirrored_pose(camera.c2w);
                 camera.intrinsics_norm.cx = 1.0 - camera.intrinsics_norm.cx;
             }
             Ok(cameras)
-        }
-        fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-            let RgbImage { width, height, rgb } = self.0.frame(scene, frame)?;
+        });
+        mirrored.with_frames(|_, _, RgbImage { width, height, rgb }| {
             let rows = rgb.chunks_exact(width * 3);
             let rgb = rows.flat_map(|row| row.as_chunks::<3>().0.iter().rev()).flatten().copied().collect();
             Ok(RgbImage { width, height, rgb })
-        }
+        })
     }
 
-    /// A room of 40 x 24 pixels whose principal points are off the middle.
+    /// One room with frames of 40 x 24 pixels.
     fn room() -> SyntheticSource {
         let config = SyntheticConfig { num_scenes: 1, num_frames: 9, width: 40, height: 24, ..Default::default() };
         SyntheticSource::new(config).unwrap()
@@ -110,7 +95,7 @@ mod tests {
         ClipReader { source, options }.read(0, &views).unwrap()
     }
 
-    /// Plücker ray through a point of a view, in pixels: moment and direction.
+    /// Returns moment and direction of the Plücker ray through a point of a view, in pixels.
     fn ray(views: &ClipViews, view: usize, x: f64, y: f64) -> [DVec3; 2] {
         let (pose, Intrinsics { fx, fy, cx, cy }) = (views.c2w[view], views.intrinsics[view]);
         let direction = pose.rotation * DVec3::new((x - cx) / fx, (y - cy) / fy, 1.0).normalize();
@@ -118,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rays_of_a_flipped_clip_mirror_and_so_do_its_pixels() {
+    fn rays_and_pixels_of_a_flipped_clip_are_mirrored() {
         let mut clip = read(Arc::new(room()), [40, 16], PoseRotation::Quaternion);
         for views in [&mut clip.context, &mut clip.target] {
             for k in &mut views.intrinsics {
@@ -152,10 +137,10 @@ mod tests {
     }
 
     #[test]
-    fn mirrored_frames_and_cameras_give_the_mirrored_clip() {
+    fn flipping_commutes_with_reading_a_clip() {
         for rotation in [PoseRotation::Quaternion, PoseRotation::Axes] {
-            // 40 x 24 to 24 x 24 leaves 8 columns on either side.
-            let expected = read(Arc::new(Mirrored(room())), [24, 24], rotation);
+            // The crop from 40 x 24 to 24 x 24 removes 8 columns on either side.
+            let expected = read(Arc::new(mirrored(room())), [24, 24], rotation);
             let got = read(Arc::new(room()), [24, 24], rotation).flipped();
             for (got, expected) in [(&got.context, &expected.context), (&got.target, &expected.target)] {
                 assert_eq!(got.images, expected.images);

@@ -1,41 +1,41 @@
-//! Context views between the two ends of a stretch: drawn, spread in space, or spread in time.
+//! Context views between the first and the last: random, spread in space, or spread in time.
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::random::sample_distinct;
 
-/// How the contexts between the ends of a stretch are chosen.
+/// Selection of the context frames between the first and the last.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum InnerViews {
-    /// Uniformly, all different: what the paper trains with.
+    /// Uniform without replacement, as in the paper.
     #[default]
     Random,
-    /// The frame whose camera centre is farthest from those chosen, again and again, starting from both ends.
+    /// Farthest point sampling of the camera centres, starting from the first and the last frame.
     ///
-    /// Departs from `DepthSplat`, whose ends are what its search picks first and last, so that targets may lie outside.
+    /// Departs from `DepthSplat`, whose search also chooses the ends, so that targets may lie outside of them.
     FarthestPoint,
-    /// Evenly over the frames.
+    /// Even spacing by frame number.
     Even,
 }
 
 impl InnerViews {
-    /// Whether the choice looks at the camera centres.
+    /// Returns whether the selection depends on the camera centres.
     pub fn needs_centres(self) -> bool {
         self == Self::FarthestPoint
     }
 
-    /// By default the key is not written: what runs from before it existed have on disk stays as it is.
+    /// Returns whether serde skips the value. Settings files from before this key then compare equal.
     #[allow(clippy::trivially_copy_pass_by_ref)] // serde's signature
     pub(crate) fn is_default(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Chooses `count` different frames between `left` and `right`, in increasing order. `centres` are the camera
-    /// centres of all frames of the scene; they are looked at only where [`InnerViews::needs_centres`] says so.
+    /// Selects `count` different frames between `left` and `right`, in increasing order.
     ///
-    /// Expects `count < right - left`, as [`BoundedSampler::sample`](crate::sampling::view_sampler::ViewSampler::sample) makes sure.
+    /// `centres` are the camera centres of all frames of the scene; empty unless [`InnerViews::needs_centres`]. Expects
+    /// `count < right - left`.
     pub(crate) fn choose(
         self,
         rng: &mut impl Rng,
@@ -47,25 +47,25 @@ impl InnerViews {
         let gap = right - left;
         match self {
             Self::Random => sample_distinct(rng, gap - 1, count).into_iter().map(|offset| left + 1 + offset).collect(),
-            // Rounded half up. Steps are of one frame or more, so no frame comes twice.
-            Self::Even => (1..=count).map(|place| left + (2 * place * gap + count + 1) / (2 * (count + 1))).collect(),
+            // Rounded half up. Steps are at least one frame, so frames do not repeat.
+            Self::Even => (1..=count).map(|view| left + (2 * view * gap + count + 1) / (2 * (count + 1))).collect(),
             Self::FarthestPoint => farthest_points(left, right, count, centres),
         }
     }
 }
 
-/// Of equally far frames the first is taken.
+/// Selects frames by farthest point sampling; the first of equally far frames.
 fn farthest_points(left: usize, right: usize, count: usize, centres: &[[f64; 3]]) -> Vec<usize> {
     let squared = |a: usize, b: usize| (0..3).map(|i| (centres[a][i] - centres[b][i]).powi(2)).sum::<f64>();
     let mut chosen = Vec::with_capacity(count);
-    // Squared distance of every inner frame to the nearest one chosen.
+    // Every inner frame with its squared distance to the nearest selected frame.
     let mut nearest: Vec<(usize, f64)> =
         (left + 1..right).map(|frame| (frame, squared(frame, left).min(squared(frame, right)))).collect();
     for _ in 0..count {
-        let Some(place) = (0..nearest.len()).reduce(|a, b| if nearest[b].1 > nearest[a].1 { b } else { a }) else {
+        let Some(farthest) = (0..nearest.len()).reduce(|a, b| if nearest[b].1 > nearest[a].1 { b } else { a }) else {
             break;
         };
-        let (frame, _) = nearest.remove(place);
+        let (frame, _) = nearest.remove(farthest);
         chosen.push(frame);
         for (other, distance) in &mut nearest {
             *distance = distance.min(squared(*other, frame));
@@ -104,26 +104,20 @@ mod tests {
     }
 
     #[test]
-    fn farthest_points_are_where_the_camera_goes_and_not_where_it_rests() {
-        // Frames 0..6 rest at 0, then the camera goes to 4 in steps of one, then sideways.
-        let places = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0];
-        let centres: Vec<[f64; 3]> = places.iter().map(|&x| [x, 0.0, 0.0]).collect();
+    fn farthest_points_avoid_a_resting_camera() {
+        // The camera rests at 0 for six frames, then moves in steps of one.
+        let path = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0];
+        let centres: Vec<[f64; 3]> = path.iter().map(|&x| [x, 0.0, 0.0]).collect();
         assert_eq!(choose(InnerViews::FarthestPoint, 0, 9, 1, &centres), [7]);
         assert_eq!(choose(InnerViews::FarthestPoint, 0, 9, 3, &centres), [6, 7, 8]);
-        // A detour to the side beats the middle of the way.
+        // A frame far off the path comes first.
         let mut detour = centres;
         detour[3] = [0.0, 9.0, 0.0];
         assert_eq!(choose(InnerViews::FarthestPoint, 0, 9, 1, &detour), [3]);
     }
 
     #[test]
-    fn a_camera_that_stands_still_gives_different_frames_all_the_same() {
-        assert_eq!(choose(InnerViews::FarthestPoint, 4, 9, 4, &[[1.0; 3]; 10]), [5, 6, 7, 8]);
-        assert_eq!(choose(InnerViews::FarthestPoint, 4, 9, 2, &[[f64::NAN; 3]; 10]).len(), 2);
-    }
-
-    #[test]
-    fn names_in_a_config_are_in_snake_case() {
+    fn names_are_in_snake_case() {
         let parse = |text: &str| serde_json::from_str::<InnerViews>(text);
         assert_eq!(parse(r#""farthest_point""#).unwrap(), InnerViews::FarthestPoint);
         assert_eq!(parse(r#""even""#).unwrap(), InnerViews::Even);

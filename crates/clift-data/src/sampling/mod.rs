@@ -1,14 +1,17 @@
-//! Clips and batches, from (seed, step, slot).
+//! Clips and batches as pure functions of (seed, step, slot).
+//!
+//! Training: `scene_order` selects the scene of a slot, `view_sampler` the frames, `clip_reader` reads them,
+//! `training_clips` joins them to batches. Evaluation: `evaluation_index` lists scenes and frames.
 //!
 //! - `clip`: view indices, views, clips
-//! - `clip_reader`: frames of a scene to a clip
+//! - `clip_reader`: reads frames of a scene as a clip
 //! - `flip`: mirrored clips
 //! - `scene_order`: seeded permutation per epoch
 //! - `inner_views`: contexts between two ends
 //! - `view_sampler`: context and target frames of an item
-//! - `slot_filler`: ONE retry loop for batch slots
+//! - `slot_filler`: retry loop of a batch slot
 //! - `training_clips`: the batch of a step
-//! - `prefetcher`: batches made ahead by threads
+//! - `prefetcher`: items computed ahead by threads
 //! - `evaluation_index`: published evaluation indices
 
 pub(crate) mod clip;

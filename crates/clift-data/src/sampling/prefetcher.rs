@@ -1,7 +1,6 @@
-//! Batches ahead of time, in step order, the same whatever the number of threads.
+//! Items made ahead by background threads, delivered in step order.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -10,12 +9,12 @@ use crate::error::WorkerPanic;
 
 type Make<T, E> = dyn Fn(u64) -> Result<T, E> + Send + Sync;
 
-/// Iterates over what `make(step)` gives for consecutive steps, made by background threads.
+/// An iterator over `make(step)` for consecutive steps, computed ahead by background threads.
 ///
-/// Items come strictly in step order. Where `make` is a pure function of its step, so is the sequence: neither the
-/// number of threads nor where a run resumes changes an item. At most `depth` items are finished or being made
-/// beyond those handed out. An error, or a panic in `make` (as a [`WorkerPanic`]), comes at its step; iteration may
-/// continue after it. Dropping the iterator waits for the items being made, at most one per thread.
+/// Items come in step order. If `make` is a pure function, the items depend neither on the number of threads nor on the
+/// first step. At most `depth` items beyond those taken are finished or in progress. Errors, and panics in `make` (as
+/// [`WorkerPanic`]), are delivered at their step; iteration may continue. Dropping the iterator waits for the items in
+/// progress, at most one per thread.
 pub struct Prefetcher<T, E> {
     shared: Arc<Shared<T, E>>,
     workers: Vec<JoinHandle<()>>,
@@ -29,16 +28,16 @@ struct Shared<T, E> {
     queue: Mutex<Queue<T, E>>,
     /// Signalled when an item is finished.
     finished: Condvar,
-    /// Signalled when an item is handed out, or at shutdown.
-    wanted: Condvar,
+    /// Signalled when an item is taken, and at shutdown.
+    taken: Condvar,
 }
 
 struct Queue<T, E> {
     /// Finished items by step.
     items: BTreeMap<u64, Result<T, E>>,
-    /// First step no thread has taken.
-    untaken: u64,
-    /// Step the consumer takes next.
+    /// First step that no thread has started.
+    unstarted: u64,
+    /// Next step of the consumer.
     consumed: u64,
     closed: bool,
 }
@@ -48,11 +47,10 @@ where
     T: Send + 'static,
     E: From<WorkerPanic> + Send + 'static,
 {
-    /// Starts making the items of `start_step..end_step`.
+    /// Starts to compute the items of `start_step..end_step`.
     ///
-    /// With `threads = 0`, `make` runs in the thread that iterates, one item at a time. `depth` is the most items
-    /// held or being made at any time, at least 1; more threads than that would idle, so no more are started. Where
-    /// the operating system refuses a thread, fewer do the work: the items are the same.
+    /// With `threads = 0`, `make` runs in the iterating thread. `depth`, at least 1, bounds the items in memory and the
+    /// number of threads. If the operating system refuses a thread, the others compute the same items.
     pub fn new(
         make: impl Fn(u64) -> Result<T, E> + Send + Sync + 'static,
         start_step: u64,
@@ -61,19 +59,19 @@ where
         depth: usize,
     ) -> Self {
         let depth = depth.max(1);
-        let queue = Queue { items: BTreeMap::new(), untaken: start_step, consumed: start_step, closed: false };
+        let queue = Queue { items: BTreeMap::new(), unstarted: start_step, consumed: start_step, closed: false };
         let shared = Arc::new(Shared {
             make: Box::new(make),
             end_step,
             depth: depth as u64,
             queue: Mutex::new(queue),
             finished: Condvar::new(),
-            wanted: Condvar::new(),
+            taken: Condvar::new(),
         });
         let workers = (0..threads.min(depth))
             .filter_map(|_| {
                 let shared = Arc::clone(&shared);
-                std::thread::Builder::new().name("clift-loader".into()).spawn(move || shared.work()).ok()
+                std::thread::Builder::new().name("clift-loader".into()).spawn(move || shared.run_worker()).ok()
             })
             .collect();
         Self { shared, workers, next_step: start_step }
@@ -96,7 +94,7 @@ impl<T, E: From<WorkerPanic>> Iterator for Prefetcher<T, E> {
         loop {
             if let Some(item) = queue.items.remove(&step) {
                 queue.consumed = self.next_step;
-                self.shared.wanted.notify_all();
+                self.shared.taken.notify_all();
                 return Some(item);
             }
             queue = self.shared.finished.wait(queue).unwrap_or_else(PoisonError::into_inner);
@@ -110,16 +108,16 @@ impl<T, E: From<WorkerPanic>> Iterator for Prefetcher<T, E> {
 }
 
 impl<T, E: From<WorkerPanic>> Shared<T, E> {
-    /// What a worker thread does: takes the next step while there is room, until the end or shutdown.
-    fn work(&self) {
+    /// Computes the next step while fewer than `depth` items are waiting, until the end or shutdown.
+    fn run_worker(&self) {
         let mut queue = self.lock();
-        while !queue.closed && queue.untaken < self.end_step {
-            if queue.untaken >= queue.consumed.saturating_add(self.depth) {
-                queue = self.wanted.wait(queue).unwrap_or_else(PoisonError::into_inner);
+        while !queue.closed && queue.unstarted < self.end_step {
+            if queue.unstarted >= queue.consumed.saturating_add(self.depth) {
+                queue = self.taken.wait(queue).unwrap_or_else(PoisonError::into_inner);
                 continue;
             }
-            let step = queue.untaken;
-            queue.untaken += 1;
+            let step = queue.unstarted;
+            queue.unstarted += 1;
             drop(queue);
             let item = self.make_caught(step);
             queue = self.lock();
@@ -129,7 +127,7 @@ impl<T, E: From<WorkerPanic>> Shared<T, E> {
     }
 
     fn make_caught(&self, step: u64) -> Result<T, E> {
-        // `make` is only shared behind `&`, and what it returned is discarded: nothing half-changed is seen.
+        // `make` is shared behind `&`, and a partial result is discarded: no inconsistent state is visible.
         catch_unwind(AssertUnwindSafe(|| (self.make)(step))).unwrap_or_else(|panic| {
             let message = panic
                 .downcast_ref::<&str>()
@@ -142,7 +140,7 @@ impl<T, E: From<WorkerPanic>> Shared<T, E> {
 }
 
 impl<T, E> Shared<T, E> {
-    /// No user code runs under the lock, so even a poisoned queue is whole.
+    /// Locks the queue. No user code runs under the lock, so even a poisoned queue is consistent.
     fn lock(&self) -> MutexGuard<'_, Queue<T, E>> {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -151,21 +149,11 @@ impl<T, E> Shared<T, E> {
 impl<T, E> Drop for Prefetcher<T, E> {
     fn drop(&mut self) {
         self.shared.lock().closed = true;
-        self.shared.wanted.notify_all();
+        self.shared.taken.notify_all();
         for worker in self.workers.drain(..) {
-            // A worker catches what it runs; should it die all the same, there is nothing left to save.
+            // A worker catches panics of `make`; a failed join leaves nothing to clean up.
             let _ = worker.join();
         }
-    }
-}
-
-impl<T, E> fmt::Debug for Prefetcher<T, E> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Prefetcher")
-            .field("next_step", &self.next_step)
-            .field("end_step", &self.shared.end_step)
-            .field("threads", &self.workers.len())
-            .finish_non_exhaustive()
     }
 }
 
@@ -199,33 +187,24 @@ mod tests {
         Prefetcher::new(|step| Ok(slow_square(step)), start, end, threads, depth)
     }
 
-    /// Fails the test, instead of hanging it, when `work` does not come back.
-    fn within_seconds<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
+    /// Fails the test after 20 seconds instead of blocking.
+    fn within_seconds<T: Send + 'static>(compute: impl FnOnce() -> T + Send + 'static) -> T {
         let (sender, receiver) = mpsc::channel();
-        std::thread::spawn(move || sender.send(work()));
+        std::thread::spawn(move || sender.send(compute()));
         receiver.recv_timeout(Duration::from_secs(20)).expect("finished in time")
     }
 
     #[test]
-    fn items_come_in_step_order_whatever_the_number_of_threads() {
-        let expected: Vec<_> = (0..60).map(|step| Ok(step * step)).collect();
+    fn items_are_in_step_order_with_any_number_of_threads() {
+        let expected: Vec<_> = (17..60).map(|step| Ok(step * step)).collect();
         for (threads, depth) in [(0, 1), (1, 1), (1, 4), (3, 2), (3, 8), (3, 0)] {
-            let items = within_seconds(move || squares(0, 60, threads, depth).collect::<Vec<_>>());
+            let items = within_seconds(move || squares(17, 60, threads, depth).collect::<Vec<_>>());
             assert_eq!(items, expected, "{threads} threads, depth {depth}");
         }
     }
 
     #[test]
-    fn a_start_at_a_later_step_gives_the_tail() {
-        for threads in [0, 3] {
-            let whole: Vec<_> = squares(0, 30, threads, 4).collect();
-            let tail: Vec<_> = squares(17, 30, threads, 4).collect();
-            assert_eq!(whole[17..], tail[..]);
-        }
-    }
-
-    #[test]
-    fn an_empty_range_gives_nothing() {
+    fn empty_range_has_no_items() {
         for threads in [0, 2] {
             assert_eq!(squares(5, 5, threads, 2).count(), 0);
             assert_eq!(squares(6, 5, threads, 2).count(), 0);
@@ -233,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_and_panics_come_at_their_step_and_the_rest_goes_on() {
+    fn errors_and_panics_come_at_their_step() {
         let make = |step| match step {
             3 => Err(Failure::Bad(3)),
             5 => panic!("boom at {step}"),
@@ -255,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_than_depth_items_are_made_ahead() {
+    fn at_most_depth_items_are_made_ahead() {
         let made = Arc::new(AtomicU64::new(0));
         let counter = Arc::clone(&made);
         let make = move |step| {
@@ -287,19 +266,5 @@ mod tests {
         assert_eq!(items.next(), Some(Ok(0)));
         within_seconds(move || drop(items));
         assert_eq!(Arc::strong_count(&alive), 1, "a thread still holds the closure");
-    }
-
-    #[test]
-    fn without_threads_nothing_is_made_before_it_is_asked_for() {
-        let made = Arc::new(AtomicU64::new(0));
-        let counter = Arc::clone(&made);
-        let make = move |step| {
-            counter.fetch_add(1, Ordering::SeqCst);
-            Ok::<_, Failure>(step)
-        };
-        let mut items = Prefetcher::new(make, 0, 9, 0, 5);
-        assert_eq!(made.load(Ordering::SeqCst), 0);
-        items.next();
-        assert_eq!(made.load(Ordering::SeqCst), 1);
     }
 }

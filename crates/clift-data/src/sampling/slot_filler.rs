@@ -1,4 +1,4 @@
-//! Retries of a batch slot whose scene cannot be used.
+//! Retry loop of a batch slot: other scenes replace unusable ones.
 
 use std::collections::BTreeSet;
 
@@ -29,10 +29,10 @@ pub struct NoUsableScene {
 }
 
 impl SlotFiller {
-    /// Returns the first scene that `read` returns without an error; those before it are appended to `skipped`.
+    /// Reads scenes until `read` succeeds and returns the result. Failed scenes are appended to `skipped`.
     ///
-    /// `scene` returns the scene of an attempt. Both closures must derive their randomness from the attempt's number
-    /// alone, so that other slots do not change.
+    /// `scene` returns the scene of an attempt. Both closures must derive their randomness from the number of the
+    /// attempt alone, so that retries of one slot do not change other slots.
     ///
     /// # Errors
     /// [`NoUsableScene`] with the last error.

@@ -1,6 +1,5 @@
-//! The training batch of a step: which scenes, which views, and what was left out.
+//! The training batch of a step: clips and skipped scenes.
 
-use std::fmt;
 use std::sync::Arc;
 
 use crate::error::DataError;
@@ -12,11 +11,11 @@ use crate::sampling::view_sampler::ViewSampler;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkippedScene;
 
-/// Tries of one slot, a scene that comes up again included, before the batch may fail.
+/// Smallest number of attempts of one slot before the batch fails, repeated scenes included.
 const MIN_ATTEMPTS: u32 = 16;
-/// Distinct scenes that one slot tries, or all where there are fewer, before the batch fails.
-const MAX_SCENES_TRIED: usize = 64;
-/// Ends the walk over a permutation that never brings up some scene; 64 come up in 300 steps or so.
+/// Smallest number of different scenes that one slot tries before the batch fails; all scenes of a smaller source.
+const MIN_SCENES_TRIED: usize = 64;
+/// Bounds the search in a scene order that never reaches some scenes; 64 different scenes take about 300 steps.
 const MAX_STEPS_AHEAD: u32 = 4096;
 
 /// Reads the given frames of a scene as a clip.
@@ -25,16 +24,17 @@ pub type ReadClip = dyn Fn(usize, &ViewIndices) -> Result<Clip, DataError> + Sen
 /// The clips of one training step, all with the same numbers of context and target views.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ClipBatch {
-    /// Step the batch is for.
+    /// Step of the batch.
     pub step: u64,
     /// One clip per slot.
     pub clips: Vec<Clip>,
-    /// Scenes left out on the way, with the reason.
+    /// Scenes that were skipped and replaced, with the reason.
     pub skipped: Vec<SkippedScene>,
 }
 
-/// Makes the batch of any step, as a pure function of (seed, step): scene order, views and replacements for scenes
-/// that cannot be used. Wrapped in a [`Prefetcher`](crate::sampling::prefetcher::Prefetcher) it is the training loader.
+/// Reads the batch of any step as a pure function of (seed, step): scenes, views, and replacements of unusable scenes.
+///
+/// A [`Prefetcher`](crate::sampling::prefetcher::Prefetcher) around [`TrainingClips::batch`] reads batches ahead.
 pub struct TrainingClips {
     source: Arc<dyn SceneSource>,
     read: Arc<ReadClip>,
@@ -45,13 +45,13 @@ pub struct TrainingClips {
 }
 
 impl TrainingClips {
-    /// Prepares batches of `batch_size` clips from `source`, whose frames `read` turns into clips.
+    /// Prepares batches of `batch_size` clips of the scenes of `source`, read by `read`.
     ///
-    /// `seed` decides everything random; give each stage of a run its own
+    /// `seed` determines all random values. Each stage of a run needs its own seed
     /// ([`derive_seed`](crate::random::derive_seed)).
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] when the sampler does not validate, there is no scene or `batch_size` is 0.
+    /// [`DataError::BadConfig`] for an invalid sampler, a source without scenes and a `batch_size` of 0.
     pub fn new(
         source: Arc<dyn SceneSource>,
         read: Arc<ReadClip>,
@@ -64,20 +64,20 @@ impl TrainingClips {
         Ok(Self { source, read, sampler, order, seed, flip: false })
     }
 
-    /// Flips half of the clips left to right, drawn by chance, as a whole ([`Clip::flipped`]); `false` flips none.
+    /// With `true`, mirrors each clip with probability 1/2 ([`Clip::flipped`]).
     #[must_use]
     pub fn with_flip(self, flip: bool) -> Self {
         Self { flip, ..self }
     }
 
-    /// Makes the batch of `step`.
+    /// Reads the batch of `step`.
     ///
-    /// A scene that is too short or cannot be read is listed in [`ClipBatch::skipped`], and its slot takes the
-    /// scene it would have had one step later, then two, and so on. The replacement is drawn with its own
-    /// randomness, so the other slots do not notice.
+    /// A scene that is too short or unreadable is listed in [`ClipBatch::skipped`] and replaced by the scene of the same
+    /// slot one step later, then two, and so on. Replacements have random streams of their own, so other slots do not
+    /// change.
     ///
     /// # Errors
-    /// [`DataError::NoUsableScene`] when 16 tries and 64 different scenes (all, where there are fewer) have failed.
+    /// [`DataError::NoUsableScene`] after 16 attempts and 64 different scenes (all scenes of a smaller source).
     pub fn batch(&self, step: u64) -> Result<ClipBatch, DataError> {
         let num_context = self.sampler.num_context(self.seed, step);
         let mut batch = ClipBatch { step, clips: Vec::new(), skipped: Vec::new() };
@@ -97,7 +97,7 @@ impl TrainingClips {
     ) -> Result<Clip, DataError> {
         let filler = SlotFiller {
             min_attempts: MIN_ATTEMPTS,
-            min_scenes: self.source.num_scenes().min(MAX_SCENES_TRIED),
+            min_scenes: self.source.num_scenes().min(MIN_SCENES_TRIED),
             max_attempts: MAX_STEPS_AHEAD,
         };
         let scene = |ahead: u32| self.order.scene(step.saturating_add(u64::from(ahead)), slot);
@@ -122,30 +122,17 @@ impl TrainingClips {
         let mut rng = item_rng(self.seed, step, slot as u32, attempt, "views");
         let views = self.sampler.sample(self.source.as_ref(), scene, step, num_context, &mut rng)?;
         let clip = (self.read)(scene, &views)?;
-        // A stream of its own, so that the views drawn are the same with and without it.
+        // A separate stream: the sampled views do not depend on `flip`.
         let is_flipped = self.flip && unit(&mut item_rng(self.seed, step, slot as u32, attempt, "flip")) < 0.5;
         Ok(if is_flipped { clip.flipped() } else { clip })
     }
 }
 
-impl fmt::Debug for TrainingClips {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("TrainingClips")
-            .field("sampler", &self.sampler)
-            .field("order", &self.order)
-            .field("seed", &self.seed)
-            .finish_non_exhaustive()
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
-
     use super::*;
     use crate::geometry::pose::Pose;
     use crate::sampling::clip::ClipViews;
-    use crate::sampling::prefetcher::Prefetcher;
     use crate::testing::Lengths;
 
     fn clips(lengths: Vec<usize>, batch_size: usize, seed: u64) -> TrainingClips {
@@ -171,7 +158,7 @@ mod tests {
 
     /// Checksums of the batches of the version before `SlotFiller`.
     #[test]
-    fn a_thousand_batches_are_those_of_earlier_versions() {
+    fn first_thousand_batches_are_reproducible() {
         let rare = (0..300).map(|scene| if scene % 23 == 5 { 90 } else { 10 + scene % 17 }).collect();
         for (clips, expected) in [(mixed().with_flip(true), 0xd652_d9cf), (clips(rare, 8, 12345), 0x1fc9_670d)] {
             let line = |batch: ClipBatch| {
@@ -191,55 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn batches_are_the_same_with_any_number_of_threads_and_from_any_start() {
-        let expected: Vec<ClipBatch> = (0..30).map(|step| mixed().batch(step).unwrap()).collect();
-        for threads in [0, 1, 3] {
-            for start in [0, 11] {
-                let clips = mixed();
-                let loader = Prefetcher::new(move |step| clips.batch(step), start, 30, threads, 4);
-                let batches: Vec<ClipBatch> = loader.map(|batch| batch.unwrap()).collect();
-                assert_eq!(batches, expected[start as usize..], "{threads} threads from step {start}");
-            }
-        }
-    }
-
-    #[test]
-    fn a_batch_has_the_same_number_of_views_in_every_clip_and_batches_differ() {
-        let clips = clips(vec![200; 40], 5, 9);
-        let batches: Vec<ClipBatch> = (0..40).map(|step| clips.batch(step).unwrap()).collect();
-        for batch in &batches {
-            let counts: BTreeSet<_> =
-                batch.clips.iter().map(|clip| (clip.context.num_views(), clip.target.num_views())).collect();
-            assert_eq!(counts.len(), 1);
-        }
-        let counts: BTreeSet<_> = batches.iter().map(|batch| batch.clips[0].context.num_views()).collect();
-        assert_eq!(counts, [4, 5, 6].into());
-        assert_ne!(batches[0].clips, batches[8].clips);
-    }
-
-    #[test]
-    fn an_epoch_of_good_scenes_reads_each_once() {
-        let clips = clips(vec![200; 40], 5, 9);
-        let keys: BTreeSet<String> =
-            (0..8).flat_map(|step| clips.batch(step).unwrap().clips).map(|clip| clip.key).collect();
-        assert_eq!(keys.len(), 40);
-    }
-
-    #[test]
-    fn short_scenes_are_replaced_and_listed_with_their_reason() {
-        let batches: Vec<ClipBatch> = (0..10).map(|step| mixed().batch(step).unwrap()).collect();
-        let skipped: Vec<_> = batches.iter().flat_map(|batch| &batch.skipped).collect();
-        let short: BTreeSet<&str> = skipped.iter().map(|scene| scene.key.as_str()).collect();
-        assert_eq!(short.len(), 14, "every third of 40 scenes is too short");
-        assert!(skipped.iter().all(|scene| scene.reason == "not enough frames: 26 needed, 10 in the scene"));
-        for batch in &batches {
-            assert_eq!(batch.clips.len(), 4);
-            assert!(batch.clips.iter().all(|clip| !short.contains(clip.key.as_str())));
-        }
-    }
-
-    #[test]
-    fn a_replacement_does_not_change_the_other_slots() {
+    fn replacements_do_not_change_other_slots() {
         let good = clips(vec![200; 40], 4, 9);
         let (whole, patched) = (good.batch(3).unwrap(), mixed().batch(3).unwrap());
         let mut same = 0;
@@ -253,8 +192,8 @@ mod tests {
     }
 
     #[test]
-    fn the_one_good_scene_among_many_bad_ones_is_found_from_every_step() {
-        // Batches of as many slots as there are scenes see one place of each epoch: the worst case of a walk.
+    fn only_usable_scene_is_found_from_every_step() {
+        // A slot of a batch as large as the source sees one position of each epoch: the worst case of the search.
         for (num_scenes, batch_size) in [(2, 1), (20, 4), (64, 1), (64, 64)] {
             let lengths = (0..num_scenes).map(|scene| if scene == 1 { 200 } else { 10 }).collect();
             let clips = clips(lengths, batch_size, 9);
@@ -266,41 +205,15 @@ mod tests {
     }
 
     #[test]
-    fn a_slot_gives_up_after_64_scenes_and_tries_a_single_one_16_times() {
-        let tries = |num_scenes| match clips(vec![10; num_scenes], 1, 9).batch(0) {
+    fn slot_fails_after_64_scenes_or_16_attempts() {
+        let attempts = |num_scenes| match clips(vec![10; num_scenes], 1, 9).batch(0) {
             Err(DataError::NoUsableScene { attempts, .. }) => attempts,
             other => panic!("{other:?}"),
         };
-        assert_eq!([tries(1), tries(1000)], [16, 64]);
-        assert!((40..=56).contains(&tries(40)), "{} tries for 40 scenes", tries(40));
-    }
-
-    #[test]
-    fn a_source_of_short_scenes_fails_naming_the_last_reason() {
+        assert_eq!([attempts(1), attempts(1000)], [16, 64]);
+        assert!((40..=56).contains(&attempts(40)), "{} attempts for 40 scenes", attempts(40));
         let error = clips(vec![10; 40], 4, 9).batch(2).unwrap_err().to_string();
         assert!(error.starts_with("no usable scene for slot 0 of step 2 in "), "{error}");
-        assert!(error.ends_with("failed with: not enough frames: 26 needed, 10 in the scene"), "{error}");
-    }
-
-    #[test]
-    fn a_sampler_that_cannot_hold_is_refused_at_the_start() {
-        let sampler = ViewSampler { num_targets: 0, ..Default::default() };
-        let read = |_: usize, _: &ViewIndices| unreachable!("nothing is read");
-        let made = TrainingClips::new(Arc::new(Lengths::new(vec![9])), Arc::new(read), sampler, 1, 0);
-        assert!(made.unwrap_err().to_string().starts_with("num_targets is 0"));
-    }
-
-    #[test]
-    fn about_half_of_the_clips_are_flipped_and_the_views_drawn_stay_the_same() {
-        let plain: Vec<ClipBatch> = (0..100).map(|step| mixed().batch(step).unwrap()).collect();
-        assert_eq!(plain, (0..100).map(|step| mixed().with_flip(false).batch(step).unwrap()).collect::<Vec<_>>());
-        let flipped: Vec<ClipBatch> = (0..100).map(|step| mixed().with_flip(true).batch(step).unwrap()).collect();
-        assert_eq!(flipped, (0..100).map(|step| mixed().with_flip(true).batch(step).unwrap()).collect::<Vec<_>>());
-        let mut num_flipped = 0;
-        for (plain, flipped) in plain.iter().zip(&flipped).flat_map(|(a, b)| a.clips.iter().zip(&b.clips)) {
-            assert!(*flipped == *plain || *flipped == plain.flipped());
-            num_flipped += usize::from(*flipped != *plain);
-        }
-        assert!((160..240).contains(&num_flipped), "{num_flipped} of 400"); // the deviation is 10
+        assert!(error.ends_with(": not enough frames: 26 needed, 10 in the scene"), "{error}");
     }
 }

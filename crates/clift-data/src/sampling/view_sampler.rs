@@ -1,4 +1,4 @@
-//! Which frames of a scene become context and target views of a training item.
+//! Samples the context and target frames of a training item.
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -9,13 +9,13 @@ use crate::sampling::clip::ViewIndices;
 use crate::sampling::inner_views::InnerViews;
 use crate::scene_source::SceneSource;
 
-/// Most context or target views of an item.
+/// Largest number of context or target views of an item.
 const MAX_VIEWS: usize = 10_000;
 
-/// Value at `step` of a number that grows linearly from `init` to `last` in `warm_up_steps` steps and then stays:
+/// Returns the value at `step` of a linear warm-up from `init` to `last` in `warm_up_steps` steps:
 /// `min(init + trunc((last - init) * step / warm_up_steps), last)`.
 ///
-/// Expects `init <= last`; without warm-up steps the value is `last` from the start.
+/// Expects `init <= last`. Without warm-up steps the value is always `last`.
 pub fn linear_warm_up(init: usize, last: usize, warm_up_steps: u64, step: u64) -> usize {
     if warm_up_steps == 0 || step >= warm_up_steps {
         return last;
@@ -24,30 +24,31 @@ pub fn linear_warm_up(init: usize, last: usize, warm_up_steps: u64, step: u64) -
     init + growth as usize
 }
 
-/// Draws a stretch of a scene, whose two ends and some inner frames are the context, and targets from inside it.
+/// Samples a range of consecutive frames. The contexts are the two ends and some inner frames, the targets any frames
+/// of the range.
 ///
-/// The stretch grows during training: its gap (last minus first frame) is uniform in `[min_gap, max_gap]`, both on
-/// the [`linear_warm_up`] of `warm_up_steps`. This is the `bounded_v2` sampler of DepthSplat, which the paper trains with;
-/// the default is its RealEstate10K setting with the paper's 4 to 6 contexts (paper, appendix).
+/// The gap (last minus first frame) is uniform in `[min_gap, max_gap]`, and both bounds grow during training
+/// ([`linear_warm_up`]). This is the `bounded_v2` sampler of DepthSplat, which the paper uses. The default is its
+/// RealEstate10K setting with the paper's 4 to 6 contexts (paper, appendix).
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ViewSampler {
-    /// Fewest context views of an item; at least 2.
+    /// Smallest number of context views of an item, at least 2.
     pub min_context: usize,
-    /// Most context views of an item. One number is drawn for each batch.
+    /// Largest number of context views of an item. The number is sampled once per batch.
     pub max_context: usize,
-    /// Smallest gap between the first and the last context frame: at step 0, and after the warm-up.
+    /// Smallest gap between the first and the last context frame, at step 0 and after the warm-up.
     pub min_gap: [usize; 2],
-    /// Largest gap between the first and the last context frame: at step 0, and after the warm-up. A scene that
-    /// is shorter lowers it, down to the smallest gap.
+    /// Largest gap between the first and the last context frame, at step 0 and after the warm-up. Shorter scenes lower
+    /// the gap, down to the smallest one.
     pub max_gap: [usize; 2],
-    /// Steps in which the gaps go from their first to their last value; 0 starts with the last.
+    /// Steps of the warm-up of both gaps; 0 disables the warm-up.
     pub warm_up_steps: u64,
-    /// Target views of an item.
+    /// Number of target views of an item.
     pub num_targets: usize,
-    /// Whether a frame may be a target more than once. A target may be a context frame either way.
+    /// Whether targets may repeat. A target may also be a context frame in both cases.
     pub with_replacement: bool,
-    /// How the contexts between the two ends are chosen: `random`, `farthest_point` or `even`.
+    /// Selection of the contexts between the two ends: `random`, `farthest_point` or `even`.
     #[serde(skip_serializing_if = "InnerViews::is_default")]
     pub inner: InnerViews,
 }
@@ -68,15 +69,15 @@ impl Default for ViewSampler {
 }
 
 impl ViewSampler {
-    /// Checks that every draw the fields allow is possible in a scene that is long enough.
+    /// Checks that a long enough scene has views for every allowed number of contexts.
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] naming the first field that cannot hold.
+    /// [`DataError::BadConfig`] with the first invalid field.
     pub fn validate(&self) -> Result<(), DataError> {
         let fail = |key: &str, problem: String| Err(DataError::bad_config(key, problem));
         let Self { min_context, max_context, min_gap, max_gap, num_targets, .. } = self;
         if *min_context < 2 {
-            return fail("min_context", format!("is {min_context}; a stretch has two ends, so use 2 or more"));
+            return fail("min_context", format!("is {min_context}; use 2 or more"));
         }
         if max_context < min_context {
             return fail("max_context", format!("is {max_context}; use min_context = {min_context} or more"));
@@ -91,12 +92,12 @@ impl ViewSampler {
         }
         for (key, gap) in [("min_gap", min_gap), ("max_gap", max_gap)] {
             if gap[0] > gap[1] {
-                return fail(key, format!("is {gap:?}; the second value must not be below the first"));
+                return fail(key, format!("is {gap:?}; the second value must be at least the first"));
             }
         }
         for when in 0..2 {
             if max_gap[when] < min_gap[when] {
-                return fail("max_gap", format!("is {max_gap:?}; it must not be below min_gap = {min_gap:?}"));
+                return fail("max_gap", format!("is {max_gap:?}; use at least min_gap = {min_gap:?}"));
             }
         }
         for num_context in *min_context..=*max_context {
@@ -121,30 +122,29 @@ impl ViewSampler {
         Ok(())
     }
 
-    /// Number of contexts of every item of the batch at `step`, uniform in `[min_context, max_context]`.
+    /// Samples the number of contexts of the batch at `step`, uniform in `[min_context, max_context]`.
     pub fn num_context(&self, seed: u64, step: u64) -> usize {
         between(&mut step_rng(seed, step, "number of contexts"), self.min_context, self.max_context)
     }
 
-    /// Smallest and largest gap at `step` of a batch with `num_context` contexts, in a scene without end.
+    /// Returns the smallest and the largest gap at `step` of a batch with `num_context` contexts.
     ///
-    /// Batches with at most half of `max_context` contexts take proportionally shorter stretches.
+    /// Both are divided by `max_context / num_context`, rounded down.
     pub fn gap_bounds(&self, step: u64, num_context: usize) -> [usize; 2] {
         [self.min_gap, self.max_gap]
             .map(|[init, last]| linear_warm_up(init, last, self.warm_up_steps, step) / self.gap_divisor(num_context))
     }
 
-    /// Frames of the shortest stretch of any step: no item can be drawn from a scene of fewer.
+    /// Returns the smallest number of frames of a usable scene.
     pub fn min_frames(&self) -> usize {
         let gaps = (self.min_context..=self.max_context).map(|num_context| self.gap_bounds(0, num_context)[0]);
         gaps.min().unwrap_or(0) + 1
     }
 
-    /// Draws the views of one item from a scene of `source`. Its cameras are read only where the choice of inner views
-    /// looks at them.
+    /// Samples the views of one item from a scene of `source`. Cameras are read only if [`InnerViews::needs_centres`].
     ///
     /// # Errors
-    /// As [`ViewSampler::sample`], and whatever reading the scene gives.
+    /// As [`ViewSampler::sample_frames`], and the errors of reading the scene.
     pub fn sample(
         &self,
         source: &dyn SceneSource,
@@ -160,18 +160,16 @@ impl ViewSampler {
         self.sample_frames(centres.len(), &centres, step, num_context, rng)
     }
 
-    /// Draws the views of one item from a scene of `num_frames` frames with their camera centres, which may be left out
-    /// where `inner` does not need them.
+    /// Samples the views of one item from a scene of `num_frames` frames. `centres` are the camera centres, empty
+    /// unless [`InnerViews::needs_centres`].
     ///
-    /// The contexts are distinct and sorted: both ends of the stretch, and inner frames as `inner` says. The
-    /// targets lie between the ends, inclusive, in the order drawn. Expects a sampler that [`validate`]s.
+    /// The contexts are distinct and sorted. The targets lie between the ends, inclusive, in the sampled order. Expects
+    /// a sampler that passes [`validate`](Self::validate).
     ///
     /// # Errors
-    /// [`DataError::NotEnoughFrames`] when the scene is not longer than the smallest gap at `step`;
-    /// [`DataError::BadConfig`] when `num_context` is outside `[min_context, max_context]`.
-    ///
-    /// [`validate`]: Self::validate
-    pub fn sample_frames(
+    /// [`DataError::NotEnoughFrames`] if the scene is not longer than the smallest gap at `step`,
+    /// [`DataError::BadConfig`] if `num_context` is outside `[min_context, max_context]` or a centre is missing.
+    pub(crate) fn sample_frames(
         &self,
         num_frames: usize,
         centres: &[[f64; 3]],
@@ -180,12 +178,12 @@ impl ViewSampler {
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
         if self.inner.needs_centres() && centres.len() != num_frames {
-            let problem = format!("are {}; farthest points need one for each of {num_frames} frames", centres.len());
+            let problem = format!("has {} values; farthest_point needs {num_frames}, one per frame", centres.len());
             return Err(DataError::bad_config("centres", problem));
         }
         let Self { min_context, max_context, .. } = self;
         if !(min_context..=max_context).contains(&&num_context) {
-            let problem = format!("is {num_context}; the sampler is set to {min_context} to {max_context}");
+            let problem = format!("is {num_context}; use {min_context} to {max_context}");
             return Err(DataError::bad_config("num_context", problem));
         }
         let [min_gap, max_gap] = self.gap_bounds(step, num_context);
@@ -212,14 +210,13 @@ impl ViewSampler {
     }
 }
 
-/// Draws stage-2 targets for a stored context set: frames between its first and last that are not contexts.
+/// Samples stage-2 targets of a stored context set: frames between the first and the last context that are no contexts.
 ///
-/// Without replacement; with replacement where there are fewer candidates than targets; from the contexts
-/// themselves, with replacement, where there is no candidate at all.
+/// Targets repeat only if there are fewer candidates than targets. Without any candidate, contexts are sampled with
+/// replacement.
 ///
 /// # Errors
-/// [`DataError::NotEnoughFrames`] when a context is not a frame of the scene; [`DataError::BadConfig`] when there are
-/// no contexts.
+/// [`DataError::NotEnoughFrames`] if a context is not a frame of the scene, [`DataError::BadConfig`] for no contexts.
 pub fn sample_targets(
     context: &[usize],
     num_frames: usize,
@@ -227,7 +224,7 @@ pub fn sample_targets(
     rng: &mut impl Rng,
 ) -> Result<Vec<usize>, DataError> {
     let (Some(&first), Some(&last)) = (context.iter().min(), context.iter().max()) else {
-        return Err(DataError::bad_config("context", "is empty; targets lie between its first and last frame"));
+        return Err(DataError::bad_config("context", "is empty; use 1 or more frames"));
     };
     if last >= num_frames {
         return Err(DataError::NotEnoughFrames { needed: last + 1, got: num_frames });

@@ -1,4 +1,4 @@
-//! Ray-traced rooms from a seed.
+//! Ray-traced rooms from a seed. `source` joins the parts to a data source.
 //!
 //! - `config`: options of synthetic scenes
 //! - `room`: a room, its objects and lamp

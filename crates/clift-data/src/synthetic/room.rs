@@ -232,6 +232,6 @@ mod tests {
     fn default_rooms_have_the_configured_number_of_objects() {
         let counts: Vec<usize> = rooms(&SyntheticConfig::default()).iter().map(|room| room.objects.len()).collect();
         assert!(counts.iter().all(|count| (3..=5).contains(count)), "{counts:?}");
-        assert!([3, 4, 5].iter().all(|wanted| counts.contains(wanted)));
+        assert!([3, 4, 5].iter().all(|count| counts.contains(count)));
     }
 }

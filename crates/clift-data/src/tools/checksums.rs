@@ -1,4 +1,4 @@
-//! `SHA256SUMS`: which files of a folder are complete, what they hold, and how they were made.
+//! `SHA256SUMS`: the complete files of a conversion in progress, their checksums, and the options of the conversion.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, OpenOptions};
@@ -11,36 +11,37 @@ use crate::error::DataError;
 use crate::files::atomic::{TEMPORARY, replace_file};
 use crate::files::listing::has_ending;
 
-/// As `sha256sum` calls it: a line per file, sum and name.
+/// Name of the file, in the format of `sha256sum`: a line per file with checksum and name.
 const FILE_NAME: &str = "SHA256SUMS";
-/// Starts the line that says how the files are made: a comment to `sha256sum -c`.
+/// Start of the line with the options of the conversion, a comment for `sha256sum -c`.
 const MADE_AS: &str = "# made as: ";
-/// Scenes of chunks, by key: the file of each.
+/// Name of the file that maps scene keys to chunks.
 pub(crate) const INDEX: &str = "index.json";
-/// The [`Ledger`](crate::skip_report::SkipReport) of what is not in the folder.
+/// Name of the file with the [`SkipReport`](crate::skip_report::SkipReport) of the conversion.
 pub(crate) const SKIPPED: &str = "skipped.json";
-/// What is written beside scenes.
+/// Files beside the scenes.
 const LISTS: [&str; 2] = [INDEX, SKIPPED];
 
-/// The sums of a folder that is being written.
+/// The checksums of a folder in progress.
 ///
-/// A file's line is on the disk before the file has its name: what is in the folder without a line is someone else's.
+/// The line of a file is on disk before the file has its name. A file without a line is therefore not from a
+/// conversion.
 #[derive(Debug)]
 pub(crate) struct Checksums {
     folder: PathBuf,
-    /// How the files are made, on one line.
+    /// Options of the conversion, on one line.
     made_as: String,
     sums: BTreeMap<String, String>,
-    /// Files with a line that hold something else now.
+    /// Files whose checksum does not match their line.
     damaged: BTreeSet<String>,
 }
 
 impl Checksums {
-    /// Looks at a folder, new or empty or one that was started, and changes nothing in it. Lines of files that are missing
-    /// or hold something else are dropped: they will be written again.
+    /// Reads the checksums of a folder that is new, empty or in progress, without changing the folder. Lines of missing
+    /// and of damaged files are dropped.
     ///
     /// # Errors
-    /// [`DataError::BadIndex`] for a folder with any other file, or whose files were made in another way.
+    /// [`DataError::BadIndex`] for a folder with other files, and for a folder converted with other options.
     pub fn open(folder: &Path, made_as: &str) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadIndex { what, path: folder.to_path_buf() };
         let path = folder.join(FILE_NAME);
@@ -53,13 +54,13 @@ impl Checksums {
         let mut found = None;
         if path.exists() {
             let text = std::fs::read_to_string(&path).map_err(DataError::io("reading the checksums", &path))?;
-            // A line that was cut off has no end, and its file no name yet.
+            // A truncated line has no line end, and its file does not exist yet.
             let lines: Vec<&str> = text.split_inclusive('\n').filter_map(|line| line.strip_suffix('\n')).collect();
             found = lines.iter().find_map(|line| line.strip_prefix(MADE_AS)).map(str::to_owned);
             if found.is_none() {
-                // It is not one of ours, and neither are the files that it names.
                 return Err(bad(format!(
-                    "its {FILE_NAME} does not say how the files were made; choose another folder"
+                    "the {FILE_NAME} is not from a conversion: it has no line `{}`; choose another folder",
+                    MADE_AS.trim_end()
                 )));
             }
             for (sum, name) in lines.iter().filter_map(|line| line.split_once("  ")) {
@@ -77,17 +78,16 @@ impl Checksums {
             }
         }
         checksums.refuse_others()?;
-        // Lists of what there is are written again whatever they say.
         let has_scenes = checksums.sums.keys().chain(&checksums.damaged).any(|name| has_ending(name, "torch"));
         match found {
             Some(found) if found != made_as && has_scenes => Err(bad(format!(
-                "its files were made as: {found}; asked for are: {made_as}; give the same options or choose another folder"
+                "its files were made as: {found}; requested: {made_as}; use the same options or choose another folder"
             ))),
             _ => Ok(checksums),
         }
     }
 
-    /// Refuses a folder with a file that has no line, or that is about to be removed and that no conversion writes.
+    /// Refuses a folder with a file without a line, and with a damaged file that no conversion writes.
     fn refuse_others(&self) -> Result<(), DataError> {
         let folder = &self.folder;
         let bad = |what: String| DataError::BadIndex { what, path: folder.clone() };
@@ -95,7 +95,7 @@ impl Checksums {
         if let Some(name) =
             self.damaged.iter().find(|name| !has_ending(name, "torch") && !LISTS.contains(&name.as_str()))
         {
-            return Err(bad(format!("its {name} is not what {FILE_NAME} says; choose an empty folder")));
+            return Err(bad(format!("the checksum of {name} differs from {FILE_NAME}; choose an empty folder")));
         }
         let entries = match std::fs::read_dir(folder) {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
@@ -106,30 +106,29 @@ impl Checksums {
             let is_ours = name == FILE_NAME || name.starts_with(TEMPORARY);
             if !is_ours && !self.sums.contains_key(&name) && !self.damaged.contains(&name) {
                 return Err(bad(format!(
-                    "it holds {name}, which is in no line of {FILE_NAME}; choose an empty folder"
+                    "it holds {name}, which is not listed in {FILE_NAME}; choose an empty folder"
                 )));
             }
         }
         Ok(())
     }
 
-    /// Makes the folder where it is new, and removes what kills in the middle of writing have left, and files that hold
-    /// something else than their line says.
+    /// Creates the folder if necessary, and removes temporary files of killed processes and damaged files.
     pub fn begin(&mut self) -> Result<(), DataError> {
         std::fs::create_dir_all(&self.folder).map_err(DataError::io("making the folder", &self.folder))?;
-        self.remove_leftovers().map_err(DataError::io("removing what a killed process left", &self.folder))?;
+        self.remove_leftovers().map_err(DataError::io("removing temporary files", &self.folder))?;
         for name in std::mem::take(&mut self.damaged) {
             self.delete(&name)?;
         }
         self.rewrite()
     }
 
-    /// The files that are complete.
+    /// Returns the names of the complete files.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.sums.keys().map(String::as_str)
     }
 
-    /// Writes a file, its line first.
+    /// Writes the line of a file, then the file.
     pub fn write(&mut self, name: &str, bytes: &[u8]) -> Result<(), DataError> {
         let sum = hex::encode(Sha256::digest(bytes));
         let line = format!("{sum}  {name}\n");
@@ -147,21 +146,21 @@ impl Checksums {
         replace_file(&path, bytes).map_err(DataError::io("writing a file", &path))
     }
 
-    /// Removes the files of these names that have a line.
+    /// Removes the files of these names that are listed, and their lines.
     pub fn remove_all<'a>(&mut self, names: impl IntoIterator<Item = &'a str>) -> Result<(), DataError> {
         let names: Vec<&str> = names.into_iter().filter(|name| self.sums.contains_key(*name)).collect();
         if names.is_empty() {
             return Ok(());
         }
         for name in names {
-            // A kill in between leaves lines without a file, and never a file without a line.
+            // The file goes first: a kill leaves a line without a file, never a file without a line.
             self.delete(name)?;
             self.sums.remove(name);
         }
         self.rewrite()
     }
 
-    /// Removes the temporary files of this folder, and of no other.
+    /// Removes the temporary files of this folder, but not of subfolders.
     fn remove_leftovers(&self) -> std::io::Result<()> {
         for entry in std::fs::read_dir(&self.folder)? {
             let entry = entry?;
@@ -174,7 +173,7 @@ impl Checksums {
 
     fn delete(&self, name: &str) -> Result<(), DataError> {
         let path = self.folder.join(name);
-        std::fs::remove_file(&path).map_err(DataError::io("removing a file that is to be written again", &path))
+        std::fs::remove_file(&path).map_err(DataError::io("removing an outdated file", &path))
     }
 
     fn rewrite(&self) -> Result<(), DataError> {
@@ -185,7 +184,7 @@ impl Checksums {
     }
 }
 
-/// SHA-256 of a file, in hexadecimal.
+/// Returns the SHA-256 of a file in hexadecimal.
 fn hash_file(path: &Path) -> Result<String, DataError> {
     let reading = || DataError::io("reading a file for its checksum", path);
     let mut file = File::open(path).map_err(reading())?;
@@ -205,7 +204,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_sum_of_a_file_is_sha_256s() {
+    fn checksums_are_sha256() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         std::fs::write(&path, b"abc").unwrap();
@@ -226,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn files_that_changed_and_lines_that_were_cut_are_forgotten() {
+    fn damaged_files_and_truncated_lines_are_dropped() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         three(folder.path());
@@ -235,7 +234,7 @@ mod tests {
         std::fs::write(at(FILE_NAME), format!("{text}18ac3e7343f01689")).unwrap();
         let mut checksums = Checksums::open(folder.path(), "chunks").unwrap();
         assert_eq!(checksums.names().collect::<Vec<_>>(), ["b.torch", "c.torch"]);
-        assert!(at("a.torch").exists(), "looking changes nothing");
+        assert!(at("a.torch").exists(), "opening changes nothing");
         checksums.begin().unwrap();
         assert!(!at("a.torch").exists());
         checksums.remove_all(["b.torch", "never.torch"]).unwrap();
@@ -246,13 +245,13 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_with_something_else_in_it_is_refused_at_any_time_and_left_as_it_was() {
+    fn folder_with_other_files_is_refused_unchanged() {
         let folder = tempfile::tempdir().unwrap();
         let refused = |name: &str| {
             std::fs::write(folder.path().join(name), "").unwrap();
             let message = Checksums::open(folder.path(), "chunks").unwrap_err().to_string();
             std::fs::remove_file(folder.path().join(name)).unwrap();
-            assert!(message.contains(&format!("it holds {name}, which is in no line of SHA256SUMS")), "{message}");
+            assert!(message.contains(&format!("it holds {name}, which is not listed in SHA256SUMS")), "{message}");
         };
         refused("thesis.txt");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
@@ -263,20 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn files_that_were_made_in_another_way_are_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        three(folder.path());
-        let message = |made_as: &str| Checksums::open(folder.path(), made_as).unwrap_err().to_string();
-        let expected = "its files were made as: chunks; asked for are: scenes; give the same options or choose another";
-        assert!(message("scenes").contains(expected), "{}", message("scenes"));
-        let path = folder.path().join(FILE_NAME);
-        let text = std::fs::read_to_string(&path).unwrap();
-        std::fs::write(&path, text.trim_start_matches("# made as: chunks\n")).unwrap();
-        assert!(message("chunks").contains("does not say how the files were made"), "{}", message("chunks"));
-    }
-
-    #[test]
-    fn a_folder_without_scenes_may_be_made_in_another_way() {
+    fn folder_without_scenes_accepts_other_options() {
         let folder = tempfile::tempdir().unwrap();
         let mut checksums = Checksums::open(folder.path(), "chunks").unwrap();
         checksums.begin().unwrap();
@@ -286,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_kill_leaves_is_removed_and_blocks_nothing() {
+    fn leftovers_of_a_kill_are_removed() {
         let folder = tempfile::tempdir().unwrap();
         let leftover = folder.path().join(".clift-Ab12Cd");
         std::fs::write(&leftover, "half a file").unwrap();
@@ -304,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_that_is_refused_keeps_everything_at_any_depth() {
+    fn refused_folder_keeps_nested_files() {
         let folder = tempfile::tempdir().unwrap();
         let mine = [".clift-x1", "mine/.clift-y2", ".clift-z3/notes.txt"].map(|name| folder.path().join(name));
         for path in &mine {
@@ -312,7 +298,7 @@ mod tests {
             std::fs::write(path, "x").unwrap();
         }
         let message = Checksums::open(folder.path(), "chunks").unwrap_err().to_string();
-        assert!(message.contains("it holds mine, which is in no line"), "{message}");
+        assert!(message.contains("it holds mine, which is not listed"), "{message}");
         assert!(mine.iter().all(|path| path.exists()));
         std::fs::rename(folder.path().join("mine"), folder.path().join(".clift-w4")).unwrap();
         three(folder.path());
@@ -320,14 +306,14 @@ mod tests {
     }
 
     #[test]
-    fn files_of_someone_elses_checksums_are_left_alone() {
+    fn checksums_of_other_programs_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         let sums = format!("{}  notes.txt\n", hex::encode(Sha256::digest(b"first")));
         std::fs::write(at("notes.txt"), "second").unwrap();
         for (text, expected) in [
-            (sums.clone(), "does not say how the files were made"),
-            (format!("{MADE_AS}chunks\n{sums}"), "its notes.txt is not what SHA256SUMS says"),
+            (sums.clone(), "the SHA256SUMS is not from a conversion"),
+            (format!("{MADE_AS}chunks\n{sums}"), "the checksum of notes.txt differs from SHA256SUMS"),
         ] {
             std::fs::write(at(FILE_NAME), &text).unwrap();
             let message =

@@ -1,4 +1,4 @@
-//! Any source as pixelSplat's chunks or as one file per scene, resumable and with checksums.
+//! Conversion of any source to pixelSplat's chunks or to one file per scene, resumable and with checksums.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
@@ -16,35 +16,34 @@ use crate::sources::test_scenes::KEPT_FOR_TESTING;
 use crate::tools::checksums::{Checksums, INDEX, SKIPPED};
 use crate::tools::export::ImageEncoding;
 
-/// Longest key that names a file: file systems take 255 bytes, the ending included.
+/// Longest key in bytes that names a file; file systems allow 255 with the ending.
 const MAX_NAME_BYTES: usize = 200;
 
-/// What is written.
+/// Format of the written files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ConvertTo {
-    /// `NNNNNN.torch` files of many scenes, each closed at so many bytes of images, and `index.json`.
+    /// Chunks `NNNNNN.torch` of many scenes, and `index.json`.
     Chunks {
-        /// Bytes of images.
+        /// Bytes of images at which a chunk is closed.
         target_bytes: u64,
     },
-    /// `<key>.torch`, a file per scene.
+    /// One file per scene, `<key>.torch`.
     Scenes,
 }
 
-/// How it is written.
+/// Options of a conversion.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConvertOptions {
-    /// Files.
+    /// Format of the files.
     pub to: ConvertTo,
-    /// How a frame is stored that has no file of its own: computed ones, and those whose lens distortion was undone.
-    /// Others keep theirs, byte by byte.
+    /// Encoding of frames without an image file: computed and undistorted ones. Image files are copied unchanged.
     pub encoding: ImageEncoding,
-    /// What the source was opened with, on one line; empty for the defaults.
+    /// Options with which the source was opened, on one line; empty for the defaults.
     pub opened_with: String,
 }
 
 impl ConvertOptions {
-    /// What two runs on one folder have to share, on one line.
+    /// Returns the options that two runs on one folder must share, on one line.
     fn made_as(&self) -> String {
         let form = match self.to {
             ConvertTo::Chunks { target_bytes } => format!("chunks of {target_bytes} bytes"),
@@ -59,84 +58,69 @@ impl ConvertOptions {
     }
 }
 
-/// What was written.
+/// Result of a conversion.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ConversionReport {
-    /// Scenes in the folder.
+    /// Number of scenes in the folder.
     pub num_scenes: usize,
-    /// Scenes of these that were there already, from a conversion that did not end.
+    /// Number of scenes found complete from an earlier run.
     pub num_found: usize,
-    /// Scenes that were there with other cameras, time stamps or numbers of frames than they have now; written anew.
+    /// Number of scenes found with other cameras, time stamps or frame counts, and written again.
     pub num_changed: usize,
-    /// Frames written now.
+    /// Number of frames written by this run.
     pub num_frames: usize,
-    /// Frames of these that had to be encoded.
+    /// Number of these frames that were encoded.
     pub num_encoded: usize,
-    /// Bytes of the images written now.
+    /// Bytes of the images written by this run.
     pub image_bytes: u64,
-    /// What opening the source left out, and scenes that could not be read.
-    pub left_out: SkipReport,
+    /// Scenes and frames skipped when the source was opened, and unreadable scenes.
+    pub skipped: SkipReport,
 }
 
-/// Opens a [`Converter`] and runs it.
-///
-/// # Errors
-/// As both.
-pub fn convert(
-    source: &dyn SceneSource,
-    left_out: &SkipReport,
-    folder: &Path,
-    options: &ConvertOptions,
-    done: impl FnMut(usize),
-) -> Result<ConversionReport, DataError> {
-    Converter::open(source, left_out, folder, options)?.run(done)
-}
-
-/// What a scene that is there is to the source's.
+/// State of a scene found in the folder, compared with the source.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum State {
     Same,
     Changed,
-    /// The source had it.
+    /// Skipped when the source was opened.
     Unreadable,
 }
 
-/// A folder that is to receive the scenes of a source.
+/// A conversion of the scenes of a source into a folder.
 ///
-/// Every file appears under its name only when it is complete, its SHA-256 in `SHA256SUMS`, which `sha256sum -c`
-/// reads. In a folder that was not finished, files are kept whose sums still hold and whose scenes still have the
-/// cameras, time stamps and numbers of frames of the source, and the rest is made; in one that was finished, all sums
-/// are verified. Pictures are not compared.
+/// A file under its final name is always complete, and `SHA256SUMS` (for `sha256sum -c`) has its checksum. A run on a
+/// folder of an earlier run verifies all checksums and keeps the files whose scenes have the cameras, time stamps and
+/// frame counts of the source; it writes the others again. Images are not compared.
 pub struct Converter<'a> {
     source: &'a dyn SceneSource,
     folder: PathBuf,
     options: ConvertOptions,
     checksums: Checksums,
-    /// File of every scene that is written.
+    /// File of every complete scene, by key.
     index: BTreeMap<String, String>,
-    /// Files with a scene that has changed.
+    /// Files with a changed scene.
     stale: BTreeSet<String>,
-    /// Scenes of files that stay which opening the source has left out.
+    /// Complete scenes that were skipped when the source was opened.
     unreadable: BTreeSet<String>,
     pending: Vec<SceneRecord>,
     pending_keys: HashSet<String>,
     fill: ChunkFill,
-    converted: ConversionReport,
+    report: ConversionReport,
 }
 
 impl<'a> Converter<'a> {
-    /// Looks at `folder` and writes nothing. `left_out` is what opening `source` left out.
+    /// Reads the state of `folder` and writes nothing. `skipped` is the report of opening `source`.
     ///
     /// # Errors
-    /// [`DataError::BadIndex`] for a folder with other files, of other scenes or made with other options.
+    /// [`DataError::BadIndex`] for a folder with other files, with other scenes, and of a conversion with other options.
     pub fn open(
         source: &'a dyn SceneSource,
-        left_out: &SkipReport,
+        skipped: &SkipReport,
         folder: &Path,
         options: &ConvertOptions,
     ) -> Result<Self, DataError> {
         let checksums = Checksums::open(folder, &options.made_as())?;
-        let mut conversion = Self {
+        let mut converter = Self {
             source,
             folder: folder.to_owned(),
             options: options.clone(),
@@ -147,18 +131,17 @@ impl<'a> Converter<'a> {
             pending: Vec::new(),
             pending_keys: HashSet::new(),
             fill: ChunkFill::default(),
-            converted: ConversionReport { left_out: left_out.clone(), ..ConversionReport::default() },
+            report: ConversionReport { skipped: skipped.clone(), ..ConversionReport::default() },
         };
-        conversion.look()?;
-        Ok(conversion)
+        converter.scan()?;
+        Ok(converter)
     }
 
-    /// Takes up the scenes of the files that the checksums knows.
-    fn look(&mut self) -> Result<(), DataError> {
-        let unreadable: HashSet<&str> =
-            self.converted.left_out.skips.iter().filter_map(SkippedScene::unreadable).collect();
+    /// Compares the scenes of the complete files with the source.
+    fn scan(&mut self) -> Result<(), DataError> {
+        let unreadable: HashSet<&str> = self.report.skipped.skips.iter().filter_map(unreadable_key).collect();
         let names: Vec<&str> = self.checksums.names().filter(|name| has_ending(name, "torch")).collect();
-        let look = |name: &str| {
+        let scan = |name: &str| {
             let path = self.folder.join(name);
             let tables: Vec<SceneTable> = ChunkTable::read(&path)?.scenes.into_values().collect();
             let states = tables.iter().map(|table| self.state(table, &path, &unreadable));
@@ -166,11 +149,11 @@ impl<'a> Converter<'a> {
             let scenes = tables.into_iter().map(|table| table.key).zip(states).collect();
             Ok((name.to_owned(), scenes))
         };
-        let looked: Vec<(String, Vec<(String, State)>)> =
-            names.into_par_iter().map(look).collect::<Result<_, DataError>>()?;
-        for (name, scenes) in looked {
+        let files: Vec<(String, Vec<(String, State)>)> =
+            names.into_par_iter().map(scan).collect::<Result<_, DataError>>()?;
+        for (name, scenes) in files {
             let num_changed = scenes.iter().filter(|(_, state)| *state == State::Changed).count();
-            self.converted.num_changed += num_changed;
+            self.report.num_changed += num_changed;
             if num_changed > 0 {
                 self.stale.insert(name);
                 continue;
@@ -182,36 +165,36 @@ impl<'a> Converter<'a> {
                 self.index.insert(key, name.clone());
             }
         }
-        self.converted.num_found = self.index.len();
+        self.report.num_found = self.index.len();
         Ok(())
     }
 
-    /// How a scene that is there compares to the source's. `unreadable` are those that opening the source left out.
+    /// Compares a scene of the folder with the source. `unreadable` are the keys skipped when the source was opened.
     fn state(&self, table: &SceneTable, path: &Path, unreadable: &HashSet<&str>) -> Result<State, DataError> {
         let key = &table.key;
         let Some(scene) = self.source.find(key).filter(|scene| self.source.key(*scene) == key) else {
             if unreadable.contains(key.as_str()) {
                 return Ok(State::Unreadable);
             }
-            let what = format!("it holds scene {key}, which is not to be converted; choose another folder");
+            let what = format!("it holds scene {key}, which the source does not have; choose another folder");
             return Err(DataError::BadIndex { what, path: path.to_owned() });
         };
         let now = self.source.timestamps(scene).and_then(|times| Ok((times, self.source.cameras(scene)?)));
-        // What cannot be read any more is no reason to throw away what could be.
+        // A converted scene that the source can no longer read is kept.
         let Ok((timestamps, cameras)) = now else { return Ok(State::Same) };
         Ok(if table.is_of(path, &timestamps, &cameras)? { State::Same } else { State::Changed })
     }
 
-    /// Writes the scenes that are missing; one that cannot be read is left out, with the reason in the result and in
-    /// `skipped.json`. `done` is told how many scenes are ready.
+    /// Writes the missing scenes, and calls `progress` with the number of finished scenes.
+    ///
+    /// Unreadable scenes are skipped, with the reason in the result and in `skipped.json`.
     ///
     /// # Errors
     /// [`DataError::Io`] from writing.
-    pub fn run(mut self, mut done: impl FnMut(usize)) -> Result<ConversionReport, DataError> {
+    pub fn run(mut self, mut progress: impl FnMut(usize)) -> Result<ConversionReport, DataError> {
         self.checksums.begin()?;
         let stale = std::mem::take(&mut self.stale);
-        if !stale.is_empty() || self.index_names_others() {
-            // It names files that are about to go, or are gone.
+        if !stale.is_empty() || self.is_index_outdated() {
             self.checksums.remove_all([INDEX])?;
         }
         self.checksums.remove_all(stale.iter().map(String::as_str))?;
@@ -220,37 +203,38 @@ impl<'a> Converter<'a> {
             if !self.index.contains_key(key) && !self.pending_keys.contains(key) {
                 match record(self.source, scene, self.options.encoding) {
                     Ok((record, num_encoded)) => self.add(record, num_encoded)?,
-                    Err(error) => self.converted.left_out.skip(key, error.to_string()),
+                    Err(error) => self.report.skipped.skip(key, error.to_string()),
                 }
             }
-            done(self.index.len() + self.pending.len());
+            progress(self.index.len() + self.pending.len());
         }
         self.finish()
     }
 
-    /// Whether the index that is there names files that are not.
-    fn index_names_others(&self) -> bool {
-        let there: HashSet<&str> = self.checksums.names().collect();
-        let is_other = |index: BTreeMap<String, String>| index.values().any(|file| !there.contains(file.as_str()));
-        there.contains(INDEX) && read_index(&self.folder.join(INDEX)).map_or(true, is_other)
+    /// Returns whether the index of an earlier run names missing files.
+    fn is_index_outdated(&self) -> bool {
+        let complete: HashSet<&str> = self.checksums.names().collect();
+        let names_missing =
+            |index: BTreeMap<String, String>| index.values().any(|file| !complete.contains(file.as_str()));
+        complete.contains(INDEX) && read_index(&self.folder.join(INDEX)).map_or(true, names_missing)
     }
 
     fn add(&mut self, record: SceneRecord, num_encoded: usize) -> Result<(), DataError> {
         let image_bytes = record.images.iter().map(|image| image.len() as u64).sum::<u64>();
         if let Err(what) = record.check() {
-            self.converted.left_out.skip(record.key, what);
+            self.report.skipped.skip(record.key, what);
             return Ok(());
         }
         if self.options.to == ConvertTo::Scenes && !is_file_name(&record.key) {
-            self.converted.left_out.skip(record.key, "its key is no name for a file; convert to chunks");
+            self.report.skipped.skip(record.key, "its key is not a valid file name; convert to chunks");
             return Ok(());
         }
         if !self.fill.has_room(&record) {
             self.flush()?;
         }
-        self.converted.num_frames += record.images.len();
-        self.converted.num_encoded += num_encoded;
-        self.converted.image_bytes += image_bytes;
+        self.report.num_frames += record.images.len();
+        self.report.num_encoded += num_encoded;
+        self.report.image_bytes += image_bytes;
         self.fill.add(&record);
         self.pending_keys.insert(record.key.clone());
         self.pending.push(record);
@@ -282,10 +266,9 @@ impl<'a> Converter<'a> {
         Ok(())
     }
 
-    /// The first chunk name that is not in use.
+    /// Returns the first unused chunk name.
     fn free_name(&self) -> String {
         let used: HashSet<&String> = self.index.values().collect();
-        // Of one name more than there are files, one is free.
         (0..=used.len()).map(chunk_name).find(|name| !used.contains(name)).unwrap_or_default()
     }
 
@@ -294,19 +277,17 @@ impl<'a> Converter<'a> {
         if !self.unreadable.is_empty() {
             let names: Vec<&String> = self.unreadable.iter().collect();
             let scenes = plural(names.len(), "scene");
-            let left_out = &mut self.converted.left_out;
-            left_out
-                .notes
-                .push(format!("{scenes} could not be read again, kept as converted before ({})", first_few(&names)));
-            left_out.skips.retain(|skip| !self.unreadable.contains(&skip.key));
+            let skipped = &mut self.report.skipped;
+            skipped.notes.push(format!("{scenes} unreadable now, kept as converted before ({})", first_few(&names)));
+            skipped.skips.retain(|skip| !self.unreadable.contains(&skip.key));
         }
         let is_chunks = self.options.to != ConvertTo::Scenes;
         let index = (is_chunks && !self.index.is_empty()).then(|| serde_json::to_vec_pretty(&self.index));
-        let left_out = &self.converted.left_out;
-        let skipped = left_out.has_skips().then(|| serde_json::to_vec_pretty(left_out));
+        let skipped = &self.report.skipped;
+        let skipped = skipped.has_skips().then(|| serde_json::to_vec_pretty(skipped));
         for (name, text) in [(INDEX, index), (SKIPPED, skipped)] {
             let Some(text) = text else {
-                // What an earlier run left out is there now.
+                // The list of an earlier run is outdated.
                 self.checksums.remove_all([name])?;
                 continue;
             };
@@ -314,19 +295,17 @@ impl<'a> Converter<'a> {
             let text = text.map_err(|error| DataError::BadIndex { what: error.to_string(), path })?;
             self.checksums.write(name, &text)?;
         }
-        self.converted.num_scenes = self.index.len();
-        Ok(self.converted)
+        self.report.num_scenes = self.index.len();
+        Ok(self.report)
     }
 }
 
-impl SkippedScene {
-    /// The key of a scene that would be used if it could be.
-    fn unreadable(&self) -> Option<&str> {
-        (!self.reason.starts_with(KEPT_FOR_TESTING)).then_some(&self.key)
-    }
+/// Returns the key of a scene that was skipped because it is unreadable, not because it is reserved for testing.
+fn unreadable_key(skip: &SkippedScene) -> Option<&str> {
+    (!skip.reason.starts_with(KEPT_FOR_TESTING)).then_some(&skip.key)
 }
 
-/// Reads a scene; also says how many of its frames had to be encoded.
+/// Reads a scene. Returns the scene and the number of encoded frames.
 fn record(source: &dyn SceneSource, scene: usize, encoding: ImageEncoding) -> Result<(SceneRecord, usize), DataError> {
     let cameras = source.cameras(scene)?;
     let timestamps = source.timestamps(scene)?;
@@ -344,6 +323,7 @@ fn record(source: &dyn SceneSource, scene: usize, encoding: ImageEncoding) -> Re
     Ok((SceneRecord { key, url: source.url(scene)?, timestamps, cameras, images }, num_encoded))
 }
 
+/// Returns whether a key is a valid file name on all operating systems.
 fn is_file_name(key: &str) -> bool {
     !key.is_empty()
         && !key.starts_with('.')

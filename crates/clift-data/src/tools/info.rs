@@ -1,4 +1,4 @@
-//! A short description of a source, for people: counts, sizes, fields of view, extents.
+//! Summary of a source: counts, image size, fields of view, extents.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -9,29 +9,29 @@ use crate::scene_source::SceneSource;
 use crate::skip_report::SkippedScene;
 use crate::statistics::MinMedianMax;
 
-/// What a source holds. Spreads and sizes are `None` for a source without scenes.
+/// Summary of a source. The optional fields are `None` for a source without scenes.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SourceInfo {
-    /// How many scenes there are.
+    /// Number of scenes.
     pub num_scenes: usize,
     /// Frames per scene.
     pub num_frames: Option<MinMedianMax>,
-    /// Columns and rows of the first frame there is.
+    /// Columns and rows of the first readable frame.
     pub image_size: Option<[usize; 2]>,
-    /// The wider of the two fields of view, one number per frame.
+    /// Wider field of view of each frame, in degrees.
     pub fov_deg: Option<MinMedianMax>,
-    /// Largest distance along a world axis of a camera centre from the scene's mean centre, one number per scene.
+    /// Largest distance of a camera centre from the mean centre along a world axis, one number per scene.
     pub extent: Option<MinMedianMax>,
-    /// Scenes whose cameras cannot be read, and those before the first whose first image can, with the error as the
-    /// reason.
+    /// Scenes with unreadable cameras, and scenes with an unreadable first image until one is readable; the reason is
+    /// the error.
     pub unreadable: Vec<SkippedScene>,
 }
 
 impl SourceInfo {
-    /// Reads every scene's cameras, on all cores, and one frame.
+    /// Reads the cameras of every scene, on all cores, and one frame.
     ///
     /// # Errors
-    /// The first scene's when none can be read.
+    /// The error of the first scene if no scene can be read.
     pub fn read(source: &dyn SceneSource) -> Result<Self, DataError> {
         let read = (0..source.num_scenes()).into_par_iter().map(|scene| {
             let cameras = source.cameras(scene)?;
@@ -72,6 +72,7 @@ impl SourceInfo {
     }
 }
 
+/// Returns the largest distance of a camera centre from the mean centre along a world axis.
 fn extent(cameras: &[Camera]) -> f64 {
     let count = cameras.len() as f64;
     let axis = |i: usize| {
@@ -91,7 +92,7 @@ mod tests {
     use crate::sources::filters::SceneFilters;
 
     #[test]
-    fn a_scene_that_cannot_be_read_is_named_and_the_others_are_described() {
+    fn unreadable_scene_is_named_and_the_others_are_summarised() {
         let root = tempfile::tempdir().unwrap();
         let train = root.path().join("train");
         std::fs::create_dir(&train).unwrap();
@@ -107,13 +108,13 @@ mod tests {
     }
 
     #[test]
-    fn a_source_is_described_by_counts_size_field_of_view_and_extent() {
+    fn summary_of_the_fixture_matches_values_by_hand() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
         let source = ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap();
         let info = SourceInfo::read(&source).unwrap();
         assert_eq!((info.num_scenes, info.image_size), (2, Some([64, 36])));
         assert_eq!(info.num_frames, Some(MinMedianMax { min: 8.0, median: 8.0, max: 8.0 }));
-        // 2 atan(0.5 / 0.9) = 58.1 degrees; centres are 0, 0.1, .., 0.7 along x, 0.35 from their mean.
+        // 2 atan(0.5 / 0.9) = 58.1 degrees; centres are 0, 0.1, .., 0.7 along x, up to 0.35 from the mean.
         assert_eq!(format!("{:.1}", info.fov_deg.unwrap()), "58.1 / 58.1 / 58.1");
         assert_eq!(format!("{:.3}", info.extent.unwrap()), "0.350 / 0.350 / 0.350");
     }

@@ -1,13 +1,13 @@
-//! `clift data`: info, index, convert.
+//! The operations of `clift data`: info, check, convert, index, synth.
 //!
 //! - `info`: counts and sizes of a source
 //! - `index_census`: statistics of an evaluation index
 //! - `overlap_index`: make an evaluation index
 //! - `export`: write a source as chunks
 //! - `convert`: convert any layout, resumable
-//! - `checksums`: SHA256SUMS of a folder in progress
-//! - `features`: corners and epipolar geometry
-//! - `check`: `clift data check`
+//! - `checksums`: `SHA256SUMS` of a conversion in progress
+//! - `features`: corners, matches and epipolar geometry
+//! - `check`: images, cameras, and poses against the images
 
 pub(crate) mod check;
 pub(crate) mod checksums;

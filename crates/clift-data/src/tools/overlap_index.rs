@@ -1,4 +1,4 @@
-//! An evaluation index for one's own data, drawn as pixelSplat's was: pairs of frames that overlap.
+//! Evaluation indices of own data, sampled like pixelSplat's: pairs of frames that overlap.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -15,18 +15,18 @@ use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, first_few, plural};
 use crate::tools::export::write_index;
 
-/// What an index asks for. The defaults are those of the published RealEstate10K index with four contexts.
+/// Options of an overlap index. The defaults are those of the published RealEstate10K index with four contexts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct OverlapOptions {
-    /// Context frames per scene, at least 2.
+    /// Number of context frames per scene, at least 2.
     pub num_context: usize,
-    /// Target frames per scene, at least 1.
+    /// Number of target frames per scene, at least 1.
     pub num_targets: usize,
-    /// Fewest and most frames from the first context to the last.
+    /// Smallest and largest gap between the first and the last context frame.
     pub distance: [usize; 2],
-    /// Least [`overlap`] of the first and the last context, in both directions.
+    /// Smallest [`overlap`] of the first and the last context, in both directions.
     pub min_overlap: f64,
-    /// Decides which of the possible frames are taken.
+    /// Seed of the selection among the possible frames.
     pub seed: u64,
 }
 
@@ -40,7 +40,7 @@ impl OverlapOptions {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::BadConfig`] naming the field that cannot hold.
+    /// [`DataError::BadConfig`] with the first invalid field.
     pub fn validate(&self) -> Result<(), DataError> {
         let fail = |key: &str, problem: String| Err(DataError::bad_config(key, problem));
         let Self { num_context, num_targets, distance: [near, far], min_overlap, .. } = *self;
@@ -49,11 +49,14 @@ impl OverlapOptions {
         }
         if near + 1 < num_context || far < near {
             let problem =
-                format!("is {near} to {far}; {num_context} contexts lie {} frames or more apart", num_context - 1);
+                format!("is {near} to {far}; {num_context} contexts need a gap of {} or more", num_context - 1);
             return fail("distance", problem);
         }
         if num_targets == 0 || num_targets > near + 1 {
-            return fail("num_targets", format!("is {num_targets}; a stretch has as few as {} frames", near + 1));
+            return fail(
+                "num_targets",
+                format!("is {num_targets}; use 1 to {}, the frames of the smallest gap", near + 1),
+            );
         }
         if !(0.0..=1.0).contains(&min_overlap) {
             return fail("min_overlap", format!("is {min_overlap}; use 0 to 1"));
@@ -61,10 +64,11 @@ impl OverlapOptions {
         Ok(())
     }
 
-    /// Draws the views of a scene: a frame at random, a partner at random among those that follow it in steps of one
-    /// from the smallest distance on, in both directions, while the overlap lasts; the next frame at random where none
-    /// does. Targets are distinct, from the first context to the last, contexts included, in increasing order. Inner
-    /// contexts are distinct and uniform. The error is a reason for the report.
+    /// Samples the views of a scene, or returns the reason for the skip report.
+    ///
+    /// Frames are visited in random order. The partner of a frame is uniform among the frames at increasing distance, in
+    /// both directions, up to the first without enough overlap. The first frame with a partner is used. Targets are
+    /// distinct, sorted, and may be contexts; inner contexts are distinct and uniform.
     fn sample_views(&self, key: &str, cameras: &[Camera]) -> Result<ViewIndices, String> {
         let num_frames = cameras.len();
         let [near, far] = self.distance;
@@ -96,13 +100,14 @@ impl OverlapOptions {
     }
 }
 
-/// Writes an index of every scene of `sources` that [`EvaluationIndex`](crate::sampling::evaluation_index::EvaluationIndex) reads, `null` for
-/// scenes without such views; nothing if no scene has any. The report says which and why. A scene's views depend on its
-/// cameras, its key and the seed alone: other scenes may come and go.
+/// Writes an evaluation index of every scene of `sources`, `null` for scenes without overlapping frames.
+///
+/// No file is written if no scene has views. The report lists the scenes without views and the reasons. The views of a
+/// scene depend only on the cameras, the key and the seed.
 ///
 /// # Errors
-/// [`DataError::BadConfig`] for options that cannot hold, [`DataError::BadIndex`] for a key that two sources have with
-/// different cameras, and [`DataError::Io`]. A scene whose cameras cannot be read is in the report.
+/// [`DataError::BadConfig`] for invalid options, [`DataError::BadIndex`] for a key that two sources have with different
+/// cameras, and [`DataError::Io`]. Scenes with unreadable cameras are skipped.
 pub fn write_overlap_index(
     path: &Path,
     sources: &[&dyn SceneSource],
@@ -110,42 +115,41 @@ pub fn write_overlap_index(
 ) -> Result<SkipReport, DataError> {
     options.validate()?;
     let mut scenes: Vec<(&dyn SceneSource, usize)> = Vec::new();
-    let mut places: HashMap<&str, usize> = HashMap::new();
+    let mut positions: HashMap<&str, usize> = HashMap::new();
     let mut shared = Vec::new();
     for (source, scene) in sources.iter().flat_map(|source| (0..source.num_scenes()).map(|scene| (*source, scene))) {
         let key = source.key(scene);
-        let place = *places.entry(key).or_insert(scenes.len());
-        let Some(&(other, other_scene)) = scenes.get(place) else {
+        let position = *positions.entry(key).or_insert(scenes.len());
+        let Some(&(other, other_scene)) = scenes.get(position) else {
             scenes.push((source, scene));
             continue;
         };
         match (other.cameras(other_scene), source.cameras(scene)) {
             (Ok(a), Ok(b)) if a != b => {
-                let what = format!("scene {key} is in both halves with other cameras; make an index of each");
+                let what = format!("scene {key} is in both splits with different cameras; make one index per split");
                 return Err(DataError::BadIndex { what, path: path.to_owned() });
             }
-            (Err(_), Ok(_)) => scenes[place] = (source, scene),
+            (Err(_), Ok(_)) => scenes[position] = (source, scene),
             _ => {}
         }
         shared.push(key);
     }
     let note = |shared: &[&str]| {
-        format!("{} in both halves, counted once ({})", plural(shared.len(), "scene"), first_few(shared))
+        format!("{} in both splits, counted once ({})", plural(shared.len(), "scene"), first_few(shared))
     };
     let notes = (!shared.is_empty()).then(|| note(&shared)).into_iter().collect();
-    let draw = |(source, scene): &(&dyn SceneSource, usize)| {
+    let sample = |(source, scene): &(&dyn SceneSource, usize)| {
         let cameras = source.cameras(*scene).map_err(|error| error.to_string())?;
         options.sample_views(source.key(*scene), &cameras)
     };
-    let drawn: Vec<_> = scenes.par_iter().map(draw).collect();
-    let mut report = SkipReport { notes, ..SkipReport::new(drawn.len()) };
-    let mut entries = Vec::with_capacity(drawn.len());
-    for ((source, scene), views) in scenes.into_iter().zip(drawn) {
+    let sampled: Vec<_> = scenes.par_iter().map(sample).collect();
+    let mut report = SkipReport { notes, ..SkipReport::new(sampled.len()) };
+    let mut entries = Vec::with_capacity(sampled.len());
+    for ((source, scene), views) in scenes.into_iter().zip(sampled) {
         let key = source.key(scene);
         let views = views.map_err(|reason| report.skip(key, reason)).ok();
         entries.push((key, views));
     }
-    // Nothing to evaluate is no index.
     if report.num_used() > 0 {
         write_index(path, entries)?;
     }
@@ -173,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn every_pair_of_the_index_overlaps_and_lies_as_far_apart_as_asked() {
+    fn every_pair_overlaps_at_an_allowed_distance() {
         let source = rooms(60, 3.0);
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
         let (written, report) = index(&source, &options);
@@ -196,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn scenes_without_views_are_null_and_in_the_ledger() {
+    fn scenes_without_views_are_null_and_reported() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         let report = write_overlap_index(&path, &[&rooms(40, 3.0)], &OverlapOptions::default()).unwrap();
@@ -207,7 +211,7 @@ mod tests {
         assert_eq!(report.to_string(), "19 of 20 scenes used; 1 shorter than 46 frames");
     }
 
-    /// Rooms of which the first has ten frames.
+    /// Returns rooms of which the first has ten frames.
     fn first_is_short(rooms: SyntheticSource) -> TestSource {
         TestSource::new(rooms).with_cameras(|scene, mut cameras| {
             cameras.truncate(if scene == 0 { 10 } else { usize::MAX });
@@ -216,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_turns_away_has_pairs_only_as_far_apart_as_it_still_sees_the_same() {
+    fn turning_camera_has_only_pairs_with_overlap() {
         // 75 degrees wide, three degrees per frame: half of the view is left after some 12 frames, nothing after 25.
         let intrinsics_norm = crate::geometry::camera::IntrinsicsNorm { fx: 0.65, fy: 0.65, cx: 0.5, cy: 0.5 };
         let camera = |frame: usize| {
@@ -237,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn views_depend_on_the_seed_and_not_on_the_other_scenes() {
+    fn views_do_not_depend_on_other_scenes() {
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
         let views = |source: &SyntheticSource, options: &OverlapOptions| {
             index(source, options).0.usable().map(|(key, views)| (key.to_owned(), views.clone())).collect::<Vec<_>>()
@@ -251,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn an_index_of_two_halves_has_the_scenes_of_both_and_a_shared_one_once() {
+    fn index_of_two_splits_has_shared_scenes_once() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
@@ -268,15 +272,15 @@ mod tests {
         let report = write_overlap_index(&path, &[&other, &other], &options).unwrap();
         assert_eq!(report.num_scenes, 3);
         let keys = [0, 1, 2].map(|scene| other.key(scene)).join(", ");
-        assert_eq!(report.notes, [format!("3 scenes in both halves, counted once ({keys})")]);
+        assert_eq!(report.notes, [format!("3 scenes in both splits, counted once ({keys})")]);
         let rooms = rooms(60, 3.0);
         let shorter = first_is_short(self::rooms(60, 3.0));
         let message = write_overlap_index(&path, &[&rooms, &shorter], &options).unwrap_err().to_string();
-        assert!(message.contains("is in both halves with other cameras; make an index of each"), "{message}");
+        assert!(message.contains("is in both splits with different cameras; make one index per split"), "{message}");
     }
 
     #[test]
-    fn of_a_shared_scene_the_half_counts_that_can_be_read() {
+    fn readable_split_of_a_shared_scene_is_used() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("index.json");
         let options = OverlapOptions { distance: [8, 30], ..OverlapOptions::default() };
@@ -294,16 +298,18 @@ mod tests {
     }
 
     #[test]
-    fn options_that_cannot_hold_are_named() {
-        let check = |options: OverlapOptions| options.validate().unwrap_err().to_string();
+    fn invalid_option_is_named() {
         let valid = OverlapOptions::default;
-        assert!(check(OverlapOptions { num_context: 1, ..valid() }).starts_with("num_context is 1"));
-        assert!(check(OverlapOptions { num_targets: 0, ..valid() }).starts_with("num_targets is 0"));
-        assert!(check(OverlapOptions { num_targets: 47, ..valid() }).starts_with("num_targets is 47"));
-        assert!(
-            check(OverlapOptions { distance: [2, 9], ..valid() }).contains("4 contexts lie 3 frames or more apart")
-        );
-        assert!(check(OverlapOptions { distance: [9, 8], ..valid() }).starts_with("distance is 9 to 8"));
-        assert!(check(OverlapOptions { min_overlap: f64::NAN, ..valid() }).starts_with("min_overlap is NaN"));
+        for (options, expected) in [
+            (OverlapOptions { num_context: 1, ..valid() }, "num_context is 1"),
+            (OverlapOptions { num_targets: 0, ..valid() }, "num_targets is 0"),
+            (OverlapOptions { num_targets: 47, ..valid() }, "num_targets is 47"),
+            (OverlapOptions { distance: [2, 9], ..valid() }, "distance is 2 to 9; 4 contexts need a gap of 3 or more"),
+            (OverlapOptions { distance: [9, 8], ..valid() }, "distance is 9 to 8"),
+            (OverlapOptions { min_overlap: f64::NAN, ..valid() }, "min_overlap is NaN"),
+        ] {
+            let message = options.validate().unwrap_err().to_string();
+            assert!(message.starts_with(expected), "{message}");
+        }
     }
 }

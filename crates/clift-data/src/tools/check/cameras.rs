@@ -1,4 +1,4 @@
-//! Plausible intrinsics and poses, whatever the images show.
+//! Checks of intrinsics and poses without the images.
 
 use crate::geometry::camera::Camera;
 use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale};
@@ -12,28 +12,28 @@ const FOV_DEG: [f64; 2] = [5.0, 120.0];
 const FILTERED_FOV_DEG: f64 = 100.0;
 /// Plausible principal points, over width and height.
 const PRINCIPAL_POINT: [f64; 2] = [0.25, 0.75];
-/// Aspect ratio of a pixel, or its inverse, above which a note is made.
+/// Aspect ratio of a pixel, or the inverse, above which a note is added.
 const NOTED_ASPECT: f64 = 1.02;
-/// Aspect ratio of a pixel, or its inverse, above which a scene is flagged.
-const MOST_ASPECT: f64 = 1.5;
-/// Entry of `R^T R - I` above which a rotation is flagged; files with four digits stay below.
-const MOST_DEFECT: f64 = 1e-3;
-/// Entry of `R^T R - I` above which a note is made; f32 files stay below.
+/// Aspect ratio of a pixel, or the inverse, above which a scene fails.
+const MAX_ASPECT: f64 = 1.5;
+/// Entry of `R^T R - I` above which a scene fails; files with four digits stay below.
+const MAX_DEFECT: f64 = 1e-3;
+/// Entry of `R^T R - I` above which a note is added; f32 files stay below.
 const NOTED_DEFECT: f64 = 1e-4;
 
 /// Checks intrinsics, rotations and centres.
 pub(crate) fn check_cameras(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     if cameras.is_empty() {
-        check.reasons.push("it has no frames".into());
+        check.reasons.push("the scene has no frames".into());
         return;
     }
-    intrinsics(cameras, sizes, check);
+    check_intrinsics(cameras, sizes, check);
     let defects = cameras.iter().map(|camera| camera.c2w.orthonormality_defect());
     let worst = defects.fold(0.0, f64::max);
     check.rotation_defect = Some(worst);
-    let sentence = format!("rotations are off orthonormal ones by up to {worst:.1e}");
-    if worst > MOST_DEFECT {
-        check.reasons.push(format!("{sentence}, more than {MOST_DEFECT:.0e}"));
+    let sentence = format!("rotations depart from orthonormal ones by up to {worst:.1e}");
+    if worst > MAX_DEFECT {
+        check.reasons.push(format!("{sentence}, more than {MAX_DEFECT:.0e}"));
     } else if worst > NOTED_DEFECT {
         check.notes.push(sentence);
     }
@@ -44,7 +44,8 @@ pub(crate) fn check_cameras(cameras: &[Camera], sizes: &Sizes, check: &mut Scene
     }
 }
 
-fn intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
+/// Checks fields of view, principal points and the aspect ratio of the pixels.
+fn check_intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     let frames_where = |test: &dyn Fn(&Camera) -> bool| -> Vec<usize> {
         cameras.iter().enumerate().filter(|(_, camera)| test(camera)).map(|(frame, _)| frame).collect()
     };
@@ -66,7 +67,7 @@ fn intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
             .reasons
             .push(format!("fields of view of {narrow:.1} and {wide:.1} degrees in {frames}, expected {low} to {high}"));
     } else if widest > FILTERED_FOV_DEG {
-        check.notes.push(format!("a field of view of {widest:.1} degrees; filters often leave out above 100"));
+        check.notes.push(format!("a field of view of {widest:.1} degrees; published filters skip scenes above 100"));
     }
     let [low, high] = PRINCIPAL_POINT;
     let middle = low..=high;
@@ -89,8 +90,8 @@ fn intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     let off = |aspect: f64| aspect.max(1.0 / aspect);
     let Some(worst) = aspects.reduce(|a, b| if off(b) > off(a) { b } else { a }) else { return };
     let sentence = format!("focal lengths in pixels have the ratio fx / fy = {worst:.3}");
-    if off(worst) > MOST_ASPECT {
-        check.reasons.push(format!("{sentence}: are they for another image size?"));
+    if off(worst) > MAX_ASPECT {
+        check.reasons.push(format!("{sentence}: the intrinsics may belong to another image size"));
     } else if off(worst) > NOTED_ASPECT {
         check.notes.push(format!("{sentence}: pixels are not square"));
     }

@@ -1,4 +1,4 @@
-//! Poses against the images: matched corners must lie on each other's epipolar lines.
+//! Check of the poses against the images: matched corners must lie on each other's epipolar lines.
 
 use std::sync::OnceLock;
 
@@ -14,26 +14,26 @@ use crate::tools::features::correspondence::Correspondence;
 use crate::tools::features::epipolar::{epipolar_distance, fundamental_from_cameras};
 use crate::tools::features::features::Features;
 
-/// Pairs of frames of a scene.
+/// Number of pairs of frames of a scene.
 const NUM_PAIRS: usize = 9;
-/// Numbers of frames of a scene over those between the two of a pair, tried in this order: at larger distances a wrong
-/// pose shows more, and fewer corners match.
-const PARTS: [usize; 4] = [6, 10, 16, 24];
-/// Most matches of one pair in the scene's median, so that no pair dominates.
+/// Frames of a scene over the gap of a pair, tried in this order: a larger gap shows wrong poses better, but fewer
+/// corners match.
+const GAP_DIVISORS: [usize; 4] = [6, 10, 16, 24];
+/// Largest number of matches of one pair in the median of the scene, so that no pair dominates.
 const MAX_MATCHES: usize = 150;
-/// Fewest matches of a scene for a median.
+/// Smallest number of matches of a scene for a median.
 const MIN_MATCHES: usize = 40;
-/// Epipolar distance in pixels above which a pair is noted in a scene that passes.
+/// Epipolar distance in pixels above which a note on a pair is added in a scene that passes.
 const NOTED_PX: f64 = 3.0;
 
-/// A pair with its matches, to draw it.
+/// A pair of frames with its matches.
 struct Pair {
     check: PairCheck,
     matches: Vec<Correspondence>,
     distances: Vec<f64>,
 }
 
-/// Measures the epipolar distance of a scene, and draws the pair nearest to it.
+/// Measures the epipolar distance of a scene. Returns an image of the pair nearest to the median of the scene.
 pub(crate) fn check_poses(
     source: &dyn SceneSource,
     scene: usize,
@@ -44,14 +44,14 @@ pub(crate) fn check_poses(
     let features: Vec<OnceLock<Option<Features>>> = (0..cameras.len()).map(|_| OnceLock::new()).collect();
     let view = SceneViews { source, scene, cameras, sizes, features };
     let mut pairs: Vec<Pair> = view.anchors().into_par_iter().filter_map(|anchor| view.pair_from(anchor)).collect();
-    // At the end of a scene two frames may have chosen each other.
+    // Two frames near the end of a scene may select each other.
     pairs.sort_by_key(|pair| pair.check.frames);
     pairs.dedup_by_key(|pair| pair.check.frames);
     check.pairs = pairs.iter().map(|pair| pair.check.clone()).collect();
-    let pooled: Vec<f64> = pairs.iter().flat_map(|pair| evenly(&pair.distances, MAX_MATCHES)).collect();
+    let pooled: Vec<f64> = pairs.iter().flat_map(|pair| subsample(&pair.distances, MAX_MATCHES)).collect();
     if pooled.len() < MIN_MATCHES {
         check.notes.push(format!(
-            "poses were not compared with the images: {} matching corners in {} pairs of frames",
+            "poses were not compared with the images: only {} matching corners in {} pairs of frames",
             pooled.len(),
             pairs.len()
         ));
@@ -62,22 +62,23 @@ pub(crate) fn check_poses(
     if scene_px > MAX_EPIPOLAR_PX {
         check.reasons.push(format!(
             "corners lie {scene_px:.2} px from their epipolar lines (median at 640 columns), more than \
-             {MAX_EPIPOLAR_PX}: poses or intrinsics do not fit the images"
+             {MAX_EPIPOLAR_PX}: poses or intrinsics do not match the images"
         ));
     } else {
         for PairCheck { frames: [a, b], epipolar_px, .. } in &check.pairs {
             if *epipolar_px > NOTED_PX {
                 check.notes.push(format!(
-                    "frames {a} and {b} alone: {epipolar_px:.1} px; their poses, or a pattern that repeats"
+                    "frames {a} and {b}: {epipolar_px:.1} px; either their poses are wrong or a pattern repeats"
                 ));
             }
         }
     }
     let off = |pair: &Pair| (pair.check.epipolar_px - scene_px).abs();
-    let shown = pairs.iter().min_by(|a, b| off(a).total_cmp(&off(b)))?;
-    view.draw(shown)
+    let typical = pairs.iter().min_by(|a, b| off(a).total_cmp(&off(b)))?;
+    view.plot(typical)
 }
 
+/// A scene with the features of the frames computed so far.
 struct SceneViews<'a> {
     source: &'a dyn SceneSource,
     scene: usize,
@@ -87,18 +88,18 @@ struct SceneViews<'a> {
 }
 
 impl SceneViews<'_> {
-    /// First frames of the pairs, spread over the scene.
+    /// Returns the first frames of the pairs, spread over the scene.
     fn anchors(&self) -> Vec<usize> {
         let count = self.cameras.len().saturating_sub(1);
         let num_pairs = NUM_PAIRS.min(count);
-        (0..num_pairs).map(|place| place * count / num_pairs).collect()
+        (0..num_pairs).map(|pair| pair * count / num_pairs).collect()
     }
 
-    /// The first partner whose corners match, from far to near in the order of the frames, then the frame of the most
-    /// similar camera: photos need not be in order.
+    /// Returns the pair with the first partner whose corners match: from large to small gaps, then the frame of the most
+    /// similar camera, because photos need not be in order.
     fn pair_from(&self, anchor: usize) -> Option<Pair> {
         let num_frames = self.cameras.len();
-        let mut gaps: Vec<usize> = PARTS.iter().map(|parts| num_frames / parts).chain([2, 1]).collect();
+        let mut gaps: Vec<usize> = GAP_DIVISORS.iter().map(|divisor| num_frames / divisor).chain([2, 1]).collect();
         gaps.retain(|gap| *gap > 0);
         gaps.sort_unstable_by(|a, b| b.cmp(a));
         gaps.dedup();
@@ -107,12 +108,13 @@ impl SceneViews<'_> {
             if after < num_frames { Some(after) } else { anchor.checked_sub(gap) }
         });
         let nearest = (0..num_frames).filter(|frame| *frame != anchor).min_by(|&a, &b| {
-            let unlike = |frame: usize| unlike(&self.cameras[anchor], &self.cameras[frame]);
-            unlike(a).total_cmp(&unlike(b))
+            let from_anchor = |frame: usize| dissimilarity(&self.cameras[anchor], &self.cameras[frame]);
+            from_anchor(a).total_cmp(&from_anchor(b))
         });
         in_order.chain(nearest).find_map(|partner| self.pair([anchor.min(partner), anchor.max(partner)]))
     }
 
+    /// Matches the corners of two frames. Returns `None` if no corners match.
     fn pair(&self, frames: [usize; 2]) -> Option<Pair> {
         let [a, b] = frames.map(|frame| &self.cameras[frame]);
         // Equal centres have no epipolar lines.
@@ -128,13 +130,14 @@ impl SceneViews<'_> {
         Some(Pair { check: PairCheck { frames, num_matches: matches.len(), epipolar_px }, matches, distances })
     }
 
-    /// Features of a frame, computed on first use; `None` for an unreadable frame.
+    /// Returns the features of a frame, computed on first use; `None` for an unreadable frame.
     fn features(&self, frame: usize) -> Option<&Features> {
-        let find = || Some(Features::find(&self.source.frame(self.scene, frame).ok()?));
+        let find = || Some(Features::detect(&self.source.frame(self.scene, frame).ok()?));
         self.features[frame].get_or_init(find).as_ref()
     }
 
-    fn draw(&self, pair: &Pair) -> Option<RgbImage> {
+    /// Plots a pair side by side with epipolar lines.
+    fn plot(&self, pair: &Pair) -> Option<RgbImage> {
         let [first, second] = pair.check.frames;
         let frames = [self.source.frame(self.scene, first).ok()?, self.source.frame(self.scene, second).ok()?];
         let sizes = [self.sizes[first]?, self.sizes[second]?];
@@ -143,16 +146,16 @@ impl SceneViews<'_> {
     }
 }
 
-/// Dissimilarity of two cameras: the distance of their centres and three times that of their forward directions.
-fn unlike(a: &Camera, b: &Camera) -> f64 {
+/// Returns the distance of the centres plus three times the distance of the forward directions.
+fn dissimilarity(a: &Camera, b: &Camera) -> f64 {
     let forward = a.c2w.rotation.z_axis.distance(b.c2w.rotation.z_axis);
     a.c2w.translation.distance(b.c2w.translation) + 3.0 * forward
 }
 
-/// At most `count` of the values, evenly spaced.
-fn evenly(values: &[f64], count: usize) -> impl Iterator<Item = f64> {
+/// Returns at most `count` of the values, evenly spaced.
+fn subsample(values: &[f64], count: usize) -> impl Iterator<Item = f64> {
     let kept = values.len().min(count);
-    (0..kept).map(move |place| values[place * values.len() / kept])
+    (0..kept).map(move |index| values[index * values.len() / kept])
 }
 
 fn median(values: Vec<f64>) -> Option<f64> {

@@ -1,4 +1,4 @@
-//! Readable, equal-sized, distinct images.
+//! Checks of the images: readable, of equal size, distinct.
 
 use std::collections::{BTreeMap, HashMap};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -10,17 +10,17 @@ use crate::geometry::camera::Camera;
 use crate::scene_source::SceneSource;
 use crate::tools::check::result::SceneCheck;
 
-/// Most frames named in a sentence.
+/// Largest number of frames listed in a message.
 const MAX_NAMED: usize = 5;
-/// Distance of two cameras, over the extent of all centres, above which equal images contradict them.
-const MOST_MOVE: f64 = 0.02;
-/// Angle between two cameras, in degrees, above which equal images contradict them.
-const MOST_TURN_DEG: f64 = 1.0;
+/// Distance of two cameras over the extent of all centres above which equal images contradict the poses.
+const MAX_MOVE: f64 = 0.02;
+/// Angle between two cameras in degrees above which equal images contradict the poses.
+const MAX_TURN_DEG: f64 = 1.0;
 
-/// Columns and rows of every frame; `None` for an unreadable one.
+/// Columns and rows of every frame, `None` for an unreadable frame.
 pub(crate) type Sizes = Vec<Option<[usize; 2]>>;
 
-/// Decodes every frame, on all cores.
+/// Decodes every frame, on all cores, and returns the sizes.
 pub(crate) fn check_images(
     source: &dyn SceneSource,
     scene: usize,
@@ -50,12 +50,12 @@ pub(crate) fn check_images(
         check.notes.push(format!("frames have {} sizes: {}", counts.len(), list.join(", ")));
     }
     let hashes: Vec<Option<u64>> = read.iter().map(|read| Some(read.as_ref().ok()?.1)).collect();
-    compare(&hashes, cameras, check);
+    check_repeated_images(&hashes, cameras, check);
     sizes
 }
 
 /// Compares the cameras of equal images.
-fn compare(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
+fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
     let extent = extent(cameras);
     let mut seen: HashMap<u64, usize> = HashMap::new();
     let (mut equal, mut contradictions) = (Vec::new(), Vec::new());
@@ -65,8 +65,8 @@ fn compare(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
             seen.insert(*hash, frame);
             continue;
         };
-        let (distance, turn_deg) = apart(&cameras[first], &cameras[frame]);
-        let is_moved = distance > MOST_MOVE * extent || turn_deg > MOST_TURN_DEG;
+        let (distance, turn_deg) = camera_distance(&cameras[first], &cameras[frame]);
+        let is_moved = distance > MAX_MOVE * extent || turn_deg > MAX_TURN_DEG;
         (if is_moved { &mut contradictions } else { &mut equal }).push(frame);
     }
     if !contradictions.is_empty() {
@@ -78,19 +78,19 @@ fn compare(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
     }
 }
 
-/// Distance of the centres, and the angle between the orientations in degrees.
-fn apart(a: &Camera, b: &Camera) -> (f64, f64) {
+/// Returns the distance of the centres, and the angle between the orientations in degrees.
+fn camera_distance(a: &Camera, b: &Camera) -> (f64, f64) {
     let trace = (a.c2w.rotation.transpose() * b.c2w.rotation).diagonal().element_sum();
     let turn_deg = ((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees();
     (a.c2w.translation.distance(b.c2w.translation), turn_deg)
 }
 
-/// Largest distance of a camera centre from the first.
+/// Returns the largest distance of a camera centre from the first.
 fn extent(cameras: &[Camera]) -> f64 {
-    cameras.iter().map(|camera| apart(&cameras[0], camera).0).fold(0.0, f64::max)
+    cameras.iter().map(|camera| camera_distance(&cameras[0], camera).0).fold(0.0, f64::max)
 }
 
-/// `3 frames (1, 4, 7)`, with dots beyond a handful.
+/// Formats frames as `3 frames (1, 4, 7)`, with dots after the fifth.
 pub(crate) fn list_frames(frames: &[usize]) -> String {
     let list: Vec<String> = frames.iter().take(MAX_NAMED).map(ToString::to_string).collect();
     let more = if frames.len() > MAX_NAMED { ", .." } else { "" };

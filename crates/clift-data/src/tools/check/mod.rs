@@ -1,4 +1,4 @@
-//! `clift data check`.
+//! The checks of `clift data check`. Read `scene` first: it calls the others.
 //!
 //! - `result`: findings of one scene
 //! - `cameras`: plausible intrinsics and poses

@@ -1,18 +1,18 @@
-//! Findings of one scene.
+//! Results of the check of one scene.
 
 use serde::{Deserialize, Serialize};
 
 /// Median symmetric epipolar distance above which a scene is flagged, in pixels of an image 640 columns wide.
 pub const MAX_EPIPOLAR_PX: f64 = 1.0;
 
-/// Findings of one scene.
+/// Results of the check of one scene.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SceneCheck {
     /// Key of the scene.
     pub key: String,
     /// Whether `reasons` is empty.
     pub ok: bool,
-    /// Errors of the scene.
+    /// Errors of the scene, empty if the scene passes.
     pub reasons: Vec<String>,
     /// Number of frames.
     pub num_frames: usize,
@@ -27,11 +27,11 @@ pub struct SceneCheck {
     pub fov_deg: Option<f64>,
     /// Largest absolute entry of `R^T R - I` of any frame.
     pub rotation_defect: Option<f64>,
-    /// Pairs of frames whose corners were matched.
+    /// Pairs of frames with matched corners.
     pub pairs: Vec<PairCheck>,
 }
 
-/// Two frames whose corners were matched.
+/// Two frames with matched corners.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PairCheck {
     /// Positions of the frames.

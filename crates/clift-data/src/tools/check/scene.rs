@@ -1,4 +1,4 @@
-//! Checks of a scene: readable images, plausible cameras, and poses that agree with the images.
+//! Checks of one scene: images, cameras, and poses against the images.
 
 use std::collections::BTreeMap;
 
@@ -9,19 +9,19 @@ use crate::sources::test_scenes::KEPT_FOR_TESTING;
 use crate::tools::check::result::SceneCheck;
 use crate::tools::check::{cameras, epipolar, images};
 
-/// Findings of one scene, with an image for inspection.
+/// Results of one scene, with an image for inspection.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CheckedScene {
-    /// The findings.
+    /// Results of the checks.
     pub check: SceneCheck,
-    /// Two frames with epipolar lines: dots of one colour are the same corner in both and must lie on the lines of
-    /// their colour. `None` if too few corners match.
+    /// Two frames with epipolar lines, `None` if too few corners match. Dots of one colour are the same corner in both
+    /// frames and must lie on the lines of the same colour.
     pub image: Option<RgbImage>,
 }
 
-/// Checks one scene of `source`. Failures are reasons in the result, never errors.
+/// Checks one scene of `source`. Every failure is a reason in the result.
 ///
-/// Decodes all frames, on all cores, and compares about nine pairs of them.
+/// Decodes all frames, on all cores, and compares about nine pairs of frames.
 pub fn check_scene(source: &dyn SceneSource, scene: usize) -> CheckedScene {
     let mut check = SceneCheck { key: source.key(scene).to_owned(), ..SceneCheck::default() };
     let cameras = match source.cameras(scene) {
@@ -39,7 +39,7 @@ pub fn check_scene(source: &dyn SceneSource, scene: usize) -> CheckedScene {
     CheckedScene { check, image }
 }
 
-/// Findings for the scenes skipped when the source was opened, except those reserved for testing.
+/// Returns results for the scenes skipped when the source was opened, except those reserved for testing.
 pub fn skipped_scenes(report: &SkipReport) -> Vec<SceneCheck> {
     let skips = report.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING);
     let flagged = skips.map(|skip| {
@@ -59,7 +59,7 @@ pub fn note_skipped_frames(report: &SkipReport, check: &mut SceneCheck) {
     }
     for (reason, names) in by_reason {
         let frames = if names.len() == 1 { "frame" } else { "frames" };
-        check.notes.push(format!("{} {frames} left out, {reason}: {}", names.len(), names.join(", ")));
+        check.notes.push(format!("{} {frames} skipped, {reason}: {}", names.len(), names.join(", ")));
     }
 }
 

@@ -1,4 +1,4 @@
-//! Converted scenes are the same scenes.
+//! Converted scenes equal those of the source, and an interrupted conversion ends with the same files.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -21,14 +21,21 @@ const fn options(to: ConvertTo) -> ConvertOptions {
     ConvertOptions { to, encoding: ImageEncoding::Png, opened_with: String::new() }
 }
 
-/// Converts a source of which opening has left nothing out.
 fn convert_all(
     source: &dyn SceneSource,
     folder: &Path,
     options: &ConvertOptions,
-    done: impl FnMut(usize),
 ) -> Result<ConversionReport, DataError> {
-    convert(source, &SkipReport::new(source.num_scenes()), folder, options, done)
+    convert(source, &SkipReport::new(source.num_scenes()), folder, options)
+}
+
+fn convert(
+    source: &dyn SceneSource,
+    skipped: &SkipReport,
+    folder: &Path,
+    options: &ConvertOptions,
+) -> Result<ConversionReport, DataError> {
+    Converter::open(source, skipped, folder, options)?.run(|_| ())
 }
 
 fn open(root: &Path, split: Split) -> OpenedSource {
@@ -68,14 +75,16 @@ fn same(a: &dyn SceneSource, b: &dyn SceneSource) {
 }
 
 #[test]
-fn chunks_and_scenes_hold_the_same_and_keep_the_files_of_the_pictures() {
+fn converted_scenes_keep_cameras_and_image_files() {
     for options in [CHUNKS, SCENES] {
         let folder = tempfile::tempdir().unwrap();
         let source = mini();
         let mut seen = Vec::new();
-        let converted = convert_all(&source, &folder.path().join("train"), &options, |done| seen.push(done)).unwrap();
-        assert_eq!((converted.num_scenes, converted.num_found, converted.num_frames), (2, 0, 16));
-        assert_eq!((converted.num_encoded, converted.left_out.skips.len()), (0, 0));
+        let report = SkipReport::new(2);
+        let converter = Converter::open(&source, &report, &folder.path().join("train"), &options).unwrap();
+        let report = converter.run(|done| seen.push(done)).unwrap();
+        assert_eq!((report.num_scenes, report.num_found, report.num_frames), (2, 0, 16));
+        assert_eq!((report.num_encoded, report.skipped.skips.len()), (0, 0));
         assert_eq!(seen, [1, 2]);
         let OpenedSource { source: back, report, .. } = open(folder.path(), Split::Train);
         assert_eq!(report.num_used(), 2);
@@ -90,15 +99,15 @@ fn chunks_and_scenes_hold_the_same_and_keep_the_files_of_the_pictures() {
 }
 
 #[test]
-fn every_layout_is_converted_to_the_same_scene() {
+fn every_layout_is_converted() {
     let layouts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/layouts");
     let open = |root: &Path| open(root, Split::Test).source;
     for name in ["re10k_txt", "re10k_folders", "dl3dv_flat", "capture", "colmap_bin", "scenes"] {
         let source = open(&layouts.join(name));
         for options in [CHUNKS, SCENES] {
             let folder = tempfile::tempdir().unwrap();
-            let converted = convert_all(source.as_ref(), &folder.path().join("test"), &options, |_| ()).unwrap();
-            assert_eq!((converted.num_scenes, &converted.left_out.skips[..]), (source.num_scenes(), &[][..]), "{name}");
+            let report = convert_all(source.as_ref(), &folder.path().join("test"), &options).unwrap();
+            assert_eq!((report.num_scenes, &report.skipped.skips[..]), (source.num_scenes(), &[][..]), "{name}");
             same(source.as_ref(), open(folder.path()).as_ref());
         }
         if name.starts_with("re10k") {
@@ -109,14 +118,14 @@ fn every_layout_is_converted_to_the_same_scene() {
 }
 
 #[test]
-fn images_without_a_file_are_encoded() {
+fn frames_without_an_image_file_are_encoded() {
     let folder = tempfile::tempdir().unwrap();
-    let converted = convert_all(&rooms(3), &folder.path().join("test"), &CHUNKS, |_| ()).unwrap();
-    assert_eq!((converted.num_frames, converted.num_encoded), (9, 9));
+    let report = convert_all(&rooms(3), &folder.path().join("test"), &CHUNKS).unwrap();
+    assert_eq!((report.num_frames, report.num_encoded), (9, 9));
     same(&rooms(3), open(folder.path(), Split::Test).source.as_ref());
 }
 
-/// Rooms of which so many frames can be read, three per scene: as when a process is killed.
+/// Returns rooms that panic after `num_frames` frames have been read, like a killed process.
 fn interrupted(num_scenes: usize, num_frames: usize) -> TestSource {
     let left = AtomicUsize::new(num_frames);
     TestSource::new(rooms(num_scenes)).with_frames(move |_, _, frame| {
@@ -127,108 +136,108 @@ fn interrupted(num_scenes: usize, num_frames: usize) -> TestSource {
 }
 
 #[test]
-fn an_interrupted_conversion_goes_on_and_ends_with_the_same_files() {
+fn interrupted_conversion_ends_with_the_same_files() {
     for options in [CHUNKS, SCENES] {
         let whole = tempfile::tempdir().unwrap();
-        convert_all(&rooms(6), whole.path(), &options, |_| ()).unwrap();
+        convert_all(&rooms(6), whole.path(), &options).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let killed = interrupted(6, 9);
-        let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &options, |_| ()));
+        let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &options));
         assert!(std::panic::catch_unwind(run).is_err());
         assert!(!folder.path().join("index.json").exists());
-        // One of the three files is damaged meanwhile: it is made again.
+        // One of the three files is damaged and written again.
         let damaged = files(folder.path()).into_keys().find(|name| name.contains(".torch")).unwrap();
         std::fs::write(folder.path().join(&damaged), [&files(folder.path())[&damaged][..], b"x"].concat()).unwrap();
-        let converted = convert_all(&rooms(6), folder.path(), &options, |_| ()).unwrap();
-        assert_eq!((converted.num_scenes, converted.num_found, converted.num_frames), (6, 2, 12));
+        let report = convert_all(&rooms(6), folder.path(), &options).unwrap();
+        assert_eq!((report.num_scenes, report.num_found, report.num_frames), (6, 2, 12));
         let (got, expected) = (files(folder.path()), files(whole.path()));
         assert_eq!(got.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
         for name in got.keys().filter(|name| *name != "SHA256SUMS") {
             assert!(got[name] == expected[name], "{name}");
         }
-        // Finished: no image is read again.
+        // A finished conversion reads no image.
         let again = interrupted(6, 0);
-        let converted = convert_all(&again, folder.path(), &options, |_| ()).unwrap();
-        assert_eq!((converted.num_found, converted.num_frames), (6, 0));
+        let report = convert_all(&again, folder.path(), &options).unwrap();
+        assert_eq!((report.num_found, report.num_frames), (6, 0));
         assert_eq!(files(folder.path()).len(), expected.len());
     }
 }
 
-/// Three rooms of which the second cannot be read.
-fn second_is_torn() -> TestSource {
-    TestSource::new(rooms(3)).with_torn_frames(|scene| scene == 1)
-}
-
 #[test]
-fn a_scene_that_cannot_be_read_is_named_and_made_later() {
+fn skipped_scenes_are_reported_and_converted_later() {
     let folder = tempfile::tempdir().unwrap();
-    let converted = convert_all(&second_is_torn(), folder.path(), &SCENES, |_| ()).unwrap();
-    assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (2, 1));
-    assert!(
-        converted.left_out.skips[0].key.ends_with("00001") && converted.left_out.skips[0].reason.contains("it is torn")
-    );
-    assert!(files(folder.path()).contains_key("skipped.json"));
-    let converted = convert_all(&rooms(3), folder.path(), &SCENES, |_| ()).unwrap();
-    assert_eq!((converted.num_scenes, converted.num_found, converted.left_out.skips.len()), (3, 2, 0));
+    let mut skipped = SkipReport::new(4);
+    skipped.skip("far", "without any picture");
+    skipped.skip_frame("near", "7.jpg", "without a picture");
+    let second_is_torn = TestSource::new(rooms(3)).with_torn_frames(|scene| scene == 1);
+    let report = convert(&second_is_torn, &skipped, folder.path(), &SCENES).unwrap();
+    assert_eq!((report.num_scenes, report.skipped.num_scenes, report.skipped.num_used()), (2, 4, 2));
+    let text = std::fs::read(folder.path().join("skipped.json")).unwrap();
+    let saved: SkipReport = serde_json::from_slice(&text).unwrap();
+    assert_eq!((&saved, saved.skips.len(), saved.frames.len()), (&report.skipped, 2, 1));
+    assert_eq!(saved.skips[0], SkippedScene { key: "far".into(), reason: "without any picture".into() });
+    assert!(saved.skips[1].key.ends_with("00001") && saved.skips[1].reason.contains("it is torn"));
+    let report = convert_all(&rooms(3), folder.path(), &SCENES).unwrap();
+    assert_eq!((report.num_scenes, report.num_found, report.skipped.skips.len()), (3, 2, 0));
     assert!(!files(folder.path()).contains_key("skipped.json"));
 }
 
 #[test]
-fn a_folder_of_other_scenes_is_refused() {
+fn folder_of_other_scenes_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    convert_all(&rooms(3), folder.path(), &SCENES, |_| ()).unwrap();
-    let message = convert_all(&mini(), folder.path(), &SCENES, |_| ()).unwrap_err().to_string();
-    assert!(message.contains("which is not to be converted; choose another folder"), "{message}");
+    convert_all(&rooms(3), folder.path(), &SCENES).unwrap();
+    let message = convert_all(&mini(), folder.path(), &SCENES).unwrap_err().to_string();
+    assert!(message.contains("which the source does not have; choose another folder"), "{message}");
     assert!(!is_file_name("a/b") && !is_file_name("..") && is_file_name("1K-ab.c"));
-    assert!(!"*?\"<>|".chars().any(|no| is_file_name(&format!("a{no}"))), "not on Windows");
+    assert!(!"*?\"<>|".chars().any(|no| is_file_name(&format!("a{no}"))), "invalid on Windows");
     assert!(is_file_name(&"k".repeat(200)) && !is_file_name(&"k".repeat(201)));
 }
 
 #[test]
-fn a_scene_that_can_no_longer_be_opened_stays_as_it_was_converted() {
+fn scene_that_is_no_longer_readable_is_kept() {
     for options in [CHUNKS, SCENES] {
         let folder = tempfile::tempdir().unwrap();
-        convert_all(&rooms(3), folder.path(), &options, |_| ()).unwrap();
+        convert_all(&rooms(3), folder.path(), &options).unwrap();
         let before = files(folder.path());
         let again = |reason: &str| {
-            let mut left_out = SkipReport::new(3);
-            left_out.skip(rooms(3).key(2), reason);
-            convert(&rooms(2), &left_out, folder.path(), &options, |_| ())
+            let mut skipped = SkipReport::new(3);
+            skipped.skip(rooms(3).key(2), reason);
+            convert(&rooms(2), &skipped, folder.path(), &options)
         };
-        let converted = again("its cameras cannot be read").unwrap();
-        assert_eq!((converted.num_scenes, converted.num_found, converted.left_out.num_used()), (3, 3, 3));
-        assert!(converted.left_out.notes[0].starts_with("1 scene could not be read again, kept as converted before ("));
+        let report = again("its cameras cannot be read").unwrap();
+        assert_eq!((report.num_scenes, report.num_found, report.skipped.num_used()), (3, 3, 3));
+        assert!(report.skipped.notes[0].starts_with("1 scene unreadable now, kept as converted before ("));
         assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), before.keys().collect::<Vec<_>>());
-        // Those of the test half have no place among the others, wherever else they are.
+        // Scenes reserved for testing are refused in a training folder.
         for reason in [KEPT_FOR_TESTING, crate::sources::test_scenes::KEPT_AND_ABSENT] {
             let message = again(reason).unwrap_err().to_string();
-            assert!(message.contains("which is not to be converted; choose another folder"), "{message}");
+            assert!(message.contains("which the source does not have; choose another folder"), "{message}");
         }
     }
 }
 
 #[test]
-fn an_index_of_files_that_are_gone_goes_before_they_are_made_again() {
+fn outdated_index_is_removed_first() {
     let folder = tempfile::tempdir().unwrap();
-    convert_all(&rooms(3), folder.path(), &CHUNKS, |_| ()).unwrap();
+    convert_all(&rooms(3), folder.path(), &CHUNKS).unwrap();
     std::fs::remove_file(folder.path().join("000001.torch")).unwrap();
     let killed = interrupted(3, 0);
-    let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &CHUNKS, |_| ()));
+    let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &CHUNKS));
     assert!(std::panic::catch_unwind(run).is_err());
     assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), ["000000.torch", "000002.torch", "SHA256SUMS"]);
 }
 
 #[test]
-fn chunks_have_no_more_frames_than_can_be_read_and_scenes_of_more_are_left_out() {
+fn chunks_and_scenes_have_a_largest_number_of_frames() {
     let folder = tempfile::tempdir().unwrap();
     let one = options(ConvertTo::Chunks { target_bytes: u64::MAX });
     let num_frames = |scene| if scene == 1 { 60_000 } else { 30_000 };
     let long = TestSource::new(rooms(3))
         .with_cameras(move |scene, cameras| Ok(vec![cameras[0]; num_frames(scene)]))
         .with_encoded_frames(|_, frame| Some(vec![frame as u8]));
-    let converted = convert_all(&long, folder.path(), &one, |_| ()).unwrap();
-    assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (2, 1));
-    let reason = &converted.left_out.skips[0].reason;
+    let report = convert_all(&long, folder.path(), &one).unwrap();
+    assert_eq!((report.num_scenes, report.skipped.skips.len()), (2, 1));
+    let reason = &report.skipped.skips[0].reason;
     assert!(reason.contains("has 60000 frames, above the limit of a file"), "{reason}");
     for name in ["000000.torch", "000001.torch"] {
         let table = ChunkTable::read(&folder.path().join(name)).unwrap();
@@ -237,9 +246,9 @@ fn chunks_have_no_more_frames_than_can_be_read_and_scenes_of_more_are_left_out()
 }
 
 #[test]
-fn a_folder_that_was_made_with_other_options_is_refused_and_stays_as_it_is() {
+fn folder_with_other_options_is_refused_unchanged() {
     let folder = tempfile::tempdir().unwrap();
-    convert_all(&rooms(2), folder.path(), &CHUNKS, |_| ()).unwrap();
+    convert_all(&rooms(2), folder.path(), &CHUNKS).unwrap();
     let before = files(folder.path());
     let others = [
         SCENES,
@@ -248,17 +257,17 @@ fn a_folder_that_was_made_with_other_options_is_refused_and_stays_as_it_is() {
         ConvertOptions { opened_with: "data.files.undistort=false".into(), ..CHUNKS },
     ];
     for other in others {
-        let message = convert_all(&rooms(2), folder.path(), &other, |_| ()).unwrap_err().to_string();
-        assert!(message.contains("its files were made as: chunks of 1 bytes, PNG; asked for are: "), "{message}");
-        assert!(message.contains("give the same options or choose another folder"), "{message}");
+        let message = convert_all(&rooms(2), folder.path(), &other).unwrap_err().to_string();
+        assert!(message.contains("its files were made as: chunks of 1 bytes, PNG; requested: "), "{message}");
+        assert!(message.contains("use the same options or choose another folder"), "{message}");
         assert!(files(folder.path()) == before);
     }
 }
 
 #[test]
-fn scenes_that_have_changed_since_are_written_anew() {
+fn changed_scenes_are_written_again() {
     for (num_frames, shift) in [(2, 0.0), (3, 0.001)] {
-        // All in one chunk; a chunk and a file for each.
+        // One chunk of all scenes, one chunk per scene, one file per scene.
         let one = options(ConvertTo::Chunks { target_bytes: u64::MAX });
         for (options, num_found) in [(one, 0), (CHUNKS, 2), (SCENES, 2)] {
             let (folder, whole) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -269,38 +278,15 @@ fn scenes_that_have_changed_since_are_written_anew() {
                 }
                 Ok(cameras)
             });
-            convert_all(&before, folder.path(), &options, |_| ()).unwrap();
-            let converted = convert_all(&rooms(3), folder.path(), &options, |_| ()).unwrap();
-            assert_eq!((converted.num_scenes, converted.num_found, converted.num_changed), (3, num_found, 1));
-            convert_all(&rooms(3), whole.path(), &options, |_| ()).unwrap();
+            convert_all(&before, folder.path(), &options).unwrap();
+            let report = convert_all(&rooms(3), folder.path(), &options).unwrap();
+            assert_eq!((report.num_scenes, report.num_found, report.num_changed), (3, num_found, 1));
+            convert_all(&rooms(3), whole.path(), &options).unwrap();
             let (mut got, mut expected) = (files(folder.path()), files(whole.path()));
             for files in [&mut got, &mut expected] {
-                files.remove("SHA256SUMS"); // in the order of writing
+                files.remove("SHA256SUMS"); // its lines are in the order of writing
             }
             assert!(got == expected, "{:?}", got.keys());
         }
     }
-}
-
-#[test]
-fn what_opening_left_out_is_in_the_list_of_what_was_skipped() {
-    let folder = tempfile::tempdir().unwrap();
-    let mut left_out = SkipReport::new(4);
-    left_out.skip("far", "without any picture");
-    left_out.skip_frame("near", "7.jpg", "without a picture");
-    let converted = convert(&second_is_torn(), &left_out, folder.path(), &SCENES, |_| ()).unwrap();
-    assert_eq!((converted.num_scenes, converted.left_out.num_scenes, converted.left_out.num_used()), (2, 4, 2));
-    let text = std::fs::read(folder.path().join("skipped.json")).unwrap();
-    let saved: SkipReport = serde_json::from_slice(&text).unwrap();
-    assert_eq!((&saved, saved.skips.len(), saved.frames.len()), (&converted.left_out, 2, 1));
-    assert_eq!(saved.skips[0], SkippedScene { key: "far".into(), reason: "without any picture".into() });
-}
-
-#[test]
-fn no_index_is_written_where_no_scene_can_be_read() {
-    let folder = tempfile::tempdir().unwrap();
-    let converted =
-        convert_all(&TestSource::new(rooms(1)).with_torn_frames(|_| true), folder.path(), &CHUNKS, |_| ()).unwrap();
-    assert_eq!((converted.num_scenes, converted.left_out.skips.len()), (0, 1));
-    assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), ["SHA256SUMS", "skipped.json"]);
 }

@@ -1,32 +1,33 @@
-//! Shi-Tomasi corners: places where the image changes in every direction.
+//! Shi-Tomasi corners: positions where the image changes in every direction.
 
 use crate::tools::features::gray_image::GrayImage;
 
-/// Half the side of the square of summed gradients, in pixels.
+/// Half the side of the window of summed gradients, in pixels.
 const REACH: usize = 2;
 /// Smallest distance between corners, in pixels.
 const APART: usize = 4;
-/// Smallest distance from the edge, in pixels: corners nearer to it have no descriptor.
+/// Smallest distance from the edge, in pixels: nearer corners have no descriptor.
 const MARGIN: usize = 12;
 /// Smallest measure of a corner, in squared gray levels per pixel: above the noise of a JPEG.
-const LEAST: f32 = 4.0;
-/// Cells of an image, about; they share the corners evenly, so that corners cover the image.
+const MIN_MEASURE: f32 = 4.0;
+/// Approximate number of cells of an image. Each cell gets the same share of the corners, so that corners cover the
+/// image.
 const CELLS: usize = 96;
 
-/// At most `count` corners as column and row; the centre of the first pixel is at (0.5, 0.5).
-pub(crate) fn find(gray: &GrayImage, count: usize) -> Vec<[f64; 2]> {
+/// Finds at most `count` corners as column and row. The centre of the first pixel is at (0.5, 0.5).
+pub(crate) fn find_corners(gray: &GrayImage, count: usize) -> Vec<[f64; 2]> {
     let (width, height) = (gray.width, gray.height);
     if width.min(height) <= 2 * MARGIN {
         return Vec::new();
     }
     let measure = measure(gray);
     let at = |x: usize, y: usize| measure[y * width + x];
-    let mut found = Vec::new();
+    let mut corners = Vec::new();
     for y in MARGIN..height - MARGIN {
         for x in MARGIN..width - MARGIN {
             let value = at(x, y);
-            // Of equal neighbours the first counts.
-            let is_largest = value > LEAST
+            // The first of equal neighbours is the corner.
+            let is_largest = value > MIN_MEASURE
                 && (y - APART..=y + APART).all(|v| {
                     (x - APART..=x + APART).all(|u| {
                         let other = at(u, v);
@@ -34,37 +35,37 @@ pub(crate) fn find(gray: &GrayImage, count: usize) -> Vec<[f64; 2]> {
                     })
                 });
             if is_largest {
-                found.push((x, y, value));
+                corners.push((x, y, value));
             }
         }
     }
     let side = ((width * height) as f64 / CELLS as f64).sqrt().max(1.0);
     let columns = (width as f64 / side).ceil() as usize;
     let cell = |x: usize, y: usize| (y as f64 / side) as usize * columns + (x as f64 / side) as usize;
-    // Strongest first; equal ones by place, so that the result does not depend on the sort.
-    found.sort_by(|a, b| b.2.total_cmp(&a.2).then((a.1, a.0).cmp(&(b.1, b.0))));
+    // Strongest first; equal ones by position, so that the result does not depend on the sort.
+    corners.sort_by(|a, b| b.2.total_cmp(&a.2).then((a.1, a.0).cmp(&(b.1, b.0))));
     let mut taken = vec![0; columns * ((height as f64 / side).ceil() as usize + 1)];
     let most = count.div_ceil(CELLS / 2);
-    let kept = found.into_iter().filter(|(x, y, _)| {
+    let kept = corners.into_iter().filter(|(x, y, _)| {
         taken[cell(*x, *y)] += 1;
         taken[cell(*x, *y)] <= most
     });
     let peak = |(x, y, _): (usize, usize, f32)| {
         [
-            x as f64 + 0.5 + top(at(x - 1, y), at(x, y), at(x + 1, y)),
-            y as f64 + 0.5 + top(at(x, y - 1), at(x, y), at(x, y + 1)),
+            x as f64 + 0.5 + parabola_peak(at(x - 1, y), at(x, y), at(x + 1, y)),
+            y as f64 + 0.5 + parabola_peak(at(x, y - 1), at(x, y), at(x, y + 1)),
         ]
     };
     kept.take(count).map(peak).collect()
 }
 
-/// Position of the maximum of the parabola through three neighbouring values, relative to the middle one.
-fn top(before: f32, middle: f32, after: f32) -> f64 {
+/// Returns the position of the maximum of the parabola through three neighbouring values, relative to the middle one.
+fn parabola_peak(before: f32, middle: f32, after: f32) -> f64 {
     let curvature = before - 2.0 * middle + after;
     if curvature >= 0.0 { 0.0 } else { f64::from((before - after) / (2.0 * curvature)).clamp(-0.5, 0.5) }
 }
 
-/// The smaller eigenvalue of the summed products of gradients around every pixel; zero at the edge.
+/// Returns the smaller eigenvalue of the summed products of gradients around every pixel; zero at the edge.
 fn measure(gray: &GrayImage) -> Vec<f32> {
     let (width, height) = (gray.width, gray.height);
     let mut products = vec![[0.0_f32; 3]; width * height];
@@ -74,7 +75,7 @@ fn measure(gray: &GrayImage) -> Vec<f32> {
             products[y * width + x] = [dx * dx, dx * dy, dy * dy];
         }
     }
-    // Binomial weights: a square window would prefer the directions of its sides.
+    // Binomial weights; a square window prefers the directions of its sides.
     let weights = [1.0, 4.0, 6.0, 4.0, 1.0_f32].map(|weight| weight / 16.0);
     let mut across = vec![[0.0; 3]; width * height];
     for y in 0..height {
@@ -107,25 +108,25 @@ mod tests {
     use crate::image::rgb_image::RgbImage;
 
     #[test]
-    fn the_corners_of_a_square_are_found_and_its_edges_are_not() {
+    fn corners_of_a_square_are_found_without_its_edges() {
         let (width, height) = (80, 60);
         let inside = |x: usize, y: usize| (20..50).contains(&x) && (15..40).contains(&y);
         let rgb =
             (0..height).flat_map(|y| (0..width).flat_map(move |x| [if inside(x, y) { 200 } else { 50 }; 3])).collect();
-        let found = find(&GrayImage::new(&RgbImage { width, height, rgb }).blurred(), 100);
+        let found = find_corners(&GrayImage::new(&RgbImage { width, height, rgb }).blurred(), 100);
         assert_eq!(found.len(), 4, "{found:?}");
         for corner in [[20.0, 15.0], [50.0, 15.0], [20.0, 40.0], [50.0, 40.0]] {
-            // The blur moves a corner inwards, by the same amount in every view.
-            let near = |place: &[f64; 2]| (0..2).all(|i| (place[i] - corner[i]).abs() < 2.0);
+            // The blur moves corners inwards.
+            let near = |found: &[f64; 2]| (0..2).all(|i| (found[i] - corner[i]).abs() < 2.0);
             assert!(found.iter().any(near), "{found:?} {corner:?}");
         }
-        assert_eq!(find(&GrayImage::new(&RgbImage { width: 20, height: 90, rgb: vec![0; 5400] }), 9).len(), 0);
+        assert_eq!(find_corners(&GrayImage::new(&RgbImage { width: 20, height: 90, rgb: vec![0; 5400] }), 9).len(), 0);
     }
 
     #[test]
-    fn the_top_of_a_parabola_is_found_between_samples() {
+    fn parabola_peak_lies_between_samples() {
         let at = |x: f64| (5.0 - (x - 0.3) * (x - 0.3)) as f32;
-        assert!((top(at(-1.0), at(0.0), at(1.0)) - 0.3).abs() < 1e-6);
-        assert_eq!(top(1.0, 1.0, 1.0), 0.0);
+        assert!((parabola_peak(at(-1.0), at(0.0), at(1.0)) - 0.3).abs() < 1e-6);
+        assert_eq!(parabola_peak(1.0, 1.0, 1.0), 0.0);
     }
 }

@@ -1,6 +1,6 @@
-//! Two corners that show the same point.
+//! Correspondences of corners.
 
-/// Columns to which wider images are reduced; distances are in pixels of this width.
+/// Number of columns to which wider images are reduced. Distances are in pixels of this width.
 pub const WIDTH: usize = 640;
 
 /// Two corners that show the same point, in pixels of an image [`WIDTH`] columns wide.

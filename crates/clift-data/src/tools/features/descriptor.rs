@@ -1,4 +1,4 @@
-//! Descriptors of corners: upright histograms of gradient directions in 4 x 4 cells, as SIFT's.
+//! Descriptors of corners: upright histograms of gradient directions in 4 x 4 cells, as in SIFT.
 
 use crate::tools::features::gray_image::GrayImage;
 
@@ -8,8 +8,8 @@ const CELLS: usize = 4;
 const DIRECTIONS: usize = 8;
 /// Side of a cell in pixels.
 const CELL_PX: f32 = 5.0;
-/// Largest component over the length; larger ones are clipped, so that one strong edge does not dominate.
-const MOST: f32 = 0.2;
+/// Largest component relative to the length. Clipping keeps one strong edge from dominating.
+const MAX_COMPONENT: f32 = 0.2;
 /// Length of a descriptor; components are integers.
 const LENGTH: f32 = 1024.0;
 
@@ -22,11 +22,11 @@ pub(crate) struct Descriptor {
 }
 
 impl Descriptor {
-    /// Describes the surroundings of (x, y), in pixels; `None` near the edge and for a constant surrounding.
+    /// Describes the surroundings of (x, y), in pixels. Returns `None` near the edge and for a constant surrounding.
     pub fn at(gray: &GrayImage, x: f64, y: f64) -> Option<Self> {
         let half = (CELLS as f32 * CELL_PX / 2.0) as i64 + 1;
         let (column, row) = (x.floor() as i64, y.floor() as i64);
-        let inside = |place: i64, size: usize| place - half >= 1 && place + half < size as i64 - 1;
+        let inside = |position: i64, size: usize| position - half >= 1 && position + half < size as i64 - 1;
         if !inside(column, gray.width) || !inside(row, gray.height) {
             return None;
         }
@@ -34,7 +34,7 @@ impl Descriptor {
         for v in row - half..=row + half {
             for u in column - half..=column + half {
                 let [dx, dy] = gray.gradient(u as usize, v as usize);
-                // Place in cells, 0 at the middle of the first.
+                // Position in cells, 0 at the centre of the first cell.
                 let across = ((u as f64 + 0.5 - x) as f32) / CELL_PX + (CELLS as f32 - 1.0) / 2.0;
                 let down = ((v as f64 + 0.5 - y) as f32) / CELL_PX + (CELLS as f32 - 1.0) / 2.0;
                 let turn = (dy.atan2(dx) / std::f32::consts::TAU).rem_euclid(1.0) * DIRECTIONS as f32;
@@ -47,7 +47,7 @@ impl Descriptor {
             return None;
         }
         for value in &mut sums {
-            *value = (*value / whole).min(MOST);
+            *value = (*value / whole).min(MAX_COMPONENT);
         }
         let cut = length(&sums);
         let values = sums.map(|value| (value / cut * LENGTH).round() as i16);
@@ -55,18 +55,18 @@ impl Descriptor {
         Some(Self { values, square })
     }
 
-    /// Squared distance of two descriptors.
+    /// Returns the squared distance of two descriptors.
     pub fn squared_distance(&self, other: &Self) -> i32 {
         let product: i32 = self.values.iter().zip(&other.values).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum();
         self.square + other.square - 2 * product
     }
 }
 
-/// Distributes a gradient over the neighbouring cells and directions, linearly by distance.
+/// Distributes a gradient over the neighbouring cells and directions with linear weights.
 fn add(sums: &mut [f32], [across, down, turn]: [f32; 3], strength: f32) {
-    let parts = |place: f32| {
-        let low = place.floor();
-        [(low as i64, 1.0 - (place - low)), (low as i64 + 1, place - low)]
+    let parts = |position: f32| {
+        let low = position.floor();
+        [(low as i64, 1.0 - (position - low)), (low as i64 + 1, position - low)]
     };
     for (row, by_row) in parts(down) {
         for (column, by_column) in parts(across) {
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn a_descriptor_moves_with_the_image_and_ignores_contrast() {
+    fn descriptor_moves_with_the_image_and_ignores_contrast() {
         let here = Descriptor::at(&waves(0.0, 60.0), 30.5, 30.5).unwrap();
         let moved = Descriptor::at(&waves(3.0, 60.0), 33.5, 30.5).unwrap();
         let faint = Descriptor::at(&waves(0.0, 30.0), 30.5, 30.5).unwrap();
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn there_is_none_at_the_edge_or_on_a_plain_wall() {
+    fn edges_and_plain_walls_have_no_descriptor() {
         assert!(Descriptor::at(&waves(0.0, 60.0), 8.0, 30.0).is_none());
         let plain = GrayImage { width: 64, height: 64, values: vec![7.0; 64 * 64] };
         assert!(Descriptor::at(&plain, 30.0, 30.0).is_none());

@@ -1,4 +1,4 @@
-//! Fundamental matrices of two cameras, and of matches by RANSAC.
+//! Fundamental matrices: of two cameras, and of matched corners by RANSAC.
 
 use glam::{DMat3, DVec3};
 
@@ -8,18 +8,18 @@ use crate::random::{step_rng, uniform_below};
 use crate::tools::features::correspondence::{Correspondence, WIDTH};
 
 /// Largest distance of an inlier from its epipolar lines, in pixels.
-const MOST_PX: f64 = 1.5;
-/// Most samples of eight matches.
+const MAX_INLIER_PX: f64 = 1.5;
+/// Largest number of samples of eight matches.
 const MAX_TRIES: u64 = 3000;
-/// Probability of no sample of eight inliers at which the search ends.
-const LEAST_DOUBT: f64 = 1e-4;
-/// Fewest inliers: eight fit any geometry, and a few more by chance.
-const FEWEST: usize = 20;
-/// Smallest share of inliers; of wrong matches about one in fifty lies on its line.
-const LEAST_SHARE: f64 = 0.25;
+/// Probability of no all-inlier sample at which the search ends.
+const MAX_FAILURE: f64 = 1e-4;
+/// Smallest number of inliers: eight fit any geometry, and some more by chance.
+const MIN_INLIERS: usize = 20;
+/// Smallest share of inliers; about 2 % of wrong matches lie on their line by chance.
+const MIN_INLIER_SHARE: f64 = 0.25;
 
-/// The fundamental matrix of two cameras whose images have the given columns and rows, in the units of [`Correspondence`]:
-/// `second^T F first = 0` for a point seen at `first` and `second`.
+/// Returns the fundamental matrix of two cameras whose images have the given columns and rows, in the units of
+/// [`Correspondence`]: `second^T F first = 0` for a point seen at `first` and `second`.
 pub fn fundamental_from_cameras(cameras: [&Camera; 2], sizes: [[usize; 2]; 2]) -> DMat3 {
     // Both images are WIDTH wide; their height keeps the shape of the pixels.
     let inverse_intrinsics = |i: usize| {
@@ -35,31 +35,31 @@ pub fn fundamental_from_cameras(cameras: [&Camera; 2], sizes: [[usize; 2]; 2]) -
     inverse_intrinsics(1).transpose() * essential * inverse_intrinsics(0)
 }
 
-/// The epipolar line `a x + b y + c = 0` in the second image of a point in the first, as `(a, b, c)` with unit normal
-/// `(a, b)`; `None` for a point at the epipole.
+/// Returns the epipolar line `a x + b y + c = 0` in the second image of a point in the first, as `(a, b, c)` with unit
+/// normal `(a, b)`; `None` for a point at the epipole.
 pub fn line(geometry: &DMat3, point: [f64; 2]) -> Option<DVec3> {
     let line = *geometry * DVec3::new(point[0], point[1], 1.0);
     let length = line.x.hypot(line.y);
     (length > 0.0 && length.is_finite()).then(|| line / length)
 }
 
-/// The epipolar line in the first image of a point in the second.
+/// Returns the epipolar line in the first image of a point in the second.
 pub fn line_back(geometry: &DMat3, point: [f64; 2]) -> Option<DVec3> {
     line(&geometry.transpose(), point)
 }
 
-/// Symmetric epipolar distance in pixels: the mean of the distances of both points to the line of the other.
+/// Returns the symmetric epipolar distance in pixels: the mean distance of each point to the line of the other.
 pub fn epipolar_distance(geometry: &DMat3, pair: &Correspondence) -> f64 {
     let away = |line: Option<DVec3>, [x, y]: [f64; 2]| line.map_or(0.0, |line| line.dot(DVec3::new(x, y, 1.0)).abs());
-    let there = away(line(geometry, pair.first), pair.second);
-    let back = away(line_back(geometry, pair.second), pair.first);
-    f64::midpoint(there, back)
+    let in_second = away(line(geometry, pair.first), pair.second);
+    let in_first = away(line_back(geometry, pair.second), pair.first);
+    f64::midpoint(in_second, in_first)
 }
 
-/// The largest set of matches that agree with one fundamental matrix, by RANSAC with samples of eight; empty if too few
-/// agree. Independent of cameras, so that cameras can be checked against the result.
+/// Returns the largest set of matches that agree with one fundamental matrix, by RANSAC with samples of eight. Empty if
+/// too few agree. Independent of cameras, so that cameras can be checked against the result.
 pub(crate) fn ransac_inliers(matches: &[Correspondence]) -> Vec<Correspondence> {
-    if matches.len() < FEWEST {
+    if matches.len() < MIN_INLIERS {
         return Vec::new();
     }
     let mut rng = step_rng(0, matches.len() as u64, "epipolar geometry");
@@ -70,22 +70,26 @@ pub(crate) fn ransac_inliers(matches: &[Correspondence]) -> Vec<Correspondence> 
         tries += 1;
         let sample: [Correspondence; 8] = std::array::from_fn(|_| matches[uniform_below(&mut rng, matches.len())]);
         let geometry = eight_point(&sample);
-        let agrees = |pair: &&Correspondence| epipolar_distance(&geometry, pair) < MOST_PX;
+        let agrees = |pair: &&Correspondence| epipolar_distance(&geometry, pair) < MAX_INLIER_PX;
         let num_agreeing = matches.iter().filter(agrees).count();
         if num_agreeing > best.len() {
             let share = num_agreeing as f64 / matches.len() as f64;
-            let doubt = (1.0 - share.powi(8)).max(f64::MIN_POSITIVE).ln();
-            enough = if doubt < 0.0 { MAX_TRIES.min((LEAST_DOUBT.ln() / doubt).ceil() as u64) } else { MAX_TRIES };
+            let log_failure = (1.0 - share.powi(8)).max(f64::MIN_POSITIVE).ln();
+            enough = if log_failure < 0.0 {
+                MAX_TRIES.min((MAX_FAILURE.ln() / log_failure).ceil() as u64)
+            } else {
+                MAX_TRIES
+            };
             best = matches.iter().filter(agrees).copied().collect();
         }
     }
-    let least = FEWEST.max((LEAST_SHARE * matches.len() as f64).ceil() as usize);
+    let least = MIN_INLIERS.max((MIN_INLIER_SHARE * matches.len() as f64).ceil() as usize);
     if best.len() < least { Vec::new() } else { best }
 }
 
-/// A matrix that eight matches satisfy. Its rank may be three, which rejects wrong matches as well as rank two.
+/// Returns a matrix that eight matches satisfy. Rank three is accepted and rejects wrong matches as well as rank two.
 fn eight_point(sample: &[Correspondence; 8]) -> DMat3 {
-    // Coordinates around zero and of about one keep the elimination accurate.
+    // Coordinates in about [-1, 1] keep the elimination accurate.
     let scale = WIDTH as f64 / 2.0;
     let unit = |[x, y]: [f64; 2]| [x / scale - 1.0, y / scale - 1.0];
     let rows = sample.map(|pair| {
@@ -97,13 +101,13 @@ fn eight_point(sample: &[Correspondence; 8]) -> DMat3 {
     to_unit.transpose() * inner * to_unit
 }
 
-/// A null vector of an 8 x 9 matrix, by elimination with full pivoting; one of many for points of a plane.
+/// Returns a null vector of an 8 x 9 matrix by elimination with full pivoting; not unique for points of a plane.
 fn null_vector(mut rows: [[f64; 9]; 8]) -> [f64; 9] {
     let mut order: [usize; 9] = std::array::from_fn(|i| i);
     let mut rank = 0;
     while rank < 8 {
-        let places = (rank..8).flat_map(|row| (rank..9).map(move |column| (row, column)));
-        let largest = places.max_by(|a, b| rows[a.0][a.1].abs().total_cmp(&rows[b.0][b.1].abs()));
+        let candidates = (rank..8).flat_map(|row| (rank..9).map(move |column| (row, column)));
+        let largest = candidates.max_by(|a, b| rows[a.0][a.1].abs().total_cmp(&rows[b.0][b.1].abs()));
         let Some((row, column)) = largest.filter(|(row, column)| rows[*row][*column].abs() > 1e-9) else { break };
         rows.swap(rank, row);
         for row in &mut rows {
@@ -124,7 +128,7 @@ fn null_vector(mut rows: [[f64; 9]; 8]) -> [f64; 9] {
         solution[row] = -sum / rows[row][row];
     }
     let mut vector = [0.0; 9];
-    order.iter().zip(solution).for_each(|(place, value)| vector[*place] = value);
+    order.iter().zip(solution).for_each(|(index, value)| vector[*index] = value);
     vector
 }
 
@@ -134,7 +138,7 @@ mod tests {
     use crate::geometry::camera::IntrinsicsNorm;
     use crate::random::unit;
 
-    /// Two cameras that look at about the same, and points that both see.
+    /// Returns two overlapping cameras, and points that both see.
     fn scene(num_points: u64) -> ([Camera; 2], Vec<Correspondence>) {
         let intrinsics_norm = IntrinsicsNorm { fx: 0.9, fy: 1.2, cx: 0.5, cy: 0.48 };
         let second = Pose { rotation: DMat3::from_rotation_y(0.2), translation: DVec3::new(-0.7, 0.2, 0.1) };
@@ -154,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn points_seen_by_both_cameras_lie_on_each_others_lines() {
+    fn points_of_both_cameras_lie_on_epipolar_lines() {
         let (cameras, matches) = scene(50);
         let geometry = fundamental_from_cameras([&cameras[0], &cameras[1]], [[320, 240], [1280, 960]]);
         for pair in &matches {
@@ -166,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn eight_matches_give_the_geometry_of_the_cameras() {
+    fn eight_matches_determine_the_geometry() {
         let (_, matches) = scene(60);
         let geometry = eight_point(&std::array::from_fn(|i| matches[i]));
         for pair in &matches {
@@ -175,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_matches_are_sorted_out_and_images_of_other_places_have_none() {
+    fn ransac_rejects_wrong_matches() {
         let (_, mut matches) = scene(120);
         for (i, pair) in matches.iter_mut().enumerate().filter(|(i, _)| i % 3 == 0) {
             let mut rng = step_rng(6, i as u64, "test");

@@ -1,4 +1,4 @@
-//! Gray images in f32.
+//! Gray images in f32: blur and gradients.
 
 use crate::image::rgb_image::RgbImage;
 
@@ -10,7 +10,7 @@ pub(crate) struct GrayImage {
 }
 
 impl GrayImage {
-    /// The mean of the channels, green twice: near the perceived brightness.
+    /// Converts an image to gray: the mean of the channels with green counted twice.
     pub fn new(image: &RgbImage) -> Self {
         let values = image.rgb.as_chunks::<3>().0.iter().map(|[r, g, b]| {
             let sum = u16::from(*r) + 2 * u16::from(*g) + u16::from(*b);
@@ -19,11 +19,11 @@ impl GrayImage {
         Self { width: image.width, height: image.height, values: values.collect() }
     }
 
-    /// Smooths by a binomial filter (1 4 6 4 1): a Gaussian of one pixel.
+    /// Smooths the image with a binomial filter (1 4 6 4 1), about a Gaussian of one pixel.
     pub fn blurred(&self) -> Self {
         let Self { width, height, values } = self;
         let (width, height) = (*width, *height);
-        let at = |place: usize, offset: usize, size: usize| (place + offset).saturating_sub(2).min(size - 1);
+        let at = |position: usize, offset: usize, size: usize| (position + offset).saturating_sub(2).min(size - 1);
         let weights = [1.0, 4.0, 6.0, 4.0, 1.0_f32].map(|weight| weight / 16.0);
         let mut across = Vec::with_capacity(values.len());
         for row in values.chunks_exact(width) {
@@ -43,7 +43,7 @@ impl GrayImage {
         Self { width, height, values: blurred }
     }
 
-    /// Half the difference of the neighbours, across and down; the pixel must not be at the edge.
+    /// Returns half the difference of the horizontal and of the vertical neighbours of a pixel off the edge.
     pub fn gradient(&self, x: usize, y: usize) -> [f32; 2] {
         let at = y * self.width + x;
         let v = &self.values;

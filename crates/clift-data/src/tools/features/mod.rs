@@ -1,4 +1,4 @@
-//! Corners and epipolar geometry.
+//! Corners, matches and epipolar geometry. `features` joins the steps; the files are in the order of the steps.
 //!
 //! - `correspondence`: two corners, one point
 //! - `gray_image`: gray levels, blur, gradients

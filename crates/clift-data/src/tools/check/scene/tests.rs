@@ -1,6 +1,5 @@
-//! Right cameras pass, wrong ones are flagged.
+//! Scenes with correct cameras pass, scenes with wrong cameras fail.
 
-use crate::tools::check::result::MAX_EPIPOLAR_PX;
 use std::sync::OnceLock;
 
 use glam::{DMat3, DVec3};
@@ -12,16 +11,17 @@ use crate::geometry::camera::Camera;
 use crate::geometry::pose::Pose;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
+use crate::tools::check::result::MAX_EPIPOLAR_PX;
 
-/// A room whose frames are traced once.
-struct Traced {
+/// A room with rendered frames.
+struct RenderedRoom {
     cameras: Vec<Camera>,
     frames: Vec<RgbImage>,
 }
 
-/// Two rooms with patterns fine enough to find corners in, seen from nearby as in a video.
-fn rooms() -> &'static [Traced] {
-    static ROOMS: OnceLock<Vec<Traced>> = OnceLock::new();
+/// Returns two rooms with fine patterns, seen from nearby as in a video.
+fn rooms() -> &'static [RenderedRoom] {
+    static ROOMS: OnceLock<Vec<RenderedRoom>> = OnceLock::new();
     ROOMS.get_or_init(|| {
         let config = SyntheticConfig {
             num_scenes: 2,
@@ -34,17 +34,17 @@ fn rooms() -> &'static [Traced] {
             ..Default::default()
         };
         let source = SyntheticSource::new(config).unwrap();
-        let traced = |scene: usize| Traced {
+        let rendered = |scene: usize| RenderedRoom {
             cameras: source.cameras(scene).unwrap(),
             frames: (0..12).into_par_iter().map(|frame| source.frame(scene, frame).unwrap()).collect(),
         };
-        (0..2).map(traced).collect()
+        (0..2).map(rendered).collect()
     })
 }
 
-/// A room with its cameras, or its frames, changed.
+/// A room with changed cameras or frames.
 struct Changed<C, F> {
-    room: &'static Traced,
+    room: &'static RenderedRoom,
     cameras: C,
     frame: F,
 }
@@ -80,13 +80,13 @@ fn check(cameras: impl Fn(usize, &mut Camera) + Send + Sync) -> SceneCheck {
     check_scene(&Changed { room: &rooms()[0], cameras, frame: |frame| frame }, 0).check
 }
 
-/// Up or down: the camera goes sideways, and a turn to the side would move points along their epipolar lines.
+/// Turns a camera up or down. The path leads sideways, so a sideways turn moves points along their epipolar lines.
 fn turned(c2w: Pose, angle_deg: f64) -> Pose {
     c2w.after(Pose { rotation: DMat3::from_rotation_x(angle_deg.to_radians()), ..Pose::IDENTITY })
 }
 
 #[test]
-fn rooms_with_right_cameras_pass() {
+fn rooms_with_correct_cameras_pass() {
     for room in rooms() {
         let source = Changed { room, cameras: |_, _: &mut _| (), frame: |frame| frame };
         let CheckedScene { check, image } = check_scene(&source, 0);
@@ -99,7 +99,7 @@ fn rooms_with_right_cameras_pass() {
 }
 
 #[test]
-fn cameras_that_do_not_fit_the_images_are_flagged() {
+fn cameras_that_contradict_the_images_fail() {
     let flagged = |name: &str, check: SceneCheck| {
         assert!(!check.ok, "{name}: {check:?}");
         assert!(check.epipolar_px.is_some_and(|px| px > MAX_EPIPOLAR_PX), "{name}: {check:?}");
@@ -125,7 +125,7 @@ fn cameras_that_do_not_fit_the_images_are_flagged() {
 }
 
 #[test]
-fn implausible_cameras_are_flagged_with_what_is_implausible() {
+fn implausible_cameras_fail_with_the_reason() {
     let reasons = |check: SceneCheck| {
         assert!(!check.ok);
         check.reasons.join("; ")
@@ -139,19 +139,19 @@ fn implausible_cameras_are_flagged_with_what_is_implausible() {
     }));
     assert!(text.contains("degrees in 1 frame (3), expected 5 to 120"), "{text}");
     let text = reasons(check(|_, camera| camera.intrinsics_norm.fy *= 2.0));
-    assert!(text.contains("fx / fy = 0.500: are they for another image size?"), "{text}");
+    assert!(text.contains("fx / fy = 0.500: the intrinsics may belong to another image size"), "{text}");
     let text = reasons(check(|frame, camera| camera.c2w.rotation.x_axis.x += 0.004 * f64::from(frame == 5)));
-    assert!(text.contains("off orthonormal ones by up to"), "{text}");
+    assert!(text.contains("depart from orthonormal ones by up to"), "{text}");
     let text = reasons(check(|_, camera| camera.c2w.translation = DVec3::new(1.0, 2.0, 3.0)));
     assert!(text.contains("has no baseline"), "{text}");
 }
 
 #[test]
-fn frames_that_repeat_or_cannot_be_read_are_told() {
+fn repeated_and_unreadable_frames_are_reported() {
     let config = SyntheticConfig { num_scenes: 1, num_frames: 8, width: 48, height: 32, ..Default::default() };
     let source = SyntheticSource::new(config).unwrap();
     let frames = (0..8).map(|frame| source.frame(0, frame).unwrap()).collect();
-    let room: &'static Traced = Box::leak(Box::new(Traced { cameras: source.cameras(0).unwrap(), frames }));
+    let room: &'static RenderedRoom = Box::leak(Box::new(RenderedRoom { cameras: source.cameras(0).unwrap(), frames }));
     let of = |frame: fn(usize) -> usize, cameras: fn(usize, &mut Camera)| {
         check_scene(&Changed { room, cameras, frame }, 0).check
     };
@@ -163,14 +163,17 @@ fn frames_that_repeat_or_cannot_be_read_are_told() {
         torn.reasons[0].starts_with("1 frame (2) cannot be read; the first: frame 2 of scene k cannot"),
         "{torn:?}"
     );
-    // Too small for corners: said, and not held against the scene.
+    // Images too small for corners add a note, no error.
     let small = of(|frame| frame, |_, _| ());
     assert!(small.ok && small.epipolar_px.is_none(), "{small:?}");
-    assert!(small.notes[0].starts_with("poses were not compared with the images: 0 matching corners"), "{small:?}");
+    assert!(
+        small.notes[0].starts_with("poses were not compared with the images: only 0 matching corners"),
+        "{small:?}"
+    );
 }
 
 #[test]
-fn scenes_that_were_left_out_are_flagged_with_the_reason() {
+fn skipped_scenes_fail_with_the_reason() {
     let mut report = SkipReport::new(3);
     report.skip("a", "not a scene");
     for name in ["0005.jpg", "0010.jpg"] {
@@ -183,5 +186,5 @@ fn scenes_that_were_left_out_are_flagged_with_the_reason() {
     let mut check = SceneCheck { key: "b".into(), ok: true, ..SceneCheck::default() };
     note_skipped_frames(&report, &mut check);
     assert!(check.ok);
-    assert_eq!(check.notes, ["2 frames left out, no such file: 0005.jpg, 0010.jpg"]);
+    assert_eq!(check.notes, ["2 frames skipped, no such file: 0005.jpg, 0010.jpg"]);
 }
