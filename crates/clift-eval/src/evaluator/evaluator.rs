@@ -116,7 +116,7 @@ impl Evaluator {
         for system in systems {
             self.require_pictures(system, &summary)?;
         }
-        sheets.commit()?;
+        sheets.keep()?;
         summary.write(&folder.join("summary.json"))?;
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         measured.write_views(&folder.join("views.csv"))?;
