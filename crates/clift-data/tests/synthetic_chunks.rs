@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use clift_data::{
-    Camera, ChunkSource, ImageEncoding, SceneFilters, SceneSource, SourceInfo, Split, SyntheticConfig, SyntheticSource,
+    Camera, ChunkSource, ImageEncoding, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource,
     write_source,
 };
 
@@ -51,20 +51,4 @@ fn frames_round_trip_and_cameras_to_f32() {
             }
         }
     }
-}
-
-#[test]
-fn chunks_split_by_size_and_keep_the_description() {
-    let root = tempfile::tempdir().unwrap();
-    write(root.path());
-    assert!(root.path().join("train/000001.torch").exists());
-    let chunks = ChunkSource::open(root.path(), Split::Test, &SceneFilters::default()).unwrap();
-    let (stored, made) = (SourceInfo::read(&chunks).unwrap(), SourceInfo::read(&synthetic(Split::Test)).unwrap());
-    let described = |info: SourceInfo| {
-        let SourceInfo { num_scenes, num_frames, image_size, fov_deg, extent, .. } = info;
-        let (fov_deg, extent) = (fov_deg.unwrap(), extent.unwrap());
-        format!("{num_scenes} {num_frames:?} {image_size:?} {fov_deg:.1} {extent:.3}") // files hold f32
-    };
-    assert_eq!(described(stored.clone()), described(made));
-    assert_eq!(stored.image_size, Some([40, 24]));
 }

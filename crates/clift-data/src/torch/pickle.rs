@@ -32,7 +32,7 @@ impl Pickle {
     }
 
     /// Reads a pickle with objects of any class, such as the checkpoint of a training program. Objects of unknown
-    /// classes become [`Value::Opaque`] and are not executed.
+    /// classes become opaque values and are not executed.
     ///
     /// # Errors
     /// As [`Pickle::parse`], but [`DataError::RefusedGlobal`] only for names that only attacks use.
@@ -135,7 +135,7 @@ mod tests {
     #[test]
     fn every_truncation_is_an_error() {
         for length in 0..VALID.len() {
-            assert!(message(&VALID[..length]).contains("bad pickle: it ends in the middle of"), "{length}");
+            assert!(message(&VALID[..length]).contains("bad pickle: the pickle ends in the middle of"), "{length}");
         }
     }
 

@@ -138,7 +138,7 @@ impl<'a> PickleMachine<'a> {
 
     pub fn take(&mut self, length: usize) -> Result<&[u8], UnpickleError> {
         let rest = &self.bytes[self.at..];
-        let taken = rest.get(..length).ok_or("it ends in the middle of a value")?;
+        let taken = rest.get(..length).ok_or("the pickle ends in the middle of a value")?;
         self.at += length;
         Ok(taken)
     }
@@ -161,7 +161,7 @@ impl<'a> PickleMachine<'a> {
     /// Reads a line of text without its newline.
     pub fn line(&mut self) -> Result<String, UnpickleError> {
         let length = self.bytes[self.at..].iter().position(|&byte| byte == b'\n');
-        let line = self.text(length.ok_or("it ends in the middle of a name")?)?;
+        let line = self.text(length.ok_or("the pickle ends in the middle of a name")?)?;
         self.at += 1;
         Ok(line)
     }

@@ -348,8 +348,8 @@ mod tests {
         assert!(message.contains("`state_dict` is no dict of tensors"), "{message}");
         let message = refused(b"}X\x01\0\0\0xcproject\nThing\n)\x81s.");
         assert!(message.contains("neither the outermost object nor an entry `state_dict` holds tensors"), "{message}");
-        assert!(refused(b"}(((((").contains("it ends in the middle of"));
+        assert!(refused(b"}(((((").contains("the pickle ends in the middle of"));
         assert!(refused(&[b'('; 300]).contains("nested deeper than 256 levels"));
-        assert!(refused(b"\x8e\xff\xff\xff\xff\xff\xff\xff\xff.").contains("it ends in the middle of"));
+        assert!(refused(b"\x8e\xff\xff\xff\xff\xff\xff\xff\xff.").contains("the pickle ends in the middle of"));
     }
 }

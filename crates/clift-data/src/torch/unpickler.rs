@@ -37,7 +37,7 @@ pub(crate) fn unpickle(bytes: &[u8], unknown: UnknownClasses) -> Result<Unpickle
 impl PickleMachine<'_> {
     fn run(&mut self) -> Result<ValueId, UnpickleError> {
         if self.bytes.len() > MAX_BYTES {
-            let what = format!("it has {} bytes, more than the limit of {MAX_BYTES}", self.bytes.len());
+            let what = format!("the pickle has {} bytes, more than the limit of {MAX_BYTES}", self.bytes.len());
             return Err(UnpickleError::Bad(what));
         }
         let max_depth = if self.skips_unknown() { MAX_CHECKPOINT_DEPTH } else { MAX_DEPTH };

@@ -121,7 +121,7 @@ impl Evaluator {
         for external in external_methods {
             self.require_images(external, &summary)?;
         }
-        sheets.commit()?;
+        sheets.keep()?;
         summary.write(&folder.join("summary.json"))?;
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;

@@ -80,7 +80,7 @@ fn index_of_chunks(folder: &Path, files: &[String], report: &mut SkipReport) -> 
                             entry.insert(file.clone());
                         }
                         Entry::Occupied(first) => {
-                            duplicates.push(format!("{} in {} and {file}", first.key(), first.get()))
+                            duplicates.push(format!("{} in {} and {file}", first.key(), first.get()));
                         }
                     }
                 }
