@@ -18,6 +18,7 @@ use clift_model::check_output_path;
 use clift_train::Config;
 use clift_train::Override;
 
+use crate::commands::parse::parse_split;
 use crate::commands::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::{UsageError, usage_bail};
 use crate::output::stdout::{print_note, print_result};
@@ -146,9 +147,4 @@ fn find_scene(source: &dyn SceneSource, key: Option<&str>) -> anyhow::Result<usi
         (None, None) if num_scenes == 1 => Ok(0),
         (None, None) => usage_bail!("{num_scenes} scenes; choose one with --scene: {keys}"),
     }
-}
-
-fn parse_split(text: &str) -> Result<Split, String> {
-    let splits = [Split::Train, Split::Test];
-    splits.into_iter().find(|split| split.to_string() == text).ok_or_else(|| "write train or test".into())
 }

@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
-use clap::ValueEnum;
 use clift_model::ModelPath;
 use clift_train::{Config, ExportFormat, export, read_config, require_absent};
 
+use crate::commands::parse::parse_format;
 use crate::output::stdout::print_result;
 
 /// Arguments of `clift export`.
@@ -14,21 +14,12 @@ pub struct ExportArgs {
     /// Model directory, run directory, or model.safetensors in one of them
     #[arg(value_name = "MODEL|RUN")]
     pub model: PathBuf,
-    /// Format of the file
-    #[arg(long, value_name = "FORMAT")]
-    pub format: Format,
+    /// Format of the file: pytorch (for torch.load) or safetensors
+    #[arg(long, value_name = "FORMAT", value_parser = parse_format)]
+    pub format: ExportFormat,
     /// File to write
     #[arg(long, short, value_name = "FILE")]
     pub out: PathBuf,
-}
-
-/// Formats of weight files.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Format {
-    /// File for torch.load
-    Pytorch,
-    /// Safetensors file with the same parameter names
-    Safetensors,
 }
 
 /// Writes the weights of a model for PyTorch.
@@ -36,11 +27,7 @@ pub fn run(args: &ExportArgs) -> anyhow::Result<()> {
     require_absent(&args.out)?;
     let model = ModelPath::find(&args.model)?;
     let (config, _) = read_config::<Config>(&model.dir.join("config.toml"), &[])?;
-    let format = match args.format {
-        Format::Pytorch => ExportFormat::Pytorch,
-        Format::Safetensors => ExportFormat::Safetensors,
-    };
-    let exported = export(&config, &model, format, &args.out)?;
+    let exported = export(&config, &model, args.format, &args.out)?;
     let condenser = if exported.has_condenser { "with condenser" } else { "without condenser" };
     print_result(&format!(
         "{}: {} tensors, {} values, {} {condenser}, from {}",

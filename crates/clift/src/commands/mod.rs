@@ -1,20 +1,6 @@
-//! One file or folder per command: arguments, the call, the printed result.
+//! One file or folder per command, named after the command: its arguments, the call, the printed result.
 //!
-//! - `parse`: parsers of argument values
-//! - `shared_args`: arguments that several commands share
-//! - `splits`: open the splits of a data set
-//! - `train`: `clift train`
-//! - `eval`: `clift eval`
-//! - `compare`: `clift compare`
-//! - `flops`: `clift flops`
-//! - `encode`: `clift encode`
-//! - `render`: `clift render`
-//! - `data`: `clift data`
-//! - `plan`: `clift plan`
-//! - `doctor`: `clift doctor`
-//! - `bench`: `clift bench`
-//! - `import`: `clift import`
-//! - `export`: `clift export`
+//! Shared by the commands: `parse` (argument values), `shared_args` (options), `splits` (data sets).
 
 pub(crate) mod bench;
 pub(crate) mod compare;

@@ -1,7 +1,8 @@
 //! Parsers of argument values.
 
+use clift_data::Split;
 use clift_eval::MethodFilter;
-use clift_train::Stage;
+use clift_train::{ExportFormat, Stage};
 
 /// Parses two methods, as `kmeans,clift`.
 pub(crate) fn parse_methods(text: &str) -> Result<[MethodFilter; 2], String> {
@@ -24,6 +25,19 @@ pub(crate) fn parse_bytes(text: &str) -> Result<u64, String> {
         Ok(number) if number > 0.0 && number * factor < 1e15 => Ok((number * factor).round() as u64),
         _ => Err("write a positive number of bytes, kB, MB or GB".into()),
     }
+}
+
+pub(crate) fn parse_format(text: &str) -> Result<ExportFormat, String> {
+    match text {
+        "pytorch" => Ok(ExportFormat::Pytorch),
+        "safetensors" => Ok(ExportFormat::Safetensors),
+        _ => Err("write pytorch or safetensors".into()),
+    }
+}
+
+pub(crate) fn parse_split(text: &str) -> Result<Split, String> {
+    let splits = [Split::Train, Split::Test];
+    splits.into_iter().find(|split| split.to_string() == text).ok_or_else(|| "write train or test".into())
 }
 
 pub(crate) fn parse_stage(text: &str) -> Result<Stage, String> {

@@ -1,9 +1,6 @@
-//! `clift bench`: time the method, f16 beside f32, and reading clips.
+//! `clift bench`: times of the method (`cases`), of f16 beside f32 (`precision`), and of reading clips (`data`).
 //!
-//! - `timing_args`: options of `clift bench` and `clift bench precision`
-//! - `data`: `clift bench data`
-//! - `precision`: `clift bench precision`
-//! - `cases`: `clift bench`
+//! `timing_args` has the options that `cases` and `precision` share.
 
 pub(crate) mod cases;
 pub(crate) mod data;

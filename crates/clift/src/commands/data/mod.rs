@@ -1,12 +1,6 @@
 //! `clift data`: create, inspect, check, convert and index data sets.
 //!
-//! - `synth`: `clift data synth`
-//! - `info_report`: table and JSON of `clift data info`
-//! - `info`: `clift data info`
-//! - `check`: `clift data check`
-//! - `convert`: `clift data convert`
-//! - `index`: `clift data index`
-//! - `command`: the `clift data` subcommands
+//! One file per subcommand; `command` lists them, `info_report` formats the result of `info`.
 
 pub(crate) mod check;
 pub(crate) mod command;

@@ -1,9 +1,4 @@
-//! `clift doctor`: check the devices of this machine.
-//!
-//! - `args`: arguments of `clift doctor`
-//! - `adapters`: the adapter table
-//! - `stability`: `clift doctor --stability`
-//! - `run`: `clift doctor`
+//! `clift doctor`: `run` checks the devices, with the table of `adapters`; `stability` runs the hard numerical cases.
 
 pub(crate) mod adapters;
 pub(crate) mod args;

@@ -1,8 +1,4 @@
-//! `clift render`: frames of a scene file along a camera path.
-//!
-//! - `args`: arguments of `clift render`
-//! - `frames`: render and write every frame
-//! - `run`: `clift render`
+//! `clift render`: `run` prepares the renderer and the cameras, `frames` renders and writes.
 
 pub(crate) mod args;
 pub(crate) mod frames;
