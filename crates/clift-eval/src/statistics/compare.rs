@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use clift_data::{mean, standard_error};
 use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
-use crate::statistics::scene_means::{capped, mean, standard_error};
+use crate::statistics::scene_means::capped;
 use crate::statistics::student_t::t_quantile_95;
 
 /// Compared metrics.

@@ -1,5 +1,6 @@
 //! `clift bench`.
 
+use crate::data::info_report::Report;
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
@@ -10,7 +11,6 @@ use clift_bench::BenchRow;
 use clift_bench::MAX_CHECKED_TOKENS;
 use clift_bench::run_bench;
 use clift_model::Precision;
-use clift_bench::BenchReport;
 
 use crate::commands::bench::data::BenchDataArgs;
 use crate::commands::bench::precision::BenchPrecisionArgs;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::{
-    ClipReader, DataError, DatasetRoot, EvaluationIndex, IndexCensus, OpenedSource, SceneSource, SceneSubset,
+    ClipReader, DataError, DatasetRoot, EvaluationIndex, OpenedSource, SceneSource, SceneSubset,
     SkipReport, SourceInfo, SourceKind, Split, open_dataset, open_source,
 };
 use clift_eval::evaluation_items;
