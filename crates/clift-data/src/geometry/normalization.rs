@@ -269,17 +269,6 @@ mod tests {
     }
 
     #[test]
-    fn non_finite_pose_names_its_frame() {
-        let mut poses = walk();
-        poses[3].translation[1] = f64::NAN;
-        let (context, target) = poses.split_at(2);
-        let message = PoseNormalization::find("00ff", context, target, PoseRotation::Axes, PoseScale::All)
-            .unwrap_err()
-            .to_string();
-        assert_eq!(message, "frame 3 of scene 00ff: bad camera: the pose holds NaN");
-    }
-
-    #[test]
     fn opposite_viewing_directions_have_no_mean_axes() {
         let context = [0.0, std::f64::consts::PI].map(|angle| pose([0.0, angle, 0.0], [angle, 0.0, 0.0]));
         let message = PoseNormalization::find("00ff", &context, &[], PoseRotation::Axes, PoseScale::Context)

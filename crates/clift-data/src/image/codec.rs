@@ -27,7 +27,7 @@ const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 ///
 /// # Errors
 /// [`DataError::BadImage`] with `key` and `frame` for another format, broken or truncated data, and a side above
-/// [`MAX_SIDE`].
+/// 16,384 pixels.
 pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
     let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
     let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {

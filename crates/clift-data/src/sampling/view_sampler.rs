@@ -28,7 +28,7 @@ pub fn linear_warm_up(init: usize, last: usize, warm_up_steps: u64, step: u64) -
 /// of the range.
 ///
 /// The gap (last minus first frame) is uniform in `[min_gap, max_gap]`, and both bounds grow during training
-/// ([`linear_warm_up`]). This is the `bounded_v2` sampler of DepthSplat, which the paper uses. The default is its
+/// (linear warm-up). This is the `bounded_v2` sampler of DepthSplat, which the paper uses. The default is its
 /// RealEstate10K setting with the paper's 4 to 6 contexts (paper, appendix).
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -144,7 +144,9 @@ impl ViewSampler {
     /// Samples the views of one item from a scene of `source`. Cameras are read only if [`InnerViews::needs_centres`].
     ///
     /// # Errors
-    /// As [`ViewSampler::sample_frames`], and the errors of reading the scene.
+    /// [`DataError::NotEnoughFrames`] if the scene is not longer than the smallest gap at `step`,
+    /// [`DataError::BadConfig`] if `num_context` is outside `[min_context, max_context]`, and the errors of reading the
+    /// scene.
     pub fn sample(
         &self,
         source: &dyn SceneSource,

@@ -5,7 +5,7 @@ use glam::DMat3;
 use crate::image::rgb_image::RgbImage;
 use crate::tools::features::correspondence::{Correspondence, WIDTH};
 use crate::tools::features::epipolar::{line, line_back};
-use crate::tools::features::features::reduced;
+use crate::tools::features::image_features::reduced;
 
 /// Number of plotted corners.
 const NUM_PLOTTED: usize = 12;

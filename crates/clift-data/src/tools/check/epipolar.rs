@@ -12,7 +12,7 @@ use crate::tools::check::images::Sizes;
 use crate::tools::check::result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
 use crate::tools::features::correspondence::Correspondence;
 use crate::tools::features::epipolar::{epipolar_distance, fundamental_from_cameras};
-use crate::tools::features::features::Features;
+use crate::tools::features::image_features::Features;
 
 /// Number of pairs of frames of a scene.
 const NUM_PAIRS: usize = 9;

@@ -1,4 +1,4 @@
-//! Corners, matches and epipolar geometry. `features` joins the steps; the files are in the order of the steps.
+//! Corners, matches and epipolar geometry. `image_features` joins the steps; the files are in the order of the steps.
 //!
 //! - `correspondence`: two corners, one point
 //! - `gray_image`: gray levels, blur, gradients
@@ -6,12 +6,12 @@
 //! - `descriptor`: gradient histograms
 //! - `matching`: mutual nearest descriptors
 //! - `epipolar`: fundamental matrices, RANSAC
-//! - `features`: corners of an image, matched
+//! - `image_features`: corners of an image, matched
 
 pub(crate) mod corners;
 pub(crate) mod correspondence;
 pub(crate) mod descriptor;
 pub(crate) mod epipolar;
-pub(crate) mod features;
 pub(crate) mod gray_image;
+pub(crate) mod image_features;
 pub(crate) mod matching;
