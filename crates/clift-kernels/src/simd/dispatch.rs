@@ -97,11 +97,12 @@ impl InstructionSet {
         }
     }
 
-    #[cfg(target_arch = "x86_64")]
     fn is_available(self) -> bool {
         match self {
             Self::Portable => true,
+            #[cfg(target_arch = "x86_64")]
             Self::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
+            #[cfg(target_arch = "x86_64")]
             Self::Avx512 => {
                 is_x86_feature_detected!("avx512f")
                     && is_x86_feature_detected!("avx512vl")
@@ -109,35 +110,28 @@ impl InstructionSet {
                     && is_x86_feature_detected!("avx512dq")
                     && Self::Avx2.is_available()
             }
+            #[cfg(not(target_arch = "x86_64"))]
+            Self::Avx2 | Self::Avx512 => false,
         }
-    }
-
-    #[cfg(not(target_arch = "x86_64"))]
-    fn is_available(self) -> bool {
-        self == Self::Portable
     }
 
     /// Runs a kernel compiled for this instruction set, on this thread.
     ///
     /// # Panics
     /// If the processor lacks it.
-    #[cfg(target_arch = "x86_64")]
     pub(crate) fn run<K: Kernel>(self, kernel: K) -> K::Output {
         assert!(self.is_available(), "this processor lacks {}", self.name());
         match self {
             Self::Portable => kernel.run(Portable),
             // SAFETY: checked above.
+            #[cfg(target_arch = "x86_64")]
             Self::Avx2 => unsafe { run_avx2(kernel) },
             // SAFETY: checked above.
+            #[cfg(target_arch = "x86_64")]
             Self::Avx512 => unsafe { run_avx512(kernel) },
+            #[cfg(not(target_arch = "x86_64"))]
+            Self::Avx2 | Self::Avx512 => unreachable!("not available"),
         }
-    }
-
-    /// Runs a kernel compiled for this instruction set, on this thread.
-    #[cfg(not(target_arch = "x86_64"))]
-    pub(crate) fn run<K: Kernel>(self, kernel: K) -> K::Output {
-        assert!(self.is_available(), "this processor lacks {}", self.name());
-        kernel.run(Portable)
     }
 }
 

@@ -108,12 +108,10 @@ mod available {
             RequestAdapterOptions { power_preference: PowerPreference::HighPerformance, ..Default::default() };
         let preferred = block_on(instance.request_adapter(&options)).ok().map(|adapter| adapter.get_info());
         let chosen = std::env::var(ADAPTER_VARIABLE).ok();
-        let mut counts: Vec<(DeviceType, usize)> = Vec::new();
-        let mut adapters = Vec::with_capacity(all.len());
+        let mut adapters: Vec<Adapter> = Vec::with_capacity(all.len());
         for adapter in all {
             let info = adapter.get_info();
-            let number = counts.iter().filter(|(of, _)| *of == info.device_type).count();
-            counts.push((info.device_type, number));
+            let number = adapters.iter().filter(|other| other.kind == kind(info.device_type)).count();
             let selector = selector(info.device_type, number);
             let is_used = match &chosen {
                 Some(chosen) => *chosen == selector,

@@ -19,13 +19,9 @@ pub const EPSILON: f64 = 1e-5;
 /// `(x - mean) / sqrt(variance + 1e-5) * gamma + beta` over the last dimension, and its gradient. The default
 /// implementations run on every backend.
 pub trait LayerNormKernels: Backend {
-    /// Computes the output, and [`NormState::statistics`] if the native kernel runs.
-    fn norm_output(
-        x: FloatTensor<Self>,
-        gamma: FloatTensor<Self>,
-        beta: FloatTensor<Self>,
-    ) -> (FloatTensor<Self>, Option<FloatTensor<Self>>) {
-        (composed_output::<Self>(x, gamma, beta), None)
+    /// Computes the output from `x`, `gamma` and `beta`, and [`NormState::statistics`] if the native kernel runs.
+    fn norm_output(inputs: [FloatTensor<Self>; 3]) -> (FloatTensor<Self>, Option<FloatTensor<Self>>) {
+        (composed_output::<Self>(inputs), None)
     }
 
     /// Computes the gradients of `x`, `gamma` and `beta`.
@@ -65,7 +61,7 @@ fn row<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     B::float_reshape(x, Shape::new([1, 1, dim]))
 }
 
-fn composed_output<B: Backend>(x: FloatTensor<B>, gamma: FloatTensor<B>, beta: FloatTensor<B>) -> FloatTensor<B> {
+fn composed_output<B: Backend>([x, gamma, beta]: [FloatTensor<B>; 3]) -> FloatTensor<B> {
     B::float_add(B::float_mul(normal::<B>(x).0, row::<B>(gamma)), row::<B>(beta))
 }
 
@@ -88,21 +84,17 @@ fn composed_backward<B: Backend>(state: NormState<FloatTensor<B>>, grad: FloatTe
 }
 
 impl LayerNormKernels for Flex {
-    fn norm_output(
-        x: FloatTensor<Self>,
-        gamma: FloatTensor<Self>,
-        beta: FloatTensor<Self>,
-    ) -> (FloatTensor<Self>, Option<FloatTensor<Self>>) {
-        if !is_native(&x) {
-            return (composed_output::<Self>(x, gamma, beta), None);
+    fn norm_output(inputs: [FloatTensor<Self>; 3]) -> (FloatTensor<Self>, Option<FloatTensor<Self>>) {
+        if !is_native(&inputs[0]) {
+            return (composed_output::<Self>(inputs), None);
         }
-        let [batch, count, dim] = x.shape().dims();
-        let [x, gamma, beta] = [x, gamma, beta].map(contiguous);
+        let [batch, count, dim] = inputs[0].shape().dims();
+        let inputs = inputs.map(contiguous);
         let mut output = vec![0.0; batch * count * dim];
         let mut statistics = vec![0.0; batch * count * 2];
-        let inputs = [values(&x), values(&gamma), values(&beta)];
         let (pairs, _) = statistics.as_chunks_mut();
-        layer_norm_forward(InstructionSet::detected(), EPSILON as f32, inputs, &mut output, pairs);
+        let slices = inputs.each_ref().map(values);
+        layer_norm_forward(InstructionSet::detected(), EPSILON as f32, slices, &mut output, pairs);
         (tensor(output, [batch, count, dim]), Some(tensor(statistics, [batch * count, 2])))
     }
 

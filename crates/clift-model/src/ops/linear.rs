@@ -139,13 +139,8 @@ pub trait LinearOps: Backend {
 /// Parts of the operations on a backend. The default implementations run on every backend.
 pub trait LinearKernels: GeluKernels + LayerNormKernels + MatmulKernels {
     /// Computes `x W + b`: `[B, N, I] -> [B, N, O]`.
-    fn linear_output(
-        precision: Precision,
-        x: FloatTensor<Self>,
-        weight: FloatTensor<Self>,
-        bias: FloatTensor<Self>,
-    ) -> FloatTensor<Self> {
-        composed_output::<Self>(precision, x, weight, bias)
+    fn linear_output(precision: Precision, inputs: [FloatTensor<Self>; 3]) -> FloatTensor<Self> {
+        composed_output::<Self>(precision, inputs)
     }
 
     /// Sums over rows: `[B, N, O] -> [O]`.
@@ -154,12 +149,7 @@ pub trait LinearKernels: GeluKernels + LayerNormKernels + MatmulKernels {
     }
 }
 
-fn composed_output<B: MatmulKernels>(
-    precision: Precision,
-    x: FloatTensor<B>,
-    weight: FloatTensor<B>,
-    bias: FloatTensor<B>,
-) -> FloatTensor<B> {
+fn composed_output<B: MatmulKernels>(precision: Precision, [x, weight, bias]: [FloatTensor<B>; 3]) -> FloatTensor<B> {
     let [batch, count, _] = x.shape().dims();
     let [_, outputs] = weight.shape().dims();
     let product = B::matmul(precision, rows::<B>(x), weight); // [BN, O]
@@ -180,21 +170,16 @@ fn rows<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
 }
 
 impl LinearKernels for Flex {
-    fn linear_output(
-        precision: Precision,
-        x: FloatTensor<Self>,
-        weight: FloatTensor<Self>,
-        bias: FloatTensor<Self>,
-    ) -> FloatTensor<Self> {
-        if !is_native(&x) || precision != Precision::F32 {
-            return composed_output::<Self>(precision, x, weight, bias);
+    fn linear_output(precision: Precision, inputs: [FloatTensor<Self>; 3]) -> FloatTensor<Self> {
+        let [x, weight, _bias] = &inputs;
+        if !is_native(x) || precision != Precision::F32 {
+            return composed_output::<Self>(precision, inputs);
         }
-        let [batch, count, inputs] = x.shape().dims();
+        let [batch, count, width] = x.shape().dims();
         let [_, outputs] = weight.shape().dims();
-        let [x, weight, bias] = [x, weight, bias].map(contiguous);
+        let inputs = inputs.map(contiguous);
         let mut output = vec![0.0; batch * count * outputs];
-        let sizes = [batch * count, inputs, outputs];
-        linear_forward(sizes, [values(&x), values(&weight), values(&bias)], &mut output);
+        linear_forward([batch * count, width, outputs], inputs.each_ref().map(values), &mut output);
         tensor(output, [batch, count, outputs])
     }
 
@@ -213,13 +198,9 @@ impl LinearKernels for NdArray {}
 #[cfg(feature = "wgpu")]
 impl LinearKernels for burn::backend::Cube {}
 
-fn forward<B: LinearKernels>(
-    x: FloatTensor<B>,
-    weight: FloatTensor<B>,
-    bias: FloatTensor<B>,
-    prologue: Prologue,
-) -> FloatTensor<B> {
-    B::linear_output(prologue.precision, if prologue.gelu { B::gelu_output(x) } else { x }, weight, bias)
+fn forward<B: LinearKernels>([x, weight, bias]: [FloatTensor<B>; 3], prologue: Prologue) -> FloatTensor<B> {
+    let x = if prologue.gelu { B::gelu_output(x) } else { x };
+    B::linear_output(prologue.precision, [x, weight, bias])
 }
 
 macro_rules! linear_ops {
@@ -231,7 +212,7 @@ macro_rules! linear_ops {
                 bias: FloatTensor<Self>,
                 prologue: Prologue,
             ) -> FloatTensor<Self> {
-                forward::<Self>(x, weight, bias, prologue)
+                forward::<Self>([x, weight, bias], prologue)
             }
 
             fn norm_then_linear(
@@ -242,8 +223,8 @@ macro_rules! linear_ops {
                 bias: FloatTensor<Self>,
                 precision: Precision,
             ) -> FloatTensor<Self> {
-                let (normal, _statistics) = Self::norm_output(x, gamma, beta);
-                Self::linear_output(precision, normal, weight, bias)
+                let (normal, _statistics) = Self::norm_output([x, gamma, beta]);
+                Self::linear_output(precision, [normal, weight, bias])
             }
         }
     };
@@ -264,10 +245,10 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
             (x.into_parts(), weight.into_parts(), bias.into_parts());
         match LinearBackward.prepare::<C>([x_node, weight_node, bias_node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let output = forward::<B>(x.clone(), weight.clone(), bias, prologue);
+                let output = forward::<B>([x.clone(), weight.clone(), bias], prologue);
                 prep.finish(LinearState { x, weight, prologue }, output)
             }
-            OpsKind::UnTracked(prep) => prep.finish(forward::<B>(x, weight, bias, prologue)),
+            OpsKind::UnTracked(prep) => prep.finish(forward::<B>([x, weight, bias], prologue)),
         }
     }
 
@@ -285,12 +266,10 @@ impl<B: LinearOps + LinearKernels, C: CheckpointStrategy> LinearOps for Autodiff
         let nodes = [x_node, gamma_node, beta_node, weight_node, bias_node];
         match NormLinearBackward.prepare::<C>(nodes).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let (normal, statistics) = B::norm_output(x.clone(), gamma.clone(), beta.clone());
-                let output = B::linear_output(precision, normal, weight.clone(), bias);
-                prep.finish(
-                    NormLinearState { norm: NormState { x, gamma, statistics }, beta, weight, precision },
-                    output,
-                )
+                let (normal, statistics) = B::norm_output([x.clone(), gamma.clone(), beta.clone()]);
+                let output = B::linear_output(precision, [normal, weight.clone(), bias]);
+                let norm = NormState { x, gamma, statistics };
+                prep.finish(NormLinearState { norm, beta, weight, precision }, output)
             }
             OpsKind::UnTracked(prep) => prep.finish(B::norm_then_linear(x, gamma, beta, weight, bias, precision)),
         }
@@ -349,7 +328,7 @@ impl<B: LinearKernels> Backward<B, 5> for NormLinearBackward {
             let [of_x, of_gamma, of_beta, of_weight, of_bias] = needed;
             let grad_bias = of_bias.then(|| B::sum_rows(grad.clone()));
             let grad_weight = of_weight.then(|| {
-                let (normal, _statistics) = B::norm_output(norm.x.clone(), norm.gamma.clone(), beta);
+                let (normal, _statistics) = B::norm_output([norm.x.clone(), norm.gamma.clone(), beta]);
                 grad_of_weight::<B>(precision, normal, grad.clone())
             });
             let [grad_x, grad_gamma, grad_beta] = if of_x || of_gamma || of_beta {

@@ -160,27 +160,6 @@ fn camera_distance_has_weight_one_fiftieth() {
 }
 
 #[test]
-fn the_grid_covers_the_image_with_a_margin_of_four_cells() {
-    let [paper, scaled] = [SelectionPreset::Paper, SelectionPreset::Scaled].map(SelectionPreset::rules);
-    assert_eq!(paper.grid(256, 256), [24, 24]);
-    assert_eq!(paper.grid(256, 448), [24, 36]);
-    assert_eq!(paper.grid(40, 17), [11, 10]);
-    for (height, width) in [(256, 256), (256, 448)] {
-        assert_eq!(scaled.grid(height, width), paper.grid(height, width));
-    }
-    assert_eq!(scaled.grid(32, 64), [24, 40]);
-    let view = camera([0.0; 3], 0.0);
-    let cells = paper.cell_directions(&view, 64, 64);
-    assert_eq!(cells.len(), 144);
-    assert_eq!(cells[0], view.direction(-56.0, -56.0));
-    assert_eq!(cells[4 * 12 + 4], view.direction(8.0, 8.0), "the first cell inside");
-    assert_eq!(cells[143], view.direction(120.0, 120.0));
-    let cells = scaled.cell_directions(&view, 64, 64);
-    assert_eq!(cells[0], view.direction(-14.0, -14.0), "a margin of a quarter of the image");
-    assert_eq!(cells[4 * 24 + 4], view.direction(2.0, 2.0));
-}
-
-#[test]
 fn zero_tokens_and_non_finite_inputs_are_refused() {
     let rays = random_rays(3, 4);
     let mut selector = Selector::new(SelectionRules::default(), &rays).unwrap();
