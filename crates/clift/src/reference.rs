@@ -52,7 +52,9 @@ fn add_command(command: &Command, page: &mut String) {
     if let Some(after) = command.get_after_help() {
         write!(page, "\n```text\n{after}\n```\n").unwrap();
     }
-    children.into_iter().for_each(|child| add_command(child, page));
+    for child in children {
+        add_command(child, page);
+    }
 }
 
 fn text(text: Option<&StyledStr>) -> String {

@@ -119,7 +119,7 @@ pub struct FlopsArgs {
     /// Rendered tokens, as numbers or shares [default: the paper's, or the config's]
     #[arg(long, value_delimiter = ',', value_name = "COUNT")]
     pub render: Vec<TokenCount>,
-    /// Override a key of the config, e.g. model.dim=512; repeatable
+    /// Override a key of the config, e.g. `model.dim=512`; repeatable
     #[arg(long, value_name = "KEY=TOML", requires = "config")]
     pub set: Vec<String>,
     #[command(flatten)]

@@ -29,7 +29,7 @@ pub struct ImportArgs {
     /// Accept f16, bf16 and f64 parameters and convert them to f32
     #[arg(long)]
     pub convert: bool,
-    /// Replace part of every parameter name, e.g. attn.qn=attn.q_norm; repeatable
+    /// Replace part of every parameter name, e.g. `attn.qn=attn.q_norm`; repeatable
     #[arg(long, value_name = "FROM=TO", value_parser = parse_rename)]
     pub rename: Vec<(String, String)>,
 }

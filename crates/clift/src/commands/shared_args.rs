@@ -14,7 +14,7 @@ use crate::output::stdout::{print_note, print_result};
 /// Options that override keys of a config.
 #[derive(Debug, clap::Args)]
 pub struct ConfigArgs {
-    /// Override a key of the config, e.g. stage1.steps=100; repeatable
+    /// Override a key of the config, e.g. `stage1.steps=100`; repeatable
     #[arg(long, value_name = "KEY=TOML")]
     pub set: Vec<String>,
     /// Select the device: flex, ndarray or wgpu [default: `device` of the config]
@@ -44,7 +44,9 @@ pub fn read_config(
     check: impl FnOnce(&Config) -> Result<(), TrainError>,
 ) -> anyhow::Result<(Config, Vec<Override>)> {
     let (config, overrides) = read_checked_config(path, set, check)?;
-    overrides.iter().for_each(|change| print_note(&change.to_string()));
+    for change in &overrides {
+        print_note(&change.to_string());
+    }
     Ok((config, overrides))
 }
 

@@ -29,7 +29,7 @@ struct DataKeys {
 pub struct SourceArgs {
     /// Data set in any layout, or one scene
     pub dir: PathBuf,
-    /// Set a path of the layout, e.g. data.files.image_folder=images_4; repeatable
+    /// Set a path of the layout, e.g. `data.files.image_folder=images_4`; repeatable
     #[arg(long, value_name = "data.files.KEY=TOML")]
     pub set: Vec<String>,
 }

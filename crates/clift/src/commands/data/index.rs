@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clift_data::{OverlapOptions, SceneSource, write_overlap_index};
 
 use crate::commands::parse::parse_distance;
-use crate::commands::splits::{SourceArgs, SplitSource, Splits};
+use crate::commands::splits::{SourceArgs, Splits};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::units::plural;
@@ -24,10 +24,14 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
         usage_bail!("{} exists; remove it or choose another file", args.out.display());
     }
     let splits = args.source.open(args.split)?;
-    splits.iter().for_each(SplitSource::print_report);
+    for split in &splits {
+        split.print_report();
+    }
     let sources: Vec<&dyn SceneSource> = splits.iter().map(|split| split.opened.source.as_ref()).collect();
     let report = write_overlap_index(&args.out, &sources, &options)?;
-    report.notes.iter().for_each(|note| print_note(&format!("note: {note}")));
+    for note in &report.notes {
+        print_note(&format!("note: {note}"));
+    }
     let used = plural(report.num_used(), "scene");
     print_result(&format!("{used} of {} with views: {}", report.num_scenes, args.out.display()))?;
     for (reason, number) in report.counts() {

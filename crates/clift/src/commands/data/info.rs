@@ -147,7 +147,7 @@ pub struct InfoArgs {
     /// Data set, one scene, config (TOML) or evaluation index (JSON)
     #[arg(value_name = "DIR|CONFIG|INDEX")]
     pub path: PathBuf,
-    /// Override a key of the config, e.g. data.filters.min_frames=60; repeatable
+    /// Override a key of the config, e.g. `data.filters.min_frames=60`; repeatable
     #[arg(long, value_name = "KEY=TOML")]
     pub set: Vec<String>,
     #[command(flatten)]

@@ -53,8 +53,8 @@ pub fn write_frames(
             let task = format!("rendering frame {first} of {}", views.len());
             return Err(TrainError::Abandoned { task }.into());
         }
-        let rendered = renderer.render(some, height, width, num_render_tokens);
-        for view in rendered.with_context(|| format!("rendering frames {first} to {}", first + some.len() - 1))? {
+        let results = renderer.render(some, height, width, num_render_tokens);
+        for view in results.with_context(|| format!("rendering frames {first} to {}", first + some.len() - 1))? {
             let image = Canvas::from_unit(&view.pixels, height, width)?;
             image.write_png(&folder.join(format!("frame-{:05}.png", render_s.len())))?;
             animation.add(&image)?;
