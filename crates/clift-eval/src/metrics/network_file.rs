@@ -93,7 +93,7 @@ impl NetworkFile {
     pub fn finish(self) -> Result<String, EvalError> {
         match self.tensors.keys().next() {
             None => Ok(self.sha256),
-            Some(name) => Err(self.bad(format!("{name} is not part of the network in the network"))),
+            Some(name) => Err(self.bad(format!("{name} is not part of the network"))),
         }
     }
 
