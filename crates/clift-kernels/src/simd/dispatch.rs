@@ -3,9 +3,11 @@
 use std::fmt;
 use std::sync::OnceLock;
 
+use crate::simd::portable::Portable;
+use crate::simd::vector::Simd;
+
 #[cfg(target_arch = "x86_64")]
 use crate::simd::{avx2::Avx2, avx512::Avx512};
-use crate::simd::{portable::Portable, vector::Simd};
 
 /// Instructions that a kernel is compiled for. [`InstructionSet::available`] lists those that the processor runs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -192,14 +192,13 @@ fn first<M: Module>(module: &M, condition: impl Fn(&TensorData) -> bool) -> Opti
 
 #[cfg(test)]
 mod tests {
-    use crate::weights::hash::weights_hash;
     use burn::tensor::Device;
 
     use super::*;
     use crate::network::architecture::CliftVariant;
     use crate::network::clift::Clift;
     use crate::testing::small_config;
-    
+    use crate::weights::hash::weights_hash;
 
     fn model(seed: u64) -> Clift {
         Clift::new(&small_config(CliftVariant::Paper), seed, &Device::flex())

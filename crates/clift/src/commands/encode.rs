@@ -7,16 +7,9 @@ use clift_data::{
     ClipReader, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions, Split,
     open_dataset, open_source,
 };
-use clift_eval::EncodeOptions;
-use clift_eval::EncodedScene;
-use clift_eval::encode;
-use clift_model::ModelPath;
-use clift_model::TokenCount;
-use clift_model::TokenFormat;
-use clift_model::TrainedModel;
-use clift_model::check_output_path;
-use clift_train::Config;
-use clift_train::Override;
+use clift_eval::{EncodeOptions, EncodedScene, encode};
+use clift_model::{ModelPath, TokenCount, TokenFormat, TrainedModel, check_output_path};
+use clift_train::{Config, Override};
 
 use crate::commands::parse::parse_split;
 use crate::commands::shared_args::{ConfigArgs, read_config};

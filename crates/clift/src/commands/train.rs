@@ -2,12 +2,8 @@
 
 use std::path::PathBuf;
 
-use clift_train::Config;
-use clift_train::Run;
-use clift_train::RunOptions;
-use clift_train::Stage;
-use clift_train::memory_warning;
 use clift_eval::available_bytes;
+use clift_train::{Config, Run, RunOptions, Stage, memory_warning};
 
 use crate::commands::parse::{parse_count, parse_stage};
 use crate::commands::shared_args::ConfigArgs;

@@ -1,15 +1,9 @@
 //! `clift bench`.
 
-use crate::data::info_report::Report;
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use clift_bench::BenchCase;
-use clift_bench::BenchEvent;
-use clift_bench::BenchOptions;
-use clift_bench::BenchRow;
-use clift_bench::MAX_CHECKED_TOKENS;
-use clift_bench::run_bench;
+use clift_bench::{BenchCase, BenchEvent, BenchOptions, BenchReport, BenchRow, MAX_CHECKED_TOKENS, run_bench};
 use clift_model::Precision;
 
 use crate::commands::bench::data::BenchDataArgs;
@@ -47,7 +41,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
 }
 
 /// Formats the table with its remarks.
-fn report_text(report: &Report) -> String {
+fn report_text(report: &BenchReport) -> String {
     let header = ["case", "median", "p95", "peak memory", "error against f64"];
     let f16 = if report.precision == Precision::F16 { ", f16 products" } else { "" };
     let title = format!("{}, {} threads{f16}\n", report.device, report.threads);
@@ -99,7 +93,7 @@ pub enum BenchCommand {
 /// Arguments of `clift bench`.
 #[derive(Debug, clap::Args)]
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
-#[command(after_help = format!("Cases:\n  {}", BenchCase::ALL.map(BenchCase::name).join(", ")))]
+#[command(after_help = format!("Cases:\n  {}", BenchCase::names()))]
 pub struct BenchArgs {
     /// Another measurement.
     #[command(subcommand)]
@@ -157,7 +151,7 @@ render_8_views: seconds per view
 kmeans: inertia 1.234500e3; the error is that of the inertia
 * error of loss and gradients, with at most 1024 tokens
 - not compared with f64";
-        let mut report = Report { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows };
+        let mut report = BenchReport { device: DeviceName::Flex, precision: Precision::F32, threads: 2, rows };
         assert_eq!(report_text(&report), expected);
         report.rows.truncate(1);
         assert!(report_text(&report).ends_with("\nencode  12.3 s  24.7 s  3.00 GiB     3.1e-7"));

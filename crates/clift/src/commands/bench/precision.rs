@@ -2,10 +2,7 @@
 
 use std::path::PathBuf;
 
-use clift_bench::PrecisionReport;
-use clift_bench::PrecisionRow;
-use clift_bench::compare_precision;
-use clift_bench::PRECISION_CASES;
+use clift_bench::{PRECISION_CASES, PrecisionReport, PrecisionRow, compare_precision};
 
 use crate::commands::bench::timing_args::TimingArgs;
 use crate::interrupt;

@@ -34,7 +34,7 @@ impl TimingArgs {
     /// Returns options for the chosen cases, or for `all`, without comparison with f64.
     pub fn options(&self, all: &[BenchCase]) -> BenchOptions {
         BenchOptions {
-            work: if self.cases.is_empty() { all.into() } else { self.cases.clone() },
+            cases: if self.cases.is_empty() { all.into() } else { self.cases.clone() },
             repeats: self.repeats,
             warmup: self.warmup,
             error: false,

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::{
-    ClipReader, DataError, DatasetRoot, EvaluationIndex, OpenedSource, SceneSource, SceneSubset,
+    ClipReader, DataError, DatasetRoot, EvaluationIndex, IndexCensus, OpenedSource, SceneSource, SceneSubset,
     SkipReport, SourceInfo, SourceKind, Split, open_dataset, open_source,
 };
 use clift_eval::evaluation_items;
@@ -28,7 +28,7 @@ pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     let name = args.path.file_name().unwrap_or_default().to_string_lossy();
     let is_scene = is_json && name.starts_with("transforms");
     if is_json && !is_scene {
-        let census = EvaluationIndex::read(&args.path)?.census();
+        let census = IndexCensus::new(&EvaluationIndex::read(&args.path)?);
         print_result(&format!("{census}\n"))?;
         return args.json.write(&census);
     }
