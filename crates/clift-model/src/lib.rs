@@ -1,4 +1,4 @@
-//! Compressive light-field tokens (CLiFT, `NeurIPS` 2025) in Burn: tensors in, tensors out.
+//! Compressive light-field tokens (`CLiFT`, `NeurIPS` 2025) in Burn: tensors in, tensors out.
 //!
 //! The [`Encoder`] turns posed context views into light-field tokens, latent K-means ([`KMeans`]) groups the tokens, and
 //! the [`Condenser`] writes every group into its centroid. To render, the [`Selector`] selects the tokens nearest to a
