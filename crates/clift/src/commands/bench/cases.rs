@@ -20,7 +20,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
     let config = timing.config.read(args.config.as_deref().unwrap_or(Path::new("")), |_| Ok(()))?;
     timing.json.check_folder()?;
-    let options = timing.options(&BenchCase::ALL);
+    let options = timing.options(BenchCase::ALL);
     let options = BenchOptions { error: !args.no_error, features: args.features.clone(), ..options };
     let stop = interrupt::flag()?;
     let mut counter: Option<Counter> = None;
