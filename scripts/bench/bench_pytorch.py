@@ -109,7 +109,7 @@ class Bench:
         size = SIZES[side.size or self.args.size]
         # The first step has no optimiser state yet while it goes backward: the second one's memory counts.
         repeats, warmup = (1, 1) if side.contexts else (self.args.repeats, self.args.warmup)
-        command = [str(self.clift), "bench", str(self.args.config), "--work", side.work, "--device", "flex"]
+        command = [str(self.clift), "bench", str(self.args.config), "--case", side.work, "--device", "flex"]
         command += ["--no-error", "--repeats", str(repeats), "--warmup", str(warmup), "--storage", "1/4"]
         for override in [*overrides(size | ({"contexts": side.contexts} if side.contexts else {})), *side.overrides]:
             command += ["--set", override]

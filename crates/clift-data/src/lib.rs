@@ -1,7 +1,7 @@
 //! Files in, clips out: data sets and captures in every layout, synthetic scenes, view samplers and the loader.
 //!
 //! A clip holds the context and target images of one scene with their normalised cameras. This crate does not depend on
-//! Burn: clips are plain host arrays, which `clift_model::ClipViews::upload` copies to a device.
+//! Burn: clips are plain host arrays, which `clift_model::Views::upload` copies to a device.
 //!
 //! ```
 //! use clift_data::{ClipReader, DataConfig, Split, ViewIndices, open_dataset};

@@ -24,7 +24,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! `examples/custom_loss.rs` makes single updates with [`TrainState`] and an own loss term.
+//! `examples/custom_loss.rs` makes single updates with [`TrainState`] and a loss term of its own.
 
 mod checkpoint;
 mod cluster_cache;

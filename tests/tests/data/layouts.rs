@@ -37,7 +37,7 @@ fn dl3dv_training_requires_a_test_scene_list() {
     for source in ["dl3dv", "auto", "captures"] {
         place
             .train("run", &[&data(source, "dl3dv", "")], &[])
-            .fails_with(2, &["`data.files.test_scenes` = missing: the folders hold DL3DV's benchmark"]);
+            .fails_with(2, &["data.files.test_scenes is missing; the folders also hold the benchmark scenes of DL3DV"]);
     }
     std::fs::write(place.at("none.txt"), "").unwrap();
     let files = format!("files={{test_scenes='{}'}},", place.at("none.txt").display());
@@ -63,8 +63,8 @@ fn a_folder_of_any_layout_is_described() {
     ] {
         let ran = clift(["data", "info", layouts.join(name).to_str().unwrap()]).ok();
         assert!(ran.stdout.starts_with(&format!("layout            {layout}\n")), "{name}: {}", ran.stdout);
-        assert!(ran.stdout.contains("  picture         32x18"), "{name}: {}", ran.stdout);
+        assert!(ran.stdout.contains("  image           32x18"), "{name}: {}", ran.stdout);
     }
     clift(["data", "info", repository("configs").to_str().unwrap()])
-        .fails_with(2, &["no scenes found: looked for index.json with chunks, "]);
+        .fails_with(2, &["no scenes found: expected index.json with chunks, "]);
 }

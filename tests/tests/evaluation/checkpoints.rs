@@ -189,7 +189,7 @@ fn an_export_writes_over_nothing() {
     // The output path is checked before the model is read.
     for words in [&format!("{model} --format pytorch"), "no/such/model --format safetensors"] {
         let ran = place.clift(&format!("export {words} -o DIR/model/model.safetensors"));
-        ran.fails_with(2, &["nothing is written over"]);
+        ran.fails_with(2, &["the path exists and is not overwritten"]);
     }
     assert!(place.bytes("model/model.safetensors") == before);
 }

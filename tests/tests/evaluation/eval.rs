@@ -249,8 +249,12 @@ fn two_evaluations_are_compared_pair_by_pair() {
     let out = place.at("fewer");
     place.eval("b", &["--set", "eval.num_scenes=2", "--out", out.to_str().unwrap()]).ok();
     let ran = clift(["compare", &a, out.to_str().unwrap()]).ok();
-    assert!(ran.stdout.contains("the 4 of both are compared, up to 2 of A alone and 0 of B alone"), "{}", ran.stdout);
-    clift(["compare", &a, "no/such/run"]).fails_with(2, &["there is no views.csv", "no/such/run"]);
+    assert!(
+        ran.stdout.contains("4 common views are compared, up to 2 views of A and 0 views of B are ignored"),
+        "{}",
+        ran.stdout
+    );
+    clift(["compare", &a, "no/such/run"]).fails_with(2, &["no views.csv here or in `eval`", "no/such/run"]);
 }
 
 #[test]

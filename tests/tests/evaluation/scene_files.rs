@@ -257,7 +257,7 @@ fn what_cannot_be_drawn_says_what_to_do() {
     let far = json!({"c2w": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0]]});
     std::fs::write(place.at("poses.json"), json!({"poses": [pose, far]}).to_string()).unwrap();
     let poses = place.at("poses.json").display().to_string();
-    render(&["--path", &poses]).fails_with(1, &["pose 1: bad camera: it stands "]);
+    render(&["--path", &poses]).fails_with(1, &["pose 1: bad camera: the camera is "]);
     render(&["--path", &poses, "--frames", "3"]).fails_with(2, &["a file of poses determines the number of frames"]);
     assert!(!place.at("out").exists(), "nothing is left of what was refused");
 
@@ -351,7 +351,7 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     assert!(on(&mini.join("test"), &[]).ok().stdout.contains("scene 00000000000000b1"));
     let train = ["--split", "train", "--scene", "00000000000000a2"];
     assert!(on(&mini, &train).ok().stdout.contains("scene 00000000000000a2"));
-    on(&place.at("run"), &[]).fails_with(2, &["no scenes found: looked for index.json with chunks, "]);
+    on(&place.at("run"), &[]).fails_with(2, &["no scenes found: expected index.json with chunks, "]);
 
     let file = place.at("run/stage1/model.safetensors").display().to_string();
     let out = place.at("from-file.clift").display().to_string();

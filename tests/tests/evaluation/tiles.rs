@@ -56,7 +56,7 @@ fn tile_runs_encode_nothing_and_refuse_their_kind() {
     train_on_tiles(&place, "tiles");
     place
         .train("few", &["clusters.grouping=\"tile\""], &[])
-        .fails_with(2, &["eval.validation_storage", "a tile for every"]);
+        .fails_with(2, &["eval.validation_storage", "at least one tile for every context view"]);
     let run = place.at("run").display().to_string();
     let tiles = place.at("tiles").display().to_string();
     place.eval("run", &["--with", &run]).fails_with(2, &["trained on the same groups of tokens"]);

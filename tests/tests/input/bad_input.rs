@@ -170,7 +170,7 @@ fn unusable_scenes_are_skipped_and_named() {
             std::fs::copy(hostile, data.join("train/000001.torch")).unwrap();
             data
         }),
-        ("of scene 00000000000000a2 cannot be decoded: its JPEG data of ", |place| {
+        ("of scene 00000000000000a2 cannot be decoded: the JPEG data of ", |place| {
             changed_scene(place, |scene| scene.images.iter_mut().for_each(|image| image.truncate(image.len() / 2)))
         }),
         ("bad camera: ", |place| moved_cameras(place, |centre| centre[1] = f64::NAN)),

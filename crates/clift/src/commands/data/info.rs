@@ -221,7 +221,7 @@ test              1 scene
         let root = tempfile::tempdir().unwrap();
         std::fs::write(root.path().join("transforms.json"), r#"{"fl_x": 20, "frames": []}"#).unwrap();
         let text = describe_folder(root.path()).unwrap().to_string();
-        assert!(text.starts_with("all               bad scene: it lists no frames: "), "{text}");
+        assert!(text.starts_with("all               bad scene: no frames listed: "), "{text}");
     }
 
     #[test]
