@@ -67,9 +67,7 @@ pub use sampling::view_sampler::{ViewSampler, sample_targets};
 
 // Cameras and poses.
 pub use geometry::camera::{Camera, Intrinsics, IntrinsicsNorm};
-pub use geometry::camera_path::{
-    PathView, interpolate as interpolate_path, mean_intrinsics, orbit as orbit_path, read_poses,
-};
+pub use geometry::camera_path::{PathView, interpolate_path, mean_intrinsics, orbit_path, read_poses};
 pub use geometry::lens::Lens;
 pub use geometry::normalization::{MAX_COORDINATE, PoseNormalization, PoseRotation, PoseScale};
 pub use geometry::overlap::overlap;
@@ -78,8 +76,8 @@ pub use geometry::pose::Pose;
 pub use glam::{DMat3, DVec3};
 
 // Images.
-pub use image::codec::{decode as decode_image, encode_jpeg, encode_png};
-pub use image::fit::{Crop, fit as fit_image};
+pub use image::codec::{decode_image, encode_jpeg, encode_png};
+pub use image::fit::{Crop, fit_image};
 pub use image::rgb_image::RgbImage;
 pub use image::undistort::Undistortion;
 

@@ -36,12 +36,12 @@ pub fn uniform_below(rng: &mut impl Rng, count: usize) -> usize {
 }
 
 /// Samples uniformly from `low..=high`.
-pub(crate) fn between(rng: &mut impl Rng, low: usize, high: usize) -> usize {
+pub(crate) fn uniform_between(rng: &mut impl Rng, low: usize, high: usize) -> usize {
     low + uniform_below(rng, high - low + 1)
 }
 
 /// Samples uniformly from `[0, 1)`, in steps of `2^-53`.
-pub(crate) fn unit(rng: &mut impl Rng) -> f64 {
+pub(crate) fn uniform_01(rng: &mut impl Rng) -> f64 {
     (rng.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
 }
 
@@ -59,7 +59,7 @@ pub fn sample_distinct(rng: &mut impl Rng, range: usize, count: usize) -> Vec<us
 /// Samples `count` of `values` without replacement, in random order.
 pub(crate) fn sample_from(rng: &mut impl Rng, mut values: Vec<usize>, count: usize) -> Vec<usize> {
     for i in 0..count {
-        let j = between(rng, i, values.len() - 1);
+        let j = uniform_between(rng, i, values.len() - 1);
         values.swap(i, j);
     }
     values.truncate(count);

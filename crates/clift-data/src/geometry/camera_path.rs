@@ -37,7 +37,7 @@ pub struct PathView {
 /// Returns a smooth path through all context views in their order, from the first view to the last.
 ///
 /// Centres follow a Catmull-Rom spline. Orientations are interpolated spherically, intrinsics linearly.
-pub fn interpolate(context: &[PathView], num_frames: usize) -> Vec<PathView> {
+pub fn interpolate_path(context: &[PathView], num_frames: usize) -> Vec<PathView> {
     let Some(last) = context.len().checked_sub(1) else { return Vec::new() };
     let time = |frame: usize| last as f64 * frame as f64 / num_frames.saturating_sub(1).max(1) as f64;
     (0..num_frames).map(|frame| view_at(context, time(frame))).collect()
@@ -61,7 +61,7 @@ fn view_at(context: &[PathView], time: f64) -> PathView {
 
 /// Returns a closed ellipse around the mean view that faces the focus of the context views. The radii are 0.7 of the
 /// extent of the context centres. A frame after the last would equal the first.
-pub fn orbit(context: &[PathView], num_frames: usize) -> Vec<PathView> {
+pub fn orbit_path(context: &[PathView], num_frames: usize) -> Vec<PathView> {
     let Some(intrinsics) = mean_intrinsics(context) else { return Vec::new() };
     let focus = focus_distance(context) * DVec3::Z;
     let extent = context.iter().fold(DVec3::ZERO, |extent, view| extent.max(view.c2w.translation.abs()));
@@ -208,7 +208,7 @@ mod tests {
     #[test]
     fn interpolated_path_passes_every_context_view() {
         let context = walk();
-        let path = interpolate(&context, 31);
+        let path = interpolate_path(&context, 31);
         assert_eq!(path.len(), 31);
         for (i, view) in context.iter().enumerate() {
             assert_close(&path[10 * i], view, 1e-12);
@@ -225,13 +225,13 @@ mod tests {
     fn midpoint_has_half_the_turn_and_mean_intrinsics() {
         let mut context = vec![view([0.0; 3], 0.2), view([1.0, 2.0, 0.0], 0.8)];
         context[1].intrinsics.fx = 60.0;
-        let middle = interpolate(&context, 3)[1];
+        let middle = interpolate_path(&context, 3)[1];
         assert_close(&middle, &view([0.5, 1.0, 0.0], 0.5), 1e-12);
         assert!((middle.intrinsics.fx - 50.0).abs() < 1e-12);
-        assert_eq!(interpolate(&context, 1).len(), 1);
-        assert_close(&interpolate(&context, 1)[0], &context[0], 1e-12);
-        assert_close(&interpolate(&context[..1], 5)[3], &context[0], 1e-12);
-        assert!(interpolate(&[], 5).is_empty());
+        assert_eq!(interpolate_path(&context, 1).len(), 1);
+        assert_close(&interpolate_path(&context, 1)[0], &context[0], 1e-12);
+        assert_close(&interpolate_path(&context[..1], 5)[3], &context[0], 1e-12);
+        assert!(interpolate_path(&[], 5).is_empty());
     }
 
     #[test]
@@ -240,7 +240,7 @@ mod tests {
         let turn = 1.0_f64.atan2(3.0);
         let context = [view([-1.0, 0.0, 0.0], turn), view([1.0, 0.0, 0.0], -turn)];
         assert!((focus_distance(&context) - 3.0).abs() < 1e-9);
-        let path = orbit(&context, 12);
+        let path = orbit_path(&context, 12);
         assert_eq!(path.len(), 12);
         for view in &path {
             let to_focus = 3.0 * DVec3::Z - view.c2w.translation;
@@ -252,7 +252,7 @@ mod tests {
         assert!((path[3].c2w.translation.y - 0.1).abs() < 1e-12, "smallest radius for contexts on a line");
         let parallel = [view([-1.0, 0.0, 0.0], 0.0), view([1.0, 0.0, 0.0], 0.0)];
         assert_eq!(focus_distance(&parallel), FOCUS);
-        assert!(orbit(&[], 3).is_empty());
+        assert!(orbit_path(&[], 3).is_empty());
     }
 
     fn read(json: &str) -> Result<Vec<PathView>, DataError> {

@@ -50,7 +50,7 @@ mod tests {
 
     use super::*;
     use crate::geometry::camera::IntrinsicsNorm;
-    use crate::random::{step_rng, unit};
+    use crate::random::{step_rng, uniform_01};
 
     fn camera(turn_deg: f64, centre: [f64; 3]) -> Camera {
         let rotation = DMat3::from_rotation_y(turn_deg.to_radians());
@@ -84,7 +84,7 @@ mod tests {
         let (mut num_seen, mut num_missed) = (0, 0);
         for i in 0..2000 {
             let mut rng = step_rng(3, i, "test");
-            let mut around = |size: f64| (2.0 * unit(&mut rng) - 1.0) * size;
+            let mut around = |size: f64| (2.0 * uniform_01(&mut rng) - 1.0) * size;
             let to = camera(around(90.0), [around(2.0), around(2.0), around(2.0)]);
             let direction = DVec3::new(around(1.0), around(1.0), 1.0);
             let motion = to.c2w.inverse();

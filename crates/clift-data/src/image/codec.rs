@@ -28,7 +28,7 @@ const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 /// # Errors
 /// [`DataError::BadImage`] with `key` and `frame` for another format, broken or truncated data, and a side above
 /// 16,384 pixels.
-pub fn decode(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
+pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
     let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
     let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {
         return Err(bad(format!("the {} bytes are neither JPEG nor PNG", bytes.len())));
@@ -181,8 +181,8 @@ mod tests {
     #[test]
     fn png_round_trips_exactly_and_jpeg_closely() {
         let image = ramp(40, 24);
-        assert_eq!(decode(&encode_png(&image).unwrap(), "k", 0).unwrap(), image);
-        let jpeg = decode(&encode_jpeg(&image, 95).unwrap(), "k", 0).unwrap();
+        assert_eq!(decode_image(&encode_png(&image).unwrap(), "k", 0).unwrap(), image);
+        let jpeg = decode_image(&encode_jpeg(&image, 95).unwrap(), "k", 0).unwrap();
         let worst = jpeg.rgb.iter().zip(&image.rgb).map(|(a, b)| a.abs_diff(*b)).max();
         assert!(worst.is_some_and(|worst| worst < 16), "{worst:?}"); // JPEG stores colour at half the resolution
     }
@@ -191,15 +191,15 @@ mod tests {
     fn unreadable_files_name_scene_and_frame() {
         let jpeg = encode_jpeg(&ramp(40, 24), 90).unwrap();
         for length in [40, jpeg.len() / 2, jpeg.len() - 2] {
-            let message = decode(&jpeg[..length], "00ff", 7).unwrap_err().to_string();
+            let message = decode_image(&jpeg[..length], "00ff", 7).unwrap_err().to_string();
             assert!(message.starts_with("frame 7 of scene 00ff cannot be decoded: "), "{message}");
             assert!(message.contains("truncated"), "{message}");
         }
         let broken = b"\xff\xd8\xff\xe0\x00\x04\xff\xda\x00\x02\xff\xd9"; // a scan without tables and sizes
-        let message = decode(broken, "00ff", 7).unwrap_err().to_string();
+        let message = decode_image(broken, "00ff", 7).unwrap_err().to_string();
         assert!(message.starts_with("frame 7 of scene 00ff cannot be decoded: "), "{message}");
-        assert_eq!(decode(&[&jpeg[..], &[0; 9]].concat(), "00ff", 7).unwrap().width, 40); // padding is common
-        let message = decode(b"GIF89a....", "00ff", 7).unwrap_err().to_string();
+        assert_eq!(decode_image(&[&jpeg[..], &[0; 9]].concat(), "00ff", 7).unwrap().width, 40); // padding is common
+        let message = decode_image(b"GIF89a....", "00ff", 7).unwrap_err().to_string();
         assert!(message.ends_with("the 10 bytes are neither JPEG nor PNG"), "{message}");
     }
 
@@ -225,7 +225,7 @@ mod tests {
         png[16..24].copy_from_slice(&[0, 1, 0, 0, 0, 1, 0, 0]); // 65,536 x 65,536
         let checksum = crc32fast::hash(&png[12..29]).to_be_bytes();
         png[29..33].copy_from_slice(&checksum);
-        let message = decode(&png, "k", 0).unwrap_err().to_string();
+        let message = decode_image(&png, "k", 0).unwrap_err().to_string();
         assert!(message.contains("limit") || message.contains("exceeds"), "{message}");
     }
 }

@@ -39,7 +39,7 @@ impl Crop {
 ///
 /// # Errors
 /// [`DataError::Upscale`] if `width` or `height` exceeds that of the image.
-pub fn fit(
+pub fn fit_image(
     image: &RgbImage,
     intrinsics_norm: IntrinsicsNorm,
     width: usize,
@@ -74,7 +74,7 @@ fn covering_size(from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::codec::decode;
+    use crate::image::codec::decode_image;
 
     fn ramp(width: usize, height: usize) -> RgbImage {
         let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 77])).collect();
@@ -95,11 +95,11 @@ mod tests {
             assert_eq!(((scaled.0 - to.0) / 2, (scaled.1 - to.1) / 2), offset);
             let norm = IntrinsicsNorm { fx: 0.9, fy: 1.6, cx: 0.5, cy: 0.5 };
             let image = RgbImage { width: from.0, height: from.1, rgb: vec![9; from.0 * from.1 * 3] };
-            let (fitted, protocol) = fit(&image, norm, to.0, to.1, false).unwrap();
+            let (fitted, protocol) = fit_image(&image, norm, to.0, to.1, false).unwrap();
             assert_eq!((fitted.width, fitted.height, fitted.rgb.len()), (to.0, to.1, to.0 * to.1 * 3));
             assert!((protocol.fx / to.0 as f64 / norm.fx - factor).abs() < 1e-5, "{protocol:?}"); // printed to 5 digits
             assert_eq!((protocol.fy, protocol.cx, protocol.cy), (1.6 * 256.0, to.0 as f64 / 2.0, 128.0));
-            let (_, moved) = fit(&image, norm, to.0, to.1, true).unwrap();
+            let (_, moved) = fit_image(&image, norm, to.0, to.1, true).unwrap();
             assert_eq!((moved.fx, moved.cx, moved.cy), (protocol.fx, exact, 128.0));
         }
     }
@@ -108,19 +108,19 @@ mod tests {
     fn protocol_and_exact_principal_points_differ_by_half_a_pixel() {
         let image = ramp(108, 192);
         let norm = IntrinsicsNorm { fx: 1.27, fy: 0.72, cx: 0.6, cy: 0.55 };
-        let [protocol, exact] = [false, true].map(|exact| fit(&image, norm, 64, 64, exact).unwrap().1);
+        let [protocol, exact] = [false, true].map(|exact| fit_image(&image, norm, 64, 64, exact).unwrap().1);
         // 64 x 114, 25 rows cut off above and below: 0.55 * 114 - 25 = 37.7.
         assert!((exact.cx - 38.4).abs() < 1e-12 && (exact.cy - 37.7).abs() < 1e-12, "{exact:?}");
         assert!((protocol.cx - exact.cx).abs() < 1e-12 && (protocol.cy - exact.cy).abs() < 1e-12, "{protocol:?}");
-        let odd = fit(&ramp(108, 193), norm, 64, 63, false).unwrap().1;
-        let exact = fit(&ramp(108, 193), norm, 64, 63, true).unwrap().1;
+        let odd = fit_image(&ramp(108, 193), norm, 64, 63, false).unwrap().1;
+        let exact = fit_image(&ramp(108, 193), norm, 64, 63, true).unwrap().1;
         assert!((odd.cy - exact.cy).abs() <= 0.5 + 1e-12, "{odd:?} {exact:?}");
     }
 
     #[test]
     fn upscaling_error_names_both_sizes() {
         let norm = IntrinsicsNorm { fx: 1.0, fy: 1.0, cx: 0.5, cy: 0.5 };
-        let message = fit(&ramp(64, 36), norm, 32, 48, false).unwrap_err().to_string();
+        let message = fit_image(&ramp(64, 36), norm, 32, 48, false).unwrap_err().to_string();
         assert!(message.contains("32x48") && message.contains("64x36"), "{message}");
     }
 
@@ -136,8 +136,8 @@ mod tests {
             // The luma sampling of the frame header is 2 x 2: decoders must enlarge the chroma (4:2:0).
             let header = file.windows(2).position(|marker| marker == [0xff, 0xc0]).unwrap();
             assert_eq!(file[header + 11], 0x22);
-            let image = decode(file, "k", 0).unwrap();
-            let (fitted, _) = fit(&image, norm, width, height, false).unwrap();
+            let image = decode_image(file, "k", 0).unwrap();
+            let (fitted, _) = fit_image(&image, norm, width, height, false).unwrap();
             let differences = fitted.rgb.iter().zip(expected.data()).map(|(a, b)| a.abs_diff(*b));
             let mean = differences.clone().map(f64::from).sum::<f64>() / fitted.rgb.len() as f64;
             // Decoders enlarge the chroma differently; the mean is 0.07 to 0.28 for real photos (docs/contributing.md).

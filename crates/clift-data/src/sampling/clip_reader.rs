@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::error::DataError;
 use crate::geometry::camera::{Camera, Intrinsics};
 use crate::geometry::normalization::{PoseNormalization, PoseRotation, PoseScale, check_near};
-use crate::image::fit::fit;
+use crate::image::fit::fit_image;
 use crate::image::rgb_image::RgbImage;
 use crate::sampling::clip::{Clip, ClipViews, ViewIndices};
 use crate::scene_source::SceneSource;
@@ -91,10 +91,8 @@ impl ClipReader {
     fn fitted(&self, scene: usize, frame: usize, camera: &Camera) -> Result<(RgbImage, Intrinsics), DataError> {
         let ClipOptions { width, height, exact_principal_point, .. } = self.options;
         let image = self.source.frame(scene, frame)?;
-        fit(&image, camera.intrinsics_norm, width, height, exact_principal_point).map_err(|source| DataError::InFrame {
-            key: self.source.key(scene).to_owned(),
-            frame,
-            source: Box::new(source),
+        fit_image(&image, camera.intrinsics_norm, width, height, exact_principal_point).map_err(|source| {
+            DataError::InFrame { key: self.source.key(scene).to_owned(), frame, source: Box::new(source) }
         })
     }
 }

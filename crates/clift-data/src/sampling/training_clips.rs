@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::error::DataError;
-use crate::random::{item_rng, unit};
+use crate::random::{item_rng, uniform_01};
 use crate::sampling::clip::{Clip, ViewIndices};
 use crate::sampling::scene_order::SceneOrder;
 use crate::sampling::slot_filler::{NoUsableScene, SlotFiller};
@@ -123,7 +123,7 @@ impl TrainingClips {
         let views = self.sampler.sample(self.source.as_ref(), scene, step, num_context, &mut rng)?;
         let clip = (self.read)(scene, &views)?;
         // A separate stream: the sampled views do not depend on `flip`.
-        let is_flipped = self.flip && unit(&mut item_rng(self.seed, step, slot as u32, attempt, "flip")) < 0.5;
+        let is_flipped = self.flip && uniform_01(&mut item_rng(self.seed, step, slot as u32, attempt, "flip")) < 0.5;
         Ok(if is_flipped { clip.flipped() } else { clip })
     }
 }

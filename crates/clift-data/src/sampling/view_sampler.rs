@@ -4,7 +4,7 @@ use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DataError;
-use crate::random::{between, sample_from, step_rng, uniform_below};
+use crate::random::{sample_from, step_rng, uniform_below, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::inner_views::InnerViews;
 use crate::scene_source::SceneSource;
@@ -124,7 +124,7 @@ impl ViewSampler {
 
     /// Samples the number of contexts of the batch at `step`, uniform in `[min_context, max_context]`.
     pub fn num_context(&self, seed: u64, step: u64) -> usize {
-        between(&mut step_rng(seed, step, "number of contexts"), self.min_context, self.max_context)
+        uniform_between(&mut step_rng(seed, step, "number of contexts"), self.min_context, self.max_context)
     }
 
     /// Returns the smallest and the largest gap at `step` of a batch with `num_context` contexts.
@@ -192,12 +192,12 @@ impl ViewSampler {
         if num_frames <= min_gap {
             return Err(DataError::NotEnoughFrames { needed: min_gap + 1, got: num_frames });
         }
-        let gap = between(rng, min_gap, max_gap.min(num_frames - 1));
+        let gap = uniform_between(rng, min_gap, max_gap.min(num_frames - 1));
         let left = uniform_below(rng, num_frames - gap);
         let right = left + gap;
 
         let target = if self.with_replacement {
-            (0..self.num_targets).map(|_| between(rng, left, right)).collect()
+            (0..self.num_targets).map(|_| uniform_between(rng, left, right)).collect()
         } else {
             sample_from(rng, (left..=right).collect(), self.num_targets)
         };

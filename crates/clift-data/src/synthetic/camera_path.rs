@@ -7,7 +7,7 @@ use rand::Rng;
 
 use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::pose::Pose;
-use crate::random::unit;
+use crate::random::uniform_01;
 use crate::synthetic::config::LookDirection;
 
 /// Smallest distance between the camera and any surface, in the scene's units of length.
@@ -37,10 +37,10 @@ impl CameraPath {
     /// Samples a path of about `length` in a room of `half_size` (y is down).
     pub fn sample(rng: &mut impl Rng, half_size: DVec3, length: f64, looks: LookDirection) -> Self {
         let widest = half_size.x.min(half_size.z) - CLEARANCE;
-        let radius = widest * (0.86 + 0.08 * unit(rng));
-        let side = if unit(rng) < 0.5 { -1.0 } else { 1.0 };
+        let radius = widest * (0.86 + 0.08 * uniform_01(rng));
+        let side = if uniform_01(rng) < 0.5 { -1.0 } else { 1.0 };
         let tall = half_size.y;
-        let mut around = |size: f64| (2.0 * unit(rng) - 1.0) * size;
+        let mut around = |size: f64| (2.0 * uniform_01(rng) - 1.0) * size;
         let height = [tall * (-0.15 + around(0.2)), around(0.15 * tall)];
         // At most 0.6 of the radius from the axis: the camera never reaches its fixated point.
         let target = DVec3::new(around(0.1 * radius), tall * (0.2 + around(0.15)), around(0.1 * radius));
@@ -50,11 +50,11 @@ impl CameraPath {
         Self {
             radius: if looks == LookDirection::Out { INNER_RADIUS * radius } else { radius },
             looks,
-            start: unit(rng) * TAU,
+            start: uniform_01(rng) * TAU,
             sweep: side * length / radius,
             height,
             target: [target, drift],
-            phase: unit(rng) * TAU,
+            phase: uniform_01(rng) * TAU,
         }
     }
 

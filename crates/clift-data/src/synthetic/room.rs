@@ -4,7 +4,7 @@ use glam::{DVec3, Vec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::random::{between, unit};
+use crate::random::{uniform_01, uniform_between};
 use crate::synthetic::camera_path::{CLEARANCE, CameraPath};
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::texture::Texture;
@@ -60,26 +60,26 @@ impl Room {
     /// Samples a room. Expects a valid `config`.
     pub fn sample(rng: &mut ChaCha8Rng, config: &SyntheticConfig) -> Self {
         let [small, large] = config.room_half_size;
-        let mut half = || small + (large - small) * unit(rng);
+        let mut half = || small + (large - small) * uniform_01(rng);
         let (wide, deep) = (half(), half());
-        let tall = small * (0.6 + 0.15 * unit(rng));
+        let tall = small * (0.6 + 0.15 * uniform_01(rng));
         let half_size = DVec3::new(wide, tall, deep);
         let path = CameraPath::sample(rng, half_size, config.path_length, config.looks);
         let lamp = DVec3::new(wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35));
 
         // Without plain rooms no random number is drawn: rooms equal those from before this option.
-        let is_plain = config.plain_share > 0.0 && unit(rng) < config.plain_share;
-        let hue = unit(rng);
+        let is_plain = config.plain_share > 0.0 && uniform_01(rng) < config.plain_share;
+        let hue = uniform_01(rng);
         let frequency = if is_plain { 0.0 } else { config.texture_frequency };
         let walls = [0, 1, 2, 3, 4, 5].map(|side| {
             let (hue, saturation, value, frequency) = match side {
                 2 => (hue, 0.1, 0.9, 0.5 * frequency),
-                3 => (0.05 + 0.1 * unit(rng), 0.35, 0.75, frequency),
+                3 => (0.05 + 0.1 * uniform_01(rng), 0.35, 0.75, frequency),
                 // The hues of the four walls are a quarter turn apart.
                 _ => {
                     let quarter = [0.0, 0.5, 0.0, 0.0, 0.25, 0.75][side] + swing(rng, 0.05);
                     let value = if side < 2 { 0.95 } else { 0.7 };
-                    (hue + quarter, 0.5 + 0.3 * unit(rng), value, frequency)
+                    (hue + quarter, 0.5 + 0.3 * uniform_01(rng), value, frequency)
                 }
             };
             Texture::sample(rng, hue, saturation, value, frequency)
@@ -87,7 +87,7 @@ impl Room {
 
         let mut room = Self { half_size: half_size.as_vec3(), walls, objects: Vec::new(), lamp: lamp.as_vec3(), path };
         let [fewest, most] = if is_plain { [0, 0] } else { config.num_objects };
-        for _ in 0..between(rng, fewest, most) {
+        for _ in 0..uniform_between(rng, fewest, most) {
             let object = (0..MAX_PLACEMENTS).find_map(|attempt| room.try_object(rng, config, attempt));
             room.objects.extend(object);
         }
@@ -97,10 +97,10 @@ impl Room {
     /// Samples an object on the floor. Returns `None` if the object touches the path, a wall or another object.
     fn try_object(&self, rng: &mut impl Rng, config: &SyntheticConfig, attempt: u32) -> Option<Object> {
         let scale = config.room_half_size[0] * 0.96_f64.powi(attempt as i32);
-        let mut size = |low: f64, high: f64| (scale * (low + (high - low) * unit(rng))) as f32;
+        let mut size = |low: f64, high: f64| (scale * (low + (high - low) * uniform_01(rng))) as f32;
         let (radius, edges) = (size(0.13, 0.26), [size(0.1, 0.2), size(0.1, 0.34), size(0.1, 0.2)]);
-        let (sin, cos) = (unit(rng) as f32 * std::f32::consts::TAU).sin_cos();
-        let is_ball = unit(rng) < 0.5;
+        let (sin, cos) = (uniform_01(rng) as f32 * std::f32::consts::TAU).sin_cos();
+        let is_ball = uniform_01(rng) < 0.5;
         let (shape, height) = if is_ball {
             (Shape::Ball { radius }, radius)
         } else {
@@ -109,9 +109,9 @@ impl Room {
 
         let Vec3 { x: wide, y: floor, z: deep } = self.half_size;
         let center = Vec3::new(wide * swing(rng, 1.0) as f32, floor - height, deep * swing(rng, 1.0) as f32);
-        let hue = unit(rng);
+        let hue = uniform_01(rng);
         let texture = Texture::sample(rng, hue, 0.75, 0.95, 2.0 * config.texture_frequency);
-        let object = Object { shape, center, texture, gloss: unit(rng) as f32 };
+        let object = Object { shape, center, texture, gloss: uniform_01(rng) as f32 };
         self.has_room_for(&object).then_some(object)
     }
 
@@ -137,7 +137,7 @@ pub(crate) fn turned(v: Vec3, [cos, sin]: [f32; 2]) -> Vec3 {
 
 /// Samples uniformly from `[-size, size)`.
 fn swing(rng: &mut impl Rng, size: f64) -> f64 {
-    size * (2.0 * unit(rng) - 1.0)
+    size * (2.0 * uniform_01(rng) - 1.0)
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 use rand::Rng;
 
-use crate::random::{uniform_below, unit};
+use crate::random::{uniform_01, uniform_below};
 
 /// Pattern in which the two colours alternate.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -34,15 +34,15 @@ impl Texture {
     /// `saturation` and `value` describe the brighter colour.
     pub fn sample(rng: &mut impl Rng, hue: f64, saturation: f64, value: f64, frequency: f64) -> Self {
         let pattern = [Pattern::Gradient, Pattern::Stripes, Pattern::Checkers, Pattern::Waves][uniform_below(rng, 4)];
-        let turn = unit(rng) * std::f64::consts::TAU;
-        let shift = 0.12 + 0.3 * unit(rng);
-        let darker = value * (0.25 + 0.15 * unit(rng));
+        let turn = uniform_01(rng) * std::f64::consts::TAU;
+        let shift = 0.12 + 0.3 * uniform_01(rng);
+        let darker = value * (0.25 + 0.15 * uniform_01(rng));
         Self {
             pattern,
             colors: [linear_color(hue, saturation, value), linear_color(hue + shift, saturation, darker)],
             axis: [turn.cos() as f32, turn.sin() as f32],
-            rate: TAU * (frequency * (0.7 + 0.6 * unit(rng))) as f32,
-            phase: unit(rng) as f32 * TAU,
+            rate: TAU * (frequency * (0.7 + 0.6 * uniform_01(rng))) as f32,
+            phase: uniform_01(rng) as f32 * TAU,
         }
     }
 

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::geometry::overlap::overlap;
-use crate::random::{between, derive_seed, sample_distinct, sample_from, step_rng};
+use crate::random::{derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, first_few, plural};
@@ -87,7 +87,7 @@ impl OverlapOptions {
             if partners.is_empty() {
                 continue;
             }
-            let partner = partners[between(&mut rng, 0, partners.len() - 1)];
+            let partner = partners[uniform_between(&mut rng, 0, partners.len() - 1)];
             let (left, right) = (frame.min(partner), frame.max(partner));
             let mut target = sample_from(&mut rng, (left..=right).collect(), self.num_targets);
             target.sort_unstable();

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
-use crate::image::codec::decode;
+use crate::image::codec::decode_image;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::{SkipReport, first_few, plural};
@@ -237,7 +237,7 @@ impl SceneSource for ChunkSource {
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-        decode(&self.read_encoded(scene, frame)?, self.key(scene), frame)
+        decode_image(&self.read_encoded(scene, frame)?, self.key(scene), frame)
     }
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {

@@ -7,7 +7,7 @@ use crate::files::bounded::read_bounded;
 use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
-use crate::image::codec::{check_end, decode, exif_orientation, read_size};
+use crate::image::codec::{check_end, decode_image, exif_orientation, read_size};
 use crate::image::rgb_image::RgbImage;
 use crate::image::undistort::Undistortion;
 
@@ -111,7 +111,7 @@ impl Photo {
 
     /// Decodes and undistorts the image.
     pub fn decode(&self, key: &str, frame: usize) -> Result<RgbImage, DataError> {
-        let image = decode(&self.read()?, key, frame)?;
+        let image = decode_image(&self.read()?, key, frame)?;
         self.check_shape([image.width, image.height])?;
         Ok(match &self.undistortion {
             Some(undistortion) => undistortion.apply(&image),

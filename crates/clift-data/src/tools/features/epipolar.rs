@@ -136,7 +136,7 @@ fn null_vector(mut rows: [[f64; 9]; 8]) -> [f64; 9] {
 mod tests {
     use super::*;
     use crate::geometry::camera::IntrinsicsNorm;
-    use crate::random::unit;
+    use crate::random::uniform_01;
 
     /// Returns two overlapping cameras, and points that both see.
     fn scene(num_points: u64) -> ([Camera; 2], Vec<Correspondence>) {
@@ -150,7 +150,11 @@ mod tests {
         };
         let matches = (0..num_points).map(|i| {
             let mut rng = step_rng(5, i, "test");
-            let point = DVec3::new(2.0 * unit(&mut rng) - 1.0, 1.5 * unit(&mut rng) - 0.7, 3.0 + 2.0 * unit(&mut rng));
+            let point = DVec3::new(
+                2.0 * uniform_01(&mut rng) - 1.0,
+                1.5 * uniform_01(&mut rng) - 0.7,
+                3.0 + 2.0 * uniform_01(&mut rng),
+            );
             Correspondence { first: seen(&cameras[0], point), second: seen(&cameras[1], point) }
         });
         let matches = matches.collect();
@@ -183,7 +187,7 @@ mod tests {
         let (_, mut matches) = scene(120);
         for (i, pair) in matches.iter_mut().enumerate().filter(|(i, _)| i % 3 == 0) {
             let mut rng = step_rng(6, i as u64, "test");
-            pair.second = [640.0 * unit(&mut rng), 480.0 * unit(&mut rng)];
+            pair.second = [640.0 * uniform_01(&mut rng), 480.0 * uniform_01(&mut rng)];
         }
         let kept = ransac_inliers(&matches);
         let right = matches.iter().enumerate().filter(|(i, _)| i % 3 != 0).map(|(_, pair)| *pair);
@@ -191,7 +195,7 @@ mod tests {
         assert!(kept.len() < 80 + 8, "{}", kept.len());
         for (i, pair) in matches.iter_mut().enumerate() {
             let mut rng = step_rng(7, i as u64, "test");
-            pair.second = [640.0 * unit(&mut rng), 480.0 * unit(&mut rng)];
+            pair.second = [640.0 * uniform_01(&mut rng), 480.0 * uniform_01(&mut rng)];
         }
         assert!(ransac_inliers(&matches).is_empty());
         assert!(ransac_inliers(&matches[..19]).is_empty());
