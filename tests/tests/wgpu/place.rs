@@ -119,7 +119,7 @@ impl Place {
     }
 
     /// Context views of a batch.
-    pub fn context(&self) -> clift_model::ClipViews {
+    pub fn context(&self) -> clift_model::Views {
         let clips = self.clips();
         upload_views(&clips.iter().map(|clip| &clip.context).collect::<Vec<_>>(), &self.device).expect("equal sizes")
     }
