@@ -97,7 +97,7 @@ def main() -> int:
     assert all(np.array_equal(converted[name], values.numpy()) for name, values in vgg19.items())
     check_against_torchvision(vgg19)
     save_file(perceptual_of(vgg19, rng, (1, 2, 45, 67)), folder / "perceptual.safetensors")
-    print(f"now: CLIFT_CHECK_VGG={folder} cargo test --release --workspace -- --ignored --nocapture full_network_gives")
+    print(f"now: CLIFT_CHECK_VGG={folder} cargo test --release --workspace -- --ignored --nocapture the_full_network")
     return 0
 
 

@@ -5,7 +5,7 @@ use std::path::Path;
 use crate::support::{repository, sources};
 
 /// Folders whose files are named in texts.
-const FOLDERS: [&str; 3] = ["docs/", "scripts/", "configs/"];
+const FOLDERS: [&str; 5] = ["docs/", "scripts/", "configs/", "crates/", "data-fixtures/"];
 
 #[test]
 fn every_link_and_named_path_exists() {

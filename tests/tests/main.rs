@@ -1,8 +1,8 @@
 //! Whole runs through the command line: arguments in, files and exit codes out.
 //!
 //! `training` runs the stages, stops them and resumes them; `evaluation` measures, encodes and renders; `data` converts and
-//! checks data sets; `input` is wrong or damaged input. `architecture`, `links` and
-//! `old_names` read the sources instead.
+//! checks data sets; `input` is wrong or damaged input; `bench` times the cases. `architecture`, `links` and `old_names` read
+//! the sources instead, `licences` reads the dependencies.
 
 mod architecture;
 mod bench;

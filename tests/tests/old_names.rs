@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use crate::architecture::{Sources, without_strings};
 use crate::support::sources;
 
-const OLD_NAMES: &str = "Accumulator Attended BadInstructionSet BadStep BoundedSampler CheckpointTensor \
-    ClusterJob Disjoint Exhibit FrameSkip GeluSlope GroupsOnce HalfRow HeldOut HostViews InF64 Judge LayoutOptions \
+const OLD_NAMES: &str = "Accumulator Adaptive Attended BadInstructionSet BadStep BoundedSampler CheckpointTensor \
+    ClusterJob Disjoint Drawn Exhibit Extended FrameSkip GeluSlope GroupsOnce HalfRow HeldOut HostViews Imported InF64 Judge LayoutOptions \
     Learner Ledger PictureFolders Projected ReadOnce RendererOnly SceneFrame SceneMemory SystemName TokenChoice \
     TokenStorage Trained Unfinished WorldFrame WrongUsage";
 

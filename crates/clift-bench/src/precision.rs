@@ -74,7 +74,7 @@ pub fn compare_precision(
 ) -> Result<PrecisionReport, TrainError> {
     if let Some(other) = options.cases.iter().find(|case| !PRECISION_CASES.contains(case)) {
         let fix = format!("write some of {}", PRECISION_CASES.map(BenchCase::name).join(", "));
-        return Err(TrainError::BadConfig { key: "--work".into(), value: other.name().into(), fix });
+        return Err(TrainError::BadConfig { key: "--case".into(), value: other.name().into(), fix });
     }
     let [single, f16] = [Precision::F32, Precision::F16]
         .map(|precision| BenchContext::new(&Config { precision, ..config.clone() }, options));

@@ -1,7 +1,7 @@
 //! A data source of one's own: implement [`SceneSource`], then read clips from it like from any other source.
 //!
 //! The source serves one scene: a camera that moves sideways in front of a coloured wall. A real source reads cameras
-//! and images from its own files in the same four methods.
+//! and images from its own files in the same five methods.
 //!
 //! ```text
 //! cargo run --release -p clift-data --example custom_source

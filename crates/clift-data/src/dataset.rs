@@ -49,8 +49,8 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
         _ => false,
     };
     if split == Split::Train && has_dl3dv && !opened.has_splits && config.files.test_scenes.is_none() {
-        let fix = "the folders also hold the benchmark scenes of DL3DV, which must be excluded from training: write the path of an \
-                   evaluation index or of a file with one key per line (an empty file excludes none)";
+        let fix = "the folders also hold the benchmark scenes of DL3DV, which must be excluded from training: write \
+                   the path of an evaluation index or of a file with one key per line (an empty file excludes none)";
         return Err(missing("data.files.test_scenes", fix));
     }
     Ok(opened)

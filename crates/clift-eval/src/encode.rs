@@ -54,7 +54,7 @@ pub fn encode(
 ) -> Result<EncodedScene, EvalError> {
     if options.grouping != Grouping::Kmeans {
         let fix = "scene files need K-means tokens: encode with a run with clusters.grouping = \"kmeans\"".into();
-        return Err(bad_config("clusters.grouping", "\"patch\"".into(), fix));
+        return Err(bad_config("clusters.grouping", "\"tile\"".into(), fix));
     }
     let key = reader.source.key(scene);
     let poses: Vec<Pose> = reader.source.cameras(scene)?.iter().map(|camera| camera.c2w).collect();

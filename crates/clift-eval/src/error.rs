@@ -134,7 +134,7 @@ pub enum EvalError {
     #[error(transparent)]
     Model(#[from] clift_model::ModelError),
     /// A tensor could not be read back from its device.
-    #[error("reading a rendering from its device failed: {reason}")]
+    #[error("reading a tensor from its device failed: {reason}")]
     Tensor {
         /// Error of the device.
         reason: String,

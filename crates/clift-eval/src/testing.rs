@@ -1,4 +1,4 @@
-//! Reference fixtures for unit tests.
+//! Reference fixtures and views for unit tests.
 
 use std::path::{Path, PathBuf};
 

@@ -81,7 +81,7 @@ pub enum TrainError {
         path: PathBuf,
     },
     /// A tensor could not be read back from its device.
-    #[error("reading tokens from their device failed: {reason}")]
+    #[error("reading a tensor from its device failed: {reason}")]
     Tensor {
         /// Error of the device.
         reason: String,

@@ -73,7 +73,7 @@ fn assert_second_is_skipped(place: &Place, ran: Ran, reason: &str) {
     let clusters = place.json("run/clusters/index.json");
     let keys: Vec<_> = clusters["entries"].as_array().unwrap().iter().map(|entry| &entry["key"]).collect();
     assert_eq!(keys, [KEYS[0]]);
-    assert_eq!(clusters["skipped"]["skips"][0]["key"], KEYS[1], "the ledger is saved");
+    assert_eq!(clusters["skipped"]["skips"][0]["key"], KEYS[1], "the skipped scene is saved");
     assert_eq!(place.json("run/eval/summary.json")["num_scenes"], 1);
 }
 

@@ -21,9 +21,9 @@ const FEED_FORWARD: Tolerance = Tolerance::both(1e-5, 2e-5, "a chain of those ab
 pub const CASES: &[Case] = &[
     Tolerance::forward(1e-6, "a division, a root and three products: each may round another way")
         .case("rays of every pixel", |place| forward(plucker(&place.targets()).flatten(0, 4))),
-    Tolerance::forward(0.0, "values are moved, not changed").case("pictures to patches and back", |place| {
-        let pictures = place.random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 1);
-        let patches = patchify(pictures, 8);
+    Tolerance::forward(0.0, "values are moved, not changed").case("images to patches and back", |place| {
+        let images = place.random([BATCH, VIEWS, SIZE[0], SIZE[1], 3], 1);
+        let patches = patchify(images, 8);
         let back = unpatchify(patches.clone(), [VIEWS, SIZE[0], SIZE[1]], 8);
         forward(Tensor::cat(vec![patches.flatten(0, 2), back.flatten(0, 4)], 0))
     }),
@@ -80,14 +80,14 @@ pub const CASES: &[Case] = &[
     BLOCK.case("decoder block with norms of queries and keys", |place| {
         decoder_block(place, CliftVariant::ReleasedDl3dv)
     }),
-    BLOCK.because("sums of 576 products, rays of their own, and a block").case("encoder, from pictures", |place| {
+    BLOCK.because("sums of 576 products, rays of their own, and a block").case("encoder, from images", |place| {
         let encoder = place.module(|init| Encoder::new(&network(CliftVariant::Paper), init));
         let context = place.context();
         place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context).flatten(0, 2))
     }),
     BLOCK
         .because("sums of 384 products, a block and a sigmoid")
-        .case("renderer, to pictures", |place| render(place, RenderTokens::from)),
+        .case("renderer, to images", |place| render(place, RenderTokens::from)),
     BLOCK
         .because("the same; rows of tokens are gathered, and their gradients added")
         .case("renderer, few tokens for each view", |place| {

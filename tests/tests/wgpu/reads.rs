@@ -51,7 +51,7 @@ fn a_training_step_reads_from_the_device_once() -> Result<(), Failure> {
 
     for (name, stage, parts, recompute) in [
         ("stage 1", Stage::Stage1, 1, false),
-        ("stage 1 in two parts, blocks computed again", Stage::Stage1, 2, true),
+        ("stage 1 two micro-batches, activation checkpointing", Stage::Stage1, 2, true),
         ("stage 2", Stage::Stage2, 1, false),
     ] {
         let batch = batch(&place, stage);

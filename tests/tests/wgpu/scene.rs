@@ -15,7 +15,7 @@ use crate::cpu;
 use crate::place::{Place, SIZE, network};
 use crate::table::{Case, Tolerance, Values};
 
-const PICTURES: Tolerance = Tolerance::forward(1e-5, "the renderer's; the same file for both devices");
+const IMAGES: Tolerance = Tolerance::forward(1e-5, "the renderer's; the same file for both devices");
 
 pub const CASES: &[Case] = &[
     Tolerance::forward(5e-5, "encoder, clusters and condenser one after the other; the chosen patches are the same")
@@ -26,13 +26,13 @@ pub const CASES: &[Case] = &[
             let tokens = scene.tokens.iter().copied().map(f64::from).collect();
             Values { forward: vec![("patches".into(), ids), ("tokens".into(), tokens)], ..Values::default() }
         }),
-    PICTURES.case("scene: f32 file to pictures, all tokens and some", |place| draw(place, TokenFormat::F32)),
-    PICTURES
+    IMAGES.case("scene: f32 file to images, all tokens and some", |place| draw(place, TokenFormat::F32)),
+    IMAGES
         .because("the same: the host unpacks 16 bits")
-        .case("scene: f16 file to pictures", |place| draw(place, TokenFormat::F16)),
-    PICTURES
+        .case("scene: f16 file to images", |place| draw(place, TokenFormat::F16)),
+    IMAGES
         .because("the same: the host unpacks 8 bits")
-        .case("scene: int8 file to pictures", |place| draw(place, TokenFormat::Int8)),
+        .case("scene: int8 file to images", |place| draw(place, TokenFormat::Int8)),
 ];
 
 /// Stored tokens of the room's 12. One cluster is a pair, whose centroid once depended on rounding.
@@ -91,7 +91,7 @@ fn draw(place: &Place, storage: TokenFormat) -> Values {
     let path = [0.0, 0.3, 0.8].map(between);
     let mut values = Values::default();
     for (name, count) in [("all tokens", STORED), ("four tokens", 4)] {
-        let frames = viewer.render(&path, SIZE[0], SIZE[1], count).expect("finite pictures");
+        let frames = viewer.render(&path, SIZE[0], SIZE[1], count).expect("finite images");
         let chosen = frames.iter().flat_map(|frame| frame.tokens.iter().flatten()).map(|&id| f64::from(id)).collect();
         let pixels = frames.iter().flat_map(|frame| &frame.pixels).map(|&pixel| f64::from(pixel)).collect();
         values.forward.extend([(format!("{name}, chosen"), chosen), (format!("{name}, pixels"), pixels)]);

@@ -13,7 +13,7 @@ const UPDATE: Tolerance = Tolerance::both(1e-5, 1e-4, "three sums over everythin
 
 pub const CASES: &[Case] = &[
     UPDATE.case("stage 1: loss, gradient norm, update; tokens dropped", |place| update(place, Stage::Stage1, 1, false)),
-    UPDATE.case("stage 1: in two parts, blocks computed again", |place| update(place, Stage::Stage1, 2, true)),
+    UPDATE.case("stage 1: two micro-batches, activation checkpointing", |place| update(place, Stage::Stage1, 2, true)),
     UPDATE
         .because("the same through the condenser")
         .case("stage 2: loss, gradient norm, update; encoder frozen", |place| update(place, Stage::Stage2, 1, false)),

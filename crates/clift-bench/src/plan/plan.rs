@@ -39,7 +39,7 @@ pub struct Plan {
 pub struct PartPlan {
     /// `stage1`, `clusters`, `stage2` or `eval`.
     pub part: &'static str,
-    /// Counted unit: `step` or `scene_with_all_tokens`.
+    /// Counted unit: `step` or `scene`.
     pub unit: &'static str,
     /// Number of units; `None` if it depends on the data.
     pub count: Option<u64>,

@@ -93,8 +93,8 @@ mod tests {
         for gap in 1..60 {
             for count in 0..gap {
                 let inner = choose(InnerViews::Even, 5, 5 + gap, count, &[]);
-                for (place, frame) in inner.iter().enumerate() {
-                    let ideal = 5.0 + (place + 1) as f64 * gap as f64 / (count + 1) as f64;
+                for (index, frame) in inner.iter().enumerate() {
+                    let ideal = 5.0 + (index + 1) as f64 * gap as f64 / (count + 1) as f64;
                     assert!((*frame as f64 - ideal).abs() <= 0.5, "{inner:?} in a gap of {gap}");
                 }
                 let all: Vec<usize> = [5].into_iter().chain(inner).chain([5 + gap]).collect();

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 
-/// Filters of the scenes of a data set. Skipped scenes are listed in the [`SkipReport`](crate::skip_report::SkipReport).
+/// Filters of the scenes of a data set. Skipped scenes are listed in the skip report.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SceneFilters {

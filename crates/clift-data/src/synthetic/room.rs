@@ -67,7 +67,7 @@ impl Room {
         let path = CameraPath::sample(rng, half_size, config.path_length, config.looks);
         let lamp = DVec3::new(wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35));
 
-        // Without plain rooms no random number is drawn: rooms equal those from before this option.
+        // Without plain rooms no random number is sampled: rooms equal those from before this option.
         let is_plain = config.plain_share > 0.0 && uniform_01(rng) < config.plain_share;
         let hue = uniform_01(rng);
         let frequency = if is_plain { 0.0 } else { config.texture_frequency };

@@ -195,6 +195,7 @@ impl<'a> Converter<'a> {
         self.checksums.begin()?;
         let stale = std::mem::take(&mut self.stale);
         if !stale.is_empty() || self.is_index_outdated() {
+            // The index goes before the files that it names.
             self.checksums.remove_all([INDEX])?;
         }
         self.checksums.remove_all(stale.iter().map(String::as_str))?;
@@ -269,6 +270,7 @@ impl<'a> Converter<'a> {
     /// Returns the first unused chunk name.
     fn free_name(&self) -> String {
         let used: HashSet<&String> = self.index.values().collect();
+        // One of `used.len() + 1` names is free.
         (0..=used.len()).map(chunk_name).find(|name| !used.contains(name)).unwrap_or_default()
     }
 

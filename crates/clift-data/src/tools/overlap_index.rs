@@ -158,7 +158,11 @@ pub fn write_overlap_index(
 
 #[cfg(test)]
 mod tests {
+    use glam::DMat3;
+
     use super::*;
+    use crate::geometry::camera::IntrinsicsNorm;
+    use crate::geometry::pose::Pose;
     use crate::sampling::evaluation_index::EvaluationIndex;
     use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::source::SyntheticSource;
@@ -222,13 +226,10 @@ mod tests {
     #[test]
     fn turning_camera_has_only_pairs_with_overlap() {
         // 75 degrees wide, three degrees per frame: half of the view is left after some 12 frames, nothing after 25.
-        let intrinsics_norm = crate::geometry::camera::IntrinsicsNorm { fx: 0.65, fy: 0.65, cx: 0.5, cy: 0.5 };
+        let intrinsics_norm = IntrinsicsNorm { fx: 0.65, fy: 0.65, cx: 0.5, cy: 0.5 };
         let camera = |frame: usize| {
-            let rotation = crate::DMat3::from_rotation_y((3.0 * frame as f64).to_radians());
-            Camera {
-                intrinsics_norm,
-                c2w: crate::geometry::pose::Pose { rotation, ..crate::geometry::pose::Pose::IDENTITY },
-            }
+            let rotation = DMat3::from_rotation_y((3.0 * frame as f64).to_radians());
+            Camera { intrinsics_norm, c2w: Pose { rotation, ..Pose::IDENTITY } }
         };
         let cameras: Vec<Camera> = (0..60).map(camera).collect();
         let options = |near, far| OverlapOptions { distance: [near, far], ..OverlapOptions::default() };

@@ -82,8 +82,9 @@ impl Evaluator {
     /// contact sheets to `folder`. Scores the images of `external_methods` too.
     ///
     /// # Errors
-    /// As [`measure`](Self::measure), [`ModelError::BadConfig`] for a method without weights, [`EvalError::NoScenes`] when
-    /// every scene failed, [`EvalError::NoPredictions`] for an external method without any image.
+    /// As [`measure`](Self::measure), [`EvalError::BadWeights`] for unusable LPIPS weights, [`ModelError::BadConfig`] for a
+    /// method without weights, [`EvalError::NoScenes`] when every scene failed, [`EvalError::NoPredictions`] for an external
+    /// method without any image, and [`EvalError::Io`].
     pub fn evaluate(
         &self,
         models: &EvalModels,

@@ -160,8 +160,7 @@ fn by_rendered(summary: &Summary) -> Plot {
     }
     // With more lines than looks, the largest counts.
     let surplus = lines.len().saturating_sub(Look::ALL.len());
-    let looks = Look::ALL.into_iter().cycle();
-    let series = lines.into_iter().skip(surplus).rev().zip(looks).map(|((stored, marks), look)| Series {
+    let series = lines.into_iter().skip(surplus).rev().zip(Look::ALL).map(|((stored, marks), look)| Series {
         name: format!("{stored} stored"),
         look,
         is_joined: true,

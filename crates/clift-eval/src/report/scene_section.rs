@@ -168,10 +168,10 @@ fn selected(figure: &SceneFigure, number: usize, tokens: &FigureTokens, selectio
             @let content = html! {
                 use.dim href={ "#s" (number) "v" (view) } {}
                 path.stored d=(rings(&others, view, figure.grid, 0.22)) {}
-                path.chosen d=(rings(&tokens.selected, view, figure.grid, 0.34)) {}
+                path.selected d=(rings(&tokens.selected, view, figure.grid, 0.34)) {}
             };
             @let caption = html! { "frame " (index) br; (num_in_view(&tokens.selected, view, per_view)) " selected" };
-            (map(figure, &format!("Chosen tokens over the context view of frame {index}"), content, caption))
+            (map(figure, &format!("Selected tokens over the context view of frame {index}"), content, caption))
         }
     };
     row(&format!("{rendered} of {stored} tokens selected for the target{by}"), strip)

@@ -164,17 +164,17 @@ impl Comparison {
     /// [`EvalError::NotComparable`] without a common key or without a common view.
     pub fn new(a: &Evaluation, b: &Evaluation, sides: Option<&[MethodFilter; 2]>) -> Result<Self, EvalError> {
         let mut pairs = Vec::new();
-        for (made_a, views_a) in &a.views {
-            for (made_b, views_b) in &b.views {
+        for (key_a, views_a) in &a.views {
+            for (key_b, views_b) in &b.views {
                 let matches = match sides {
-                    None => made_a == made_b,
+                    None => key_a == key_b,
                     Some([side_a, side_b]) => {
                         let counts = |key: &RowKey| (key.num_storage_tokens, key.num_render_tokens);
-                        side_a.matches(made_a) && side_b.matches(made_b) && counts(made_a) == counts(made_b)
+                        side_a.matches(key_a) && side_b.matches(key_b) && counts(key_a) == counts(key_b)
                     }
                 };
                 if matches {
-                    pairs.push(PairedRow::new((made_a, views_a), (made_b, views_b)));
+                    pairs.push(PairedRow::new((key_a, views_a), (key_b, views_b)));
                 }
             }
         }
@@ -202,7 +202,7 @@ impl Comparison {
 }
 
 impl PairedRow {
-    fn new((made_a, a): (&RowKey, &BTreeMap<View, Values>), (made_b, b): (&RowKey, &BTreeMap<View, Values>)) -> Self {
+    fn new((key_a, a): (&RowKey, &BTreeMap<View, Values>), (key_b, b): (&RowKey, &BTreeMap<View, Values>)) -> Self {
         let common: Vec<(&View, &Values, &Values)> =
             a.iter().filter_map(|(view, values)| Some((view, values, b.get(view)?))).collect();
         let scenes: Vec<_> = common.chunk_by(|(a, ..), (b, ..)| a.0 == b.0).collect();
@@ -218,8 +218,8 @@ impl PairedRow {
             MetricDifference::of(&scene_means.collect::<Vec<_>>())
         };
         Self {
-            a: made_a.clone(),
-            b: made_b.clone(),
+            a: key_a.clone(),
+            b: key_b.clone(),
             num_scenes: scenes.len(),
             num_views: common.len(),
             num_only_a: a.len() - common.len(),

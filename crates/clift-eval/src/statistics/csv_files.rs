@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use clift_data::replace_file;
+use clift_data::{mean, replace_file};
 
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::scene_means::{capped, mean};
+use crate::statistics::scene_means::capped;
 use crate::statistics::view_metrics::ViewMetrics;
 
 const VIEW_COLUMNS: [&str; 11] = [

@@ -1,7 +1,7 @@
 //! Results, their summaries and comparisons.
 //!
 //! - `view_metrics`: `EvalKey`, `ViewMetrics`, `Cost`
-//! - `eval_results`: all measured views, one owner
+//! - `eval_results`: metrics of every view
 //! - `scene_means`: mean per scene, then over scenes
 //! - `student_t`: Student's t quantile
 //! - `pareto`: Pareto front

@@ -1,9 +1,9 @@
 //! Means over the views of a scene, then over the scenes, so every scene has the same weight.
 
+use clift_data::mean;
+
 use crate::statistics::eval_results::SceneViews;
 use crate::statistics::view_metrics::ViewMetrics;
-
-pub(crate) use clift_data::mean;
 
 /// Upper bound of a PSNR in a mean, in dB, for identical images with their infinite PSNR.
 ///

@@ -9,13 +9,13 @@ use crate::error::EvalError;
 
 /// Clusters and tiles of one count, each computed on first use.
 pub(crate) struct LazyClusters<'a> {
-    pub kmeans: &'a KMeans,
+    kmeans: &'a KMeans,
     /// The clustered tokens, `[1, N, D]`.
-    pub lift: &'a Tensor<3>,
+    lift: &'a Tensor<3>,
     pub num_clusters: usize,
     pub seed: u64,
     /// Number of context views, and rows and columns of patches of a view.
-    pub views: (usize, [usize; 2]),
+    views: (usize, [usize; 2]),
     fit: OnceCell<KMeansFit>,
     tiles: OnceCell<Clusters>,
 }

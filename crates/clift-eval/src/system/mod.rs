@@ -1,7 +1,7 @@
-//! The machine, for reports.
+//! The machine and the memory of the process.
 //!
 //! - `machine`: processor and memory, for reports
-//! - `memory`: peak memory of the process
+//! - `memory`: peak and free memory
 
 pub(crate) mod machine;
 pub(crate) mod memory;

@@ -17,8 +17,8 @@ pub struct Macs {
     pub linear: u64,
     /// Multiply-accumulates of scores (`Q K^T`) and weighted sums (`A V`).
     pub attention: u64,
-    /// Values that layer norms normalise.
-    pub normalised: u64,
+    /// Values that layer norms normalize.
+    pub normalized: u64,
 }
 
 /// Convention for the cost of a forward pass.
@@ -67,7 +67,7 @@ impl Macs {
     /// Returns the cost in a convention.
     pub fn count(self, convention: FlopConvention) -> u64 {
         match convention {
-            FlopConvention::Paper => self.linear + 5 * self.normalised,
+            FlopConvention::Paper => self.linear + 5 * self.normalized,
             FlopConvention::Macs => self.linear + self.attention,
             FlopConvention::Flops => 2 * (self.linear + self.attention),
         }
@@ -86,7 +86,7 @@ impl Layer {
             LayerKind::Linear { inputs, outputs, .. } => {
                 Macs { linear: rows * (inputs * outputs) as u64, ..Macs::default() }
             }
-            LayerKind::LayerNorm { width } => Macs { normalised: rows * width as u64, ..Macs::default() },
+            LayerKind::LayerNorm { width } => Macs { normalized: rows * width as u64, ..Macs::default() },
             LayerKind::Attention { width, keys, .. } => pairs(rows * sizes.group_len(keys), width),
             LayerKind::ClusterAttention { width, keys } => pairs(sizes.num_rows(keys), width),
             LayerKind::HeadNorm { .. } | LayerKind::Activation { .. } => Macs::default(),
@@ -102,7 +102,7 @@ impl ModelConfig {
         macs.fold(Macs::default(), |sum, macs| Macs {
             linear: sum.linear + macs.linear,
             attention: sum.attention + macs.attention,
-            normalised: sum.normalised + macs.normalised,
+            normalized: sum.normalized + macs.normalized,
         })
     }
 
@@ -114,7 +114,7 @@ impl ModelConfig {
         let num_patches = self.num_tokens(1, height, width)?;
         let mut macs = self.macs(Part::Renderer, &SceneSizes::new(num_render_tokens, 1, num_patches));
         // The paper counts one norm more than the network has.
-        macs.normalised += (num_patches * self.dim) as u64;
+        macs.normalized += (num_patches * self.dim) as u64;
         Ok(macs)
     }
 

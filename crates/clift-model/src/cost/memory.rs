@@ -219,7 +219,7 @@ pub fn inference_bytes(config: &ModelConfig, sizes: &InferenceSizes) -> f64 {
     let x = values(sizes.num_tokens);
     let patches = (sizes.num_tokens * config.context_patch_len()) as f64;
     let encode = (x + forward_values(config, x)).max(2.5 * patches + x);
-    // Centred tokens and distances.
+    // Centered tokens and distances.
     let distances = |num_clusters| 2.0 * x + kmeans_values(sizes.num_tokens, num_clusters) as f64;
     let kmeans = sizes.num_clusters.map_or(0.0, distances);
     let render = match sizes.num_targets {

@@ -114,7 +114,7 @@ impl CondenserBlock {
         if self.norm_cross.is_some() { input.clone() + output } else { output }
     }
 
-    /// Applies `W_z`, the one layer of this crate that is Burn's own, because it has no bias.
+    /// Applies `W_z` with Burn's linear layer: those of this crate need a bias, and `W_z` has none.
     fn gate(&self, x: Tensor<3>) -> Tensor<3> {
         let [batch, stored, dim] = x.dims();
         mac_counter::add_linear(batch * stored, dim, dim);
@@ -167,6 +167,35 @@ mod tests {
                 let expected = fixture.tensor::<3>("grad.input.lift", &device).inner();
                 assert_close(&lift.grad(&grads).expect("tracked"), &expected, 5e-5);
                 weight_gradients(&condenser, &grads, &fixture, "grad.weight.", 5e-5);
+            }
+        }
+    }
+
+    #[test]
+    fn singletons_and_duplicate_tokens_give_finite_gradients() {
+        let cases = [
+            SceneClusters::new(vec![0; 5], vec![4]).expect("one cluster"),
+            SceneClusters::identity(5),
+            SceneClusters::new(vec![0, 1, 1, 1, 1], vec![0, 2]).expect("a singleton"),
+        ];
+        for (residual, distinct) in [(false, 5), (true, 5), (false, 1), (true, 1)] {
+            let mut config = config(CliftVariant::Paper);
+            config.condenser.residual = residual;
+            for (scene, device) in cases.iter().flat_map(|scene| devices().into_iter().map(move |d| (scene, d))) {
+                let device = device.autodiff();
+                let condenser = Condenser::new(&config, &mut Init::new(0, &device));
+                let fixture = Fixture::open(if residual { "condenser_residual" } else { "condenser" });
+                // The gates of the fixture are open.
+                let condenser = load_weights(condenser, &fixture, "weight.");
+                let tokens = random([1, distinct, 16], 2, &device).cast(DType::F32);
+                let lift = tokens.expand([1, 5, 16]).detach().require_grad();
+                let index = Clusters::new(vec![scene.clone()]).expect("one scene").upload(&device);
+                let output = condenser.forward(lift.clone(), &index);
+                let gradient = lift.grad(&output.clone().square().sum().backward()).expect("tracked");
+                for values in [output.inner(), gradient] {
+                    let sum = values.abs().sum().into_scalar::<f32>();
+                    assert!(sum.is_finite() && sum > 0.0, "{residual} {distinct} {scene:?}: {sum}");
+                }
             }
         }
     }

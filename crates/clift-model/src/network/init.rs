@@ -10,7 +10,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// A source of initialised layers on a device. All layers share one stream of random numbers.
+/// A source of initialized layers on a device. All layers share one stream of random numbers.
 #[derive(Debug)]
 pub struct Init {
     device: Device,

@@ -12,7 +12,7 @@ pub const MAX_SIDE_PX: usize = 1 << 14;
 /// Most patches of all context views. Every patch is one encoder token.
 const MAX_PATCHES: usize = 1 << 20;
 
-/// Largest coordinate of a context camera; those of normalised cameras are at most 1.
+/// Largest coordinate of a context camera; those of normalized cameras are at most 1.
 const MAX_COORDINATE: f64 = 1e3;
 
 /// Largest error of `R^T R` in a pose, as in the readers of data sets.
@@ -92,9 +92,9 @@ fn check_camera(camera: &ViewCamera) -> Result<(), String> {
         return Err(format!("intrinsics {:?}, expected finite values and positive focal lengths", camera.intrinsics));
     }
     check_pose(&camera.c2w)?;
-    let centre = [3, 7, 11].map(|i| camera.c2w[i]);
-    if centre.iter().any(|value| value.abs() > MAX_COORDINATE) {
-        return Err(format!("position {centre:?}, expected coordinates up to {MAX_COORDINATE}"));
+    let position = [3, 7, 11].map(|i| camera.c2w[i]);
+    if position.iter().any(|value| value.abs() > MAX_COORDINATE) {
+        return Err(format!("position {position:?}, expected coordinates up to {MAX_COORDINATE}"));
     }
     Ok(())
 }

@@ -7,10 +7,10 @@
 //! |---|---|---|
 //! | length of the header, little-endian | u64 | |
 //! | header: JSON with spaces up to [`HEADER_BYTES`] | | |
-//! | `context_c2w`: normalised poses, camera to world | F64 | `[views, 4, 4]` |
+//! | `context_c2w`: normalized poses, camera to world | F64 | `[views, 4, 4]` |
 //! | `context_intrinsics`: `fx, fy, cx, cy` in pixels | F64 | `[views, 4]` |
-//! | `world_mean_c2w`, `world_scale`: the normalisation of poses | F64 | `[4, 4]`, `[1]` |
-//! | `token_rays`: `[moment, direction]` through the centre of a token's patch | F32 | `[tokens, 6]` |
+//! | `world_mean_c2w`, `world_scale`: the normalization of poses | F64 | `[4, 4]`, `[1]` |
+//! | `token_rays`: `[moment, direction]` through the center of a token's patch | F32 | `[tokens, 6]` |
 //! | `token_scales`, with `int8` tokens only | F32 | `[tokens]` |
 //! | `context_frames`: frame number of each view in the capture | U32 | `[views]` |
 //! | `token_ids`: patch of the context views of each token | U32 | `[tokens]` |
@@ -34,12 +34,12 @@ pub(crate) const FORMAT: &str = "clift-scene";
 /// The renderer hash of version 1 did not include the number of heads.
 pub(crate) const VERSION: &str = "2";
 
-/// Normalisation of camera positions: `R^T (c - t) * scale`, where `[R | t]` is the mean pose.
+/// Normalization of camera positions: `R^T (c - t) * scale`, where `[R | t]` is the mean pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SceneNormalization {
     /// Mean context camera in the world of the capture, camera to world, 4 x 4, row-major.
     pub mean_c2w: [f64; 16],
-    /// Normalised units per unit of the world of the capture.
+    /// Normalized units per unit of the world of the capture.
     pub scale: f64,
 }
 
@@ -60,11 +60,11 @@ pub struct Scene {
     pub height: usize,
     /// Width of the context views in pixels.
     pub width: usize,
-    /// Normalised context cameras.
+    /// Normalized context cameras.
     pub context: Vec<ViewCamera>,
     /// Frame number of each context view in the capture.
     pub context_frames: Vec<u32>,
-    /// Normalisation of the poses.
+    /// Normalization of the poses.
     pub world: SceneNormalization,
     /// Patch of each token, `[S]`: `view * rows * columns + row * columns + column`.
     pub token_ids: Vec<u32>,
@@ -78,7 +78,7 @@ impl Scene {
         self.token_ids.len()
     }
 
-    /// Returns the ray of every token, through the centre of its patch.
+    /// Returns the ray of every token, through the center of its patch.
     ///
     /// # Shapes
     /// - returns `[num_tokens]`

@@ -34,17 +34,19 @@ pub struct PublishedTensor {
 impl PublishedTensor {
     /// Whether a shape is this tensor's; a projection may be a 1 x 1 convolution.
     pub fn fits(&self, shape: &[u64]) -> bool {
-        let shape = match shape {
-            [outer @ .., 1, 1] if outer.len() == 2 && is_projection(&self.key) => outer,
-            shape => shape,
-        };
+        let shape = linear_shape(&self.key, shape);
         shape.len() == self.shape.len() && shape.iter().zip(&self.shape).all(|(&got, &expected)| got == expected as u64)
     }
 }
 
-/// Whether a key is the weight of one of the [`PROJECTIONS`].
-pub fn is_projection(key: &str) -> bool {
-    key.strip_suffix(".weight").is_some_and(|layer| PROJECTIONS.contains(&layer))
+/// Returns the shape as that of a linear weight: without the sides of a 1 x 1 convolution, which the weights of the
+/// [`PROJECTIONS`] may be.
+pub(crate) fn linear_shape<'a>(key: &str, shape: &'a [u64]) -> &'a [u64] {
+    let is_projection = || key.strip_suffix(".weight").is_some_and(|layer| PROJECTIONS.contains(&layer));
+    match shape {
+        [outer @ .., 1, 1] if outer.len() == 2 && is_projection() => outer,
+        shape => shape,
+    }
 }
 
 /// Paths of modules and the start of their keys. The first matching path counts.

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 use crate::network::architecture::CliftVariant;
 use crate::network::config::{CondenserConfig, ModelConfig};
-use crate::weights::published_keys::{is_projection, published_tensors};
+use crate::weights::published_keys::{linear_shape, published_tensors};
 
 /// Key prefixes before the number of a layer.
 const LAYERS: [&str; 3] = ["encoder.layers.", "decoder.layers.", "squeezer.blocks."];
@@ -83,10 +83,7 @@ pub fn infer_config<'a>(
         has_condenser |= key.starts_with("squeezer.");
         has_norm_cross |= first == "squeezer.blocks.0.norm_cross.weight";
         let Some(expected) = known.get(&first) else { continue };
-        let shape = match shape {
-            [outer @ .., 1, 1] if outer.len() == 2 && is_projection(key) => outer,
-            shape => shape,
-        };
+        let shape = linear_shape(key, shape);
         if shape.len() != expected.len() {
             continue;
         }

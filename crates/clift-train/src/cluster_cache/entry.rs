@@ -72,3 +72,16 @@ pub(crate) fn settings(config: &Config) -> String {
     })
     .to_string()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_of_tiles_keep_the_former_name() {
+        let mut config = Config::default();
+        assert!(settings(&config).contains("\"grouping\":\"kmeans\""));
+        config.clusters.grouping = Grouping::Tile;
+        assert!(settings(&config).contains("\"grouping\":\"patch\""));
+    }
+}

@@ -186,6 +186,7 @@ impl ResumeLog {
     pub fn publish(self, path: &Path, num_scenes: usize) -> Result<(), TrainError> {
         let Self { folder, cache_key, data, lines, entries, skipped } = self;
         if entries.is_empty() {
+            // A kept log would skip the same scenes again after their files are repaired.
             std::fs::remove_dir_all(&folder).map_err(TrainError::io("removing an empty cache", &folder))?;
             let reason = skipped.into_iter().next().map(|(_, reason)| reason).unwrap_or_default();
             return Err(TrainError::NoScenes { reason: format!("none could be clustered; the first error: {reason}") });

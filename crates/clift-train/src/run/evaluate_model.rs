@@ -18,8 +18,8 @@ use crate::run::validation::Validation;
 /// which renders the other methods. `external` methods are measured beside it.
 ///
 /// # Errors
-/// [`TrainError::BadFile`] when `stage1` has another encoder, [`TrainError::BadConfig`] for methods without
-/// weights, [`TrainError::Model`] for heads that are not the model's, and those of data, models and evaluation.
+/// [`TrainError::BadFile`] when `stage1` has another encoder, [`TrainError::BadConfig`] for methods that
+/// need `stage1`, [`TrainError::Model`] for heads that are not the model's, and those of data, models and evaluation.
 pub fn evaluate_model(
     mut config: Config,
     model: &ModelPath,

@@ -130,11 +130,27 @@ pub struct FlopsArgs {
 mod tests {
     use super::*;
 
+    /// The counts of the paper's network.
+    fn counts(convention: FlopConvention) -> Counts {
+        let json = JsonArg { path: None };
+        let args = FlopsArgs { config: None, convention, render: Vec::new(), set: Vec::new(), json };
+        count(&sizes(&args).unwrap(), convention).unwrap()
+    }
+
+    #[test]
+    fn macs_have_every_part_and_flops_are_twice_as_many() {
+        let (macs, flops) = (counts(FlopConvention::Macs), counts(FlopConvention::Flops));
+        let parts: Vec<&str> = macs.rows.iter().map(|row| row.work).collect();
+        assert_eq!(parts.iter().filter(|part| **part == "condense").count(), 5);
+        assert!(parts.contains(&"encode"));
+        for (macs, flops) in macs.rows.iter().zip(&flops.rows) {
+            assert!((2.0 * macs.giga - flops.giga).abs() < 1e-9);
+        }
+    }
+
     #[test]
     fn paper_convention_gives_the_papers_table() {
-        let (convention, json) = (FlopConvention::Paper, JsonArg { path: None });
-        let args = FlopsArgs { config: None, convention, render: Vec::new(), set: Vec::new(), json };
-        let paper = count(&sizes(&args).unwrap(), convention).unwrap();
+        let paper = counts(FlopConvention::Paper);
         let printed: Vec<String> = paper.rows.iter().map(|row| format!("{:.2}", row.giga)).collect();
         assert_eq!(printed, ["70.59", "63.35", "56.10", "48.85", "45.23"]);
         let text = report_text(&paper, FlopConvention::Paper);

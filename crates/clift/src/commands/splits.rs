@@ -145,6 +145,14 @@ mod tests {
     use super::*;
 
     #[test]
+    fn set_accepts_only_keys_of_data_files() {
+        for set in ["data.width=64", "data.files.undistrot=true", "stage1.steps=2"] {
+            let error = SourceArgs { dir: "data".into(), set: vec![set.into()] }.files().unwrap_err();
+            assert!(error.is::<clift_train::ConfigError>(), "{set}: {error}");
+        }
+    }
+
+    #[test]
     fn list_of_test_scenes_divides_a_folder_without_splits() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini/train");
         let folder = tempfile::tempdir().unwrap();

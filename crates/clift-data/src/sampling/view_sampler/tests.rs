@@ -40,10 +40,10 @@ fn number_of_contexts_outside_the_bounds_is_refused() {
 
 #[test]
 fn number_of_contexts_depends_on_seed_and_step() {
-    let drawn: Vec<usize> = (0..200).map(|step| sampler().num_context(5, step)).collect();
-    assert_eq!(drawn, (0..200).map(|step| sampler().num_context(5, step)).collect::<Vec<_>>());
-    assert_ne!(drawn, (0..200).map(|step| sampler().num_context(6, step)).collect::<Vec<_>>());
-    assert_eq!(drawn.into_iter().collect::<BTreeSet<_>>(), [4, 5, 6].into());
+    let sampled: Vec<usize> = (0..200).map(|step| sampler().num_context(5, step)).collect();
+    assert_eq!(sampled, (0..200).map(|step| sampler().num_context(5, step)).collect::<Vec<_>>());
+    assert_ne!(sampled, (0..200).map(|step| sampler().num_context(6, step)).collect::<Vec<_>>());
+    assert_eq!(sampled.into_iter().collect::<BTreeSet<_>>(), [4, 5, 6].into());
 }
 
 // The expected values come from an implementation of this sampler in Python.

@@ -67,7 +67,9 @@ fn check_intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
             .reasons
             .push(format!("fields of view of {narrow:.1} and {wide:.1} degrees in {frames}, expected {low} to {high}"));
     } else if widest > FILTERED_FOV_DEG {
-        check.notes.push(format!("a field of view of {widest:.1} degrees; published filters skip scenes above 100"));
+        check.notes.push(format!(
+            "a field of view of {widest:.1} degrees; published filters skip scenes above {FILTERED_FOV_DEG}"
+        ));
     }
     let [low, high] = PRINCIPAL_POINT;
     let middle = low..=high;

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
+use crate::statistics::upper_median;
 use crate::tools::check::drawing::epipolar_image;
 use crate::tools::check::images::Sizes;
 use crate::tools::check::result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
@@ -57,7 +58,7 @@ pub(crate) fn check_poses(
         ));
         return None;
     }
-    let scene_px = median(pooled)?;
+    let scene_px = median(&pooled)?;
     check.epipolar_px = Some(scene_px);
     if scene_px > MAX_EPIPOLAR_PX {
         check.reasons.push(format!(
@@ -126,7 +127,7 @@ impl SceneViews<'_> {
         let matches = self.features(first)?.matches(self.features(second)?);
         let geometry = fundamental_from_cameras([a, b], sizes);
         let distances: Vec<f64> = matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect();
-        let epipolar_px = median(distances.clone())?;
+        let epipolar_px = median(&distances)?;
         Some(Pair { check: PairCheck { frames, num_matches: matches.len(), epipolar_px }, matches, distances })
     }
 
@@ -158,6 +159,7 @@ fn subsample(values: &[f64], count: usize) -> impl Iterator<Item = f64> {
     (0..kept).map(move |index| values[index * values.len() / kept])
 }
 
-fn median(values: Vec<f64>) -> Option<f64> {
-    (!values.is_empty()).then(|| crate::statistics::upper_median(&values))
+/// Returns the upper median; `None` for no values.
+fn median(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| upper_median(values))
 }

@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::scene_source::SceneSource;
+use crate::skip_report::plural;
 use crate::tools::check::result::SceneCheck;
 
 /// Largest number of frames listed in a message.
@@ -94,6 +95,5 @@ fn extent(cameras: &[Camera]) -> f64 {
 pub(crate) fn list_frames(frames: &[usize]) -> String {
     let list: Vec<String> = frames.iter().take(MAX_NAMED).map(ToString::to_string).collect();
     let more = if frames.len() > MAX_NAMED { ", .." } else { "" };
-    let noun = if frames.len() == 1 { "frame" } else { "frames" };
-    format!("{} {noun} ({}{more})", frames.len(), list.join(", "))
+    format!("{} ({}{more})", plural(frames.len(), "frame"), list.join(", "))
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
-use crate::skip_report::SkipReport;
+use crate::skip_report::{SkipReport, plural};
 use crate::sources::test_scenes::KEPT_FOR_TESTING;
 use crate::tools::check::result::SceneCheck;
 use crate::tools::check::{cameras, epipolar, images};
@@ -58,8 +58,7 @@ pub fn note_skipped_frames(report: &SkipReport, check: &mut SceneCheck) {
         by_reason.entry(&skip.reason).or_default().push(&skip.frame);
     }
     for (reason, names) in by_reason {
-        let frames = if names.len() == 1 { "frame" } else { "frames" };
-        check.notes.push(format!("{} {frames} skipped, {reason}: {}", names.len(), names.join(", ")));
+        check.notes.push(format!("{} skipped, {reason}: {}", plural(names.len(), "frame"), names.join(", ")));
     }
 }
 

@@ -167,15 +167,15 @@ fn interrupted_conversion_ends_with_the_same_files() {
 fn skipped_scenes_are_reported_and_converted_later() {
     let folder = tempfile::tempdir().unwrap();
     let mut skipped = SkipReport::new(4);
-    skipped.skip("far", "without any picture");
-    skipped.skip_frame("near", "7.jpg", "without a picture");
+    skipped.skip("far", "without any image");
+    skipped.skip_frame("near", "7.jpg", "without an image");
     let second_is_torn = TestSource::new(rooms(3)).with_torn_frames(|scene| scene == 1);
     let report = convert(&second_is_torn, &skipped, folder.path(), &SCENES).unwrap();
     assert_eq!((report.num_scenes, report.skipped.num_scenes, report.skipped.num_used()), (2, 4, 2));
     let text = std::fs::read(folder.path().join("skipped.json")).unwrap();
     let saved: SkipReport = serde_json::from_slice(&text).unwrap();
     assert_eq!((&saved, saved.skips.len(), saved.frames.len()), (&report.skipped, 2, 1));
-    assert_eq!(saved.skips[0], SkippedScene { key: "far".into(), reason: "without any picture".into() });
+    assert_eq!(saved.skips[0], SkippedScene { key: "far".into(), reason: "without any image".into() });
     assert!(saved.skips[1].key.ends_with("00001") && saved.skips[1].reason.contains("it is torn"));
     let report = convert_all(&rooms(3), folder.path(), &SCENES).unwrap();
     assert_eq!((report.num_scenes, report.num_found, report.skipped.skips.len()), (3, 2, 0));

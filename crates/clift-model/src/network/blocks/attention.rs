@@ -21,7 +21,7 @@ pub struct SelfAttention {
 }
 
 impl SelfAttention {
-    /// Makes the layer with PyTorch's initialisation of multi-head attention.
+    /// Makes the layer with PyTorch's initialization of multi-head attention.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         let ModelConfig { dim, num_heads, .. } = *config;
         Self {
@@ -58,7 +58,7 @@ pub struct CrossAttention {
 }
 
 impl CrossAttention {
-    /// Makes the layer with PyTorch's initialisation of multi-head attention.
+    /// Makes the layer with PyTorch's initialization of multi-head attention.
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
         let ModelConfig { dim, num_heads, .. } = *config;
         Self {

@@ -26,7 +26,7 @@ pub struct FeedForward {
 }
 
 impl FeedForward {
-    /// Makes a network with GELU and PyTorch's initialisation.
+    /// Makes a network with GELU and PyTorch's initialization.
     pub fn new(dim: usize, hidden: usize, init: &mut Init) -> Self {
         Self::with(Activation::Gelu, dim, hidden, init)
     }

@@ -118,7 +118,7 @@ impl<B: AttentionOps + AttentionKernels, C: CheckpointStrategy> AttentionOps for
 struct SdpaBackward;
 
 #[derive(Clone, Debug)]
-pub(crate) struct SdpaState<T> {
+struct SdpaState<T> {
     inputs: Qkv<T>,
     attended: AttentionOutput<T>,
     heads: HeadConfig,

@@ -47,14 +47,14 @@ impl ClusterAttentionKernels for Flex {
 
 /// Groups members by segment; `None` for tensors that the kernel does not accept.
 fn segments(inputs: &ClusterInputs<Flex>) -> Option<ClusterSegments> {
+    if !is_native(&inputs.query) || !is_native(&inputs.key_value) {
+        return None;
+    }
     let [batch, num_segments, dim] = inputs.query.shape().dims();
     let sizes = [batch * num_segments, inputs.num_heads, dim / inputs.num_heads];
     let segment: FlexTensor = contiguous(inputs.segment.clone());
     let start = segment.layout().start_offset();
     let range = start..start + segment.layout().num_elements();
-    if !is_native(&inputs.query) || !is_native(&inputs.key_value) {
-        return None;
-    }
     match segment.dtype() {
         DType::I64 => Some(ClusterSegments::new(sizes, segment.storage::<i64>()[range].iter().map(|&s| s as usize))),
         DType::I32 => Some(ClusterSegments::new(sizes, segment.storage::<i32>()[range].iter().map(|&s| s as usize))),

@@ -57,9 +57,9 @@ impl KMeansFit {
 /// [`ModelError::Device`] if the values cannot be read from the device.
 pub fn total_variance(tokens: &Tensor<3>) -> Result<Vec<f64>, ModelError> {
     let [batch, num_tokens, _] = tokens.dims();
-    let centred = tokens.clone() - tokens.clone().mean_dim(1);
+    let centered = tokens.clone() - tokens.clone().mean_dim(1);
     // Summed in f64 on the host: squares of thousands of tokens differ in magnitude.
-    let squares = centred.square().sum_dim(2).reshape([batch * num_tokens]); // [B, N, D] -> [B * N]
+    let squares = centered.square().sum_dim(2).reshape([batch * num_tokens]); // [B, N, D] -> [B * N]
     let squares = squares
         .into_data()
         .convert::<f32>()

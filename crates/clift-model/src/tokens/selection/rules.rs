@@ -72,7 +72,8 @@ pub struct SelectionRules {
     pub previous_bonus: f32,
     /// Weight of the distances of the previous frame, in `[0, 1)`.
     pub momentum: f32,
-    /// Whether every cell selects its `R / Q` nearest tokens before the remaining tokens are the nearest to any cell.
+    /// Whether each of the Q cells first selects its `R / Q` nearest tokens, of R in all; the rest are the nearest to any
+    /// cell.
     pub per_cell: bool,
     /// Whether the side of a cell is 1/16 of the shorter side of the image instead of 16 pixels.
     pub scaled_cells: bool,

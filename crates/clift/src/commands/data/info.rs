@@ -229,14 +229,14 @@ test              1 scene
         let mut split = SplitReport { num_scenes: 1, num_used: 1, num_described: 1, ..SplitReport::default() };
         let mut skips = SkipReport::new(1);
         for name in ["0005.jpg", "0016.jpg"] {
-            skips.skip_frame("fox", name, "without a picture");
+            skips.skip_frame("fox", name, "without an image");
         }
         (split.frames, split.notes) = (skips.frames, vec!["both halves are the same scenes".into()]);
         let splits = BTreeMap::from([("all".into(), split)]);
         let text = Report { layout: Some(SourceKind::Captures), splits, ..Report::default() }.to_string();
         let expected = "layout            captures
 all               1 scene
-  skipped         of fox 2 frames without a picture: 0005.jpg, 0016.jpg
+  skipped         of fox 2 frames without an image: 0005.jpg, 0016.jpg
   note            both halves are the same scenes";
         assert_eq!(text, expected);
     }

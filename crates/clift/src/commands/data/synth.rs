@@ -253,6 +253,15 @@ mod tests {
         assert_eq!((config.num_scenes, config.width, config.height, config.specular), (3, 24, 8, 0.9));
     }
 
+    #[test]
+    fn wrong_keys_and_values_are_usage_errors() {
+        for set in ["widht=24", "fov_deg=200", "split=\"test\""] {
+            let synth = <Parsed as clap::Parser>::parse_from(["synth", "out", "--set", set]).synth;
+            let error = config(&synth).unwrap_err();
+            assert_eq!(crate::exit_code::exit_code(&error), crate::exit_code::USAGE, "{set}: {error}");
+        }
+    }
+
     /// Parses the printed section as part of a whole config.
     fn printed_config(num_frames: usize, size: [usize; 2], has_index: bool) -> Config {
         let config = SyntheticConfig { num_frames, width: size[0], height: size[1], ..Default::default() };

@@ -19,7 +19,7 @@ use crate::output::json::write_json;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::units::file_size;
 
-/// Frames of `interpolate_path` and `orbit_path` without `--frames`.
+/// Frames of `--path interpolate` and `--path orbit` without `--frames`.
 const DEFAULT_FRAMES: usize = 60;
 
 /// Content of `render.json`.
