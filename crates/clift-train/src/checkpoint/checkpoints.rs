@@ -104,6 +104,8 @@ impl Checkpoints {
     pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<Progress>, TrainError> {
         let mut all = self.list()?;
         let Some(path) = all.pop() else { return Ok(None) };
+        // A finished stage saves no more, and a save is what removes them otherwise.
+        self.remove_unfinished()?;
         let loaded = load_checkpoint(&path, self.model.as_ref(), train_state).map_err(|source| {
             let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let fix = match all.last() {
@@ -149,14 +151,20 @@ impl Checkpoints {
         Ok(found.into_iter().map(|(_, path)| path).collect())
     }
 
-    /// Removes the checkpoints that are no longer kept, and unfinished saves.
-    fn prune(&self, progress: &Progress) -> Result<(), TrainError> {
+    /// Removes unfinished saves, and what a killed process left of a removed checkpoint.
+    fn remove_unfinished(&self) -> Result<(), TrainError> {
         for item in std::fs::read_dir(&self.folder).map_err(TrainError::io(LISTING, &self.folder))? {
             let path = item.map_err(TrainError::io(LISTING, &self.folder))?.path();
             if path.extension().is_some_and(|extension| extension == "tmp") {
                 remove_if_present(&path)?;
             }
         }
+        Ok(())
+    }
+
+    /// Removes the checkpoints that are no longer kept, and unfinished saves.
+    fn prune(&self, progress: &Progress) -> Result<(), TrainError> {
+        self.remove_unfinished()?;
         let steps: Vec<u64> = self.list()?.iter().filter_map(|path| step_of(path)).collect();
         for step in steps_to_remove(&steps, &self.retention, progress.best) {
             let path = self.path_of(step);
@@ -318,6 +326,17 @@ mod tests {
         update_checksum(&step, MODEL);
         let message = checkpoints.resume(&mut train_state).unwrap_err().to_string();
         assert!(message.contains("is F64, not F32"), "{message}");
+    }
+
+    #[test]
+    fn a_resume_removes_what_killed_processes_left() {
+        let place = tempfile::tempdir().unwrap();
+        let (mut train_state, checkpoints, step) = saved(place.path());
+        let removed = step.with_file_name("step-000000030.tmp");
+        std::fs::create_dir(&removed).unwrap();
+        std::fs::write(removed.join(MODEL), b"half").unwrap();
+        assert!(checkpoints.resume(&mut train_state).unwrap().is_some());
+        assert!(step.exists() && !removed.exists());
     }
 
     #[test]
