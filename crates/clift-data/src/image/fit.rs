@@ -75,11 +75,7 @@ fn covering_size(from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
 mod tests {
     use super::*;
     use crate::image::codec::decode_image;
-
-    fn ramp(width: usize, height: usize) -> RgbImage {
-        let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 77])).collect();
-        RgbImage { width, height, rgb }
-    }
+    use crate::testing::ramp;
 
     #[test]
     fn sizes_crops_and_focal_lengths_equal_the_protocol() {

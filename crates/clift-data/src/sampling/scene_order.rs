@@ -1,6 +1,6 @@
 //! The scene of every batch slot: a function of (seed, step, slot) alone.
 
-use crate::error::DataError;
+use crate::error::{DataError, check_config};
 use crate::random::{derive_seed, mix};
 
 /// Rounds of the Feistel network behind [`SceneOrder`]. Four suffice in theory; more cost nothing.
@@ -21,14 +21,9 @@ pub struct SceneOrder {
 
 impl SceneOrder {
     /// Creates the order of `num_scenes` scenes in batches of `batch_size`.
-    ///
-    /// # Errors
-    /// [`DataError::BadConfig`] for no scenes and for batches without slots.
     pub fn new(seed: u64, num_scenes: usize, batch_size: usize) -> Result<Self, DataError> {
         for (key, value) in [("num_scenes", num_scenes), ("batch_size", batch_size)] {
-            if value == 0 {
-                return Err(DataError::bad_config(key, "is 0; at least 1 is needed"));
-            }
+            check_config(value > 0, key, || "is 0; at least 1 is needed".into())?;
         }
         let num_scenes = num_scenes as u64;
         let bits = (u64::BITS - (num_scenes - 1).leading_zeros()).max(2);

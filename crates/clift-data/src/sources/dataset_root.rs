@@ -73,9 +73,6 @@ pub(crate) struct SplitFolder<'a> {
 
 impl<'a> SplitFolder<'a> {
     /// Finds the folder of a split.
-    ///
-    /// # Errors
-    /// [`DataError::UnknownLayout`] if only the other split has a folder.
     pub fn find(root: &'a DatasetRoot, split: Split) -> Result<Self, DataError> {
         let base = if root.has_splits { root.path.join(split.to_string()) } else { root.path.clone() };
         let folder = Self { root, base, split };
@@ -86,9 +83,6 @@ impl<'a> SplitFolder<'a> {
     }
 
     /// Finds the scenes of the requested kind, or of the detected kind.
-    ///
-    /// # Errors
-    /// [`DataError::UnknownLayout`] for a folder without scenes, and for DL3DV scenes among other scenes.
     pub fn detect(&self, asked: SourceKind) -> Result<DetectedSource, DataError> {
         let base = &self.base;
         if base.is_file() {
@@ -148,9 +142,6 @@ impl<'a> SplitFolder<'a> {
     }
 
     /// Returns the kind of the scenes.
-    ///
-    /// # Errors
-    /// [`DataError::UnknownLayout`] for DL3DV scenes among other scenes.
     fn recognise(&self, scenes: &[SceneFolder]) -> Result<SourceKind, DataError> {
         if scenes.iter().all(|scene| matches!(scene.files, SceneFiles::Re10kText { .. })) {
             return Ok(SourceKind::Re10kTxt);

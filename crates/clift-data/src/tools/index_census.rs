@@ -69,12 +69,10 @@ impl fmt::Display for IndexCensus {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::read_from_file;
 
     fn census(json: &str) -> IndexCensus {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("index.json");
-        std::fs::write(&path, json).unwrap();
-        IndexCensus::new(&EvaluationIndex::read(&path).unwrap())
+        IndexCensus::new(&read_from_file("index.json", json, EvaluationIndex::read).unwrap())
     }
 
     #[test]

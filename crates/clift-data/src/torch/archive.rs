@@ -45,9 +45,6 @@ impl ByteSpan {
     }
 
     /// Reads the bytes from the archive at `path`.
-    ///
-    /// # Errors
-    /// [`DataError::Io`], and [`DataError::BadChunk`] for a missing header, a truncated file or a wrong checksum.
     pub fn read(&self, path: &Path) -> Result<Vec<u8>, DataError> {
         let bad = |what: &str| DataError::BadChunk {
             what: format!("the member at byte {} {what}; download the file again", self.header_start),
@@ -80,9 +77,6 @@ pub(crate) struct Archive {
 
 impl Archive {
     /// Reads the directory. Member names are stored without the top folder: `data.pkl`, `data/0`.
-    ///
-    /// # Errors
-    /// [`DataError::Io`], and [`DataError::BadChunk`] for a malformed archive, compressed members or big-endian data.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
         let file = File::open(path).map_err(DataError::io("opening the chunk", path))?;

@@ -206,9 +206,10 @@ pub fn write_state_dict(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::{self, read_from_file};
 
     fn fixture(name: &str) -> PathBuf {
-        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/checkpoints").join(name)
+        testing::fixture("checkpoints").join(name)
     }
 
     #[test]
@@ -291,10 +292,8 @@ mod tests {
 
     /// Opens a checkpoint of this pickle, and its tensor `x` if there is one.
     fn read(pickle: PickleWriter) -> Result<Vec<f32>, String> {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("a.ckpt");
-        std::fs::write(&path, pickle.pack("a").unwrap()).unwrap();
-        StateDict::open(&path).and_then(|state| state.read("x")).map_err(|error| error.to_string())
+        let read = |path: &Path| StateDict::open(path).and_then(|state| state.read("x"));
+        read_from_file("a.ckpt", pickle.pack("a").unwrap(), read).map_err(|error| error.to_string())
     }
 
     fn refused(opcodes: &[u8]) -> String {

@@ -44,9 +44,6 @@ pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> 
 
 /// Returns the file of every scene in a folder without an index: for one file per scene from the file names, for chunks
 /// from their tables.
-///
-/// # Errors
-/// [`DataError::Io`] for a folder that cannot be listed, and the errors of reading `invalid_keys.txt`.
 pub(crate) fn index_of_files(folder: &Path, report: &mut SkipReport) -> Result<BTreeMap<String, String>, DataError> {
     let files = torch_files(folder)?;
     let stem = |file: &str| file.strip_suffix(".torch").unwrap_or(file).to_owned();

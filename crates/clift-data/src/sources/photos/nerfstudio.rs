@@ -159,10 +159,6 @@ impl<'a> Optics<'a> {
 }
 
 /// Reads a `transforms.json` and locates its images. Frames are in the natural order of their names.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] for a file of another form, a camera that cannot be used and two
-/// frames of one name.
 pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;

@@ -66,9 +66,6 @@ pub(crate) struct PhotoScene {
 
 impl Photo {
     /// Creates a photo. With `undistort`, the image is undistorted on load; otherwise `lens` is ignored.
-    ///
-    /// # Errors
-    /// [`DataError::BadCamera`] for invalid intrinsics, and the errors of [`Undistortion::new`].
     pub fn new(
         path: PathBuf,
         c2w: Pose,

@@ -67,9 +67,6 @@ struct Findings {
 impl PhotoSource {
     /// Reads the cameras of every scene in parallel and locates their images. Header and end of every image are checked;
     /// with `whole_scenes`, only of the first image of a scene.
-    ///
-    /// # Errors
-    /// [`DataError::BadConfig`] for invalid filters, and the first error if no scene can be read.
     pub fn open(folders: Vec<SceneFolder>, options: &PhotoSourceOptions) -> Result<Self, DataError> {
         options.filters.validate()?;
         let findings: Vec<_> = folders.par_iter().map(|folder| examine(folder, options)).collect();

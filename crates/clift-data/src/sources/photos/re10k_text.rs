@@ -17,9 +17,6 @@ const MAX_URL_CHARS: usize = 1000;
 const NUM_COLUMNS: usize = 19;
 
 /// Reads the cameras of a clip and locates the frames, which are named by time stamp. Frames are in the order of the file.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] with the line.
 pub(crate) fn read_re10k_text(path: &Path, frames: &Path) -> Result<PhotoScene, DataError> {
     let images = if frames.is_dir() { numbered_images(frames)? } else { HashMap::new() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;

@@ -106,9 +106,6 @@ pub(crate) struct FoundScenes {
 
 /// Finds the scenes in `base` and below it. A folder that is reachable by several paths has the path without links, or
 /// the first one in order of names.
-///
-/// # Errors
-/// [`DataError::Io`] for a `base` that cannot be listed, and [`DataError::UnknownLayout`] for too many folders.
 pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     if let Some(files) = scene_in(base) {
         let absolute = base.canonicalize().unwrap_or_else(|_| base.to_owned());

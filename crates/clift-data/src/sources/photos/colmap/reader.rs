@@ -27,9 +27,6 @@ fn model_files(model: &Path) -> Option<([PathBuf; 2], bool)> {
 
 /// Reads the model in `model` and locates the images of the scene in `folder`. Frames are in the natural order of their
 /// names.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] for a malformed file or an unsupported camera.
 pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let Some(([cameras_path, images_path], is_binary)) = model_files(model) else {
         let what = "expected cameras.bin and images.bin, or cameras.txt and images.txt".into();
