@@ -31,9 +31,7 @@ pub fn read_from_file<T>(name: &str, bytes: impl AsRef<[u8]>, read: impl FnOnce(
 
 /// Returns the names in a folder, sorted.
 pub fn names(folder: &Path) -> Vec<String> {
-    let mut names = file_names(folder).unwrap();
-    names.sort();
-    names
+    file_names(folder).unwrap()
 }
 
 /// Returns an image whose red and green rise along the columns and rows.

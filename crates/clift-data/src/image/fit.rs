@@ -18,14 +18,6 @@ pub enum Crop {
     Exact,
 }
 
-impl Crop {
-    /// Returns whether serde skips the value. Settings files from before this key then compare equal.
-    #[allow(clippy::trivially_copy_pass_by_ref)] // serde's signature
-    pub fn is_default(&self) -> bool {
-        *self == Self::default()
-    }
-}
-
 /// Rescales an image to the smallest size that covers `width` by `height` pixels, crops the centre, and adapts the
 /// intrinsics, as pixelSplat's `rescale_and_crop`.
 ///

@@ -50,20 +50,13 @@ impl ClipReader {
         if let Some(&frame) = frames.clone().find(|frame| **frame >= cameras.len()) {
             return Err(DataError::NoSuchFrame { key: key.to_owned(), frame, num_frames: cameras.len() });
         }
+        for &frame in frames.clone() {
+            cameras[frame].c2w.check_finite().map_err(DataError::in_frame(key, frame))?;
+        }
         let poses = |frames: &[usize]| frames.iter().map(|frame| cameras[*frame].c2w).collect::<Vec<_>>();
         let (context, target) = (poses(&views.context), poses(&views.target));
         let ClipOptions { pose_rotation, pose_scale, .. } = self.options;
-        let normalization =
-            PoseNormalization::find(key, &context, &target, pose_rotation, pose_scale).map_err(|error| {
-                // Convert the position in the list of views to the frame of the scene.
-                match error {
-                    DataError::InFrame { key, frame, source } => {
-                        let frame = frames.clone().nth(frame).copied().unwrap_or(frame);
-                        DataError::InFrame { key, frame, source }
-                    }
-                    other => other,
-                }
-            })?;
+        let normalization = PoseNormalization::find(key, &context, &target, pose_rotation, pose_scale)?;
         for &frame in frames.clone() {
             check_near(&normalization.normalize(cameras[frame].c2w)).map_err(DataError::in_frame(key, frame))?;
         }

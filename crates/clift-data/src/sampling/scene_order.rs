@@ -33,18 +33,14 @@ impl SceneOrder {
 
     /// Returns the scene, in `0..num_scenes`, of batch slot `slot` at `step`.
     pub fn scene(&self, step: u64, slot: usize) -> usize {
-        let position = self.position(step, slot);
-        self.permuted((position / u128::from(self.num_scenes)) as u64, (position % u128::from(self.num_scenes)) as u64)
-            as usize
+        let position = u128::from(step) * u128::from(self.batch_size) + slot as u128;
+        let num_scenes = u128::from(self.num_scenes);
+        self.permuted((position / num_scenes) as u64, (position % num_scenes) as u64) as usize
     }
 
     /// Returns the number of slots per batch.
     pub fn batch_size(&self) -> usize {
         self.batch_size as usize
-    }
-
-    fn position(&self, step: u64, slot: usize) -> u128 {
-        u128::from(step) * u128::from(self.batch_size) + slot as u128
     }
 
     fn permuted(&self, epoch: u64, position: u64) -> u64 {

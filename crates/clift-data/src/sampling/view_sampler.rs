@@ -49,8 +49,13 @@ pub struct ViewSampler {
     /// Whether targets may repeat. A target may also be a context frame in both cases.
     pub with_replacement: bool,
     /// Selection of the contexts between the two ends: `random`, `farthest_point` or `even`.
-    #[serde(skip_serializing_if = "InnerViews::is_default")]
+    #[serde(skip_serializing_if = "is_default")]
     pub inner: InnerViews,
+}
+
+/// Returns whether serde skips the value of a newer key. Settings files from before the key then compare equal.
+pub(crate) fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 impl Default for ViewSampler {

@@ -14,8 +14,13 @@ use crate::sources::photos::scene_folder::{
 
 /// The folder, or the file of a single scene, that a data set is opened from.
 pub struct DatasetRoot {
-    path: PathBuf,
-    has_splits: bool,
+    /// Path of the root.
+    pub path: PathBuf,
+    /// Whether training and test scenes lie in folders of their own, `train/` and `test/`.
+    ///
+    /// A capture may have such a name as well, such as `train` of Tanks and Temples. A capture counts as a split only if
+    /// the other split is a capture too and no third capture lies beside them.
+    pub has_splits: bool,
 }
 
 impl DatasetRoot {
@@ -26,19 +31,6 @@ impl DatasetRoot {
     pub fn find(path: &Path) -> Result<Self, DataError> {
         std::fs::metadata(path).map_err(DataError::io("opening the data", path))?;
         Ok(Self { path: path.to_owned(), has_splits: has_splits(path) })
-    }
-
-    /// Path of the root.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Returns whether training and test scenes lie in folders of their own, `train/` and `test/`.
-    ///
-    /// A capture may have such a name as well, such as `train` of Tanks and Temples. A capture counts as a split only if
-    /// the other split is a capture too and no third capture lies beside them.
-    pub fn has_splits(&self) -> bool {
-        self.has_splits
     }
 }
 
@@ -167,7 +159,7 @@ impl<'a> SplitFolder<'a> {
     /// Returns the error of a folder without scenes, with the data found instead.
     fn no_scenes(&self, what: &str, others: &[String]) -> DataError {
         let mut parts = vec![what.to_owned()];
-        let folders = [self.base.as_path(), self.root.path()];
+        let folders = [self.base.as_path(), self.root.path.as_path()];
         let files = folders.into_iter().map(transforms_in).find(|files| !files.is_empty());
         parts.extend(files.map(|files| {
             format!(

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::files::listing::has_ending;
 use crate::scene_source::SceneSource;
-use crate::skip_report::{SkipReport, SkippedScene, first_few, plural};
+use crate::skip_report::{SkipReport, note_on};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::chunks::writer::{ChunkFill, SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
@@ -139,7 +139,9 @@ impl<'a> Converter<'a> {
 
     /// Compares the scenes of the complete files with the source.
     fn scan(&mut self) -> Result<(), DataError> {
-        let unreadable: HashSet<&str> = self.report.skipped.skips.iter().filter_map(unreadable_key).collect();
+        // Scenes reserved for testing are readable.
+        let unreadable = self.report.skipped.skips.iter().filter(|skip| !skip.reason.starts_with(KEPT_FOR_TESTING));
+        let unreadable: HashSet<&str> = unreadable.map(|skip| skip.key.as_str()).collect();
         let names: Vec<&str> = self.checksums.names().filter(|name| has_ending(name, "torch")).collect();
         let scan = |name: &str| {
             let path = self.folder.join(name);
@@ -275,13 +277,10 @@ impl<'a> Converter<'a> {
 
     fn finish(mut self) -> Result<ConversionReport, DataError> {
         self.flush()?;
-        if !self.unreadable.is_empty() {
-            let names: Vec<&String> = self.unreadable.iter().collect();
-            let scenes = plural(names.len(), "scene");
-            let skipped = &mut self.report.skipped;
-            skipped.notes.push(format!("{scenes} unreadable now, kept as converted before ({})", first_few(&names)));
-            skipped.skips.retain(|skip| !self.unreadable.contains(&skip.key));
-        }
+        let names: Vec<&String> = self.unreadable.iter().collect();
+        let skipped = &mut self.report.skipped;
+        skipped.notes.extend(note_on(&names, "scene", "unreadable now, kept as converted before"));
+        skipped.skips.retain(|skip| !self.unreadable.contains(&skip.key));
         let is_chunks = self.options.to != ConvertTo::Scenes;
         let index = (is_chunks && !self.index.is_empty()).then(|| serde_json::to_vec_pretty(&self.index));
         let skipped = &self.report.skipped;
@@ -299,11 +298,6 @@ impl<'a> Converter<'a> {
         self.report.num_scenes = self.index.len();
         Ok(self.report)
     }
-}
-
-/// Returns the key of a scene that was skipped because it is unreadable, not because it is reserved for testing.
-fn unreadable_key(skip: &SkippedScene) -> Option<&str> {
-    (!skip.reason.starts_with(KEPT_FOR_TESTING)).then_some(&skip.key)
 }
 
 /// Returns whether a key is a valid file name on all operating systems.

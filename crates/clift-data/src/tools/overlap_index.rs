@@ -12,7 +12,7 @@ use crate::geometry::overlap::overlap;
 use crate::random::{derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
-use crate::skip_report::{SkipReport, first_few, plural};
+use crate::skip_report::{SkipReport, note_on};
 use crate::tools::export::write_index;
 
 /// Options of an overlap index. The defaults are those of the published RealEstate10K index with four contexts.
@@ -125,10 +125,7 @@ pub fn write_overlap_index(
         }
         shared.push(key);
     }
-    let note = |shared: &[&str]| {
-        format!("{} in both splits, counted once ({})", plural(shared.len(), "scene"), first_few(shared))
-    };
-    let notes = (!shared.is_empty()).then(|| note(&shared)).into_iter().collect();
+    let notes = note_on(&shared, "scene", "in both splits, counted once").into_iter().collect();
     let sample = |(source, scene): &(&dyn SceneSource, usize)| {
         let cameras = source.cameras(*scene).map_err(|error| error.to_string())?;
         options.sample_views(source.key(*scene), &cameras)

@@ -8,6 +8,7 @@ use std::path::Path;
 use zip::{CompressionMethod, ZipArchive};
 
 use crate::error::DataError;
+use crate::torch::values::MAX_BYTES;
 
 /// Byte range of a member of an archive, or of a part of a member. It takes 24 bytes, because a data set has millions.
 #[derive(Clone, Copy, Debug)]
@@ -108,6 +109,18 @@ impl Archive {
             }
         }
         Ok(archive)
+    }
+
+    /// Reads the pickle of the archive at `path`, the member `data.pkl`.
+    pub fn read_pickle(&self, path: &Path) -> Result<Vec<u8>, DataError> {
+        let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
+        let member = self
+            .member("data.pkl")
+            .ok_or_else(|| bad("no member data.pkl: the file was not written by torch.save".into()))?;
+        if member.len() > MAX_BYTES as u64 {
+            return Err(bad(format!("data.pkl has {} bytes, more than the limit of {MAX_BYTES}", member.len())));
+        }
+        member.read(path)
     }
 
     /// Returns a member by its name without the top folder.

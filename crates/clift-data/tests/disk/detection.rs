@@ -16,7 +16,7 @@ fn copy(part: &str, to: &Path) {
 }
 
 fn has_splits(root: &Path) -> bool {
-    DatasetRoot::find(root).unwrap().has_splits()
+    DatasetRoot::find(root).unwrap().has_splits
 }
 
 fn open_any(root: &Path, split: Split) -> OpenedSource {

@@ -109,18 +109,20 @@ const BINARY: [&str; 2] = ["attic/sparse/0/cameras.bin", "attic/sparse/0/images.
 const RE10K: &str = "test/d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a.txt";
 const TEXT: [&str; 2] = ["attic/sparse/0/cameras.txt", "attic/sparse/0/images.txt"];
 
+/// Returns the error of reading a binary model with these bytes at a position of a file.
+fn patched_model(file: &str, at: usize, patch: &[u8]) -> String {
+    let change = |mut bytes: Vec<u8>| {
+        bytes[at..at + patch.len()].copy_from_slice(patch);
+        bytes
+    };
+    changed("colmap_bin", file, change).unwrap_err()
+}
+
 #[test]
 fn truncated_or_huge_colmap_models_are_refused() {
     for file in BINARY {
-        let count = |count: u64| {
-            let change = |mut bytes: Vec<u8>| {
-                bytes[..8].copy_from_slice(&count.to_le_bytes());
-                bytes
-            };
-            changed("colmap_bin", file, change)
-        };
-        for number in [7, u64::from(u32::MAX), u64::MAX] {
-            let message = count(number).unwrap_err();
+        for count in [7, u64::from(u32::MAX), u64::MAX] {
+            let message = patched_model(file, 0, &count.to_le_bytes());
             assert!(message.contains("exceeds the file of") && message.ends_with("s.bin"), "{message}");
         }
         for length in [0, 7, 9, 40, 100] {
@@ -129,16 +131,10 @@ fn truncated_or_huge_colmap_models_are_refused() {
         }
     }
     // The number of points of the first image follows its name.
-    let points = |count: u64| {
-        let change = |mut bytes: Vec<u8>| {
-            let at = 8 + 4 + 56 + 4 + "left/frame 8.png".len() + 1;
-            bytes[at..at + 8].copy_from_slice(&count.to_le_bytes());
-            bytes
-        };
-        changed("colmap_bin", BINARY[1], change).unwrap_err()
-    };
+    let at = 8 + 4 + 56 + 4 + "left/frame 8.png".len() + 1;
     for count in [1 << 20, 1 << 60, u64::MAX / 24, u64::MAX] {
-        assert!(points(count).contains("exceeds the file of"), "{count}");
+        let message = patched_model(BINARY[1], at, &count.to_le_bytes());
+        assert!(message.contains("exceeds the file of"), "{count}: {message}");
     }
     let unending = |bytes: Vec<u8>| [&bytes[..8 + 64], &[b'x'; 10_000]].concat();
     assert!(changed("colmap_bin", BINARY[1], unending).unwrap_err().contains("is longer than 4096 bytes"));
@@ -146,16 +142,13 @@ fn truncated_or_huge_colmap_models_are_refused() {
 
 #[test]
 fn errors_of_colmap_models_are_named() {
-    let model = |id: i32| {
-        let change = |mut bytes: Vec<u8>| {
-            bytes[12..16].copy_from_slice(&id.to_le_bytes());
-            bytes
-        };
-        changed("colmap_bin", BINARY[0], change).unwrap_err()
-    };
-    assert!(model(99).contains("camera 0 of 1 has the unknown model 99"), "{}", model(99));
-    assert!(model(-1).contains("unknown model -1"), "{}", model(-1));
-    assert!(model(5).contains("truncated"), "too few parameters: {}", model(5));
+    // OPENCV_FISHEYE, of id 5, has more parameters than the file.
+    for (id, expected) in
+        [(99, "camera 0 of 1 has the unknown model 99"), (-1, "unknown model -1"), (5_i32, "truncated")]
+    {
+        let message = patched_model(BINARY[0], 12, &id.to_le_bytes());
+        assert!(message.contains(expected), "{message}");
+    }
     for (file, from, to, expected) in [
         (0, "7 PINHOLE", "7 FULL_OPENCV", "camera 7: FULL_OPENCV has 4 parameters, expected 12"),
         (0, "7 PINHOLE", "7 FISH", "camera 7: the model is FISH, expected SIMPLE_PINHOLE"),

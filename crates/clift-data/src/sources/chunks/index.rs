@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::files::listing::{file_names, has_ending};
-use crate::skip_report::{SkipReport, first_few, plural};
+use crate::skip_report::{SkipReport, first_few, note_on, plural};
 use crate::sources::chunks::table::ChunkTable;
 use crate::sources::test_scenes::TestScenes;
 
@@ -88,12 +88,8 @@ fn index_of_chunks(folder: &Path, files: &[String], report: &mut SkipReport) -> 
             }
         }
     }
-    if !duplicates.is_empty() {
-        duplicates.sort_unstable();
-        let counted = plural(duplicates.len(), "scene");
-        let note = format!("{counted} in more than one file, the first of which is used ({})", first_few(&duplicates));
-        report.notes.push(note);
-    }
+    duplicates.sort_unstable();
+    report.notes.extend(note_on(&duplicates, "scene", "in more than one file, the first of which is used"));
     report
         .notes
         .push(format!("no index.json: the scenes of {} files were determined from their contents", files.len()));
@@ -103,7 +99,6 @@ fn index_of_chunks(folder: &Path, files: &[String], report: &mut SkipReport) -> 
 fn torch_files(folder: &Path) -> Result<Vec<String>, DataError> {
     let mut files = file_names(folder)?;
     files.retain(|name| has_ending(name, "torch"));
-    files.sort_unstable();
     Ok(files)
 }
 

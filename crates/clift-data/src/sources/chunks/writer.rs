@@ -258,7 +258,7 @@ mod tests {
         let source =
             ChunkSource::open(folder.path(), Split::Test, &SceneFilters { min_frames: 1, ..Default::default() });
         let source = source.unwrap();
-        assert_eq!(source.report().to_string(), "20001 of 20001 scenes used");
+        assert_eq!(source.report.to_string(), "20001 of 20001 scenes used");
         assert_eq!(source.num_frames(source.find("long").unwrap()).unwrap(), most);
         let message = write_chunks(&folder.path().join("train"), [Ok(record("a", most + 1))], 1).unwrap_err();
         assert!(message.to_string().contains(" frames, above the limit of a file (about 50,000)"), "{message}");

@@ -139,6 +139,11 @@ fn number_at_end(path: &Path) -> Option<i64> {
 }
 
 impl PhotoScene {
+    /// Adds a frame without a usable image.
+    pub fn skip(&mut self, name: impl Into<String>, reason: impl Into<String>) {
+        self.missing.push(MissingPhoto { name: name.into(), reason: reason.into() });
+    }
+
     /// Returns time stamps that increase from frame to frame; frame indices if the names have none.
     pub fn timestamps(&self) -> Vec<i64> {
         let times: Option<Vec<i64>> = self.photos.iter().map(|photo| photo.time).collect();

@@ -40,7 +40,7 @@ pub(crate) struct PhotoSource {
     scenes: Vec<Entry>,
     positions: HashMap<String, usize>,
     options: PhotoOptions,
-    report: SkipReport,
+    pub report: SkipReport,
     /// Scenes used last, with their indices; the latest at the end.
     cache: Mutex<Vec<(usize, Arc<PhotoScene>)>>,
 }
@@ -111,11 +111,6 @@ impl PhotoSource {
         }
         let positions = scenes.iter().enumerate().map(|(i, scene)| (scene.folder.key.clone(), i)).collect();
         Ok(Self { scenes, positions, options: options.photos.clone(), report, cache: Mutex::default() })
-    }
-
-    /// Returns the skipped scenes and frames.
-    pub fn report(&self) -> &SkipReport {
-        &self.report
     }
 
     fn entry(&self, scene: usize) -> Result<&Entry, DataError> {

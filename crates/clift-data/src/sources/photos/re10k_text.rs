@@ -7,7 +7,7 @@ use crate::error::DataError;
 use crate::files::bounded::read_bounded;
 use crate::geometry::camera::Camera;
 use crate::sources::photos::image_folder::numbered_images;
-use crate::sources::photos::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoScene};
+use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoScene};
 
 /// Largest size of a file, in bytes: a hundred times the longest clip.
 const MAX_BYTES: u64 = 16 << 20;
@@ -48,15 +48,10 @@ fn parse(text: &str, images: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Strin
         }
         match images.get(&time) {
             Some(path) => {
-                scene.photos.push(Photo {
-                    path: path.clone(),
-                    camera,
-                    undistortion: None,
-                    shape: None,
-                    time: Some(time),
-                });
+                let (path, time) = (path.clone(), Some(time));
+                scene.photos.push(Photo { path, camera, undistortion: None, shape: None, time });
             }
-            None => scene.missing.push(MissingPhoto { name: time.to_string(), reason: "without an image".into() }),
+            None => scene.skip(time.to_string(), "without an image"),
         }
     }
     // Time stamps increase, so that no image is counted twice.

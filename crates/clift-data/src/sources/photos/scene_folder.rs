@@ -183,9 +183,7 @@ fn push_folders(
     folders: &mut VecDeque<String>,
     links: &mut VecDeque<String>,
 ) -> Result<(), DataError> {
-    let mut names = file_names(folder)?;
-    names.sort_unstable();
-    for name in names.into_iter().filter(|name| !name.starts_with('.')) {
+    for name in file_names(folder)?.into_iter().filter(|name| !name.starts_with('.')) {
         let path = folder.join(&name);
         let to = if path.is_symlink() { &mut *links } else { &mut *folders };
         if path.is_dir() {
@@ -212,7 +210,6 @@ fn other_data_in(folder: &Path) -> Option<String> {
 pub(crate) fn transforms_in(folder: &Path) -> Vec<String> {
     let mut names = file_names(folder).unwrap_or_default();
     names.retain(|name| name.starts_with("transforms") && has_ending(name, "json"));
-    names.sort_unstable();
     names
 }
 

@@ -26,7 +26,7 @@ fn mini_chunk() -> Vec<u8> {
 fn chunks_of_torch_save_are_read_by_frame() {
     let source = re10k_mini(Split::Train);
     assert_eq!(source.num_scenes(), 2);
-    assert_eq!(source.report().to_string(), "2 of 2 scenes used");
+    assert_eq!(source.report.to_string(), "2 of 2 scenes used");
     let scene = source.find("00000000000000a2").unwrap();
     assert_eq!(source.key(scene), "00000000000000a2");
     assert_eq!(source.url(scene).unwrap(), "https://example.org/00000000000000a2");
@@ -57,10 +57,10 @@ fn filters_skip_scenes_with_reasons() {
     assert_eq!(open(8, Some(60.0)).num_scenes(), 2);
     let short = open(9, None);
     assert_eq!((short.num_scenes(), short.find("00000000000000a1")), (0, None));
-    assert_eq!(short.report().to_string(), "0 of 2 scenes used; 2 shorter than 9 frames");
+    assert_eq!(short.report.to_string(), "0 of 2 scenes used; 2 shorter than 9 frames");
     // fx = 0.9 of the width: 58.1 degrees.
     let wide = open(8, Some(58.0));
-    assert_eq!(wide.report().to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
+    assert_eq!(wide.report.to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
 }
 
 #[test]
@@ -157,7 +157,7 @@ fn scenes_of_failing_chunks_are_skipped_with_the_error() {
         let source = ChunkSource::open(folder.path(), Split::Train, filters).unwrap();
         assert_eq!((source.num_scenes(), source.key(0)), (1, "00000000000000a1"));
         assert!(source.find("00000000000000a2").is_none() && source.frame(0, 0).is_ok());
-        let report = source.report().to_string();
+        let report = source.report.to_string();
         assert!(report.starts_with(&format!("1 of 2 scenes used; {reason}")), "{report}");
         assert!(report.contains("2.torch"), "{report}");
     }
@@ -180,7 +180,7 @@ fn unreadable_cameras_are_skipped_by_the_field_of_view() {
     let filters = SceneFilters { min_frames: 0, max_fov_deg: Some(100.0) };
     let source = ChunkSource::open(folder.path(), Split::Train, &filters).unwrap();
     assert_eq!((source.num_scenes(), source.key(0)), (1, "00000000000000a2"));
-    let skip = &source.report().skips[0];
+    let skip = &source.report.skips[0];
     assert!(skip.key == "00000000000000a1" && skip.reason.contains("frame 3: bad camera: "), "{skip:?}");
 }
 

@@ -8,7 +8,7 @@ use crate::files::listing::natural_order;
 use crate::sources::photos::colmap::model::Model;
 use crate::sources::photos::colmap::{binary, text};
 use crate::sources::photos::image_folder::ImageFolders;
-use crate::sources::photos::photo::{MissingPhoto, Photo, PhotoOptions, PhotoScene};
+use crate::sources::photos::photo::{Photo, PhotoOptions, PhotoScene};
 
 /// Returns the folder of the COLMAP model of a scene: the scene folder, or one of the usual subfolders.
 pub(crate) fn find_model(folder: &Path) -> Option<PathBuf> {
@@ -52,7 +52,7 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         let path = match found {
             Ok(path) => path,
             Err(reason) => {
-                scene.missing.push(MissingPhoto { name: image.name.clone(), reason });
+                scene.skip(&image.name, reason);
                 continue;
             }
         };
