@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::normalization::{PoseRotation, PoseScale};
 use crate::image::fit::Crop;
 use crate::sampling::clip_reader::ClipOptions;
-use crate::sampling::view_sampler::ViewSampler;
+use crate::sampling::view_sampler::{ViewSampler, is_default};
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
 use crate::sources::options::FileOptions;
@@ -35,7 +35,7 @@ pub struct DataConfig {
     /// Former notation of `crop = "exact"`.
     pub exact_principal_point: bool,
     /// Principal point of cropped images: `protocol`, as in published results, or `exact`.
-    #[serde(skip_serializing_if = "Crop::is_default")]
+    #[serde(skip_serializing_if = "is_default")]
     pub crop: Crop,
     /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
     #[serde(skip_serializing_if = "std::ops::Not::not")]

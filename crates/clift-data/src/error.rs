@@ -230,8 +230,18 @@ impl DataError {
         Self::BadConfig { key: key.into(), problem: problem.into() }
     }
 
+    /// Returns a function that names the frame of an error, for `map_err`.
+    pub(crate) fn in_frame(key: &str, frame: usize) -> impl FnOnce(Self) -> Self {
+        move |source| Self::InFrame { key: key.to_owned(), frame, source: Box::new(source) }
+    }
+
     /// Returns a function that wraps an error of the operating system, for `map_err`.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, source, path: path.to_path_buf() }
     }
+}
+
+/// Returns a [`DataError::BadConfig`] unless the value of `key` is valid.
+pub(crate) fn check_config(is_valid: bool, key: &str, problem: impl FnOnce() -> String) -> Result<(), DataError> {
+    if is_valid { Ok(()) } else { Err(DataError::bad_config(key, problem())) }
 }

@@ -122,6 +122,11 @@ impl fmt::Display for SkipReport {
     }
 }
 
+/// Returns a note on these names, such as `2 scenes unreadable now (a, b)`; `None` for no names.
+pub(crate) fn note_on<S: AsRef<str>>(names: &[S], noun: &str, what: &str) -> Option<String> {
+    (!names.is_empty()).then(|| format!("{} {what} ({})", plural(names.len(), noun), first_few(names)))
+}
+
 /// Joins the first few names, with dots for the others.
 pub(crate) fn first_few<S: AsRef<str>>(names: &[S]) -> String {
     let mut shown: Vec<&str> = names.iter().take(MAX_NAMES_SHOWN).map(AsRef::as_ref).collect();

@@ -1,11 +1,62 @@
-//! Data sources for tests.
+//! Files and data sources for tests.
 
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::error::DataError;
+use crate::files::listing::file_names;
 use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
-use crate::scene_source::SceneSource;
+use crate::scene_source::{SceneSource, Split};
+use crate::sources::chunks::chunk_source::ChunkSource;
+use crate::sources::filters::SceneFilters;
+
+/// Returns the path of a fixture.
+pub fn fixture(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures").join(name)
+}
+
+/// Returns two training scenes, or one test scene, of RealEstate10K with eight frames.
+pub fn re10k_mini(split: Split) -> ChunkSource {
+    ChunkSource::open(&fixture("re10k-mini"), split, &SceneFilters::default()).unwrap()
+}
+
+/// Passes a file with these bytes to `read`.
+pub fn read_from_file<T>(name: &str, bytes: impl AsRef<[u8]>, read: impl FnOnce(&Path) -> T) -> T {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(name);
+    std::fs::write(&path, bytes).unwrap();
+    read(&path)
+}
+
+/// Returns the names in a folder, sorted.
+pub fn names(folder: &Path) -> Vec<String> {
+    file_names(folder).unwrap()
+}
+
+/// Returns an image whose red and green rise along the columns and rows.
+pub fn ramp(width: usize, height: usize) -> RgbImage {
+    let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 77])).collect();
+    RgbImage { width, height, rgb }
+}
+
+/// Asserts that two sources have the same scenes; cameras up to the precision of f32 files.
+pub fn assert_same(a: &dyn SceneSource, b: &dyn SceneSource) {
+    assert_eq!(a.num_scenes(), b.num_scenes());
+    for scene in 0..a.num_scenes() {
+        let other = b.find(a.key(scene)).unwrap();
+        assert_eq!(a.timestamps(scene).unwrap(), b.timestamps(other).unwrap());
+        assert_eq!(a.url(scene).unwrap(), b.url(other).unwrap());
+        let (cameras, others) = (a.cameras(scene).unwrap(), b.cameras(other).unwrap());
+        assert_eq!(cameras.len(), others.len());
+        for (frame, (camera, other_camera)) in cameras.iter().zip(&others).enumerate() {
+            assert_eq!(a.frame(scene, frame).unwrap(), b.frame(other, frame).unwrap());
+            for (x, y) in camera.to_re10k().iter().zip(other_camera.to_re10k()) {
+                assert!((x - y).abs() < 1e-6 * (1.0 + x.abs()), "{x} {y}"); // f32 files
+            }
+        }
+    }
+}
 
 type ChangeCameras = dyn Fn(usize, Vec<Camera>) -> Result<Vec<Camera>, DataError> + Send + Sync;
 type ChangeFrame = dyn Fn(usize, usize, RgbImage) -> Result<RgbImage, DataError> + Send + Sync;

@@ -85,14 +85,14 @@ pub fn cluster_attention_forward(
     );
     let weights = SharedSlice::new(weights);
     output.par_chunks_mut(SEGMENTS_PER_TASK * dim).enumerate().for_each(|(task, output)| {
-        set.run(Forward { segments, query, key_value, first: task * SEGMENTS_PER_TASK, output, weights: &weights });
+        let first = task * SEGMENTS_PER_TASK;
+        set.run(Forward { segments, inputs: [query, key_value], first, output, weights: &weights });
     });
 }
 
 struct Forward<'a> {
     segments: &'a ClusterSegments,
-    query: &'a [f32],
-    key_value: &'a [f32],
+    inputs: [&'a [f32]; 2],
     first: usize,
     output: &'a mut [f32],
     weights: &'a SharedSlice<'a>,
@@ -103,7 +103,7 @@ impl Kernel for Forward<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let Self { segments, query, key_value, first, output, weights } = self;
+        let Self { segments, inputs: [query, key_value], first, output, weights } = self;
         let (dim, heads, width) = (segments.dim(), segments.num_heads, segments.head_width);
         let mut scores = Vec::new();
         for (i, output) in output.chunks_exact_mut(dim).enumerate() {
@@ -162,25 +162,14 @@ pub fn cluster_attention_backward(
     assert_eq!(grad_key_value.len(), key_value.len(), "rows of all members");
     let grad_key_value = SharedSlice::new(grad_key_value);
     grad_query.par_chunks_mut(SEGMENTS_PER_TASK * dim).enumerate().for_each(|(task, grad_query)| {
-        set.run(Backward {
-            segments,
-            query,
-            key_value,
-            weights,
-            grad,
-            first: task * SEGMENTS_PER_TASK,
-            grad_query,
-            grad_key_value: &grad_key_value,
-        });
+        let (inputs, first) = ([query, key_value, weights, grad], task * SEGMENTS_PER_TASK);
+        set.run(Backward { segments, inputs, first, grad_query, grad_key_value: &grad_key_value });
     });
 }
 
 struct Backward<'a> {
     segments: &'a ClusterSegments,
-    query: &'a [f32],
-    key_value: &'a [f32],
-    weights: &'a [f32],
-    grad: &'a [f32],
+    inputs: [&'a [f32]; 4],
     first: usize,
     grad_query: &'a mut [f32],
     grad_key_value: &'a SharedSlice<'a>,
@@ -191,7 +180,7 @@ impl Kernel for Backward<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let Self { segments, query, key_value, weights, grad, first, grad_query, grad_key_value } = self;
+        let Self { segments, inputs: [query, key_value, weights, grad], first, grad_query, grad_key_value } = self;
         let (dim, heads, width) = (segments.dim(), segments.num_heads, segments.head_width);
         let mut slopes: Vec<f32> = Vec::new();
         for (i, grad_query) in grad_query.chunks_exact_mut(dim).enumerate() {
@@ -262,40 +251,30 @@ fn set_scaled<S: Simd>(simd: S, from: &[f32], factor: f32, to: &mut [f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{assert_close, random};
+    use crate::attention::shapes::AttentionSizes;
+    use crate::testing::{assert_close, attention_reference, random};
 
-    /// Computes output and gradients of `query` and `key_value` in f64.
+    /// Computes output and gradients of `query` and `key_value` in f64: every segment is an attention with one query.
     fn reference(sizes: [usize; 3], segment: &[usize], [q, kv, grad]: [&[f32]; 3]) -> [Vec<f64>; 3] {
-        let [num_segments, heads, width] = sizes;
-        let dim = heads * width;
-        let wide = |values: &[f32]| values.iter().map(|&value| f64::from(value)).collect::<Vec<_>>();
-        let (q, kv, grad) = (wide(q), wide(kv), wide(grad));
-        let mut results = [vec![0.0; q.len()], vec![0.0; q.len()], vec![0.0; kv.len()]];
-        let [output, grad_q, grad_kv] = &mut results;
-        let scale = 1.0 / (width as f64).sqrt();
-        for (s, head) in (0..num_segments).flat_map(|s| (0..heads).map(move |head| (s, head))) {
+        let [num_segments, num_heads, head_width] = sizes;
+        let dim = num_heads * head_width;
+        let (mut output, mut grad_q, mut grad_kv) = (Vec::new(), Vec::new(), vec![0.0; kv.len()]);
+        for s in 0..num_segments {
             let members: Vec<usize> = (0..segment.len()).filter(|&i| segment[i] == s).collect();
-            let at = |e: usize| s * dim + head * width + e;
-            let key = |i: usize, e: usize| i * 2 * dim + head * width + e;
-            let value = |i: usize, e: usize| key(i, e) + dim;
-            let sum = |term: &dyn Fn(usize) -> f64| (0..width).map(term).sum::<f64>();
-            let scores: Vec<f64> = members.iter().map(|&i| scale * sum(&|e| q[at(e)] * kv[key(i, e)])).collect();
-            let highest = scores.iter().copied().fold(f64::MIN, f64::max);
-            let total: f64 = scores.iter().map(|score| (score - highest).exp()).sum();
-            let weights: Vec<f64> = scores.iter().map(|score| (score - highest).exp() / total).collect();
-            let slopes: Vec<f64> = members.iter().map(|&i| sum(&|e| grad[at(e)] * kv[value(i, e)])).collect();
-            let mean: f64 = weights.iter().zip(&slopes).map(|(weight, slope)| weight * slope).sum();
-            for ((&i, weight), slope) in members.iter().zip(&weights).zip(&slopes) {
-                let grad_score = weight * (slope - mean) * scale;
-                for e in 0..width {
-                    output[at(e)] += weight * kv[value(i, e)];
-                    grad_q[at(e)] += grad_score * kv[key(i, e)];
-                    grad_kv[key(i, e)] += grad_score * q[at(e)];
-                    grad_kv[value(i, e)] += weight * grad[at(e)];
+            let part = |start: usize| members.iter().flat_map(move |&i| &kv[i * 2 * dim + start..][..dim]);
+            let (keys, values): (Vec<f32>, Vec<f32>) = (part(0).copied().collect(), part(dim).copied().collect());
+            let sizes = AttentionSizes { batch: 1, num_queries: 1, num_keys: members.len(), num_heads, head_width };
+            let inputs = [&q[s * dim..][..dim], &keys, &values, &grad[s * dim..][..dim]];
+            let results = attention_reference(&sizes, inputs);
+            output.extend(&results[0]);
+            grad_q.extend(&results[1]);
+            for (row, &i) in members.iter().enumerate() {
+                for (part, grads) in results[2..].iter().enumerate() {
+                    grad_kv[(2 * i + part) * dim..][..dim].copy_from_slice(&grads[row * dim..][..dim]);
                 }
             }
         }
-        results
+        [output, grad_q, grad_kv]
     }
 
     fn check(sizes: [usize; 3], num_members: usize) {
@@ -321,9 +300,8 @@ mod tests {
 
     #[test]
     fn every_instruction_set_equals_f64_at_odd_shapes() {
-        check([1, 1, 12], 3);
-        check([37, 2, 12], 200);
-        check([19, 3, 96], 77);
-        check([5, 1, 5], 40);
+        for (sizes, num_members) in [([1, 1, 12], 3), ([37, 2, 12], 200), ([19, 3, 96], 77), ([5, 1, 5], 40)] {
+            check(sizes, num_members);
+        }
     }
 }

@@ -90,9 +90,6 @@ pub fn remove_leftovers(folder: &Path) -> std::io::Result<()> {
 }
 
 /// Syncs the names in a folder, where the system supports that: Windows and some file systems do not.
-///
-/// # Errors
-/// Errors of the operating system.
 pub fn sync_folder(folder: &Path) -> std::io::Result<()> {
     if cfg!(windows) {
         return Ok(());
@@ -110,13 +107,7 @@ fn folder_of(path: &Path) -> &Path {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn names(folder: &Path) -> Vec<String> {
-        let items = std::fs::read_dir(folder).unwrap();
-        let mut names: Vec<_> = items.map(|item| item.unwrap().file_name().into_string().unwrap()).collect();
-        names.sort();
-        names
-    }
+    use crate::testing::names;
 
     #[test]
     fn replaced_files_leave_no_temporary_files() {

@@ -8,10 +8,7 @@ use crate::error::DataError;
 /// Largest number of entries of a folder.
 const MAX_ENTRIES: usize = 1_000_000;
 
-/// Returns the names of the entries of a folder, unsorted, without names that are no UTF-8.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::UnknownLayout`] for more than a million entries.
+/// Returns the names of the entries of a folder, sorted, without names that are no UTF-8.
 pub(crate) fn file_names(folder: &Path) -> Result<Vec<String>, DataError> {
     let mut names = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(DataError::io("listing the folder", folder))? {
@@ -22,6 +19,7 @@ pub(crate) fn file_names(folder: &Path) -> Result<Vec<String>, DataError> {
             return Err(DataError::UnknownLayout { what, path: folder.to_owned() });
         }
     }
+    names.sort_unstable();
     Ok(names)
 }
 

@@ -183,6 +183,7 @@ pub fn read_poses(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::read_from_file;
 
     const K: Intrinsics = Intrinsics { fx: 40.0, fy: 41.0, cx: 16.0, cy: 12.0 };
 
@@ -256,11 +257,8 @@ mod tests {
     }
 
     fn read(json: &str) -> Result<Vec<PathView>, DataError> {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("poses.json");
-        std::fs::write(&path, json).unwrap();
         let frame = PoseNormalization { mean_c2w: view([1.0, 0.0, 0.0], 0.0).c2w, scale: 2.0 };
-        read_poses(&path, &frame, K, 64, 32)
+        read_from_file("poses.json", json, |path| read_poses(path, &frame, K, 64, 32))
     }
 
     #[test]

@@ -63,11 +63,7 @@ impl PoseNormalization {
         scale: PoseScale,
     ) -> Result<Self, DataError> {
         for (frame, pose) in context.iter().chain(target).enumerate() {
-            pose.check_finite().map_err(|source| DataError::InFrame {
-                key: key.to_owned(),
-                frame,
-                source: Box::new(source),
-            })?;
+            pose.check_finite().map_err(DataError::in_frame(key, frame))?;
         }
         if context.is_empty() {
             return Err(DataError::BadCamera {

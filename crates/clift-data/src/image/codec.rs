@@ -51,9 +51,6 @@ pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, D
 }
 
 /// Reads the columns and rows of a JPEG or PNG file from its header.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] for a file of another format.
 pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let metadata = std::fs::metadata(path).map_err(DataError::io("opening an image", path))?;
@@ -77,9 +74,6 @@ pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
 /// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated.
 ///
 /// Reads only the last bytes, except of files with data after the image, such as a phone's film.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] for a truncated file.
 pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
     const READING: &str = "reading the end of an image";
     let io = || DataError::io(READING, path);
@@ -172,11 +166,7 @@ fn encode(encoder: impl ImageEncoder, image: &RgbImage) -> Result<(), DataError>
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn ramp(width: usize, height: usize) -> RgbImage {
-        let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 77])).collect();
-        RgbImage { width, height, rgb }
-    }
+    use crate::testing::ramp;
 
     #[test]
     fn png_round_trips_exactly_and_jpeg_closely() {

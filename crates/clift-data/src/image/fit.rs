@@ -18,14 +18,6 @@ pub enum Crop {
     Exact,
 }
 
-impl Crop {
-    /// Returns whether serde skips the value. Settings files from before this key then compare equal.
-    #[allow(clippy::trivially_copy_pass_by_ref)] // serde's signature
-    pub fn is_default(&self) -> bool {
-        *self == Self::default()
-    }
-}
-
 /// Rescales an image to the smallest size that covers `width` by `height` pixels, crops the centre, and adapts the
 /// intrinsics, as pixelSplat's `rescale_and_crop`.
 ///
@@ -75,11 +67,7 @@ fn covering_size(from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
 mod tests {
     use super::*;
     use crate::image::codec::decode_image;
-
-    fn ramp(width: usize, height: usize) -> RgbImage {
-        let rgb = (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 77])).collect();
-        RgbImage { width, height, rgb }
-    }
+    use crate::testing::ramp;
 
     #[test]
     fn sizes_crops_and_focal_lengths_equal_the_protocol() {

@@ -50,26 +50,15 @@ impl ClipReader {
         if let Some(&frame) = frames.clone().find(|frame| **frame >= cameras.len()) {
             return Err(DataError::NoSuchFrame { key: key.to_owned(), frame, num_frames: cameras.len() });
         }
+        for &frame in frames.clone() {
+            cameras[frame].c2w.check_finite().map_err(DataError::in_frame(key, frame))?;
+        }
         let poses = |frames: &[usize]| frames.iter().map(|frame| cameras[*frame].c2w).collect::<Vec<_>>();
         let (context, target) = (poses(&views.context), poses(&views.target));
         let ClipOptions { pose_rotation, pose_scale, .. } = self.options;
-        let normalization =
-            PoseNormalization::find(key, &context, &target, pose_rotation, pose_scale).map_err(|error| {
-                // Convert the position in the list of views to the frame of the scene.
-                match error {
-                    DataError::InFrame { key, frame, source } => {
-                        let frame = frames.clone().nth(frame).copied().unwrap_or(frame);
-                        DataError::InFrame { key, frame, source }
-                    }
-                    other => other,
-                }
-            })?;
+        let normalization = PoseNormalization::find(key, &context, &target, pose_rotation, pose_scale)?;
         for &frame in frames.clone() {
-            check_near(&normalization.normalize(cameras[frame].c2w)).map_err(|source| DataError::InFrame {
-                key: key.to_owned(),
-                frame,
-                source: Box::new(source),
-            })?;
+            check_near(&normalization.normalize(cameras[frame].c2w)).map_err(DataError::in_frame(key, frame))?;
         }
         let mut fitted = HashMap::new();
         for &frame in frames {
@@ -91,23 +80,19 @@ impl ClipReader {
     fn fitted(&self, scene: usize, frame: usize, camera: &Camera) -> Result<(RgbImage, Intrinsics), DataError> {
         let ClipOptions { width, height, exact_principal_point, .. } = self.options;
         let image = self.source.frame(scene, frame)?;
-        fit_image(&image, camera.intrinsics_norm, width, height, exact_principal_point).map_err(|source| {
-            DataError::InFrame { key: self.source.key(scene).to_owned(), frame, source: Box::new(source) }
-        })
+        fit_image(&image, camera.intrinsics_norm, width, height, exact_principal_point)
+            .map_err(DataError::in_frame(self.source.key(scene), frame))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use super::*;
     use crate::geometry::pose::Pose;
     use crate::scene_source::Split;
-    use crate::sources::chunks::chunk_source::ChunkSource;
-    use crate::sources::filters::SceneFilters;
-    use crate::testing::TestSource;
+    use crate::testing::{TestSource, re10k_mini};
 
     const OPTIONS: ClipOptions = ClipOptions {
         width: 32,
@@ -119,11 +104,9 @@ mod tests {
 
     /// Returns a reader of the fixture's test scene with another pose of frame 4, and the count of decoded frames.
     fn reader(frame_4: Option<Pose>, options: ClipOptions) -> (ClipReader, Arc<AtomicUsize>) {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
-        let chunks = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
         let num_decoded = Arc::new(AtomicUsize::new(0));
         let counter = num_decoded.clone();
-        let source = TestSource::new(chunks)
+        let source = TestSource::new(re10k_mini(Split::Test))
             .with_cameras(move |_, mut cameras| {
                 cameras[4].c2w = frame_4.unwrap_or(cameras[4].c2w);
                 Ok(cameras)

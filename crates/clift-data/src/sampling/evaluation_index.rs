@@ -181,17 +181,12 @@ pub fn even_views(num_frames: usize, num_context: usize, num_targets: usize) -> 
 mod tests {
     use super::*;
     use crate::scene_source::Split;
-    use crate::sources::chunks::chunk_source::ChunkSource;
-    use crate::sources::filters::SceneFilters;
     use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::source::SyntheticSource;
-    use crate::testing::TestSource;
+    use crate::testing::{TestSource, fixture, re10k_mini, read_from_file};
 
     fn index(json: &str) -> Result<EvaluationIndex, DataError> {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("index.json");
-        std::fs::write(&path, json).unwrap();
-        EvaluationIndex::read(&path)
+        read_from_file("index.json", json, EvaluationIndex::read)
     }
 
     #[test]
@@ -237,15 +232,12 @@ mod tests {
 
     #[test]
     fn skipped_entries_are_counted() {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
-        let source = ChunkSource::open(&root, Split::Test, &SceneFilters::default()).unwrap();
-        let (items, report) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&source, 0);
+        let index = EvaluationIndex::read(&fixture("re10k-mini/evaluation_index.json")).unwrap();
+        let (items, report) = index.select(&re10k_mini(Split::Test), 0);
         let views = ViewIndices { context: vec![0, 2, 5, 7], target: vec![1, 3, 4, 6] };
         assert_eq!(items, [EvaluationItem { scene: 0, views }]);
         assert_eq!(report.to_string(), "1 of 3 scenes used; 2 without views in the evaluation index");
-
-        let train = ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap();
-        let (items, report) = EvaluationIndex::read(&root.join("evaluation_index.json")).unwrap().select(&train, 0);
+        let (items, report) = index.select(&re10k_mini(Split::Train), 0);
         assert!(items.is_empty());
         assert_eq!(report.counts()["not in the data"], 1);
     }

@@ -22,13 +22,8 @@ impl Clip {
 
 impl ClipViews {
     fn flipped(&self) -> Self {
-        let row_bytes = self.width * 3;
-        let images = if row_bytes == 0 {
-            Vec::new()
-        } else {
-            let rows = self.images.chunks_exact(row_bytes);
-            rows.flat_map(|row| row.as_chunks::<3>().0.iter().rev()).flatten().copied().collect()
-        };
+        let rows = self.images.chunks_exact((self.width * 3).max(1));
+        let images = rows.flat_map(|row| row.as_chunks::<3>().0.iter().rev()).flatten().copied().collect();
         let mirrored = |k: &Intrinsics| Intrinsics { cx: self.width as f64 - k.cx, ..*k };
         Self {
             images,

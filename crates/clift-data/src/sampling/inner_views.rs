@@ -26,12 +26,6 @@ impl InnerViews {
         self == Self::FarthestPoint
     }
 
-    /// Returns whether serde skips the value. Settings files from before this key then compare equal.
-    #[allow(clippy::trivially_copy_pass_by_ref)] // serde's signature
-    pub(crate) fn is_default(&self) -> bool {
-        *self == Self::default()
-    }
-
     /// Selects `count` different frames between `left` and `right`, in increasing order.
     ///
     /// `centres` are the camera centres of all frames of the scene; empty unless [`InnerViews::needs_centres`]. Expects

@@ -100,11 +100,6 @@ impl<T, E: From<WorkerPanic>> Iterator for Prefetcher<T, E> {
             queue = self.shared.finished.wait(queue).unwrap_or_else(PoisonError::into_inner);
         }
     }
-
-    fn size_hint(&self) -> (usize, Option<usize>) {
-        let left = usize::try_from(self.shared.end_step.saturating_sub(self.next_step)).ok();
-        (left.unwrap_or(usize::MAX), left)
-    }
 }
 
 impl<T, E: From<WorkerPanic>> Shared<T, E> {

@@ -1,6 +1,6 @@
 //! The scene of every batch slot: a function of (seed, step, slot) alone.
 
-use crate::error::DataError;
+use crate::error::{DataError, check_config};
 use crate::random::{derive_seed, mix};
 
 /// Rounds of the Feistel network behind [`SceneOrder`]. Four suffice in theory; more cost nothing.
@@ -21,14 +21,9 @@ pub struct SceneOrder {
 
 impl SceneOrder {
     /// Creates the order of `num_scenes` scenes in batches of `batch_size`.
-    ///
-    /// # Errors
-    /// [`DataError::BadConfig`] for no scenes and for batches without slots.
     pub fn new(seed: u64, num_scenes: usize, batch_size: usize) -> Result<Self, DataError> {
         for (key, value) in [("num_scenes", num_scenes), ("batch_size", batch_size)] {
-            if value == 0 {
-                return Err(DataError::bad_config(key, "is 0; at least 1 is needed"));
-            }
+            check_config(value > 0, key, || "is 0; at least 1 is needed".into())?;
         }
         let num_scenes = num_scenes as u64;
         let bits = (u64::BITS - (num_scenes - 1).leading_zeros()).max(2);
@@ -38,18 +33,14 @@ impl SceneOrder {
 
     /// Returns the scene, in `0..num_scenes`, of batch slot `slot` at `step`.
     pub fn scene(&self, step: u64, slot: usize) -> usize {
-        let position = self.position(step, slot);
-        self.permuted((position / u128::from(self.num_scenes)) as u64, (position % u128::from(self.num_scenes)) as u64)
-            as usize
+        let position = u128::from(step) * u128::from(self.batch_size) + slot as u128;
+        let num_scenes = u128::from(self.num_scenes);
+        self.permuted((position / num_scenes) as u64, (position % num_scenes) as u64) as usize
     }
 
     /// Returns the number of slots per batch.
     pub fn batch_size(&self) -> usize {
         self.batch_size as usize
-    }
-
-    fn position(&self, step: u64, slot: usize) -> u128 {
-        u128::from(step) * u128::from(self.batch_size) + slot as u128
     }
 
     fn permuted(&self, epoch: u64, position: u64) -> u64 {

@@ -3,7 +3,7 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::error::DataError;
+use crate::error::{DataError, check_config};
 use crate::random::{sample_from, step_rng, uniform_below, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::inner_views::InnerViews;
@@ -49,8 +49,13 @@ pub struct ViewSampler {
     /// Whether targets may repeat. A target may also be a context frame in both cases.
     pub with_replacement: bool,
     /// Selection of the contexts between the two ends: `random`, `farthest_point` or `even`.
-    #[serde(skip_serializing_if = "InnerViews::is_default")]
+    #[serde(skip_serializing_if = "is_default")]
     pub inner: InnerViews,
+}
+
+/// Returns whether serde skips the value of a newer key. Settings files from before the key then compare equal.
+pub(crate) fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 impl Default for ViewSampler {
@@ -74,50 +79,31 @@ impl ViewSampler {
     /// # Errors
     /// [`DataError::BadConfig`] with the first invalid field.
     pub fn validate(&self) -> Result<(), DataError> {
-        let fail = |key: &str, problem: String| Err(DataError::bad_config(key, problem));
-        let Self { min_context, max_context, min_gap, max_gap, num_targets, .. } = self;
-        if *min_context < 2 {
-            return fail("min_context", format!("is {min_context}; use 2 or more"));
-        }
-        if max_context < min_context {
-            return fail("max_context", format!("is {max_context}; use min_context = {min_context} or more"));
-        }
-        if *num_targets == 0 {
-            return fail("num_targets", "is 0; use 1 or more".into());
-        }
+        let Self { min_context, max_context, min_gap, max_gap, num_targets, .. } = *self;
+        check_config(min_context >= 2, "min_context", || format!("is {min_context}; use 2 or more"))?;
+        check_config(max_context >= min_context, "max_context", || {
+            format!("is {max_context}; use min_context = {min_context} or more")
+        })?;
+        check_config(num_targets > 0, "num_targets", || "is 0; use 1 or more".into())?;
         for (key, count) in [("max_context", max_context), ("num_targets", num_targets)] {
-            if *count > MAX_VIEWS {
-                return fail(key, format!("is {count}; use {MAX_VIEWS} or fewer"));
-            }
+            check_config(count <= MAX_VIEWS, key, || format!("is {count}; use {MAX_VIEWS} or fewer"))?;
         }
         for (key, gap) in [("min_gap", min_gap), ("max_gap", max_gap)] {
-            if gap[0] > gap[1] {
-                return fail(key, format!("is {gap:?}; the second value must be at least the first"));
-            }
+            check_config(gap[0] <= gap[1], key, || format!("is {gap:?}; the second value must be at least the first"))?;
         }
-        for when in 0..2 {
-            if max_gap[when] < min_gap[when] {
-                return fail("max_gap", format!("is {max_gap:?}; use at least min_gap = {min_gap:?}"));
-            }
-        }
-        for num_context in *min_context..=*max_context {
-            let gap = min_gap[0] / self.gap_divisor(num_context);
-            if gap + 1 < num_context {
+        check_config(max_gap[0] >= min_gap[0] && max_gap[1] >= min_gap[1], "max_gap", || {
+            format!("is {max_gap:?}; use at least min_gap = {min_gap:?}")
+        })?;
+        for num_context in min_context..=max_context {
+            let num_frames = min_gap[0] / self.gap_divisor(num_context) + 1;
+            check_config(num_frames >= num_context, "min_gap", || {
                 let needed = (num_context - 1) * self.gap_divisor(num_context);
-                return fail(
-                    "min_gap",
-                    format!("is {min_gap:?}; {num_context} distinct contexts need a gap of {needed} or more"),
-                );
-            }
-            if !self.with_replacement && gap + 1 < *num_targets {
-                return fail(
-                    "num_targets",
-                    format!(
-                        "is {num_targets}; a gap of {gap} has {} frames, so use fewer or with_replacement",
-                        gap + 1
-                    ),
-                );
-            }
+                format!("is {min_gap:?}; {num_context} distinct contexts need a gap of {needed} or more")
+            })?;
+            check_config(self.with_replacement || num_frames >= num_targets, "num_targets", || {
+                let gap = num_frames - 1;
+                format!("is {num_targets}; a gap of {gap} has {num_frames} frames, so use fewer or with_replacement")
+            })?;
         }
         Ok(())
     }
@@ -167,10 +153,6 @@ impl ViewSampler {
     ///
     /// The contexts are distinct and sorted. The targets lie between the ends, inclusive, in the sampled order. Expects
     /// a sampler that passes [`validate`](Self::validate).
-    ///
-    /// # Errors
-    /// [`DataError::NotEnoughFrames`] if the scene is not longer than the smallest gap at `step`,
-    /// [`DataError::BadConfig`] if `num_context` is outside `[min_context, max_context]` or a centre is missing.
     pub(crate) fn sample_frames(
         &self,
         num_frames: usize,
@@ -179,15 +161,13 @@ impl ViewSampler {
         num_context: usize,
         rng: &mut impl Rng,
     ) -> Result<ViewIndices, DataError> {
-        if self.inner.needs_centres() && centres.len() != num_frames {
-            let problem = format!("has {} values; farthest_point needs {num_frames}, one per frame", centres.len());
-            return Err(DataError::bad_config("centres", problem));
-        }
-        let Self { min_context, max_context, .. } = self;
-        if !(min_context..=max_context).contains(&&num_context) {
-            let problem = format!("is {num_context}; use {min_context} to {max_context}");
-            return Err(DataError::bad_config("num_context", problem));
-        }
+        check_config(!self.inner.needs_centres() || centres.len() == num_frames, "centres", || {
+            format!("has {} values; farthest_point needs {num_frames}, one per frame", centres.len())
+        })?;
+        let Self { min_context, max_context, .. } = *self;
+        check_config((min_context..=max_context).contains(&num_context), "num_context", || {
+            format!("is {num_context}; use {min_context} to {max_context}")
+        })?;
         let [min_gap, max_gap] = self.gap_bounds(step, num_context);
         if num_frames <= min_gap {
             return Err(DataError::NotEnoughFrames { needed: min_gap + 1, got: num_frames });

@@ -14,8 +14,13 @@ use crate::sources::photos::scene_folder::{
 
 /// The folder, or the file of a single scene, that a data set is opened from.
 pub struct DatasetRoot {
-    path: PathBuf,
-    has_splits: bool,
+    /// Path of the root.
+    pub path: PathBuf,
+    /// Whether training and test scenes lie in folders of their own, `train/` and `test/`.
+    ///
+    /// A capture may have such a name as well, such as `train` of Tanks and Temples. A capture counts as a split only if
+    /// the other split is a capture too and no third capture lies beside them.
+    pub has_splits: bool,
 }
 
 impl DatasetRoot {
@@ -26,19 +31,6 @@ impl DatasetRoot {
     pub fn find(path: &Path) -> Result<Self, DataError> {
         std::fs::metadata(path).map_err(DataError::io("opening the data", path))?;
         Ok(Self { path: path.to_owned(), has_splits: has_splits(path) })
-    }
-
-    /// Path of the root.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Returns whether training and test scenes lie in folders of their own, `train/` and `test/`.
-    ///
-    /// A capture may have such a name as well, such as `train` of Tanks and Temples. A capture counts as a split only if
-    /// the other split is a capture too and no third capture lies beside them.
-    pub fn has_splits(&self) -> bool {
-        self.has_splits
     }
 }
 
@@ -73,9 +65,6 @@ pub(crate) struct SplitFolder<'a> {
 
 impl<'a> SplitFolder<'a> {
     /// Finds the folder of a split.
-    ///
-    /// # Errors
-    /// [`DataError::UnknownLayout`] if only the other split has a folder.
     pub fn find(root: &'a DatasetRoot, split: Split) -> Result<Self, DataError> {
         let base = if root.has_splits { root.path.join(split.to_string()) } else { root.path.clone() };
         let folder = Self { root, base, split };
@@ -86,9 +75,6 @@ impl<'a> SplitFolder<'a> {
     }
 
     /// Finds the scenes of the requested kind, or of the detected kind.
-    ///
-    /// # Errors
-    /// [`DataError::UnknownLayout`] for a folder without scenes, and for DL3DV scenes among other scenes.
     pub fn detect(&self, asked: SourceKind) -> Result<DetectedSource, DataError> {
         let base = &self.base;
         if base.is_file() {
@@ -148,9 +134,6 @@ impl<'a> SplitFolder<'a> {
     }
 
     /// Returns the kind of the scenes.
-    ///
-    /// # Errors
-    /// [`DataError::UnknownLayout`] for DL3DV scenes among other scenes.
     fn recognise(&self, scenes: &[SceneFolder]) -> Result<SourceKind, DataError> {
         if scenes.iter().all(|scene| matches!(scene.files, SceneFiles::Re10kText { .. })) {
             return Ok(SourceKind::Re10kTxt);
@@ -176,7 +159,7 @@ impl<'a> SplitFolder<'a> {
     /// Returns the error of a folder without scenes, with the data found instead.
     fn no_scenes(&self, what: &str, others: &[String]) -> DataError {
         let mut parts = vec![what.to_owned()];
-        let folders = [self.base.as_path(), self.root.path()];
+        let folders = [self.base.as_path(), self.root.path.as_path()];
         let files = folders.into_iter().map(transforms_in).find(|files| !files.is_empty());
         parts.extend(files.map(|files| {
             format!(

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::DataError;
+use crate::error::{DataError, check_config};
 use crate::geometry::camera::Camera;
 
 /// Filters of the scenes of a data set. Skipped scenes are listed in the skip report.
@@ -21,12 +21,10 @@ impl SceneFilters {
     /// # Errors
     /// [`DataError::BadConfig`] with the invalid field.
     pub fn validate(&self) -> Result<(), DataError> {
-        match self.max_fov_deg {
-            Some(limit) if !(limit.is_finite() && limit > 0.0) => {
-                Err(DataError::bad_config("max_fov_deg", format!("is {limit}; use a positive number such as 100")))
-            }
-            _ => Ok(()),
-        }
+        let Some(limit) = self.max_fov_deg else { return Ok(()) };
+        check_config(limit.is_finite() && limit > 0.0, "max_fov_deg", || {
+            format!("is {limit}; use a positive number such as 100")
+        })
     }
 
     /// Returns whether filtering reads the scenes.

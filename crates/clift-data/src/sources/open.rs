@@ -89,8 +89,8 @@ impl SplitFolder<'_> {
         if kind == SourceKind::Chunks {
             source.record_unlisted(&self.base, &index);
         }
-        report.append(source.report().clone());
-        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits(), report })
+        report.append(source.report.clone());
+        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits, report })
     }
 
     fn open_photos(
@@ -119,20 +119,19 @@ impl SplitFolder<'_> {
             min_size: options.min_size,
         };
         let source = PhotoSource::open(scenes, &source_options)?;
-        report.append(source.report().clone());
-        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits(), report })
+        report.append(source.report.clone());
+        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits, report })
     }
 
     /// Returns the clips of RealEstate10K as text files, with the folders of their frames.
     fn re10k_clips(&self, options: &SourceOptions) -> Result<Vec<SceneFolder>, DataError> {
-        let mut names = file_names(&self.base)?;
-        names.sort_unstable();
+        let names = file_names(&self.base)?;
         let split = self.split.to_string();
         let folders: Vec<PathBuf> = if let Some(frames) = &options.files.frames {
             vec![frames.clone(), frames.join(&split)]
         } else {
             let above = self.base.parent().unwrap_or(&self.base);
-            let frames = [self.root.path().join("frames"), above.join("frames")];
+            let frames = [self.root.path.join("frames"), above.join("frames")];
             let frames = frames.iter().flat_map(|frames| [frames.clone(), frames.join(&split)]);
             std::iter::once(self.base.clone()).chain(frames).collect()
         };
@@ -140,7 +139,7 @@ impl SplitFolder<'_> {
             let key = name.strip_suffix(".txt")?;
             let mut candidates = folders.iter().map(|folder| folder.join(key));
             let frames =
-                candidates.find(|frames| frames.is_dir()).unwrap_or_else(|| self.root.path().join("frames").join(key));
+                candidates.find(|frames| frames.is_dir()).unwrap_or_else(|| self.root.path.join("frames").join(key));
             let files = SceneFiles::Re10kText { cameras: self.base.join(name), frames };
             Some(SceneFolder { key: key.into(), files })
         };
@@ -156,8 +155,8 @@ impl SplitFolder<'_> {
         report: &mut SkipReport,
     ) -> Vec<bool> {
         let Some(list) = list else { return vec![true; keys.len()] };
-        let (kept, mut divided) = list.divide(keys, self.split, !self.root.has_splits());
-        if self.root.has_splits() && self.split == Split::Train && !divided.skips.is_empty() {
+        let (kept, mut divided) = list.divide(keys, self.split, !self.root.has_splits);
+        if self.root.has_splits && self.split == Split::Train && !divided.skips.is_empty() {
             let in_test = TestScenes::of_keys(&self.test_keys(options).unwrap_or_default());
             let absent = divided.skips.iter_mut().filter(|skip| !in_test.contains(&skip.key));
             absent.for_each(|skip| skip.reason = KEPT_AND_ABSENT.into());

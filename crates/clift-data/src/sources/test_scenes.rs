@@ -88,12 +88,10 @@ impl TestScenes {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::read_from_file;
 
     fn read(text: &str) -> Result<TestScenes, String> {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("list");
-        std::fs::write(&path, text).unwrap();
-        TestScenes::read(&path).map_err(|error| error.to_string())
+        read_from_file("list", text, TestScenes::read).map_err(|error| error.to_string())
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::DataError;
+use crate::error::{DataError, check_config};
 use crate::scene_source::Split;
 
 /// Largest number of scenes of one source: the table of key blocks stays below 1 MiB.
@@ -84,25 +84,22 @@ impl SyntheticConfig {
     /// # Errors
     /// [`DataError::BadConfig`] with the first field out of range.
     pub fn validate(&self) -> Result<(), DataError> {
-        let fail = |key: &str, problem: String| Err(DataError::bad_config(key, problem));
         for (key, count, most) in [
             ("num_scenes", self.num_scenes, MAX_SCENES),
             ("num_frames", self.num_frames, 100_000),
             ("width", self.width, 16_384),
             ("height", self.height, 16_384),
         ] {
-            if count == 0 || count > most {
-                return fail(key, format!("is {count}; use 1 to {most}"));
-            }
+            check_config((1..=most).contains(&count), key, || format!("is {count}; use 1 to {most}"))?;
         }
         let [fewest, most] = self.num_objects;
-        if fewest > most || most > 100 {
-            return fail("num_objects", format!("is [{fewest}, {most}]; use [fewest, most] up to 100"));
-        }
+        check_config(fewest <= most && most <= 100, "num_objects", || {
+            format!("is [{fewest}, {most}]; use [fewest, most] up to 100")
+        })?;
         let [small, large] = self.room_half_size;
-        if !(small >= 1.0 && large >= small && large <= 100.0) {
-            return fail("room_half_size", format!("is [{small}, {large}]; use [smallest, largest] from 1 to 100"));
-        }
+        check_config(small >= 1.0 && large >= small && large <= 100.0, "room_half_size", || {
+            format!("is [{small}, {large}]; use [smallest, largest] from 1 to 100")
+        })?;
         for (key, value, low, high) in [
             ("fov_deg", self.fov_deg, 10.0, 100.0),
             ("path_length", self.path_length, 0.01, 1_000.0),
@@ -110,15 +107,13 @@ impl SyntheticConfig {
             ("plain_share", self.plain_share, 0.0, 1.0),
             ("specular", self.specular, 0.0, 1.0),
         ] {
-            if !(low..=high).contains(&value) {
-                return fail(key, format!("is {value}; use {low} to {high}"));
-            }
+            check_config((low..=high).contains(&value), key, || format!("is {value}; use {low} to {high}"))?;
         }
         let samples = self.samples_per_pixel;
-        if samples == 0 || samples > 256 || samples.isqrt().pow(2) != samples {
-            return fail("samples_per_pixel", format!("is {samples}; use a square number such as 1, 4, 9 or 16"));
-        }
-        Ok(())
+        let is_square = samples.isqrt().pow(2) == samples;
+        check_config((1..=256).contains(&samples) && is_square, "samples_per_pixel", || {
+            format!("is {samples}; use a square number such as 1, 4, 9 or 16")
+        })
     }
 }
 

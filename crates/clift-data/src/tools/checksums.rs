@@ -39,9 +39,6 @@ pub(crate) struct Checksums {
 impl Checksums {
     /// Reads the checksums of a folder that is new, empty or in progress, without changing the folder. Lines of missing
     /// and of damaged files are dropped.
-    ///
-    /// # Errors
-    /// [`DataError::BadIndex`] for a folder with other files, and for a folder converted with other options.
     pub fn open(folder: &Path, made_as: &str) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadIndex { what, path: folder.to_path_buf() };
         let path = folder.join(FILE_NAME);

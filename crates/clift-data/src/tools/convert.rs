@@ -8,13 +8,13 @@ use rayon::prelude::*;
 use crate::error::DataError;
 use crate::files::listing::has_ending;
 use crate::scene_source::SceneSource;
-use crate::skip_report::{SkipReport, SkippedScene, first_few, plural};
+use crate::skip_report::{SkipReport, note_on};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::chunks::writer::{ChunkFill, SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
 use crate::sources::test_scenes::KEPT_FOR_TESTING;
 use crate::tools::checksums::{Checksums, INDEX, SKIPPED};
-use crate::tools::export::ImageEncoding;
+use crate::tools::export::{ImageEncoding, read_scene};
 
 /// Longest key in bytes that names a file; file systems allow 255 with the ending.
 const MAX_NAME_BYTES: usize = 200;
@@ -139,7 +139,9 @@ impl<'a> Converter<'a> {
 
     /// Compares the scenes of the complete files with the source.
     fn scan(&mut self) -> Result<(), DataError> {
-        let unreadable: HashSet<&str> = self.report.skipped.skips.iter().filter_map(unreadable_key).collect();
+        // Scenes reserved for testing are readable.
+        let unreadable = self.report.skipped.skips.iter().filter(|skip| !skip.reason.starts_with(KEPT_FOR_TESTING));
+        let unreadable: HashSet<&str> = unreadable.map(|skip| skip.key.as_str()).collect();
         let names: Vec<&str> = self.checksums.names().filter(|name| has_ending(name, "torch")).collect();
         let scan = |name: &str| {
             let path = self.folder.join(name);
@@ -202,7 +204,7 @@ impl<'a> Converter<'a> {
         for scene in 0..self.source.num_scenes() {
             let key = self.source.key(scene);
             if !self.index.contains_key(key) && !self.pending_keys.contains(key) {
-                match record(self.source, scene, self.options.encoding) {
+                match read_scene(self.source, scene, self.options.encoding) {
                     Ok((record, num_encoded)) => self.add(record, num_encoded)?,
                     Err(error) => self.report.skipped.skip(key, error.to_string()),
                 }
@@ -221,7 +223,6 @@ impl<'a> Converter<'a> {
     }
 
     fn add(&mut self, record: SceneRecord, num_encoded: usize) -> Result<(), DataError> {
-        let image_bytes = record.images.iter().map(|image| image.len() as u64).sum::<u64>();
         if let Err(what) = record.check() {
             self.report.skipped.skip(record.key, what);
             return Ok(());
@@ -235,7 +236,7 @@ impl<'a> Converter<'a> {
         }
         self.report.num_frames += record.images.len();
         self.report.num_encoded += num_encoded;
-        self.report.image_bytes += image_bytes;
+        self.report.image_bytes += record.image_bytes();
         self.fill.add(&record);
         self.pending_keys.insert(record.key.clone());
         self.pending.push(record);
@@ -276,13 +277,10 @@ impl<'a> Converter<'a> {
 
     fn finish(mut self) -> Result<ConversionReport, DataError> {
         self.flush()?;
-        if !self.unreadable.is_empty() {
-            let names: Vec<&String> = self.unreadable.iter().collect();
-            let scenes = plural(names.len(), "scene");
-            let skipped = &mut self.report.skipped;
-            skipped.notes.push(format!("{scenes} unreadable now, kept as converted before ({})", first_few(&names)));
-            skipped.skips.retain(|skip| !self.unreadable.contains(&skip.key));
-        }
+        let names: Vec<&String> = self.unreadable.iter().collect();
+        let skipped = &mut self.report.skipped;
+        skipped.notes.extend(note_on(&names, "scene", "unreadable now, kept as converted before"));
+        skipped.skips.retain(|skip| !self.unreadable.contains(&skip.key));
         let is_chunks = self.options.to != ConvertTo::Scenes;
         let index = (is_chunks && !self.index.is_empty()).then(|| serde_json::to_vec_pretty(&self.index));
         let skipped = &self.report.skipped;
@@ -300,29 +298,6 @@ impl<'a> Converter<'a> {
         self.report.num_scenes = self.index.len();
         Ok(self.report)
     }
-}
-
-/// Returns the key of a scene that was skipped because it is unreadable, not because it is reserved for testing.
-fn unreadable_key(skip: &SkippedScene) -> Option<&str> {
-    (!skip.reason.starts_with(KEPT_FOR_TESTING)).then_some(&skip.key)
-}
-
-/// Reads a scene. Returns the scene and the number of encoded frames.
-fn record(source: &dyn SceneSource, scene: usize, encoding: ImageEncoding) -> Result<(SceneRecord, usize), DataError> {
-    let cameras = source.cameras(scene)?;
-    let timestamps = source.timestamps(scene)?;
-    let read = |frame: usize| {
-        Ok(match source.encoded_frame(scene, frame)? {
-            Some(bytes) => (bytes, false),
-            None => (encoding.encode(&source.frame(scene, frame)?)?, true),
-        })
-    };
-    let images: Vec<(Vec<u8>, bool)> =
-        (0..cameras.len()).into_par_iter().map(read).collect::<Result<_, DataError>>()?;
-    let num_encoded = images.iter().filter(|(_, is_encoded)| *is_encoded).count();
-    let images = images.into_iter().map(|(bytes, _)| bytes).collect();
-    let key = source.key(scene).to_owned();
-    Ok((SceneRecord { key, url: source.url(scene)?, timestamps, cameras, images }, num_encoded))
 }
 
 /// Returns whether a key is a valid file name on all operating systems.

@@ -45,7 +45,7 @@ pub struct ExportReport {
     pub image_bytes: u64,
 }
 
-/// Writes every scene of `source` into `folder` with [`write_chunks`]. Time stamps are frame numbers.
+/// Writes every scene of `source` into `folder` with [`write_chunks`]. Frames without an image file are encoded.
 ///
 /// Calls `progress` with the number of finished scenes after each scene. Frames of a scene are read on all cores.
 ///
@@ -60,20 +60,37 @@ pub fn write_source(
 ) -> Result<ExportReport, DataError> {
     let mut total = ExportReport::default();
     let scenes = (0..source.num_scenes()).map(|scene| {
-        let cameras = source.cameras(scene)?;
-        let images: Vec<Vec<u8>> = (0..cameras.len())
-            .into_par_iter()
-            .map(|frame| encoding.encode(&source.frame(scene, frame)?))
-            .collect::<Result<_, _>>()?;
+        let (record, _) = read_scene(source, scene, encoding)?;
         total.num_scenes += 1;
-        total.num_frames += images.len();
-        total.image_bytes += images.iter().map(|image| image.len() as u64).sum::<u64>();
+        total.num_frames += record.images.len();
+        total.image_bytes += record.image_bytes();
         progress(total.num_scenes);
-        let timestamps = (0..images.len() as i64).collect();
-        Ok(SceneRecord { key: source.key(scene).to_owned(), url: String::new(), timestamps, cameras, images })
+        Ok(record)
     });
     write_chunks(folder, scenes, target_bytes)?;
     Ok(total)
+}
+
+/// Reads a scene, its frames on all cores. Image files are copied, other frames encoded. Returns the scene and the number
+/// of encoded frames.
+pub(crate) fn read_scene(
+    source: &dyn SceneSource,
+    scene: usize,
+    encoding: ImageEncoding,
+) -> Result<(SceneRecord, usize), DataError> {
+    let cameras = source.cameras(scene)?;
+    let timestamps = source.timestamps(scene)?;
+    let read = |frame: usize| {
+        Ok(match source.encoded_frame(scene, frame)? {
+            Some(bytes) => (bytes, 0),
+            None => (encoding.encode(&source.frame(scene, frame)?)?, 1),
+        })
+    };
+    let images: Vec<(Vec<u8>, usize)> =
+        (0..cameras.len()).into_par_iter().map(read).collect::<Result<_, DataError>>()?;
+    let (images, encoded): (Vec<_>, Vec<usize>) = images.into_iter().unzip();
+    let key = source.key(scene).to_owned();
+    Ok((SceneRecord { key, url: source.url(scene)?, timestamps, cameras, images }, encoded.iter().sum()))
 }
 
 /// Writes an evaluation index of every scene of `source` with [`even_views`], `null` for scenes with too few frames.
@@ -119,12 +136,25 @@ pub(crate) fn write_index<'a>(
 mod tests {
     use super::*;
     use crate::sampling::evaluation_index::EvaluationIndex;
+    use crate::scene_source::Split;
+    use crate::sources::chunks::chunk_source::ChunkSource;
+    use crate::sources::filters::SceneFilters;
     use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::source::SyntheticSource;
+    use crate::testing::assert_same;
 
-    fn source(num_frames: usize) -> SyntheticSource {
-        let config = SyntheticConfig { num_scenes: 3, num_frames, width: 8, height: 8, ..Default::default() };
-        SyntheticSource::new(config).unwrap()
+    #[test]
+    fn written_scenes_equal_those_of_the_source() {
+        let root = tempfile::tempdir().unwrap();
+        for split in [Split::Train, Split::Test] {
+            let size = SyntheticConfig { num_scenes: 5, num_frames: 6, width: 40, height: 24, ..Default::default() };
+            let source = SyntheticSource::new(SyntheticConfig { seed: 5, split, ..size }).unwrap();
+            // About two scenes to a chunk.
+            let folder = root.path().join(split.to_string());
+            let written = write_source(&source, &folder, ImageEncoding::Png, 25_000, |_| ()).unwrap();
+            assert_eq!((written.num_scenes, written.num_frames), (5, 30));
+            assert_same(&source, &ChunkSource::open(root.path(), split, &SceneFilters::default()).unwrap());
+        }
     }
 
     #[test]
@@ -132,7 +162,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("evaluation_index.json");
         for (num_frames, expected) in [(16, 3), (6, 0)] {
-            let source = source(num_frames);
+            let config = SyntheticConfig { num_scenes: 3, num_frames, ..Default::default() };
+            let source = SyntheticSource::new(config).unwrap();
             assert_eq!(write_evaluation_index(&path, &source, 4, 3).unwrap(), expected);
             let (items, report) = EvaluationIndex::read(&path).unwrap().select(&source, 0);
             assert_eq!((items.len(), report.num_scenes), (expected, 3));

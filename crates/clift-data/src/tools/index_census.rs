@@ -4,6 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
+use crate::sampling::clip::ViewIndices;
 use crate::sampling::evaluation_index::EvaluationIndex;
 
 /// Counts of an [`EvaluationIndex`].
@@ -31,19 +32,17 @@ impl IndexCensus {
         let mut census = Self { num_keys: index.num_keys(), ..Self::default() };
         for (_, views) in index.usable() {
             let given = views.target.iter().filter(|frame| views.context.contains(frame)).count();
-            let is_first = census.num_usable == 0;
             census.num_usable += 1;
             census.num_targets += views.target.len();
             census.num_targets_given += given;
             census.num_scenes_with_given += usize::from(given > 0);
-            for (bounds, count) in [
-                (&mut census.num_context, views.context.len()),
-                (&mut census.num_targets_per_scene, views.target.len()),
-            ] {
-                let [least, most] = *bounds;
-                *bounds = if is_first { [count, count] } else { [least.min(count), most.max(count)] };
-            }
         }
+        let bounds = |count: fn(&ViewIndices) -> usize| {
+            let counts = || index.usable().map(|(_, views)| count(views));
+            [counts().min().unwrap_or(0), counts().max().unwrap_or(0)]
+        };
+        census.num_context = bounds(|views| views.context.len());
+        census.num_targets_per_scene = bounds(|views| views.target.len());
         census
     }
 }
@@ -69,12 +68,10 @@ impl fmt::Display for IndexCensus {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::read_from_file;
 
     fn census(json: &str) -> IndexCensus {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("index.json");
-        std::fs::write(&path, json).unwrap();
-        IndexCensus::new(&EvaluationIndex::read(&path).unwrap())
+        IndexCensus::new(&read_from_file("index.json", json, EvaluationIndex::read).unwrap())
     }
 
     #[test]

@@ -84,20 +84,18 @@ fn extent(cameras: &[Camera]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use super::*;
     use crate::scene_source::Split;
     use crate::sources::chunks::chunk_source::ChunkSource;
     use crate::sources::filters::SceneFilters;
+    use crate::testing::{fixture, re10k_mini};
 
     #[test]
     fn unreadable_scene_is_named_and_the_others_are_summarised() {
         let root = tempfile::tempdir().unwrap();
         let train = root.path().join("train");
         std::fs::create_dir(&train).unwrap();
-        let mini = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini/train");
-        std::fs::copy(mini.join("000000.torch"), train.join("000000.torch")).unwrap();
+        std::fs::copy(fixture("re10k-mini/train/000000.torch"), train.join("000000.torch")).unwrap();
         let index = r#"{"00000000000000a1": "000000.torch", "elsewhere": "000000.torch"}"#;
         std::fs::write(train.join("index.json"), index).unwrap();
         let source = ChunkSource::open(root.path(), Split::Train, &SceneFilters::default()).unwrap();
@@ -109,9 +107,7 @@ mod tests {
 
     #[test]
     fn summary_of_the_fixture_matches_values_by_hand() {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
-        let source = ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap();
-        let info = SourceInfo::read(&source).unwrap();
+        let info = SourceInfo::read(&re10k_mini(Split::Train)).unwrap();
         assert_eq!((info.num_scenes, info.image_size), (2, Some([64, 36])));
         assert_eq!(info.num_frames, Some(MinMedianMax { min: 8.0, median: 8.0, max: 8.0 }));
         // 2 atan(0.5 / 0.9) = 58.1 degrees; centres are 0, 0.1, .., 0.7 along x, up to 0.35 from the mean.

@@ -6,13 +6,13 @@ use std::path::Path;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::error::DataError;
+use crate::error::{DataError, check_config};
 use crate::geometry::camera::Camera;
 use crate::geometry::overlap::overlap;
 use crate::random::{derive_seed, sample_distinct, sample_from, step_rng, uniform_between};
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
-use crate::skip_report::{SkipReport, first_few, plural};
+use crate::skip_report::{SkipReport, note_on};
 use crate::tools::export::write_index;
 
 /// Options of an overlap index. The defaults are those of the published RealEstate10K index with four contexts.
@@ -42,26 +42,17 @@ impl OverlapOptions {
     /// # Errors
     /// [`DataError::BadConfig`] with the first invalid field.
     pub fn validate(&self) -> Result<(), DataError> {
-        let fail = |key: &str, problem: String| Err(DataError::bad_config(key, problem));
         let Self { num_context, num_targets, distance: [near, far], min_overlap, .. } = *self;
-        if !(2..=10_000).contains(&num_context) {
-            return fail("num_context", format!("is {num_context}; use 2 or more"));
-        }
-        if near + 1 < num_context || far < near {
-            let problem =
-                format!("is {near} to {far}; {num_context} contexts need a gap of {} or more", num_context - 1);
-            return fail("distance", problem);
-        }
-        if num_targets == 0 || num_targets > near + 1 {
-            return fail(
-                "num_targets",
-                format!("is {num_targets}; use 1 to {}, the frames of the smallest gap", near + 1),
-            );
-        }
-        if !(0.0..=1.0).contains(&min_overlap) {
-            return fail("min_overlap", format!("is {min_overlap}; use 0 to 1"));
-        }
-        Ok(())
+        check_config((2..=10_000).contains(&num_context), "num_context", || {
+            format!("is {num_context}; use 2 or more")
+        })?;
+        check_config(near + 1 >= num_context && far >= near, "distance", || {
+            format!("is {near} to {far}; {num_context} contexts need a gap of {} or more", num_context - 1)
+        })?;
+        check_config((1..=near + 1).contains(&num_targets), "num_targets", || {
+            format!("is {num_targets}; use 1 to {}, the frames of the smallest gap", near + 1)
+        })?;
+        check_config((0.0..=1.0).contains(&min_overlap), "min_overlap", || format!("is {min_overlap}; use 0 to 1"))
     }
 
     /// Samples the views of a scene, or returns the reason for the skip report.
@@ -134,10 +125,7 @@ pub fn write_overlap_index(
         }
         shared.push(key);
     }
-    let note = |shared: &[&str]| {
-        format!("{} in both splits, counted once ({})", plural(shared.len(), "scene"), first_few(shared))
-    };
-    let notes = (!shared.is_empty()).then(|| note(&shared)).into_iter().collect();
+    let notes = note_on(&shared, "scene", "in both splits, counted once").into_iter().collect();
     let sample = |(source, scene): &(&dyn SceneSource, usize)| {
         let cameras = source.cameras(*scene).map_err(|error| error.to_string())?;
         options.sample_views(source.key(*scene), &cameras)

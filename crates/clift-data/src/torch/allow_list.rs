@@ -3,9 +3,10 @@
 use crate::torch::values::{ElementType, Global};
 
 /// Treatment of objects whose classes are not on the allow-list.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum UnknownClasses {
     /// The file is refused.
+    #[default]
     Refuse,
     /// The objects are skipped, as [`Value::Opaque`](crate::torch::values::Value::Opaque).
     Skip,

@@ -8,6 +8,7 @@ use std::path::Path;
 use zip::{CompressionMethod, ZipArchive};
 
 use crate::error::DataError;
+use crate::torch::values::MAX_BYTES;
 
 /// Byte range of a member of an archive, or of a part of a member. It takes 24 bytes, because a data set has millions.
 #[derive(Clone, Copy, Debug)]
@@ -45,9 +46,6 @@ impl ByteSpan {
     }
 
     /// Reads the bytes from the archive at `path`.
-    ///
-    /// # Errors
-    /// [`DataError::Io`], and [`DataError::BadChunk`] for a missing header, a truncated file or a wrong checksum.
     pub fn read(&self, path: &Path) -> Result<Vec<u8>, DataError> {
         let bad = |what: &str| DataError::BadChunk {
             what: format!("the member at byte {} {what}; download the file again", self.header_start),
@@ -80,9 +78,6 @@ pub(crate) struct Archive {
 
 impl Archive {
     /// Reads the directory. Member names are stored without the top folder: `data.pkl`, `data/0`.
-    ///
-    /// # Errors
-    /// [`DataError::Io`], and [`DataError::BadChunk`] for a malformed archive, compressed members or big-endian data.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
         let file = File::open(path).map_err(DataError::io("opening the chunk", path))?;
@@ -114,6 +109,18 @@ impl Archive {
             }
         }
         Ok(archive)
+    }
+
+    /// Reads the pickle of the archive at `path`, the member `data.pkl`.
+    pub fn read_pickle(&self, path: &Path) -> Result<Vec<u8>, DataError> {
+        let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
+        let member = self
+            .member("data.pkl")
+            .ok_or_else(|| bad("no member data.pkl: the file was not written by torch.save".into()))?;
+        if member.len() > MAX_BYTES as u64 {
+            return Err(bad(format!("data.pkl has {} bytes, more than the limit of {MAX_BYTES}", member.len())));
+        }
+        member.read(path)
     }
 
     /// Returns a member by its name without the top folder.

@@ -12,9 +12,6 @@ const NUM_BYTES: u64 = 512;
 const LEGACY: &[u8] = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.";
 
 /// Refuses files of known other formats.
-///
-/// # Errors
-/// [`DataError::BadCheckpoint`] with the format and the remedy, and [`DataError::Io`] for an unreadable file.
 pub(crate) fn refuse_others(path: &Path) -> Result<(), DataError> {
     let bad = |what: &str| Err(DataError::BadCheckpoint { what: what.into(), path: path.to_path_buf() });
     let opening = "opening the checkpoint";

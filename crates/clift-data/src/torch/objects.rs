@@ -28,13 +28,9 @@ impl PickleMachine<'_> {
             }
             // SHORT_BINSTRING, SHORT_BINBYTES: one byte of length; BINSTRING, BINBYTES, LONG4: four; BINBYTES8,
             // BYTEARRAY8, BINUNICODE8: eight.
-            b'U' | b'C' => {
-                let length = usize::from(self.u8()?);
-                self.skip_bytes(length)?;
-            }
-            b'T' | b'B' | 0x8b => {
-                let length = u32::from_le_bytes(self.array()?) as usize;
-                self.skip_bytes(length)?;
+            b'U' | b'C' | b'T' | b'B' | 0x8b => {
+                let length = self.short_or_u32(matches!(opcode, b'U' | b'C'))?;
+                self.skip_bytes(length as usize)?;
             }
             0x8e | 0x96 | 0x8d => {
                 let length = u64::from_le_bytes(self.array()?);

@@ -9,6 +9,7 @@ use crate::torch::values::{MAX_VALUES, Value, ValueId};
 const MAX_SKIPPED_OBJECTS: usize = 256;
 
 /// The pickle machine: a stack, marks and a memo.
+#[derive(Default)]
 pub(crate) struct PickleMachine<'a> {
     pub bytes: &'a [u8],
     /// Position of the next byte.
@@ -24,16 +25,7 @@ pub(crate) struct PickleMachine<'a> {
 impl<'a> PickleMachine<'a> {
     /// Creates a machine at the first byte.
     pub fn new(bytes: &'a [u8], unknown: UnknownClasses) -> Self {
-        Self {
-            bytes,
-            at: 0,
-            unknown,
-            values: Vec::new(),
-            stack: Vec::new(),
-            marks: Vec::new(),
-            memo: HashMap::new(),
-            skipped_objects: BTreeSet::new(),
-        }
+        Self { bytes, unknown, ..Self::default() }
     }
 
     pub fn skips_unknown(&self) -> bool {
@@ -151,6 +143,11 @@ impl<'a> PickleMachine<'a> {
 
     pub fn u8(&mut self) -> Result<u8, UnpickleError> {
         Ok(self.array::<1>()?[0])
+    }
+
+    /// Reads an unsigned integer of one byte, or of four.
+    pub fn short_or_u32(&mut self, is_short: bool) -> Result<u32, UnpickleError> {
+        Ok(if is_short { self.u8()?.into() } else { u32::from_le_bytes(self.array()?) })
     }
 
     pub fn text(&mut self, length: usize) -> Result<String, UnpickleError> {

@@ -15,7 +15,7 @@ use crate::torch::file_kind::refuse_others;
 use crate::torch::pickle::Pickle;
 use crate::torch::pickle_writer::PickleWriter;
 use crate::torch::tensor_span::{in_row_major_order, storage_stretch, tensor_span};
-use crate::torch::values::{ElementType, MAX_BYTES, Tensor, Value};
+use crate::torch::values::{ElementType, Tensor, Value};
 
 /// Readable number formats of weights.
 const FLOATS: [ElementType; 4] = [ElementType::F32, ElementType::F16, ElementType::BF16, ElementType::F64];
@@ -25,12 +25,15 @@ const SIZES: &str = "clift";
 
 /// An open checkpoint. Tensors are read on demand.
 pub struct StateDict {
-    path: PathBuf,
+    /// Path of the file.
+    pub path: PathBuf,
+    /// Size of the file in bytes.
+    pub num_bytes: u64,
+    /// Python names of skipped objects of the file, at most 256.
+    pub skipped_objects: BTreeSet<String>,
     archive: Archive,
     tensors: BTreeMap<String, Option<Tensor>>,
     sizes: BTreeMap<String, i64>,
-    skipped_objects: BTreeSet<String>,
-    num_bytes: u64,
 }
 
 impl StateDict {
@@ -44,13 +47,7 @@ impl StateDict {
         refuse_others(path)?;
         let num_bytes = std::fs::metadata(path).map_err(DataError::io("opening the checkpoint", path))?.len();
         let archive = Archive::open(path).map_err(as_checkpoint)?;
-        let member = archive
-            .member("data.pkl")
-            .ok_or_else(|| bad("no member data.pkl: the file was not written by torch.save".into()))?;
-        if member.len() > MAX_BYTES as u64 {
-            return Err(bad(format!("data.pkl has {} bytes, more than the limit of {MAX_BYTES}", member.len())));
-        }
-        let bytes = member.read(path).map_err(as_checkpoint)?;
+        let bytes = archive.read_pickle(path).map_err(as_checkpoint)?;
         let pickle = Pickle::parse_checkpoint(&bytes, path)?;
         let root = pickle.root();
         let state = pickle.item(root, "state_dict").unwrap_or(root);
@@ -81,28 +78,12 @@ impl StateDict {
                 }
             }
         }
-        let skipped_objects = pickle.skipped_objects().clone();
-        Ok(Self { path: path.into(), archive, tensors, sizes, skipped_objects, num_bytes })
-    }
-
-    /// Returns the path of the file.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Returns the size of the file in bytes.
-    pub fn num_bytes(&self) -> u64 {
-        self.num_bytes
+        Ok(Self { path: path.into(), num_bytes, skipped_objects: pickle.skipped_objects, archive, tensors, sizes })
     }
 
     /// Returns the keys, sorted.
     pub fn keys(&self) -> impl Iterator<Item = &str> {
         self.tensors.keys().map(String::as_str)
-    }
-
-    /// Returns the Python names of skipped objects of the file.
-    pub fn skipped_objects(&self) -> &BTreeSet<String> {
-        &self.skipped_objects
     }
 
     /// Returns a size of the network that [`write_state_dict`] stored beside the tensors.
@@ -206,9 +187,10 @@ pub fn write_state_dict(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::{self, read_from_file};
 
     fn fixture(name: &str) -> PathBuf {
-        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/checkpoints").join(name)
+        testing::fixture("checkpoints").join(name)
     }
 
     #[test]
@@ -220,7 +202,7 @@ mod tests {
         assert_eq!(state.tensor("optimizer_states"), None);
         assert_eq!(state.read("transformer.linear_input.weight").unwrap().len(), 15 * 576);
         for name in ["project.config.ModelConfig", "project.config.Mode", "functools.partial", "torch.BoolStorage"] {
-            assert!(state.skipped_objects().contains(name), "{:?}", state.skipped_objects());
+            assert!(state.skipped_objects.contains(name), "{:?}", state.skipped_objects);
         }
     }
 
@@ -291,10 +273,8 @@ mod tests {
 
     /// Opens a checkpoint of this pickle, and its tensor `x` if there is one.
     fn read(pickle: PickleWriter) -> Result<Vec<f32>, String> {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("a.ckpt");
-        std::fs::write(&path, pickle.pack("a").unwrap()).unwrap();
-        StateDict::open(&path).and_then(|state| state.read("x")).map_err(|error| error.to_string())
+        let read = |path: &Path| StateDict::open(path).and_then(|state| state.read("x"));
+        read_from_file("a.ckpt", pickle.pack("a").unwrap(), read).map_err(|error| error.to_string())
     }
 
     fn refused(opcodes: &[u8]) -> String {

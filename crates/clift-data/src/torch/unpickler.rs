@@ -1,7 +1,5 @@
 //! Opcodes of `torch.save`, executed on a [`PickleMachine`].
 
-use std::collections::BTreeSet;
-
 use crate::torch::allow_list::{UnknownClasses, UnpickleError};
 use crate::torch::pickle_machine::PickleMachine;
 use crate::torch::values::{Global, MAX_BYTES, Storage, Tensor, Value, ValueId};
@@ -15,20 +13,11 @@ const MAX_DIMENSIONS: usize = 4;
 /// Longest name of a storage; `torch.save` numbers the storages.
 const MAX_STORAGE_KEY_BYTES: usize = 32;
 
-/// Values of a pickle.
-pub(crate) struct Unpickled {
-    pub values: Vec<Value>,
-    /// The outermost value.
-    pub root: ValueId,
-    /// Python names of skipped objects.
-    pub skipped_objects: BTreeSet<String>,
-}
-
-/// Reads a pickle.
-pub(crate) fn unpickle(bytes: &[u8], unknown: UnknownClasses) -> Result<Unpickled, UnpickleError> {
+/// Reads a pickle; returns the outermost value and the machine that holds all values.
+pub(crate) fn unpickle(bytes: &[u8], unknown: UnknownClasses) -> Result<(ValueId, PickleMachine<'_>), UnpickleError> {
     let mut machine = PickleMachine::new(bytes, unknown);
     match machine.run() {
-        Ok(root) => Ok(Unpickled { root, skipped_objects: machine.skipped_objects, values: machine.values }),
+        Ok(root) => Ok((root, machine)),
         Err(UnpickleError::Bad(what)) => Err(UnpickleError::Bad(format!("{what} (at byte {})", machine.at))),
         Err(refused) => Err(refused),
     }
@@ -94,13 +83,9 @@ impl PickleMachine<'_> {
                 Value::Int(i64::from_le_bytes(extended))
             }
             b'G' => Value::Float(f64::from_be_bytes(self.array()?)),
-            b'X' => {
-                let length = u32::from_le_bytes(self.array()?) as usize;
-                Value::Str(self.text(length)?)
-            }
-            0x8c => {
-                let length = self.u8()? as usize;
-                Value::Str(self.text(length)?)
+            b'X' | 0x8c => {
+                let length = self.short_or_u32(opcode == 0x8c)?;
+                Value::Str(self.text(length as usize)?)
             }
             _ => return Ok(false),
         };
@@ -151,21 +136,13 @@ impl PickleMachine<'_> {
     /// Handles the opcodes of the memo, Python names, storages and calls; returns false for another opcode.
     fn read_reference(&mut self, opcode: u8) -> Result<bool, UnpickleError> {
         match opcode {
-            b'q' => {
-                let slot = u32::from(self.u8()?);
-                self.remember(slot)?;
-            }
-            b'r' => {
-                let slot = u32::from_le_bytes(self.array()?);
+            b'q' | b'r' => {
+                let slot = self.short_or_u32(opcode == b'q')?;
                 self.remember(slot)?;
             }
             0x94 => self.remember(self.memo.len() as u32)?,
-            b'h' => {
-                let slot = u32::from(self.u8()?);
-                self.recall(slot)?;
-            }
-            b'j' => {
-                let slot = u32::from_le_bytes(self.array()?);
+            b'h' | b'j' => {
+                let slot = self.short_or_u32(opcode == b'h')?;
                 self.recall(slot)?;
             }
             b'c' => {

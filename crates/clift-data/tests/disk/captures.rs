@@ -5,58 +5,29 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::{
-    FileOptions, IntrinsicsNorm, Lens, RgbImage, SceneSource, SkipReport, SourceOptions, Split, Undistortion,
-    decode_image, encode_png,
+    FileOptions, IntrinsicsNorm, Lens, OpenedSource, RgbImage, SceneSource, Undistortion, decode_image, encode_png,
 };
 use serde_json::{Value, json};
+use tempfile::TempDir;
 
-use crate::files::{copy_folder, fixtures};
-use crate::open_at;
+use crate::files::{copy_folder, copy_of_layout, frame_at, write_capture};
+use crate::{open_test, open_with, skipped_frames};
 
-const SIZE: [usize; 2] = [24, 16];
-
-/// Returns the PNG of an image that depends on a number.
-fn png(number: u8) -> Vec<u8> {
-    let [width, height] = SIZE;
-    let rgb = (0..width * height * 3).map(|i| number.wrapping_mul(31).wrapping_add((i / 5) as u8)).collect();
-    encode_png(&RgbImage { width, height, rgb }).unwrap()
-}
-
-/// Returns the rows of a camera-to-world matrix at `(x, 0, 0)`.
-fn at(x: f64) -> Value {
-    json!([[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-}
-
-/// A capture with image files and a `transforms.json`.
-struct Capture(tempfile::TempDir);
-
-impl Capture {
-    fn new(images: &[&str], transforms: &Value) -> Self {
-        let root = tempfile::tempdir().unwrap();
-        for (number, name) in images.iter().enumerate() {
-            let path = root.path().join(name);
-            fs::create_dir_all(path.parent().unwrap()).unwrap();
-            fs::write(path, png(number as u8)).unwrap();
-        }
-        fs::write(root.path().join("transforms.json"), transforms.to_string()).unwrap();
-        Self(root)
-    }
-
-    fn open(&self) -> Result<(Arc<dyn SceneSource>, SkipReport), String> {
-        let opened = open_at(self.0.path(), Split::Test, &SourceOptions::default());
-        opened.map(|opened| (opened.source, opened.report)).map_err(|error| error.to_string())
-    }
-}
-
-fn frame(name: &str, x: f64) -> Value {
-    json!({"file_path": name, "transform_matrix": at(x)})
+/// Opens a capture with images of 24 x 16 pixels and a `transforms.json`.
+fn capture(images: &[&str], transforms: &Value) -> (TempDir, OpenedSource) {
+    let png = encode_png(&RgbImage { width: 24, height: 16, rgb: vec![9; 24 * 16 * 3] }).unwrap();
+    let images: Vec<_> = images.iter().map(|name| (*name, png.clone())).collect();
+    let root = tempfile::tempdir().unwrap();
+    write_capture(root.path(), &images, transforms);
+    let opened = open_test(root.path()).unwrap();
+    (root, opened)
 }
 
 #[test]
 fn angles_and_image_size_replace_missing_intrinsics() {
     let angle = 2.0 * (0.5_f64 / 0.8).atan();
-    let capture = Capture::new(&["r_0.png"], &json!({"camera_angle_x": angle, "frames": [frame("./r_0", 0.0)]}));
-    let k = capture.open().unwrap().0.cameras(0).unwrap()[0].intrinsics_norm;
+    let (_root, opened) = capture(&["r_0.png"], &json!({"camera_angle_x": angle, "frames": [frame_at(0.0, "./r_0")]}));
+    let k = opened.source.cameras(0).unwrap()[0].intrinsics_norm;
     // Square pixels.
     for (got, expected) in [(k.fx, 0.8), (k.fy, 0.8 * 24.0 / 16.0), (k.cx, 0.5), (k.cy, 0.5)] {
         assert!((got - expected).abs() < 1e-12, "{k:?}");
@@ -65,14 +36,14 @@ fn angles_and_image_size_replace_missing_intrinsics() {
 
 #[test]
 fn frame_intrinsics_override_and_scale_with_images() {
-    let mut own = frame("images/b.png", 1.0);
+    let mut own = frame_at(1.0, "images/b.png");
     for (key, value) in [("fl_x", 30.0), ("w", 48.0), ("h", 32.0), ("cx", 12.0)] {
         own[key] = value.into();
     }
     let top = json!({"fl_x": 120, "fl_y": 90, "cx": 60, "cy": 36, "w": 120, "h": 80,
-                     "frames": [frame("images/a.png", 0.0), own]});
-    let capture = Capture::new(&["images/a.png", "images/b.png"], &top);
-    let cameras = capture.open().unwrap().0.cameras(0).unwrap();
+                     "frames": [frame_at(0.0, "images/a.png"), own]});
+    let (_root, opened) = capture(&["images/a.png", "images/b.png"], &top);
+    let cameras = opened.source.cameras(0).unwrap();
     let [a, b] = [0, 1].map(|frame: usize| cameras[frame].intrinsics_norm);
     assert_eq!([a.fx, a.fy, a.cx, a.cy], [1.0, 1.125, 0.5, 0.45]);
     // The frame's fl_x holds for both axes and is not mixed with the fl_y of the top level.
@@ -81,18 +52,16 @@ fn frame_intrinsics_override_and_scale_with_images() {
 
 #[test]
 fn images_named_twice_are_used_once() {
-    let frames = [frame("images/a.png", 0.0), frame("images/a", 1.0), frame("images/b.png", 2.0)];
-    let capture = Capture::new(&["images/a.png", "images/b.png"], &json!({"fl_x": 20, "frames": frames}));
-    assert_eq!(capture.open().unwrap().0.num_frames(0).unwrap(), 2);
-    let report = capture.open().unwrap().1;
-    assert_eq!(report.frames[0].reason, "with the image of another frame");
-    assert_eq!(report.frames.len(), 1);
+    let frames = [frame_at(0.0, "images/a.png"), frame_at(1.0, "images/a"), frame_at(2.0, "images/b.png")];
+    let (_root, opened) = capture(&["images/a.png", "images/b.png"], &json!({"fl_x": 20, "frames": frames}));
+    assert_eq!(opened.source.num_frames(0).unwrap(), 2);
+    let [(_, reason)] = skipped_frames(&opened.report)[..] else { panic!("{}", opened.report) };
+    assert_eq!(reason, "with the image of another frame");
 }
 
 /// Copies the COLMAP fixture with another camera model; returns its first image as stored.
-fn colmap(model: &str) -> (tempfile::TempDir, RgbImage) {
-    let root = tempfile::tempdir().unwrap();
-    copy_folder(&fixtures().join("layouts/colmap_txt"), root.path());
+fn colmap(model: &str) -> (TempDir, RgbImage) {
+    let root = copy_of_layout("colmap_txt");
     let path = root.path().join("attic/sparse/0/cameras.txt");
     let text = fs::read_to_string(&path).unwrap();
     let line = text.lines().find(|line| line.starts_with('7')).unwrap();
@@ -102,8 +71,7 @@ fn colmap(model: &str) -> (tempfile::TempDir, RgbImage) {
 }
 
 fn open(root: &Path, undistort: Option<bool>) -> Arc<dyn SceneSource> {
-    let files = FileOptions { undistort, ..FileOptions::default() };
-    open_at(root, Split::Test, &SourceOptions { files, ..SourceOptions::default() }).unwrap().source
+    open_with(root, FileOptions { undistort, ..FileOptions::default() }).unwrap().source
 }
 
 #[test]
@@ -140,7 +108,7 @@ fn colmap_images_are_found_from_any_model_folder() {
     let (root, image) = colmap("PINHOLE 64 36 56 57 31 19");
     let scene = root.path().join("attic");
     copy_folder(&scene.join("sparse/0"), &scene.join("sparse/1"));
-    let report = open_at(root.path(), Split::Test, &SourceOptions::default()).unwrap().report;
+    let report = open_test(root.path()).unwrap().report;
     assert!(report.notes[0].ends_with("sparse/0 has 1 more models; only model 0 is used"), "{report}");
     let models: [(&str, PathBuf); 3] =
         [("colmap/sparse/0", "images".into()), ("dense/sparse", "dense/images".into()), ("sparse", "images_4".into())];

@@ -5,22 +5,18 @@ use std::path::Path;
 
 use clift_data::{DatasetRoot, FileOptions, OpenedSource, SceneFilters, SourceKind, SourceOptions, Split};
 
-use crate::files::{copy_folder, fixtures};
-use crate::open_at;
+use crate::files::{copy_folder, fixtures, layout};
+use crate::open;
 
 const HASH: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 
 /// Copies a fixture of a layout.
 fn copy(part: &str, to: &Path) {
-    copy_folder(&fixtures().join("layouts").join(part), to);
-}
-
-fn open(root: &Path, split: Split, options: &SourceOptions) -> Result<OpenedSource, String> {
-    open_at(root, split, options).map_err(|error| error.to_string())
+    copy_folder(&layout(part), to);
 }
 
 fn has_splits(root: &Path) -> bool {
-    DatasetRoot::find(root).unwrap().has_splits()
+    DatasetRoot::find(root).unwrap().has_splits
 }
 
 fn open_any(root: &Path, split: Split) -> OpenedSource {

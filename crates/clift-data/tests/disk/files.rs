@@ -1,10 +1,41 @@
-//! Fixtures and their copies.
+//! Fixtures, their copies, and captures.
 
 use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
 
 /// Returns the folder of the fixtures.
 pub fn fixtures() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures")
+}
+
+/// Returns the folder of a fixture of one scene.
+pub fn layout(name: &str) -> PathBuf {
+    fixtures().join("layouts").join(name)
+}
+
+/// Returns a copy of a fixture of one scene.
+pub fn copy_of_layout(name: &str) -> TempDir {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&layout(name), root.path());
+    root
+}
+
+/// Writes the image files and the `transforms.json` of a capture.
+pub fn write_capture(root: &Path, images: &[(&str, Vec<u8>)], transforms: &Value) {
+    for (name, bytes) in images {
+        let path = root.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, bytes).unwrap();
+    }
+    std::fs::write(root.join("transforms.json"), transforms.to_string()).unwrap();
+}
+
+/// Returns a frame of a `transforms.json` whose camera is at `(x, 0, 0)`.
+pub fn frame_at(x: f64, name: &str) -> Value {
+    let c2w = json!([[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]);
+    json!({"file_path": name, "transform_matrix": c2w})
 }
 
 /// Copies a folder with its contents.

@@ -3,15 +3,15 @@
 use std::fs;
 use std::path::Path;
 
-use clift_data::{OpenedSource, SourceOptions, Split};
+use clift_data::OpenedSource;
 
-use crate::files::{copy_folder, fixtures};
-use crate::open_at;
+use crate::files::copy_of_layout;
+use crate::{open_test, skipped_frames};
 
 /// Opens a data set and reads all scenes; returns the first error as text.
 fn read(root: &Path) -> Result<usize, String> {
     let text = |error: clift_data::DataError| error.to_string();
-    let source = open_at(root, Split::Test, &SourceOptions::default()).map_err(text)?.source;
+    let source = open_test(root)?.source;
     for scene in 0..source.num_scenes() {
         for frame in 0..source.cameras(scene).map_err(text)?.len() {
             source.frame(scene, frame).map_err(text)?;
@@ -22,8 +22,7 @@ fn read(root: &Path) -> Result<usize, String> {
 
 /// Reads a copy of a fixture in which `file` is changed.
 fn changed(layout: &str, file: &str, change: impl FnOnce(Vec<u8>) -> Vec<u8>) -> Result<usize, String> {
-    let root = tempfile::tempdir().unwrap();
-    copy_folder(&fixtures().join("layouts").join(layout), root.path());
+    let root = copy_of_layout(layout);
     let path = root.path().join(file);
     fs::write(&path, change(fs::read(&path).unwrap())).unwrap();
     read(root.path())
@@ -88,21 +87,19 @@ fn rotations_that_are_not_orthonormal_are_refused() {
 
 #[test]
 fn rotated_images_are_skipped_for_their_aspect_ratio() {
-    let root = tempfile::tempdir().unwrap();
-    copy_folder(&fixtures().join("layouts/capture"), root.path());
+    let root = copy_of_layout("capture");
     let image = clift_data::RgbImage { width: 18, height: 32, rgb: vec![9; 18 * 32 * 3] };
     let png = clift_data::encode_png(&image).unwrap();
     fs::write(root.path().join("attic/images/10.png"), &png).unwrap();
     fs::write(root.path().join("attic/images/11.png"), "no image").unwrap();
-    let OpenedSource { source, report, .. } = open_at(root.path(), Split::Test, &SourceOptions::default()).unwrap();
+    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
     assert_eq!(source.num_frames(0).unwrap(), 4);
-    let skipped: Vec<_> = report.frames.iter().map(|skip| (skip.frame.as_str(), skip.reason.as_str())).collect();
     let expected = [
         ("./images/99", "without an image"),
         ("10.png", "whose image has another aspect ratio than its camera"),
         ("11.png", "whose image cannot be read"),
     ];
-    assert_eq!(skipped, expected);
+    assert_eq!(skipped_frames(&report), expected);
     // Cameras and images stay paired: frame 2 is now 12.png.
     assert_eq!(source.frame(0, 2).unwrap().width, 32);
     assert!((source.cameras(0).unwrap()[2].c2w.translation[0] - 1.8).abs() < 1e-9);
@@ -112,18 +109,20 @@ const BINARY: [&str; 2] = ["attic/sparse/0/cameras.bin", "attic/sparse/0/images.
 const RE10K: &str = "test/d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a.txt";
 const TEXT: [&str; 2] = ["attic/sparse/0/cameras.txt", "attic/sparse/0/images.txt"];
 
+/// Returns the error of reading a binary model with these bytes at a position of a file.
+fn patched_model(file: &str, at: usize, patch: &[u8]) -> String {
+    let change = |mut bytes: Vec<u8>| {
+        bytes[at..at + patch.len()].copy_from_slice(patch);
+        bytes
+    };
+    changed("colmap_bin", file, change).unwrap_err()
+}
+
 #[test]
 fn truncated_or_huge_colmap_models_are_refused() {
     for file in BINARY {
-        let count = |count: u64| {
-            let change = |mut bytes: Vec<u8>| {
-                bytes[..8].copy_from_slice(&count.to_le_bytes());
-                bytes
-            };
-            changed("colmap_bin", file, change)
-        };
-        for number in [7, u64::from(u32::MAX), u64::MAX] {
-            let message = count(number).unwrap_err();
+        for count in [7, u64::from(u32::MAX), u64::MAX] {
+            let message = patched_model(file, 0, &count.to_le_bytes());
             assert!(message.contains("exceeds the file of") && message.ends_with("s.bin"), "{message}");
         }
         for length in [0, 7, 9, 40, 100] {
@@ -132,16 +131,10 @@ fn truncated_or_huge_colmap_models_are_refused() {
         }
     }
     // The number of points of the first image follows its name.
-    let points = |count: u64| {
-        let change = |mut bytes: Vec<u8>| {
-            let at = 8 + 4 + 56 + 4 + "left/frame 8.png".len() + 1;
-            bytes[at..at + 8].copy_from_slice(&count.to_le_bytes());
-            bytes
-        };
-        changed("colmap_bin", BINARY[1], change).unwrap_err()
-    };
+    let at = 8 + 4 + 56 + 4 + "left/frame 8.png".len() + 1;
     for count in [1 << 20, 1 << 60, u64::MAX / 24, u64::MAX] {
-        assert!(points(count).contains("exceeds the file of"), "{count}");
+        let message = patched_model(BINARY[1], at, &count.to_le_bytes());
+        assert!(message.contains("exceeds the file of"), "{count}: {message}");
     }
     let unending = |bytes: Vec<u8>| [&bytes[..8 + 64], &[b'x'; 10_000]].concat();
     assert!(changed("colmap_bin", BINARY[1], unending).unwrap_err().contains("is longer than 4096 bytes"));
@@ -149,16 +142,13 @@ fn truncated_or_huge_colmap_models_are_refused() {
 
 #[test]
 fn errors_of_colmap_models_are_named() {
-    let model = |id: i32| {
-        let change = |mut bytes: Vec<u8>| {
-            bytes[12..16].copy_from_slice(&id.to_le_bytes());
-            bytes
-        };
-        changed("colmap_bin", BINARY[0], change).unwrap_err()
-    };
-    assert!(model(99).contains("camera 0 of 1 has the unknown model 99"), "{}", model(99));
-    assert!(model(-1).contains("unknown model -1"), "{}", model(-1));
-    assert!(model(5).contains("truncated"), "too few parameters: {}", model(5));
+    // OPENCV_FISHEYE, of id 5, has more parameters than the file.
+    for (id, expected) in
+        [(99, "camera 0 of 1 has the unknown model 99"), (-1, "unknown model -1"), (5_i32, "truncated")]
+    {
+        let message = patched_model(BINARY[0], 12, &id.to_le_bytes());
+        assert!(message.contains(expected), "{message}");
+    }
     for (file, from, to, expected) in [
         (0, "7 PINHOLE", "7 FULL_OPENCV", "camera 7: FULL_OPENCV has 4 parameters, expected 12"),
         (0, "7 PINHOLE", "7 FISH", "camera 7: the model is FISH, expected SIMPLE_PINHOLE"),
@@ -217,8 +207,7 @@ fn lists_of_millions_of_frames_are_refused() {
 
 #[test]
 fn large_files_are_refused_unread() {
-    let root = tempfile::tempdir().unwrap();
-    copy_folder(&fixtures().join("layouts/capture"), root.path());
+    let root = copy_of_layout("capture");
     let file = fs::OpenOptions::new().write(true).open(root.path().join(JSON)).unwrap();
     file.set_len(1 << 40).unwrap(); // sparse
     let message = read(root.path()).unwrap_err();
@@ -229,8 +218,7 @@ fn large_files_are_refused_unread() {
 #[test]
 fn circular_links_and_devices_are_bounded() {
     use std::os::unix::fs::symlink;
-    let root = tempfile::tempdir().unwrap();
-    copy_folder(&fixtures().join("layouts/capture"), root.path());
+    let root = copy_of_layout("capture");
     symlink(root.path(), root.path().join("up")).unwrap();
     symlink(root.path().join("attic"), root.path().join("again")).unwrap();
     symlink(root.path().join("loop"), root.path().join("loop")).unwrap();
@@ -238,7 +226,7 @@ fn circular_links_and_devices_are_bounded() {
     assert_eq!(read(root.path()), Ok(1));
     // An image that is a device.
     symlink("/dev/zero", root.path().join("attic/images/99.png")).unwrap();
-    let OpenedSource { source, report, .. } = open_at(root.path(), Split::Test, &SourceOptions::default()).unwrap();
+    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
     assert_eq!(source.num_frames(0).unwrap(), 6);
     assert!(report.frames.iter().any(|skip| skip.reason == "whose image cannot be read"), "{report}");
 }

@@ -1,15 +1,15 @@
 //! One scene in every layout, written by `scripts/fixtures/make_layout_fixtures.py`.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use clift_data::{
     Clip, ClipOptions, ClipReader, FileOptions, OpenedSource, PoseRotation, PoseScale, SceneFilters, SceneSource,
-    SkipReport, SourceInfo, SourceKind, SourceOptions, Split, ViewIndices,
+    SourceInfo, SourceKind, SourceOptions, Split, ViewIndices,
 };
 
-use crate::files::{copy_folder, fixtures};
-use crate::open_at;
+use crate::files::{copy_folder, copy_of_layout, layout};
+use crate::{open, open_test, open_with};
 
 const KEY: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 
@@ -27,13 +27,8 @@ const LAYOUTS: [(&str, Split, SourceKind, &str); 10] = [
     ("colmap_bin", Split::Test, SourceKind::Captures, "attic"),
 ];
 
-fn layouts() -> PathBuf {
-    fixtures().join("layouts")
-}
-
-fn open(root: &Path, split: Split, layout: SourceKind) -> OpenedSource {
-    let options = SourceOptions { kind: layout, ..SourceOptions::default() };
-    open_at(root, split, &options).unwrap_or_else(|error| panic!("{}: {error}", root.display()))
+fn open_kind(root: &Path, split: Split, kind: SourceKind) -> OpenedSource {
+    open(root, split, &SourceOptions { kind, ..SourceOptions::default() }).unwrap()
 }
 
 fn clip(source: Arc<dyn SceneSource>) -> Clip {
@@ -57,12 +52,12 @@ fn numbers(clip: &Clip) -> Vec<f64> {
 
 #[test]
 fn all_layouts_give_the_same_clip() {
-    let expected = clip(open(&layouts().join("chunks"), Split::Test, SourceKind::Auto).source);
+    let expected = clip(open_test(&layout("chunks")).unwrap().source);
     let text_model = ("colmap_txt", Split::Test, SourceKind::Captures, "attic");
-    for (name, split, layout, key) in LAYOUTS.into_iter().chain([text_model]) {
-        for asked in [SourceKind::Auto, layout] {
-            let opened = open(&layouts().join(name), split, asked);
-            assert_eq!((opened.kind, opened.source.num_scenes()), (layout, 1), "{name}");
+    for (name, split, kind, key) in LAYOUTS.into_iter().chain([text_model]) {
+        for asked in [SourceKind::Auto, kind] {
+            let opened = open_kind(&layout(name), split, asked);
+            assert_eq!((opened.kind, opened.source.num_scenes()), (kind, 1), "{name}");
             let source = opened.source;
             assert!(source.key(0).starts_with(key), "{name}: {}", source.key(0));
             let found = if key == "attic" { key } else { KEY };
@@ -88,7 +83,7 @@ fn all_layouts_give_the_same_clip() {
 fn cameras_equal_those_of_the_fixture_script() {
     // Frame 3 of the script: 1.0 + 0.2 * 3, -0.5 + 0.03 * 9, 2.0 - 0.1 * 3.
     for (name, split, ..) in LAYOUTS {
-        let source = open(&layouts().join(name), split, SourceKind::Auto).source;
+        let source = open_kind(&layout(name), split, SourceKind::Auto).source;
         let camera = source.cameras(0).unwrap()[3];
         let k = camera.intrinsics_norm;
         let expected = [1.6, -0.23, 1.7, 0.875, 1.5625, 0.515_625, 0.468_75];
@@ -102,24 +97,24 @@ fn cameras_equal_those_of_the_fixture_script() {
 
 #[test]
 fn timestamps_and_urls_come_from_the_files() {
-    let times = |name: &str| open(&layouts().join(name), Split::Test, SourceKind::Auto).source.timestamps(0).unwrap();
+    let times = |name: &str| open_test(&layout(name)).unwrap().source.timestamps(0).unwrap();
     assert_eq!(times("re10k_txt")[..2], [1_000_000, 1_033_367]);
     assert_eq!(times("dl3dv"), [1, 2, 3, 4, 5, 6]);
     assert_eq!(times("capture"), [8, 9, 10, 11, 12, 13]);
-    let url = |name: &str| open(&layouts().join(name), Split::Test, SourceKind::Auto).source.url(0).unwrap();
+    let url = |name: &str| open_test(&layout(name)).unwrap().source.url(0).unwrap();
     assert_eq!((url("re10k_txt").as_str(), url("dl3dv").as_str()), ("https://example.org/watch", ""));
 }
 
 #[test]
 fn captures_open_as_folders_or_file() {
-    let capture = layouts().join("capture");
-    let expected = clip(open(&capture, Split::Test, SourceKind::Auto).source);
+    let capture = layout("capture");
+    let expected = clip(open_test(&capture).unwrap().source);
     for part in ["attic", "attic/transforms.json"] {
-        let opened = open(&capture.join(part), Split::Train, SourceKind::Auto);
+        let opened = open_kind(&capture.join(part), Split::Train, SourceKind::Auto);
         assert_eq!((opened.source.key(0), opened.kind), ("attic", SourceKind::Captures));
         assert_eq!(clip(opened.source), expected, "{part}");
     }
-    let model = open(&layouts().join("colmap_txt/attic"), Split::Test, SourceKind::Auto).source;
+    let model = open_test(&layout("colmap_txt/attic")).unwrap().source;
     assert_eq!((model.key(0), model.num_scenes()), ("attic", 1));
 }
 
@@ -127,29 +122,24 @@ fn captures_open_as_folders_or_file() {
 fn two_scenes(root: &Path) -> [String; 2] {
     let keys = [KEY.to_owned(), KEY.replace('d', "e")];
     for key in &keys {
-        copy_folder(&layouts().join("dl3dv/1K").join(KEY), &root.join("2K").join(key));
+        copy_folder(&layout("dl3dv/1K").join(KEY), &root.join("2K").join(key));
     }
     let images = root.join("2K").join(&keys[1]).join("images_8");
     std::fs::rename(images.join("frame_00004.png"), images.join("4.png")).unwrap();
     keys
 }
 
-fn open_with(root: &Path, split: Split, files: FileOptions) -> (Arc<dyn SceneSource>, SkipReport) {
-    let opened = open_at(root, split, &SourceOptions { files, ..SourceOptions::default() }).unwrap();
-    (opened.source, opened.report)
-}
-
 #[test]
 fn incomplete_scenes_are_skipped_unless_asked_for() {
     let root = tempfile::tempdir().unwrap();
     let [whole, torn] = two_scenes(root.path());
-    let (source, report) = open_with(root.path(), Split::Test, FileOptions::default());
+    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
     assert_eq!((source.num_scenes(), source.key(0)), (1, whole.as_str()));
     assert_eq!(report.skips[0].reason, "with frames that have no image");
     assert_eq!((&report.frames[0].key, report.frames[0].frame.as_str()), (&torn, "images/frame_00004.png"));
 
     let files = FileOptions { keep_incomplete: true, ..FileOptions::default() };
-    let (source, report) = open_with(root.path(), Split::Test, files);
+    let OpenedSource { source, report, .. } = open_with(root.path(), files).unwrap();
     let scene = source.find(&torn).unwrap();
     assert_eq!((source.num_scenes(), source.num_frames(scene).unwrap()), (2, 5));
     assert!(report.skips.is_empty() && report.frames.len() == 1);
@@ -163,7 +153,7 @@ fn incomplete_scenes_are_skipped_unless_asked_for() {
 fn filters_and_sizes_skip_scenes_with_reasons() {
     let report = |filters: SceneFilters, min_size: [usize; 2]| {
         let options = SourceOptions { filters, min_size, ..SourceOptions::default() };
-        let OpenedSource { source, report, .. } = open_at(&layouts().join("dl3dv"), Split::Test, &options).unwrap();
+        let OpenedSource { source, report, .. } = open(&layout("dl3dv"), Split::Test, &options).unwrap();
         assert_eq!(source.num_scenes(), report.num_used());
         report.skips.into_iter().map(|skip| skip.reason).collect::<Vec<_>>()
     };
@@ -177,16 +167,14 @@ fn filters_and_sizes_skip_scenes_with_reasons() {
 
 #[test]
 fn image_folders_may_be_chosen() {
-    let root = tempfile::tempdir().unwrap();
-    copy_folder(&layouts().join("dl3dv"), root.path());
+    let root = copy_of_layout("dl3dv");
     let scene = root.path().join("1K").join(KEY);
     copy_folder(&scene.join("images_8"), &scene.join("small"));
     let chosen = |folder: &str| {
-        let files = FileOptions { image_folder: Some(folder.into()), ..FileOptions::default() };
-        open_at(root.path(), Split::Test, &SourceOptions { files, ..SourceOptions::default() })
+        open_with(root.path(), FileOptions { image_folder: Some(folder.into()), ..FileOptions::default() })
     };
     assert_eq!(chosen("small").unwrap().source.num_frames(0).unwrap(), 6);
-    let message = chosen("large").err().unwrap().to_string();
+    let message = chosen("large").err().unwrap();
     assert!(message.contains("none of 6 frames has an image; the first is images/frame_00001.png"), "{message}");
     assert!(message.ends_with("transforms.json"), "{message}");
 }
@@ -194,31 +182,29 @@ fn image_folders_may_be_chosen() {
 #[test]
 fn re10k_frames_are_found_where_configured() {
     let root = tempfile::tempdir().unwrap();
-    copy_folder(&layouts().join("re10k_txt/test"), &root.path().join("data/test"));
+    copy_folder(&layout("re10k_txt/test"), &root.path().join("data/test"));
     let elsewhere = root.path().join("extracted");
-    copy_folder(&layouts().join("re10k_txt/frames"), &elsewhere.join("test"));
+    copy_folder(&layout("re10k_txt/frames"), &elsewhere.join("test"));
     let data = root.path().join("data");
-    let message = open_at(&data, Split::Test, &SourceOptions::default()).err().unwrap().to_string();
+    let message = open_test(&data).err().unwrap();
     assert!(message.contains("none of 6 frames has an image; the first is 1000000"), "{message}");
     let files = FileOptions { frames: Some(elsewhere), ..FileOptions::default() };
-    assert_eq!(open_with(&data, Split::Test, files).0.num_frames(0).unwrap(), 6);
+    assert_eq!(open_with(&data, files).unwrap().source.num_frames(0).unwrap(), 6);
 }
 
 #[test]
 fn scenes_and_chunks_open_without_an_index() {
-    let root = tempfile::tempdir().unwrap();
-    copy_folder(&layouts().join("scenes"), root.path());
-    let (source, report) = open_with(root.path(), Split::Test, FileOptions::default());
+    let root = copy_of_layout("scenes");
+    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
     assert_eq!((source.key(0), report.to_string()), (KEY, "1 of 1 scenes used".into()));
     std::fs::write(root.path().join("test/invalid_keys.txt"), KEY).unwrap();
-    let (source, report) = open_with(root.path(), Split::Test, FileOptions::default());
+    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
     assert_eq!((source.num_scenes(), report.to_string()), (0, "0 of 1 scenes used; 1 in invalid_keys.txt".into()));
 
-    let chunks = tempfile::tempdir().unwrap();
-    copy_folder(&layouts().join("chunks"), chunks.path());
+    let chunks = copy_of_layout("chunks");
     std::fs::remove_file(chunks.path().join("test/index.json")).unwrap();
     std::fs::write(chunks.path().join("test/000001.torch"), "cut").unwrap();
-    let opened = open(chunks.path(), Split::Test, SourceKind::Auto);
+    let opened = open_test(chunks.path()).unwrap();
     assert_eq!((opened.source.key(0), opened.source.num_frames(0).unwrap()), (KEY, 6));
     let report = opened.report.to_string();
     assert!(report.starts_with("1 of 2 scenes used; 1 bad chunk: "), "{report}");
@@ -229,9 +215,9 @@ fn scenes_and_chunks_open_without_an_index() {
 fn scenes_of_equal_name_take_distinct_keys() {
     let root = tempfile::tempdir().unwrap();
     for path in ["a/attic", "b/c/attic", "b/cellar"] {
-        copy_folder(&layouts().join("capture/attic"), &root.path().join(path));
+        copy_folder(&layout("capture/attic"), &root.path().join(path));
     }
-    let source = open(root.path(), Split::Test, SourceKind::Auto).source;
+    let source = open_test(root.path()).unwrap().source;
     let keys: Vec<&str> = (0..source.num_scenes()).map(|scene| source.key(scene)).collect();
     assert_eq!(keys, ["a/attic", "b/c/attic", "cellar"]);
 }
@@ -239,10 +225,10 @@ fn scenes_of_equal_name_take_distinct_keys() {
 #[test]
 fn split_folders_differ_from_a_shared_folder() {
     let root = tempfile::tempdir().unwrap();
-    copy_folder(&layouts().join("capture"), &root.path().join("train"));
-    let opened = open(root.path(), Split::Train, SourceKind::Auto);
+    copy_folder(&layout("capture"), &root.path().join("train"));
+    let opened = open_kind(root.path(), Split::Train, SourceKind::Auto);
     assert!(opened.has_splits && opened.report.notes.is_empty());
-    let error = open_at(root.path(), Split::Test, &SourceOptions::default()).err().unwrap();
-    assert!(error.to_string().starts_with("no scenes found: no folder test/ beside the other split: "));
-    assert!(!open(&root.path().join("train"), Split::Test, SourceKind::Auto).has_splits);
+    let error = open_test(root.path()).err().unwrap();
+    assert!(error.starts_with("no scenes found: no folder test/ beside the other split: "));
+    assert!(!open_test(&root.path().join("train")).unwrap().has_splits);
 }

@@ -3,13 +3,11 @@
 use std::fs;
 use std::path::Path;
 
-use clift_data::{
-    FileOptions, OpenedSource, RgbImage, SkipReport, SourceKind, SourceOptions, Split, encode_jpeg, encode_png,
-};
+use clift_data::{FileOptions, OpenedSource, RgbImage, SourceKind, SourceOptions, Split, encode_jpeg, encode_png};
 use serde_json::{Value, json};
 
-use crate::files::{copy_folder, fixtures};
-use crate::open_at;
+use crate::files::{copy_folder, copy_of_layout, fixtures, frame_at, write_capture};
+use crate::{open, open_test, open_with, skipped_frames};
 
 fn image(width: usize, height: usize) -> RgbImage {
     RgbImage { width, height, rgb: (0..width * height * 3).map(|i| (i * i / 7) as u8).collect() }
@@ -17,26 +15,8 @@ fn image(width: usize, height: usize) -> RgbImage {
 
 /// Writes images, and a `transforms.json` with `frames`.
 fn write(root: &Path, images: &[(&str, Vec<u8>)], frames: &[&str]) {
-    for (name, bytes) in images {
-        let path = root.join(name);
-        fs::create_dir_all(path.parent().unwrap()).unwrap();
-        fs::write(path, bytes).unwrap();
-    }
-    let frame = |(x, name): (usize, &&str)| {
-        let c2w = json!([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
-        json!({"file_path": name, "transform_matrix": c2w})
-    };
-    let frames: Vec<Value> = frames.iter().enumerate().map(frame).collect();
-    let cameras = json!({"fl_x": 40, "w": 48, "h": 32, "frames": frames});
-    fs::write(root.join("transforms.json"), cameras.to_string()).unwrap();
-}
-
-fn open(root: &Path) -> Result<OpenedSource, String> {
-    open_at(root, Split::Test, &SourceOptions::default()).map_err(|error| error.to_string())
-}
-
-fn skipped_frames(report: &SkipReport) -> Vec<(&str, &str)> {
-    report.frames.iter().map(|skip| (skip.frame.as_str(), skip.reason.as_str())).collect()
+    let frames: Vec<Value> = frames.iter().enumerate().map(|(x, name)| frame_at(x as f64, name)).collect();
+    write_capture(root, images, &json!({"fl_x": 40, "w": 48, "h": 32, "frames": frames}));
 }
 
 #[test]
@@ -58,7 +38,7 @@ fn truncated_images_are_skipped_at_opening() {
     ];
     let root = tempfile::tempdir().unwrap();
     write(root.path(), &images, &images.clone().map(|(name, _)| name));
-    let OpenedSource { source, report, .. } = open(root.path()).unwrap();
+    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
     let truncated = ["1.jpg", "3.png", "8.jpg"].map(|name| (name, "whose image is truncated"));
     assert_eq!(skipped_frames(&report), truncated);
     for frame in 0..source.num_frames(0).unwrap() {
@@ -83,7 +63,7 @@ fn scenes_without_usable_images_report_the_reason() {
         let file = if name == "heic" { "1.heic" } else { "0.jpg" };
         write(&scenes.path().join(name), &[(file, bytes)], frames);
     }
-    let report = open(scenes.path()).unwrap().report;
+    let report = open_test(scenes.path()).unwrap().report;
     let reason = |key: &str| report.skips.iter().find(|skip| skip.key == key).unwrap().reason.as_str();
     assert!(reason("corrupt").contains("the image cannot be read"), "{report}");
     assert!(reason("cut").contains("the image is truncated"), "{report}");
@@ -99,7 +79,7 @@ fn scenes_without_usable_images_report_the_reason() {
         write(&root.path().join(key), &[("0.jpg", jpeg.clone()), ("1.jpg", jpeg.clone())], &["0.jpg", "1.jpg"]);
     }
     fs::write(root.path().join("a".repeat(64)).join("0.jpg"), "no image").unwrap();
-    let report = open(root.path()).unwrap().report;
+    let report = open_test(root.path()).unwrap().report;
     assert!(report.skips[0].reason.contains("the image cannot be read"), "{report}");
 }
 
@@ -111,7 +91,7 @@ fn unreadable_images_leave_other_frames_in_use() {
     let mut cameras: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
     cameras.as_object_mut().unwrap().retain(|key, _| key != "w");
     fs::write(&path, cameras.to_string()).unwrap();
-    assert_eq!(skipped_frames(&open(root.path()).unwrap().report), [("1.png", "whose image cannot be read")]);
+    assert_eq!(skipped_frames(&open_test(root.path()).unwrap().report), [("1.png", "whose image cannot be read")]);
 }
 
 #[test]
@@ -127,13 +107,12 @@ fn images_without_cameras_are_counted() {
     let images = images.map(|(name, png)| (format!("images/{name}.png"), png));
     let images: Vec<(&str, Vec<u8>)> = images.iter().map(|(name, png)| (name.as_str(), png.clone())).collect();
     write(&root.path().join("b"), &images, &["images/2", "images/9"]);
-    assert_eq!(open(root.path()).unwrap().report.notes[0], "3 images without a camera, not used: 1 of a, 2 of b");
+    assert_eq!(open_test(root.path()).unwrap().report.notes[0], "3 images without a camera, not used: 1 of a, 2 of b");
 
     for (layout, frames) in [("colmap_bin/attic", "images/left"), ("re10k_folders", "")] {
-        let copy = tempfile::tempdir().unwrap();
-        copy_folder(&fixtures().join("layouts").join(layout), copy.path());
+        let copy = copy_of_layout(layout);
         let note = "1 image without a camera, not used: ";
-        let has_note = || open(copy.path()).unwrap().report.notes.iter().any(|got| got.starts_with(note));
+        let has_note = || open_test(copy.path()).unwrap().report.notes.iter().any(|got| got.starts_with(note));
         assert!(!has_note(), "{layout}");
         let mut folder = copy.path().join(frames);
         if frames.is_empty() {
@@ -158,7 +137,7 @@ fn byte_order_marks_are_skipped() {
     let path = root.path().join("transforms.json");
     let text = fs::read(&path).unwrap();
     fs::write(&path, [b"\xef\xbb\xbf", &text[..]].concat()).unwrap();
-    assert_eq!(open(root.path()).unwrap().source.num_frames(0).unwrap(), 1);
+    assert_eq!(open_test(root.path()).unwrap().source.num_frames(0).unwrap(), 1);
 }
 
 #[test]
@@ -181,15 +160,13 @@ fn images_are_found_by_the_end_of_paths() {
         let root = tempfile::tempdir().unwrap();
         write(root.path(), &[(file, png())], &[named]);
         let files = FileOptions { image_folder: image_folder.map(str::to_owned), ..FileOptions::default() };
-        let options = SourceOptions { files, ..SourceOptions::default() };
-        let opened = open_at(root.path(), Split::Test, &options);
-        let opened = opened.unwrap_or_else(|error| panic!("{file} for {named}: {error}"));
+        let opened = open_with(root.path(), files).unwrap_or_else(|error| panic!("{file} for {named}: {error}"));
         assert_eq!(opened.source.num_frames(0).unwrap(), 1, "{file} for {named}");
     }
     // Relative paths keep their folder.
     let root = tempfile::tempdir().unwrap();
     write(root.path(), &[("0.png", png())], &["images/0.png"]);
-    let message = open(root.path()).err().unwrap();
+    let message = open_test(root.path()).err().unwrap();
     assert!(message.contains("none of 1 frames has an image; the first is images/0.png"), "{message}");
 }
 
@@ -204,14 +181,14 @@ fn exif_orientation_is_reported_for_wrong_aspect_ratios() {
     let root = tempfile::tempdir().unwrap();
     let images = [("0.jpg", tagged(&image(48, 32))), ("1.jpg", tagged(&image(32, 48)))];
     write(root.path(), &images, &["0.jpg", "1.jpg"]);
-    let opened = open(root.path()).unwrap();
+    let opened = open_test(root.path()).unwrap();
     let expected =
         "whose image has another aspect ratio than its camera, and an EXIF orientation, which is not applied";
     assert_eq!(skipped_frames(&opened.report), [("1.jpg", expected)]);
     let frame = opened.source.frame(0, 0).unwrap();
     assert_eq!((frame.width, frame.height), (48, 32), "as stored");
     fs::remove_file(root.path().join("0.jpg")).unwrap();
-    let message = open(root.path()).err().unwrap();
+    let message = open_test(root.path()).err().unwrap();
     assert!(message.contains("the EXIF orientation 6 is not applied"), "{message}");
 }
 
@@ -224,7 +201,7 @@ fn listed_scenes_missing_from_test_are_flagged() {
     let flagged = |layout| {
         let files = FileOptions { test_scenes: Some(list.clone()), ..FileOptions::default() };
         let options = SourceOptions { kind: layout, files, ..SourceOptions::default() };
-        let opened = open_at(root.path(), Split::Train, &options).unwrap();
+        let opened = open(root.path(), Split::Train, &options).unwrap();
         assert_eq!((opened.source.num_scenes(), opened.report.skips.len()), (1, 1));
         let flagged = clift_data::skipped_scenes(&opened.report).into_iter();
         flagged.map(|check| (check.key, check.reasons.concat())).collect::<Vec<_>>()

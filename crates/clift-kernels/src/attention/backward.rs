@@ -8,7 +8,7 @@ use crate::attention::shapes::{
     AttentionGradients, AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows, copy_padded, copy_transposed,
 };
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
-use crate::primitives::scratch::{Scratch, cut};
+use crate::primitives::scratch::Scratch;
 use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
@@ -141,7 +141,7 @@ impl<'a> Kernel for BackwardTask<'a> {
         let head_of = |rows: &StridedRows<'a>, row: usize| rows.head(&sizes, scene, row, head);
         let mut scratch = Scratch::take(lens.iter().sum());
         let [queries, grads, delta, keys_t, values_t, key_rows, key_sums, value_sums, weights, slopes] =
-            cut(&mut scratch, lens);
+            scratch.cut(lens);
         copy_padded(queries, width, (0..num_queries).map(|row| head_of(&inputs.query, row)));
         copy_padded(grads, width, (0..num_queries).map(|row| head_of(&inputs.grad_output, row)));
         for (row, to) in delta.iter_mut().enumerate() {

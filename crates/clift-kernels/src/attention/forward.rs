@@ -8,7 +8,7 @@ use crate::attention::shapes::{
     AttentionSizes, HeadBlocks, QUERY_BLOCK, ROW_PADDING, StridedRows, copy_padded, copy_transposed,
 };
 use crate::primitives::matmul::{Left, Right, multiply, padded, panel_width};
-use crate::primitives::scratch::{Scratch, cut};
+use crate::primitives::scratch::Scratch;
 use crate::primitives::shared_slice::SharedSlice;
 use crate::simd::dispatch::{InstructionSet, Kernel};
 use crate::simd::vector::Simd;
@@ -44,9 +44,7 @@ pub fn attention_forward(
         let bound = |part: usize| (part * blocks / parts * QUERY_BLOCK).min(sizes.num_queries);
         set.run(Forward {
             sizes,
-            query,
-            key,
-            value,
+            inputs: [query, key, value],
             output,
             log_sum: log_sum.as_ref(),
             scene: head / sizes.num_heads,
@@ -58,9 +56,7 @@ pub fn attention_forward(
 
 struct Forward<'a> {
     sizes: AttentionSizes,
-    query: StridedRows<'a>,
-    key: StridedRows<'a>,
-    value: StridedRows<'a>,
+    inputs: [StridedRows<'a>; 3],
     output: HeadBlocks<'a>,
     log_sum: Option<&'a SharedSlice<'a>>,
     scene: usize,
@@ -73,7 +69,7 @@ impl Kernel for Forward<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let Self { sizes, query, key, value, output, log_sum, scene, head, queries } = self;
+        let Self { sizes, inputs: [query, key, value], output, log_sum, scene, head, queries } = self;
         let AttentionSizes { num_keys, head_width, .. } = sizes;
         let (width, panel) = (padded::<S>(head_width), panel_width::<S>());
         let score_row = num_keys.min(FORWARD_KEYS).next_multiple_of(panel) + ROW_PADDING;
@@ -87,7 +83,7 @@ impl Kernel for Forward<'_> {
             QUERY_BLOCK,
         ];
         let mut scratch = Scratch::take(lens.iter().sum());
-        let [keys, values, block, scores, sums, highest, total] = cut(&mut scratch, lens);
+        let [keys, values, block, scores, sums, highest, total] = scratch.cut(lens);
         copy_transposed(keys, panel, head_width, (0..num_keys).map(|row| key.head(&sizes, scene, row, head)));
         copy_padded(values, width, (0..num_keys).map(|row| value.head(&sizes, scene, row, head)));
         for start in queries.clone().step_by(QUERY_BLOCK) {

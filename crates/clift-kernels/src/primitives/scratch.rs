@@ -1,7 +1,6 @@
 //! Reusable buffers, one per thread.
 
 use std::cell::RefCell;
-use std::ops::{Deref, DerefMut};
 
 thread_local! {
     static KEPT: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
@@ -13,7 +12,6 @@ thread_local! {
 /// A guard instead of a closure: code in a closure is not compiled with the instructions of the enclosing function.
 pub(crate) struct Scratch {
     values: Vec<f32>,
-    len: usize,
 }
 
 impl Scratch {
@@ -22,7 +20,17 @@ impl Scratch {
         if values.len() < len {
             values = vec![0.0; len];
         }
-        Self { values, len }
+        Self { values }
+    }
+
+    /// Splits the buffer into parts of the given lengths.
+    pub(crate) fn cut<const COUNT: usize>(&mut self, lens: [usize; COUNT]) -> [&mut [f32]; COUNT] {
+        let mut slice = self.values.as_mut_slice();
+        lens.map(|len| {
+            let (part, rest) = std::mem::take(&mut slice).split_at_mut(len);
+            slice = rest;
+            part
+        })
     }
 }
 
@@ -30,27 +38,4 @@ impl Drop for Scratch {
     fn drop(&mut self) {
         KEPT.set(std::mem::take(&mut self.values));
     }
-}
-
-impl Deref for Scratch {
-    type Target = [f32];
-
-    fn deref(&self) -> &[f32] {
-        &self.values[..self.len]
-    }
-}
-
-impl DerefMut for Scratch {
-    fn deref_mut(&mut self) -> &mut [f32] {
-        &mut self.values[..self.len]
-    }
-}
-
-/// Splits a slice into parts of the given lengths.
-pub(crate) fn cut<const COUNT: usize>(mut slice: &mut [f32], lens: [usize; COUNT]) -> [&mut [f32]; COUNT] {
-    lens.map(|len| {
-        let (part, rest) = std::mem::take(&mut slice).split_at_mut(len);
-        slice = rest;
-        part
-    })
 }

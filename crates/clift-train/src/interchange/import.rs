@@ -41,11 +41,9 @@ pub fn import(
 
     let num_bytes: u64 = expected.iter().map(|tensor| 4 * tensor.shape.iter().product::<usize>() as u64).sum();
     // Parameters of a network share no storage, though keys of a file may.
-    if num_bytes > state.num_bytes().saturating_mul(2) {
-        let reason = format!(
-            "the parameters take {num_bytes} bytes, more than twice the {} bytes of the file",
-            state.num_bytes()
-        );
+    if num_bytes > state.num_bytes.saturating_mul(2) {
+        let reason =
+            format!("the parameters take {num_bytes} bytes, more than twice the {} bytes of the file", state.num_bytes);
         return Err(TrainError::bad_file("checkpoint", file)(reason));
     }
     let (mut parameters, mut mapping, mut convolutions, mut num_converted) = (vec![], vec![], vec![], 0);
@@ -72,7 +70,7 @@ pub fn import(
         parameters: mapping,
         ignored: keys.ignored,
         outside: keys.outside,
-        passed_over: state.skipped_objects().clone(),
+        passed_over: state.skipped_objects.clone(),
     };
     let config = model_dir::evaluation_config(model, out);
     model_dir::write_model_dir(out, &config, &parameters, &imported, stop)?;
@@ -84,7 +82,7 @@ fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>
     let stored = state.size("num_heads").and_then(|size| usize::try_from(size).ok());
     match (options.num_heads, stored) {
         (Some(given), Some(stored)) if given != stored => {
-            let fix = format!("the checkpoint has {stored} heads: omit the option: {}", state.path().display());
+            let fix = format!("the checkpoint has {stored} heads: omit the option: {}", state.path.display());
             Err(TrainError::BadConfig { key: "--num-heads".into(), value: given.to_string(), fix })
         }
         (given, stored) => Ok(given.or(stored)),
@@ -94,7 +92,7 @@ fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>
 /// Checks the number of heads, which shapes do not determine, and the other sizes.
 fn check_sizes(sizes: &InferredConfig, keys: &Keys, state: &StateDict) -> Result<(), TrainError> {
     let InferredConfig { config: model, has_num_heads, width_key, .. } = sizes;
-    let file = state.path();
+    let file = &state.path;
     let num_heads = model.num_heads;
     if !has_num_heads || num_heads == 0 || !model.dim.is_multiple_of(num_heads) {
         let key = width_key.as_ref().map(|key| &keys.network[key]);

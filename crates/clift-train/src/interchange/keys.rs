@@ -48,7 +48,7 @@ impl Keys {
         if let Some(((from, to), _)) = options.renames.iter().zip(&is_used).find(|(_, is_used)| !**is_used) {
             let first = all.first().map_or("none", |(_, key)| key);
             let fix =
-                format!("no key contains {from:?}; the first key is {}: {}", printable(first), state.path().display());
+                format!("no key contains {from:?}; the first key is {}: {}", printable(first), state.path.display());
             return Err(TrainError::BadConfig { key: "--rename".into(), value: format!("{from}={to}"), fix });
         }
 
@@ -67,7 +67,7 @@ impl Keys {
             } else if let Some(plain) = name.strip_prefix(prefix) {
                 if let Some(other) = keys.network.insert(plain.to_owned(), key.to_owned()) {
                     let reason = format!("{} and {} are both {}", printable(&other), printable(key), printable(plain));
-                    return Err(TrainError::bad_file("checkpoint", state.path())(reason));
+                    return Err(TrainError::bad_file("checkpoint", &state.path)(reason));
                 }
             } else if starts_as_network(&name) {
                 keys.strays.insert(name, key.to_owned());

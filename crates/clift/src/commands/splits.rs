@@ -78,9 +78,9 @@ impl SplitSource {
 /// Returns the requested splits that exist; a single one for a data set without splits.
 pub fn present_splits(root: &DatasetRoot, splits: Splits) -> Vec<Split> {
     let requested = splits.list();
-    let is_present = |split: &Split| root.path().join(split.to_string()).is_dir();
+    let is_present = |split: &Split| root.path.join(split.to_string()).is_dir();
     let present: Vec<Split> = requested.iter().copied().filter(is_present).collect();
-    if present.is_empty() || !root.has_splits() { requested[requested.len() - 1..].to_vec() } else { present }
+    if present.is_empty() || !root.has_splits { requested[requested.len() - 1..].to_vec() } else { present }
 }
 
 /// Returns the options for reading every scene of a source, which includes the content of chunks.
@@ -98,7 +98,7 @@ pub fn open_splits(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::
     let list = files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
     let has_list = list.is_some_and(|list| list.num_scenes() > 0);
     let root = DatasetRoot::find(root)?;
-    let is_listed = has_list && !root.has_splits();
+    let is_listed = has_list && !root.has_splits;
     let present = if is_listed { splits.list().to_vec() } else { present_splits(&root, splits) };
     let mut sources = Vec::new();
     for split in present {

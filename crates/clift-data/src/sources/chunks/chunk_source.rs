@@ -11,7 +11,7 @@ use crate::geometry::camera::Camera;
 use crate::image::codec::decode_image;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
-use crate::skip_report::{SkipReport, first_few, plural};
+use crate::skip_report::{SkipReport, note_on};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::filters::SceneFilters;
@@ -59,7 +59,8 @@ pub struct ChunkSource {
     chunks: Vec<Chunk>,
     scenes: Vec<Entry>,
     positions: HashMap<String, usize>,
-    report: SkipReport,
+    /// Skipped scenes: filtered and unreadable ones.
+    pub report: SkipReport,
 }
 
 impl ChunkSource {
@@ -102,11 +103,6 @@ impl ChunkSource {
         source.skip_scenes(filters, reads_all || filters.is_any_set())?;
         source.positions = source.scenes.iter().enumerate().map(|(i, entry)| (entry.key.clone(), i)).collect();
         Ok(source)
-    }
-
-    /// Returns the skipped scenes: filtered and unreadable ones.
-    pub fn report(&self) -> &SkipReport {
-        &self.report
     }
 
     /// Reads the JPEG or PNG file of a frame.
@@ -172,15 +168,9 @@ impl ChunkSource {
         for key in unlisted {
             self.report.skip(key, "in a chunk but not in its index.json");
         }
-        if !elsewhere.is_empty() {
-            let names: Vec<String> = elsewhere.into_iter().collect();
-            let note = format!(
-                "{} also in chunks other than those of index.json, not used ({})",
-                plural(names.len(), "scene"),
-                first_few(&names)
-            );
-            self.report.notes.push(note);
-        }
+        let names: Vec<String> = elsewhere.into_iter().collect();
+        let what = "also in chunks other than those of index.json, not used";
+        self.report.notes.extend(note_on(&names, "scene", what));
     }
 
     fn reason_to_skip(&self, scene: usize, filters: &SceneFilters) -> Result<Option<String>, DataError> {

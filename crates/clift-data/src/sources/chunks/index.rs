@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::error::DataError;
 use crate::files::listing::{file_names, has_ending};
-use crate::skip_report::{SkipReport, first_few, plural};
+use crate::skip_report::{SkipReport, first_few, note_on, plural};
 use crate::sources::chunks::table::ChunkTable;
 use crate::sources::test_scenes::TestScenes;
 
@@ -44,9 +44,6 @@ pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> 
 
 /// Returns the file of every scene in a folder without an index: for one file per scene from the file names, for chunks
 /// from their tables.
-///
-/// # Errors
-/// [`DataError::Io`] for a folder that cannot be listed, and the errors of reading `invalid_keys.txt`.
 pub(crate) fn index_of_files(folder: &Path, report: &mut SkipReport) -> Result<BTreeMap<String, String>, DataError> {
     let files = torch_files(folder)?;
     let stem = |file: &str| file.strip_suffix(".torch").unwrap_or(file).to_owned();
@@ -91,12 +88,8 @@ fn index_of_chunks(folder: &Path, files: &[String], report: &mut SkipReport) -> 
             }
         }
     }
-    if !duplicates.is_empty() {
-        duplicates.sort_unstable();
-        let counted = plural(duplicates.len(), "scene");
-        let note = format!("{counted} in more than one file, the first of which is used ({})", first_few(&duplicates));
-        report.notes.push(note);
-    }
+    duplicates.sort_unstable();
+    report.notes.extend(note_on(&duplicates, "scene", "in more than one file, the first of which is used"));
     report
         .notes
         .push(format!("no index.json: the scenes of {} files were determined from their contents", files.len()));
@@ -106,7 +99,6 @@ fn index_of_chunks(folder: &Path, files: &[String], report: &mut SkipReport) -> 
 fn torch_files(folder: &Path) -> Result<Vec<String>, DataError> {
     let mut files = file_names(folder)?;
     files.retain(|name| has_ending(name, "torch"));
-    files.sort_unstable();
     Ok(files)
 }
 

@@ -35,13 +35,7 @@ impl ChunkTable {
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadChunk { what, path: path.to_path_buf() };
         let archive = Archive::open(path)?;
-        let member = archive
-            .member("data.pkl")
-            .ok_or_else(|| bad("no member data.pkl: the file was not written by torch.save".into()))?;
-        if member.len() > MAX_BYTES as u64 {
-            return Err(bad(format!("data.pkl has {} bytes, more than the limit of {MAX_BYTES}", member.len())));
-        }
-        let pickle = Pickle::parse(&member.read(path)?, path)?;
+        let pickle = Pickle::parse(&archive.read_pickle(path)?, path)?;
         // A chunk is a list of scenes; files of one scene hold its dict.
         let scenes: Vec<&Value> = match pickle.root() {
             Value::List(items) => items.iter().map(|id| pickle.get(*id)).collect(),
@@ -96,15 +90,12 @@ impl Builder<'_> {
                 .map_err(|what| in_scene(format!("`images[{frame}]`: {what}")))?;
             images.push(span);
         }
-        let (cameras, camera_type) = tensor_span(
-            item("cameras")?,
-            &[Some(num_frames), Some(18)],
-            &[ElementType::F32, ElementType::F64],
-            archive,
-        )
-        .map_err(|what| in_scene(format!("`cameras`: {what}")))?;
-        let (timestamps, _) = tensor_span(item("timestamps")?, &[Some(num_frames)], &[ElementType::I64], archive)
-            .map_err(|what| in_scene(format!("`timestamps`: {what}")))?;
+        let tensor = |name: &str, shape: &[Option<u64>], types: &[ElementType]| {
+            tensor_span(item(name)?, shape, types, archive).map_err(|what| in_scene(format!("`{name}`: {what}")))
+        };
+        let (cameras, camera_type) =
+            tensor("cameras", &[Some(num_frames), Some(18)], &[ElementType::F32, ElementType::F64])?;
+        let (timestamps, _) = tensor("timestamps", &[Some(num_frames)], &[ElementType::I64])?;
         let table = SceneTable { key: key.clone(), url: url.to_owned(), timestamps, cameras, camera_type, images };
         self.scenes.insert(key.clone(), table);
         Ok(())

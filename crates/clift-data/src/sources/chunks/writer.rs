@@ -28,6 +28,11 @@ pub struct SceneRecord {
 }
 
 impl SceneRecord {
+    /// Returns the bytes of all images.
+    pub(crate) fn image_bytes(&self) -> u64 {
+        self.images.iter().map(|image| image.len() as u64).sum()
+    }
+
     /// Checks that the lists have equal lengths and that the scene fits into one file.
     pub(crate) fn check(&self) -> Result<(), String> {
         let Self { key, timestamps, cameras, images, .. } = self;
@@ -58,7 +63,7 @@ impl ChunkFill {
         let num_frames = scene.images.len();
         // At most 19 values and 170 bytes per tensor: one tensor per frame, two and five names per scene.
         Self {
-            image_bytes: self.image_bytes + scene.images.iter().map(|image| image.len() as u64).sum::<u64>(),
+            image_bytes: self.image_bytes + scene.image_bytes(),
             num_frames: self.num_frames + num_frames,
             num_values: self.num_values + 20 * num_frames + 60,
             pickle_bytes: self.pickle_bytes + 180 * num_frames + 600 + scene.url.len() + scene.key.len(),
@@ -106,7 +111,7 @@ pub fn write_chunks(
     for scene in scenes {
         let scene = scene?;
         scene.check().map_err(&bad)?;
-        if !fill.has_room(&scene) {
+        if !pending.is_empty() && (fill.is_full(target_bytes) || !fill.has_room(&scene)) {
             write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
             num_chunks += 1;
             pending.clear();
@@ -117,12 +122,6 @@ pub fn write_chunks(
         }
         fill.add(&scene);
         pending.push(scene);
-        if fill.is_full(target_bytes) {
-            write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
-            num_chunks += 1;
-            pending.clear();
-            fill = ChunkFill::default();
-        }
     }
     if !pending.is_empty() {
         write_chunk(&folder.join(chunk_name(num_chunks)), &pending)?;
@@ -259,7 +258,7 @@ mod tests {
         let source =
             ChunkSource::open(folder.path(), Split::Test, &SceneFilters { min_frames: 1, ..Default::default() });
         let source = source.unwrap();
-        assert_eq!(source.report().to_string(), "20001 of 20001 scenes used");
+        assert_eq!(source.report.to_string(), "20001 of 20001 scenes used");
         assert_eq!(source.num_frames(source.find("long").unwrap()).unwrap(), most);
         let message = write_chunks(&folder.path().join("train"), [Ok(record("a", most + 1))], 1).unwrap_err();
         assert!(message.to_string().contains(" frames, above the limit of a file (about 50,000)"), "{message}");

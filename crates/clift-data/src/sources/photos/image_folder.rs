@@ -88,10 +88,8 @@ impl ImageFolder {
 /// Returns the images of a folder whose names are numbers (time stamps in RealEstate10K), by number. Of two names of one
 /// number (`77` and `077`), the first in order of names counts.
 pub(crate) fn numbered_images(folder: &Path) -> Result<HashMap<i64, PathBuf>, DataError> {
-    let mut names = file_names(folder)?;
-    names.sort_unstable();
     let mut numbered = HashMap::new();
-    for name in names {
+    for name in file_names(folder)? {
         let (stem, extension) = split_name(&name);
         let is_image = extension.is_some_and(|ending| EXTENSIONS.contains(&ending.to_ascii_lowercase().as_str()));
         if let (true, Ok(number)) = (is_image, stem.parse()) {

@@ -18,7 +18,7 @@ use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
 use crate::image::codec::read_size;
 use crate::sources::photos::image_folder::ImageFolders;
-use crate::sources::photos::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoOptions, PhotoScene};
+use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene};
 
 /// Largest size of a `transforms.json`, in bytes.
 const MAX_BYTES: u64 = 128 << 20;
@@ -159,10 +159,6 @@ impl<'a> Optics<'a> {
 }
 
 /// Reads a `transforms.json` and locates its images. Frames are in the natural order of their names.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] for a file of another form, a camera that cannot be used and two
-/// frames of one name.
 pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
@@ -186,8 +182,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let image = match images.find(name) {
             Ok(image) if used.insert(image.clone()) => image,
             found => {
-                let reason = found.map_or_else(|reason| reason, |_| "with the image of another frame".into());
-                scene.missing.push(MissingPhoto { name: name.clone(), reason });
+                scene.skip(name, found.map_or_else(|reason| reason, |_| "with the image of another frame".into()));
                 continue;
             }
         };
@@ -196,8 +191,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let given = optics.size().map_err(in_frame)?;
         let size = given.map_or_else(|| read_size(&image).map(|size| size.map(|side| side as f64)), Ok);
         let Ok(size) = size else {
-            let reason = "whose image cannot be read".into();
-            scene.missing.push(MissingPhoto { name: name.clone(), reason });
+            scene.skip(name, "whose image cannot be read");
             continue;
         };
         let intrinsics_norm = optics.intrinsics_norm(size).map_err(in_frame)?;

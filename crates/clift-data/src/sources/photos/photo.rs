@@ -66,9 +66,6 @@ pub(crate) struct PhotoScene {
 
 impl Photo {
     /// Creates a photo. With `undistort`, the image is undistorted on load; otherwise `lens` is ignored.
-    ///
-    /// # Errors
-    /// [`DataError::BadCamera`] for invalid intrinsics, and the errors of [`Undistortion::new`].
     pub fn new(
         path: PathBuf,
         c2w: Pose,
@@ -142,6 +139,11 @@ fn number_at_end(path: &Path) -> Option<i64> {
 }
 
 impl PhotoScene {
+    /// Adds a frame without a usable image.
+    pub fn skip(&mut self, name: impl Into<String>, reason: impl Into<String>) {
+        self.missing.push(MissingPhoto { name: name.into(), reason: reason.into() });
+    }
+
     /// Returns time stamps that increase from frame to frame; frame indices if the names have none.
     pub fn timestamps(&self) -> Vec<i64> {
         let times: Option<Vec<i64>> = self.photos.iter().map(|photo| photo.time).collect();

@@ -40,7 +40,7 @@ pub(crate) struct PhotoSource {
     scenes: Vec<Entry>,
     positions: HashMap<String, usize>,
     options: PhotoOptions,
-    report: SkipReport,
+    pub report: SkipReport,
     /// Scenes used last, with their indices; the latest at the end.
     cache: Mutex<Vec<(usize, Arc<PhotoScene>)>>,
 }
@@ -67,9 +67,6 @@ struct Findings {
 impl PhotoSource {
     /// Reads the cameras of every scene in parallel and locates their images. Header and end of every image are checked;
     /// with `whole_scenes`, only of the first image of a scene.
-    ///
-    /// # Errors
-    /// [`DataError::BadConfig`] for invalid filters, and the first error if no scene can be read.
     pub fn open(folders: Vec<SceneFolder>, options: &PhotoSourceOptions) -> Result<Self, DataError> {
         options.filters.validate()?;
         let findings: Vec<_> = folders.par_iter().map(|folder| examine(folder, options)).collect();
@@ -114,11 +111,6 @@ impl PhotoSource {
         }
         let positions = scenes.iter().enumerate().map(|(i, scene)| (scene.folder.key.clone(), i)).collect();
         Ok(Self { scenes, positions, options: options.photos.clone(), report, cache: Mutex::default() })
-    }
-
-    /// Returns the skipped scenes and frames.
-    pub fn report(&self) -> &SkipReport {
-        &self.report
     }
 
     fn entry(&self, scene: usize) -> Result<&Entry, DataError> {

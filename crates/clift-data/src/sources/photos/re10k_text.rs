@@ -7,7 +7,7 @@ use crate::error::DataError;
 use crate::files::bounded::read_bounded;
 use crate::geometry::camera::Camera;
 use crate::sources::photos::image_folder::numbered_images;
-use crate::sources::photos::photo::{MAX_FRAMES, MissingPhoto, Photo, PhotoScene};
+use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoScene};
 
 /// Largest size of a file, in bytes: a hundred times the longest clip.
 const MAX_BYTES: u64 = 16 << 20;
@@ -17,9 +17,6 @@ const MAX_URL_CHARS: usize = 1000;
 const NUM_COLUMNS: usize = 19;
 
 /// Reads the cameras of a clip and locates the frames, which are named by time stamp. Frames are in the order of the file.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] with the line.
 pub(crate) fn read_re10k_text(path: &Path, frames: &Path) -> Result<PhotoScene, DataError> {
     let images = if frames.is_dir() { numbered_images(frames)? } else { HashMap::new() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
@@ -51,15 +48,10 @@ fn parse(text: &str, images: &HashMap<i64, PathBuf>) -> Result<PhotoScene, Strin
         }
         match images.get(&time) {
             Some(path) => {
-                scene.photos.push(Photo {
-                    path: path.clone(),
-                    camera,
-                    undistortion: None,
-                    shape: None,
-                    time: Some(time),
-                });
+                let (path, time) = (path.clone(), Some(time));
+                scene.photos.push(Photo { path, camera, undistortion: None, shape: None, time });
             }
-            None => scene.missing.push(MissingPhoto { name: time.to_string(), reason: "without an image".into() }),
+            None => scene.skip(time.to_string(), "without an image"),
         }
     }
     // Time stamps increase, so that no image is counted twice.

@@ -106,9 +106,6 @@ pub(crate) struct FoundScenes {
 
 /// Finds the scenes in `base` and below it. A folder that is reachable by several paths has the path without links, or
 /// the first one in order of names.
-///
-/// # Errors
-/// [`DataError::Io`] for a `base` that cannot be listed, and [`DataError::UnknownLayout`] for too many folders.
 pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     if let Some(files) = scene_in(base) {
         let absolute = base.canonicalize().unwrap_or_else(|_| base.to_owned());
@@ -186,9 +183,7 @@ fn push_folders(
     folders: &mut VecDeque<String>,
     links: &mut VecDeque<String>,
 ) -> Result<(), DataError> {
-    let mut names = file_names(folder)?;
-    names.sort_unstable();
-    for name in names.into_iter().filter(|name| !name.starts_with('.')) {
+    for name in file_names(folder)?.into_iter().filter(|name| !name.starts_with('.')) {
         let path = folder.join(&name);
         let to = if path.is_symlink() { &mut *links } else { &mut *folders };
         if path.is_dir() {
@@ -215,7 +210,6 @@ fn other_data_in(folder: &Path) -> Option<String> {
 pub(crate) fn transforms_in(folder: &Path) -> Vec<String> {
     let mut names = file_names(folder).unwrap_or_default();
     names.retain(|name| name.starts_with("transforms") && has_ending(name, "json"));
-    names.sort_unstable();
     names
 }
 

@@ -3,8 +3,7 @@
 use glam::DMat3;
 
 use crate::image::rgb_image::RgbImage;
-use crate::tools::features::correspondence::{Correspondence, WIDTH};
-use crate::tools::features::epipolar::{line, line_back};
+use crate::tools::features::epipolar::{Correspondence, WIDTH, line, line_back};
 use crate::tools::features::image_features::reduced;
 
 /// Number of plotted corners.

@@ -2,6 +2,7 @@
 
 use std::sync::OnceLock;
 
+use glam::DMat3;
 use rayon::prelude::*;
 
 use crate::geometry::camera::Camera;
@@ -11,8 +12,7 @@ use crate::statistics::upper_median;
 use crate::tools::check::drawing::epipolar_image;
 use crate::tools::check::images::Sizes;
 use crate::tools::check::result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
-use crate::tools::features::correspondence::Correspondence;
-use crate::tools::features::epipolar::{epipolar_distance, fundamental_from_cameras};
+use crate::tools::features::epipolar::{Correspondence, epipolar_distance, fundamental_from_cameras};
 use crate::tools::features::image_features::Features;
 
 /// Number of pairs of frames of a scene.
@@ -30,6 +30,7 @@ const NOTED_PX: f64 = 3.0;
 /// A pair of frames with its matches.
 struct Pair {
     check: PairCheck,
+    geometry: DMat3,
     matches: Vec<Correspondence>,
     distances: Vec<f64>,
 }
@@ -58,7 +59,7 @@ pub(crate) fn check_poses(
         ));
         return None;
     }
-    let scene_px = median(&pooled)?;
+    let scene_px = upper_median(&pooled);
     check.epipolar_px = Some(scene_px);
     if scene_px > MAX_EPIPOLAR_PX {
         check.reasons.push(format!(
@@ -125,10 +126,18 @@ impl SceneViews<'_> {
         let [first, second] = frames;
         let sizes = [self.sizes[first]?, self.sizes[second]?];
         let matches = self.features(first)?.matches(self.features(second)?);
+        if matches.is_empty() {
+            return None;
+        }
         let geometry = fundamental_from_cameras([a, b], sizes);
         let distances: Vec<f64> = matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect();
-        let epipolar_px = median(&distances)?;
-        Some(Pair { check: PairCheck { frames, num_matches: matches.len(), epipolar_px }, matches, distances })
+        let epipolar_px = upper_median(&distances);
+        Some(Pair {
+            check: PairCheck { frames, num_matches: matches.len(), epipolar_px },
+            geometry,
+            matches,
+            distances,
+        })
     }
 
     /// Returns the features of a frame, computed on first use; `None` for an unreadable frame.
@@ -141,9 +150,7 @@ impl SceneViews<'_> {
     fn plot(&self, pair: &Pair) -> Option<RgbImage> {
         let [first, second] = pair.check.frames;
         let frames = [self.source.frame(self.scene, first).ok()?, self.source.frame(self.scene, second).ok()?];
-        let sizes = [self.sizes[first]?, self.sizes[second]?];
-        let geometry = fundamental_from_cameras([&self.cameras[first], &self.cameras[second]], sizes);
-        Some(epipolar_image(&frames, &geometry, &pair.matches))
+        Some(epipolar_image(&frames, &pair.geometry, &pair.matches))
     }
 }
 
@@ -157,9 +164,4 @@ fn dissimilarity(a: &Camera, b: &Camera) -> f64 {
 fn subsample(values: &[f64], count: usize) -> impl Iterator<Item = f64> {
     let kept = values.len().min(count);
     (0..kept).map(move |index| values[index * values.len() / kept])
-}
-
-/// Returns the upper median; `None` for no values.
-fn median(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| upper_median(values))
 }

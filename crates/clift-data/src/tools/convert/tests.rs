@@ -5,14 +5,12 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use super::*;
 use crate::scene_source::Split;
 use crate::skip_report::SkippedScene;
-use crate::sources::chunks::chunk_source::ChunkSource;
 use crate::sources::dataset_root::DatasetRoot;
-use crate::sources::filters::SceneFilters;
 use crate::sources::open::{OpenedSource, open_source};
 use crate::sources::options::SourceOptions;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
-use crate::testing::TestSource;
+use crate::testing::{TestSource, assert_same, fixture, names, re10k_mini};
 
 const CHUNKS: ConvertOptions = options(ConvertTo::Chunks { target_bytes: 1 });
 const SCENES: ConvertOptions = options(ConvertTo::Scenes);
@@ -47,38 +45,16 @@ fn rooms(num_scenes: usize) -> SyntheticSource {
     SyntheticSource::new(config).unwrap()
 }
 
-fn mini() -> ChunkSource {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/re10k-mini");
-    ChunkSource::open(&root, Split::Train, &SceneFilters::default()).unwrap()
-}
-
 fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
-    let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap());
-    entries.map(|entry| (entry.file_name().into_string().unwrap(), std::fs::read(entry.path()).unwrap())).collect()
-}
-
-fn same(a: &dyn SceneSource, b: &dyn SceneSource) {
-    assert_eq!(a.num_scenes(), b.num_scenes());
-    for scene in 0..a.num_scenes() {
-        let other = b.find(a.key(scene)).unwrap();
-        assert_eq!(a.timestamps(scene).unwrap(), b.timestamps(other).unwrap());
-        assert_eq!(a.url(scene).unwrap(), b.url(other).unwrap());
-        let (cameras, others) = (a.cameras(scene).unwrap(), b.cameras(other).unwrap());
-        assert_eq!(cameras.len(), others.len());
-        for (frame, (camera, other_camera)) in cameras.iter().zip(&others).enumerate() {
-            assert_eq!(a.frame(scene, frame).unwrap(), b.frame(other, frame).unwrap());
-            for (x, y) in camera.to_re10k().iter().zip(other_camera.to_re10k()) {
-                assert!((x - y).abs() < 1e-6 * (1.0 + x.abs()), "{x} {y}"); // f32 files
-            }
-        }
-    }
+    let file = |name: String| (name.clone(), std::fs::read(folder.join(name)).unwrap());
+    names(folder).into_iter().map(file).collect()
 }
 
 #[test]
 fn converted_scenes_keep_cameras_and_image_files() {
     for options in [CHUNKS, SCENES] {
         let folder = tempfile::tempdir().unwrap();
-        let source = mini();
+        let source = re10k_mini(Split::Train);
         let mut seen = Vec::new();
         let report = SkipReport::new(2);
         let converter = Converter::open(&source, &report, &folder.path().join("train"), &options).unwrap();
@@ -88,7 +64,7 @@ fn converted_scenes_keep_cameras_and_image_files() {
         assert_eq!(seen, [1, 2]);
         let OpenedSource { source: back, report, .. } = open(folder.path(), Split::Train);
         assert_eq!(report.num_used(), 2);
-        same(&source, back.as_ref());
+        assert_same(&source, back.as_ref());
         for scene in 0..2 {
             let other = back.find(source.key(scene)).unwrap();
             for frame in 0..8 {
@@ -100,15 +76,14 @@ fn converted_scenes_keep_cameras_and_image_files() {
 
 #[test]
 fn every_layout_is_converted() {
-    let layouts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/layouts");
     let open = |root: &Path| open(root, Split::Test).source;
     for name in ["re10k_txt", "re10k_folders", "dl3dv_flat", "capture", "colmap_bin", "scenes"] {
-        let source = open(&layouts.join(name));
+        let source = open(&fixture("layouts").join(name));
         for options in [CHUNKS, SCENES] {
             let folder = tempfile::tempdir().unwrap();
             let report = convert_all(source.as_ref(), &folder.path().join("test"), &options).unwrap();
             assert_eq!((report.num_scenes, &report.skipped.skips[..]), (source.num_scenes(), &[][..]), "{name}");
-            same(source.as_ref(), open(folder.path()).as_ref());
+            assert_same(source.as_ref(), open(folder.path()).as_ref());
         }
         if name.starts_with("re10k") {
             let times: Vec<i64> = (0..6).map(|frame| 1_000_000 + 33_367 * frame).collect();
@@ -122,7 +97,7 @@ fn frames_without_an_image_file_are_encoded() {
     let folder = tempfile::tempdir().unwrap();
     let report = convert_all(&rooms(3), &folder.path().join("test"), &CHUNKS).unwrap();
     assert_eq!((report.num_frames, report.num_encoded), (9, 9));
-    same(&rooms(3), open(folder.path(), Split::Test).source.as_ref());
+    assert_same(&rooms(3), open(folder.path(), Split::Test).source.as_ref());
 }
 
 /// Returns rooms that panic after `num_frames` frames have been read, like a killed process.
@@ -151,7 +126,7 @@ fn interrupted_conversion_ends_with_the_same_files() {
         let report = convert_all(&rooms(6), folder.path(), &options).unwrap();
         assert_eq!((report.num_scenes, report.num_found, report.num_frames), (6, 2, 12));
         let (got, expected) = (files(folder.path()), files(whole.path()));
-        assert_eq!(got.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
+        assert!(got.keys().eq(expected.keys()), "{:?}", got.keys());
         for name in got.keys().filter(|name| *name != "SHA256SUMS") {
             assert!(got[name] == expected[name], "{name}");
         }
@@ -186,7 +161,7 @@ fn skipped_scenes_are_reported_and_converted_later() {
 fn folder_of_other_scenes_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     convert_all(&rooms(3), folder.path(), &SCENES).unwrap();
-    let message = convert_all(&mini(), folder.path(), &SCENES).unwrap_err().to_string();
+    let message = convert_all(&re10k_mini(Split::Train), folder.path(), &SCENES).unwrap_err().to_string();
     assert!(message.contains("which the source does not have; choose another folder"), "{message}");
     assert!(!is_file_name("a/b") && !is_file_name("..") && is_file_name("1K-ab.c"));
     assert!(!"*?\"<>|".chars().any(|no| is_file_name(&format!("a{no}"))), "invalid on Windows");
@@ -198,7 +173,7 @@ fn scene_that_is_no_longer_readable_is_kept() {
     for options in [CHUNKS, SCENES] {
         let folder = tempfile::tempdir().unwrap();
         convert_all(&rooms(3), folder.path(), &options).unwrap();
-        let before = files(folder.path());
+        let before = names(folder.path());
         let again = |reason: &str| {
             let mut skipped = SkipReport::new(3);
             skipped.skip(rooms(3).key(2), reason);
@@ -207,7 +182,7 @@ fn scene_that_is_no_longer_readable_is_kept() {
         let report = again("its cameras cannot be read").unwrap();
         assert_eq!((report.num_scenes, report.num_found, report.skipped.num_used()), (3, 3, 3));
         assert!(report.skipped.notes[0].starts_with("1 scene unreadable now, kept as converted before ("));
-        assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), before.keys().collect::<Vec<_>>());
+        assert_eq!(names(folder.path()), before);
         // Scenes reserved for testing are refused in a training folder.
         for reason in [KEPT_FOR_TESTING, crate::sources::test_scenes::KEPT_AND_ABSENT] {
             let message = again(reason).unwrap_err().to_string();
@@ -224,7 +199,7 @@ fn outdated_index_is_removed_first() {
     let killed = interrupted(3, 0);
     let run = std::panic::AssertUnwindSafe(|| convert_all(&killed, folder.path(), &CHUNKS));
     assert!(std::panic::catch_unwind(run).is_err());
-    assert_eq!(files(folder.path()).keys().collect::<Vec<_>>(), ["000000.torch", "000002.torch", "SHA256SUMS"]);
+    assert_eq!(names(folder.path()), ["000000.torch", "000002.torch", "SHA256SUMS"]);
 }
 
 #[test]

@@ -5,7 +5,18 @@ use glam::{DMat3, DVec3};
 use crate::geometry::camera::Camera;
 use crate::geometry::pose::Pose;
 use crate::random::{step_rng, uniform_below};
-use crate::tools::features::correspondence::{Correspondence, WIDTH};
+
+/// Number of columns to which wider images are reduced. Distances are in pixels of this width.
+pub const WIDTH: usize = 640;
+
+/// Two corners that show the same point, in pixels of an image [`WIDTH`] columns wide.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Correspondence {
+    /// Column and row in the first image.
+    pub first: [f64; 2],
+    /// Column and row in the second image.
+    pub second: [f64; 2],
+}
 
 /// Largest distance of an inlier from its epipolar lines, in pixels.
 const MAX_INLIER_PX: f64 = 1.5;

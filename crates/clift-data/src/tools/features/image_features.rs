@@ -6,9 +6,8 @@
 use crate::image::lanczos::resize_lanczos;
 use crate::image::rgb_image::RgbImage;
 use crate::tools::features::corners::find_corners;
-use crate::tools::features::correspondence::{Correspondence, WIDTH};
 use crate::tools::features::descriptor::Descriptor;
-use crate::tools::features::epipolar::ransac_inliers;
+use crate::tools::features::epipolar::{Correspondence, WIDTH, ransac_inliers};
 use crate::tools::features::gray_image::GrayImage;
 use crate::tools::features::matching::match_mutually;
 

@@ -1,15 +1,13 @@
 //! Corners, matches and epipolar geometry. `image_features` joins the steps; the files are in the order of the steps.
 //!
-//! - `correspondence`: two corners, one point
 //! - `gray_image`: gray levels, blur, gradients
 //! - `corners`: Shi-Tomasi corners
 //! - `descriptor`: gradient histograms
 //! - `matching`: mutual nearest descriptors
-//! - `epipolar`: fundamental matrices, RANSAC
+//! - `epipolar`: correspondences of corners, fundamental matrices, RANSAC
 //! - `image_features`: corners of an image, matched
 
 pub(crate) mod corners;
-pub(crate) mod correspondence;
 pub(crate) mod descriptor;
 pub(crate) mod epipolar;
 pub(crate) mod gray_image;

@@ -53,7 +53,7 @@ fn describe_folder(root: &Path) -> anyhow::Result<Report> {
     let mut report = Report { path: root.to_owned(), ..Report::default() };
     let root = DatasetRoot::find(root)?;
     for split in present_splits(&root, Splits::Both) {
-        let name = if root.has_splits() { split.to_string() } else { "all".into() };
+        let name = if root.has_splits { split.to_string() } else { "all".into() };
         let described = match open_source(&root, split, &read_all_options()) {
             Ok(opened) => {
                 report.layout = Some(opened.kind);

@@ -2,12 +2,10 @@ use safetensors::SafeTensors;
 
 use super::*;
 use crate::sources::chunks::writer::{SceneRecord, write_chunks};
+use crate::testing::{fixture, re10k_mini};
+use crate::torch::pickle_writer::PickleWriter;
 
 const ALL: SceneFilters = SceneFilters { min_frames: 0, max_fov_deg: None };
-
-fn fixtures() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures")
-}
 
 /// A data set whose only training chunk has the given bytes and whose index lists the given scenes.
 fn with_chunk(bytes: &[u8], keys: &[&str]) -> (tempfile::TempDir, ChunkSource) {
@@ -21,21 +19,21 @@ fn with_chunk(bytes: &[u8], keys: &[&str]) -> (tempfile::TempDir, ChunkSource) {
 }
 
 fn mini_chunk() -> Vec<u8> {
-    std::fs::read(fixtures().join("re10k-mini/train/000000.torch")).unwrap()
+    std::fs::read(fixture("re10k-mini/train/000000.torch")).unwrap()
 }
 
 #[test]
 fn chunks_of_torch_save_are_read_by_frame() {
-    let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &ALL).unwrap();
+    let source = re10k_mini(Split::Train);
     assert_eq!(source.num_scenes(), 2);
-    assert_eq!(source.report().to_string(), "2 of 2 scenes used");
+    assert_eq!(source.report.to_string(), "2 of 2 scenes used");
     let scene = source.find("00000000000000a2").unwrap();
     assert_eq!(source.key(scene), "00000000000000a2");
     assert_eq!(source.url(scene).unwrap(), "https://example.org/00000000000000a2");
     let times: Vec<i64> = (0..8).map(|frame| 1_000_000 + 33_367 * frame).collect();
     assert_eq!(source.timestamps(scene).unwrap(), times);
 
-    let bytes = std::fs::read(fixtures().join("reference/re10k_mini.safetensors")).unwrap();
+    let bytes = std::fs::read(fixture("reference/re10k_mini.safetensors")).unwrap();
     let tensors = SafeTensors::deserialize(&bytes).unwrap();
     let frame = source.frame(scene, 3).unwrap();
     let expected = tensors.tensor("frame").unwrap();
@@ -54,15 +52,15 @@ fn chunks_of_torch_save_are_read_by_frame() {
 fn filters_skip_scenes_with_reasons() {
     let open = |min_frames, max_fov_deg| {
         let filters = SceneFilters { min_frames, max_fov_deg };
-        ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &filters).unwrap()
+        ChunkSource::open(&fixture("re10k-mini"), Split::Train, &filters).unwrap()
     };
     assert_eq!(open(8, Some(60.0)).num_scenes(), 2);
     let short = open(9, None);
     assert_eq!((short.num_scenes(), short.find("00000000000000a1")), (0, None));
-    assert_eq!(short.report().to_string(), "0 of 2 scenes used; 2 shorter than 9 frames");
+    assert_eq!(short.report.to_string(), "0 of 2 scenes used; 2 shorter than 9 frames");
     // fx = 0.9 of the width: 58.1 degrees.
     let wide = open(8, Some(58.0));
-    assert_eq!(wide.report().to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
+    assert_eq!(wide.report.to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
 }
 
 #[test]
@@ -78,7 +76,7 @@ fn errors_of_truncated_chunks_name_the_file() {
 
 #[test]
 fn chunks_that_call_os_system_are_refused() {
-    let bytes = std::fs::read(fixtures().join("hostile/calls_system.torch")).unwrap();
+    let bytes = std::fs::read(fixture("hostile/calls_system.torch")).unwrap();
     let (_folder, source) = with_chunk(&bytes, &["a"]);
     let message = source.cameras(0).unwrap_err().to_string();
     assert!(message.contains("`os.system`") && message.ends_with("000000.torch"), "{message}");
@@ -104,7 +102,7 @@ fn keys_missing_from_the_chunk_are_errors() {
 
 #[test]
 fn missing_frames_and_scenes_are_errors() {
-    let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Test, &ALL).unwrap();
+    let source = re10k_mini(Split::Test);
     let message = source.frame(0, 8).unwrap_err().to_string();
     assert_eq!(message, "scene 00000000000000b1 has 8 frames; frame 8 (counted from 0) does not exist");
     let message = source.frame(1, 0).unwrap_err().to_string();
@@ -159,7 +157,7 @@ fn scenes_of_failing_chunks_are_skipped_with_the_error() {
         let source = ChunkSource::open(folder.path(), Split::Train, filters).unwrap();
         assert_eq!((source.num_scenes(), source.key(0)), (1, "00000000000000a1"));
         assert!(source.find("00000000000000a2").is_none() && source.frame(0, 0).is_ok());
-        let report = source.report().to_string();
+        let report = source.report.to_string();
         assert!(report.starts_with(&format!("1 of 2 scenes used; {reason}")), "{report}");
         assert!(report.contains("2.torch"), "{report}");
     }
@@ -168,7 +166,7 @@ fn scenes_of_failing_chunks_are_skipped_with_the_error() {
 #[test]
 fn unreadable_cameras_are_skipped_by_the_field_of_view() {
     let folder = tempfile::tempdir().unwrap();
-    let source = ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &ALL).unwrap();
+    let source = re10k_mini(Split::Train);
     let records = (0..2).map(|scene| {
         let mut cameras = source.cameras(scene).unwrap();
         if scene == 0 {
@@ -182,7 +180,7 @@ fn unreadable_cameras_are_skipped_by_the_field_of_view() {
     let filters = SceneFilters { min_frames: 0, max_fov_deg: Some(100.0) };
     let source = ChunkSource::open(folder.path(), Split::Train, &filters).unwrap();
     assert_eq!((source.num_scenes(), source.key(0)), (1, "00000000000000a2"));
-    let skip = &source.report().skips[0];
+    let skip = &source.report.skips[0];
     assert!(skip.key == "00000000000000a1" && skip.reason.contains("frame 3: bad camera: "), "{skip:?}");
 }
 
@@ -192,52 +190,30 @@ fn invalid_fields_of_view_are_refused() {
         let filters = SceneFilters { min_frames: 0, max_fov_deg: Some(limit) };
         let message = filters.validate().unwrap_err().to_string();
         assert_eq!(message, format!("max_fov_deg is {limit}; use a positive number such as 100"));
-        assert!(ChunkSource::open(&fixtures().join("re10k-mini"), Split::Train, &filters).is_err());
+        assert!(ChunkSource::open(&fixture("re10k-mini"), Split::Train, &filters).is_err());
     }
     assert!(ALL.validate().is_ok());
 }
 
-/// An archive whose pickle is a list of `scenes`, after a tensor in memo slot 1 and a list of 10,000 references
-/// to it in slot 2.
+/// An archive whose pickle is a list of `scenes`, after a list of 10,000 references to one image in memo slot 2, their
+/// cameras in slot 3 and their time stamps in slot 4.
 fn sharing_chunk(scenes: &[u8]) -> Vec<u8> {
-    let mut pickle = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((X\x07\0\0\0storagectorch\nByteStorage\n\
-        X\x01\0\0\x000X\x03\0\0\0cpuK\0tQK\0K\0\x85K\x01\x85\x89ccollections\nOrderedDict\n)RtRq\x01"
-        .to_vec();
-    pickle.extend(b"](");
-    pickle.extend(b"h\x01".repeat(10_000));
-    pickle.extend(b"eq\x02](");
-    pickle.extend(scenes);
-    pickle.extend(b"e.");
-    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
-    let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
-    // 10,000 rows of cameras, and as many time stamps.
-    for (name, bytes) in [("data.pkl", pickle), ("data/0", Vec::new()), ("data/1", vec![0; 720_000])] {
-        zip.start_file(format!("bomb/{name}"), options).unwrap();
-        std::io::Write::write_all(&mut zip, &bytes).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
+    let mut pickle = PickleWriter::new();
+    pickle.tensor("ByteStorage", Vec::new(), &[0]);
+    pickle.raw(&[b"q\x01](", b"h\x01".repeat(10_000).as_slice(), b"eq\x02"].concat());
+    pickle.tensor("FloatStorage", vec![0; 720_000], &[10_000, 18]);
+    pickle.raw(b"q\x03");
+    pickle.tensor("LongStorage", vec![0; 80_000], &[10_000]);
+    pickle.raw(&[b"q\x04](", scenes, b"e."].concat());
+    pickle.pack("bomb").unwrap()
 }
 
-/// A scene with the 10,000 shared images and opcodes that give its address; the memo's slot 3 receives it.
+/// A scene with the 10,000 shared images and opcodes that give its address; the memo's slot 5 receives the address, and
+/// slot 6 the scene.
 fn sharing_scene(key: &str, url: &[u8]) -> Vec<u8> {
-    let mut scene = b"}(X\x06\0\0\0imagesh\x02X\x03\0\0\0keyX".to_vec();
-    scene.extend((key.len() as u32).to_le_bytes());
-    scene.extend(key.as_bytes());
-    scene.extend(b"X\x03\0\0\0url");
-    scene.extend(url);
-    for (name, storage, shape) in [
-        ("cameras", "FloatStorage", &b"M\x10\x27K\x12\x86K\x12K\x01\x86"[..]),
-        ("timestamps", "LongStorage", b"M\x10\x27\x85K\x01\x85"),
-    ] {
-        scene.push(b'X');
-        scene.extend((name.len() as u32).to_le_bytes());
-        scene.extend(format!("{name}ctorch._utils\n_rebuild_tensor_v2\n((").as_bytes());
-        scene.extend(format!("X\x07\0\0\0storagectorch\n{storage}\nX\x01\0\0\x001X\x03\0\0\0cpuK\0tQK\0").as_bytes());
-        scene.extend(shape);
-        scene.extend(b"\x89ccollections\nOrderedDict\n)RtR");
-    }
-    scene.extend(b"uq\x03");
-    scene
+    let shared = b"X\x06\0\0\0imagesh\x02X\x07\0\0\0camerash\x03X\x0a\0\0\0timestampsh\x04";
+    let length = (key.len() as u32).to_le_bytes();
+    [b"}(", &shared[..], b"X\x03\0\0\0keyX", &length, key.as_bytes(), b"X\x03\0\0\0url", url, b"uq\x06"].concat()
 }
 
 #[test]
@@ -249,13 +225,13 @@ fn shared_values_cannot_fill_the_memory() {
     let empty = b"X\0\0\0\0";
     assert_eq!(message(&sharing_scene("a", empty)), Ok(10_000), "the file is readable");
     // 2,000 million frames of 24 bytes, from 400 kB.
-    let repeated = [sharing_scene("a", empty), b"h\x03".repeat(200_000)].concat();
+    let repeated = [sharing_scene("a", empty), b"h\x06".repeat(200_000)].concat();
     assert!(message(&repeated).unwrap_err().contains("scene 1: key \"a\": it occurs twice"));
     let scenes: Vec<u8> = (0..1000).flat_map(|number| sharing_scene(&format!("{number}"), empty)).collect();
     assert!(message(&scenes).unwrap_err().contains("more than the limit of 131072 frames"));
-    let long = [b"X\0\0\x40\0", vec![b'u'; 0x40_0000].as_slice(), b"q\x04"].concat();
+    let long = [b"X\0\0\x40\0", vec![b'u'; 0x40_0000].as_slice(), b"q\x05"].concat();
     let scenes: Vec<u8> = (0..9)
-        .flat_map(|number| sharing_scene(&format!("{number}"), if number == 0 { &long } else { b"h\x04" }))
+        .flat_map(|number| sharing_scene(&format!("{number}"), if number == 0 { &long } else { b"h\x05" }))
         .collect();
     assert!(message(&scenes).unwrap_err().contains("more than the limit of 16777216 bytes"));
 }

@@ -41,9 +41,6 @@ pub(crate) struct ColmapCamera {
 
 impl ColmapCamera {
     /// Returns normalised intrinsics and the lens.
-    ///
-    /// # Errors
-    /// A description of an unsupported model or of invalid parameters.
     pub fn optics(&self) -> Result<(IntrinsicsNorm, Lens), String> {
         let (focal, centre, distortion) = match (self.model.as_str(), self.params.as_slice()) {
             ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], [0.0; 4]),
@@ -86,9 +83,6 @@ pub(crate) struct ColmapImage {
 
 impl ColmapImage {
     /// Returns the pose, camera to world.
-    ///
-    /// # Errors
-    /// [`DataError::BadCamera`] for a value that is not finite, and a quaternion whose length is not within 0.1 of 1.
     pub fn c2w(&self) -> Result<Pose, DataError> {
         let bad = |what: String| DataError::BadCamera { what };
         if let Some(value) = self.w2c.iter().find(|value| !value.is_finite()) {

@@ -8,7 +8,7 @@ use crate::files::listing::natural_order;
 use crate::sources::photos::colmap::model::Model;
 use crate::sources::photos::colmap::{binary, text};
 use crate::sources::photos::image_folder::ImageFolders;
-use crate::sources::photos::photo::{MissingPhoto, Photo, PhotoOptions, PhotoScene};
+use crate::sources::photos::photo::{Photo, PhotoOptions, PhotoScene};
 
 /// Returns the folder of the COLMAP model of a scene: the scene folder, or one of the usual subfolders.
 pub(crate) fn find_model(folder: &Path) -> Option<PathBuf> {
@@ -27,9 +27,6 @@ fn model_files(model: &Path) -> Option<([PathBuf; 2], bool)> {
 
 /// Reads the model in `model` and locates the images of the scene in `folder`. Frames are in the natural order of their
 /// names.
-///
-/// # Errors
-/// [`DataError::Io`], and [`DataError::BadScene`] for a malformed file or an unsupported camera.
 pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let Some(([cameras_path, images_path], is_binary)) = model_files(model) else {
         let what = "expected cameras.bin and images.bin, or cameras.txt and images.txt".into();
@@ -55,7 +52,7 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         let path = match found {
             Ok(path) => path,
             Err(reason) => {
-                scene.missing.push(MissingPhoto { name: image.name.clone(), reason });
+                scene.skip(&image.name, reason);
                 continue;
             }
         };
