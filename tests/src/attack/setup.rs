@@ -1,5 +1,6 @@
 //! The valid files that attacks start from: fixtures, and the files of a small run.
 
+use std::error::Error;
 use std::io::{Cursor, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -19,7 +20,7 @@ pub struct Setup {
 
 impl Setup {
     /// Trains the run and stores a scene of it with the command line.
-    pub fn make() -> Result<Self, Box<dyn std::error::Error>> {
+    pub fn make() -> Result<Self, Box<dyn Error>> {
         // In memory where possible: files are written once per execution.
         let memory = Path::new("/dev/shm");
         let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }?;
@@ -65,14 +66,10 @@ fn text(path: &Path) -> String {
 }
 
 /// Runs the command line beside this program.
-fn clift(args: &[&str]) -> Result<(), String> {
-    let program = std::env::current_exe().map_err(|error| error.to_string())?.with_file_name("clift-under-test");
-    let output = Command::new(&program)
-        .args(args)
-        .stdin(Stdio::null())
-        .output()
-        .map_err(|error| format!("{}: {error}", program.display()))?;
-    if output.status.success() { Ok(()) } else { Err(String::from_utf8_lossy(&output.stderr).into_owned()) }
+fn clift(args: &[&str]) -> Result<(), Box<dyn Error>> {
+    let program = std::env::current_exe()?.with_file_name("clift-under-test");
+    let output = Command::new(program).args(args).stdin(Stdio::null()).output()?;
+    if output.status.success() { Ok(()) } else { Err(String::from_utf8_lossy(&output.stderr).into()) }
 }
 
 /// The folder of the fixtures.

@@ -46,14 +46,13 @@ fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> PathBuf {
     let source = ChunkSource::open(&repository(MINI), Split::Train, &SceneFilters::default()).unwrap();
     let scenes = (0..source.num_scenes()).map(|scene| {
         let frames = 0..source.num_frames(scene)?;
+        let images = frames.filter_map(|frame| source.encoded_frame(scene, frame).transpose());
         let mut record = SceneRecord {
             key: source.key(scene).into(),
             url: source.url(scene)?,
             timestamps: source.timestamps(scene)?,
             cameras: source.cameras(scene)?,
-            images: frames
-                .filter_map(|frame| source.encoded_frame(scene, frame).transpose())
-                .collect::<Result<_, _>>()?,
+            images: images.collect::<Result<_, _>>()?,
         };
         if record.key == KEYS[1] {
             change(&mut record);

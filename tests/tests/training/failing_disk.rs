@@ -9,17 +9,20 @@ use crate::support::{BINARY, Place, STAGE_1, Shared, finish, start};
 const HALF: [&str; 4] = ["stage1.steps=24", "stage2.steps=12", "eval.every=12", "checkpoint={every=12, keep=2}"];
 static UNDISTURBED: Shared = Shared::new("run", &HALF);
 
+fn num_bytes(place: &Place, name: &str) -> u64 {
+    place.bytes(name).len() as u64
+}
+
 /// A limit on file sizes stops a save as a full disk does, without the right to mount one.
 #[test]
 fn failed_saves_keep_the_checkpoint_and_runs_resume() {
     let place = Place::new();
     place.copy(&UNDISTURBED, "whole");
     place.kill_at("saved/stage1/12", "run", &HALF);
-    let largest = |path: &Path| std::fs::metadata(path).expect("there").len();
-    let model = largest(&place.at("run/stage1/checkpoints/step-000000012/model.bpk"));
+    let model = num_bytes(&place, "run/stage1/checkpoints/step-000000012/model.bpk");
     // Blocks have 512 bytes or 1,024, by the shell; the config fits and the weights do not.
     let blocks = model / 1024 - 1;
-    assert!(largest(&place.at("run/config.toml")) < blocks * 512, "{model}");
+    assert!(num_bytes(&place, "run/config.toml") < blocks * 512, "{model}");
     let mut command = Command::new("sh");
     command.args(["-c", "trap '' XFSZ; ulimit -f $0; exec \"$@\"", &blocks.to_string(), BINARY]);
     let message = finish(start(command.args(place.train_args("run", &HALF)))).fails_with(
@@ -57,20 +60,15 @@ impl Drop for SmallDisk<'_> {
 fn full_disks_keep_the_checkpoint_and_runs_resume() {
     let place = Place::new();
     let folder = place.at("disk");
-    let Some(disk) = SmallDisk::mount(&folder, 4096) else {
-        println!("passed by: no right to mount a tmpfs");
-        return;
-    };
+    let Some(disk) = SmallDisk::mount(&folder, 4096) else { return println!("passed by: no right to mount a tmpfs") };
     place.copy(&UNDISTURBED, "whole");
     let run = "disk/run";
     place.kill_at("saved/stage1/12", run, &HALF);
     // Fills the disk up to less than a checkpoint takes.
-    let model =
-        std::fs::metadata(place.at("disk/run/stage1/checkpoints/step-000000012/model.bpk")).expect("there").len();
+    let model = num_bytes(&place, "disk/run/stage1/checkpoints/step-000000012/model.bpk");
     let free = || {
-        let output = Command::new("stat").args(["-f", "-c", "%a %S"]).arg(&folder).output().expect("stat runs");
-        let text = String::from_utf8(output.stdout).expect("text");
-        text.split_whitespace().map(|number| number.parse::<u64>().expect("a number")).product::<u64>()
+        let output = finish(start(Command::new("stat").args(["-f", "-c", "%a %S"]).arg(&folder)));
+        output.stdout.split_whitespace().map(|number| number.parse::<u64>().expect("a number")).product::<u64>()
     };
     std::fs::write(folder.join("ballast"), vec![1; (free() - model / 2) as usize]).expect("fits");
     let parts = ["No space left on device", "stage1 stopped after step 24; "];

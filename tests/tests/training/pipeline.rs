@@ -75,12 +75,11 @@ fn a_run_writes_every_documented_file() {
     // A header, then 6 views of 6 points and 2 baselines.
     assert_eq!(views.lines().count(), 1 + 6 * 8, "{views}");
 
-    let names = |folder: &str| place.names(folder);
-    assert_eq!(names("run/eval/sheets"), ["synthetic-0-test-00000.png"], "eval.num_sheets = 1");
-    assert_eq!(names("run/stage1/samples"), ["step-000000003.png", "step-000000006.png"], "eval.every = 3");
-    assert_eq!(names("run/stage2/samples"), ["step-000000003.png", "step-000000004.png"]);
+    assert_eq!(place.names("run/eval/sheets"), ["synthetic-0-test-00000.png"], "eval.num_sheets = 1");
+    assert_eq!(place.names("run/stage1/samples"), ["step-000000003.png", "step-000000006.png"], "eval.every = 3");
+    assert_eq!(place.names("run/stage2/samples"), ["step-000000003.png", "step-000000004.png"]);
     for folder in ["run/eval/sheets", "run/stage1/samples", "run/stage2/samples"] {
-        for name in names(folder) {
+        for name in place.names(folder) {
             let path = place.at(folder).join(name);
             let picture = image::open(&path).unwrap_or_else(|error| panic!("{path:?}: {error}")).into_rgb8();
             // Two targets below each other, at least five columns beside each other.
@@ -92,8 +91,12 @@ fn a_run_writes_every_documented_file() {
 
     let clusters = place.json("run/clusters/index.json");
     assert_eq!(list(&clusters["entries"]).len(), 6);
-    assert_eq!(names("run/stage1/checkpoints"), ["step-000000004", "step-000000006"], "every 2, the last 2 are kept");
-    assert_eq!(names("run/stage2/checkpoints"), ["step-000000002", "step-000000004"]);
+    assert_eq!(
+        place.names("run/stage1/checkpoints"),
+        ["step-000000004", "step-000000006"],
+        "every 2, the last 2 are kept"
+    );
+    assert_eq!(place.names("run/stage2/checkpoints"), ["step-000000002", "step-000000004"]);
     let part = |stage: &str, network: &str| place.weights("run", stage).part(network).0.len();
     for network in ["encoder.", "renderer."] {
         assert_eq!(part("stage1", network), part("stage2", network));
