@@ -73,7 +73,9 @@ fn a_first_stage_model_adds_the_uncondensed_variants() {
         .map(|key| {
             let mut values = state.read(key).unwrap();
             if key.contains("patch_to_image") {
-                values.iter_mut().for_each(|value| *value *= 0.9);
+                for value in &mut values {
+                    *value *= 0.9;
+                }
             }
             let shape = state.tensor(key).unwrap().1.iter().map(|&size| size as usize).collect();
             (key.to_owned(), shape, values)

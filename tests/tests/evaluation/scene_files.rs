@@ -71,7 +71,7 @@ fn scene_files_reproduce_the_evaluation() {
         let rows: Vec<Vec<f64>> = cameras[frame].c2w.to_matrix_f64().chunks(4).map(<[f64]>::to_vec).collect();
         json!({"c2w": rows})
     });
-    place.write("poses.json", &json!({"poses": poses.collect::<Vec<_>>()}).to_string());
+    place.write("poses.json", json!({"poses": poses.collect::<Vec<_>>()}).to_string());
 
     for (count, storage) in [(4, "f32"), (8, "f32"), (4, "f16"), (8, "f16"), (4, "int8"), (8, "int8")] {
         let name = format!("{count}-{storage}.clift");
@@ -202,7 +202,7 @@ fn what_cannot_be_drawn_says_what_to_do() {
     // The second pose is an invalid camera: the command also writes no frame of the first.
     let pose = json!({"c2w": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]});
     let far = json!({"c2w": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0]]});
-    place.write("poses.json", &json!({"poses": [pose, far]}).to_string());
+    place.write("poses.json", json!({"poses": [pose, far]}).to_string());
     render("--path DIR/poses.json").fails_with(1, &["pose 1: bad camera: the camera is "]);
     let counted = "a file of poses determines the number of frames";
     render("--path DIR/poses.json --frames 3").fails_with(2, &[counted]);

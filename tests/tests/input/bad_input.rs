@@ -26,7 +26,7 @@ fn train_on_mini(place: &Place, set: &[&str]) -> Ran {
 /// Key that names the evaluation index of the folder, and the index with this text.
 fn index(place: &Place, text: &str) -> String {
     place.write("index.json", text);
-    format!("eval.index={:?}", place.at("index.json"))
+    format!("eval.index=\"{}\"", place.at("index.json").display())
 }
 
 /// Copies the mini data set, with its two training scenes in a chunk each.
@@ -35,7 +35,7 @@ fn two_chunks(place: &Place) -> PathBuf {
     copy_folder(&repository(MINI), &data);
     std::fs::copy(data.join("train/000000.torch"), data.join("train/000001.torch")).unwrap();
     let index = serde_json::json!({KEYS[0]: "000000.torch", KEYS[1]: "000001.torch"});
-    place.write("data/train/index.json", &index.to_string());
+    place.write("data/train/index.json", index.to_string());
     data
 }
 
@@ -230,7 +230,7 @@ fn truncated_weights_and_stale_caches_are_refused() {
     let good = place.text("run/clusters/index.json");
     let mut stale = place.json("run/clusters/index.json");
     stale["encoder"] = "0123456789abcdef".into();
-    place.write("run/clusters/index.json", &stale.to_string());
+    place.write("run/clusters/index.json", stale.to_string());
     let what = "stale cluster cache: its tokens are of encoder 0123456789ab, the run's is ";
     place.train("run", &[]).fails_with(1, &[what, "remove the cache to build a new one"]);
     assert!(!place.at("run/stage2").exists(), "nothing is trained on it");

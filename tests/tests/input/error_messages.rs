@@ -75,7 +75,7 @@ fn every_wrong_input_gives_its_message() {
     let mut differing = Vec::new();
     for (name, from, to) in CONFIGS {
         assert!(RIGHT.contains(from), "{name}: the config does not hold {from}");
-        place.write("wrong.toml", &RIGHT.replacen(from, to, 1).replace("DIR", &dir));
+        place.write("wrong.toml", RIGHT.replacen(from, to, 1).replace("DIR", &dir));
         differing.extend(differs(name, &place.clift("train DIR/wrong.toml"), &dir));
         assert!(!place.at("run").exists(), "{name}: a refused config leaves nothing behind");
     }
