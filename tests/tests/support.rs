@@ -9,25 +9,6 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// The smallest run that has everything: two 16 x 16 views of 4 tokens each, 8 rooms, a fraction of a second.
-///
-/// Replaces every section, so that changes of `configs/tiny.toml` do not affect these tests.
-const MICRO: [&str; 9] = [
-    "seed=0",
-    "device=flex",
-    "data={source='synthetic', width=16, height=16, \
-        synthetic={num_scenes=8, num_frames=8, width=16, height=16, samples_per_pixel=1}, \
-        views={min_context=2, max_context=2, min_gap=[3, 3], max_gap=[6, 6], warm_up_steps=0, num_targets=2}}",
-    "model={dim=16, num_heads=2, feed_forward_dim=24, num_encoder_blocks=1, num_renderer_blocks=1, \
-        condenser={num_blocks=1}}",
-    "stage1={steps=6, batch_size=2, optimizer={learning_rate=1e-3, warm_up_steps=2}}",
-    "clusters={grid=[0.5, 1.0], num_passes=1, num_scenes=6}",
-    "stage2={steps=4, batch_size=2, optimizer={learning_rate=1e-3, warm_up_steps=1}}",
-    "checkpoint={every=2, keep=2}",
-    "eval={storage=[0.5, 1.0], num_scenes=3, num_context=2, num_targets=2, num_sheets=1, every=3, \
-        num_validation_scenes=1}",
-];
-
 /// A file of the repository.
 pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the repository").join(path)
@@ -43,6 +24,7 @@ pub struct Ran {
 
 impl Ran {
     /// Expects success.
+    #[track_caller]
     pub fn ok(self) -> Self {
         assert_eq!(self.code, Some(0), "stdout:\n{}\nstderr:\n{}", self.stdout, self.stderr);
         self
@@ -56,24 +38,41 @@ impl Ran {
         self.stderr
     }
 
-    /// Expects this exit code and these parts of the error.
+    /// Expects this exit code and these parts of the error; returns the error stream.
     #[track_caller]
-    pub fn fails_with(self, code: i32, parts: &[&str]) {
+    pub fn fails_with(self, code: i32, parts: &[&str]) -> String {
         let message = self.fails(code);
         for part in parts {
             assert!(message.contains(part), "{part}\nis not in\n{message}");
         }
+        message
+    }
+
+    /// Expects this exit code, these parts of the error and its end, which names a file or what to do.
+    #[track_caller]
+    pub fn fails_naming(self, code: i32, parts: &[&str], end: &str) {
+        let message = self.fails_with(code, parts);
+        assert!(message.trim_end().ends_with(end), "{end}\nis not the end of\n{message}");
+    }
+
+    /// Expects a part of the output.
+    #[track_caller]
+    pub fn prints(self, part: &str) -> Self {
+        assert!(self.stdout.contains(part), "{part}\nis not in\n{}", self.stdout);
+        self
+    }
+
+    /// Expects a part of the error stream.
+    #[track_caller]
+    pub fn notes(self, part: &str) -> Self {
+        assert!(self.stderr.contains(part), "{part}\nis not in\n{}", self.stderr);
+        self
     }
 }
 
-/// Runs the command line to its end.
+/// Runs the command line, for words with spaces in them.
 pub fn clift<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Ran {
-    finish(spawn(args))
-}
-
-/// Starts the command line.
-pub fn spawn<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Child {
-    start(Command::new(BINARY).args(args))
+    finish(start(Command::new(BINARY).args(args)))
 }
 
 /// The command line as a program.
@@ -85,29 +84,19 @@ pub fn start(command: &mut Command) -> Child {
     piped.spawn().expect("the binary under test starts")
 }
 
-/// Runs a training that must kill itself at `moment` (see `clift-killed`).
-pub fn killed_at(moment: &str, args: &[String]) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_clift-killed"));
-    let ran = finish(start(command.arg(moment).args(args)));
-    assert_eq!(ran.code, None, "{moment}: stdout:\n{}\nstderr:\n{}", ran.stdout, ran.stderr);
-}
-
 /// Sends a signal to a command.
 pub fn signal(child: &Child, name: &str) {
     let sent = Command::new("kill").args([name, &child.id().to_string()]).status().expect("kill runs");
     assert!(sent.success(), "the run is still there to be stopped");
 }
 
-/// Waits until a run has made `count` steps.
-pub fn wait_for_steps(run: &Path, child: &mut Child, count: usize) {
+/// Waits until a command has come as far as `is_there` says.
+#[track_caller]
+pub fn wait_until(child: &mut Child, what: &str, is_there: impl Fn() -> bool) {
     let started = Instant::now();
-    loop {
-        let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
-        if text.lines().count() >= count {
-            return;
-        }
-        assert!(child.try_wait().expect("a child").is_none(), "the run ended before step {count}");
-        assert!(started.elapsed() < Duration::from_mins(1), "no step {count} within a minute");
+    while !is_there() {
+        assert!(child.try_wait().expect("a child").is_none(), "the command ended before {what}");
+        assert!(started.elapsed() < Duration::from_mins(1), "no {what} within a minute");
         std::thread::sleep(Duration::from_millis(2));
     }
 }
@@ -121,20 +110,20 @@ pub fn finish(child: Child) -> Ran {
 
 /// A micro run that several tests copy, trained once.
 pub struct Shared {
+    words: &'static str,
     set: &'static [&'static str],
-    flags: &'static [&'static str],
     files: OnceLock<BTreeMap<PathBuf, Vec<u8>>>,
 }
 
 /// The whole micro run, with its evaluation.
-pub static WHOLE: Shared = Shared::new(&[], &[]);
+pub static WHOLE: Shared = Shared::new("run", &[]);
 /// Its first stage.
-pub static STAGE_1: Shared = Shared::new(&[], &["--only", "stage1"]);
+pub static STAGE_1: Shared = Shared::new("run --only stage1", &[]);
 
 impl Shared {
-    /// The micro run with changed keys and further flags.
-    pub const fn new(set: &'static [&'static str], flags: &'static [&'static str]) -> Self {
-        Self { set, flags, files: OnceLock::new() }
+    /// The micro run `run` with flags and changed keys, see [`Place::train`].
+    pub const fn new(words: &'static str, set: &'static [&'static str]) -> Self {
+        Self { words, set, files: OnceLock::new() }
     }
 }
 
@@ -146,25 +135,57 @@ impl Place {
         Self(tempfile::tempdir().expect("a temporary folder"))
     }
 
+    /// A folder with a copy of a shared run in `run`.
+    pub fn with(shared: &Shared) -> Self {
+        let place = Self::new();
+        place.copy(shared, "run");
+        place
+    }
+
     /// Path of an item of the folder.
     pub fn at(&self, name: &str) -> PathBuf {
         self.0.path().join(name)
     }
 
-    /// Arguments that train the micro run `name` with changed keys and further flags.
-    pub fn train_args(&self, name: &str, set: &[&str], flags: &[&str]) -> Vec<String> {
-        let mut args = vec!["train".into(), repository("configs/tiny.toml").display().to_string()];
+    /// The words of a text, where `DIR` is the folder and `REPO` the repository.
+    fn words(&self, text: &str) -> Vec<String> {
+        let (dir, repository) = (self.at("").display().to_string(), repository("").display().to_string());
+        text.split_whitespace().map(|word| word.replace("DIR/", &dir).replace("REPO/", &repository)).collect()
+    }
+
+    /// Arguments that train the micro run of a name, which flags may follow, with changed keys.
+    pub fn train_args(&self, words: &str, set: &[&str]) -> Vec<String> {
+        let (name, flags) = words.split_once(' ').unwrap_or((words, ""));
         let run_dir = format!("run_dir=\"{}\"", self.at(name).display());
-        for text in MICRO.iter().chain(&[run_dir.as_str()]).chain(set) {
-            args.extend(["--set".into(), (*text).into()]);
-        }
-        args.extend(flags.iter().map(|&flag| flag.into()));
+        let mut args = self.words(&format!("train REPO/tests/micro.toml {flags}"));
+        args.extend([run_dir.as_str()].iter().chain(set).flat_map(|text| ["--set".into(), (*text).into()]));
         args
     }
 
-    /// Trains the micro run `name` to its end.
-    pub fn train(&self, name: &str, set: &[&str], flags: &[&str]) -> Ran {
-        clift(self.train_args(name, set, flags))
+    /// Trains the micro run of a name, which flags may follow, with changed keys to its end.
+    pub fn train(&self, words: &str, set: &[&str]) -> Ran {
+        finish(self.start_train(words, set))
+    }
+
+    /// Starts such a training.
+    pub fn start_train(&self, words: &str, set: &[&str]) -> Child {
+        start(Command::new(BINARY).args(self.train_args(words, set)))
+    }
+
+    /// Runs a training that must kill itself at `moment` (see `clift-killed`).
+    #[track_caller]
+    pub fn kill_at(&self, moment: &str, words: &str, set: &[&str]) {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_clift-killed"));
+        let ran = finish(start(command.arg(moment).args(self.train_args(words, set))));
+        assert_eq!(ran.code, None, "{moment}: stdout:\n{}\nstderr:\n{}", ran.stdout, ran.stderr);
+    }
+
+    /// Waits until a run has made `count` steps.
+    #[track_caller]
+    pub fn wait_for_steps(&self, run: &str, child: &mut Child, count: usize) {
+        let metrics = self.at(&format!("{run}/metrics.jsonl"));
+        let num_steps = || std::fs::read_to_string(&metrics).unwrap_or_default().lines().count();
+        wait_until(child, &format!("step {count}"), || num_steps() >= count);
     }
 
     /// Copies a shared run to `name`, as if it had been trained here.
@@ -177,35 +198,33 @@ impl Place {
         };
         let files = shared.files.get_or_init(|| {
             let place = Self::new();
-            place.train("run", shared.set, shared.flags).ok();
+            place.train(shared.words, shared.set).ok();
             let run = place.at("run");
-            let relative = |path: &Path| path.strip_prefix(&run).expect("below").to_owned();
-            let mut found: BTreeMap<_, _> =
-                files(&run).into_iter().map(|(path, bytes)| (relative(&path), bytes)).collect();
+            let mut found = files(&run);
             let text = found.get_mut(config).expect("a config");
             *text = moved(text, &run, Path::new("RUN"));
             found
         });
+        let run = self.at(name);
         for (path, bytes) in files {
-            let to = self.at(name).join(path);
-            std::fs::create_dir_all(to.parent().expect("a folder")).expect("writable");
-            let run = self.at(name);
             let moved = (path == config).then(|| moved(bytes, Path::new("RUN"), &run));
-            std::fs::write(to, moved.as_ref().unwrap_or(bytes)).expect("writable");
+            self.write(&format!("{name}/{}", path.display()), moved.as_ref().unwrap_or(bytes));
         }
     }
 
     /// Runs the command line with the words of a text, where `DIR` is the folder and `REPO` the repository.
     pub fn clift(&self, words: &str) -> Ran {
-        let (dir, repository) = (self.at("").display().to_string(), repository("").display().to_string());
-        let path = |word: &str| word.replace("DIR/", &dir).replace("REPO/", &repository);
-        clift(words.split_whitespace().map(path))
+        finish(self.start(words))
     }
 
-    /// Evaluates the run `name`.
-    pub fn eval(&self, name: &str, flags: &[&str]) -> Ran {
-        let run = self.at(name).display().to_string();
-        clift(["eval", &run].iter().chain(flags))
+    /// Starts the command line with such words.
+    pub fn start(&self, words: &str) -> Child {
+        start(Command::new(BINARY).args(self.words(words)))
+    }
+
+    /// Evaluates the run of a name, which flags may follow.
+    pub fn eval(&self, words: &str) -> Ran {
+        self.clift(&format!("eval DIR/{words}"))
     }
 
     /// Reads a file of the folder.
@@ -223,10 +242,15 @@ impl Place {
         serde_json::from_slice(&self.bytes(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
     }
 
+    /// Reads a file of the folder with a JSON value on each line.
+    pub fn json_lines(&self, name: &str) -> Vec<Value> {
+        let text = self.text(name);
+        text.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}"))).collect()
+    }
+
     /// The lines of a run's `metrics.jsonl`.
     pub fn metrics(&self, run: &str) -> Vec<Value> {
-        let text = self.text(&format!("{run}/metrics.jsonl"));
-        text.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}"))).collect()
+        self.json_lines(&format!("{run}/metrics.jsonl"))
     }
 
     /// The lines of a run's `metrics.jsonl` without times.
@@ -240,12 +264,12 @@ impl Place {
 
     /// The weights of a stage of a run.
     pub fn weights(&self, run: &str, stage: &str) -> Weights {
-        Weights::read(&self.at(&format!("{run}/{stage}/model.safetensors")))
+        self.model(&format!("{run}/{stage}"))
     }
 
     /// The weights of a model directory.
     pub fn model(&self, name: &str) -> Weights {
-        Weights::read(&self.at(&format!("{name}/model.safetensors")))
+        Weights::read(&self.bytes(&format!("{name}/model.safetensors")))
     }
 
     /// Expects the same clusters and the same weights of both stages, bit for bit.
@@ -266,14 +290,12 @@ impl Place {
         let compared = |run: &str| {
             let mut files = files(&self.at(run));
             // The report holds the date, `views.csv` times, and `config.toml` the path of its run.
-            let is_result = |path: &Path| {
-                let name = path.strip_prefix(self.at(run)).expect("below").display().to_string();
-                let (others, progress) = (["metrics.jsonl", "config.toml", "lock"], name.contains("/checkpoints/"));
-                !(others.contains(&name.as_str()) || name.starts_with("eval/") || progress)
-            };
-            files.retain(|path, _| is_result(path));
-            let name = |path: PathBuf| path.strip_prefix(self.at(run)).expect("below").to_owned();
-            files.into_iter().map(|(path, bytes)| (name(path), bytes)).collect::<BTreeMap<_, _>>()
+            files.retain(|path, _| {
+                let name = path.display().to_string();
+                let other = ["metrics.jsonl", "config.toml", "lock"].contains(&name.as_str());
+                !other && !name.starts_with("eval/") && !name.contains("/checkpoints/")
+            });
+            files
         };
         let (files, expected) = (compared(run), compared(other));
         assert!(files.keys().eq(expected.keys()), "{:?} is not {:?}", files.keys(), expected.keys());
@@ -296,21 +318,48 @@ impl Place {
         summary
     }
 
+    /// Names of the items of a folder, in order.
+    #[track_caller]
+    pub fn names(&self, folder: &str) -> Vec<String> {
+        let items = std::fs::read_dir(self.at(folder)).unwrap_or_else(|error| panic!("{folder}: {error}"));
+        let name = |item: std::io::Result<std::fs::DirEntry>| item.expect("readable").file_name().into_string();
+        let mut names: Vec<_> = items.map(|item| name(item).expect("text")).collect();
+        names.sort();
+        names
+    }
+
     /// The steps of a stage's checkpoints.
     pub fn checkpoints(&self, run: &str, stage: &str) -> Vec<u64> {
-        let folder = std::fs::read_dir(self.at(&format!("{run}/{stage}/checkpoints"))).expect("a folder");
-        let name = |item: std::io::Result<std::fs::DirEntry>| item.expect("readable").file_name().into_string();
-        let step = |name: String| name.strip_prefix("step-").and_then(|step| step.parse().ok());
-        let mut steps: Vec<u64> =
-            folder.map(|item| name(item).expect("text")).map(|name| step(name.clone()).expect(&name)).collect();
-        steps.sort_unstable();
-        steps
+        let names = self.names(&format!("{run}/{stage}/checkpoints"));
+        let step = |name: &String| name.strip_prefix("step-").and_then(|step| step.parse().ok());
+        names.iter().map(|name| step(name).expect(name)).collect()
+    }
+
+    /// Expects a message that ends with the last good checkpoint of stage 1, the only one there is.
+    #[track_caller]
+    pub fn assert_names_last_checkpoint(&self, run: &str, step: u64, message: &str) {
+        let checkpoint = self.at(&format!("{run}/stage1/checkpoints/step-{step:09}"));
+        let end = format!("the last good checkpoint is {}", checkpoint.display());
+        assert!(message.trim_end().ends_with(&end), "{message}");
+        assert_eq!(self.checkpoints(run, "stage1"), [step], "nothing half-written lies beside it");
     }
 
     /// The progress in the last checkpoint of a stage.
     pub fn progress(&self, run: &str, stage: &str) -> Value {
         let step = *self.checkpoints(run, stage).last().expect("a checkpoint");
         self.json(&format!("{run}/{stage}/checkpoints/step-{step:09}/state.json"))["progress"].take()
+    }
+
+    /// The points of an evaluation.
+    pub fn points(&self, eval: &str) -> Vec<Value> {
+        list(&self.json(&format!("{eval}/summary.json"))["points"]).to_vec()
+    }
+
+    /// Writes a file, and its folder where there is none.
+    pub fn write(&self, name: &str, text: impl AsRef<[u8]>) {
+        let path = self.at(name);
+        std::fs::create_dir_all(path.parent().expect("a folder")).expect("writable");
+        std::fs::write(path, text).expect("writable");
     }
 
     /// Cuts a file in half.
@@ -320,29 +369,44 @@ impl Place {
     }
 }
 
-/// Copies a folder with everything in it.
+/// A list of a JSON file.
+#[track_caller]
+pub fn list(value: &Value) -> &[Value] {
+    value.as_array().unwrap_or_else(|| panic!("{value} is not a list"))
+}
+
+/// A number of a JSON object.
+#[track_caller]
+pub fn number(value: &Value, key: &str) -> f64 {
+    value[key].as_f64().unwrap_or_else(|| panic!("{key} is not a number: {value}"))
+}
+
+/// The first point of an evaluation with these values.
+#[track_caller]
+pub fn point<'a>(points: &'a [Value], variant: &str, num_storage_tokens: usize) -> &'a Value {
+    let is_it = |point: &&Value| point["variant"] == variant && point["num_storage_tokens"] == num_storage_tokens;
+    points.iter().find(is_it).unwrap_or_else(|| panic!("no {variant} of {num_storage_tokens} tokens"))
+}
+
+/// Copies the files of a folder.
 pub fn copy_folder(from: &Path, to: &Path) {
-    std::fs::create_dir_all(to).expect("writable");
-    for item in std::fs::read_dir(from).expect("a folder") {
-        let item = item.expect("readable").path();
-        let name = to.join(item.file_name().expect("named"));
-        if item.is_dir() {
-            copy_folder(&item, &name);
-        } else {
-            std::fs::copy(&item, &name).expect("writable");
-        }
+    for (path, bytes) in files(from) {
+        let to = to.join(path);
+        std::fs::create_dir_all(to.parent().expect("a folder")).expect("writable");
+        std::fs::write(to, bytes).expect("writable");
     }
 }
 
-/// Every file below a folder, with its bytes.
+/// Every file below a folder by its path in it, with its bytes.
 pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     for item in std::fs::read_dir(folder).expect("a folder") {
         let path = item.expect("readable").path();
+        let name = Path::new(path.file_name().expect("named"));
         if path.is_dir() {
-            found.extend(files(&path));
+            found.extend(files(&path).into_iter().map(|(below, bytes)| (name.join(below), bytes)));
         } else {
-            found.insert(path.clone(), std::fs::read(&path).expect("readable"));
+            found.insert(name.to_owned(), std::fs::read(&path).expect("readable"));
         }
     }
     found
@@ -350,14 +414,16 @@ pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 
 /// Texts of the repository's files with these endings below some folders, by their paths in it.
 pub fn sources(folders: &[&str], endings: &[&str]) -> BTreeMap<String, String> {
-    let root = repository("");
-    let all = folders.iter().flat_map(|folder| files(&repository(folder)));
     let has_ending = |path: &Path| path.extension().is_some_and(|ending| endings.iter().any(|one| ending == *one));
-    let text = |(path, bytes): (PathBuf, Vec<u8>)| {
-        let name = path.strip_prefix(&root).expect("a file of the repository").display().to_string();
-        (name, String::from_utf8(bytes).expect("sources are UTF-8"))
-    };
-    all.filter(|(path, _)| has_ending(path)).map(text).collect()
+    let mut found = BTreeMap::new();
+    for folder in folders {
+        let files = files(&repository(folder)).into_iter().filter(|(path, _)| has_ending(path));
+        found.extend(files.map(|(path, bytes)| {
+            let text = String::from_utf8(bytes).expect("sources are UTF-8");
+            (format!("{folder}/{}", path.display()), text)
+        }));
+    }
+    found
 }
 
 /// Parameters by name.
@@ -366,9 +432,8 @@ pub struct Weights(pub BTreeMap<String, Vec<f32>>);
 
 impl Weights {
     /// Reads a weight file. Files of equal weights differ in bytes: Burn writes the header's metadata in any order.
-    fn read(path: &Path) -> Self {
-        let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-        let file = safetensors::SafeTensors::deserialize(&bytes).expect("valid safetensors");
+    fn read(bytes: &[u8]) -> Self {
+        let file = safetensors::SafeTensors::deserialize(bytes).expect("valid safetensors");
         let values = |data: &[u8]| data.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
         let tensors = file.tensors().into_iter().map(|(name, view)| {
             assert_eq!(view.dtype(), safetensors::Dtype::F32, "{name}");

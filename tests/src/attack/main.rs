@@ -116,7 +116,7 @@ fn hush_panics() -> Messages {
 fn attack(target: &Target, setup: &Setup, args: &Args, messages: &Messages) -> Attacked {
     let seeds = (target.seeds)(setup, target.file);
     let mut read = (target.open)(setup, target.file);
-    let mut row = Attacked::new(target.name);
+    let mut row = Attacked { name: target.name, ..Attacked::default() };
     for (i, seed) in seeds.iter().enumerate() {
         if let Err(error) = read(seed) {
             row.find(format!("valid file {i} is refused: {error}"), None);

@@ -4,28 +4,8 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// Boundary values of lengths and counts.
-const NUMBERS: [u64; 20] = [
-    0,
-    1,
-    2,
-    3,
-    7,
-    8,
-    127,
-    128,
-    255,
-    256,
-    0x7fff,
-    0x8000,
-    0xffff,
-    0x1_0000,
-    0x7fff_ffff,
-    0x8000_0000,
-    0xffff_ffff,
-    0x1_0000_0000,
-    0x7fff_ffff_ffff_ffff,
-    u64::MAX,
-];
+const NUMBERS: &str = "0 1 2 3 7 8 127 128 255 256 32767 32768 65535 65536 2147483647 2147483648 4294967295 4294967296 \
+    9223372036854775807 18446744073709551615";
 
 /// Replacements of numbers in texts.
 const TEXTS: &str = "0 -1 1 2 65536 4294967296 9223372036854775807 9223372036854775808 18446744073709551615 \
@@ -117,7 +97,7 @@ fn overwrite_number(bytes: &mut [u8], at: usize, rng: &mut ChaCha8Rng) {
             there[..end - at].copy_from_slice(&bytes[at..end]);
             u64::from_le_bytes(there).wrapping_add(rng.random_range(0..17)).wrapping_sub(8)
         }
-        _ => NUMBERS[below(rng, NUMBERS.len())],
+        _ => word_of(NUMBERS, rng).parse().expect("a number"),
     };
     let little = number.to_le_bytes();
     let mut part = little[..width].to_vec();
@@ -132,9 +112,13 @@ fn overwrite_number(bytes: &mut [u8], at: usize, rng: &mut ChaCha8Rng) {
 fn replace_digits(bytes: &mut Vec<u8>, at: usize, rng: &mut ChaCha8Rng) {
     let Some(start) = (at..bytes.len()).find(|&i| bytes[i].is_ascii_digit()) else { return };
     let end = (start..bytes.len()).find(|&i| !bytes[i].is_ascii_digit()).unwrap_or(bytes.len());
-    let texts: Vec<&str> = TEXTS.split(' ').collect();
-    let text = texts[below(rng, texts.len())];
-    bytes.splice(start..end, text.bytes());
+    bytes.splice(start..end, word_of(TEXTS, rng).bytes());
+}
+
+/// One of the words of a text.
+fn word_of(text: &'static str, rng: &mut ChaCha8Rng) -> &'static str {
+    let words: Vec<&str> = text.split(' ').collect();
+    words[below(rng, words.len())]
 }
 
 /// A hash of a name, the same on every platform (FNV-1a).

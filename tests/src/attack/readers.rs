@@ -125,7 +125,7 @@ pub fn weights(setup: &Setup, _: &'static str) -> Read {
 /// Resumes from a checkpoint with one damaged file, whose checksum is corrected: otherwise no other check is reached.
 pub fn checkpoint(setup: &Setup, name: &'static str) -> Read {
     let folder = setup.fresh(&format!("checkpoint-{name}"));
-    let step = folder.join("step-000000002");
+    let step = folder.join("step-000000006");
     copy_folder(&setup.checkpoint(), &step);
     let mut state: serde_json::Value = serde_json::from_slice(&read(&step.join("state.json"))).expect("a valid state");
     let model = setup.model();
@@ -150,7 +150,7 @@ pub fn checkpoint(setup: &Setup, name: &'static str) -> Read {
 /// Reads every entry of a cluster cache with one damaged file.
 pub fn clusters(setup: &Setup, file: &'static str) -> Read {
     let root = setup.fresh(&file.replace('/', "-"));
-    copy_folder(&setup.run().join("clusters"), &root.join("clusters"));
+    copy_folder(&setup.at("run/clusters"), &root.join("clusters"));
     let config = setup.config.clone();
     let index: serde_json::Value =
         serde_json::from_slice(&read(&root.join("clusters/index.json"))).expect("a valid index");

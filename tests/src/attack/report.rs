@@ -10,9 +10,10 @@ pub const MOST_FINDINGS: usize = 20;
 pub const MOST_MESSAGE: usize = 20_000;
 
 /// Results of one reader.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Attacked {
-    name: &'static str,
+    /// Name of the reader.
+    pub name: &'static str,
     /// Inputs read.
     pub executions: u64,
     /// Inputs accepted.
@@ -28,11 +29,6 @@ pub struct Attacked {
 }
 
 impl Attacked {
-    pub fn new(name: &'static str) -> Self {
-        let (slowest, findings) = (Duration::ZERO, Vec::new());
-        Self { name, executions: 0, accepted: 0, slowest, peak_bytes: 0, seconds: 0.0, findings }
-    }
-
     /// Records a finding and the file that shows it.
     pub fn find(&mut self, what: String, saved: Option<String>) {
         if self.findings.iter().all(|known| !known.starts_with(&what)) {

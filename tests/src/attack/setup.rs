@@ -1,5 +1,6 @@
 //! The valid files that attacks start from: fixtures, and the files of a small run.
 
+use std::error::Error;
 use std::io::{Cursor, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -10,20 +11,6 @@ use tempfile::TempDir;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-/// The smallest run that has everything.
-const RUN: &str = "\
-seed = 0
-data = { width = 16, height = 16, \
-    synthetic = { num_scenes = 4, num_frames = 8, width = 16, height = 16, samples_per_pixel = 1 }, \
-    views = { min_context = 2, max_context = 2, min_gap = [3, 3], max_gap = [6, 6], warm_up_steps = 0, num_targets = 2 } }
-model = { dim = 16, num_heads = 2, feed_forward_dim = 24, num_encoder_blocks = 1, num_renderer_blocks = 1, \
-    condenser = { num_blocks = 1 } }
-stage1 = { steps = 2, batch_size = 1 }
-clusters = { grid = [0.5, 1.0], num_passes = 1, num_scenes = 3 }
-stage2 = { steps = 1, batch_size = 1 }
-eval = { storage = [0.5], num_scenes = 1, num_context = 2, num_targets = 1, num_sheets = 0, num_validation_scenes = 1 }
-";
-
 /// A folder with a run, its scene files, and damaged copies.
 pub struct Setup {
     folder: TempDir,
@@ -33,28 +20,22 @@ pub struct Setup {
 
 impl Setup {
     /// Trains the run and stores a scene of it with the command line.
-    pub fn make() -> Result<Self, String> {
+    pub fn make() -> Result<Self, Box<dyn Error>> {
         // In memory where possible: files are written once per execution.
         let memory = Path::new("/dev/shm");
-        let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
-        let folder = folder.map_err(|error| error.to_string())?;
+        let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }?;
         let place = |name: &str| folder.path().join(name);
         let run = place("run");
-        std::fs::write(place("run.toml"), format!("run_dir = {:?}\n{RUN}", run.display().to_string()))
-            .map_err(|error| error.to_string())?;
-        clift(&["train", &text(&place("run.toml"))])?;
+        let run_dir = format!("run_dir={:?}", text(&run));
+        let micro = text(&Path::new(env!("CARGO_MANIFEST_DIR")).join("micro.toml"));
+        clift(&["train", &micro, "--set", &run_dir])?;
         for storage in TokenFormat::ALL {
             let out = text(&place(&format!("room-{storage}.clift")));
             let scene = ["--scene", "synthetic-0-test-00000", "--tokens", storage.name(), "-o", &out];
             clift(&[&["encode", &text(&run)], &scene[..]].concat())?;
         }
-        let (config, _) = read_config(&run.join("config.toml"), &[]).map_err(|error| error.to_string())?;
+        let (config, _) = read_config(&run.join("config.toml"), &[])?;
         Ok(Self { folder, config })
-    }
-
-    /// The run directory.
-    pub fn run(&self) -> PathBuf {
-        self.folder.path().join("run")
     }
 
     /// A file of the folder.
@@ -76,7 +57,7 @@ impl Setup {
 
     /// The newest checkpoint of stage 1.
     pub fn checkpoint(&self) -> PathBuf {
-        self.run().join("stage1/checkpoints/step-000000002")
+        self.at("run/stage1/checkpoints/step-000000006")
     }
 }
 
@@ -85,14 +66,10 @@ fn text(path: &Path) -> String {
 }
 
 /// Runs the command line beside this program.
-fn clift(args: &[&str]) -> Result<(), String> {
-    let program = std::env::current_exe().map_err(|error| error.to_string())?.with_file_name("clift-under-test");
-    let output = Command::new(&program)
-        .args(args)
-        .stdin(Stdio::null())
-        .output()
-        .map_err(|error| format!("{}: {error}", program.display()))?;
-    if output.status.success() { Ok(()) } else { Err(String::from_utf8_lossy(&output.stderr).into_owned()) }
+fn clift(args: &[&str]) -> Result<(), Box<dyn Error>> {
+    let program = std::env::current_exe()?.with_file_name("clift-under-test");
+    let output = Command::new(program).args(args).stdin(Stdio::null()).output()?;
+    if output.status.success() { Ok(()) } else { Err(String::from_utf8_lossy(&output.stderr).into()) }
 }
 
 /// The folder of the fixtures.
@@ -131,23 +108,25 @@ pub fn copy_folder(from: &Path, to: &Path) {
 
 /// A member of an archive of `torch.save`.
 pub fn member(archive: &[u8], ending: &str) -> Vec<u8> {
+    members(archive).into_iter().find(|(name, _)| name.ends_with(ending)).expect("it has such a member").1
+}
+
+/// Names and bytes of all members.
+fn members(archive: &[u8]) -> Vec<(String, Vec<u8>)> {
     let mut archive = ZipArchive::new(Cursor::new(archive)).expect("a valid archive");
-    let names: Vec<String> = archive.file_names().map(|name| name.expect("a name").into_owned()).collect();
-    let name = names.iter().find(|name| name.ends_with(ending)).expect("it has such a member");
-    let mut bytes = Vec::new();
-    archive.by_name(name).expect("it is there").read_to_end(&mut bytes).expect("it can be read");
-    bytes
+    let members = (0..archive.len()).map(|i| {
+        let (mut member, mut bytes) = (archive.by_index(i).expect("it is there"), Vec::new());
+        member.read_to_end(&mut bytes).expect("it can be read");
+        (member.name().expect("a name").into_owned(), bytes)
+    });
+    members.collect()
 }
 
 /// The archive with another pickle, and a checksum that fits it.
 pub fn with_pickle(archive: &[u8], pickle: &[u8]) -> Vec<u8> {
-    let mut source = ZipArchive::new(Cursor::new(archive)).expect("a valid archive");
-    let names: Vec<String> = source.file_names().map(|name| name.expect("a name").into_owned()).collect();
     let mut writer = ZipWriter::new(Cursor::new(Vec::new()));
     let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
-    for name in names {
-        let mut bytes = Vec::new();
-        source.by_name(&name).expect("it is there").read_to_end(&mut bytes).expect("it can be read");
+    for (name, bytes) in members(archive) {
         writer.start_file(&name, options).expect("a new member");
         writer.write_all(if name.ends_with("data.pkl") { pickle } else { &bytes }).expect("memory is writable");
     }

@@ -4,6 +4,9 @@ use crate::readers::{self, Read};
 use crate::setup::{Setup, fixture, member, read};
 use crate::words;
 
+type Seeds = fn(&Setup, &'static str) -> Vec<Vec<u8>>;
+type Open = fn(&Setup, &'static str) -> Read;
+
 /// One reader.
 pub struct Target {
     /// Name of the reader.
@@ -11,9 +14,9 @@ pub struct Target {
     /// File that is damaged: a path below `data-fixtures` or in the run.
     pub file: &'static str,
     /// Valid files.
-    pub seeds: fn(&Setup, &'static str) -> Vec<Vec<u8>>,
+    pub seeds: Seeds,
     /// Makes the reader.
-    pub open: fn(&Setup, &'static str) -> Read,
+    pub open: Open,
     /// Words of the format, see [`words::list`].
     pub words: &'static [u8],
     /// Corrects checksums.
@@ -22,12 +25,19 @@ pub struct Target {
     pub most_bytes: fn(usize) -> usize,
 }
 
-type Seeds = fn(&Setup, &'static str) -> Vec<Vec<u8>>;
-type Open = fn(&Setup, &'static str) -> Read;
-
 /// A reader without checksums that takes a fixed amount of memory and a multiple of the input.
 const fn target(name: &'static str, file: &'static str, seeds: Seeds, open: Open, words: &'static [u8]) -> Target {
     Target { name, file, seeds, open, words, repair: |_| (), most_bytes: |len| (64 << 20) + 64 * len }
+}
+
+/// A reader of a file of a data set.
+const fn layout(name: &'static str, file: &'static str, words: &'static [u8]) -> Target {
+    target(name, file, fixtures, readers::layout, words)
+}
+
+/// A reader of a file of the last checkpoint.
+const fn checkpoint(name: &'static str, file: &'static str, words: &'static [u8]) -> Target {
+    target(name, file, of_checkpoint, readers::checkpoint, words)
 }
 
 /// An image of a few bytes may have 8,192 x 8,192 pixels: the decoder's limit, the image and its conversion.
@@ -57,37 +67,19 @@ pub const TARGETS: &[Target] = &[
     target("config", "config.toml", configs, readers::config, words::TOML),
     target("scene-file", "room.clift", rooms, readers::scene_file, words::SAFETENSORS),
     target("weights", "stage1/model.safetensors", of_run, readers::weights, words::SAFETENSORS),
-    target("checkpoint-model", "model.bpk", of_checkpoint, readers::checkpoint, words::SAFETENSORS),
-    target("checkpoint-optimizer", "optimizer.bpk", of_checkpoint, readers::checkpoint, words::SAFETENSORS),
-    target("checkpoint-state", "state.json", of_checkpoint, readers::checkpoint, words::JSON),
+    checkpoint("checkpoint-model", "model.bpk", words::SAFETENSORS),
+    checkpoint("checkpoint-optimizer", "optimizer.bpk", words::SAFETENSORS),
+    checkpoint("checkpoint-state", "state.json", words::JSON),
     target("clusters-index", "clusters/index.json", of_run, readers::clusters, words::JSON),
     target("clusters-data", "clusters/clusters.bin", of_run, readers::clusters, b""),
     target("run-file", "run.json", of_run, readers::run_file, words::JSON),
-    target("transforms", "layouts/capture/attic/transforms.json", fixtures, readers::layout, words::TRANSFORMS),
-    target(
-        "colmap-cameras-bin",
-        "layouts/colmap_bin/attic/sparse/0/cameras.bin",
-        fixtures,
-        readers::layout,
-        words::BINARY,
-    ),
-    target(
-        "colmap-images-bin",
-        "layouts/colmap_bin/attic/sparse/0/images.bin",
-        fixtures,
-        readers::layout,
-        words::BINARY,
-    ),
-    target(
-        "colmap-cameras-txt",
-        "layouts/colmap_txt/attic/sparse/0/cameras.txt",
-        fixtures,
-        readers::layout,
-        words::TEXT,
-    ),
-    target("colmap-images-txt", "layouts/colmap_txt/attic/sparse/0/images.txt", fixtures, readers::layout, words::TEXT),
-    target("re10k-text", RE10K_TEXT, fixtures, readers::layout, words::TEXT),
-    target("scene-torch", SCENE_TORCH, fixtures, readers::layout, words::PICKLE),
+    layout("transforms", "layouts/capture/attic/transforms.json", words::TRANSFORMS),
+    layout("colmap-cameras-bin", "layouts/colmap_bin/attic/sparse/0/cameras.bin", words::BINARY),
+    layout("colmap-images-bin", "layouts/colmap_bin/attic/sparse/0/images.bin", words::BINARY),
+    layout("colmap-cameras-txt", "layouts/colmap_txt/attic/sparse/0/cameras.txt", words::TEXT),
+    layout("colmap-images-txt", "layouts/colmap_txt/attic/sparse/0/images.txt", words::TEXT),
+    layout("re10k-text", RE10K_TEXT, words::TEXT),
+    layout("scene-torch", SCENE_TORCH, words::PICKLE),
     target("published-checkpoint", "checkpoints/re10k.ckpt", fixtures, readers::published_checkpoint, words::PICKLE),
     target("test-scenes", INDEX, test_scenes, readers::test_scenes, words::JSON),
 ];
@@ -101,7 +93,7 @@ fn pickles(_: &Setup, file: &'static str) -> Vec<Vec<u8>> {
 }
 
 fn of_run(setup: &Setup, file: &'static str) -> Vec<Vec<u8>> {
-    vec![read(&setup.run().join(file))]
+    vec![read(&setup.at("run").join(file))]
 }
 
 fn of_checkpoint(setup: &Setup, file: &'static str) -> Vec<Vec<u8>> {
@@ -109,7 +101,7 @@ fn of_checkpoint(setup: &Setup, file: &'static str) -> Vec<Vec<u8>> {
 }
 
 fn configs(setup: &Setup, file: &'static str) -> Vec<Vec<u8>> {
-    vec![fixture("../configs/tiny.toml"), read(&setup.run().join(file))]
+    vec![fixture("../configs/tiny.toml"), read(&setup.at("run").join(file))]
 }
 
 fn rooms(setup: &Setup, _: &'static str) -> Vec<Vec<u8>> {

@@ -1,6 +1,6 @@
 //! Scenes in other layouts than chunks, through the command line.
 
-use crate::support::{Place, clift, repository};
+use crate::support::{Place, repository};
 
 /// Keys that put the micro run on six frames of 32 x 18.
 fn data(source: &str, layout: &str, more: &str) -> String {
@@ -15,20 +15,15 @@ fn data(source: &str, layout: &str, more: &str) -> String {
 #[test]
 fn captures_train_and_render_and_name_missing_frames() {
     let place = Place::new();
-    let ran = place.train("run", &[&data("auto", "capture", ""), "clusters.num_scenes=0"], &[]).ok();
-    let text = format!("{}{}", ran.stdout, ran.stderr);
-    let expected = "train: 1 of 1 scenes used; 1 frame without an image (./images/99); no folders train/ and test/";
-    assert!(text.contains(expected), "{text}");
-    let skipped = place.json("run/skipped-train.json");
-    assert_eq!(skipped["frames"][0]["frame"], "./images/99");
-    assert_eq!(skipped["frames"][0]["key"], "attic");
+    let ran = place.train("run", &[&data("auto", "capture", ""), "clusters.num_scenes=0"]).ok();
+    ran.notes("train: 1 of 1 scenes used; 1 frame without an image (./images/99); no folders train/ and test/");
+    let frame = &place.json("run/skipped-train.json")["frames"][0];
+    assert_eq!((&frame["key"], &frame["frame"]), (&"attic".into(), &"./images/99".into()));
 
-    let capture = repository("data-fixtures/layouts/colmap_txt/attic");
-    let [run, out, frames] = ["run", "attic.clift", "frames"].map(|name| place.at(name).display().to_string());
-    let ran = clift(["encode", &run, capture.to_str().unwrap(), "-o", &out]).ok();
-    assert!(ran.stdout.contains("scene attic, 2 views of 16 x 16"), "{}", ran.stdout);
-    let ran = clift(["render", &out, "--path", "interpolate", "--frames", "2", "-o", &frames]).ok();
-    assert!(ran.stdout.contains("2 frames of 16 x 16"), "{}", ran.stdout);
+    let encode = "encode DIR/run REPO/data-fixtures/layouts/colmap_txt/attic -o DIR/attic.clift";
+    place.clift(encode).ok().prints("scene attic, 2 views of 16 x 16");
+    let render = "render DIR/attic.clift --path interpolate --frames 2 -o DIR/frames";
+    place.clift(render).ok().prints("2 frames of 16 x 16");
 }
 
 #[test]
@@ -36,22 +31,23 @@ fn dl3dv_training_requires_a_test_scene_list() {
     let place = Place::new();
     for source in ["dl3dv", "auto", "captures"] {
         place
-            .train("run", &[&data(source, "dl3dv", "")], &[])
+            .train("run", &[&data(source, "dl3dv", "")])
             .fails_with(2, &["data.files.test_scenes is missing; the folders also hold the benchmark scenes of DL3DV"]);
     }
-    std::fs::write(place.at("none.txt"), "").unwrap();
+    place.write("none.txt", "");
     let files = format!("files={{test_scenes='{}'}},", place.at("none.txt").display());
-    let ran = place.train("run", &[&data("dl3dv", "dl3dv", &files)], &["--only", "stage1"]).ok();
-    assert!(format!("{}{}", ran.stdout, ran.stderr).contains("both splits are the same scenes"));
+    let ran = place.train("run --only stage1", &[&data("dl3dv", "dl3dv", &files)]).ok();
+    ran.notes("both splits are the same scenes");
     let files = format!("{files} filters={{min_frames=9}},");
     place
-        .train("other", &[&data("auto", "dl3dv", &files)], &[])
+        .train("other", &[&data("auto", "dl3dv", &files)])
         .fails_with(1, &["0 of 1 scenes used; 1 shorter than 9 frames"]);
 }
 
 #[test]
 fn a_folder_of_any_layout_is_described() {
-    let layouts = repository("data-fixtures/layouts");
+    let place = Place::new();
+    let info = |folder: &str| place.clift(&format!("data info REPO/{folder}"));
     for (name, layout) in [
         ("chunks", "chunks"),
         ("scenes", "scenes"),
@@ -61,10 +57,8 @@ fn a_folder_of_any_layout_is_described() {
         ("capture/attic/transforms.json", "captures"),
         ("colmap_bin", "captures"),
     ] {
-        let ran = clift(["data", "info", layouts.join(name).to_str().unwrap()]).ok();
+        let ran = info(&format!("data-fixtures/layouts/{name}")).ok().prints("  image           32x18");
         assert!(ran.stdout.starts_with(&format!("layout            {layout}\n")), "{name}: {}", ran.stdout);
-        assert!(ran.stdout.contains("  image           32x18"), "{name}: {}", ran.stdout);
     }
-    clift(["data", "info", repository("configs").to_str().unwrap()])
-        .fails_with(2, &["no scenes found: expected index.json with chunks, "]);
+    info("configs").fails_with(2, &["no scenes found: expected index.json with chunks, "]);
 }

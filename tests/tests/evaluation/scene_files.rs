@@ -1,41 +1,23 @@
 //! Scene files through the command line: encoded, rendered, measured.
 
-use std::path::Path;
-
 use clift_data::{Clip, ClipReader, Split, even_views, open_dataset};
 use clift_eval::{Canvas, psnr, ssim, view_cameras};
 use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenFormat, TokenKind, load_renderer};
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
-use crate::support::{Place, STAGE_1, Shared, WHOLE, clift, repository};
+use crate::support::{Place, STAGE_1, Shared, WHOLE, finish, number, point, signal, wait_until};
 
 /// A run whose methods differ by more than rounding.
-static LONGER: Shared = Shared::new(&["stage1.steps=60", "stage2.steps=20"], &[]);
+static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
 
 const KEY: &str = "synthetic-0-test-00000";
-
-/// Encodes a scene of the run `run` into `name`.
-fn encode_args(place: &Place, run: &str, name: &str, flags: &[&str]) -> Vec<String> {
-    let mut args = vec!["encode".into(), place.at(run).display().to_string()];
-    args.extend(["--out".into(), place.at(name).display().to_string()]);
-    args.extend(flags.iter().map(|&flag| flag.to_owned()));
-    args
-}
-
-fn render_args(place: &Place, name: &str, out: &str, flags: &[&str]) -> Vec<String> {
-    let [name, out] = [name, out].map(|name| place.at(name).display().to_string());
-    let args = ["render", &name, "--out", &out].map(String::from);
-    args.into_iter().chain(flags.iter().map(|&flag| flag.to_owned())).collect()
-}
-
-fn config(place: &Place, run: &str) -> Config {
-    read_config(&place.at(run).join("config.toml"), &[]).expect("a run's config").0
-}
+/// Encodes this scene of the run `run`.
+const ENCODE: &str = "encode DIR/run --scene synthetic-0-test-00000 --out";
 
 /// The first test scene with the views that `clift eval` gives it.
 fn first_clip(place: &Place, run: &str) -> (Clip, ClipReader) {
-    let config = config(place, run);
+    let config: Config = read_config(&place.at(run).join("config.toml"), &[]).expect("a run's config").0;
     let source = open_dataset(&config.data, Split::Test).expect("the run's rooms").source;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let views = even_views(8, config.eval.num_context, config.eval.num_targets).expect("enough frames");
@@ -65,47 +47,37 @@ fn evaluated(place: &Place, eval: &str, num_tokens: usize, num_render_tokens: us
     rows.map(|row| (row[5].parse().expect("a number"), row[6].parse().expect("a number"))).collect()
 }
 
-/// Renders a clip's targets from a scene file, each view from `num_render_tokens` tokens.
-fn drawn(
-    scene: &Path,
-    weights: &Path,
-    clip: &Clip,
-    preset: SelectionPreset,
-    num_render_tokens: usize,
-) -> Vec<Vec<f32>> {
-    let (scene, _) = Scene::read(scene).expect("a scene");
+/// Opens a scene file of the run `run`.
+fn open(place: &Place, name: &str, preset: SelectionPreset) -> SceneRenderer {
+    let (scene, _) = Scene::read(&place.at(name)).expect("a scene");
     let device = burn::tensor::Device::flex();
-    let renderer = load_renderer(&scene, weights, &device).expect("its renderer");
-    let mut viewer = SceneRenderer::new(&scene, renderer, preset.rules(), &device).expect("its tokens");
+    let renderer = load_renderer(&scene, &place.at("run/stage2/model.safetensors"), &device).expect("its renderer");
+    SceneRenderer::new(&scene, renderer, preset.rules(), &device).expect("its tokens")
+}
+
+/// Renders a clip's targets, each view from `num_render_tokens` tokens.
+fn drawn(mut scene: SceneRenderer, clip: &Clip, num_render_tokens: usize) -> Vec<Vec<f32>> {
     let views = view_cameras(&clip.target);
-    let frames = viewer.render(&views, clip.target.height, clip.target.width, num_render_tokens).expect("draws");
+    let frames = scene.render(&views, clip.target.height, clip.target.width, num_render_tokens).expect("draws");
     frames.into_iter().map(|frame| frame.pixels).collect()
 }
 
 #[test]
 fn scene_files_reproduce_the_evaluation() {
-    let place = Place::new();
-    place.copy(&LONGER, "run");
+    let place = Place::with(&LONGER);
     let (clip, reader) = first_clip(&place, "run");
-    let weights = place.at("run/stage2/model.safetensors");
-    let poses: Vec<Value> = clip
-        .target
-        .frame_index
-        .iter()
-        .map(|&frame| {
-            let camera = &reader.source.cameras(0).expect("cameras")[frame];
-            let rows: Vec<Vec<f64>> = camera.c2w.to_matrix_f64().chunks(4).map(<[f64]>::to_vec).collect();
-            json!({"c2w": rows})
-        })
-        .collect();
-    std::fs::write(place.at("poses.json"), json!({"poses": poses}).to_string()).unwrap();
+    let cameras = reader.source.cameras(0).expect("cameras");
+    let poses = clip.target.frame_index.iter().map(|&frame| {
+        let rows: Vec<Vec<f64>> = cameras[frame].c2w.to_matrix_f64().chunks(4).map(<[f64]>::to_vec).collect();
+        json!({"c2w": rows})
+    });
+    place.write("poses.json", json!({"poses": poses.collect::<Vec<_>>()}).to_string());
 
     for (count, storage) in [(4, "f32"), (8, "f32"), (4, "f16"), (8, "f16"), (4, "int8"), (8, "int8")] {
         let name = format!("{count}-{storage}.clift");
-        let stored = count.to_string();
-        let flags = ["--scene", KEY, "--context", "0,7", "--storage", &stored, "--tokens", storage];
-        let ran = clift(encode_args(&place, "run", &name, &flags)).ok();
-        assert!(ran.stdout.contains(&format!("{count} of 8 tokens (clift, {storage})")), "{}", ran.stdout);
+        let flags = format!("--context 0,7 --storage {count} --tokens {storage}");
+        let ran = place.clift(&format!("{ENCODE} DIR/{name} {flags}")).ok();
+        ran.prints(&format!("{count} of 8 tokens (clift, {storage})"));
 
         // The file's size is that of the formula, and of the evaluation's summary.
         let format: TokenFormat = storage.parse().unwrap();
@@ -115,16 +87,11 @@ fn scene_files_reproduce_the_evaluation() {
         let bytes = place.bytes(&name).len() as u64;
         assert_eq!(bytes, 8 + 2048 + 136 + 164 * 2 + (count * (28 + format.bytes_per_token(16))) as u64);
         assert_eq!(bytes, scene.file_bytes(format));
-        let eval = place.at(storage);
-        place.eval("run", &["--tokens", storage, "--out", eval.to_str().unwrap()]).ok();
-        let points = place.json(&format!("{storage}/summary.json"))["points"].clone();
-        let point = points.as_array().unwrap().iter().find(|point| {
-            (point["variant"].as_str(), point["num_storage_tokens"].as_u64()) == (Some("clift"), Some(count as u64))
-        });
-        assert_eq!(point.unwrap()["scene_bytes"], bytes);
+        place.eval(&format!("run --tokens {storage} --out DIR/{storage}")).ok();
+        assert_eq!(point(&place.points(storage), "clift", count)["scene_bytes"], bytes);
 
         // Images from the file equal those of the evaluation in memory to the last digit, at every format.
-        let from_file = measure(&clip, &drawn(&place.at(&name), &weights, &clip, SelectionPreset::Paper, count));
+        let from_file = measure(&clip, &drawn(open(&place, &name, SelectionPreset::Paper), &clip, count));
         assert_eq!(from_file, evaluated(&place, storage, count, count), "{name}");
         let exact = evaluated(&place, "run/eval", count, count);
         let loss_db = match format {
@@ -138,14 +105,12 @@ fn scene_files_reproduce_the_evaluation() {
 
         // The command renders the same images, rounded to 8 bits: half a level is at most 0.02 dB here.
         let out = format!("{count}-{storage}");
-        let poses = place.at("poses.json").display().to_string();
-        clift(render_args(&place, &name, &out, &["--path", &poses])).ok();
-        let pictures: Vec<Vec<f32>> = (0..clip.target.num_views())
-            .map(|view| {
-                let picture = image::open(place.at(&format!("{out}/frame-{view:05}.png"))).unwrap().into_rgb8();
-                picture.into_raw().iter().map(|&value| f32::from(value) / 255.0).collect()
-            })
-            .collect();
+        place.clift(&format!("render DIR/{name} --out DIR/{out} --path DIR/poses.json")).ok();
+        let pictures = (0..clip.target.num_views()).map(|view| {
+            let picture = image::open(place.at(&format!("{out}/frame-{view:05}.png"))).unwrap().into_rgb8();
+            picture.into_raw().iter().map(|&value| f32::from(value) / 255.0).collect()
+        });
+        let pictures: Vec<Vec<f32>> = pictures.collect();
         for ((psnr, _), (exact, _)) in measure(&clip, &pictures).iter().zip(&from_file) {
             assert!((psnr - exact).abs() < 0.02, "{name}: {psnr} dB in the file, {exact} drawn");
         }
@@ -154,72 +119,57 @@ fn scene_files_reproduce_the_evaluation() {
 
 #[test]
 fn evaluation_of_selected_tokens_equals_rendering_the_file() {
-    let place = Place::new();
-    place.copy(&LONGER, "run");
+    let place = Place::with(&LONGER);
     let (clip, _) = first_clip(&place, "run");
-    let weights = place.at("run/stage2/model.safetensors");
-    let flags = ["--scene", KEY, "--context", "0,7", "--storage", "8", "--tokens", "f32"];
-    clift(encode_args(&place, "run", "room.clift", &flags)).ok();
+    place.clift(&format!("{ENCODE} DIR/room.clift --context 0,7 --storage 8 --tokens f32")).ok();
     for preset in SelectionPreset::ALL {
-        let out = place.at(preset.name());
-        let ran =
-            place.eval("run", &["--render", "3,1/4", "--selection", preset.name(), "--out", out.to_str().unwrap()]);
-        ran.ok();
+        let name = preset.name();
+        place.eval(&format!("run --render 3,1/4 --selection {name} --out DIR/{name}")).ok();
         for count in [2, 3] {
-            let from_file = measure(&clip, &drawn(&place.at("room.clift"), &weights, &clip, preset, count));
-            assert_eq!(from_file, evaluated(&place, preset.name(), 8, count), "{}, {count}", preset.name());
+            let from_file = measure(&clip, &drawn(open(&place, "room.clift", preset), &clip, count));
+            assert_eq!(from_file, evaluated(&place, name, 8, count), "{name}, {count}");
         }
     }
 }
 
 #[test]
 fn paths_render_to_frames_and_animation_by_count() {
-    let place = Place::new();
-    place.copy(&WHOLE, "run");
-    clift(encode_args(&place, "run", "room.clift", &["--scene", KEY, "--storage", "1.0"])).ok();
+    let place = Place::with(&WHOLE);
+    place.clift(&format!("{ENCODE} DIR/room.clift --storage 1.0")).ok();
     let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
     assert_eq!((scene.num_tokens(), storage), (8, TokenFormat::F16));
     assert_eq!(scene.context_frames.len(), 2, "as many contexts as in training");
 
-    let names = |out: &str| {
-        let items = std::fs::read_dir(place.at(out)).unwrap();
-        let mut names: Vec<_> = items.map(|item| item.unwrap().file_name().into_string().unwrap()).collect();
-        names.sort();
-        names
-    };
     for (out, size, flags, num_render_tokens) in [
-        ("all", (16, 16), vec!["--path", "interpolate"], 8),
-        ("some", (16, 16), vec!["--path", "interpolate", "--render", "3"], 3),
-        ("global", (16, 16), vec!["--path", "orbit", "--render", "1/2", "--selection", "global"], 4),
-        ("large", (48, 32), vec!["--path", "orbit", "--size", "48x32"], 8),
-        ("in-time", (16, 16), vec!["--path", "orbit", "--budget-ms", "60000"], 8),
+        ("all", (16, 16), "--path interpolate", 8),
+        ("some", (16, 16), "--path interpolate --render 3", 3),
+        ("global", (16, 16), "--path orbit --render 1/2 --selection global", 4),
+        ("large", (48, 32), "--path orbit --size 48x32", 8),
+        ("in-time", (16, 16), "--path orbit --budget-ms 60000", 8),
     ] {
-        let flags = [&flags[..], &["--frames", "10", "--fps", "12"]].concat();
-        let ran = clift(render_args(&place, "room.clift", out, &flags)).ok();
-        let expected = format!("10 frames of {} x {}, each from {num_render_tokens} of 8 tokens", size.0, size.1);
-        assert!(ran.stdout.contains(&expected), "{}", ran.stdout);
+        let ran = place.clift(&format!("render DIR/room.clift --out DIR/{out} {flags} --frames 10 --fps 12")).ok();
+        ran.prints(&format!("10 frames of {} x {}, each from {num_render_tokens} of 8 tokens", size.0, size.1));
         let mut expected: Vec<String> = (0..10).map(|frame| format!("frame-{frame:05}.png")).collect();
         expected.insert(0, "animation.png".into());
         expected.push("render.json".into());
-        assert_eq!(names(out), expected);
+        assert_eq!(place.names(out), expected);
         for name in &expected[..11] {
             assert_eq!(image::image_dimensions(place.at(out).join(name)).unwrap(), size, "{out}/{name}");
         }
         let report = place.json(&format!("{out}/render.json"));
         assert_eq!((&report["num_frames"], &report["num_render_tokens"]), (&10.into(), &num_render_tokens.into()));
         assert_eq!(report["calibration"].is_array(), out == "in-time", "{report}");
-        assert_eq!(report["select_s"].as_f64().unwrap() > 0.0, num_render_tokens < 8, "{report}");
+        assert_eq!(number(&report, "select_s") > 0.0, num_render_tokens < 8, "{report}");
         let selection = match out {
             "some" => "scaled".into(),
             "global" => "global".into(),
             _ => Value::Null,
         };
-        assert_eq!((&report["path"], &report["selection"]), (&flags[1].into(), &selection));
+        let path = flags.split(' ').nth(1);
+        assert_eq!((report["path"].as_str(), &report["selection"]), (path, &selection));
     }
     // The first frame through the contexts is the first context's.
-    let device = burn::tensor::Device::flex();
-    let renderer = load_renderer(&scene, &place.at("run/stage2/model.safetensors"), &device).unwrap();
-    let mut viewer = SceneRenderer::new(&scene, renderer, SelectionPreset::Paper.rules(), &device).unwrap();
+    let mut viewer = open(&place, "room.clift", SelectionPreset::Paper);
     let first = viewer.render(&scene.context[..1], 16, 16, 8).unwrap().remove(0);
     let first = Canvas::from_unit(&first.pixels, 16, 16).unwrap();
     let written = image::open(place.at("all/frame-00000.png")).unwrap().into_rgb8();
@@ -231,74 +181,57 @@ fn paths_render_to_frames_and_animation_by_count() {
 
 #[test]
 fn what_cannot_be_drawn_says_what_to_do() {
-    let place = Place::new();
-    place.copy(&WHOLE, "run");
-    place.train("other", &["seed=1"], &["--only", "stage1"]).ok();
-    clift(encode_args(&place, "run", "room.clift", &["--scene", KEY])).ok();
-    let render = |flags: &[&str]| clift(render_args(&place, "room.clift", "out", flags));
-    let orbit = ["--path", "orbit", "--frames", "2"];
-    let with = |flags: &[&str]| render(&[&orbit[..], flags].concat());
+    let place = Place::with(&WHOLE);
+    place.train("other --only stage1", &["seed=1"]).ok();
+    place.clift(&format!("{ENCODE} DIR/room.clift")).ok();
+    let render = |flags: &str| place.clift(&format!("render DIR/room.clift --out DIR/out {flags}"));
+    let orbit = "--path orbit --frames 2";
 
-    let other = place.at("other/stage1/model.safetensors").display().to_string();
+    let no_path = "--path interpolated: no such file; write interpolate, orbit or";
+    render("--path interpolated").fails_with(2, &[no_path]);
     for (flags, expected) in [
-        (["--budget-ms", "0.0001"], "the fastest frame takes "),
-        (["--size", "20x16"], "an image of 20 x 16 does not divide into patches of 8 x 8"),
-        (["--size", "1000000x8"], "--size 1000000x8: write at most 16384 pixels per side"),
-        (["--size", "17179869184x17179869184"], "--size 17179869184x17179869184: write at most 16384 pixels per side"),
-        (["--render", "9"], "a scene has 2 tokens"),
-        (["--model", &other], "the scene was made for the renderer "),
-        (["--path", "interpolated"], "--path interpolated: no such file; write interpolate, orbit or"),
+        ("--budget-ms 0.0001", "the fastest frame takes "),
+        ("--size 20x16", "an image of 20 x 16 does not divide into patches of 8 x 8"),
+        ("--size 1000000x8", "--size 1000000x8: write at most 16384 pixels per side"),
+        ("--size 17179869184x17179869184", "--size 17179869184x17179869184: write at most 16384 pixels per side"),
+        ("--render 9", "a scene has 2 tokens"),
+        ("--model DIR/other/stage1/model.safetensors", "the scene was made for the renderer "),
     ] {
-        let path = if flags[0] == "--path" { &[][..] } else { &orbit[..] };
-        render(&[path, &flags].concat()).fails_with(2, &[expected]);
+        render(&format!("{orbit} {flags}")).fails_with(2, &[expected]);
     }
     // The second pose is an invalid camera: the command also writes no frame of the first.
     let pose = json!({"c2w": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]});
     let far = json!({"c2w": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0]]});
-    std::fs::write(place.at("poses.json"), json!({"poses": [pose, far]}).to_string()).unwrap();
-    let poses = place.at("poses.json").display().to_string();
-    render(&["--path", &poses]).fails_with(1, &["pose 1: bad camera: the camera is "]);
-    render(&["--path", &poses, "--frames", "3"]).fails_with(2, &["a file of poses determines the number of frames"]);
+    place.write("poses.json", json!({"poses": [pose, far]}).to_string());
+    render("--path DIR/poses.json").fails_with(1, &["pose 1: bad camera: the camera is "]);
+    let counted = "a file of poses determines the number of frames";
+    render("--path DIR/poses.json --frames 3").fails_with(2, &[counted]);
     assert!(!place.at("out").exists(), "nothing is left of what was refused");
 
-    std::fs::create_dir(place.at("out")).unwrap();
-    std::fs::write(place.at("out/notes.txt"), "").unwrap();
-    with(&[]).fails_with(2, &["is not empty; choose another folder"]);
+    place.write("out/notes.txt", "");
+    render(orbit).fails_with(2, &["is not empty; choose another folder"]);
     std::fs::remove_file(place.at("out/notes.txt")).unwrap();
 
     std::fs::rename(place.at("run"), place.at("moved")).unwrap();
-    with(&[]).fails_with(2, &["the weights of the scene are not found at ", "; set --model RUN"]);
-    let moved = place.at("moved").display().to_string();
-    with(&["--model", &moved]).ok();
+    render(orbit).fails_with(2, &["the weights of the scene are not found at ", "; set --model RUN"]);
+    render(&format!("{orbit} --model DIR/moved")).ok();
 
     place.truncate("room.clift");
-    clift(render_args(&place, "room.clift", "again", &orbit))
-        .fails_with(1, &["cannot use the scene: the file is truncated", "copy it again"]);
-    let weights = place.at("moved/stage2/model.safetensors").display().to_string();
-    clift(["render", weights.as_str(), "--path", "orbit", "--out", "again"])
-        .fails_with(1, &["its header lacks the scene format"]);
+    let again = |scene: &str| place.clift(&format!("render DIR/{scene} --out DIR/again {orbit}"));
+    again("room.clift").fails_with(1, &["cannot use the scene: the file is truncated", "copy it again"]);
+    again("moved/stage2/model.safetensors").fails_with(1, &["its header lacks the scene format"]);
 }
 
 #[cfg(unix)]
 #[test]
 fn a_path_that_is_interrupted_leaves_nothing_behind() {
-    use crate::support::{finish, signal, spawn};
-
-    let place = Place::new();
-    place.copy(&WHOLE, "run");
-    clift(encode_args(&place, "run", "room.clift", &["--scene", KEY])).ok();
-    let flags = ["--path", "orbit", "--frames", "100000"];
-    let mut child = spawn(render_args(&place, "room.clift", "out", &flags));
-    let started = std::time::Instant::now();
-    let is_drawing = || {
+    let place = Place::with(&WHOLE);
+    place.clift(&format!("{ENCODE} DIR/room.clift")).ok();
+    let mut child = place.start("render DIR/room.clift --out DIR/out --path orbit --frames 100000");
+    wait_until(&mut child, "a frame", || {
         let mut items = std::fs::read_dir(place.at("out")).into_iter().flatten().flatten();
         items.any(|item| std::fs::read_dir(item.path()).is_ok_and(|frames| frames.count() > 3))
-    };
-    while !is_drawing() {
-        assert!(child.try_wait().expect("a child").is_none(), "the path ended before the signal");
-        assert!(started.elapsed().as_secs() < 60, "no frame within a minute");
-        std::thread::sleep(std::time::Duration::from_millis(2));
-    }
+    });
     signal(&child, "-INT");
     finish(child).fails_with(130, &["error: interrupted while rendering frame ", "no output files were written"]);
     assert!(!place.at("out").exists());
@@ -306,60 +239,53 @@ fn a_path_that_is_interrupted_leaves_nothing_behind() {
 
 #[test]
 fn scene_files_overwrite_only_scene_files() {
-    let place = Place::new();
-    place.copy(&STAGE_1, "run");
-    let encode =
-        |name: &str, flags: &[&str]| clift(encode_args(&place, "run", name, &[&["--scene", KEY][..], flags].concat()));
+    let place = Place::with(&STAGE_1);
+    let encode = |words: &str| place.clift(&format!("{ENCODE} DIR/{words}"));
     let weights = place.bytes("run/stage1/model.safetensors");
-    encode("run/stage1/model.safetensors", &[])
+    encode("run/stage1/model.safetensors")
         .fails_with(2, &["the existing file is no scene, and only scenes are overwritten"]);
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
-    encode("no/room.clift", &[]).fails_with(2, &["no folder "]);
-    encode("room.clift", &[]).ok();
-    encode("room.clift", &["--storage", "8"]).ok();
+    encode("no/room.clift").fails_with(2, &["no folder "]);
+    encode("room.clift").ok();
+    encode("room.clift --storage 8").ok();
     assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);
     // Another number of heads fits the same weights and would change every image.
     for change in ["model.num_heads=1", "model={num_heads=1}"] {
-        encode("heads.clift", &["--set", change])
+        encode(&format!("heads.clift --set {change}"))
             .fails_with(2, &["--set model: the weights were trained with another network"]);
     }
 }
 
 #[test]
 fn encode_chooses_scenes_by_key_context_and_count() {
-    let place = Place::new();
-    place.copy(&STAGE_1, "run");
-    let encode = |flags: &[&str]| clift(encode_args(&place, "run", "room.clift", flags));
-    encode(&[]).fails_with(2, &["scenes; choose one with --scene: synthetic-0-test-00000, "]);
-    encode(&["--scene", "attic"]).fails_with(2, &["no scene attic; the "]);
-    encode(&["--scene", KEY, "--context", "0,8"])
-        .fails_with(2, &["`--context` = 0,8: there is no frame 8; the scene has frames 0 to 7"]);
-    encode(&["--scene", KEY, "--storage", "9"]).fails_with(2, &["a scene has 8 tokens"]);
+    let place = Place::with(&STAGE_1);
+    let encode = |words: &str| place.clift(&format!("encode DIR/run --out DIR/room.clift {words}"));
+    encode("").fails_with(2, &["scenes; choose one with --scene: synthetic-0-test-00000, "]);
+    encode("--scene attic").fails_with(2, &["no scene attic; the "]);
+    let one = |flags: &str| encode(&format!("--scene {KEY} {flags}"));
+    one("--context 0,8").fails_with(2, &["`--context` = 0,8: there is no frame 8; the scene has frames 0 to 7"]);
+    one("--storage 9").fails_with(2, &["a scene has 8 tokens"]);
 
     // Without stage 2, tokens are those nearest to the cluster centres; all of them leave no variance within clusters.
-    let ran = encode(&["--scene", KEY, "--storage", "8"]).ok();
-    assert!(ran.stdout.contains("8 of 8 tokens (kmeans, f16)"), "{}", ran.stdout);
+    let ran = one("--storage 8").ok().prints("8 of 8 tokens (kmeans, f16)");
     assert!(ran.stdout.ends_with("     8  0.0000\n"), "{}", ran.stdout);
-    assert!(encode(&["--scene", KEY, "--storage", "1/2"]).ok().stdout.contains("4 of 8 tokens"));
-    let frames = clift(render_args(&place, "room.clift", "out", &["--path", "orbit", "--frames", "2"])).ok();
-    assert!(frames.stdout.contains("2 frames of 16 x 16"), "{}", frames.stdout);
+    one("--storage 1/2").ok().prints("4 of 8 tokens");
+    let ran = place.clift("render DIR/room.clift --out DIR/out --path orbit --frames 2").ok();
+    ran.prints("2 frames of 16 x 16");
 
     // Chunks of the same kind as the run's or not: any folder of them, either half, whole or by its index.
-    let mini = repository("data-fixtures/re10k-mini");
-    let on = |folder: &Path, flags: &[&str]| encode(&[&[folder.to_str().unwrap()], flags].concat());
-    assert!(on(&mini, &[]).ok().stdout.contains("scene 00000000000000b1, 2 views of 16 x 16"));
-    assert!(on(&mini.join("test"), &[]).ok().stdout.contains("scene 00000000000000b1"));
-    let train = ["--split", "train", "--scene", "00000000000000a2"];
-    assert!(on(&mini, &train).ok().stdout.contains("scene 00000000000000a2"));
-    on(&place.at("run"), &[]).fails_with(2, &["no scenes found: expected index.json with chunks, "]);
+    let mini = "REPO/data-fixtures/re10k-mini";
+    encode(mini).ok().prints("scene 00000000000000b1, 2 views of 16 x 16");
+    encode(&format!("{mini}/test")).ok().prints("scene 00000000000000b1");
+    let second = encode(&format!("{mini} --split train --scene 00000000000000a2")).ok();
+    second.prints("scene 00000000000000a2");
+    encode("DIR/run").fails_with(2, &["no scenes found: expected index.json with chunks, "]);
 
-    let file = place.at("run/stage1/model.safetensors").display().to_string();
-    let out = place.at("from-file.clift").display().to_string();
-    clift(["encode", &file, mini.to_str().unwrap(), "-o", &out]).ok();
-    assert_eq!(Scene::read(Path::new(&out)).unwrap().0.model_path, file);
-    let stage = place.at("run/stage1").display().to_string();
-    clift(["encode", &stage, mini.to_str().unwrap(), "-o", &out]).ok();
+    let by = |model: &str| place.clift(&format!("encode DIR/{model} {mini} -o DIR/from-file.clift"));
+    by("run/stage1/model.safetensors").ok();
+    let file = place.at("run/stage1/model.safetensors");
+    assert_eq!(Scene::read(&place.at("from-file.clift")).unwrap().0.model_path, file.display().to_string());
+    by("run/stage1").ok();
     std::fs::copy(&file, place.at("alone.safetensors")).unwrap();
-    let alone = place.at("alone.safetensors").display().to_string();
-    clift(["encode", &alone, mini.to_str().unwrap(), "-o", &out]).fails_with(2, &["no config.toml next to"]);
+    by("alone.safetensors").fails_with(2, &["no config.toml next to"]);
 }

@@ -4,18 +4,29 @@ use std::path::{Path, PathBuf};
 
 use clift_data::{ChunkSource, SceneFilters, SceneRecord, SceneSource, Split, write_chunks};
 
-use crate::support::{Place, Ran, STAGE_1, WHOLE, copy_folder, files, repository};
+use crate::support::{Place, Ran, STAGE_1, WHOLE, copy_folder, files, list, number, repository};
 
 /// Images of two training scenes and a test scene, written by PyTorch's `torch.save`.
 const MINI: &str = "data-fixtures/re10k-mini";
 /// Keys of the training scenes.
 const KEYS: [&str; 2] = ["00000000000000a1", "00000000000000a2"];
 
-/// Trains the micro run on a folder of chunks.
-fn train_on(place: &Place, data: &Path, set: &[&str], flags: &[&str]) -> Ran {
+/// Trains the micro run `run`, which flags may follow, on a folder of chunks.
+fn train_on(place: &Place, words: &str, data: &Path, set: &[&str]) -> Ran {
     let root = format!("data.root=\"{}\"", data.display());
     let chunks = ["data.source=chunks", root.as_str(), "data.width=32", "data.height=32"];
-    place.train("run", &[&chunks[..], set].concat(), flags)
+    place.train(words, &[&chunks[..], set].concat())
+}
+
+/// Trains it on the mini data set.
+fn train_on_mini(place: &Place, set: &[&str]) -> Ran {
+    train_on(place, "run", &repository(MINI), set)
+}
+
+/// Key that names the evaluation index of the folder, and the index with this text.
+fn index(place: &Place, text: &str) -> String {
+    place.write("index.json", text);
+    format!("eval.index=\"{}\"", place.at("index.json").display())
 }
 
 /// Copies the mini data set, with its two training scenes in a chunk each.
@@ -24,7 +35,7 @@ fn two_chunks(place: &Place) -> PathBuf {
     copy_folder(&repository(MINI), &data);
     std::fs::copy(data.join("train/000000.torch"), data.join("train/000001.torch")).unwrap();
     let index = serde_json::json!({KEYS[0]: "000000.torch", KEYS[1]: "000001.torch"});
-    std::fs::write(data.join("train/index.json"), index.to_string()).unwrap();
+    place.write("data/train/index.json", index.to_string());
     data
 }
 
@@ -35,14 +46,13 @@ fn changed_scene(place: &Place, change: impl Fn(&mut SceneRecord)) -> PathBuf {
     let source = ChunkSource::open(&repository(MINI), Split::Train, &SceneFilters::default()).unwrap();
     let scenes = (0..source.num_scenes()).map(|scene| {
         let frames = 0..source.num_frames(scene)?;
+        let images = frames.filter_map(|frame| source.encoded_frame(scene, frame).transpose());
         let mut record = SceneRecord {
             key: source.key(scene).into(),
             url: source.url(scene)?,
             timestamps: source.timestamps(scene)?,
             cameras: source.cameras(scene)?,
-            images: frames
-                .filter_map(|frame| source.encoded_frame(scene, frame).transpose())
-                .collect::<Result<_, _>>()?,
+            images: images.collect::<Result<_, _>>()?,
         };
         if record.key == KEYS[1] {
             change(&mut record);
@@ -71,7 +81,7 @@ fn assert_second_is_skipped(place: &Place, ran: Ran, reason: &str) {
     }
     assert_eq!(place.metrics("run").len(), 6 + 4, "every step is made");
     let clusters = place.json("run/clusters/index.json");
-    let keys: Vec<_> = clusters["entries"].as_array().unwrap().iter().map(|entry| &entry["key"]).collect();
+    let keys: Vec<_> = list(&clusters["entries"]).iter().map(|entry| &entry["key"]).collect();
     assert_eq!(keys, [KEYS[0]]);
     assert_eq!(clusters["skipped"]["skips"][0]["key"], KEYS[1], "the skipped scene is saved");
     assert_eq!(place.json("run/eval/summary.json")["num_scenes"], 1);
@@ -80,24 +90,20 @@ fn assert_second_is_skipped(place: &Place, ran: Ran, reason: &str) {
 #[test]
 fn what_the_data_refutes_is_refused_before_any_step() {
     let place = Place::new();
-    let message = place.train("run", &["eval.storage=[9]"], &[]).fails(2);
     let expected = "`eval.storage` = 9: write at most 8, the fewest tokens of an evaluated scene";
-    assert!(message.contains(expected), "{message}");
+    place.train("run", &["eval.storage=[9]"]).fails_with(2, &[expected]);
     assert!(!place.at("run/metrics.jsonl").exists());
     let nowhere = place.at("nowhere");
-    let message = train_on(&place, &nowhere, &[], &[]).fails(1);
-    assert!(message.trim_end().ends_with(&nowhere.display().to_string()), "{message}");
+    train_on(&place, "run", &nowhere, &[]).fails_naming(1, &[], &nowhere.display().to_string());
     // The corrected command is accepted: the refused one started no run.
-    train_on(&place, &repository(MINI), &[], &["--only", "stage1"]).ok();
+    train_on(&place, "run --only stage1", &repository(MINI), &[]).ok();
 }
 
 #[cfg(not(feature = "wgpu"))]
 #[test]
 fn missing_devices_are_refused_with_the_build_command() {
     let place = Place::new();
-    place
-        .train("run", &[], &["--device", "wgpu"])
-        .fails_with(2, &["cargo build --release --features wgpu", "`--device flex`"]);
+    place.train("run --device wgpu", &[]).fails_with(2, &["cargo build --release --features wgpu", "`--device flex`"]);
     assert!(!place.at("run").exists());
 }
 
@@ -105,9 +111,9 @@ fn missing_devices_are_refused_with_the_build_command() {
 fn chunks_train_and_null_index_entries_are_unused() {
     let place = Place::new();
     let index = format!("eval.index={:?}", repository(MINI).join("evaluation_index.json"));
-    let stderr = train_on(&place, &repository(MINI), &[&index], &[]).ok().stderr;
-    assert!(!stderr.contains("skipped"), "{stderr}");
-    assert!(stderr.contains("evaluation: 1 of 3 scenes used; 2 without views in the evaluation index"), "{stderr}");
+    let ran = train_on_mini(&place, &[&index]).ok();
+    assert!(!ran.stderr.contains("skipped"), "{}", ran.stderr);
+    ran.notes("evaluation: 1 of 3 scenes used; 2 without views in the evaluation index");
     let summary = place.json("run/eval/summary.json");
     let counts = ["num_scenes", "num_views", "num_skipped"].map(|key| summary[key].as_u64());
     assert_eq!(counts, [Some(1), Some(4), Some(2)]);
@@ -119,39 +125,33 @@ fn chunks_train_and_null_index_entries_are_unused() {
 #[test]
 fn an_index_of_other_scenes_fails_before_training() {
     let place = Place::new();
-    std::fs::write(place.at("index.json"), r#"{"ffff": {"context": [0, 2], "target": [1]}}"#).unwrap();
-    let index = format!("eval.index={:?}", place.at("index.json"));
-    train_on(&place, &repository(MINI), &[&index], &[])
-        .fails_with(1, &["no usable scene: evaluation: 0 of 1 scenes used; 1 not in the data"]);
+    let train = |text: &str| train_on_mini(&place, &[&index(&place, text)]);
+    let message = "no usable scene: evaluation: 0 of 1 scenes used; 1 not in the data";
+    train(r#"{"ffff": {"context": [0, 2], "target": [1]}}"#).fails_with(1, &[message]);
     assert!(!place.at("run/metrics.jsonl").exists());
 
+    let absent = "frame 9 of scene 00000000000000b1 does not exist";
     for (text, expected) in [
-        (
-            r#"{"00000000000000b1": {"context": [0, 9], "target": [1]}}"#,
-            "frame 9 of scene 00000000000000b1 does not exist",
-        ),
+        (r#"{"00000000000000b1": {"context": [0, 9], "target": [1]}}"#, absent),
         (r#"{"00000000000000b1": {"context": [0, 2]}}"#, "has 2 context and 0 target frames"),
         ("[]", "bad index: expected {key: "),
     ] {
-        std::fs::write(place.at("index.json"), text).unwrap();
-        let message = train_on(&place, &repository(MINI), &[&index], &[]).fails(1);
-        assert!(message.contains(expected) && message.trim_end().ends_with("index.json"), "{expected}: {message}");
+        train(text).fails_naming(1, &[expected], "index.json");
     }
 }
 
 #[test]
 fn targets_that_are_contexts_are_measured() {
     let place = Place::new();
-    std::fs::write(place.at("index.json"), r#"{"00000000000000b1": {"context": [0, 7], "target": [0, 7]}}"#).unwrap();
-    let index = format!("eval.index={:?}", place.at("index.json"));
+    let index = index(&place, r#"{"00000000000000b1": {"context": [0, 7], "target": [0, 7]}}"#);
     // Between neighbouring contexts no other frame is left for targets.
     let views = "data.views={min_context=2, max_context=2, min_gap=[1, 1], max_gap=[1, 1], num_targets=3}";
-    let stderr = train_on(&place, &repository(MINI), &[&index, views], &[]).ok().stderr;
+    let stderr = train_on_mini(&place, &[&index, views]).ok().stderr;
     assert!(!stderr.contains("skipped"), "{stderr}");
     let summary = place.json("run/eval/summary.json");
     // The nearest view is the target itself: an infinite PSNR counts as 100 dB.
     assert_eq!(summary["baselines"]["nearest_view"]["psnr"], 100.0);
-    assert!(summary["points"][0]["psnr"].as_f64().unwrap() < 40.0, "{summary}");
+    assert!(number(&summary["points"][0], "psnr") < 40.0, "{summary}");
 }
 
 #[test]
@@ -182,8 +182,7 @@ fn unusable_scenes_are_skipped_and_named() {
     for (reason, damage) in cases {
         let place = Place::new();
         let data = damage(&place);
-        let ran = train_on(&place, &data, &[], &[]);
-        assert_second_is_skipped(&place, ran, reason);
+        assert_second_is_skipped(&place, train_on(&place, "run", &data, &[]), reason);
     }
 }
 
@@ -194,9 +193,8 @@ fn without_any_usable_scene_the_run_ends() {
     for chunk in ["000000.torch", "000001.torch"] {
         place.truncate(&format!("data/train/{chunk}"));
     }
-    let message = train_on(&place, &data, &[], &[]).fails(1);
-    assert!(message.contains("error: no usable scene for slot 0 of step 0 in 16 tries; the last, "), "{message}");
-    assert!(message.contains("bad chunk: "), "{message}");
+    let expected = "error: no usable scene for slot 0 of step 0 in 16 tries; the last, ";
+    let message = train_on(&place, "run", &data, &[]).fails_with(1, &[expected, "bad chunk: "]);
     assert!(message.trim_end().ends_with("000000.torch") || message.trim_end().ends_with("000001.torch"), "{message}");
 }
 
@@ -208,9 +206,8 @@ fn too_short_scenes_are_skipped_at_the_start() {
         scene.cameras.truncate(3);
         scene.timestamps.truncate(3);
     });
-    let ran = train_on(&place, &data, &[], &["--only", "stage1"]).ok();
-    let expected = "train: 1 of 2 scenes used; 1 shorter than the 4 frames that data.views needs";
-    assert!(ran.stderr.contains(expected), "{}", ran.stderr);
+    let ran = train_on(&place, "run --only stage1", &data, &[]).ok();
+    let ran = ran.notes("train: 1 of 2 scenes used; 1 shorter than the 4 frames that data.views needs");
     assert!(!ran.stderr.contains("skipped "), "{}", ran.stderr);
     assert_eq!(place.json("run/skipped-train.json")["skips"][0]["key"], KEYS[1]);
 }
@@ -218,38 +215,29 @@ fn too_short_scenes_are_skipped_at_the_start() {
 #[test]
 fn too_small_images_are_refused_with_the_fix() {
     let place = Place::new();
-    train_on(&place, &repository(MINI), &["data.height=64"], &[])
+    train_on_mini(&place, &["data.height=64"])
         .fails_with(1, &["cannot make a 32x64 image from a 64x36 image", "lower the configured size"]);
 }
 
 #[test]
 fn truncated_weights_and_stale_caches_are_refused() {
-    let place = Place::new();
-    place.copy(&WHOLE, "run");
+    let place = Place::with(&WHOLE);
     place.truncate("run/stage2/model.safetensors");
-    let message = place.eval("run", &[]).fails(1);
-    assert!(message.contains("reading the weights failed: "), "{message}");
-    assert!(message.trim_end().ends_with("run/stage2/model.safetensors"), "{message}");
+    let file = "run/stage2/model.safetensors";
+    place.eval("run").fails_naming(1, &["reading the weights failed: "], file);
 
     std::fs::remove_dir_all(place.at("run/stage2")).unwrap();
-    let clusters = place.at("run/clusters/index.json");
-    let good = place.json("run/clusters/index.json");
-    let mut stale = good.clone();
+    let good = place.text("run/clusters/index.json");
+    let mut stale = place.json("run/clusters/index.json");
     stale["encoder"] = "0123456789abcdef".into();
-    std::fs::write(&clusters, stale.to_string()).unwrap();
-    place.train("run", &[], &[]).fails_with(
-        1,
-        &[
-            "stale cluster cache: its tokens are of encoder 0123456789ab, the run's is ",
-            "remove the cache to build a new one",
-        ],
-    );
+    place.write("run/clusters/index.json", stale.to_string());
+    let what = "stale cluster cache: its tokens are of encoder 0123456789ab, the run's is ";
+    place.train("run", &[]).fails_with(1, &[what, "remove the cache to build a new one"]);
     assert!(!place.at("run/stage2").exists(), "nothing is trained on it");
 
-    std::fs::write(&clusters, good.to_string()).unwrap();
+    place.write("run/clusters/index.json", &good);
     place.truncate("run/clusters/clusters.bin");
-    let message = place.train("run", &[], &[]).fails(1);
-    assert!(message.contains("bad cluster cache: ") && message.trim_end().ends_with("clusters.bin"), "{message}");
+    place.train("run", &[]).fails_naming(1, &["bad cluster cache: "], "clusters.bin");
 }
 
 #[test]
@@ -270,10 +258,9 @@ fn damaged_checkpoints_are_errors_and_change_nothing() {
             }
             std::fs::remove_file(run.join("config.toml")).unwrap(); // names the run it was copied from
             let before = files(&run.join("stage1"));
-            let message = place.train("run", &[], &["--only", "stage1"]).fails(1);
-            assert!(message.contains(&run.join(newest).join(file).display().to_string()), "{file}: {message}");
+            let damaged = run.join(newest).join(file).display().to_string();
             let fix = "the newest checkpoint is damaged: remove step-000000006 to resume from step-000000004";
-            assert!(message.trim_end().ends_with(fix), "{file}: {message}");
+            place.train("run --only stage1", &[]).fails_naming(1, &[&damaged], fix);
             assert!(files(&run.join("stage1")) == before, "{file}: a checkpoint was changed");
             assert_eq!(place.metrics("run"), place.metrics("whole"), "{file}: a step was made or forgotten");
             std::fs::remove_dir_all(run).unwrap();
@@ -286,14 +273,10 @@ fn three_steps_without_finite_loss_stop_the_run() {
     let place = Place::new();
     // One update of this size overflows every product after it.
     let set = ["stage1.optimizer={learning_rate=1e30, warm_up_steps=1}", "checkpoint.every=1", "stage1.steps=9"];
-    place.train("run", &set, &[]).fails_with(
-        1,
-        &[
-            "skipped step 2: loss or gradient is not finite (scenes synthetic-0-train-",
-            "skipped 3 consecutive steps, the last at step 4: loss or gradient is not finite",
-            &place.at("run/stage1/checkpoints").display().to_string(),
-        ],
-    );
+    let skipped = "skipped step 2: loss or gradient is not finite (scenes synthetic-0-train-";
+    let stopped = "skipped 3 consecutive steps, the last at step 4: loss or gradient is not finite";
+    let saved = place.at("run/stage1/checkpoints").display().to_string();
+    place.train("run", &set).fails_with(1, &[skipped, stopped, &saved]);
     assert!(!place.at("run/stage1/model.safetensors").exists());
     let lines = place.metrics("run");
     assert_eq!(lines.len(), 4);
@@ -304,9 +287,9 @@ fn three_steps_without_finite_loss_stop_the_run() {
 fn weights_of_two_trainings_are_not_evaluated_together() {
     let place = Place::new();
     place.copy(&WHOLE, "a");
-    place.train("b", &["seed=1"], &["--only", "stage1"]).ok();
+    place.train("b --only stage1", &["seed=1"]).ok();
     std::fs::copy(place.at("b/stage1/model.safetensors"), place.at("a/stage1/model.safetensors")).expect("copies");
-    place.eval("a", &[]).fails_with(1, &["trained on another encoder"]);
+    place.eval("a").fails_with(1, &["trained on another encoder"]);
 }
 
 #[test]
@@ -315,6 +298,6 @@ fn an_empty_cluster_cache_is_not_kept() {
     // Scenes of 8 frames train in the first steps and are too short once the gaps have grown.
     let views =
         "data.views={min_context=2, max_context=2, min_gap=[3, 8], max_gap=[6, 8], warm_up_steps=6, num_targets=2}";
-    place.train("run", &[views, "stage1.steps=6"], &[]).fails_with(1, &["none could be clustered"]);
+    place.train("run", &[views, "stage1.steps=6"]).fails_with(1, &["none could be clustered"]);
     assert!(!place.at("run/clusters").exists());
 }

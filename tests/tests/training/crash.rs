@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::support::{Place, finish, spawn};
+use crate::support::{Place, finish};
 
 /// A checkpoint after every step takes about half of the time.
 const SAVING: [&str; 4] = ["stage1.steps=40", "stage2.steps=30", "eval.every=10", "checkpoint={every=1, keep=2}"];
@@ -19,13 +19,13 @@ fn draw(state: &mut u64) -> f64 {
 fn runs_killed_at_random_end_the_same() {
     let place = Place::new();
     let started = Instant::now();
-    place.train("whole", &SAVING, &[]).ok();
+    place.train("whole", &SAVING).ok();
     let whole = started.elapsed();
     let (mut state, mut num_kills) = (7, 0);
     for run in 0.. {
         let name = format!("run{run}");
         loop {
-            let mut child = spawn(place.train_args(&name, &SAVING, &[]));
+            let mut child = place.start_train(&name, &SAVING);
             if num_kills < NUM_KILLS {
                 let until = Instant::now() + whole.mul_f64(draw(&mut state));
                 while Instant::now() < until && child.try_wait().expect("a child").is_none() {

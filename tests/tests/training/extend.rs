@@ -1,35 +1,34 @@
 //! `--extend`: more steps than at the start of the run.
 
-use crate::support::{Place, WHOLE, files, killed_at};
+use crate::support::{Place, WHOLE, files, number};
 
 #[test]
 fn extended_stages_follow_the_longer_schedule() {
-    let place = Place::new();
-    place.copy(&WHOLE, "run");
+    let place = Place::with(&WHOLE);
     let former = place.bytes("run/stage2/model.safetensors");
     let before = files(&place.at("run"));
     let more = ["stage2.steps=8"];
-    place.train("run", &more, &[]).fails_with(2, &["  stage2.steps: 4 -> 8\n", "continue with --extend"]);
+    place.train("run", &more).fails_with(2, &["  stage2.steps: 4 -> 8\n", "continue with --extend"]);
     assert!(files(&place.at("run")) == before, "a refusal changes nothing");
 
-    let ran = place.train("run", &more, &["--extend"]).ok();
-    assert!(ran.stderr.contains("stage2: resumed after 4 of 8 steps"), "{}", ran.stderr);
+    place.train("run --extend", &more).ok().notes("stage2: resumed after 4 of 8 steps");
     assert_eq!(place.bytes("run/stage2/model-4-steps.safetensors"), former);
     assert_ne!(place.bytes("run/stage2/model.safetensors"), former);
     let expected = serde_json::json!([{"stage": "stage2", "from": 4, "to": 8, "at_step": 4}]);
     assert_eq!(place.json("run/run.json")["extended"], expected);
 
     // From step 5 on the rates are those of a run of eight steps; up to it they were those of one of four.
-    place.train("eight", &more, &[]).ok();
-    let rate = |run: &str, step: usize| place.metrics(run)[6 + step - 1]["lr"].as_f64().expect("a rate");
+    place.train("eight", &more).ok();
+    let rate = |run: &str, step: usize| number(&place.metrics(run)[6 + step - 1], "lr");
     assert_eq!(place.metrics("run").len(), 14);
     assert!((5..=8).all(|step| rate("run", step) == rate("eight", step)));
     assert!(rate("run", 3) < rate("eight", 3) && rate("run", 5) > rate("run", 4));
 
     // The run now has this count: the flag is not needed, and run.json keeps the record.
-    place.train("run", &more, &[]).ok();
+    place.train("run", &more).ok();
     assert_eq!(place.json("run/run.json")["extended"], expected);
-    assert!(place.train("run", &[], &["--extend"]).fails(2).contains("stage2.steps: 8 -> 4"), "counts do not shrink");
+    // Counts do not shrink.
+    place.train("run --extend", &[]).fails_with(2, &["stage2.steps: 8 -> 4"]);
 }
 
 #[test]
@@ -37,43 +36,35 @@ fn an_extended_stage_resumes_exactly() {
     let place = Place::new();
     let (six, twelve) = (["checkpoint.every=3"], ["checkpoint.every=3", "stage1.steps=12"]);
     for name in ["whole", "parts"] {
-        place.train(name, &six, &["--only", "stage1"]).ok();
+        place.train(&format!("{name} --only stage1"), &six).ok();
     }
-    place.train("whole", &twelve, &["--only", "stage1", "--extend"]).ok();
-    let mut args = place.train_args("parts", &six, &["--only", "stage1"]);
+    place.train("whole --only stage1 --extend", &twelve).ok();
     // Killed after the weights were renamed and before the new count was written: the extension has no effect.
     let weights = place.at("parts/stage1/model.safetensors");
     std::fs::rename(&weights, place.at("parts/stage1/model-6-steps.safetensors")).expect("renames");
-    crate::support::clift(&args).ok();
+    place.train("parts --only stage1", &six).ok();
     assert!(weights.exists(), "written again from the last checkpoint");
     std::fs::remove_file(place.at("parts/stage1/model-6-steps.safetensors")).expect("removes");
 
-    args = place.train_args("parts", &twelve, &["--only", "stage1", "--extend"]);
-    crate::support::clift(&args).ok();
+    place.train("parts --only stage1 --extend", &twelve).ok();
     assert_eq!(place.bytes("parts/stage1/model.safetensors"), place.bytes("whole/stage1/model.safetensors"));
 
     // Before its end a stage is extended too, from the checkpoint it has.
-    killed_at("saved/stage1/3", &place.train_args("early", &six, &[]));
-    place.train("early", &twelve, &["--only", "stage1", "--extend"]).ok();
+    place.kill_at("saved/stage1/3", "early", &six);
+    place.train("early --only stage1 --extend", &twelve).ok();
     assert_eq!(place.json("early/run.json")["extended"][0]["at_step"], 3);
     assert_ne!(place.bytes("early/stage1/model.safetensors"), place.bytes("whole/stage1/model.safetensors"));
 }
 
 #[test]
 fn what_cannot_go_on_is_refused() {
-    let place = Place::new();
-    place.copy(&WHOLE, "run");
+    let place = Place::with(&WHOLE);
     let before = files(&place.at("run"));
-    place
-        .train("run", &["stage1.steps=9"], &["--extend"])
-        .fails_with(2, &["clusters/ depends on the present encoder of stage 1"]);
-    place
-        .train("run", &["stage2.steps=9", "seed=1"], &["--extend"])
-        .fails_with(2, &["settings:\n  seed: 0 -> 1\nresume"]);
+    let refused = |set: &[&str], expected: &str| place.train("run --extend", set).fails_with(2, &[expected]);
+    refused(&["stage1.steps=9"], "clusters/ depends on the present encoder of stage 1");
+    refused(&["stage2.steps=9", "seed=1"], "settings:\n  seed: 0 -> 1\nresume");
     assert!(files(&place.at("run")) == before, "a refusal changes nothing");
     std::fs::remove_dir_all(place.at("run/stage2/checkpoints")).expect("removes");
-    place
-        .train("run", &["stage2.steps=9"], &["--extend"])
-        .fails_with(2, &["the stage has no checkpoint to resume from in stage2/checkpoints"]);
+    refused(&["stage2.steps=9"], "the stage has no checkpoint to resume from in stage2/checkpoints");
     assert!(place.at("run/stage2/model.safetensors").exists());
 }

@@ -3,17 +3,14 @@
 use std::path::Path;
 use std::process::Command;
 
-use crate::support::{BINARY, Place, STAGE_1, Shared, clift, finish, killed_at, spawn, start, wait_for_steps};
+use crate::support::{BINARY, Place, STAGE_1, Shared, finish, start};
 
 /// Stage 1 of 24 steps, with a checkpoint at step 12.
 const HALF: [&str; 4] = ["stage1.steps=24", "stage2.steps=12", "eval.every=12", "checkpoint={every=12, keep=2}"];
-static UNDISTURBED: Shared = Shared::new(&HALF, &[]);
+static UNDISTURBED: Shared = Shared::new("run", &HALF);
 
-/// Expects a message that names the last good checkpoint, and no half-written one beside it.
-fn assert_names_the_last_good_checkpoint(place: &Place, run: &str, step: u64, message: &str) {
-    let checkpoint = place.at(&format!("{run}/stage1/checkpoints/step-{step:09}")).display().to_string();
-    assert!(message.trim_end().ends_with(&format!("the last good checkpoint is {checkpoint}")), "{message}");
-    assert_eq!(place.checkpoints(run, "stage1"), [step], "nothing half-written lies beside it");
+fn num_bytes(place: &Place, name: &str) -> u64 {
+    place.bytes(name).len() as u64
 }
 
 /// A limit on file sizes stops a save as a full disk does, without the right to mount one.
@@ -21,22 +18,23 @@ fn assert_names_the_last_good_checkpoint(place: &Place, run: &str, step: u64, me
 fn failed_saves_keep_the_checkpoint_and_runs_resume() {
     let place = Place::new();
     place.copy(&UNDISTURBED, "whole");
-    killed_at("saved/stage1/12", &place.train_args("run", &HALF, &[]));
-    let largest = |path: &Path| std::fs::metadata(path).expect("there").len();
-    let model = largest(&place.at("run/stage1/checkpoints/step-000000012/model.bpk"));
+    place.kill_at("saved/stage1/12", "run", &HALF);
+    let model = num_bytes(&place, "run/stage1/checkpoints/step-000000012/model.bpk");
     // Blocks have 512 bytes or 1,024, by the shell; the config fits and the weights do not.
     let blocks = model / 1024 - 1;
-    assert!(largest(&place.at("run/config.toml")) < blocks * 512, "{model}");
+    assert!(num_bytes(&place, "run/config.toml") < blocks * 512, "{model}");
     let mut command = Command::new("sh");
     command.args(["-c", "trap '' XFSZ; ulimit -f $0; exec \"$@\"", &blocks.to_string(), BINARY]);
-    let message = finish(start(command.args(place.train_args("run", &HALF, &[])))).fails(1);
-    assert!(
-        message.contains("error: writing a checkpoint failed: ") && message.contains("File too large"),
-        "{message}"
+    let message = finish(start(command.args(place.train_args("run", &HALF)))).fails_with(
+        1,
+        &[
+            "error: writing a checkpoint failed: ",
+            "File too large",
+            "step-000000024.tmp/model.bpk\nstage1 stopped after step 24; ",
+        ],
     );
-    assert!(message.contains("step-000000024.tmp/model.bpk\nstage1 stopped after step 24; "), "{message}");
-    assert_names_the_last_good_checkpoint(&place, "run", 12, &message);
-    place.train("run", &HALF, &[]).ok();
+    place.assert_names_last_checkpoint("run", 12, &message);
+    place.train("run", &HALF).ok();
     place.assert_same_run("run", "whole");
 }
 
@@ -62,36 +60,29 @@ impl Drop for SmallDisk<'_> {
 fn full_disks_keep_the_checkpoint_and_runs_resume() {
     let place = Place::new();
     let folder = place.at("disk");
-    let Some(disk) = SmallDisk::mount(&folder, 4096) else {
-        println!("passed by: no right to mount a tmpfs");
-        return;
-    };
+    let Some(disk) = SmallDisk::mount(&folder, 4096) else { return println!("passed by: no right to mount a tmpfs") };
     place.copy(&UNDISTURBED, "whole");
     let run = "disk/run";
-    killed_at("saved/stage1/12", &place.train_args(run, &HALF, &[]));
+    place.kill_at("saved/stage1/12", run, &HALF);
     // Fills the disk up to less than a checkpoint takes.
-    let model =
-        std::fs::metadata(place.at("disk/run/stage1/checkpoints/step-000000012/model.bpk")).expect("there").len();
+    let model = num_bytes(&place, "disk/run/stage1/checkpoints/step-000000012/model.bpk");
     let free = || {
-        let output = Command::new("stat").args(["-f", "-c", "%a %S"]).arg(&folder).output().expect("stat runs");
-        let text = String::from_utf8(output.stdout).expect("text");
-        text.split_whitespace().map(|number| number.parse::<u64>().expect("a number")).product::<u64>()
+        let output = finish(start(Command::new("stat").args(["-f", "-c", "%a %S"]).arg(&folder)));
+        output.stdout.split_whitespace().map(|number| number.parse::<u64>().expect("a number")).product::<u64>()
     };
     std::fs::write(folder.join("ballast"), vec![1; (free() - model / 2) as usize]).expect("fits");
-    let message = finish(spawn(place.train_args(run, &HALF, &[]))).fails(1);
-    assert!(message.contains("No space left on device"), "{message}");
-    assert!(message.contains("stage1 stopped after step 24; "), "{message}");
-    assert_names_the_last_good_checkpoint(&place, run, 12, &message);
+    let parts = ["No space left on device", "stage1 stopped after step 24; "];
+    let message = place.train(run, &HALF).fails_with(1, &parts);
+    place.assert_names_last_checkpoint(run, 12, &message);
 
     // No line of metrics fits: the run stops before the next save, without a gap in its metrics.
-    let rest = vec![1; free() as usize];
-    let _ = std::fs::write(folder.join("more-ballast"), rest);
-    finish(spawn(place.train_args(run, &HALF, &[]))).fails_with(1, &["No space left on device"]);
+    let _ = std::fs::write(folder.join("more-ballast"), vec![1; free() as usize]);
+    place.train(run, &HALF).fails_with(1, &["No space left on device"]);
 
     for name in ["ballast", "more-ballast"] {
         std::fs::remove_file(folder.join(name)).expect("removes");
     }
-    place.train(run, &HALF, &[]).ok();
+    place.train(run, &HALF).ok();
     place.assert_same_run(run, "whole");
     drop(disk);
 }
@@ -99,17 +90,12 @@ fn full_disks_keep_the_checkpoint_and_runs_resume() {
 #[test]
 fn impossible_run_directories_are_errors() {
     let place = Place::new();
-    std::fs::write(place.at("file"), b"not a folder").expect("writable");
-    let message = place.train("file/run", &[], &[]).fails(1);
-    assert!(
-        message.contains("making the run directory failed: ") && message.trim_end().ends_with("file/run"),
-        "{message}"
-    );
+    place.write("file", "not a folder");
+    place.train("file/run", &[]).fails_naming(1, &["making the run directory failed: "], "file/run");
     // A file in place of a folder.
     place.copy(&STAGE_1, "run");
-    std::fs::write(place.at("run/clusters.tmp"), b"not a folder").expect("writable");
-    let message = place.train("run", &[], &[]).fails(1);
-    assert!(message.trim_end().ends_with("run/clusters.tmp"), "{message}");
+    place.write("run/clusters.tmp", "not a folder");
+    place.train("run", &[]).fails_naming(1, &[], "run/clusters.tmp");
     assert!(place.at("run/stage1/model.safetensors").exists());
 }
 
@@ -118,39 +104,25 @@ fn vanished_data_stops_runs_which_resume_with_it() {
     let place = Place::new();
     let data = place.at("rooms");
     let folder = data.display().to_string();
-    clift([
-        "data",
-        "synth",
-        &folder,
-        "--scenes",
-        "8",
-        "--frames",
-        "8",
-        "--size",
-        "16x16",
-        "--set",
-        "samples_per_pixel=1",
-    ])
-    .ok();
+    place.clift("data synth DIR/rooms --scenes 8 --frames 8 --size 16x16 --set samples_per_pixel=1").ok();
     let source = format!(
         "data={{source='chunks', root='{folder}', width=16, height=16, num_threads=0, \
          views={{min_context=2, max_context=2, min_gap=[3, 3], max_gap=[6, 6], warm_up_steps=0, num_targets=2}}}}"
     );
     let set = ["stage1.steps=400", "eval.every=0", "checkpoint={every=1000, keep=2}", source.as_str()];
-    place.train("whole", &set, &[]).ok();
+    place.train("whole", &set).ok();
 
-    let mut child = spawn(place.train_args("run", &set, &[]));
-    wait_for_steps(&place.at("run"), &mut child, 5);
+    let mut child = place.start_train("run", &set);
+    place.wait_for_steps("run", &mut child, 5);
     std::fs::rename(&data, place.at("gone")).expect("renames");
-    let message = finish(child).fails(1);
+    let message = finish(child).fails_with(1, &["no usable scene for slot 0 of step ", "000000.torch"]);
     let steps = place.metrics("run").len() as u64;
     assert!((5..400).contains(&steps), "{steps}");
-    assert!(message.contains("no usable scene for slot 0 of step ") && message.contains("000000.torch"), "{message}");
     assert!(message.contains(&format!("\nstage1 stopped after step {steps}; ")), "{message}");
-    assert_names_the_last_good_checkpoint(&place, "run", steps, &message);
+    place.assert_names_last_checkpoint("run", steps, &message);
 
-    place.train("run", &set, &[]).fails_with(1, &[&folder]);
+    place.train("run", &set).fails_with(1, &[&folder]);
     std::fs::rename(place.at("gone"), &data).expect("renames");
-    place.train("run", &set, &[]).ok();
+    place.train("run", &set).ok();
     place.assert_same_run("run", "whole");
 }

@@ -2,14 +2,14 @@
 
 use serde_json::{Value, json};
 
-use crate::support::{Place, clift, repository};
+use crate::support::{Place, clift, number, repository};
 
 const REFERENCE: &str = "data-fixtures/reference/tiny_loss.json";
 
 /// Losses of a stage, step by step.
 fn losses(lines: &[Value], stage: &str) -> Vec<f64> {
     let lines = lines.iter().filter(|line| line["stage"] == stage);
-    lines.map(|line| line["loss"].as_f64().expect("a finite loss")).collect()
+    lines.map(|line| number(line, "loss")).collect()
 }
 
 /// Trains with the settings that the reference lists.

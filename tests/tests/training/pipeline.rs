@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use crate::support::{Place, STAGE_1, WHOLE, clift};
+use crate::support::{Place, STAGE_1, WHOLE, list, number};
 
 /// Keys of a JSON object, in any order.
 fn keys(value: &Value) -> Vec<&str> {
@@ -25,12 +25,10 @@ const POINT_KEYS: &str = "\
 #[test]
 fn a_run_writes_every_documented_file() {
     let place = Place::new();
-    let ran = place.train("run", &[], &[]).ok();
-    assert!(ran.stdout.contains("nearest_view") && ran.stdout.contains("clift "), "{}", ran.stdout);
+    let ran = place.train("run", &[]).ok().prints("nearest_view").prints("clift ").prints("run/eval/report.html\n");
     assert!(ran.stdout.trim_end().ends_with("run/eval"), "{}", ran.stdout);
-    assert!(ran.stdout.contains("run/eval/report.html\n"), "{}", ran.stdout);
-    let changed = format!("--set run_dir: \"runs/tiny\" -> {:?}\n", place.at("run"));
-    assert!(ran.stderr.contains(&changed), "what differs from the file is printed: {}", ran.stderr);
+    // What differs from the file is printed.
+    ran.notes(&format!("--set run_dir: \"runs/micro\" -> {:?}\n", place.at("run")));
 
     let config = place.text("run/config.toml");
     // Resolved: overrides, and defaults that neither the file nor an override names.
@@ -45,33 +43,28 @@ fn a_run_writes_every_documented_file() {
     assert_eq!(steps.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
     for line in &lines {
         assert_eq!(keys(line), ["grad_norm", "loss", "lr", "psnr", "stage", "step", "step_s"]);
-        let number = |key: &str| line[key].as_f64().unwrap_or_else(|| panic!("{key}: {line}"));
+        let number = |key: &str| number(line, key);
         assert!(number("loss") > 0.0 && number("grad_norm") > 0.0 && number("step_s") > 0.0, "{line}");
         // Written from the same f64 to the last digit.
         assert!((number("psnr") + 10.0 * number("loss").log10()).abs() < 1e-9, "{line}");
     }
     // Warm-up of two steps to 1e-3, then half a cosine to nothing at step 6.
     assert_eq!(lines[1]["lr"], 1e-3);
-    assert!(lines[5]["lr"].as_f64().unwrap() < 1e-18, "{}", lines[5]);
+    assert!(number(&lines[5], "lr") < 1e-18, "{}", lines[5]);
 
     let summary = place.json("run/eval/summary.json");
     assert_eq!(keys(&summary).join(" "), SUMMARY_KEYS);
-    assert_eq!(
-        (&summary["num_scenes"], &summary["num_views"], &summary["num_skipped"]),
-        (&3.into(), &6.into(), &0.into())
-    );
+    assert_eq!(["num_scenes", "num_views", "num_skipped"].map(|key| summary[key].as_u64()), [3, 6, 0].map(Some));
     assert_eq!(keys(&summary["baselines"]), ["mean_image", "nearest_view"]);
     for baseline in ["mean_image", "nearest_view"] {
         let baseline = &summary["baselines"][baseline];
         assert_eq!(keys(baseline), ["lpips_vgg", "psnr", "ssim"]);
-        assert!(baseline["psnr"].as_f64().unwrap() > 5.0 && baseline["ssim"].is_f64(), "{baseline}");
+        assert!(number(baseline, "psnr") > 5.0 && baseline["ssim"].is_f64(), "{baseline}");
     }
-    let points = summary["points"].as_array().unwrap();
-    let settings: Vec<_> = points
-        .iter()
-        .map(|point| (point["variant"].as_str().unwrap(), point["num_storage_tokens"].as_u64().unwrap()))
-        .collect();
-    assert_eq!(settings, [("clift", 4), ("clift", 8), ("kmeans", 4), ("kmeans", 8), ("random", 4), ("random", 8)]);
+    let points = list(&summary["points"]);
+    let settings = points.iter().map(|point| (point["variant"].as_str(), point["num_storage_tokens"].as_u64()));
+    let expected = ["clift", "kmeans", "random"].map(|variant| [4, 8].map(|count| (Some(variant), Some(count))));
+    assert_eq!(settings.collect::<Vec<_>>(), expected.concat());
     for point in points {
         assert_eq!(keys(point).join(" "), POINT_KEYS);
         assert_eq!(point["num_render_tokens"], point["num_storage_tokens"]);
@@ -82,17 +75,11 @@ fn a_run_writes_every_documented_file() {
     // A header, then 6 views of 6 points and 2 baselines.
     assert_eq!(views.lines().count(), 1 + 6 * 8, "{views}");
 
-    let names = |folder: &str| {
-        let items = std::fs::read_dir(place.at(folder)).unwrap_or_else(|error| panic!("{folder}: {error}"));
-        let mut names: Vec<_> = items.map(|item| item.unwrap().file_name().into_string().unwrap()).collect();
-        names.sort();
-        names
-    };
-    assert_eq!(names("run/eval/sheets"), ["synthetic-0-test-00000.png"], "eval.num_sheets = 1");
-    assert_eq!(names("run/stage1/samples"), ["step-000000003.png", "step-000000006.png"], "eval.every = 3");
-    assert_eq!(names("run/stage2/samples"), ["step-000000003.png", "step-000000004.png"]);
+    assert_eq!(place.names("run/eval/sheets"), ["synthetic-0-test-00000.png"], "eval.num_sheets = 1");
+    assert_eq!(place.names("run/stage1/samples"), ["step-000000003.png", "step-000000006.png"], "eval.every = 3");
+    assert_eq!(place.names("run/stage2/samples"), ["step-000000003.png", "step-000000004.png"]);
     for folder in ["run/eval/sheets", "run/stage1/samples", "run/stage2/samples"] {
-        for name in names(folder) {
+        for name in place.names(folder) {
             let path = place.at(folder).join(name);
             let picture = image::open(&path).unwrap_or_else(|error| panic!("{path:?}: {error}")).into_rgb8();
             // Two targets below each other, at least five columns beside each other.
@@ -103,14 +90,17 @@ fn a_run_writes_every_documented_file() {
     }
 
     let clusters = place.json("run/clusters/index.json");
-    assert_eq!(clusters["entries"].as_array().unwrap().len(), 6);
-    assert_eq!(names("run/stage1/checkpoints"), ["step-000000004", "step-000000006"], "every 2, the last 2 are kept");
-    assert_eq!(names("run/stage2/checkpoints"), ["step-000000002", "step-000000004"]);
-    let part = |stage: &str, network: &str| place.weights("run", stage).part(network).0.len();
+    assert_eq!(list(&clusters["entries"]).len(), 6);
     assert_eq!(
-        (part("stage1", "encoder."), part("stage1", "renderer.")),
-        (part("stage2", "encoder."), part("stage2", "renderer."))
+        place.names("run/stage1/checkpoints"),
+        ["step-000000004", "step-000000006"],
+        "every 2, the last 2 are kept"
     );
+    assert_eq!(place.names("run/stage2/checkpoints"), ["step-000000002", "step-000000004"]);
+    let part = |stage: &str, network: &str| place.weights("run", stage).part(network).0.len();
+    for network in ["encoder.", "renderer."] {
+        assert_eq!(part("stage1", network), part("stage2", network));
+    }
     assert!(part("stage2", "condenser.") > 0);
     assert!(place.weights("run", "stage1").0.keys().all(|name| !name.starts_with("condenser.")));
 }
@@ -122,16 +112,15 @@ fn moved_runs_evaluate_with_other_counts() {
     let summary = place.summary_but_time("before");
     std::fs::rename(place.at("before"), place.at("after")).unwrap();
 
-    let ran = place.eval("after", &[]).ok();
+    let ran = place.eval("after").ok();
     assert!(ran.stdout.trim_end().ends_with("after/eval"), "{}", ran.stdout);
     assert_eq!(place.summary_but_time("after"), summary);
     assert!(!place.at("before").exists(), "nothing is written to where the run was trained");
 
-    let out = place.at("elsewhere");
-    place.eval("after", &["--storage", "3,1/2", "--set", "eval.num_scenes=2", "--out", out.to_str().unwrap()]).ok();
+    place.eval("after --storage 3,1/2 --set eval.num_scenes=2 --out DIR/elsewhere").ok();
     let other = place.json("elsewhere/summary.json");
     assert_eq!(other["num_scenes"], 2);
-    let stored: Vec<_> = other["points"].as_array().unwrap().iter().map(|point| &point["num_storage_tokens"]).collect();
+    let stored: Vec<_> = list(&other["points"]).iter().map(|point| &point["num_storage_tokens"]).collect();
     assert_eq!(stored, [3, 4, 3, 4, 3, 4]);
     assert_eq!(place.summary_but_time("after"), summary, "--out leaves the run's own results alone");
 }
@@ -141,13 +130,13 @@ fn stages_run_singly_give_equal_weights() {
     let place = Place::new();
     place.copy(&WHOLE, "whole");
     for stage in ["stage1", "clusters", "stage2"] {
-        let ran = place.train("parts", &[], &["--only", stage]).ok();
+        let ran = place.train(&format!("parts --only {stage}"), &[]).ok();
         assert!(ran.stdout.is_empty(), "a part has no evaluation to print: {}", ran.stdout);
     }
     assert!(!place.at("parts/eval").exists());
     place.assert_same_result("parts", "whole");
     assert_eq!(place.metrics_but_time("parts"), place.metrics_but_time("whole"));
-    place.eval("parts", &[]).ok();
+    place.eval("parts").ok();
     let summary = |run: &str| place.summary_but_time(run);
     assert_eq!(summary("parts"), summary("whole"));
 }
@@ -156,36 +145,31 @@ fn stages_run_singly_give_equal_weights() {
 fn early_stages_name_what_to_run_first() {
     let place = Place::new();
     for stage in ["stage2", "clusters"] {
-        let message = place.train("run", &[], &["--only", stage]).fails(2);
-        let expected = format!("error: {stage} needs the weights of stage 1, not found at ");
-        assert!(message.contains(&expected), "{message}");
-        assert!(message.contains("run/stage1/model.safetensors; run `--only stage1` first"), "{message}");
+        let needs = format!("error: {stage} needs the weights of stage 1, not found at ");
+        let fix = "run/stage1/model.safetensors; run `--only stage1` first";
+        place.train(&format!("run --only {stage}"), &[]).fails_with(2, &[&needs, fix]);
     }
     place.copy(&STAGE_1, "run");
-    place
-        .train("run", &[], &["--only", "stage2"])
-        .fails_with(2, &["error: stage2 needs the cluster cache, not found at "]);
+    place.train("run --only stage2", &[]).fails_with(2, &["error: stage2 needs the cluster cache, not found at "]);
     // Without stage 2 the evaluation measures stage 1 and prints a note.
-    let ran = place.eval("run", &[]).ok();
-    assert!(ran.stderr.contains("stage 2 has not run"), "{}", ran.stderr);
+    let ran = place.eval("run").ok().notes("stage 2 has not run");
     assert!(!ran.stdout.contains("\nclift "), "{}", ran.stdout);
 
-    let message = clift(["eval", place.at("nowhere").to_str().unwrap()]).fails(2);
-    assert!(message.trim_end().ends_with("nowhere/config.toml"), "{message}");
+    place.eval("nowhere").fails_naming(2, &[], "nowhere/config.toml");
 }
 
 #[test]
 fn overfitting_one_scene_trains_and_measures_that_scene() {
     let place = Place::new();
-    place.train("run", &["stage1.steps=20", "stage2.steps=2"], &["--overfit", "1"]).ok();
+    place.train("run --overfit 1", &["stage1.steps=20", "stage2.steps=2"]).ok();
     assert_eq!(place.json("run/run.json")["overfit"], 1);
     let summary = place.json("run/eval/summary.json");
     assert_eq!((&summary["num_scenes"], &summary["num_views"]), (&1.into(), &2.into()));
     let views = place.text("run/eval/views.csv");
     assert!(views.lines().skip(1).all(|line| line.contains("synthetic-0-train-0")), "{views}");
-    assert_eq!(place.json("run/clusters/index.json")["entries"].as_array().unwrap().len(), 1);
+    assert_eq!(list(&place.json("run/clusters/index.json")["entries"]).len(), 1);
     // One scene over and over: the loss of the last five steps is below that of the first five.
-    let losses: Vec<f64> = place.metrics("run").iter().map(|line| line["loss"].as_f64().unwrap()).collect();
+    let losses: Vec<f64> = place.metrics("run").iter().map(|line| number(line, "loss")).collect();
     let mean = |losses: &[f64]| losses.iter().sum::<f64>() / losses.len() as f64;
     assert!(mean(&losses[15..20]) < mean(&losses[..5]), "{losses:?}");
 }
@@ -193,24 +177,21 @@ fn overfitting_one_scene_trains_and_measures_that_scene() {
 #[test]
 fn runs_start_from_weights_of_other_runs() {
     let place = Place::new();
-    place.train("first", &["seed=7"], &["--only", "stage1"]).ok();
+    place.train("first --only stage1", &["seed=7"]).ok();
     let first = place.at("first").display().to_string();
     let file = place.at("first/stage1/model.safetensors").display().to_string();
     for from in [&first, &file] {
         // No steps: the weights of the second run are those it starts from.
         let set = [&format!("stage1.init_from={from:?}"), "stage1.steps=0"];
-        let ran = place.train("second", &set, &["--only", "stage1", "--fresh"]).ok();
+        let ran = place.train("second --only stage1 --fresh", &set).ok();
         let count = place.weights("first", "stage1").0.len();
-        let expected = format!(
+        ran.notes(&format!(
             "loaded {count} parameters from {file}; initialized, not in the file: none; unused in the file: none"
-        );
-        assert!(ran.stderr.contains(&expected), "{expected}\nis not in\n{}", ran.stderr);
+        ));
         assert_eq!(place.weights("second", "stage1"), place.weights("first", "stage1"));
     }
 
     let set = [&format!("stage1.init_from={first:?}"), "model.dim=8"];
-    place.train("third", &set, &["--only", "stage1"]).fails_with(1, &[&file]);
-    place
-        .train("fourth", &["stage1.init_from=no/such/run.safetensors"], &[])
-        .fails_with(1, &["no/such/run.safetensors"]);
+    place.train("third --only stage1", &set).fails_with(1, &[&file]);
+    place.train("fourth", &["stage1.init_from=no/such/run.safetensors"]).fails_with(1, &["no/such/run.safetensors"]);
 }

@@ -1,19 +1,17 @@
 //! A second command on an existing run: kept, refused and repeated work.
 
-use std::time::{Duration, Instant};
-
-use crate::support::{Place, STAGE_1, WHOLE, clift, files, finish, killed_at, signal, spawn};
+use crate::support::{Place, STAGE_1, WHOLE, files, finish, number, signal, wait_until};
 
 #[test]
 fn micro_batches_give_the_same_update() {
     let place = Place::new();
     let batches = ["stage1.batch_size=5", "stage2.batch_size=5"];
-    place.train("at_once", &batches, &[]).ok();
+    place.train("at_once", &batches).ok();
     // Three scenes and two: parts weigh as many scenes as they have. Stage 2 on its own, because K-means may cluster
     // other tokens after the smallest change of the encoder.
     for stage in ["stage1", "stage2"] {
         let accumulate = format!("{stage}.accumulate=2");
-        place.train(stage, &[&batches[..], &[accumulate.as_str()]].concat(), &[]).ok();
+        place.train(stage, &[&batches[..], &[accumulate.as_str()]].concat()).ok();
         let (whole, parts) = (place.weights("at_once", stage), place.weights(stage, stage));
         let moves: Vec<f64> = parts.moved_from(&whole).collect();
         // Sums in another order differ in the last bit of f32. Adam divides by the size of a gradient, so one that is
@@ -22,7 +20,7 @@ fn micro_batches_give_the_same_update() {
         let mean = moves.iter().sum::<f64>() / moves.len() as f64;
         assert!(most < 1e-4 && mean < 1e-7, "{stage}: {most:e}, {mean:e}");
         for (part, whole) in place.metrics(stage).iter().zip(&place.metrics("at_once")) {
-            let relative = |key: &str| (part[key].as_f64().unwrap() / whole[key].as_f64().unwrap() - 1.0).abs();
+            let relative = |key: &str| (number(part, key) / number(whole, key) - 1.0).abs();
             // Eight times the rounding of one f32.
             let same = relative("loss") < 1e-6 && relative("grad_norm") < 1e-6;
             assert!(same || part["stage"] != stage, "{part} is not {whole}");
@@ -32,11 +30,10 @@ fn micro_batches_give_the_same_update() {
 
 #[test]
 fn a_finished_run_is_left_as_it_is() {
-    let place = Place::new();
-    place.copy(&WHOLE, "run");
+    let place = Place::with(&WHOLE);
     let before = files(&place.at("run"));
     let summary = place.summary_but_time("run");
-    let ran = place.train("run", &[], &[]).ok();
+    let ran = place.train("run", &[]).ok();
     assert!(!ran.stderr.contains("stage1: 6 steps") && !ran.stderr.contains("stage2: 4 steps"), "{}", ran.stderr);
     let after = files(&place.at("run"));
     assert!(before.keys().eq(after.keys()), "{:?}", after.keys());
@@ -51,8 +48,7 @@ fn a_finished_run_is_left_as_it_is() {
 
 #[test]
 fn changed_settings_are_refused_unless_results_stay_equal() {
-    let place = Place::new();
-    place.copy(&STAGE_1, "run");
+    let place = Place::with(&STAGE_1);
     let before = files(&place.at("run"));
     for (change, expected) in [
         ("seed=1", "  seed: 0 -> 1"),
@@ -61,61 +57,51 @@ fn changed_settings_are_refused_unless_results_stay_equal() {
         ("clusters.grid=[0.5]", "  clusters.grid: [\"1/2\", \"1/1\"] -> [\"1/2\"]"),
         ("stage1.init_from=other", "  stage1.init_from: not set -> \"other\""),
     ] {
-        let message = place.train("run", &[change], &[]).fails(2);
-        assert!(message.contains(&format!("settings:\n{expected}\nresume")), "{expected}: {message}");
-        assert!(message.contains("--fresh") && message.trim_end().ends_with("/run"), "{message}");
+        let settings = format!("settings:\n{expected}\nresume");
+        place.train("run", &[change]).fails_naming(2, &[&settings, "--fresh"], "/run");
     }
-    let message = place.train("run", &["seed=1", "stage1.steps=7"], &["--overfit", "2"]).fails(2);
-    let expected = "settings:\n  --overfit: off -> 2\n  seed: 0 -> 1\n  stage1.steps: 6 -> 7\nresume";
-    assert!(message.contains(expected), "{message}");
+    let settings = "settings:\n  --overfit: off -> 2\n  seed: 0 -> 1\n  stage1.steps: 6 -> 7\nresume";
+    place.train("run --overfit 2", &["seed=1", "stage1.steps=7"]).fails_with(2, &[settings]);
     assert!(files(&place.at("run")) == before, "a refusal changes nothing");
 
     let free = ["data.num_threads=0", "checkpoint.every=3", "eval.num_scenes=1", "device=ndarray"];
-    place.train("run", &free, &["--only", "clusters"]).ok();
+    place.train("run --only clusters", &free).ok();
 }
 
 #[test]
 fn fresh_moves_the_former_run_aside() {
-    let place = Place::new();
-    place.copy(&STAGE_1, "run");
+    let place = Place::with(&STAGE_1);
     let before = files(&place.at("run"));
-    place.train("run", &[], &["--fresh", "--only", "clusters"]).fails_with(2, &["--fresh"]);
+    place.train("run --fresh --only clusters", &[]).fails_with(2, &["--fresh"]);
     assert!(files(&place.at("run")) == before, "a later stage cannot be fresh: nothing is moved");
-    let ran = place.train("run", &["stage1.steps=3"], &["--only", "stage1", "--fresh"]).ok();
-    assert!(ran.stderr.contains("renamed the existing run to "), "{}", ran.stderr);
+    place.train("run --only stage1 --fresh", &["stage1.steps=3"]).ok().notes("renamed the existing run to ");
     assert!(files(&place.at("run.1")).into_values().eq(before.into_values()), "every byte of it");
     assert_eq!(place.metrics("run").len(), 3);
-    place.train("run", &[], &["--only", "stage1", "--fresh"]).ok();
+    place.train("run --only stage1 --fresh", &[]).ok();
     assert_eq!((place.metrics("run.2").len(), place.metrics("run").len()), (3, 6));
 }
 
 #[test]
 fn an_evaluation_can_be_interrupted() {
     let place = Place::new();
-    place.train("run", &["data.synthetic.num_scenes=400"], &[]).ok();
-    let run = place.at("run").display().to_string();
+    place.train("run", &["data.synthetic.num_scenes=400"]).ok();
     // Hundreds of scenes with rows of targets: far longer than the signal takes.
-    let mut child = spawn(["eval", &run, "--set", "eval.num_scenes=0", "--set", "eval.num_sheets=400"]);
-    let sheets = place.at("run/eval/sheets");
-    let names = || {
-        let items = std::fs::read_dir(&sheets).expect("the first evaluation's");
-        items.map(|item| item.expect("an item").path()).collect::<std::collections::BTreeSet<_>>()
-    };
+    let mut child = place.start("eval DIR/run --set eval.num_scenes=0 --set eval.num_sheets=400");
+    let names = || place.names("run/eval/sheets");
     let (before, summary) = (names(), place.bytes("run/eval/summary.json"));
     // Sheets are made in a folder of their own, and take the place of the former ones all together.
-    let new = |path: &std::path::PathBuf| std::fs::read_dir(path).map_or(0, Iterator::count);
-    let started = Instant::now();
-    while names().difference(&before).map(new).sum::<usize>() < 3 {
-        assert!(child.try_wait().expect("a child").is_none(), "the evaluation ended before the signal");
-        assert!(started.elapsed() < Duration::from_mins(1), "no sheet within a minute");
-        std::thread::sleep(Duration::from_millis(2));
-    }
+    let num_new = || {
+        let new = names().into_iter().filter(|name| !before.contains(name));
+        let items = new.map(|name| std::fs::read_dir(place.at("run/eval/sheets").join(name)));
+        items.map(|items| items.map_or(0, Iterator::count)).sum::<usize>()
+    };
+    wait_until(&mut child, "three sheets", || num_new() >= 3);
     signal(&child, "-INT");
     finish(child).fails_with(130, &["interrupted during the evaluation, after ", " scenes; no results were written"]);
     assert_eq!((names(), place.bytes("run/eval/summary.json")), (before, summary));
     // A shorter evaluation removes the sheets of a longer one and no other file.
-    std::fs::write(sheets.join("mine.png"), b"").expect("writable");
-    clift(["eval", &run, "--set", "eval.num_sheets=1", "--set", "eval.num_scenes=2"]).ok();
+    place.write("run/eval/sheets/mine.png", "");
+    place.eval("run --set eval.num_sheets=1 --set eval.num_scenes=2").ok();
     assert_eq!(names().len(), 2);
 }
 
@@ -124,10 +110,10 @@ fn resumed_runs_need_neither_initial_weights_nor_clusters() {
     let place = Place::new();
     place.copy(&STAGE_1, "first");
     let from = format!("stage1.init_from=\"{}\"", place.at("first").display());
-    killed_at("saved/stage1/2", &place.train_args("second", &[&from], &[]));
+    place.kill_at("saved/stage1/2", "second", &[&from]);
     std::fs::remove_dir_all(place.at("first")).expect("removes");
-    place.train("second", &[&from], &[]).ok();
+    place.train("second", &[&from]).ok();
     std::fs::remove_dir_all(place.at("second/clusters")).expect("removes");
-    place.train("second", &[&from], &[]).ok();
+    place.train("second", &[&from]).ok();
     assert!(!place.at("second/clusters").exists(), "nothing was clustered again");
 }

@@ -4,7 +4,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::support::{Place, finish, signal, spawn, start, wait_for_steps};
+use crate::support::{BINARY, Place, finish, signal, start, wait_until};
 
 /// A run that lasts until the signal arrives.
 const LONG: [&str; 5] =
@@ -22,26 +22,23 @@ fn signals_save_and_runs_resume_to_the_same_result() {
     // A stage lasts until the signal arrives: a step takes milliseconds.
     let set = ["stage1.steps=120", "stage2.steps=120", "eval.every=50", "checkpoint.every=25"];
     let place = Place::new();
-    place.train("whole", &set, &[]).ok();
+    place.train("whole", &set).ok();
     for (name, code, count) in [("-INT", 130, 10), ("-HUP", 129, 60), ("-TERM", 143, 130)] {
         if name == "-HUP" && is_hang_up_ignored() {
             continue;
         }
-        let mut child = spawn(place.train_args("run", &set, &[]));
-        wait_for_steps(&place.at("run"), &mut child, count);
+        let mut child = place.start_train("run", &set);
+        place.wait_for_steps("run", &mut child, count);
         signal(&child, name);
-        let message = finish(child).fails(code);
+        let ran = finish(child);
         let last = place.metrics("run").pop().expect("a step");
         let (stage, step) = (last["stage"].as_str().expect("text"), last["step"].as_u64().expect("a number"));
-        let expected = format!("error: interrupted at step {step}; the same command resumes");
-        assert!(message.contains(&expected), "{message}");
-        let checkpoints = place.at(&format!("run/{stage}/checkpoints"));
-        assert!(message.contains(&format!("saved {}", checkpoints.display())), "{message}");
+        let saved = format!("saved {}", place.at(&format!("run/{stage}/checkpoints")).display());
+        ran.fails_with(code, &[&format!("error: interrupted at step {step}; the same command resumes"), &saved]);
         assert_eq!(place.checkpoints("run", stage).last(), Some(&step));
         assert!(!place.at(&format!("run/{stage}/model.safetensors")).exists());
     }
-    let message = place.train("run", &set, &[]).ok().stderr;
-    assert!(message.contains("stage2: resumed after"), "{message}");
+    place.train("run", &set).ok().notes("stage2: resumed after");
     place.assert_same_run("run", "whole");
 }
 
@@ -50,13 +47,10 @@ fn second_signals_end_runs_without_saving() {
     let place = Place::new();
     // The first batch takes far longer than two signals.
     let set = [&LONG[..], &["stage1.batch_size=50000"]].concat();
-    let mut child = spawn(place.train_args("run", &set, &[]));
+    let mut child = place.start_train("run", &set);
     // The handler is installed before the lock is taken.
     let id = child.id().to_string();
-    while std::fs::read_to_string(place.at("run/lock")).unwrap_or_default() != id {
-        assert!(child.try_wait().expect("a child").is_none(), "the run ended before it began");
-        std::thread::sleep(Duration::from_millis(2));
-    }
+    wait_until(&mut child, "the lock", || std::fs::read_to_string(place.at("run/lock")).unwrap_or_default() == id);
     signal(&child, "-TERM");
     std::thread::sleep(Duration::from_millis(200));
     assert!(child.try_wait().expect("a child").is_none(), "the first signal waits for the step");
@@ -70,14 +64,13 @@ fn second_signals_end_runs_without_saving() {
 #[test]
 fn a_run_started_by_nohup_outlives_its_terminal() {
     let place = Place::new();
-    let args = place.train_args("run", &LONG, &[]);
     let mut command = Command::new("sh");
-    command.args(["-c", "trap '' HUP; exec \"$@\"", "sh", crate::support::BINARY]).args(args);
+    command.args(["-c", "trap '' HUP; exec \"$@\"", "sh", BINARY]).args(place.train_args("run", &LONG));
     let mut child = start(&mut command);
-    wait_for_steps(&place.at("run"), &mut child, 5);
+    place.wait_for_steps("run", &mut child, 5);
     signal(&child, "-HUP");
     let steps = place.metrics("run").len();
-    wait_for_steps(&place.at("run"), &mut child, steps + 20);
+    place.wait_for_steps("run", &mut child, steps + 20);
     signal(&child, "-TERM");
     finish(child).fails(143);
 }
@@ -85,18 +78,16 @@ fn a_run_started_by_nohup_outlives_its_terminal() {
 #[test]
 fn second_processes_are_refused_while_the_first_lives() {
     let place = Place::new();
-    let mut first = spawn(place.train_args("run", &LONG, &[]));
-    wait_for_steps(&place.at("run"), &mut first, 5);
+    let mut first = place.start_train("run", &LONG);
+    place.wait_for_steps("run", &mut first, 5);
     let holder = format!(" is in use by process {}; wait until it exits", first.id());
-    for flags in [&[][..], &["--fresh"], &["--only", "clusters"]] {
-        let message = place.train("run", &LONG, flags).fails(1);
-        assert!(message.contains(&holder) && message.contains("/run is in use"), "{message}");
+    for words in ["run", "run --fresh", "run --only clusters"] {
+        place.train(words, &LONG).fails_with(1, &[&holder, "/run is in use"]);
     }
     assert!(!place.at("run.1").exists(), "nothing was moved from under it");
-    place.eval("run", &[]).fails_with(1, &[&holder]);
+    place.eval("run").fails_with(1, &[&holder]);
     // Elsewhere an evaluation may write; there are no weights yet.
-    let elsewhere = place.at("elsewhere").display().to_string();
-    place.eval("run", &["--out", &elsewhere]).fails_with(2, &["the weights of stage 1"]);
+    place.eval("run --out DIR/elsewhere").fails_with(2, &["the weights of stage 1"]);
 
     assert!(first.try_wait().expect("a child").is_none(), "the first goes on");
     signal(&first, "-KILL");
@@ -104,8 +95,8 @@ fn second_processes_are_refused_while_the_first_lives() {
     assert_eq!(status.signal(), Some(9));
     // The lock of the killed process is void. Its metrics are removed, since the next wait counts lines.
     std::fs::remove_file(place.at("run/metrics.jsonl")).expect("removes");
-    let mut next = spawn(place.train_args("run", &LONG, &[]));
-    wait_for_steps(&place.at("run"), &mut next, 5);
+    let mut next = place.start_train("run", &LONG);
+    place.wait_for_steps("run", &mut next, 5);
     signal(&next, "-INT");
     finish(next).fails(130);
 }

@@ -11,7 +11,7 @@ pub const CASES: &[Case] = &[
         "K-means: cluster of every token, centroids",
         |place| {
             let mut values = scattered(place);
-            if place.is_wrong() {
+            if place.is_wrong {
                 // One token moves to where another cluster is.
                 let (first, second) = values.split_at_mut(DIM);
                 first.copy_from_slice(&second[..DIM]);
@@ -23,7 +23,7 @@ pub const CASES: &[Case] = &[
         "K-means: inertia, variance of all tokens",
         |place| {
             let mut values = scattered(place);
-            if place.is_wrong() {
+            if place.is_wrong {
                 values[0] += 0.3;
             }
             let shape = [2, values.len() / DIM / 2, DIM];
@@ -35,7 +35,7 @@ pub const CASES: &[Case] = &[
     Tolerance::forward(0.0, "whole numbers, of which every sum is exact; of equally near means the first is taken")
         .case("K-means: ties, more clusters than different tokens", |place| {
             // Four different tokens in each scene of 16, unordered; the wrong input changes the first.
-            let first = usize::from(place.is_wrong());
+            let first = usize::from(place.is_wrong);
             let kind = |i: usize| if i == 0 { first } else { i * (i + 1) / 2 % 4 };
             let token = |i: usize| (0..DIM).map(move |d| (kind(i) * (d % 3)) as f32 - 1.0);
             let values = (0..2 * 16).flat_map(token).collect();
@@ -51,8 +51,7 @@ fn scattered(place: &Place) -> Vec<f32> {
 }
 
 fn fit(place: &Place, values: Vec<f32>, num_tokens: usize, num_clusters: usize) -> KMeansFit {
-    let tokens: Tensor<3> =
-        Tensor::from_data(burn::tensor::TensorData::new(values, [2, num_tokens, DIM]), &place.plain());
+    let tokens: Tensor<3> = place.tensor(values, [2, num_tokens, DIM]).inner();
     KMeans::default().fit(tokens, num_clusters, &[11, 12]).expect("finite tokens")
 }
 

@@ -27,7 +27,7 @@ pub const CASES: &[Case] = &[
         let key_value = place.random([BATCH, NUM_TOKENS, 2 * DIM], 2);
         let nothing: Vec<burn::nn::Linear> = Vec::new();
         place.differentiate(&nothing, [query, key_value], |_, [query, key_value]| {
-            cluster_attention(query, key_value, rows, 4).flatten(0, 2)
+            cluster_attention(query, key_value, rows, 4)
         })
     }),
     BLOCKS.case("condenser, with residuals", |place| condense(place, &paper(true), place.tokens(1), clusters())),
@@ -58,5 +58,5 @@ fn paper(residual: bool) -> ModelConfig {
 fn condense(place: &Place, config: &ModelConfig, lift: Tensor<3>, scenes: Vec<SceneClusters>) -> Values {
     let condenser = place.module(|init| Condenser::new(config, init));
     let index = Clusters::new(scenes).expect("equal counts").upload(&place.device);
-    place.differentiate(&condenser, [lift.detach()], |condenser, [lift]| condenser.forward(lift, &index).flatten(0, 2))
+    place.differentiate(&condenser, [lift.detach()], |condenser, [lift]| condenser.forward(lift, &index))
 }

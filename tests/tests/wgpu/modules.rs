@@ -29,35 +29,35 @@ pub const CASES: &[Case] = &[
     }),
     Tolerance::both(5e-6, 5e-6, PRODUCT).case("linear layer", |place| {
         let layer = place.module(|init| init.linear(DIM, 48));
-        place.differentiate(&layer, [place.tokens(1)], |layer, [x]| linear(layer, x).flatten(0, 2))
+        place.differentiate(&layer, [place.tokens(1)], |layer, [x]| linear(layer, x))
     }),
     Tolerance::both(1e-5, 1e-5, "the same, and an `erf` from a polynomial that is good to 1.5e-7").case(
         "linear layer of GELU",
         |place| {
             let layer = place.module(|init| init.linear(DIM, 48));
             let x = place.tokens(1).mul_scalar(3.0);
-            place.differentiate(&layer, [x], |layer, [x]| gelu_linear(layer, x).flatten(0, 2))
+            place.differentiate(&layer, [x], |layer, [x]| gelu_linear(layer, x))
         },
     ),
     Tolerance::both(5e-6, 1e-5, "the same, and two means over a row").case("linear layer of a layer norm", |place| {
         let layers = place.module(|init| (init.layer_norm(DIM), init.linear(DIM, 48)));
-        place.differentiate(&layers, [place.tokens(1)], |(norm, layer), [x]| norm_linear(norm, layer, x).flatten(0, 2))
+        place.differentiate(&layers, [place.tokens(1)], |(norm, layer), [x]| norm_linear(norm, layer, x))
     }),
     FEED_FORWARD.case("feed-forward network, GELU", |place| feed_forward(place, Activation::Gelu)),
     FEED_FORWARD.case("feed-forward network, ReLU", |place| feed_forward(place, Activation::Relu)),
     SOFTMAX.case("self-attention of packed projections", |place| {
         let packed = place.random([BATCH, NUM_TOKENS, 3 * DIM], 1).mul_scalar(2.0);
-        place.differentiate(&none(), [packed], |_, [packed]| self_sdpa(packed, 4).flatten(0, 2))
+        place.differentiate(&none(), [packed], |_, [packed]| self_sdpa(packed, 4))
     }),
     SOFTMAX
         .because("the same with larger sums: sizes at which other kernels are chosen, and no multiple of a tile")
         .case("self-attention of 130 tokens, a width of 96", |place| {
             let packed = place.random([1, 130, 3 * 96], 1).mul_scalar(2.0);
-            place.differentiate(&none(), [packed], |_, [packed]| self_sdpa(packed, 4).flatten(0, 2))
+            place.differentiate(&none(), [packed], |_, [packed]| self_sdpa(packed, 4))
         }),
     SOFTMAX.case("cross-attention of projections", |place| {
         let inputs = [place.tokens(1), place.random([BATCH, NUM_TOKENS, 2 * DIM], 2).mul_scalar(2.0)];
-        place.differentiate(&none(), inputs, |_, [query, key_value]| cross_sdpa(query, key_value, 4).flatten(0, 2))
+        place.differentiate(&none(), inputs, |_, [query, key_value]| cross_sdpa(query, key_value, 4))
     }),
     BLOCK.case("self-attention layer", |place| self_attention(place, CliftVariant::Paper)),
     BLOCK
@@ -69,12 +69,12 @@ pub const CASES: &[Case] = &[
         "layer norm behind the encoder",
         |place| {
             let norm = place.module(|init| LiftNorm::new(&network(CliftVariant::ReleasedDl3dv), init));
-            place.differentiate(&norm, [place.tokens(1)], |norm, [x]| norm.forward(x).flatten(0, 2))
+            place.differentiate(&norm, [place.tokens(1)], |norm, [x]| norm.forward(x))
         },
     ),
     BLOCK.case("encoder block", |place| {
         let block = place.module(|init| EncoderBlock::new(&network(CliftVariant::Paper), init));
-        place.differentiate(&block, [place.tokens(1)], |block, [x]| block.forward(x).flatten(0, 2))
+        place.differentiate(&block, [place.tokens(1)], |block, [x]| block.forward(x))
     }),
     BLOCK.case("decoder block, two views of a scene", |place| decoder_block(place, CliftVariant::Paper)),
     BLOCK.case("decoder block with norms of queries and keys", |place| {
@@ -83,7 +83,7 @@ pub const CASES: &[Case] = &[
     BLOCK.because("sums of 576 products, rays of their own, and a block").case("encoder, from images", |place| {
         let encoder = place.module(|init| Encoder::new(&network(CliftVariant::Paper), init));
         let context = place.context();
-        place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context).flatten(0, 2))
+        place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context))
     }),
     BLOCK
         .because("sums of 384 products, a block and a sigmoid")
@@ -116,30 +116,24 @@ fn forward(result: Tensor<1>) -> Values {
 fn feed_forward(place: &Place, activation: Activation) -> Values {
     let layers: (LayerNorm, FeedForward) =
         place.module(|init| (init.layer_norm(DIM), FeedForward::with(activation, DIM, 48, init)));
-    place.differentiate(&layers, [place.tokens(1)], |(norm, feed_forward), [x]| {
-        feed_forward.forward(norm, x).flatten(0, 2)
-    })
+    place.differentiate(&layers, [place.tokens(1)], |(norm, feed_forward), [x]| feed_forward.forward(norm, x))
 }
 
 fn self_attention(place: &Place, variant: CliftVariant) -> Values {
     let layers = place.module(|init| (init.layer_norm(DIM), SelfAttention::new(&network(variant), init)));
-    place.differentiate(&layers, [place.tokens(1)], |(norm, attention), [x]| attention.forward(norm, x).flatten(0, 2))
+    place.differentiate(&layers, [place.tokens(1)], |(norm, attention), [x]| attention.forward(norm, x))
 }
 
 fn decoder_block(place: &Place, variant: CliftVariant) -> Values {
     let block = place.module(|init| DecoderBlock::new(&network(variant), init));
     let inputs = [place.random([BATCH * VIEWS, 6, DIM], 1), place.tokens(2)];
-    place.differentiate(&block, inputs, |block, [x, tokens]| {
-        block.forward(x, block.project_tokens(tokens)).flatten(0, 2)
-    })
+    place.differentiate(&block, inputs, |block, [x, tokens]| block.forward(x, block.project_tokens(tokens)))
 }
 
 fn render(place: &Place, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {
     let renderer = place.module(|init| Renderer::new(&network(CliftVariant::Paper), init));
     let targets = place.targets();
-    place.differentiate(&renderer, [place.tokens(1)], |renderer, [tokens]| {
-        renderer.forward(choose(tokens), &targets).flatten(0, 4)
-    })
+    place.differentiate(&renderer, [place.tokens(1)], |renderer, [tokens]| renderer.forward(choose(tokens), &targets))
 }
 
 /// `count` tokens for every view of every scene; views share some.

@@ -28,7 +28,8 @@ pub const DIM: usize = 32;
 /// A device, and whether the inputs are slightly wrong.
 pub struct Place {
     pub device: Device,
-    is_wrong: bool,
+    /// Whether inputs not made by [`random`](Self::random) must be slightly wrong.
+    pub is_wrong: bool,
 }
 
 impl Place {
@@ -40,11 +41,6 @@ impl Place {
     /// The same device with one number of every input changed by two hundredths of its range.
     pub fn wrong(&self) -> Self {
         Self { device: self.device.clone(), is_wrong: true }
-    }
-
-    /// Returns whether inputs not made by [`random`](Self::random) must be slightly wrong.
-    pub fn is_wrong(&self) -> bool {
-        self.is_wrong
     }
 
     /// Uniform values in `[-1, 1)`.
@@ -131,14 +127,14 @@ impl Place {
     }
 
     /// Runs `f` forward on inputs and backward from a fixed gradient of the result.
-    pub fn differentiate<M: Module, const COUNT: usize>(
+    pub fn differentiate<M: Module, const COUNT: usize, const D: usize>(
         &self,
         module: &M,
         inputs: [Tensor<3>; COUNT],
-        f: impl FnOnce(&M, [Tensor<3>; COUNT]) -> Tensor<1>,
+        f: impl FnOnce(&M, [Tensor<3>; COUNT]) -> Tensor<D>,
     ) -> Values {
         let inputs = inputs.map(Tensor::require_grad);
-        let output = f(module, inputs.clone());
+        let output = f(module, inputs.clone()).flatten::<1>(0, D - 1);
         let result = values(output.clone().inner());
         let pull: Vec<f32> = (0..result.len()).map(|i| (i as f32 * 0.37 + 0.2).sin()).collect();
         let grads = (output * self.tensor(pull, [result.len()])).sum().backward();

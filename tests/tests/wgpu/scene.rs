@@ -46,7 +46,7 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
         num_frames: 6,
         height,
         width,
-        seed: u64::from(place.is_wrong()),
+        seed: u64::from(place.is_wrong),
         ..SyntheticConfig::default()
     };
     let views = ViewSampler { min_context: 2, max_context: 2, ..ViewSampler::default() };
@@ -75,7 +75,7 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
 fn draw(place: &Place, storage: TokenFormat) -> Values {
     let folder = tempfile::tempdir().expect("a folder");
     let maker = Place::new(&cpu());
-    let maker = if place.is_wrong() { maker.wrong() } else { maker };
+    let maker = if place.is_wrong { maker.wrong() } else { maker };
     let scene = encode_room(&maker, folder.path(), storage);
     let weights_file = folder.path().join("model.safetensors");
     save_weights(&maker.model().valid(), &weights_file).expect("the folder takes a file");
