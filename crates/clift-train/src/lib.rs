@@ -48,9 +48,8 @@ pub use error::TrainError;
 pub use events::{Event, Sink, Stage, StepEvent};
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::{Run, RunOptions};
-pub use stage::settings::StageSettings;
+pub use stage::settings::{StageSettings, freeze};
 // One update
-pub use run::stage_plan::freeze;
 pub use step::batch::{StageBatch, TokenSelection};
 pub use step::device_batch::{DeviceBatch, render_loss};
 pub use step::loss::{ImageLoss, Loss, LossParts, MeanSquared, mse, psnr_of_mse};

@@ -251,15 +251,8 @@ mod tests {
     fn saved(root: &Path) -> (TrainState, Checkpoints, PathBuf) {
         let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
         let device = burn::tensor::Device::flex().autodiff();
-        let optimizer = crate::step::optimizer::adamw(&crate::config::config::OptimizerConfig::default());
-        let train_state = TrainState {
-            model: clift_model::Clift::new(&config, 0, &device),
-            optimizer,
-            device,
-            loss: crate::step::loss::Loss::default(),
-            activation_checkpointing: false,
-            loss_scale: None,
-        };
+        let model = clift_model::Clift::new(&config, 0, &device);
+        let train_state = TrainState::new(model, &crate::config::config::OptimizerConfig::default(), device);
         let checkpoints = Checkpoints::new(root.into(), CheckpointConfig::default());
         let step = checkpoints.save(&train_state, &Progress { step: 1, ..Progress::default() }).unwrap();
         (train_state, checkpoints, step)

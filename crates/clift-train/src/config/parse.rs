@@ -27,21 +27,9 @@ pub enum ConfigError {
         /// The file.
         path: PathBuf,
     },
-    /// The file is not TOML.
+    /// A mistake in the file or an override, shown with its line: no TOML, an unknown or missing key, or a wrong value.
     #[error("{0}")]
-    Syntax(String),
-    /// A `--set` is not `key=TOML`, or its key continues below a value.
-    #[error("{0}")]
-    Override(String),
-    /// All unknown keys.
-    #[error("{0}")]
-    UnknownKeys(String),
-    /// A key is missing, or its value has a wrong type or is no allowed choice.
-    #[error("{0}")]
-    Value(String),
-    /// A value is out of its range or contradicts another value.
-    #[error("{0}")]
-    Range(String),
+    Invalid(String),
     /// Another error of the values.
     #[error(transparent)]
     Other(Box<TrainError>),
@@ -77,7 +65,7 @@ pub fn parse_config<T: DeserializeOwned + Serialize>(
 /// Does [`read_config`] for a whole experiment, then calls `check` on the config.
 ///
 /// # Errors
-/// As [`read_config`], and [`ConfigError::Range`] with the line of the key that `check` refuses.
+/// As [`read_config`], and [`ConfigError::Invalid`] with the line of the key that `check` refuses.
 pub fn read_checked_config(
     path: &Path,
     overrides: &[String],
@@ -104,16 +92,16 @@ fn parse_checked<T: DeserializeOwned + Serialize>(
     let unknown = errors::unknown_keys(&keys, root.get_ref(), &sources);
     if !unknown.is_empty() {
         let all: Vec<_> = unknown.iter().map(|diagnostic| sources.render(diagnostic)).collect();
-        return Err(ConfigError::UnknownKeys(all.join("\n\n")));
+        return Err(ConfigError::Invalid(all.join("\n\n")));
     }
-    let value = |diagnostic| ConfigError::Value(sources.render(&diagnostic));
+    let invalid = |diagnostic| ConfigError::Invalid(sources.render(&diagnostic));
     let config = T::deserialize(toml::Deserializer::from(root.clone()))
-        .map_err(|error| value(errors::wrong_value(&error, root.get_ref(), &sources)))?;
+        .map_err(|error| invalid(errors::wrong_value(&error, root.get_ref(), &sources)))?;
     if let Some(diagnostic) = errors::too_long(&config, root.get_ref(), &sources) {
-        return Err(value(diagnostic));
+        return Err(invalid(diagnostic));
     }
     check(&config).map_err(|error| match errors::out_of_range(&error, root.get_ref(), &sources) {
-        Some(diagnostic) => ConfigError::Range(sources.render(&diagnostic)),
+        Some(diagnostic) => invalid(diagnostic),
         None => ConfigError::Other(Box::new(error)),
     })?;
     Ok((config, changed))
@@ -125,20 +113,18 @@ fn merged<'t>(
     file: &'t str,
     padded: &'t [String],
 ) -> Result<(Spanned<DeTable<'t>>, Vec<Override>), ConfigError> {
+    let invalid = |diagnostic: &_| ConfigError::Invalid(sources.render(diagnostic));
     let mut root = DeTable::parse(file).map_err(|error| {
-        let span = error.span().unwrap_or(0..0);
-        let diagnostic = sources.at(span, "the file is not TOML".into(), error.message().into());
-        ConfigError::Syntax(sources.render(&diagnostic))
+        invalid(&sources.at(error.span().unwrap_or(0..0), "the file is not TOML".into(), error.message().into()))
     })?;
-    let refused = |diagnostic: &_| ConfigError::Override(sources.render(diagnostic));
     let mut changed: Vec<Override> = Vec::new();
     for (index, text) in padded.iter().enumerate() {
         let start = sources.override_start(index);
-        let (key, value) = parse_override(sources, text, start).map_err(|diagnostic| refused(&diagnostic))?;
+        let (key, value) = parse_override(sources, text, start).map_err(|diagnostic| invalid(&diagnostic))?;
         let to = to_toml(value.get_ref());
         let from = merge_value(root.get_mut(), &key, value).map_err(|blocked| {
             let title = format!("`{}` is a value, not a section", blocked.get_ref());
-            refused(&sources.at(blocked.span(), title, "cannot hold a key".into()))
+            invalid(&sources.at(blocked.span(), title, "cannot hold a key".into()))
         })?;
         let key = dotted(&key);
         match changed.iter_mut().find(|change| change.key == key) {

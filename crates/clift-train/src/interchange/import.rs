@@ -7,7 +7,7 @@ use clift_data::{ElementType, StateDict};
 use clift_model::{InferredConfig, PublishedTensor, published_tensors};
 
 use crate::config::config::Config;
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::interchange::keys::{Keys, printable};
 use crate::interchange::model_dir::{self, Parameter};
 use crate::interchange::problems;
@@ -85,7 +85,7 @@ fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>
     match (options.num_heads, stored) {
         (Some(given), Some(stored)) if given != stored => {
             let fix = format!("the checkpoint has {stored} heads: omit the option: {}", state.path().display());
-            Err(TrainError::BadConfig { key: "--num-heads".into(), value: given.to_string(), fix })
+            Err(bad("--num-heads", given, &fix))
         }
         (given, stored) => Ok(given.or(stored)),
     }
@@ -107,7 +107,7 @@ fn check_sizes(sizes: &InferredConfig, keys: &Keys, state: &StateDict) -> Result
             ("not given".into(), "tensor shapes do not determine the number: ")
         };
         let fix = format!("{why}give the number of heads, a divisor of the width {dim}{from}: {file}");
-        return Err(TrainError::BadConfig { key: "--num-heads".into(), value, fix });
+        return Err(bad("--num-heads", value, &fix));
     }
     let bad_sizes = |error: clift_model::ModelError| TrainError::bad_file("checkpoint", file)(error);
     model.validate().map_err(bad_sizes)

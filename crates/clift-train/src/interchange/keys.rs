@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use clift_data::StateDict;
 use clift_model::{CliftVariant, InferredConfig, PERCEPTUAL_PREFIX, PREFIX, canonical_key, infer_config};
 
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::interchange::record::ImportOptions;
 
 /// Most characters of a key in a message.
@@ -49,7 +49,7 @@ impl Keys {
             let first = all.first().map_or("none", |(_, key)| key);
             let fix =
                 format!("no key contains {from:?}; the first key is {}: {}", printable(first), state.path().display());
-            return Err(TrainError::BadConfig { key: "--rename".into(), value: format!("{from}={to}"), fix });
+            return Err(bad("--rename", format!("{from}={to}"), &fix));
         }
 
         // A state dict of the network alone has no prefix.

@@ -12,7 +12,7 @@ use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 
 use crate::config::config::Config;
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::interchange::record::{ImportRecord, check_stop};
 
 /// A parameter on the host, in PyTorch's layout.
@@ -57,8 +57,7 @@ pub fn require_absent(path: &Path) -> Result<(), TrainError> {
     if path.symlink_metadata().is_err() {
         return Ok(());
     }
-    let fix = "the path exists and is not overwritten; write another one".to_owned();
-    Err(TrainError::BadConfig { key: "-o".into(), value: path.display().to_string(), fix })
+    Err(bad("-o", path.display(), "the path exists and is not overwritten; write another one"))
 }
 
 /// Returns the SHA-256 of a file as 64 hexadecimal digits.
@@ -85,8 +84,7 @@ pub(crate) fn write_model_dir(
     stop: &AtomicBool,
 ) -> Result<(), TrainError> {
     if folder.file_name().is_none() {
-        let fix = "write the name of a directory".to_owned();
-        return Err(TrainError::BadConfig { key: "-o".into(), value: folder.display().to_string(), fix });
+        return Err(bad("-o", folder.display(), "write the name of a directory"));
     }
     let above = folder.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let writing = "writing the model directory";

@@ -4,10 +4,9 @@
 //! - `logs`: metrics, skipped steps and scenes as JSONL
 //! - `extend`: `--extend`
 //! - `run_file`: run.json; same settings on resume
-//! - `stage_plan`: settings, batches and folder of a stage
+//! - `stage_plan`: resume or start a stage
 //! - `validation`: validation and evaluation
 //! - `train_loop`: step, save, validate
-//! - `train_stage`: resume or start a stage
 //! - `init_from`: initial weights of stage 1
 //! - `evaluate_model`: evaluate a model without a run
 //! - `run`: a run: open, train, evaluate
@@ -21,5 +20,4 @@ pub(crate) mod run;
 pub(crate) mod run_file;
 pub(crate) mod stage_plan;
 pub(crate) mod train_loop;
-pub(crate) mod train_stage;
 pub(crate) mod validation;

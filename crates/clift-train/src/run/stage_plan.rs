@@ -1,27 +1,36 @@
-//! Settings, batches and folder of a stage, the same for both stages.
+//! Trains one stage, new or resumed, to its last step; the same for both stages.
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
 
-use burn::module::{Module, ParamGroup};
+use burn::module::ParamGroup;
+use burn::optim::lr_scheduler::DynLrScheduler;
 use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleLrScheduler};
 use burn::tensor::Device;
-use clift_data::Prefetcher;
-use clift_model::{Clift, Part};
+use clift_data::{Prefetcher, make_folder};
+use clift_model::Clift;
 
 use crate::checkpoint::checkpoints::Checkpoints;
 use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::events::Stage;
-use crate::stage::settings::StageSettings;
+use crate::events::{Event, Sink};
+use crate::run::logs::RunLog;
+use crate::run::train_loop::TrainLoop;
+use crate::run::validation::Validation;
+use crate::stage::settings::{StageSettings, freeze};
 use crate::step::batch::StageBatch;
+use crate::step::loss::Loss;
+use crate::step::loss_scale::LossScale;
+use crate::step::train_state::TrainState;
 
 /// Makes the batch of a step; called from several threads.
 pub type MakeBatch = dyn Fn(u64) -> Result<StageBatch, TrainError> + Send + Sync;
 
 /// A stage to train.
 pub struct StagePlan<'a> {
-    /// Stage, steps, optimizer and trained networks.
+    /// Stage, steps, optimizer and learning rates.
     pub settings: StageSettings<'a>,
     /// Makes the batches.
     pub batches: Arc<MakeBatch>,
@@ -34,42 +43,59 @@ pub struct StagePlan<'a> {
 }
 
 impl StagePlan<'_> {
+    /// Trains the remaining steps and returns the model. `start` makes the initial model if there is no checkpoint.
+    ///
+    /// # Errors
+    /// [`TrainError::Interrupted`] after `stop` was set and the state saved, [`TrainError::Diverged`] after too many skipped
+    /// steps, [`TrainError::Stopped`] with an error of data, model or disk.
+    pub fn train(
+        &self,
+        start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
+        validation: &Validation,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Clift, TrainError> {
+        let started = Instant::now();
+        let Self { settings, config, folder, device, .. } = self;
+        let StageSettings { stage, steps: num_steps, optimizer, .. } = *settings;
+        let checkpoints = Checkpoints::new(folder.join("checkpoints"), config.checkpoint.clone());
+        let checkpoints = checkpoints.with_model(config.model.clone());
+        let model = match checkpoints.newest()? {
+            // The checkpoint replaces all parameters.
+            Some(_) => Clift::new(&config.model, config.seed, device),
+            None => start(sink)?,
+        };
+        let loss = Loss::load(&config.loss, device)?;
+        for term in loss.describe() {
+            sink.event(&Event::Message(term));
+        }
+        let mut train_state = TrainState {
+            loss,
+            activation_checkpointing: config.activation_checkpointing,
+            loss_scale: LossScale::of(config.precision),
+            ..TrainState::new(model, optimizer, device.clone())
+        };
+        let progress = checkpoints.resume(&mut train_state)?.unwrap_or_default();
+        train_state.model = freeze(stage, train_state.model);
+        make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
+        let mut log = RunLog::open(&config.run_dir, stage, progress.step, sink)?;
+        log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
+
+        let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
+        let model = training.run(train_state).map_err(|error| training.name_checkpoint(error))?;
+        training.log.event(&Event::StageFinished { stage, elapsed_s: started.elapsed().as_secs_f64() });
+        Ok(model)
+    }
+
     /// Starts to make the batches of the steps after `step`.
     pub(crate) fn prefetch(&self, step: u64) -> Prefetcher<StageBatch, TrainError> {
         let (data, make) = (&self.config.data, self.batches.clone());
         Prefetcher::new(move |step| make(step), step, self.settings.steps, data.num_threads, data.num_prefetch)
     }
 
-    /// Opens the checkpoints of the stage.
-    pub(crate) fn checkpoints(&self) -> Checkpoints {
-        let checkpoints = Checkpoints::new(self.folder.join("checkpoints"), self.config.checkpoint.clone());
-        checkpoints.with_model(self.config.model.clone())
-    }
-
-    /// Makes a model whose parameters a checkpoint will replace.
-    pub(crate) fn blank_model(&self) -> Clift {
-        Clift::new(&self.config.model, self.config.seed, &self.device)
-    }
-
     /// Returns the learning rates of a step: `lr`, and for the renderer `lr` times its factor.
     pub(crate) fn learning_rate(&self, lr: f64) -> ModuleLearningRate {
-        let renderer = ParamGroup::from_predicate("renderer");
-        ModuleLrScheduler::new(lr).with_group(renderer, constant(lr * self.settings.renderer_lr_factor)).step()
+        let renderer = DynLrScheduler::from(lr * self.settings.renderer_lr_factor);
+        ModuleLrScheduler::new(lr).with_group(ParamGroup::from_predicate("renderer"), renderer).step()
     }
-}
-
-/// Freezes the networks that the stage does not train: their parameters get no gradient and no weight decay.
-pub fn freeze(stage: Stage, mut model: Clift) -> Clift {
-    let trained = stage.trained();
-    if !trained.contains(&Part::Encoder) {
-        model.encoder = model.encoder.no_grad();
-    }
-    if !trained.contains(&Part::Condenser) {
-        model.condenser = model.condenser.no_grad();
-    }
-    model
-}
-
-fn constant(lr: f64) -> burn::optim::lr_scheduler::DynLrScheduler {
-    lr.into()
 }
