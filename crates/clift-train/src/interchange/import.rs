@@ -9,7 +9,7 @@ use clift_model::{InferredConfig, PublishedTensor, published_tensors};
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
 use crate::interchange::keys::{Keys, printable};
-use crate::interchange::model_dir::{self, Parameter};
+use crate::interchange::model_dir::{self, HostTensor};
 use crate::interchange::problems;
 use crate::interchange::record::{ImportOptions, ImportRecord, check_stop};
 
@@ -114,13 +114,12 @@ fn check_sizes(sizes: &InferredConfig, keys: &Keys, state: &StateDict) -> Result
 }
 
 /// Splits a published tensor into parameters.
-fn parts<'a>(tensor: &'a PublishedTensor, values: &'a [f32]) -> impl Iterator<Item = Parameter> + 'a {
+fn parts<'a>(tensor: &'a PublishedTensor, values: &'a [f32]) -> impl Iterator<Item = HostTensor> + 'a {
     let row_len: usize = tensor.shape[1..].iter().product();
     tensor.parts.iter().map(move |(path, rows)| {
         let mut shape = tensor.shape.clone();
         shape[0] = rows.len();
-        let values = values[rows.start * row_len..rows.end * row_len].to_vec();
-        Parameter { path: path.clone(), shape, values }
+        (path.clone(), shape, values[rows.start * row_len..rows.end * row_len].to_vec())
     })
 }
 

@@ -15,16 +15,8 @@ use crate::config::config::Config;
 use crate::error::{TrainError, bad};
 use crate::interchange::record::{ImportRecord, check_stop};
 
-/// A parameter on the host, in PyTorch's layout.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Parameter {
-    /// Path in weight files.
-    pub path: String,
-    /// Shape.
-    pub shape: Vec<usize>,
-    /// Values, row-major.
-    pub values: Vec<f32>,
-}
+/// Name, shape and row-major values of a tensor in PyTorch's layout, as [`clift_data::write_state_dict`] takes it.
+pub type HostTensor = (String, Vec<usize>, Vec<f32>);
 
 /// Returns the settings with which the reference evaluates a published network.
 pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
@@ -79,7 +71,7 @@ pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
 pub(crate) fn write_model_dir(
     folder: &Path,
     config: &Config,
-    parameters: &[Parameter],
+    parameters: &[HostTensor],
     imported: &ImportRecord,
     stop: &AtomicBool,
 ) -> Result<(), TrainError> {
@@ -95,20 +87,21 @@ pub(crate) fn write_model_dir(
     // Removed on drop.
     let temporary = std::fs::create_dir_all(above).and_then(|()| builder.tempdir_in(above));
     let temporary = temporary.map_err(TrainError::io(writing, above))?;
-    let weights_path = temporary.path().join("model.safetensors");
-    let bytes = to_safetensors(parameters, HashMap::new(), &weights_path)?;
+    let write = |name: &str, bytes: &[u8]| {
+        let path = temporary.path().join(name);
+        replace_file(&path, bytes).map_err(TrainError::io(writing, &path))
+    };
+    let bytes = to_safetensors(parameters, HashMap::new(), folder)?;
     check_stop(stop)?;
-    replace_file(&weights_path, &bytes).map_err(TrainError::io(writing, &weights_path))?;
+    write("model.safetensors", &bytes)?;
     drop(bytes);
     check_stop(stop)?;
-    let config_path = temporary.path().join("config.toml");
-    let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &config_path))?;
-    replace_file(&config_path, text.as_bytes()).map_err(TrainError::io(writing, &config_path))?;
-    let import_path = temporary.path().join("import.json");
-    let text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", &import_path))?;
-    replace_file(&import_path, &text).map_err(TrainError::io(writing, &import_path))?;
+    let config_text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", folder))?;
+    write("config.toml", config_text.as_bytes())?;
+    let import_text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", folder))?;
+    write("import.json", &import_text)?;
 
-    let written = ModelPath { dir: temporary.path().into(), weights: weights_path };
+    let written = ModelPath { dir: temporary.path().into(), weights: temporary.path().join("model.safetensors") };
     TrainedModel::open(&written, &config.model, &config.device.open()?)?;
     check_stop(stop)?;
     require_absent(folder)?;
@@ -119,18 +112,18 @@ pub(crate) fn write_model_dir(
 
 /// Returns the bytes of a safetensors file with `metadata`.
 pub(crate) fn to_safetensors(
-    parameters: &[Parameter],
+    tensors: &[HostTensor],
     mut metadata: HashMap<String, String>,
     path: &Path,
 ) -> Result<Vec<u8>, TrainError> {
     let bad = |error: safetensors::SafeTensorError| TrainError::bad_file("weight file", path)(error);
-    let bytes: Vec<Vec<u8>> =
-        parameters.iter().map(|p| p.values.iter().flat_map(|value| value.to_le_bytes()).collect()).collect();
-    let views: Result<Vec<(&str, TensorView)>, _> = parameters
+    let to_bytes = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect();
+    let bytes: Vec<Vec<u8>> = tensors.iter().map(|(_, _, values)| to_bytes(values)).collect();
+    let views = tensors
         .iter()
         .zip(&bytes)
-        .map(|(p, bytes)| Ok((p.path.as_str(), TensorView::new(Dtype::F32, p.shape.clone(), bytes)?)))
-        .collect();
+        .map(|((name, shape, _), bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)))
+        .collect::<Result<Vec<_>, _>>();
     metadata.insert("format".into(), "clift-1".into());
     let file = safetensors::serialize(views.map_err(bad)?, Some(metadata)).map_err(bad)?;
     // Equal weights give equal files.

@@ -133,7 +133,7 @@ fn network_keys_outside_the_prefix_are_refused() {
 
     let place = tempfile::tempdir().unwrap();
     let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
-    let mut tensors = tensors_of("re10k.ckpt", str::to_owned);
+    let mut tensors = network(&fixture("checkpoints/re10k.ckpt"), str::to_owned);
     for layer in 0..2 {
         tensors.push((format!("ema.encoder.layers.{layer}.norm1.weight"), vec![1], vec![0.0]));
     }
@@ -159,7 +159,7 @@ fn prefixes_are_removed_and_renames_applied() {
         let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
         let rename =
             |key: &str| key.replace("squeezer.linear1", &format!("squeezer.{linear1}")).replace("transformer.", lead);
-        write_state_dict(&file, &tensors_of("re10k.ckpt", rename), &[]).unwrap();
+        write_state_dict(&file, &network(&fixture("checkpoints/re10k.ckpt"), rename), &[]).unwrap();
         if !renames.is_empty() {
             refused(&file, place.path(), &re10k());
         }
@@ -173,7 +173,12 @@ fn prefixes_are_removed_and_renames_applied() {
 fn renames_apply_to_whole_keys_or_fail() {
     let place = tempfile::tempdir().unwrap();
     let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
-    write_state_dict(&file, &tensors_of("re10k.ckpt", |key| key.replace("transformer.", "net.")), &[]).unwrap();
+    write_state_dict(
+        &file,
+        &network(&fixture("checkpoints/re10k.ckpt"), |key| key.replace("transformer.", "net.")),
+        &[],
+    )
+    .unwrap();
     let renamed = |renames: &[(&str, &str)]| {
         let renames = renames.iter().map(|(from, to)| ((*from).to_owned(), (*to).to_owned())).collect();
         import(&file, &out, &ImportOptions { renames, ..re10k() })
