@@ -323,11 +323,4 @@ mod tests {
         let none = CheckpointConfig { keep: 1, ..CheckpointConfig::default() };
         assert_eq!(steps_to_remove(&steps, &none, None).len(), 5);
     }
-
-    #[test]
-    fn only_complete_checkpoints_have_a_step() {
-        let step = |name: &str| step_of(Path::new(name));
-        assert_eq!((step("a/step-000000017"), step("a/step-1000000000")), (Some(17), Some(1_000_000_000)));
-        assert_eq!((step("a/step-000000017.tmp"), step("a/best")), (None, None));
-    }
 }

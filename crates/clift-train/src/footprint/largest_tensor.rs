@@ -6,7 +6,9 @@ use clift_model::{Part, SceneSizes, kmeans_values, largest_tensors, max_tensor_b
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
 use crate::events::Stage;
-use crate::footprint::scene_sizes::{VIEWS_PER_PASS, cluster_counts, scene_with_all_tokens, scene_with_stored_tokens};
+use crate::footprint::scene_sizes::{
+    VIEWS_PER_PASS, cluster_counts, kept, largest_sizes, scene_with_all_tokens, scene_with_stored_tokens,
+};
 use crate::stage::settings::StageSettings;
 
 /// Bytes of an f32 value; f16 operands are smaller copies of f32 tensors.
@@ -125,14 +127,9 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
         all.extend(of(Part::Renderer, &scene_with_stored_tokens(scene, most)));
     }
     if part == Stage::Stage1 {
-        let [low, high] = config.stage1.keep_tokens;
-        let kept = ((scene.num_tokens as f64 * high) as usize).clamp(1, scene.num_tokens);
-        // Views share the tokens only if all are kept; with one token less, every view has its own subset.
-        if low < 1.0 {
-            let num_render_tokens = kept.min((scene.num_tokens - 1).max(1));
-            all.extend(of(Part::Renderer, &SceneSizes { num_render_tokens, is_per_view: true, ..scene }));
-        }
-        if kept == scene.num_tokens {
+        all.extend(of(Part::Renderer, &largest_sizes(config, part)?));
+        // Views share the tokens of the steps in which all are kept.
+        if kept(scene, config.stage1.keep_tokens[1]) == scene {
             all.extend(of(Part::Renderer, &scene));
         }
     }

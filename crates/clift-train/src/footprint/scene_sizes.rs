@@ -131,7 +131,8 @@ fn training_scene(config: &Config, num_context: usize) -> Result<SceneSizes, Tra
     scene_with_all_tokens(config, num_context, config.data.views.num_targets)
 }
 
-fn kept(scene: SceneSizes, share: f64) -> SceneSizes {
+/// Returns the sizes of a scene whose target views are rendered from a share of its tokens.
+pub fn kept(scene: SceneSizes, share: f64) -> SceneSizes {
     let count = ((scene.num_tokens as f64 * share) as usize).max(1);
     SceneSizes { num_render_tokens: count, is_per_view: count < scene.num_tokens, ..scene }
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use clift_data::{ElementType, StateDict};
+use clift_data::{ElementType, StateDict, hash_file};
 use clift_model::{InferredConfig, PublishedTensor, published_tensors};
 
 use crate::config::config::Config;
@@ -64,7 +64,7 @@ pub fn import(
     let imported = ImportRecord {
         version: 1,
         file: file.file_name().unwrap_or_default().to_string_lossy().into_owned(),
-        sha256: model_dir::sha256(file)?,
+        sha256: hash_file(file)?,
         variant: options.variant,
         has_condenser,
         convolutions,

@@ -1,15 +1,12 @@
 //! A model directory: `model.safetensors`, `config.toml` with the network and its evaluation settings, and `import.json`.
 
 use std::collections::HashMap;
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::{PoseRotation, PoseScale, SourceKind, TEMPORARY, publish_folder, replace_file};
 use clift_model::{CliftVariant, ModelConfig, ModelPath, TrainedModel, sorted_header};
 use safetensors::tensor::{Dtype, TensorView};
-use sha2::{Digest, Sha256};
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
@@ -50,20 +47,6 @@ pub fn require_absent(path: &Path) -> Result<(), TrainError> {
         return Ok(());
     }
     Err(bad("-o", path.display(), "the path exists and is not overwritten; write another one"))
-}
-
-/// Returns the SHA-256 of a file as 64 hexadecimal digits.
-pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
-    let reading = "reading the checkpoint";
-    let mut file = File::open(path).map_err(TrainError::io(reading, path))?;
-    let (mut sha, mut buffer) = (Sha256::new(), vec![0; 1 << 20]);
-    loop {
-        match file.read(&mut buffer).map_err(TrainError::io(reading, path))? {
-            0 => break,
-            count => sha.update(&buffer[..count]),
-        }
-    }
-    Ok(hex::encode(sha.finalize()))
 }
 
 /// Writes a model directory under a temporary name, opens the model to check it, and renames the directory. Removes all

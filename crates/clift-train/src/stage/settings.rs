@@ -89,20 +89,3 @@ impl Config {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn stage_2_freezes_the_encoder_and_slows_the_renderer() {
-        let mut config = Config::default();
-        let [one, two] = [Stage::Stage1, Stage::Stage2].map(|stage| config.stage(stage));
-        assert_eq!((one.steps, one.batch_size, one.renderer_lr_factor), (90_000, 64, 1.0));
-        assert_eq!((two.steps, two.batch_size, two.renderer_lr_factor), (50_000, 80, 0.1));
-        let trains = |stage: Stage| [Part::Encoder, Part::Condenser].map(|part| stage.trained().contains(&part));
-        assert_eq!([Stage::Stage1, Stage::Stage2].map(trains), [[true, false], [false, true]]);
-        config.set_accumulate(Stage::Stage2, 5);
-        assert_eq!((config.stage(Stage::Stage1).accumulate, config.stage(Stage::Stage2).accumulate), (1, 5));
-    }
-}
