@@ -47,7 +47,7 @@ pub use stage::settings::{StageSettings, freeze};
 // One update
 pub use step::batch::{StageBatch, TokenSelection};
 pub use step::device_batch::{DeviceBatch, render_loss};
-pub use step::loss::{ImageLoss, Loss, LossParts, MeanSquared, mse, psnr_of_mse};
+pub use step::loss::{ImageLoss, Loss, LossParts, mse, psnr_of_mse};
 pub use step::loss_scale::LossScale;
 pub use step::optimizer::{adamw, clip_global_norm, global_norm};
 pub use step::schedule::warm_up_cosine;

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::DataConfig;
-use clift_eval::{EvalConfig, PERCEPTUAL_COMMAND};
+use clift_data::{DataConfig, derive_seed};
+use clift_eval::{EvalConfig, Method, PERCEPTUAL_COMMAND, Sweep};
 use clift_model::{DeviceName, Grouping, KMeans, ModelConfig, Precision, TokenCount};
 use serde::{Deserialize, Serialize};
 
@@ -53,6 +53,26 @@ pub struct Config {
     /// Validation during training, and evaluation after it.
     #[serde(default)]
     pub eval: EvalConfig,
+}
+
+impl Config {
+    /// Returns the settings of an evaluation, without LPIPS and external methods.
+    pub(crate) fn sweep(&self, storage: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
+        let Self { seed, eval, clusters, model, device, .. } = self;
+        Sweep {
+            storage,
+            render: eval.render.clone(),
+            selection: eval.selection,
+            tokens: eval.tokens.clone(),
+            methods,
+            kmeans: clusters.kmeans.clone(),
+            model: model.clone(),
+            lpips: None,
+            external_methods: Vec::new(),
+            is_cpu: matches!(device, DeviceName::Flex | DeviceName::Ndarray),
+            seed: derive_seed(*seed, "eval"),
+        }
+    }
 }
 
 /// The training loss: mean squared error plus a weighted perceptual term (paper section 3.3).

@@ -7,7 +7,6 @@ use serde::de::DeserializeOwned;
 use toml::Spanned;
 use toml::de::DeTable;
 
-use crate::config::config::Config;
 use crate::config::diagnostic::SourceText;
 use crate::config::errors;
 use crate::config::former_names::apply_former_names;
@@ -47,7 +46,7 @@ pub fn read_config<T: DeserializeOwned + Serialize>(
     path: &Path,
     overrides: &[String],
 ) -> Result<(T, Vec<Override>), ConfigError> {
-    parse_config(path, &read(path)?, overrides)
+    read_checked_config(path, overrides, |_| Ok(()))
 }
 
 /// Does [`read_config`] on a text; `path` is only used in messages.
@@ -62,20 +61,17 @@ pub fn parse_config<T: DeserializeOwned + Serialize>(
     parse_checked(path, file, overrides, |_| Ok(()))
 }
 
-/// Does [`read_config`] for a whole experiment, then calls `check` on the config.
+/// Does [`read_config`], then calls `check` on the config.
 ///
 /// # Errors
 /// As [`read_config`], and [`ConfigError::Invalid`] with the line of the key that `check` refuses.
-pub fn read_checked_config(
+pub fn read_checked_config<T: DeserializeOwned + Serialize>(
     path: &Path,
     overrides: &[String],
-    check: impl FnOnce(&Config) -> Result<(), TrainError>,
-) -> Result<(Config, Vec<Override>), ConfigError> {
-    parse_checked(path, &read(path)?, overrides, check)
-}
-
-fn read(path: &Path) -> Result<String, ConfigError> {
-    std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })
+    check: impl FnOnce(&T) -> Result<(), TrainError>,
+) -> Result<(T, Vec<Override>), ConfigError> {
+    let file = std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })?;
+    parse_checked(path, &file, overrides, check)
 }
 
 fn parse_checked<T: DeserializeOwned + Serialize>(
@@ -142,6 +138,7 @@ mod tests {
     use clift_model::Grouping;
 
     use super::*;
+    use crate::config::config::Config;
 
     const FILE: &str = "run_dir = \"run\"\n[data]\n[stage1]\nsteps = 90000\n[stage2]\n[clusters]\n";
 

@@ -4,7 +4,6 @@ use clift_eval::{LPIPS_MIN_SIZE_PX, Method, Sweep};
 use clift_model::SceneSizes;
 
 use crate::config::config::Config;
-use crate::config::sweep::eval_sweep;
 use crate::error::TrainError;
 use crate::events::Stage;
 
@@ -86,7 +85,7 @@ pub fn eval_sizes(config: &Config) -> Sweep {
     let mut variants = config.eval.variants.clone();
     // The condenser of tiles belongs to another run.
     variants.retain(|variant| *variant != Method::PatchClift);
-    eval_sweep(config, config.eval.storage.clone(), if variants.is_empty() { methods.to_vec() } else { variants })
+    config.sweep(config.eval.storage.clone(), if variants.is_empty() { methods.to_vec() } else { variants })
 }
 
 /// Whether an evaluation measures LPIPS.

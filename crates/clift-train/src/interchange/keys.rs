@@ -14,6 +14,7 @@ pub(crate) const MAX_SHOWN: usize = 160;
 const MAX_OUTSIDE: usize = 200;
 
 /// The keys of a checkpoint.
+#[derive(Default)]
 pub(crate) struct Keys {
     /// Keys of the network: canonical name to name in the file.
     pub network: BTreeMap<String, String>,
@@ -54,13 +55,7 @@ impl Keys {
 
         // A state dict of the network alone has no prefix.
         let prefix = if all.iter().any(|(name, _)| name.starts_with(PREFIX)) { PREFIX } else { "" };
-        let mut keys = Self {
-            network: BTreeMap::new(),
-            prefix,
-            strays: BTreeMap::new(),
-            ignored: BTreeMap::new(),
-            outside: BTreeMap::new(),
-        };
+        let mut keys = Self { prefix, ..Self::default() };
         for (name, key) in all {
             if name.starts_with(PERCEPTUAL_PREFIX) {
                 *keys.ignored.entry(PERCEPTUAL_PREFIX.trim_end_matches('.').into()).or_insert(0) += 1;

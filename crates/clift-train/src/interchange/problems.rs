@@ -131,11 +131,10 @@ pub(crate) fn describe(
         "the checkpoint is no {variant} network (width {dim}, {num_heads} heads, {num_encoder_blocks} + \
          {num_renderer_blocks} layers); no files were written"
     );
-    let of_kinds = |kinds: &[Kind]| {
-        let found = problems.iter().filter(|problem| kinds.contains(&problem.kind));
+    let [missing, unknown, strays] = [Kind::Missing, Kind::Unknown, Kind::Stray].map(|kind| {
+        let found = problems.iter().filter(|problem| problem.kind == kind);
         PatternNames::of(found.map(|problem| problem.name.as_str()))
-    };
-    let (missing, unknown, strays) = (of_kinds(&[Kind::Missing]), of_kinds(&[Kind::Unknown]), of_kinds(&[Kind::Stray]));
+    });
     let expected = published_tensors(model, true);
     let expected = PatternNames::of(expected.iter().map(|tensor| tensor.key.as_str()));
     let mut lines: BTreeMap<(Kind, String, &str), Vec<&Problem>> = BTreeMap::new();

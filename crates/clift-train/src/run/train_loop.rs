@@ -3,6 +3,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+use burn::module::Module;
 use clift_model::Clift;
 
 use crate::checkpoint::checkpoints::Checkpoints;
@@ -127,14 +128,15 @@ impl<'a> TrainLoop<'a> {
         self.progress.bad_steps += 1;
         self.progress.num_bad_steps += 1;
         let finite = |value: f64| value.is_finite().then_some(value);
+        let [median_loss, median_grad_norm] = self.progress.recent.medians();
         let line = SkippedStep {
             step: self.progress.step,
             stage: self.plan.settings.stage,
             reason: anomaly,
             loss: finite(update.loss),
             grad_norm: finite(update.grad_norm),
-            median_loss: self.progress.recent.median_loss(),
-            median_grad_norm: self.progress.recent.median_grad_norm(),
+            median_loss,
+            median_grad_norm,
             in_a_row: self.progress.bad_steps,
             scenes: SkippedStepScene::all(batch),
         };
@@ -177,7 +179,7 @@ impl<'a> TrainLoop<'a> {
             return Ok(());
         }
         let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
-        let model = train_state.inference_model();
+        let model = train_state.model.valid();
         let psnr = self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
         if psnr.is_none() && self.stop.load(Ordering::Relaxed) {
             if self.saved < step {

@@ -1,6 +1,5 @@
 //! One optimizer update, the same for both stages.
 
-use burn::module::Module;
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::{GradientsAccumulator, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor};
@@ -129,11 +128,6 @@ impl TrainState {
             (false, false) => {}
         }
         is_overflow
-    }
-
-    /// Returns the model without autodiff.
-    pub fn inference_model(&self) -> Clift {
-        self.model.valid()
     }
 }
 

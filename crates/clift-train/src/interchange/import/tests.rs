@@ -145,16 +145,23 @@ fn checkpoints_compute_as_the_twin_and_round_trip() {
     }
 }
 
+/// Shape and values of tensors by key.
+type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
 /// Imports a checkpoint with changed tensors and returns the error message.
-fn refusal(change: impl Fn(&mut BTreeMap<String, (Vec<usize>, Vec<f32>)>), options: &ImportOptions) -> String {
+fn refusal(change: impl Fn(&mut Tensors)) -> String {
+    let tensors = re10k_tensors(str::to_owned).into_iter();
+    let mut tensors = tensors.map(|(key, shape, values)| (key, (shape, values))).collect();
+    change(&mut tensors);
+    refusal_of(tensors.into_iter().map(|(key, (shape, values))| (key, shape, values)).collect())
+}
+
+/// Imports tensors and returns the error message.
+fn refusal_of(tensors: Vec<HostTensor>) -> String {
     let place = tempfile::tempdir().unwrap();
     let file = place.path().join("changed.ckpt");
-    let tensors = network(&fixture("checkpoints/re10k.ckpt"), str::to_owned);
-    let mut tensors = tensors.into_iter().map(|(key, shape, values)| (key, (shape, values))).collect();
-    change(&mut tensors);
-    let tensors: Vec<HostTensor> = tensors.into_iter().map(|(key, (shape, values))| (key, shape, values)).collect();
     write_state_dict(&file, &tensors, &[]).unwrap();
-    refused(&file, place.path(), options)
+    refused(&file, place.path(), &re10k())
 }
 
 fn refused(file: &Path, place: &Path, options: &ImportOptions) -> String {
@@ -166,8 +173,16 @@ fn refused(file: &Path, place: &Path, options: &ImportOptions) -> String {
     message
 }
 
+fn refused_fixture(name: &str, options: &ImportOptions) -> String {
+    refused(&fixture(&format!("checkpoints/{name}.ckpt")), tempfile::tempdir().unwrap().path(), options)
+}
+
 fn re10k() -> ImportOptions {
     options(CliftVariant::ReleasedRe10k, Some(3))
+}
+
+fn re10k_tensors(rename: impl Fn(&str) -> String) -> Vec<HostTensor> {
+    network(&fixture("checkpoints/re10k.ckpt"), rename)
 }
 
 #[track_caller]
@@ -179,28 +194,19 @@ fn assert_says(message: &str, parts: &[&str]) {
 
 #[test]
 fn another_variant_is_named_where_it_fits() {
-    let place = tempfile::tempdir().unwrap();
     for (name, wrong, right) in [
         ("dl3dv", CliftVariant::ReleasedRe10k, "--variant released-dl3dv"),
         ("re10k", CliftVariant::ReleasedDl3dv, "--variant released-re10k"),
         ("paper", CliftVariant::ReleasedRe10k, "--variant paper"),
     ] {
         let heads = CHECKPOINTS.iter().find(|(other, ..)| *other == name).unwrap().2.unwrap_or(7);
-        let file = fixture(&format!("checkpoints/{name}.ckpt"));
-        let message = refused(&file, place.path(), &options(wrong, Some(heads)));
-        assert_says(&message, &[right]);
+        assert_says(&refused_fixture(name, &options(wrong, Some(heads))), &[right]);
     }
 }
 
 #[test]
 fn heads_must_divide_the_width() {
-    let place = tempfile::tempdir().unwrap();
-    let import = |heads| {
-        let folder = place.path().join("model");
-        import(&fixture("checkpoints/re10k.ckpt"), &folder, &options(CliftVariant::ReleasedRe10k, heads))
-            .unwrap_err()
-            .to_string()
-    };
+    let import = |heads| refused_fixture("re10k", &options(CliftVariant::ReleasedRe10k, heads));
     assert_says(
         &import(None),
         &[
@@ -212,11 +218,8 @@ fn heads_must_divide_the_width() {
     assert_says(&import(Some(0)), &["`--num-heads` = 0"]);
     assert_says(&import(Some(4)), &["`--num-heads` = 4", "width 15 (transformer.decoder.layers.0.", "re10k.ckpt"]);
     // Normalised heads show their width.
-    let place = tempfile::tempdir().unwrap();
-    let message =
-        refused(&fixture("checkpoints/dl3dv.ckpt"), place.path(), &options(CliftVariant::ReleasedDl3dv, Some(2)));
     assert_says(
-        &message,
+        &refused_fixture("dl3dv", &options(CliftVariant::ReleasedDl3dv, Some(2))),
         &["misshapen: transformer.encoder.layers.N.self_attn.q_norm.weight is [2], expected [7] (N = 0, 1, 2)"],
     );
 }
@@ -225,9 +228,8 @@ fn heads_must_divide_the_width() {
 fn half_precision_needs_conversion() {
     let place = tempfile::tempdir().unwrap();
     let options = options(CliftVariant::ReleasedRe10k, Some(5));
-    let message = refused(&fixture("checkpoints/half.ckpt"), place.path(), &options);
     assert_says(
-        &message,
+        &refused_fixture("half", &options),
         &[
             "not in f32: transformer.linear_input.weight [10, 576] is F16; --convert converts it to f32",
             "is BF16; --convert",
@@ -267,17 +269,13 @@ fn truncated_damaged_and_hostile_files_are_refused() {
     assert_says(&message, &["which is not on the allow-list; no code was run"]);
 
     // Values that are not finite.
-    let message =
-        refusal(|tensors| tensors.get_mut("transformer.output_norm.bias").unwrap().1[3] = f32::INFINITY, &re10k());
+    let message = refusal(|tensors| tensors.get_mut("transformer.output_norm.bias").unwrap().1[3] = f32::INFINITY);
     assert_says(&message, &["transformer.output_norm.bias [15]: value 3 is inf"]);
     // Sizes that nobody has.
-    let message = refusal(
-        |tensors| {
-            let all = tensors.clone().into_iter().filter(|(key, _)| key.contains("encoder.layers.0."));
-            tensors.extend(all.map(|(key, tensor)| (key.replace(".0.", ".18446744073709551615."), tensor)));
-        },
-        &re10k(),
-    );
+    let message = refusal(|tensors| {
+        let all = tensors.clone().into_iter().filter(|(key, _)| key.contains("encoder.layers.0."));
+        tensors.extend(all.map(|(key, tensor)| (key.replace(".0.", ".18446744073709551615."), tensor)));
+    });
     assert!(message.contains("num_encoder_blocks"), "{message}");
 }
 
