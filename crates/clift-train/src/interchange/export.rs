@@ -97,8 +97,11 @@ fn sizes(model: &ModelConfig) -> [(&'static str, usize); 6] {
     ]
 }
 
-/// Reads shape and values of the parameters of a weight file, by path.
-fn read_parameters(path: &Path) -> Result<BTreeMap<String, (Vec<usize>, Vec<f32>)>, TrainError> {
+/// Shape and values of parameters, by path.
+type Parameters = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
+/// Reads the parameters of a weight file.
+fn read_parameters(path: &Path) -> Result<Parameters, TrainError> {
     let bytes = std::fs::read(path).map_err(TrainError::io("reading the weights", path))?;
     let file = SafeTensors::deserialize(&bytes).map_err(TrainError::bad_file("weight file", path))?;
     let mut found = BTreeMap::new();

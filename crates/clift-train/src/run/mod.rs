@@ -4,9 +4,9 @@
 //! - `logs`: metrics, skipped steps and scenes as JSONL
 //! - `extend`: `--extend`
 //! - `run_file`: run.json; same settings on resume
-//! - `stage_plan`: resume or start a stage
+//! - `stage_plan`: settings, batches and folder of a stage
 //! - `validation`: validation and evaluation
-//! - `train_loop`: step, save, validate
+//! - `train_loop`: resume or start a stage; step, save, validate
 //! - `init_from`: initial weights of stage 1
 //! - `evaluate_model`: evaluate a model without a run
 //! - `run`: a run: open, train, evaluate
