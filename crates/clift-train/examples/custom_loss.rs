@@ -5,7 +5,7 @@
 use burn::tensor::Tensor;
 use clift_model::{DeviceName, ModelConfig};
 use clift_train::{
-    ClipShape, ImageLoss, Loss, OptimizerConfig, TrainError, TrainState, adamw, psnr_of_mse, seeded_batch, seeded_model,
+    ClipShape, ImageLoss, Loss, OptimizerConfig, TrainError, TrainState, psnr_of_mse, seeded_batch, seeded_model,
 };
 
 /// Mean absolute difference of the horizontal gradients of rendering and target.
@@ -33,14 +33,9 @@ fn main() -> Result<(), TrainError> {
         ..ModelConfig::default()
     };
     let device = DeviceName::Flex.open()?;
-    let mut state = TrainState {
-        model: seeded_model(&model, 0, &device),
-        optimizer: adamw(&OptimizerConfig::default()),
-        device: device.autodiff(),
-        loss: Loss::default().with_term(0.1, EdgeLoss),
-        activation_checkpointing: false,
-        loss_scale: None,
-    };
+    let trained = seeded_model(&model, 0, &device);
+    let mut state = TrainState::new(trained, &OptimizerConfig::default(), device.autodiff());
+    state.loss = Loss::default().with_term(0.1, EdgeLoss);
     // Two scenes of two context and two target views; the renderer receives all tokens, as in stage 1.
     let shape = ClipShape { num_context: 2, num_targets: 2, size: [32, 32] };
     let batch = seeded_batch(shape, 2, model.num_tokens(2, 32, 32)?, None, 0)?;

@@ -114,3 +114,9 @@ pub trait Sink {
     /// Receives one event.
     fn event(&mut self, event: &Event);
 }
+
+impl<F: FnMut(&Event)> Sink for F {
+    fn event(&mut self, event: &Event) {
+        self(event);
+    }
+}

@@ -6,20 +6,13 @@
 //! use std::path::Path;
 //! use std::sync::atomic::AtomicBool;
 //!
-//! use clift_train::{Config, Event, Run, RunOptions, Sink, read_config};
-//!
-//! struct Print;
-//!
-//! impl Sink for Print {
-//!     fn event(&mut self, event: &Event) {
-//!         println!("{event:?}");
-//!     }
-//! }
+//! use clift_train::{Config, Event, Run, RunOptions, read_config};
 //!
 //! let overrides = ["stage1.steps=1000".to_owned()];
 //! let (config, _) = read_config::<Config>(Path::new("configs/tiny.toml"), &overrides)?;
-//! let run = Run::open(config, &RunOptions::default(), &mut Print)?;
-//! let summary = run.train(None, &AtomicBool::new(false), &mut Print)?;
+//! let mut print = |event: &Event| println!("{event:?}");
+//! let run = Run::open(config, &RunOptions::default(), &mut print)?;
+//! let summary = run.train(None, &AtomicBool::new(false), &mut print)?;
 //! println!("{:?}", summary.map(|summary| summary.points));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
@@ -36,6 +29,8 @@ mod interchange;
 mod run;
 mod stage;
 mod step;
+#[cfg(test)]
+mod testing;
 
 // Configuration
 pub use config::config::{
@@ -48,12 +43,11 @@ pub use error::TrainError;
 pub use events::{Event, Sink, Stage, StepEvent};
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::{Run, RunOptions};
-pub use stage::settings::StageSettings;
+pub use stage::settings::{StageSettings, freeze};
 // One update
-pub use run::stage_plan::freeze;
 pub use step::batch::{StageBatch, TokenSelection};
 pub use step::device_batch::{DeviceBatch, render_loss};
-pub use step::loss::{ImageLoss, Loss, LossParts, MeanSquared, mse, psnr_of_mse};
+pub use step::loss::{ImageLoss, Loss, LossParts, mse, psnr_of_mse};
 pub use step::loss_scale::LossScale;
 pub use step::optimizer::{adamw, clip_global_norm, global_norm};
 pub use step::schedule::warm_up_cosine;

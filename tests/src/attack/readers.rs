@@ -11,8 +11,8 @@ use clift_data::{
 };
 use clift_model::{Clift, CliftVariant, Scene, load_part};
 use clift_train::{
-    CheckpointConfig, Checkpoints, ClusterCache, Config, ImportOptions, Loss, OptimizerConfig, Run, TrainState, adamw,
-    import, read_checked_config,
+    CheckpointConfig, Checkpoints, ClusterCache, Config, ImportOptions, OptimizerConfig, Run, TrainState, import,
+    read_checked_config,
 };
 
 use crate::setup::{Setup, copy_folder, fixture, fixtures, read, with_pickle, write};
@@ -135,14 +135,7 @@ pub fn checkpoint(setup: &Setup, name: &'static str) -> Read {
             state["files"][name] = serde_json::json!({"num_bytes": bytes.len(), "crc32": crc32fast::hash(bytes)});
             write(&step.join("state.json"), state.to_string().as_bytes());
         }
-        let mut train_state = TrainState {
-            model: model.clone(),
-            optimizer: adamw(&OptimizerConfig::default()),
-            device: Device::flex().autodiff(),
-            loss: Loss::default(),
-            activation_checkpointing: false,
-            loss_scale: None,
-        };
+        let mut train_state = TrainState::new(model.clone(), &OptimizerConfig::default(), Device::flex().autodiff());
         done(Checkpoints::new(folder.clone(), CheckpointConfig::default()).resume(&mut train_state))
     })
 }

@@ -3,7 +3,7 @@
 use burn::module::Module;
 use clift_eval::upload_images;
 use clift_model::{Clift, Clusters, RenderTokens, SceneModel};
-use clift_train::{Loss, OptimizerConfig, Stage, StageBatch, TokenSelection, TrainState, adamw};
+use clift_train::{Loss, OptimizerConfig, Stage, StageBatch, TokenSelection, TrainState, freeze};
 
 use crate::modules::subsets;
 use crate::place::{Place, clusters, gradients, parameters};
@@ -23,20 +23,9 @@ const LEARNING_RATE: f64 = 1e-3;
 
 /// A model of a stage with its optimiser.
 pub fn learner(place: &Place, stage: Stage, activation_checkpointing: bool) -> TrainState {
-    let mut model = place.model();
-    match stage {
-        Stage::Stage2 => model.encoder = model.encoder.no_grad(),
-        _ => model.condenser = model.condenser.no_grad(),
-    }
-    let optimizer = adamw(&OptimizerConfig::default());
-    TrainState {
-        model,
-        optimizer,
-        device: place.device.clone(),
-        loss: Loss::default(),
-        activation_checkpointing,
-        loss_scale: None,
-    }
+    let model = freeze(stage, place.model());
+    let state = TrainState::new(model, &OptimizerConfig::default(), place.device.clone());
+    TrainState { activation_checkpointing, ..state }
 }
 
 /// A batch of a stage.

@@ -9,8 +9,8 @@ use clift_data::{ClipReader, Split, item_rng, open_dataset, step_rng, upper_medi
 use clift_eval::{EvalModels, EvalResults, Lpips, Sweep, evaluate_scene, upload_cameras, upload_views};
 use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
-    ClipShape, Config, DeviceBatch, Loss, LossScale, Stage, StageBatch, StageSettings, TokenSelection, TrainError,
-    TrainState, TypicalStep, adamw, clip_global_norm, eval_sizes, freeze, global_norm, measures_lpips, render_loss,
+    ClipShape, Config, DeviceBatch, Loss, LossScale, Stage, StageBatch, TokenSelection, TrainError, TrainState,
+    TypicalStep, adamw, clip_global_norm, eval_sizes, freeze, global_norm, measures_lpips, render_loss,
     scene_with_all_tokens, seeded_batch, seeded_clip,
 };
 use cpu_time::ProcessTime;
@@ -125,7 +125,7 @@ pub fn update_rates(config: &Config, stage: Stage, typical: &TypicalStep) -> Res
     let macs_of_scene = update_macs(&shallow, stage, &typical.scene);
     let num_scenes = ((ENOUGH_MACS / macs_of_scene) as usize).clamp(1, typical.num_scenes);
     let batch = calibration_batch(&context, stage, typical, num_scenes)?;
-    let StageSettings { optimizer, trained, .. } = config.stage(stage);
+    let optimizer = config.stage(stage).optimizer;
     let state = TrainState {
         model: freeze(stage, context.model()),
         optimizer: adamw(optimizer),
@@ -155,7 +155,7 @@ pub fn update_rates(config: &Config, stage: Stage, typical: &TypicalStep) -> Res
         optimizer_s = optimizer_s.min(started.elapsed().as_secs_f64());
     }
     let macs = num_scenes as f64 * macs_of_scene;
-    let parameters = Parameters::of(&shallow.model).of_parts(trained) as f64;
+    let parameters = Parameters::of(&shallow.model).of_parts(stage.trained()) as f64;
     Ok(Rates {
         per_mac: (step.seconds - optimizer_s).max(0.0) / macs,
         per_parameter: optimizer_s / parameters,

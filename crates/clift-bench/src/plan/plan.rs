@@ -145,11 +145,11 @@ pub fn check_plan(config: &Config) -> Result<(), TrainError> {
 }
 
 fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool) -> Result<PartPlan, TrainError> {
-    let StageSettings { steps, batch_size, trained, .. } = config.stage(stage);
+    let StageSettings { steps, batch_size, .. } = config.stage(stage);
     let all = possible_sizes(config, stage)?;
     let macs_of_scene = all.iter().map(|scene| update_macs(config, stage, scene)).sum::<f64>() / all.len() as f64;
     let macs = batch_size as f64 * macs_of_scene;
-    let trained_parameters = parameters.of_parts(trained);
+    let trained_parameters = parameters.of_parts(stage.trained());
     let rates = is_timed.then(|| update_rates(config, stage, &typical_sizes(config, stage)?)).transpose()?;
     let images = (batch_size * config.data.views.num_targets) as f64;
     let compute_s = rates

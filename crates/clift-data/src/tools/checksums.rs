@@ -182,7 +182,10 @@ impl Checksums {
 }
 
 /// Returns the SHA-256 of a file in hexadecimal.
-fn hash_file(path: &Path) -> Result<String, DataError> {
+///
+/// # Errors
+/// [`DataError::Io`].
+pub fn hash_file(path: &Path) -> Result<String, DataError> {
     let reading = || DataError::io("reading a file for its checksum", path);
     let mut file = File::open(path).map_err(reading())?;
     let mut digest = Sha256::new();

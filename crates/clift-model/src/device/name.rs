@@ -110,17 +110,10 @@ fn open_wgpu() -> Result<Device, ModelError> {
     Ok(Device::wgpu(DeviceKind::DefaultDevice))
 }
 
-#[cfg(test)]
+#[cfg(all(test, not(feature = "wgpu")))]
 mod tests {
     use super::*;
 
-    #[test]
-    fn an_unknown_name_is_refused_with_all_names() {
-        let message = "cuda".parse::<DeviceName>().unwrap_err().to_string();
-        assert_eq!(message, "device `cuda`: unknown; use one of flex, ndarray, wgpu");
-    }
-
-    #[cfg(not(feature = "wgpu"))]
     #[test]
     fn a_build_without_wgpu_names_the_feature() {
         let message = DeviceName::Wgpu.open().unwrap_err().to_string();

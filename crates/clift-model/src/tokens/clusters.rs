@@ -23,21 +23,17 @@ impl SceneClusters {
     /// [`ModelError::BadClusters`] for an index out of range or a centroid outside its cluster.
     pub fn new(assignment: Vec<u32>, centroid_index: Vec<u32>) -> Result<Self, ModelError> {
         let (tokens, clusters) = (assignment.len(), centroid_index.len());
+        let bad = |reason: String| Err(ModelError::BadClusters { reason });
         if let Some(token) = assignment.iter().position(|&cluster| cluster as usize >= clusters) {
-            let reason = format!("token {token} is in cluster {} of {clusters}", assignment[token]);
-            return Err(ModelError::BadClusters { reason });
+            return bad(format!("token {token} is in cluster {} of {clusters}", assignment[token]));
         }
         for (cluster, &token) in centroid_index.iter().enumerate() {
             match assignment.get(token as usize) {
                 Some(&own) if own as usize == cluster => {}
                 Some(own) => {
-                    let reason = format!("token {token}, the centroid of cluster {cluster}, is in cluster {own}");
-                    return Err(ModelError::BadClusters { reason });
+                    return bad(format!("token {token}, the centroid of cluster {cluster}, is in cluster {own}"));
                 }
-                None => {
-                    let reason = format!("the centroid of cluster {cluster} is token {token} of {tokens}");
-                    return Err(ModelError::BadClusters { reason });
-                }
+                None => return bad(format!("the centroid of cluster {cluster} is token {token} of {tokens}")),
             }
         }
         Ok(Self { assignment, centroid_index })

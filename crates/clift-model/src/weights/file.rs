@@ -137,11 +137,13 @@ fn read<M: Module>(
     if let Some(first) = result.errors.first() {
         return Err(error(describe(first)));
     }
-    if let Some((name, dtype)) = first_not_f32(module) {
-        return Err(error(format!("{name} is {dtype:?}, expected F32")));
-    }
-    if let Some((name, _)) = first(module, |data| data.iter::<f32>().any(|value| !value.is_finite())) {
-        return Err(error(format!("{name} contains values that are not finite")));
+    let problem = find(module, |name, data| match data.dtype() {
+        DType::F32 if data.iter::<f32>().all(f32::is_finite) => None,
+        DType::F32 => Some(format!("{name} contains values that are not finite")),
+        other => Some(format!("{name} is {other:?}, expected F32")),
+    });
+    if let Some(problem) = problem {
+        return Err(error(problem));
     }
     // Burn also reports absent parameters that do not match the filter.
     let missing = result.missing.iter().filter(|(name, _)| part.matches(name));
@@ -176,15 +178,15 @@ fn describe(error: &ApplyError) -> String {
 
 /// Returns path and type of the first parameter that is no 32-bit float.
 pub fn first_not_f32<M: Module>(module: &M) -> Option<(String, DType)> {
-    first(module, |data| data.dtype() != DType::F32)
+    find(module, |name, data| (data.dtype() != DType::F32).then(|| (name.to_owned(), data.dtype())))
 }
 
-/// Returns path and type of the first parameter whose values fulfil a condition.
-fn first<M: Module>(module: &M, condition: impl Fn(&TensorData) -> bool) -> Option<(String, DType)> {
+/// Returns the first result of `f`, called with path and values of every parameter.
+fn find<M: Module, T>(module: &M, f: impl Fn(&str, &TensorData) -> Option<T>) -> Option<T> {
     let mut found = None;
     visit(module, |name, _, data| {
-        if found.is_none() && condition(data) {
-            found = Some((name.to_owned(), data.dtype()));
+        if found.is_none() {
+            found = f(name, data);
         }
     });
     found

@@ -10,7 +10,7 @@ use burn::store::ModuleRecord;
 use clift_data::{make_folder, publish_folder, remove_folder};
 use clift_model::{ModelConfig, first_not_f32};
 
-use crate::checkpoint::progress::{Best, Fingerprint, Progress, State, VERSION};
+use crate::checkpoint::progress::{Best, Fingerprint, Progress, STATE, State, VERSION};
 use crate::config::config::CheckpointConfig;
 use crate::error::TrainError;
 use crate::step::train_state::TrainState;
@@ -18,7 +18,6 @@ use crate::step::train_state::TrainState;
 const MODEL: &str = "model.bpk";
 const OPTIMIZER: &str = "optimizer.bpk";
 const SAVING: &str = "writing a checkpoint";
-const LISTING: &str = "listing checkpoints";
 
 /// The checkpoints of one stage.
 #[derive(Clone, Debug)]
@@ -102,14 +101,13 @@ impl Checkpoints {
     /// # Errors
     /// [`TrainError::Damaged`] for a damaged checkpoint.
     pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<Progress>, TrainError> {
-        let mut all = self.list()?;
-        let Some(path) = all.pop() else { return Ok(None) };
+        let mut steps = self.steps()?;
+        let Some(step) = steps.pop() else { return Ok(None) };
         // A finished stage saves no more, and a save is what removes them otherwise.
         self.remove_unfinished()?;
-        let loaded = load_checkpoint(&path, self.model.as_ref(), train_state).map_err(|source| {
-            let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            let fix = match all.last() {
-                Some(older) => format!("remove {} to resume from {}", name(&path), name(older)),
+        let loaded = load_checkpoint(&self.path_of(step), self.model.as_ref(), train_state).map_err(|source| {
+            let fix = match steps.last() {
+                Some(older) => format!("remove {} to resume from {}", name_of(step), name_of(*older)),
                 None => "the stage has no other; start a new run with --fresh".into(),
             };
             TrainError::Damaged { source: Box::new(source), fix }
@@ -122,7 +120,7 @@ impl Checkpoints {
     /// # Errors
     /// [`TrainError::Io`].
     pub fn newest(&self) -> Result<Option<PathBuf>, TrainError> {
-        Ok(self.list()?.pop())
+        Ok(self.newest_step()?.map(|step| self.path_of(step)))
     }
 
     /// Returns the step of the newest checkpoint.
@@ -130,31 +128,30 @@ impl Checkpoints {
     /// # Errors
     /// [`TrainError::Io`].
     pub fn newest_step(&self) -> Result<Option<u64>, TrainError> {
-        Ok(self.newest()?.as_deref().and_then(step_of))
+        Ok(self.steps()?.pop())
     }
 
     fn path_of(&self, step: u64) -> PathBuf {
-        self.folder.join(format!("step-{step:09}"))
+        self.folder.join(name_of(step))
     }
 
-    /// Lists the complete checkpoints, oldest first.
-    fn list(&self) -> Result<Vec<PathBuf>, TrainError> {
-        if !self.folder.exists() {
-            return Ok(Vec::new());
-        }
-        let mut found = Vec::new();
-        for item in std::fs::read_dir(&self.folder).map_err(TrainError::io(LISTING, &self.folder))? {
-            let path = item.map_err(TrainError::io(LISTING, &self.folder))?.path();
-            found.extend(step_of(&path).map(|step| (step, path)));
-        }
-        found.sort();
-        Ok(found.into_iter().map(|(_, path)| path).collect())
+    /// Lists all files and folders.
+    fn items(&self) -> Result<Vec<PathBuf>, TrainError> {
+        let items = std::fs::read_dir(&self.folder).and_then(|items| items.map(|item| Ok(item?.path())).collect());
+        items.map_err(TrainError::io("listing checkpoints", &self.folder))
+    }
+
+    /// Lists the steps of the complete checkpoints, oldest first.
+    fn steps(&self) -> Result<Vec<u64>, TrainError> {
+        let items = if self.folder.exists() { self.items()? } else { Vec::new() };
+        let mut steps: Vec<u64> = items.iter().filter_map(|path| step_of(path)).collect();
+        steps.sort_unstable();
+        Ok(steps)
     }
 
     /// Removes unfinished saves, and what a killed process left of a removed checkpoint.
     fn remove_unfinished(&self) -> Result<(), TrainError> {
-        for item in std::fs::read_dir(&self.folder).map_err(TrainError::io(LISTING, &self.folder))? {
-            let path = item.map_err(TrainError::io(LISTING, &self.folder))?.path();
+        for path in self.items()? {
             if path.extension().is_some_and(|extension| extension == "tmp") {
                 remove_if_present(&path)?;
             }
@@ -165,8 +162,7 @@ impl Checkpoints {
     /// Removes the checkpoints that are no longer kept, and unfinished saves.
     fn prune(&self, progress: &Progress) -> Result<(), TrainError> {
         self.remove_unfinished()?;
-        let steps: Vec<u64> = self.list()?.iter().filter_map(|path| step_of(path)).collect();
-        for step in steps_to_remove(&steps, &self.retention, progress.best) {
+        for step in steps_to_remove(&self.steps()?, &self.retention, progress.best) {
             let path = self.path_of(step);
             remove_folder(&path).map_err(TrainError::io("removing an old checkpoint", &path))?;
         }
@@ -182,6 +178,10 @@ fn steps_to_remove(steps: &[u64], retention: &CheckpointConfig, best: Option<Bes
         is_best || (keep_every > 0 && step.is_multiple_of(keep_every))
     };
     steps[..steps.len().saturating_sub(keep)].iter().copied().filter(|step| !is_kept(*step)).collect()
+}
+
+fn name_of(step: u64) -> String {
+    format!("step-{step:09}")
 }
 
 fn step_of(path: &Path) -> Option<u64> {
@@ -200,46 +200,41 @@ fn load_checkpoint(
     expected: Option<&ModelConfig>,
     train_state: &mut TrainState,
 ) -> Result<Progress, TrainError> {
+    let bad = |name: &str, reason: String| TrainError::bad_file("checkpoint", &folder.join(name))(reason);
     let State { progress, files, model, loss_scale, .. } = State::read(folder)?;
     if let Some(name) = [MODEL, OPTIMIZER].into_iter().find(|name| !files.contains_key(*name)) {
-        let reason = format!("the checksum of {name} is missing");
-        return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
+        return Err(bad(STATE, format!("the checksum of {name} is missing")));
     }
     if let (Some(model), Some(expected)) = (&model, expected)
         && model != expected
     {
-        let reason = format!("the network ({model:?}) differs from [model] of the config");
-        return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
+        return Err(bad(STATE, format!("the network ({model:?}) differs from [model] of the config")));
     }
     for (name, expected) in &files {
         let file = folder.join(name);
         let found = Fingerprint::of(&file).map_err(TrainError::io("reading a checkpoint", &file))?;
         if found != *expected {
             let reason = format!("{} bytes with other contents, {} expected", found.num_bytes, expected.num_bytes);
-            return Err(TrainError::bad_file("checkpoint", &file)(reason));
+            return Err(bad(name, reason));
         }
     }
-    let model = folder.join(MODEL);
-    let bad_model = |reason: String| TrainError::bad_file("checkpoint", &model)(reason);
-    let record = ModuleRecord::load(&model).map_err(|error| bad_model(error.to_string()))?;
+    let record = ModuleRecord::load(folder.join(MODEL)).map_err(|error| bad(MODEL, error.to_string()))?;
     // Burn 0.22 panics for integer tensors and for optimizer tensors without parameter ids, and ignores unknown tensors.
     let loaded = catch_unwind(AssertUnwindSafe(|| train_state.model.clone().try_load_record(record)));
-    let loaded = loaded.map_err(|_| bad_model("a tensor is not of a float type".into()))?;
-    let loaded = loaded.map_err(|error| bad_model(format!("{error:?}")))?;
+    let loaded = loaded.map_err(|_| bad(MODEL, "a tensor is not of a float type".into()))?;
+    let loaded = loaded.map_err(|error| bad(MODEL, format!("{error:?}")))?;
     if let Some((name, dtype)) = first_not_f32(&loaded) {
-        return Err(bad_model(format!("{name} is {dtype:?}, not F32")));
+        return Err(bad(MODEL, format!("{name} is {dtype:?}, not F32")));
     }
     train_state.model = loaded;
-    let optimizer = folder.join(OPTIMIZER);
-    let record = OptimizerRecord::load(&optimizer).map_err(TrainError::bad_file("checkpoint", &optimizer))?;
+    let record = OptimizerRecord::load(folder.join(OPTIMIZER)).map_err(|error| bad(OPTIMIZER, error.to_string()))?;
     let num_tensors = record.len();
     let loaded = catch_unwind(AssertUnwindSafe(|| train_state.optimizer.clone().load_record(record)));
     let whole = loaded.ok().filter(|loaded| loaded.to_record().len() == num_tensors);
-    let foreign = || TrainError::bad_file("checkpoint", &optimizer)("the file is no record of this optimizer");
+    let foreign = || bad(OPTIMIZER, "the file is no record of this optimizer".into());
     train_state.optimizer = whole.ok_or_else(foreign)?;
     if loss_scale.is_some_and(|scale| !scale.is_possible()) {
-        let reason = "the loss scale is no power of two from 1 to 2^32";
-        return Err(TrainError::bad_file("checkpoint", &folder.join("state.json"))(reason));
+        return Err(bad(STATE, "the loss scale is no power of two from 1 to 2^32".into()));
     }
     // The precision is that of the config.
     if train_state.loss_scale.is_some() && loss_scale.is_some() {
@@ -259,15 +254,8 @@ mod tests {
     fn saved(root: &Path) -> (TrainState, Checkpoints, PathBuf) {
         let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
         let device = burn::tensor::Device::flex().autodiff();
-        let optimizer = crate::step::optimizer::adamw(&crate::config::config::OptimizerConfig::default());
-        let train_state = TrainState {
-            model: clift_model::Clift::new(&config, 0, &device),
-            optimizer,
-            device,
-            loss: crate::step::loss::Loss::default(),
-            activation_checkpointing: false,
-            loss_scale: None,
-        };
+        let model = clift_model::Clift::new(&config, 0, &device);
+        let train_state = TrainState::new(model, &crate::config::config::OptimizerConfig::default(), device);
         let checkpoints = Checkpoints::new(root.into(), CheckpointConfig::default());
         let step = checkpoints.save(&train_state, &Progress { step: 1, ..Progress::default() }).unwrap();
         (train_state, checkpoints, step)
@@ -353,12 +341,5 @@ mod tests {
         assert_eq!(removed(9, 0, false, 20), [0; 0]);
         let none = CheckpointConfig { keep: 1, ..CheckpointConfig::default() };
         assert_eq!(steps_to_remove(&steps, &none, None).len(), 5);
-    }
-
-    #[test]
-    fn only_complete_checkpoints_have_a_step() {
-        let step = |name: &str| step_of(Path::new(name));
-        assert_eq!((step("a/step-000000017"), step("a/step-1000000000")), (Some(17), Some(1_000_000_000)));
-        assert_eq!((step("a/step-000000017.tmp"), step("a/best")), (None, None));
     }
 }

@@ -14,6 +14,8 @@ use crate::error::TrainError;
 use crate::step::loss_scale::LossScale;
 use crate::step::step_guard::LossHistory;
 
+/// Name of the file.
+pub(crate) const STATE: &str = "state.json";
 /// The written version.
 pub(crate) const VERSION: u32 = 3;
 /// Version with the numbers of [`Progress`] as strings.
@@ -84,7 +86,7 @@ impl State {
     /// # Errors
     /// [`TrainError::Io`] and [`TrainError::BadFile`].
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
-        let path = folder.join("state.json");
+        let path = folder.join(STATE);
         let text = std::fs::read(&path).map_err(TrainError::io("reading a checkpoint", &path))?;
         Self::parse(&text).map_err(TrainError::bad_file("checkpoint", &path))
     }
@@ -106,7 +108,7 @@ impl State {
     /// # Errors
     /// [`TrainError::Io`].
     pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
-        let path = folder.join("state.json");
+        let path = folder.join(STATE);
         let text = serde_json::to_vec(self).map_err(TrainError::bad_file("checkpoint", &path))?;
         replace_file(&path, &text).map_err(TrainError::io("writing a checkpoint", &path))
     }

@@ -10,8 +10,7 @@ use clift_data::{ClipReader, DataError, ViewIndices, derive_seed, item_rng, unif
 use clift_eval::upload_views;
 use clift_model::{Encoder, Grouping, SceneClusters, tile_clusters};
 
-use crate::cluster_cache::cache::ClusterCache;
-use crate::cluster_cache::entry::{VERSION, settings};
+use crate::cluster_cache::cache::{ClusterCache, VERSION, settings};
 use crate::cluster_cache::resume_log::{CacheKey, ResumeLog};
 use crate::config::config::{ClustersConfig, Config};
 use crate::error::TrainError;

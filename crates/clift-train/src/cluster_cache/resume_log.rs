@@ -12,7 +12,7 @@ use clift_data::{SkipReport, make_folder, publish_folder, replace_file};
 use clift_model::SceneClusters;
 use serde::{Deserialize, Serialize};
 
-use crate::cluster_cache::entry::{CacheEntry, CacheIndex};
+use crate::cluster_cache::cache::{CacheEntry, CacheIndex};
 use crate::config::config::MAX_TOKENS;
 use crate::error::TrainError;
 

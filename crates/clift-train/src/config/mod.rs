@@ -6,7 +6,6 @@
 //! - `errors`: unknown keys, wrong values, ranges
 //! - `config`: every key of an experiment
 //! - `checks`: values that must fit each other
-//! - `sweep`: a config as evaluation settings
 //! - `parse`: read a config file
 
 pub(crate) mod checks;
@@ -17,4 +16,3 @@ pub(crate) mod former_names;
 pub(crate) mod overrides;
 pub(crate) mod parse;
 pub(crate) mod schema;
-pub(crate) mod sweep;

@@ -7,7 +7,6 @@ use serde::de::DeserializeOwned;
 use toml::Spanned;
 use toml::de::DeTable;
 
-use crate::config::config::Config;
 use crate::config::diagnostic::SourceText;
 use crate::config::errors;
 use crate::config::former_names::apply_former_names;
@@ -27,21 +26,9 @@ pub enum ConfigError {
         /// The file.
         path: PathBuf,
     },
-    /// The file is not TOML.
+    /// A mistake in the file or an override, shown with its line: no TOML, an unknown or missing key, or a wrong value.
     #[error("{0}")]
-    Syntax(String),
-    /// A `--set` is not `key=TOML`, or its key continues below a value.
-    #[error("{0}")]
-    Override(String),
-    /// All unknown keys.
-    #[error("{0}")]
-    UnknownKeys(String),
-    /// A key is missing, or its value has a wrong type or is no allowed choice.
-    #[error("{0}")]
-    Value(String),
-    /// A value is out of its range or contradicts another value.
-    #[error("{0}")]
-    Range(String),
+    Invalid(String),
     /// Another error of the values.
     #[error(transparent)]
     Other(Box<TrainError>),
@@ -59,7 +46,7 @@ pub fn read_config<T: DeserializeOwned + Serialize>(
     path: &Path,
     overrides: &[String],
 ) -> Result<(T, Vec<Override>), ConfigError> {
-    parse_config(path, &read(path)?, overrides)
+    read_checked_config(path, overrides, |_| Ok(()))
 }
 
 /// Does [`read_config`] on a text; `path` is only used in messages.
@@ -74,20 +61,17 @@ pub fn parse_config<T: DeserializeOwned + Serialize>(
     parse_checked(path, file, overrides, |_| Ok(()))
 }
 
-/// Does [`read_config`] for a whole experiment, then calls `check` on the config.
+/// Does [`read_config`], then calls `check` on the config.
 ///
 /// # Errors
-/// As [`read_config`], and [`ConfigError::Range`] with the line of the key that `check` refuses.
-pub fn read_checked_config(
+/// As [`read_config`], and [`ConfigError::Invalid`] with the line of the key that `check` refuses.
+pub fn read_checked_config<T: DeserializeOwned + Serialize>(
     path: &Path,
     overrides: &[String],
-    check: impl FnOnce(&Config) -> Result<(), TrainError>,
-) -> Result<(Config, Vec<Override>), ConfigError> {
-    parse_checked(path, &read(path)?, overrides, check)
-}
-
-fn read(path: &Path) -> Result<String, ConfigError> {
-    std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })
+    check: impl FnOnce(&T) -> Result<(), TrainError>,
+) -> Result<(T, Vec<Override>), ConfigError> {
+    let file = std::fs::read_to_string(path).map_err(|source| ConfigError::Io { source, path: path.to_owned() })?;
+    parse_checked(path, &file, overrides, check)
 }
 
 fn parse_checked<T: DeserializeOwned + Serialize>(
@@ -104,16 +88,16 @@ fn parse_checked<T: DeserializeOwned + Serialize>(
     let unknown = errors::unknown_keys(&keys, root.get_ref(), &sources);
     if !unknown.is_empty() {
         let all: Vec<_> = unknown.iter().map(|diagnostic| sources.render(diagnostic)).collect();
-        return Err(ConfigError::UnknownKeys(all.join("\n\n")));
+        return Err(ConfigError::Invalid(all.join("\n\n")));
     }
-    let value = |diagnostic| ConfigError::Value(sources.render(&diagnostic));
+    let invalid = |diagnostic| ConfigError::Invalid(sources.render(&diagnostic));
     let config = T::deserialize(toml::Deserializer::from(root.clone()))
-        .map_err(|error| value(errors::wrong_value(&error, root.get_ref(), &sources)))?;
+        .map_err(|error| invalid(errors::wrong_value(&error, root.get_ref(), &sources)))?;
     if let Some(diagnostic) = errors::too_long(&config, root.get_ref(), &sources) {
-        return Err(value(diagnostic));
+        return Err(invalid(diagnostic));
     }
     check(&config).map_err(|error| match errors::out_of_range(&error, root.get_ref(), &sources) {
-        Some(diagnostic) => ConfigError::Range(sources.render(&diagnostic)),
+        Some(diagnostic) => invalid(diagnostic),
         None => ConfigError::Other(Box::new(error)),
     })?;
     Ok((config, changed))
@@ -125,20 +109,18 @@ fn merged<'t>(
     file: &'t str,
     padded: &'t [String],
 ) -> Result<(Spanned<DeTable<'t>>, Vec<Override>), ConfigError> {
+    let invalid = |diagnostic: &_| ConfigError::Invalid(sources.render(diagnostic));
     let mut root = DeTable::parse(file).map_err(|error| {
-        let span = error.span().unwrap_or(0..0);
-        let diagnostic = sources.at(span, "the file is not TOML".into(), error.message().into());
-        ConfigError::Syntax(sources.render(&diagnostic))
+        invalid(&sources.at(error.span().unwrap_or(0..0), "the file is not TOML".into(), error.message().into()))
     })?;
-    let refused = |diagnostic: &_| ConfigError::Override(sources.render(diagnostic));
     let mut changed: Vec<Override> = Vec::new();
     for (index, text) in padded.iter().enumerate() {
         let start = sources.override_start(index);
-        let (key, value) = parse_override(sources, text, start).map_err(|diagnostic| refused(&diagnostic))?;
+        let (key, value) = parse_override(sources, text, start).map_err(|diagnostic| invalid(&diagnostic))?;
         let to = to_toml(value.get_ref());
         let from = merge_value(root.get_mut(), &key, value).map_err(|blocked| {
             let title = format!("`{}` is a value, not a section", blocked.get_ref());
-            refused(&sources.at(blocked.span(), title, "cannot hold a key".into()))
+            invalid(&sources.at(blocked.span(), title, "cannot hold a key".into()))
         })?;
         let key = dotted(&key);
         match changed.iter_mut().find(|change| change.key == key) {
@@ -150,50 +132,20 @@ fn merged<'t>(
     Ok((root, changed))
 }
 
+// The suite compares whole messages with `tests/snapshots`.
 #[cfg(test)]
 mod tests {
-    use serde::{Deserialize, Serialize};
+    use clift_model::Grouping;
 
     use super::*;
+    use crate::config::config::Config;
 
-    #[derive(Debug, PartialEq, Deserialize, Serialize)]
-    #[serde(deny_unknown_fields)]
-    struct Config {
-        #[serde(default)]
-        device: String,
-        model: Model,
-        #[serde(default)]
-        stage1: Stage,
-        #[serde(default)]
-        clusters: Clusters,
-    }
+    const FILE: &str = "run_dir = \"run\"\n[data]\n[stage1]\nsteps = 90000\n[stage2]\n[clusters]\n";
 
-    #[derive(Debug, PartialEq, Deserialize, Serialize)]
-    #[serde(deny_unknown_fields)]
-    struct Model {
-        num_heads: usize,
-    }
-
-    #[derive(Debug, Default, PartialEq, Deserialize, Serialize)]
-    #[serde(default, deny_unknown_fields)]
-    struct Stage {
-        steps: usize,
-        lr: f64,
-        batch_size: usize,
-    }
-
-    #[derive(Debug, Default, PartialEq, Deserialize, Serialize)]
-    #[serde(default, deny_unknown_fields)]
-    struct Clusters {
-        grid: Vec<f64>,
-        range: [f64; 2],
-    }
-
-    const FILE: &str = "# tiny\n[model]\nnum_heads = 4\n\n[stage1]\nsteps = 90000\n";
-
-    fn parse(file: &str, overrides: &[&str]) -> Result<(Config, Vec<Override>), ConfigError> {
+    fn parse(file: &str, overrides: &[&str]) -> Result<(Config, Vec<String>), ConfigError> {
         let overrides: Vec<String> = overrides.iter().map(|&text| text.to_owned()).collect();
-        parse_config(Path::new("tiny.toml"), file, &overrides)
+        let (config, changed) = parse_config(Path::new("tiny.toml"), file, &overrides)?;
+        Ok((config, changed.iter().map(ToString::to_string).collect()))
     }
 
     fn message(file: &str, overrides: &[&str]) -> String {
@@ -207,72 +159,69 @@ mod tests {
             "stage1.steps = 30",
             "clusters.grid=[0.5, 1]",
             "device=wgpu",
-            "model.num_heads=4",
-            "stage1.lr=3e-4",
+            "data={}",
+            "stage1.optimizer.learning_rate=3e-4",
         ];
         let (config, changed) = parse(FILE, &overrides).unwrap();
-        assert_eq!((config.stage1.steps, config.stage1.lr), (30, 3e-4));
-        assert_eq!((config.device.as_str(), config.clusters.grid.as_slice()), ("wgpu", &[0.5, 1.0][..]));
-        let shown: Vec<String> = changed.iter().map(ToString::to_string).collect();
+        assert_eq!((config.stage1.steps, config.stage1.optimizer.learning_rate), (30, 3e-4));
+        assert_eq!((config.device.as_str(), config.clusters.grid.len()), ("wgpu", 2));
         let expected = [
             "--set stage1.steps: 90000 -> 30",
             "--set clusters.grid: (default) -> [0.5, 1]",
             "--set device: (default) -> \"wgpu\"",
-            "--set stage1.lr: (default) -> 3e-4",
+            "--set stage1.optimizer.learning_rate: (default) -> 3e-4",
         ];
-        assert_eq!(shown, expected);
+        assert_eq!(changed, expected);
     }
 
     #[test]
     fn overrides_supply_missing_keys_and_need_no_quotes() {
-        assert_eq!(parse("", &["model.num_heads=2"]).unwrap().0.model.num_heads, 2);
-        for (text, expected) in [("device=/data/re10k-v2.1", "/data/re10k-v2.1"), ("device=\"a b\"", "a b")] {
-            assert_eq!(parse(FILE, &[text]).unwrap().0.device, expected);
+        let file = FILE.replace("run_dir = \"run\"", "");
+        for (text, expected) in [("run_dir=/data/re10k-v2.1", "/data/re10k-v2.1"), ("run_dir=\"a b\"", "a b")] {
+            assert_eq!(parse(&file, &[text]).unwrap().0.run_dir, Path::new(expected));
         }
         assert!(message(FILE, &["device="]).starts_with("the value of `device` is not TOML"));
     }
 
     #[test]
-    fn every_unknown_key_is_listed_with_a_suggestion() {
-        let expected = "unknown key `batch_size` in [model]
-  --> tiny.toml:3:1
-  |
-3 | batch_size = 4
-  | ^^^^^^^^^^ `batch_size` belongs to [stage1]
-  |
-  = help: [model] has `num_heads`
-
-unknown section [stage2]
-  --> tiny.toml:4:2
-  |
-4 | [stage2]
-  |  ^^^^^^ did you mean [stage1]?
-  |
-  = help: the top level has `device`, `model`, `stage1`, `clusters`";
-        assert_eq!(message("[model]\nnum_heads = 4\nbatch_size = 4\n[stage2]\n", &[]), expected);
+    fn every_mistake_is_listed_in_its_text() {
+        let overrides = ["device=wgpu", "stage2.step=3"];
+        let message = message(&FILE.replace("[clusters]", "[cluster]"), &overrides);
+        let titles: Vec<&str> = message.split("\n\n").filter_map(|part| part.split("\n  |").next()).collect();
+        assert_eq!(
+            titles,
+            ["unknown section [cluster]\n  --> tiny.toml:6:2", "unknown key `step` in [stage2]\n  --> --set:1:8"]
+        );
     }
 
     #[test]
-    fn override_errors_point_into_the_override() {
-        for (text, title, position) in [
-            ("stage1.step=100", "unknown key `step` in [stage1]", "--set:1:8"),
-            ("stage1.steps=1O0", "wrong value of `stage1.steps`", "--set:1:14"),
-            ("clusters.range=[0]", "wrong value of `clusters.range`", "--set:1:16"),
-            ("clusters.range=[0, 1, 2]", "wrong value of `clusters.range`", "--set:1:16"),
-            ("device=a b", "the value of `device` is not TOML", "--set:1:8"),
-            ("stage1.steps.x=1", "`steps` is a value, not a section", "--set:1:8"),
-        ] {
+    fn lists_of_another_length_are_refused() {
+        for text in ["stage1.keep_tokens=[0]", "stage1.keep_tokens=[0, 1, 2]"] {
             let message = message(FILE, &["device=wgpu", text]);
-            assert!(message.starts_with(&format!("{title}\n  --> {position}\n")), "{message}");
+            assert!(message.starts_with("wrong value of `stage1.keep_tokens`\n  --> --set:1:20\n"), "{message}");
         }
     }
 
     #[test]
-    fn missing_keys_and_files_are_named() {
-        assert_eq!(message("[model]\n", &[]), "the key `model.num_heads` is missing\n = in tiny.toml");
-        assert_eq!(message("", &[]), "the key `model` is missing\n = in tiny.toml");
-        let error = read_config::<Config>(Path::new("no/such.toml"), &[]).unwrap_err().to_string();
-        assert!(error.starts_with("reading the configuration failed: "), "{error}");
-        assert!(error.ends_with(": no/such.toml"), "{error}");
+    fn former_names_are_read_with_a_note() {
+        let file = format!("recompute = true\n{FILE}grouping = \"patch\"\n");
+        for (file, overrides) in [(file.as_str(), &[][..]), (FILE, &["recompute=true", "clusters.grouping=patch"][..])]
+        {
+            let (config, changed) = parse(file, overrides).unwrap();
+            assert!(config.activation_checkpointing && config.clusters.grouping == Grouping::Tile);
+            assert_eq!(
+                changed[overrides.len()..],
+                [
+                    "`recompute` is named `activation_checkpointing` now",
+                    "`clusters.grouping = \"patch\"` is named `clusters.grouping = \"tile\"` now"
+                ]
+            );
+            let written = toml::to_string(&config).unwrap();
+            assert!(written.contains("activation_checkpointing = true\n") && !written.contains("recompute"));
+            assert!(written.contains("grouping = \"tile\"\n") && !written.contains("\"patch\""));
+        }
+        let message = message(FILE, &["recompute=true", "activation_checkpointing=false"]);
+        assert!(message.starts_with("unknown key `recompute`"), "{message}");
+        assert!(message.contains("`activation_checkpointing`"), "{message}");
     }
 }

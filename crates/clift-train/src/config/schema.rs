@@ -122,37 +122,17 @@ impl<'de> MapAccess<'de> for Probe<'_> {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
-    use serde::Deserialize;
-
     use super::*;
-
-    #[derive(Deserialize)]
-    #[serde(default, deny_unknown_fields)]
-    #[derive(Default)]
-    #[allow(dead_code)] // only their names matter
-    struct Outer {
-        seed: u64,
-        inner: Option<Inner>,
-        free: BTreeMap<String, f64>,
-    }
-
-    #[derive(Deserialize)]
-    #[allow(dead_code)] // only their names matter
-    struct Inner {
-        num_heads: usize,
-        dim: usize,
-    }
+    use crate::config::config::Config;
 
     #[test]
     fn keys_of_a_type_include_those_of_its_sections() {
-        let keys = Keys::of::<Outer>();
-        assert_eq!(keys.names().collect::<Vec<_>>(), ["seed", "inner", "free"]);
-        assert_eq!(keys.get("inner").unwrap().names().collect::<Vec<_>>(), ["num_heads", "dim"]);
+        let keys = Keys::of::<Config>();
+        assert!(keys.names().take(2).eq(["run_dir", "seed"]));
+        let kmeans = keys.get("clusters").and_then(|clusters| clusters.get("kmeans")).unwrap();
+        assert!(kmeans.names().eq(["max_iterations", "tolerance"]));
         assert_eq!(keys.get("seed").unwrap().fields, None);
-        assert_eq!(keys.get("free").unwrap().fields, None);
-        assert_eq!(keys.sections_with("dim"), ["inner"]);
+        assert_eq!(keys.sections_with("tolerance"), ["clusters.kmeans"]);
     }
 
     #[test]

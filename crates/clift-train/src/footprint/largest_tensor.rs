@@ -4,9 +4,11 @@ use burn::tensor::Device;
 use clift_model::{Part, SceneSizes, kmeans_values, largest_tensors, max_tensor_bytes};
 
 use crate::config::config::Config;
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::events::Stage;
-use crate::footprint::scene_sizes::{VIEWS_PER_PASS, cluster_counts, scene_with_all_tokens, scene_with_stored_tokens};
+use crate::footprint::scene_sizes::{
+    VIEWS_PER_PASS, cluster_counts, kept, largest_sizes, scene_with_all_tokens, scene_with_stored_tokens,
+};
 use crate::stage::settings::StageSettings;
 
 /// Bytes of an f32 value; f16 operands are smaller copies of f32 tensors.
@@ -54,7 +56,7 @@ fn check_tensor_limit(config: &Config, limit: u64, parts: &[Stage]) -> Result<()
                 "{what} of {of} would be one tensor of {bytes} bytes, and {} takes at most {limit} in one: {fix}",
                 config.device
             );
-            return Err(TrainError::BadConfig { key, value, fix });
+            return Err(bad(&key, value, &fix));
         }
     }
     Ok(())
@@ -72,8 +74,9 @@ fn largest_fitting_setting(config: &Config, part: Stage, limit: u64) -> Result<(
         config.data.views.max_context = count;
         config.data.views.min_context = config.data.views.min_context.min(count);
     };
-    let StageSettings { batch_size, accumulate, trained, .. } = config.stage(part);
-    if !trained.is_empty() {
+    let StageSettings { batch_size, accumulate, .. } = config.stage(part);
+    let is_trained = !part.trained().is_empty();
+    if is_trained {
         for parts in accumulate..=batch_size {
             smaller.set_accumulate(part, parts);
             if fits(&smaller)? {
@@ -85,8 +88,7 @@ fn largest_fitting_setting(config: &Config, part: Stage, limit: u64) -> Result<(
         Stage::Eval => ("eval.num_context", config.eval.num_context),
         _ => ("data.views.max_context", config.data.views.max_context),
     };
-    let also =
-        if trained.is_empty() { String::new() } else { format!(" with {}.accumulate = {batch_size}", part.name()) };
+    let also = if is_trained { format!(" with {}.accumulate = {batch_size}", part.name()) } else { String::new() };
     for count in (1..now).rev() {
         set_views(&mut smaller, count);
         if fits(&smaller)? {
@@ -125,14 +127,9 @@ fn tensors(config: &Config, part: Stage) -> Result<Vec<(String, u64)>, TrainErro
         all.extend(of(Part::Renderer, &scene_with_stored_tokens(scene, most)));
     }
     if part == Stage::Stage1 {
-        let [low, high] = config.stage1.keep_tokens;
-        let kept = ((scene.num_tokens as f64 * high) as usize).clamp(1, scene.num_tokens);
-        // Views share the tokens only if all are kept; with one token less, every view has its own subset.
-        if low < 1.0 {
-            let num_render_tokens = kept.min((scene.num_tokens - 1).max(1));
-            all.extend(of(Part::Renderer, &SceneSizes { num_render_tokens, is_per_view: true, ..scene }));
-        }
-        if kept == scene.num_tokens {
+        all.extend(of(Part::Renderer, &largest_sizes(config, part)?));
+        // Views share the tokens of the steps in which all are kept.
+        if kept(scene, config.stage1.keep_tokens[1]) == scene {
             all.extend(of(Part::Renderer, &scene));
         }
     }

@@ -79,7 +79,7 @@ fn update(config: &Config, stage: Stage) -> Result<f64, TrainError> {
         parameters: 0.0,
     });
     let sizes = UpdateSizes {
-        trained: settings.trained,
+        trained: stage.trained(),
         num_scenes,
         is_accumulated: num_scenes < settings.batch_size,
         activation_checkpointing: config.activation_checkpointing,

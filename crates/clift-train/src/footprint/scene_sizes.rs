@@ -4,7 +4,6 @@ use clift_eval::{LPIPS_MIN_SIZE_PX, Method, Sweep};
 use clift_model::SceneSizes;
 
 use crate::config::config::Config;
-use crate::config::sweep::eval_sweep;
 use crate::error::TrainError;
 use crate::events::Stage;
 
@@ -86,7 +85,7 @@ pub fn eval_sizes(config: &Config) -> Sweep {
     let mut variants = config.eval.variants.clone();
     // The condenser of tiles belongs to another run.
     variants.retain(|variant| *variant != Method::PatchClift);
-    eval_sweep(config, config.eval.storage.clone(), if variants.is_empty() { methods.to_vec() } else { variants })
+    config.sweep(config.eval.storage.clone(), if variants.is_empty() { methods.to_vec() } else { variants })
 }
 
 /// Whether an evaluation measures LPIPS.
@@ -131,7 +130,8 @@ fn training_scene(config: &Config, num_context: usize) -> Result<SceneSizes, Tra
     scene_with_all_tokens(config, num_context, config.data.views.num_targets)
 }
 
-fn kept(scene: SceneSizes, share: f64) -> SceneSizes {
+/// Returns the sizes of a scene whose target views are rendered from a share of its tokens.
+pub fn kept(scene: SceneSizes, share: f64) -> SceneSizes {
     let count = ((scene.num_tokens as f64 * share) as usize).max(1);
     SceneSizes { num_render_tokens: count, is_per_view: count < scene.num_tokens, ..scene }
 }

@@ -10,7 +10,7 @@ use safetensors::tensor::Dtype;
 
 use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::interchange::model_dir::{Parameter, require_absent, to_safetensors};
+use crate::interchange::model_dir::{HostTensor, require_absent, to_safetensors};
 use crate::interchange::record::ImportRecord;
 
 /// Format of an exported file.
@@ -48,17 +48,17 @@ pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Pa
     let mut ours = read_parameters(&model.weights)?;
     let bad = |reason: String| TrainError::bad_file("weight file", &model.weights)(reason);
     let has_condenser = ours.keys().any(|path| path.starts_with("condenser."));
-    let mut tensors = Vec::new();
+    let mut tensors: Vec<HostTensor> = Vec::new();
     for tensor in published_tensors(&config.model, has_condenser) {
         let mut values = Vec::new();
         for (path, rows) in &tensor.parts {
             let mut shape = tensor.shape.clone();
             shape[0] = rows.len();
-            let part = ours.remove(path).ok_or_else(|| bad(format!("{path} {shape:?} is missing")))?;
-            if part.shape != shape {
-                return Err(bad(format!("{path} is {:?}, expected {shape:?}", part.shape)));
+            let (found, part) = ours.remove(path).ok_or_else(|| bad(format!("{path} {shape:?} is missing")))?;
+            if found != shape {
+                return Err(bad(format!("{path} is {found:?}, expected {shape:?}")));
             }
-            values.extend(part.values);
+            values.extend(part);
         }
         let mut shape = tensor.shape;
         if tensor.key.strip_suffix(".weight").is_some_and(|layer| convolutions.iter().any(|name| name == layer)) {
@@ -77,10 +77,8 @@ pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Pa
     match format {
         ExportFormat::Pytorch => write_state_dict(out, &tensors, &sizes(&config.model))?,
         ExportFormat::Safetensors => {
-            let parameters: Vec<Parameter> =
-                tensors.into_iter().map(|(path, shape, values)| Parameter { path, shape, values }).collect();
             let metadata = sizes(&config.model).map(|(name, size)| (name.to_owned(), size.to_string()));
-            let bytes = to_safetensors(&parameters, HashMap::from(metadata), out)?;
+            let bytes = to_safetensors(&tensors, HashMap::from(metadata), out)?;
             replace_file(out, &bytes).map_err(TrainError::io("writing the weights", out))?;
         }
     }
@@ -99,8 +97,11 @@ fn sizes(model: &ModelConfig) -> [(&'static str, usize); 6] {
     ]
 }
 
-/// Reads the parameters of a weight file by path.
-fn read_parameters(path: &Path) -> Result<BTreeMap<String, Parameter>, TrainError> {
+/// Shape and values of parameters, by path.
+type Parameters = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
+/// Reads the parameters of a weight file.
+fn read_parameters(path: &Path) -> Result<Parameters, TrainError> {
     let bytes = std::fs::read(path).map_err(TrainError::io("reading the weights", path))?;
     let file = SafeTensors::deserialize(&bytes).map_err(TrainError::bad_file("weight file", path))?;
     let mut found = BTreeMap::new();
@@ -110,7 +111,7 @@ fn read_parameters(path: &Path) -> Result<BTreeMap<String, Parameter>, TrainErro
             return Err(TrainError::bad_file("weight file", path)(reason));
         }
         let values = view.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
-        found.insert(name.clone(), Parameter { path: name, shape: view.shape().to_vec(), values });
+        found.insert(name, (view.shape().to_vec(), values));
     }
     Ok(found)
 }

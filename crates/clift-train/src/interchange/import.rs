@@ -3,13 +3,13 @@
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use clift_data::{ElementType, StateDict};
+use clift_data::{ElementType, StateDict, hash_file};
 use clift_model::{InferredConfig, PublishedTensor, published_tensors};
 
 use crate::config::config::Config;
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::interchange::keys::{Keys, printable};
-use crate::interchange::model_dir::{self, Parameter};
+use crate::interchange::model_dir::{self, HostTensor};
 use crate::interchange::problems;
 use crate::interchange::record::{ImportOptions, ImportRecord, check_stop};
 
@@ -62,7 +62,7 @@ pub fn import(
     let imported = ImportRecord {
         version: 1,
         file: file.file_name().unwrap_or_default().to_string_lossy().into_owned(),
-        sha256: model_dir::sha256(file)?,
+        sha256: hash_file(file)?,
         variant: options.variant,
         has_condenser,
         convolutions,
@@ -83,7 +83,7 @@ fn num_heads(state: &StateDict, options: &ImportOptions) -> Result<Option<usize>
     match (options.num_heads, stored) {
         (Some(given), Some(stored)) if given != stored => {
             let fix = format!("the checkpoint has {stored} heads: omit the option: {}", state.path.display());
-            Err(TrainError::BadConfig { key: "--num-heads".into(), value: given.to_string(), fix })
+            Err(bad("--num-heads", given, &fix))
         }
         (given, stored) => Ok(given.or(stored)),
     }
@@ -105,20 +105,19 @@ fn check_sizes(sizes: &InferredConfig, keys: &Keys, state: &StateDict) -> Result
             ("not given".into(), "tensor shapes do not determine the number: ")
         };
         let fix = format!("{why}give the number of heads, a divisor of the width {dim}{from}: {file}");
-        return Err(TrainError::BadConfig { key: "--num-heads".into(), value, fix });
+        return Err(bad("--num-heads", value, &fix));
     }
     let bad_sizes = |error: clift_model::ModelError| TrainError::bad_file("checkpoint", file)(error);
     model.validate().map_err(bad_sizes)
 }
 
 /// Splits a published tensor into parameters.
-fn parts<'a>(tensor: &'a PublishedTensor, values: &'a [f32]) -> impl Iterator<Item = Parameter> + 'a {
+fn parts<'a>(tensor: &'a PublishedTensor, values: &'a [f32]) -> impl Iterator<Item = HostTensor> + 'a {
     let row_len: usize = tensor.shape[1..].iter().product();
     tensor.parts.iter().map(move |(path, rows)| {
         let mut shape = tensor.shape.clone();
         shape[0] = rows.len();
-        let values = values[rows.start * row_len..rows.end * row_len].to_vec();
-        Parameter { path: path.clone(), shape, values }
+        (path.clone(), shape, values[rows.start * row_len..rows.end * row_len].to_vec())
     })
 }
 

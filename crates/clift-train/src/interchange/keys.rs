@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use clift_data::StateDict;
 use clift_model::{CliftVariant, InferredConfig, PERCEPTUAL_PREFIX, PREFIX, canonical_key, infer_config};
 
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::interchange::record::ImportOptions;
 
 /// Most characters of a key in a message.
@@ -14,6 +14,7 @@ pub(crate) const MAX_SHOWN: usize = 160;
 const MAX_OUTSIDE: usize = 200;
 
 /// The keys of a checkpoint.
+#[derive(Default)]
 pub(crate) struct Keys {
     /// Keys of the network: canonical name to name in the file.
     pub network: BTreeMap<String, String>,
@@ -49,18 +50,12 @@ impl Keys {
             let first = all.first().map_or("none", |(_, key)| key);
             let fix =
                 format!("no key contains {from:?}; the first key is {}: {}", printable(first), state.path.display());
-            return Err(TrainError::BadConfig { key: "--rename".into(), value: format!("{from}={to}"), fix });
+            return Err(bad("--rename", format!("{from}={to}"), &fix));
         }
 
         // A state dict of the network alone has no prefix.
         let prefix = if all.iter().any(|(name, _)| name.starts_with(PREFIX)) { PREFIX } else { "" };
-        let mut keys = Self {
-            network: BTreeMap::new(),
-            prefix,
-            strays: BTreeMap::new(),
-            ignored: BTreeMap::new(),
-            outside: BTreeMap::new(),
-        };
+        let mut keys = Self { prefix, ..Self::default() };
         for (name, key) in all {
             if name.starts_with(PERCEPTUAL_PREFIX) {
                 *keys.ignored.entry(PERCEPTUAL_PREFIX.trim_end_matches('.').into()).or_insert(0) += 1;

@@ -1,30 +1,19 @@
 //! A model directory: `model.safetensors`, `config.toml` with the network and its evaluation settings, and `import.json`.
 
 use std::collections::HashMap;
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::{PoseRotation, PoseScale, SourceKind, TEMPORARY, publish_folder, replace_file};
 use clift_model::{CliftVariant, ModelConfig, ModelPath, TrainedModel, sorted_header};
 use safetensors::tensor::{Dtype, TensorView};
-use sha2::{Digest, Sha256};
 
 use crate::config::config::Config;
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::interchange::record::{ImportRecord, check_stop};
 
-/// A parameter on the host, in PyTorch's layout.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Parameter {
-    /// Path in weight files.
-    pub path: String,
-    /// Shape.
-    pub shape: Vec<usize>,
-    /// Values, row-major.
-    pub values: Vec<f32>,
-}
+/// Name, shape and row-major values of a tensor in PyTorch's layout, as [`clift_data::write_state_dict`] takes it.
+pub type HostTensor = (String, Vec<usize>, Vec<f32>);
 
 /// Returns the settings with which the reference evaluates a published network.
 pub fn evaluation_config(model: ModelConfig, folder: &Path) -> Config {
@@ -57,22 +46,7 @@ pub fn require_absent(path: &Path) -> Result<(), TrainError> {
     if path.symlink_metadata().is_err() {
         return Ok(());
     }
-    let fix = "the path exists and is not overwritten; write another one".to_owned();
-    Err(TrainError::BadConfig { key: "-o".into(), value: path.display().to_string(), fix })
-}
-
-/// Returns the SHA-256 of a file as 64 hexadecimal digits.
-pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
-    let reading = "reading the checkpoint";
-    let mut file = File::open(path).map_err(TrainError::io(reading, path))?;
-    let (mut sha, mut buffer) = (Sha256::new(), vec![0; 1 << 20]);
-    loop {
-        match file.read(&mut buffer).map_err(TrainError::io(reading, path))? {
-            0 => break,
-            count => sha.update(&buffer[..count]),
-        }
-    }
-    Ok(hex::encode(sha.finalize()))
+    Err(bad("-o", path.display(), "the path exists and is not overwritten; write another one"))
 }
 
 /// Writes a model directory under a temporary name, opens the model to check it, and renames the directory. Removes all
@@ -80,13 +54,12 @@ pub(crate) fn sha256(path: &Path) -> Result<String, TrainError> {
 pub(crate) fn write_model_dir(
     folder: &Path,
     config: &Config,
-    parameters: &[Parameter],
+    parameters: &[HostTensor],
     imported: &ImportRecord,
     stop: &AtomicBool,
 ) -> Result<(), TrainError> {
     if folder.file_name().is_none() {
-        let fix = "write the name of a directory".to_owned();
-        return Err(TrainError::BadConfig { key: "-o".into(), value: folder.display().to_string(), fix });
+        return Err(bad("-o", folder.display(), "write the name of a directory"));
     }
     let above = folder.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let writing = "writing the model directory";
@@ -97,20 +70,21 @@ pub(crate) fn write_model_dir(
     // Removed on drop.
     let temporary = std::fs::create_dir_all(above).and_then(|()| builder.tempdir_in(above));
     let temporary = temporary.map_err(TrainError::io(writing, above))?;
-    let weights_path = temporary.path().join("model.safetensors");
-    let bytes = to_safetensors(parameters, HashMap::new(), &weights_path)?;
+    let write = |name: &str, bytes: &[u8]| {
+        let path = temporary.path().join(name);
+        replace_file(&path, bytes).map_err(TrainError::io(writing, &path))
+    };
+    let bytes = to_safetensors(parameters, HashMap::new(), folder)?;
     check_stop(stop)?;
-    replace_file(&weights_path, &bytes).map_err(TrainError::io(writing, &weights_path))?;
+    write("model.safetensors", &bytes)?;
     drop(bytes);
     check_stop(stop)?;
-    let config_path = temporary.path().join("config.toml");
-    let text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", &config_path))?;
-    replace_file(&config_path, text.as_bytes()).map_err(TrainError::io(writing, &config_path))?;
-    let import_path = temporary.path().join("import.json");
-    let text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", &import_path))?;
-    replace_file(&import_path, &text).map_err(TrainError::io(writing, &import_path))?;
+    let config_text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", folder))?;
+    write("config.toml", config_text.as_bytes())?;
+    let import_text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", folder))?;
+    write("import.json", &import_text)?;
 
-    let written = ModelPath { dir: temporary.path().into(), weights: weights_path };
+    let written = ModelPath { dir: temporary.path().into(), weights: temporary.path().join("model.safetensors") };
     TrainedModel::open(&written, &config.model, &config.device.open()?)?;
     check_stop(stop)?;
     require_absent(folder)?;
@@ -121,18 +95,18 @@ pub(crate) fn write_model_dir(
 
 /// Returns the bytes of a safetensors file with `metadata`.
 pub(crate) fn to_safetensors(
-    parameters: &[Parameter],
+    tensors: &[HostTensor],
     mut metadata: HashMap<String, String>,
     path: &Path,
 ) -> Result<Vec<u8>, TrainError> {
     let bad = |error: safetensors::SafeTensorError| TrainError::bad_file("weight file", path)(error);
-    let bytes: Vec<Vec<u8>> =
-        parameters.iter().map(|p| p.values.iter().flat_map(|value| value.to_le_bytes()).collect()).collect();
-    let views: Result<Vec<(&str, TensorView)>, _> = parameters
+    let to_bytes = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect();
+    let bytes: Vec<Vec<u8>> = tensors.iter().map(|(_, _, values)| to_bytes(values)).collect();
+    let views = tensors
         .iter()
         .zip(&bytes)
-        .map(|(p, bytes)| Ok((p.path.as_str(), TensorView::new(Dtype::F32, p.shape.clone(), bytes)?)))
-        .collect();
+        .map(|((name, shape, _), bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)))
+        .collect::<Result<Vec<_>, _>>();
     metadata.insert("format".into(), "clift-1".into());
     let file = safetensors::serialize(views.map_err(bad)?, Some(metadata)).map_err(bad)?;
     // Equal weights give equal files.

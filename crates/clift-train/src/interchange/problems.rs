@@ -48,27 +48,24 @@ pub(crate) fn problems(
 ) -> Vec<Problem> {
     let mut problems = Vec::new();
     let known: BTreeSet<&str> = expected.iter().map(|tensor| tensor.key.as_str()).collect();
+    let is_convertible = |got| matches!(got, ElementType::F16 | ElementType::BF16 | ElementType::F64);
     for tensor in expected {
         let (name, expected) = (tensor.key.clone(), &tensor.shape);
-        let Some(key) = keys.network.get(&name) else {
-            let key = format!("{}{name}", keys.prefix);
-            problems.push(Problem { kind: Kind::Missing, key, name, detail: format!(" {expected:?}") });
-            continue;
+        let key = keys.network.get(&name);
+        let (kind, detail) = match key.map(|key| state.tensor(key)) {
+            None => (Kind::Missing, format!(" {expected:?}")),
+            Some(None) => (Kind::NoTensor, format!(", expected {expected:?}")),
+            Some(Some((_, shape))) if !tensor.fits(shape) => {
+                (Kind::Misshapen, format!(" is {shape:?}, expected {expected:?}"))
+            }
+            Some(Some((got, shape))) if got != ElementType::F32 && !(options.convert && is_convertible(got)) => {
+                let fix = if is_convertible(got) { "; --convert converts it to f32" } else { "" };
+                (Kind::NotF32, format!(" {shape:?} is {got:?}{fix}"))
+            }
+            Some(Some(_)) => continue,
         };
-        let key = key.clone();
-        let Some((got, shape)) = state.tensor(&key) else {
-            let detail = format!(", expected {expected:?}");
-            problems.push(Problem { kind: Kind::NoTensor, key, name, detail });
-            continue;
-        };
-        let is_convertible = matches!(got, ElementType::F16 | ElementType::BF16 | ElementType::F64);
-        if !tensor.fits(shape) {
-            let detail = format!(" is {shape:?}, expected {expected:?}");
-            problems.push(Problem { kind: Kind::Misshapen, key, name, detail });
-        } else if got != ElementType::F32 && !(options.convert && is_convertible) {
-            let fix = if is_convertible { "; --convert converts it to f32" } else { "" };
-            problems.push(Problem { kind: Kind::NotF32, key, name, detail: format!(" {shape:?} is {got:?}{fix}") });
-        }
+        let key = key.cloned().unwrap_or_else(|| format!("{}{name}", keys.prefix));
+        problems.push(Problem { kind, key, name, detail });
     }
     let unknown = keys.network.iter().filter(|(name, _)| !known.contains(name.as_str()));
     let unknown = unknown.map(|(name, key)| (Kind::Unknown, keys.prefix, name, key));
@@ -134,11 +131,10 @@ pub(crate) fn describe(
         "the checkpoint is no {variant} network (width {dim}, {num_heads} heads, {num_encoder_blocks} + \
          {num_renderer_blocks} layers); no files were written"
     );
-    let of_kinds = |kinds: &[Kind]| {
-        let found = problems.iter().filter(|problem| kinds.contains(&problem.kind));
+    let [missing, unknown, strays] = [Kind::Missing, Kind::Unknown, Kind::Stray].map(|kind| {
+        let found = problems.iter().filter(|problem| problem.kind == kind);
         PatternNames::of(found.map(|problem| problem.name.as_str()))
-    };
-    let (missing, unknown, strays) = (of_kinds(&[Kind::Missing]), of_kinds(&[Kind::Unknown]), of_kinds(&[Kind::Stray]));
+    });
     let expected = published_tensors(model, true);
     let expected = PatternNames::of(expected.iter().map(|tensor| tensor.key.as_str()));
     let mut lines: BTreeMap<(Kind, String, &str), Vec<&Problem>> = BTreeMap::new();

@@ -8,7 +8,7 @@ use clift_eval::{EvalModels, ExternalMethod, Method, Summary};
 use clift_model::{ModelPath, TrainedModel};
 
 use crate::config::config::Config;
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink};
 use crate::run::validation::Validation;
 
@@ -47,8 +47,8 @@ pub fn evaluate_model(
             methods.push(Method::Clift);
         }
         if let Some(method) = methods.iter().find(|method| **method != Method::Clift) {
-            let fix = "give the stage-1 model, which renders this method, with --stage1".to_owned();
-            return Err(TrainError::BadConfig { key: "eval.variants".into(), value: method.name().into(), fix });
+            let fix = "give the stage-1 model, which renders this method, with --stage1";
+            return Err(bad("eval.variants", method.name(), fix));
         }
     }
     if last.has_condenser {

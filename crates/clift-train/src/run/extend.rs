@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::checkpoint::checkpoints::Checkpoints;
 use crate::config::config::CheckpointConfig;
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 
 /// A larger number of steps for a stage.
@@ -42,26 +42,21 @@ impl StepExtension {
     /// [`TrainError::BadConfig`] if the stage cannot be continued, [`TrainError::Io`].
     pub fn apply(self, folder: &Path, sink: &mut dyn Sink) -> Result<ExtensionRecord, TrainError> {
         let Self { stage, from, to } = self;
-        let refuse = |fix: String| {
-            let value = format!("{}.steps {from} -> {to}", stage.name());
-            TrainError::BadConfig { key: "--extend".into(), value, fix }
-        };
+        let refuse = |fix: &str| bad("--extend", format!("{}.steps {from} -> {to}", stage.name()), fix);
         let later = ["clusters", "stage2"].into_iter().find(|name| folder.join(name).exists());
         if let (Stage::Stage1, Some(later)) = (stage, later) {
             let fix = format!(
                 "{later}/ depends on the present encoder of stage 1; start a new run with stage1.init_from instead"
             );
-            return Err(refuse(fix));
+            return Err(refuse(&fix));
         }
         let own = folder.join(stage.name());
         let newest = Checkpoints::new(own.join("checkpoints"), CheckpointConfig::default()).newest_step()?;
         let weights = own.join("model.safetensors");
         if weights.exists() {
             if newest.is_none() {
-                return Err(refuse(format!(
-                    "the stage has no checkpoint to resume from in {}/checkpoints",
-                    stage.name()
-                )));
+                let fix = format!("the stage has no checkpoint to resume from in {}/checkpoints", stage.name());
+                return Err(refuse(&fix));
             }
             // Before the new number is written: a process killed in between makes these weights again.
             let kept = own.join(format!("model-{from}-steps.safetensors"));

@@ -6,8 +6,7 @@
 //! - `run_file`: run.json; same settings on resume
 //! - `stage_plan`: settings, batches and folder of a stage
 //! - `validation`: validation and evaluation
-//! - `train_loop`: step, save, validate
-//! - `train_stage`: resume or start a stage
+//! - `train_loop`: resume or start a stage; step, save, validate
 //! - `init_from`: initial weights of stage 1
 //! - `evaluate_model`: evaluate a model without a run
 //! - `run`: a run: open, train, evaluate
@@ -21,5 +20,4 @@ pub(crate) mod run;
 pub(crate) mod run_file;
 pub(crate) mod stage_plan;
 pub(crate) mod train_loop;
-pub(crate) mod train_stage;
 pub(crate) mod validation;

@@ -19,7 +19,7 @@ use crate::cluster_cache::builder::ClusterBuilder;
 use crate::cluster_cache::cache::ClusterCache;
 use crate::cluster_cache::resume_log::remove_resume_log;
 use crate::config::config::Config;
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::footprint::scene_sizes::PARTS;
@@ -72,13 +72,12 @@ impl Run {
         config.loss.weights()?;
         if let Some(path) = config.eval.lpips_path().filter(|path| !path.is_file()) {
             let fix = format!("file not found; make it with `{LPIPS_COMMAND}`, or write \"\" to skip LPIPS");
-            let value = path.display().to_string();
-            return Err(TrainError::BadConfig { key: "eval.lpips_weights".into(), value, fix });
+            return Err(bad("eval.lpips_weights", path.display(), &fix));
         }
         let folder = &config.run_dir;
         if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
             let fix = "a new run starts with stage 1: omit --fresh or --only";
-            return Err(TrainError::BadConfig { key: "--fresh".into(), value: "with --only".into(), fix: fix.into() });
+            return Err(bad("--fresh", "with --only", fix));
         }
         if options.fresh && folder.exists() {
             // Refuses a directory in use. Dropped before the rename, which Windows refuses otherwise.
@@ -171,10 +170,9 @@ impl Run {
         let mut models = self.models(sink)?;
         if let Some(other) = beside {
             if other.clusters.grouping == self.config.clusters.grouping {
-                let value = other.run_dir.display().to_string();
                 let fix = "its stage 2 was trained on the same groups of tokens: choose a run with another \
                            clusters.grouping";
-                return Err(TrainError::BadConfig { key: "--with".into(), value, fix: fix.into() });
+                return Err(bad("--with", other.run_dir.display(), fix));
             }
             models.set_stage2(other.clusters.grouping, self.open_stage2(other, &models.stage1)?);
         }

@@ -1,8 +1,10 @@
-//! The training loop: step, save, validate, until the last step, an interrupt or an error.
+//! Training of a stage, new or resumed: step, save, validate, until the last step, an interrupt or an error.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+use burn::module::Module;
+use clift_data::make_folder;
 use clift_model::Clift;
 
 use crate::checkpoint::checkpoints::Checkpoints;
@@ -12,12 +14,59 @@ use crate::events::{Event, Sink, StepEvent};
 use crate::run::logs::RunLog;
 use crate::run::stage_plan::StagePlan;
 use crate::run::validation::Validation;
-use crate::stage::settings::StageSettings;
+use crate::stage::settings::{StageSettings, freeze};
 use crate::step::batch::StageBatch;
-use crate::step::loss::psnr_of_mse;
+use crate::step::loss::{Loss, psnr_of_mse};
+use crate::step::loss_scale::LossScale;
 use crate::step::schedule::warm_up_cosine;
 use crate::step::step_guard::{SkippedStep, SkippedStepScene, StepAnomaly};
 use crate::step::train_state::{TrainState, Update};
+
+impl StagePlan<'_> {
+    /// Trains the remaining steps and returns the model. `start` makes the initial model if there is no checkpoint.
+    ///
+    /// # Errors
+    /// [`TrainError::Interrupted`] after `stop` was set and the state saved, [`TrainError::Diverged`] after too many skipped
+    /// steps, [`TrainError::Stopped`] with an error of data, model or disk.
+    pub fn train(
+        &self,
+        start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
+        validation: &Validation,
+        stop: &AtomicBool,
+        sink: &mut dyn Sink,
+    ) -> Result<Clift, TrainError> {
+        let started = Instant::now();
+        let Self { settings, config, folder, device, .. } = self;
+        let StageSettings { stage, steps: num_steps, optimizer, .. } = *settings;
+        let checkpoints = Checkpoints::new(folder.join("checkpoints"), config.checkpoint.clone());
+        let checkpoints = checkpoints.with_model(config.model.clone());
+        let model = match checkpoints.newest()? {
+            // The checkpoint replaces all parameters.
+            Some(_) => Clift::new(&config.model, config.seed, device),
+            None => start(sink)?,
+        };
+        let loss = Loss::load(&config.loss, device)?;
+        for term in loss.describe() {
+            sink.event(&Event::Message(term));
+        }
+        let mut train_state = TrainState {
+            loss,
+            activation_checkpointing: config.activation_checkpointing,
+            loss_scale: LossScale::of(config.precision),
+            ..TrainState::new(model, optimizer, device.clone())
+        };
+        let progress = checkpoints.resume(&mut train_state)?.unwrap_or_default();
+        train_state.model = freeze(stage, train_state.model);
+        make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
+        let mut log = RunLog::open(&config.run_dir, stage, progress.step, sink)?;
+        log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
+
+        let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
+        let model = training.run(train_state).map_err(|error| training.name_checkpoint(error))?;
+        training.log.event(&Event::StageFinished { stage, elapsed_s: started.elapsed().as_secs_f64() });
+        Ok(model)
+    }
+}
 
 /// A stage during training.
 pub(crate) struct TrainLoop<'a> {
@@ -127,14 +176,15 @@ impl<'a> TrainLoop<'a> {
         self.progress.bad_steps += 1;
         self.progress.num_bad_steps += 1;
         let finite = |value: f64| value.is_finite().then_some(value);
+        let [median_loss, median_grad_norm] = self.progress.recent.medians();
         let line = SkippedStep {
             step: self.progress.step,
             stage: self.plan.settings.stage,
             reason: anomaly,
             loss: finite(update.loss),
             grad_norm: finite(update.grad_norm),
-            median_loss: self.progress.recent.median_loss(),
-            median_grad_norm: self.progress.recent.median_grad_norm(),
+            median_loss,
+            median_grad_norm,
             in_a_row: self.progress.bad_steps,
             scenes: SkippedStepScene::all(batch),
         };
@@ -177,7 +227,7 @@ impl<'a> TrainLoop<'a> {
             return Ok(());
         }
         let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
-        let model = train_state.inference_model();
+        let model = train_state.model.valid();
         let psnr = self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
         if psnr.is_none() && self.stop.load(Ordering::Relaxed) {
             if self.saved < step {

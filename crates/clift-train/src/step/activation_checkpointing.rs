@@ -137,7 +137,7 @@ mod tests {
 
     use super::*;
     use crate::events::Stage;
-    use crate::run::stage_plan::freeze;
+    use crate::stage::settings::freeze;
     use crate::step::batch::StageBatch;
     use crate::step::device_batch::render_loss;
     use crate::step::seeded_inputs::{ClipShape, seeded_batch, seeded_model};

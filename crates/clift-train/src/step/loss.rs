@@ -23,16 +23,6 @@ pub trait ImageLoss: fmt::Debug + Send + Sync {
     }
 }
 
-/// Mean squared error over all values of all images.
-#[derive(Clone, Copy, Debug)]
-pub struct MeanSquared;
-
-impl ImageLoss for MeanSquared {
-    fn loss(&self, rendering: &Tensor<5>, target: &Tensor<5>) -> Tensor<1> {
-        mse(rendering.clone(), target.clone())
-    }
-}
-
 impl ImageLoss for Perceptual {
     fn loss(&self, rendering: &Tensor<5>, target: &Tensor<5>) -> Tensor<1> {
         self.forward(rendering.clone(), target.clone())
@@ -86,7 +76,7 @@ impl Loss {
     /// # Shapes
     /// - `rendering`, `target`: `[batch, views, height, width, 3]` in `[0, 1]`
     pub fn of(&self, rendering: Tensor<5>, target: Tensor<5>) -> LossParts {
-        let mse = MeanSquared.loss(&rendering, &target);
+        let mse = mse(rendering.clone(), target.clone());
         let weighted = self.terms.iter().map(|(weight, term)| term.loss(&rendering, &target).mul_scalar(*weight));
         LossParts { total: weighted.fold(mse.clone(), |total, term| total + term), mse }
     }

@@ -104,6 +104,7 @@ mod tests {
     #[test]
     fn overflows_change_only_the_factor() {
         use crate::config::config::OptimizerConfig;
+        use crate::stage::settings::freeze;
         use crate::step::seeded_inputs::{ClipShape, seeded_batch, seeded_model};
         use crate::step::train_state::TrainState;
 
@@ -118,13 +119,10 @@ mod tests {
         };
         let batch = seeded_batch(ClipShape { num_context: 2, num_targets: 2, size: [16, 16] }, 2, 8, None, 1).unwrap();
         for activation_checkpointing in [false, true] {
-            let new_state = |loss_scale| TrainState {
-                model: crate::run::stage_plan::freeze(crate::events::Stage::Stage1, seeded_model(&sizes, 3, &device)),
-                optimizer: crate::step::optimizer::adamw(&OptimizerConfig::default()),
-                device: device.clone().autodiff(),
-                loss: crate::step::loss::Loss::default(),
-                activation_checkpointing,
-                loss_scale,
+            let new_state = |loss_scale| {
+                let model = freeze(crate::events::Stage::Stage1, seeded_model(&sizes, 3, &device));
+                let plain = TrainState::new(model, &OptimizerConfig::default(), device.clone().autodiff());
+                TrainState { activation_checkpointing, loss_scale, ..plain }
             };
             let (_, expected) = new_state(None).step(&batch, 1, 1e-4.into(), 1.0).unwrap();
             let hash = |state: &TrainState| clift_model::weights_hash(&state.model);

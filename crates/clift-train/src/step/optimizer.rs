@@ -73,10 +73,10 @@ pub fn scale_gradients<M: Module>(module: &M, grads: GradientsParams, factor: f6
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::{Device, TensorData};
-    use safetensors::SafeTensors;
+    use burn::tensor::Device;
 
     use super::*;
+    use crate::testing::Reference;
 
     #[derive(Module, Debug)]
     struct Toy {
@@ -84,33 +84,12 @@ mod tests {
         b: Param<Tensor<1>>,
     }
 
-    struct Fixture(Vec<u8>);
-
-    impl Fixture {
-        fn open() -> Self {
-            let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data-fixtures/reference/adamw.safetensors");
-            Self(std::fs::read(path).expect("the fixture is checked in"))
-        }
-
-        fn tensor<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
-            let file = SafeTensors::deserialize(&self.0).expect("valid");
-            let view = file.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}"));
-            let values: Vec<f32> = match view.dtype() {
-                safetensors::Dtype::F32 => {
-                    view.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect()
-                }
-                _ => view.data().as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes) as f32).collect(),
-            };
-            Tensor::from_data(TensorData::new(values, view.shape().to_vec()), device)
-        }
-    }
-
     fn assert_close<const D: usize>(got: Tensor<D>, expected: Tensor<D>, tolerance: f32) {
         let difference = (got - expected).abs().max().into_scalar::<f32>();
         assert!(difference <= tolerance, "{difference:e}");
     }
 
-    fn toy(fixture: &Fixture, device: &Device) -> Toy {
+    fn toy(fixture: &Reference, device: &Device) -> Toy {
         Toy {
             a: Param::from_tensor(fixture.tensor("input.param_a", device)),
             b: Param::from_tensor(fixture.tensor("input.param_b", device)),
@@ -119,19 +98,18 @@ mod tests {
 
     #[test]
     fn five_updates_equal_pytorch() {
-        let fixture = Fixture::open();
+        let fixture = Reference::open("reference/adamw");
         let device = Device::flex();
         // Parameters that train live with autodiff, their gradients without.
         let mut model = toy(&fixture, &device.clone().autodiff());
         let mut optimizer = adamw(&OptimizerConfig::default());
         let grads_a: Tensor<3> = fixture.tensor("input.grad_a", &device);
         let grads_b: Tensor<2> = fixture.tensor("input.grad_b", &device);
-        let rates = fixture.tensor::<1>("output.lr", &device).into_data().try_to_vec::<f32>().expect("f32");
-        for (step, rate) in rates.into_iter().take(5).enumerate() {
+        for (step, rate) in fixture.values("output.lr").into_iter().take(5).enumerate() {
             let mut grads = GradientsParams::new();
             grads.register(model.a.id, grads_a.clone().narrow(0, step, 1).squeeze_dim::<2>(0));
             grads.register(model.b.id, grads_b.clone().narrow(0, step, 1).squeeze_dim::<1>(0));
-            model = optimizer.step(f64::from(rate), model, grads);
+            model = optimizer.step(rate, model, grads);
             // f32 against f64 for parameters of about one.
             let expected = fixture.tensor::<3>("output.param_a", &device).narrow(0, step, 1);
             assert_close(model.a.val().inner(), expected.squeeze_dim::<2>(0), 1e-6);
@@ -142,7 +120,7 @@ mod tests {
 
     #[test]
     fn clipping_equals_pytorch() {
-        let fixture = Fixture::open();
+        let fixture = Reference::open("reference/adamw");
         let device = Device::flex();
         let model = toy(&fixture, &device);
         for case in ["large", "small"] {

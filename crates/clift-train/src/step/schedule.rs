@@ -16,34 +16,22 @@ pub fn warm_up_cosine(step: u64, base: f64, num_warm_up_steps: u64, num_steps: u
 
 #[cfg(test)]
 mod tests {
-    use safetensors::SafeTensors;
-
     use super::*;
+    use crate::testing::Reference;
 
     #[test]
     fn rates_equal_those_of_pytorch() {
-        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data-fixtures/reference/adamw.safetensors");
-        let bytes = std::fs::read(path).unwrap();
-        let fixture = SafeTensors::deserialize(&bytes).unwrap();
-        let expected = fixture.tensor("output.lr").unwrap();
-        for (i, bytes) in expected.data().as_chunks::<8>().0.iter().enumerate() {
-            let (rate, expected) = (warm_up_cosine(i as u64 + 1, 1e-3, 3, 10), f64::from_le_bytes(*bytes));
+        for (step, expected) in (1..).zip(Reference::open("reference/adamw").values("output.lr")) {
+            let rate = warm_up_cosine(step, 1e-3, 3, 10);
             // The same formula in f64; the two cosines may differ in the last bit, 1e-16 of 1e-3.
-            assert!((rate - expected).abs() < 1e-18, "step {}: {rate} is not {expected}", i + 1);
+            assert!((rate - expected).abs() < 1e-18, "step {step}: {rate} is not {expected}");
         }
     }
 
     #[test]
-    fn warm_up_ends_at_base_rate_and_run_at_zero() {
-        assert_eq!(warm_up_cosine(2500, 4e-4, 2500, 90_000), 4e-4);
-        assert!(warm_up_cosine(90_000, 4e-4, 2500, 90_000).abs() < 1e-20);
+    fn rates_after_the_last_step_and_of_short_runs() {
         assert_eq!(warm_up_cosine(90_001, 4e-4, 2500, 90_000), warm_up_cosine(90_000, 4e-4, 2500, 90_000));
-    }
-
-    #[test]
-    fn short_runs_have_finite_rates() {
-        assert!(warm_up_cosine(1, 1e-3, 0, 30) < 1e-3);
-        assert!(warm_up_cosine(30, 1e-3, 100, 30) < 1e-3);
+        assert!(warm_up_cosine(1, 1e-3, 0, 30) < 1e-3 && warm_up_cosine(30, 1e-3, 100, 30) < 1e-3);
         assert!(warm_up_cosine(101, 1e-3, 100, 30).is_finite());
     }
 }

@@ -45,10 +45,11 @@ impl LossHistory {
         }
         let factor = optimizer.spike_factor;
         let is_spike = |value: f64, median: Option<f64>| factor > 0.0 && median.is_some_and(|m| value > factor * m);
-        if is_spike(loss, self.median_loss()) {
+        let [median_loss, median_grad_norm] = self.medians();
+        if is_spike(loss, median_loss) {
             return Some(StepAnomaly::LossSpike);
         }
-        is_spike(grad_norm, self.median_grad_norm()).then_some(StepAnomaly::GradNormSpike)
+        is_spike(grad_norm, median_grad_norm).then_some(StepAnomaly::GradNormSpike)
     }
 
     /// Adds a good step. Skipped steps are not added, since they would raise the medians.
@@ -61,20 +62,13 @@ impl LossHistory {
         }
     }
 
-    /// Returns the median loss of the window; `None` for fewer than 20 steps.
-    pub fn median_loss(&self) -> Option<f64> {
-        median(&self.losses)
+    /// Returns the upper medians of loss and gradient norm, which are values of the window; `None` for fewer than 20
+    /// steps.
+    pub fn medians(&self) -> [Option<f64>; 2] {
+        [&self.losses, &self.grad_norms].map(|window| {
+            (window.len() >= MIN_STEPS).then(|| upper_median(&window.iter().copied().collect::<Vec<_>>()))
+        })
     }
-
-    /// Returns the median gradient norm of the window; `None` for fewer than 20 steps.
-    pub fn median_grad_norm(&self) -> Option<f64> {
-        median(&self.grad_norms)
-    }
-}
-
-/// Returns the upper median, which is one of the values, without rounding.
-fn median(window: &VecDeque<f64>) -> Option<f64> {
-    (window.len() >= MIN_STEPS).then(|| upper_median(&window.iter().copied().collect::<Vec<_>>()))
 }
 
 /// A line of `bad_steps.jsonl`. NaN and infinity are written as `null`.
@@ -150,7 +144,7 @@ mod tests {
     fn spikes_exceed_the_factor_times_the_median() {
         let recent = after((1..=21).map(|i| (f64::from(i), 2.0 * f64::from(i))));
         let anomaly = |loss, norm, factor| recent.anomaly(loss, norm, &with_factor(factor));
-        assert_eq!((recent.median_loss(), recent.median_grad_norm()), (Some(11.0), Some(22.0)));
+        assert_eq!(recent.medians(), [Some(11.0), Some(22.0)]);
         assert_eq!(anomaly(33.0, 66.0, 3.0), None, "exactly the factor");
         assert_eq!(anomaly(33.1, 66.0, 3.0), Some(StepAnomaly::LossSpike));
         assert_eq!(anomaly(33.0, 66.1, 3.0), Some(StepAnomaly::GradNormSpike));
@@ -159,9 +153,9 @@ mod tests {
 
     #[test]
     fn median_needs_20_steps_of_the_last_101() {
-        assert_eq!(after(vec![(1.0, 1.0); 19]).median_loss(), None);
-        assert_eq!(after(vec![(1.0, 1.0); 20]).median_loss(), Some(1.0));
+        assert_eq!(after(vec![(1.0, 1.0); 19]).medians(), [None; 2]);
+        assert_eq!(after(vec![(1.0, 1.0); 20]).medians(), [Some(1.0); 2]);
         let steps = (0..202).map(|i| if i < 101 { (1.0, 1.0) } else { (7.0, 8.0) });
-        assert_eq!(after(steps).median_grad_norm(), Some(8.0));
+        assert_eq!(after(steps).medians(), [Some(7.0), Some(8.0)]);
     }
 }

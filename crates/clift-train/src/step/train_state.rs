@@ -1,18 +1,18 @@
 //! One optimizer update, the same for both stages.
 
-use burn::module::Module;
 use burn::optim::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::{GradientsAccumulator, GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor};
 use clift_model::{Clift, Precision};
 
+use crate::config::config::OptimizerConfig;
 use crate::error::TrainError;
 use crate::step::activation_checkpointing;
 use crate::step::batch::StageBatch;
 use crate::step::device_batch::{DeviceBatch, render_loss};
 use crate::step::loss::{Loss, LossParts};
 use crate::step::loss_scale::LossScale;
-use crate::step::optimizer::{clip_factor, norm_on_device, scale_gradients};
+use crate::step::optimizer::{adamw, clip_factor, norm_on_device, scale_gradients};
 
 /// A model with its optimizer on an autodiff device.
 pub struct TrainState {
@@ -44,6 +44,12 @@ pub struct Update {
 }
 
 impl TrainState {
+    /// Makes the state before the first update: mean squared error, f32, activations stored.
+    pub fn new(model: Clift, optimizer: &OptimizerConfig, device: Device) -> Self {
+        let (optimizer, loss) = (adamw(optimizer), Loss::default());
+        Self { model, optimizer, device, loss, activation_checkpointing: false, loss_scale: None }
+    }
+
     /// Makes one update from a batch in `accumulate` micro-batches. An update with a loss or gradient that is not finite is
     /// not applied.
     ///
@@ -100,17 +106,16 @@ impl TrainState {
             read.add(share, parts);
         }
         let grads = accumulator.grads();
-        let Read { loss: total, mse, grad_norm } = read.finish(norm_on_device(&model, &grads))?;
-        let grad_norm = grad_norm / factor;
-        let applied = accept(total, grad_norm);
-        let model = if applied {
-            let grads = scale_gradients(&model, grads, clip_factor(grad_norm, max_grad_norm) / factor);
+        let mut update = read.finish(norm_on_device(&model, &grads))?;
+        update.grad_norm /= factor;
+        update.applied = accept(update.loss, update.grad_norm);
+        let model = if update.applied {
+            let grads = scale_gradients(&model, grads, clip_factor(update.grad_norm, max_grad_norm) / factor);
             optimizer.step(rate, model, grads)
         } else {
             model
         };
-        let state = Self { model, optimizer, device, loss, activation_checkpointing, loss_scale };
-        Ok((state, Update { loss: total, mse, grad_norm, applied }))
+        Ok((Self { model, optimizer, device, loss, activation_checkpointing, loss_scale }, update))
     }
 
     /// Adapts the loss scale after an update. Returns whether the update overflowed.
@@ -124,11 +129,6 @@ impl TrainState {
         }
         is_overflow
     }
-
-    /// Returns the model without autodiff.
-    pub fn inference_model(&self) -> Clift {
-        self.model.valid()
-    }
 }
 
 /// Values of an update that the host needs. They are read together at the end, because each read waits for the queued work
@@ -140,27 +140,21 @@ struct HostReads {
     values: Vec<Tensor<1>>,
 }
 
-/// The values of [`HostReads`].
-struct Read {
-    loss: f64,
-    mse: f64,
-    grad_norm: f64,
-}
-
 impl HostReads {
     fn add(&mut self, share: f64, parts: LossParts) {
         self.shares.push(share);
         self.values.extend([parts.total, parts.mse]);
     }
 
-    /// Reads the losses of the whole batch and the gradient norm, 0 without gradients.
-    fn finish(mut self, grad_norm: Option<Tensor<1>>) -> Result<Read, TrainError> {
+    /// Reads the losses of the whole batch and the gradient norm, 0 without gradients, of an update not applied yet.
+    fn finish(mut self, grad_norm: Option<Tensor<1>>) -> Result<Update, TrainError> {
         self.values.extend(grad_norm);
         let values = Tensor::cat(self.values, 0).try_into_vec_as::<f64>();
         let values = values.map_err(|error| TrainError::Device { reason: error.to_string() })?;
         let (parts, norm) = values.split_at(2 * self.shares.len());
         let of =
             |offset: usize| parts.iter().skip(offset).step_by(2).zip(&self.shares).map(|(v, share)| share * v).sum();
-        Ok(Read { loss: of(0), mse: of(1), grad_norm: norm.first().copied().unwrap_or(0.0) })
+        let grad_norm = norm.first().copied().unwrap_or(0.0);
+        Ok(Update { loss: of(0), mse: of(1), grad_norm, applied: false })
     }
 }

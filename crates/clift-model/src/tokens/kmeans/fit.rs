@@ -142,6 +142,10 @@ mod tests {
         }
     }
 
+    fn fit(tokens: &Tensor<3>, num_clusters: usize, seeds: &[u64]) -> KMeansFit {
+        KMeans::default().fit(tokens.clone(), num_clusters, seeds).expect("fits")
+    }
+
     /// Computes the squared distance of every token to the mean of every cluster in f64, `[N][S]`.
     fn brute_force(tokens: &[Vec<f64>], assignment: &[u32], num_clusters: usize) -> Vec<Vec<f64>> {
         let mut means = vec![vec![0.0; tokens[0].len()]; num_clusters];
@@ -177,7 +181,7 @@ mod tests {
                     let num_clusters = num_clusters as usize;
                     let inertia: Vec<f64> = (0..20)
                         .map(|seed| {
-                            let fit = KMeans::default().fit(tokens.clone(), num_clusters, &[seed]).expect("fits");
+                            let fit = fit(&tokens, num_clusters, &[seed]);
                             assert_valid(&fit, num_clusters);
                             fit.inertia[0]
                         })
@@ -195,10 +199,10 @@ mod tests {
     fn clusters_depend_on_the_seed_alone() {
         for device in devices() {
             let tokens = random([3, 60, 8], 5, &device).cast(burn::tensor::DType::F32);
-            let all = KMeans::default().fit(tokens.clone(), 7, &[1, 2, 3]).expect("fits");
-            let again = KMeans::default().fit(tokens.clone(), 7, &[1, 2, 3]).expect("fits");
+            let all = fit(&tokens, 7, &[1, 2, 3]);
+            let again = fit(&tokens, 7, &[1, 2, 3]);
             assert_eq!(all.clusters, again.clusters);
-            let one = KMeans::default().fit(tokens.narrow(0, 1, 1), 7, &[2]).expect("fits");
+            let one = fit(&tokens.narrow(0, 1, 1), 7, &[2]);
             assert_eq!(all.clusters.scenes()[1], one.clusters.scenes()[0]);
         }
     }
@@ -207,13 +211,13 @@ mod tests {
     fn counts_from_one_to_all_tokens_and_zero_iterations() {
         for device in devices() {
             let tokens = random([2, 9, 4], 6, &device).cast(burn::tensor::DType::F32);
-            let one = KMeans::default().fit(tokens.clone(), 1, &[0, 1]).expect("fits");
+            let one = fit(&tokens, 1, &[0, 1]);
             assert_valid(&one, 1);
             let spread = to_vec(tokens.clone().var_bias(1).sum_dim(2));
             assert!((one.inertia[1] - 9.0 * spread[1]).abs() < 1e-4, "{} against {}", one.inertia[1], spread[1]);
-            let all = KMeans::default().fit(tokens.clone(), 9, &[0, 1]).expect("fits");
+            let all = fit(&tokens, 9, &[0, 1]);
             assert_eq!(all.clusters.scenes()[1], SceneClusters::identity(9));
-            let most = KMeans::default().fit(tokens.clone(), 8, &[0, 1]).expect("fits");
+            let most = fit(&tokens, 8, &[0, 1]);
             assert_valid(&most, 8);
             let start =
                 KMeans { max_iterations: 0, ..KMeans::default() }.fit(tokens.clone(), 6, &[0, 1]).expect("fits");
@@ -228,10 +232,10 @@ mod tests {
     fn duplicate_tokens_give_distinct_centroids() {
         for device in devices() {
             let tokens = Tensor::<3>::ones([1, 12, 4], &device);
-            assert_valid(&KMeans::default().fit(tokens.clone(), 5, &[0]).expect("fits"), 5);
+            assert_valid(&fit(&tokens, 5, &[0]), 5);
             // Two distinct tokens, eight clusters.
             let tokens = Tensor::cat(vec![tokens.clone(), tokens * 3.0], 1);
-            let fit = KMeans::default().fit(tokens, 8, &[0]).expect("fits");
+            let fit = fit(&tokens, 8, &[0]);
             assert_valid(&fit, 8);
             assert!(fit.inertia[0] < 1e-4, "no cluster contains both: {}", fit.inertia[0]);
         }
@@ -267,8 +271,7 @@ mod tests {
             let near = random([1, 100, 4], 14, &device).cast(burn::tensor::DType::F32);
             let far = Tensor::<3>::full([1, 1, 4], 1e4, &device);
             for seed in 0..5 {
-                let fit = KMeans::default().fit(Tensor::cat(vec![near.clone(), far.clone()], 1), 11, &[seed]);
-                let fit = fit.expect("fits");
+                let fit = fit(&Tensor::cat(vec![near.clone(), far.clone()], 1), 11, &[seed]);
                 assert_valid(&fit, 11);
                 let assignment = fit.clusters.scenes()[0].assignment();
                 assert_eq!(assignment.iter().filter(|&&cluster| cluster == assignment[100]).count(), 1);
@@ -281,8 +284,7 @@ mod tests {
         for device in devices() {
             // Multiples of 1/8 are exact at 4096: both sets are equal up to the shift.
             let near = (random([1, 40, 4], 8, &device).cast(burn::tensor::DType::F32) * 64.0).round() / 8.0;
-            let fit = |tokens| KMeans::default().fit(tokens, 5, &[3]).expect("fits").clusters;
-            assert_eq!(fit(near.clone()), fit(near + 4096.0));
+            assert_eq!(fit(&near, 5, &[3]).clusters, fit(&(near + 4096.0), 5, &[3]).clusters);
         }
     }
 
@@ -312,7 +314,7 @@ mod tests {
         let expected = (spread(&even) + spread(&odd)) / spread(&rows);
         let error = |tokens: Tensor<3>| {
             let variance = total_variance(&tokens).unwrap()[0];
-            KMeans::default().fit(tokens, 2, &[1]).unwrap().error(0, variance)
+            fit(&tokens, 2, &[1]).error(0, variance)
         };
         assert!((error(tokens) / expected - 1.0).abs() < 1e-3); // f32
         assert_eq!(error(Tensor::ones([1, 8, 2], &Device::flex())), 0.0, "equal tokens");

@@ -2,16 +2,18 @@
 
 use super::*;
 
+fn renaming(renames: &[(&str, &str)]) -> ImportOptions {
+    let renames = renames.iter().map(|&(from, to)| (from.to_owned(), to.to_owned())).collect();
+    ImportOptions { renames, ..re10k() }
+}
+
 #[test]
 fn missing_and_unknown_keys_list_nearest_names() {
-    let message = refusal(
-        |tensors| {
-            let tensor = tensors.remove("transformer.encoder.layers.0.norm1.weight").unwrap();
-            tensors.insert("transformer.encoder.layers.0.norm_1.weight".into(), tensor);
-            tensors.insert("transformer.extra.deep.bias".into(), (vec![2], vec![0.0; 2]));
-        },
-        &re10k(),
-    );
+    let message = refusal(|tensors| {
+        let tensor = tensors.remove("transformer.encoder.layers.0.norm1.weight").unwrap();
+        tensors.insert("transformer.encoder.layers.0.norm_1.weight".into(), tensor);
+        tensors.insert("transformer.extra.deep.bias".into(), (vec![2], vec![0.0; 2]));
+    });
     assert_says(
         &message,
         &[
@@ -23,21 +25,16 @@ fn missing_and_unknown_keys_list_nearest_names() {
         ],
     );
     // A missing layer is not taken for a smaller network: all its keys are listed.
-    let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("decoder.layers.0")), &re10k());
+    let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("decoder.layers.0")));
     assert_says(&message, &["missing: transformer.decoder.layers.0.self_attn.in_proj_weight [45, 15]"]);
     assert_eq!(message.matches("missing: transformer.decoder.layers.0.").count(), 18, "{message}");
     // An incomplete condenser is not taken for a first-stage checkpoint.
-    let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("squeezer.linear1")), &re10k());
+    let message = refusal(|tensors| tensors.retain(|key, _| !key.contains("squeezer.linear1")));
     let [weight, bias] =
         ["weight [15, 15]", "bias [15]"].map(|rest| format!("missing: transformer.squeezer.linear1.{rest}"));
     assert_says(&message, &[&weight, &bias]);
     // Equal problems of all layers are one line; a name unlike all missing ones also has a nearest name.
-    let rename = |from: &str, to: &str| {
-        let change = |tensors: &mut BTreeMap<String, (Vec<usize>, Vec<f32>)>| {
-            *tensors = tensors.iter().map(|(key, tensor)| (key.replace(from, to), tensor.clone())).collect();
-        };
-        refusal(change, &re10k())
-    };
+    let rename = |from: &str, to: &str| refusal_of(re10k_tensors(|key| key.replace(from, to)));
     assert_says(
         &rename(".norm2.weight", ".ln_2.scale"),
         &[
@@ -61,12 +58,9 @@ fn missing_and_unknown_keys_list_nearest_names() {
 
 #[test]
 fn stray_and_misshapen_tensors_are_reported_alone() {
-    let message = refusal(
-        |tensors| {
-            tensors.insert("transformer.decoder.layers.3.norm1.weight".into(), (vec![15], vec![0.0; 15]));
-        },
-        &re10k(),
-    );
+    let message = refusal(|tensors| {
+        tensors.insert("transformer.decoder.layers.3.norm1.weight".into(), (vec![15], vec![0.0; 15]));
+    });
     assert_says(
         &message,
         &[
@@ -84,15 +78,12 @@ fn stray_and_misshapen_tensors_are_reported_alone() {
             ("linear_target.weight", &[15, 96, 2, 2], "[15, 96, 2, 2], expected [15, 384]"),
         ],
     ] {
-        let message = refusal(
-            |tensors| {
-                for (key, shape, _) in changes {
-                    let tensor = (shape.to_vec(), vec![0.0; shape.iter().product()]);
-                    assert!(tensors.insert(format!("transformer.{key}"), tensor).is_some());
-                }
-            },
-            &re10k(),
-        );
+        let message = refusal(|tensors| {
+            for (key, shape, _) in changes {
+                let tensor = (shape.to_vec(), vec![0.0; shape.iter().product()]);
+                assert!(tensors.insert(format!("transformer.{key}"), tensor).is_some());
+            }
+        });
         for (key, _, shapes) in changes {
             assert_says(&message, &[&format!("misshapen: transformer.{key} is {shapes}")]);
         }
@@ -103,13 +94,11 @@ fn stray_and_misshapen_tensors_are_reported_alone() {
 #[test]
 fn network_keys_outside_the_prefix_are_refused() {
     let outside = |from: &str| {
-        let change = |tensors: &mut BTreeMap<String, (Vec<usize>, Vec<f32>)>| {
-            let short =
-                |key: &String| key.strip_prefix("transformer.").filter(|key| key.starts_with(from)).map(String::from);
-            *tensors =
-                tensors.iter().map(|(key, tensor)| (short(key).unwrap_or(key.clone()), tensor.clone())).collect();
+        let short = |key: &str| match key.strip_prefix("transformer.") {
+            Some(short) if short.starts_with(from) => short.to_owned(),
+            _ => key.to_owned(),
         };
-        refusal(change, &re10k())
+        refusal_of(re10k_tensors(short))
     };
     assert_says(
         &outside("squeezer."),
@@ -133,7 +122,7 @@ fn network_keys_outside_the_prefix_are_refused() {
 
     let place = tempfile::tempdir().unwrap();
     let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
-    let mut tensors = tensors_of("re10k.ckpt", str::to_owned);
+    let mut tensors = re10k_tensors(str::to_owned);
     for layer in 0..2 {
         tensors.push((format!("ema.encoder.layers.{layer}.norm1.weight"), vec![1], vec![0.0]));
     }
@@ -159,12 +148,11 @@ fn prefixes_are_removed_and_renames_applied() {
         let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
         let rename =
             |key: &str| key.replace("squeezer.linear1", &format!("squeezer.{linear1}")).replace("transformer.", lead);
-        write_state_dict(&file, &tensors_of("re10k.ckpt", rename), &[]).unwrap();
+        write_state_dict(&file, &re10k_tensors(rename), &[]).unwrap();
         if !renames.is_empty() {
             refused(&file, place.path(), &re10k());
         }
-        let renames = renames.iter().map(|(from, to)| ((*from).to_owned(), (*to).to_owned())).collect();
-        import(&file, &out, &ImportOptions { renames, ..re10k() }).unwrap();
+        import(&file, &out, &renaming(renames)).unwrap();
         assert_computes(&out, "re10k");
     }
 }
@@ -173,11 +161,8 @@ fn prefixes_are_removed_and_renames_applied() {
 fn renames_apply_to_whole_keys_or_fail() {
     let place = tempfile::tempdir().unwrap();
     let (file, out) = (place.path().join("changed.ckpt"), place.path().join("model"));
-    write_state_dict(&file, &tensors_of("re10k.ckpt", |key| key.replace("transformer.", "net.")), &[]).unwrap();
-    let renamed = |renames: &[(&str, &str)]| {
-        let renames = renames.iter().map(|(from, to)| ((*from).to_owned(), (*to).to_owned())).collect();
-        import(&file, &out, &ImportOptions { renames, ..re10k() })
-    };
+    write_state_dict(&file, &re10k_tensors(|key| key.replace("transformer.", "net.")), &[]).unwrap();
+    let renamed = |renames: &[(&str, &str)]| import(&file, &out, &renaming(renames));
     let message = renamed(&[("net.", "transformer."), ("net.encoder", "encoder")]).unwrap_err().to_string();
     assert_says(&message, &["`--rename` = net.encoder=encoder: no key contains \"net.encoder\"", "changed.ckpt"]);
     let message = renamed(&[("net.output_norm", "transformer.output")]).unwrap_err().to_string();
