@@ -8,9 +8,9 @@ use crate::error::EvalError;
 use crate::figures::canvas::{Canvas, error_map};
 use crate::figures::contact_sheet::{Cell, Row, contact_sheet};
 use crate::statistics::view_metrics::{EvalKey, best_method};
+use crate::sweep::baselines::view_image;
 use crate::sweep::rendered_views::ScoredViews;
 use crate::sweep::scene_results::SceneResults;
-use crate::sweep::view_scorer::target_image;
 
 /// Longer side of an image in the report, which holds dozens of images.
 const MAX_SIDE_PX: usize = 128;
@@ -109,7 +109,7 @@ impl SceneFigure {
             grid: [height / patch_size, width / patch_size],
             context: canvases(&clip.context)?.into_iter().map(small).collect(),
             context_frames: clip.context.frame_index.clone(),
-            target: small(Canvas::from_unit(&target_image(&clip.target, view), height, width)?),
+            target: small(Canvas::from_unit(&view_image(&clip.target, view), height, width)?),
             target_frame: clip.target.frame_index[view],
             images,
             clusters,
@@ -152,7 +152,7 @@ fn scene_sheet(clip: &Clip, renderings: &[ScoredViews], views: &[usize]) -> Resu
 
     let mut rows = Vec::new();
     for &view in views {
-        let target = target_image(&clip.target, view);
+        let target = view_image(&clip.target, view);
         let cell = |image: Canvas, caption: String| Cell { images: vec![image], caption };
         let mut cells = vec![
             Cell { images: contexts.clone(), caption: String::new() },

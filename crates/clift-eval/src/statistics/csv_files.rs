@@ -97,26 +97,19 @@ fn write<const N: usize>(
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenFormat;
-
     use super::*;
     use crate::config::method::Method;
     use crate::statistics::view_metrics::EvalKey;
+    use crate::testing::CLIFT;
 
     #[test]
     fn rows_have_a_fixed_order() {
-        let key = EvalKey {
-            method: Method::Clift,
-            num_storage_tokens: 64,
-            num_render_tokens: 32,
-            tokens: Some(TokenFormat::F16),
-        };
         let measured =
             |psnr, lpips_vgg| ViewMetrics { lpips_vgg, render_s: Some(0.25), ..ViewMetrics::quality(psnr, Some(0.5)) };
         let rows = [
-            ("room, \"big\"", 3, key, measured(f64::INFINITY, None)),
-            ("attic", 9, key, measured(20.0, Some(0.25))),
-            ("attic", 2, key, measured(23.0, Some(0.75))),
+            ("room, \"big\"", 3, CLIFT, measured(f64::INFINITY, None)),
+            ("attic", 9, CLIFT, measured(20.0, Some(0.25))),
+            ("attic", 2, CLIFT, measured(23.0, Some(0.75))),
             ("attic", 9, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.5, None)),
         ];
         let views = "\

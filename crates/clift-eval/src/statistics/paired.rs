@@ -78,10 +78,7 @@ fn scene_differences(better: &SceneViews, other: &SceneViews) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn key(method: Method, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
-        EvalKey { method, num_storage_tokens, num_render_tokens, tokens: Some(TokenFormat::F32) }
-    }
+    use crate::testing::f32_key as key;
 
     fn differences_of(rows: &[(&str, usize, EvalKey, f64)]) -> Vec<PairedDifference> {
         let mut results = EvalResults::default();

@@ -3,14 +3,16 @@
 use std::collections::BTreeSet;
 
 use clift_model::TokenFormat;
+use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
 
 /// The key that views are averaged under: method, token counts and number format. Keys are ordered as in the files: by
 /// method, then by ascending token counts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct EvalKey {
     /// The method.
+    #[serde(rename = "variant")]
     pub method: Method,
     /// Tokens in the scene file; 0 for a baseline.
     pub num_storage_tokens: usize,
@@ -73,14 +75,26 @@ impl ViewMetrics {
 }
 
 /// Cost of a key, the same for every view; `None` was not computed.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
     /// Bytes of a scene file, or the given data size of an external method.
     pub scene_bytes: Option<u64>,
-    /// Peak memory of the process while a view was rendered.
+    /// Peak resident memory of the process, weights included, while a view was rendered; on CPUs only.
     pub peak_bytes: Option<u64>,
+}
+
+impl Cost {
+    /// Returns the size of a scene file in kB.
+    pub fn scene_kb(&self) -> Option<f64> {
+        self.scene_bytes.map(|bytes| bytes as f64 / 1e3)
+    }
+
+    /// Returns the number of decimals of `gflops` in tables.
+    pub fn gflops_decimals(&self) -> usize {
+        if self.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }
+    }
 }
 
 #[cfg(test)]

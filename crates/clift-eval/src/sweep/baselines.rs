@@ -26,14 +26,18 @@ pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, Eva
     Ok(near[first])
 }
 
+/// Returns the image of a view, `[height, width, 3]` in `[0, 1]`.
+pub(crate) fn view_image(views: &ClipViews, view: usize) -> Vec<f32> {
+    let len = views.height * views.width * 3;
+    views.images[view * len..][..len].iter().map(|&value| f32::from(value) / 255.0).collect()
+}
+
 /// Returns the image of the nearest context view, `[height, width, 3]` in [0, 1].
 ///
 /// # Errors
 /// [`EvalError::NoContext`] without context views.
 pub fn nearest_image(context: &ClipViews, target_c2w: Pose) -> Result<Vec<f32>, EvalError> {
-    let nearest = nearest_view(&context.c2w, target_c2w)?;
-    let size = context.height * context.width * 3;
-    Ok(context.images[nearest * size..][..size].iter().map(|&value| f32::from(value) / 255.0).collect())
+    Ok(view_image(context, nearest_view(&context.c2w, target_c2w)?))
 }
 
 /// Returns the mean of the context images, `[height, width, 3]` in [0, 1].

@@ -9,7 +9,7 @@ use clift_model::{Cameras, FlopConvention, SceneModel, scene_file_bytes};
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::view_metrics::EvalKey;
+use crate::statistics::view_metrics::{Cost, EvalKey};
 use crate::sweep::compressed_tokens::{CompressedTokens, select_tokens};
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
@@ -103,7 +103,7 @@ pub fn evaluate_scene(
         if keep_images {
             let own = own_norm.iter().find(|(of, ..)| *of == Method::Clift);
             let index = own.map_or(&index, |(.., index)| index);
-            results.clusters.push(index.scene_clusters()?.clone());
+            results.clusters.push(index.clusters()?.scenes()[0].clone());
         }
     }
     for external in &sweep.external_methods {
@@ -158,13 +158,14 @@ impl TargetRenderer<'_> {
         };
         // Queued work must not count as rendering time.
         device.sync().map_err(EvalError::tensor)?;
-        if !metrics.is_warm(key) {
+        if !metrics.costs.contains_key(&key) {
             // One untimed view per key: one-time work of the device, and the peak memory.
             let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
             render(0)?;
-            metrics.set_warm(key, if has_peak { memory::peak_bytes() } else { None });
+            let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
             let macs = self.sweep.model.render_macs(target.height, target.width, key.num_render_tokens)?;
-            metrics.add_gflops(key, macs.count(FlopConvention::Macs) as f64 / 1e9);
+            let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
+            metrics.costs.insert(key, Cost { gflops, peak_bytes, scene_bytes: None });
         }
         let mut rendered = ScoredViews::new(key);
         for view in 0..target.num_views() {
