@@ -9,13 +9,17 @@ use std::time::Instant;
 use clift_data::{median, p95};
 use clift_eval::{peak_bytes, start_peak};
 use clift_model::{DeviceName, Precision};
-use clift_train::{Config, TrainError};
+use clift_train::{Config, Stage, TrainError};
 use serde::Serialize;
 
 use crate::cases::case::BenchCase;
+use crate::cases::clustering::KMeansCase;
 use crate::cases::context::BenchContext;
+use crate::cases::forward;
 use crate::cases::options::BenchOptions;
-use crate::cases::prepare::prepare;
+use crate::cases::selection::SelectionCase;
+use crate::cases::step::StepCase;
+use crate::cases::task::BenchTask;
 
 /// Results of a benchmark.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -99,6 +103,25 @@ pub fn run_bench(
         rows.push(row);
     }
     Ok(BenchReport { device: config.device, precision: config.precision, threads: rayon::current_num_threads(), rows })
+}
+
+/// Makes networks and inputs of a case, so that only its computation is left to be timed.
+///
+/// # Errors
+/// [`TrainError::BadConfig`] for impossible sizes, and those of the device or a file of features.
+pub(crate) fn prepare(case: BenchCase, context: &BenchContext) -> Result<Box<dyn BenchTask>, TrainError> {
+    Ok(match case {
+        BenchCase::Encode => Box::new(forward::encode(context)?),
+        BenchCase::Kmeans => Box::new(KMeansCase::new(context)?),
+        BenchCase::Condense => Box::new(forward::condense(context)?),
+        BenchCase::ClusterAttention => Box::new(forward::attention_in_clusters(context)?),
+        BenchCase::Select => Box::new(SelectionCase::new(context)?),
+        BenchCase::Render => Box::new(forward::render(context, 1)?),
+        BenchCase::Render8Views => Box::new(forward::render(context, 8)?),
+        BenchCase::Stage1Step => Box::new(StepCase::new(context, Stage::Stage1)?),
+        BenchCase::Stage1StepTiny => Box::new(StepCase::new(&context.tiny(), Stage::Stage1)?),
+        BenchCase::Stage2Step => Box::new(StepCase::new(context, Stage::Stage2)?),
+    })
 }
 
 fn measure(

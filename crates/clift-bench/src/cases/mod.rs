@@ -9,14 +9,12 @@
 //! - `step`: rows of whole updates
 //! - `clustering`: the K-means row
 //! - `selection`: the token-selection row
-//! - `prepare`: a case with its inputs
 
 pub(crate) mod case;
 pub(crate) mod clustering;
 pub(crate) mod context;
 pub(crate) mod forward;
 pub(crate) mod options;
-pub(crate) mod prepare;
 pub(crate) mod reference;
 pub(crate) mod selection;
 pub(crate) mod step;
