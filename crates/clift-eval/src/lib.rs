@@ -54,9 +54,8 @@ pub use config::method::{Method, MethodName};
 pub use config::token_selection::Selection;
 
 // A complete evaluation with its files.
-pub use evaluator::evaluator::{Evaluator, SceneLimits, write_skip_report};
+pub use evaluator::evaluator::{Evaluator, Progress, SceneLimits, write_skip_report};
 pub use evaluator::items::evaluation_items;
-pub use evaluator::progress::Progress;
 pub use report::page::RunDescription;
 
 // One scene with every method and token count.

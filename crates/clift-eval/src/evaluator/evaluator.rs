@@ -10,7 +10,6 @@ use crate::config::eval_config::EvalConfig;
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::evaluator::items::evaluation_items;
-use crate::evaluator::progress::Progress;
 use crate::evaluator::sheets::Sheets;
 use crate::figures::scene_figure::SceneFigures;
 use crate::metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
@@ -128,9 +127,7 @@ impl Evaluator {
     ) -> Result<(EvalResults, SkipReport), EvalError> {
         let _precision = self.eval.precision.scope();
         let (mut measured, mut skip_report) = (EvalResults::default(), self.skip_report.clone());
-        for skip in &skip_report.skips {
-            measured.skip(&skip.key);
-        }
+        measured.skipped.extend(skip_report.skips.iter().map(|skip| skip.key.clone()));
         let total = self.items.len().min(limits.num_scenes);
         for (i, item) in self.items.iter().take(total).enumerate() {
             if progress.is_interrupted() {
@@ -146,7 +143,7 @@ impl Evaluator {
                 }
                 Err(error) => {
                     let reason = error.to_string();
-                    measured.skip(key);
+                    measured.skipped.insert(key.into());
                     progress.skipped(key, &reason);
                     skip_report.skip(key, reason);
                 }
@@ -205,6 +202,21 @@ impl Evaluator {
         let (value, fix) = (method.name().into(), fix.into());
         Err(ModelError::BadConfig { key: "eval.variants", value, fix }.into())
     }
+}
+
+/// Receiver of progress, with the request to stop.
+pub trait Progress {
+    /// Reports that `scenes` of `total` are done. The first call has 0 scenes.
+    fn done(&mut self, scenes: usize, total: usize);
+
+    /// Reports a line of text.
+    fn note(&mut self, text: &str);
+
+    /// Reports a skipped scene.
+    fn skipped(&mut self, key: &str, reason: &str);
+
+    /// Returns whether to stop the evaluation.
+    fn is_interrupted(&self) -> bool;
 }
 
 /// Numbers of measured scenes and of scenes with figures.

@@ -30,19 +30,17 @@ impl Canvas {
     /// Copies an 8-bit `[height, width, 3]` array.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`] unless there are `height * width * 3` values.
+    /// [`EvalError::BadImage`] unless there are `height * width * 3` values.
     pub fn from_rgb8(rgb: &[u8], height: usize, width: usize) -> Result<Self, EvalError> {
-        let mismatch = EvalError::SizeMismatch { expected: height * width * 3, got: rgb.len() };
-        if rgb.len() != height * width * 3 {
-            return Err(mismatch);
-        }
-        RgbImage::from_raw(width as u32, height as u32, rgb.to_vec()).map(|rgb| Self { rgb }).ok_or(mismatch)
+        let expected = height * width * 3;
+        let image = RgbImage::from_raw(width as u32, height as u32, rgb.to_vec()).filter(|_| rgb.len() == expected);
+        image.map(|rgb| Self { rgb }).ok_or_else(|| EvalError::size_mismatch(expected, rgb.len()))
     }
 
     /// Rounds a `[height, width, 3]` array in [0, 1] to 8 bits; values outside are clamped.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`] unless there are `height * width * 3` values.
+    /// [`EvalError::BadImage`] unless there are `height * width * 3` values.
     pub fn from_unit(values: &[f32], height: usize, width: usize) -> Result<Self, EvalError> {
         let rgb: Vec<u8> = values.iter().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
         Self::from_rgb8(&rgb, height, width)
@@ -145,8 +143,8 @@ impl DrawTarget for Canvas {
 /// brightest from [`ERROR_FULL_SCALE`] on.
 ///
 /// # Errors
-/// [`EvalError::SizeMismatch`] unless both images hold `height * width * 3` values, and [`EvalError::NotFinite`] for a NaN
-/// or an infinity, which would look like no error.
+/// [`EvalError::BadImage`] unless both images hold `height * width * 3` values, and for a NaN or an infinity, which would
+/// look like no error.
 pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<Canvas, EvalError> {
     check(pred, target, height * width * 3)?;
     let colours: Vec<u8> = pred

@@ -73,7 +73,7 @@ impl SceneFigures {
     /// Makes both figures from the results of a scene with patches of `patch_size` pixels.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`] for results of another clip.
+    /// [`EvalError::BadImage`] for results of another clip.
     pub fn new(clip: &Clip, results: &SceneResults, patch_size: usize) -> Result<Self, EvalError> {
         let views = &results.kept_views;
         let contact_sheet = scene_sheet(clip, &results.renderings, views)?;

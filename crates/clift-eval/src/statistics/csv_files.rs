@@ -6,7 +6,6 @@ use clift_data::{mean, replace_file};
 
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::scene_means::capped;
 use crate::statistics::view_metrics::ViewMetrics;
 
 const VIEW_COLUMNS: [&str; 11] = [
@@ -69,7 +68,7 @@ pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError>
                 key.num_render_tokens.to_string(),
                 key.format_name().into(),
                 views.len().to_string(),
-                mean_of(|view| Some(capped(view.psnr))),
+                mean_of(|view| Some(view.capped_psnr())),
                 mean_of(|view| view.ssim),
                 mean_of(|view| view.lpips_vgg),
             ]

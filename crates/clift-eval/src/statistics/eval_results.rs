@@ -28,6 +28,7 @@ pub struct EvalResults {
     views: BTreeMap<EvalKey, SceneViews>,
     /// Cost of every key of which a warm-up view was rendered, and of external methods.
     pub(crate) costs: BTreeMap<EvalKey, Cost>,
+    /// Keys of the skipped scenes.
     pub(crate) skipped: BTreeSet<String>,
     pub(crate) not_measured: Vec<NotMeasured>,
     pub(crate) missing: BTreeMap<MethodName, BTreeSet<String>>,
@@ -86,11 +87,6 @@ impl EvalResults {
     /// Records an image that an external method does not have.
     pub fn record_missing_image(&mut self, method: MethodName, image: String) {
         self.missing.entry(method).or_default().insert(image);
-    }
-
-    /// Records a skipped scene.
-    pub fn skip(&mut self, scene: &str) {
-        self.skipped.insert(scene.to_owned());
     }
 }
 

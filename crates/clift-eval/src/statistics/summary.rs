@@ -15,7 +15,6 @@ use crate::error::EvalError;
 use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
-use crate::statistics::scene_means::{capped, scene_means};
 use crate::statistics::view_metrics::{Cost, EvalKey, ViewMetrics, best_method};
 
 /// Means of a baseline.
@@ -52,7 +51,7 @@ pub struct SummaryPoint {
     pub psnr_stderr: Option<f64>,
     /// Mean PSNR over all views, in dB. Equals `psnr` if all scenes have the same number of views.
     pub psnr_per_view: Option<f64>,
-    /// Views whose PSNR is infinite, counted as [`crate::statistics::scene_means::PSNR_CAP_DB`] in the means.
+    /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
     pub num_identical_views: usize,
     /// Mean over scenes of the scene's mean SSIM.
     pub ssim: Option<f64>,
@@ -176,10 +175,15 @@ impl Summary {
     }
 }
 
+/// Returns the mean over the views of each scene, for the scenes that have a value.
+fn scene_means(views: &SceneViews, value: fn(&ViewMetrics) -> Option<f64>) -> Vec<f64> {
+    views.values().filter_map(|frames| mean(&frames.values().filter_map(value).collect::<Vec<_>>())).collect()
+}
+
 impl Quality {
     fn new(views: &SceneViews) -> Self {
         Self {
-            psnr: mean(&scene_means(views, |view| Some(capped(view.psnr)))),
+            psnr: mean(&scene_means(views, |view| Some(view.capped_psnr()))),
             ssim: mean(&scene_means(views, |view| view.ssim)),
             lpips_vgg: mean(&scene_means(views, |view| view.lpips_vgg)),
         }
@@ -199,8 +203,8 @@ impl SummaryPoint {
             key,
             num_views: views.len(),
             psnr,
-            psnr_stderr: standard_error(&scene_means(scenes, |view| Some(capped(view.psnr)))),
-            psnr_per_view: mean(&values(|view| Some(capped(view.psnr)))),
+            psnr_stderr: standard_error(&scene_means(scenes, |view| Some(view.capped_psnr()))),
+            psnr_per_view: mean(&values(|view| Some(view.capped_psnr()))),
             num_identical_views: views.iter().filter(|view| view.psnr == f64::INFINITY).count(),
             ssim,
             ssim_per_view: mean(&values(|view| view.ssim)),
@@ -270,7 +274,7 @@ mod tests {
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
         let cost = Cost { gflops: Some(2.5), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) };
         views.costs.insert(CLIFT, cost);
-        views.skip("c");
+        views.skipped.insert("c".into());
         views.note_not_measured("lpips_vgg", "no weights".into());
         let folder = tempfile::tempdir().unwrap();
         let summary = Summary::new(&views);

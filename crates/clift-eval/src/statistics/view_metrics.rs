@@ -47,6 +47,12 @@ pub(crate) fn best_method(keys: impl IntoIterator<Item = EvalKey>) -> Option<Met
         .find(|method| found.contains(method))
 }
 
+/// Upper bound of a PSNR in a mean, in dB, for identical images with their infinite PSNR.
+///
+/// A mean cannot hold infinity, nor can JSON. A single wrong 8-bit level in a 256 x 256 image has 101 dB, so the bound
+/// affects no real difference. Skipping identical views would lower the mean of the better method.
+pub const PSNR_CAP_DB: f64 = 100.0;
+
 /// The metrics of one view; `None` was not measured.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ViewMetrics {
@@ -63,6 +69,11 @@ pub struct ViewMetrics {
 }
 
 impl ViewMetrics {
+    /// Returns the PSNR as it counts in a mean, at most [`PSNR_CAP_DB`].
+    pub fn capped_psnr(&self) -> f64 {
+        self.psnr.min(PSNR_CAP_DB)
+    }
+
     /// Returns the time per frame: token selection, if any, and rendering.
     pub fn frame_s(&self) -> Option<f64> {
         self.render_s.map(|render_s| render_s + self.select_s.unwrap_or_default())

@@ -28,7 +28,7 @@ use crate::upload::{upload_cameras, upload_views};
 ///
 /// # Errors
 /// [`BadTokenCount`](clift_model::ModelError::BadTokenCount) for a count above the tokens of the scene,
-/// [`EvalError::NotFinite`] for a rendering with a NaN or an infinity, and the errors of the model.
+/// [`EvalError::BadImage`] for a rendering with a NaN or an infinity, and the errors of the model.
 pub fn evaluate_scene(
     models: &EvalModels,
     clip: &Clip,
