@@ -10,9 +10,8 @@ use clift_train::{Config, DeviceBatch, Stage, TrainError, freeze, psnr_of_mse};
 use serde::Serialize;
 
 use crate::cases::case::BenchCase;
-use crate::cases::context::BenchContext;
+use crate::cases::context::{BenchContext, BenchOptions};
 use crate::cases::forward::{encode, render};
-use crate::cases::options::BenchOptions;
 use crate::cases::reference::{flat_gradient, values};
 use crate::cases::step::{gradients, loss_factor, micro_batch};
 use crate::cases::task::BenchTask;

@@ -59,18 +59,3 @@ impl std::str::FromStr for BenchCase {
         found.ok_or_else(|| format!("unknown; the cases are {}", Self::names()))
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn names_parse_and_unknown_ones_list_all() {
-        for case in BenchCase::ALL {
-            assert_eq!(case.name().parse(), Ok(*case));
-        }
-        let expected = "unknown; the cases are encode, kmeans, condense, cluster_attention, select, render, \
-                        render_8_views, stage1_step, stage1_step_tiny, stage2_step";
-        assert_eq!("incode".parse::<BenchCase>().unwrap_err(), expected);
-    }
-}

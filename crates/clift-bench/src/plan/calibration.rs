@@ -17,8 +17,7 @@ use cpu_time::ProcessTime;
 use rand::RngExt;
 use rand::seq::index::sample;
 
-use crate::cases::context::BenchContext;
-use crate::cases::options::BenchOptions;
+use crate::cases::context::{BenchContext, BenchOptions};
 
 /// Multiply-accumulates of a calibrated update: about a second on a laptop.
 const ENOUGH_MACS: f64 = 30e9;
@@ -202,9 +201,13 @@ fn calibration_batch(
     Ok(batch)
 }
 
-/// Times encoding and rendering of one scene, and its clustering or its evaluation.
-pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<InferenceRates, TrainError> {
-    let InferenceTimed { num_context, num_targets, counts, with_evaluation } = *sizes;
+/// Times encoding and rendering of one scene, and its clustering to each of `counts`; without counts, its whole evaluation.
+pub fn inference_rates(
+    config: &Config,
+    num_context: usize,
+    num_targets: usize,
+    counts: Option<&[usize]>,
+) -> Result<InferenceRates, TrainError> {
     let shallow = shallow(config);
     let context = context(&shallow, num_context)?;
     let model = context.model().valid();
@@ -220,17 +223,7 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
     let render_s = Timed::of(|| wait_for(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?.seconds;
     let mut kmeans = Vec::new();
     let mut evaluation_s = 0.0;
-    if with_evaluation {
-        let stage2 = TrainedModel::snapshot(&model, &shallow.model, true);
-        let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
-        let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
-        let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
-        let sweep = Sweep { model: shallow.model.clone(), lpips, ..eval_sizes(config) };
-        // Shared by the repetitions: warm-up views are rendered only for the first one.
-        let mut results = EvalResults::default();
-        evaluation_s =
-            Timed::of(|| Ok(evaluate_scene(&models, &clip, &sweep, false, &mut results).map(|_| ())?))?.seconds;
-    } else {
+    if let Some(counts) = counts {
         for &count in counts {
             // The number of iterations depends on the seed.
             let seeds: Vec<u64> =
@@ -243,22 +236,19 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
             })?;
             kmeans.push((count, timed.seconds / seeds.len() as f64));
         }
+    } else {
+        let stage2 = TrainedModel::snapshot(&model, &shallow.model, true);
+        let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
+        let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
+        let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
+        let sweep = Sweep { model: shallow.model.clone(), lpips, ..eval_sizes(config) };
+        // Shared by the repetitions: warm-up views are rendered only for the first one.
+        let mut results = EvalResults::default();
+        evaluation_s =
+            Timed::of(|| Ok(evaluate_scene(&models, &clip, &sweep, false, &mut results).map(|_| ())?))?.seconds;
     }
     let [encode_per_mac, render_per_mac] = [encode_s / encode_macs, render_s / render_macs];
     Ok(InferenceRates { encode_per_mac, render_per_mac, kmeans, evaluation_s, timed: shallow.model })
-}
-
-/// Sizes of a measurement without gradients.
-#[derive(Clone, Copy, Debug)]
-pub struct InferenceTimed<'a> {
-    /// Context views.
-    pub num_context: usize,
-    /// Target views rendered at once.
-    pub num_targets: usize,
-    /// Numbers of clusters.
-    pub counts: &'a [usize],
-    /// Whether the whole evaluation of the scene is timed instead of K-means.
-    pub with_evaluation: bool,
 }
 
 /// Returns the seconds that one thread takes to read a view of a training scene; `None` if the data cannot be read.

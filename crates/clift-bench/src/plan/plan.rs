@@ -13,9 +13,7 @@ use clift_train::{
 };
 use serde::Serialize;
 
-use crate::plan::calibration::{
-    InferenceRates, InferenceTimed, inference_rates, loading_s, part_macs, update_macs, update_rates,
-};
+use crate::plan::calibration::{InferenceRates, inference_rates, loading_s, part_macs, update_macs, update_rates};
 
 /// Estimate of a run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -168,9 +166,7 @@ fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     macs /= (views.max_context - views.min_context + 1) as f64;
     let compute_s = if is_timed {
         let counts = cluster_counts(config, num_tokens(config, num_context)?)?;
-        let timed =
-            InferenceTimed { num_context, num_targets: 1, counts: &timed_counts(&counts), with_evaluation: false };
-        let rates = inference_rates(config, &timed)?;
+        let rates = inference_rates(config, num_context, 1, Some(&timed_counts(&counts)))?;
         let kmeans = counts.iter().map(|&count| kmeans_s(&rates, count)).sum::<f64>() / counts.len() as f64;
         Some(macs * rates.encode_per_mac + kmeans)
     } else {
@@ -207,8 +203,7 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     };
     let (encoder, rest) = encode_and_rest(&config.model);
     let compute_s = if is_timed {
-        let timed = InferenceTimed { num_context: eval.num_context, num_targets, counts: &[], with_evaluation: true };
-        let rates = inference_rates(config, &timed)?;
+        let rates = inference_rates(config, eval.num_context, num_targets, None)?;
         let (timed_encoder, timed_rest) = encode_and_rest(&rates.timed);
         Some(
             rates.evaluation_s

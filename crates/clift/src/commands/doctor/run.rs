@@ -1,10 +1,11 @@
 //! `clift doctor`: the machine and its devices.
 
+use std::path::PathBuf;
+
 use clift_bench::{DeviceCheck, Gradient, probe};
 use clift_eval::machine_rows;
 use clift_model::{DeviceName, InstructionSet, Precision};
 
-use crate::commands::doctor::args::DoctorArgs;
 use crate::commands::doctor::{adapters, stability};
 use crate::output::stdout::print_result;
 use crate::output::table::table;
@@ -22,7 +23,7 @@ const TOLERANCE_F16: f64 = 3e-2;
 /// If the default device fails, or a stability case.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     if args.stability {
-        return stability::run(args);
+        return stability::run(args.small, args.markdown.as_deref());
     }
     let machine = [("clift", version())].into_iter().chain(machine_rows()).chain([("kernels", kernels())]);
     let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
@@ -138,6 +139,20 @@ fn device_table(mut rows: Vec<[String; 6]>) -> String {
     }
     let table = table(["device", "state", "adapter", "dtypes", "fwd+bwd", "gradient difference"], rows);
     [table].into_iter().chain(failures).collect::<Vec<_>>().join("\n")
+}
+
+/// Arguments of `clift doctor`.
+#[derive(Debug, clap::Args)]
+pub struct DoctorArgs {
+    /// Run the stability cases instead: hard numerical inputs against f64
+    #[arg(long)]
+    pub stability: bool,
+    /// Run small versions of the cases: seconds instead of minutes
+    #[arg(long, requires = "stability")]
+    pub small: bool,
+    /// Write the table of the cases as Markdown
+    #[arg(long, requires = "stability", value_name = "FILE")]
+    pub markdown: Option<PathBuf>,
 }
 
 #[cfg(test)]
