@@ -62,7 +62,7 @@ pub use report::page::RunDescription;
 pub use sweep::eval_models::{EvalModels, stage2_method};
 pub use sweep::evaluate_scene::evaluate_scene;
 pub use sweep::predictions::ExternalMethod;
-pub use sweep::scene_results::SceneResults;
+pub use sweep::rendered_views::SceneResults;
 pub use sweep::sweep::Sweep;
 
 // Results and comparisons.

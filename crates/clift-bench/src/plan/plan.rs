@@ -72,18 +72,20 @@ pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
     check_plan(config)?;
     let parameters = Parameters::of(&config.model);
     let views = &config.data.views;
+    let parts = vec![
+        update(config, Stage::Stage1, &parameters, is_timed)?,
+        clusters(config, is_timed)?,
+        update(config, Stage::Stage2, &parameters, is_timed)?,
+        evaluation(config, is_timed)?,
+    ];
     let mut plan = Plan {
         device: config.device,
         threads: rayon::current_num_threads(),
         parameters,
         num_tokens: [num_tokens(config, views.min_context)?, num_tokens(config, views.max_context)?],
         available_bytes: available_bytes(config.device),
-        parts: Vec::new(),
+        parts,
     };
-    plan.parts.push(update(config, Stage::Stage1, &parameters, is_timed)?);
-    plan.parts.push(clusters(config, is_timed)?);
-    plan.parts.push(update(config, Stage::Stage2, &parameters, is_timed)?);
-    plan.parts.push(evaluation(config, is_timed)?);
     let per_view_s = if is_timed { loading_s(config) } else { None };
     for part in &mut plan.parts {
         let (num_views, num_threads) = views_and_threads(config, part.part);
@@ -152,8 +154,9 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
     let images = (batch_size * config.data.views.num_targets) as f64;
     let compute_s = rates
         .map(|rates| macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_image);
-    let part = PartPlan { trained_parameters, ..untimed(config, stage, macs)? };
-    Ok(PartPlan { unit: "step", count: Some(steps), compute_s, busy_threads: rates.map(|rates| rates.busy), ..part })
+    let busy_threads = rates.map(|rates| rates.busy);
+    let part = untimed(config, stage, macs)?;
+    Ok(PartPlan { unit: "step", count: Some(steps), trained_parameters, compute_s, busy_threads, ..part })
 }
 
 fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {

@@ -13,8 +13,7 @@ use crate::statistics::view_metrics::{Cost, EvalKey};
 use crate::sweep::compressed_tokens::{CompressedTokens, select_tokens};
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
-use crate::sweep::rendered_views::{ScoredViews, baselines};
-use crate::sweep::scene_results::{SceneResults, kept_views};
+use crate::sweep::rendered_views::{MAX_KEPT_VIEWS, SceneResults, ScoredViews, baselines, spread};
 use crate::sweep::sweep::{Sweep, render_counts};
 use crate::sweep::token_choice::{SelectedTokens, select_for_views};
 use crate::sweep::view_scorer::ViewScorer;
@@ -50,7 +49,7 @@ pub fn evaluate_scene(
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
     let views = (clip.context.num_views(), grid);
-    let kept_views = if keep_images { kept_views(clip.target.num_views()) } else { Vec::new() };
+    let kept_views = if keep_images { spread(clip.target.num_views(), MAX_KEPT_VIEWS) } else { Vec::new() };
     let keep_images = !kept_views.is_empty();
     let scorer = ViewScorer::new(&clip.target, sweep.lpips.as_ref());
     let renderer = TargetRenderer { clip, scorer: &scorer, cameras: upload_cameras(&[&clip.target], device)?, sweep };
