@@ -105,9 +105,6 @@ pub fn run_bench(
 }
 
 /// Makes networks and inputs of a case, so that only its computation is left to be timed.
-///
-/// # Errors
-/// [`TrainError::BadConfig`] for impossible sizes, and those of the device or a file of features.
 pub(crate) fn prepare(case: BenchCase, context: &BenchContext) -> Result<Box<dyn BenchTask>, TrainError> {
     Ok(match case {
         BenchCase::Encode => Box::new(forward::encode(context)?),

@@ -61,9 +61,6 @@ pub struct BenchContext {
 
 impl BenchContext {
     /// Checks the sizes and opens the device of a config. The scenes of the config are not opened.
-    ///
-    /// # Errors
-    /// [`TrainError::BadConfig`] for impossible sizes and counts, and those of the device.
     pub fn new(config: &Config, options: &BenchOptions) -> Result<Self, TrainError> {
         let mut config = config.clone();
         // The rows use seeded images: the data of the config need not exist.

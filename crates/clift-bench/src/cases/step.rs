@@ -117,9 +117,6 @@ pub(crate) fn loss_factor() -> f64 {
 /// The error of a gradient is relative to the largest entry of its parameter, or to `least_share` of the largest entry of
 /// all parameters if that is larger: a gradient that is zero in exact arithmetic, such as that of a query with one key,
 /// is rounding noise.
-///
-/// # Errors
-/// Those of the model and of the device.
 pub(crate) fn update_error(
     model: &Clift,
     batch: &StageBatch,

@@ -68,9 +68,6 @@ impl NetworkFile {
     }
 
     /// Takes a tensor out.
-    ///
-    /// # Errors
-    /// [`EvalError::BadWeights`] for a missing tensor or another shape.
     pub fn take<const D: usize>(
         &mut self,
         name: &str,
@@ -87,9 +84,6 @@ impl NetworkFile {
     }
 
     /// Checks that every tensor was taken, and returns the SHA-256 of the file in 64 hexadecimal digits.
-    ///
-    /// # Errors
-    /// [`EvalError::BadWeights`] with the first tensor that is not part of the network.
     pub fn finish(self) -> Result<String, EvalError> {
         match self.tensors.keys().next() {
             None => Ok(self.sha256),

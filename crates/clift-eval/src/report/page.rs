@@ -56,9 +56,6 @@ pub struct Report {
 
 impl Report {
     /// Writes the report, atomically.
-    ///
-    /// # Errors
-    /// [`EvalError::Io`] when the folder is missing or cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), EvalError> {
         self.to_html()
             .and_then(|html| replace_file(path, html.as_bytes()))
@@ -66,9 +63,6 @@ impl Report {
     }
 
     /// Returns the page.
-    ///
-    /// # Errors
-    /// As [`crate::figures::canvas::Canvas::png`].
     pub fn to_html(&self) -> io::Result<String> {
         let RunDescription { name, config, device } = &self.run;
         let page = html! {

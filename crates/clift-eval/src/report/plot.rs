@@ -17,7 +17,6 @@ const BOTTOM: f64 = 48.0;
 /// Colour and marker of a series. The marker identifies a series without colour.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Look {
-    /// Class of the style sheet.
     pub class: &'static str,
     /// Path of the marker around (0, 0).
     pub marker: &'static str,
@@ -44,26 +43,20 @@ impl Look {
 /// One measured point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mark {
-    /// Value on the horizontal axis.
     pub x: f64,
-    /// Value on the vertical axis.
     pub y: f64,
     /// Half the length of the error bar.
     pub error: Option<f64>,
-    /// Tooltip.
     pub title: String,
 }
 
 /// Marks with one look and one legend entry.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Series {
-    /// Name in the legend.
     pub name: String,
-    /// Colour and marker.
     pub look: Look,
     /// Whether a line joins the marks, in their order.
     pub is_joined: bool,
-    /// The marks.
     pub marks: Vec<Mark>,
 }
 
@@ -81,7 +74,6 @@ pub struct Level {
 /// A plot over two axes.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Plot {
-    /// Heading above the plot.
     pub heading: &'static str,
     /// Description for screen readers.
     pub title: String,
@@ -91,7 +83,6 @@ pub struct Plot {
     pub x_scale: Scale,
     /// Series of marks. The first series is on top.
     pub series: Vec<Series>,
-    /// Horizontal lines.
     pub levels: Vec<Level>,
     /// Points of the Pareto front by ascending x, joined as a staircase; may be empty.
     pub front: Vec<(f64, f64)>,

@@ -26,9 +26,6 @@ const SCENE_COLUMNS: [&str; 9] =
     ["scene", "variant", "num_storage_tokens", "num_render_tokens", "tokens", "num_views", "psnr", "ssim", "lpips_vgg"];
 
 /// Writes `views.csv`: a row per key and view, baselines included. An identical image has the PSNR `inf`.
-///
-/// # Errors
-/// [`EvalError::Io`] when the file cannot be written.
 pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
     let rows = results.views().flat_map(|(key, scenes)| {
         let views = scenes.iter().flat_map(|(scene, frames)| frames.iter().map(move |view| (scene, view)));
@@ -52,9 +49,6 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
 }
 
 /// Writes `scenes.csv`: a row per key and scene, baselines included, with means over the views of the scene.
-///
-/// # Errors
-/// [`EvalError::Io`] when the file cannot be written.
 pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
     let rows = results.views().flat_map(|(key, scenes)| {
         scenes.iter().map(move |(scene, views)| {

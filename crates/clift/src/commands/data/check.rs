@@ -29,7 +29,6 @@ struct Row {
 #[derive(Debug, Serialize)]
 struct Report {
     scenes: Vec<Row>,
-    /// Notes on the data set.
     notes: Vec<String>,
 }
 

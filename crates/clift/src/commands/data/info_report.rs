@@ -34,17 +34,14 @@ pub struct Report {
 pub struct SplitReport {
     /// Reason why the split is not usable.
     pub error: Option<String>,
-    /// Number of scenes.
     pub num_scenes: usize,
     /// Number of scenes after the filters.
     pub num_used: usize,
-    /// Number of skipped scenes by reason.
     pub skipped: BTreeMap<String, usize>,
     /// Skipped scenes, each with its reason.
     pub left_out: Vec<SkippedScene>,
     /// Skipped frames, each with its reason.
     pub frames: Vec<SkippedFrame>,
-    /// Notes on the split.
     pub notes: Vec<String>,
     /// Number of scenes that `info` describes: all used scenes, or the first synthetic ones.
     pub num_described: usize,
@@ -59,11 +56,9 @@ pub struct SplitReport {
 pub struct EvaluationReport {
     /// Reason why no scene can be evaluated.
     pub error: Option<String>,
-    /// Number of scenes.
     pub num_scenes: usize,
     /// Number of target views of all scenes.
     pub num_views: usize,
-    /// Number of skipped scenes by reason.
     pub skipped: BTreeMap<String, usize>,
 }
 
