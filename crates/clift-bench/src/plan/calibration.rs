@@ -9,15 +9,16 @@ use clift_data::{ClipReader, Split, item_rng, open_dataset, step_rng, upper_medi
 use clift_eval::{EvalModels, EvalResults, Lpips, Sweep, evaluate_scene, upload_cameras, upload_views};
 use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
-    ClipShape, Config, DeviceBatch, Loss, LossScale, Stage, StageBatch, StageSettings, TokenSelection, TrainError,
-    TrainState, TypicalStep, adamw, clip_global_norm, eval_sizes, freeze, global_norm, measures_lpips, render_loss,
-    scene_with_all_tokens, seeded_batch, seeded_clip,
+    ClipShape, Config, DeviceBatch, Loss, Stage, StageBatch, StageSettings, TokenSelection, TrainError, TypicalStep,
+    clip_global_norm, eval_sizes, global_norm, measures_lpips, render_loss, scene_with_all_tokens, seeded_batch,
+    seeded_clip,
 };
 use cpu_time::ProcessTime;
 use rand::RngExt;
 use rand::seq::index::sample;
 
 use crate::cases::context::{BenchContext, BenchOptions};
+use crate::cases::step::train_state;
 
 /// Multiply-accumulates of a calibrated update: about a second on a laptop.
 const ENOUGH_MACS: f64 = 30e9;
@@ -125,17 +126,9 @@ pub fn update_rates(config: &Config, stage: Stage, typical: &TypicalStep) -> Res
     let num_scenes = ((ENOUGH_MACS / macs_of_scene) as usize).clamp(1, typical.num_scenes);
     let batch = calibration_batch(&context, stage, typical, num_scenes)?;
     let StageSettings { optimizer, trained, .. } = config.stage(stage);
-    let state = TrainState {
-        model: freeze(stage, context.model()),
-        optimizer: adamw(optimizer),
-        device: context.device.clone().autodiff(),
-        // The perceptual term is timed on its own.
-        loss: Loss::default(),
-        activation_checkpointing: config.activation_checkpointing,
-        loss_scale: LossScale::of(config.precision),
-    };
     let rate = optimizer.learning_rate;
-    let (mut state, step) = Timed::with_state(state, |state| {
+    // The perceptual term is timed on its own.
+    let (mut state, step) = Timed::with_state(train_state(&context, stage), |state| {
         let (state, _) = state.step(&batch, 1, rate.into(), optimizer.max_grad_norm)?;
         context.sync()?;
         Ok(state)

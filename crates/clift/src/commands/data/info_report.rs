@@ -4,10 +4,8 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
-use clift_data::{SkippedFrame, SkippedScene, SourceInfo, SourceKind};
+use clift_data::{SkippedFrame, SkippedScene, SourceInfo, SourceKind, plural};
 use serde::Serialize;
-
-use crate::output::units::plural;
 
 /// Most scenes, and groups of scenes, that the table lists; the JSON lists all.
 const MAX_LISTED_SCENES: usize = 20;

@@ -66,17 +66,15 @@ fn version() -> String {
 
 /// Describes the instruction set of the flex kernels, the reason for it, and the alternatives.
 fn kernels() -> String {
-    let names = |sets: &mut dyn Iterator<Item = InstructionSet>| {
-        let names: Vec<_> = sets.map(InstructionSet::name).collect();
-        if names.is_empty() { "none".to_owned() } else { names.join(", ") }
-    };
     let variable = InstructionSet::VARIABLE;
     match InstructionSet::forced() {
         Err(bad) => format!("{variable} = {}: {bad}", bad.text),
         Ok(forced) => {
             let used = InstructionSet::detected();
             let why = if forced.is_some() { format!("set by {variable}") } else { "widest".into() };
-            let others = names(&mut InstructionSet::available().filter(|set| *set != used));
+            let others = InstructionSet::available().filter(|set| *set != used).map(InstructionSet::name);
+            let others = Some(others.collect::<Vec<_>>().join(", ")).filter(|names| !names.is_empty());
+            let others = others.unwrap_or_else(|| "none".into());
             format!("{} ({why}; also available: {others})", used.name())
         }
     }
