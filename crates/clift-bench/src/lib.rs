@@ -24,7 +24,7 @@ mod runner;
 
 // Time and error of the parts of the method
 pub use cases::case::BenchCase;
-pub use cases::options::{BenchOptions, MAX_CHECKED_TOKENS};
+pub use cases::context::{BenchOptions, MAX_CHECKED_TOKENS};
 pub use runner::{BenchEvent, BenchReport, BenchRow, run_bench};
 // f16 beside f32
 pub use precision::{PRECISION_CASES, PrecisionReport, PrecisionRow, compare_precision};

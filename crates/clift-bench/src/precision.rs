@@ -3,8 +3,6 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use burn::module::{Module, ModuleVisitor, Param};
-use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::median;
 use clift_model::{DeviceName, Precision};
@@ -12,13 +10,12 @@ use clift_train::{Config, DeviceBatch, Stage, TrainError, freeze, psnr_of_mse};
 use serde::Serialize;
 
 use crate::cases::case::BenchCase;
-use crate::cases::context::BenchContext;
-use crate::cases::forward::{EncodeCase, RenderCase};
-use crate::cases::options::BenchOptions;
-use crate::cases::prepare::prepare;
-use crate::cases::reference::values;
+use crate::cases::context::{BenchContext, BenchOptions};
+use crate::cases::forward::{encode, render};
+use crate::cases::reference::{flat_gradient, values};
 use crate::cases::step::{gradients, loss_factor, micro_batch};
-use crate::cases::task::{BenchTask, Forward};
+use crate::cases::task::BenchTask;
+use crate::runner::prepare;
 
 /// The cases that can be compared.
 pub const PRECISION_CASES: [BenchCase; 4] =
@@ -82,8 +79,7 @@ pub fn compare_precision(
     let mut rows = Vec::new();
     for case in PRECISION_CASES.into_iter().filter(|case| options.cases.contains(case)) {
         let [f32_s, f16_s] = median_times(case, &contexts, options, stop)?;
-        let PrecisionErrors { error, loss, psnr_to_f32 } = precision_errors(case, &contexts[0])?;
-        rows.push(PrecisionRow { case, f32_s, f16_s, ratio: f16_s / f32_s, error, loss, psnr_to_f32 });
+        rows.push(PrecisionRow { f32_s, f16_s, ratio: f16_s / f32_s, ..compare_results(case, &contexts[0])? });
     }
     Ok(PrecisionReport { device: config.device, rows })
 }
@@ -119,54 +115,44 @@ fn median_times(
     Ok(samples.map(|samples| median(&samples)))
 }
 
-struct PrecisionErrors {
-    error: f64,
-    loss: Option<[f64; 2]>,
-    psnr_to_f32: Option<f64>,
-}
-
-fn precision_errors(case: BenchCase, context: &BenchContext) -> Result<PrecisionErrors, TrainError> {
+/// Returns the row of a case without its times.
+fn compare_results(case: BenchCase, context: &BenchContext) -> Result<PrecisionRow, TrainError> {
     let both = |forward: &dyn Fn() -> Tensor<1>| {
         [Precision::F32, Precision::F16].map(|precision| {
             let _scope = precision.scope();
             values(forward())
         })
     };
+    let row = PrecisionRow { case, f32_s: 0.0, f16_s: 0.0, ratio: 0.0, error: 0.0, loss: None, psnr_to_f32: None };
     let stage = match case {
         BenchCase::Encode => {
-            let encode = EncodeCase::new(context)?;
+            let encode = encode(context)?;
             let [single, f16] = both(&|| encode.forward());
-            return Ok(PrecisionErrors { error: relative_distance(&f16, &single), loss: None, psnr_to_f32: None });
+            return Ok(PrecisionRow { error: relative_distance(&f16, &single), ..row });
         }
         BenchCase::Render => {
-            let render = RenderCase::new(context, 1)?;
+            let render = render(context, 1)?;
             let [single, f16] = both(&|| render.forward());
             let squares = f16.iter().zip(&single).map(|(a, b)| (a - b).powi(2));
             let mse = squares.sum::<f64>() / single.len() as f64;
-            return Ok(PrecisionErrors {
-                error: relative_distance(&f16, &single),
-                loss: None,
-                psnr_to_f32: Some(psnr_of_mse(mse)),
-            });
+            let psnr_to_f32 = Some(psnr_of_mse(mse));
+            return Ok(PrecisionRow { error: relative_distance(&f16, &single), psnr_to_f32, ..row });
         }
         BenchCase::Stage2Step => Stage::Stage2,
         _ => Stage::Stage1,
     };
     let model = freeze(stage, context.model());
     let batch = micro_batch(context, stage)?;
-    let mut results = Vec::new();
-    for precision in [Precision::F32, Precision::F16] {
+    let results = [Precision::F32, Precision::F16].map(|precision| -> Result<_, TrainError> {
         let _scope = precision.scope();
         let device_batch = DeviceBatch::upload(&batch, &context.device.clone().autodiff())?;
         let (loss, grads) = gradients(&model, &batch, device_batch)?;
-        results.push((loss, flat_gradient(&model, &grads, loss_factor())));
-    }
-    let [(single_loss, single), (f16_loss, f16)] = &results[..] else { unreachable!("two precisions") };
-    Ok(PrecisionErrors {
-        error: relative_distance(f16, single),
-        loss: Some([*single_loss, *f16_loss]),
-        psnr_to_f32: None,
-    })
+        let factor = loss_factor();
+        Ok((loss, flat_gradient(&model, &grads).into_iter().map(|value| value / factor).collect::<Vec<_>>()))
+    });
+    let [single, f16] = results;
+    let ((single_loss, single), (f16_loss, f16)) = (single?, f16?);
+    Ok(PrecisionRow { error: relative_distance(&f16, &single), loss: Some([single_loss, f16_loss]), ..row })
 }
 
 /// Returns `|a - b| / |b|`, NaN if a value is NaN.
@@ -175,21 +161,6 @@ fn relative_distance(a: &[f64], b: &[f64]) -> f64 {
     let norm = |squares: f64| squares.sqrt();
     let difference = norm(a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum());
     if difference == 0.0 { 0.0 } else { difference / norm(b.iter().map(|b| b.powi(2)).sum()) }
-}
-
-/// Returns the gradients of all parameters in one list, divided by the factor of the loss.
-fn flat_gradient<M: Module>(model: &M, grads: &GradientsParams, factor: f64) -> Vec<f64> {
-    struct Collect<'a>(&'a GradientsParams, Vec<f64>);
-    impl ModuleVisitor for Collect<'_> {
-        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            if let Some(grad) = self.0.get::<D>(param.id) {
-                self.1.extend(values(grad));
-            }
-        }
-    }
-    let mut collect = Collect(grads, Vec::new());
-    model.visit(&mut collect);
-    collect.1.iter().map(|value| value / factor).collect()
 }
 
 #[cfg(test)]

@@ -39,7 +39,7 @@ pub use config::DataConfig;
 pub use dataset::{open_dataset, open_training_dataset};
 pub use error::{DataError, WorkerPanic};
 pub use scene_source::{SceneSource, Split};
-pub use skip_report::{SkipReport, SkippedFrame, SkippedScene};
+pub use skip_report::{SkipReport, SkippedFrame, SkippedScene, plural};
 
 // Layouts on disk, and synthetic scenes.
 pub use sources::chunks::chunk_source::ChunkSource;

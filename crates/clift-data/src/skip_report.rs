@@ -137,7 +137,7 @@ pub(crate) fn first_few<S: AsRef<str>>(names: &[S]) -> String {
 }
 
 /// Formats a count with its noun: `1 scene`, `2 scenes`.
-pub(crate) fn plural(count: usize, noun: &str) -> String {
+pub fn plural(count: usize, noun: &str) -> String {
     format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
 

@@ -16,35 +16,12 @@ pub enum EvalError {
         /// The file.
         path: PathBuf,
     },
-    /// Two compared images have different numbers of values.
-    #[error("image sizes differ: expected {expected} values, got {got}")]
-    SizeMismatch {
-        /// Values of the target, or of the given shape.
-        expected: usize,
-        /// Values of the other image.
-        got: usize,
-    },
-    /// An image has a NaN or an infinity.
-    #[error("the {image} is not finite: value {value} at index {index}")]
-    NotFinite {
-        /// `"prediction"` or `"target"`.
-        image: &'static str,
-        /// Index of the value.
-        index: usize,
-        /// The NaN or infinity.
-        value: f32,
-    },
-    /// An image is smaller than a metric allows.
-    #[error("{metric} needs at least {min} x {min} pixels, got {width} x {height}")]
-    ImageTooSmall {
-        /// Name of the metric.
-        metric: &'static str,
-        /// Smallest side, in pixels.
-        min: usize,
-        /// Columns.
-        width: usize,
-        /// Rows.
-        height: usize,
+    /// An image has another number of values than its target or shape, is too small for a metric, or has a NaN or an
+    /// infinity.
+    #[error("{reason}")]
+    BadImage {
+        /// The problem.
+        reason: String,
     },
     /// The weight file of a metric or loss is not usable.
     #[error("bad weights for {what}: {reason}; make the file with `{command}`: {path}", path = path.display())]
@@ -145,6 +122,11 @@ impl EvalError {
     /// Wraps an error of the operating system; for `map_err`.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, source, path: path.to_path_buf() }
+    }
+
+    /// Makes the error of an image with `got` values.
+    pub(crate) fn size_mismatch(expected: usize, got: usize) -> Self {
+        Self::BadImage { reason: format!("image sizes differ: expected {expected} values, got {got}") }
     }
 
     /// Wraps an error of a device; for `map_err`.

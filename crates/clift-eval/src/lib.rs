@@ -54,15 +54,15 @@ pub use config::method::{Method, MethodName};
 pub use config::token_selection::Selection;
 
 // A complete evaluation with its files.
-pub use evaluator::evaluator::{Evaluator, RunDescription, SceneLimits, write_skip_report};
+pub use evaluator::evaluator::{Evaluator, Progress, SceneLimits, write_skip_report};
 pub use evaluator::items::evaluation_items;
-pub use evaluator::progress::Progress;
+pub use report::page::RunDescription;
 
 // One scene with every method and token count.
 pub use sweep::eval_models::{EvalModels, stage2_method};
 pub use sweep::evaluate_scene::evaluate_scene;
 pub use sweep::predictions::ExternalMethod;
-pub use sweep::scene_results::SceneResults;
+pub use sweep::rendered_views::SceneResults;
 pub use sweep::sweep::Sweep;
 
 // Results and comparisons.

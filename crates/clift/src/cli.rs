@@ -5,7 +5,7 @@ use clap::{Parser, Subcommand};
 use crate::commands::bench::cases::BenchArgs;
 use crate::commands::compare::CompareArgs;
 use crate::commands::data::command::DataCommand;
-use crate::commands::doctor::args::DoctorArgs;
+use crate::commands::doctor::run::DoctorArgs;
 use crate::commands::encode::EncodeArgs;
 use crate::commands::eval::EvalArgs;
 use crate::commands::export::ExportArgs;

@@ -24,16 +24,9 @@ pub(crate) fn error_message(error: &anyhow::Error) -> String {
 }
 
 /// An invalid combination of arguments.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
 pub(crate) struct UsageError(pub(crate) String);
-
-impl std::fmt::Display for UsageError {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for UsageError {}
 
 /// Returns a [`UsageError`] with a formatted message from the function.
 macro_rules! usage_bail {

@@ -14,9 +14,6 @@ const SIGNALLED: u8 = 128;
 static LAST_SIGNAL: OnceLock<Arc<AtomicUsize>> = OnceLock::new();
 
 /// Listens for signals and returns a flag that the first one sets.
-///
-/// # Errors
-/// Errors of the operating system.
 pub fn flag() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let last = LAST_SIGNAL.get_or_init(Arc::default);

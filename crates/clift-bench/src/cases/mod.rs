@@ -1,22 +1,18 @@
 //! The rows of `clift bench`.
 //!
 //! - `case`: names of the rows
-//! - `options`: repetitions, token counts, f64 check
 //! - `reference`: the same computation in f64
 //! - `task`: traits of a timed computation
-//! - `context`: device and sizes of all rows
+//! - `context`: options, device and sizes of all rows
 //! - `forward`: rows without gradient
 //! - `step`: rows of whole updates
 //! - `clustering`: the K-means row
 //! - `selection`: the token-selection row
-//! - `prepare`: a case with its inputs
 
 pub(crate) mod case;
 pub(crate) mod clustering;
 pub(crate) mod context;
 pub(crate) mod forward;
-pub(crate) mod options;
-pub(crate) mod prepare;
 pub(crate) mod reference;
 pub(crate) mod selection;
 pub(crate) mod step;

@@ -1,7 +1,8 @@
 //! The same computation with weights and inputs in f64, and the error of a result against that reference.
 
-use burn::module::{Module, ModuleMapper, Param};
-use burn::tensor::{DType, Device, Tensor};
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::optim::GradientsParams;
+use burn::tensor::{DType, Device, Int, Tensor};
 use clift_model::{Cameras, Views};
 
 /// Inputs that can be copied to f64.
@@ -14,6 +15,45 @@ pub trait ToF64 {
 impl<const D: usize> ToF64 for Tensor<D> {
     fn in_f64(&self, reference: &Device) -> Self {
         self.clone().to_device(reference).cast(DType::F64)
+    }
+}
+
+impl<T: ToF64> ToF64 for [T; 2] {
+    fn in_f64(&self, reference: &Device) -> Self {
+        self.each_ref().map(|value| value.in_f64(reference))
+    }
+}
+
+impl ToF64 for Tensor<1, Int> {
+    fn in_f64(&self, reference: &Device) -> Self {
+        self.clone().to_device(reference)
+    }
+}
+
+impl ToF64 for usize {
+    fn in_f64(&self, _reference: &Device) -> Self {
+        *self
+    }
+}
+
+impl<A: ToF64, B: ToF64> ToF64 for (A, B) {
+    fn in_f64(&self, reference: &Device) -> Self {
+        (self.0.in_f64(reference), self.1.in_f64(reference))
+    }
+}
+
+impl<A: ToF64, B: ToF64, C: ToF64> ToF64 for (A, B, C) {
+    fn in_f64(&self, reference: &Device) -> Self {
+        (self.0.in_f64(reference), self.1.in_f64(reference), self.2.in_f64(reference))
+    }
+}
+
+/// A network among the inputs.
+pub struct Network<M>(pub M);
+
+impl<M: Module> ToF64 for Network<M> {
+    fn in_f64(&self, reference: &Device) -> Self {
+        Self(module_in_f64(&self.0, reference))
     }
 }
 
@@ -38,6 +78,19 @@ pub fn module_in_f64<M: Module>(module: &M, reference: &Device) -> M {
         }
     }
     module.valid().map(&mut Cast(reference))
+}
+
+/// Returns the gradients of all parameters in one list.
+pub fn flat_gradient<M: Module>(model: &M, grads: &GradientsParams) -> Vec<f64> {
+    struct Collect<'a>(&'a GradientsParams, Vec<f64>);
+    impl ModuleVisitor for Collect<'_> {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            self.1.extend(self.0.get::<D>(param.id).map(values).unwrap_or_default());
+        }
+    }
+    let mut collect = Collect(grads, Vec::new());
+    model.visit(&mut collect);
+    collect.1
 }
 
 /// Returns the largest difference over the largest absolute value of `reference`: 0 for two tensors of zeros, NaN or
@@ -80,7 +133,7 @@ mod tests {
     #[test]
     fn module_in_f64_has_the_same_parameters() {
         struct IsF64(usize);
-        impl burn::module::ModuleVisitor for IsF64 {
+        impl ModuleVisitor for IsF64 {
             fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
                 assert_eq!(param.val().dtype(), DType::F64);
                 self.0 += 1;

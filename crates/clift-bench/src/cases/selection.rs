@@ -2,6 +2,7 @@
 
 use burn::tensor::Device;
 use clift_data::{DVec3, step_rng};
+use clift_eval::view_cameras;
 use clift_model::{SelectionPreset, Selector, TokenRay, ViewCamera};
 use clift_train::TrainError;
 use rand::RngExt;
@@ -31,12 +32,9 @@ impl SelectionCase {
                 TokenRay { origin: pose.translation.into(), direction: direction.into() }
             })
             .collect();
-        let lens = clip.target.intrinsics[0];
-        let camera =
-            ViewCamera { c2w: clip.target.c2w[0].to_matrix_f64(), intrinsics: [lens.fx, lens.fy, lens.cx, lens.cy] };
         Ok(Self {
             selector: Selector::new(SelectionPreset::Paper.rules(), &rays)?,
-            camera,
+            camera: view_cameras(&clip.target).swap_remove(0),
             size: context.shape().size,
             num_render_tokens: count.div_ceil(2),
         })

@@ -29,24 +29,27 @@ pub struct StepCase {
 impl StepCase {
     pub fn new(context: &BenchContext, stage: Stage) -> Result<Self, TrainError> {
         let StageSettings { steps, batch_size, accumulate, optimizer, .. } = context.config.stage(stage);
-        let state = TrainState {
-            model: freeze(stage, context.model()),
-            optimizer: adamw(optimizer),
-            device: context.device.clone().autodiff(),
-            // Without the VGG network of a perceptual term.
-            loss: Loss::default(),
-            activation_checkpointing: context.config.activation_checkpointing,
-            loss_scale: LossScale::of(context.config.precision),
-        };
         Ok(Self {
             stage,
-            state: Some(state),
+            state: Some(train_state(context, stage)),
             batch: stage_batch(context, stage, batch_size)?,
             accumulate,
             rate: warm_up_cosine(1, optimizer.learning_rate, optimizer.warm_up_steps, steps),
             max_grad_norm: optimizer.max_grad_norm,
             reduced: context.reduced()?,
         })
+    }
+}
+
+/// Makes the state of a stage before its first update, without the VGG network of a perceptual term.
+pub(crate) fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
+    TrainState {
+        model: freeze(stage, context.model()),
+        optimizer: adamw(context.config.stage(stage).optimizer),
+        device: context.device.clone().autodiff(),
+        loss: Loss::default(),
+        activation_checkpointing: context.config.activation_checkpointing,
+        loss_scale: LossScale::of(context.config.precision),
     }
 }
 
@@ -117,9 +120,6 @@ pub(crate) fn loss_factor() -> f64 {
 /// The error of a gradient is relative to the largest entry of its parameter, or to `least_share` of the largest entry of
 /// all parameters if that is larger: a gradient that is zero in exact arithmetic, such as that of a query with one key,
 /// is rounding noise.
-///
-/// # Errors
-/// Those of the model and of the device.
 pub(crate) fn update_error(
     model: &Clift,
     batch: &StageBatch,

@@ -4,12 +4,14 @@ use std::panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use burn::module::{Module, ModuleVisitor, Param};
-use burn::tensor::{DType, Device, Gradients, Tensor};
+use burn::optim::GradientsParams;
+use burn::tensor::{DType, Device};
 use clift_data::{Clip, ClipOptions, ClipReader, SyntheticConfig, SyntheticSource, ViewIndices};
 use clift_eval::{upload_cameras, upload_images, upload_views};
 use clift_model::{Clift, Clusters, DeviceName, KMeans, ModelConfig, Precision, SceneClusters};
 use clift_train::mse;
+
+use crate::cases::reference::flat_gradient;
 
 /// Capabilities of a working device.
 #[derive(Clone, Debug)]
@@ -106,23 +108,8 @@ fn gradient(device: &Device) -> anyhow::Result<Gradient> {
     let tokens = model.condenser.forward(lift, &index);
     let rendering = model.renderer.forward(tokens, &upload_cameras(&[&clip.target], &device)?);
     let loss = mse(rendering, upload_images(&[&clip.target], &device)?);
-    let grads = loss.backward();
-    let mut collect = Collect { grads: &grads, values: Vec::new() };
-    model.visit(&mut collect);
-    Ok(Gradient { loss: loss.into_scalar::<f64>(), values: collect.values })
-}
-
-struct Collect<'a> {
-    grads: &'a Gradients,
-    values: Vec<f64>,
-}
-
-impl ModuleVisitor for Collect<'_> {
-    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-        if let Some(grad) = param.val().grad(self.grads) {
-            self.values.extend(grad.into_data().convert::<f64>().try_to_vec::<f64>().unwrap_or_default());
-        }
-    }
+    let grads = GradientsParams::from_grads(loss.backward(), &model);
+    Ok(Gradient { loss: loss.into_scalar::<f64>(), values: flat_gradient(&model, &grads) })
 }
 
 fn clip() -> anyhow::Result<Clip> {

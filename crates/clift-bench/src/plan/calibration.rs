@@ -9,16 +9,15 @@ use clift_data::{ClipReader, Split, item_rng, open_dataset, step_rng, upper_medi
 use clift_eval::{EvalModels, EvalResults, Lpips, Sweep, evaluate_scene, upload_cameras, upload_views};
 use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
-    ClipShape, Config, DeviceBatch, Loss, LossScale, Stage, StageBatch, TokenSelection, TrainError, TrainState,
-    TypicalStep, adamw, clip_global_norm, eval_sizes, freeze, global_norm, measures_lpips, render_loss,
-    scene_with_all_tokens, seeded_batch, seeded_clip,
+    ClipShape, Config, DeviceBatch, Loss, Stage, StageBatch, TokenSelection, TrainError, TypicalStep, clip_global_norm,
+    eval_sizes, global_norm, measures_lpips, render_loss, scene_with_all_tokens, seeded_batch, seeded_clip,
 };
 use cpu_time::ProcessTime;
 use rand::RngExt;
 use rand::seq::index::sample;
 
-use crate::cases::context::BenchContext;
-use crate::cases::options::BenchOptions;
+use crate::cases::context::{BenchContext, BenchOptions};
+use crate::cases::step::train_state;
 
 /// Multiply-accumulates of a calibrated update: about a second on a laptop.
 const ENOUGH_MACS: f64 = 30e9;
@@ -126,17 +125,9 @@ pub fn update_rates(config: &Config, stage: Stage, typical: &TypicalStep) -> Res
     let num_scenes = ((ENOUGH_MACS / macs_of_scene) as usize).clamp(1, typical.num_scenes);
     let batch = calibration_batch(&context, stage, typical, num_scenes)?;
     let optimizer = config.stage(stage).optimizer;
-    let state = TrainState {
-        model: freeze(stage, context.model()),
-        optimizer: adamw(optimizer),
-        device: context.device.clone().autodiff(),
-        // The perceptual term is timed on its own.
-        loss: Loss::default(),
-        activation_checkpointing: config.activation_checkpointing,
-        loss_scale: LossScale::of(config.precision),
-    };
     let rate = optimizer.learning_rate;
-    let (mut state, step) = Timed::with_state(state, |state| {
+    // The perceptual term is timed on its own.
+    let (mut state, step) = Timed::with_state(train_state(&context, stage), |state| {
         let (state, _) = state.step(&batch, 1, rate.into(), optimizer.max_grad_norm)?;
         context.sync()?;
         Ok(state)
@@ -202,9 +193,13 @@ fn calibration_batch(
     Ok(batch)
 }
 
-/// Times encoding and rendering of one scene, and its clustering or its evaluation.
-pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<InferenceRates, TrainError> {
-    let InferenceTimed { num_context, num_targets, counts, with_evaluation } = *sizes;
+/// Times encoding and rendering of one scene, and its clustering to each of `counts`; without counts, its whole evaluation.
+pub fn inference_rates(
+    config: &Config,
+    num_context: usize,
+    num_targets: usize,
+    counts: Option<&[usize]>,
+) -> Result<InferenceRates, TrainError> {
     let shallow = shallow(config);
     let context = context(&shallow, num_context)?;
     let model = context.model().valid();
@@ -220,17 +215,7 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
     let render_s = Timed::of(|| wait_for(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?.seconds;
     let mut kmeans = Vec::new();
     let mut evaluation_s = 0.0;
-    if with_evaluation {
-        let stage2 = TrainedModel::snapshot(&model, &shallow.model, true);
-        let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
-        let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
-        let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
-        let sweep = Sweep { model: shallow.model.clone(), lpips, ..eval_sizes(config) };
-        // Shared by the repetitions: warm-up views are rendered only for the first one.
-        let mut results = EvalResults::default();
-        evaluation_s =
-            Timed::of(|| Ok(evaluate_scene(&models, &clip, &sweep, false, &mut results).map(|_| ())?))?.seconds;
-    } else {
+    if let Some(counts) = counts {
         for &count in counts {
             // The number of iterations depends on the seed.
             let seeds: Vec<u64> =
@@ -243,22 +228,19 @@ pub fn inference_rates(config: &Config, sizes: &InferenceTimed) -> Result<Infere
             })?;
             kmeans.push((count, timed.seconds / seeds.len() as f64));
         }
+    } else {
+        let stage2 = TrainedModel::snapshot(&model, &shallow.model, true);
+        let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
+        let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
+        let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
+        let sweep = Sweep { model: shallow.model.clone(), lpips, ..eval_sizes(config) };
+        // Shared by the repetitions: warm-up views are rendered only for the first one.
+        let mut results = EvalResults::default();
+        evaluation_s =
+            Timed::of(|| Ok(evaluate_scene(&models, &clip, &sweep, false, &mut results).map(|_| ())?))?.seconds;
     }
     let [encode_per_mac, render_per_mac] = [encode_s / encode_macs, render_s / render_macs];
     Ok(InferenceRates { encode_per_mac, render_per_mac, kmeans, evaluation_s, timed: shallow.model })
-}
-
-/// Sizes of a measurement without gradients.
-#[derive(Clone, Copy, Debug)]
-pub struct InferenceTimed<'a> {
-    /// Context views.
-    pub num_context: usize,
-    /// Target views rendered at once.
-    pub num_targets: usize,
-    /// Numbers of clusters.
-    pub counts: &'a [usize],
-    /// Whether the whole evaluation of the scene is timed instead of K-means.
-    pub with_evaluation: bool,
 }
 
 /// Returns the seconds that one thread takes to read a view of a training scene; `None` if the data cannot be read.

@@ -13,9 +13,7 @@ use clift_train::{
 };
 use serde::Serialize;
 
-use crate::plan::calibration::{
-    InferenceRates, InferenceTimed, inference_rates, loading_s, part_macs, update_macs, update_rates,
-};
+use crate::plan::calibration::{InferenceRates, inference_rates, loading_s, part_macs, update_macs, update_rates};
 
 /// Estimate of a run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -74,18 +72,20 @@ pub fn plan(config: &Config, is_timed: bool) -> Result<Plan, TrainError> {
     check_plan(config)?;
     let parameters = Parameters::of(&config.model);
     let views = &config.data.views;
+    let parts = vec![
+        update(config, Stage::Stage1, &parameters, is_timed)?,
+        clusters(config, is_timed)?,
+        update(config, Stage::Stage2, &parameters, is_timed)?,
+        evaluation(config, is_timed)?,
+    ];
     let mut plan = Plan {
         device: config.device,
         threads: rayon::current_num_threads(),
         parameters,
         num_tokens: [num_tokens(config, views.min_context)?, num_tokens(config, views.max_context)?],
         available_bytes: available_bytes(config.device),
-        parts: Vec::new(),
+        parts,
     };
-    plan.parts.push(update(config, Stage::Stage1, &parameters, is_timed)?);
-    plan.parts.push(clusters(config, is_timed)?);
-    plan.parts.push(update(config, Stage::Stage2, &parameters, is_timed)?);
-    plan.parts.push(evaluation(config, is_timed)?);
     let per_view_s = if is_timed { loading_s(config) } else { None };
     for part in &mut plan.parts {
         let (num_views, num_threads) = views_and_threads(config, part.part);
@@ -154,8 +154,9 @@ fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool
     let images = (batch_size * config.data.views.num_targets) as f64;
     let compute_s = rates
         .map(|rates| macs * rates.per_mac + trained_parameters as f64 * rates.per_parameter + images * rates.per_image);
-    let part = PartPlan { trained_parameters, ..untimed(config, stage, macs)? };
-    Ok(PartPlan { unit: "step", count: Some(steps), compute_s, busy_threads: rates.map(|rates| rates.busy), ..part })
+    let busy_threads = rates.map(|rates| rates.busy);
+    let part = untimed(config, stage, macs)?;
+    Ok(PartPlan { unit: "step", count: Some(steps), trained_parameters, compute_s, busy_threads, ..part })
 }
 
 fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
@@ -168,9 +169,7 @@ fn clusters(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     macs /= (views.max_context - views.min_context + 1) as f64;
     let compute_s = if is_timed {
         let counts = cluster_counts(config, num_tokens(config, num_context)?)?;
-        let timed =
-            InferenceTimed { num_context, num_targets: 1, counts: &timed_counts(&counts), with_evaluation: false };
-        let rates = inference_rates(config, &timed)?;
+        let rates = inference_rates(config, num_context, 1, Some(&timed_counts(&counts)))?;
         let kmeans = counts.iter().map(|&count| kmeans_s(&rates, count)).sum::<f64>() / counts.len() as f64;
         Some(macs * rates.encode_per_mac + kmeans)
     } else {
@@ -207,8 +206,7 @@ fn evaluation(config: &Config, is_timed: bool) -> Result<PartPlan, TrainError> {
     };
     let (encoder, rest) = encode_and_rest(&config.model);
     let compute_s = if is_timed {
-        let timed = InferenceTimed { num_context: eval.num_context, num_targets, counts: &[], with_evaluation: true };
-        let rates = inference_rates(config, &timed)?;
+        let rates = inference_rates(config, eval.num_context, num_targets, None)?;
         let (timed_encoder, timed_rest) = encode_and_rest(&rates.timed);
         Some(
             rates.evaluation_s

@@ -1,5 +1,6 @@
 //! The `[eval]` section of a config.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use clift_model::{Precision, TokenCount, TokenFormat};
@@ -66,13 +67,8 @@ fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TokenFo
         Written::One(format) => vec![format],
         Written::More(formats) => formats,
     };
-    let mut seen = Vec::new();
-    formats.retain(|format| {
-        !seen.contains(format) && {
-            seen.push(*format);
-            true
-        }
-    });
+    let mut seen = BTreeSet::new();
+    formats.retain(|format| seen.insert(*format));
     if formats.is_empty() {
         return Err(serde::de::Error::custom("at least one format is needed"));
     }

@@ -10,11 +10,10 @@ use crate::config::eval_config::EvalConfig;
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::evaluator::items::evaluation_items;
-use crate::evaluator::progress::Progress;
 use crate::evaluator::sheets::Sheets;
 use crate::figures::scene_figure::SceneFigures;
 use crate::metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
-use crate::report::page::{MAX_FIGURES, Report};
+use crate::report::page::{MAX_FIGURES, Report, RunDescription};
 use crate::statistics::csv_files::{write_scenes, write_views};
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::summary::Summary;
@@ -26,23 +25,14 @@ use crate::sweep::sweep::Sweep;
 /// The scenes and views of an evaluation, and the settings of every scene.
 pub struct Evaluator {
     eval: EvalConfig,
-    sweep: Sweep,
+    /// The settings of every scene.
+    pub sweep: Sweep,
     description: RunDescription,
     reader: ClipReader,
     items: Vec<EvaluationItem>,
-    skip_report: SkipReport,
+    /// The scenes that were skipped when the views were chosen.
+    pub skip_report: SkipReport,
     device: Device,
-}
-
-/// Description of the evaluated run for the report.
-#[derive(Clone, Debug)]
-pub struct RunDescription {
-    /// Name of the run.
-    pub name: String,
-    /// The config of the run, as TOML.
-    pub config: String,
-    /// Name of the device.
-    pub device: String,
 }
 
 impl Evaluator {
@@ -66,16 +56,6 @@ impl Evaluator {
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
         check_counts(&eval, fewest_views * tokens_per_view)?;
         Ok(Self { eval, sweep, description, reader, items, skip_report, device: device.clone() })
-    }
-
-    /// Returns the scenes that were skipped when the views were chosen.
-    pub fn skip_report(&self) -> &SkipReport {
-        &self.skip_report
-    }
-
-    /// Returns the settings of every scene.
-    pub fn sweep(&self) -> &Sweep {
-        &self.sweep
     }
 
     /// Measures every scene and writes `report.html`, `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the
@@ -127,8 +107,7 @@ impl Evaluator {
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;
         write_skip_report(&skipped, &folder.join("skipped.json"))?;
-        let RunDescription { name, config, device } = self.description.clone();
-        let report = Report { name, summary: summary.clone(), skipped, figures, config, device };
+        let report = Report { run: self.description.clone(), summary: summary.clone(), skipped, figures };
         report.write(&folder.join("report.html"))?;
         Ok(summary)
     }
@@ -148,9 +127,7 @@ impl Evaluator {
     ) -> Result<(EvalResults, SkipReport), EvalError> {
         let _precision = self.eval.precision.scope();
         let (mut measured, mut skip_report) = (EvalResults::default(), self.skip_report.clone());
-        for skip in &skip_report.skips {
-            measured.skip(&skip.key);
-        }
+        measured.skipped.extend(skip_report.skips.iter().map(|skip| skip.key.clone()));
         let total = self.items.len().min(limits.num_scenes);
         for (i, item) in self.items.iter().take(total).enumerate() {
             if progress.is_interrupted() {
@@ -166,7 +143,7 @@ impl Evaluator {
                 }
                 Err(error) => {
                     let reason = error.to_string();
-                    measured.skip(key);
+                    measured.skipped.insert(key.into());
                     progress.skipped(key, &reason);
                     skip_report.skip(key, reason);
                 }
@@ -194,7 +171,7 @@ impl Evaluator {
 
     /// Refuses an external method without any image: probably a wrong path.
     fn require_images(&self, external: &ExternalMethod, summary: &Summary) -> Result<(), EvalError> {
-        if summary.points.iter().any(|point| point.method == external.key().method) {
+        if summary.points.iter().any(|point| point.key.method == external.key().method) {
             return Ok(());
         }
         let first = self.items.first().and_then(|item| {
@@ -225,6 +202,21 @@ impl Evaluator {
         let (value, fix) = (method.name().into(), fix.into());
         Err(ModelError::BadConfig { key: "eval.variants", value, fix }.into())
     }
+}
+
+/// Receiver of progress, with the request to stop.
+pub trait Progress {
+    /// Reports that `scenes` of `total` are done. The first call has 0 scenes.
+    fn done(&mut self, scenes: usize, total: usize);
+
+    /// Reports a line of text.
+    fn note(&mut self, text: &str);
+
+    /// Reports a skipped scene.
+    fn skipped(&mut self, key: &str, reason: &str);
+
+    /// Returns whether to stop the evaluation.
+    fn is_interrupted(&self) -> bool;
 }
 
 /// Numbers of measured scenes and of scenes with figures.

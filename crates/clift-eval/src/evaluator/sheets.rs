@@ -1,5 +1,6 @@
 //! The contact sheets of an evaluation on disk.
 
+use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -15,7 +16,7 @@ pub(crate) struct Sheets {
     folder: PathBuf,
     files: StagedDir,
     /// File names of the earlier sheets.
-    former: Vec<String>,
+    former: BTreeSet<String>,
 }
 
 impl Sheets {
@@ -24,10 +25,9 @@ impl Sheets {
         let folder = evaluation.join("sheets");
         let files = StagedDir::new(&folder).map_err(EvalError::io("making a folder", &folder))?;
         // The earlier scenes.csv lists the earlier scenes. Other files in the folder belong to the user.
-        let table = std::fs::read_to_string(evaluation.join("scenes.csv")).unwrap_or_default();
-        let mut keys: Vec<&str> = table.lines().skip(1).filter_map(|line| line.split(',').next()).collect();
-        keys.dedup();
-        Ok(Self { folder, files, former: keys.into_iter().map(sheet_name).collect() })
+        let table = csv::Reader::from_path(evaluation.join("scenes.csv"));
+        let rows = table.into_iter().flat_map(|table| table.into_records().map_while(Result::ok));
+        Ok(Self { folder, files, former: rows.map(|row| sheet_name(&row[0])).collect() })
     }
 
     /// Writes the sheet of a scene to a temporary folder.

@@ -21,8 +21,7 @@ impl Animation {
     /// # Errors
     /// [`EvalError::Io`] for zero frames or an image without pixels, and for a file that cannot be written.
     pub fn new(path: &Path, width: usize, height: usize, num_frames: usize, fps: u16) -> Result<Self, EvalError> {
-        let writing = |source| EvalError::Io { action: "writing the animation", source, path: path.to_owned() };
-        let file = BufWriter::new(File::create(path).map_err(writing)?);
+        let file = BufWriter::new(File::create(path).map_err(EvalError::io("writing the animation", path))?);
         let mut encoder = png::Encoder::new(file, width as u32, height as u32);
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
@@ -61,7 +60,7 @@ impl Animation {
 }
 
 fn failed(path: &Path, error: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> EvalError {
-    EvalError::Io { action: "encoding the animation", source: std::io::Error::other(error), path: path.to_owned() }
+    EvalError::io("encoding the animation", path)(std::io::Error::other(error))
 }
 
 #[cfg(test)]

@@ -3,41 +3,17 @@
 use std::path::Path;
 
 use clift_data::replace_file;
-use embedded_graphics::mono_font::{MonoFont, MonoTextStyle, iso_8859_1};
+use embedded_graphics::mono_font::{MonoFont, MonoTextStyle};
 use embedded_graphics::pixelcolor::{Rgb888, RgbColor};
 use embedded_graphics::prelude::{DrawTarget, Drawable, OriginDimensions, Pixel, Point, Size};
 use embedded_graphics::text::{Baseline, Text};
-use image::{ImageEncoder, RgbImage};
+use image::RgbImage;
 
 use crate::error::EvalError;
 use crate::metrics::image_metrics::check;
 
 /// Mean absolute error over red, green and blue at the brightest colour of [`error_map`].
 pub const ERROR_FULL_SCALE: f32 = 0.25;
-
-/// Size of a line of text.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum TextSize {
-    /// 7 x 13 pixels a character.
-    Small,
-    /// 9 x 18 pixels a character, bold.
-    Large,
-}
-
-impl TextSize {
-    fn font(self) -> &'static MonoFont<'static> {
-        match self {
-            Self::Small => &iso_8859_1::FONT_7X13,
-            Self::Large => &iso_8859_1::FONT_9X18_BOLD,
-        }
-    }
-
-    /// Returns the width and height of one character, in pixels.
-    pub fn glyph_px(self) -> (usize, usize) {
-        let size = self.font().character_size;
-        (size.width as usize, size.height as usize)
-    }
-}
 
 /// An 8-bit RGB image to paint on.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -54,19 +30,17 @@ impl Canvas {
     /// Copies an 8-bit `[height, width, 3]` array.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`] unless there are `height * width * 3` values.
+    /// [`EvalError::BadImage`] unless there are `height * width * 3` values.
     pub fn from_rgb8(rgb: &[u8], height: usize, width: usize) -> Result<Self, EvalError> {
-        let mismatch = EvalError::SizeMismatch { expected: height * width * 3, got: rgb.len() };
-        if rgb.len() != height * width * 3 {
-            return Err(mismatch);
-        }
-        RgbImage::from_raw(width as u32, height as u32, rgb.to_vec()).map(|rgb| Self { rgb }).ok_or(mismatch)
+        let expected = height * width * 3;
+        let image = RgbImage::from_raw(width as u32, height as u32, rgb.to_vec()).filter(|_| rgb.len() == expected);
+        image.map(|rgb| Self { rgb }).ok_or_else(|| EvalError::size_mismatch(expected, rgb.len()))
     }
 
     /// Rounds a `[height, width, 3]` array in [0, 1] to 8 bits; values outside are clamped.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`] unless there are `height * width * 3` values.
+    /// [`EvalError::BadImage`] unless there are `height * width * 3` values.
     pub fn from_unit(values: &[f32], height: usize, width: usize) -> Result<Self, EvalError> {
         let rgb: Vec<u8> = values.iter().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
         Self::from_rgb8(&rgb, height, width)
@@ -120,8 +94,8 @@ impl Canvas {
     }
 
     /// Writes one line of text at column `x` and row `y` (top left corner). Characters beyond Latin-1 become `?`.
-    pub fn write_text(&mut self, text: &str, x: usize, y: usize, size: TextSize, colour: [u8; 3]) {
-        let style = MonoTextStyle::new(size.font(), Rgb888::new(colour[0], colour[1], colour[2]));
+    pub fn write_text(&mut self, text: &str, x: usize, y: usize, font: &MonoFont, colour: [u8; 3]) {
+        let style = MonoTextStyle::new(font, Rgb888::new(colour[0], colour[1], colour[2]));
         let Ok(_) = Text::with_baseline(text, Point::new(x as i32, y as i32), style, Baseline::Top).draw(self);
     }
 
@@ -130,11 +104,9 @@ impl Canvas {
     /// # Errors
     /// For an image without pixels.
     pub fn png(&self) -> std::io::Result<Vec<u8>> {
-        let mut png = Vec::new();
-        image::codecs::png::PngEncoder::new(&mut png)
-            .write_image(&self.rgb, self.rgb.width(), self.rgb.height(), image::ExtendedColorType::Rgb8)
-            .map_err(std::io::Error::other)?;
-        Ok(png)
+        let mut png = std::io::Cursor::new(Vec::new());
+        self.rgb.write_to(&mut png, image::ImageFormat::Png).map_err(std::io::Error::other)?;
+        Ok(png.into_inner())
     }
 
     /// Writes the image as a PNG file, atomically.
@@ -142,11 +114,7 @@ impl Canvas {
     /// # Errors
     /// [`EvalError::Io`] when the folder cannot be written.
     pub fn write_png(&self, path: &Path) -> Result<(), EvalError> {
-        self.png().and_then(|png| replace_file(path, &png)).map_err(|source| EvalError::Io {
-            action: "writing the image",
-            source,
-            path: path.to_owned(),
-        })
+        self.png().and_then(|png| replace_file(path, &png)).map_err(EvalError::io("writing the image", path))
     }
 }
 
@@ -175,8 +143,8 @@ impl DrawTarget for Canvas {
 /// brightest from [`ERROR_FULL_SCALE`] on.
 ///
 /// # Errors
-/// [`EvalError::SizeMismatch`] unless both images hold `height * width * 3` values, and [`EvalError::NotFinite`] for a NaN
-/// or an infinity, which would look like no error.
+/// [`EvalError::BadImage`] unless both images hold `height * width * 3` values, and for a NaN or an infinity, which would
+/// look like no error.
 pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<Canvas, EvalError> {
     check(pred, target, height * width * 3)?;
     let colours: Vec<u8> = pred
@@ -211,6 +179,8 @@ pub fn error_colour(share: f32) -> [u8; 3] {
 
 #[cfg(test)]
 mod tests {
+    use embedded_graphics::mono_font::iso_8859_1::FONT_7X13;
+
     use super::*;
 
     fn lightness([r, g, b]: [u8; 3]) -> f32 {
@@ -255,7 +225,7 @@ mod tests {
     fn png_files_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let mut image = Canvas::new(40, 20, [1, 2, 3]);
-        image.write_text("Hi", 2, 2, TextSize::Small, [255, 255, 255]);
+        image.write_text("Hi", 2, 2, &FONT_7X13, [255, 255, 255]);
         image.write_png(&folder.path().join("a.png")).unwrap();
         let read = image::open(folder.path().join("a.png")).unwrap().to_rgb8();
         assert_eq!(read, image.rgb);

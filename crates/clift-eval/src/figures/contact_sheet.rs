@@ -1,6 +1,9 @@
 //! The contact sheet of a scene: a row per target view, a column per method.
 
-use crate::figures::canvas::{Canvas, ERROR_FULL_SCALE, TextSize, error_colour};
+use embedded_graphics::mono_font::MonoFont;
+use embedded_graphics::mono_font::iso_8859_1::{FONT_7X13 as SMALL, FONT_9X18_BOLD as LARGE};
+
+use crate::figures::canvas::{Canvas, ERROR_FULL_SCALE, error_colour};
 
 const BACKGROUND: [u8; 3] = [250, 250, 248];
 const INK: [u8; 3] = [28, 28, 30];
@@ -39,7 +42,7 @@ pub fn contact_sheet(title: &str, columns: &[&str], rows: &[Row]) -> Canvas {
     let (width, height) = first.map_or((1, 1), |image| (image.width().max(1), image.height().max(1)));
     let factor = MIN_CELL_PX.div_ceil(width);
     let (cell_width, cell_height) = (width * factor, height * factor);
-    let (small, large) = (TextSize::Small.glyph_px().1, TextSize::Large.glyph_px().1);
+    let [small, large] = [SMALL, LARGE].map(|font| font.character_size.height as usize);
 
     let head = MARGIN_PX + large + GAP_PX + small + GAP_PX;
     let row_height = small + GAP_PX / 2 + cell_height + 4 + small + 2 * GAP_PX;
@@ -52,19 +55,19 @@ pub fn contact_sheet(title: &str, columns: &[&str], rows: &[Row]) -> Canvas {
     );
 
     let full_width = canvas.width() - 2 * MARGIN_PX;
-    canvas.write_text(&cut(title, full_width, TextSize::Large), MARGIN_PX, MARGIN_PX, TextSize::Large, INK);
+    canvas.write_text(&cut(title, full_width, &LARGE), MARGIN_PX, MARGIN_PX, &LARGE, INK);
     for (column, title) in columns.iter().enumerate() {
         let x = MARGIN_PX + pitch * column;
-        canvas.write_text(&cut(title, cell_width, TextSize::Small), x, head - small - GAP_PX, TextSize::Small, INK);
+        canvas.write_text(&cut(title, cell_width, &SMALL), x, head - small - GAP_PX, &SMALL, INK);
     }
     for (i, row) in rows.iter().enumerate() {
         let top = head + row_height * i;
-        canvas.write_text(&cut(&row.label, full_width, TextSize::Small), MARGIN_PX, top, TextSize::Small, FAINT);
+        canvas.write_text(&cut(&row.label, full_width, &SMALL), MARGIN_PX, top, &SMALL, FAINT);
         for (column, cell) in row.cells.iter().enumerate() {
             let (x, y) = (MARGIN_PX + pitch * column, top + small + GAP_PX / 2);
             canvas.paste(&tiled(&cell.images, cell_width, cell_height), x, y);
-            let caption = cut(&cell.caption, cell_width, TextSize::Small);
-            canvas.write_text(&caption, x, y + cell_height + 4, TextSize::Small, INK);
+            let caption = cut(&cell.caption, cell_width, &SMALL);
+            canvas.write_text(&caption, x, y + cell_height + 4, &SMALL, INK);
         }
     }
     paint_legend(&mut canvas, head + row_height * rows.len());
@@ -92,21 +95,21 @@ fn tiled(images: &[Canvas], width: usize, height: usize) -> Canvas {
 }
 
 fn paint_legend(canvas: &mut Canvas, y: usize) {
-    let (glyph, height) = TextSize::Small.glyph_px();
+    let [glyph, height] = [SMALL.character_size.width, SMALL.character_size.height].map(|side| side as usize);
     let before = "error 0";
-    canvas.write_text(before, MARGIN_PX, y, TextSize::Small, FAINT);
+    canvas.write_text(before, MARGIN_PX, y, &SMALL, FAINT);
     let bar = LEGEND_PX.saturating_sub(glyph * 18).max(48);
     let x = MARGIN_PX + glyph * (before.len() + 1);
     for i in 0..bar {
         let colour = error_colour(i as f32 / (bar - 1) as f32);
         canvas.paste(&Canvas::new(1, height, colour), x + i, y);
     }
-    canvas.write_text(&format!("{ERROR_FULL_SCALE}"), x + bar + glyph, y, TextSize::Small, FAINT);
+    canvas.write_text(&format!("{ERROR_FULL_SCALE}"), x + bar + glyph, y, &SMALL, FAINT);
 }
 
 /// Shortens text to `width` pixels and marks the cut with `..`.
-fn cut(text: &str, width: usize, size: TextSize) -> String {
-    let fits = width / size.glyph_px().0;
+fn cut(text: &str, width: usize, font: &MonoFont) -> String {
+    let fits = width / font.character_size.width as usize;
     if text.chars().count() <= fits {
         return text.to_owned();
     }
@@ -143,8 +146,8 @@ mod tests {
 
     #[test]
     fn long_text_is_cut_and_sheets_may_be_empty() {
-        assert_eq!(cut("abcdefgh", 7 * 8, TextSize::Small), "abcdefgh");
-        assert_eq!(cut("abcdefghi", 7 * 8, TextSize::Small), "abcdef..");
+        assert_eq!(cut("abcdefgh", 7 * 8, &SMALL), "abcdefgh");
+        assert_eq!(cut("abcdefghi", 7 * 8, &SMALL), "abcdef..");
         assert!(contact_sheet("no rows", &[], &[]).height() > 0);
     }
 }

@@ -8,9 +8,8 @@ use crate::error::EvalError;
 use crate::figures::canvas::{Canvas, error_map};
 use crate::figures::contact_sheet::{Cell, Row, contact_sheet};
 use crate::statistics::view_metrics::{EvalKey, best_method};
-use crate::sweep::rendered_views::ScoredViews;
-use crate::sweep::scene_results::SceneResults;
-use crate::sweep::view_scorer::target_image;
+use crate::sweep::baselines::view_image;
+use crate::sweep::rendered_views::{SceneResults, ScoredViews};
 
 /// Longer side of an image in the report, which holds dozens of images.
 const MAX_SIDE_PX: usize = 128;
@@ -73,7 +72,7 @@ impl SceneFigures {
     /// Makes both figures from the results of a scene with patches of `patch_size` pixels.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`] for results of another clip.
+    /// [`EvalError::BadImage`] for results of another clip.
     pub fn new(clip: &Clip, results: &SceneResults, patch_size: usize) -> Result<Self, EvalError> {
         let views = &results.kept_views;
         let contact_sheet = scene_sheet(clip, &results.renderings, views)?;
@@ -109,7 +108,7 @@ impl SceneFigure {
             grid: [height / patch_size, width / patch_size],
             context: canvases(&clip.context)?.into_iter().map(small).collect(),
             context_frames: clip.context.frame_index.clone(),
-            target: small(Canvas::from_unit(&target_image(&clip.target, view), height, width)?),
+            target: small(Canvas::from_unit(&view_image(&clip.target, view), height, width)?),
             target_frame: clip.target.frame_index[view],
             images,
             clusters,
@@ -152,7 +151,7 @@ fn scene_sheet(clip: &Clip, renderings: &[ScoredViews], views: &[usize]) -> Resu
 
     let mut rows = Vec::new();
     for &view in views {
-        let target = target_image(&clip.target, view);
+        let target = view_image(&clip.target, view);
         let cell = |image: Canvas, caption: String| Cell { images: vec![image], caption };
         let mut cells = vec![
             Cell { images: contexts.clone(), caption: String::new() },

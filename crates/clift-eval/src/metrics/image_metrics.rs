@@ -19,7 +19,7 @@ const SAMPLE_COVARIANCE: f64 = 121.0 / 120.0;
 /// The mean squared error is over all values. Identical images give `+inf`, which counts as 100 dB in means.
 ///
 /// # Errors
-/// [`EvalError::SizeMismatch`], and [`EvalError::NotFinite`] where clamping would hide a NaN or an infinity.
+/// [`EvalError::BadImage`], also where clamping would hide a NaN or an infinity.
 pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, EvalError> {
     check(pred, target, target.len())?;
     let squared_error: f64 = pred
@@ -37,12 +37,10 @@ pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, EvalError> {
 /// images are not clamped.
 ///
 /// # Errors
-/// [`EvalError::ImageTooSmall`] below 11 x 11 pixels, [`EvalError::SizeMismatch`], [`EvalError::NotFinite`].
+/// [`EvalError::BadImage`], also below 11 x 11 pixels.
 pub fn ssim(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<f64, EvalError> {
     check(pred, target, height * width * 3)?;
-    if height < SSIM_MIN_SIZE_PX || width < SSIM_MIN_SIZE_PX {
-        return Err(EvalError::ImageTooSmall { metric: "SSIM", min: SSIM_MIN_SIZE_PX, width, height });
-    }
+    check_size("SSIM", SSIM_MIN_SIZE_PX, height, width)?;
     // Single-threaded (13 ms for 256 x 256): callers have many images to distribute over cores.
     let per_channel = [0, 1, 2].map(|channel| {
         let plane = |image: &[f32]| image.iter().skip(channel).step_by(3).map(|&v| f64::from(v)).collect();
@@ -101,13 +99,23 @@ fn blur(plane: &[f64], width: usize, taps: &[f64; SSIM_MIN_SIZE_PX]) -> Vec<f64>
 pub(crate) fn check(pred: &[f32], target: &[f32], expected: usize) -> Result<(), EvalError> {
     for (image, name) in [(target, "target"), (pred, "prediction")] {
         if image.len() != expected || image.is_empty() {
-            return Err(EvalError::SizeMismatch { expected, got: image.len() });
+            return Err(EvalError::size_mismatch(expected, image.len()));
         }
         if let Some(index) = image.iter().position(|value| !value.is_finite()) {
-            return Err(EvalError::NotFinite { image: name, index, value: image[index] });
+            let reason = format!("the {name} is not finite: value {} at index {index}", image[index]);
+            return Err(EvalError::BadImage { reason });
         }
     }
     Ok(())
+}
+
+/// Refuses an image that is smaller than a metric allows.
+pub(crate) fn check_size(metric: &str, min: usize, height: usize, width: usize) -> Result<(), EvalError> {
+    if height.min(width) >= min {
+        return Ok(());
+    }
+    let reason = format!("{metric} needs at least {min} x {min} pixels, got {width} x {height}");
+    Err(EvalError::BadImage { reason })
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use burn::module::Module;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 
 use crate::error::EvalError;
-use crate::metrics::image_metrics::check;
+use crate::metrics::image_metrics::{check, check_size};
 use crate::metrics::network_file::{NetworkFile, WeightFileSpec};
 use crate::metrics::vgg::{MIN_SIZE_PX, NUM_STAGES, Vgg, VggShape};
 
@@ -70,12 +70,10 @@ impl Lpips {
     /// Computes the features of an image, `[height, width, 3]` in `[0, 1]`; other values are not clamped.
     ///
     /// # Errors
-    /// [`EvalError::SizeMismatch`], [`EvalError::NotFinite`], and [`EvalError::ImageTooSmall`] below 16 x 16 pixels.
+    /// [`EvalError::BadImage`], also below 16 x 16 pixels.
     pub fn features(&self, image: &[f32], height: usize, width: usize) -> Result<LpipsFeatures, EvalError> {
         check(image, image, height * width * 3)?;
-        if height.min(width) < LPIPS_MIN_SIZE_PX {
-            return Err(EvalError::ImageTooSmall { metric: "LPIPS", min: LPIPS_MIN_SIZE_PX, width, height });
-        }
+        check_size("LPIPS", LPIPS_MIN_SIZE_PX, height, width)?;
         let pixels = TensorData::new(image.to_vec(), [1, height, width, 3]);
         let dtype = self.heads[0].dtype();
         let pixels = Tensor::<4>::from_data(pixels, (&self.device, dtype)).permute([0, 3, 1, 2]); // [1, 3, H, W]

@@ -38,7 +38,7 @@ impl NetworkFile {
     /// [`EvalError::BadWeights`] for a file that cannot be read, has another format, or holds values that are not finite
     /// f32.
     pub fn read(path: &Path, wanted: WeightFileSpec) -> Result<Self, EvalError> {
-        let bad = |reason: String| bad_weights(wanted, reason, path);
+        let bad = |reason: String| wanted.bad(reason, path);
         let size = std::fs::metadata(path).map_err(|error| bad(error.to_string()))?.len();
         if size > MAX_BYTES {
             return Err(bad(format!("{size} bytes, expected at most {MAX_BYTES}")));
@@ -68,9 +68,6 @@ impl NetworkFile {
     }
 
     /// Takes a tensor out.
-    ///
-    /// # Errors
-    /// [`EvalError::BadWeights`] for a missing tensor or another shape.
     pub fn take<const D: usize>(
         &mut self,
         name: &str,
@@ -78,33 +75,27 @@ impl NetworkFile {
         (device, dtype): (&Device, DType),
     ) -> Result<Tensor<D>, EvalError> {
         let Some((found, values)) = self.tensors.remove(name) else {
-            return Err(self.bad(format!("{name} is missing")));
+            return Err(self.wanted.bad(format!("{name} is missing"), &self.path));
         };
         if found != shape {
-            return Err(self.bad(format!("{name} has shape {found:?}, expected {shape:?}")));
+            return Err(self.wanted.bad(format!("{name} has shape {found:?}, expected {shape:?}"), &self.path));
         }
         Ok(Tensor::from_data(TensorData::new(values, shape), (device, dtype)))
     }
 
     /// Checks that every tensor was taken, and returns the SHA-256 of the file in 64 hexadecimal digits.
-    ///
-    /// # Errors
-    /// [`EvalError::BadWeights`] with the first tensor that is not part of the network.
     pub fn finish(self) -> Result<String, EvalError> {
         match self.tensors.keys().next() {
             None => Ok(self.sha256),
-            Some(name) => Err(self.bad(format!("{name} is not part of the network"))),
+            Some(name) => Err(self.wanted.bad(format!("{name} is not part of the network"), &self.path)),
         }
-    }
-
-    fn bad(&self, reason: String) -> EvalError {
-        bad_weights(self.wanted, reason, &self.path)
     }
 }
 
-fn bad_weights(wanted: WeightFileSpec, reason: String, path: &Path) -> EvalError {
-    let WeightFileSpec { what, command, .. } = wanted;
-    EvalError::BadWeights { what, reason, command, path: path.into() }
+impl WeightFileSpec {
+    fn bad(self, reason: String, path: &Path) -> EvalError {
+        EvalError::BadWeights { what: self.what, reason, command: self.command, path: path.into() }
+    }
 }
 
 #[cfg(test)]

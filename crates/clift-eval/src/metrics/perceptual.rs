@@ -110,10 +110,18 @@ mod tests {
         (values(loss.inner())[0], values(rendering.grad(&grads).expect("the rendering is tracked")))
     }
 
-    fn largest_difference(a: &[f64], b: &[f64]) -> f64 {
-        assert_eq!(a.len(), b.len());
-        let scale = b.iter().fold(0.0_f64, |scale, value| scale.max(value.abs()));
-        a.iter().zip(b).fold(0.0_f64, |most, (a, b)| most.max((a - b).abs())) / scale
+    /// Checks loss and gradient. Rounding can flip the sign of a difference near zero, and change an entry of the
+    /// gradient. In f32 its tolerance is therefore relative to the largest entry.
+    fn check_fixture(loss: &Perceptual, fixture: &Reference, options: (&Device, DType), tolerances: [f64; 2]) {
+        let tensor = |name: &str| fixture.tensor::<5>(name, options.0, options.1);
+        let (loss, grad) = loss_and_grad(loss, tensor("input.rendering"), tensor("input.target"));
+        let (expected, expected_grad) = (fixture.f64s("output.loss")[0], fixture.f64s("grad.input.rendering"));
+        assert!((loss - expected).abs() <= tolerances[0] * expected, "{loss} is not {expected}");
+        assert_eq!(grad.len(), expected_grad.len());
+        let scale = expected_grad.iter().fold(0.0_f64, |scale, value| scale.max(value.abs()));
+        let error = grad.iter().zip(expected_grad).fold(0.0_f64, |most, (a, b)| most.max((a - b).abs())) / scale;
+        assert!(error <= tolerances[1], "{options:?}: {error:.2e}");
+        println!("loss {loss} for {expected}, largest error of the gradient {error:.2e} of its largest entry");
     }
 
     #[test]
@@ -121,15 +129,8 @@ mod tests {
         let fixture = Reference::open("perceptual");
         for device in [DeviceName::Flex, DeviceName::Ndarray].map(|name| name.open().unwrap()) {
             for (dtype, tolerance) in [(DType::F64, 1e-9), (DType::F32, 1e-4)] {
-                let tensor = |name: &str| fixture.tensor::<5>(name, &device, dtype);
-                let (loss, grad) =
-                    loss_and_grad(&narrow((&device, dtype)), tensor("input.rendering"), tensor("input.target"));
-                let expected = fixture.f64s("output.loss")[0];
-                // Rounding can flip the sign of a difference near zero, and change an entry of the gradient. In f32 the
-                // tolerance is therefore relative to the largest entry.
-                assert!((loss - expected).abs() <= tolerance * 0.1 * expected, "{loss} is not {expected}");
-                let error = largest_difference(&grad, &fixture.f64s("grad.input.rendering"));
-                assert!(error <= tolerance, "{dtype:?}: {error:.2e}");
+                let options = (&device, dtype);
+                check_fixture(&narrow(options), &fixture, options, [tolerance * 0.1, tolerance]);
             }
         }
     }
@@ -171,13 +172,6 @@ mod tests {
         let device = Device::flex();
         let loss = Perceptual::load(&folder.join("vgg19.safetensors"), &device).unwrap();
         let fixture = Reference::read(&folder.join("perceptual.safetensors"));
-        let tensor = |name: &str| fixture.tensor::<5>(name, &device, DType::F32);
-        let (value, grad) = loss_and_grad(&loss, tensor("input.rendering"), tensor("input.target"));
-        let expected = fixture.f64s("output.loss")[0];
-        assert!((value - expected).abs() <= 1e-4 * expected, "{value} is not {expected}");
-        let error = largest_difference(&grad, &fixture.f64s("grad.input.rendering"));
-        // As above: rounding flips signs of differences.
-        assert!(error <= 1e-3, "{error:.2e}");
-        println!("loss {value} for {expected}, largest error of the gradient {error:.2e} of its largest entry");
+        check_fixture(&loss, &fixture, (&device, DType::F32), [1e-4, 1e-3]);
     }
 }

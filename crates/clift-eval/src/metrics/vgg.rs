@@ -103,9 +103,6 @@ pub struct Vgg {
 
 impl Vgg {
     /// Takes the tensors `convS_I.weight` `[out, in, 3, 3]` and `convS_I.bias` out of a file.
-    ///
-    /// # Errors
-    /// As [`NetworkFile::take`].
     pub fn take(file: &mut NetworkFile, shape: VggShape, options: (&Device, DType)) -> Result<Self, EvalError> {
         let mut inputs = 3;
         let mut stages = Vec::new();

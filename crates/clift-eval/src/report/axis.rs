@@ -1,9 +1,10 @@
 //! An axis of a plot: range, ticks, and positions of values.
 
 /// The scale of an axis.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Scale {
     /// Linear.
+    #[default]
     Linear,
     /// Logarithmic; values are positive.
     Log,

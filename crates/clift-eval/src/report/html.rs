@@ -40,9 +40,6 @@ pub fn head(names: &[&str]) -> Markup {
 }
 
 /// Returns an image as a data URI for `src` and `href`.
-///
-/// # Errors
-/// As [`Canvas::png`].
 pub fn data_uri(image: &Canvas) -> io::Result<String> {
     Ok(format!("data:image/png;base64,{}", BASE64_STANDARD.encode(image.png()?)))
 }

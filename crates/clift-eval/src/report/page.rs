@@ -10,10 +10,9 @@ use crate::error::EvalError;
 use crate::figures::scene_figure::SceneFigure;
 use crate::report::axis::{grouped, milliseconds};
 use crate::report::html::{count, number};
-use crate::report::plots::{PlotSection, plot_sections};
+use crate::report::plots::plots;
 use crate::report::{date, scene_section, tables};
 use crate::statistics::summary::{Summary, SummaryPoint};
-use crate::statistics::view_metrics::best_method;
 
 const STYLE: &str = include_str!("style.css");
 
@@ -31,53 +30,53 @@ const FOOTNOTE: &str = "PSNR: images clamped to [0, 1]. SSIM: Gaussian window of
                         VGG-16. Means are over the views of a scene, then over scenes; \u{b1} is the standard error \
                         over scenes. A dash: not measured. Times are of this machine, including other load.";
 
+/// Description of the evaluated run for the report.
+#[derive(Clone, Debug)]
+pub struct RunDescription {
+    /// Name of the run.
+    pub name: String,
+    /// The config of the run, as TOML.
+    pub config: String,
+    /// Name of the device.
+    pub device: String,
+}
+
 /// The content of a report.
 #[derive(Clone, Debug)]
 pub struct Report {
-    /// Name of the evaluated run or model.
-    pub name: String,
+    /// The evaluated run or model.
+    pub run: RunDescription,
     /// Means of all keys.
     pub summary: Summary,
     /// Skipped scenes with their reasons.
     pub skipped: SkipReport,
     /// Figures of scenes; the report has the first [`MAX_FIGURES`].
     pub figures: Vec<SceneFigure>,
-    /// The resolved config as TOML.
-    pub config: String,
-    /// Name of the device.
-    pub device: String,
 }
 
 impl Report {
     /// Writes the report, atomically.
-    ///
-    /// # Errors
-    /// [`EvalError::Io`] when the folder is missing or cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), EvalError> {
-        self.to_html().and_then(|html| replace_file(path, html.as_bytes())).map_err(|source| EvalError::Io {
-            action: "writing the report",
-            source,
-            path: path.to_owned(),
-        })
+        self.to_html()
+            .and_then(|html| replace_file(path, html.as_bytes()))
+            .map_err(EvalError::io("writing the report", path))
     }
 
     /// Returns the page.
-    ///
-    /// # Errors
-    /// As [`crate::figures::canvas::Canvas::png`].
     pub fn to_html(&self) -> io::Result<String> {
+        let RunDescription { name, config, device } = &self.run;
         let page = html! {
             (DOCTYPE)
             html lang="en" {
                 head {
                     meta charset="utf-8";
                     meta name="viewport" content="width=device-width, initial-scale=1";
-                    title { (self.name) " \u{b7} clift evaluation" }
+                    title { (name) " \u{b7} clift evaluation" }
                     style { (PreEscaped(STYLE)) }
                 }
                 body {
                     main {
-                        h1 { (self.name) }
+                        h1 { (name) }
                         p.soft { "clift evaluation, " (date::now()) }
                         (self.headline())
                         (self.quality_and_cost())
@@ -85,9 +84,9 @@ impl Report {
                         (tables::differences(&self.summary.differences))
                         (self.scenes()?)
                         (tables::skipped(self.summary.num_scenes, &self.skipped))
-                        (tables::machine(&self.device))
+                        (tables::machine(device))
                         h2 { "Config" }
-                        details { summary { "Every key, resolved" } pre { (self.config) } }
+                        details { summary { "Every key, resolved" } pre { (config) } }
                         footer { p { (FOOTNOTE) } }
                     }
                 }
@@ -99,20 +98,15 @@ impl Report {
 
     /// Returns the main results.
     fn headline(&self) -> Markup {
-        let Summary { num_scenes, num_views, baselines, points, .. } = &self.summary;
-        let best = best_method(points.iter().map(SummaryPoint::key));
-        let mut whole: Vec<&SummaryPoint> =
-            points.iter().filter(|p| Some(p.method) == best && p.key().is_whole()).collect();
-        // With several formats, the finest.
-        let format = whole.iter().map(|point| point.tokens).min().flatten();
-        whole.retain(|point| point.tokens == format);
+        let Summary { num_scenes, num_views, baselines, .. } = &self.summary;
+        let whole: Vec<&SummaryPoint> = self.summary.best_points().filter(|point| point.key.is_whole()).collect();
         let (first, last) = (whole.first(), whole.last());
-        let tokens = |point: &SummaryPoint| format!("{} tokens", count(point.num_storage_tokens));
+        let tokens = |point: &SummaryPoint| format!("{} tokens", count(point.key.num_storage_tokens));
         let nearest = baselines.nearest_view.psnr;
         html! {
             @if let (Some(first), Some(last)) = (first, last) {
                 p.lead {
-                    (first.method.name()) " reaches " (psnr_at(first))
+                    (first.key.method.name()) " reaches " (psnr_at(first))
                     @if first != last { " and " (psnr_at(last)) }
                     "."
                     @if let Some(gain) = last.psnr.zip(nearest).map(|(psnr, nearest)| psnr - nearest) {
@@ -124,11 +118,11 @@ impl Report {
             dl.tiles {
                 @for point in first.into_iter().chain(last.filter(|_| whole.len() > 1)) {
                     @let error = point.psnr_stderr.map(|error| format!("\u{b1} {error:.2}")).unwrap_or_default();
-                    (tile(&format!("{}, {}", point.method.name(), tokens(point)), &number(point.psnr, 2), "dB", &error))
+                    (tile(&format!("{}, {}", point.key.method.name(), tokens(point)), &number(point.psnr, 2), "dB", &error))
                 }
                 (tile("nearest view", &number(nearest, 2), "dB", "a copy, no model"))
-                @if let Some((point, bytes)) = first.and_then(|point| Some((point, point.scene_bytes?))) {
-                    (tile("a scene file", &grouped(bytes as f64 / 1e3, 1), "kB", &tokens(point)))
+                @if let Some((point, kb)) = first.and_then(|point| Some((point, point.cost.scene_kb()?))) {
+                    (tile("a scene file", &grouped(kb, 1), "kB", &tokens(point)))
                 }
                 @if let Some((point, seconds)) = last.and_then(|point| Some((point, point.frame_median_s?))) {
                     (tile("a frame", &milliseconds(seconds), "ms", &tokens(point)))
@@ -144,11 +138,11 @@ impl Report {
         html! {
             h2 { "Quality and cost" }
             div.figures {
-                @for PlotSection { heading, plot, note } in plot_sections(&self.summary) {
+                @for plot in plots(&self.summary) {
                     section {
-                        h3 { (heading) }
+                        h3 { (plot.heading) }
                         (plot.to_html())
-                        @if !note.is_empty() { p.note { (note) } }
+                        @if !plot.note.is_empty() { p.note { (plot.note) } }
                     }
                 }
             }
@@ -184,7 +178,7 @@ impl Report {
 }
 
 fn psnr_at(point: &SummaryPoint) -> Markup {
-    html! { strong { (number(point.psnr, 2)) " dB" } " with " (count(point.num_storage_tokens)) " stored tokens" }
+    html! { strong { (number(point.psnr, 2)) " dB" } " with " (count(point.key.num_storage_tokens)) " stored tokens" }
 }
 
 fn tile(name: &str, value: &str, unit: &str, more: &str) -> Markup {

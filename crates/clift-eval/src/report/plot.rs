@@ -1,4 +1,4 @@
-//! A plot as inline SVG: points with error bars, joined or not, over two axes. The style sheet has the colours.
+//! A plot of PSNR as inline SVG: points with error bars, joined or not, over two axes. The style sheet has the colours.
 
 use std::fmt::Write;
 
@@ -17,7 +17,6 @@ const BOTTOM: f64 = 48.0;
 /// Colour and marker of a series. The marker identifies a series without colour.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Look {
-    /// Class of the style sheet.
     pub class: &'static str,
     /// Path of the marker around (0, 0).
     pub marker: &'static str,
@@ -44,26 +43,20 @@ impl Look {
 /// One measured point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mark {
-    /// Value on the horizontal axis.
     pub x: f64,
-    /// Value on the vertical axis.
     pub y: f64,
     /// Half the length of the error bar.
     pub error: Option<f64>,
-    /// Tooltip.
     pub title: String,
 }
 
 /// Marks with one look and one legend entry.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Series {
-    /// Name in the legend.
     pub name: String,
-    /// Colour and marker.
     pub look: Look,
     /// Whether a line joins the marks, in their order.
     pub is_joined: bool,
-    /// The marks.
     pub marks: Vec<Mark>,
 }
 
@@ -79,22 +72,22 @@ pub struct Level {
 }
 
 /// A plot over two axes.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Plot {
+    pub heading: &'static str,
     /// Description for screen readers.
     pub title: String,
     /// Label of the horizontal axis, with its unit.
     pub x_label: &'static str,
     /// Scale of the horizontal axis.
     pub x_scale: Scale,
-    /// Label of the vertical axis, with its unit.
-    pub y_label: &'static str,
     /// Series of marks. The first series is on top.
     pub series: Vec<Series>,
-    /// Horizontal lines.
     pub levels: Vec<Level>,
     /// Points of the Pareto front by ascending x, joined as a staircase; may be empty.
     pub front: Vec<(f64, f64)>,
+    /// Note below the plot; may be empty.
+    pub note: &'static str,
 }
 
 impl Plot {
@@ -131,7 +124,7 @@ impl Plot {
                 }
                 text.label x=(middle_x) y=(HEIGHT - 8.0) text-anchor="middle" { (self.x_label) }
                 text.label transform=(format!("translate(14 {middle_y}) rotate(-90)")) text-anchor="middle" {
-                    (self.y_label)
+                    "PSNR, dB"
                 }
                 @for Level { class, y: level, .. } in &self.levels {
                     path class={ "level " (class) } d=(format!("M{LEFT} {:.1}H{right}", y(*level))) {}
@@ -231,10 +224,10 @@ mod tests {
             title: "quality & tokens".into(),
             x_label: "tokens",
             x_scale: Scale::LogValues,
-            y_label: "PSNR, dB",
             series: vec![series],
             levels: vec![Level { name: "nearest view".into(), class: "nearest", y: 12.0 }],
             front: vec![(8.0, 14.0), (16.0, 18.0)],
+            ..Plot::default()
         }
     }
 

@@ -12,7 +12,7 @@ use crate::figures::scene_figure::{FigureImage, FigureTokens, SceneFigure};
 use crate::report::axis::grouped;
 use crate::report::html::data_uri;
 use crate::statistics::view_metrics::{EvalKey, best_method};
-use crate::sweep::scene_results::spread;
+use crate::sweep::rendered_views::spread;
 
 /// Largest number of token counts per method on the page.
 const MAX_COUNTS: usize = 4;

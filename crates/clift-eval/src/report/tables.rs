@@ -62,10 +62,10 @@ pub fn points(summary: &Summary) -> Markup {
                         }
                     }
                     @for (i, point) in points.iter().enumerate() {
-                        @let is_first = i == 0 || points[i - 1].method != point.method;
+                        @let is_first = i == 0 || points[i - 1].key.method != point.key.method;
                         @let is_front = point.pareto_time || point.pareto_bytes;
                         tr.first[is_first].front-row[is_front] {
-                            td { (point.method.name()) }
+                            td { (point.key.method.name()) }
                             @for cell in cells(point) { td { (cell) } }
                         }
                     }
@@ -91,9 +91,9 @@ fn cells(point: &SummaryPoint) -> [String; 16] {
     let ms = |seconds: Option<f64>| seconds.map_or_else(|| DASH.into(), milliseconds);
     let dot = |is_front: bool| if is_front { "\u{25cf}".to_owned() } else { String::new() };
     [
-        tokens(point.num_storage_tokens),
-        tokens(point.num_render_tokens),
-        point.tokens.map_or(DASH, TokenFormat::name).to_owned(),
+        tokens(point.key.num_storage_tokens),
+        tokens(point.key.num_render_tokens),
+        point.key.tokens.map_or(DASH, TokenFormat::name).to_owned(),
         number(point.psnr, 2),
         number(point.psnr_stderr, 2),
         number(point.ssim, 3),
@@ -102,9 +102,9 @@ fn cells(point: &SummaryPoint) -> [String; 16] {
         ms(point.render_p95_s),
         ms(point.frame_median_s),
         ms(point.frame_p95_s),
-        number(point.gflops, if point.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }),
-        number(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
-        number(point.peak_bytes.map(|bytes| bytes as f64 / 1e6), 0),
+        number(point.cost.gflops, point.cost.gflops_decimals()),
+        number(point.cost.scene_kb(), 1),
+        number(point.cost.peak_bytes.map(|bytes| bytes as f64 / 1e6), 0),
         dot(point.pareto_time),
         dot(point.pareto_bytes),
     ]

@@ -7,8 +7,8 @@ use clift_data::{mean, standard_error};
 use serde::{Deserialize, Serialize};
 
 use crate::error::EvalError;
-use crate::statistics::scene_means::capped;
 use crate::statistics::student_t::t_quantile_95;
+use crate::statistics::view_metrics::PSNR_CAP_DB;
 
 /// Compared metrics.
 const METRICS: [&str; 3] = ["psnr", "ssim", "lpips_vgg"];
@@ -75,7 +75,7 @@ impl Evaluation {
                 num_render_tokens: row.num_render_tokens,
                 tokens: row.tokens,
             };
-            let psnr = row.psnr.map(capped);
+            let psnr = row.psnr.map(|psnr| psnr.min(PSNR_CAP_DB));
             views.entry(key).or_default().insert((row.scene, row.target_frame), [psnr, row.ssim, row.lpips_vgg]);
         }
         Ok(Self { path: path.into(), views })

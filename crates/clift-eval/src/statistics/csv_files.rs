@@ -6,7 +6,6 @@ use clift_data::{mean, replace_file};
 
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::scene_means::capped;
 use crate::statistics::view_metrics::ViewMetrics;
 
 const VIEW_COLUMNS: [&str; 11] = [
@@ -27,9 +26,6 @@ const SCENE_COLUMNS: [&str; 9] =
     ["scene", "variant", "num_storage_tokens", "num_render_tokens", "tokens", "num_views", "psnr", "ssim", "lpips_vgg"];
 
 /// Writes `views.csv`: a row per key and view, baselines included. An identical image has the PSNR `inf`.
-///
-/// # Errors
-/// [`EvalError::Io`] when the file cannot be written.
 pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
     let rows = results.views().flat_map(|(key, scenes)| {
         let views = scenes.iter().flat_map(|(scene, frames)| frames.iter().map(move |view| (scene, view)));
@@ -53,9 +49,6 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
 }
 
 /// Writes `scenes.csv`: a row per key and scene, baselines included, with means over the views of the scene.
-///
-/// # Errors
-/// [`EvalError::Io`] when the file cannot be written.
 pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError> {
     let rows = results.views().flat_map(|(key, scenes)| {
         scenes.iter().map(move |(scene, views)| {
@@ -69,7 +62,7 @@ pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError>
                 key.num_render_tokens.to_string(),
                 key.format_name().into(),
                 views.len().to_string(),
-                mean_of(|view| Some(capped(view.psnr))),
+                mean_of(|view| Some(view.capped_psnr())),
                 mean_of(|view| view.ssim),
                 mean_of(|view| view.lpips_vgg),
             ]
@@ -97,26 +90,19 @@ fn write<const N: usize>(
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenFormat;
-
     use super::*;
     use crate::config::method::Method;
     use crate::statistics::view_metrics::EvalKey;
+    use crate::testing::CLIFT;
 
     #[test]
     fn rows_have_a_fixed_order() {
-        let key = EvalKey {
-            method: Method::Clift,
-            num_storage_tokens: 64,
-            num_render_tokens: 32,
-            tokens: Some(TokenFormat::F16),
-        };
         let measured =
             |psnr, lpips_vgg| ViewMetrics { lpips_vgg, render_s: Some(0.25), ..ViewMetrics::quality(psnr, Some(0.5)) };
         let rows = [
-            ("room, \"big\"", 3, key, measured(f64::INFINITY, None)),
-            ("attic", 9, key, measured(20.0, Some(0.25))),
-            ("attic", 2, key, measured(23.0, Some(0.75))),
+            ("room, \"big\"", 3, CLIFT, measured(f64::INFINITY, None)),
+            ("attic", 9, CLIFT, measured(20.0, Some(0.25))),
+            ("attic", 2, CLIFT, measured(23.0, Some(0.75))),
             ("attic", 9, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.5, None)),
         ];
         let views = "\

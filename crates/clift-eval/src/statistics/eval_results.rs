@@ -26,8 +26,9 @@ pub type SceneViews = BTreeMap<String, BTreeMap<usize, ViewMetrics>>;
 #[derive(Clone, Debug, Default)]
 pub struct EvalResults {
     views: BTreeMap<EvalKey, SceneViews>,
-    costs: BTreeMap<EvalKey, Cost>,
-    warm: BTreeSet<EvalKey>,
+    /// Cost of every key of which a warm-up view was rendered, and of external methods.
+    pub(crate) costs: BTreeMap<EvalKey, Cost>,
+    /// Keys of the skipped scenes.
     pub(crate) skipped: BTreeSet<String>,
     pub(crate) not_measured: Vec<NotMeasured>,
     pub(crate) missing: BTreeMap<MethodName, BTreeSet<String>>,
@@ -72,31 +73,10 @@ impl EvalResults {
         self.views.get(&key)
     }
 
-    /// Returns the cost of one key.
-    pub fn cost(&self, key: EvalKey) -> Cost {
-        self.costs.get(&key).copied().unwrap_or_default()
-    }
-
     /// Records the size of a scene file. The largest size counts, since scenes can have different numbers of context views.
     pub fn add_scene_bytes(&mut self, key: EvalKey, bytes: u64) {
         let cost = self.costs.entry(key).or_default();
         cost.scene_bytes = cost.scene_bytes.max(Some(bytes));
-    }
-
-    /// Records the multiply-accumulates of rendering a view, in billions.
-    pub fn add_gflops(&mut self, key: EvalKey, gflops: f64) {
-        self.costs.entry(key).or_default().gflops = Some(gflops);
-    }
-
-    /// Returns whether a warm-up view of a key has been rendered.
-    pub(crate) fn is_warm(&self, key: EvalKey) -> bool {
-        self.warm.contains(&key)
-    }
-
-    /// Records the warm-up view of a key, with its peak memory.
-    pub(crate) fn set_warm(&mut self, key: EvalKey, peak_bytes: Option<u64>) {
-        self.warm.insert(key);
-        self.costs.entry(key).or_default().peak_bytes = peak_bytes;
     }
 
     /// Records why a metric is not measured.
@@ -108,26 +88,12 @@ impl EvalResults {
     pub fn record_missing_image(&mut self, method: MethodName, image: String) {
         self.missing.entry(method).or_default().insert(image);
     }
-
-    /// Records a skipped scene.
-    pub fn skip(&mut self, scene: &str) {
-        self.skipped.insert(scene.to_owned());
-    }
 }
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenFormat;
-
     use super::*;
-    use crate::config::method::Method;
-
-    const CLIFT: EvalKey = EvalKey {
-        method: Method::Clift,
-        num_storage_tokens: 64,
-        num_render_tokens: 32,
-        tokens: Some(TokenFormat::F16),
-    };
+    use crate::testing::CLIFT;
 
     #[test]
     fn duplicate_views_are_refused() {

@@ -2,7 +2,6 @@
 //!
 //! - `view_metrics`: `EvalKey`, `ViewMetrics`, `Cost`
 //! - `eval_results`: metrics of every view
-//! - `scene_means`: mean per scene, then over scenes
 //! - `student_t`: Student's t quantile
 //! - `pareto`: Pareto front
 //! - `paired`: paired differences of methods
@@ -18,7 +17,6 @@ pub(crate) mod csv_files;
 pub(crate) mod eval_results;
 pub(crate) mod paired;
 pub(crate) mod pareto;
-pub(crate) mod scene_means;
 pub(crate) mod student_t;
 pub(crate) mod summary;
 pub(crate) mod table;

@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
 use crate::statistics::eval_results::{EvalResults, SceneViews};
-use crate::statistics::scene_means::capped;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 
 /// Pairs of methods, the better method of the paper first (section 4.3).
@@ -70,7 +69,7 @@ fn scene_differences(better: &SceneViews, other: &SceneViews) -> Vec<f64> {
     let of_scene = |(scene, views): (&String, &BTreeMap<usize, ViewMetrics>)| {
         let others = other.get(scene)?;
         let pairs = views.iter().filter_map(|(frame, view)| Some((view, others.get(frame)?)));
-        mean(&pairs.map(|(view, against)| capped(view.psnr) - capped(against.psnr)).collect::<Vec<_>>())
+        mean(&pairs.map(|(view, against)| view.capped_psnr() - against.capped_psnr()).collect::<Vec<_>>())
     };
     better.iter().filter_map(of_scene).collect()
 }
@@ -78,10 +77,7 @@ fn scene_differences(better: &SceneViews, other: &SceneViews) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn key(method: Method, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
-        EvalKey { method, num_storage_tokens, num_render_tokens, tokens: Some(TokenFormat::F32) }
-    }
+    use crate::testing::f32_key as key;
 
     fn differences_of(rows: &[(&str, usize, EvalKey, f64)]) -> Vec<PairedDifference> {
         let mut results = EvalResults::default();

@@ -7,7 +7,6 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use clift_data::{mean, median, p95, replace_file, standard_error};
-use clift_model::TokenFormat;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
@@ -16,8 +15,7 @@ use crate::error::EvalError;
 use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
-use crate::statistics::scene_means::{capped, scene_means};
-use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
+use crate::statistics::view_metrics::{Cost, EvalKey, ViewMetrics, best_method};
 
 /// Means of a baseline.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -42,15 +40,9 @@ pub struct Baselines {
 /// Means of one key; `null` where nothing was measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SummaryPoint {
-    /// The method.
-    #[serde(rename = "variant")]
-    pub method: Method,
-    /// Tokens in the scene file.
-    pub num_storage_tokens: usize,
-    /// Tokens of a rendering.
-    pub num_render_tokens: usize,
-    /// Number format of the stored tokens.
-    pub tokens: Option<TokenFormat>,
+    /// Method, token counts and number format.
+    #[serde(flatten)]
+    pub key: EvalKey,
     /// Measured views; below the views of the evaluation only for an external method with missing images.
     pub num_views: usize,
     /// Mean over scenes of the scene's mean PSNR, in dB.
@@ -59,7 +51,7 @@ pub struct SummaryPoint {
     pub psnr_stderr: Option<f64>,
     /// Mean PSNR over all views, in dB. Equals `psnr` if all scenes have the same number of views.
     pub psnr_per_view: Option<f64>,
-    /// Views whose PSNR is infinite, counted as [`crate::statistics::scene_means::PSNR_CAP_DB`] in the means.
+    /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
     pub num_identical_views: usize,
     /// Mean over scenes of the scene's mean SSIM.
     pub ssim: Option<f64>,
@@ -81,12 +73,9 @@ pub struct SummaryPoint {
     pub frame_median_s: Option<f64>,
     /// 95th percentile of the time per frame, in seconds.
     pub frame_p95_s: Option<f64>,
-    /// Billions of multiply-accumulates per rendered view, attention included.
-    pub gflops: Option<f64>,
-    /// Bytes of a scene file, or the given data size of an external method.
-    pub scene_bytes: Option<u64>,
-    /// Peak resident memory of the process, weights included, while a view was rendered; on CPUs only.
-    pub peak_bytes: Option<u64>,
+    /// Multiply-accumulates, bytes and memory.
+    #[serde(flatten)]
+    pub cost: Cost,
     /// Whether no other point is as good in PSNR for as little time per frame (`frame_median_s`).
     pub pareto_time: bool,
     /// Whether no other point is as good in PSNR for as few bytes (`scene_bytes`).
@@ -166,6 +155,14 @@ impl Summary {
         }
     }
 
+    /// Returns the points of the main method in its finest number format.
+    pub(crate) fn best_points(&self) -> impl Iterator<Item = &SummaryPoint> {
+        let best = best_method(self.points.iter().map(|point| point.key));
+        let of_best = self.points.iter().filter(move |point| Some(point.key.method) == best);
+        let format = of_best.clone().map(|point| point.key.tokens).min().flatten();
+        of_best.filter(move |point| point.key.tokens == format)
+    }
+
     /// Writes `summary.json`.
     ///
     /// # Errors
@@ -178,10 +175,15 @@ impl Summary {
     }
 }
 
+/// Returns the mean over the views of each scene, for the scenes that have a value.
+fn scene_means(views: &SceneViews, value: fn(&ViewMetrics) -> Option<f64>) -> Vec<f64> {
+    views.values().filter_map(|frames| mean(&frames.values().filter_map(value).collect::<Vec<_>>())).collect()
+}
+
 impl Quality {
     fn new(views: &SceneViews) -> Self {
         Self {
-            psnr: mean(&scene_means(views, |view| Some(capped(view.psnr)))),
+            psnr: mean(&scene_means(views, |view| Some(view.capped_psnr()))),
             ssim: mean(&scene_means(views, |view| view.ssim)),
             lpips_vgg: mean(&scene_means(views, |view| view.lpips_vgg)),
         }
@@ -197,16 +199,12 @@ impl SummaryPoint {
         };
         let statistic = |values: &[f64], statistic: fn(&[f64]) -> f64| (!values.is_empty()).then(|| statistic(values));
         let (render_s, frame_s) = (values(|view| view.render_s), values(ViewMetrics::frame_s));
-        let cost = results.cost(key);
         Self {
-            method: key.method,
-            num_storage_tokens: key.num_storage_tokens,
-            num_render_tokens: key.num_render_tokens,
-            tokens: key.tokens,
+            key,
             num_views: views.len(),
             psnr,
-            psnr_stderr: standard_error(&scene_means(scenes, |view| Some(capped(view.psnr)))),
-            psnr_per_view: mean(&values(|view| Some(capped(view.psnr)))),
+            psnr_stderr: standard_error(&scene_means(scenes, |view| Some(view.capped_psnr()))),
+            psnr_per_view: mean(&values(|view| Some(view.capped_psnr()))),
             num_identical_views: views.iter().filter(|view| view.psnr == f64::INFINITY).count(),
             ssim,
             ssim_per_view: mean(&values(|view| view.ssim)),
@@ -218,18 +216,10 @@ impl SummaryPoint {
             select_s: mean(&values(|view| view.select_s)),
             frame_median_s: statistic(&frame_s, median),
             frame_p95_s: statistic(&frame_s, p95),
-            gflops: cost.gflops,
-            scene_bytes: cost.scene_bytes,
-            peak_bytes: cost.peak_bytes,
+            cost: results.costs.get(&key).copied().unwrap_or_default(),
             pareto_time: false,
             pareto_bytes: false,
         }
-    }
-
-    /// Returns the key of the point.
-    pub(crate) const fn key(&self) -> EvalKey {
-        let Self { method, num_storage_tokens, num_render_tokens, tokens, .. } = *self;
-        EvalKey { method, num_storage_tokens, num_render_tokens, tokens }
     }
 }
 
@@ -241,7 +231,7 @@ fn mark_fronts(points: &mut [SummaryPoint]) {
     for i in of(points, |point| point.frame_median_s) {
         points[i].pareto_time = true;
     }
-    for i in of(points, |point| point.scene_bytes.map(|bytes| bytes as f64)) {
+    for i in of(points, |point| point.cost.scene_bytes.map(|bytes| bytes as f64)) {
         points[i].pareto_bytes = true;
     }
 }
@@ -249,18 +239,12 @@ fn mark_fronts(points: &mut [SummaryPoint]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const KEY: EvalKey = EvalKey {
-        method: Method::Clift,
-        num_storage_tokens: 64,
-        num_render_tokens: 32,
-        tokens: Some(TokenFormat::F16),
-    };
+    use crate::testing::CLIFT;
 
     fn results(views: &[(&str, usize, f64)]) -> EvalResults {
         let mut results = EvalResults::default();
         for &(scene, frame, psnr) in views {
-            results.add(scene, frame, KEY, ViewMetrics::quality(psnr, Some(psnr / 100.0))).unwrap();
+            results.add(scene, frame, CLIFT, ViewMetrics::quality(psnr, Some(psnr / 100.0))).unwrap();
         }
         results
     }
@@ -288,10 +272,9 @@ mod tests {
     fn the_file_has_the_documented_names() {
         let mut views = results(&[("a", 0, 20.0)]);
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
-        views.add_gflops(KEY, 2.5);
-        views.add_scene_bytes(KEY, 99_000);
-        views.set_warm(KEY, Some(1 << 20));
-        views.skip("c");
+        let cost = Cost { gflops: Some(2.5), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) };
+        views.costs.insert(CLIFT, cost);
+        views.skipped.insert("c".into());
         views.note_not_measured("lpips_vgg", "no weights".into());
         let folder = tempfile::tempdir().unwrap();
         let summary = Summary::new(&views);
@@ -332,7 +315,7 @@ mod tests {
             let ms = if frame == 7 { 100.0 } else { 1.0 + frame as f64 };
             let measured =
                 ViewMetrics { render_s: Some(ms * 1e-3), select_s: Some(0.5), ..ViewMetrics::quality(20.0, None) };
-            views.add("a", frame, KEY, measured).unwrap();
+            views.add("a", frame, CLIFT, measured).unwrap();
         }
         let point = Summary::new(&views).points.remove(0);
         let near = |got: Option<f64>, expected: f64| (got.unwrap() - expected).abs() < 1e-12;
@@ -347,13 +330,13 @@ mod tests {
         let mut views = EvalResults::default();
         // (stored, dB, ms, bytes): the second is slower and worse than the first but smaller than the third.
         for (stored, psnr, ms, bytes) in [(8, 20.0, 1.0, 900), (4, 19.0, 2.0, 400), (16, 22.0, 3.0, 1600)] {
-            let key = EvalKey { num_storage_tokens: stored, ..KEY };
+            let key = EvalKey { num_storage_tokens: stored, ..CLIFT };
             let measured = ViewMetrics { render_s: Some(ms * 1e-3), ..ViewMetrics::quality(psnr, None) };
             views.add("a", 0, key, measured).unwrap();
             views.add_scene_bytes(key, bytes);
         }
         let points = Summary::new(&views).points;
-        let marks: Vec<_> = points.iter().map(|p| (p.num_storage_tokens, p.pareto_time, p.pareto_bytes)).collect();
+        let marks: Vec<_> = points.iter().map(|p| (p.key.num_storage_tokens, p.pareto_time, p.pareto_bytes)).collect();
         assert_eq!(marks, [(4, false, true), (8, true, true), (16, true, true)]);
     }
 }

@@ -31,7 +31,7 @@ impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
         writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes skipped\n")?;
-        let names = points.iter().map(|point| point.method.name().chars().count());
+        let names = points.iter().map(|point| point.key.method.name().chars().count());
         let width = names.chain([Method::NearestView.name().len()]).max().unwrap_or_default();
         let mut row = |name: &str, cells: [String; 12], mark: &str| {
             write!(f, "{name:<width$}")?;
@@ -52,9 +52,9 @@ impl fmt::Display for Summary {
             let count = |count: usize| if count == 0 { cell(None, 0) } else { count.to_string() };
             let ms = |seconds: Option<f64>| cell(seconds.map(|seconds| seconds * 1e3), 1);
             let cells = [
-                count(point.num_storage_tokens),
-                count(point.num_render_tokens),
-                point.tokens.map_or("-", TokenFormat::name).to_owned(),
+                count(point.key.num_storage_tokens),
+                count(point.key.num_render_tokens),
+                point.key.tokens.map_or("-", TokenFormat::name).to_owned(),
                 cell(point.psnr, 2),
                 cell(point.psnr_stderr, 2),
                 cell(point.ssim, 3),
@@ -62,8 +62,8 @@ impl fmt::Display for Summary {
                 ms(point.render_median_s),
                 ms(point.frame_median_s),
                 ms(point.frame_p95_s),
-                cell(point.gflops, if point.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }),
-                cell(point.scene_bytes.map(|bytes| bytes as f64 / 1e3), 1),
+                cell(point.cost.gflops, point.cost.gflops_decimals()),
+                cell(point.cost.scene_kb(), 1),
             ];
             let mark = match (point.pareto_time, point.pareto_bytes) {
                 (true, true) => " tb",
@@ -71,7 +71,7 @@ impl fmt::Display for Summary {
                 (false, true) => "  b",
                 (false, false) => "",
             };
-            row(point.method.name(), cells, mark)?;
+            row(point.key.method.name(), cells, mark)?;
         }
         if points.iter().any(|point| point.pareto_time || point.pareto_bytes) {
             writeln!(f, "\nt: no other point has this PSNR in this time per frame (median); b: in as few bytes")?;
@@ -111,17 +111,13 @@ mod tests {
     use crate::config::method::{Method, MethodName};
     use crate::statistics::eval_results::EvalResults;
     use crate::statistics::summary::Summary;
-    use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
+    use crate::statistics::view_metrics::{Cost, EvalKey, ViewMetrics};
+    use crate::testing::CLIFT;
 
     #[test]
     fn table_columns_are_aligned() {
         let mut views = EvalResults::default();
-        let key = EvalKey {
-            method: Method::Clift,
-            num_storage_tokens: 64,
-            num_render_tokens: 32,
-            tokens: Some(TokenFormat::Int8),
-        };
+        let key = EvalKey { tokens: Some(TokenFormat::Int8), ..CLIFT };
         for (scene, psnr, ms) in [("a", 20.0, 1.0), ("b", 21.0, 2.0)] {
             let measured = ViewMetrics {
                 render_s: Some(ms * 1e-3),
@@ -135,8 +131,8 @@ mod tests {
         views.add("a", 0, other, ViewMetrics { lpips_vgg: Some(0.25), ..ViewMetrics::quality(19.0, None) }).unwrap();
         views.record_missing_image(name, "b/000000.png".into());
         views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
-        views.add_gflops(key, 45.23);
-        views.add_scene_bytes(key, 99_000);
+        let cost = Cost { gflops: Some(45.23), scene_bytes: Some(99_000), peak_bytes: None };
+        views.costs.insert(key, cost);
         views.note_not_measured("lpips_vgg", "no weights".into());
         let expected = "\
 2 views of 2 scenes, 0 scenes skipped

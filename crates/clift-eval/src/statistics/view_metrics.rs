@@ -3,14 +3,16 @@
 use std::collections::BTreeSet;
 
 use clift_model::TokenFormat;
+use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
 
 /// The key that views are averaged under: method, token counts and number format. Keys are ordered as in the files: by
 /// method, then by ascending token counts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct EvalKey {
     /// The method.
+    #[serde(rename = "variant")]
     pub method: Method,
     /// Tokens in the scene file; 0 for a baseline.
     pub num_storage_tokens: usize,
@@ -45,6 +47,12 @@ pub(crate) fn best_method(keys: impl IntoIterator<Item = EvalKey>) -> Option<Met
         .find(|method| found.contains(method))
 }
 
+/// Upper bound of a PSNR in a mean, in dB, for identical images with their infinite PSNR.
+///
+/// A mean cannot hold infinity, nor can JSON. A single wrong 8-bit level in a 256 x 256 image has 101 dB, so the bound
+/// affects no real difference. Skipping identical views would lower the mean of the better method.
+pub const PSNR_CAP_DB: f64 = 100.0;
+
 /// The metrics of one view; `None` was not measured.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ViewMetrics {
@@ -61,6 +69,11 @@ pub struct ViewMetrics {
 }
 
 impl ViewMetrics {
+    /// Returns the PSNR as it counts in a mean, at most [`PSNR_CAP_DB`].
+    pub fn capped_psnr(&self) -> f64 {
+        self.psnr.min(PSNR_CAP_DB)
+    }
+
     /// Returns the time per frame: token selection, if any, and rendering.
     pub fn frame_s(&self) -> Option<f64> {
         self.render_s.map(|render_s| render_s + self.select_s.unwrap_or_default())
@@ -73,14 +86,26 @@ impl ViewMetrics {
 }
 
 /// Cost of a key, the same for every view; `None` was not computed.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
     /// Bytes of a scene file, or the given data size of an external method.
     pub scene_bytes: Option<u64>,
-    /// Peak memory of the process while a view was rendered.
+    /// Peak resident memory of the process, weights included, while a view was rendered; on CPUs only.
     pub peak_bytes: Option<u64>,
+}
+
+impl Cost {
+    /// Returns the size of a scene file in kB.
+    pub fn scene_kb(&self) -> Option<f64> {
+        self.scene_bytes.map(|bytes| bytes as f64 / 1e3)
+    }
+
+    /// Returns the number of decimals of `gflops` in tables.
+    pub fn gflops_decimals(&self) -> usize {
+        if self.gflops.is_some_and(|gflops| gflops < 10.0) { 3 } else { 1 }
+    }
 }
 
 #[cfg(test)]

@@ -11,9 +11,6 @@ const TIE: f64 = 1e-9;
 /// Finds the context view whose camera centre is nearest to the target's.
 ///
 /// Ties go to the smaller rotation angle, then to the lower index.
-///
-/// # Errors
-/// [`EvalError::NoContext`] when `context_c2w` is empty.
 pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, EvalError> {
     let distances: Vec<f64> = context_c2w.iter().map(|c2w| c2w.translation.distance(target_c2w.translation)).collect();
     let nearest = distances.iter().copied().reduce(f64::min).ok_or(EvalError::NoContext)?;
@@ -26,20 +23,18 @@ pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, Eva
     Ok(near[first])
 }
 
+/// Returns the image of a view, `[height, width, 3]` in `[0, 1]`.
+pub(crate) fn view_image(views: &ClipViews, view: usize) -> Vec<f32> {
+    let len = views.height * views.width * 3;
+    views.images[view * len..][..len].iter().map(|&value| f32::from(value) / 255.0).collect()
+}
+
 /// Returns the image of the nearest context view, `[height, width, 3]` in [0, 1].
-///
-/// # Errors
-/// [`EvalError::NoContext`] without context views.
 pub fn nearest_image(context: &ClipViews, target_c2w: Pose) -> Result<Vec<f32>, EvalError> {
-    let nearest = nearest_view(&context.c2w, target_c2w)?;
-    let size = context.height * context.width * 3;
-    Ok(context.images[nearest * size..][..size].iter().map(|&value| f32::from(value) / 255.0).collect())
+    Ok(view_image(context, nearest_view(&context.c2w, target_c2w)?))
 }
 
 /// Returns the mean of the context images, `[height, width, 3]` in [0, 1].
-///
-/// # Errors
-/// [`EvalError::NoContext`] without context views.
 pub fn mean_image(context: &ClipViews) -> Result<Vec<f32>, EvalError> {
     if context.num_views() == 0 {
         return Err(EvalError::NoContext);

@@ -9,12 +9,11 @@ use clift_model::{Cameras, FlopConvention, SceneModel, scene_file_bytes};
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::view_metrics::EvalKey;
+use crate::statistics::view_metrics::{Cost, EvalKey};
 use crate::sweep::compressed_tokens::{CompressedTokens, select_tokens};
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
-use crate::sweep::rendered_views::{ScoredViews, baselines};
-use crate::sweep::scene_results::{SceneResults, kept_views};
+use crate::sweep::rendered_views::{MAX_KEPT_VIEWS, SceneResults, ScoredViews, baselines, spread};
 use crate::sweep::sweep::{Sweep, render_counts};
 use crate::sweep::token_choice::{SelectedTokens, select_for_views};
 use crate::sweep::view_scorer::ViewScorer;
@@ -28,7 +27,7 @@ use crate::upload::{upload_cameras, upload_views};
 ///
 /// # Errors
 /// [`BadTokenCount`](clift_model::ModelError::BadTokenCount) for a count above the tokens of the scene,
-/// [`EvalError::NotFinite`] for a rendering with a NaN or an infinity, and the errors of the model.
+/// [`EvalError::BadImage`] for a rendering with a NaN or an infinity, and the errors of the model.
 pub fn evaluate_scene(
     models: &EvalModels,
     clip: &Clip,
@@ -50,7 +49,7 @@ pub fn evaluate_scene(
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
     let views = (clip.context.num_views(), grid);
-    let kept_views = if keep_images { kept_views(clip.target.num_views()) } else { Vec::new() };
+    let kept_views = if keep_images { spread(clip.target.num_views(), MAX_KEPT_VIEWS) } else { Vec::new() };
     let keep_images = !kept_views.is_empty();
     let scorer = ViewScorer::new(&clip.target, sweep.lpips.as_ref());
     let renderer = TargetRenderer { clip, scorer: &scorer, cameras: upload_cameras(&[&clip.target], device)?, sweep };
@@ -103,7 +102,7 @@ pub fn evaluate_scene(
         if keep_images {
             let own = own_norm.iter().find(|(of, ..)| *of == Method::Clift);
             let index = own.map_or(&index, |(.., index)| index);
-            results.clusters.push(index.scene_clusters()?.clone());
+            results.clusters.push(index.clusters()?.scenes()[0].clone());
         }
     }
     for external in &sweep.external_methods {
@@ -158,13 +157,14 @@ impl TargetRenderer<'_> {
         };
         // Queued work must not count as rendering time.
         device.sync().map_err(EvalError::tensor)?;
-        if !metrics.is_warm(key) {
+        if !metrics.costs.contains_key(&key) {
             // One untimed view per key: one-time work of the device, and the peak memory.
             let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
             render(0)?;
-            metrics.set_warm(key, if has_peak { memory::peak_bytes() } else { None });
+            let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
             let macs = self.sweep.model.render_macs(target.height, target.width, key.num_render_tokens)?;
-            metrics.add_gflops(key, macs.count(FlopConvention::Macs) as f64 / 1e9);
+            let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
+            metrics.costs.insert(key, Cost { gflops, peak_bytes, scene_bytes: None });
         }
         let mut rendered = ScoredViews::new(key);
         for view in 0..target.num_views() {

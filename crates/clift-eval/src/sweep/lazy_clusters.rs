@@ -3,7 +3,7 @@
 use std::cell::OnceCell;
 
 use burn::tensor::Tensor;
-use clift_model::{Clusters, KMeans, KMeansFit, SceneClusters, tile_clusters};
+use clift_model::{Clusters, KMeans, tile_clusters};
 
 use crate::error::EvalError;
 
@@ -16,7 +16,7 @@ pub(crate) struct LazyClusters<'a> {
     pub seed: u64,
     /// Number of context views, and rows and columns of patches of a view.
     views: (usize, [usize; 2]),
-    fit: OnceCell<KMeansFit>,
+    clusters: OnceCell<Clusters>,
     tiles: OnceCell<Clusters>,
 }
 
@@ -28,34 +28,32 @@ impl<'a> LazyClusters<'a> {
         num_clusters: usize,
         seed: u64,
     ) -> Self {
-        Self { kmeans, lift, num_clusters, seed, views, fit: OnceCell::new(), tiles: OnceCell::new() }
+        Self { kmeans, lift, num_clusters, seed, views, clusters: OnceCell::new(), tiles: OnceCell::new() }
     }
 
     /// Returns the tiles of the context views, see [`tile_clusters`].
     pub fn tiles(&self) -> Result<&Clusters, EvalError> {
-        if let Some(tiles) = self.tiles.get() {
-            return Ok(tiles);
-        }
-        let (num_views, grid) = self.views;
-        let tiles = Clusters::new(vec![tile_clusters(num_views, grid, self.num_clusters)?])?;
-        Ok(self.tiles.get_or_init(|| tiles))
+        computed_once(&self.tiles, || {
+            let (num_views, grid) = self.views;
+            Ok(Clusters::new(vec![tile_clusters(num_views, grid, self.num_clusters)?])?)
+        })
     }
 
     /// Returns the clusters of latent K-means.
     pub fn clusters(&self) -> Result<&Clusters, EvalError> {
-        Ok(&self.fit()?.clusters)
+        computed_once(&self.clusters, || {
+            Ok(self.kmeans.fit(self.lift.clone(), self.num_clusters, &[self.seed])?.clusters)
+        })
     }
+}
 
-    fn fit(&self) -> Result<&KMeansFit, EvalError> {
-        if let Some(fit) = self.fit.get() {
-            return Ok(fit);
-        }
-        let fit = self.kmeans.fit(self.lift.clone(), self.num_clusters, &[self.seed])?;
-        Ok(self.fit.get_or_init(|| fit))
+fn computed_once(
+    cell: &OnceCell<Clusters>,
+    compute: impl FnOnce() -> Result<Clusters, EvalError>,
+) -> Result<&Clusters, EvalError> {
+    if let Some(clusters) = cell.get() {
+        return Ok(clusters);
     }
-
-    /// Returns the clusters of the scene.
-    pub fn scene_clusters(&self) -> Result<&SceneClusters, EvalError> {
-        Ok(&self.clusters()?.scenes()[0])
-    }
+    let clusters = compute()?;
+    Ok(cell.get_or_init(|| clusters))
 }

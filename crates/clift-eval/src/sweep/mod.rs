@@ -7,9 +7,8 @@
 //! - `token_choice`: tokens selected for each view
 //! - `baselines`: nearest view and mean image
 //! - `view_scorer`: score renderings of a scene
-//! - `rendered_views`: scored views of one `EvalKey`
+//! - `rendered_views`: scored views of one `EvalKey`, results of one scene
 //! - `predictions`: images of another method, scored
-//! - `scene_results`: results of one scene
 //! - `evaluate_scene`: encode once, render every key
 
 pub(crate) mod baselines;
@@ -19,7 +18,6 @@ pub(crate) mod evaluate_scene;
 pub(crate) mod lazy_clusters;
 pub(crate) mod predictions;
 pub(crate) mod rendered_views;
-pub(crate) mod scene_results;
 pub(crate) mod sweep;
 pub(crate) mod token_choice;
 pub(crate) mod view_scorer;

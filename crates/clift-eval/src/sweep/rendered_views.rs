@@ -1,13 +1,15 @@
-//! The target views of a scene as one key renders them: metrics, and images for the figures.
+//! The target views of a scene as one key renders them, and the results of the scene, from which its figures are made.
 
 use std::collections::BTreeMap;
 
 use clift_data::Clip;
+use clift_model::SceneClusters;
 
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 use crate::sweep::baselines::{mean_image, nearest_image};
+use crate::sweep::token_choice::SelectedTokens;
 use crate::sweep::view_scorer::ViewScorer;
 
 /// The scored target views of a scene under one key.
@@ -40,6 +42,36 @@ impl ScoredViews {
     }
 }
 
+/// Largest number of target views whose images are kept.
+pub(crate) const MAX_KEPT_VIEWS: usize = 6;
+
+/// Images, clusters and selected tokens of one scene.
+pub struct SceneResults {
+    /// The renderings of every key: baselines first, external methods last.
+    pub(crate) renderings: Vec<ScoredViews>,
+    /// The clusters of every storage count.
+    pub(crate) clusters: Vec<SceneClusters>,
+    /// The patches of the stored tokens, and the tokens selected for every target.
+    pub(crate) selections: Vec<(EvalKey, Vec<u32>, Vec<SelectedTokens>)>,
+    /// The target views whose images are kept; at least one.
+    pub(crate) kept_views: Vec<usize>,
+}
+
+impl SceneResults {
+    /// Starts with the baselines, of which the images of `kept_views` are kept.
+    pub(crate) fn new(baselines: Vec<ScoredViews>, kept_views: Vec<usize>) -> Self {
+        Self { renderings: baselines, clusters: Vec::new(), selections: Vec::new(), kept_views }
+    }
+}
+
+/// Returns all of `0..count`, or `most` of them from the first to the last; `most` is at least 2.
+pub(crate) fn spread(count: usize, most: usize) -> Vec<usize> {
+    if count <= most {
+        return (0..count).collect();
+    }
+    (0..most).map(|i| i * (count - 1) / (most - 1)).collect()
+}
+
 /// Scores both baselines: the nearest context view and the mean of the context views.
 pub(crate) fn baselines(clip: &Clip, scorer: &ViewScorer, kept_views: &[usize]) -> Result<Vec<ScoredViews>, EvalError> {
     let mean = mean_image(&clip.context)?;
@@ -50,4 +82,15 @@ pub(crate) fn baselines(clip: &Clip, scorer: &ViewScorer, kept_views: &[usize]) 
         means.add(view, mean.clone(), scorer, kept_views)?;
     }
     Ok(vec![nearest, means])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn kept_views_span_first_to_last() {
+        assert_eq!(spread(6, MAX_KEPT_VIEWS), [0, 1, 2, 3, 4, 5]);
+        assert_eq!(spread(121, MAX_KEPT_VIEWS), [0, 24, 48, 72, 96, 120]);
+    }
 }

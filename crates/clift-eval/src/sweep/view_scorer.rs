@@ -9,6 +9,7 @@ use crate::error::EvalError;
 use crate::metrics::image_metrics::{SSIM_MIN_SIZE_PX, psnr, ssim};
 use crate::metrics::lpips::{LPIPS_MIN_SIZE_PX, Lpips, LpipsFeatures};
 use crate::statistics::view_metrics::ViewMetrics;
+use crate::sweep::baselines::view_image;
 
 /// Memory for the LPIPS features of the target views, which every key is compared with: 31 images of 256 x 256. The
 /// features of further targets are computed every time.
@@ -30,7 +31,7 @@ impl<'a> ViewScorer<'a> {
 
     /// Measures a rendering of a target view. Metrics that need a larger image are `None`.
     pub fn measure(&self, pixels: &[f32], view: usize) -> Result<ViewMetrics, EvalError> {
-        let target = target_image(self.target, view);
+        let target = view_image(self.target, view);
         let (height, width) = (self.target.height, self.target.width);
         let has_ssim = height.min(width) >= SSIM_MIN_SIZE_PX;
         let ssim = has_ssim.then(|| ssim(pixels, &target, height, width)).transpose()?;
@@ -53,10 +54,4 @@ impl<'a> ViewScorer<'a> {
         }
         Ok(distance)
     }
-}
-
-/// Returns a target image, `[height, width, 3]` in `[0, 1]`.
-pub(crate) fn target_image(target: &ClipViews, view: usize) -> Vec<f32> {
-    let len = target.height * target.width * 3;
-    target.images[view * len..(view + 1) * len].iter().map(|&value| f32::from(value) / 255.0).collect()
 }

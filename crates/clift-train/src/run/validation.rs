@@ -44,8 +44,8 @@ impl<'a> Validation<'a> {
         };
         let sweep = config.sweep(eval.storage.clone(), Vec::new());
         let evaluator = Evaluator::new(eval, sweep, description, reader, device)?;
-        if !evaluator.skip_report().skips.is_empty() {
-            sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report())));
+        if !evaluator.skip_report.skips.is_empty() {
+            sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report)));
         }
         Ok(Self { config, evaluator })
     }
@@ -75,7 +75,7 @@ impl<'a> Validation<'a> {
         } else {
             (TokenCount::Share(1.0), Method::Kmeans)
         };
-        let all = self.evaluator.sweep();
+        let all = &self.evaluator.sweep;
         let sweep = Sweep {
             storage: vec![storage],
             render: Vec::new(),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use clift_data::{
     ClipReader, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions, Split,
-    open_dataset, open_source,
+    open_dataset, open_source, plural,
 };
 use clift_eval::{EncodeOptions, EncodedScene, encode};
 use clift_model::{ModelPath, TokenCount, TokenFormat, TrainedModel, check_output_path};
@@ -15,7 +15,7 @@ use crate::commands::parse::parse_split;
 use crate::commands::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::{UsageError, usage_bail};
 use crate::output::stdout::{print_note, print_result};
-use crate::output::units::{file_size, plural};
+use crate::output::units::file_size;
 
 /// Most scene keys listed in an error message.
 const MAX_LISTED_KEYS: usize = 8;

@@ -11,7 +11,7 @@ use crate::commands::parse::parse_bytes;
 use crate::commands::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
-use crate::output::progress::progress_sink;
+use crate::output::bar::progress_sink;
 use crate::output::stdout::{print_evaluation, print_note};
 
 /// Evaluates a run or a model and prints the table.

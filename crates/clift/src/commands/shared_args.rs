@@ -24,9 +24,6 @@ pub struct ConfigArgs {
 
 impl ConfigArgs {
     /// Reads a config with these overrides and checks its values.
-    ///
-    /// # Errors
-    /// As [`read_config`].
     pub fn read(&self, path: &Path, check: impl FnOnce(&Config) -> Result<(), TrainError>) -> anyhow::Result<Config> {
         let (mut config, _) = read_config(path, &self.set, check)?;
         config.device = self.device.unwrap_or(config.device);

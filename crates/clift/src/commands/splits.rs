@@ -45,9 +45,6 @@ impl SourceArgs {
     }
 
     /// Opens the present splits.
-    ///
-    /// # Errors
-    /// As [`Self::files`] and [`open_splits`].
     pub fn open(&self, splits: Splits) -> anyhow::Result<Vec<SplitSource>> {
         open_splits(&self.dir, splits, &self.files()?.0)
     }
@@ -57,7 +54,6 @@ impl SourceArgs {
 pub struct SplitSource {
     /// The split; `None` for a data set without splits.
     pub split: Option<Split>,
-    /// Its scenes.
     pub opened: OpenedSource,
 }
 
@@ -90,9 +86,6 @@ pub fn read_all_options() -> SourceOptions {
 
 /// Opens the requested splits that exist. A folder without `train/` and `test/` is opened once, unless a list of test
 /// scenes divides it.
-///
-/// # Errors
-/// The first error of opening a split.
 pub fn open_splits(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Result<Vec<SplitSource>> {
     // An empty list divides nothing.
     let list = files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
@@ -130,7 +123,6 @@ pub enum Splits {
 }
 
 impl Splits {
-    /// Returns the splits.
     pub fn list(self) -> &'static [Split] {
         match self {
             Self::Train => &[Split::Train],

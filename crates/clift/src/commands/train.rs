@@ -8,7 +8,7 @@ use clift_train::{Config, Run, RunOptions, Stage, memory_warning};
 use crate::commands::parse::{parse_count, parse_stage};
 use crate::commands::shared_args::ConfigArgs;
 use crate::interrupt;
-use crate::output::progress::progress_sink;
+use crate::output::bar::progress_sink;
 use crate::output::stdout::{print_evaluation, print_note};
 
 /// Trains a run and prints its evaluation.

@@ -1,13 +1,24 @@
 //! A progress bar on a terminal.
 
+use std::io::IsTerminal;
 use std::time::Duration;
 
 use clift_train::{Event, Sink};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 use crate::output::event_line::{event_line, step_metrics};
+use crate::output::plain::PlainLines;
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
+
+/// Creates a progress bar if the standard error is a terminal, progress lines otherwise.
+pub fn progress_sink() -> Box<dyn Sink> {
+    if std::io::stderr().is_terminal() {
+        Box::new(Bar::default())
+    } else {
+        Box::new(PlainLines::new(std::io::stderr()))
+    }
+}
 
 /// A progress bar per stage, with the lines of other events above the bar.
 #[derive(Default)]

@@ -7,9 +7,6 @@ use clift_data::replace_file;
 use serde::Serialize;
 
 /// Writes `value` as indented JSON, atomically.
-///
-/// # Errors
-/// Errors of the serialisation and of the operating system, with the path.
 pub fn write_json(value: &impl Serialize, path: &Path) -> anyhow::Result<()> {
     let mut text = serde_json::to_vec_pretty(value).context("serializing the results as JSON")?;
     text.push(b'\n');

@@ -5,17 +5,15 @@
 //! - `json`: results as JSON files
 //! - `stdout`: results to stdout, notes to stderr
 //! - `event_line`: an event as one line
-//! - `bar`: progress bar
 //! - `plain`: progress lines for log files
+//! - `bar`: progress bar, or lines
 //! - `counter`: progress of counted work
-//! - `progress`: choose bar or lines
 
 pub(crate) mod bar;
 pub(crate) mod counter;
 pub(crate) mod event_line;
 pub(crate) mod json;
 pub(crate) mod plain;
-pub(crate) mod progress;
 pub(crate) mod stdout;
 pub(crate) mod table;
 pub(crate) mod units;

@@ -15,9 +15,6 @@ pub fn print_result(text: &str) -> anyhow::Result<()> {
 }
 
 /// Writes the table of an evaluation and the paths of its report and files.
-///
-/// # Errors
-/// As [`print_result`].
 pub fn print_evaluation(summary: &Summary, folder: &Path) -> anyhow::Result<()> {
     let report = folder.join("report.html");
     print_result(&format!("{summary}\nreport: {}\nresults: {}", report.display(), folder.display()))

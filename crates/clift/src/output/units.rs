@@ -46,11 +46,6 @@ pub fn file_size(bytes: u64) -> String {
     if unit == 0 { format!("{bytes} bytes") } else { format!("{value:.1} {}", units[unit]) }
 }
 
-/// Formats a count with its noun: `1 scene`, `2 scenes`.
-pub fn plural(count: usize, noun: &str) -> String {
-    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -62,6 +57,5 @@ mod tests {
         assert_eq!([12.34, 1.0, 0.4].map(rate), ["12.3/s", "1.0/s", "2.5 s each"]);
         let sizes = [0, 999, 1000, 999_960, 23_456_789].map(file_size);
         assert_eq!(sizes, ["0 bytes", "999 bytes", "1.0 kB", "1.0 MB", "23.5 MB"]);
-        assert_eq!([1, 2, 0].map(|count| plural(count, "scene")), ["1 scene", "2 scenes", "0 scenes"]);
     }
 }

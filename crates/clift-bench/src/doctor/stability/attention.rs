@@ -136,7 +136,7 @@ fn operation_error(
         });
         Ok([output.inner(), a?, b?])
     };
-    let reference = inputs.clone().map(|input| input.in_f64(&devices.reference));
+    let reference = inputs.in_f64(&devices.reference);
     let pairs = run(inputs)?.into_iter().zip(run(reference)?);
     Ok(Outcome::Error(largest_magnitude(pairs.map(|(result, reference)| relative_error(result, reference)))))
 }

@@ -2,14 +2,11 @@
 
 use burn::tensor::Tensor;
 use clift_model::{KMeans, ModelError, SceneClusters};
-use clift_train::{
-    Stage, TokenSelection, TrainError, freeze, seeded_batch, seeded_clusters, seeded_model, seeded_uniform,
-};
+use clift_train::{Stage, TokenSelection, TrainError, seeded_batch, seeded_clusters, seeded_uniform};
 
 use crate::cases::reference::{ToF64, values};
-use crate::cases::step::update_error;
 use crate::doctor::stability::case::{Bound, CaseDevices, Outcome, RunCase, StabilityCase};
-use crate::doctor::stability::updates::{NOISE_SHARE, network, num_tokens, shape};
+use crate::doctor::stability::updates::{num_tokens, shape, stage_error};
 
 /// Makes a case whose bound is the rounding of f32 through all blocks of stage 2.
 const fn gradient_case(name: &'static str, breaks: &'static str, run: RunCase) -> StabilityCase {
@@ -84,6 +81,5 @@ fn condenser_error(
     let num_tokens = num_tokens(devices, 4);
     let mut batch = seeded_batch(shape(devices, 4), 2, num_tokens, None, 0)?;
     batch.tokens = TokenSelection::Clusters(vec![scene(num_tokens)?; 2]);
-    let model = freeze(Stage::Stage2, seeded_model(&network(devices), 0, &devices.device));
-    Ok(Outcome::Error(update_error(&model, &batch, &devices.device, &devices.reference, NOISE_SHARE)?))
+    stage_error(devices, Stage::Stage2, &batch)
 }

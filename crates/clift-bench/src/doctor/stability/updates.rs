@@ -72,7 +72,7 @@ pub(crate) const CASES: &[StabilityCase] = &[
 ];
 
 /// Share of the largest gradient below which a gradient counts as rounding noise.
-pub(crate) const NOISE_SHARE: f64 = 1e-3;
+const NOISE_SHARE: f64 = 1e-3;
 
 /// Returns the network of the cases.
 pub(crate) fn network(devices: &CaseDevices) -> ModelConfig {
@@ -103,8 +103,13 @@ fn changed_views(devices: &CaseDevices, num_context: usize, change: impl Fn(&mut
     let mut batch: StageBatch =
         seeded_batch(shape(devices, num_context), 1, num_tokens(devices, num_context), None, 0)?;
     batch.clips.iter_mut().for_each(change);
-    let model = freeze(Stage::Stage1, seeded_model(&network(devices), 0, &devices.device));
-    Ok(Outcome::Error(update_error(&model, &batch, &devices.device, &devices.reference, NOISE_SHARE)?))
+    stage_error(devices, Stage::Stage1, &batch)
+}
+
+/// Returns the error of an update of a stage.
+pub(crate) fn stage_error(devices: &CaseDevices, stage: Stage, batch: &StageBatch) -> Result<Outcome, TrainError> {
+    let model = freeze(stage, seeded_model(&network(devices), 0, &devices.device));
+    Ok(Outcome::Error(update_error(&model, batch, &devices.device, &devices.reference, NOISE_SHARE)?))
 }
 
 fn all_views(clip: &mut Clip) -> [&mut ClipViews; 2] {

@@ -6,12 +6,9 @@ use crate::figures::canvas::Canvas;
 use crate::figures::scene_figure::{FigureImage, FigureTokens};
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
+use crate::testing::f32_key as key;
 
 const HOSTILE: &str = "<script>alert('room')</script>";
-
-fn key(method: Method, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
-    EvalKey { method, num_storage_tokens, num_render_tokens, tokens: Some(TokenFormat::F32) }
-}
 
 /// Two methods at two counts and one selection, over two scenes.
 fn summary() -> Summary {
@@ -69,12 +66,14 @@ fn report() -> Report {
     let mut skipped = SkipReport::new(3);
     skipped.skip("c", format!("bad frame {HOSTILE}"));
     Report {
-        name: format!("run {HOSTILE}"),
+        run: RunDescription {
+            name: format!("run {HOSTILE}"),
+            config: format!("data.root = \"{HOSTILE}\""),
+            device: "flex".into(),
+        },
         summary: summary(),
         skipped,
         figures: vec![figure()],
-        config: format!("data.root = \"{HOSTILE}\""),
-        device: "flex".into(),
     }
 }
 
@@ -120,7 +119,7 @@ fn pages_have_all_sections_and_no_external_resources() {
 #[test]
 fn pages_without_selections_or_points_explain_the_gap() {
     let mut plain = report();
-    plain.summary.points.retain(|point| point.num_render_tokens == point.num_storage_tokens);
+    plain.summary.points.retain(|point| point.key.is_whole());
     plain.figures[0].selections.clear();
     let html = page(&plain);
     assert!(html.contains("--render 1/4,1/2") && !html.contains("Quality against rendered tokens"));
@@ -171,7 +170,7 @@ fn external_methods_are_escaped_everywhere_and_missing_images_noted() {
     other.summary.points.extend(summary.points);
     (other.summary.missing, other.summary.not_measured) = (summary.missing, summary.not_measured);
     other.figures[0].images.push(FigureImage { key, psnr: 17.0, image: Canvas::new(16, 16, [9; 3]) });
-    other.name = "a\u{7}&".into();
+    other.run.name = "a\u{7}&".into();
     let html = page(&other);
     let escaped = "&lt;b&gt;&quot; onload=&quot;MVSplat";
     for part in [
@@ -195,10 +194,10 @@ fn several_formats_have_lines_of_their_own() {
     let mut several = report();
     assert!(!page(&several).contains("clift, f32"), "a single format is not named");
     let points = several.summary.points.clone();
-    let coarse = points.into_iter().filter(|point| point.method == Method::Clift).map(|point| SummaryPoint {
-        tokens: Some(TokenFormat::Int8),
-        scene_bytes: point.scene_bytes.map(|bytes| bytes / 4),
-        ..point
+    let coarse = points.into_iter().filter(|point| point.key.method == Method::Clift).map(|mut point| {
+        point.key.tokens = Some(TokenFormat::Int8);
+        point.cost.scene_bytes = point.cost.scene_bytes.map(|bytes| bytes / 4);
+        point
     });
     several.summary.points.extend(coarse);
     let html = page(&several);

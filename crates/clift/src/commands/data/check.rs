@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clift_data::{
-    CheckedScene, SceneCheck, Split, check_scene, encode_png, note_skipped_frames, replace_file, skipped_scenes,
+    CheckedScene, SceneCheck, Split, check_scene, encode_png, note_skipped_frames, plural, replace_file, skipped_scenes,
 };
 use serde::Serialize;
 
@@ -14,7 +14,6 @@ use crate::commands::splits::{SourceArgs, SplitSource, Splits};
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::table::table;
-use crate::output::units::plural;
 
 /// Findings of one scene.
 #[derive(Debug, Serialize)]
@@ -29,7 +28,6 @@ struct Row {
 #[derive(Debug, Serialize)]
 struct Report {
     scenes: Vec<Row>,
-    /// Notes on the data set.
     notes: Vec<String>,
 }
 

@@ -6,7 +6,7 @@ use std::time::Instant;
 use anyhow::Context;
 use clap::ValueEnum;
 use clift_data::{
-    ConversionReport, ConvertOptions, ConvertTo, Converter, KEPT_FOR_TESTING, SkipReport, SkippedScene, Split,
+    ConversionReport, ConvertOptions, ConvertTo, Converter, KEPT_FOR_TESTING, SkipReport, SkippedScene, Split, plural,
 };
 
 use crate::commands::shared_args::ChunkArgs;
@@ -14,7 +14,7 @@ use crate::commands::splits::{SourceArgs, SplitSource, Splits, open_splits};
 use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
-use crate::output::units::{file_size, plural};
+use crate::output::units::file_size;
 
 /// Most skipped scenes that are printed; `skipped.json` lists all.
 const MAX_LISTED_SKIPS: usize = 50;

@@ -2,13 +2,12 @@
 
 use std::path::PathBuf;
 
-use clift_data::{OverlapOptions, SceneSource, write_overlap_index};
+use clift_data::{OverlapOptions, SceneSource, plural, write_overlap_index};
 
 use crate::commands::parse::parse_distance;
 use crate::commands::splits::{SourceArgs, Splits};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result};
-use crate::output::units::plural;
 
 /// Writes the evaluation index and prints the number of scenes with and without views.
 pub fn run(args: &IndexArgs) -> anyhow::Result<()> {

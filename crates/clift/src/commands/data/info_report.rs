@@ -4,10 +4,8 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
-use clift_data::{SkippedFrame, SkippedScene, SourceInfo, SourceKind};
+use clift_data::{SkippedFrame, SkippedScene, SourceInfo, SourceKind, plural};
 use serde::Serialize;
-
-use crate::output::units::plural;
 
 /// Most scenes, and groups of scenes, that the table lists; the JSON lists all.
 const MAX_LISTED_SCENES: usize = 20;
@@ -34,17 +32,14 @@ pub struct Report {
 pub struct SplitReport {
     /// Reason why the split is not usable.
     pub error: Option<String>,
-    /// Number of scenes.
     pub num_scenes: usize,
     /// Number of scenes after the filters.
     pub num_used: usize,
-    /// Number of skipped scenes by reason.
     pub skipped: BTreeMap<String, usize>,
     /// Skipped scenes, each with its reason.
     pub left_out: Vec<SkippedScene>,
     /// Skipped frames, each with its reason.
     pub frames: Vec<SkippedFrame>,
-    /// Notes on the split.
     pub notes: Vec<String>,
     /// Number of scenes that `info` describes: all used scenes, or the first synthetic ones.
     pub num_described: usize,
@@ -59,11 +54,9 @@ pub struct SplitReport {
 pub struct EvaluationReport {
     /// Reason why no scene can be evaluated.
     pub error: Option<String>,
-    /// Number of scenes.
     pub num_scenes: usize,
     /// Number of target views of all scenes.
     pub num_views: usize,
-    /// Number of skipped scenes by reason.
     pub skipped: BTreeMap<String, usize>,
 }
 

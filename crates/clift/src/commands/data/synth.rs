@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use anyhow::Context;
 use clift_data::{
-    ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource,
+    ChunkSource, EvaluationIndex, SceneFilters, SceneSource, Split, SyntheticConfig, SyntheticSource, plural,
     write_evaluation_index, write_source,
 };
 use clift_eval::EvalConfig;
@@ -18,7 +18,7 @@ use crate::commands::splits::Splits;
 use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
-use crate::output::units::{file_size, plural};
+use crate::output::units::file_size;
 
 /// Fewest frames for training and evaluation: two contexts and another frame as target.
 const MIN_FRAMES: usize = 3;

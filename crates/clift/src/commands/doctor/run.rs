@@ -1,10 +1,11 @@
 //! `clift doctor`: the machine and its devices.
 
+use std::path::PathBuf;
+
 use clift_bench::{DeviceCheck, Gradient, probe};
 use clift_eval::machine_rows;
 use clift_model::{DeviceName, InstructionSet, Precision};
 
-use crate::commands::doctor::args::DoctorArgs;
 use crate::commands::doctor::{adapters, stability};
 use crate::output::stdout::print_result;
 use crate::output::table::table;
@@ -22,7 +23,7 @@ const TOLERANCE_F16: f64 = 3e-2;
 /// If the default device fails, or a stability case.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     if args.stability {
-        return stability::run(args);
+        return stability::run(args.small, args.markdown.as_deref());
     }
     let machine = [("clift", version())].into_iter().chain(machine_rows()).chain([("kernels", kernels())]);
     let machine: Vec<String> = machine.map(|(name, value)| format!("{name:<12}{value}")).collect();
@@ -65,17 +66,15 @@ fn version() -> String {
 
 /// Describes the instruction set of the flex kernels, the reason for it, and the alternatives.
 fn kernels() -> String {
-    let names = |sets: &mut dyn Iterator<Item = InstructionSet>| {
-        let names: Vec<_> = sets.map(InstructionSet::name).collect();
-        if names.is_empty() { "none".to_owned() } else { names.join(", ") }
-    };
     let variable = InstructionSet::VARIABLE;
     match InstructionSet::forced() {
         Err(bad) => format!("{variable} = {}: {bad}", bad.text),
         Ok(forced) => {
             let used = InstructionSet::detected();
             let why = if forced.is_some() { format!("set by {variable}") } else { "widest".into() };
-            let others = names(&mut InstructionSet::available().filter(|set| *set != used));
+            let others = InstructionSet::available().filter(|set| *set != used).map(InstructionSet::name);
+            let others = Some(others.collect::<Vec<_>>().join(", ")).filter(|names| !names.is_empty());
+            let others = others.unwrap_or_else(|| "none".into());
             format!("{} ({why}; also available: {others})", used.name())
         }
     }
@@ -138,6 +137,20 @@ fn device_table(mut rows: Vec<[String; 6]>) -> String {
     }
     let table = table(["device", "state", "adapter", "dtypes", "fwd+bwd", "gradient difference"], rows);
     [table].into_iter().chain(failures).collect::<Vec<_>>().join("\n")
+}
+
+/// Arguments of `clift doctor`.
+#[derive(Debug, clap::Args)]
+pub struct DoctorArgs {
+    /// Run the stability cases instead: hard numerical inputs against f64
+    #[arg(long)]
+    pub stability: bool,
+    /// Run small versions of the cases: seconds instead of minutes
+    #[arg(long, requires = "stability")]
+    pub small: bool,
+    /// Write the table of the cases as Markdown
+    #[arg(long, requires = "stability", value_name = "FILE")]
+    pub markdown: Option<PathBuf>,
 }
 
 #[cfg(test)]

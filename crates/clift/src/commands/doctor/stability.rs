@@ -1,23 +1,24 @@
 //! `clift doctor --stability`.
 
+use std::path::Path;
+
 use anyhow::Context;
 use clift_bench::{CaseSize, StabilityRow, outcome_text, run_stability, stability_markdown};
 use clift_data::replace_file;
 use clift_model::DeviceName;
 
-use crate::commands::doctor::args::DoctorArgs;
 use crate::output::stdout::{print_note, print_result};
 
 /// Runs every case on every device of the build.
 ///
 /// # Errors
 /// If an error exceeds its bound.
-pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
+pub fn run(is_small: bool, markdown: Option<&Path>) -> anyhow::Result<()> {
     let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
-    let size = if args.small { CaseSize::Small } else { CaseSize::Full };
+    let size = if is_small { CaseSize::Small } else { CaseSize::Full };
     let rows = run_stability(&devices, size, &mut |row| print_note(&line(&devices, row)))?;
-    if let Some(path) = &args.markdown {
-        let text = format!("{}\n{}\n", markdown_head(args.small), stability_markdown(&devices, &rows));
+    if let Some(path) = markdown {
+        let text = format!("{}\n{}\n", markdown_head(is_small), stability_markdown(&devices, &rows));
         replace_file(path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
         print_result(&format!("table: {}", path.display()))?;
     }

@@ -8,13 +8,17 @@ use clift_data::{is_empty_folder, upper_median};
 use clift_eval::{Animation, Canvas};
 use clift_model::{SceneRenderer, ViewCamera};
 use clift_train::TrainError;
+use serde::Serialize;
 
 use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
 
-/// Median seconds per frame: token selection and rendering.
+/// Median seconds per frame.
+#[derive(Debug, Serialize)]
 pub struct Timing {
+    /// Token selection.
     pub select_s: f64,
+    /// Rendering.
     pub render_s: f64,
 }
 

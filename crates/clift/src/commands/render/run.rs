@@ -12,7 +12,7 @@ use clift_model::{
 use serde::Serialize;
 
 use crate::commands::render::args::{CameraPath, RenderArgs};
-use crate::commands::render::frames::{self, Frames};
+use crate::commands::render::frames::{self, Frames, Timing};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::json::write_json;
@@ -36,10 +36,8 @@ struct Report {
     num_frames: usize,
     num_storage_tokens: usize,
     num_render_tokens: usize,
-    /// Median seconds per frame for token selection.
-    select_s: f64,
-    /// Median seconds per frame for rendering.
-    render_s: f64,
+    #[serde(flatten)]
+    timing: Timing,
     /// Token counts and their seconds per frame, measured for `--budget-ms`.
     calibration: Option<Vec<(usize, f64)>>,
 }
@@ -70,6 +68,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let files = StagedDir::new(&args.out).with_context(creating)?;
     let frames = Frames { height, width, num_render_tokens, fps: args.fps };
     let timing = frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
+    let Timing { select_s, render_s } = timing;
     let report = Report {
         scene: scene.key.clone(),
         path: args.path.to_string(),
@@ -80,8 +79,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         num_frames: views.len(),
         num_storage_tokens: scene.num_tokens(),
         num_render_tokens,
-        select_s: timing.select_s,
-        render_s: timing.render_s,
+        timing,
         calibration: calibration.map(|times| times.some.into_iter().chain([times.all]).collect()),
     };
     write_json(&report, &files.path().join("render.json"))?;
@@ -92,9 +90,9 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         args.out.display(),
         views.len(),
         scene.num_tokens(),
-        1e3 * (timing.select_s + timing.render_s),
-        1e3 * timing.select_s,
-        1e3 * timing.render_s,
+        1e3 * (select_s + render_s),
+        1e3 * select_s,
+        1e3 * render_s,
     ))
 }
 
