@@ -134,7 +134,6 @@ struct TargetRenderer<'a> {
 
 impl TargetRenderer<'_> {
     /// Renders every target view in a call of its own, from all stored tokens or from the tokens selected for the view.
-    ///
     /// The measured time is from tokens on the device to pixels on the host. Views share no work, so the times of any two
     /// keys are comparable. A viewer that keeps the keys and values of a scene's tokens between frames is faster.
     fn render(
@@ -179,7 +178,6 @@ impl TargetRenderer<'_> {
     }
 }
 
-/// Returns the camera of one view.
 fn camera_of(cameras: &Cameras, view: usize) -> Cameras {
     Cameras {
         c2w: cameras.c2w.clone().narrow(1, view, 1),

@@ -19,10 +19,7 @@ use crate::output::units::file_size;
 /// Most skipped scenes that are printed; `skipped.json` lists all.
 const MAX_LISTED_SKIPS: usize = 50;
 
-/// Converts the splits and prints the skipped scenes.
-///
-/// # Errors
-/// If no scene of a split can be converted.
+/// Converts the splits and prints the skipped scenes; fails if no scene of a split can be converted.
 pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     let to = match args.to {
         ConvertForm::Chunks => ConvertTo::Chunks { target_bytes: args.chunks.target_bytes() },
@@ -34,7 +31,6 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     changes.sort_by(|a, b| a.key.cmp(&b.key));
     let opened_with = changes.iter().map(|change| format!("{}={}", change.key, change.to)).collect::<Vec<_>>();
     let options = ConvertOptions { to, encoding: args.chunks.encoding(), opened_with: opened_with.join(" ") };
-
     let dir = &args.source.dir;
     let splits = open_splits(dir, args.split, &files)?;
     // Every output folder is checked before the first is written.
@@ -121,7 +117,6 @@ fn real_path(path: &Path) -> std::io::Result<PathBuf> {
     Ok(real)
 }
 
-/// Arguments of `clift data convert`.
 #[derive(Debug, clap::Args)]
 pub struct ConvertArgs {
     #[command(flatten)]
@@ -138,7 +133,6 @@ pub struct ConvertArgs {
     pub chunks: ChunkArgs,
 }
 
-/// Layouts of converted scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ConvertForm {
     /// Chunks: NNNNNN.torch files of many scenes, with index.json
