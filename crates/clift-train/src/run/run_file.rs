@@ -17,7 +17,6 @@ const VERSION: u32 = 1;
 /// Keys that may change when a run is resumed.
 const FREE_KEYS: [&str; 7] =
     ["run_dir", "device", "activation_checkpointing", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
-
 /// Keys that `--extend` may increase.
 const STEP_COUNTS: [(&str, Stage); 2] = [("stage1.steps", Stage::Stage1), ("stage2.steps", Stage::Stage2)];
 
@@ -34,15 +33,10 @@ pub(crate) struct RunFile {
 }
 
 impl RunFile {
-    /// Makes the file of a new run.
     pub fn new(overfit: Option<usize>) -> Self {
         Self { version: VERSION, overfit, extended: Vec::new() }
     }
 
-    /// Reads `run.json` of a run directory.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`] and [`TrainError::BadFile`].
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
         let path = folder.join("run.json");
         let text = std::fs::read(&path).map_err(TrainError::io("reading the run file", &path))?;
@@ -54,10 +48,6 @@ impl RunFile {
         Ok(run)
     }
 
-    /// Writes `run.json` to a run directory.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
         let path = folder.join("run.json");
         let json = serde_json::to_vec_pretty(self).map_err(TrainError::bad_file("run file", &path))?;
@@ -146,7 +136,6 @@ fn flatten(table: toml::Table) -> BTreeMap<String, String> {
 mod tests {
     use super::*;
 
-    /// Compares `config` with an existing run of the config `old`.
     fn differ(old: &str, config: &Config, extend: bool) -> Result<Vec<StepExtension>, TrainError> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("config.toml"), old).unwrap();
@@ -168,8 +157,7 @@ mod tests {
         other.stage2.optimizer.spike_factor = 7.0;
         let message = differ(&shorter, &other, false).unwrap_err().to_string();
         assert!(message.contains("  stage2.optimizer.spike_factor: 100.0 -> 7.0\n"), "{message}");
-        let unknown = format!("wings = 2\n{text}");
-        let message = differ(&unknown, &old(), false).unwrap_err().to_string();
+        let message = differ(&format!("wings = 2\n{text}"), &old(), false).unwrap_err().to_string();
         assert!(message.contains("  wings: 2 -> not set\n"), "{message}");
     }
 
