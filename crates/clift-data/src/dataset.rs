@@ -84,7 +84,6 @@ mod tests {
     use super::*;
     use crate::sampling::view_sampler::ViewSampler;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
-    use crate::synthetic::config::SyntheticConfig;
 
     #[test]
     fn training_skips_scenes_too_short_for_any_step() {
@@ -111,8 +110,7 @@ mod tests {
         data.root = Some(folder.path().to_owned());
         let OpenedSource { source, report, .. } = open_training_dataset(&data).unwrap();
         assert_eq!((source.num_scenes(), source.key(0), source.find("of-8")), (2, "of-5", Some(1)));
-        let expected = "2 of 3 scenes used; 1 shorter than the 5 frames that data.views needs";
-        assert_eq!(report.to_string(), expected);
+        assert_eq!(report.to_string(), "2 of 3 scenes used; 1 shorter than the 5 frames that data.views needs");
         assert_eq!(report.skips[0].key, "of-4");
         assert_eq!(open_dataset(&data, Split::Train).unwrap().source.num_scenes(), 3);
         data.views = ViewSampler { min_gap: [9, 9], max_gap: [9, 9], ..Default::default() };

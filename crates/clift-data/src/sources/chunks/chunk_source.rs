@@ -45,7 +45,6 @@ impl Chunk {
     }
 }
 
-/// Key and chunk of a scene.
 struct Entry {
     key: String,
     chunk: usize,
@@ -79,8 +78,7 @@ impl ChunkSource {
         Ok(source)
     }
 
-    /// Opens the scenes of `index`, a map from keys to files in `folder`, for which `kept` is true. With `reads_all`, the
-    /// table of every chunk is read even without filters.
+    /// Opens the scenes of `index` (keys to files in `folder`) for which `kept` is true. `reads_all` reads all tables.
     pub(crate) fn of_index(
         folder: &Path,
         index: &BTreeMap<String, String>,
@@ -105,7 +103,6 @@ impl ChunkSource {
         Ok(source)
     }
 
-    /// Reads the JPEG or PNG file of a frame.
     fn read_encoded(&self, scene: usize, frame: usize) -> Result<Vec<u8>, DataError> {
         let (path, table) = self.table(scene)?;
         let span = table.images.get(frame).ok_or_else(|| DataError::NoSuchFrame {
@@ -178,7 +175,6 @@ impl ChunkSource {
         filters.reason_to_skip(num_frames, || self.cameras(scene))
     }
 
-    /// Returns the table of a scene and the path of its chunk.
     fn table(&self, scene: usize) -> Result<(&Path, &SceneTable), DataError> {
         let num_scenes = self.scenes.len();
         let Entry { key, chunk } = self.scenes.get(scene).ok_or(DataError::NoSuchScene { scene, num_scenes })?;
@@ -196,40 +192,32 @@ impl SceneSource for ChunkSource {
     fn num_scenes(&self) -> usize {
         self.scenes.len()
     }
-
     fn key(&self, scene: usize) -> &str {
         &self.scenes[scene].key
     }
-
     fn find(&self, key: &str) -> Option<usize> {
         // The training chunks of DepthSplat prefix the keys; its indices do not.
         let prefixed = || self.positions.get(&format!("{DL3DV_PREFIX}{key}"));
         let by_name = || find_by_name(self.scenes.iter().map(|entry| entry.key.as_str()), key);
         self.positions.get(key).or_else(prefixed).copied().or_else(by_name)
     }
-
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.table(scene)?.1.images.len())
     }
-
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
         let (path, table) = self.table(scene)?;
         table.read_timestamps(path)
     }
-
     fn url(&self, scene: usize) -> Result<String, DataError> {
         Ok(self.table(scene)?.1.url.clone())
     }
-
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         let (path, table) = self.table(scene)?;
         table.read_cameras(path)
     }
-
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         decode_image(&self.read_encoded(scene, frame)?, self.key(scene), frame)
     }
-
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         self.read_encoded(scene, frame).map(Some)
     }
