@@ -1,5 +1,6 @@
 //! The sweep of one scene: encoded once, rendered by every method at every token count.
 
+use std::collections::btree_map::Entry;
 use std::time::Instant;
 
 use burn::tensor::Tensor;
@@ -156,14 +157,14 @@ impl TargetRenderer<'_> {
         };
         // Queued work must not count as rendering time.
         device.sync().map_err(EvalError::tensor)?;
-        if !metrics.costs.contains_key(&key) {
+        if let Entry::Vacant(cost) = metrics.costs.entry(key) {
             // One untimed view per key: one-time work of the device, and the peak memory.
             let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
             render(0)?;
             let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
             let macs = self.sweep.model.render_macs(target.height, target.width, key.num_render_tokens)?;
             let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
-            metrics.costs.insert(key, Cost { gflops, peak_bytes, scene_bytes: None });
+            cost.insert(Cost { gflops, peak_bytes, scene_bytes: None });
         }
         let mut rendered = ScoredViews::new(key);
         for view in 0..target.num_views() {
