@@ -111,18 +111,23 @@ impl SceneSource for TestSource {
     fn num_scenes(&self) -> usize {
         self.base.num_scenes()
     }
+
     fn key(&self, scene: usize) -> &str {
         self.base.key(scene)
     }
+
     fn find(&self, key: &str) -> Option<usize> {
         self.base.find(key)
     }
+
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         (self.cameras)(scene, self.base.cameras(scene)?)
     }
+
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         (self.frame)(scene, frame, self.base.frame(scene, frame)?)
     }
+
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         Ok((self.encoded_frame)(scene, frame))
     }
@@ -145,18 +150,23 @@ impl SceneSource for Lengths {
     fn num_scenes(&self) -> usize {
         self.lengths.len()
     }
+
     fn key(&self, scene: usize) -> &str {
         &self.keys[scene]
     }
+
     fn find(&self, key: &str) -> Option<usize> {
         self.keys.iter().position(|other| other == key)
     }
+
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         panic!("sampling views reads the cameras of scene {scene}, and reading the clip would again")
     }
+
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.lengths[scene])
     }
+
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         Err(DataError::NoSuchFrame { key: self.keys[scene].clone(), frame, num_frames: self.lengths[scene] })
     }

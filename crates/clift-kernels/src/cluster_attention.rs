@@ -99,6 +99,7 @@ struct Forward<'a> {
 
 impl Kernel for Forward<'_> {
     type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { segments, inputs: [query, key_value], first, output, weights } = self;
@@ -175,6 +176,7 @@ struct Backward<'a> {
 
 impl Kernel for Backward<'_> {
     type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { segments, inputs: [query, key_value, weights, grad], first, grad_query, grad_key_value } = self;

@@ -80,6 +80,7 @@ struct Forward<'a> {
 
 impl Kernel for Forward<'_> {
     type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { epsilon, x, gamma, beta, output, statistics } = self;
@@ -112,6 +113,7 @@ struct Backward<'a> {
 
 impl Kernel for Backward<'_> {
     type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { x, gamma, grad, grad_x, statistics, sums } = self;
@@ -195,6 +197,7 @@ struct SumRows<'a> {
 
 impl Kernel for SumRows<'_> {
     type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         for x in self.x.chunks_exact(self.to.len()) {

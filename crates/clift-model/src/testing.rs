@@ -226,9 +226,11 @@ pub fn weight_gradients<M: burn::module::Module>(
         fn enter_module(&mut self, name: &str, _container: &str) {
             self.path.push(name.into());
         }
+
         fn exit_module(&mut self, _name: &str, _container: &str) {
             self.path.pop();
         }
+
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             let path = self.path.join(".").replace("gamma", "weight").replace("beta", "bias");
             let name = format!("{}{path}", self.prefix);

@@ -191,9 +191,11 @@ fn collect<M: Module>(module: &M, grads: Option<&Gradients>) -> Named {
         fn enter_module(&mut self, name: &str, _container: &str) {
             self.path.push(name.into());
         }
+
         fn exit_module(&mut self, _name: &str, _container: &str) {
             self.path.pop();
         }
+
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             let tensor = match self.grads {
                 Some(grads) => param.val().grad(grads),

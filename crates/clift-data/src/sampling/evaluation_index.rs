@@ -141,6 +141,7 @@ impl<'de> Deserialize<'de> for IndexFile {
         struct InOrder;
         impl<'de> Visitor<'de> for InOrder {
             type Value = IndexFile;
+
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 f.write_str("a map from scene keys")
             }

@@ -80,6 +80,7 @@ where
 
 impl<T, E: From<WorkerPanic>> Iterator for Prefetcher<T, E> {
     type Item = Result<T, E>;
+
     fn next(&mut self) -> Option<Self::Item> {
         let step = self.next_step;
         if step >= self.shared.end_step {

@@ -67,6 +67,7 @@ impl SceneSource for SyntheticSource {
     fn num_scenes(&self) -> usize {
         self.config.num_scenes
     }
+
     fn key(&self, scene: usize) -> &str {
         let (block, position) = (scene / KEYS_PER_BLOCK, scene % KEYS_PER_BLOCK);
         let keys = self.key_blocks[block].get_or_init(|| {
@@ -75,18 +76,22 @@ impl SceneSource for SyntheticSource {
         });
         &keys[position]
     }
+
     fn find(&self, key: &str) -> Option<usize> {
         let index = key.strip_prefix(&self.key_prefix())?.parse().ok()?;
         (index < self.num_scenes() && self.key(index) == key).then_some(index)
     }
+
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         let SyntheticConfig { num_scenes, num_frames, .. } = self.config;
         if scene < num_scenes { Ok(num_frames) } else { Err(DataError::NoSuchScene { scene, num_scenes }) }
     }
+
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         let room = self.room(scene)?;
         Ok((0..self.config.num_frames).map(|frame| self.camera(&room, frame)).collect())
     }
+
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         let room = self.room(scene)?;
         let SyntheticConfig { num_frames, width, height, samples_per_pixel, specular, .. } = self.config;

@@ -116,6 +116,7 @@ struct BackwardTask<'a> {
 impl<'a> Kernel for BackwardTask<'a> {
     /// Unscaled gradients of all queries from the task's keys, in rows of the padded head width.
     type Output = Vec<f32>;
+
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> Vec<f32> {
         let Self { sizes, inputs, grad_key, grad_value, scene, head, keys } = self;

@@ -66,6 +66,7 @@ struct Forward<'a> {
 
 impl Kernel for Forward<'_> {
     type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { sizes, inputs: [query, key, value], output, log_sum, scene, head, queries } = self;

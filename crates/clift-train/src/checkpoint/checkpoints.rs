@@ -103,7 +103,7 @@ impl Checkpoints {
     pub fn resume(&self, train_state: &mut TrainState) -> Result<Option<Progress>, TrainError> {
         let mut steps = self.steps()?;
         let Some(step) = steps.pop() else { return Ok(None) };
-        // A finished stage saves no more, and a save is what removes them otherwise.
+        // Each save removes unfinished saves, but a finished stage makes no further save.
         self.remove_unfinished()?;
         let loaded = load_checkpoint(&self.path_of(step), self.model.as_ref(), train_state).map_err(|source| {
             let fix = match steps.last() {

@@ -118,9 +118,11 @@ pub fn seeded_model(config: &ModelConfig, seed: u64, device: &Device) -> Clift {
         fn enter_module(&mut self, name: &str, _container: &str) {
             self.path.push(name.into());
         }
+
         fn exit_module(&mut self, _name: &str, _container: &str) {
             self.path.pop();
         }
+
         fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
             if !self.path.iter().any(|name| name == "gate") {
                 return param;

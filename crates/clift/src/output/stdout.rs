@@ -39,6 +39,7 @@ mod tests {
         fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
             Ok(bytes.len())
         }
+
         fn flush(&mut self) -> std::io::Result<()> {
             Err(self.0.into())
         }

@@ -192,32 +192,40 @@ impl SceneSource for ChunkSource {
     fn num_scenes(&self) -> usize {
         self.scenes.len()
     }
+
     fn key(&self, scene: usize) -> &str {
         &self.scenes[scene].key
     }
+
     fn find(&self, key: &str) -> Option<usize> {
         // The training chunks of DepthSplat prefix the keys; its indices do not.
         let prefixed = || self.positions.get(&format!("{DL3DV_PREFIX}{key}"));
         let by_name = || find_by_name(self.scenes.iter().map(|entry| entry.key.as_str()), key);
         self.positions.get(key).or_else(prefixed).copied().or_else(by_name)
     }
+
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.table(scene)?.1.images.len())
     }
+
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
         let (path, table) = self.table(scene)?;
         table.read_timestamps(path)
     }
+
     fn url(&self, scene: usize) -> Result<String, DataError> {
         Ok(self.table(scene)?.1.url.clone())
     }
+
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         let (path, table) = self.table(scene)?;
         table.read_cameras(path)
     }
+
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         decode_image(&self.read_encoded(scene, frame)?, self.key(scene), frame)
     }
+
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         self.read_encoded(scene, frame).map(Some)
     }

@@ -222,28 +222,36 @@ impl SceneSource for PhotoSource {
     fn num_scenes(&self) -> usize {
         self.scenes.len()
     }
+
     fn key(&self, scene: usize) -> &str {
         &self.scenes[scene].folder.key
     }
+
     fn find(&self, key: &str) -> Option<usize> {
         let by_name = || find_by_name(self.scenes.iter().map(|scene| scene.folder.key.as_str()), key);
         self.positions.get(key).copied().or_else(by_name)
     }
+
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.entry(scene)?.num_frames)
     }
+
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         Ok(self.scene(scene)?.photos.iter().map(|photo| photo.camera).collect())
     }
+
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
         Ok(self.scene(scene)?.timestamps())
     }
+
     fn url(&self, scene: usize) -> Result<String, DataError> {
         Ok(self.scene(scene)?.url.clone())
     }
+
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         self.photo(scene, frame)?.decode(self.key(scene), frame)
     }
+
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         let photo = self.photo(scene, frame)?;
         if photo.undistortion.is_some() {

@@ -53,17 +53,21 @@ where
     fn num_scenes(&self) -> usize {
         1
     }
+
     fn key(&self, _scene: usize) -> &'static str {
         "room"
     }
+
     fn find(&self, _key: &str) -> Option<usize> {
         None
     }
+
     fn cameras(&self, _scene: usize) -> Result<Vec<Camera>, DataError> {
         let mut cameras = self.room.cameras.clone();
         cameras.iter_mut().enumerate().for_each(|(frame, camera)| (self.cameras)(frame, camera));
         Ok(cameras)
     }
+
     fn frame(&self, _scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         match (self.frame)(frame) {
             usize::MAX => Err(DataError::BadImage { key: "k".into(), frame, what: "it is torn".into() }),
