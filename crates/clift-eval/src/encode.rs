@@ -68,14 +68,14 @@ pub fn encode(
     let lift = model.network.encode(&upload_views(&[&clip.context], &model.device)?); // [1, N, D]
     let [_, num_lift_tokens, dim] = lift.dims();
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
-    let (clusters, cluster_error) = cluster(&options.kmeans, &lift, options.storage, seed)?;
+    let (clusters, cluster_error) = cluster(&options.kmeans, &lift.values, options.storage, seed)?;
     let index = clusters.upload(&model.device);
     let (kind, tokens) = if model.has_condenser {
         (TokenKind::Clift, model.network.compress(lift, &index))
     } else {
-        (TokenKind::Kmeans, index.gather_centroids(lift))
+        (TokenKind::Kmeans, lift.centroids(&index))
     };
-    let tokens = tokens.into_data().convert::<f32>().try_to_vec::<f32>().map_err(EvalError::tensor)?;
+    let tokens = tokens.values.into_data().convert::<f32>().try_to_vec::<f32>().map_err(EvalError::tensor)?;
     let token_ids = clusters.scenes()[0].centroid_index().to_vec();
     debug_assert_eq!(tokens.len(), token_ids.len() * dim, "a row per centroid");
     let scene = Scene {

@@ -65,6 +65,7 @@ pub use tokens::selection::token_ray::TokenRay;
 pub use tokens::tiles::{Grouping, tile_clusters};
 // Networks
 pub use network::architecture::CliftVariant;
+pub use network::camera_encoding::{CameraEncoding, TokenTransforms};
 pub use network::clift::Clift;
 pub use network::condenser::Condenser;
 pub use network::config::{CondenserConfig, ModelConfig};
@@ -73,6 +74,7 @@ pub use network::init::Init;
 pub use network::render_tokens::{KeyValueCache, RenderTokens};
 pub use network::renderer::Renderer;
 pub use network::scene_model::SceneModel;
+pub use network::tokens::Tokens;
 // Layers and operations of the networks
 pub use network::blocks::attention::SelfAttention;
 pub use network::blocks::block::{DecoderBlock, EncoderBlock};

@@ -7,6 +7,7 @@ use safetensors::{Dtype, SafeTensors};
 
 use crate::device::name::DeviceName;
 use crate::network::architecture::CliftVariant;
+use crate::network::camera_encoding::CameraEncoding;
 use crate::network::config::{CondenserConfig, ModelConfig};
 
 /// Opens every device of this build: flex, ndarray, and wgpu if an adapter exists.
@@ -29,6 +30,7 @@ pub fn small_config(variant: CliftVariant) -> ModelConfig {
         num_encoder_blocks: 1,
         num_renderer_blocks: 3,
         patch_size: 8,
+        camera_encoding: CameraEncoding::Plucker,
         condenser: CondenserConfig::of(variant),
     }
 }

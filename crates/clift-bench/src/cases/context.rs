@@ -4,10 +4,10 @@ use std::cell::OnceCell;
 use std::path::PathBuf;
 
 use burn::module::Module;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Device;
 use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
 use clift_eval::upload_views;
-use clift_model::{Clift, DeviceName, ModelConfig, SceneModel, TokenCount};
+use clift_model::{Clift, DeviceName, ModelConfig, SceneModel, TokenCount, Tokens};
 use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
 
 use crate::cases::case::BenchCase;
@@ -54,7 +54,7 @@ pub struct BenchContext {
     render: Option<TokenCount>,
     pub features: Option<PathBuf>,
     /// Tokens of one scene, computed once.
-    lift: OnceCell<Tensor<3>>,
+    lift: OnceCell<Tokens>,
 }
 
 impl BenchContext {
@@ -164,7 +164,7 @@ impl BenchContext {
     }
 
     /// Returns the tokens of one scene, `[1, N, D]`, computed by the seeded encoder.
-    pub fn lift(&self) -> Result<Tensor<3>, TrainError> {
+    pub fn lift(&self) -> Result<Tokens, TrainError> {
         if let Some(lift) = self.lift.get() {
             return Ok(lift.clone());
         }

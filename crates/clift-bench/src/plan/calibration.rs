@@ -207,7 +207,7 @@ pub fn inference_rates(
     let scene = scene_with_all_tokens(config, num_context, num_targets)?;
     let [encode_macs, render_macs] =
         [Part::Encoder, Part::Renderer].map(|network| part_macs(&shallow.model, network, &scene));
-    let encode_s = Timed::of(|| wait_for(model.encode(&views)))?.seconds;
+    let encode_s = Timed::of(|| wait_for(model.encode(&views).values))?.seconds;
     let lift = model.encode(&views);
     let render_s = Timed::of(|| wait_for(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?.seconds;
     let mut kmeans = Vec::new();
@@ -219,7 +219,7 @@ pub fn inference_rates(
                 (0..3).map(|seed| step_rng(context.config.seed, seed, "plan clusters").random()).collect();
             let timed = Timed::of(|| {
                 for &seed in &seeds {
-                    config.clusters.kmeans.fit(lift.clone(), count, &[seed])?;
+                    config.clusters.kmeans.fit(lift.values.clone(), count, &[seed])?;
                 }
                 Ok(())
             })?;

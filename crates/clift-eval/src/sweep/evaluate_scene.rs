@@ -2,15 +2,14 @@
 
 use std::time::Instant;
 
-use burn::tensor::Tensor;
 use clift_data::{Clip, derive_seed};
-use clift_model::{Cameras, FlopConvention, SceneModel, scene_file_bytes};
+use clift_model::{Cameras, FlopConvention, SceneModel, Tokens, scene_file_bytes};
 
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::{Cost, EvalKey};
-use crate::sweep::compressed_tokens::{CompressedTokens, select_tokens};
+use crate::sweep::compressed_tokens::CompressedTokens;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
 use crate::sweep::rendered_views::{MAX_KEPT_VIEWS, SceneResults, ScoredViews, baselines, spread};
@@ -38,7 +37,7 @@ pub fn evaluate_scene(
     let (stage1, device) = (&models.stage1.network, &models.stage1.device);
     let features = stage1.features(&upload_views(&[&clip.context], device)?);
     // A stage 2 with its own token norm clusters and condenses the tokens of its own norm.
-    let normed: Vec<(Method, Tensor<3>)> = [Method::Clift, Method::PatchClift]
+    let normed: Vec<(Method, Tokens)> = [Method::Clift, Method::PatchClift]
         .into_iter()
         .filter_map(|method| Some((method, &models.for_method(method)?.network)))
         .filter(|(_, network)| network.has_token_norm())
@@ -59,10 +58,12 @@ pub fn evaluate_scene(
     }
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
-        let index = LazyClusters::new(&sweep.kmeans, &lift, views, num_storage_tokens, seed);
+        let index = LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed);
         let own_norm: Vec<_> = normed
             .iter()
-            .map(|(of, lift)| (*of, lift, LazyClusters::new(&sweep.kmeans, lift, views, num_storage_tokens, seed)))
+            .map(|(of, lift)| {
+                (*of, lift, LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed))
+            })
             .collect();
         for &method in &sweep.methods {
             let own = own_norm.iter().find(|(of, ..)| *of == method);
@@ -145,10 +146,10 @@ impl TargetRenderer<'_> {
         metrics: &mut EvalResults,
     ) -> Result<ScoredViews, EvalError> {
         let target = &self.clip.target;
-        let device = stored.tokens.device();
+        let device = stored.tokens.values.device();
         let render = |view: usize| -> Result<Vec<f32>, EvalError> {
-            let tokens: Tensor<3> = match selected {
-                Some(selected) => select_tokens(&stored.tokens, &selected[view].tokens), // [1, S, D] -> [1, R, D]
+            let tokens = match selected {
+                Some(selected) => stored.tokens.select(&selected[view].tokens), // [1, S, D] -> [1, R, D]
                 None => stored.tokens.clone(),
             };
             let image = stored.model.network.render(tokens, &camera_of(&self.cameras, view)); // [1, 1, H, W, 3]

@@ -49,12 +49,12 @@ impl ReleasedCondenser {
     /// - `centroids` and the result: `[batch, num_storage_tokens, dim]`
     /// - `lift`: `[batch, num_tokens, dim]`
     pub fn forward(&self, centroids: Tensor<3>, lift: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
-        let x = centroids.clone() + self.self_attn.forward(&self.norm_self, centroids.clone());
+        let x = centroids.clone() + self.self_attn.forward(&self.norm_self, centroids.clone(), None);
 
-        let key_value = self.cluster_attn.project_key_value(None, lift);
-        let query = self.cluster_attn.project_query(Some(&self.norm_cross), x.clone());
+        let key_value = self.cluster_attn.project_key_value(None, lift.into());
+        let query = self.cluster_attn.project_query(Some(&self.norm_cross), x.clone(), None);
         let attended = cluster_attention(query, key_value, clusters.segment.clone(), self.cluster_attn.num_heads());
-        let x = x + self.cluster_attn.project_out(attended);
+        let x = x + self.cluster_attn.project_out(attended, None);
 
         let x = x.clone() + self.feed_forward.forward(&self.norm_ff, x);
         centroids + linear(&self.gate, x)

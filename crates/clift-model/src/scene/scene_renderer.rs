@@ -7,8 +7,10 @@ use std::time::Instant;
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::error::ModelError;
+use crate::network::camera_encoding::TransformMaker;
 use crate::network::render_tokens::KeyValueCache;
 use crate::network::renderer::Renderer;
+use crate::network::tokens::Tokens;
 use crate::scene::scene::Scene;
 use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::selector::Selector;
@@ -71,7 +73,11 @@ impl SceneRenderer {
     /// [`ModelError::BadRay`] for a scene with rays that are not finite; [`Scene::read`] returns no such scene.
     pub fn new(scene: &Scene, renderer: Renderer, rules: SelectionRules, device: &Device) -> Result<Self, ModelError> {
         let shape = [1, scene.num_tokens(), scene.model.dim];
-        let tokens = Tensor::from_data(TensorData::new(scene.tokens.clone(), shape), device);
+        let values = Tensor::from_data(TensorData::new(scene.tokens.clone(), shape), device);
+        let context = Cameras::of_views(&scene.context, scene.height, scene.width, device)?;
+        let transforms = TransformMaker::new(&scene.model).of_views(&context);
+        let transforms = transforms.map(|transforms| transforms.select(&scene.token_ids));
+        let tokens = Tokens { values, transforms };
         let selector = Selector::new(rules, &scene.token_rays())?;
         Ok(Self { cache: renderer.project_tokens(&tokens), renderer, selector, device: device.clone() })
     }

@@ -104,10 +104,23 @@ impl LossConfig {
     }
 }
 
-/// AdamW with warm-up and cosine decay.
+/// Optimizer of the weight matrices of transformer blocks. All other parameters have AdamW.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Algorithm {
+    /// AdamW, as in the paper.
+    #[default]
+    Adamw,
+    /// Muon: momentum, then the nearest orthogonal matrix by five Newton-Schulz steps.
+    Muon,
+}
+
+/// AdamW or Muon, with warm-up and cosine decay.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OptimizerConfig {
+    /// Optimizer of the weight matrices of transformer blocks: `adamw`, or `muon`, which learns more per step.
+    pub algorithm: Algorithm,
     /// Highest learning rate.
     pub learning_rate: f64,
     /// Steps until this rate is reached.
@@ -126,6 +139,7 @@ pub struct OptimizerConfig {
 impl Default for OptimizerConfig {
     fn default() -> Self {
         Self {
+            algorithm: Algorithm::Adamw,
             learning_rate: 4e-4,
             warm_up_steps: 2500,
             weight_decay: 0.05,

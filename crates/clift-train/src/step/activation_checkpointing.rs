@@ -7,7 +7,7 @@
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Gradients, Tensor};
-use clift_model::{Cameras, Clift, EncoderBlock, Views};
+use clift_model::{Cameras, Clift, EncoderBlock, SceneModel, Tokens, Views};
 
 use crate::error::TrainError;
 use crate::step::batch::TokenSelection;
@@ -32,11 +32,14 @@ pub(crate) fn backward(
         cameras: untracked(&device_batch.context.cameras),
     };
     let targets = untracked(&device_batch.targets);
-    let (encoder_inputs, lift) =
-        block_inputs(plain.encoder.embed(&context), plain.encoder.blocks(), EncoderBlock::forward);
-    let tokens = selection.apply(&plain.condenser, plain.lift_norm.forward(lift.clone()))?;
+    let context_transforms = plain.encoder.transforms(&context.cameras);
+    let target_transforms = plain.renderer.transforms(&targets);
+    let encode = |block: &EncoderBlock, x: Tensor<3>| block.forward(x, context_transforms.as_ref());
+    let (encoder_inputs, lift) = block_inputs(plain.encoder.embed(&context), plain.encoder.blocks(), encode);
+    let lift = Tokens { values: lift, transforms: context_transforms.clone() };
+    let tokens = selection.apply(&plain.condenser, plain.normalize(lift.clone()))?;
     let (renderer_inputs, x) = block_inputs(plain.renderer.embed(&targets), plain.renderer.blocks(), |block, x| {
-        block.forward(x, tokens.project(block))
+        block.forward(x, tokens.project(block), target_transforms.as_ref())
     });
 
     // Backward, one block after the other.
@@ -48,9 +51,11 @@ pub(crate) fn backward(
     add(grads);
 
     let mut grad_tokens: Option<Tensor<3>> = None;
+    let target_transforms = model.renderer.transforms(&device_batch.targets);
     for (block, input) in model.renderer.blocks().iter().zip(renderer_inputs).rev() {
-        let (x, block_tokens) = (leaf(input), leaf(tokens.tokens().clone()));
-        let output = block.forward(x.clone(), tokens.with_tokens(block_tokens.clone()).project(block));
+        let (x, block_tokens) = (leaf(input), leaf(tokens.values().clone()));
+        let key_value = tokens.with_values(block_tokens.clone()).project(block);
+        let output = block.forward(x.clone(), key_value, target_transforms.as_ref());
         let mut grads = backward_from(output, grad_x);
         grad_x = take_gradient(&x, &mut grads);
         let grad = take_gradient(&block_tokens, &mut grads);
@@ -65,17 +70,17 @@ pub(crate) fn backward(
         return Ok(parts); // a renderer without blocks reads no token
     };
 
-    let lift = leaf(lift);
-    let output = selection.apply(&model.condenser, model.lift_norm.forward(lift.clone()))?.tokens().clone();
+    let lift = lift.with_values(leaf(lift.values.clone()));
+    let output = selection.apply(&model.condenser, model.normalize(lift.clone()))?.values().clone();
     let mut grads = backward_from(output, grad_tokens);
-    let mut grad_x = take_gradient(&lift, &mut grads);
+    let mut grad_x = take_gradient(&lift.values, &mut grads);
     add(grads);
     if !trains(&model.encoder) {
         return Ok(parts);
     }
     for (block, input) in model.encoder.blocks().iter().zip(encoder_inputs).rev() {
         let x = leaf(input);
-        let mut grads = backward_from(block.forward(x.clone()), grad_x);
+        let mut grads = backward_from(block.forward(x.clone(), lift.transforms.as_ref()), grad_x);
         grad_x = take_gradient(&x, &mut grads);
         add(grads);
     }
