@@ -204,3 +204,50 @@ impl TokenTransforms {
         transform_heads(x, self.0.clone(), OUTPUT, num_heads)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::DType;
+
+    use super::*;
+    use crate::ops::attention::sdpa::cross_sdpa;
+    use crate::testing::{Fixture, assert_close, cpu_devices, devices, output_and_gradients};
+
+    fn maker(encoding: CameraEncoding) -> TransformMaker {
+        let config = ModelConfig { camera_encoding: encoding, dim: 32, num_heads: 2, ..ModelConfig::default() };
+        TransformMaker::new(&config)
+    }
+
+    /// Attention of two target views to three context views, as in the fixture.
+    fn attend(encoding: CameraEncoding, cameras: [&Cameras; 2], [query, key_value]: [Tensor<3>; 2]) -> Tensor<3> {
+        let [targets, context] = cameras.map(|cameras| maker(encoding).of_views(cameras).expect("camera-relative"));
+        let (query, key_value) = (targets.tracked_as(&query).query(query, 2), context.key_value(key_value, 2));
+        targets.output(cross_sdpa(query, key_value, 2), 2)
+    }
+
+    #[test]
+    fn camera_relative_attention_equals_pytorch_in_f32_and_f64() {
+        let fixture = Fixture::open("camera_attention");
+        let wide = cpu_devices().into_iter().map(|device| (device, DType::F64, 1e-12));
+        let cases = devices().into_iter().map(|device| (device, DType::F32, 1e-5)).chain(wide);
+        for (device, dtype, tolerance) in cases {
+            let cameras = |prefix: &str| Cameras {
+                height: 16,
+                width: 24,
+                c2w: fixture.tensor_f64::<4>(&format!("input.{prefix}c2w"), &device).cast(dtype),
+                intrinsics: fixture.tensor_f64::<3>(&format!("input.{prefix}intrinsics"), &device).cast(dtype),
+            };
+            let (targets, context) = (cameras("target_"), cameras(""));
+            let read = |name: &str| fixture.tensor_f64::<3>(name, &device).cast(dtype);
+            for encoding in [CameraEncoding::Gta, CameraEncoding::Prope] {
+                let inputs = ["input.q", "input.key_value"].map(read);
+                let attend = |inputs| attend(encoding, [&targets, &context], inputs);
+                let (output, grads) = output_and_gradients(inputs, read("input.cotangent"), attend);
+                assert_close(&output, &read(&format!("output.{encoding}")), tolerance);
+                for (name, grad) in ["q", "key_value"].iter().zip(&grads) {
+                    assert_close(grad, &read(&format!("grad.{encoding}.{name}")), tolerance);
+                }
+            }
+        }
+    }
+}
