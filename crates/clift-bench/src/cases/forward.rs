@@ -110,7 +110,7 @@ pub fn attention_in_clusters(context: &BenchContext) -> Result<Forward<Attention
 pub fn render(
     context: &BenchContext,
     num_views: usize,
-) -> Result<Forward<(Network<Renderer>, Tensor<3>, Cameras)>, TrainError> {
+) -> Result<Forward<(Network<Renderer>, Tokens, Cameras)>, TrainError> {
     let ids: Vec<u32> = (0..context.num_render_tokens()? as u32).collect();
     let lift = context.lift()?.select(&ids);
     let targets = upload_cameras(&[&context.clip(num_views).target], &context.device)?;
