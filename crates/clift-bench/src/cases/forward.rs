@@ -69,9 +69,7 @@ impl ToF64 for UploadedClusters {
 }
 
 /// Condenser: tokens and clusters to condensed tokens.
-pub fn condense(
-    context: &BenchContext,
-) -> Result<Forward<(Network<Condenser>, Tokens, UploadedClusters)>, TrainError> {
+pub fn condense(context: &BenchContext) -> Result<Forward<(Network<Condenser>, Tokens, UploadedClusters)>, TrainError> {
     let lift = context.lift()?;
     let count = context.num_storage_tokens()?;
     let clusters = Clusters::new(vec![seeded_clusters(lift.dims()[1], count, context.config.seed, 0)?])?;

@@ -115,6 +115,16 @@ pub enum Algorithm {
     Muon,
 }
 
+impl Algorithm {
+    /// Returns the moments per value of a weight matrix of a block.
+    pub const fn matrix_moments(self) -> usize {
+        match self {
+            Self::Adamw => 2,
+            Self::Muon => 1,
+        }
+    }
+}
+
 /// AdamW or Muon, with warm-up and cosine decay.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

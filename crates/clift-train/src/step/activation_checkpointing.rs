@@ -133,7 +133,7 @@ fn trains<M: Module>(module: &M) -> bool {
 #[cfg(test)]
 mod tests {
     use burn::tensor::Device;
-    use clift_model::{CliftVariant, CondenserConfig, ModelConfig};
+    use clift_model::{CameraEncoding, CliftVariant, CondenserConfig, ModelConfig};
 
     use super::*;
     use crate::events::Stage;
@@ -148,7 +148,7 @@ mod tests {
 
     /// Returns the gradient of every parameter by the plain and by the checkpointed backward.
     fn both(
-        variant: CliftVariant,
+        (variant, camera_encoding): (CliftVariant, CameraEncoding),
         stage: Stage,
         batch: &StageBatch,
         loss: &Loss,
@@ -169,9 +169,10 @@ mod tests {
         }
         let config = ModelConfig {
             variant,
+            camera_encoding,
             condenser: CondenserConfig::of(variant),
             dim: 16,
-            num_heads: 4,
+            num_heads: 2,
             feed_forward_dim: 24,
             num_encoder_blocks: 2,
             num_renderer_blocks: 2,
@@ -204,9 +205,11 @@ mod tests {
         let few = StageBatch { tokens: subsets(2), ..all.clone() };
         let many = StageBatch { tokens: subsets(7), ..all.clone() };
         let cases = [(Stage::Stage1, all), (Stage::Stage1, few), (Stage::Stage1, many), (Stage::Stage2, stored)];
-        for variant in CliftVariant::ALL {
+        let plain = CliftVariant::ALL.map(|variant| (variant, CameraEncoding::Plucker));
+        let relative = [CameraEncoding::Gta, CameraEncoding::Prope].map(|encoding| (CliftVariant::Paper, encoding));
+        for network @ (variant, _) in plain.into_iter().chain(relative) {
             for (stage, batch) in &cases {
-                let pairs = both(variant, *stage, batch, &Loss::default(), &Device::flex());
+                let pairs = both(network, *stage, batch, &Loss::default(), &Device::flex());
                 let largest = |values: &[f32]| values.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
                 let scale = pairs.iter().map(|(plain, _)| largest(plain)).fold(0.0, f32::max);
                 for (plain, again) in pairs {
@@ -216,7 +219,7 @@ mod tests {
                     // Burn adds the gradients of a composed norm in the order of the whole graph. The floor covers
                     // biases with a gradient near zero.
                     let error = plain.iter().zip(&again).fold(0.0_f32, |error, (a, b)| error.max((a - b).abs()));
-                    assert!(error <= 1e-5 * largest(&plain) + 1e-7 * scale, "{variant}: {error:e} of {scale:e}");
+                    assert!(error <= 1e-5 * largest(&plain) + 1e-7 * scale, "{network:?}: {error:e} of {scale:e}");
                 }
             }
         }

@@ -131,6 +131,57 @@ mod tests {
         }
     }
 
+    /// Weight matrices of transformer blocks, and one outside of them.
+    #[derive(Module, Debug)]
+    struct Matrices {
+        blocks: Vec<Block>,
+        outside: Block,
+    }
+
+    #[derive(Module, Debug)]
+    struct Block {
+        layer: Weight,
+    }
+
+    #[derive(Module, Debug)]
+    struct Weight {
+        weight: Param<Tensor<2>>,
+    }
+
+    #[test]
+    fn five_updates_of_muon_equal_the_definition_in_f64() {
+        let fixture = Reference::open("reference/muon");
+        let device = Device::flex();
+        let rate = fixture.values("output.lr")[0];
+        let block = |name: &str| {
+            let weight = fixture.tensor(&format!("input.param_{name}"), &device.clone().autodiff());
+            Block { layer: Weight { weight: Param::from_tensor(weight) } }
+        };
+        let names = ["wide", "tall", "wide"];
+        let mut model = Matrices { blocks: vec![block("wide"), block("tall")], outside: block("wide") };
+        let config = OptimizerConfig { algorithm: Algorithm::Muon, ..OptimizerConfig::default() };
+        let mut optimizer = make_optimizer(&config);
+        for step in 0..5 {
+            let of_step = |kind: &str, name: &str| {
+                let all: Tensor<3> = fixture.tensor(&format!("{kind}_{name}"), &device);
+                all.narrow(0, step, 1).squeeze_dim::<2>(0)
+            };
+            let weights = |model: &Matrices| {
+                let blocks = [&model.blocks[0], &model.blocks[1], &model.outside];
+                blocks.map(|block| block.layer.weight.clone())
+            };
+            let mut grads = GradientsParams::new();
+            for (weight, name) in weights(&model).iter().zip(names) {
+                grads.register(weight.id, of_step("input.grad", name));
+            }
+            model = optimizer.step(rate, model, grads);
+            let [wide, tall, outside] = weights(&model).map(|weight| weight.val().inner());
+            assert_close(wide.clone(), of_step("output.param", "wide"), 2e-6);
+            assert_close(tall, of_step("output.param", "tall"), 2e-6);
+            assert!((wide - outside).abs().max().into_scalar::<f32>() > 1e-3, "AdamW updates it");
+        }
+    }
+
     #[test]
     fn clipping_equals_pytorch() {
         let fixture = Reference::open("reference/adamw");

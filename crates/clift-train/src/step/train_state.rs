@@ -12,7 +12,7 @@ use crate::step::batch::StageBatch;
 use crate::step::device_batch::{DeviceBatch, render_loss};
 use crate::step::loss::{Loss, LossParts};
 use crate::step::loss_scale::LossScale;
-use crate::step::optimizer::{ clip_factor, make_optimizer, norm_on_device, scale_gradients};
+use crate::step::optimizer::{clip_factor, make_optimizer, norm_on_device, scale_gradients};
 
 /// A model with its optimizer on an autodiff device.
 pub struct TrainState {
