@@ -10,6 +10,8 @@ use crate::support::{Place, STAGE_1, Shared, WHOLE, finish, number, point, signa
 
 /// A run whose methods differ by more than rounding.
 static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
+/// The same with camera-relative attention.
+static RELATIVE: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20", "model.camera_encoding=\"gta\""]);
 
 const KEY: &str = "synthetic-0-test-00000";
 /// Encodes this scene of the run `run`.
@@ -117,17 +119,26 @@ fn scene_files_reproduce_the_evaluation() {
 
 #[test]
 fn evaluation_of_selected_tokens_equals_rendering_the_file() {
-    let place = Place::with(&LONGER);
-    let (clip, _) = first_clip(&place, "run");
-    place.clift(&format!("{ENCODE} DIR/room.clift --context 0,7 --storage 8 --tokens f32")).ok();
-    for preset in SelectionPreset::ALL {
-        let name = preset.name();
-        place.eval(&format!("run --render 3,1/4 --selection {name} --out DIR/{name}")).ok();
-        for count in [2, 3] {
-            let from_file = measure(&clip, &drawn(open(&place, "room.clift", preset), &clip, count));
-            assert_eq!(from_file, evaluated(&place, name, 8, count), "{name}, {count}");
+    for run in [&LONGER, &RELATIVE] {
+        let place = Place::with(run);
+        let (clip, _) = first_clip(&place, "run");
+        place.clift(&format!("{ENCODE} DIR/room.clift --context 0,7 --storage 4 --tokens f32")).ok();
+        for preset in SelectionPreset::ALL {
+            let name = preset.name();
+            place.eval(&format!("run --render 3,1/2 --selection {name} --out DIR/{name}")).ok();
+            for count in [2, 3] {
+                let from_file = measure(&clip, &drawn(open(&place, "room.clift", preset), &clip, count));
+                assert_eq!(from_file, evaluated(&place, name, 4, count), "{name}, {count}");
+            }
         }
     }
+}
+
+#[test]
+fn camera_relative_networks_have_no_published_form() {
+    let place = Place::with(&RELATIVE);
+    let expected = "`model.camera_encoding` = gta: published networks have plain attention";
+    place.clift("export DIR/run --format pytorch -o DIR/run.ckpt").fails_with(2, &[expected]);
 }
 
 #[test]
