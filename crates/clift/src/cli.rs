@@ -30,7 +30,7 @@ Exit codes:
   130  Ctrl-C, after the state was saved
   143  SIGTERM, after the state was saved
 
-A second signal ends the process at once."
+A second signal, a second or more after the first, ends the process at once."
 )]
 pub struct Args {
     /// Command to run.
