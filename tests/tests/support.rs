@@ -222,9 +222,9 @@ impl Place {
         start(Command::new(BINARY).args(self.words(words)))
     }
 
-    /// Evaluates the run of a name, which flags may follow.
+    /// Evaluates the run of a name, which flags may follow, and replaces an existing evaluation.
     pub fn eval(&self, words: &str) -> Ran {
-        self.clift(&format!("eval DIR/{words}"))
+        self.clift(&format!("eval DIR/{words} --force"))
     }
 
     /// Reads a file of the folder.

@@ -6,7 +6,7 @@ use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenFormat, TokenKind,
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
-use crate::support::{Place, STAGE_1, Shared, WHOLE, finish, number, point, signal, wait_until};
+use crate::support::{Place, STAGE_1, Shared, WHOLE, files, finish, number, point, signal, wait_until};
 
 /// A run whose methods differ by more than rounding.
 static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
@@ -209,12 +209,17 @@ fn what_cannot_be_drawn_says_what_to_do() {
     assert!(!place.at("out").exists(), "nothing is left of what was refused");
 
     place.write("out/notes.txt", "");
-    render(orbit).fails_with(2, &["is not empty; choose another folder"]);
+    render(&format!("{orbit} --force")).fails_with(2, &["is not empty and holds no frames; choose another folder"]);
     std::fs::remove_file(place.at("out/notes.txt")).unwrap();
 
     std::fs::rename(place.at("run"), place.at("moved")).unwrap();
     render(orbit).fails_with(2, &["the weights of the scene are not found at ", "; set --model RUN"]);
     render(&format!("{orbit} --model DIR/moved")).ok();
+    let before = files(&place.at("out"));
+    render(&format!("{orbit} --model DIR/moved")).fails_with(2, &["holds frames; replace them with --force"]);
+    assert!(files(&place.at("out")) == before);
+    render("--path orbit --frames 1 --model DIR/moved --force").ok();
+    assert_eq!(place.names("out"), ["animation.png", "frame-00000.png", "render.json"]);
 
     place.truncate("room.clift");
     let again = |scene: &str| place.clift(&format!("render DIR/{scene} --out DIR/again {orbit}"));
@@ -247,7 +252,8 @@ fn scene_files_overwrite_only_scene_files() {
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
     encode("no/room.clift").fails_with(2, &["no folder "]);
     encode("room.clift").ok();
-    encode("room.clift --storage 8").ok();
+    encode("room.clift --storage 8").fails_with(2, &["room.clift exists; replace it with --force"]);
+    encode("room.clift --storage 8 --force").ok();
     assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);
     // Another number of heads fits the same weights and would change every image.
     for change in ["model.num_heads=1", "model={num_heads=1}"] {
@@ -259,7 +265,7 @@ fn scene_files_overwrite_only_scene_files() {
 #[test]
 fn encode_chooses_scenes_by_key_context_and_count() {
     let place = Place::with(&STAGE_1);
-    let encode = |words: &str| place.clift(&format!("encode DIR/run --out DIR/room.clift {words}"));
+    let encode = |words: &str| place.clift(&format!("encode DIR/run --out DIR/room.clift --force {words}"));
     encode("").fails_with(2, &["scenes; choose one with --scene: synthetic-0-test-00000, "]);
     encode("--scene attic").fails_with(2, &["no scene attic; the "]);
     let one = |flags: &str| encode(&format!("--scene {KEY} {flags}"));
@@ -281,7 +287,7 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     second.prints("scene 00000000000000a2");
     encode("DIR/run").fails_with(2, &["no scenes found: expected index.json with chunks, "]);
 
-    let by = |model: &str| place.clift(&format!("encode DIR/{model} {mini} -o DIR/from-file.clift"));
+    let by = |model: &str| place.clift(&format!("encode DIR/{model} {mini} -o DIR/from-file.clift --force"));
     by("run/stage1/model.safetensors").ok();
     let file = place.at("run/stage1/model.safetensors");
     assert_eq!(Scene::read(&place.at("from-file.clift")).unwrap().0.model_path, file.display().to_string());

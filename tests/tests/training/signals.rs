@@ -79,6 +79,23 @@ fn a_run_started_by_nohup_outlives_its_terminal() {
 }
 
 #[test]
+fn a_run_that_is_moved_stops_and_resumes_elsewhere() {
+    let place = Place::new();
+    let set = [&LONG[..3], &["checkpoint.every=20", "data.num_threads=0"]].concat();
+    let mut child = place.start_train("run", &set);
+    place.wait_for_steps("run", &mut child, 25);
+    std::fs::rename(place.at("run"), place.at("moved")).expect("renames");
+    let moved = "the run directory was moved or removed during training; resume at its new place";
+    finish(child).fails_naming(1, &[moved], "/run");
+    assert!(!place.at("run").exists(), "no second run directory without a config is made");
+    let step = *place.checkpoints("moved", "stage1").last().expect("a checkpoint");
+    let mut child = place.start_train("moved", &set);
+    place.wait_for_steps("moved", &mut child, step as usize + 1);
+    signal(&child, "-INT");
+    finish(child).fails_with(130, &[]);
+}
+
+#[test]
 fn second_processes_are_refused_while_the_first_lives() {
     let place = Place::new();
     let mut first = place.start_train("run", &LONG);

@@ -32,6 +32,9 @@ pub struct EncodeArgs {
     /// Scene file to write
     #[arg(long, short, value_name = "FILE")]
     pub out: PathBuf,
+    /// Replace an existing scene file
+    #[arg(long)]
+    pub force: bool,
     /// Key of the scene, if the data set has several
     #[arg(long, value_name = "KEY")]
     pub scene: Option<String>,
@@ -54,6 +57,9 @@ pub struct EncodeArgs {
 /// Encodes one scene and writes its file.
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_output_path(&args.out).map_err(|error| UsageError(error.to_string()))?;
+    if !args.force && args.out.exists() {
+        usage_bail!("the scene file {} exists; replace it with --force or choose another name", args.out.display());
+    }
     let model = ModelPath::find(&args.model)?;
     let (mut config, overrides) = read_config(&model.dir.join("config.toml"), &args.overrides.set, |_| Ok(()))?;
     // Tensor shapes do not determine the number of heads: a wrong one would silently change the tokens.

@@ -31,12 +31,35 @@ pub struct Frames {
     pub fps: u16,
 }
 
-/// Checks that the output folder is empty or absent: frames of another path would mix with the new ones.
-pub fn require_empty(out: &Path) -> anyhow::Result<()> {
+/// File of the path, token counts and times of the frames.
+pub const REPORT: &str = "render.json";
+
+/// Checks that the output folder is empty or absent, or holds frames that `replace` allows to replace.
+pub fn check_out(out: &Path, replace: bool) -> anyhow::Result<()> {
     if is_empty_folder(out).with_context(|| format!("reading {}", out.display()))? {
         return Ok(());
     }
-    usage_bail!("output folder {} is not empty; choose another folder or move it away", out.display())
+    let out_text = out.display();
+    match (out.join(REPORT).is_file(), replace) {
+        (true, true) => Ok(()),
+        (true, false) => {
+            usage_bail!("output folder {out_text} holds frames; replace them with --force or choose another")
+        }
+        (false, _) => usage_bail!("output folder {out_text} is not empty and holds no frames; choose another folder"),
+    }
+}
+
+/// Removes the frames of a longer path that was replaced by one of `num_frames`.
+pub fn remove_later_frames(out: &Path, num_frames: usize) -> std::io::Result<()> {
+    for item in std::fs::read_dir(out)? {
+        let item = item?;
+        let name = item.file_name();
+        let number = name.to_str().and_then(|name| name.strip_prefix("frame-")?.strip_suffix(".png")?.parse().ok());
+        if number.is_some_and(|number: usize| number >= num_frames) {
+            std::fs::remove_file(item.path())?;
+        }
+    }
+    Ok(())
 }
 
 /// Renders every view and writes the frames and the animation to `folder`, until `stop` is set.

@@ -48,7 +48,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let [width, height] = args.size.unwrap_or([scene.width, scene.height]);
     let device = args.device.unwrap_or_default();
     check_size(&scene, [width, height], args.render.is_some(), device)?;
-    frames::require_empty(&args.out)?;
+    frames::check_out(&args.out, args.force)?;
     let views = path_cameras(&scene, args, height, width)?;
     let model = args.model.clone().unwrap_or_else(|| scene.model_path.clone().into());
     let weights = ModelPath::for_tokens(&model, scene.kind);
@@ -82,8 +82,9 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         timing,
         calibration: calibration.map(|times| times.some.into_iter().chain([times.all]).collect()),
     };
-    write_json(&report, &files.path().join("render.json"))?;
+    write_json(&report, &files.path().join(frames::REPORT))?;
     files.commit().with_context(creating)?;
+    frames::remove_later_frames(&args.out, views.len()).with_context(creating)?;
     print_result(&format!(
         "{}: {} frames of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
          {:.1} ms per frame on {device} (median): {:.1} ms token selection, {:.1} ms rendering",
