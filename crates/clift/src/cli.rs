@@ -85,8 +85,8 @@ Examples:
     Encode(EncodeArgs),
     /// Render a scene file along a camera path
     ///
-    /// Writes frame-00000.png and so on, animation.png (an animated PNG for browsers) and render.json (token counts and
-    /// times) to a new folder.
+    /// Writes frame-00000.png and so on, animation.png (an animated PNG for browsers) and render.json (token
+    /// counts, times and the tokens of each frame) to a folder.
     #[command(after_help = "\
 Paths:
   interpolate   through the context views

@@ -6,7 +6,7 @@ use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenFormat, TokenKind,
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
-use crate::support::{Place, STAGE_1, Shared, WHOLE, files, finish, number, point, signal, wait_until};
+use crate::support::{Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, wait_until};
 
 /// A run whose methods differ by more than rounding.
 static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
@@ -158,6 +158,12 @@ fn paths_render_to_frames_and_animation_by_count() {
         }
         let report = place.json(&format!("{out}/render.json"));
         assert_eq!((&report["num_frames"], &report["num_render_tokens"]), (&10.into(), &num_render_tokens.into()));
+        let tokens = &report["tokens"];
+        assert_eq!(tokens.is_null(), num_render_tokens == 8, "{report}");
+        for frame in tokens.as_array().into_iter().flatten() {
+            let ids: Vec<u64> = list(frame).iter().map(|id| id.as_u64().expect("an index")).collect();
+            assert!(ids.len() == num_render_tokens && ids.is_sorted_by(|a, b| a < b) && ids.iter().all(|id| *id < 8));
+        }
         assert_eq!(report["calibration"].is_array(), out == "in-time", "{report}");
         assert_eq!(number(&report, "select_s") > 0.0, num_render_tokens < 8, "{report}");
         let selection = match out {
@@ -275,7 +281,16 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     // Without stage 2, tokens are those nearest to the cluster centres; all of them leave no variance within clusters.
     let ran = one("--storage 8").ok().prints("8 of 8 tokens (kmeans, f16)");
     assert!(ran.stdout.ends_with("     8  0.0000\n"), "{}", ran.stdout);
-    one("--storage 1/2").ok().prints("4 of 8 tokens");
+    one("--storage 1/2 --save-clusters DIR/clusters.json").ok().prints("4 of 8 tokens");
+    let clusters = place.json("clusters.json");
+    assert_eq!((list(&clusters["assignment"]).len(), list(&clusters["centroids"]).len()), (8, 4));
+    assert_eq!((&clusters["rows"], &clusters["columns"]), (&2.into(), &2.into()));
+    // A centroid is a token of its own cluster, and a token of the scene file.
+    let centroids: Vec<u32> = list(&clusters["centroids"]).iter().map(|id| id.as_u64().unwrap() as u32).collect();
+    assert_eq!(centroids, Scene::read(&place.at("room.clift")).unwrap().0.token_ids);
+    for (cluster, &token) in centroids.iter().enumerate() {
+        assert_eq!(clusters["assignment"][token as usize], cluster);
+    }
     let ran = place.clift("render DIR/room.clift --out DIR/out --path orbit --frames 2").ok();
     ran.prints("2 frames of 16 x 16");
 

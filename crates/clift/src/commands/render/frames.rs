@@ -22,6 +22,14 @@ pub struct Timing {
     pub render_s: f64,
 }
 
+/// Times and tokens of the rendered frames.
+pub struct Rendered {
+    /// Median seconds.
+    pub timing: Timing,
+    /// Indices of the tokens of each frame, ascending; `None` if every frame uses all tokens.
+    pub tokens: Option<Vec<Vec<u32>>>,
+}
+
 /// Settings of all frames.
 pub struct Frames {
     pub height: usize,
@@ -69,11 +77,11 @@ pub fn write_frames(
     frames: &Frames,
     folder: &Path,
     stop: &AtomicBool,
-) -> anyhow::Result<Timing> {
+) -> anyhow::Result<Rendered> {
     let &Frames { height, width, num_render_tokens, fps } = frames;
     let mut animation = Animation::new(&folder.join("animation.png"), width, height, views.len(), fps)?;
     let mut counter = Counter::new("frames", views.len() as u64);
-    let (mut select_s, mut render_s) = (Vec::new(), Vec::new());
+    let (mut select_s, mut render_s, mut tokens) = (Vec::new(), Vec::new(), Vec::new());
     for some in views.chunks(renderer.frames_per_call(height, width)) {
         let first = render_s.len();
         if stop.load(Ordering::Relaxed) {
@@ -87,9 +95,11 @@ pub fn write_frames(
             animation.add(&image)?;
             select_s.push(view.select_s);
             render_s.push(view.render_s);
+            tokens.push(view.tokens);
         }
         counter.set(render_s.len() as u64);
     }
     animation.finish()?;
-    Ok(Timing { select_s: upper_median(&select_s), render_s: upper_median(&render_s) })
+    let timing = Timing { select_s: upper_median(&select_s), render_s: upper_median(&render_s) };
+    Ok(Rendered { timing, tokens: tokens.into_iter().collect() })
 }

@@ -12,7 +12,7 @@ use clift_model::{
 use serde::Serialize;
 
 use crate::commands::render::args::{CameraPath, RenderArgs};
-use crate::commands::render::frames::{self, Frames, Timing};
+use crate::commands::render::frames::{self, Frames, Rendered, Timing};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::json::write_json;
@@ -38,6 +38,8 @@ struct Report {
     num_render_tokens: usize,
     #[serde(flatten)]
     timing: Timing,
+    /// Tokens of the scene file that each frame is rendered from; `null` if every frame uses all.
+    tokens: Option<Vec<Vec<u32>>>,
     /// Token counts and their seconds per frame, measured for `--budget-ms`.
     calibration: Option<Vec<(usize, f64)>>,
 }
@@ -67,7 +69,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let creating = || format!("creating {}", args.out.display());
     let files = StagedDir::new(&args.out).with_context(creating)?;
     let frames = Frames { height, width, num_render_tokens, fps: args.fps };
-    let timing = frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
+    let Rendered { timing, tokens } = frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
     let Timing { select_s, render_s } = timing;
     let report = Report {
         scene: scene.key.clone(),
@@ -80,6 +82,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         num_storage_tokens: scene.num_tokens(),
         num_render_tokens,
         timing,
+        tokens,
         calibration: calibration.map(|times| times.some.into_iter().chain([times.all]).collect()),
     };
     write_json(&report, &files.path().join(frames::REPORT))?;
