@@ -51,9 +51,9 @@ External methods:
   letters, digits, - _ and . are replaced by _.
 
 Examples:
-  clift eval runs/tiny --storage 8,1/4,1.0 --tokens f32,f16,int8
-  clift eval runs/re10k --index INDEX.json --set 'eval.lpips_weights=\"lpips-vgg.safetensors\"'
-  clift eval runs/re10k --index INDEX.json --predictions out/mvsplat --name MVSplat --data-size 12MB")]
+  clift eval runs/tiny --storage 8,1/4,1.0 --tokens f32,f16,int8 --out runs/tiny/formats
+  clift eval runs/re10k --index INDEX.json --set 'eval.lpips_weights=\"lpips-vgg.safetensors\"' --out lpips
+  clift eval runs/re10k --index INDEX.json --predictions out/mvsplat --name MVSplat --data-size 12MB --force")]
     Eval(EvalArgs),
     /// Compare two evaluations view by view, with confidence intervals
     ///
