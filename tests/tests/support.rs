@@ -253,11 +253,14 @@ impl Place {
         self.json_lines(&format!("{run}/metrics.jsonl"))
     }
 
-    /// The lines of a run's `metrics.jsonl` without times.
+    /// The lines of a run's `metrics.jsonl` and `validation.jsonl` without times.
     pub fn metrics_but_time(&self, run: &str) -> Vec<Value> {
         let mut lines = self.metrics(run);
+        if self.at(&format!("{run}/validation.jsonl")).exists() {
+            lines.extend(self.json_lines(&format!("{run}/validation.jsonl")));
+        }
         for line in &mut lines {
-            line.as_object_mut().expect("an object").remove("step_s");
+            line.as_object_mut().expect("an object").retain(|key, _| key != "step_s" && key != "time");
         }
         lines
     }
@@ -292,7 +295,7 @@ impl Place {
             // The report holds the date, `views.csv` times, and `config.toml` the path of its run.
             files.retain(|path, _| {
                 let name = path.display().to_string();
-                let other = ["metrics.jsonl", "config.toml", "lock"].contains(&name.as_str());
+                let other = ["metrics.jsonl", "validation.jsonl", "config.toml", "lock"].contains(&name.as_str());
                 !other && !name.starts_with("eval/") && !name.contains("/checkpoints/")
             });
             files

@@ -60,7 +60,7 @@ impl StagePlan<'_> {
         let progress = checkpoints.resume(&mut train_state)?.unwrap_or_default();
         train_state.model = freeze(stage, train_state.model);
         make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
-        let mut log = RunLog::open(&config.run_dir, stage, progress.step, sink)?;
+        let mut log = RunLog::open(&config.run_dir, stage, [progress.step, progress.validated], sink)?;
         log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
 
         let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
