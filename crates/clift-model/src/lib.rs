@@ -96,7 +96,7 @@ pub use weights::file::{first_not_f32, load_part, save_part, save_weights, sorte
 pub use weights::hash::weights_hash;
 pub use weights::model_path::{ModelPath, check_heads, refuse_checkpoint};
 pub use weights::published_keys::{
-    CONVOLUTIONS, PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
+    PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };
 pub use weights::published_sizes::{InferredConfig, infer_config};
 pub use weights::trained_model::TrainedModel;

@@ -30,7 +30,7 @@ Exit codes:
   130  Ctrl-C, after the state was saved
   143  SIGTERM, after the state was saved
 
-A second signal ends the process at once."
+A second signal, a second or more after the first, ends the process at once."
 )]
 pub struct Args {
     /// Command to run.
@@ -51,9 +51,9 @@ External methods:
   letters, digits, - _ and . are replaced by _.
 
 Examples:
-  clift eval runs/tiny --storage 8,1/4,1.0 --tokens f32,f16,int8
-  clift eval runs/re10k --index INDEX.json --set 'eval.lpips_weights=\"lpips-vgg.safetensors\"'
-  clift eval runs/re10k --index INDEX.json --predictions out/mvsplat --name MVSplat --data-size 12MB")]
+  clift eval runs/tiny --storage 8,1/4,1.0 --tokens f32,f16,int8 --out runs/tiny/formats
+  clift eval runs/re10k --index INDEX.json --set 'eval.lpips_weights=\"lpips-vgg.safetensors\"' --out lpips
+  clift eval runs/re10k --index INDEX.json --predictions out/mvsplat --name MVSplat --data-size 12MB --force")]
     Eval(EvalArgs),
     /// Compare two evaluations view by view, with confidence intervals
     ///
@@ -85,8 +85,8 @@ Examples:
     Encode(EncodeArgs),
     /// Render a scene file along a camera path
     ///
-    /// Writes frame-00000.png and so on, animation.png (an animated PNG for browsers) and render.json (token counts and
-    /// times) to a new folder.
+    /// Writes frame-00000.png and so on, animation.png (an animated PNG for browsers) and render.json (token
+    /// counts, times and the tokens of each frame) to a folder.
     #[command(after_help = "\
 Paths:
   interpolate   through the context views

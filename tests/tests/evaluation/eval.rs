@@ -22,7 +22,7 @@ fn views(place: &Place, folder: &str) -> Vec<(String, String)> {
 }
 
 /// Writes a file in the form of `scripts/tools/convert_vgg.py`, with small random weights.
-fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) {
+pub fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) {
     let mut state = 1_u32;
     let mut random = |count: usize, scale: f32| -> Vec<u8> {
         let mut value = || {

@@ -6,7 +6,7 @@ use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenFormat, TokenKind,
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
-use crate::support::{Place, STAGE_1, Shared, WHOLE, finish, number, point, signal, wait_until};
+use crate::support::{Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, wait_until};
 
 /// A run whose methods differ by more than rounding.
 static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
@@ -166,6 +166,12 @@ fn paths_render_to_frames_and_animation_by_count() {
         }
         let report = place.json(&format!("{out}/render.json"));
         assert_eq!((&report["num_frames"], &report["num_render_tokens"]), (&10.into(), &num_render_tokens.into()));
+        let tokens = &report["tokens"];
+        assert_eq!(tokens.is_null(), num_render_tokens == 8, "{report}");
+        for frame in tokens.as_array().into_iter().flatten() {
+            let ids: Vec<u64> = list(frame).iter().map(|id| id.as_u64().expect("an index")).collect();
+            assert!(ids.len() == num_render_tokens && ids.is_sorted_by(|a, b| a < b) && ids.iter().all(|id| *id < 8));
+        }
         assert_eq!(report["calibration"].is_array(), out == "in-time", "{report}");
         assert_eq!(number(&report, "select_s") > 0.0, num_render_tokens < 8, "{report}");
         let selection = match out {
@@ -215,11 +221,16 @@ fn what_cannot_be_drawn_says_what_to_do() {
     render("--path DIR/poses.json --frames 3").fails_with(2, &[counted]);
     assert!(!place.at("out").exists(), "nothing is left of what was refused");
     place.write("out/notes.txt", "");
-    render(orbit).fails_with(2, &["is not empty; choose another folder"]);
+    render(&format!("{orbit} --force")).fails_with(2, &["is not empty and holds no frames; choose another folder"]);
     std::fs::remove_file(place.at("out/notes.txt")).unwrap();
     std::fs::rename(place.at("run"), place.at("moved")).unwrap();
     render(orbit).fails_with(2, &["the weights of the scene are not found at ", "; set --model RUN"]);
     render(&format!("{orbit} --model DIR/moved")).ok();
+    let before = files(&place.at("out"));
+    render(&format!("{orbit} --model DIR/moved")).fails_with(2, &["holds frames; replace them with --force"]);
+    assert!(files(&place.at("out")) == before);
+    render("--path orbit --frames 1 --model DIR/moved --force").ok();
+    assert_eq!(place.names("out"), ["animation.png", "frame-00000.png", "render.json"]);
 
     place.truncate("room.clift");
     let again = |scene: &str| place.clift(&format!("render DIR/{scene} --out DIR/again {orbit}"));
@@ -252,7 +263,8 @@ fn scene_files_overwrite_only_scene_files() {
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
     encode("no/room.clift").fails_with(2, &["no folder "]);
     encode("room.clift").ok();
-    encode("room.clift --storage 8").ok();
+    encode("room.clift --storage 8").fails_with(2, &["room.clift exists; replace it with --force"]);
+    encode("room.clift --storage 8 --force").ok();
     assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);
     // Another number of heads fits the same weights and would change every image.
     for change in ["model.num_heads=1", "model={num_heads=1}"] {
@@ -264,7 +276,7 @@ fn scene_files_overwrite_only_scene_files() {
 #[test]
 fn encode_chooses_scenes_by_key_context_and_count() {
     let place = Place::with(&STAGE_1);
-    let encode = |words: &str| place.clift(&format!("encode DIR/run --out DIR/room.clift {words}"));
+    let encode = |words: &str| place.clift(&format!("encode DIR/run --out DIR/room.clift --force {words}"));
     encode("").fails_with(2, &["scenes; choose one with --scene: synthetic-0-test-00000, "]);
     encode("--scene attic").fails_with(2, &["no scene attic; the "]);
     let one = |flags: &str| encode(&format!("--scene {KEY} {flags}"));
@@ -274,7 +286,16 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     // Without stage 2, tokens are those nearest to the cluster centres; all of them leave no variance within clusters.
     let ran = one("--storage 8").ok().prints("8 of 8 tokens (kmeans, f16)");
     assert!(ran.stdout.ends_with("     8  0.0000\n"), "{}", ran.stdout);
-    one("--storage 1/2").ok().prints("4 of 8 tokens");
+    one("--storage 1/2 --save-clusters DIR/clusters.json").ok().prints("4 of 8 tokens");
+    let clusters = place.json("clusters.json");
+    assert_eq!((list(&clusters["assignment"]).len(), list(&clusters["centroids"]).len()), (8, 4));
+    assert_eq!((&clusters["rows"], &clusters["columns"]), (&2.into(), &2.into()));
+    // A centroid is a token of its own cluster, and a token of the scene file.
+    let centroids: Vec<u32> = list(&clusters["centroids"]).iter().map(|id| id.as_u64().unwrap() as u32).collect();
+    assert_eq!(centroids, Scene::read(&place.at("room.clift")).unwrap().0.token_ids);
+    for (cluster, &token) in centroids.iter().enumerate() {
+        assert_eq!(clusters["assignment"][token as usize], cluster);
+    }
     let ran = place.clift("render DIR/room.clift --out DIR/out --path orbit --frames 2").ok();
     ran.prints("2 frames of 16 x 16");
 
@@ -285,7 +306,8 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     let second = encode(&format!("{mini} --split train --scene 00000000000000a2")).ok();
     second.prints("scene 00000000000000a2");
     encode("DIR/run").fails_with(2, &["no scenes found: expected index.json with chunks, "]);
-    let by = |model: &str| place.clift(&format!("encode DIR/{model} {mini} -o DIR/from-file.clift"));
+
+    let by = |model: &str| place.clift(&format!("encode DIR/{model} {mini} -o DIR/from-file.clift --force"));
     by("run/stage1/model.safetensors").ok();
     let file = place.at("run/stage1/model.safetensors");
     assert_eq!(Scene::read(&place.at("from-file.clift")).unwrap().0.model_path, file.display().to_string());

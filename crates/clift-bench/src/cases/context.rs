@@ -77,7 +77,10 @@ impl BenchContext {
             lift: OnceCell::new(),
             config,
         };
-        context.num_storage_tokens()?;
+        // K-means of a file clusters the tokens of the file.
+        if options.features.is_none() || options.cases.iter().any(|case| *case != BenchCase::Kmeans) {
+            context.num_storage_tokens()?;
+        }
         context.num_render_tokens()?;
         Ok(context)
     }
@@ -143,7 +146,10 @@ impl BenchContext {
     }
 
     pub fn stored_of(&self, num_tokens: usize) -> Result<usize, TrainError> {
-        self.storage.of(num_tokens).map_err(|error| self.bad_storage(&error.to_string()))
+        self.storage.of(num_tokens).map_err(|error| {
+            let hint = if self.features.is_some() { "; --case kmeans alone uses the tokens of --features" } else { "" };
+            self.bad_storage(&format!("{error}{hint}"))
+        })
     }
 
     pub fn bad_storage(&self, fix: &str) -> TrainError {

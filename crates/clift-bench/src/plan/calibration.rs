@@ -6,7 +6,7 @@ use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
 use clift_data::{ClipReader, Split, item_rng, open_dataset, step_rng, upper_median};
-use clift_eval::{EvalModels, EvalResults, Lpips, Sweep, evaluate_scene, upload_cameras, upload_views};
+use clift_eval::{EvalModels, EvalResults, Lpips, Perceptual, Sweep, evaluate_scene, upload_cameras, upload_views};
 use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
     ClipShape, Config, DeviceBatch, Loss, Stage, StageBatch, TokenSelection, TrainError, TypicalStep, clip_global_norm,
@@ -155,10 +155,12 @@ pub fn update_rates(config: &Config, stage: Stage, typical: &TypicalStep) -> Res
 
 /// Returns the seconds of the perceptual term of one image and of its gradient.
 fn perceptual_s(config: &Config, context: &BenchContext) -> Result<f64, TrainError> {
-    if config.loss.weights()?.is_none() {
+    let weight = config.loss.perceptual_weight;
+    if weight == 0.0 {
         return Ok(0.0);
     }
-    let loss = Loss::load(&config.loss, &context.device)?;
+    // The values of the weights do not change the time: the file need not exist.
+    let loss = Loss::default().with_term(weight, Perceptual::random(&context.device));
     let size = [1, 1, config.data.height, config.data.width, 3];
     let image = |value: f64| Tensor::<5>::full(size, value, &context.device.clone().autodiff());
     let timed = Timed::of(|| {
@@ -228,7 +230,7 @@ pub fn inference_rates(
     } else {
         let stage2 = TrainedModel::snapshot(&model, &shallow.model, true);
         let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
-        let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
+        let lpips = config.eval.lpips_path().filter(|path| measures_lpips(config) && path.is_file());
         let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
         let sweep = Sweep { model: shallow.model.clone(), lpips, ..eval_sizes(config) };
         // Shared by the repetitions: warm-up views are rendered only for the first one.

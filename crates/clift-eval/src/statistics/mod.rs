@@ -6,6 +6,7 @@
 //! - `pareto`: Pareto front
 //! - `paired`: paired differences of methods
 //! - `summary`: summary.json
+//! - `headline`: the result in a few lines
 //! - `csv_files`: views.csv and scenes.csv
 //! - `table`: the terminal table
 //! - `compare`: two evaluations, view by view
@@ -15,6 +16,7 @@ pub(crate) mod compare;
 pub(crate) mod compare_table;
 pub(crate) mod csv_files;
 pub(crate) mod eval_results;
+pub(crate) mod headline;
 pub(crate) mod paired;
 pub(crate) mod pareto;
 pub(crate) mod student_t;

@@ -17,7 +17,7 @@ pub enum CliftVariant {
     /// and values are all tokens of the cluster without a norm, followed by a gate with bias.
     ReleasedRe10k,
     /// The released code's network for DL3DV: [`CliftVariant::ReleasedRe10k`] with an RMS norm of every head's queries and
-    /// keys in all attention, and a layer norm after the encoder.
+    /// keys in encoder and renderer, and a layer norm after the encoder.
     ReleasedDl3dv,
 }
 
@@ -35,7 +35,7 @@ impl CliftVariant {
         self != Self::Paper
     }
 
-    /// Whether the heads of queries and keys and the encoder's tokens have norms.
+    /// Whether the heads of queries and keys in encoder and renderer, and the encoder's tokens, have norms.
     pub fn has_norms(self) -> bool {
         self == Self::ReleasedDl3dv
     }

@@ -5,6 +5,7 @@ use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 
+use crate::network::architecture::CliftVariant;
 use crate::network::blocks::attention::{CrossAttention, SelfAttention};
 use crate::network::blocks::feed_forward::{Activation, FeedForward};
 use crate::network::config::ModelConfig;
@@ -31,6 +32,8 @@ pub(crate) struct ReleasedCondenser {
 
 impl ReleasedCondenser {
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        // The network for DL3DV has the same condenser: only its encoder and renderer have norms of queries and keys.
+        let config = &ModelConfig { variant: CliftVariant::ReleasedRe10k, ..config.clone() };
         let dim = config.dim;
         Self {
             norm_self: init.layer_norm(dim),

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use clift_data::{replace_file, write_state_dict};
-use clift_model::{CONVOLUTIONS, CameraEncoding, ModelConfig, ModelPath, PREFIX, published_tensors};
+use clift_model::{CameraEncoding, ModelConfig, ModelPath, PREFIX, PROJECTIONS, published_tensors};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
@@ -47,7 +47,7 @@ pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Pa
     }
     let convolutions = match ImportRecord::read(&model.dir)? {
         Some(imported) => imported.convolutions,
-        None => CONVOLUTIONS.map(String::from).into(),
+        None => PROJECTIONS.map(String::from).into(),
     };
     let mut ours = read_parameters(&model.weights)?;
     let bad = |reason: String| TrainError::bad_file("weight file", &model.weights)(reason);

@@ -1,6 +1,5 @@
 //! Evaluation of a model without a run: an imported model or a weight file.
 
-use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::{ClipReader, OpenedSource, Split, open_dataset};
@@ -10,6 +9,7 @@ use clift_model::{ModelPath, TrainedModel};
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink};
+use crate::run::eval_folder::EvalFolder;
 use crate::run::validation::Validation;
 
 /// Evaluates a model with the data and settings of `config`, and writes the results to `folder`.
@@ -25,7 +25,7 @@ pub fn evaluate_model(
     model: &ModelPath,
     stage1: Option<&ModelPath>,
     external: &[ExternalMethod],
-    folder: &Path,
+    folder: &EvalFolder,
     stop: &AtomicBool,
     sink: &mut dyn Sink,
 ) -> Result<Summary, TrainError> {
@@ -58,6 +58,5 @@ pub fn evaluate_model(
     sink.event(&Event::Message(format!("{}: {report}", Split::Test)));
     let reader = ClipReader { source, options: config.data.clip_options() };
     let validation = Validation::new(&config, config.eval.clone(), reader, &device, sink)?;
-    std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
-    validation.evaluate(&models, external, folder, stop, sink)
+    validation.evaluate(&models, external, folder.path(), stop, sink)
 }

@@ -1,6 +1,7 @@
 //! A run directory from open to report.
 //!
-//! - `lock`: lock of a run directory
+//! - `lock`: lock of a run directory or an output folder
+//! - `eval_folder`: output folder of an evaluation
 //! - `logs`: metrics, skipped steps and scenes as JSONL
 //! - `extend`: `--extend`
 //! - `run_file`: run.json; same settings on resume
@@ -11,6 +12,7 @@
 //! - `evaluate_model`: evaluate a model without a run
 //! - `run`: a run: open, train, evaluate
 
+pub(crate) mod eval_folder;
 pub(crate) mod evaluate_model;
 pub(crate) mod extend;
 pub(crate) mod init_from;

@@ -23,9 +23,10 @@ use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::footprint::scene_sizes::PARTS;
+use crate::run::eval_folder::{EvalFolder, SUMMARY};
 use crate::run::init_from::init_from;
-use crate::run::lock::RunLock;
-use crate::run::run_file::{RunFile, compare_settings, write_config};
+use crate::run::lock::{LockedFolder, RunLock};
+use crate::run::run_file::{RunFile, compare_settings, require_run, write_config};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
 use crate::run::validation::Validation;
 use crate::stage::stage1_batches::Stage1Batches;
@@ -80,13 +81,13 @@ impl Run {
         }
         if options.fresh && folder.exists() {
             // Refuses a directory in use. Dropped before the rename, which Windows refuses otherwise.
-            drop(RunLock::take(folder, sink)?);
+            drop(RunLock::take(folder, LockedFolder::Run, sink)?);
             let moved = free_name(folder);
             std::fs::rename(folder, &moved).map_err(TrainError::io("renaming the existing run", folder))?;
             sink.event(&Event::Message(format!("renamed the existing run to {}", moved.display())));
         }
         make_folder(folder).map_err(TrainError::io("making the run directory", folder))?;
-        let lock = RunLock::take(folder, sink)?;
+        let lock = RunLock::take(folder, LockedFolder::Run, sink)?;
         remove_leftovers(folder).map_err(TrainError::io("removing temporary files of a killed process", folder))?;
         // A run that failed before its first stage may get other settings.
         let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
@@ -117,7 +118,8 @@ impl Run {
         Ok(Self { config, overfit: run.overfit, device, lock: None })
     }
 
-    /// Trains the remaining steps of the run, or of one stage, and evaluates. Returns the evaluation of a whole run.
+    /// Trains the remaining steps of the run, or of one stage, and evaluates. Returns the evaluation of a whole run; the
+    /// existing one if the run was trained and evaluated before.
     ///
     /// # Errors
     /// [`TrainError::Missing`] if `only` is a stage whose predecessor has not run, and those of the stages.
@@ -128,6 +130,16 @@ impl Run {
         sink: &mut dyn Sink,
     ) -> Result<Option<Summary>, TrainError> {
         let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
+        let is_trained = [Stage::Stage1, Stage::Stage2].into_iter().all(|stage| self.weights(stage).exists());
+        let summary = self.folder("eval").join(SUMMARY);
+        if only.is_none() && is_trained && summary.exists() {
+            let run = self.config.run_dir.display();
+            sink.event(&Event::Message(format!(
+                "the run is trained and evaluated; `clift eval {run} --force` evaluates it again"
+            )));
+            let text = std::fs::read(&summary).map_err(TrainError::io("reading the evaluation", &summary))?;
+            return serde_json::from_slice(&text).map(Some).map_err(TrainError::bad_file("evaluation", &summary));
+        }
         let reader = self.reader(Split::Train, sink)?;
         let validation = self.validation(sink)?;
 
@@ -146,7 +158,9 @@ impl Run {
         if only.is_some() {
             return Ok(None);
         }
-        validation.evaluate(&self.models(sink)?, &[], &self.folder("eval"), stop, sink).map(Some)
+        require_run(&self.config.run_dir)?;
+        let folder = EvalFolder::open(&self.folder("eval"), true, sink)?;
+        validation.evaluate(&self.models(sink)?, &[], folder.path(), stop, sink).map(Some)
     }
 
     /// Evaluates the run, and the images of `external` methods beside it, and writes the results to `folder`. `beside` is
@@ -158,14 +172,14 @@ impl Run {
     pub fn evaluate(
         &self,
         external: &[ExternalMethod],
-        folder: &Path,
+        folder: &EvalFolder,
         beside: Option<&Config>,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
-        let is_inside = self.lock.is_none() && folder.starts_with(&self.config.run_dir);
-        let _lock = is_inside.then(|| RunLock::take(&self.config.run_dir, sink)).transpose()?;
-        std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
+        let run_dir = &self.config.run_dir;
+        let is_inside = self.lock.is_none() && folder.is_in(run_dir);
+        let _lock = is_inside.then(|| RunLock::take(run_dir, LockedFolder::Run, sink)).transpose()?;
         let mut models = self.models(sink)?;
         if let Some(other) = beside {
             if other.clusters.grouping == self.config.clusters.grouping {
@@ -175,7 +189,7 @@ impl Run {
             }
             models.set_stage2(other.clusters.grouping, self.open_stage2(other, &models.stage1)?);
         }
-        self.validation(sink)?.evaluate(&models, external, folder, stop, sink)
+        self.validation(sink)?.evaluate(&models, external, folder.path(), stop, sink)
     }
 
     /// Opens the trained models of both stages, or of stage 1 only.

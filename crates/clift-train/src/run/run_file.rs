@@ -12,6 +12,7 @@ use crate::error::TrainError;
 use crate::events::Stage;
 use crate::run::extend::{ExtensionRecord, StepExtension};
 
+const FILE: &str = "run.json";
 const VERSION: u32 = 1;
 
 /// Keys that may change when a run is resumed.
@@ -38,7 +39,7 @@ impl RunFile {
     }
 
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
-        let path = folder.join("run.json");
+        let path = folder.join(FILE);
         let text = std::fs::read(&path).map_err(TrainError::io("reading the run file", &path))?;
         let run: Self = serde_json::from_slice(&text).map_err(TrainError::bad_file("run file", &path))?;
         if run.version != VERSION {
@@ -49,10 +50,18 @@ impl RunFile {
     }
 
     pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
-        let path = folder.join("run.json");
+        let path = folder.join(FILE);
         let json = serde_json::to_vec_pretty(self).map_err(TrainError::bad_file("run file", &path))?;
         replace_file(&path, &json).map_err(TrainError::io("writing the run file", &path))
     }
+}
+
+/// Checks that a run directory is still at its path: a process that has it open must not make a second one there.
+///
+/// # Errors
+/// [`TrainError::Moved`].
+pub(crate) fn require_run(folder: &Path) -> Result<(), TrainError> {
+    if folder.join(FILE).exists() { Ok(()) } else { Err(TrainError::Moved { path: folder.into() }) }
 }
 
 /// Writes every key of a config to its run directory.

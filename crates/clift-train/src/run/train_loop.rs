@@ -12,6 +12,7 @@ use crate::checkpoint::progress::{Best, Progress};
 use crate::error::TrainError;
 use crate::events::{Event, Sink, StepEvent};
 use crate::run::logs::RunLog;
+use crate::run::run_file::require_run;
 use crate::run::stage_plan::StagePlan;
 use crate::run::validation::Validation;
 use crate::stage::settings::{StageSettings, freeze};
@@ -31,6 +32,7 @@ impl StagePlan<'_> {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Clift, TrainError> {
+        require_run(&self.config.run_dir)?;
         let started = Instant::now();
         let Self { settings, config, folder, device, .. } = self;
         let StageSettings { stage, steps: num_steps, optimizer, .. } = *settings;
@@ -54,7 +56,7 @@ impl StagePlan<'_> {
         let progress = checkpoints.resume(&mut train_state)?.unwrap_or_default();
         train_state.model = freeze(stage, train_state.model);
         make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
-        let mut log = RunLog::open(&config.run_dir, stage, progress.step, sink)?;
+        let mut log = RunLog::open(&config.run_dir, stage, [progress.step, progress.validated], sink)?;
         log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
 
         let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
@@ -192,6 +194,7 @@ impl<'a> TrainLoop<'a> {
     }
 
     fn save(&mut self, train_state: &TrainState) -> Result<(), TrainError> {
+        require_run(&self.plan.config.run_dir)?;
         // A resumed run does not write the lines of these steps again.
         self.log.check()?;
         let path = self.checkpoints.save(train_state, &self.progress)?;
@@ -218,6 +221,7 @@ impl<'a> TrainLoop<'a> {
             return Ok(());
         }
         let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
+        require_run(&self.plan.config.run_dir)?;
         let model = train_state.model.valid();
         let psnr = self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
         if psnr.is_none() && self.stop.load(Ordering::Relaxed) {
@@ -253,8 +257,9 @@ impl<'a> TrainLoop<'a> {
 
     /// Adds the last step and the newest checkpoint to an error.
     pub fn name_checkpoint(&self, error: TrainError) -> TrainError {
-        let has_step = matches!(error, TrainError::Interrupted { .. } | TrainError::Diverged { .. });
-        if has_step || self.progress.step == 0 {
+        let is_complete =
+            matches!(error, TrainError::Interrupted { .. } | TrainError::Diverged { .. } | TrainError::Moved { .. });
+        if is_complete || self.progress.step == 0 {
             return error;
         }
         TrainError::Stopped {

@@ -10,10 +10,12 @@ use clift_data::{
 use clift_eval::{EncodeOptions, EncodedScene, encode};
 use clift_model::{ModelPath, TokenCount, TokenFormat, TrainedModel, check_output_path};
 use clift_train::{Config, Override};
+use serde::Serialize;
 
 use crate::commands::parse::parse_split;
 use crate::commands::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::{UsageError, usage_bail};
+use crate::output::json::write_json;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::units::file_size;
 
@@ -30,6 +32,9 @@ pub struct EncodeArgs {
     /// Scene file to write
     #[arg(long, short, value_name = "FILE")]
     pub out: PathBuf,
+    /// Replace existing files
+    #[arg(long)]
+    pub force: bool,
     /// Key of the scene, if the data set has several
     #[arg(long, value_name = "KEY")]
     pub scene: Option<String>,
@@ -45,12 +50,50 @@ pub struct EncodeArgs {
     /// Number format of the tokens in the file: f32, f16 or int8
     #[arg(long, value_name = "FORMAT", default_value_t)]
     pub tokens: TokenFormat,
+    /// Also write the cluster of every token, as JSON
+    #[arg(long, value_name = "FILE")]
+    pub save_clusters: Option<PathBuf>,
     #[command(flatten)]
     pub overrides: ConfigArgs,
 }
 
+/// Content of `--save-clusters`.
+#[derive(Debug, Serialize)]
+struct ClustersFile<'a> {
+    scene: &'a str,
+    /// Context frames; tokens are ordered by frame, row and column of the patch.
+    frames: &'a [u32],
+    rows: usize,
+    columns: usize,
+    /// Cluster of each token, which is the index of a token of the scene file.
+    assignment: &'a [u32],
+    /// Token nearest to the centre of each cluster.
+    centroids: &'a [u32],
+}
+
+impl<'a> ClustersFile<'a> {
+    fn of(encoded: &'a EncodedScene) -> Self {
+        let EncodedScene { scene, clusters, .. } = encoded;
+        let patch_size = scene.model.patch_size;
+        Self {
+            scene: &scene.key,
+            frames: &scene.context_frames,
+            rows: scene.height / patch_size,
+            columns: scene.width / patch_size,
+            assignment: clusters.assignment(),
+            centroids: clusters.centroid_index(),
+        }
+    }
+}
+
+/// Encodes one scene and writes its file.
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_output_path(&args.out).map_err(|error| UsageError(error.to_string()))?;
+    for path in [Some(&args.out), args.save_clusters.as_ref()].into_iter().flatten() {
+        if !args.force && path.exists() {
+            usage_bail!("the file {} exists; replace it with --force or choose another name", path.display());
+        }
+    }
     let model = ModelPath::find(&args.model)?;
     let (mut config, overrides) = read_config(&model.dir.join("config.toml"), &args.overrides.set, |_| Ok(()))?;
     // Tensor shapes do not determine the number of heads: a wrong one would silently change the tokens.
@@ -82,11 +125,14 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     let model = TrainedModel::open(&model, &config.model, &config.device.open()?)?;
     let encoded = encode(&model, &reader, scene, &options)?;
     encoded.scene.write(&args.out, args.tokens)?;
+    if let Some(path) = &args.save_clusters {
+        write_json(&ClustersFile::of(&encoded), path)?;
+    }
     print_result(&describe(&encoded, args.tokens, &args.out))
 }
 
 fn describe(encoded: &EncodedScene, format: TokenFormat, path: &Path) -> String {
-    let EncodedScene { scene, num_lift_tokens, cluster_error } = encoded;
+    let EncodedScene { scene, num_lift_tokens, cluster_error, .. } = encoded;
     let num_tokens = scene.num_tokens();
     let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
     format!(

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clift_data::SourceKind;
 use clift_eval::{Experiment, ExternalMethod, MethodName, Selection};
 use clift_model::{ModelPath, TokenCount, TokenFormat};
-use clift_train::{Config, Run, evaluate_model};
+use clift_train::{Config, EvalFolder, Run, evaluate_model};
 
 use crate::commands::parse::parse_bytes;
 use crate::commands::shared_args::{ConfigArgs, read_config};
@@ -38,11 +38,12 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     }
     let mut sink = progress_sink();
     let stop = interrupt::flag()?;
+    let folder = EvalFolder::open(&out, args.force, sink.as_mut())?;
     let summary = match &model {
-        None => Run::reopen(config)?.evaluate(&external, &out, with.as_ref(), &stop, sink.as_mut())?,
+        None => Run::reopen(config)?.evaluate(&external, &folder, with.as_ref(), &stop, sink.as_mut())?,
         Some(model) => {
             let stage1 = args.stage1.as_deref().map(ModelPath::find).transpose()?;
-            evaluate_model(config, model, stage1.as_ref(), &external, &out, &stop, sink.as_mut())?
+            evaluate_model(config, model, stage1.as_ref(), &external, &folder, &stop, sink.as_mut())?
         }
     };
     drop(sink);
@@ -153,4 +154,7 @@ pub struct EvalArgs {
     /// Output folder [default: `eval` in the run]
     #[arg(long, short, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Replace the evaluation in the output folder
+    #[arg(long)]
+    pub force: bool,
 }

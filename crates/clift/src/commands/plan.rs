@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clift_bench::{PartPlan, Plan, check_plan, plan};
+use clift_bench::{PartPlan, Plan, check_plan, missing_weights, plan};
 use clift_model::max_tensor_bytes;
 use clift_train::{Config, LargestTensor, PARTS, largest_tensor, memory_warning};
 
@@ -14,6 +14,9 @@ use crate::output::units::{duration, memory_size, seconds};
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, check_plan)?;
     args.json.check_folder()?;
+    for missing in missing_weights(&config) {
+        print_note(&format!("warning: {missing}"));
+    }
     let plan = plan(&config, !args.no_time)?;
     print_result(&report_text(&plan))?;
     print_result(&largest_tensors(&config)?)?;

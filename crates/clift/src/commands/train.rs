@@ -9,7 +9,7 @@ use crate::commands::parse::{parse_count, parse_stage};
 use crate::commands::shared_args::ConfigArgs;
 use crate::interrupt;
 use crate::output::bar::progress_sink;
-use crate::output::stdout::{print_evaluation, print_note};
+use crate::output::stdout::{print_note, print_run};
 
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, Config::validate)?;
@@ -24,7 +24,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let run = Run::open(config, &options, sink.as_mut())?;
     let summary = run.train(args.only, &stop, sink.as_mut())?;
     drop(sink);
-    summary.map_or(Ok(()), |summary| print_evaluation(&summary, &run_dir.join("eval")))
+    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir.join("eval")))
 }
 
 #[derive(Debug, clap::Args)]

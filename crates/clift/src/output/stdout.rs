@@ -11,6 +11,11 @@ pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
 }
 
+/// Writes the result of a run and the path of its report, which has the whole table: six lines for a small terminal.
+pub fn print_run(summary: &Summary, folder: &Path) -> anyhow::Result<()> {
+    print_result(&format!("{}\nreport: {}", summary.headline(), folder.join("report.html").display()))
+}
+
 /// Writes the table of an evaluation and the paths of its report and files.
 pub fn print_evaluation(summary: &Summary, folder: &Path) -> anyhow::Result<()> {
     let report = folder.join("report.html");
