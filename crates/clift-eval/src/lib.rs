@@ -51,6 +51,7 @@ pub use metrics::vgg::VggShape;
 pub use config::eval_config::EvalConfig;
 pub use config::experiment::Experiment;
 pub use config::method::{Method, MethodName};
+pub use config::split::{EvalFrames, EvalSplit};
 pub use config::token_selection::Selection;
 
 // A complete evaluation with its files.

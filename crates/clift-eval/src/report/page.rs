@@ -77,7 +77,11 @@ impl Report {
                 body {
                     main {
                         h1 { (name) }
-                        p.soft { "clift evaluation, " (date::now()) }
+                        p.soft {
+                            "clift evaluation, " (date::now())
+                            @if let Some(split) = self.summary.split { " \u{b7} measured on: " strong { (split) } }
+                        }
+                        @for warning in self.summary.warnings() { p.warning { "Warning: " (warning) } }
                         (self.headline())
                         (self.quality_and_cost())
                         (tables::points(&self.summary))
@@ -111,7 +115,12 @@ impl Report {
                     "."
                     @if let Some(gain) = last.psnr.zip(nearest).map(|(psnr, nearest)| psnr - nearest) {
                         " The latter is " (grouped(gain.abs(), 2)) " dB "
-                        (if gain < 0.0 { "below" } else { "above" }) " a copy of the nearest context view."
+                        (if gain < 0.0 { "below" } else { "above" }) " a copy of the nearest context view"
+                        @if baselines.nearest_view.num_identical_views > 0 {
+                            ", which is the target itself for " (count(baselines.nearest_view.num_identical_views))
+                            " of " (count(*num_views)) " views"
+                        }
+                        "."
                     }
                 }
             }
@@ -120,7 +129,7 @@ impl Report {
                     @let error = point.psnr_stderr.map(|error| format!("\u{b1} {error:.2}")).unwrap_or_default();
                     (tile(&format!("{}, {}", point.key.method.name(), tokens(point)), &number(point.psnr, 2), "dB", &error))
                 }
-                (tile("nearest view", &number(nearest, 2), "dB", "a copy, no model"))
+                (tile("nearest view", &number(nearest, 2), "dB", &copies(baselines.nearest_view.num_identical_views)))
                 @if let Some((point, kb)) = first.and_then(|point| Some((point, point.cost.scene_kb()?))) {
                     (tile("a scene file", &grouped(kb, 1), "kB", &tokens(point)))
                 }
@@ -179,6 +188,15 @@ impl Report {
 
 fn psnr_at(point: &SummaryPoint) -> Markup {
     html! { strong { (number(point.psnr, 2)) " dB" } " with " (count(point.key.num_storage_tokens)) " stored tokens" }
+}
+
+/// Returns the note on the baseline of copied context views.
+fn copies(num_identical: usize) -> String {
+    if num_identical == 0 {
+        "a copy, no model".into()
+    } else {
+        format!("{} of the target itself", count(num_identical))
+    }
 }
 
 fn tile(name: &str, value: &str, unit: &str, more: &str) -> Markup {

@@ -52,7 +52,12 @@ pub fn points(summary: &Summary) -> Markup {
                 tbody {
                     @for (name, quality) in [("nearest view", baselines.nearest_view), ("mean image", baselines.mean_image)] {
                         tr {
-                            td { (name) }
+                            td {
+                                (name)
+                                @if quality.num_identical_views > 0 {
+                                    " (" (count(quality.num_identical_views)) " views identical to the target)"
+                                }
+                            }
                             td {} td {} td {}
                             td { (number(quality.psnr, 2)) }
                             td {}

@@ -3,19 +3,20 @@
 //! Means are over the views of a scene, then over the scenes, so every scene has the same weight. Fields `.._per_view` are
 //! means over all views.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use clift_data::{mean, median, p95, replace_file, standard_error};
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
+use crate::config::split::EvalSplit;
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
 use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
-use crate::statistics::view_metrics::{Cost, EvalKey, ViewMetrics, best_method};
+use crate::statistics::view_metrics::{Cost, EvalKey, PSNR_CAP_DB, ViewMetrics, best_method};
 
 /// Means of a baseline.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -26,6 +27,9 @@ pub struct Quality {
     pub ssim: Option<f64>,
     /// Mean over scenes of the scene's mean LPIPS.
     pub lpips_vgg: Option<f64>,
+    /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
+    #[serde(default)]
+    pub num_identical_views: usize,
 }
 
 /// Quality of the baselines, which every method must exceed.
@@ -104,6 +108,12 @@ pub struct Summary {
     pub num_views: usize,
     /// Skipped scenes; `skipped.json` has the reasons.
     pub num_skipped: usize,
+    /// What was measured on; `null` in files of earlier versions.
+    #[serde(default)]
+    pub split: Option<EvalSplit>,
+    /// Target views that are also contexts: the input holds their images.
+    #[serde(default)]
+    pub num_context_targets: usize,
     /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
     pub selection: Option<Selection>,
     /// SHA-256 of the LPIPS weights.
@@ -145,6 +155,8 @@ impl Summary {
             num_scenes: scenes.len(),
             num_views: views.len(),
             num_skipped: results.skipped.len(),
+            split: results.split,
+            num_context_targets: results.context_targets.len(),
             selection: results.selection,
             lpips_weights_sha256: results.lpips_sha256.clone(),
             not_measured: results.not_measured.clone(),
@@ -153,6 +165,12 @@ impl Summary {
             points,
             differences: differences(results),
         }
+    }
+
+    /// Returns warnings about figures that mislead.
+    pub(crate) fn warnings(&self) -> impl Iterator<Item = String> {
+        let split = self.split.and_then(EvalSplit::warning).map(str::to_owned);
+        split.into_iter().chain(context_targets_note(self.num_context_targets))
     }
 
     /// Returns the points of the main method in its finest number format.
@@ -175,6 +193,17 @@ impl Summary {
     }
 }
 
+/// Returns the note on targets that are also contexts; `None` for no such target.
+pub(crate) fn context_targets_note(num_given: usize) -> Option<String> {
+    (num_given > 0).then(|| {
+        let targets = if num_given == 1 { "target is also a context" } else { "targets are also contexts" };
+        format!(
+            "{num_given} {targets}: nearest_view copies such an image and scores {PSNR_CAP_DB} dB; leave them out with \
+             --drop-context-targets"
+        )
+    })
+}
+
 /// Returns the mean over the views of each scene, for the scenes that have a value.
 fn scene_means(views: &SceneViews, value: fn(&ViewMetrics) -> Option<f64>) -> Vec<f64> {
     views.values().filter_map(|frames| mean(&frames.values().filter_map(value).collect::<Vec<_>>())).collect()
@@ -186,13 +215,14 @@ impl Quality {
             psnr: mean(&scene_means(views, |view| Some(view.capped_psnr()))),
             ssim: mean(&scene_means(views, |view| view.ssim)),
             lpips_vgg: mean(&scene_means(views, |view| view.lpips_vgg)),
+            num_identical_views: views.values().flat_map(BTreeMap::values).filter(|view| view.is_identical()).count(),
         }
     }
 }
 
 impl SummaryPoint {
     fn new(results: &EvalResults, key: EvalKey, scenes: &SceneViews) -> Self {
-        let Quality { psnr, ssim, lpips_vgg } = Quality::new(scenes);
+        let Quality { psnr, ssim, lpips_vgg, num_identical_views } = Quality::new(scenes);
         let views: Vec<&ViewMetrics> = scenes.values().flat_map(|frames| frames.values()).collect();
         let values = |value: fn(&ViewMetrics) -> Option<f64>| -> Vec<f64> {
             views.iter().filter_map(|view| value(view)).collect()
@@ -205,7 +235,7 @@ impl SummaryPoint {
             psnr,
             psnr_stderr: standard_error(&scene_means(scenes, |view| Some(view.capped_psnr()))),
             psnr_per_view: mean(&values(|view| Some(view.capped_psnr()))),
-            num_identical_views: views.iter().filter(|view| view.psnr == f64::INFINITY).count(),
+            num_identical_views,
             ssim,
             ssim_per_view: mean(&values(|view| view.ssim)),
             lpips_vgg,
@@ -271,7 +301,10 @@ mod tests {
     #[test]
     fn the_file_has_the_documented_names() {
         let mut views = results(&[("a", 0, 20.0)]);
-        views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
+        let copy = ViewMetrics::quality(f64::INFINITY, Some(1.0));
+        views.add("a", 0, EvalKey::baseline(Method::NearestView), copy).unwrap();
+        views.split = Some(EvalSplit::HeldOutFrames);
+        views.context_targets.insert(("a".into(), 0));
         let cost = Cost { gflops: Some(2.5), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) };
         views.costs.insert(CLIFT, cost);
         views.skipped.insert("c".into());
@@ -281,13 +314,13 @@ mod tests {
         summary.write(&folder.path().join("summary.json")).unwrap();
         let text = std::fs::read_to_string(folder.path().join("summary.json")).unwrap();
         let expected = serde_json::json!({
-            "num_scenes": 1, "num_views": 1, "num_skipped": 1,
+            "num_scenes": 1, "num_views": 1, "num_skipped": 1, "split": "held_out_frames", "num_context_targets": 1,
             "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
             "missing": [],
             "baselines": {
-                "nearest_view": {"psnr": 18.0, "ssim": 0.5, "lpips_vgg": null},
-                "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null}
+                "nearest_view": {"psnr": 100.0, "ssim": 1.0, "lpips_vgg": null, "num_identical_views": 1},
+                "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null, "num_identical_views": 0}
             },
             "points": [{
                 "variant": "clift", "num_storage_tokens": 64, "num_render_tokens": 32, "tokens": "f16",

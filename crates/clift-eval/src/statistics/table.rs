@@ -30,7 +30,12 @@ const WIDTHS: [usize; 12] = [7, 9, 6, 8, 6, 6, 6, 10, 9, 7, 7, 9];
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
-        writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes skipped\n")?;
+        let split = self.split.map_or_else(String::new, |split| format!(" ({split})"));
+        writeln!(f, "{num_views} views of {num_scenes} scenes{split}, {num_skipped} scenes skipped")?;
+        for warning in self.warnings() {
+            writeln!(f, "warning: {warning}")?;
+        }
+        writeln!(f)?;
         let names = points.iter().map(|point| point.key.method.name().chars().count());
         let width = names.chain([Method::NearestView.name().len()]).max().unwrap_or_default();
         let mut row = |name: &str, cells: [String; 12], mark: &str| {
@@ -41,12 +46,13 @@ impl fmt::Display for Summary {
             writeln!(f, "{mark}")
         };
         row("method", HEADERS.map(str::to_owned), "")?;
-        for (method, Quality { psnr, ssim, lpips_vgg }) in
+        for (method, Quality { psnr, ssim, lpips_vgg, num_identical_views }) in
             [(Method::NearestView, baselines.nearest_view), (Method::MeanImage, baselines.mean_image)]
         {
             let mut cells = std::array::from_fn(|_| cell(None, 0));
             (cells[3], cells[5], cells[6]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3));
-            row(method.name(), cells, "")?;
+            let identical = format!(" {num_identical_views} of {num_views} views identical to the target");
+            row(method.name(), cells, if num_identical_views > 0 { &identical } else { "" })?;
         }
         for point in points {
             let count = |count: usize| if count == 0 { cell(None, 0) } else { count.to_string() };

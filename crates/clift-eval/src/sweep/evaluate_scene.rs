@@ -57,6 +57,8 @@ pub fn evaluate_scene(
     for rendering in &results.renderings {
         record(clip, rendering, metrics)?;
     }
+    let given = clip.target.frame_index.iter().filter(|frame| clip.context.frame_index.contains(frame));
+    metrics.context_targets.extend(given.map(|&frame| (clip.key.clone(), frame)));
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
         let index = LazyClusters::new(&sweep.kmeans, &lift, views, num_storage_tokens, seed);

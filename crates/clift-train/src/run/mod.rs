@@ -4,6 +4,8 @@
 //! - `logs`: metrics, skipped steps and scenes as JSONL
 //! - `extend`: `--extend`
 //! - `run_file`: run.json; same settings on resume
+//! - `training_data`: the data that a run was trained on
+//! - `eval_request`: what an evaluation measures
 //! - `stage_plan`: settings, batches and folder of a stage
 //! - `validation`: validation and evaluation
 //! - `train_loop`: resume or start a stage; step, save, validate
@@ -11,6 +13,7 @@
 //! - `evaluate_model`: evaluate a model without a run
 //! - `run`: a run: open, train, evaluate
 
+pub(crate) mod eval_request;
 pub(crate) mod evaluate_model;
 pub(crate) mod extend;
 pub(crate) mod init_from;
@@ -20,4 +23,5 @@ pub(crate) mod run;
 pub(crate) mod run_file;
 pub(crate) mod stage_plan;
 pub(crate) mod train_loop;
+pub(crate) mod training_data;
 pub(crate) mod validation;

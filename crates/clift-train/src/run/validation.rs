@@ -7,7 +7,7 @@ use std::time::Instant;
 use burn::tensor::Device;
 use clift_data::ClipReader;
 use clift_eval::{
-    EvalConfig, EvalError, EvalModels, Evaluator, ExternalMethod, Method, Progress, RunDescription, SceneFigures,
+    EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, Method, Progress, RunDescription, SceneFigures,
     SceneLimits, Summary, Sweep, stage2_method,
 };
 use clift_model::{Clift, TokenCount, TrainedModel};
@@ -16,6 +16,7 @@ use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
+use crate::run::eval_request::EvalRequest;
 
 /// The validation and test views of a run.
 pub struct Validation<'a> {
@@ -24,7 +25,7 @@ pub struct Validation<'a> {
 }
 
 impl<'a> Validation<'a> {
-    /// Chooses the scenes and views of `reader` by `eval`, for an evaluation on `device`.
+    /// Chooses the scenes and views among the `frames` of `reader` by `eval`, for an evaluation on `device`.
     ///
     /// # Errors
     /// As [`Evaluator::new`], and [`TrainError::BadConfig`] for tensors that the device cannot hold.
@@ -32,6 +33,7 @@ impl<'a> Validation<'a> {
         config: &'a Config,
         eval: EvalConfig,
         reader: ClipReader,
+        frames: EvalFrames,
         device: &Device,
         sink: &mut dyn Sink,
     ) -> Result<Self, TrainError> {
@@ -43,10 +45,13 @@ impl<'a> Validation<'a> {
             device: config.device.to_string(),
         };
         let sweep = config.sweep(eval.storage.clone(), Vec::new());
-        let evaluator = Evaluator::new(eval, sweep, description, reader, device)?;
+        let evaluator = Evaluator::new(eval, sweep, description, reader, frames, device)?;
         if !evaluator.skip_report.skips.is_empty() {
             sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report)));
         }
+        let (text, warnings) = evaluator.describe();
+        sink.event(&Event::Message(text));
+        warnings.into_iter().for_each(|warning| sink.event(&Event::Warning(warning)));
         Ok(Self { config, evaluator })
     }
 
@@ -101,21 +106,20 @@ impl<'a> Validation<'a> {
         Ok(point.psnr.filter(|psnr| psnr.is_finite()))
     }
 
-    /// Evaluates models, and external methods beside them, and writes the results to `folder`.
+    /// Evaluates models on the views of this validation.
     ///
     /// # Errors
     /// As [`Evaluator::evaluate`].
     pub fn evaluate(
         &self,
         models: &EvalModels,
-        external: &[ExternalMethod],
-        folder: &Path,
+        request: &EvalRequest,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
         let started = Instant::now();
         let mut progress = EvalEvents { stop, sink, is_stage: true };
-        let summary = self.evaluator.evaluate(models, external, folder, &mut progress)?;
+        let summary = self.evaluator.evaluate(models, request.external, request.folder, &mut progress)?;
         sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
     }
