@@ -62,6 +62,7 @@ pub use report::page::RunDescription;
 // One scene with every method and token count.
 pub use sweep::eval_models::{EvalModels, stage2_method};
 pub use sweep::evaluate_scene::evaluate_scene;
+pub use sweep::held_out_frame::HeldOutFrame;
 pub use sweep::predictions::ExternalMethod;
 pub use sweep::rendered_views::SceneResults;
 pub use sweep::sweep::Sweep;
