@@ -15,14 +15,6 @@ pub fn median(values: &[f64]) -> f64 {
     }
 }
 
-/// Returns the upper median, which is always one of the values: for an even count the larger of the two middle ones,
-/// NaN for no values.
-pub fn upper_median(values: &[f64]) -> f64 {
-    let mut values = values.to_vec();
-    let middle = values.len() / 2;
-    if values.is_empty() { f64::NAN } else { *values.select_nth_unstable_by(middle, f64::total_cmp).1 }
-}
-
 /// Returns the mean, summed in the given order; `None` for no values.
 pub fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
@@ -85,12 +77,10 @@ mod tests {
 
     #[test]
     fn medians_ignore_the_order_of_the_values() {
-        for (values, middle, upper) in
-            [(&[3.0, 1.0, 2.0][..], 2.0, 2.0), (&[4.0, 1.0, 3.0, 2.0], 2.5, 3.0), (&[7.0], 7.0, 7.0)]
-        {
-            assert_eq!((median(values), upper_median(values)), (middle, upper));
+        for (values, middle) in [(&[3.0, 1.0, 2.0][..], 2.0), (&[4.0, 1.0, 3.0, 2.0], 2.5), (&[7.0], 7.0)] {
+            assert_eq!(median(values), middle);
         }
-        assert!(median(&[]).is_nan() && upper_median(&[]).is_nan());
+        assert!(median(&[]).is_nan());
     }
 
     #[test]
