@@ -58,6 +58,7 @@ pub use config::token_selection::Selection;
 pub use evaluator::evaluator::{Evaluator, Progress, SceneLimits, write_skip_report};
 pub use evaluator::items::evaluation_items;
 pub use report::page::RunDescription;
+pub use report::training::TrainingCurve;
 
 // One scene with every method and token count.
 pub use sweep::eval_models::{EvalModels, stage2_method};

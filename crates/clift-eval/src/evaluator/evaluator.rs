@@ -15,8 +15,10 @@ use crate::evaluator::sheets::Sheets;
 use crate::figures::scene_figure::SceneFigures;
 use crate::metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
 use crate::report::page::{MAX_FIGURES, Report, RunDescription};
+use crate::report::training::TrainingCurve;
 use crate::statistics::csv_files::{write_scenes, write_views};
 use crate::statistics::eval_results::EvalResults;
+use crate::statistics::scene_scores::SceneScores;
 use crate::statistics::summary::{Summary, context_targets_note};
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::evaluate_scene::evaluate_scene;
@@ -71,7 +73,7 @@ impl Evaluator {
     }
 
     /// Measures every scene and writes `report.html`, `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the
-    /// contact sheets to `folder`. Scores the images of `external_methods` too.
+    /// contact sheets to `folder`. Scores the images of `external_methods` too. The report has the curves of `training`.
     ///
     /// # Errors
     /// As [`measure`](Self::measure), [`EvalError::BadWeights`] for unusable LPIPS weights, [`ModelError::BadConfig`] for a
@@ -81,6 +83,7 @@ impl Evaluator {
         &self,
         models: &EvalModels,
         external_methods: &[ExternalMethod],
+        training: Vec<TrainingCurve>,
         folder: &Path,
         progress: &mut dyn Progress,
     ) -> Result<Summary, EvalError> {
@@ -119,7 +122,9 @@ impl Evaluator {
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;
         write_skip_report(&skipped, &folder.join("skipped.json"))?;
-        let report = Report { run: self.description.clone(), summary: summary.clone(), skipped, figures };
+        let scenes = SceneScores::new(&measured);
+        let report =
+            Report { run: self.description.clone(), summary: summary.clone(), training, scenes, skipped, figures };
         report.write(&folder.join("report.html"))?;
         Ok(summary)
     }

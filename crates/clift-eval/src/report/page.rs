@@ -11,7 +11,9 @@ use crate::figures::scene_figure::SceneFigure;
 use crate::report::axis::{grouped, milliseconds};
 use crate::report::html::{count, number};
 use crate::report::plots::plots;
-use crate::report::{date, scene_section, tables};
+use crate::report::training::{self, TrainingCurve};
+use crate::report::{date, scene_list, scene_section, tables};
+use crate::statistics::scene_scores::SceneScores;
 use crate::statistics::summary::{Summary, SummaryPoint};
 
 const STYLE: &str = include_str!("style.css");
@@ -21,7 +23,7 @@ pub const MAX_FIGURES: usize = 6;
 
 const SCENES_NOTE: &str = "The middle target view of each scene, rendered by every method. In the maps, a patch of the \
                            context views has the colour of its cluster; rings mark the centroids, which are the \
-                           stored tokens.";
+                           stored tokens. Error maps: the largest channel's absolute difference, brightest from 0.25 on.";
 
 const SELECTION_NOTE: &str = "For views rendered from fewer tokens than stored, dots mark the tokens selected for the \
                               target and rings mark the other stored tokens.";
@@ -39,6 +41,8 @@ pub struct RunDescription {
     pub config: String,
     /// Name of the device.
     pub device: String,
+    /// The command line.
+    pub command: String,
 }
 
 /// The content of a report.
@@ -48,6 +52,10 @@ pub struct Report {
     pub run: RunDescription,
     /// Means of all keys.
     pub summary: Summary,
+    /// Training curves of the run, by stage; may be empty.
+    pub training: Vec<TrainingCurve>,
+    /// The scenes from worst to best.
+    pub scenes: SceneScores,
     /// Skipped scenes with their reasons.
     pub skipped: SkipReport,
     /// Figures of scenes; the report has the first [`MAX_FIGURES`].
@@ -64,7 +72,7 @@ impl Report {
 
     /// Returns the page.
     pub fn to_html(&self) -> io::Result<String> {
-        let RunDescription { name, config, device } = &self.run;
+        let RunDescription { name, config, device, command } = &self.run;
         let page = html! {
             (DOCTYPE)
             html lang="en" {
@@ -86,9 +94,11 @@ impl Report {
                         (self.quality_and_cost())
                         (tables::points(&self.summary))
                         (tables::differences(&self.summary.differences))
-                        (self.scenes()?)
+                        (scene_list::section(&self.scenes))
+                        (self.figures()?)
+                        (training::section(&self.training))
                         (tables::skipped(self.summary.num_scenes, &self.skipped))
-                        (tables::machine(device))
+                        (tables::machine(device, command))
                         h2 { "Config" }
                         details { summary { "Every key, resolved" } pre { (config) } }
                         footer { p { (FOOTNOTE) } }
@@ -162,10 +172,10 @@ impl Report {
         }
     }
 
-    fn scenes(&self) -> io::Result<Markup> {
+    fn figures(&self) -> io::Result<Markup> {
         let has_selections = self.figures.iter().any(|figure| !figure.selections.is_empty());
         Ok(html! {
-            h2 { "Scenes" }
+            h2 { "Images of scenes" }
             @if self.figures.is_empty() {
                 p.none { "No figures: " code { "eval.num_sheets" } " is 0." }
             } @else {

@@ -119,7 +119,7 @@ fn cells(point: &SummaryPoint) -> [String; 16] {
 pub fn differences(differences: &[PairedDifference]) -> Markup {
     html! {
         @if !differences.is_empty() {
-            h2 { "Scene by scene" }
+            h2 { "Differences between methods" }
             p.note { (DIFFERENCES_NOTE) }
             div.scroll {
                 table {
@@ -151,10 +151,12 @@ pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
         @if skip_report.skips.is_empty() {
             p { "No scene was skipped." }
         } @else {
-            table.plain {
-                thead { tr { th { "scenes" } th { "reason" } } }
-                tbody {
-                    @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (reason) } } }
+            div.scroll {
+                table.plain {
+                    thead { tr { th { "scenes" } th { "reason" } } }
+                    tbody {
+                        @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (reason) } } }
+                    }
                 }
             }
             p.note { "All names: " code { "skipped.json" } "." }
@@ -162,14 +164,19 @@ pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
     }
 }
 
-/// Returns the table of program version, device and machine.
-pub fn machine(device: &str) -> Markup {
-    let program = [("clift", env!("CARGO_PKG_VERSION").to_owned()), ("device", device.to_owned())];
+/// Returns the table of command line, program version, device and machine.
+pub fn machine(device: &str, command: &str) -> Markup {
+    let version = env!("CARGO_PKG_VERSION").to_owned();
+    let program = [("command", command.to_owned()), ("clift", version), ("device", device.to_owned())];
     html! {
-        h2 { "Machine" }
-        table.plain {
-            tbody {
-                @for (name, value) in program.into_iter().chain(machine_rows()) { tr { td { (name) } td { (value) } } }
+        h2 { "Command and machine" }
+        div.scroll {
+            table.plain {
+                tbody {
+                    @for (name, value) in program.into_iter().chain(machine_rows()) {
+                        tr { td { (name) } td { (value) } }
+                    }
+                }
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Logs of a run: `metrics.jsonl`, `bad_steps.jsonl` and `skipped.jsonl`.
+//! Logs of a run: `metrics.jsonl`, `validation.jsonl`, `bad_steps.jsonl` and `skipped.jsonl`.
 
 use std::collections::HashSet;
 use std::fs::{File, OpenOptions};
@@ -113,11 +113,26 @@ pub struct SkipLine {
     pub skip: SkippedScene,
 }
 
-/// The logs of a stage in front of another sink: a line per step in `metrics.jsonl`, per skipped step in `bad_steps.jsonl`,
+/// A line of `validation.jsonl`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct ValidationLine {
+    step: u64,
+    stage: Stage,
+    /// Mean PSNR in dB.
+    psnr: f64,
+    ssim: Option<f64>,
+    num_views: usize,
+}
+
+/// The logs of a stage in front of another sink: a line per step in `metrics.jsonl`, per validation in `validation.jsonl`, per
+/// skipped step in `bad_steps.jsonl`,
 /// and per skipped scene in `skipped.jsonl`.
 pub struct RunLog<'a> {
     sink: &'a mut dyn Sink,
     metrics: StepLines,
+    validations: StepLines,
+    /// Stage and step of the last line of `validations`: a resumed run may validate a step again.
+    validated: Option<(Stage, u64)>,
     bad_steps: StepLines,
     skips: StepLines,
     /// Scenes that have a line.
@@ -136,7 +151,18 @@ impl<'a> RunLog<'a> {
         };
         let skips = open("skipped.jsonl")?;
         let skipped = read_skips(skips.path()).map_err(TrainError::io("reading the log of scenes", skips.path()))?;
-        Ok(Self { sink, metrics: open("metrics.jsonl")?, bad_steps: open("bad_steps.jsonl")?, skips, skipped })
+        let validations = open("validation.jsonl")?;
+        let validated = last_step(validations.path())
+            .map_err(TrainError::io("reading the log of validations", validations.path()))?;
+        Ok(Self {
+            sink,
+            metrics: open("metrics.jsonl")?,
+            validations,
+            validated,
+            bad_steps: open("bad_steps.jsonl")?,
+            skips,
+            skipped,
+        })
     }
 
     /// Reports and logs a scene that `step` could not use, once per run.
@@ -157,11 +183,21 @@ impl<'a> RunLog<'a> {
     /// # Errors
     /// [`TrainError::Io`] with the first failure.
     pub fn check(&mut self) -> Result<(), TrainError> {
-        for lines in [&mut self.metrics, &mut self.bad_steps, &mut self.skips] {
+        for lines in [&mut self.metrics, &mut self.validations, &mut self.bad_steps, &mut self.skips] {
             lines.check().map_err(TrainError::io("writing the log of steps", lines.path()))?;
         }
         Ok(())
     }
+}
+
+/// Reads stage and step of the last line.
+fn last_step(path: &Path) -> std::io::Result<Option<(Stage, u64)>> {
+    if !path.exists() {
+        return Ok(None);
+    }
+    let text = std::fs::read_to_string(path)?;
+    let last = text.lines().last().map(serde_json::from_str::<LinePosition>).transpose()?;
+    Ok(last.map(|found| (found.stage, found.step)))
 }
 
 /// Reads the keys of the scenes that have a line.
@@ -176,8 +212,13 @@ fn read_skips(path: &Path) -> std::io::Result<HashSet<String>> {
 impl Sink for RunLog<'_> {
     fn event(&mut self, event: &Event) {
         self.sink.event(event);
-        if let Event::Step(step) = event {
-            self.metrics.write(step);
+        match *event {
+            Event::Step(step) => self.metrics.write(&step),
+            Event::Evaluated { stage, step, psnr, ssim, num_views } if self.validated < Some((stage, step)) => {
+                self.validated = Some((stage, step));
+                self.validations.write(&ValidationLine { step, stage, psnr, ssim, num_views });
+            }
+            _ => {}
         }
     }
 }
@@ -218,6 +259,25 @@ mod tests {
         }
         log.check().unwrap();
         assert_eq!(count.0, steps.len(), "events are passed on");
+    }
+
+    #[test]
+    fn repeated_validation_of_a_step_has_one_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let validate = |step| {
+            let mut count = Count::default();
+            let mut log = RunLog::open(folder.path(), Stage::Stage1, 4, &mut count).unwrap();
+            log.event(&Event::Evaluated { stage: Stage::Stage1, step, psnr: 20.5, ssim: None, num_views: 3 });
+            log.check().unwrap();
+        };
+        // Every log is opened after step 4, so the line of step 6 is written again.
+        for step in [2, 4, 4, 6, 6] {
+            validate(step);
+        }
+        let text = std::fs::read_to_string(folder.path().join("validation.jsonl")).unwrap();
+        let line =
+            |step| format!("{{\"step\":{step},\"stage\":\"stage1\",\"psnr\":20.5,\"ssim\":null,\"num_views\":3}}\n");
+        assert_eq!(text, [2, 4, 6].map(line).concat());
     }
 
     fn steps(path: &Path) -> Vec<(Stage, u64)> {

@@ -5,6 +5,7 @@
 //! - `extend`: `--extend`
 //! - `run_file`: run.json; same settings on resume
 //! - `training_data`: the data that a run was trained on
+//! - `training_curves`: curves of metrics.jsonl and validation.jsonl
 //! - `eval_request`: what an evaluation measures
 //! - `stage_plan`: settings, batches and folder of a stage
 //! - `validation`: validation and evaluation
@@ -23,5 +24,6 @@ pub(crate) mod run;
 pub(crate) mod run_file;
 pub(crate) mod stage_plan;
 pub(crate) mod train_loop;
+pub(crate) mod training_curves;
 pub(crate) mod training_data;
 pub(crate) mod validation;

@@ -17,6 +17,7 @@ use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::run::eval_request::EvalRequest;
+use crate::run::training_curves::training_curves;
 
 /// The validation and test views of a run.
 pub struct Validation<'a> {
@@ -43,6 +44,7 @@ impl<'a> Validation<'a> {
             name: run_dir.file_name().unwrap_or(run_dir.as_os_str()).to_string_lossy().into_owned(),
             config: toml::to_string_pretty(config).map_err(TrainError::bad_file("config", run_dir))?,
             device: config.device.to_string(),
+            command: std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect::<Vec<_>>().join(" "),
         };
         let sweep = config.sweep(eval.storage.clone(), Vec::new());
         let evaluator = Evaluator::new(eval, sweep, description, reader, frames, device)?;
@@ -119,7 +121,8 @@ impl<'a> Validation<'a> {
     ) -> Result<Summary, TrainError> {
         let started = Instant::now();
         let mut progress = EvalEvents { stop, sink, is_stage: true };
-        let summary = self.evaluator.evaluate(models, request.external, request.folder, &mut progress)?;
+        let training = training_curves(&self.config.run_dir);
+        let summary = self.evaluator.evaluate(models, request.external, training, request.folder, &mut progress)?;
         sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
     }
