@@ -101,4 +101,4 @@ pub use torch::values::ElementType;
 pub use files::atomic::{TEMPORARY, make_folder, publish_folder, remove_folder, remove_leftovers, replace_file};
 pub use files::staged_dir::{StagedDir, is_empty_folder};
 pub use random::{derive_seed, item_rng, sample_distinct, step_rng, uniform_below};
-pub use statistics::{MinMedianMax, mean, median, p95, standard_error};
+pub use statistics::{MinMedianMax, mean, median, p95, quartiles, standard_error};

@@ -38,6 +38,18 @@ pub fn p95(values: &[f64]) -> f64 {
     rank.checked_sub(1).map_or(f64::NAN, |index| sorted[index])
 }
 
+/// Returns the first and the third quartile, interpolated linearly between neighbouring values; `None` for no values.
+pub fn quartiles(values: &[f64]) -> Option<[f64; 2]> {
+    let sorted = sorted(values);
+    let last = sorted.len().checked_sub(1)?;
+    Some([0.25, 0.75].map(|share| {
+        let position = share * last as f64;
+        let below = position.floor() as usize;
+        let above = (below + 1).min(last);
+        sorted[below] + (sorted[above] - sorted[below]) * (position - below as f64)
+    }))
+}
+
 /// Smallest value, median and largest value. Prints as `1.0 / 2.5 / 4.0`, with the precision of the format string.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct MinMedianMax {
@@ -91,6 +103,13 @@ mod tests {
             assert_eq!(p95(&values(count)), expected, "of {count}");
         }
         assert!(p95(&[]).is_nan());
+    }
+
+    #[test]
+    fn quartiles_are_interpolated() {
+        assert_eq!(quartiles(&[5.0, 1.0, 3.0, 2.0, 4.0]), Some([2.0, 4.0]));
+        assert_eq!(quartiles(&[4.0, 1.0, 2.0, 3.0]), Some([1.75, 3.25]));
+        assert_eq!((quartiles(&[7.0]), quartiles(&[])), (Some([7.0; 2]), None));
     }
 
     #[test]

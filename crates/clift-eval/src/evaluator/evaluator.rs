@@ -25,6 +25,9 @@ use crate::sweep::evaluate_scene::evaluate_scene;
 use crate::sweep::predictions::{ExternalMethod, image_name};
 use crate::sweep::sweep::Sweep;
 
+/// Smallest number of timed views of a point: quartiles of fewer mean little.
+const MIN_TIMED_VIEWS: usize = 20;
+
 /// The scenes and views of an evaluation, and the settings of every scene.
 pub struct Evaluator {
     eval: EvalConfig,
@@ -93,6 +96,7 @@ impl Evaluator {
             methods,
             lpips: lpips.clone().ok(),
             external_methods: external_methods.to_vec(),
+            min_timed_views: MIN_TIMED_VIEWS,
             ..self.sweep.clone()
         };
         progress.done(0, self.items.len());
