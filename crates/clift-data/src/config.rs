@@ -40,6 +40,9 @@ pub struct DataConfig {
     /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub flip: bool,
+    /// Where a data set has no test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
+    /// never read in training, as in the practice of NeRF; 0 holds out no frame, and training scenes are evaluated.
+    pub hold_out: usize,
     /// Filters of the scenes on disk.
     pub filters: SceneFilters,
     /// Options of the synthetic scenes.
@@ -65,6 +68,7 @@ impl Default for DataConfig {
             exact_principal_point: false,
             crop: Crop::Protocol,
             flip: false,
+            hold_out: 8,
             filters: SceneFilters::default(),
             synthetic: SyntheticConfig::default(),
             views: ViewSampler::default(),

@@ -9,9 +9,10 @@ use crate::skip_report::SkipReport;
 use crate::sources::dataset_root::DatasetRoot;
 use crate::sources::keys::is_dl3dv_key;
 use crate::sources::kind::SourceKind;
-use crate::sources::open::{OpenedSource, open_source};
+use crate::sources::open::{OpenedSource, SAME_SCENES, open_source};
 use crate::sources::options::SourceOptions;
 use crate::sources::subset::SceneSubset;
+use crate::sources::training_frames::TrainingFrames;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
 
@@ -25,7 +26,13 @@ pub fn open_dataset(config: &DataConfig, split: Split) -> Result<OpenedSource, D
         SourceKind::Synthetic => {
             let source = SyntheticSource::new(SyntheticConfig { split, ..config.synthetic.clone() })?;
             let report = SkipReport::new(source.num_scenes());
-            OpenedSource { source: Arc::new(source), kind: config.source, has_splits: true, report }
+            OpenedSource {
+                source: Arc::new(source),
+                kind: config.source,
+                has_splits: true,
+                shares_scenes: false,
+                report,
+            }
         }
         kind => open_files(config, kind, split)?,
     };
@@ -41,7 +48,7 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
     let root = root.ok_or_else(|| missing("data.root", "write the folder that holds train/ and test/"))?;
     let (filters, files) = (config.filters.clone(), config.files.clone());
     let options = SourceOptions { kind, filters, files, min_size: [config.width, config.height], reads_chunks: false };
-    let opened = open_source(&DatasetRoot::find(root)?, split, &options)?;
+    let mut opened = open_source(&DatasetRoot::find(root)?, split, &options)?;
     let source = &opened.source;
     let has_dl3dv = match opened.kind {
         SourceKind::Dl3dv => true,
@@ -53,15 +60,25 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
                    the path of an evaluation index or of a file with one key per line (an empty file excludes none)";
         return Err(missing("data.files.test_scenes", fix));
     }
+    if opened.shares_scenes && config.hold_out > 0 {
+        opened.report.notes.retain(|note| note != SAME_SCENES);
+        let every = config.hold_out;
+        let note = format!("no test split: 1 of {every} frames (0, {every}, ..) is held out of training as a target");
+        opened.report.notes.push(note);
+    }
     Ok(opened)
 }
 
-/// Opens the training split as [`open_dataset`] does, and skips the scenes that are too short for `data.views`.
+/// Opens the training split as [`open_dataset`] does, without the frames of `data.hold_out` where the data set has no test
+/// split, and skips the scenes that are too short for `data.views`.
 ///
 /// # Errors
 /// As [`open_dataset`].
 pub fn open_training_dataset(config: &DataConfig) -> Result<OpenedSource, DataError> {
     let mut opened = open_dataset(config, Split::Train)?;
+    if opened.shares_scenes && config.hold_out > 0 {
+        opened.source = Arc::new(TrainingFrames::new(opened.source, config.hold_out));
+    }
     let source = opened.source.clone();
     let needed = config.views.min_frames();
     // An unreadable scene is reported when it is sampled.

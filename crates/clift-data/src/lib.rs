@@ -52,13 +52,14 @@ pub use sources::open::{OpenedSource, SAME_SCENES, open_source};
 pub use sources::options::{FileOptions, SourceOptions};
 pub use sources::subset::SceneSubset;
 pub use sources::test_scenes::{KEPT_FOR_TESTING, TestScenes};
+pub use sources::training_frames::is_held_out;
 pub use synthetic::config::SyntheticConfig;
 pub use synthetic::source::SyntheticSource;
 
 // Clips and batches.
 pub use sampling::clip::{Clip, ClipViews, ViewIndices};
 pub use sampling::clip_reader::{ClipOptions, ClipReader};
-pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views};
+pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views, even_views_of};
 pub use sampling::inner_views::InnerViews;
 pub use sampling::prefetcher::Prefetcher;
 pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
@@ -100,4 +101,4 @@ pub use torch::values::ElementType;
 pub use files::atomic::{TEMPORARY, make_folder, publish_folder, remove_folder, remove_leftovers, replace_file};
 pub use files::staged_dir::{StagedDir, is_empty_folder};
 pub use random::{derive_seed, item_rng, sample_distinct, step_rng, uniform_below};
-pub use statistics::{MinMedianMax, mean, median, p95, standard_error, upper_median};
+pub use statistics::{MinMedianMax, mean, median, p95, quartiles, standard_error};

@@ -59,7 +59,7 @@ pub fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) 
 fn every_format_and_count_has_speed_and_fronts() {
     let place = Place::with(&WHOLE);
     let ran = place.eval("run --tokens f32,f16,int8 --render 1/2 --out DIR/formats").ok();
-    ran.prints("t: no other point has this PSNR");
+    ran.prints("t: no other point has a higher PSNR");
     let points = place.points("formats");
     let of = |variant: &str, format: &str| {
         points.iter().filter(move |point| point["variant"] == variant && point["tokens"] == format).count()

@@ -4,4 +4,5 @@ mod checkpoints;
 pub mod eval;
 mod report;
 mod scene_files;
+mod splits;
 mod tiles;

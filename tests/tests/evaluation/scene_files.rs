@@ -1,12 +1,16 @@
 //! Scene files through the command line: encoded, rendered, measured.
 
-use clift_data::{Clip, ClipReader, Split, even_views, open_dataset};
+use std::process::Command;
+
+use clift_data::{Clip, ClipReader, Split, ViewIndices, even_views, open_dataset};
 use clift_eval::{Canvas, psnr, ssim, view_cameras};
 use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenFormat, TokenKind, load_renderer};
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
-use crate::support::{Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, wait_until};
+use crate::support::{
+    BINARY, Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, start, wait_until,
+};
 
 /// A run whose methods differ by more than rounding.
 static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
@@ -274,6 +278,49 @@ fn scene_files_overwrite_only_scene_files() {
 }
 
 #[test]
+fn encode_compares_a_frame_that_is_no_context() {
+    let place = Place::with(&LONGER);
+    let encode = |flags: &str| place.clift(&format!("{ENCODE} DIR/room.clift --tokens f32 --storage 8 {flags}")).ok();
+    let ran = encode("--context 0,7");
+    let check = ran.stdout.lines().find(|line| line.starts_with("check: frame 3, not a context: ")).expect("a check");
+    let decibels: Vec<f64> = check.split(' ').filter_map(|word| word.parse().ok()).collect();
+    // The frame of the scene file, rendered as `clift eval` does.
+    let (mut clip, reader) = first_clip(&place, "run");
+    clip.target = reader.read(0, &ViewIndices { context: vec![0, 7], target: vec![3] }).unwrap().target;
+    let rendered = drawn(open(&place, "room.clift", SelectionPreset::Paper), &clip, 8);
+    let expected = measure(&clip, &rendered)[0].0;
+    assert!((decibels[0] - expected).abs() < 0.006, "{check}, expected {expected}");
+    // Sixty steps teach less than a copy of a context view is worth.
+    assert_eq!(
+        decibels[0] < decibels[1],
+        ran.stderr.contains("warning: the rendering of frame 3 is worse than"),
+        "{check}"
+    );
+    assert!(decibels[0] < decibels[1], "{check}");
+    encode("--context 0,1,2,3,4,5,6,7").prints("check: no frame beside the contexts");
+}
+
+#[test]
+fn scene_and_run_move_together() {
+    let place = Place::new();
+    place.copy(&STAGE_1, "home/run");
+    std::fs::create_dir_all(place.at("home/scenes")).unwrap();
+    let clift = |folder: &str, words: &str| {
+        finish(start(Command::new(BINARY).current_dir(place.at(folder)).args(words.split(' '))))
+    };
+    clift("home", &format!("encode run --scene {KEY} -o scenes/room.clift")).ok();
+    assert_eq!(Scene::read(&place.at("home/scenes/room.clift")).unwrap().0.model_path, "../run");
+    std::fs::rename(place.at("home"), place.at("moved")).unwrap();
+    clift("", "render moved/scenes/room.clift --path orbit --frames 2 --out out").ok();
+    clift("moved/scenes", "render room.clift --path orbit --frames 2 --out out").ok();
+    // A file of an earlier version holds the path as its writer saw it.
+    let (mut scene, format) = Scene::read(&place.at("moved/scenes/room.clift")).unwrap();
+    scene.model_path = "moved/run".into();
+    scene.write(&place.at("moved/scenes/old.clift"), format).unwrap();
+    clift("", "render moved/scenes/old.clift --path orbit --frames 2 --out old").ok();
+}
+
+#[test]
 fn encode_chooses_scenes_by_key_context_and_count() {
     let place = Place::with(&STAGE_1);
     let encode = |words: &str| place.clift(&format!("encode DIR/run --out DIR/room.clift --force {words}"));
@@ -284,8 +331,8 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     one("--storage 9").fails_with(2, &["a scene has 8 tokens"]);
 
     // Without stage 2, tokens are those nearest to the cluster centres; all of them leave no variance within clusters.
-    let ran = one("--storage 8").ok().prints("8 of 8 tokens (kmeans, f16)");
-    assert!(ran.stdout.ends_with("     8  0.0000\n"), "{}", ran.stdout);
+    let ran = one("--storage 8 --context 0,7").ok().prints("8 of 8 tokens (kmeans, f16)");
+    ran.prints("     8  0.0000\ncheck: frame 3, not a context: ");
     one("--storage 1/2 --save-clusters DIR/clusters.json").ok().prints("4 of 8 tokens");
     let clusters = place.json("clusters.json");
     assert_eq!((list(&clusters["assignment"]).len(), list(&clusters["centroids"]).len()), (8, 4));

@@ -5,7 +5,7 @@ use std::time::Instant;
 use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
-use clift_data::{ClipReader, Split, item_rng, open_dataset, step_rng, upper_median};
+use clift_data::{ClipReader, Split, item_rng, median, open_dataset, step_rng};
 use clift_eval::{EvalModels, EvalResults, Lpips, Perceptual, Sweep, evaluate_scene, upload_cameras, upload_views};
 use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
@@ -65,7 +65,7 @@ impl Timed {
             seconds.push(started.elapsed().as_secs_f64());
         }
         let busy = cpu.elapsed().as_secs_f64() / begun.elapsed().as_secs_f64();
-        Ok((state, Self { seconds: upper_median(&seconds), busy }))
+        Ok((state, Self { seconds: median(&seconds), busy }))
     }
 }
 

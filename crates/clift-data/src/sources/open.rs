@@ -32,6 +32,8 @@ pub struct OpenedSource {
     pub kind: SourceKind,
     /// Whether training and test scenes are separate without a list: in folders `train/` and `test/`, or synthetic.
     pub has_splits: bool,
+    /// Whether both splits are the same scenes.
+    pub shares_scenes: bool,
     /// Skipped scenes and frames.
     pub report: SkipReport,
 }
@@ -59,7 +61,8 @@ pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) ->
             folder.open_photos(kind, scenes, report, options, list.as_ref())?
         }
     };
-    if !opened.has_splits && list.is_none() {
+    opened.shares_scenes = !opened.has_splits && list.is_none();
+    if opened.shares_scenes {
         opened.report.notes.push(SAME_SCENES.into());
     }
     Ok(opened)
@@ -90,7 +93,13 @@ impl SplitFolder<'_> {
             source.record_unlisted(&self.base, &index);
         }
         report.append(source.report.clone());
-        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits, report })
+        Ok(OpenedSource {
+            source: Arc::new(source),
+            kind,
+            has_splits: self.root.has_splits,
+            shares_scenes: false,
+            report,
+        })
     }
 
     fn open_photos(
@@ -120,7 +129,13 @@ impl SplitFolder<'_> {
         };
         let source = PhotoSource::open(scenes, &source_options)?;
         report.append(source.report.clone());
-        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits, report })
+        Ok(OpenedSource {
+            source: Arc::new(source),
+            kind,
+            has_splits: self.root.has_splits,
+            shares_scenes: false,
+            report,
+        })
     }
 
     /// Returns the clips of RealEstate10K as text files, with the folders of their frames.

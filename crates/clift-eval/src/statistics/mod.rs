@@ -5,6 +5,7 @@
 //! - `student_t`: Student's t quantile
 //! - `pareto`: Pareto front
 //! - `paired`: paired differences of methods
+//! - `scene_scores`: scenes from worst to best
 //! - `summary`: summary.json
 //! - `headline`: the result in a few lines
 //! - `csv_files`: views.csv and scenes.csv
@@ -19,6 +20,7 @@ pub(crate) mod eval_results;
 pub(crate) mod headline;
 pub(crate) mod paired;
 pub(crate) mod pareto;
+pub(crate) mod scene_scores;
 pub(crate) mod student_t;
 pub(crate) mod summary;
 pub(crate) mod table;

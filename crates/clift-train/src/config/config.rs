@@ -60,6 +60,7 @@ impl Config {
     pub(crate) fn sweep(&self, storage: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
         let Self { seed, eval, clusters, model, device, .. } = self;
         Sweep {
+            min_timed_views: 0,
             storage,
             render: eval.render.clone(),
             selection: eval.selection,

@@ -5,6 +5,9 @@
 //! - `logs`: metrics, skipped steps and scenes as JSONL
 //! - `extend`: `--extend`
 //! - `run_file`: run.json; same settings on resume
+//! - `training_data`: the data that a run was trained on
+//! - `training_curves`: curves of metrics.jsonl and validation.jsonl
+//! - `eval_request`: what an evaluation measures
 //! - `stage_plan`: settings, batches and folder of a stage
 //! - `validation`: validation and evaluation
 //! - `train_loop`: resume or start a stage; step, save, validate
@@ -13,6 +16,7 @@
 //! - `run`: a run: open, train, evaluate
 
 pub(crate) mod eval_folder;
+pub(crate) mod eval_request;
 pub(crate) mod evaluate_model;
 pub(crate) mod extend;
 pub(crate) mod init_from;
@@ -22,4 +26,6 @@ pub(crate) mod run;
 pub(crate) mod run_file;
 pub(crate) mod stage_plan;
 pub(crate) mod train_loop;
+pub(crate) mod training_curves;
+pub(crate) mod training_data;
 pub(crate) mod validation;

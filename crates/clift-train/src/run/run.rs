@@ -10,7 +10,7 @@ use clift_data::{
     ClipReader, OpenedSource, SceneSource, SceneSubset, Split, make_folder, open_dataset, open_training_dataset,
     remove_leftovers,
 };
-use clift_eval::{EvalModels, ExternalMethod, LPIPS_COMMAND, Summary, write_skip_report};
+use clift_eval::{EvalFrames, EvalModels, EvalSplit, LPIPS_COMMAND, Summary, write_skip_report};
 use clift_model::{
     Clift, ModelError, ModelPath, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
 };
@@ -24,10 +24,12 @@ use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::footprint::scene_sizes::PARTS;
 use crate::run::eval_folder::{EvalFolder, SUMMARY};
+use crate::run::eval_request::EvalRequest;
 use crate::run::init_from::init_from;
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, compare_settings, require_run, write_config};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
+use crate::run::training_data::TrainingData;
 use crate::run::validation::Validation;
 use crate::stage::stage1_batches::Stage1Batches;
 use crate::stage::stage2_batches::Stage2Batches;
@@ -52,6 +54,8 @@ pub struct Run {
     config: Config,
     overfit: Option<usize>,
     device: Device,
+    /// Whether `config` reads the data set that the run was trained on.
+    is_training_data: bool,
     /// `None` for a run opened for evaluation.
     lock: Option<RunLock>,
 }
@@ -63,7 +67,11 @@ impl Run {
     /// # Errors
     /// [`TrainError::OtherRun`] if the directory contains a run with other settings, [`TrainError::Locked`] if another process
     /// uses it, and those of config, device and disk.
-    pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+    pub fn open(mut config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+        if options.overfit.is_some() {
+            // The training scenes themselves are evaluated.
+            config.data.hold_out = 0;
+        }
         config.validate()?;
         let device = config.device.open()?;
         config.precision.check("precision", &device)?;
@@ -94,6 +102,11 @@ impl Run {
         let mut file = RunFile::new(options.overfit);
         if folder.join("config.toml").exists() && has_begun {
             let found = RunFile::read(folder)?;
+            if !TrainingData::read(&config.run_dir)?.has_key {
+                // A run from before the key resumes with the frames that it was started with.
+                config.data.hold_out = 0;
+            }
+            let folder = &config.run_dir;
             let extensions = compare_settings(folder, &found, &config, options.overfit, options.extend)?;
             file.extended = found.extended;
             for extension in extensions {
@@ -102,7 +115,7 @@ impl Run {
         }
         file.write(folder)?;
         write_config(&config)?;
-        Ok(Self { config, overfit: options.overfit, device, lock: Some(lock) })
+        Ok(Self { config, overfit: options.overfit, device, is_training_data: true, lock: Some(lock) })
     }
 
     /// Opens an existing run for evaluation.
@@ -110,12 +123,15 @@ impl Run {
     /// # Errors
     /// [`TrainError::BadFile`] for a damaged `run.json`, [`TrainError::Model`] for other heads than those of the run, and those
     /// of the device.
-    pub fn reopen(config: Config) -> Result<Self, TrainError> {
+    pub fn reopen(mut config: Config) -> Result<Self, TrainError> {
+        let trained = TrainingData::read(&config.run_dir)?;
+        config.data.hold_out = trained.hold_out;
+        let is_training_data = trained.is_of(&config);
         config.validate()?;
         check_heads(&config.model, &config.run_dir)?;
         let run = RunFile::read(&config.run_dir)?;
         let device = config.device.open()?;
-        Ok(Self { config, overfit: run.overfit, device, lock: None })
+        Ok(Self { config, overfit: run.overfit, device, is_training_data, lock: None })
     }
 
     /// Trains the remaining steps of the run, or of one stage, and evaluates. Returns the evaluation of a whole run; the
@@ -140,8 +156,8 @@ impl Run {
             let text = std::fs::read(&summary).map_err(TrainError::io("reading the evaluation", &summary))?;
             return serde_json::from_slice(&text).map(Some).map_err(TrainError::bad_file("evaluation", &summary));
         }
-        let reader = self.reader(Split::Train, sink)?;
-        let validation = self.validation(sink)?;
+        let reader = self.reader(open_training_dataset(&self.config.data)?, Split::Train, sink)?;
+        let validation = self.validation(Split::Test, sink)?;
 
         let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
             self.train_stage1(&reader, &validation, stop, sink)?
@@ -160,25 +176,25 @@ impl Run {
         }
         require_run(&self.config.run_dir)?;
         let folder = EvalFolder::open(&self.folder("eval"), true, sink)?;
-        validation.evaluate(&self.models(sink)?, &[], folder.path(), stop, sink).map(Some)
+        let request = EvalRequest { split: Split::Test, external: &[], folder: &folder };
+        validation.evaluate(&self.models(sink)?, &request, stop, sink).map(Some)
     }
 
-    /// Evaluates the run, and the images of `external` methods beside it, and writes the results to `folder`. `beside` is
-    /// another run with the same stage 1 whose stage 2 was trained on other groups of tokens, evaluated on the same views.
+    /// Evaluates the run. `beside` is another run with the same stage 1 whose stage 2 was trained on other groups of tokens,
+    /// evaluated on the same views.
     ///
     /// # Errors
     /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] if stage 2 was trained on another
     /// encoder, [`TrainError::Locked`] if `folder` is in a run directory that another process uses, and those of the evaluation.
     pub fn evaluate(
         &self,
-        external: &[ExternalMethod],
-        folder: &EvalFolder,
+        request: &EvalRequest,
         beside: Option<&Config>,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
         let run_dir = &self.config.run_dir;
-        let is_inside = self.lock.is_none() && folder.is_in(run_dir);
+        let is_inside = self.lock.is_none() && request.folder.is_in(run_dir);
         let _lock = is_inside.then(|| RunLock::take(run_dir, LockedFolder::Run, sink)).transpose()?;
         let mut models = self.models(sink)?;
         if let Some(other) = beside {
@@ -189,7 +205,7 @@ impl Run {
             }
             models.set_stage2(other.clusters.grouping, self.open_stage2(other, &models.stage1)?);
         }
-        self.validation(sink)?.evaluate(&models, external, folder.path(), stop, sink)
+        self.validation(request.split, sink)?.evaluate(&models, request, stop, sink)
     }
 
     /// Opens the trained models of both stages, or of stage 1 only.
@@ -221,14 +237,22 @@ impl Run {
         if model.has_encoder_of(stage1) { Ok(model) } else { Err(TrainError::OtherEncoder { path }) }
     }
 
-    fn validation(&self, sink: &mut dyn Sink) -> Result<Validation<'_>, TrainError> {
+    /// Opens the evaluated views of a split.
+    fn validation(&self, split: Split, sink: &mut dyn Sink) -> Result<Validation<'_>, TrainError> {
         let mut eval = self.config.eval.clone();
         if self.overfit.is_some() && eval.index.take().is_some() {
             sink.event(&Event::Message("--overfit evaluates the training scenes: eval.index is not used".into()));
         }
-        // The test split, or the training scenes themselves under --overfit.
-        let reader = self.reader(if self.overfit.is_some() { Split::Train } else { Split::Test }, sink)?;
-        Validation::new(&self.config, eval, reader, &self.device, sink)
+        let data = &self.config.data;
+        let (opened, split, frames) = if self.overfit.is_some() {
+            (open_training_dataset(data)?, Split::Train, EvalFrames::whole(EvalSplit::Train))
+        } else {
+            let opened = open_dataset(data, split)?;
+            let frames = EvalFrames::new(&opened, split, data.hold_out, self.is_training_data);
+            (opened, split, frames)
+        };
+        let reader = self.reader(opened, split, sink)?;
+        Validation::new(&self.config, eval, reader, frames, &self.device, sink)
     }
 
     fn train_stage1(
@@ -323,12 +347,8 @@ impl Run {
         Err(TrainError::Missing { stage: stage.name(), what, first: "--only stage1", path })
     }
 
-    fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
-        let data = &self.config.data;
-        let OpenedSource { source, report, .. } = match split {
-            Split::Train => open_training_dataset(data)?,
-            Split::Test => open_dataset(data, split)?,
-        };
+    fn reader(&self, opened: OpenedSource, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
+        let OpenedSource { source, report, .. } = opened;
         sink.event(&Event::Message(format!("{split}: {report}")));
         if report.has_skips() && self.config.run_dir.is_dir() {
             write_skip_report(&report, &self.folder(&format!("skipped-{split}.json")))?;

@@ -11,6 +11,7 @@ use crate::config::parse::parse_config;
 use crate::error::TrainError;
 use crate::events::Stage;
 use crate::run::extend::{ExtensionRecord, StepExtension};
+use crate::run::training_data::TrainingData;
 
 const FILE: &str = "run.json";
 const VERSION: u32 = 1;
@@ -87,7 +88,10 @@ pub(crate) fn compare_settings(
     let bad = || TrainError::bad_file("config", &path);
     // Keys that an older version did not write have their defaults; keys unknown to this version are differences.
     let old = match parse_config::<Config>(&path, &text, &[]) {
-        Ok((old, _)) => toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?,
+        Ok((mut old, _)) => {
+            old.data.hold_out = TrainingData::read(folder)?.hold_out;
+            toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?
+        }
         Err(_) => text.parse().map_err(|error: toml::de::Error| bad()(error.message().to_owned()))?,
     };
     let new = toml::Table::try_from(config).map_err(|error| bad()(error.to_string()))?;

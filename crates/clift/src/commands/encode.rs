@@ -7,8 +7,8 @@ use clift_data::{
     ClipReader, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions, Split,
     open_dataset, open_source, plural,
 };
-use clift_eval::{EncodeOptions, EncodedScene, encode};
-use clift_model::{ModelPath, TokenCount, TokenFormat, TrainedModel, check_output_path};
+use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode};
+use clift_model::{ModelPath, Scene, TokenCount, TokenFormat, TrainedModel, check_output_path};
 use clift_train::{Config, Override};
 use serde::Serialize;
 
@@ -120,7 +120,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
-        model_path: args.model.to_string_lossy().into_owned(),
+        model_path: Scene::model_path_for(&args.model, &args.out),
     };
     let model = TrainedModel::open(&model, &config.model, &config.device.open()?)?;
     let encoded = encode(&model, &reader, scene, &options)?;
@@ -128,7 +128,26 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.save_clusters {
         write_json(&ClustersFile::of(&encoded), path)?;
     }
-    print_result(&describe(&encoded, args.tokens, &args.out))
+    print_result(&describe(&encoded, args.tokens, &args.out))?;
+    print_check(HeldOutFrame::render(&model, &reader, scene, &encoded.scene)?, &args.model)
+}
+
+/// Prints how a frame that is no context is rendered, with a warning if a copy of a context view is nearer to it.
+fn print_check(check: Option<HeldOutFrame>, model: &Path) -> anyhow::Result<()> {
+    let Some(HeldOutFrame { frame, psnr, nearest_psnr }) = check else {
+        return print_result("check: no frame beside the contexts to compare a rendering with");
+    };
+    print_result(&format!(
+        "check: frame {frame}, not a context: {psnr:.2} dB rendered, {nearest_psnr:.2} dB copied from the nearest context"
+    ))?;
+    if psnr < nearest_psnr {
+        print_note(&format!(
+            "warning: the rendering of frame {frame} is worse than a copy of the nearest context view; the scene differs \
+             from the training scenes of {}, or the run is not trained enough",
+            model.display()
+        ));
+    }
+    Ok(())
 }
 
 fn describe(encoded: &EncodedScene, format: TokenFormat, path: &Path) -> String {

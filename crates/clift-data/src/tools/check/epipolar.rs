@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
-use crate::statistics::upper_median;
+use crate::statistics::median;
 use crate::tools::check::drawing::epipolar_image;
 use crate::tools::check::images::Sizes;
 use crate::tools::check::result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
@@ -59,7 +59,7 @@ pub(crate) fn check_poses(
         ));
         return None;
     }
-    let scene_px = upper_median(&pooled);
+    let scene_px = median(&pooled);
     check.epipolar_px = Some(scene_px);
     if scene_px > MAX_EPIPOLAR_PX {
         check.reasons.push(format!(
@@ -131,7 +131,7 @@ impl SceneViews<'_> {
         }
         let geometry = fundamental_from_cameras([a, b], sizes);
         let distances: Vec<f64> = matches.iter().map(|pair| epipolar_distance(&geometry, pair)).collect();
-        let epipolar_px = upper_median(&distances);
+        let epipolar_px = median(&distances);
         Some(Pair {
             check: PairCheck { frames, num_matches: matches.len(), epipolar_px },
             geometry,

@@ -9,7 +9,7 @@ use clift_data::{
     ClipReader, DataError, DatasetRoot, EvaluationIndex, IndexCensus, OpenedSource, SceneSource, SceneSubset,
     SkipReport, SourceInfo, SourceKind, Split, open_dataset, open_source,
 };
-use clift_eval::evaluation_items;
+use clift_eval::{EvalFrames, evaluation_items};
 use clift_train::Config;
 
 use crate::commands::data::info_report::{EvaluationReport, Report, SplitReport};
@@ -70,10 +70,12 @@ fn describe_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
     let data = &config.data;
     let mut report = Report { path: path.to_owned(), ..Report::default() };
     for split in [Split::Train, Split::Test] {
-        let described = open_dataset(data, split).and_then(|OpenedSource { source, report: skips, .. }| {
+        let described = open_dataset(data, split).and_then(|opened| {
             if split == Split::Test {
-                report.evaluation = Some(evaluation(config, source.clone()));
+                let frames = EvalFrames::new(&opened, split, data.hold_out, true);
+                report.evaluation = Some(evaluation(config, opened.source.clone(), frames));
             }
+            let OpenedSource { source, report: skips, .. } = opened;
             let source: Arc<dyn SceneSource> = match data.source {
                 SourceKind::Synthetic => Arc::new(SceneSubset::first(source, MAX_SYNTHETIC)),
                 _ => source,
@@ -127,11 +129,12 @@ fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
     [needed, num_long]
 }
 
-fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport {
+fn evaluation(config: &Config, source: Arc<dyn SceneSource>, frames: EvalFrames) -> EvaluationReport {
     let reader = ClipReader { source, options: config.data.clip_options() };
-    match evaluation_items(&config.eval, &reader) {
-        Ok((items, skips)) => EvaluationReport {
+    match evaluation_items(&config.eval, &reader, frames) {
+        Ok((items, skips, split)) => EvaluationReport {
             error: None,
+            split: Some(split),
             num_scenes: items.len(),
             num_views: items.iter().map(|item| item.views.target.len()).sum(),
             skipped: counts(&skips),

@@ -5,6 +5,7 @@ use std::fmt;
 use std::path::PathBuf;
 
 use clift_data::{SkippedFrame, SkippedScene, SourceInfo, SourceKind, plural};
+use clift_eval::EvalSplit;
 use serde::Serialize;
 
 /// Most scenes, and groups of scenes, that the table lists; the JSON lists all.
@@ -47,6 +48,8 @@ pub struct SplitReport {
 pub struct EvaluationReport {
     /// Reason why no scene can be evaluated.
     pub error: Option<String>,
+    /// What is measured on.
+    pub split: Option<EvalSplit>,
     pub num_scenes: usize,
     pub num_views: usize,
     pub skipped: BTreeMap<String, usize>,
@@ -68,7 +71,8 @@ impl fmt::Display for Report {
         if let Some(evaluation) = &self.evaluation {
             let counted =
                 format!("{} of {}", plural(evaluation.num_views, "view"), plural(evaluation.num_scenes, "scene"));
-            rows.push(("evaluation", evaluation.error.clone().unwrap_or(counted)));
+            let split = evaluation.split.map_or_else(String::new, |split| format!(", {split}"));
+            rows.push(("evaluation", evaluation.error.clone().unwrap_or(counted + &split)));
             rows.extend(evaluation.skipped.iter().map(|(reason, count)| ("  skipped", format!("{count} {reason}"))));
         }
         match self.num_tokens {

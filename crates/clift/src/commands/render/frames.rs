@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
-use clift_data::{is_empty_folder, upper_median};
+use clift_data::{is_empty_folder, median};
 use clift_eval::{Animation, Canvas};
 use clift_model::{SceneRenderer, ViewCamera};
 use clift_train::TrainError;
@@ -97,6 +97,6 @@ pub fn write_frames(
         counter.set(render_s.len() as u64);
     }
     animation.finish()?;
-    let timing = Timing { select_s: upper_median(&select_s), render_s: upper_median(&render_s) };
+    let timing = Timing { select_s: median(&select_s), render_s: median(&render_s) };
     Ok(Rendered { timing, tokens: tokens.into_iter().collect() })
 }

@@ -50,7 +50,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     check_size(&scene, [width, height], args.render.is_some(), device)?;
     frames::check_out(&args.out, args.force)?;
     let views = path_cameras(&scene, args, height, width)?;
-    let model = args.model.clone().unwrap_or_else(|| scene.model_path.clone().into());
+    let model = args.model.clone().unwrap_or_else(|| scene.find_model(&args.scene));
     let weights = ModelPath::for_tokens(&model, scene.kind);
     if args.model.is_none() && !weights.exists() {
         // The path comes from an untrusted file: control characters must not reach the terminal.
