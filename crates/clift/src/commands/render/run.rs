@@ -48,6 +48,12 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let [width, height] = args.size.unwrap_or([scene.width, scene.height]);
     let device = args.device.unwrap_or_default();
     check_size(&scene, [width, height], args.render.is_some(), device)?;
+    if [width, height] != [scene.width, scene.height] {
+        print_note(&format!(
+            "warning: the network was trained on images of {} x {}; frames of {width} x {height} show its patches as a grid",
+            scene.width, scene.height
+        ));
+    }
     frames::check_out(&args.out, args.force)?;
     let views = path_cameras(&scene, args, height, width)?;
     let model = args.model.clone().unwrap_or_else(|| scene.find_model(&args.scene));
