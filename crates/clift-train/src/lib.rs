@@ -41,9 +41,9 @@ pub use config::parse::{ConfigError, parse_config, read_checked_config, read_con
 // A run, its events and errors
 pub use error::TrainError;
 pub use events::{Event, Sink, Stage, StepEvent};
-pub use run::eval_request::EvalRequest;
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::{Run, RunOptions};
+pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
 // One update
 pub use step::batch::{StageBatch, TokenSelection};
