@@ -41,7 +41,7 @@ pub struct DataConfig {
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub flip: bool,
     /// Where a data set has no test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
-    /// never read in training, as in the practice of NeRF; 0 holds out no frame, and training scenes are evaluated.
+    /// never read in training, as in the practice of `NeRF`; 0 holds out no frame, and training scenes are evaluated.
     pub hold_out: usize,
     /// Filters of the scenes on disk.
     pub filters: SceneFilters,

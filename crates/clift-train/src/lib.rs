@@ -42,9 +42,9 @@ pub use config::parse::{ConfigError, parse_config, read_checked_config, read_con
 pub use error::TrainError;
 pub use events::{Event, Sink, Stage, StepEvent};
 pub use run::eval_folder::EvalFolder;
-pub use run::eval_request::EvalRequest;
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::{Run, RunOptions};
+pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
 // One update
 pub use step::batch::{StageBatch, TokenSelection};

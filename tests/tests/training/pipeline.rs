@@ -12,8 +12,8 @@ fn keys(value: &Value) -> Vec<&str> {
 }
 
 const SUMMARY_KEYS: &str = "\
-    baselines differences lpips_weights_sha256 missing not_measured num_scenes num_skipped num_views points \
-    selection";
+    baselines differences lpips_weights_sha256 missing not_measured num_context_targets num_scenes num_skipped \
+    num_views points selection split";
 
 const POINT_KEYS: &str = "\
     frame_median_s frame_p95_s frame_quartiles_s gflops lpips_vgg lpips_vgg_per_view num_identical_views num_render_tokens \
@@ -56,13 +56,20 @@ fn a_run_writes_every_documented_file() {
     assert_eq!(lines[1]["lr"], 1e-3);
     assert!(number(&lines[5], "lr") < 1e-18, "{}", lines[5]);
 
+    let validations = place.json_lines("run/validation.jsonl");
+    let steps = validations.iter().map(|line| (line["stage"].as_str().unwrap(), line["step"].as_u64().unwrap()));
+    let expected = [("stage1", 3), ("stage1", 6), ("stage2", 3), ("stage2", 4)];
+    assert_eq!(steps.collect::<Vec<_>>(), expected, "eval.every = 3");
+    assert!(validations.iter().all(|line| number(line, "psnr") > 5.0 && line["num_views"] == 2));
+
     let summary = place.json("run/eval/summary.json");
+    assert_eq!(summary["split"], "test");
     assert_eq!(keys(&summary).join(" "), SUMMARY_KEYS);
     assert_eq!(["num_scenes", "num_views", "num_skipped"].map(|key| summary[key].as_u64()), [3, 6, 0].map(Some));
     assert_eq!(keys(&summary["baselines"]), ["mean_image", "nearest_view"]);
     for baseline in ["mean_image", "nearest_view"] {
         let baseline = &summary["baselines"][baseline];
-        assert_eq!(keys(baseline), ["lpips_vgg", "psnr", "ssim"]);
+        assert_eq!(keys(baseline), ["lpips_vgg", "num_identical_views", "psnr", "ssim"]);
         assert!(number(baseline, "psnr") > 5.0 && baseline["ssim"].is_f64(), "{baseline}");
     }
     let points = list(&summary["points"]);

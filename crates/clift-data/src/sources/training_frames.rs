@@ -7,8 +7,8 @@ use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 
-/// Returns whether a frame is held out of training: frames 0, `every`, 2 `every`, .., as in the practice of NeRF. With
-/// 0 no frame is.
+/// Returns whether a frame is held out of training: frames 0, `every`, 2 `every`, .., as in the practice of `NeRF`.
+/// With 0 no frame is.
 pub fn is_held_out(frame: usize, every: usize) -> bool {
     every > 0 && frame.is_multiple_of(every)
 }

@@ -60,9 +60,10 @@ impl OverlapOptions {
         check_config(near >= least && far >= near, "distance", || {
             format!("is {near} to {far}; {num_context} contexts and a target need a gap of {least} or more")
         })?;
-        let (most, frames) = match self.context_targets {
-            true => (near + 1, "the frames of the smallest gap"),
-            false => (near + 1 - num_context, "the frames of the smallest gap that are no contexts"),
+        let (most, frames) = if self.context_targets {
+            (near + 1, "the frames of the smallest gap")
+        } else {
+            (near + 1 - num_context, "the frames of the smallest gap that are no contexts")
         };
         check_config((1..=most).contains(&num_targets), "num_targets", || {
             format!("is {num_targets}; use 1 to {most}, {frames}")

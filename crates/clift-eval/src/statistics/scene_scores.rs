@@ -1,9 +1,12 @@
 //! The scenes of an evaluation from worst to best.
 
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+
 use clift_data::mean;
 
 use crate::config::method::Method;
-use crate::statistics::eval_results::{EvalResults, SceneViews};
+use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics, best_method};
 
 /// The mean PSNR of one scene.
@@ -31,16 +34,12 @@ impl SceneScores {
     pub fn new(results: &EvalResults) -> Self {
         let best = best_method(results.views().map(|(key, _)| key));
         let of_best = results.views().filter(|(key, _)| Some(key.method) == best && key.is_whole());
-        let most = of_best.max_by_key(|(key, _)| (key.num_storage_tokens, std::cmp::Reverse(key.tokens)));
+        let most = of_best.max_by_key(|(key, _)| (key.num_storage_tokens, Reverse(key.tokens)));
         let Some((key, views)) = most else { return Self::default() };
         let nearest = results.of(EvalKey::baseline(Method::NearestView));
-        let score = |(scene, frames): (&String, _)| {
-            let nearest = nearest.and_then(|views: &SceneViews| mean_psnr(views.get(scene)?.values()));
-            Some(SceneScore {
-                scene: scene.clone(),
-                psnr: mean_psnr(std::collections::BTreeMap::values(frames))?,
-                nearest_psnr: nearest,
-            })
+        let score = |(scene, frames): (&String, &BTreeMap<usize, ViewMetrics>)| {
+            let nearest_psnr = nearest.and_then(|views| mean_psnr(views.get(scene)?));
+            Some(SceneScore { scene: scene.clone(), psnr: mean_psnr(frames)?, nearest_psnr })
         };
         let mut scenes: Vec<SceneScore> = views.iter().filter_map(score).collect();
         scenes.sort_by(|a, b| a.psnr.total_cmp(&b.psnr));
@@ -48,8 +47,8 @@ impl SceneScores {
     }
 }
 
-fn mean_psnr<'a>(views: impl Iterator<Item = &'a ViewMetrics>) -> Option<f64> {
-    mean(&views.map(ViewMetrics::capped_psnr).collect::<Vec<_>>())
+fn mean_psnr(views: &BTreeMap<usize, ViewMetrics>) -> Option<f64> {
+    mean(&views.values().map(ViewMetrics::capped_psnr).collect::<Vec<_>>())
 }
 
 #[cfg(test)]

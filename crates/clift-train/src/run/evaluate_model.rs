@@ -9,8 +9,7 @@ use clift_model::{ModelPath, TrainedModel};
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink};
-use crate::run::eval_request::EvalRequest;
-use crate::run::validation::Validation;
+use crate::run::validation::{EvalRequest, Validation};
 
 /// Evaluates a model with the data and settings of `config`.
 ///

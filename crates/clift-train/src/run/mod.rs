@@ -7,7 +7,6 @@
 //! - `run_file`: run.json; same settings on resume
 //! - `training_data`: the data that a run was trained on
 //! - `training_curves`: curves of metrics.jsonl and validation.jsonl
-//! - `eval_request`: what an evaluation measures
 //! - `stage_plan`: settings, batches and folder of a stage
 //! - `validation`: validation and evaluation
 //! - `train_loop`: resume or start a stage; step, save, validate
@@ -16,7 +15,6 @@
 //! - `run`: a run: open, train, evaluate
 
 pub(crate) mod eval_folder;
-pub(crate) mod eval_request;
 pub(crate) mod evaluate_model;
 pub(crate) mod extend;
 pub(crate) mod init_from;

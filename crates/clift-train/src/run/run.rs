@@ -24,13 +24,12 @@ use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::footprint::scene_sizes::PARTS;
 use crate::run::eval_folder::{EvalFolder, SUMMARY};
-use crate::run::eval_request::EvalRequest;
 use crate::run::init_from::init_from;
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, compare_settings, require_run, write_config};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
 use crate::run::training_data::TrainingData;
-use crate::run::validation::Validation;
+use crate::run::validation::{EvalRequest, Validation};
 use crate::stage::stage1_batches::Stage1Batches;
 use crate::stage::stage2_batches::Stage2Batches;
 

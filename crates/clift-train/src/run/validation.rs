@@ -5,10 +5,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use burn::tensor::Device;
-use clift_data::ClipReader;
+use clift_data::{ClipReader, Split};
 use clift_eval::{
-    EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, Method, Progress, RunDescription, SceneFigures,
-    SceneLimits, Summary, Sweep, stage2_method,
+    EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, Progress, RunDescription,
+    SceneFigures, SceneLimits, Summary, Sweep, stage2_method,
 };
 use clift_model::{Clift, TokenCount, TrainedModel};
 
@@ -16,8 +16,19 @@ use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
-use crate::run::eval_request::EvalRequest;
+use crate::run::eval_folder::EvalFolder;
 use crate::run::training_curves::training_curves;
+
+/// What an evaluation measures, and where its results are written.
+#[derive(Clone, Copy, Debug)]
+pub struct EvalRequest<'a> {
+    /// The split of the data set.
+    pub split: Split,
+    /// Methods of other programs, measured beside the model.
+    pub external: &'a [ExternalMethod],
+    /// Folder of the results.
+    pub folder: &'a EvalFolder,
+}
 
 /// The validation and test views of a run.
 pub struct Validation<'a> {

@@ -65,7 +65,7 @@ pub struct IndexArgs {
     /// Minimum overlap of the first and the last context
     #[arg(long, value_name = "SHARE", default_value_t = 0.6)]
     pub overlap: f64,
-    /// Allow contexts as targets, as in published indices; the input then holds the answer
+    /// Allow contexts as targets, as published indices do
     #[arg(long)]
     pub context_targets: bool,
     /// Seed of the sampled frames

@@ -186,7 +186,10 @@ test              1 scene
         config.eval.index = Some(fixtures().join("evaluation_index.json"));
         let text = describe_config(Path::new("a.toml"), &config).unwrap().to_string();
         assert!(text.contains("  long enough     0 of 2: data.views needs 46 frames"), "{text}");
-        assert!(text.contains("evaluation        4 views of 1 scene\n  skipped         2 without views"), "{text}");
+        assert!(
+            text.contains("evaluation        4 views of 1 scene, test split\n  skipped         2 without views"),
+            "{text}"
+        );
         assert!(text.ends_with("tokens per scene  96 to 144"), "{text}");
 
         config.data.filters.min_frames = 9;
