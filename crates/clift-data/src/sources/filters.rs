@@ -39,7 +39,7 @@ impl SceneFilters {
         cameras: impl FnOnce() -> Result<Vec<Camera>, DataError>,
     ) -> Result<Option<String>, DataError> {
         if num_frames < self.min_frames {
-            return Ok(Some(format!("shorter than {} frames", self.min_frames)));
+            return Ok(Some(format!("shorter than the {} frames of data.filters.min_frames", self.min_frames)));
         }
         let Some(limit) = self.max_fov_deg else { return Ok(None) };
         let is_wide = cameras()?.iter().any(|camera| {

@@ -160,7 +160,10 @@ fn filters_and_sizes_skip_scenes_with_reasons() {
     let none = SceneFilters::default;
     assert_eq!(report(none(), [32, 18]), [] as [&str; 0]);
     assert_eq!(report(none(), [32, 19]), ["with images smaller than 32x19"]);
-    assert_eq!(report(SceneFilters { min_frames: 7, ..none() }, [0, 0]), ["shorter than 7 frames"]);
+    assert_eq!(
+        report(SceneFilters { min_frames: 7, ..none() }, [0, 0]),
+        ["shorter than the 7 frames of data.filters.min_frames"]
+    );
     let narrow = SceneFilters { max_fov_deg: Some(40.0), ..none() };
     assert_eq!(report(narrow, [0, 0]), ["with a field of view above 40 degrees"]);
 }

@@ -319,7 +319,7 @@ impl Run {
     fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
         let data = &self.config.data;
         let OpenedSource { source, report, .. } = match split {
-            Split::Train => open_training_dataset(data)?,
+            Split::Train => open_training_dataset(data, self.config.stage1.steps)?,
             Split::Test => open_dataset(data, split)?,
         };
         sink.event(&Event::Message(format!("{split}: {report}")));

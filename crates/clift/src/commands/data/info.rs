@@ -117,9 +117,7 @@ fn or_error<E: fmt::Display>(described: Result<SplitReport, E>) -> SplitReport {
 
 /// Returns the frames that `data.views` needs, and the number of scenes that have them.
 fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
-    let views = &config.data.views;
-    let gaps = (views.min_context..=views.max_context).map(|num_context| views.gap_bounds(u64::MAX, num_context)[0]);
-    let needed = gaps.max().unwrap_or(0) + 1;
+    let needed = config.data.views.min_frames(config.stage1.steps);
     let mut num_long = 0;
     for scene in 0..source.num_scenes() {
         // Unreadable scenes are part of the description.
@@ -184,14 +182,17 @@ test              1 scene
         config.data.filters.min_frames = 8;
         config.eval.index = Some(fixtures().join("evaluation_index.json"));
         let text = describe_config(Path::new("a.toml"), &config).unwrap().to_string();
-        assert!(text.contains("  long enough     0 of 2: data.views needs 46 frames"), "{text}");
+        assert!(text.contains("  long enough     0 of 2: data.views.min_gap needs 46 frames"), "{text}");
         assert!(text.contains("evaluation        4 views of 1 scene\n  skipped         2 without views"), "{text}");
         assert!(text.ends_with("tokens per scene  96 to 144"), "{text}");
 
         config.data.filters.min_frames = 9;
         let report = describe_config(Path::new("a.toml"), &config).unwrap();
         let error = report.splits["train"].error.as_deref().unwrap();
-        assert!(error.contains("0 of 2 scenes used; 2 shorter than 9 frames"), "{error}");
+        assert!(
+            error.contains("0 of 2 scenes used; 2 shorter than the 9 frames of data.filters.min_frames"),
+            "{error}"
+        );
         assert!(report.evaluation.is_none());
     }
 

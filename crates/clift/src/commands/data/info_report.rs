@@ -155,7 +155,10 @@ impl SplitReport {
         }
         if let Some([needed, num_long]) = self.views {
             let of = self.num_described;
-            rows.push(("  long enough", format!("{num_long} of {of}: data.views needs {}", plural(needed, "frame"))));
+            rows.push((
+                "  long enough",
+                format!("{num_long} of {of}: data.views.min_gap needs {}", plural(needed, "frame")),
+            ));
         }
     }
 }

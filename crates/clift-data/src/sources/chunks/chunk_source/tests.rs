@@ -57,7 +57,7 @@ fn filters_skip_scenes_with_reasons() {
     assert_eq!(open(8, Some(60.0)).num_scenes(), 2);
     let short = open(9, None);
     assert_eq!((short.num_scenes(), short.find("00000000000000a1")), (0, None));
-    assert_eq!(short.report.to_string(), "0 of 2 scenes used; 2 shorter than 9 frames");
+    assert_eq!(short.report.to_string(), "0 of 2 scenes used; 2 shorter than the 9 frames of data.filters.min_frames");
     // fx = 0.9 of the width: 58.1 degrees.
     let wide = open(8, Some(58.0));
     assert_eq!(wide.report.to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
