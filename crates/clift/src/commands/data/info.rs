@@ -102,6 +102,7 @@ fn describe_split(source: &dyn SceneSource, skips: &SkipReport) -> Result<SplitR
         frames: skips.frames.clone(),
         notes: skips.notes.clone(),
         num_described: source.num_scenes(),
+        keys: (0..source.num_scenes()).map(|scene| source.key(scene).to_owned()).collect(),
         info: Some(SourceInfo::read(source)?),
         views: None,
     })
@@ -154,6 +155,8 @@ pub struct InfoArgs {
 
 #[cfg(test)]
 mod tests {
+    use clift_data::{RgbImage, encode_png};
+
     use super::*;
 
     fn fixtures() -> PathBuf {
@@ -165,6 +168,7 @@ mod tests {
         let text = describe_folder(&fixtures()).unwrap().to_string();
         let expected = "layout            chunks
 train             2 scenes
+  keys            00000000000000a1, 00000000000000a2
   frames          8 / 8 / 8 (smallest / median / largest)
   image           64x36
   field of view   58.1 / 58.1 / 58.1 deg
@@ -194,6 +198,23 @@ test              1 scene
             "{error}"
         );
         assert!(report.evaluation.is_none());
+    }
+
+    #[test]
+    fn captures_are_listed_with_keys_and_every_size() {
+        let root = tempfile::tempdir().unwrap();
+        for (key, width) in [("attic", 32), ("barn", 48), ("cellar", 48)] {
+            let folder = root.path().join(key);
+            std::fs::create_dir(&folder).unwrap();
+            let image = RgbImage { width, height: 24, rgb: vec![9; width * 24 * 3] };
+            std::fs::write(folder.join("0.png"), encode_png(&image).unwrap()).unwrap();
+            let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]";
+            let frames = format!(r#"{{"fl_x": 20, "frames": [{{"file_path": "0.png", "transform_matrix": {pose}}}]}}"#);
+            std::fs::write(folder.join("transforms.json"), frames).unwrap();
+        }
+        let text = describe_folder(root.path()).unwrap().to_string();
+        assert!(text.contains("\n  keys            attic, barn, cellar\n"), "{text}");
+        assert!(text.contains("\n  image           48x24 (2 scenes), 32x24 (1 scene)\n"), "{text}");
     }
 
     #[test]
