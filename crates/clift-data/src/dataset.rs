@@ -40,15 +40,19 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
     let root = config.root.as_deref();
     let root = root.ok_or_else(|| missing("data.root", "write the folder that holds train/ and test/"))?;
     let (filters, files) = (config.filters.clone(), config.files.clone());
-    let options = SourceOptions { kind, filters, files, min_size: [config.width, config.height], reads_chunks: false };
+    let options = SourceOptions {
+        kind,
+        filters,
+        files,
+        min_size: [config.width, config.height],
+        image_cache: Some(config.image_cache.clone()),
+        reads_chunks: false,
+    };
     let opened = open_source(&DatasetRoot::find(root)?, split, &options)?;
     let source = &opened.source;
-    let has_dl3dv = match opened.kind {
-        SourceKind::Dl3dv => true,
-        SourceKind::Captures => (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene))),
-        _ => false,
-    };
-    if split == Split::Train && has_dl3dv && !opened.has_splits && config.files.test_scenes.is_none() {
+    let has_dl3dv = || (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene)));
+    let is_divided = opened.has_splits || config.files.test_scenes.is_some();
+    if split == Split::Train && !is_divided && (opened.kind == SourceKind::Dl3dv || has_dl3dv()) {
         let fix = "the folders also hold the benchmark scenes of DL3DV, which must be excluded from training: write \
                    the path of an evaluation index or of a file with one key per line (an empty file excludes none)";
         return Err(missing("data.files.test_scenes", fix));

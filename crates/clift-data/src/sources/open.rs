@@ -117,6 +117,7 @@ impl SplitFolder<'_> {
             filters: options.filters.clone(),
             whole_scenes: (is_dl3dv || is_text) && !files.keep_incomplete,
             min_size: options.min_size,
+            image_cache: options.image_cache.clone(),
         };
         let source = PhotoSource::open(scenes, &source_options)?;
         report.append(source.report.clone());

@@ -1,6 +1,7 @@
 //! A run directory from open to report.
 //!
 //! - `lock`: lock of a run directory
+//! - `batch_wait`: whether reading limits the speed
 //! - `logs`: metrics, skipped steps and scenes as JSONL
 //! - `extend`: `--extend`
 //! - `run_file`: run.json; same settings on resume
@@ -11,6 +12,7 @@
 //! - `evaluate_model`: evaluate a model without a run
 //! - `run`: a run: open, train, evaluate
 
+pub(crate) mod batch_wait;
 pub(crate) mod evaluate_model;
 pub(crate) mod extend;
 pub(crate) mod init_from;

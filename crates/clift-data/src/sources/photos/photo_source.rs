@@ -12,6 +12,7 @@ use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::filters::SceneFilters;
 use crate::sources::keys::find_by_name;
+use crate::sources::photos::image_cache::{ImageCache, ImageCacheConfig};
 use crate::sources::photos::photo::{MissingPhoto, Photo, PhotoHeader, PhotoOptions, PhotoScene};
 use crate::sources::photos::scene_folder::SceneFolder;
 
@@ -40,6 +41,8 @@ pub(crate) struct PhotoSourceOptions {
     pub whole_scenes: bool,
     /// Smallest columns and rows of an image.
     pub min_size: [usize; 2],
+    /// Cache of large photos, scaled to cover `min_size`.
+    pub image_cache: Option<ImageCacheConfig>,
 }
 
 /// Scenes of photos, sorted by key. Cameras are read on use, and cached for the scenes used last.
@@ -48,6 +51,7 @@ pub(crate) struct PhotoSource {
     positions: HashMap<String, usize>,
     options: PhotoOptions,
     pub report: SkipReport,
+    image_cache: Option<ImageCache>,
     /// Scenes used last, with their indices; the latest at the end.
     cache: Mutex<Vec<(usize, Arc<PhotoScene>)>>,
 }
@@ -117,7 +121,8 @@ impl PhotoSource {
             return Err(error);
         }
         let positions = scenes.iter().enumerate().map(|(i, scene)| (scene.folder.key.clone(), i)).collect();
-        Ok(Self { scenes, positions, options: options.photos.clone(), report, cache: Mutex::default() })
+        let image_cache = options.image_cache.as_ref().and_then(|config| ImageCache::open(config, options.min_size));
+        Ok(Self { scenes, positions, options: options.photos.clone(), report, image_cache, cache: Mutex::default() })
     }
 
     fn entry(&self, scene: usize) -> Result<&Entry, DataError> {
@@ -264,7 +269,9 @@ impl SceneSource for PhotoSource {
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-        self.photo(scene, frame)?.decode(self.key(scene), frame)
+        let photo = self.photo(scene, frame)?;
+        let decode = || photo.decode(self.key(scene), frame);
+        self.image_cache.as_ref().map_or_else(decode, |cache| cache.scaled(&photo, decode))
     }
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
