@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use crate::config::DataConfig;
 use crate::error::DataError;
 use crate::scene_source::{SceneSource, Split};
@@ -71,7 +73,7 @@ pub fn open_training_dataset(config: &DataConfig, last_step: u64) -> Result<Open
     let needed = config.views.min_frames(last_step);
     // An unreadable scene is reported when it is sampled.
     let is_short = |scene: &usize| source.num_frames(*scene).is_ok_and(|num_frames| num_frames < needed);
-    let (short, long): (Vec<usize>, Vec<usize>) = (0..source.num_scenes()).partition(is_short);
+    let (short, long): (Vec<usize>, Vec<usize>) = (0..source.num_scenes()).into_par_iter().partition(is_short);
     if short.is_empty() {
         return Ok(opened);
     }

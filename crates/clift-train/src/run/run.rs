@@ -318,6 +318,10 @@ impl Run {
 
     fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
         let data = &self.config.data;
+        if let Some(root) = &data.root {
+            // Opening reads thousands of files the first time.
+            sink.event(&Event::Message(format!("{split}: opening {}", root.display())));
+        }
         let OpenedSource { source, report, .. } = match split {
             Split::Train => open_training_dataset(data, self.config.stage1.steps)?,
             Split::Test => open_dataset(data, split)?,

@@ -11,6 +11,7 @@ use sha2::{Digest, Sha256};
 
 use crate::error::{DataError, check_config};
 use crate::files::atomic::TEMPORARY;
+use crate::files::caches::cache_folder;
 use crate::files::listing::has_ending;
 use crate::image::fit::covering_size;
 use crate::image::lanczos::resize_lanczos;
@@ -54,12 +55,7 @@ impl ImageCacheConfig {
 
     /// Returns the configured folder, or the default one if the environment has a folder for caches.
     fn folder(&self) -> Option<PathBuf> {
-        let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-        let caches = || {
-            let home = || variable("HOME").map(|home| home.join(".cache"));
-            variable("XDG_CACHE_HOME").or_else(|| variable("LOCALAPPDATA")).or_else(home)
-        };
-        self.folder.clone().or_else(|| Some(caches()?.join("clift/images")))
+        self.folder.clone().or_else(|| Some(cache_folder()?.join("images")))
     }
 }
 

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
+use crate::geometry::camera::{Camera, widest_fov_deg};
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, first_few, plural};
@@ -229,8 +229,8 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
         let [width, height] = options.min_size;
         Some((format!("with images smaller than {width}x{height}"), None))
     } else {
-        let cameras = || Ok(photos.iter().map(|photo| photo.camera).collect());
-        options.filters.reason_to_skip(num_frames, cameras)?.map(|reason| (reason, None))
+        let fov_deg = || Ok(widest_fov_deg(&photos.iter().map(|photo| photo.camera).collect::<Vec<_>>()));
+        options.filters.reason_to_skip(num_frames, fov_deg)?.map(|reason| (reason, None))
     };
     // Without extracted frames, a data set has millions of missing ones.
     missing.truncate(if photos.is_empty() { 1 } else { MAX_NAMED_FRAMES });
