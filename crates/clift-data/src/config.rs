@@ -11,6 +11,7 @@ use crate::sampling::view_sampler::{ViewSampler, is_default};
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
 use crate::sources::options::FileOptions;
+use crate::sources::photos::image_cache::ImageCacheConfig;
 use crate::synthetic::config::SyntheticConfig;
 
 /// Data set, image size, pose normalisation and view sampling.
@@ -47,6 +48,8 @@ pub struct DataConfig {
     pub filters: SceneFilters,
     /// Options of the synthetic scenes.
     pub synthetic: SyntheticConfig,
+    /// Cache of decoded photos.
+    pub image_cache: ImageCacheConfig,
     /// Sampling of context and target frames for training.
     pub views: ViewSampler,
     /// Number of threads that prepare batches; 0 prepares them between the steps.
@@ -71,6 +74,7 @@ impl Default for DataConfig {
             hold_out: 8,
             filters: SceneFilters::default(),
             synthetic: SyntheticConfig::default(),
+            image_cache: ImageCacheConfig::default(),
             views: ViewSampler::default(),
             num_threads: 1,
             num_prefetch: 4,

@@ -50,6 +50,7 @@ pub use sources::keys::is_dl3dv_key;
 pub use sources::kind::SourceKind;
 pub use sources::open::{OpenedSource, SAME_SCENES, open_source};
 pub use sources::options::{FileOptions, SourceOptions};
+pub use sources::photos::image_cache::ImageCacheConfig;
 pub use sources::subset::SceneSubset;
 pub use sources::test_scenes::{KEPT_FOR_TESTING, TestScenes};
 pub use sources::training_frames::is_held_out;

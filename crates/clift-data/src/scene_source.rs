@@ -42,6 +42,15 @@ pub trait SceneSource: Send + Sync {
     fn url(&self, _scene: usize) -> Result<String, DataError> {
         Ok(String::new())
     }
+    /// Returns the file name of every frame; empty for frames without files of their own.
+    fn frame_names(&self, _scene: usize) -> Result<Vec<String>, DataError> {
+        Ok(Vec::new())
+    }
+    /// Returns columns and rows of a frame. The default decodes the frame.
+    fn image_size(&self, scene: usize, frame: usize) -> Result<[usize; 2], DataError> {
+        let image = self.frame(scene, frame)?;
+        Ok([image.width, image.height])
+    }
     /// Decodes one frame.
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError>;
     /// Returns the bytes of the JPEG or PNG file of a frame; `None` for images that are computed, or resampled on load.

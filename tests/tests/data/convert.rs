@@ -61,8 +61,9 @@ fn scenes_skipped_at_opening_are_listed() {
     std::fs::remove_dir_all(data.join("empty/images")).unwrap();
     let ran = place.clift("data convert DIR/data DIR/out --to chunks").ok();
     ran.notes("skipped empty: without any image").notes("skipped.json");
-    let skipped = place.json("out/test/skipped.json");
+    let skipped = place.json("out/skipped.json");
     assert_eq!((&skipped["num_scenes"], &skipped["skips"][0]["key"]), (&2.into(), &"empty".into()));
+    place.clift("data info DIR/out").ok().prints("chunks").prints("all               1 scene");
     let frame = &skipped["frames"][0];
     assert_eq!((&frame["key"], &frame["frame"]), (&"attic".into(), &"./images/99".into()));
 }

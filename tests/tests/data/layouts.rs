@@ -40,7 +40,7 @@ fn dl3dv_training_requires_a_test_scene_list() {
     let files = format!("{files} filters={{min_frames=9}},");
     place
         .train("other", &[&data("auto", "dl3dv", &files)])
-        .fails_with(1, &["0 of 1 scenes used; 1 shorter than 9 frames"]);
+        .fails_with(1, &["0 of 1 scenes used; 1 shorter than the 9 frames of data.filters.min_frames"]);
 }
 
 #[test]

@@ -204,7 +204,7 @@ fn too_short_scenes_are_skipped_at_the_start() {
         scene.timestamps.truncate(3);
     });
     let ran = train_on(&place, "run --only stage1", &data, &[]).ok();
-    let ran = ran.notes("train: 1 of 2 scenes used; 1 shorter than the 4 frames that data.views needs");
+    let ran = ran.notes("train: 1 of 2 scenes used; 1 shorter than the 4 frames that data.views.min_gap needs");
     assert!(!ran.stderr.contains("skipped "), "{}", ran.stderr);
     assert_eq!(place.json("run/skipped-train.json")["skips"][0]["key"], KEYS[1]);
 }

@@ -6,7 +6,8 @@ use std::path::Path;
 
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
-use image::{ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
+use image::metadata::Orientation;
+use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
@@ -50,8 +51,8 @@ pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, D
     Ok(RgbImage { width: width as usize, height: height as usize, rgb: image.into_raw() })
 }
 
-/// Reads the columns and rows of a JPEG or PNG file from its header.
-pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
+/// Reads the columns and rows of a JPEG or PNG file, as stored, and its EXIF orientation.
+pub(crate) fn read_header(path: &Path) -> Result<([usize; 2], Orientation), DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let metadata = std::fs::metadata(path).map_err(DataError::io("opening an image", path))?;
     if !metadata.is_file() {
@@ -62,13 +63,35 @@ pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
     if !matches!(reader.format(), Some(ImageFormat::Jpeg | ImageFormat::Png)) {
         return Err(bad("the image is neither JPEG nor PNG".into()));
     }
-    let (width, height) = reader
-        .into_dimensions()
+    let mut decoder = reader
+        .into_decoder()
         .map_err(|error| bad(format!("the image cannot be read: {}", error.to_string().trim_end())))?;
+    let (width, height) = decoder.dimensions();
     if width == 0 || height == 0 {
         return Err(bad(format!("the image is {width}x{height}")));
     }
-    Ok([width as usize, height as usize])
+    // Broken EXIF data does not affect the pixels.
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    Ok(([width as usize, height as usize], orientation))
+}
+
+/// Returns the EXIF orientation of a JPEG or PNG file in memory.
+pub(crate) fn exif_orientation(bytes: &[u8]) -> Orientation {
+    let decoder =
+        ImageReader::new(Cursor::new(bytes)).with_guessed_format().ok().and_then(|reader| reader.into_decoder().ok());
+    decoder.and_then(|mut decoder| decoder.orientation().ok()).unwrap_or(Orientation::NoTransforms)
+}
+
+/// Turns or mirrors an image by its EXIF orientation.
+pub(crate) fn apply_orientation(image: RgbImage, orientation: Orientation) -> RgbImage {
+    let RgbImage { width, height, rgb } = image;
+    // A decoded image has three values per pixel, so that none is lost here.
+    let pixels = image::RgbImage::from_raw(width as u32, height as u32, rgb).unwrap_or_default();
+    let mut turned = DynamicImage::ImageRgb8(pixels);
+    turned.apply_orientation(orientation);
+    let turned = turned.into_rgb8();
+    let (width, height) = turned.dimensions();
+    RgbImage { width: width as usize, height: height as usize, rgb: turned.into_raw() }
 }
 
 /// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated.
@@ -95,12 +118,6 @@ pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
     }
     let what = format!("the image is truncated: its {num_bytes} bytes have no end marker");
     Err(DataError::BadScene { what, path: path.to_owned() })
-}
-
-/// Reads the EXIF orientation of an image file, 2 to 8. Returns `None` for 1 (upright) and for no orientation.
-pub(crate) fn exif_orientation(path: &Path) -> Option<u8> {
-    let mut decoder = ImageReader::open(path).ok()?.with_guessed_format().ok()?.into_decoder().ok()?;
-    decoder.orientation().ok().map(image::metadata::Orientation::to_exif).filter(|orientation| *orientation != 1)
 }
 
 /// Returns whether the JPEG data has its end marker. The decoder fills the missing part of a truncated JPEG with gray.

@@ -36,8 +36,11 @@ pub enum ConvertTo {
 pub struct ConvertOptions {
     /// Format of the files.
     pub to: ConvertTo,
-    /// Encoding of frames without an image file: computed and undistorted ones. Image files are copied unchanged.
+    /// Encoding of frames without an image file of their size: computed, undistorted and reduced ones. Other image files
+    /// are copied unchanged.
     pub encoding: ImageEncoding,
+    /// Largest side of an image in pixels; larger images are reduced.
+    pub max_size: Option<usize>,
     /// Options with which the source was opened, on one line; empty for the defaults.
     pub opened_with: String,
 }
@@ -53,8 +56,9 @@ impl ConvertOptions {
             ImageEncoding::Png => "PNG".into(),
             ImageEncoding::Jpeg(quality) => format!("JPEG of quality {quality}"),
         };
+        let size = self.max_size.map_or(String::new(), |size| format!(", at most {size} pixels a side"));
         let with = if self.opened_with.is_empty() { "" } else { ", with " };
-        format!("{form}, {images}{with}{}", self.opened_with)
+        format!("{form}, {images}{size}{with}{}", self.opened_with)
     }
 }
 
@@ -204,7 +208,7 @@ impl<'a> Converter<'a> {
         for scene in 0..self.source.num_scenes() {
             let key = self.source.key(scene);
             if !self.index.contains_key(key) && !self.pending_keys.contains(key) {
-                match read_scene(self.source, scene, self.options.encoding) {
+                match read_scene(self.source, scene, self.options.encoding, self.options.max_size) {
                     Ok((record, num_encoded)) => self.add(record, num_encoded)?,
                     Err(error) => self.report.skipped.skip(key, error.to_string()),
                 }

@@ -131,6 +131,7 @@ fn validate_data(data: &DataConfig) -> Result<(), TrainError> {
     if data.root.is_none() {
         return Err(bad("data.root", "missing", "write the folder with train/ and test/"));
     }
+    data.image_cache.validate().map_err(in_section("data.image_cache"))?;
     data.filters.validate().map_err(in_section("data.filters"))
 }
 

@@ -155,7 +155,9 @@ impl Run {
             let text = std::fs::read(&summary).map_err(TrainError::io("reading the evaluation", &summary))?;
             return serde_json::from_slice(&text).map(Some).map_err(TrainError::bad_file("evaluation", &summary));
         }
-        let reader = self.reader(open_training_dataset(&self.config.data)?, Split::Train, sink)?;
+        self.report_opening(Split::Train, sink);
+        let opened = open_training_dataset(&self.config.data, self.config.stage1.steps)?;
+        let reader = self.reader(opened, Split::Train, sink)?;
         let validation = self.validation(Split::Test, sink)?;
 
         let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
@@ -242,9 +244,10 @@ impl Run {
         if self.overfit.is_some() && eval.index.take().is_some() {
             sink.event(&Event::Message("--overfit evaluates the training scenes: eval.index is not used".into()));
         }
+        self.report_opening(split, sink);
         let data = &self.config.data;
         let (opened, split, frames) = if self.overfit.is_some() {
-            (open_training_dataset(data)?, Split::Train, EvalFrames::whole(EvalSplit::Train))
+            (open_training_dataset(data, self.config.stage1.steps)?, Split::Train, EvalFrames::whole(EvalSplit::Train))
         } else {
             let opened = open_dataset(data, split)?;
             let frames = EvalFrames::new(&opened, split, data.hold_out, self.is_training_data);
@@ -344,6 +347,13 @@ impl Run {
         }
         let what = "the weights of stage 1";
         Err(TrainError::Missing { stage: stage.name(), what, first: "--only stage1", path })
+    }
+
+    /// Reports that a data set is opened: the first time, thousands of files are read.
+    fn report_opening(&self, split: Split, sink: &mut dyn Sink) {
+        if let Some(root) = &self.config.data.root {
+            sink.event(&Event::Message(format!("{split}: opening {}", root.display())));
+        }
     }
 
     fn reader(&self, opened: OpenedSource, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {

@@ -17,8 +17,17 @@ const FILE: &str = "run.json";
 const VERSION: u32 = 1;
 
 /// Keys that may change when a run is resumed.
-const FREE_KEYS: [&str; 7] =
-    ["run_dir", "device", "activation_checkpointing", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
+const FREE_KEYS: [&str; 8] = [
+    "run_dir",
+    "device",
+    "activation_checkpointing",
+    "data.num_threads",
+    "data.num_prefetch",
+    "data.image_cache.",
+    "checkpoint.",
+    "eval.",
+];
+
 /// Keys that `--extend` may increase.
 const STEP_COUNTS: [(&str, Stage); 2] = [("stage1.steps", Stage::Stage1), ("stage2.steps", Stage::Stage2)];
 

@@ -11,6 +11,7 @@ use crate::checkpoint::checkpoints::Checkpoints;
 use crate::checkpoint::progress::{Best, Progress};
 use crate::error::TrainError;
 use crate::events::{Event, Sink, StepEvent};
+use crate::run::batch_wait::BatchWait;
 use crate::run::logs::RunLog;
 use crate::run::run_file::require_run;
 use crate::run::stage_plan::StagePlan;
@@ -94,7 +95,14 @@ impl<'a> TrainLoop<'a> {
     pub fn run(&mut self, mut train_state: TrainState) -> Result<Clift, TrainError> {
         // The process may have been killed between a checkpoint and the validation of its step.
         self.validate_if_due(&train_state)?;
-        for batch in self.plan.prefetch(self.progress.step) {
+        let mut batches = self.plan.prefetch(self.progress.step);
+        let mut batch_wait = BatchWait::new();
+        loop {
+            let asked = Instant::now();
+            let Some(batch) = batches.next() else { break };
+            if let Some(hint) = batch_wait.add(asked.elapsed(), &self.plan.config.data) {
+                self.log.event(&Event::Message(hint));
+            }
             let batch = match batch {
                 Ok(batch) => batch,
                 Err(error) => return Err(self.save_before(error, &train_state)),

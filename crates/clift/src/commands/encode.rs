@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::{
-    ClipReader, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions, Split,
-    open_dataset, open_source, plural,
+    ClipReader, DataError, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions,
+    Split, open_dataset, open_source, plural,
 };
 use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode};
 use clift_model::{ModelPath, Scene, TokenCount, TokenFormat, TrainedModel, check_output_path};
@@ -41,9 +41,12 @@ pub struct EncodeArgs {
     /// Split of the data set: train or test
     #[arg(long, value_name = "SPLIT", default_value = "test", value_parser = parse_split)]
     pub split: Split,
-    /// Context frames, e.g. 0,5,9 [default: as many as in training, evenly spread]
+    /// Context frames by position or file name [default: as many as in training]
+    ///
+    /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension:
+    /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. The default is spread along the camera path.
     #[arg(long, value_name = "FRAMES", value_delimiter = ',')]
-    pub context: Vec<usize>,
+    pub context: Vec<String>,
     /// Tokens to store, as a number or a share
     #[arg(long, value_name = "COUNT", default_value = "1/4")]
     pub storage: TokenCount,
@@ -112,9 +115,10 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         None => open_dataset(&config.data, args.split)?.source,
     };
     let scene = find_scene(source.as_ref(), args.scene.as_deref())?;
+    let context = frame_positions(&args.context, || source.frame_names(scene))?;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let options = EncodeOptions {
-        context: (!args.context.is_empty()).then(|| args.context.clone()),
+        context: (!args.context.is_empty()).then_some(context),
         num_context: config.data.views.max_context,
         storage: args.storage,
         grouping: config.clusters.grouping,
@@ -148,6 +152,30 @@ fn print_check(check: Option<HeldOutFrame>, model: &Path) -> anyhow::Result<()> 
         ));
     }
     Ok(())
+}
+
+/// Returns the positions of frames that are given by position or file name.
+fn frame_positions(
+    frames: &[String],
+    names: impl FnOnce() -> Result<Vec<String>, DataError>,
+) -> anyhow::Result<Vec<usize>> {
+    if let Ok(positions) = frames.iter().map(|frame| frame.parse()).collect() {
+        return Ok(positions);
+    }
+    let names = names()?;
+    let position = |frame: &String| {
+        let has_stem = |name: &String| name.rsplit_once('.').is_some_and(|(stem, _)| stem == frame);
+        let named = names.iter().position(|name| name == frame).or_else(|| names.iter().position(has_stem));
+        let Some(position) = named.or_else(|| frame.parse().ok()) else {
+            let first = names.iter().take(MAX_LISTED_KEYS).map(String::as_str).collect::<Vec<_>>().join(", ");
+            match names.len() {
+                0 => usage_bail!("--context {frame}: the frames of this data set have no file names; write positions"),
+                count => usage_bail!("--context: no frame {frame}; the {count} frames start with {first}"),
+            }
+        };
+        Ok(position)
+    };
+    frames.iter().map(position).collect()
 }
 
 fn describe(encoded: &EncodedScene, format: TokenFormat, path: &Path) -> String {
@@ -199,5 +227,27 @@ fn find_scene(source: &dyn SceneSource, key: Option<&str>) -> anyhow::Result<usi
         (Some(key), None) => usage_bail!("no scene {key}; the {num_scenes} scenes are: {keys}"),
         (None, None) if num_scenes == 1 => Ok(0),
         (None, None) => usage_bail!("{num_scenes} scenes; choose one with --scene: {keys}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn context_frames_are_positions_or_file_names() {
+        let positions = |frames: &[&str]| {
+            let frames: Vec<String> = frames.iter().map(ToString::to_string).collect();
+            let names = || Ok(["a.jpg", "b.v2.png", "7.png", "0"].map(String::from).to_vec());
+            frame_positions(&frames, names).map_err(|error| error.to_string())
+        };
+        assert_eq!(positions(&["7", "0"]).unwrap(), [7, 0], "numbers alone are positions");
+        assert_eq!(positions(&["b.v2.png", "a", "7.png", "2"]).unwrap(), [1, 0, 2, 2]);
+        assert_eq!(
+            positions(&["a.jpg", "c.jpg"]).unwrap_err(),
+            "--context: no frame c.jpg; the 4 frames start with a.jpg, b.v2.png, 7.png, 0"
+        );
+        let message = frame_positions(&["a.jpg".into()], || Ok(Vec::new())).unwrap_err().to_string();
+        assert!(message.contains("write positions"), "{message}");
     }
 }

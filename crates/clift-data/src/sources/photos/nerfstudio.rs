@@ -16,7 +16,7 @@ use crate::files::listing::natural_order;
 use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
-use crate::image::codec::read_size;
+use crate::image::codec::read_header;
 use crate::sources::photos::image_folder::ImageFolders;
 use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene};
 
@@ -189,7 +189,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let optics = entry.optics().or(&top);
         let lens = optics.lens().map_err(in_frame)?;
         let given = optics.size().map_err(in_frame)?;
-        let size = given.map_or_else(|| read_size(&image).map(|size| size.map(|side| side as f64)), Ok);
+        let size = given.map_or_else(|| read_header(&image).map(|(size, _)| size.map(|side| side as f64)), Ok);
         let Ok(size) = size else {
             scene.skip(name, "whose image cannot be read");
             continue;

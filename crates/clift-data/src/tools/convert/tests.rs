@@ -16,7 +16,7 @@ const CHUNKS: ConvertOptions = options(ConvertTo::Chunks { target_bytes: 1 });
 const SCENES: ConvertOptions = options(ConvertTo::Scenes);
 
 const fn options(to: ConvertTo) -> ConvertOptions {
-    ConvertOptions { to, encoding: ImageEncoding::Png, opened_with: String::new() }
+    ConvertOptions { to, encoding: ImageEncoding::Png, max_size: None, opened_with: String::new() }
 }
 
 fn convert_all(
@@ -48,6 +48,20 @@ fn rooms(num_scenes: usize) -> SyntheticSource {
 fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let file = |name: String| (name.clone(), std::fs::read(folder.join(name)).unwrap());
     names(folder).into_iter().map(file).collect()
+}
+
+#[test]
+fn large_images_are_reduced_with_their_field_of_view() {
+    let source = re10k_mini(Split::Train); // 64 x 36
+    for (max_size, expected, num_encoded) in [(48, [48, 27], 16), (64, [64, 36], 0)] {
+        let folder = tempfile::tempdir().unwrap();
+        let options = ConvertOptions { max_size: Some(max_size), ..CHUNKS };
+        let report = convert_all(&source, folder.path(), &options).unwrap();
+        assert_eq!((report.num_frames, report.num_encoded), (16, num_encoded));
+        let reduced = open(folder.path(), Split::Train).source;
+        assert_eq!(reduced.image_size(1, 3).unwrap(), expected);
+        assert_eq!(reduced.cameras(1).unwrap(), source.cameras(1).unwrap());
+    }
 }
 
 #[test]
@@ -229,6 +243,7 @@ fn folder_with_other_options_is_refused_unchanged() {
         SCENES,
         options(ConvertTo::Chunks { target_bytes: 2 }),
         ConvertOptions { encoding: ImageEncoding::Jpeg(90), ..CHUNKS },
+        ConvertOptions { max_size: Some(48), ..CHUNKS },
         ConvertOptions { opened_with: "data.files.undistort=false".into(), ..CHUNKS },
     ];
     for other in others {

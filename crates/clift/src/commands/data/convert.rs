@@ -6,9 +6,10 @@ use std::time::Instant;
 use anyhow::Context;
 use clap::ValueEnum;
 use clift_data::{
-    ConversionReport, ConvertOptions, ConvertTo, Converter, KEPT_FOR_TESTING, SkipReport, SkippedScene, Split, plural,
+    ConversionReport, ConvertOptions, ConvertTo, Converter, KEPT_FOR_TESTING, SkipReport, SkippedScene, plural,
 };
 
+use crate::commands::parse::parse_count;
 use crate::commands::shared_args::ChunkArgs;
 use crate::commands::splits::{SourceArgs, SplitSource, Splits, open_splits};
 use crate::exit_code::usage_bail;
@@ -30,15 +31,17 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     changes.retain(|change| change.key != "data.files.test_scenes");
     changes.sort_by(|a, b| a.key.cmp(&b.key));
     let opened_with = changes.iter().map(|change| format!("{}={}", change.key, change.to)).collect::<Vec<_>>();
-    let options = ConvertOptions { to, encoding: args.chunks.encoding(), opened_with: opened_with.join(" ") };
+    let opened_with = opened_with.join(" ");
+    let options = ConvertOptions { to, encoding: args.chunks.encoding(), max_size: args.max_size, opened_with };
+
     let dir = &args.source.dir;
     let splits = open_splits(dir, args.split, &files)?;
     // Every output folder is checked before the first is written.
     let mut converters = Vec::new();
     for split in &splits {
         split.print_report();
-        // A data set without splits becomes the test split, which `clift eval` and `clift encode` read.
-        let folder = args.out.join(split.split.unwrap_or(Split::Test).to_string());
+        // A data set without splits stays one.
+        let folder = split.split.map_or_else(|| args.out.clone(), |split| args.out.join(split.to_string()));
         require_disjoint(dir, &folder)?;
         let opened = &split.opened;
         converters.push((split, Converter::open(opened.source.as_ref(), &opened.report, &folder, &options)?, folder));
@@ -129,6 +132,9 @@ pub struct ConvertArgs {
     /// Convert this split, if there are two
     #[arg(long, value_enum, default_value_t = Splits::Both)]
     pub split: Splits,
+    /// Reduce images with a side of more than N pixels, and encode them
+    #[arg(long, value_name = "N", value_parser = parse_count)]
+    pub max_size: Option<usize>,
     #[command(flatten)]
     pub chunks: ChunkArgs,
 }

@@ -15,7 +15,7 @@ pub struct RenderArgs {
     /// Scene file from `clift encode`
     #[arg(value_name = "SCENE")]
     pub scene: PathBuf,
-    /// Camera path: interpolate, orbit, or a file of poses (JSON)
+    /// Camera path: interpolate, orbit, a transforms.json or a file of poses
     #[arg(long, value_name = "PATH")]
     pub path: CameraPath,
     /// Output folder
