@@ -85,7 +85,7 @@ pub use image::undistort::Undistortion;
 pub use tools::check::result::{FrameCheck, PairCheck, SceneCheck, Verdict};
 pub use tools::check::scene::{CheckedScene, check_scene, note_skipped_frames, skipped_scenes};
 pub use tools::checksums::hash_file;
-pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter};
+pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter, UnreadableImage};
 pub use tools::export::{ImageEncoding, write_evaluation_index, write_source};
 pub use tools::index_census::IndexCensus;
 pub use tools::info::SourceInfo;

@@ -7,6 +7,7 @@ use glam::{DMat3, DVec3};
 use serde::Deserialize;
 
 use crate::error::DataError;
+use crate::files::bounded::parse_json;
 use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::normalization::{PoseNormalization, check_near};
 use crate::geometry::pose::Pose;
@@ -144,7 +145,7 @@ pub fn read_poses(
 ) -> Result<Vec<PathView>, DataError> {
     let text = std::fs::read(path).map_err(DataError::io("reading the poses", path))?;
     let bad = |what: String| DataError::BadPoses { what, path: path.to_path_buf() };
-    let file: PoseFile = serde_json::from_slice(&text)
+    let file: PoseFile = parse_json(&text)
         .map_err(|error| bad(format!("expected {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}")))?;
     if !(1..=MAX_POSES).contains(&file.poses.len()) {
         return Err(bad(format!("{} poses, expected 1 to {MAX_POSES}", file.poses.len())));

@@ -8,6 +8,7 @@ use indicatif::ProgressBar;
 use crate::output::bar::progress_bar;
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
+use crate::output::visible::visible;
 
 /// Seconds between two progress lines.
 const INTERVAL_S: f64 = 10.0;
@@ -45,7 +46,7 @@ impl Counter {
     /// Prints a line, above the bar if there is one.
     pub fn note(&self, line: &str) {
         match &self.bar {
-            Some(bar) => bar.println(line),
+            Some(bar) => bar.println(visible(line)),
             None => print_note(line),
         }
     }

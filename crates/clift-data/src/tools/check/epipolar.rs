@@ -24,7 +24,7 @@ const MIN_MATCHES: usize = 40;
 /// Epipolar distance in pixels above which a note on a pair is added in a scene that passes.
 const NOTED_PX: f64 = 3.0;
 /// Epipolar distance of changed cameras over that of the given ones, in the median over pairs, below which the change is
-/// a mistake of the scene. Right cameras of ten real scenes gave at least 1.03 (docs/guide/data.md).
+/// a mistake of the scene. Right cameras of eight real scenes gave at least 1.03 (docs/guide/data.md).
 const MAX_MISTAKE_RATIO: f64 = 0.93;
 /// Smallest share of the pairs in which the changed cameras fit better.
 const MIN_MISTAKE_SHARE: f64 = 0.6;

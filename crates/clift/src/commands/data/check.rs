@@ -15,6 +15,7 @@ use crate::commands::splits::{SourceArgs, SplitSource, Splits};
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::table::table;
+use crate::output::visible::visible_line;
 
 /// Findings of one scene.
 #[derive(Debug, Serialize)]
@@ -96,6 +97,7 @@ fn report_text(report: &Report) -> String {
     let mut sentences = Vec::new();
     for Row { split, check } in &report.scenes {
         let name = split.map_or_else(|| check.key.clone(), |split| format!("{split}/{}", check.key));
+        let name = visible_line(&name).into_owned();
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".into());
         rows.push([
             name.clone(),
