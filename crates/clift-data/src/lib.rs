@@ -84,10 +84,10 @@ pub use image::rgb_image::RgbImage;
 pub use image::undistort::Undistortion;
 
 // Tools for data sets: describe, check, convert, index.
-pub use tools::check::result::SceneCheck;
+pub use tools::check::result::{FrameCheck, PairCheck, SceneCheck, Verdict};
 pub use tools::check::scene::{CheckedScene, check_scene, note_skipped_frames, skipped_scenes};
 pub use tools::checksums::hash_file;
-pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter};
+pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter, UnreadableImage};
 pub use tools::export::{ImageEncoding, write_evaluation_index, write_source};
 pub use tools::index_census::IndexCensus;
 pub use tools::info::SourceInfo;

@@ -2,7 +2,7 @@
 //!
 //! - `atomic`: atomic writes of a file or a folder
 //! - `staged_dir`: several files that appear together
-//! - `bounded`: reading with a size limit
+//! - `bounded`: reading with a size limit, JSON
 //! - `caches`: the folder for caches
 //! - `listing`: file names of a folder, natural order
 

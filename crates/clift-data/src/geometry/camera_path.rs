@@ -8,6 +8,7 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use crate::error::DataError;
+use crate::files::bounded::parse_json;
 use crate::files::listing::natural_order;
 use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::normalization::{PoseNormalization, check_near};
@@ -174,15 +175,15 @@ pub fn read_poses(
     let wrong_form = |error: serde_json::Error| {
         bad(format!("expected a transforms.json or {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}"))
     };
-    let form = serde_json::from_slice(&text).unwrap_or(FileForm { poses: None, frames: None });
+    let form = parse_json(&text).unwrap_or(FileForm { poses: None, frames: None });
     let is_transforms = form.frames.is_some() && form.poses.is_none();
     let poses: Vec<FilePose> = if is_transforms {
-        let mut file: TransformsFile = serde_json::from_slice(&text).map_err(wrong_form)?;
+        let mut file: TransformsFile = parse_json(&text).map_err(wrong_form)?;
         file.frames.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
         let pose = |frame: TransformsFrame| FilePose { c2w: frame.transform_matrix, intrinsics_norm: None };
         file.frames.into_iter().map(pose).collect()
     } else {
-        let file: PoseFile = serde_json::from_slice(&text).map_err(wrong_form)?;
+        let file: PoseFile = parse_json(&text).map_err(wrong_form)?;
         file.poses
     };
     if !(1..=MAX_POSES).contains(&poses.len()) {

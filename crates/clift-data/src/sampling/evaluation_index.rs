@@ -8,6 +8,7 @@ use serde::Deserialize;
 use serde::de::{Deserializer, MapAccess, Visitor};
 
 use crate::error::DataError;
+use crate::files::bounded::parse_json;
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkipReport;
@@ -39,7 +40,7 @@ impl EvaluationIndex {
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let text = std::fs::read(path).map_err(DataError::io("reading the evaluation index", path))?;
         let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
-        let file: IndexFile = serde_json::from_slice(&text).map_err(|error| {
+        let file: IndexFile = parse_json(&text).map_err(|error| {
             bad(format!("expected {{key: {{\"context\": [..], \"target\": [..]}} or null}}, got {error}"))
         })?;
         let mut positions = HashMap::with_capacity(file.0.len());

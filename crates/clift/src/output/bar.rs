@@ -10,6 +10,7 @@ use crate::output::event_line::{event_line, step_metrics};
 use crate::output::plain::PlainLines;
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
+use crate::output::visible::visible;
 
 pub fn progress_sink() -> Box<dyn Sink> {
     if std::io::stderr().is_terminal() {
@@ -34,7 +35,7 @@ impl Sink for Bar {
         }
         if let Some(line) = event_line(event) {
             match &self.bar {
-                Some(bar) => bar.println(line),
+                Some(bar) => bar.println(visible(&line)),
                 None => print_note(&line),
             }
         }

@@ -8,6 +8,7 @@ use indicatif::ProgressBar;
 use crate::output::bar::progress_bar;
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
+use crate::output::visible::visible;
 
 const INTERVAL_S: f64 = 10.0;
 
@@ -41,7 +42,7 @@ impl Counter {
 
     pub fn note(&self, line: &str) {
         match &self.bar {
-            Some(bar) => bar.println(line),
+            Some(bar) => bar.println(visible(line)),
             None => print_note(line),
         }
     }

@@ -1,6 +1,7 @@
 //! Results, notes and progress for people: results go to the standard output, everything else to the standard error.
 //!
 //! - `units`: seconds, bytes, counts
+//! - `visible`: control characters escaped
 //! - `table`: aligned columns
 //! - `json`: results as JSON files
 //! - `stdout`: results to stdout, notes to stderr
@@ -17,3 +18,4 @@ pub(crate) mod plain;
 pub(crate) mod stdout;
 pub(crate) mod table;
 pub(crate) mod units;
+pub(crate) mod visible;

@@ -6,6 +6,7 @@ use clift_train::{Event, Sink, StepEvent};
 
 use crate::output::event_line::{event_line, step_metrics};
 use crate::output::units::duration;
+use crate::output::visible::visible;
 
 /// Seconds of training between two progress lines.
 const INTERVAL_S: f64 = 10.0;
@@ -59,7 +60,7 @@ impl<W: Write> Sink for PlainLines<W> {
             (self.pace, self.since_line_s, self.printed_tenth) = ((0, 0.0), 0.0, 0);
         }
         if let Some(line) = line {
-            drop(writeln!(self.out, "{line}")); // no other stream could report the failure
+            drop(writeln!(self.out, "{}", visible(&line))); // no other stream could report the failure
         }
     }
 }

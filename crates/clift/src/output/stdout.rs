@@ -6,6 +6,8 @@ use std::path::Path;
 use anyhow::Context;
 use clift_eval::Summary;
 
+use crate::output::visible::visible;
+
 /// Writes lines to the standard output and flushes them. A closed pipe, as `head` leaves behind, is no error.
 pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
@@ -23,7 +25,7 @@ pub fn print_evaluation(summary: &Summary, folder: &Path) -> anyhow::Result<()> 
 }
 
 fn write_result(mut out: impl Write, text: &str) -> anyhow::Result<()> {
-    match writeln!(out, "{text}").and_then(|()| out.flush()) {
+    match writeln!(out, "{}", visible(text)).and_then(|()| out.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
         written => written.context("writing to the standard output"),
     }
@@ -31,7 +33,7 @@ fn write_result(mut out: impl Write, text: &str) -> anyhow::Result<()> {
 
 /// Writes a line to the standard error. A failure is ignored: no other stream could report it.
 pub fn print_note(text: &str) {
-    drop(writeln!(std::io::stderr(), "{text}"));
+    drop(writeln!(std::io::stderr(), "{}", visible(text)));
 }
 
 #[cfg(test)]
@@ -57,5 +59,8 @@ mod tests {
         let mut out = Vec::new();
         write_result(&mut out, "row").unwrap();
         assert_eq!(out, b"row\n");
+        out.clear();
+        write_result(&mut out, "key\u{1b}[2J").unwrap();
+        assert_eq!(out, b"key\\u{1b}[2J\n");
     }
 }

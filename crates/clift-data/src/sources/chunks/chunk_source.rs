@@ -234,6 +234,10 @@ impl ChunkSource {
             what: format!("expected scene {key}, found {} other scenes", table.scenes.len()),
             path: chunk.path.clone(),
         })?;
+        if scene.images.is_empty() {
+            let what = format!("scene {key} has no frames");
+            return Err(DataError::BadChunk { what, path: chunk.path.clone() });
+        }
         Ok((&chunk.path, scene))
     }
 }

@@ -11,7 +11,7 @@ use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
 use crate::error::DataError;
-use crate::files::bounded::read_bounded;
+use crate::files::bounded::{parse_json, read_bounded};
 use crate::files::listing::natural_order;
 use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
@@ -162,9 +162,7 @@ impl<'a> Optics<'a> {
 pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
-    // Editors on Windows put a byte order mark in front.
-    let json = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&text);
-    let document: Document = serde_json::from_slice(json).map_err(|error| bad(explain(&error, json)))?;
+    let document: Document = parse_json(&text).map_err(|error| bad(explain(&error, &text)))?;
     drop(text);
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut entries: Vec<&Entry> = document.frames.0.iter().collect();

@@ -172,6 +172,36 @@ fn skipped_scenes_are_reported_and_converted_later() {
 }
 
 #[test]
+fn unreadable_images_are_listed_in_every_run() {
+    let torn = TestSource::new(rooms(3)).with_encoded_frames(|scene, frame| {
+        let image = ImageEncoding::Png.encode(&rooms(3).frame(scene, frame).unwrap()).unwrap();
+        Some(if scene == 1 && frame > 0 { image[..image.len() - 1].to_vec() } else { image })
+    });
+    for options in [CHUNKS, SCENES] {
+        let folder = tempfile::tempdir().unwrap();
+        for num_found in [0, 3] {
+            let report = convert_all(&torn, folder.path(), &options).unwrap();
+            assert_eq!((report.num_scenes, report.num_found), (3, num_found));
+            let unreadable: Vec<(&str, usize)> =
+                report.unreadable.iter().map(|image| (&*image.key, image.frame)).collect();
+            assert_eq!(unreadable, [(rooms(3).key(1), 1), (rooms(3).key(1), 2)]);
+            assert!(report.unreadable[0].reason.contains("the PNG data of"), "{}", report.unreadable[0].reason);
+            assert!(names(folder.path()).contains(&"unreadable.json".to_owned()));
+        }
+    }
+}
+
+#[test]
+fn scene_without_frames_is_skipped() {
+    let folder = tempfile::tempdir().unwrap();
+    let empty =
+        TestSource::new(rooms(2)).with_cameras(|scene, cameras| Ok(if scene == 0 { Vec::new() } else { cameras }));
+    let report = convert_all(&empty, folder.path(), &CHUNKS).unwrap();
+    assert_eq!((report.num_scenes, report.skipped.skips.len()), (1, 1));
+    assert!(report.skipped.skips[0].reason.contains("has no frames"), "{:?}", report.skipped.skips);
+}
+
+#[test]
 fn folder_of_other_scenes_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     convert_all(&rooms(3), folder.path(), &SCENES).unwrap();

@@ -1,7 +1,7 @@
 use safetensors::SafeTensors;
 
 use super::*;
-use crate::sources::chunks::writer::{SceneRecord, write_chunks};
+use crate::sources::chunks::writer::{SceneRecord, scene_file_bytes, write_chunks};
 use crate::testing::{fixture, re10k_mini};
 use crate::torch::pickle_writer::PickleWriter;
 
@@ -46,6 +46,20 @@ fn chunks_of_torch_save_are_read_by_frame() {
     for (got, expected) in c2w.iter().zip(&expected) {
         assert!((f64::from(*got) - expected).abs() < 1e-6, "{got} against {expected}"); // f32 file, f32 matrix
     }
+}
+
+#[test]
+fn scene_without_frames_is_no_scene() {
+    let (key, url) = ("a".to_owned(), String::new());
+    let empty = SceneRecord { key, url, timestamps: Vec::new(), cameras: Vec::new(), images: Vec::new() };
+    let (folder, source) = with_chunk(&scene_file_bytes("a".as_ref(), &empty).unwrap(), &["a"]);
+    for error in [source.cameras(0).err(), source.num_frames(0).err()] {
+        assert!(error.unwrap().to_string().contains("scene a has no frames"));
+    }
+    let filters = SceneFilters { min_frames: 1, ..ALL };
+    let filtered = ChunkSource::open(folder.path(), Split::Train, &filters).unwrap();
+    assert_eq!((filtered.num_scenes(), filtered.report.skips.len()), (0, 1));
+    assert!(filtered.report.skips[0].reason.contains("has no frames"));
 }
 
 #[test]

@@ -1,0 +1,81 @@
+//! Each frame against the others: exchanged neighbours, and single cameras that do not fit.
+
+use crate::statistics::{mean, median};
+use crate::tools::check::triplets::Triplet;
+use crate::tools::features::pixel_camera::PixelCamera;
+
+/// Reprojection distance of a frame above which its camera is wrong, in pixels of an image 640 columns wide.
+const MAX_FRAME_PX: f64 = 2.5;
+/// The same over the median of all frames: noisy poses are a property of the scene.
+const MAX_FRAME_RATIO: f64 = 3.5;
+/// Reprojection distance of two exchanged cameras over that of the given ones, below which they are exchanged.
+const MAX_EXCHANGED_RATIO: f64 = 0.85;
+/// Smallest share of the triplets in which the exchanged cameras fit better.
+const MIN_EXCHANGED_SHARE: f64 = 0.6;
+/// Frames over the largest number of wrong frames that are listed one by one.
+const MIN_FRAMES_PER_WRONG: usize = 4;
+
+/// Two neighbours whose cameras fit better when they are exchanged.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Exchanged {
+    /// The first of the two frames.
+    pub frame: usize,
+    /// Median reprojection distance of both, in pixels, as given and exchanged.
+    pub px: [f64; 2],
+}
+
+/// Exchanges neighbours in `cameras` as long as they fit better, the clearest first.
+pub(crate) fn exchange_neighbours(cameras: &mut [PixelCamera], triplets: &[Vec<Triplet>]) -> Vec<Exchanged> {
+    let mut found = Vec::new();
+    while found.len() <= cameras.len() / MIN_FRAMES_PER_WRONG {
+        let tried = (1..cameras.len()).filter_map(|second| exchanged(cameras, triplets, second - 1));
+        let ratio = |exchanged: &Exchanged| exchanged.px[1] / exchanged.px[0];
+        let best = tried.min_by(|a, b| ratio(a).total_cmp(&ratio(b)));
+        let Some(best) = best.filter(|best| ratio(best) < MAX_EXCHANGED_RATIO) else { break };
+        cameras.swap(best.frame, best.frame + 1);
+        found.push(best);
+    }
+    found
+}
+
+/// Exchanges the cameras of a frame and the next. Returns `None` if most triplets fit worse.
+fn exchanged(cameras: &[PixelCamera], triplets: &[Vec<Triplet>], frame: usize) -> Option<Exchanged> {
+    let mut changed = cameras.to_vec();
+    changed.swap(frame, frame + 1);
+    let concerned = || triplets[frame].iter().chain(&triplets[frame + 1]);
+    let distances =
+        |cameras: &[PixelCamera]| -> Vec<f64> { concerned().map(|triplet| triplet.reprojection_px(cameras)).collect() };
+    let (given, new) = (distances(cameras), distances(&changed));
+    let is_better = given.iter().zip(&new).map(|(given, new)| f64::from(u8::from(new < given)));
+    let share = mean(&is_better.collect::<Vec<f64>>())?;
+    (share >= MIN_EXCHANGED_SHARE).then(|| Exchanged { frame, px: [median(&given), median(&new)] })
+}
+
+/// Returns the reprojection distance of every frame in pixels, the lower median of its triplets without those that
+/// `wrong` frames place; `None` for a frame without triplets.
+pub(crate) fn reprojection_px(cameras: &[PixelCamera], triplets: &[Vec<Triplet>], wrong: &[usize]) -> Vec<Option<f64>> {
+    let of_frame = |triplets: &Vec<Triplet>| {
+        let right = triplets.iter().filter(|triplet| !wrong.iter().any(|frame| triplet.is_placed_by(*frame)));
+        let mut distances: Vec<f64> = right.map(|triplet| triplet.reprojection_px(cameras)).collect();
+        distances.sort_by(f64::total_cmp);
+        distances.get(distances.len().saturating_sub(1) / 2).copied()
+    };
+    triplets.iter().map(of_frame).collect()
+}
+
+/// Returns the frames whose cameras do not fit the others, the worst first, each with its reprojection distance in
+/// pixels. A wrong frame no longer places points for the others.
+pub(crate) fn wrong_frames(cameras: &[PixelCamera], triplets: &[Vec<Triplet>]) -> Vec<(usize, f64)> {
+    let mut wrong: Vec<(usize, f64)> = Vec::new();
+    while wrong.len() <= cameras.len() / MIN_FRAMES_PER_WRONG {
+        let names: Vec<usize> = wrong.iter().map(|(frame, _)| *frame).collect();
+        let distances = reprojection_px(cameras, triplets, &names);
+        let known: Vec<f64> = distances.iter().flatten().copied().collect();
+        let bound = MAX_FRAME_PX.max(MAX_FRAME_RATIO * median(&known));
+        let rest = distances.into_iter().enumerate().filter(|(frame, _)| !names.contains(frame));
+        let worst = rest.filter_map(|(frame, px)| Some((frame, px?))).max_by(|a, b| a.1.total_cmp(&b.1));
+        let Some(worst) = worst.filter(|(_, px)| *px > bound) else { break };
+        wrong.push(worst);
+    }
+    wrong
+}
