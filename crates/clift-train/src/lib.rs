@@ -34,7 +34,8 @@ mod testing;
 
 // Configuration
 pub use config::config::{
-    CheckpointConfig, ClustersConfig, Config, LossConfig, OptimizerConfig, Stage1Config, Stage2Config,
+    Algorithm, CheckpointConfig, ClustersConfig, Config, LossConfig, OptimizerConfig, Schedule, Stage1Config,
+    Stage2Config,
 };
 pub use config::overrides::Override;
 pub use config::parse::{ConfigError, parse_config, read_checked_config, read_config};
@@ -52,7 +53,7 @@ pub use step::device_batch::{DeviceBatch, render_loss};
 pub use step::loss::{ImageLoss, Loss, LossParts, mse, psnr_of_mse};
 pub use step::loss_scale::LossScale;
 pub use step::optimizer::{clip_global_norm, global_norm, make_optimizer};
-pub use step::schedule::warm_up_cosine;
+pub use step::schedule::learning_rate;
 pub use step::step_guard::StepAnomaly;
 pub use step::train_state::{TrainState, Update};
 // Results of the stages

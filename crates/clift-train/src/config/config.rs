@@ -126,12 +126,26 @@ impl Algorithm {
     }
 }
 
-/// AdamW or Muon, with warm-up and cosine decay.
+/// Learning rate after the warm-up.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Schedule {
+    /// Half a cosine down to 0.
+    #[default]
+    Cosine,
+    /// Warm-up, stable, decay: constant, and linear to 0 in the last half of the steps (arXiv 2404.06395).
+    Wsd,
+}
+
+/// AdamW or Muon, with warm-up and decay.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OptimizerConfig {
     /// Optimizer of the weight matrices of transformer blocks: `adamw`, or `muon`, which learns more per step.
     pub algorithm: Algorithm,
+    /// Decay of the learning rate after the warm-up: `cosine`, or `wsd`: constant, and linear to 0 in the last half of the
+    /// steps.
+    pub schedule: Schedule,
     /// Highest learning rate.
     pub learning_rate: f64,
     /// Steps until this rate is reached.
@@ -151,6 +165,7 @@ impl Default for OptimizerConfig {
     fn default() -> Self {
         Self {
             algorithm: Algorithm::Adamw,
+            schedule: Schedule::Cosine,
             learning_rate: 4e-4,
             warm_up_steps: 2500,
             weight_decay: 0.05,

@@ -20,7 +20,7 @@ use crate::stage::settings::{StageSettings, freeze};
 use crate::step::batch::StageBatch;
 use crate::step::loss::{Loss, psnr_of_mse};
 use crate::step::loss_scale::LossScale;
-use crate::step::schedule::warm_up_cosine;
+use crate::step::schedule::learning_rate;
 use crate::step::step_guard::{SkippedStep, SkippedStepScene, StepAnomaly};
 use crate::step::train_state::{TrainState, Update};
 
@@ -130,7 +130,7 @@ impl<'a> TrainLoop<'a> {
         }
         let StageSettings { steps: num_steps, accumulate, optimizer, .. } = self.plan.settings;
         let step = self.progress.step + 1;
-        let lr = warm_up_cosine(step, optimizer.learning_rate, optimizer.warm_up_steps, num_steps);
+        let lr = learning_rate(optimizer, step, num_steps);
         let (rate, recent) = (self.plan.learning_rate(lr), &self.progress.recent);
         let mut anomaly = None;
         // Checked before the update: a skipped step does not change the weights.
