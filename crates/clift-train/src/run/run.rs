@@ -141,6 +141,10 @@ impl Run {
             let text = std::fs::read(&summary).map_err(TrainError::io("reading the evaluation", &summary))?;
             return serde_json::from_slice(&text).map(Some).map_err(TrainError::bad_file("evaluation", &summary));
         }
+        if !is_trained && summary.exists() {
+            // Of former weights: of stage 1 alone, or before `--extend`.
+            std::fs::remove_file(&summary).map_err(TrainError::io("removing the former evaluation", &summary))?;
+        }
         let reader = self.reader(Split::Train, sink)?;
         let validation = self.validation(sink)?;
 
