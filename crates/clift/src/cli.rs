@@ -183,13 +183,22 @@ Examples:
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
+    use clap::{CommandFactory, ValueEnum};
 
     use super::*;
+    use crate::commands::completions;
 
     #[test]
     fn command_tree_is_consistent() {
         Args::command().debug_assert();
+    }
+
+    #[test]
+    fn completion_scripts_of_all_shells_have_the_commands() {
+        for shell in clap_complete::Shell::value_variants() {
+            let script = completions::script(*shell, Args::command());
+            assert!(["encode", "convert", "storage"].iter().all(|word| script.contains(word)), "{shell}");
+        }
     }
 
     #[test]

@@ -18,7 +18,7 @@ mod reference;
 
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 
 use crate::cli::{Args, Command};
 use crate::commands::bench::cases::{BenchArgs, BenchCommand};
@@ -38,7 +38,7 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(&args),
         Command::Eval(args) => eval::run(&args),
         Command::Compare(args) => compare::run(&args),
-        Command::Completions(args) => completions::run(&args),
+        Command::Completions(args) => completions::run(&args, Args::command()),
         Command::Flops(args) => flops::run(&args),
         Command::Encode(args) => encode::run(&args),
         Command::Render(args) => render::run::run(&args),
