@@ -1,6 +1,7 @@
 //! `clift metrics`.
 
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -90,11 +91,11 @@ fn read_rows(run: &Path) -> anyhow::Result<Rows> {
 fn csv(rows: &Rows) -> Vec<u8> {
     let mut text = format!("stage,step,time,{}", STEP_KEYS.join(","));
     for key in VALIDATION_KEYS {
-        text += &format!(",validation_{key}");
+        let _ = write!(text, ",validation_{key}");
     }
     text.push('\n');
     for ((stage, step), row) in rows {
-        text += &format!("{},{step},{}", stage.name(), row.time);
+        let _ = write!(text, "{},{step},{}", stage.name(), row.time);
         let cells = STEP_KEYS.iter().map(|key| (&row.step, key));
         for (values, key) in cells.chain(VALIDATION_KEYS.iter().map(|key| (&row.validation, key))) {
             let value = values.get(*key).copied().flatten();

@@ -1,8 +1,8 @@
 //! TensorBoard's event files: scalars over steps.
 //!
 //! A record is its length as u64, the masked CRC-32C of the length, the data, and the masked CRC-32C of the data, all
-//! little-endian. The data is a protocol buffer `Event`: wall_time = 1 (double), step = 2 (int64), file_version = 3
-//! (string), summary = 5, which holds values = 1 with tag = 1 (string) and simple_value = 2 (float).
+//! little-endian. The data is a protocol buffer `Event`: `wall_time` = 1 (double), `step` = 2 (int64), `file_version`
+//! = 3 (string), `summary` = 5, which holds values = 1 with `tag` = 1 (string) and `simple_value` = 2 (float).
 
 /// A value of a curve.
 pub struct Scalar<'a> {
