@@ -14,13 +14,15 @@ use crate::support::{BINARY, Place, copy_folder, finish, repository, sources, st
 const KEY: &str = "00000000000000b1";
 
 /// Words of the documents, and those for small data.
-const SMALLER: [(&str, &str); 9] = [
+const SMALLER: [(&str, &str); 10] = [
     ("target/release/clift ", "clift "),
+    // Later examples read the other data.
+    (" /data/re10k-txt /data/re10k ", " /data/re10k-txt /data/converted "),
     (" /data/", " data/"),
     ("5aca87f95a9412c6", KEY),
     ("--scene KEY", "--scene 00000000000000b1"),
     ("chunks|scenes", "chunks"),
-    ("--distance 45..135", "--distance 2..6"),
+    ("--distance 45..135", "--distance 3..7"),
     ("--distance 6..20 --context 4 --targets 6", "--distance 2..6 --context 2 --targets 1"),
     ("--render 256", "--render 2"),
     ("--storage 256", "--storage 2"),
@@ -184,7 +186,9 @@ fn shrink(args: &mut Vec<String>) {
             set(args, &SMALL_RUN[1..6]);
             set(args, &["data.root=PATH"]);
         }
-        ("data", Some("index")) => default(args, "--distance", "2..6"),
+        ("data", Some("index")) if !args.iter().any(|arg| arg == "--distance") => {
+            args.extend(["--distance".to_owned(), "3..7".to_owned()]);
+        }
         _ => {}
     }
 }
