@@ -84,7 +84,8 @@ fn every_documented_command_runs() {
             shrink(&mut args);
             let ran = finish(start(Command::new(BINARY).args(&args).current_dir(&folder)));
             // A check with a flagged scene is a result.
-            let is_flagged = args[..2] == ["data", "check"] && ran.code == Some(1) && !ran.stdout.is_empty();
+            let is_flagged =
+                args.starts_with(&["data".into(), "check".into()]) && ran.code == Some(1) && !ran.stdout.is_empty();
             if ran.code != Some(0) && !is_flagged {
                 failures.push(format!("{document}: {line}\n  ran {args:?}\n{}", ran.stderr));
             }
@@ -136,7 +137,7 @@ fn smaller(line: &str) -> String {
 /// Removes what an earlier example wrote where this one writes. Evaluations of runs stay: a user has them, too.
 fn make_room(folder: &Path, args: &[String]) {
     let flag = args.iter().position(|arg| arg == "-o" || arg == "--out").and_then(|at| args.get(at + 1));
-    let positional = match [args[0].as_str(), args[1].as_str()] {
+    let positional = match [args[0].as_str(), args.get(1).map_or("", String::as_str)] {
         ["data", "synth"] => args.get(2),
         ["data", "convert"] => args.get(3),
         _ => None,
