@@ -122,7 +122,6 @@ impl Evaluator {
             self.require_images(external, &summary)?;
         }
         sheets.keep()?;
-        summary.write(&folder.join("summary.json"))?;
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;
         write_skip_report(&skipped, &folder.join("skipped.json"))?;
@@ -130,6 +129,8 @@ impl Evaluator {
         let report =
             Report { run: self.description.clone(), summary: summary.clone(), training, scenes, skipped, figures };
         report.write(&folder.join("report.html"))?;
+        // Last: an evaluation with a summary is complete.
+        summary.write(&folder.join("summary.json"))?;
         Ok(summary)
     }
 

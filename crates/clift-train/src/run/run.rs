@@ -155,6 +155,10 @@ impl Run {
             let text = std::fs::read(&summary).map_err(TrainError::io("reading the evaluation", &summary))?;
             return serde_json::from_slice(&text).map(Some).map_err(TrainError::bad_file("evaluation", &summary));
         }
+        if !is_trained && summary.exists() {
+            // Of former weights: of stage 1 alone, or before `--extend`.
+            std::fs::remove_file(&summary).map_err(TrainError::io("removing the former evaluation", &summary))?;
+        }
         self.report_opening(Split::Train, sink);
         let opened = open_training_dataset(&self.config.data, self.config.stage1.steps)?;
         let reader = self.reader(opened, Split::Train, sink)?;

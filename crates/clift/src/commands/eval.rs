@@ -12,7 +12,7 @@ use crate::commands::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::bar::progress_sink;
-use crate::output::stdout::{print_evaluation, print_note};
+use crate::output::stdout::{print_evaluation, print_warning};
 
 pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let external = external_methods(args)?;
@@ -32,8 +32,8 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     });
     let with = with.transpose()?;
     if model.is_some() && config.eval.index.is_none() {
-        print_note(
-            "warning: without --index, contexts and targets are spread evenly over each scene; published figures use an \
+        print_warning(
+            "without --index, contexts and targets are spread evenly over each scene; published figures use an \
              evaluation index with four contexts and are not comparable",
         );
     }

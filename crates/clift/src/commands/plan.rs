@@ -7,7 +7,7 @@ use clift_model::max_tensor_bytes;
 use clift_train::{Config, LargestTensor, PARTS, largest_tensor, memory_warning};
 
 use crate::commands::shared_args::{ConfigArgs, JsonArg};
-use crate::output::stdout::{print_note, print_result};
+use crate::output::stdout::{print_result, print_warning};
 use crate::output::table::table;
 use crate::output::units::{duration, memory_size, seconds};
 
@@ -15,13 +15,13 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, check_plan)?;
     args.json.check_folder()?;
     for missing in missing_weights(&config) {
-        print_note(&format!("warning: {missing}"));
+        print_warning(missing);
     }
     let plan = plan(&config, !args.no_time)?;
     print_result(&report_text(&plan))?;
     print_result(&largest_tensors(&config)?)?;
     if let Some(warning) = memory_warning(&config, plan.available_bytes)? {
-        print_note(&format!("warning: {warning}"));
+        print_warning(warning);
     }
     args.json.write(&plan)
 }

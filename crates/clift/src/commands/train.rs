@@ -9,13 +9,13 @@ use crate::commands::parse::{parse_count, parse_stage};
 use crate::commands::shared_args::ConfigArgs;
 use crate::interrupt;
 use crate::output::bar::progress_sink;
-use crate::output::stdout::{print_note, print_run};
+use crate::output::stdout::{print_run, print_warning};
 
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, Config::validate)?;
     // Before the system ends a run for its memory after hours of training.
     if let Ok(Some(warning)) = memory_warning(&config, available_bytes(config.device)) {
-        print_note(&format!("warning: {warning}"));
+        print_warning(warning);
     }
     let stop = interrupt::flag()?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };

@@ -1,11 +1,13 @@
 //! Results to stdout, notes to stderr.
 
+use std::fmt::Display;
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 
 use anyhow::Context;
 use clift_eval::Summary;
 
+use crate::output::verbosity::Verbosity;
 use crate::output::visible::visible;
 
 /// Writes lines to the standard output and flushes them. A closed pipe, as `head` leaves behind, is no error.
@@ -31,8 +33,20 @@ fn write_result(mut out: impl Write, text: &str) -> anyhow::Result<()> {
     }
 }
 
-/// Writes a line to the standard error. A failure is ignored: no other stream could report it.
+/// Writes a line to the standard error, unless the command is quiet.
 pub fn print_note(text: &str) {
+    if Verbosity::chosen() != Verbosity::Quiet {
+        print_problem(text);
+    }
+}
+
+/// Writes a warning to the standard error.
+pub fn print_warning(text: impl Display) {
+    print_problem(&format!("warning: {text}"));
+}
+
+/// Writes a line to the standard error. A failure is ignored: no other stream could report it.
+pub fn print_problem(text: &str) {
     drop(writeln!(std::io::stderr(), "{}", visible(text)));
 }
 
