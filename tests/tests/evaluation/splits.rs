@@ -79,7 +79,7 @@ fn scene_key_of_5000_letters_has_a_sheet() {
     let cameras = rooms.cameras(0).unwrap();
     let record =
         SceneRecord { key: "k".repeat(5000), url: String::new(), timestamps: (0..8).collect(), cameras, images };
-    write_chunks(&place.at("long"), [Ok(record)].into_iter(), 1).unwrap();
+    write_chunks(&place.at("long"), [Ok(record)], 1).unwrap();
     place.eval("run --data DIR/long --out DIR/out").ok();
     let sheets = place.names("out/sheets");
     assert!(sheets.len() == 1 && sheets[0].len() < 200, "{sheets:?}");
