@@ -206,7 +206,7 @@ impl TargetRenderer<'_> {
     fn render(&self, jobs: &[RenderJob], num_timed: usize) -> Result<Vec<ScoredViews>, EvalError> {
         let num_views = self.clip.target.num_views();
         let mut scored: Vec<ScoredViews> = jobs.iter().map(|job| ScoredViews::new(job.key)).collect();
-        let mut seconds = vec![vec![Vec::new(); num_views]; jobs.len()];
+        let mut seconds = vec![vec![Vec::new(); jobs.len()]; num_views];
         if let Some(job) = jobs.first() {
             job.tokens.values.device().sync().map_err(EvalError::tensor)?;
         }
@@ -218,7 +218,7 @@ impl TargetRenderer<'_> {
             if round > 0 && started.elapsed().as_secs_f64() > first_round_s + MAX_REPETITION_S {
                 break;
             }
-            for view in 0..num_views {
+            for (view, times) in seconds.iter_mut().enumerate() {
                 let mut order: Vec<usize> = (0..jobs.len()).collect();
                 if (round + view) % 2 == 1 {
                     order.reverse();
@@ -226,7 +226,7 @@ impl TargetRenderer<'_> {
                 for i in order {
                     let now = Instant::now();
                     let pixels = self.render_view(&jobs[i], view)?;
-                    seconds[i][view].push(now.elapsed().as_secs_f64());
+                    times[i].push(now.elapsed().as_secs_f64());
                     if round == 0 {
                         scored[i].add(view, pixels, self.scorer, jobs[i].kept_views)?;
                     }
@@ -238,7 +238,7 @@ impl TargetRenderer<'_> {
         }
         for (i, job) in jobs.iter().enumerate() {
             for (&view, measured) in &mut scored[i].metrics {
-                measured.render_s = Some(median(&seconds[i][view]));
+                measured.render_s = Some(median(&seconds[view][i]));
                 measured.select_s = job.selected.as_ref().map(|selected| selected[view].select_s);
             }
         }

@@ -75,12 +75,8 @@ const MAX_KEY_CHARS: usize = 120;
 /// digits.
 pub fn file_name(key: &str) -> String {
     let name = key.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' });
-    let mut name: String = name.enumerate().map(|(i, c)| if i == 0 && c == '.' { '_' } else { c }).collect();
-    if name.len() > MAX_KEY_CHARS {
-        name.truncate(MAX_KEY_CHARS);
-        name += &format!("-{:016x}", derive_seed(0, key));
-    }
-    name
+    let name: String = name.enumerate().map(|(i, c)| if i == 0 && c == '.' { '_' } else { c }).collect();
+    if name.len() <= MAX_KEY_CHARS { name } else { format!("{}-{:016x}", &name[..MAX_KEY_CHARS], derive_seed(0, key)) }
 }
 
 /// Reads an opaque PNG of 8 or 16 bits as `[height, width, 3]` in `[0, 1]`.

@@ -64,7 +64,9 @@ impl<'a> Validation<'a> {
         }
         let (text, warnings) = evaluator.describe();
         sink.event(&Event::Message(text));
-        warnings.into_iter().for_each(|warning| sink.event(&Event::Warning(warning)));
+        for warning in warnings {
+            sink.event(&Event::Warning(warning));
+        }
         Ok(Self { config, evaluator })
     }
 
