@@ -1,7 +1,7 @@
 use safetensors::SafeTensors;
 
 use super::*;
-use crate::sources::chunks::writer::{SceneRecord, write_chunks};
+use crate::sources::chunks::writer::{SceneRecord, chunk_bytes, write_chunks};
 use crate::testing::{fixture, re10k_mini};
 use crate::torch::pickle_writer::PickleWriter;
 
@@ -239,24 +239,21 @@ fn shared_values_cannot_fill_the_memory() {
 /// Writes `num_chunks` chunks of `num_scenes` scenes each; frames are no images.
 fn write_made_up(folder: &Path, num_chunks: usize, num_scenes: usize, num_frames: usize) {
     let cameras = re10k_mini(Split::Train).cameras(0).unwrap();
+    let mut index = BTreeMap::new();
     for chunk in 0..num_chunks {
-        let part = folder.join("part");
-        let record = |scene: usize| {
-            Ok(SceneRecord {
-                key: format!("scene-{chunk:05}-{scene:03}"),
-                url: String::new(),
-                timestamps: (0..num_frames as i64).collect(),
-                cameras: (0..num_frames).map(|frame| cameras[frame % cameras.len()]).collect(),
-                images: vec![vec![0; 64]; num_frames],
-            })
+        let file = format!("{chunk:06}.torch");
+        let record = |scene: usize| SceneRecord {
+            key: format!("scene-{chunk:05}-{scene:03}"),
+            url: String::new(),
+            timestamps: (0..num_frames as i64).collect(),
+            cameras: (0..num_frames).map(|frame| cameras[frame % cameras.len()]).collect(),
+            images: vec![vec![0; 64]; num_frames],
         };
-        write_chunks(&part, (0..num_scenes).map(record), u64::MAX).unwrap();
-        std::fs::rename(part.join("000000.torch"), folder.join(format!("{chunk:06}.torch"))).unwrap();
-        std::fs::remove_dir_all(part).unwrap();
+        let scenes: Vec<SceneRecord> = (0..num_scenes).map(record).collect();
+        let path = folder.join(&file);
+        std::fs::write(&path, chunk_bytes(&path, &scenes).unwrap()).unwrap();
+        index.extend(scenes.into_iter().map(|scene| (scene.key, file.clone())));
     }
-    let key = |chunk: usize, scene: usize| format!("scene-{chunk:05}-{scene:03}");
-    let index = (0..num_chunks).flat_map(|chunk| (0..num_scenes).map(move |scene| (chunk, scene)));
-    let index: BTreeMap<_, _> = index.map(|(chunk, scene)| (key(chunk, scene), format!("{chunk:06}.torch"))).collect();
     std::fs::write(folder.join("index.json"), serde_json::to_vec(&index).unwrap()).unwrap();
 }
 
@@ -305,7 +302,7 @@ fn unchanged_chunks_are_not_read_again() {
 
 /// Figures of docs/results/performance.md.
 #[test]
-#[ignore = "writes 2 GB; run with --ignored --nocapture for the times"]
+#[ignore = "writes 3 GB; run with --ignored --nocapture for the times"]
 fn start_up_of_67000_scenes_takes_two_seconds() {
     let folder = tempfile::tempdir().unwrap();
     write_made_up(folder.path(), 6700, 10, 100);
