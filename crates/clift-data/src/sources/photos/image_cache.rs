@@ -121,8 +121,9 @@ impl ImageCache {
         let time = metadata.modified().ok()?.duration_since(UNIX_EPOCH).ok()?;
         let path = std::path::absolute(&photo.path).ok()?;
         let Photo { undistortion, shape, .. } = photo;
-        let key = format!("{path:?} {} {time:?} {undistortion:?} {shape:?} {:?}", metadata.len(), self.size);
-        Some(format!("{}.{EXTENSION}", hex(&Sha256::digest(key)[..16])))
+        let (path, bytes) = (path.display(), metadata.len());
+        let key = format!("{path}\n{bytes} {time:?} {undistortion:?} {shape:?} {:?}", self.size);
+        Some(format!("{}.{EXTENSION}", hex::encode(&Sha256::digest(key)[..16])))
     }
 
     /// Writes an image if there is room for it, or if unused files make room.
@@ -159,10 +160,6 @@ impl ImageCache {
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Returns the file of an image: [`MAGIC`], columns and rows as u32, pixels, CRC-32 of all before it.
