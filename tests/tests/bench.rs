@@ -4,7 +4,6 @@ use std::io::{BufRead, BufReader};
 
 use crate::support::{Place, finish, list, number, signal};
 
-/// Names of the rows, in order.
 const ROWS: &str = "encode kmeans condense cluster_attention select render render_8_views stage1_step \
     stage1_step_tiny stage2_step";
 

@@ -9,12 +9,10 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// A file of the repository.
 pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the repository").join(path)
 }
 
-/// Exit code and output of a command.
 #[derive(Debug)]
 pub struct Ran {
     pub code: Option<i32>,
@@ -23,7 +21,6 @@ pub struct Ran {
 }
 
 impl Ran {
-    /// Expects success.
     #[track_caller]
     pub fn ok(self) -> Self {
         assert_eq!(self.code, Some(0), "stdout:\n{}\nstderr:\n{}", self.stdout, self.stderr);
@@ -55,14 +52,12 @@ impl Ran {
         assert!(message.trim_end().ends_with(end), "{end}\nis not the end of\n{message}");
     }
 
-    /// Expects a part of the output.
     #[track_caller]
     pub fn prints(self, part: &str) -> Self {
         assert!(self.stdout.contains(part), "{part}\nis not in\n{}", self.stdout);
         self
     }
 
-    /// Expects a part of the error stream.
     #[track_caller]
     pub fn notes(self, part: &str) -> Self {
         assert!(self.stderr.contains(part), "{part}\nis not in\n{}", self.stderr);
@@ -75,7 +70,6 @@ pub fn clift<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Ra
     finish(start(Command::new(BINARY).args(args)))
 }
 
-/// The command line as a program.
 pub const BINARY: &str = env!("CARGO_BIN_EXE_clift-under-test");
 
 /// Starts a command that [`finish`] waits for.
@@ -84,13 +78,11 @@ pub fn start(command: &mut Command) -> Child {
     piped.spawn().expect("the binary under test starts")
 }
 
-/// Sends a signal to a command.
 pub fn signal(child: &Child, name: &str) {
     let sent = Command::new("kill").args([name, &child.id().to_string()]).status().expect("kill runs");
     assert!(sent.success(), "the run is still there to be stopped");
 }
 
-/// Waits until a command has come as far as `is_there` says.
 #[track_caller]
 pub fn wait_until(child: &mut Child, what: &str, is_there: impl Fn() -> bool) {
     let started = Instant::now();
@@ -101,7 +93,6 @@ pub fn wait_until(child: &mut Child, what: &str, is_there: impl Fn() -> bool) {
     }
 }
 
-/// Waits for a command.
 pub fn finish(child: Child) -> Ran {
     let output = child.wait_with_output().expect("the binary under test ends");
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("it prints UTF-8");
@@ -117,7 +108,6 @@ pub struct Shared {
 
 /// The whole micro run, with its evaluation.
 pub static WHOLE: Shared = Shared::new("run", &[]);
-/// Its first stage.
 pub static STAGE_1: Shared = Shared::new("run --only stage1", &[]);
 
 impl Shared {
@@ -127,7 +117,6 @@ impl Shared {
     }
 }
 
-/// A temporary folder for runs.
 pub struct Place(TempDir);
 
 impl Place {
@@ -135,14 +124,12 @@ impl Place {
         Self(tempfile::tempdir().expect("a temporary folder"))
     }
 
-    /// A folder with a copy of a shared run in `run`.
     pub fn with(shared: &Shared) -> Self {
         let place = Self::new();
         place.copy(shared, "run");
         place
     }
 
-    /// Path of an item of the folder.
     pub fn at(&self, name: &str) -> PathBuf {
         self.0.path().join(name)
     }
@@ -167,7 +154,6 @@ impl Place {
         finish(self.start_train(words, set))
     }
 
-    /// Starts such a training.
     pub fn start_train(&self, words: &str, set: &[&str]) -> Child {
         start(Command::new(BINARY).args(self.train_args(words, set)))
     }
@@ -180,7 +166,6 @@ impl Place {
         assert_eq!(ran.code, None, "{moment}: stdout:\n{}\nstderr:\n{}", ran.stdout, ran.stderr);
     }
 
-    /// Waits until a run has made `count` steps.
     #[track_caller]
     pub fn wait_for_steps(&self, run: &str, child: &mut Child, count: usize) {
         let metrics = self.at(&format!("{run}/metrics.jsonl"));
@@ -212,48 +197,39 @@ impl Place {
         }
     }
 
-    /// Runs the command line with the words of a text, where `DIR` is the folder and `REPO` the repository.
     pub fn clift(&self, words: &str) -> Ran {
         finish(self.start(words))
     }
 
-    /// Starts the command line with such words.
     pub fn start(&self, words: &str) -> Child {
         start(Command::new(BINARY).args(self.words(words)))
     }
 
-    /// Evaluates the run of a name, which flags may follow.
     pub fn eval(&self, words: &str) -> Ran {
         self.clift(&format!("eval DIR/{words}"))
     }
 
-    /// Reads a file of the folder.
     pub fn bytes(&self, name: &str) -> Vec<u8> {
         std::fs::read(self.at(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
     }
 
-    /// Reads a text file of the folder.
     pub fn text(&self, name: &str) -> String {
         String::from_utf8(self.bytes(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
     }
 
-    /// Reads a JSON file of the folder.
     pub fn json(&self, name: &str) -> Value {
         serde_json::from_slice(&self.bytes(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
     }
 
-    /// Reads a file of the folder with a JSON value on each line.
     pub fn json_lines(&self, name: &str) -> Vec<Value> {
         let text = self.text(name);
         text.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}"))).collect()
     }
 
-    /// The lines of a run's `metrics.jsonl`.
     pub fn metrics(&self, run: &str) -> Vec<Value> {
         self.json_lines(&format!("{run}/metrics.jsonl"))
     }
 
-    /// The lines of a run's `metrics.jsonl` without times.
     pub fn metrics_but_time(&self, run: &str) -> Vec<Value> {
         let mut lines = self.metrics(run);
         for line in &mut lines {
@@ -262,12 +238,10 @@ impl Place {
         lines
     }
 
-    /// The weights of a stage of a run.
     pub fn weights(&self, run: &str, stage: &str) -> Weights {
         self.model(&format!("{run}/{stage}"))
     }
 
-    /// The weights of a model directory.
     pub fn model(&self, name: &str) -> Weights {
         Weights::read(&self.bytes(&format!("{name}/model.safetensors")))
     }
@@ -308,7 +282,6 @@ impl Place {
         assert_eq!(self.summary_but_time(run), self.summary_but_time(other));
     }
 
-    /// A run's `summary.json` without times.
     pub fn summary_but_time(&self, run: &str) -> Value {
         let mut summary = self.json(&format!("{run}/eval/summary.json"));
         for point in summary["points"].as_array_mut().expect("a list") {
@@ -318,7 +291,6 @@ impl Place {
         summary
     }
 
-    /// Names of the items of a folder, in order.
     #[track_caller]
     pub fn names(&self, folder: &str) -> Vec<String> {
         let items = std::fs::read_dir(self.at(folder)).unwrap_or_else(|error| panic!("{folder}: {error}"));
@@ -328,7 +300,6 @@ impl Place {
         names
     }
 
-    /// The steps of a stage's checkpoints.
     pub fn checkpoints(&self, run: &str, stage: &str) -> Vec<u64> {
         let names = self.names(&format!("{run}/{stage}/checkpoints"));
         let step = |name: &String| name.strip_prefix("step-").and_then(|step| step.parse().ok());
@@ -350,12 +321,10 @@ impl Place {
         self.json(&format!("{run}/{stage}/checkpoints/step-{step:09}/state.json"))["progress"].take()
     }
 
-    /// The points of an evaluation.
     pub fn points(&self, eval: &str) -> Vec<Value> {
         list(&self.json(&format!("{eval}/summary.json"))["points"]).to_vec()
     }
 
-    /// Writes a file, and its folder where there is none.
     pub fn write(&self, name: &str, text: impl AsRef<[u8]>) {
         let path = self.at(name);
         std::fs::create_dir_all(path.parent().expect("a folder")).expect("writable");
@@ -369,13 +338,11 @@ impl Place {
     }
 }
 
-/// A list of a JSON file.
 #[track_caller]
 pub fn list(value: &Value) -> &[Value] {
     value.as_array().unwrap_or_else(|| panic!("{value} is not a list"))
 }
 
-/// A number of a JSON object.
 #[track_caller]
 pub fn number(value: &Value, key: &str) -> f64 {
     value[key].as_f64().unwrap_or_else(|| panic!("{key} is not a number: {value}"))
@@ -388,7 +355,6 @@ pub fn point<'a>(points: &'a [Value], variant: &str, num_storage_tokens: usize) 
     points.iter().find(is_it).unwrap_or_else(|| panic!("no {variant} of {num_storage_tokens} tokens"))
 }
 
-/// Copies the files of a folder.
 pub fn copy_folder(from: &Path, to: &Path) {
     for (path, bytes) in files(from) {
         let to = to.join(path);
@@ -397,7 +363,7 @@ pub fn copy_folder(from: &Path, to: &Path) {
     }
 }
 
-/// Every file below a folder by its path in it, with its bytes.
+/// Every file below a folder by its path in it.
 pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     for item in std::fs::read_dir(folder).expect("a folder") {
@@ -426,7 +392,6 @@ pub fn sources(folders: &[&str], endings: &[&str]) -> BTreeMap<String, String> {
     found
 }
 
-/// Parameters by name.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Weights(pub BTreeMap<String, Vec<f32>>);
 
@@ -442,7 +407,6 @@ impl Weights {
         Self(tensors.collect())
     }
 
-    /// The parameters of one network.
     pub fn part(&self, prefix: &str) -> Self {
         let part: BTreeMap<_, _> = self.0.clone().into_iter().filter(|(name, _)| name.starts_with(prefix)).collect();
         assert!(!part.is_empty(), "no parameter starts with {prefix}");

@@ -9,7 +9,6 @@ use clift_data::{
 };
 use serde::Serialize;
 
-/// Clips prepared ahead.
 const NUM_PREFETCH: usize = 8;
 
 /// Clips to read.
@@ -86,7 +85,6 @@ pub fn measure_reading(source: &Arc<dyn SceneSource>, options: &ThroughputOption
     let in_order: Vec<(usize, ViewIndices)> = in_order.collect::<Result<_, DataError>>()?;
     let random = (0..num_clips).map(|index| views(at_random(index), num_clips + index));
     let random: Vec<(usize, ViewIndices)> = random.collect::<Result<_, DataError>>()?;
-
     let list = in_order.clone();
     let started = Instant::now();
     let sequential_reader = reader.clone();

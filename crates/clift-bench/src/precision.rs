@@ -115,7 +115,6 @@ fn median_times(
     Ok(samples.map(|samples| median(&samples)))
 }
 
-/// Returns the row of a case without its times.
 fn compare_results(case: BenchCase, context: &BenchContext) -> Result<PrecisionRow, TrainError> {
     let both = |forward: &dyn Fn() -> Tensor<1>| {
         [Precision::F32, Precision::F16].map(|precision| {

@@ -156,7 +156,6 @@ mod tests {
         let expected = (spread(&even) + spread(&odd)) / spread(&rows);
         let (_, error) = cluster(&KMeans::default(), &lift, TokenCount::Count(2), 1).unwrap();
         assert!((error / expected - 1.0).abs() < 1e-3, "{error} against {expected}"); // f32
-
         let lift = Tensor::<3>::ones([1, 8, 2], &Device::flex());
         assert_eq!(cluster(&KMeans::default(), &lift, TokenCount::Count(2), 1).unwrap().1, 0.0);
     }

@@ -119,17 +119,14 @@ pub enum EvalError {
 }
 
 impl EvalError {
-    /// Wraps an error of the operating system; for `map_err`.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, source, path: path.to_path_buf() }
     }
 
-    /// Makes the error of an image with `got` values.
     pub(crate) fn size_mismatch(expected: usize, got: usize) -> Self {
         Self::BadImage { reason: format!("image sizes differ: expected {expected} values, got {got}") }
     }
 
-    /// Wraps an error of a device; for `map_err`.
     pub(crate) fn tensor(reason: impl std::fmt::Debug) -> Self {
         Self::Tensor { reason: format!("{reason:?}") }
     }

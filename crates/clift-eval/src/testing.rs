@@ -14,7 +14,6 @@ use crate::statistics::view_metrics::EvalKey;
 pub const CLIFT: EvalKey =
     EvalKey { method: Method::Clift, num_storage_tokens: 64, num_render_tokens: 32, tokens: Some(TokenFormat::F16) };
 
-/// Returns a key of tokens in f32.
 pub fn f32_key(method: Method, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
     EvalKey { method, num_storage_tokens, num_render_tokens, tokens: Some(TokenFormat::F32) }
 }
@@ -22,7 +21,6 @@ pub fn f32_key(method: Method, num_storage_tokens: usize, num_render_tokens: usi
 /// Channels of the narrow networks in the fixtures.
 pub const NARROW: [usize; 5] = [4, 6, 8, 8, 10];
 
-/// Returns the path of a file in `data-fixtures/reference`.
 pub fn reference_path(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join(format!("../../data-fixtures/reference/{name}.safetensors"))
 }
@@ -31,7 +29,6 @@ pub fn reference_path(name: &str) -> PathBuf {
 pub struct Reference(Vec<u8>);
 
 impl Reference {
-    /// Reads a file of `data-fixtures/reference`.
     pub fn open(name: &str) -> Self {
         Self::read(&reference_path(name))
     }
@@ -71,7 +68,6 @@ impl Reference {
     }
 }
 
-/// Makes views of one gray level.
 pub fn gray_views((width, height): (usize, usize), level: u8, c2w: Vec<Pose>, frame_index: Vec<usize>) -> ClipViews {
     let intrinsics = Intrinsics { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0 };
     ClipViews {

@@ -7,7 +7,6 @@ use std::path::Path;
 /// Prefix of temporary file names, which identifies files left by a killed process.
 pub(crate) const TEMPORARY: &str = ".clift-";
 
-/// Returns the folder of a file.
 pub(crate) fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }

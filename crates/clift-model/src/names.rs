@@ -14,7 +14,6 @@ pub fn names<T: Named>() -> String {
     T::VARIANTS.iter().map(|&variant| variant.into()).collect::<Vec<&str>>().join(", ")
 }
 
-/// Returns the variant with a name.
 pub fn parse<T: Named>(name: &str) -> Option<T> {
     T::VARIANTS.iter().copied().find(|&variant| variant.into() == name)
 }

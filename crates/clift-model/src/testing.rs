@@ -67,14 +67,11 @@ pub struct Fixture {
 }
 
 impl Fixture {
-    /// Reads `data-fixtures/reference/<name>.safetensors`.
     pub fn open(name: &str) -> Self {
         let path = Self::path(name);
-        let bytes = std::fs::read(&path).unwrap_or_else(|error| panic!("{error}: {}", path.display()));
-        Self { bytes }
+        Self { bytes: std::fs::read(&path).unwrap_or_else(|error| panic!("{error}: {}", path.display())) }
     }
 
-    /// Returns the path of a fixture.
     pub fn path(name: &str) -> PathBuf {
         PathBuf::from(env!("CARGO_MANIFEST_DIR")).join(format!("../../data-fixtures/reference/{name}.safetensors"))
     }
@@ -85,22 +82,18 @@ impl Fixture {
         file.names().into_iter().filter_map(|name| name.strip_prefix(prefix)).map(String::from).collect()
     }
 
-    /// Reads a float tensor in f32.
     pub fn tensor<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
         Tensor::from_data(self.data(name), (device, DType::F32))
     }
 
-    /// Reads a float tensor in f64.
     pub fn tensor_f64<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
         Tensor::from_data(self.data(name), (device, DType::F64))
     }
 
-    /// Reads integers.
     pub fn integers(&self, name: &str) -> Vec<i64> {
         self.data(name).try_to_vec().expect("a tensor of i64")
     }
 
-    /// Returns the shape of a tensor.
     pub fn shape(&self, name: &str) -> Vec<usize> {
         self.data(name).shape().to_vec()
     }

@@ -184,7 +184,6 @@ impl TrainError {
     }
 }
 
-/// Makes a [`TrainError::BadConfig`].
 pub(crate) fn bad(key: &str, value: impl std::fmt::Display, fix: &str) -> TrainError {
     TrainError::BadConfig { key: key.into(), value: value.to_string(), fix: fix.into() }
 }

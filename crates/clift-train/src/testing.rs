@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
 
-/// Returns the path of a fixture.
 pub fn fixture(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures").join(name)
 }
@@ -18,7 +17,6 @@ impl Reference {
         Self(std::fs::read(fixture(&format!("{name}.safetensors"))).unwrap())
     }
 
-    /// Returns the values of a tensor; `None` if the file lacks the tensor.
     pub fn data(&self, name: &str) -> Option<TensorData> {
         let file = SafeTensors::deserialize(&self.0).unwrap();
         let view = file.tensor(name).ok()?;
@@ -31,15 +29,11 @@ impl Reference {
         Some(TensorData::from_bytes_vec(view.data().to_vec(), view.shape(), dtype))
     }
 
-    /// Returns the values of a tensor in f64.
     pub fn values(&self, name: &str) -> Vec<f64> {
-        let data = self.data(name).unwrap_or_else(|| panic!("{name} is missing"));
-        data.try_into_vec_as().unwrap()
+        self.data(name).unwrap_or_else(|| panic!("{name} is missing")).try_into_vec_as().unwrap()
     }
 
-    /// Reads a tensor in f32.
     pub fn tensor<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
-        let data = self.data(name).unwrap_or_else(|| panic!("{name} is missing"));
-        Tensor::from_data(data, (device, DType::F32))
+        Tensor::from_data(self.data(name).unwrap_or_else(|| panic!("{name} is missing")), (device, DType::F32))
     }
 }

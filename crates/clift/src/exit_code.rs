@@ -5,12 +5,8 @@ use clift_train::TrainError;
 
 use crate::interrupt;
 
-/// The command succeeded.
 pub(crate) const DONE: u8 = 0;
-
-/// The command failed.
 pub(crate) const FAILED: u8 = 1;
-
 /// The command line, the config or the model is invalid.
 pub(crate) const USAGE: u8 = 2;
 
@@ -36,7 +32,6 @@ macro_rules! usage_bail {
 }
 pub(crate) use usage_bail;
 
-/// Returns the exit code of an error.
 pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
     if error.is::<UsageError>() || error.is::<clift_train::ConfigError>() {
         return USAGE;

@@ -34,7 +34,6 @@ fn cli_page_is_current() {
     compare("docs/reference/cli.md", &page);
 }
 
-/// Adds a command, its arguments and its subcommands.
 fn add_command(command: &Command, page: &mut String) {
     let (name, about) = (command.get_bin_name().unwrap_or("clift"), command.get_long_about().or(command.get_about()));
     let usage = command.clone().render_usage().to_string().replace("Usage: ", "");
@@ -70,7 +69,6 @@ fn argument(arg: &Arg) -> String {
     [flags.join(", ")].into_iter().chain(value).collect::<Vec<_>>().join(" ").trim().to_owned()
 }
 
-/// Formats the help of an argument with its default and possible values.
 fn help(arg: &Arg) -> String {
     let mut help = text(arg.get_long_help().or(arg.get_help()));
     if arg.get_action().takes_values() {
@@ -100,7 +98,6 @@ fn config_page_is_current() {
     compare("docs/reference/config.md", &page);
 }
 
-/// Reads the structs of all source files below a folder.
 fn read_structs(folder: &Path, structs: &mut Structs) {
     for entry in fs::read_dir(folder).expect("a folder") {
         let path = entry.expect("an entry").path();
@@ -128,7 +125,6 @@ fn read_structs(folder: &Path, structs: &mut Structs) {
     }
 }
 
-/// Adds the keys of a section, then the sections below it.
 fn add_section(path: &str, fields: &[[String; 3]], defaults: &Table, structs: &Structs, page: &mut String) {
     let is_section =
         |[name, kind, _]: &&[String; 3]| structs.contains_key(kind) && defaults.get(name).is_some_and(Value::is_table);

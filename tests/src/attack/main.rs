@@ -143,7 +143,6 @@ fn attack(target: &Target, setup: &Setup, args: &Args, messages: &Messages) -> A
     row
 }
 
-/// Reads one input and returns the finding, if any.
 fn execute(
     read: &mut readers::Read,
     bytes: &[u8],

@@ -14,18 +14,14 @@ const TEXTS: &str = "0 -1 1 2 65536 4294967296 9223372036854775807 9223372036854
 /// Largest size that insertions produce.
 const MOST_BYTES: usize = 1 << 20;
 
-/// Damages one reader's valid files.
 pub struct Mutator<'a> {
-    /// The valid files.
     pub seeds: &'a [Vec<u8>],
-    /// Words of the format.
     pub words: &'a [&'a [u8]],
     /// Corrects checksums, which would hide the damage from later checks.
     pub repair: fn(&mut [u8]),
 }
 
 impl Mutator<'_> {
-    /// The input of an execution.
     pub fn input(&self, target: &str, seed: u64, number: u64) -> Vec<u8> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed ^ name_hash(target));
         rng.set_stream(number);
@@ -115,7 +111,6 @@ fn replace_digits(bytes: &mut Vec<u8>, at: usize, rng: &mut ChaCha8Rng) {
     bytes.splice(start..end, word_of(TEXTS, rng).bytes());
 }
 
-/// One of the words of a text.
 fn word_of(text: &'static str, rng: &mut ChaCha8Rng) -> &'static str {
     let words: Vec<&str> = text.split(' ').collect();
     words[below(rng, words.len())]

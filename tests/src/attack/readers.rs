@@ -22,7 +22,6 @@ pub type Read = Box<dyn FnMut(&[u8]) -> Result<(), String>>;
 
 /// A chunk of two scenes.
 pub const CHUNK: &str = "re10k-mini/train/000000.torch";
-/// The index of its folder.
 pub const CHUNK_INDEX: &str = "re10k-mini/train/index.json";
 
 /// Drops a result, and turns its error into text.
@@ -30,7 +29,6 @@ fn done<T, E: Display>(result: Result<T, E>) -> Result<(), String> {
     result.map(drop).map_err(|error| error.to_string())
 }
 
-/// A reader of one file.
 fn file(setup: &Setup, name: &str, read: impl Fn(&Path) -> Result<(), String> + 'static) -> Read {
     let path = setup.fresh(name).join(name);
     Box::new(move |bytes| {
@@ -80,7 +78,6 @@ fn scenes<S: SceneSource + ?Sized>(
     done((0..source.num_scenes()).try_for_each(read_scene))
 }
 
-/// An image of 40 x 24 pixels with a pattern.
 fn pattern() -> RgbImage {
     let rgb = (0..40 * 24 * 3).map(|i: usize| (i * 7 % 251) as u8).collect();
     RgbImage { width: 40, height: 24, rgb }
@@ -140,7 +137,6 @@ pub fn checkpoint(setup: &Setup, name: &'static str) -> Read {
     })
 }
 
-/// Reads every entry of a cluster cache with one damaged file.
 pub fn clusters(setup: &Setup, file: &'static str) -> Read {
     let root = setup.fresh(&file.replace('/', "-"));
     copy_folder(&setup.at("run/clusters"), &root.join("clusters"));

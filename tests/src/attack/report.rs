@@ -9,34 +9,25 @@ pub const MOST_FINDINGS: usize = 20;
 /// Longest error message in bytes: people read it.
 pub const MOST_MESSAGE: usize = 20_000;
 
-/// Results of one reader.
 #[derive(Debug, Default)]
 pub struct Attacked {
-    /// Name of the reader.
     pub name: &'static str,
-    /// Inputs read.
     pub executions: u64,
-    /// Inputs accepted.
     pub accepted: u64,
-    /// Longest execution.
     pub slowest: Duration,
-    /// Peak memory of one execution.
     pub peak_bytes: usize,
-    /// Seconds of all executions.
     pub seconds: f64,
     /// Findings, each once.
     pub findings: Vec<String>,
 }
 
 impl Attacked {
-    /// Records a finding and the file that shows it.
     pub fn find(&mut self, what: String, saved: Option<String>) {
         if self.findings.iter().all(|known| !known.starts_with(&what)) {
             self.findings.push(saved.map_or(what.clone(), |saved| format!("{what} ({saved})")));
         }
     }
 
-    /// The line that is printed.
     pub fn line(&self) -> String {
         let Self { name, executions, accepted, slowest, peak_bytes, seconds, findings } = self;
         let mut line = format!(
@@ -51,7 +42,6 @@ impl Attacked {
     }
 }
 
-/// The table of all readers.
 pub fn markdown(rows: &[Attacked], seconds: f64, seed: u64) -> String {
     let mut text = format!(
         "`clift-attack --seconds {seconds} --seed {seed}`:\n\n\

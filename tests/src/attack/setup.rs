@@ -11,15 +11,12 @@ use tempfile::TempDir;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-/// A folder with a run, its scene files, and damaged copies.
 pub struct Setup {
     folder: TempDir,
-    /// The run's config.
     pub config: Config,
 }
 
 impl Setup {
-    /// Trains the run and stores a scene of it with the command line.
     pub fn make() -> Result<Self, Box<dyn Error>> {
         // In memory where possible: files are written once per execution.
         let memory = Path::new("/dev/shm");
@@ -38,12 +35,10 @@ impl Setup {
         Ok(Self { folder, config })
     }
 
-    /// A file of the folder.
     pub fn at(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
 
-    /// A new folder for damaged files.
     pub fn fresh(&self, name: &str) -> PathBuf {
         let folder = self.folder.path().join("attack").join(name);
         std::fs::create_dir_all(&folder).expect("a temporary folder is writable");
@@ -72,27 +67,22 @@ fn clift(args: &[&str]) -> Result<(), Box<dyn Error>> {
     if output.status.success() { Ok(()) } else { Err(String::from_utf8_lossy(&output.stderr).into()) }
 }
 
-/// The folder of the fixtures.
 pub fn fixtures() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../data-fixtures")
 }
 
-/// Reads a fixture.
 pub fn fixture(path: &str) -> Vec<u8> {
     read(&fixtures().join(path))
 }
 
-/// Reads a file that exists.
 pub fn read(path: &Path) -> Vec<u8> {
     std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// Writes a file of a temporary folder.
 pub fn write(path: &Path, bytes: &[u8]) {
     std::fs::write(path, bytes).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
 }
 
-/// Copies a folder with everything in it.
 pub fn copy_folder(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).expect("a temporary folder is writable");
     for entry in std::fs::read_dir(from).expect("a folder") {
@@ -111,7 +101,6 @@ pub fn member(archive: &[u8], ending: &str) -> Vec<u8> {
     members(archive).into_iter().find(|(name, _)| name.ends_with(ending)).expect("it has such a member").1
 }
 
-/// Names and bytes of all members.
 fn members(archive: &[u8]) -> Vec<(String, Vec<u8>)> {
     let mut archive = ZipArchive::new(Cursor::new(archive)).expect("a valid archive");
     let members = (0..archive.len()).map(|i| {

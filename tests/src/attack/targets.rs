@@ -7,19 +7,14 @@ use crate::words;
 type Seeds = fn(&Setup, &'static str) -> Vec<Vec<u8>>;
 type Open = fn(&Setup, &'static str) -> Read;
 
-/// One reader.
 pub struct Target {
-    /// Name of the reader.
     pub name: &'static str,
     /// File that is damaged: a path below `data-fixtures` or in the run.
     pub file: &'static str,
-    /// Valid files.
     pub seeds: Seeds,
-    /// Makes the reader.
     pub open: Open,
     /// Words of the format, see [`words::list`].
     pub words: &'static [u8],
-    /// Corrects checksums.
     pub repair: fn(&mut [u8]),
     /// Most bytes of memory for an input of a length.
     pub most_bytes: fn(usize) -> usize,
@@ -30,12 +25,10 @@ const fn target(name: &'static str, file: &'static str, seeds: Seeds, open: Open
     Target { name, file, seeds, open, words, repair: |_| (), most_bytes: |len| (64 << 20) + 64 * len }
 }
 
-/// A reader of a file of a data set.
 const fn layout(name: &'static str, file: &'static str, words: &'static [u8]) -> Target {
     target(name, file, fixtures, readers::layout, words)
 }
 
-/// A reader of a file of the last checkpoint.
 const fn checkpoint(name: &'static str, file: &'static str, words: &'static [u8]) -> Target {
     target(name, file, of_checkpoint, readers::checkpoint, words)
 }

@@ -14,7 +14,6 @@ struct Running {
 static RUNNING: Mutex<Option<Running>> = Mutex::new(None);
 static NUMBER: AtomicU64 = AtomicU64::new(0);
 
-/// Starts the thread that looks at the clock.
 pub fn start(most: Duration) {
     std::thread::spawn(move || {
         loop {
@@ -30,7 +29,6 @@ pub fn start(most: Duration) {
     });
 }
 
-/// Records the start of an execution.
 pub fn enter(target: &'static str, seed: u64, number: u64) {
     NUMBER.store(number, Ordering::Relaxed);
     if let Ok(mut running) = RUNNING.lock() {
@@ -38,7 +36,6 @@ pub fn enter(target: &'static str, seed: u64, number: u64) {
     }
 }
 
-/// Records the end of an execution.
 pub fn leave() {
     if let Ok(mut running) = RUNNING.lock() {
         *running = None;

@@ -25,7 +25,6 @@ fn conversion_into_other_data_is_refused_unwritten() {
     place.write("other/test/thesis.txt", "");
     convert(&format!("{MINI} DIR/other --to scenes")).fails_with(1, &["it holds thesis.txt"]);
     assert!(!place.at("other/train").exists(), "the other half is not begun");
-
     convert(&format!("{MINI} DIR/out --to chunks")).ok();
     for words in ["DIR/out DIR/out/scenes --to scenes", "DIR/out DIR/out --to chunks"] {
         convert(words).fails_with(2, &["choose an output folder outside the input"]);
@@ -45,7 +44,6 @@ fn test_scene_lists_split_conversion_and_check() {
     assert!(place.at("out/train/00000000000000a1.torch").exists());
     assert!(place.at("out/test/00000000000000a2.torch").exists());
     assert_eq!(place.names("out/test").len(), 2, "and the sums");
-
     let check = |flags: &str| place.clift(&format!("data check {MINI}/train {flags} {list}"));
     check("--split test").prints("test/00000000000000a2").prints("\n\n1 scene, ");
     let ran = check("").prints("\n\n2 scenes, ");

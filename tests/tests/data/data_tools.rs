@@ -23,7 +23,6 @@ fn scenes_are_checked_converted_and_checked_again() {
     assert!(number(scene, "epipolar_px") < 1.0, "{scene}");
     let key = scene["key"].as_str().unwrap();
     assert!(place.at("lines").join(format!("test-{key}.png")).exists());
-
     let convert = || place.clift("data convert DIR/rooms DIR/packed --to scenes").ok();
     convert().prints("2 scenes of 2; 18 frames written, 18 copied and 0 encoded");
     convert().prints("2 scenes of 2, 2 of them already complete; 0 frames written");

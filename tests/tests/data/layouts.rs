@@ -19,7 +19,6 @@ fn captures_train_and_render_and_name_missing_frames() {
     ran.notes("train: 1 of 1 scenes used; 1 frame without an image (./images/99); no folders train/ and test/");
     let frame = &place.json("run/skipped-train.json")["frames"][0];
     assert_eq!((&frame["key"], &frame["frame"]), (&"attic".into(), &"./images/99".into()));
-
     let encode = "encode DIR/run REPO/data-fixtures/layouts/colmap_txt/attic -o DIR/attic.clift";
     place.clift(encode).ok().prints("scene attic, 2 views of 16 x 16");
     let render = "render DIR/attic.clift --path interpolate --frames 2 -o DIR/frames";

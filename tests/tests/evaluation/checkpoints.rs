@@ -53,7 +53,6 @@ fn published_checkpoints_import_evaluate_encode_and_render() {
         // The reference's shares of 24 tokens.
         let stored: Vec<_> = list(&summary["points"]).iter().map(|point| &point["num_storage_tokens"]).collect();
         assert_eq!(stored, [1, 3, 6, 12, 18, 24]);
-
         let data = "REPO/data-fixtures/re10k-mini --scene 00000000000000b1";
         place.clift(&format!("encode {model} {data} -o DIR/{name}.clift --storage 1/2 {SMALL}")).ok();
         place.clift(&format!("render DIR/{name}.clift --path interpolate --frames 3 -o DIR/{name}-frames")).ok();
@@ -83,14 +82,12 @@ fn a_first_stage_model_adds_the_uncondensed_variants() {
         .collect();
     write_state_dict(&place.at("first.ckpt"), &first, &[]).unwrap();
     let first = import(&place, "DIR/first.ckpt", "released-re10k", "3", "first");
-
     assert_eq!(variants(&evaluate(&place, &first, "a", "")), ["kmeans", "random"].into());
     let alone = evaluate(&place, &first, "a", "--storage 6");
     let both = evaluate(&place, &model, "b", &format!("--stage1 {first} --storage 6"));
     assert_eq!(variants(&both), ["clift", "kmeans", "random"].into());
     let psnr = |summary: &serde_json::Value| number(point(list(&summary["points"]), "kmeans", 6), "psnr");
     assert_eq!(psnr(&alone), psnr(&both), "the first stage's own renderer draws them");
-
     let other = import(&place, &checkpoint("re10k_first"), "released-re10k", "5", "other");
     place
         .clift(&format!("eval --checkpoint {model} --stage1 {other} {DATA} --out DIR/c {SMALL}"))
@@ -132,7 +129,6 @@ fn released_variants_train_and_export() {
         assert_eq!(state["model"]["variant"], *variant, "saved with every checkpoint");
         let points = place.json(&format!("{variant}/eval/summary.json"));
         assert_eq!(variants(&points), ["clift", "kmeans", "random"].into());
-
         place.clift(&format!("export DIR/{variant} --format pytorch -o DIR/{variant}.ckpt")).ok();
         let name = format!("{variant}-model");
         // The exported file holds the number of heads, two.

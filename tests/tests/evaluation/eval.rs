@@ -140,7 +140,6 @@ fn lpips_needs_its_weights() {
     let summary = place.json("run/eval/summary.json");
     assert_eq!(summary["not_measured"][0]["metric"], "lpips_vgg");
     assert!(summary["points"][0]["lpips_vgg"].is_null() && summary["lpips_weights_sha256"].is_null());
-
     write_vgg(&place.at("lpips.safetensors"), "clift-lpips-vgg-1", [2, 2, 3, 3, 3], true);
     let ran = place.eval("run --set eval.lpips_weights=\"DIR/lpips.safetensors\"").ok();
     assert!(!ran.stdout.contains("not measured"), "{}", ran.stdout);
@@ -170,7 +169,6 @@ fn the_perceptual_loss_trains_both_stages() {
     let weight = "loss.perceptual_weight=0.5";
     place.train("run", &[weight]).fails_with(2, &["`loss.vgg_weights` = missing", "convert_vgg.py vgg19"]);
     assert!(!place.at("run").exists(), "nothing is begun");
-
     let file = place.at("vgg19.safetensors");
     write_vgg(&file, "clift-vgg19-1", [2, 2, 4, 4, 2], false);
     let file = format!("loss.vgg_weights={file:?}");

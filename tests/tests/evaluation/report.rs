@@ -16,7 +16,6 @@ fn reports_need_no_other_file() {
     assert_eq!(html.matches("<article").count(), 1, "eval.num_sheets = 1");
     // Pictures of 16 x 16 pixels: styles, plots and config are most of it.
     assert!(html.len() < 200_000, "{} bytes", html.len());
-
     let ran = place.eval("run --render 1/2 --set eval.num_sheets=2 --out DIR/elsewhere").ok();
     ran.prints("elsewhere/report.html");
     let chosen = place.text("elsewhere/report.html");

@@ -47,7 +47,6 @@ fn evaluated(place: &Place, eval: &str, num_tokens: usize, num_render_tokens: us
     rows.map(|row| (row[5].parse().expect("a number"), row[6].parse().expect("a number"))).collect()
 }
 
-/// Opens a scene file of the run `run`.
 fn open(place: &Place, name: &str, preset: SelectionPreset) -> SceneRenderer {
     let (scene, _) = Scene::read(&place.at(name)).expect("a scene");
     let device = burn::tensor::Device::flex();
@@ -72,7 +71,6 @@ fn scene_files_reproduce_the_evaluation() {
         json!({"c2w": rows})
     });
     place.write("poses.json", json!({"poses": poses.collect::<Vec<_>>()}).to_string());
-
     for (count, storage) in [(4, "f32"), (8, "f32"), (4, "f16"), (8, "f16"), (4, "int8"), (8, "int8")] {
         let name = format!("{count}-{storage}.clift");
         let flags = format!("--context 0,7 --storage {count} --tokens {storage}");
@@ -139,7 +137,6 @@ fn paths_render_to_frames_and_animation_by_count() {
     let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
     assert_eq!((scene.num_tokens(), storage), (8, TokenFormat::F16));
     assert_eq!(scene.context_frames.len(), 2, "as many contexts as in training");
-
     for (out, size, flags, num_render_tokens) in [
         ("all", (16, 16), "--path interpolate", 8),
         ("some", (16, 16), "--path interpolate --render 3", 3),
@@ -186,7 +183,6 @@ fn what_cannot_be_drawn_says_what_to_do() {
     place.clift(&format!("{ENCODE} DIR/room.clift")).ok();
     let render = |flags: &str| place.clift(&format!("render DIR/room.clift --out DIR/out {flags}"));
     let orbit = "--path orbit --frames 2";
-
     let no_path = "--path interpolated: no such file; write interpolate, orbit or";
     render("--path interpolated").fails_with(2, &[no_path]);
     for (flags, expected) in [
@@ -207,11 +203,9 @@ fn what_cannot_be_drawn_says_what_to_do() {
     let counted = "a file of poses determines the number of frames";
     render("--path DIR/poses.json --frames 3").fails_with(2, &[counted]);
     assert!(!place.at("out").exists(), "nothing is left of what was refused");
-
     place.write("out/notes.txt", "");
     render(orbit).fails_with(2, &["is not empty; choose another folder"]);
     std::fs::remove_file(place.at("out/notes.txt")).unwrap();
-
     std::fs::rename(place.at("run"), place.at("moved")).unwrap();
     render(orbit).fails_with(2, &["the weights of the scene are not found at ", "; set --model RUN"]);
     render(&format!("{orbit} --model DIR/moved")).ok();
@@ -280,7 +274,6 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     let second = encode(&format!("{mini} --split train --scene 00000000000000a2")).ok();
     second.prints("scene 00000000000000a2");
     encode("DIR/run").fails_with(2, &["no scenes found: expected index.json with chunks, "]);
-
     let by = |model: &str| place.clift(&format!("encode DIR/{model} {mini} -o DIR/from-file.clift"));
     by("run/stage1/model.safetensors").ok();
     let file = place.at("run/stage1/model.safetensors");

@@ -17,7 +17,6 @@ fn tiles_and_clusters_have_paired_differences() {
     train_on_tiles(&place, "tiles");
     let words = "run --preset patchwise --with DIR/tiles --storage 1/2 --out DIR/out";
     place.eval(words).ok().prints("kmeans - patch").prints("patch_clift");
-
     let summary = place.json("out/summary.json");
     let points = list(&summary["points"]);
     let psnr = |variant: &str| number(point(points, variant, 4), "psnr");

@@ -8,7 +8,6 @@ use crate::support::{Place, Ran, STAGE_1, WHOLE, copy_folder, files, list, numbe
 
 /// Images of two training scenes and a test scene, written by PyTorch's `torch.save`.
 const MINI: &str = "data-fixtures/re10k-mini";
-/// Keys of the training scenes.
 const KEYS: [&str; 2] = ["00000000000000a1", "00000000000000a2"];
 
 /// Trains the micro run `run`, which flags may follow, on a folder of chunks.
@@ -18,7 +17,6 @@ fn train_on(place: &Place, words: &str, data: &Path, set: &[&str]) -> Ran {
     place.train(words, &[&chunks[..], set].concat())
 }
 
-/// Trains it on the mini data set.
 fn train_on_mini(place: &Place, set: &[&str]) -> Ran {
     train_on(place, "run", &repository(MINI), set)
 }
@@ -129,7 +127,6 @@ fn an_index_of_other_scenes_fails_before_training() {
     let message = "no usable scene: evaluation: 0 of 1 scenes used; 1 not in the data";
     train(r#"{"ffff": {"context": [0, 2], "target": [1]}}"#).fails_with(1, &[message]);
     assert!(!place.at("run/metrics.jsonl").exists());
-
     let absent = "frame 9 of scene 00000000000000b1 does not exist";
     for (text, expected) in [
         (r#"{"00000000000000b1": {"context": [0, 9], "target": [1]}}"#, absent),
@@ -225,7 +222,6 @@ fn truncated_weights_and_stale_caches_are_refused() {
     place.truncate("run/stage2/model.safetensors");
     let file = "run/stage2/model.safetensors";
     place.eval("run").fails_naming(1, &["reading the weights failed: "], file);
-
     std::fs::remove_dir_all(place.at("run/stage2")).unwrap();
     let good = place.text("run/clusters/index.json");
     let mut stale = place.json("run/clusters/index.json");

@@ -5,7 +5,6 @@ use std::process::Command;
 
 use crate::support::{BINARY, Place, Ran, clift, finish, repository, start};
 
-/// A valid config.
 const RIGHT: &str = include_str!("../../snapshots/right.toml");
 
 /// Name, replaced text of the config (where it is first), and replacement.

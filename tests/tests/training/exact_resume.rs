@@ -45,7 +45,6 @@ fn f16_training_resumes_with_its_loss_scale() {
     place.assert_same_run("parts", "whole");
     let state = place.json("whole/stage2/checkpoints/step-000000030/state.json");
     assert_eq!(state["loss_scale"], json!({"factor": 65536.0, "good_steps": 30}));
-
     place.copy(&UNDISTURBED, "single");
     let last_loss = |run: &str| number(place.metrics(run).last().expect("a step"), "loss");
     let apart = (last_loss("whole") / last_loss("single") - 1.0).abs();
@@ -95,7 +94,6 @@ fn spikes_are_skipped_identically_after_kills() {
     }
     place.train("parts", &SPIKES).ok();
     place.assert_same_run("parts", "whole");
-
     let lines = place.json_lines("whole/bad_steps.jsonl");
     assert_eq!(place.progress("whole", "stage1")["num_bad_steps"], lines.len());
     let metrics = place.metrics("whole");

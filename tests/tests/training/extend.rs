@@ -10,7 +10,6 @@ fn extended_stages_follow_the_longer_schedule() {
     let more = ["stage2.steps=8"];
     place.train("run", &more).fails_with(2, &["  stage2.steps: 4 -> 8\n", "continue with --extend"]);
     assert!(files(&place.at("run")) == before, "a refusal changes nothing");
-
     place.train("run --extend", &more).ok().notes("stage2: resumed after 4 of 8 steps");
     assert_eq!(place.bytes("run/stage2/model-4-steps.safetensors"), former);
     assert_ne!(place.bytes("run/stage2/model.safetensors"), former);
@@ -45,7 +44,6 @@ fn an_extended_stage_resumes_exactly() {
     place.train("parts --only stage1", &six).ok();
     assert!(weights.exists(), "written again from the last checkpoint");
     std::fs::remove_file(place.at("parts/stage1/model-6-steps.safetensors")).expect("removes");
-
     place.train("parts --only stage1 --extend", &twelve).ok();
     assert_eq!(place.bytes("parts/stage1/model.safetensors"), place.bytes("whole/stage1/model.safetensors"));
 

@@ -78,7 +78,6 @@ fn full_disks_keep_the_checkpoint_and_runs_resume() {
     // No line of metrics fits: the run stops before the next save, without a gap in its metrics.
     let _ = std::fs::write(folder.join("more-ballast"), vec![1; free() as usize]);
     place.train(run, &HALF).fails_with(1, &["No space left on device"]);
-
     for name in ["ballast", "more-ballast"] {
         std::fs::remove_file(folder.join(name)).expect("removes");
     }
@@ -111,7 +110,6 @@ fn vanished_data_stops_runs_which_resume_with_it() {
     );
     let set = ["stage1.steps=400", "eval.every=0", "checkpoint={every=1000, keep=2}", source.as_str()];
     place.train("whole", &set).ok();
-
     let mut child = place.start_train("run", &set);
     place.wait_for_steps("run", &mut child, 5);
     std::fs::rename(&data, place.at("gone")).expect("renames");

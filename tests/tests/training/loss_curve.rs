@@ -6,7 +6,6 @@ use crate::support::{Place, clift, number, repository};
 
 const REFERENCE: &str = "data-fixtures/reference/tiny_loss.json";
 
-/// Losses of a stage, step by step.
 fn losses(lines: &[Value], stage: &str) -> Vec<f64> {
     let lines = lines.iter().filter(|line| line["stage"] == stage);
     lines.map(|line| number(line, "loss")).collect()

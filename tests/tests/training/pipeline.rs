@@ -11,12 +11,10 @@ fn keys(value: &Value) -> Vec<&str> {
     keys
 }
 
-/// Keys of `summary.json`.
 const SUMMARY_KEYS: &str = "\
     baselines differences lpips_weights_sha256 missing not_measured num_scenes num_skipped num_views points \
     selection";
 
-/// Keys of a point in it.
 const POINT_KEYS: &str = "\
     frame_median_s frame_p95_s gflops lpips_vgg lpips_vgg_per_view num_identical_views num_render_tokens \
     num_storage_tokens num_views pareto_bytes pareto_time peak_bytes psnr psnr_per_view psnr_stderr \
@@ -29,7 +27,6 @@ fn a_run_writes_every_documented_file() {
     assert!(ran.stdout.trim_end().ends_with("run/eval"), "{}", ran.stdout);
     // What differs from the file is printed.
     ran.notes(&format!("--set run_dir: \"runs/micro\" -> {:?}\n", place.at("run")));
-
     let config = place.text("run/config.toml");
     // Resolved: overrides, and defaults that neither the file nor an override names.
     for line in ["steps = 6", "dim = 16", "max_grad_norm = 1.0", "exact_principal_point = false"] {
@@ -74,7 +71,6 @@ fn a_run_writes_every_documented_file() {
     let views = place.text("run/eval/views.csv");
     // A header, then 6 views of 6 points and 2 baselines.
     assert_eq!(views.lines().count(), 1 + 6 * 8, "{views}");
-
     assert_eq!(place.names("run/eval/sheets"), ["synthetic-0-test-00000.png"], "eval.num_sheets = 1");
     assert_eq!(place.names("run/stage1/samples"), ["step-000000003.png", "step-000000006.png"], "eval.every = 3");
     assert_eq!(place.names("run/stage2/samples"), ["step-000000003.png", "step-000000004.png"]);
@@ -111,7 +107,6 @@ fn moved_runs_evaluate_with_other_counts() {
     place.copy(&WHOLE, "before");
     let summary = place.summary_but_time("before");
     std::fs::rename(place.at("before"), place.at("after")).unwrap();
-
     let ran = place.eval("after").ok();
     assert!(ran.stdout.trim_end().ends_with("after/eval"), "{}", ran.stdout);
     assert_eq!(place.summary_but_time("after"), summary);

@@ -103,12 +103,10 @@ pub const CASES: &[Case] = &[
     }),
 ];
 
-/// No module at all.
 fn none() -> Vec<Linear> {
     Vec::new()
 }
 
-/// A result without gradient.
 fn forward(result: Tensor<1>) -> Values {
     Values { forward: vec![("result".into(), values(result.inner()))], ..Values::default() }
 }

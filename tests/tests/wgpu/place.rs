@@ -16,13 +16,10 @@ use crate::table::{Named, Values};
 
 /// Rows and columns of an image: two rows of three patches, so that swapped axes are detected.
 pub const SIZE: [usize; 2] = [16, 24];
-/// Scenes of a batch.
 pub const BATCH: usize = 2;
 /// Context views, and target views, of a scene.
 pub const VIEWS: usize = 2;
-/// Tokens of a scene.
 pub const NUM_TOKENS: usize = VIEWS * 6;
-/// Width of a token.
 pub const DIM: usize = 32;
 
 /// A device, and whether the inputs are slightly wrong.
@@ -33,7 +30,6 @@ pub struct Place {
 }
 
 impl Place {
-    /// The right inputs on a device.
     pub fn new(device: &Device) -> Self {
         Self { device: device.clone().autodiff(), is_wrong: false }
     }
@@ -53,28 +49,23 @@ impl Place {
         self.tensor(values, shape)
     }
 
-    /// Tokens of [`BATCH`] scenes.
     pub fn tokens(&self, seed: u64) -> Tensor<3> {
         self.random([BATCH, NUM_TOKENS, DIM], seed)
     }
 
-    /// These values on the device.
     pub fn tensor<const D: usize>(&self, values: Vec<f32>, shape: [usize; D]) -> Tensor<D> {
         Tensor::from_data(TensorData::new(values, shape), &self.device)
     }
 
-    /// The device without autodiff.
     pub fn plain(&self) -> Device {
         self.device.clone().without_autodiff()
     }
 
-    /// Makes a module with every parameter moved by a fixed pattern: gates start at zero and norms at one, and behind a
-    /// closed gate every gradient is zero.
+    /// Moves every parameter by a fixed pattern: behind gates, which start at zero, every gradient would be zero.
     pub fn module<M: Module>(&self, make: impl FnOnce(&mut Init) -> M) -> M {
         make(&mut Init::new(7, &self.device)).map(&mut Move)
     }
 
-    /// All networks.
     pub fn model(&self) -> Clift {
         let config = network(CliftVariant::Paper);
         self.module(|init| Clift {
@@ -109,18 +100,15 @@ impl Place {
         Clip { key: format!("scene {scene}"), context: views([-0.8, 0.7]), target: views([-0.3, 0.4]) }
     }
 
-    /// The clips of a batch.
     pub fn clips(&self) -> Vec<Clip> {
         (0..BATCH).map(|scene| self.clip(scene)).collect()
     }
 
-    /// Context views of a batch.
     pub fn context(&self) -> clift_model::Views {
         let clips = self.clips();
         upload_views(&clips.iter().map(|clip| &clip.context).collect::<Vec<_>>(), &self.device).expect("equal sizes")
     }
 
-    /// Target cameras of a batch.
     pub fn targets(&self) -> Cameras {
         let clips = self.clips();
         upload_cameras(&clips.iter().map(|clip| &clip.target).collect::<Vec<_>>(), &self.device).expect("equal sizes")
@@ -154,7 +142,6 @@ fn pose(place: f64) -> Pose {
     Pose { rotation, translation: DVec3::new(place, 0.1 * place, 0.25 * place * place) }
 }
 
-/// The network of the cases.
 pub fn network(variant: CliftVariant) -> ModelConfig {
     ModelConfig {
         variant,

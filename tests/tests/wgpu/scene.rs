@@ -54,7 +54,6 @@ fn encode_room(place: &Place, folder: &Path, storage: TokenFormat) -> Scene {
     let config = Config { data, model: network(CliftVariant::Paper), ..Config::default() };
     let source = open_dataset(&config.data, Split::Test).expect("rooms are made").source;
     let reader = ClipReader { source, options: config.data.clip_options() };
-
     let trained = TrainedModel::snapshot(&place.model().valid(), &config.model, true);
     let options = EncodeOptions {
         context: None,

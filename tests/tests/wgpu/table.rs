@@ -4,11 +4,8 @@ use std::time::Duration;
 
 use crate::place::Place;
 
-/// An operation of the model, forward and backward.
 pub struct Case {
-    /// Name of the operation.
     pub operation: &'static str,
-    /// Largest errors.
     pub tolerance: Tolerance,
     /// Runs the operation on a device, always with the same inputs.
     pub run: fn(&Place) -> Values,
@@ -21,41 +18,32 @@ pub struct Tolerance {
     forward: f64,
     /// Difference of gradients, each tensor over its own largest entry; `None` without gradients.
     backward: Option<f64>,
-    /// Reason of the difference.
     reason: &'static str,
 }
 
 impl Tolerance {
-    /// Tolerance of results without gradient.
     pub const fn forward(forward: f64, reason: &'static str) -> Self {
         Self { forward, backward: None, reason }
     }
 
-    /// Tolerance of results and gradients.
     pub const fn both(forward: f64, backward: f64, reason: &'static str) -> Self {
         Self { forward, backward: Some(backward), reason }
     }
 
-    /// The same tolerance for another reason.
     pub const fn because(self, reason: &'static str) -> Self {
         Self { reason, ..self }
     }
 
-    /// An operation with this tolerance.
     pub const fn case(self, operation: &'static str, run: fn(&Place) -> Values) -> Case {
         Case { operation, tolerance: self, run }
     }
 }
 
-/// Named tensors on the host.
 pub type Named = Vec<(String, Vec<f64>)>;
 
-/// Results of a [`Case`].
 #[derive(Default)]
 pub struct Values {
-    /// Results.
     pub forward: Named,
-    /// Gradients.
     pub backward: Named,
 }
 
@@ -66,7 +54,6 @@ pub struct Difference {
     backward: Worst,
 }
 
-/// The tensor with the largest error.
 #[derive(Debug, Default)]
 struct Worst {
     error: f64,
@@ -78,7 +65,6 @@ struct Worst {
 const SMALLEST_SCALE: f64 = 1e-3;
 
 impl Difference {
-    /// Compares the results of two devices.
     pub fn of(got: &Values, expected: &Values) -> Self {
         Self {
             forward: Worst::of(&got.forward, &expected.forward, 0.0),
@@ -86,7 +72,6 @@ impl Difference {
         }
     }
 
-    /// Returns whether all values are equal.
     pub fn is_zero(&self) -> bool {
         self.forward.error == 0.0 && self.backward.error == 0.0
     }
@@ -117,13 +102,11 @@ impl Worst {
     }
 }
 
-/// The table's first two lines.
 pub fn header() -> &'static str {
     "| operation | forward | at most | backward | at most | seconds | why |\n|---|---|---|---|---|---|---|"
 }
 
 impl Case {
-    /// One line of the table.
     pub fn row(&self, difference: &Difference, elapsed: Duration) -> String {
         let Tolerance { forward, backward, reason } = self.tolerance;
         let backward = match backward {
@@ -135,7 +118,6 @@ impl Case {
         format!("| {} | {forward} | {backward} | {seconds:.1} | {reason} |", self.operation)
     }
 
-    /// Errors beyond the tolerance.
     pub fn complaints(&self, difference: &Difference) -> Vec<String> {
         let directions = [
             ("result", &difference.forward, Some(self.tolerance.forward)),
@@ -151,7 +133,6 @@ impl Case {
         too_far.collect()
     }
 
-    /// Number of tolerances.
     pub fn num_directions(&self) -> usize {
         1 + usize::from(self.tolerance.backward.is_some())
     }

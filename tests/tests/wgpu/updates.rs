@@ -21,14 +21,12 @@ pub const CASES: &[Case] = &[
 
 const LEARNING_RATE: f64 = 1e-3;
 
-/// A model of a stage with its optimiser.
 pub fn learner(place: &Place, stage: Stage, activation_checkpointing: bool) -> TrainState {
     let model = freeze(stage, place.model());
     let state = TrainState::new(model, &OptimizerConfig::default(), place.device.clone());
     TrainState { activation_checkpointing, ..state }
 }
 
-/// A batch of a stage.
 pub fn batch(place: &Place, stage: Stage) -> StageBatch {
     let tokens = match stage {
         Stage::Stage2 => TokenSelection::Clusters(clusters()),
@@ -37,7 +35,6 @@ pub fn batch(place: &Place, stage: Stage) -> StageBatch {
     StageBatch { clips: place.clips(), tokens, skipped: Vec::new() }
 }
 
-/// Makes an update.
 pub fn step(learner: TrainState, batch: &StageBatch, parts: usize) -> (TrainState, clift_train::Update) {
     let (learner, update) = learner.step(batch, parts, LEARNING_RATE.into(), 1.0).expect("the model takes the batch");
     assert!(update.applied, "{update:?}");
@@ -57,7 +54,6 @@ fn update(place: &Place, stage: Stage, parts: usize, activation_checkpointing: b
     Values { forward: numbers.map(|(name, value)| (name.to_owned(), vec![value])).into(), backward }
 }
 
-/// The gradient of every parameter, by hand.
 fn gradient(place: &Place, model: &Clift, batch: &StageBatch) -> Named {
     let lift = model.encode(&place.context());
     let tokens: RenderTokens = match &batch.tokens {
@@ -74,8 +70,7 @@ fn gradient(place: &Place, model: &Clift, batch: &StageBatch) -> Named {
     gradients(model, &loss.backward())
 }
 
-/// Change of every weight in units of the learning rate, times its gradient.
-///
+/// Change of every weight in units of the learning rate, times its gradient:
 /// `AdamW`'s first update is the sign of the gradient, which is random where the gradient is rounding.
 fn moved(before: &Named, after: &Named, gradients: &Named) -> Named {
     let weights = before.iter().zip(after);

@@ -12,7 +12,6 @@ use crate::cases::context::BenchContext;
 use crate::cases::reference::{ToF64, values};
 use crate::cases::task::BenchTask;
 
-/// Name of the tensor in a file of features.
 const FEATURES: &str = "features";
 
 /// K-means of one scene's tokens, from the same seed in every repetition.

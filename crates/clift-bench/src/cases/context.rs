@@ -45,7 +45,6 @@ impl BenchOptions {
 
 /// Sizes, device and inputs shared by all rows.
 pub struct BenchContext {
-    /// Config of the sizes, the seed and the optimizers.
     pub config: Config,
     /// Where tensors live, without autodiff.
     pub device: Device,
@@ -53,7 +52,6 @@ pub struct BenchContext {
     pub is_cpu: bool,
     storage: TokenCount,
     render: Option<TokenCount>,
-    /// File of features for K-means.
     pub features: Option<PathBuf>,
     /// Tokens of one scene, computed once.
     lift: OnceCell<Tensor<3>>,
@@ -84,7 +82,6 @@ impl BenchContext {
         Ok(context)
     }
 
-    /// Returns a context of another config on the same device.
     fn with(&self, config: Config) -> Self {
         let (device, is_cpu, storage) = (self.device.clone(), self.is_cpu, self.storage);
         Self { config, device, is_cpu, storage, render: None, features: None, lift: OnceCell::new() }
@@ -129,18 +126,15 @@ impl BenchContext {
         Ok(reduced)
     }
 
-    /// Returns the number of tokens of one scene.
     pub fn num_tokens(&self) -> Result<usize, TrainError> {
         let DataConfig { width, height, views, .. } = &self.config.data;
         Ok(self.config.model.num_tokens(views.min_context, *height, *width)?)
     }
 
-    /// Returns the number of stored tokens of one scene.
     pub fn num_storage_tokens(&self) -> Result<usize, TrainError> {
         self.stored_of(self.num_tokens()?)
     }
 
-    /// Returns the number of tokens from which a view is rendered.
     pub fn num_render_tokens(&self) -> Result<usize, TrainError> {
         let all = self.num_tokens()?;
         let Some(count) = self.render else { return Ok(all) };
@@ -148,28 +142,23 @@ impl BenchContext {
         count.of(all).map_err(|error| bad(error.to_string()))
     }
 
-    /// Returns the number of stored tokens of a scene with `num_tokens` tokens.
     pub fn stored_of(&self, num_tokens: usize) -> Result<usize, TrainError> {
         self.storage.of(num_tokens).map_err(|error| self.bad_storage(&error.to_string()))
     }
 
-    /// Makes the error of an impossible `--storage`.
     pub fn bad_storage(&self, fix: &str) -> TrainError {
         TrainError::BadConfig { key: "--storage".into(), value: self.storage.to_string(), fix: fix.into() }
     }
 
-    /// Returns the numbers and the size of the views of a scene.
     pub fn shape(&self) -> ClipShape {
         let DataConfig { width, height, views, .. } = &self.config.data;
         ClipShape { num_context: views.min_context, num_targets: views.num_targets, size: [*height, *width] }
     }
 
-    /// Makes a scene with `num_targets` target views.
     pub fn clip(&self, num_targets: usize) -> Clip {
         seeded_clip(ClipShape { num_targets, ..self.shape() }, self.config.seed, 0)
     }
 
-    /// Makes a model with seeded weights on the autodiff device.
     pub fn model(&self) -> Clift {
         seeded_model(&self.config.model, self.config.seed, &self.device)
     }
@@ -189,7 +178,6 @@ impl BenchContext {
         if self.is_cpu { Ok(self.device.clone()) } else { Ok(DeviceName::Flex.open()?) }
     }
 
-    /// Waits for the queued work of the device.
     pub fn sync(&self) -> Result<(), TrainError> {
         self.device.sync().map_err(|error| TrainError::Device { reason: error.to_string() })
     }

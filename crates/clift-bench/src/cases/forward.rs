@@ -14,7 +14,6 @@ use crate::cases::task::BenchTask;
 
 /// A computation without gradient, with a numeric result.
 pub struct Forward<I> {
-    /// Networks and inputs.
     inputs: I,
     /// Computes the result, flattened.
     compute: fn(&I) -> Tensor<1>,
@@ -27,7 +26,6 @@ impl<I> Forward<I> {
         Self { inputs, compute, num_views: 1 }
     }
 
-    /// Computes the result, flattened.
     pub fn forward(&self) -> Tensor<1> {
         (self.compute)(&self.inputs)
     }

@@ -5,7 +5,6 @@ use burn::optim::GradientsParams;
 use burn::tensor::{DType, Device, Int, Tensor};
 use clift_model::{Cameras, Views};
 
-/// Inputs that can be copied to f64.
 pub trait ToF64 {
     /// Returns the same values in f64 on the reference device.
     #[must_use]
@@ -80,7 +79,6 @@ pub fn module_in_f64<M: Module>(module: &M, reference: &Device) -> M {
     module.valid().map(&mut Cast(reference))
 }
 
-/// Returns the gradients of all parameters in one list.
 pub fn flat_gradient<M: Module>(model: &M, grads: &GradientsParams) -> Vec<f64> {
     struct Collect<'a>(&'a GradientsParams, Vec<f64>);
     impl ModuleVisitor for Collect<'_> {

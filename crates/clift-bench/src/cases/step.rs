@@ -53,7 +53,6 @@ pub(crate) fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
     }
 }
 
-/// Makes one micro-batch of a stage.
 pub(crate) fn micro_batch(context: &BenchContext, stage: Stage) -> Result<StageBatch, TrainError> {
     let StageSettings { batch_size, accumulate, .. } = context.config.stage(stage);
     stage_batch(context, stage, batch_size.div_ceil(accumulate))

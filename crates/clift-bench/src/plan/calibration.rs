@@ -80,11 +80,9 @@ pub struct InferenceRates {
     pub kmeans: Vec<(usize, f64)>,
     /// Seconds to evaluate one scene with the networks of `timed`: clusters, images and metrics.
     pub evaluation_s: f64,
-    /// The timed network.
     pub timed: ModelConfig,
 }
 
-/// Returns the multiply-accumulates of one network on a scene.
 pub fn part_macs(model: &ModelConfig, network: Part, scene: &SceneSizes) -> f64 {
     model.macs(network, scene).count(FlopConvention::Macs) as f64
 }
@@ -172,7 +170,6 @@ fn perceptual_s(config: &Config, context: &BenchContext) -> Result<f64, TrainErr
     Ok(timed.seconds)
 }
 
-/// Makes a batch of seeded scenes with the typical numbers of tokens.
 fn calibration_batch(
     context: &BenchContext,
     stage: Stage,

@@ -7,7 +7,6 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::error::EvalError;
 
-/// Largest number of characters in a name.
 const MAX_NAME: usize = 40;
 
 /// A method that makes images of target views.

@@ -15,12 +15,10 @@ use crate::sweep::predictions::file_name;
 pub(crate) struct Sheets {
     folder: PathBuf,
     files: StagedDir,
-    /// File names of the earlier sheets.
     former: BTreeSet<String>,
 }
 
 impl Sheets {
-    /// Starts the sheets of the evaluation in the folder `evaluation`.
     pub fn new(evaluation: &Path) -> Result<Self, EvalError> {
         let folder = evaluation.join("sheets");
         let files = StagedDir::new(&folder).map_err(EvalError::io("making a folder", &folder))?;
@@ -30,7 +28,6 @@ impl Sheets {
         Ok(Self { folder, files, former: rows.map(|row| sheet_name(&row[0])).collect() })
     }
 
-    /// Writes the sheet of a scene to a temporary folder.
     pub fn add(&self, sheet: &Canvas, key: &str) -> Result<(), EvalError> {
         sheet.write_png(&self.files.path().join(sheet_name(key)))
     }

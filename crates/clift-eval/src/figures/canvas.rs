@@ -139,12 +139,8 @@ impl DrawTarget for Canvas {
     }
 }
 
-/// Makes an image of the mean absolute error over red, green and blue, in the colours of [`error_colour`]: black at 0,
-/// brightest from [`ERROR_FULL_SCALE`] on.
-///
-/// # Errors
-/// [`EvalError::BadImage`] unless both images hold `height * width * 3` values, and for a NaN or an infinity, which would
-/// look like no error.
+/// Makes an image of the mean absolute error over red, green and blue, in the colours of [`error_colour`]. Refuses a
+/// NaN or an infinity, which would look like no error.
 pub fn error_map(pred: &[f32], target: &[f32], height: usize, width: usize) -> Result<Canvas, EvalError> {
     check(pred, target, height * width * 3)?;
     let colours: Vec<u8> = pred

@@ -14,7 +14,6 @@ const GAP_PX: usize = 10;
 const MIN_CELL_PX: usize = 192;
 const LEGEND_PX: usize = 192;
 
-/// One cell of the sheet.
 #[derive(Clone, Debug)]
 pub struct Cell {
     /// One image fills the cell; several images are tiled.
@@ -28,7 +27,6 @@ pub struct Cell {
 pub struct Row {
     /// Label above the row, such as `frame 17`.
     pub label: String,
-    /// One cell per column.
     pub cells: Vec<Cell>,
 }
 
@@ -43,7 +41,6 @@ pub fn contact_sheet(title: &str, columns: &[&str], rows: &[Row]) -> Canvas {
     let factor = MIN_CELL_PX.div_ceil(width);
     let (cell_width, cell_height) = (width * factor, height * factor);
     let [small, large] = [SMALL, LARGE].map(|font| font.character_size.height as usize);
-
     let head = MARGIN_PX + large + GAP_PX + small + GAP_PX;
     let row_height = small + GAP_PX / 2 + cell_height + 4 + small + 2 * GAP_PX;
     let foot = small + MARGIN_PX;
@@ -53,7 +50,6 @@ pub fn contact_sheet(title: &str, columns: &[&str], rows: &[Row]) -> Canvas {
         head + row_height * rows.len() + foot,
         BACKGROUND,
     );
-
     let full_width = canvas.width() - 2 * MARGIN_PX;
     canvas.write_text(&cut(title, full_width, &LARGE), MARGIN_PX, MARGIN_PX, &LARGE, INK);
     for (column, title) in columns.iter().enumerate() {

@@ -139,7 +139,6 @@ fn scene_sheet(clip: &Clip, renderings: &[ScoredViews], views: &[usize]) -> Resu
         best = vec![best[0], best[best.len() - 1]];
     }
     let nearest = renderings.iter().find(|r| r.key.method == Method::NearestView);
-
     let (height, width) = (clip.target.height, clip.target.width);
     let contexts = canvases(&clip.context)?;
     let mut columns = vec!["contexts".to_owned(), "target".into(), "nearest view".into()];
@@ -148,7 +147,6 @@ fn scene_sheet(clip: &Clip, renderings: &[ScoredViews], views: &[usize]) -> Resu
     }
     columns.push("error".into());
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
-
     let mut rows = Vec::new();
     for &view in views {
         let target = view_image(&clip.target, view);

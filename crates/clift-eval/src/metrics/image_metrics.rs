@@ -56,7 +56,6 @@ fn ssim_of_planes(pred: Vec<f64>, target: Vec<f64>, width: usize) -> f64 {
     let squared_target = blur(&product(&target, &target), width, &taps);
     let cross = blur(&product(&pred, &target), width, &taps);
     let (mean_pred, mean_target) = (blur(&pred, width, &taps), blur(&target, width, &taps));
-
     let mut sum = 0.0;
     for (i, (&p, &t)) in mean_pred.iter().zip(&mean_target).enumerate() {
         let variance_pred = SAMPLE_COVARIANCE * (squared_pred[i] - p * p);
@@ -109,7 +108,6 @@ pub(crate) fn check(pred: &[f32], target: &[f32], expected: usize) -> Result<(),
     Ok(())
 }
 
-/// Refuses an image that is smaller than a metric allows.
 pub(crate) fn check_size(metric: &str, min: usize, height: usize, width: usize) -> Result<(), EvalError> {
     if height.min(width) >= min {
         return Ok(());
@@ -129,7 +127,6 @@ mod tests {
         let [count, height, width, 3] = fixture.shape("input.prediction")[..] else { panic!() };
         let [pred, target] = ["input.prediction", "input.target"].map(|name| fixture.f32s(name));
         let (expected_psnr, expected_ssim) = (fixture.f64s("output.psnr"), fixture.f64s("output.ssim"));
-
         let size = height * width * 3;
         for i in 0..count {
             let (pred, target) = (&pred[i * size..][..size], &target[i * size..][..size]);

@@ -111,7 +111,6 @@ impl Lpips {
 }
 
 impl LpipsFeatures {
-    /// Returns the bytes of the features.
     pub(crate) fn num_bytes(&self) -> usize {
         self.0.iter().map(|stage| stage.dims().iter().product::<usize>() * size_of::<f32>()).sum()
     }
@@ -125,7 +124,6 @@ mod tests {
     use crate::metrics::image_metrics::{psnr, ssim};
     use crate::testing::{NARROW, Reference, reference_path};
 
-    /// Loads the narrow network of the fixtures.
     fn narrow(device: &Device) -> Lpips {
         let path = reference_path("lpips_weights");
         Lpips::with_shape(&path, VggShape { widths: NARROW, ..VggShape::VGG16 }, (device, DType::F32)).unwrap()

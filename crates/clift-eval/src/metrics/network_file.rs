@@ -19,7 +19,6 @@ pub struct WeightFileSpec {
     pub what: &'static str,
     /// Value of `format` in the file's metadata.
     pub format: &'static str,
-    /// Command that makes the file.
     pub command: &'static str,
 }
 
@@ -32,11 +31,7 @@ pub struct NetworkFile {
 }
 
 impl NetworkFile {
-    /// Reads a file.
-    ///
-    /// # Errors
-    /// [`EvalError::BadWeights`] for a file that cannot be read, has another format, or holds values that are not finite
-    /// f32.
+    /// Refuses a file that cannot be read, has another format, or holds values that are not finite f32.
     pub fn read(path: &Path, wanted: WeightFileSpec) -> Result<Self, EvalError> {
         let bad = |reason: String| wanted.bad(reason, path);
         let size = std::fs::metadata(path).map_err(|error| bad(error.to_string()))?.len();
@@ -67,7 +62,6 @@ impl NetworkFile {
         Ok(Self { wanted, tensors, sha256, path: path.into() })
     }
 
-    /// Takes a tensor out.
     pub fn take<const D: usize>(
         &mut self,
         name: &str,

@@ -102,7 +102,6 @@ mod tests {
         tensor.into_data().convert::<f64>().try_to_vec().unwrap()
     }
 
-    /// Returns the loss and its gradient with respect to the rendering.
     fn loss_and_grad(loss: &Perceptual, rendering: Tensor<5>, target: Tensor<5>) -> (f64, Vec<f64>) {
         let rendering = rendering.autodiff().require_grad();
         let loss = loss.forward(rendering.clone(), target.autodiff());

@@ -44,8 +44,7 @@ impl VggShape {
     /// VGG-16 with the features `relu1_2`, `relu2_2`, `relu3_3`, `relu4_3` and `relu5_3`.
     pub const VGG16: Self =
         Self { widths: [64, 128, 256, 512, 512], convs: [2, 2, 3, 3, 3], taps: [2, 2, 3, 3, 3], pooling: Pooling::Max };
-    /// VGG-19 with average pooling and the features `relu1_2`, `relu2_2`, `relu3_2`, `relu4_2` and
-    /// `relu5_2`.
+    /// VGG-19 with average pooling and the features `relu1_2`, `relu2_2`, `relu3_2`, `relu4_2` and `relu5_2`.
     pub const VGG19: Self = Self {
         widths: [64, 128, 256, 512, 512],
         convs: [2, 2, 4, 4, 2],
@@ -123,8 +122,6 @@ impl Vgg {
         Ok(Self { stages, shape })
     }
 
-    /// Computes the features of every stage.
-    ///
     /// # Shapes
     /// - `images`: `[batch, 3, height, width]`, both sides at least [`MIN_SIZE_PX`]
     /// - returns `[batch, channels, height / 2^s, width / 2^s]` for the stages s = 0 to 4
@@ -155,7 +152,6 @@ impl Pooling {
     }
 }
 
-/// Returns a parameter without gradient.
 fn frozen<const D: usize>(tensor: Tensor<D>) -> Param<Tensor<D>> {
     Param::from_tensor(tensor).set_require_grad(false)
 }

@@ -1,9 +1,7 @@
 //! An axis of a plot: range, ticks, and positions of values.
 
-/// The scale of an axis.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Scale {
-    /// Linear.
     #[default]
     Linear,
     /// Logarithmic; values are positive.
@@ -15,7 +13,6 @@ pub enum Scale {
 /// Free share of the range at either end.
 const PADDING: f64 = 0.06;
 
-/// Largest number of ticks.
 const MAX_TICKS: usize = 7;
 
 /// Smallest distance of ticks as a share of the axis; below it, labels overlap.
@@ -58,7 +55,6 @@ impl Axis {
         (along(value) - along(self.min)) / (along(self.max) - along(self.min))
     }
 
-    /// Returns the ticks with their labels.
     pub fn ticks(&self) -> impl Iterator<Item = (f64, String)> {
         // Enough decimals to distinguish neighbours.
         let step = self.ticks.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
@@ -67,7 +63,6 @@ impl Axis {
         self.ticks.iter().map(move |&tick| (tick, grouped(tick, decimals)))
     }
 
-    /// Removes ticks that are too close to the tick before.
     fn thin(&mut self) {
         let mut kept: Vec<f64> = Vec::new();
         for &tick in &self.ticks {

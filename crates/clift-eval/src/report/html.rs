@@ -8,7 +8,6 @@ use maud::{Markup, html};
 use crate::figures::canvas::Canvas;
 use crate::report::axis::grouped;
 
-/// Text of a value that was not measured.
 pub const DASH: &str = "\u{2013}";
 
 /// Returns a value as text; a dash without a finite value.
@@ -16,7 +15,6 @@ pub fn number(value: Option<f64>, decimals: usize) -> String {
     value.filter(|value| value.is_finite()).map_or_else(|| DASH.into(), |value| grouped(value, decimals))
 }
 
-/// Returns a count with a comma between thousands.
 pub fn count(count: usize) -> String {
     grouped(count as f64, 0)
 }
@@ -39,7 +37,6 @@ pub fn head(names: &[&str]) -> Markup {
     }
 }
 
-/// Returns an image as a data URI for `src` and `href`.
 pub fn data_uri(image: &Canvas) -> io::Result<String> {
     Ok(format!("data:image/png;base64,{}", BASE64_STANDARD.encode(image.png()?)))
 }

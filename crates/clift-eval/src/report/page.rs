@@ -41,28 +41,22 @@ pub struct RunDescription {
     pub device: String,
 }
 
-/// The content of a report.
 #[derive(Clone, Debug)]
 pub struct Report {
-    /// The evaluated run or model.
     pub run: RunDescription,
-    /// Means of all keys.
     pub summary: Summary,
-    /// Skipped scenes with their reasons.
     pub skipped: SkipReport,
     /// Figures of scenes; the report has the first [`MAX_FIGURES`].
     pub figures: Vec<SceneFigure>,
 }
 
 impl Report {
-    /// Writes the report, atomically.
     pub fn write(&self, path: &Path) -> Result<(), EvalError> {
         self.to_html()
             .and_then(|html| replace_file(path, html.as_bytes()))
             .map_err(EvalError::io("writing the report", path))
     }
 
-    /// Returns the page.
     pub fn to_html(&self) -> io::Result<String> {
         let RunDescription { name, config, device } = &self.run;
         let page = html! {
@@ -96,7 +90,6 @@ impl Report {
         Ok(page.into_string().replace(|c: char| c.is_control() && !matches!(c, '\n' | '\t'), "\u{fffd}"))
     }
 
-    /// Returns the main results.
     fn headline(&self) -> Markup {
         let Summary { num_scenes, num_views, baselines, .. } = &self.summary;
         let whole: Vec<&SummaryPoint> = self.summary.best_points().filter(|point| point.key.is_whole()).collect();

@@ -40,7 +40,6 @@ impl Look {
     ];
 }
 
-/// One measured point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mark {
     pub x: f64,
@@ -63,23 +62,17 @@ pub struct Series {
 /// A horizontal line across the plot, such as a baseline.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Level {
-    /// Name in the legend.
     pub name: String,
-    /// Class of the style sheet.
     pub class: &'static str,
-    /// Value on the vertical axis.
     pub y: f64,
 }
 
-/// A plot over two axes.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Plot {
     pub heading: &'static str,
     /// Description for screen readers.
     pub title: String,
-    /// Label of the horizontal axis, with its unit.
     pub x_label: &'static str,
-    /// Scale of the horizontal axis.
     pub x_scale: Scale,
     /// Series of marks. The first series is on top.
     pub series: Vec<Series>,
@@ -91,7 +84,6 @@ pub struct Plot {
 }
 
 impl Plot {
-    /// Returns the SVG with its legend, or a sentence for a plot without points.
     pub fn to_html(&self) -> Markup {
         let marks = || self.series.iter().flat_map(|series| &series.marks);
         let ends = |mark: &Mark| {
@@ -190,7 +182,6 @@ impl Series {
     }
 }
 
-/// Returns a coordinate in tenths of a pixel.
 fn tenths(value: f64) -> String {
     format!("{value:.1}")
 }

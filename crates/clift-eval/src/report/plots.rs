@@ -59,7 +59,6 @@ fn has_formats(summary: &Summary) -> bool {
     stored.filter_map(|point| point.key.tokens).collect::<BTreeSet<_>>().len() > 1
 }
 
-/// Returns a line for every method and number format.
 fn series(summary: &Summary, is_joined: bool, mark: impl Fn(&SummaryPoint) -> Option<Mark>) -> Vec<Series> {
     let has_formats = has_formats(summary);
     let mut lines: BTreeMap<(Method, Option<TokenFormat>), Vec<Mark>> = BTreeMap::new();

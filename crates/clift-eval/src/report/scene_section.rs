@@ -54,7 +54,6 @@ fn row(heading: &str, strip: Markup) -> Markup {
     html! { div.row { h4 { (heading) } div.strip { (strip) } } }
 }
 
-/// Returns the target and the nearest view, then a row per method.
 fn image_rows(figure: &SceneFigure) -> io::Result<Markup> {
     let target_frame = figure.target_frame;
     let of = |method: Method| figure.images.iter().filter(move |image| image.key.method == method);
@@ -188,7 +187,6 @@ fn map(figure: &SceneFigure, label: &str, content: Markup, caption: Markup) -> M
     }
 }
 
-/// Counts the patches of one view.
 fn num_in_view(ids: &[u32], view: usize, per_view: usize) -> usize {
     ids.iter().filter(|&&id| id as usize / per_view == view).count()
 }

@@ -157,7 +157,6 @@ pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
     }
 }
 
-/// Returns the table of program version, device and machine.
 pub fn machine(device: &str) -> Markup {
     let program = [("clift", env!("CARGO_PKG_VERSION").to_owned()), ("device", device.to_owned())];
     html! {

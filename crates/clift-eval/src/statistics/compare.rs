@@ -10,7 +10,6 @@ use crate::error::EvalError;
 use crate::statistics::student_t::t_quantile_95;
 use crate::statistics::view_metrics::PSNR_CAP_DB;
 
-/// Compared metrics.
 const METRICS: [&str; 3] = ["psnr", "ssim", "lpips_vgg"];
 
 /// The key of a row of `views.csv`, as text.

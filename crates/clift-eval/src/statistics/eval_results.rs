@@ -28,7 +28,6 @@ pub struct EvalResults {
     views: BTreeMap<EvalKey, SceneViews>,
     /// Cost of every key of which a warm-up view was rendered, and of external methods.
     pub(crate) costs: BTreeMap<EvalKey, Cost>,
-    /// Keys of the skipped scenes.
     pub(crate) skipped: BTreeSet<String>,
     pub(crate) not_measured: Vec<NotMeasured>,
     pub(crate) missing: BTreeMap<MethodName, BTreeSet<String>>,

@@ -8,15 +8,12 @@ use crate::error::EvalError;
 /// rotate in place.
 const TIE: f64 = 1e-9;
 
-/// Finds the context view whose camera centre is nearest to the target's.
-///
-/// Ties go to the smaller rotation angle, then to the lower index.
+/// Finds the nearest camera centre. Ties go to the smaller rotation angle, then to the lower index.
 pub fn nearest_view(context_c2w: &[Pose], target_c2w: Pose) -> Result<usize, EvalError> {
     let distances: Vec<f64> = context_c2w.iter().map(|c2w| c2w.translation.distance(target_c2w.translation)).collect();
     let nearest = distances.iter().copied().reduce(f64::min).ok_or(EvalError::NoContext)?;
     let tie = TIE * distances.iter().copied().fold(0.0, f64::max);
     let near: Vec<usize> = (0..distances.len()).filter(|&i| distances[i] <= nearest + tie).collect();
-
     let angles: Vec<f64> = near.iter().map(|&i| rotation_angle_rad(context_c2w[i], target_c2w)).collect();
     let smallest = angles.iter().copied().fold(f64::INFINITY, f64::min);
     let first = angles.iter().position(|&angle| angle <= smallest + TIE).ok_or(EvalError::NoContext)?;

@@ -12,13 +12,11 @@ use crate::error::EvalError;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
 
-/// Stored tokens of one scene.
 pub(crate) struct CompressedTokens<'a> {
     /// `[1, S, D]`
     pub tokens: Tensor<3>,
     /// The patch of the context views of every token, `[S]`.
     pub ids: Vec<u32>,
-    /// The model that renders the tokens.
     pub model: &'a TrainedModel,
 }
 

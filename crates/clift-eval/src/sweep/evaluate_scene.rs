@@ -1,5 +1,6 @@
 //! The sweep of one scene: encoded once, rendered by every method at every token count.
 
+use std::collections::btree_map::Entry;
 use std::time::Instant;
 
 use burn::tensor::Tensor;
@@ -134,7 +135,6 @@ struct TargetRenderer<'a> {
 
 impl TargetRenderer<'_> {
     /// Renders every target view in a call of its own, from all stored tokens or from the tokens selected for the view.
-    ///
     /// The measured time is from tokens on the device to pixels on the host. Views share no work, so the times of any two
     /// keys are comparable. A viewer that keeps the keys and values of a scene's tokens between frames is faster.
     fn render(
@@ -157,14 +157,14 @@ impl TargetRenderer<'_> {
         };
         // Queued work must not count as rendering time.
         device.sync().map_err(EvalError::tensor)?;
-        if !metrics.costs.contains_key(&key) {
+        if let Entry::Vacant(cost) = metrics.costs.entry(key) {
             // One untimed view per key: one-time work of the device, and the peak memory.
             let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
             render(0)?;
             let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
             let macs = self.sweep.model.render_macs(target.height, target.width, key.num_render_tokens)?;
             let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
-            metrics.costs.insert(key, Cost { gflops, peak_bytes, scene_bytes: None });
+            cost.insert(Cost { gflops, peak_bytes, scene_bytes: None });
         }
         let mut rendered = ScoredViews::new(key);
         for view in 0..target.num_views() {
@@ -179,7 +179,6 @@ impl TargetRenderer<'_> {
     }
 }
 
-/// Returns the camera of one view.
 fn camera_of(cameras: &Cameras, view: usize) -> Cameras {
     Cameras {
         c2w: cameras.c2w.clone().narrow(1, view, 1),

@@ -31,7 +31,6 @@ impl<'a> LazyClusters<'a> {
         Self { kmeans, lift, num_clusters, seed, views, clusters: OnceCell::new(), tiles: OnceCell::new() }
     }
 
-    /// Returns the tiles of the context views, see [`tile_clusters`].
     pub fn tiles(&self) -> Result<&Clusters, EvalError> {
         computed_once(&self.tiles, || {
             let (num_views, grid) = self.views;
@@ -39,7 +38,6 @@ impl<'a> LazyClusters<'a> {
         })
     }
 
-    /// Returns the clusters of latent K-means.
     pub fn clusters(&self) -> Result<&Clusters, EvalError> {
         computed_once(&self.clusters, || {
             Ok(self.kmeans.fit(self.lift.clone(), self.num_clusters, &[self.seed])?.clusters)

@@ -72,7 +72,6 @@ pub(crate) fn spread(count: usize, most: usize) -> Vec<usize> {
     (0..most).map(|i| i * (count - 1) / (most - 1)).collect()
 }
 
-/// Scores both baselines: the nearest context view and the mean of the context views.
 pub(crate) fn baselines(clip: &Clip, scorer: &ViewScorer, kept_views: &[usize]) -> Result<Vec<ScoredViews>, EvalError> {
     let mean = mean_image(&clip.context)?;
     let mut nearest = ScoredViews::new(EvalKey::baseline(Method::NearestView));

@@ -44,7 +44,6 @@ impl Sweep {
         counts.repeat(num_formats)
     }
 
-    /// Returns the number formats of a method.
     pub(crate) fn formats(&self, method: Method) -> &[TokenFormat] {
         if method == Method::Random { &[TokenFormat::F32] } else { &self.tokens }
     }

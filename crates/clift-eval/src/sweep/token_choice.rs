@@ -11,7 +11,6 @@ use crate::error::EvalError;
 use crate::sweep::compressed_tokens::random_subset;
 use crate::upload::view_cameras;
 
-/// The tokens selected for one view.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct SelectedTokens {
     /// Rows of the stored tokens, ascending.
@@ -20,8 +19,7 @@ pub(crate) struct SelectedTokens {
     pub select_s: f64,
 }
 
-/// Selects tokens for every target view of a clip, and returns them in the order of the target views. Momentum (Algorithm
-/// 1) needs the views in the order of their frames.
+/// Selects in the order of frames, which momentum (Algorithm 1) needs, and returns the order of the target views.
 ///
 /// `ids` are the patches of the stored tokens in the context views, `[S]`.
 pub(crate) fn select_for_views(

@@ -35,7 +35,6 @@ fn features() -> Vec<(&'static str, bool)> {
     Vec::new()
 }
 
-/// Returns total and available memory from the text of `/proc/meminfo`.
 fn memory(meminfo: &str) -> String {
     let gib = |name: &str| {
         let kib: f64 = proc_field(meminfo, name)?.strip_suffix("kB")?.trim().parse().ok()?;

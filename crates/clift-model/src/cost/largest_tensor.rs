@@ -11,8 +11,7 @@ use crate::tokens::kmeans::seeding::MAX_TABLE_LEN;
 /// values.
 pub fn largest_tensors(config: &ModelConfig, part: Part, sizes: &SceneSizes, num_scenes: usize) -> Vec<(String, u64)> {
     let layers = config.layers();
-    let tensors = layers.iter().filter(|layer| layer.part == part).filter_map(|layer| tensor(layer, sizes, num_scenes));
-    tensors.collect()
+    layers.iter().filter(|layer| layer.part == part).filter_map(|layer| tensor(layer, sizes, num_scenes)).collect()
 }
 
 /// Returns the largest tensor of a layer; `None` for layers whose block always has a larger one.

@@ -75,7 +75,6 @@ impl Macs {
 }
 
 impl Layer {
-    /// Returns the cost of this layer in a forward pass of one scene.
     fn macs(&self, sizes: &SceneSizes) -> Macs {
         if self.rows == [Rows::GatheringTokens] && sizes.num_rows(&[Rows::Members]) == 0 {
             return Macs::default();
@@ -123,8 +122,7 @@ impl ModelConfig {
     /// # Errors
     /// [`ModelError::NotDivisible`] if a side is not a positive multiple of the patch.
     pub fn encode_macs(&self, num_views: usize, height: usize, width: usize) -> Result<Macs, ModelError> {
-        let num_tokens = self.num_tokens(num_views, height, width)?;
-        Ok(self.macs(Part::Encoder, &SceneSizes::new(num_tokens, 0, 0)))
+        Ok(self.macs(Part::Encoder, &SceneSizes::new(self.num_tokens(num_views, height, width)?, 0, 0)))
     }
 
     /// Returns the cost of condensing `num_tokens` tokens into `num_storage_tokens`.

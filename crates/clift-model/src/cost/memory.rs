@@ -9,7 +9,6 @@ use crate::network::layers::{Layer, LayerKind, Part, Rows};
 
 /// Bytes of an f32.
 const F32: f64 = 4.0;
-
 /// Bytes of the C library's heap per byte that a backward pass keeps: the heap holds on to freed pieces below 32 MiB.
 /// Measured: 1.05 to 1.22 (docs/guide/training.md).
 const HEAP: f64 = 1.2;

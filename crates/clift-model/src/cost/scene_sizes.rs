@@ -32,8 +32,7 @@ impl SceneSizes {
         }
     }
 
-    /// Tokens from which keys and values are projected: those of the scene, or the subsets of its views, whichever are
-    /// fewer.
+    /// Tokens projected to keys and values: those of the scene, or the subsets of its views, whichever are fewer.
     fn num_projected(&self) -> usize {
         let all = self.num_storage_tokens.unwrap_or(self.num_tokens);
         if self.is_per_view { all.min(self.num_targets * self.num_render_tokens) } else { self.num_render_tokens }
@@ -49,7 +48,6 @@ impl SceneSizes {
         if rows.iter().any(is_per_view) { self.num_targets as u64 } else { 1 }
     }
 
-    /// Number of rows of one group.
     pub(crate) fn group_len(&self, rows: &[Rows]) -> u64 {
         let stored = self.num_storage_tokens.unwrap_or(0);
         let len = |rows: &Rows| match rows {

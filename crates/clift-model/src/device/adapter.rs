@@ -150,7 +150,6 @@ mod available {
 
     /// Returns the selector of the `number`-th adapter of a type, in `CubeCL`'s syntax.
     fn selector(device_type: DeviceType, number: usize) -> String {
-        // Software has no number.
         if device_type == DeviceType::Cpu { "Cpu".into() } else { format!("{device_type:?}({number})") }
     }
 }

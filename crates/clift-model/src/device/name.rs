@@ -86,9 +86,8 @@ fn open_wgpu() -> Result<Device, ModelError> {
 
 #[cfg(feature = "wgpu")]
 fn open_wgpu() -> Result<Device, ModelError> {
-    use burn::tensor::{DeviceKind, DeviceType};
-
     use crate::device::adapter::{ADAPTER_VARIABLE, adapters};
+    use burn::tensor::{DeviceKind, DeviceType};
     // wgpu panics when it opens a device without an adapter.
     let num_adapters = std::panic::catch_unwind(|| Device::enumerate(DeviceType::Wgpu).into_vec().len()).unwrap_or(0);
     if num_adapters == 0 {

@@ -8,12 +8,10 @@ pub(crate) fn is_native(tensor: &FlexTensor) -> bool {
     tensor.dtype() == DType::F32
 }
 
-/// Returns a contiguous tensor, copied if necessary.
 pub(crate) fn contiguous(tensor: FlexTensor) -> FlexTensor {
     if tensor.is_contiguous() { tensor } else { tensor.to_contiguous() }
 }
 
-/// Returns the values of a contiguous tensor.
 pub(crate) fn values(tensor: &FlexTensor) -> &[f32] {
     debug_assert!(tensor.is_contiguous(), "values of a contiguous tensor");
     let start = tensor.layout().start_offset();
@@ -27,7 +25,6 @@ pub(crate) fn values_mut(tensor: &mut FlexTensor) -> &mut [f32] {
     &mut tensor.storage_mut::<f32>()[start..start + len]
 }
 
-/// Creates a tensor of values.
 pub(crate) fn tensor(values: Vec<f32>, shape: impl Into<Shape>) -> FlexTensor {
     FlexTensor::new(Bytes::from_elems(values), Layout::contiguous(shape.into()), DType::F32)
 }

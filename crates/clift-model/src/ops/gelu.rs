@@ -13,7 +13,6 @@ use crate::ops::flex::{contiguous, is_native, tensor, values, values_mut};
 /// GELU, `x * Phi(x)` with the normal distribution function `Phi` (erf, not the tanh approximation), and its exact
 /// gradient; Burn 0.22 differentiates the approximation on GPUs. The default implementations run on every backend.
 pub trait GeluKernels: Backend {
-    /// Computes `x * Phi(x)`.
     fn gelu_output(x: FloatTensor<Self>) -> FloatTensor<Self> {
         composed_output::<Self>(x)
     }
@@ -31,8 +30,7 @@ fn composed_output<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
 fn composed_grad<B: Backend>(x: FloatTensor<B>, grad: FloatTensor<B>) -> FloatTensor<B> {
     let density = B::float_exp(B::float_mul_scalar(B::float_mul(x.clone(), x.clone()), (-0.5).into()));
     let density = B::float_mul_scalar(density, (1.0 / (2.0 * std::f64::consts::PI).sqrt()).into());
-    let slope = B::float_add(normal_cdf::<B>(x.clone()), B::float_mul(x, density));
-    B::float_mul(grad, slope)
+    B::float_mul(grad, B::float_add(normal_cdf::<B>(x.clone()), B::float_mul(x, density)))
 }
 
 fn normal_cdf<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
@@ -62,6 +60,5 @@ impl GeluKernels for Flex {
 }
 
 impl GeluKernels for NdArray {}
-
 #[cfg(feature = "wgpu")]
 impl GeluKernels for burn::backend::Cube {}

@@ -38,13 +38,6 @@ pub fn linear(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
 }
 
 /// Computes [`linear`] in f32, independent of the precision of this thread: for layers whose inputs are rays.
-///
-/// # Shapes
-/// - `x`: `[batch, count, inputs]`
-/// - returns `[batch, count, outputs]`
-///
-/// # Panics
-/// If the layer has no bias.
 pub fn linear_in_f32(layer: &Linear, x: Tensor<3>) -> Tensor<3> {
     apply(layer, x, Prologue { gelu: false, precision: Precision::F32 })
 }
@@ -76,9 +69,7 @@ pub fn norm_linear(norm: &LayerNorm, layer: &Linear, x: Tensor<3>) -> Tensor<3> 
 /// The computation before the bias of a layer is added.
 #[derive(Clone, Copy, Debug)]
 pub struct Prologue {
-    /// Whether the input goes through a GELU.
     gelu: bool,
-    /// Precision of the product's operands.
     precision: Precision,
 }
 
@@ -88,7 +79,6 @@ fn apply(layer: &Linear, x: Tensor<3>, prologue: Prologue) -> Tensor<3> {
     Tensor::from_dispatch(<Dispatch as LinearOps>::linear_layer(x, weight, bias, prologue))
 }
 
-/// Computes [`norm_linear`] with the parameters of the norm as tensors.
 pub(crate) fn norm_then_linear(x: Tensor<3>, gamma: Tensor<1>, beta: Tensor<1>, layer: &Linear) -> Tensor<3> {
     let (weight, bias) = parameters(layer, &x);
     let [inputs, _outputs] = weight.dims();
@@ -117,7 +107,6 @@ fn parameters(layer: &Linear, x: &Tensor<3>) -> (Tensor<2>, Tensor<1>) {
 /// The operations of [`linear`], [`gelu_linear`] and [`norm_linear`] on a backend.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait LinearOps: Backend {
-    /// See [`linear`] and [`gelu_linear`].
     fn linear_layer(
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
@@ -125,7 +114,6 @@ pub trait LinearOps: Backend {
         prologue: Prologue,
     ) -> FloatTensor<Self>;
 
-    /// See [`norm_linear`].
     fn norm_then_linear(
         x: FloatTensor<Self>,
         gamma: FloatTensor<Self>,

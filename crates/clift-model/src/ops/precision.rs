@@ -120,7 +120,6 @@ pub trait MatmulKernels: Backend {
 
 impl MatmulKernels for Flex {}
 impl MatmulKernels for NdArray {}
-
 #[cfg(feature = "wgpu")]
 impl MatmulKernels for burn::backend::Cube {
     /// The kernels accumulate in f32 and write f32.
@@ -150,8 +149,7 @@ mod tests {
                 assert_eq!(Precision::current(), Precision::F32);
             }
             assert_eq!(Precision::current(), Precision::F16);
-            let other = std::thread::spawn(Precision::current).join().expect("no panic");
-            assert_eq!(other, Precision::F32);
+            assert_eq!(std::thread::spawn(Precision::current).join().expect("no panic"), Precision::F32);
         }
         assert_eq!(Precision::current(), Precision::F32);
     }
@@ -167,12 +165,10 @@ mod tests {
 
     /// Returns output and gradients of a chain of all operations.
     fn results(device: &Device, precision: Precision, dtype: DType) -> Vec<Vec<f64>> {
-        use burn::module::Param;
-        use burn::nn::{LayerNorm, LayerNormConfig, Linear};
-
         use crate::ops::attention::sdpa::{cross_sdpa, self_sdpa};
         use crate::ops::linear::{gelu_linear, linear, norm_linear};
-
+        use burn::module::Param;
+        use burn::nn::{LayerNorm, LayerNormConfig, Linear};
         let device = device.clone().autodiff();
         let sample = |shape: [usize; 3], seed: u64| random(shape, seed, &device).cast(dtype).detach();
         let layer = |weight: &Tensor<3>| {
@@ -214,8 +210,7 @@ mod tests {
     #[test]
     fn f16_errors_of_outputs_and_gradients_match_11_bits() {
         let expected = results(&Device::flex(), Precision::F16, DType::F64);
-        let exact = results(&Device::flex(), Precision::F32, DType::F64);
-        assert_eq!(expected, exact, "f64 is not rounded");
+        assert_eq!(expected, results(&Device::flex(), Precision::F32, DType::F64), "f64 is not rounded");
         let errors = |found: &[Vec<f64>]| -> Vec<f64> {
             let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>().sqrt();
             let error = |(found, expected): (&Vec<f64>, &Vec<f64>)| {

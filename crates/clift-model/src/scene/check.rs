@@ -3,26 +3,18 @@
 use crate::scene::scene::{HEADER_BYTES, Scene};
 use crate::views::camera::ViewCamera;
 
-/// Most context views of a scene.
 const MAX_VIEWS: usize = 1024;
-
 /// Longest side of a context view or a rendered image in pixels.
 pub const MAX_SIDE_PX: usize = 1 << 14;
-
 /// Most patches of all context views. Every patch is one encoder token.
 const MAX_PATCHES: usize = 1 << 20;
-
 /// Largest coordinate of a context camera; those of normalized cameras are at most 1.
 const MAX_COORDINATE: f64 = 1e3;
-
 /// Largest error of `R^T R` in a pose, as in the readers of data sets.
 const MAX_ROTATION_ERROR: f64 = 1e-2;
 
 impl Scene {
-    /// Checks every field of the scene.
-    ///
-    /// # Errors
-    /// A message about the first invalid field.
+    /// Returns a message about the first invalid field.
     pub(crate) fn check(&self) -> Result<(), String> {
         self.model.validate().map_err(|error| error.to_string())?;
         let views = self.context.len();

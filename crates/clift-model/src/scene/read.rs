@@ -14,10 +14,8 @@ use crate::views::camera::ViewCamera;
 
 /// Longest accepted header; headers of this version have 2048 bytes.
 const MAX_HEADER_BYTES: u64 = 1 << 16;
-
 /// Largest accepted file: 65,536 tokens of width 768 in f32 take a fifth of it.
 const MAX_FILE_BYTES: u64 = 1 << 30;
-
 /// Largest relative difference between a stored ray, which is f32, and the ray of its camera.
 const RAY_TOLERANCE: f64 = 1e-4;
 
@@ -25,7 +23,6 @@ const GIVE_ANOTHER: &str = "give a file that `clift encode` wrote";
 const COPY_AGAIN: &str = "copy it again, or encode the scene again";
 const OTHER_VERSION: &str = "use the version of clift that wrote it, or encode the scene again";
 
-/// The reason why a file is refused, and the remedy.
 struct Refusal {
     reason: String,
     fix: &'static str,
@@ -164,7 +161,6 @@ impl Tensors<'_> {
         self.0.tensor(name).map_err(|_| format!("no tensor `{name}`"))
     }
 
-    /// Returns the length of a one-dimensional tensor.
     fn length(&self, name: &str) -> Result<usize, String> {
         match self.view(name)?.shape() {
             &[length] => Ok(length),
@@ -175,8 +171,7 @@ impl Tensors<'_> {
     fn data(&self, name: &str, dtype: Dtype, shape: &[usize]) -> Result<Vec<u8>, String> {
         let view = self.view(name)?;
         if view.dtype() != dtype || view.shape() != shape {
-            let (found, found_shape) = (view.dtype(), view.shape());
-            return Err(format!("`{name}` is {found:?} {found_shape:?}, expected {dtype:?} {shape:?}"));
+            return Err(format!("`{name}` is {:?} {:?}, expected {dtype:?} {shape:?}", view.dtype(), view.shape()));
         }
         Ok(view.data().to_vec())
     }
@@ -196,7 +191,6 @@ impl Tensors<'_> {
         Ok(data.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect())
     }
 
-    /// Reads the tokens: format, number and values.
     fn tokens(&self, dim: usize) -> Result<(TokenFormat, usize, Vec<f32>), String> {
         let dtype = self.view("tokens")?.dtype();
         let format = TokenFormat::ALL.into_iter().find(|format| format!("{dtype:?}") == dtype_name(*format));

@@ -8,7 +8,6 @@ use crate::views::camera::ViewCamera;
 
 /// Timed shares of the storage tokens, in sixteenths, besides all tokens.
 const SIXTEENTHS: [usize; 5] = [1, 2, 4, 8, 12];
-
 /// Most timed repetitions of one token count.
 const MAX_REPETITIONS: usize = 7;
 /// Seconds after which two repetitions are enough.

@@ -19,7 +19,6 @@ use crate::weights::trained_model::open_renderer;
 
 /// Most frames of one call with all tokens, where frames share keys and values.
 const FRAMES_PER_CALL: usize = 8;
-
 /// Most patches of one call with several frames: eight frames of 512 x 512 pixels.
 const PATCHES_PER_CALL: usize = 1 << 15;
 
@@ -184,7 +183,6 @@ mod tests {
         (0..num_frames).map(|i| camera(-0.5 + 0.1 * i as f64, 0.1 - 0.02 * i as f64)).collect()
     }
 
-    /// Expects the frames of `count` tokens to equal the renderer's images of each frame's tokens alone.
     fn assert_equals_single_frames(device: &Device, preset: SelectionPreset, count: usize, tolerance: f32) {
         let renderer = Clift::new(&config(), 3, device).renderer;
         let scene = whole_scene(&renderer);

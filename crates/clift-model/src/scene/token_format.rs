@@ -14,22 +14,9 @@ use crate::names::parse_value;
 const INT8_MAX: f32 = 127.0;
 
 /// Number format of the tokens in a scene file.
-#[derive(
-    Clone,
-    Copy,
-    Debug,
-    Default,
-    PartialEq,
-    Eq,
-    PartialOrd,
-    Ord,
-    Serialize,
-    Deserialize,
-    Display,
-    IntoStaticStr,
-    VariantArray,
-)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[derive(Display, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "lowercase")]
 pub enum TokenFormat {
     /// 32-bit floats, without rounding.
@@ -69,9 +56,6 @@ impl TokenFormat {
     }
 
     /// Encodes tokens `[S, D]` as little-endian bytes, with a scale per token for 8 bits.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] for values beyond the range of 16-bit floats.
     pub(crate) fn encode(self, tokens: &[f32], dim: usize) -> Result<(Vec<u8>, Option<Vec<f32>>), ModelError> {
         match self {
             Self::F32 => Ok((tokens.iter().flat_map(|value| value.to_le_bytes()).collect(), None)),
@@ -101,7 +85,6 @@ impl TokenFormat {
         }
     }
 
-    /// Decodes the bytes of [`TokenFormat::encode`].
     pub(crate) fn decode(self, bytes: &[u8], scales: &[f32], dim: usize) -> Vec<f32> {
         match self {
             Self::F32 => bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect(),

@@ -112,7 +112,6 @@ impl Clusters {
             let count = values.len();
             Tensor::<1, Int>::from_data(TensorData::new(values, [count]), device)
         };
-        let has_singletons = singleton.contains(&true);
         ClusterIndex {
             batch,
             num_tokens,
@@ -120,7 +119,7 @@ impl Clusters {
             centroid: index(centroid),
             segment: index(all_segments),
             members: (num_members > 0).then(|| Members { token: index(member), segment: index(segment) }),
-            singleton: has_singletons.then(|| {
+            singleton: singleton.contains(&true).then(|| {
                 Tensor::<3, Bool>::from_data(TensorData::new(singleton, [batch, num_storage_tokens, 1]), device)
             }),
         }
@@ -144,7 +143,6 @@ pub struct ClusterIndex {
     pub(crate) singleton: Option<Tensor<3, Bool>>,
 }
 
-/// Tokens that are not centroids.
 #[derive(Clone, Debug)]
 pub(crate) struct Members {
     /// Token row of every member, `[B * M]`.
@@ -188,10 +186,8 @@ mod tests {
         };
         assert_eq!(message(&[0, 2], &[0]), "bad clusters: token 1 is in cluster 2 of 1");
         assert_eq!(message(&[0, 0], &[7]), "bad clusters: the centroid of cluster 0 is token 7 of 2");
-        let expected = "bad clusters: token 0, the centroid of cluster 1, is in cluster 0";
-        assert_eq!(message(&[0, 0], &[1, 0]), expected);
-        let scenes = vec![SceneClusters::identity(2), SceneClusters::identity(3)];
-        assert!(Clusters::new(scenes).is_err());
+        assert_eq!(message(&[0, 0], &[1, 0]), "bad clusters: token 0, the centroid of cluster 1, is in cluster 0");
+        assert!(Clusters::new(vec![SceneClusters::identity(2), SceneClusters::identity(3)]).is_err());
         assert!(Clusters::new(Vec::new()).is_err());
     }
 

@@ -21,7 +21,6 @@ pub enum Grouping {
     Tile,
 }
 
-/// A rectangle of tokens in a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Tile {
     row: usize,

@@ -21,8 +21,7 @@ pub fn plucker(cameras: &Cameras) -> Tensor<5> {
     let device = cameras.c2w.device();
     let dtype = cameras.c2w.dtype();
     let centers = |count: usize, shape: [usize; 5]| {
-        let index = Tensor::<1, Int>::arange(0..count as i64, &device);
-        index.float().cast(dtype).add_scalar(0.5).reshape(shape)
+        Tensor::<1, Int>::arange(0..count as i64, &device).float().cast(dtype).add_scalar(0.5).reshape(shape)
     };
     let x = ((centers(width, [1, 1, 1, width, 1]) - cx) / fx).expand(grid);
     let y = ((centers(height, [1, 1, height, 1, 1]) - cy) / fy).expand(grid);

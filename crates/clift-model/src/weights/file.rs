@@ -114,9 +114,6 @@ pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> R
 }
 
 /// Reads one module of a larger one from its file, such as the `renderer` of a whole model.
-///
-/// # Errors
-/// As [`load_part`].
 pub fn load_module<M: Module>(module: &mut M, name: &str, path: &Path) -> Result<LoadReport, ModelError> {
     let store = SafetensorsStore::from_file(path).with_key_remapping(format!("^{name}\\."), "");
     read(module, store, &PathFilter::all(), path)

@@ -70,7 +70,6 @@ impl ModelPath {
 
 const WEIGHTS: &str = "model.safetensors";
 
-/// Returns the weight file of the stage of a run that makes tokens of a kind.
 fn weights_of(run: &Path, kind: TokenKind) -> PathBuf {
     let stage = match kind {
         TokenKind::Clift => "stage2",

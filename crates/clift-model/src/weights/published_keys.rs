@@ -10,13 +10,10 @@ use crate::network::layers::Part;
 
 /// Prefix of the network's keys in a checkpoint of the published training program.
 pub const PREFIX: &str = "transformer.";
-
 /// Prefix of the keys of the perceptual loss, which is no part of the network.
 pub const PERCEPTUAL_PREFIX: &str = "perceptual_loss.";
-
 /// Layers that may be 1 x 1 convolutions in a checkpoint, `[outputs, inputs, 1, 1]`.
 pub const PROJECTIONS: [&str; 3] = ["linear_input", "linear_target", "patch_to_image.0"];
-
 /// Layers that are exported as 1 x 1 convolutions if the model was not imported.
 pub const CONVOLUTIONS: [&str; 2] = ["linear_input", "linear_target"];
 

@@ -68,10 +68,6 @@ impl TrainedModel {
     }
 }
 
-/// Reads the renderer from a weight file.
-///
-/// # Errors
-/// [`ModelError::Weights`] for a file that cannot be read or lacks parameters of the renderer.
 pub fn open_renderer(config: &ModelConfig, path: &Path, device: &Device) -> Result<Renderer, ModelError> {
     let refuse = |reason: String| ModelError::Weights { action: "reading", reason, path: path.into() };
     let size = std::fs::metadata(path).map_err(|error| refuse(error.to_string()))?.len();

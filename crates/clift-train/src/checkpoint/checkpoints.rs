@@ -135,7 +135,6 @@ impl Checkpoints {
         self.folder.join(name_of(step))
     }
 
-    /// Lists all files and folders.
     fn items(&self) -> Result<Vec<PathBuf>, TrainError> {
         let items = std::fs::read_dir(&self.folder).and_then(|items| items.map(|item| Ok(item?.path())).collect());
         items.map_err(TrainError::io("listing checkpoints", &self.folder))
@@ -159,7 +158,6 @@ impl Checkpoints {
         Ok(())
     }
 
-    /// Removes the checkpoints that are no longer kept, and unfinished saves.
     fn prune(&self, progress: &Progress) -> Result<(), TrainError> {
         self.remove_unfinished()?;
         for step in steps_to_remove(&self.steps()?, &self.retention, progress.best) {
@@ -250,7 +248,6 @@ mod tests {
 
     use super::*;
 
-    /// Makes a state and its first checkpoint in `root`.
     fn saved(root: &Path) -> (TrainState, Checkpoints, PathBuf) {
         let config = ModelConfig { dim: 8, num_heads: 2, feed_forward_dim: 8, ..ModelConfig::default() };
         let device = burn::tensor::Device::flex().autodiff();
@@ -261,7 +258,6 @@ mod tests {
         (train_state, checkpoints, step)
     }
 
-    /// Writes the present checksum of a file to `state.json`.
     fn update_checksum(step: &Path, name: &str) {
         let mut state = State::read(step).unwrap();
         state.files.insert(name.into(), Fingerprint::of(&step.join(name)).unwrap());
@@ -272,7 +268,6 @@ mod tests {
     fn foreign_optimizer_and_missing_checksum_are_refused() {
         let place = tempfile::tempdir().unwrap();
         let (mut train_state, checkpoints, step) = saved(place.path());
-
         // Weights of the model in the file of the optimizer, with a matching checksum.
         std::fs::copy(step.join(MODEL), step.join(OPTIMIZER)).unwrap();
         update_checksum(&step, OPTIMIZER);
@@ -286,7 +281,6 @@ mod tests {
         assert!(message.contains("the checksum of model.bpk is missing"), "{message}");
     }
 
-    /// Casts parameters to f64.
     struct ToF64;
     impl ModuleMapper for ToF64 {
         fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
@@ -299,7 +293,6 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let (mut train_state, checkpoints, step) = saved(place.path());
         let path = step.join(MODEL);
-
         // Another type in the header of the first tensor, with a matching checksum.
         let mut bytes = std::fs::read(&path).unwrap();
         let at = bytes.windows(3).position(|window| window == b"F32").expect("a type");

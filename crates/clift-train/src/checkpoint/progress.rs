@@ -14,9 +14,7 @@ use crate::error::TrainError;
 use crate::step::loss_scale::LossScale;
 use crate::step::step_guard::LossHistory;
 
-/// Name of the file.
 pub(crate) const STATE: &str = "state.json";
-/// The written version.
 pub(crate) const VERSION: u32 = 3;
 /// Version with the numbers of [`Progress`] as strings.
 const STRING_VERSION: u32 = 2;
@@ -68,7 +66,6 @@ pub struct Progress {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Best {
-    /// Its step.
     pub step: u64,
     /// Mean PSNR of the validation views in dB.
     #[serde(deserialize_with = "null_as_nan")]
@@ -82,9 +79,6 @@ fn null_as_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Err
 
 impl State {
     /// Reads `state.json` of a checkpoint, also of version 2.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`] and [`TrainError::BadFile`].
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
         let path = folder.join(STATE);
         let text = std::fs::read(&path).map_err(TrainError::io("reading a checkpoint", &path))?;
@@ -103,10 +97,6 @@ impl State {
         Ok(Self { version: VERSION, ..state })
     }
 
-    /// Writes `state.json` of a checkpoint.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
         let path = folder.join(STATE);
         let text = serde_json::to_vec(self).map_err(TrainError::bad_file("checkpoint", &path))?;
@@ -129,10 +119,6 @@ fn parse_numbers(value: &mut Value) {
 }
 
 impl Fingerprint {
-    /// Computes size and checksum of a file.
-    ///
-    /// # Errors
-    /// Those of the operating system.
     pub fn of(path: &Path) -> std::io::Result<Self> {
         let mut file = File::open(path)?;
         let mut hasher = crc32fast::Hasher::new();

@@ -18,15 +18,12 @@ use crate::events::{Event, Sink, Stage};
 
 /// Inputs of the cluster cache of a run.
 pub struct ClusterBuilder<'a> {
-    /// Settings of the run.
     pub config: &'a Config,
     /// Training scenes.
     pub reader: &'a ClipReader,
     /// The trained encoder, without autodiff.
     pub encoder: &'a Encoder,
-    /// Hash of the encoder's weights.
     pub encoder_hash: &'a str,
-    /// Device of the encoder.
     pub device: &'a Device,
 }
 
@@ -34,9 +31,6 @@ impl ClusterBuilder<'_> {
     /// Clusters every training scene `num_passes` times, each time with one context set and one count of the grid, and opens
     /// the cache. Resumes an interrupted build with the same encoder and settings; the bytes do not depend on interruptions.
     /// The cache is written to a temporary folder, which is then renamed. Scenes that cannot be used are skipped.
-    ///
-    /// # Errors
-    /// [`TrainError::NoScenes`] if no scene could be clustered, [`TrainError::Interrupted`], and those of disk and model.
     pub fn build(&self, folder: &Path, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<ClusterCache, TrainError> {
         let Self { config, reader, encoder_hash, .. } = *self;
         let cache_key = CacheKey { version: VERSION, encoder: encoder_hash.into(), settings: settings(config) };

@@ -20,11 +20,9 @@ pub(crate) const VERSION: u32 = 1;
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CacheEntry {
-    /// Key of the scene.
     pub key: String,
     /// Frames of the contexts.
     pub context: Vec<usize>,
-    /// Number of tokens of the scene.
     pub num_tokens: usize,
     /// Number of clusters.
     pub num_storage_tokens: usize,
@@ -132,7 +130,6 @@ impl ClusterCache {
     }
 }
 
-/// Returns the settings that determine the clusters, as JSON.
 pub(crate) fn settings(config: &Config) -> String {
     let data = &config.data;
     let mut clusters = serde_json::json!(config.clusters);

@@ -27,7 +27,6 @@ pub(crate) struct CacheKey {
     pub version: u32,
     /// Hash of the encoder's weights.
     pub encoder: String,
-    /// Settings that determine the clusters.
     pub settings: String,
 }
 
@@ -35,7 +34,6 @@ pub(crate) struct CacheKey {
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Line {
-    /// Index of the set.
     set: u64,
     outcome: Outcome,
     /// Checksum of index, outcome and bytes of the set.
@@ -71,9 +69,6 @@ pub(crate) struct ResumeLog {
 
 impl ResumeLog {
     /// Resumes the build in `folder`, or starts a new one if the folder has no log of `cache_key`.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn open(folder: &Path, cache_key: CacheKey) -> Result<Self, TrainError> {
         let failed = |source| TrainError::io("resuming an unfinished cluster cache", folder)(source);
         if let Some(log) = Self::resume(folder, &cache_key).map_err(failed)? {
@@ -134,15 +129,10 @@ impl ResumeLog {
         Ok(Some(Self { folder: folder.into(), cache_key: cache_key.clone(), data, lines, entries, skipped }))
     }
 
-    /// Returns the number of finished sets.
     pub fn num_sets(&self) -> u64 {
         (self.entries.len() + self.skipped.len()) as u64
     }
 
-    /// Adds the clusters of the next set.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`], and [`TrainError::NoScenes`] for more than [`MAX_TOKENS`] tokens.
     pub fn add(&mut self, key: &str, context: Vec<usize>, clusters: &SceneClusters) -> Result<(), TrainError> {
         let bytes = encode_clusters(clusters)?;
         let entry = CacheEntry {
@@ -159,9 +149,6 @@ impl ResumeLog {
     }
 
     /// Logs that the next set could not be clustered.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn skip(&mut self, key: &str, reason: &str) -> Result<(), TrainError> {
         self.write_outcome(Outcome::Skipped { key: key.into(), reason: reason.into() }, &[])?;
         self.skipped.push((key.into(), reason.into()));
@@ -180,9 +167,6 @@ impl ResumeLog {
     }
 
     /// Writes the index of the finished cache, renames the folder to `path`, and removes the log.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`], and [`TrainError::NoScenes`] for an empty cache.
     pub fn publish(self, path: &Path, num_scenes: usize) -> Result<(), TrainError> {
         let Self { folder, cache_key, data, lines, entries, skipped } = self;
         if entries.is_empty() {
@@ -212,9 +196,6 @@ impl ResumeLog {
 }
 
 /// Removes the log of a finished cache, which a killed process may have left.
-///
-/// # Errors
-/// [`TrainError::Io`].
 pub(crate) fn remove_resume_log(cache: &Path) -> Result<(), TrainError> {
     let path = cache.join(JOURNAL);
     match std::fs::remove_file(&path) {
@@ -244,14 +225,12 @@ mod tests {
         CacheKey { version: 1, encoder: "abc".into(), settings: "{}".into() }
     }
 
-    /// Makes a temporary folder, and returns it with the folder of a build in it.
     fn new_build() -> (tempfile::TempDir, PathBuf) {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("clusters.tmp");
         (place, folder)
     }
 
-    /// Makes one cluster of all tokens.
     fn clusters(num_tokens: usize) -> SceneClusters {
         SceneClusters::new(vec![0; num_tokens], vec![0]).unwrap()
     }

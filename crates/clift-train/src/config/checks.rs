@@ -64,7 +64,6 @@ impl Config {
         Ok(())
     }
 
-    /// Checks that images consist of whole patches.
     fn validate_size(&self) -> Result<(), TrainError> {
         let patch_size = self.model.patch_size;
         for (key, value) in [("data.width", self.data.width), ("data.height", self.data.height)] {
@@ -95,7 +94,6 @@ impl Config {
         Ok(())
     }
 
-    /// Checks the token counts of all possible scenes.
     fn validate_token_counts(&self) -> Result<(), TrainError> {
         let views = &self.data.views;
         let tokens_per_view = self.model.num_tokens(1, self.data.height, self.data.width)?;
@@ -110,8 +108,7 @@ impl Config {
         }
         if self.clusters.grouping == Grouping::Tile {
             let grid = self.clusters.grid.iter().map(|count| ("clusters.grid", count));
-            let counts = grid.chain([("eval.validation_storage", &self.eval.validation_storage)]);
-            for (key, count) in counts {
+            for (key, count) in grid.chain([("eval.validation_storage", &self.eval.validation_storage)]) {
                 let too_few = |views: usize| count.of(views * tokens_per_view).is_ok_and(|count| count < views);
                 if too_few(views.min_context) || too_few(views.max_context) {
                     return Err(bad(key, count, "write at least one tile for every context view"));

@@ -32,24 +32,20 @@ impl<'a> SourceText<'a> {
         self.texts[1..].iter().map(|(start, text)| format!("{}{text}", " ".repeat(*start))).collect()
     }
 
-    /// Returns the offset of the first byte of an override.
     pub(crate) fn override_start(&self, index: usize) -> usize {
         self.texts[index + 1].0
     }
 
-    /// Makes a diagnostic at a span of the texts.
     pub(crate) fn at(&self, span: Range<usize>, title: String, label: String) -> Diagnostic<usize> {
         let (id, range) = self.find(span);
         Diagnostic::error().with_message(title).with_label(Label::primary(id, range).with_message(label))
     }
 
-    /// Makes a label at a further span.
     pub(crate) fn mark(&self, span: Range<usize>, label: String) -> Label<usize> {
         let (id, range) = self.find(span);
         Label::secondary(id, range).with_message(label)
     }
 
-    /// Makes a diagnostic of the whole file.
     pub(crate) fn whole(&self, title: String) -> Diagnostic<usize> {
         let file = self.files.get(0).map(|file| format!("in {}", file.name()));
         Diagnostic::error().with_message(title).with_notes(file.into_iter().collect())

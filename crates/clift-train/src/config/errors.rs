@@ -79,8 +79,7 @@ pub(crate) fn wrong_value(error: &toml::de::Error, root: &DeTable, sources: &Sou
     let of_path = if path.is_empty() { String::new() } else { format!(" of `{path}`") };
 
     if let Some(field) = between(message, "missing field `", "`") {
-        let key = join(&path, field);
-        return sources.whole(format!("the key `{key}` is missing"));
+        return sources.whole(format!("the key `{}` is missing", join(&path, field)));
     }
     let Some(span) = span else { return sources.whole(message.to_owned()) };
     if let Some(variant) = between(message, "unknown variant `", "`") {
@@ -155,7 +154,6 @@ pub(crate) fn out_of_range(error: &TrainError, root: &DeTable, sources: &SourceT
     Some(diagnostic)
 }
 
-/// Returns the distinct dotted keys in a text.
 fn dotted_keys(text: &str) -> Vec<&str> {
     let is_part = |c: char| c.is_ascii_alphanumeric() || "_.".contains(c);
     let mut found: Vec<&str> = Vec::new();

@@ -8,7 +8,6 @@ use crate::config::schema::Keys;
 
 /// Keys of the top level: former and present name.
 const KEYS: [(&str, &str); 1] = [("recompute", "activation_checkpointing")];
-
 /// Values: section, key, former and present name.
 const VALUES: [(&str, &str, &str, &str); 1] = [("clusters", "grouping", "patch", "tile")];
 

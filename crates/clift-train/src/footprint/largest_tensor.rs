@@ -13,7 +13,6 @@ use crate::stage::settings::StageSettings;
 
 /// Bytes of an f32 value; f16 operands are smaller copies of f32 tensors.
 const F32: u64 = 4;
-
 /// Channels of the first layers of both VGG networks, at the size of the image.
 const VGG_CHANNELS: u64 = 64;
 
@@ -39,9 +38,6 @@ pub fn largest_tensor(config: &Config, part: Stage) -> Result<LargestTensor, Tra
 }
 
 /// Refuses a run with a tensor that the open device cannot hold.
-///
-/// # Errors
-/// [`TrainError::BadConfig`] with a setting that fits.
 pub fn check_tensors(config: &Config, device: &Device, parts: &[Stage]) -> Result<(), TrainError> {
     max_tensor_bytes(device).map_or(Ok(()), |limit| check_tensor_limit(config, limit, parts))
 }

@@ -9,10 +9,8 @@ use crate::events::Stage;
 
 /// The parts of a run, in the order they run.
 pub const PARTS: [Stage; 4] = [Stage::Stage1, Stage::Clusters, Stage::Stage2, Stage::Eval];
-
 /// Target views that an evaluation renders at once.
 pub const VIEWS_PER_PASS: usize = 8;
-
 /// Number of token shares over which averages are taken.
 const NUM_SHARES: usize = 9;
 
@@ -34,11 +32,8 @@ pub fn possible_sizes(config: &Config, stage: Stage) -> Result<Vec<SceneSizes>, 
     for num_context in views.min_context..=views.max_context {
         let scene = training_scene(config, num_context)?;
         if stage == Stage::Stage2 {
-            all.extend(
-                cluster_counts(config, scene.num_tokens)?
-                    .into_iter()
-                    .map(|count| scene_with_stored_tokens(scene, count)),
-            );
+            let counts = cluster_counts(config, scene.num_tokens)?;
+            all.extend(counts.into_iter().map(|count| scene_with_stored_tokens(scene, count)));
             continue;
         }
         let [low, high] = config.stage1.keep_tokens;
@@ -63,7 +58,6 @@ pub fn typical_sizes(config: &Config, stage: Stage) -> Result<TypicalStep, Train
     Ok(TypicalStep { num_context, num_scenes: config.stage(stage).micro_batch_size(), scene })
 }
 
-/// Returns the sizes of the largest scene of a stage.
 pub fn largest_sizes(config: &Config, stage: Stage) -> Result<SceneSizes, TrainError> {
     let scene = training_scene(config, config.data.views.max_context)?;
     if stage == Stage::Stage2 {

@@ -100,7 +100,6 @@ fn sizes(model: &ModelConfig) -> [(&'static str, usize); 6] {
 /// Shape and values of parameters, by path.
 type Parameters = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
-/// Reads the parameters of a weight file.
 fn read_parameters(path: &Path) -> Result<Parameters, TrainError> {
     let bytes = std::fs::read(path).map_err(TrainError::io("reading the weights", path))?;
     let file = SafeTensors::deserialize(&bytes).map_err(TrainError::bad_file("weight file", path))?;

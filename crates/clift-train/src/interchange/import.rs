@@ -107,11 +107,9 @@ fn check_sizes(sizes: &InferredConfig, keys: &Keys, state: &StateDict) -> Result
         let fix = format!("{why}give the number of heads, a divisor of the width {dim}{from}: {file}");
         return Err(bad("--num-heads", value, &fix));
     }
-    let bad_sizes = |error: clift_model::ModelError| TrainError::bad_file("checkpoint", file)(error);
-    model.validate().map_err(bad_sizes)
+    model.validate().map_err(TrainError::bad_file("checkpoint", file))
 }
 
-/// Splits a published tensor into parameters.
 fn parts<'a>(tensor: &'a PublishedTensor, values: &'a [f32]) -> impl Iterator<Item = HostTensor> + 'a {
     let row_len: usize = tensor.shape[1..].iter().product();
     tensor.parts.iter().map(move |(path, rows)| {

@@ -13,7 +13,6 @@ pub(crate) const MAX_SHOWN: usize = 160;
 /// Most patterns of keys outside the network.
 const MAX_OUTSIDE: usize = 200;
 
-/// The keys of a checkpoint.
 #[derive(Default)]
 pub(crate) struct Keys {
     /// Keys of the network: canonical name to name in the file.
@@ -30,9 +29,6 @@ pub(crate) struct Keys {
 
 impl Keys {
     /// Classifies the keys of a checkpoint after renaming.
-    ///
-    /// # Errors
-    /// [`TrainError::BadConfig`] for a rename without effect, [`TrainError::BadFile`] for two keys with one canonical name.
     pub fn of(state: &StateDict, options: &ImportOptions) -> Result<Self, TrainError> {
         let mut is_used = vec![false; options.renames.len()];
         let mut all = Vec::new();
@@ -75,7 +71,6 @@ impl Keys {
         Ok(keys)
     }
 
-    /// Infers the sizes of the network from the shapes.
     pub fn sizes(&self, state: &StateDict, variant: CliftVariant, num_heads: Option<usize>) -> InferredConfig {
         let shape = |key: &str| state.tensor(key).map_or(&[][..], |(_, shape)| shape);
         infer_config(variant, num_heads, self.network.iter().map(|(name, key)| (name.as_str(), shape(key))))
@@ -90,7 +85,6 @@ fn starts_as_network(name: &str) -> bool {
         || first.ends_with("_norm")
 }
 
-/// Whether a part of a key is a number.
 pub(crate) fn is_number(part: &str) -> bool {
     !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit())
 }

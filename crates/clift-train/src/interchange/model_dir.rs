@@ -93,7 +93,6 @@ pub(crate) fn write_model_dir(
     Ok(())
 }
 
-/// Returns the bytes of a safetensors file with `metadata`.
 pub(crate) fn to_safetensors(
     tensors: &[HostTensor],
     mut metadata: HashMap<String, String>,

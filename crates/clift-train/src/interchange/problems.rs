@@ -14,7 +14,6 @@ const MAX_LISTED: usize = 200;
 /// Most layer numbers in a line.
 const MAX_NUMBERS: usize = 64;
 
-/// A problem of a key.
 pub(crate) struct Problem {
     kind: Kind,
     /// The key in the file, or the expected key.
@@ -81,7 +80,6 @@ pub(crate) fn problems(
     problems
 }
 
-/// Names by pattern.
 struct PatternNames<'a>(BTreeMap<String, BTreeSet<&'a str>>);
 
 impl<'a> PatternNames<'a> {
@@ -118,7 +116,6 @@ impl<'a> PatternNames<'a> {
     }
 }
 
-/// Formats all problems.
 pub(crate) fn describe(
     keys: &Keys,
     state: &StateDict,
@@ -208,10 +205,7 @@ fn suggest_fix(keys: &Keys, state: &StateDict, options: &ImportOptions, has_unkn
     if let Some(lead) = lead.filter(|_| keys.prefix.is_empty()).map(printable) {
         return format!("\n  --rename {lead}.{PREFIX}={PREFIX} gives the keys their expected names");
     }
-    if has_unknown {
-        return "\n  --rename FROM=TO replaces a part of the keys listed here".into();
-    }
-    String::new()
+    if has_unknown { "\n  --rename FROM=TO replaces a part of the keys listed here".into() } else { String::new() }
 }
 
 /// Lists the first number of each key.

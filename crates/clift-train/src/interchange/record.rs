@@ -50,10 +50,6 @@ pub struct ImportRecord {
     pub passed_over: BTreeSet<String>,
 }
 
-/// Returns an error if `stop` is set.
-///
-/// # Errors
-/// [`TrainError::Abandoned`].
 pub(crate) fn check_stop(stop: &AtomicBool) -> Result<(), TrainError> {
     if stop.load(Ordering::SeqCst) { Err(TrainError::Abandoned { task: "importing".into() }) } else { Ok(()) }
 }
@@ -71,8 +67,7 @@ impl ImportRecord {
         let text = std::fs::read(&path).map_err(TrainError::io("reading what was imported", &path))?;
         let imported: Self = serde_json::from_slice(&text).map_err(TrainError::bad_file("import.json", &path))?;
         if let Some(layer) = imported.convolutions.iter().find(|layer| !PROJECTIONS.contains(&layer.as_str())) {
-            let reason = format!("unknown projection {layer:?}");
-            return Err(TrainError::bad_file("import.json", &path)(reason));
+            return Err(TrainError::bad_file("import.json", &path)(format!("unknown projection {layer:?}")));
         }
         Ok(Some(imported))
     }

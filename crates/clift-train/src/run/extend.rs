@@ -16,7 +16,6 @@ use crate::events::{Event, Sink, Stage};
 /// A larger number of steps for a stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct StepExtension {
-    /// The stage.
     pub stage: Stage,
     /// The former number of steps.
     pub from: u64,
@@ -37,9 +36,6 @@ pub(crate) struct ExtensionRecord {
 
 impl StepExtension {
     /// Prepares the stage of the run in `folder` for more steps. Weights of a finished stage are renamed.
-    ///
-    /// # Errors
-    /// [`TrainError::BadConfig`] if the stage cannot be continued, [`TrainError::Io`].
     pub fn apply(self, folder: &Path, sink: &mut dyn Sink) -> Result<ExtensionRecord, TrainError> {
         let Self { stage, from, to } = self;
         let refuse = |fix: &str| bad("--extend", format!("{}.steps {from} -> {to}", stage.name()), fix);

@@ -9,10 +9,6 @@ use crate::events::{Event, Sink};
 
 /// Loads the weights of stage 1 of another run, of a model directory or of a weight file, and reports which parameters
 /// were loaded.
-///
-/// # Errors
-/// [`TrainError::Model`] for a PyTorch checkpoint and for other heads, [`TrainError::BadFile`] for a file without any of
-/// the parameters.
 pub(crate) fn init_from(
     model: &mut Clift,
     config: &ModelConfig,

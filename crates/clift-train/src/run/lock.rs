@@ -23,9 +23,6 @@ impl Drop for RunLock {
 
 impl RunLock {
     /// Locks the run in the existing `folder`. A file system without locks gives a warning only.
-    ///
-    /// # Errors
-    /// [`TrainError::Locked`] if another process has the lock, [`TrainError::Io`] if the file cannot be opened.
     pub fn take(folder: &Path, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         let path = folder.join("lock");
         let opened = File::options().read(true).write(true).create(true).truncate(false).open(&path);

@@ -53,10 +53,7 @@ impl StepLines {
         file.write_all(format!("{}\n", serde_json::to_string(line)?).as_bytes())
     }
 
-    /// Flushes all lines to the disk.
-    ///
-    /// # Errors
-    /// The first failure to write a line.
+    /// Flushes all lines to the disk, or returns the first failure to write a line.
     pub fn check(&mut self) -> std::io::Result<()> {
         if let Some(failure) = self.failure.take() {
             return Err(failure);
@@ -64,13 +61,11 @@ impl StepLines {
         self.file.as_ref().map_or(Ok(()), File::sync_data)
     }
 
-    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 }
 
-/// Stage and step of a line.
 #[derive(Deserialize)]
 struct LinePosition {
     step: u64,
@@ -88,8 +83,7 @@ fn truncate_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
             break;
         }
         if let Some(number) = broken {
-            let reason = format!("line {number} has no step");
-            return Err(std::io::Error::new(std::io::ErrorKind::InvalidData, reason));
+            return Err(std::io::Error::new(std::io::ErrorKind::InvalidData, format!("line {number} has no step")));
         }
         match serde_json::from_slice::<LinePosition>(&line) {
             // A line without newline may be torn even if it can be parsed.
@@ -104,11 +98,8 @@ fn truncate_after(path: &Path, stage: Stage, step: u64) -> std::io::Result<()> {
 /// A line of `skipped.jsonl`: a scene that could not be used, at its first step.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkipLine {
-    /// The step.
     pub step: u64,
-    /// The stage.
     pub stage: Stage,
-    /// Scene and reason.
     #[serde(flatten)]
     pub skip: SkippedScene,
 }
@@ -126,9 +117,6 @@ pub struct RunLog<'a> {
 
 impl<'a> RunLog<'a> {
     /// Opens the files in `run_dir` after `step` updates of `stage`, as [`StepLines::open`].
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn open(run_dir: &Path, stage: Stage, step: u64, sink: &'a mut dyn Sink) -> Result<Self, TrainError> {
         let open = |name: &str| {
             let path = run_dir.join(name);
@@ -147,15 +135,11 @@ impl<'a> RunLog<'a> {
         }
     }
 
-    /// Logs a skipped step.
     pub fn bad_step(&mut self, line: &SkippedStep) {
         self.bad_steps.write(line);
     }
 
     /// Flushes all lines to the disk. Must succeed before a checkpoint is saved, or a resumed run would lack lines.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`] with the first failure.
     pub fn check(&mut self) -> Result<(), TrainError> {
         for lines in [&mut self.metrics, &mut self.bad_steps, &mut self.skips] {
             lines.check().map_err(TrainError::io("writing the log of steps", lines.path()))?;
@@ -199,7 +183,6 @@ mod tests {
         step_s: 0.25,
     };
 
-    /// Counts events.
     #[derive(Default)]
     struct Count(usize);
 

@@ -76,8 +76,7 @@ impl Run {
         }
         let folder = &config.run_dir;
         if options.fresh && !matches!(options.only, None | Some(Stage::Stage1)) {
-            let fix = "a new run starts with stage 1: omit --fresh or --only";
-            return Err(bad("--fresh", "with --only", fix));
+            return Err(bad("--fresh", "with --only", "a new run starts with stage 1: omit --fresh or --only"));
         }
         if options.fresh && folder.exists() {
             // Refuses a directory in use. Dropped before the rename, which Windows refuses otherwise.
@@ -208,7 +207,6 @@ impl Run {
         if model.has_encoder_of(stage1) { Ok(model) } else { Err(TrainError::OtherEncoder { path }) }
     }
 
-    /// Opens the validation and test views.
     fn validation(&self, sink: &mut dyn Sink) -> Result<Validation<'_>, TrainError> {
         let mut eval = self.config.eval.clone();
         if self.overfit.is_some() && eval.index.take().is_some() {
@@ -282,19 +280,14 @@ impl Run {
             return ClusterCache::open(&folder, &self.config, encoder_hash);
         }
         if only == Some(Stage::Stage2) {
-            return Err(TrainError::Missing {
-                stage: "stage2",
-                what: "the cluster cache",
-                first: "--only clusters",
-                path: folder,
-            });
+            let what = "the cluster cache";
+            return Err(TrainError::Missing { stage: "stage2", what, first: "--only clusters", path: folder });
         }
         let encoder = model.encoder.valid();
         ClusterBuilder { config: &self.config, reader, encoder: &encoder, encoder_hash, device: &self.device }
             .build(&folder, stop, sink)
     }
 
-    /// Makes a model with initial weights on the autodiff device.
     fn new_model(&self) -> Clift {
         Clift::new(&self.config.model, self.config.seed, &self.device.clone().autodiff())
     }

@@ -42,15 +42,10 @@ pub(crate) struct RunFile {
 }
 
 impl RunFile {
-    /// Makes the file of a new run.
     pub fn new(overfit: Option<usize>) -> Self {
         Self { version: VERSION, overfit, extended: Vec::new() }
     }
 
-    /// Reads `run.json` of a run directory.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`] and [`TrainError::BadFile`].
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
         let path = folder.join("run.json");
         let text = std::fs::read(&path).map_err(TrainError::io("reading the run file", &path))?;
@@ -62,10 +57,6 @@ impl RunFile {
         Ok(run)
     }
 
-    /// Writes `run.json` to a run directory.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`].
     pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
         let path = folder.join("run.json");
         let json = serde_json::to_vec_pretty(self).map_err(TrainError::bad_file("run file", &path))?;
@@ -154,7 +145,6 @@ fn flatten(table: toml::Table) -> BTreeMap<String, String> {
 mod tests {
     use super::*;
 
-    /// Compares `config` with an existing run of the config `old`.
     fn differ(old: &str, config: &Config, extend: bool) -> Result<Vec<StepExtension>, TrainError> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("config.toml"), old).unwrap();
@@ -176,8 +166,7 @@ mod tests {
         other.stage2.optimizer.spike_factor = 7.0;
         let message = differ(&shorter, &other, false).unwrap_err().to_string();
         assert!(message.contains("  stage2.optimizer.spike_factor: 100.0 -> 7.0\n"), "{message}");
-        let unknown = format!("wings = 2\n{text}");
-        let message = differ(&unknown, &old(), false).unwrap_err().to_string();
+        let message = differ(&format!("wings = 2\n{text}"), &old(), false).unwrap_err().to_string();
         assert!(message.contains("  wings: 2 -> not set\n"), "{message}");
     }
 

@@ -21,9 +21,7 @@ pub type MakeBatch = dyn Fn(u64) -> Result<StageBatch, TrainError> + Send + Sync
 pub struct StagePlan<'a> {
     /// Stage, steps, optimizer and learning rates.
     pub settings: StageSettings<'a>,
-    /// Makes the batches.
     pub batches: Arc<MakeBatch>,
-    /// Config of the run.
     pub config: &'a Config,
     /// Folder of the stage inside the run.
     pub folder: PathBuf,

@@ -25,10 +25,6 @@ use crate::step::train_state::{TrainState, Update};
 
 impl StagePlan<'_> {
     /// Trains the remaining steps and returns the model. `start` makes the initial model if there is no checkpoint.
-    ///
-    /// # Errors
-    /// [`TrainError::Interrupted`] after `stop` was set and the state saved, [`TrainError::Diverged`] after too many skipped
-    /// steps, [`TrainError::Stopped`] with an error of data, model or disk.
     pub fn train(
         &self,
         start: impl FnOnce(&mut dyn Sink) -> Result<Clift, TrainError>,
@@ -78,7 +74,6 @@ pub(crate) struct TrainLoop<'a> {
     saved: u64,
     validation: &'a Validation<'a>,
     stop: &'a AtomicBool,
-    /// Receiver of events.
     pub(crate) log: RunLog<'a>,
 }
 
@@ -95,7 +90,6 @@ impl<'a> TrainLoop<'a> {
         Self { plan, checkpoints, saved: progress.step, progress, validation, stop, log }
     }
 
-    /// Makes the remaining steps and returns the trained model.
     pub fn run(&mut self, mut train_state: TrainState) -> Result<Clift, TrainError> {
         // The process may have been killed between a checkpoint and the validation of its step.
         self.validate_if_due(&train_state)?;
@@ -176,10 +170,7 @@ impl<'a> TrainLoop<'a> {
         }));
     }
 
-    /// Counts and logs a step without update.
-    ///
-    /// # Errors
-    /// [`TrainError::Diverged`] after `max_bad_steps` consecutive ones.
+    /// Counts and logs a step without update; [`TrainError::Diverged`] after `max_bad_steps` consecutive ones.
     fn skip_step(&mut self, anomaly: StepAnomaly, update: Update, batch: &StageBatch) -> Result<(), TrainError> {
         self.progress.bad_steps += 1;
         self.progress.num_bad_steps += 1;
@@ -265,8 +256,7 @@ impl<'a> TrainLoop<'a> {
     }
 
     fn newest_checkpoint(&self) -> String {
-        let newest = self.checkpoints.newest().ok().flatten();
-        newest.map_or("none".into(), |path| path.display().to_string())
+        self.checkpoints.newest().ok().flatten().map_or("none".into(), |path| path.display().to_string())
     }
 
     /// Adds the last step and the newest checkpoint to an error.

@@ -25,9 +25,6 @@ pub struct Validation<'a> {
 
 impl<'a> Validation<'a> {
     /// Chooses the scenes and views of `reader` by `eval`, for an evaluation on `device`.
-    ///
-    /// # Errors
-    /// As [`Evaluator::new`], and [`TrainError::BadConfig`] for tensors that the device cannot hold.
     pub fn new(
         config: &'a Config,
         eval: EvalConfig,
@@ -102,9 +99,6 @@ impl<'a> Validation<'a> {
     }
 
     /// Evaluates models, and external methods beside them, and writes the results to `folder`.
-    ///
-    /// # Errors
-    /// As [`Evaluator::evaluate`].
     pub fn evaluate(
         &self,
         models: &EvalModels,

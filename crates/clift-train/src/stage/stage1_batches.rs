@@ -19,10 +19,6 @@ pub struct Stage1Batches {
 }
 
 impl Stage1Batches {
-    /// Prepares the batches of a run.
-    ///
-    /// # Errors
-    /// Those of the sampler, and an image size that is no multiple of the patch size.
     pub fn new(config: &Config, reader: &ClipReader) -> Result<Self, TrainError> {
         let seed = derive_seed(config.seed, "stage1");
         let read = reader.clone();
@@ -41,9 +37,6 @@ impl Stage1Batches {
     /// Makes the batch of `step`, counted from 0.
     ///
     /// The share of tokens is sampled once per step; every target view gets its own random subset.
-    ///
-    /// # Errors
-    /// As [`TrainingClips::batch`].
     pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
         let batch = self.clips.batch(step)?;
         let num_context = batch.clips.first().map_or(0, |clip| clip.context.num_views());

@@ -29,10 +29,6 @@ pub struct Stage2Batches {
 }
 
 impl Stage2Batches {
-    /// Prepares the batches of a run.
-    ///
-    /// # Errors
-    /// [`TrainError::NoScenes`] for an empty cache.
     pub fn new(config: &Config, reader: &ClipReader, cache: Arc<ClusterCache>) -> Result<Self, TrainError> {
         let mut groups: BTreeMap<_, Vec<usize>> = BTreeMap::new();
         for (i, entry) in cache.entries().iter().enumerate() {
@@ -52,9 +48,6 @@ impl Stage2Batches {
     }
 
     /// Makes the batch of `step`, counted from 0: samples a group, then its entries.
-    ///
-    /// # Errors
-    /// [`TrainError::NoScenes`] if all attempts for a slot fail.
     pub fn batch(&self, step: u64) -> Result<StageBatch, TrainError> {
         let group = &self.groups[self.sample_group(step)];
         let (mut clips, mut clusters, mut skipped) = (Vec::new(), Vec::new(), Vec::new());

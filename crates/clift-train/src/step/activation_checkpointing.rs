@@ -95,29 +95,24 @@ fn block_inputs<B>(
 ) -> (Vec<Tensor<3>>, Tensor<3>) {
     let mut inputs = vec![first];
     for block in blocks {
-        let x = inputs[inputs.len() - 1].clone();
-        inputs.push(forward(block, x));
+        inputs.push(forward(block, inputs[inputs.len() - 1].clone()));
     }
     let last = inputs.pop().expect("the first input");
     (inputs, last)
 }
 
-/// Makes a leaf of the autodiff graph.
 fn leaf(x: Tensor<3>) -> Tensor<3> {
     x.autodiff().require_grad()
 }
 
-/// Backpropagates from `output`, whose gradient is `grad`.
 fn backward_from(output: Tensor<3>, grad: Tensor<3>) -> Gradients {
     (output * grad.autodiff()).sum().backward()
 }
 
-/// Takes the gradient of a leaf, zeros if the leaf has none.
 fn take_gradient(leaf: &Tensor<3>, grads: &mut Gradients) -> Tensor<3> {
     leaf.grad_remove(grads).unwrap_or_else(|| leaf.clone().inner().zeros_like())
 }
 
-/// Whether any parameter requires a gradient.
 fn trains<M: Module>(module: &M) -> bool {
     struct Any(bool);
     impl ModuleVisitor for Any {

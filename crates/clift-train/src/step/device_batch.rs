@@ -47,6 +47,5 @@ pub fn render_loss(
 ) -> Result<LossParts, TrainError> {
     let lift = model.encode(&device_batch.context); // [B, N, D]
     let tokens = selection.apply(&model.condenser, lift)?;
-    let rendering = model.render(tokens, &device_batch.targets);
-    Ok(loss.of(rendering, device_batch.target_images.clone()))
+    Ok(loss.of(model.render(tokens, &device_batch.targets), device_batch.target_images.clone()))
 }

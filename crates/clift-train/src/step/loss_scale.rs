@@ -107,7 +107,6 @@ mod tests {
         use crate::stage::settings::freeze;
         use crate::step::seeded_inputs::{ClipShape, seeded_batch, seeded_model};
         use crate::step::train_state::TrainState;
-
         let device = burn::tensor::Device::flex();
         let sizes = clift_model::ModelConfig {
             dim: 16,

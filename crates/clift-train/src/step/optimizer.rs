@@ -44,13 +44,11 @@ pub fn clip_global_norm<M: Module>(module: &M, grads: GradientsParams, norm: f64
     scale_gradients(module, grads, clip_factor(norm, max_norm))
 }
 
-/// Returns the factor that clips gradients with global norm `norm` to `max_norm`.
 pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
     // PyTorch's guard against a norm of zero.
     (max_norm / (norm + 1e-6)).min(1.0)
 }
 
-/// Multiplies all gradients of a module by a factor.
 pub fn scale_gradients<M: Module>(module: &M, grads: GradientsParams, factor: f64) -> GradientsParams {
     struct Scale {
         grads: GradientsParams,

@@ -133,8 +133,7 @@ pub fn seeded_model(config: &ModelConfig, seed: u64, device: &Device) -> Clift {
             })
         }
     }
-    let model = Clift::new(config, seed, &device.clone().autodiff());
-    model.map(&mut OpenGates { seed, path: Vec::new() })
+    Clift::new(config, seed, &device.clone().autodiff()).map(&mut OpenGates { seed, path: Vec::new() })
 }
 
 #[cfg(test)]

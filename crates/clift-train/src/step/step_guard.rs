@@ -76,11 +76,8 @@ impl LossHistory {
 pub struct SkippedStep {
     /// The skipped step, from 1.
     pub step: u64,
-    /// The stage.
     pub stage: Stage,
-    /// The reason.
     pub reason: StepAnomaly,
-    /// Loss of the batch.
     pub loss: Option<f64>,
     /// Global norm of the gradient before clipping.
     pub grad_norm: Option<f64>,
@@ -90,14 +87,11 @@ pub struct SkippedStep {
     pub median_grad_norm: Option<f64>,
     /// Number of consecutive skipped steps, including this one.
     pub in_a_row: u32,
-    /// Scenes of the batch.
     pub scenes: Vec<SkippedStepScene>,
 }
 
-/// A clip of a skipped batch.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkippedStepScene {
-    /// Key of the scene.
     pub key: String,
     /// Frames of the contexts.
     pub context: Vec<usize>,
@@ -106,7 +100,6 @@ pub struct SkippedStepScene {
 }
 
 impl SkippedStepScene {
-    /// Lists the clips of a batch.
     pub fn all(batch: &StageBatch) -> Vec<Self> {
         let scene = |clip: &clift_data::Clip| Self {
             key: clip.key.clone(),

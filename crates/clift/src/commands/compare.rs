@@ -8,7 +8,6 @@ use crate::commands::parse::parse_methods;
 use crate::commands::shared_args::JsonArg;
 use crate::output::stdout::print_result;
 
-/// Compares two evaluations, prints the table and writes the JSON.
 pub fn run(args: &CompareArgs) -> anyhow::Result<()> {
     let (a, b) = (Evaluation::read(&args.a)?, Evaluation::read(&args.b)?);
     let comparison = Comparison::new(&a, &b, args.methods.as_ref())?;
@@ -16,7 +15,6 @@ pub fn run(args: &CompareArgs) -> anyhow::Result<()> {
     args.json.write(&comparison)
 }
 
-/// Arguments of `clift compare`.
 #[derive(Debug, clap::Args)]
 pub struct CompareArgs {
     /// First evaluation

@@ -17,10 +17,8 @@ use crate::exit_code::{UsageError, usage_bail};
 use crate::output::stdout::{print_note, print_result};
 use crate::output::units::file_size;
 
-/// Most scene keys listed in an error message.
 const MAX_LISTED_KEYS: usize = 8;
 
-/// Arguments of `clift encode`.
 #[derive(Debug, clap::Args)]
 pub struct EncodeArgs {
     /// Run or model directory, or model.safetensors in one of them
@@ -54,7 +52,6 @@ pub struct EncodeArgs {
     pub overrides: ConfigArgs,
 }
 
-/// Encodes one scene and writes its file.
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_output_path(&args.out).map_err(|error| UsageError(error.to_string()))?;
     let model = ModelPath::find(&args.model)?;
@@ -116,7 +113,6 @@ fn frame_positions(
     frames.iter().map(position).collect()
 }
 
-/// Describes the written scene file.
 fn describe(encoded: &EncodedScene, format: TokenFormat, path: &Path) -> String {
     let EncodedScene { scene, num_lift_tokens, cluster_error } = encoded;
     let num_tokens = scene.num_tokens();
@@ -134,8 +130,7 @@ fn describe(encoded: &EncodedScene, format: TokenFormat, path: &Path) -> String 
     )
 }
 
-/// Opens a data set or a single scene. The `data.files` keys of the run describe another data set: they apply only if
-/// `--set` sets one of them.
+/// The `data.files` keys of the run describe another data set: they apply only if `--set` sets one of them.
 fn open_folder(
     folder: &Path,
     split: Split,

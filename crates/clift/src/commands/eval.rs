@@ -14,7 +14,6 @@ use crate::interrupt;
 use crate::output::bar::progress_sink;
 use crate::output::stdout::{print_evaluation, print_note};
 
-/// Evaluates a run or a model and prints the table.
 pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let external = external_methods(args)?;
     let model = args.checkpoint.as_deref().map(ModelPath::find).transpose()?;
@@ -50,7 +49,6 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     print_evaluation(&summary, &out)
 }
 
-/// Reads the config of a run or model directory and applies the options of the command line.
 fn eval_config(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
     let mut config = args.overrides.read(&folder.join("config.toml"), |_| Ok(()))?;
     // The directory may have been moved since it was written.
@@ -80,7 +78,6 @@ fn eval_config(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
     Ok(config)
 }
 
-/// Returns the external methods of `--predictions`, each with its name and data size.
 fn external_methods(args: &EvalArgs) -> anyhow::Result<Vec<ExternalMethod>> {
     let EvalArgs { predictions, name, data_size, .. } = args;
     for (flag, count) in [("--name", name.len()), ("--data-size", data_size.len())] {
@@ -103,7 +100,6 @@ fn external_methods(args: &EvalArgs) -> anyhow::Result<Vec<ExternalMethod>> {
     Ok(methods)
 }
 
-/// Arguments of `clift eval`.
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
     /// Run directory

@@ -8,7 +8,6 @@ use clift_train::{Config, ExportFormat, export, read_config, require_absent};
 use crate::commands::parse::parse_format;
 use crate::output::stdout::print_result;
 
-/// Arguments of `clift export`.
 #[derive(Debug, clap::Args)]
 pub struct ExportArgs {
     /// Model directory, run directory, or model.safetensors in one of them
@@ -22,7 +21,6 @@ pub struct ExportArgs {
     pub out: PathBuf,
 }
 
-/// Writes the weights of a model for PyTorch.
 pub fn run(args: &ExportArgs) -> anyhow::Result<()> {
     require_absent(&args.out)?;
     let model = ModelPath::find(&args.model)?;

@@ -24,7 +24,6 @@ struct Counts {
     rows: Vec<Row>,
 }
 
-/// Cost of one part.
 #[derive(Debug, Serialize)]
 struct Row {
     /// `render` (per view), `encode` or `condense` (per scene).
@@ -33,13 +32,10 @@ struct Row {
     num_tokens: usize,
     /// Cost in 10^9 units of the convention.
     giga: f64,
-    /// Multiply-accumulates of linear layers.
     linear_macs: u64,
-    /// Multiply-accumulates of attention.
     attention_macs: u64,
 }
 
-/// Sizes of the network, of the views and of the token counts.
 struct Sizes {
     model: ModelConfig,
     height: usize,
@@ -49,7 +45,6 @@ struct Sizes {
     counts: Vec<TokenCount>,
 }
 
-/// Counts, prints the table and writes the JSON.
 pub fn run(args: &FlopsArgs) -> anyhow::Result<()> {
     let sizes = sizes(args)?;
     let counts = count(&sizes, args.convention)?;
@@ -108,7 +103,6 @@ fn report_text(counts: &Counts, convention: FlopConvention) -> String {
     format!("views of {width} x {height}, {num_context} context views, {num_tokens} tokens\n\n{table}")
 }
 
-/// Arguments of `clift flops`.
 #[derive(Debug, clap::Args)]
 pub struct FlopsArgs {
     /// Config file (TOML) with the sizes to count [default: the paper's sizes]
@@ -130,7 +124,6 @@ pub struct FlopsArgs {
 mod tests {
     use super::*;
 
-    /// The counts of the paper's network.
     fn counts(convention: FlopConvention) -> Counts {
         let json = JsonArg { path: None };
         let args = FlopsArgs { config: None, convention, render: Vec::new(), set: Vec::new(), json };

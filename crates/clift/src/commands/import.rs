@@ -9,7 +9,6 @@ use crate::commands::parse::parse_rename;
 use crate::interrupt;
 use crate::output::stdout::print_result;
 
-/// Arguments of `clift import`.
 #[derive(Debug, clap::Args)]
 pub struct ImportArgs {
     /// Checkpoint written by PyTorch
@@ -34,7 +33,6 @@ pub struct ImportArgs {
     pub rename: Vec<(String, String)>,
 }
 
-/// Imports a checkpoint and prints the origin of every parameter.
 pub fn run(args: &ImportArgs) -> anyhow::Result<()> {
     let options = ImportOptions {
         variant: args.variant,
@@ -61,7 +59,6 @@ pub fn run(args: &ImportArgs) -> anyhow::Result<()> {
     print_result(&lines.join("\n"))
 }
 
-/// Describes the content of the checkpoint that was skipped or converted.
 fn skipped(record: &ImportRecord) -> Vec<String> {
     let ignored =
         record.ignored.iter().map(|(first, count)| format!("skipped, other networks: {count} keys {first}.*"));

@@ -45,7 +45,6 @@ pub(crate) fn parse_stage(text: &str) -> Result<Stage, String> {
     stages.into_iter().find(|stage| stage.name() == text).ok_or_else(|| "write stage1, clusters or stage2".into())
 }
 
-/// Parses a number of at least 1.
 pub(crate) fn parse_count(text: &str) -> Result<usize, String> {
     text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "write a number of at least 1".into())
 }
@@ -67,7 +66,6 @@ pub(crate) fn parse_views(text: &str) -> Result<[usize; 2], String> {
     views.ok_or_else(|| "write contexts (at least 2) and targets, e.g. 4+6".into())
 }
 
-/// Parses milliseconds per frame.
 pub(crate) fn parse_budget_ms(text: &str) -> Result<f64, String> {
     let budget = text.parse().ok().filter(|budget: &f64| *budget > 0.0 && budget.is_finite());
     budget.ok_or_else(|| "write milliseconds per frame, more than 0".into())

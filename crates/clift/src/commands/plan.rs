@@ -11,7 +11,6 @@ use crate::output::stdout::{print_note, print_result};
 use crate::output::table::table;
 use crate::output::units::{duration, memory_size, seconds};
 
-/// Estimates a run, prints the tables and writes the JSON.
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, check_plan)?;
     args.json.check_folder()?;
@@ -24,7 +23,6 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     args.json.write(&plan)
 }
 
-/// Formats the largest tensor of each part beside the limit of the device.
 fn largest_tensors(config: &Config) -> anyhow::Result<String> {
     // A plan for a device that this machine does not have shows no limit.
     let limit = config.device.open().ok().and_then(|device| max_tensor_bytes(&device));
@@ -74,7 +72,6 @@ fn cells(part: &PartPlan) -> [String; 8] {
     ]
 }
 
-/// Arguments of `clift plan`.
 #[derive(Debug, clap::Args)]
 pub struct PlanArgs {
     /// Config file (TOML)

@@ -32,9 +32,6 @@ impl ConfigArgs {
 }
 
 /// Reads a config, applies the overrides of `--set`, checks the values and prints what changed.
-///
-/// # Errors
-/// [`clift_train::ConfigError`] for a file or an override that is no valid config, and the errors of `check`.
 pub fn read_config(
     path: &Path,
     set: &[String],
@@ -47,7 +44,6 @@ pub fn read_config(
     Ok((config, overrides))
 }
 
-/// The option `--json`.
 #[derive(Debug, clap::Args)]
 pub struct JsonArg {
     /// Write the results as JSON
@@ -91,7 +87,6 @@ impl ChunkArgs {
         self.chunk_mb * 1_000_000
     }
 
-    /// Returns the encoding of images that are encoded.
     pub fn encoding(&self) -> ImageEncoding {
         self.quality.map_or(ImageEncoding::Png, ImageEncoding::Jpeg)
     }

@@ -36,15 +36,11 @@ pub struct SourceArgs {
 
 impl SourceArgs {
     /// Returns the options of `--set` and what they changed.
-    ///
-    /// # Errors
-    /// [`clift_train::ConfigError`] for any other key and for values of another type.
     pub fn files(&self) -> anyhow::Result<(FileOptions, Vec<Override>)> {
         let (keys, changes) = parse_config::<Keys>(Path::new("--set"), "", &self.set)?;
         Ok((keys.data.files, changes))
     }
 
-    /// Opens the present splits.
     pub fn open(&self, splits: Splits) -> anyhow::Result<Vec<SplitSource>> {
         open_splits(&self.dir, splits, &self.files()?.0)
     }
@@ -63,7 +59,6 @@ impl SplitSource {
         self.split.map_or_else(|| "scenes".into(), |split| split.to_string())
     }
 
-    /// Prints skipped scenes and notes from opening the source.
     pub fn print_report(&self) {
         if self.opened.report.has_content() {
             print_note(&format!("{}: {}", self.name(), self.opened.report));
@@ -84,8 +79,7 @@ pub fn read_all_options() -> SourceOptions {
     SourceOptions { reads_chunks: true, ..SourceOptions::default() }
 }
 
-/// Opens the requested splits that exist. A folder without `train/` and `test/` is opened once, unless a list of test
-/// scenes divides it.
+/// Opens a folder without `train/` and `test/` once, unless a list of test scenes divides it.
 pub fn open_splits(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::Result<Vec<SplitSource>> {
     // An empty list divides nothing.
     let list = files.test_scenes.as_deref().map(TestScenes::read).transpose()?;
@@ -111,7 +105,6 @@ pub fn open_splits(root: &Path, splits: Splits, files: &FileOptions) -> anyhow::
     Ok(sources)
 }
 
-/// One split, or both.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Splits {
     /// Training scenes

@@ -11,7 +11,6 @@ use crate::interrupt;
 use crate::output::bar::progress_sink;
 use crate::output::stdout::{print_evaluation, print_note};
 
-/// Trains a run and prints its evaluation.
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, Config::validate)?;
     // Before the system ends a run for its memory after hours of training.
@@ -28,7 +27,6 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     summary.map_or(Ok(()), |summary| print_evaluation(&summary, &run_dir.join("eval")))
 }
 
-/// Arguments of `clift train`.
 #[derive(Debug, clap::Args)]
 pub struct TrainArgs {
     /// Config file (TOML)

@@ -11,7 +11,6 @@ use crate::output::plain::PlainLines;
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
 
-/// Creates a progress bar if the standard error is a terminal, progress lines otherwise.
 pub fn progress_sink() -> Box<dyn Sink> {
     if std::io::stderr().is_terminal() {
         Box::new(Bar::default())
@@ -57,7 +56,6 @@ impl Sink for Bar {
 // copies of itself behind.
 const TEMPLATE: &str = "{prefix} {bar:16.cyan/dim} {pos}/{len}{pace}  {wide_msg}";
 
-/// Creates a bar on the standard error, at `done` of `total`.
 pub(crate) fn progress_bar(name: &str, done: u64, total: u64) -> ProgressBar {
     // Steps of an earlier process must not count for the rate: the position is set before the clock starts.
     let hidden = ProgressDrawTarget::hidden();

@@ -9,7 +9,6 @@ use crate::output::bar::progress_bar;
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
 
-/// Seconds between two progress lines.
 const INTERVAL_S: f64 = 10.0;
 
 /// A counter of finished items: a bar on a terminal, a line every ten seconds elsewhere.
@@ -22,14 +21,12 @@ pub struct Counter {
 }
 
 impl Counter {
-    /// Creates a counter from 0 to `total`.
     pub fn new(name: &str, total: u64) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| progress_bar(name, 0, total));
         let now = Instant::now();
         Self { name: name.into(), total, bar, started: now, last_line: now }
     }
 
-    /// Sets the number of finished items.
     pub fn set(&mut self, done: u64) {
         match &self.bar {
             Some(bar) => bar.set_position(done),
@@ -42,7 +39,6 @@ impl Counter {
         }
     }
 
-    /// Prints a line, above the bar if there is one.
     pub fn note(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.println(line),

@@ -4,12 +4,10 @@ use clift_train::{Event, Stage, StepEvent};
 
 use crate::output::units::duration;
 
-/// Formats loss, PSNR and learning rate of a step.
 pub(crate) fn step_metrics(step: &StepEvent) -> String {
     format!("loss {:.4}  {:.2} dB  lr {:.2e}", step.loss, step.psnr, step.lr)
 }
 
-/// Formats an event; `None` for steps and other progress.
 pub(crate) fn event_line(event: &Event) -> Option<String> {
     let unit = |stage: Stage| match stage {
         Stage::Stage1 | Stage::Stage2 => "steps",

@@ -20,7 +20,6 @@ pub struct PlainLines<W> {
 }
 
 impl<W: Write> PlainLines<W> {
-    /// Creates a sink that writes to `out`.
     pub fn new(out: W) -> Self {
         Self { out, since_line_s: 0.0, pace: (0, 0.0), printed_tenth: 0 }
     }

@@ -6,10 +6,7 @@ use std::path::Path;
 use anyhow::Context;
 use clift_eval::Summary;
 
-/// Writes one or more lines to the standard output and flushes them.
-///
-/// # Errors
-/// Errors of the operating system. A closed pipe, as `head` leaves behind, is no error.
+/// Writes lines to the standard output and flushes them. A closed pipe, as `head` leaves behind, is no error.
 pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
 }
@@ -36,7 +33,6 @@ pub fn print_note(text: &str) {
 mod tests {
     use super::*;
 
-    /// A stream that fails when it is flushed.
     struct Fails(ErrorKind);
 
     impl Write for Fails {

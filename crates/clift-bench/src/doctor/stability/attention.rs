@@ -50,7 +50,6 @@ pub(crate) const CASES: &[StabilityCase] = &[
     },
 ];
 
-/// Measures cross-attention of some queries over many tokens.
 fn long_attention(devices: &CaseDevices) -> Result<Outcome, TrainError> {
     const DIM: usize = 32;
     let (keys, queries) = (devices.size.pick(2048, 1 << 16), devices.size.pick(16, 1024));
@@ -59,7 +58,6 @@ fn long_attention(devices: &CaseDevices) -> Result<Outcome, TrainError> {
     operation_error(devices, [query, key_value], |[query, key_value]| cross_sdpa(query, key_value, 2))
 }
 
-/// Measures cross-attention whose largest score is `largest`.
 fn attention_up_to(devices: &CaseDevices, largest: f64) -> Result<Outcome, TrainError> {
     let (dim, count) = (32, devices.size.pick(64, 1024));
     let (query, key_value) = scores_up_to(devices, largest, [count, count], dim);
@@ -107,7 +105,6 @@ fn level_scores(devices: &CaseDevices, level: f64, [queries, keys]: [usize; 2]) 
     [query, Tensor::cat(vec![key, uniform(keys, DIM, "stability value")], 2)]
 }
 
-/// Measures attention inside clusters with scores near 1e4 and -1e4.
 fn clustered_attention(devices: &CaseDevices) -> Result<Outcome, TrainError> {
     let (stored, members) = (devices.size.pick(8, 64), devices.size.pick(64, 1024));
     let inputs = level_scores(devices, 1e4, [stored, members]);

@@ -13,7 +13,6 @@ pub enum CaseSize {
 }
 
 impl CaseSize {
-    /// Returns the value of this size.
     pub(crate) fn pick<T>(self, small: T, full: T) -> T {
         match self {
             Self::Small => small,
@@ -51,7 +50,6 @@ pub enum Bound {
     Refused(&'static str),
 }
 
-/// Computation of a case on its devices.
 pub(crate) type RunCase = fn(&CaseDevices) -> Result<Outcome, TrainError>;
 
 /// One hard case.

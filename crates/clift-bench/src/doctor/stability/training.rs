@@ -32,7 +32,6 @@ pub(crate) const CASES: &[StabilityCase] = &[StabilityCase {
     },
 }];
 
-/// Number of updates.
 const STEPS: usize = 20;
 
 /// Returns the losses of [`STEPS`] updates on one batch.

@@ -74,7 +74,6 @@ pub(crate) const CASES: &[StabilityCase] = &[
 /// Share of the largest gradient below which a gradient counts as rounding noise.
 const NOISE_SHARE: f64 = 1e-3;
 
-/// Returns the network of the cases.
 pub(crate) fn network(devices: &CaseDevices) -> ModelConfig {
     ModelConfig {
         dim: devices.size.pick(16, 64),
@@ -92,13 +91,11 @@ pub(crate) fn shape(devices: &CaseDevices, num_context: usize) -> ClipShape {
     ClipShape { num_context, num_targets: if num_context == 1 { 1 } else { 2 }, size: [side, side] }
 }
 
-/// Returns the number of tokens of such a scene.
 pub(crate) fn num_tokens(devices: &CaseDevices, num_context: usize) -> usize {
     let [height, width] = shape(devices, num_context).size;
     num_context * (height / 8) * (width / 8)
 }
 
-/// Returns the error of an update of stage 1 on a scene after `change`.
 fn changed_views(devices: &CaseDevices, num_context: usize, change: impl Fn(&mut Clip)) -> Result<Outcome, TrainError> {
     let mut batch: StageBatch =
         seeded_batch(shape(devices, num_context), 1, num_tokens(devices, num_context), None, 0)?;
@@ -106,7 +103,6 @@ fn changed_views(devices: &CaseDevices, num_context: usize, change: impl Fn(&mut
     stage_error(devices, Stage::Stage1, &batch)
 }
 
-/// Returns the error of an update of a stage.
 pub(crate) fn stage_error(devices: &CaseDevices, stage: Stage, batch: &StageBatch) -> Result<Outcome, TrainError> {
     let model = freeze(stage, seeded_model(&network(devices), 0, &devices.device));
     Ok(Outcome::Error(update_error(&model, batch, &devices.device, &devices.reference, NOISE_SHARE)?))

@@ -15,10 +15,8 @@ use crate::tools::check::result::{MAX_EPIPOLAR_PX, PairCheck, SceneCheck};
 use crate::tools::features::epipolar::{Correspondence, epipolar_distance, fundamental_from_cameras};
 use crate::tools::features::image_features::Features;
 
-/// Number of pairs of frames of a scene.
 const NUM_PAIRS: usize = 9;
-/// Frames of a scene over the gap of a pair, tried in this order: a larger gap shows wrong poses better, but fewer
-/// corners match.
+/// Frames of a scene over the gap of a pair, in order: a larger gap shows wrong poses better, but fewer corners match.
 const GAP_DIVISORS: [usize; 4] = [6, 10, 16, 24];
 /// Largest number of matches of one pair in the median of the scene, so that no pair dominates.
 const MAX_MATCHES: usize = 150;
@@ -27,7 +25,6 @@ const MIN_MATCHES: usize = 40;
 /// Epipolar distance in pixels above which a note on a pair is added in a scene that passes.
 const NOTED_PX: f64 = 3.0;
 
-/// A pair of frames with its matches.
 struct Pair {
     check: PairCheck,
     geometry: DMat3,
@@ -146,7 +143,6 @@ impl SceneViews<'_> {
         self.features[frame].get_or_init(find).as_ref()
     }
 
-    /// Plots a pair side by side with epipolar lines.
     fn plot(&self, pair: &Pair) -> Option<RgbImage> {
         let [first, second] = pair.check.frames;
         let frames = [self.source.frame(self.scene, first).ok()?, self.source.frame(self.scene, second).ok()?];

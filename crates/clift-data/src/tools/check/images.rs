@@ -11,7 +11,6 @@ use crate::scene_source::SceneSource;
 use crate::skip_report::plural;
 use crate::tools::check::result::SceneCheck;
 
-/// Largest number of frames listed in a message.
 const MAX_NAMED: usize = 5;
 /// Distance of two cameras over the extent of all centres above which equal images contradict the poses.
 const MAX_MOVE: f64 = 0.02;
@@ -55,7 +54,6 @@ pub(crate) fn check_images(
     sizes
 }
 
-/// Compares the cameras of equal images.
 fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
     let extent = extent(cameras);
     let mut seen: HashMap<u64, usize> = HashMap::new();

@@ -123,7 +123,6 @@ fn pages_without_selections_or_points_explain_the_gap() {
     plain.figures[0].selections.clear();
     let html = page(&plain);
     assert!(html.contains("--render 1/4,1/2") && !html.contains("Quality against rendered tokens"));
-
     plain.summary.points.clear();
     plain.figures.clear();
     plain.skipped = SkipReport::default();

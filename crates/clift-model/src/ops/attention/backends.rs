@@ -120,7 +120,6 @@ pub trait AttentionKernels: MatmulKernels {
         composed_forward::<Self>(inputs, heads)
     }
 
-    /// Computes the gradients of the inputs from the gradient of the output.
     fn attend_backward(
         inputs: Qkv<FloatTensor<Self>>,
         attended: AttentionOutput<FloatTensor<Self>>,
@@ -132,6 +131,5 @@ pub trait AttentionKernels: MatmulKernels {
 }
 
 impl AttentionKernels for NdArray {}
-
 #[cfg(feature = "wgpu")]
 impl AttentionKernels for burn::backend::Cube {}

@@ -14,7 +14,6 @@ pub struct HeadConfig {
 }
 
 impl HeadConfig {
-    /// Takes the current precision of this thread.
     pub(crate) fn now(num_heads: usize) -> Self {
         Self { num_heads, precision: Precision::current() }
     }
@@ -25,7 +24,6 @@ impl HeadConfig {
 pub enum Qkv<T> {
     /// Queries, keys and values side by side: `[B, N, 3D]`.
     Packed(T),
-    /// Queries apart from keys and values.
     Separate {
         /// Queries, `[B, Q, D]`.
         query: T,
@@ -34,7 +32,6 @@ pub enum Qkv<T> {
     },
 }
 
-/// Result of an attention.
 #[derive(Clone, Debug)]
 pub struct AttentionOutput<T> {
     /// Output, `[B, Q, D]`.
@@ -161,8 +158,7 @@ fn rows<B: Backend>(x: &FloatTensor<B>, (start, end): (usize, usize)) -> FloatTe
     if (start, end) == (0, count) {
         return x.clone();
     }
-    let ranges = [0..batch, 0..num_heads, start..end, 0..width].map(Slice::from);
-    B::float_slice(x.clone(), &ranges)
+    B::float_slice(x.clone(), &[0..batch, 0..num_heads, start..end, 0..width].map(Slice::from))
 }
 
 fn concat<B: Backend>(mut chunks: Vec<FloatTensor<B>>) -> FloatTensor<B> {

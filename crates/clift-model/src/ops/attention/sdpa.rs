@@ -59,10 +59,7 @@ pub fn cross_sdpa(query: Tensor<3>, key_value: Tensor<3>, num_heads: usize) -> T
 /// The operations of [`self_sdpa`] and [`cross_sdpa`] on a backend.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait AttentionOps: Backend {
-    /// See [`self_sdpa`].
     fn self_sdpa(query_key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self>;
-
-    /// See [`cross_sdpa`].
     fn cross_sdpa(query: FloatTensor<Self>, key_value: FloatTensor<Self>, heads: HeadConfig) -> FloatTensor<Self>;
 }
 
@@ -125,7 +122,6 @@ struct SdpaState<T> {
 }
 
 impl<T> SdpaState<T> {
-    /// Computes the gradients of the inputs.
     fn backward<B: AttentionKernels<FloatTensorPrimitive = T>>(self, grad_output: T) -> Qkv<T> {
         B::attend_backward(self.inputs, self.attended, self.heads, grad_output)
     }
@@ -171,7 +167,6 @@ mod tests {
         cross_sdpa(query, Tensor::cat(vec![key, value], 2), num_heads)
     }
 
-    /// Composes attention of Burn's differentiable operations: the plain reference.
     fn plain(query: Tensor<3>, key: Tensor<3>, value: Tensor<3>, num_heads: usize) -> Tensor<3> {
         let [batch, num_queries, dim] = query.dims();
         let num_keys = key.dims()[1];

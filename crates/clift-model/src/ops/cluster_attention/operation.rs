@@ -52,7 +52,6 @@ pub fn cluster_attention(
 /// The operation of [`cluster_attention`] on a backend.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "wgpu"), Autodiff)]
 pub trait ClusterAttentionOps: Backend {
-    /// See [`cluster_attention`].
     fn cluster_attention(
         query: FloatTensor<Self>,
         key_value: FloatTensor<Self>,
@@ -78,7 +77,6 @@ pub trait ClusterAttentionKernels: Backend {
     }
 }
 
-/// Inputs of [`cluster_attention`].
 #[derive(Clone, Debug)]
 pub struct ClusterInputs<B: Backend> {
     pub(crate) query: FloatTensor<B>,
@@ -149,8 +147,7 @@ fn split<B: Backend>(key_value: FloatTensor<B>, num_heads: usize) -> [FloatTenso
     let [batch, count, width] = key_value.shape().dims();
     let dim = width / 2;
     [0..dim, dim..width].map(|columns| {
-        let part = B::float_slice(key_value.clone(), &[0..batch, 0..count, columns].map(Slice::from));
-        flatten::<B>(part, num_heads)
+        flatten::<B>(B::float_slice(key_value.clone(), &[0..batch, 0..count, columns].map(Slice::from)), num_heads)
     })
 }
 

@@ -47,13 +47,11 @@ impl Folder {
         self.0.path().join("room.clift")
     }
 
-    /// The bytes of a valid file.
     fn bytes(&self, format: TokenFormat) -> Vec<u8> {
         scene().write(&self.path(), format).expect("writes");
         std::fs::read(self.path()).expect("reads")
     }
 
-    /// Expects an error for a file of these bytes.
     fn assert_refused(&self, bytes: &[u8], expected: &str) {
         std::fs::write(self.path(), bytes).expect("writes");
         let error = Scene::read(&self.path()).expect_err("an invalid file");
@@ -64,7 +62,6 @@ impl Folder {
         assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
     }
 
-    /// Expects an error for a valid file with parts of its header replaced.
     fn assert_header_refused(&self, changes: &[(&str, &str)], expected: &str) {
         let bytes = self.bytes(TokenFormat::F32);
         let mut header = String::from_utf8(bytes[8..8 + HEADER_BYTES].to_vec()).expect("text").trim_end().to_owned();
@@ -90,8 +87,7 @@ fn scenes_survive_a_file_whose_size_is_the_formula() {
         assert_eq!((bytes.len(), scene().file_bytes(format)), (expected, expected as u64), "{format}");
         let (back, found) = Scene::read(&folder.path()).expect("reads");
         assert_eq!(found, format);
-        let tokens = format.round(&scene().tokens, DIM).expect("in range");
-        assert_eq!(back, Scene { tokens, ..scene() });
+        assert_eq!(back, Scene { tokens: format.round(&scene().tokens, DIM).expect("in range"), ..scene() });
         assert_eq!(folder.bytes(format), bytes, "equal scenes are equal files");
         assert!(format != TokenFormat::F32 || back == scene(), "f32 is exact");
     }
@@ -243,7 +239,6 @@ fn only_scene_files_are_overwritten() {
     folder.bytes(TokenFormat::F16);
     std::fs::write(folder.path(), &bytes[..1000]).unwrap();
     folder.bytes(TokenFormat::F16); // replaces a truncated scene
-
     let weights = folder.0.path().join("model.safetensors");
     std::fs::write(&weights, b"weights").unwrap();
     #[cfg(unix)]

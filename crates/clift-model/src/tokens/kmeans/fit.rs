@@ -200,8 +200,7 @@ mod tests {
         for device in devices() {
             let tokens = random([3, 60, 8], 5, &device).cast(burn::tensor::DType::F32);
             let all = fit(&tokens, 7, &[1, 2, 3]);
-            let again = fit(&tokens, 7, &[1, 2, 3]);
-            assert_eq!(all.clusters, again.clusters);
+            assert_eq!(all.clusters, fit(&tokens, 7, &[1, 2, 3]).clusters);
             let one = fit(&tokens.narrow(0, 1, 1), 7, &[2]);
             assert_eq!(all.clusters.scenes()[1], one.clusters.scenes()[0]);
         }
@@ -215,10 +214,8 @@ mod tests {
             assert_valid(&one, 1);
             let spread = to_vec(tokens.clone().var_bias(1).sum_dim(2));
             assert!((one.inertia[1] - 9.0 * spread[1]).abs() < 1e-4, "{} against {}", one.inertia[1], spread[1]);
-            let all = fit(&tokens, 9, &[0, 1]);
-            assert_eq!(all.clusters.scenes()[1], SceneClusters::identity(9));
-            let most = fit(&tokens, 8, &[0, 1]);
-            assert_valid(&most, 8);
+            assert_eq!(fit(&tokens, 9, &[0, 1]).clusters.scenes()[1], SceneClusters::identity(9));
+            assert_valid(&fit(&tokens, 8, &[0, 1]), 8);
             let start =
                 KMeans { max_iterations: 0, ..KMeans::default() }.fit(tokens.clone(), 6, &[0, 1]).expect("fits");
             assert_valid(&start, 6);
@@ -312,10 +309,7 @@ mod tests {
         };
         let (even, odd): (Vec<_>, Vec<_>) = rows.iter().partition(|row| row[0] == 0.0);
         let expected = (spread(&even) + spread(&odd)) / spread(&rows);
-        let error = |tokens: Tensor<3>| {
-            let variance = total_variance(&tokens).unwrap()[0];
-            fit(&tokens, 2, &[1]).error(0, variance)
-        };
+        let error = |tokens: Tensor<3>| fit(&tokens, 2, &[1]).error(0, total_variance(&tokens).unwrap()[0]);
         assert!((error(tokens) / expected - 1.0).abs() < 1e-3); // f32
         assert_eq!(error(Tensor::ones([1, 8, 2], &Device::flex())), 0.0, "equal tokens");
     }

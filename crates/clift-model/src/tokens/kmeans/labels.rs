@@ -15,7 +15,6 @@ pub(crate) struct Labels {
 }
 
 impl Labels {
-    /// Returns the sum of all squared distances.
     pub fn inertia(&self) -> f64 {
         self.distance.iter().sum()
     }

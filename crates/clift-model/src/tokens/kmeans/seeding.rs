@@ -13,10 +13,8 @@ use crate::tokens::kmeans::samples::Samples;
 
 /// Most entries of the table (256 MiB in f32), unless a pool of twice the clusters needs more.
 pub(crate) const MAX_TABLE_LEN: usize = 1 << 26;
-
 /// Rounds of sampling the pool; Bahmani et al. find no gain in more rounds.
 const NUM_ROUNDS: usize = 5;
-
 /// Fewest distances that one thread sums.
 const PARALLEL_LEN: usize = 1 << 15;
 

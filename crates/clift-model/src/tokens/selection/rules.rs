@@ -10,10 +10,8 @@ use crate::views::camera::ViewCamera;
 
 /// Side of a grid cell of the target view in pixels.
 const CELL_PX: f64 = 16.0;
-
 /// Cells along the shorter side of the image with scaled cells, as in an image of 256 pixels.
 const SCALED_CELLS: f64 = 16.0;
-
 /// Cells beyond each edge of the image.
 const MARGIN_CELLS: usize = 4;
 
@@ -97,7 +95,6 @@ impl Default for SelectionRules {
 }
 
 impl SelectionRules {
-    /// Returns the side of a cell in pixels.
     fn cell_px(&self, height: usize, width: usize) -> f64 {
         if self.scaled_cells { height.min(width).max(1) as f64 / SCALED_CELLS } else { CELL_PX }
     }
@@ -108,10 +105,7 @@ impl SelectionRules {
         [height, width].map(|side| (side as f64 / cell_px).ceil() as usize + 2 * MARGIN_CELLS)
     }
 
-    /// Returns the directions through the centers of the grid cells, row by row; margin cells lie outside the image.
-    ///
-    /// # Shapes
-    /// - returns `[rows * columns]` unit directions with `[rows, columns]` of [`SelectionRules::grid`]
+    /// Returns the unit directions through the cell centers, `[rows * columns]`; margin cells lie outside the image.
     pub(crate) fn cell_directions(&self, camera: &ViewCamera, height: usize, width: usize) -> Vec<[f64; 3]> {
         let [rows, columns] = self.grid(height, width);
         let cell_px = self.cell_px(height, width);

@@ -13,7 +13,6 @@ use crate::views::camera::ViewCamera;
 
 /// Fewest cells per task.
 const CELLS_PER_TASK: usize = 16;
-
 /// Distances of a row whose minimum is compared with the limit at once.
 const GROUP: usize = 32;
 
@@ -204,7 +203,6 @@ fn angle(squared_chord: f32) -> f32 {
     if is_acute { angle } else { std::f32::consts::PI - angle }
 }
 
-/// Orders by distance, then by id.
 fn nearer((a, first): (f32, u32), (b, second): (f32, u32)) -> std::cmp::Ordering {
     a.total_cmp(&b).then(first.cmp(&second))
 }

@@ -25,7 +25,6 @@ const CHECKPOINTS: [(&str, CliftVariant, Option<usize>); 5] = [
     ("paper", CliftVariant::Paper, Some(3)),
 ];
 
-/// Imports without interrupt.
 fn import(file: &Path, out: &Path, options: &ImportOptions) -> Result<(Config, ImportRecord), TrainError> {
     crate::interchange::import::import(file, out, options, &AtomicBool::new(false))
 }
@@ -95,7 +94,6 @@ fn network(path: &Path, rename: impl Fn(&str) -> String) -> Vec<HostTensor> {
     state.keys().filter(|key| key.starts_with(PREFIX)).map(tensor).collect()
 }
 
-/// Shapes and bits of tensors by key.
 fn bits(tensors: Vec<HostTensor>) -> BTreeMap<String, (Vec<usize>, Vec<u32>)> {
     let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect();
     tensors.into_iter().map(|(key, shape, values)| (key, (shape, bits(values)))).collect()
@@ -118,7 +116,6 @@ fn checkpoints_compute_as_the_twin_and_round_trip() {
         let summary = export(&config, &model, ExportFormat::Pytorch, &exported).unwrap();
         assert_eq!(summary.has_condenser, imported.has_condenser);
         let [original, written] = [&file, &exported].map(|path| bits(network(path, str::to_owned)));
-        assert_eq!(written.keys().collect::<Vec<_>>(), original.keys().collect::<Vec<_>>(), "{name}");
         assert!(written == original, "{name}: shapes or values differ");
         // The export stores the number of heads.
         let other = import(&exported, &again, &options(variant, Some(config.model.num_heads + 2)));
@@ -145,7 +142,6 @@ fn checkpoints_compute_as_the_twin_and_round_trip() {
     }
 }
 
-/// Shape and values of tensors by key.
 type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
 /// Imports a checkpoint with changed tensors and returns the error message.
@@ -156,7 +152,6 @@ fn refusal(change: impl Fn(&mut Tensors)) -> String {
     refusal_of(tensors.into_iter().map(|(key, (shape, values))| (key, shape, values)).collect())
 }
 
-/// Imports tensors and returns the error message.
 fn refusal_of(tensors: Vec<HostTensor>) -> String {
     let place = tempfile::tempdir().unwrap();
     let file = place.path().join("changed.ckpt");
@@ -262,11 +257,9 @@ fn truncated_damaged_and_hostile_files_are_refused() {
     std::fs::write(&file, &damaged).unwrap();
     assert_says(&refused(&file, place.path(), &re10k()), &["has another checksum"]);
 
-    let hostile = fixture("hostile/calls_system.torch");
     let copy = place.path().join("calls_system.torch");
-    std::fs::copy(hostile, &copy).unwrap();
-    let message = refused(&copy, place.path(), &re10k());
-    assert_says(&message, &["which is not on the allow-list; no code was run"]);
+    std::fs::copy(fixture("hostile/calls_system.torch"), &copy).unwrap();
+    assert_says(&refused(&copy, place.path(), &re10k()), &["which is not on the allow-list; no code was run"]);
 
     // Values that are not finite.
     let message = refusal(|tensors| tensors.get_mut("transformer.output_norm.bias").unwrap().1[3] = f32::INFINITY);

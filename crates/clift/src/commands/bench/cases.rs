@@ -15,7 +15,6 @@ use crate::output::stdout::print_result;
 use crate::output::table::table;
 use crate::output::units::{memory_size, seconds};
 
-/// Times the chosen cases, prints the table and writes the JSON.
 pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
     let config = timing.config.read(args.config.as_deref().unwrap_or(Path::new("")), |_| Ok(()))?;
@@ -40,7 +39,6 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     timing.json.write(&report)
 }
 
-/// Formats the table with its remarks.
 fn report_text(report: &BenchReport) -> String {
     let header = ["case", "median", "p95", "peak memory", "error against f64"];
     let f16 = if report.precision == Precision::F16 { ", f16 products" } else { "" };
@@ -49,7 +47,6 @@ fn report_text(report: &BenchReport) -> String {
     [title, table].into_iter().chain(remarks(&report.rows)).collect::<Vec<_>>().join("\n")
 }
 
-/// Returns an empty line and the remarks that apply to the rows, or nothing.
 fn remarks(rows: &[BenchRow]) -> Vec<String> {
     let has = |test: &dyn Fn(&BenchRow) -> bool| rows.iter().any(test);
     let inertia = rows.iter().find_map(|row| row.inertia);
@@ -90,7 +87,6 @@ pub enum BenchCommand {
     Precision(BenchPrecisionArgs),
 }
 
-/// Arguments of `clift bench`.
 #[derive(Debug, clap::Args)]
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 #[command(after_help = format!("Cases:\n  {}", BenchCase::names()))]

@@ -14,7 +14,6 @@ use crate::exit_code::usage_bail;
 use crate::output::stdout::print_result;
 use crate::output::table::table;
 
-/// Arguments of `clift bench data`.
 #[derive(Debug, clap::Args)]
 pub struct BenchDataArgs {
     /// Data set in any layout
@@ -50,7 +49,6 @@ struct Report {
     throughput: Throughput,
 }
 
-/// Measures reading, prints the table and writes the JSON.
 pub fn run(args: &BenchDataArgs) -> anyhow::Result<()> {
     let _peak = start_peak();
     let Some(split) = open_splits(&args.dir, args.split, &FileOptions::default())?.pop() else {

@@ -10,7 +10,6 @@ use crate::output::stdout::print_result;
 use crate::output::table::table;
 use crate::output::units::seconds;
 
-/// Arguments of `clift bench precision`.
 #[derive(Debug, clap::Args)]
 pub struct BenchPrecisionArgs {
     /// Config file (TOML) with the sizes to time
@@ -19,7 +18,6 @@ pub struct BenchPrecisionArgs {
     pub timing: TimingArgs,
 }
 
-/// Times both precisions in turn, prints the table and writes the JSON.
 pub fn run(args: &BenchPrecisionArgs) -> anyhow::Result<()> {
     let timing = &args.timing;
     let config = timing.config.read(&args.config, |_| Ok(()))?;

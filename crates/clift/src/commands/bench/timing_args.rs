@@ -31,7 +31,6 @@ pub struct TimingArgs {
 }
 
 impl TimingArgs {
-    /// Returns options for the chosen cases, or for `all`, without comparison with f64.
     pub fn options(&self, all: &[BenchCase]) -> BenchOptions {
         BenchOptions {
             cases: if self.cases.is_empty() { all.into() } else { self.cases.clone() },

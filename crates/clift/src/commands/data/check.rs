@@ -15,7 +15,6 @@ use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::table::table;
 
-/// Findings of one scene.
 #[derive(Debug, Serialize)]
 struct Row {
     /// Split of the scene; `None` for a data set without splits.
@@ -37,10 +36,7 @@ impl Report {
     }
 }
 
-/// Checks every scene and prints the table.
-///
-/// # Errors
-/// If a scene is flagged, or if there are no scenes.
+/// Checks every scene and prints the table; fails if a scene is flagged, or if there are none.
 pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     if let Some(folder) = &args.images {
         fs::create_dir_all(folder).with_context(|| format!("creating {}", folder.display()))?;
@@ -115,7 +111,6 @@ fn report_text(report: &Report) -> String {
     format!("{text}\n\n{}, {} ok, {flagged} flagged", plural(num_scenes, "scene"), num_scenes - flagged)
 }
 
-/// Arguments of `clift data check`.
 #[derive(Debug, clap::Args)]
 pub struct CheckArgs {
     #[command(flatten)]

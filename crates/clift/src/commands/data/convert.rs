@@ -20,10 +20,7 @@ use crate::output::units::file_size;
 /// Most skipped scenes that are printed; `skipped.json` lists all.
 const MAX_LISTED_SKIPS: usize = 50;
 
-/// Converts the splits and prints the skipped scenes.
-///
-/// # Errors
-/// If no scene of a split can be converted.
+/// Converts the splits and prints the skipped scenes; fails if no scene of a split can be converted.
 pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     let to = match args.to {
         ConvertForm::Chunks => ConvertTo::Chunks { target_bytes: args.chunks.target_bytes() },
@@ -123,7 +120,6 @@ fn real_path(path: &Path) -> std::io::Result<PathBuf> {
     Ok(real)
 }
 
-/// Arguments of `clift data convert`.
 #[derive(Debug, clap::Args)]
 pub struct ConvertArgs {
     #[command(flatten)]
@@ -143,7 +139,6 @@ pub struct ConvertArgs {
     pub chunks: ChunkArgs,
 }
 
-/// Layouts of converted scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ConvertForm {
     /// Chunks: NNNNNN.torch files of many scenes, with index.json

@@ -9,7 +9,6 @@ use crate::commands::splits::{SourceArgs, Splits};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result};
 
-/// Writes the evaluation index and prints the number of scenes with and without views.
 pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     let options = OverlapOptions {
         num_context: args.context,
@@ -43,7 +42,6 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Arguments of `clift data index`.
 #[derive(Debug, clap::Args)]
 pub struct IndexArgs {
     #[command(flatten)]

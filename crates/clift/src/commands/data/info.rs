@@ -21,7 +21,6 @@ use crate::output::stdout::print_result;
 /// Most synthetic scenes that are described: a config may have millions of similar ones.
 const MAX_SYNTHETIC: usize = 1000;
 
-/// Describes a data set, a config or an evaluation index.
 pub fn run(args: &InfoArgs) -> anyhow::Result<()> {
     let is_json = args.path.extension().is_some_and(|extension| extension == "json");
     // A scene may be given by one of its camera files, e.g. transforms_train.json.
@@ -140,7 +139,6 @@ fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport
     }
 }
 
-/// Arguments of `clift data info`.
 #[derive(Debug, clap::Args)]
 pub struct InfoArgs {
     /// Data set, one scene, config (TOML) or evaluation index (JSON)

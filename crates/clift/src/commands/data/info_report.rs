@@ -14,22 +14,17 @@ const MAX_LISTED_SCENES: usize = 20;
 /// Most frames of one scene that the table lists.
 const MAX_LISTED_FRAMES: usize = 50;
 
-/// Description of a data set or of a config's use of one.
 #[derive(Debug, Default, Serialize)]
 pub struct Report {
-    /// Path of the data set or config.
     pub path: PathBuf,
-    /// Detected layout of a data set.
     pub layout: Option<SourceKind>,
     /// Splits by name; `all` for a data set without splits.
     pub splits: BTreeMap<String, SplitReport>,
-    /// Scenes of the evaluation of a config.
     pub evaluation: Option<EvaluationReport>,
     /// Tokens per scene of a config, with the fewest and the most contexts.
     pub num_tokens: Option<[usize; 2]>,
 }
 
-/// Description of one split.
 #[derive(Debug, Default, Serialize)]
 pub struct SplitReport {
     /// Reason why the split is not usable.
@@ -40,7 +35,6 @@ pub struct SplitReport {
     pub skipped: BTreeMap<String, usize>,
     /// Skipped scenes, each with its reason.
     pub left_out: Vec<SkippedScene>,
-    /// Skipped frames, each with its reason.
     pub frames: Vec<SkippedFrame>,
     pub notes: Vec<String>,
     /// Number of scenes that `info` describes: all used scenes, or the first synthetic ones.
@@ -53,13 +47,11 @@ pub struct SplitReport {
     pub views: Option<[usize; 2]>,
 }
 
-/// Scenes of an evaluation.
 #[derive(Debug, Default, Serialize)]
 pub struct EvaluationReport {
     /// Reason why no scene can be evaluated.
     pub error: Option<String>,
     pub num_scenes: usize,
-    /// Number of target views of all scenes.
     pub num_views: usize,
     pub skipped: BTreeMap<String, usize>,
 }

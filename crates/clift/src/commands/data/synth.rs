@@ -23,12 +23,10 @@ use crate::output::units::file_size;
 /// Fewest frames for training and evaluation: two contexts and another frame as target.
 const MIN_FRAMES: usize = 3;
 
-/// Scenes per split without `--scenes`.
 const DEFAULT_SCENES: usize = 100;
 
 const INDEX: &str = "evaluation_index.json";
 
-/// Writes the scenes and prints the config section that trains on them.
 pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
     let config = config(args)?;
     require_absent(&args.out, args.split)?;
@@ -55,7 +53,6 @@ pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
     }
 }
 
-/// Writes one split, and the evaluation index of the test split.
 fn write_split(args: &SynthArgs, config: &SyntheticConfig, split: Split) -> anyhow::Result<()> {
     let source = SyntheticSource::new(SyntheticConfig { split, ..config.clone() })?;
     let folder = args.out.join(split.to_string());
@@ -85,7 +82,6 @@ fn write_split(args: &SynthArgs, config: &SyntheticConfig, split: Split) -> anyh
     Ok(())
 }
 
-/// Returns the config of the options, overridden by `--set`.
 fn config(args: &SynthArgs) -> anyhow::Result<SyntheticConfig> {
     let [width, height] = args.size.map_or([None; 2], |size| size.map(Some));
     let options = [("num_frames", args.frames), ("width", width), ("height", height)];
@@ -152,7 +148,6 @@ fn has_views(index: &Path) -> bool {
     EvaluationIndex::read(index).is_ok_and(|index| index.usable().next().is_some())
 }
 
-/// Returns the side of the default model's patch, in pixels.
 fn patch_size() -> usize {
     ModelConfig::default().patch_size
 }
@@ -206,7 +201,6 @@ num_targets = 3{eval}"
     ))
 }
 
-/// Arguments of `clift data synth`.
 #[derive(Debug, clap::Args)]
 pub struct SynthArgs {
     /// Output folder: new, or with only the other split, of the same size

@@ -10,17 +10,13 @@ use crate::commands::doctor::{adapters, stability};
 use crate::output::stdout::print_result;
 use crate::output::table::table;
 
-/// Largest accepted difference of a gradient from that of the default device, over its largest entry. Different
-/// orders of f32 sums differ by about 1e-6, a wrong kernel by about 1.
+/// Largest accepted difference of a gradient over its largest entry: orders of sums differ by 1e-6, wrong kernels by 1.
 const TOLERANCE: f64 = 1e-3;
 
 /// Largest accepted difference with f16 operands: their rounding of 5e-4 accumulates over four blocks.
 const TOLERANCE_F16: f64 = 3e-2;
 
-/// Prints the machine and a row per device, or runs the stability cases.
-///
-/// # Errors
-/// If the default device fails, or a stability case.
+/// Prints the machine and a row per device, or runs the stability cases; fails with the default device or a case.
 pub fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     if args.stability {
         return stability::run(args.small, args.markdown.as_deref());
@@ -139,7 +135,6 @@ fn device_table(mut rows: Vec<[String; 6]>) -> String {
     [table].into_iter().chain(failures).collect::<Vec<_>>().join("\n")
 }
 
-/// Arguments of `clift doctor`.
 #[derive(Debug, clap::Args)]
 pub struct DoctorArgs {
     /// Run the stability cases instead: hard numerical inputs against f64

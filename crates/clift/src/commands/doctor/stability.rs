@@ -9,10 +9,7 @@ use clift_model::DeviceName;
 
 use crate::output::stdout::{print_note, print_result};
 
-/// Runs every case on every device of the build.
-///
-/// # Errors
-/// If an error exceeds its bound.
+/// Runs every case on every device of the build; fails if an error exceeds its bound.
 pub fn run(is_small: bool, markdown: Option<&Path>) -> anyhow::Result<()> {
     let devices: Vec<DeviceName> = DeviceName::ALL.into_iter().filter(|device| device.is_built()).collect();
     let size = if is_small { CaseSize::Small } else { CaseSize::Full };
@@ -38,7 +35,6 @@ fn line(devices: &[DeviceName], row: &StabilityRow) -> String {
     format!("{}: {}", row.case.name, outcomes.collect::<Vec<_>>().join(", "))
 }
 
-/// Returns the text above the Markdown table.
 fn markdown_head(small: bool) -> String {
     let command = if small { "clift doctor --stability --small" } else { "clift doctor --stability" };
     format!(

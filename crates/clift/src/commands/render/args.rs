@@ -10,7 +10,6 @@ use clift_model::{DeviceName, Precision, SelectionPreset, TokenCount};
 
 use crate::commands::parse::{parse_budget_ms, parse_size};
 
-/// Arguments of `clift render`.
 #[derive(Debug, clap::Args)]
 pub struct RenderArgs {
     /// Scene file from `clift encode`
@@ -51,14 +50,12 @@ pub struct RenderArgs {
     pub precision: Precision,
 }
 
-/// Path of the camera.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum CameraPath {
     /// Through the context views.
     Interpolate,
     /// Once around the point that the context views look at.
     Orbit,
-    /// Poses of a JSON file.
     File(PathBuf),
 }
 

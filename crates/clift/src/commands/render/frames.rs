@@ -16,18 +16,14 @@ use crate::output::counter::Counter;
 /// Median seconds per frame.
 #[derive(Debug, Serialize)]
 pub struct Timing {
-    /// Token selection.
     pub select_s: f64,
-    /// Rendering.
     pub render_s: f64,
 }
 
-/// Settings of all frames.
 pub struct Frames {
     pub height: usize,
     pub width: usize,
     pub num_render_tokens: usize,
-    /// Frames per second of the animation.
     pub fps: u16,
 }
 

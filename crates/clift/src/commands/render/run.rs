@@ -26,7 +26,6 @@ const DEFAULT_FRAMES: usize = 60;
 #[derive(Debug, Serialize)]
 struct Report {
     scene: String,
-    /// Value of `--path`.
     path: String,
     /// Rule of token selection; `null` if every frame uses all tokens.
     selection: Option<&'static str>,
@@ -42,7 +41,6 @@ struct Report {
     calibration: Option<Vec<(usize, f64)>>,
 }
 
-/// Renders a scene file along a path.
 pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let (scene, _) = Scene::read(&args.scene)?;
     let [width, height] = args.size.unwrap_or([scene.width, scene.height]);

@@ -1,13 +1,11 @@
-use safetensors::SafeTensors;
-
 use super::*;
 use crate::sources::chunks::writer::{SceneRecord, chunk_bytes, write_chunks};
 use crate::testing::{fixture, re10k_mini};
 use crate::torch::pickle_writer::PickleWriter;
+use safetensors::SafeTensors;
 
 const ALL: SceneFilters = SceneFilters { min_frames: 0, max_fov_deg: None };
 
-/// A data set whose only training chunk has the given bytes and whose index lists the given scenes.
 fn with_chunk(bytes: &[u8], keys: &[&str]) -> (tempfile::TempDir, ChunkSource) {
     let folder = tempfile::tempdir().unwrap();
     std::fs::create_dir(folder.path().join("train")).unwrap();
@@ -30,9 +28,7 @@ fn chunks_of_torch_save_are_read_by_frame() {
     let scene = source.find("00000000000000a2").unwrap();
     assert_eq!(source.key(scene), "00000000000000a2");
     assert_eq!(source.url(scene).unwrap(), "https://example.org/00000000000000a2");
-    let times: Vec<i64> = (0..8).map(|frame| 1_000_000 + 33_367 * frame).collect();
-    assert_eq!(source.timestamps(scene).unwrap(), times);
-
+    assert_eq!(source.timestamps(scene).unwrap(), [0, 1, 2, 3, 4, 5, 6, 7].map(|frame| 1_000_000 + 33_367 * frame));
     let bytes = std::fs::read(fixture("reference/re10k_mini.safetensors")).unwrap();
     let tensors = SafeTensors::deserialize(&bytes).unwrap();
     let frame = source.frame(scene, 3).unwrap();
@@ -59,8 +55,7 @@ fn filters_skip_scenes_with_reasons() {
     assert_eq!((short.num_scenes(), short.find("00000000000000a1")), (0, None));
     assert_eq!(short.report.to_string(), "0 of 2 scenes used; 2 shorter than the 9 frames of data.filters.min_frames");
     // fx = 0.9 of the width: 58.1 degrees.
-    let wide = open(8, Some(58.0));
-    assert_eq!(wide.report.to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
+    assert_eq!(open(8, Some(58.0)).report.to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
 }
 
 #[test]
