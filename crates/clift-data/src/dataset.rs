@@ -110,7 +110,6 @@ mod tests {
     use crate::random::item_rng;
     use crate::sampling::view_sampler::ViewSampler;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
-    use crate::synthetic::config::SyntheticConfig;
 
     #[test]
     fn training_skips_scenes_too_short_for_its_last_step() {

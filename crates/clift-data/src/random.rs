@@ -66,8 +66,7 @@ pub(crate) fn sample_from(rng: &mut impl Rng, mut values: Vec<usize>, count: usi
     values
 }
 
-/// Returns the generator whose 32-byte cipher key consists of the four numbers, so that distinct numbers give distinct
-/// streams.
+/// Returns the generator whose 32-byte cipher key is the four numbers: distinct numbers give distinct streams.
 fn keyed_rng(seed: u64, purpose: &str, step: u64, item: u64) -> ChaCha8Rng {
     let mut key = [0; 32];
     for (bytes, value) in key.chunks_exact_mut(8).zip([seed, purpose_tag(purpose), step, item]) {
@@ -91,11 +90,9 @@ pub(crate) fn mix(value: u64) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
-
-    use proptest::prelude::*;
-
     use super::*;
+    use proptest::prelude::*;
+    use std::collections::BTreeSet;
 
     // The expected values come from an implementation of ChaCha8 and of this file in Python.
     #[test]

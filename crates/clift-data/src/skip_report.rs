@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 
 /// Number of names per reason in a printed report.
 const MAX_NAMES_SHOWN: usize = 3;
-
 /// Number of reasons in a printed report.
 const MAX_REASONS_SHOWN: usize = 8;
 
@@ -87,7 +86,6 @@ impl SkipReport {
         counts
     }
 
-    /// Appends all entries of another report.
     pub(crate) fn append(&mut self, other: Self) {
         self.num_scenes += other.num_scenes;
         self.skips.extend(other.skips);

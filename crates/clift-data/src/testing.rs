@@ -11,7 +11,6 @@ use crate::scene_source::{SceneSource, Split};
 use crate::sources::chunks::chunk_source::ChunkSource;
 use crate::sources::filters::SceneFilters;
 
-/// Returns the path of a fixture.
 pub fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures").join(name)
 }
@@ -29,7 +28,6 @@ pub fn read_from_file<T>(name: &str, bytes: impl AsRef<[u8]>, read: impl FnOnce(
     read(&path)
 }
 
-/// Returns the names in a folder, sorted.
 pub fn names(folder: &Path) -> Vec<String> {
     file_names(folder).unwrap()
 }
@@ -71,7 +69,6 @@ pub struct TestSource {
 }
 
 impl TestSource {
-    /// Wraps `base` without changes.
     pub fn new(base: impl SceneSource + 'static) -> Self {
         Self {
             base: Arc::new(base),
@@ -81,7 +78,6 @@ impl TestSource {
         }
     }
 
-    /// Sets the function that changes the cameras of a scene.
     pub fn with_cameras(
         self,
         change: impl Fn(usize, Vec<Camera>) -> Result<Vec<Camera>, DataError> + Send + Sync + 'static,
@@ -89,7 +85,6 @@ impl TestSource {
         Self { cameras: Box::new(change), ..self }
     }
 
-    /// Sets the function that changes a frame.
     pub fn with_frames(
         self,
         change: impl Fn(usize, usize, RgbImage) -> Result<RgbImage, DataError> + Send + Sync + 'static,
@@ -97,7 +92,6 @@ impl TestSource {
         Self { frame: Box::new(change), ..self }
     }
 
-    /// Makes every frame of the scenes with `is_torn` fail.
     pub fn with_torn_frames(self, is_torn: impl Fn(usize) -> bool + Send + Sync + 'static) -> Self {
         self.with_frames(move |scene, frame, decoded| {
             let torn = || DataError::BadImage { key: scene.to_string(), frame, what: "it is torn".into() };
@@ -105,7 +99,6 @@ impl TestSource {
         })
     }
 
-    /// Sets the function that returns image files.
     pub fn with_encoded_frames(
         self,
         encoded_frame: impl Fn(usize, usize) -> Option<Vec<u8>> + Send + Sync + 'static,

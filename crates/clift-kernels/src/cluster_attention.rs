@@ -61,7 +61,6 @@ impl ClusterSegments {
     }
 }
 
-/// Segments per task.
 const SEGMENTS_PER_TASK: usize = 16;
 
 /// Computes `sum_i softmax_i(q_s k_i / sqrt(head width)) v_i` per head over the members of every segment; zeros for a
@@ -100,7 +99,6 @@ struct Forward<'a> {
 
 impl Kernel for Forward<'_> {
     type Output = ();
-
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { segments, inputs: [query, key_value], first, output, weights } = self;
@@ -177,7 +175,6 @@ struct Backward<'a> {
 
 impl Kernel for Backward<'_> {
     type Output = ();
-
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { segments, inputs: [query, key_value, weights, grad], first, grad_query, grad_key_value } = self;

@@ -80,7 +80,6 @@ struct Forward<'a> {
 
 impl Kernel for Forward<'_> {
     type Output = ();
-
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { epsilon, x, gamma, beta, output, statistics } = self;
@@ -113,7 +112,6 @@ struct Backward<'a> {
 
 impl Kernel for Backward<'_> {
     type Output = ();
-
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { x, gamma, grad, grad_x, statistics, sums } = self;
@@ -159,7 +157,6 @@ fn sum<S: Simd>(simd: S, values: &[f32]) -> f32 {
     simd.sum(total)
 }
 
-/// Returns the sum of `(value - mean)^2`.
 #[inline(always)]
 fn sum_of_squares<S: Simd>(simd: S, values: &[f32], mean: f32) -> f32 {
     let full = values.len() / S::LANES * S::LANES;
@@ -198,7 +195,6 @@ struct SumRows<'a> {
 
 impl Kernel for SumRows<'_> {
     type Output = ();
-
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         for x in self.x.chunks_exact(self.to.len()) {

@@ -5,7 +5,6 @@ use std::path::Path;
 
 use crate::error::DataError;
 
-/// Largest number of entries of a folder.
 const MAX_ENTRIES: usize = 1_000_000;
 
 /// Returns the names of the entries of a folder, sorted, without names that are no UTF-8.
@@ -51,8 +50,7 @@ fn take_number<'a>(text: &mut &'a [u8]) -> &'a [u8] {
     let end = text.iter().position(|byte| !byte.is_ascii_digit()).unwrap_or(text.len());
     let (digits, rest) = text.split_at(end);
     *text = rest;
-    let zeros = digits.iter().take_while(|digit| **digit == b'0').count();
-    &digits[zeros..]
+    &digits[digits.iter().take_while(|digit| **digit == b'0').count()..]
 }
 
 #[cfg(test)]

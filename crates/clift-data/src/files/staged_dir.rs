@@ -75,18 +75,16 @@ impl Drop for StagedDir {
 /// # Errors
 /// Errors of the operating system.
 pub fn is_empty_folder(folder: &Path) -> std::io::Result<bool> {
-    match std::fs::read_dir(folder) {
-        Err(error) if error.kind() == ErrorKind::NotFound => Ok(true),
-        Err(error) => Err(error),
-        Ok(items) => {
-            for item in items {
-                if !is_temporary(&item?.file_name()) {
-                    return Ok(false);
-                }
-            }
-            Ok(true)
+    let items = match std::fs::read_dir(folder) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(true),
+        items => items?,
+    };
+    for item in items {
+        if !is_temporary(&item?.file_name()) {
+            return Ok(false);
         }
     }
+    Ok(true)
 }
 
 fn is_temporary(name: &std::ffi::OsStr) -> bool {
@@ -121,7 +119,6 @@ mod tests {
         std::fs::write(staged.path().join("one"), "").unwrap();
         drop(staged);
         assert!(!out.exists(), "created by StagedDir");
-
         std::fs::create_dir_all(out.join(".clift-unfinished-x")).unwrap();
         std::fs::write(out.join(".clift-unfinished-x/one"), "").unwrap();
         assert!(is_empty_folder(&out).unwrap());

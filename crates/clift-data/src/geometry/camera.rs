@@ -111,8 +111,7 @@ pub(crate) fn widest_fov_deg(cameras: &[Camera]) -> f64 {
     cameras.iter().map(Camera::fov_deg).fold(0.0, |widest, (x, y)| widest.max(x).max(y))
 }
 
-/// Returns the angle between two directions in degrees. `atan2` is accurate for small angles, where `acos` loses half
-/// the digits.
+/// Returns the angle in degrees. `atan2` is accurate for small angles, where `acos` loses half the digits.
 fn angle_deg(a: DVec3, b: DVec3) -> f64 {
     a.cross(b).length().atan2(a.dot(b)).to_degrees()
 }
@@ -137,10 +136,8 @@ mod tests {
         assert_eq!(camera.c2w.translation, DVec3::new(1.0, 2.0, 3.0));
         assert_eq!(camera.c2w.rotation.z_axis, DVec3::X);
         assert_eq!(camera.c2w.rotation.x_axis, -DVec3::Z);
-        assert_eq!(
-            camera.intrinsics_norm.to_pixels(640, 360),
-            Intrinsics { fx: 576.0, fy: 576.0, cx: 320.0, cy: 90.0 }
-        );
+        let pixels = camera.intrinsics_norm.to_pixels(640, 360);
+        assert_eq!(pixels, Intrinsics { fx: 576.0, fy: 576.0, cx: 320.0, cy: 90.0 });
     }
 
     #[test]

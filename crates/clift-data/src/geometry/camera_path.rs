@@ -16,16 +16,12 @@ use crate::geometry::pose::Pose;
 
 /// Radius of an orbit over the extent of the context centres; farther out the contexts show little.
 const ORBIT_SHARE: f64 = 0.7;
-
 /// Smallest radius of an orbit, for contexts on a line. Normalised contexts reach to 1.
 const MIN_ORBIT_RADIUS: f64 = 0.1;
-
 /// Distance of an orbit's focus for contexts with parallel axes.
 const FOCUS: f64 = 2.0;
 /// Bounds of the distance otherwise.
 const FOCUS_RANGE: [f64; 2] = [0.5, 8.0];
-
-/// Largest number of poses in a file.
 const MAX_POSES: usize = 100_000;
 
 /// One view to render, in the scene's normalised frame.
@@ -109,11 +105,9 @@ fn look_at(centre: DVec3, point: DVec3) -> Pose {
     Pose { rotation: DMat3::from_cols(right, forward.cross(right), forward), translation: centre }
 }
 
-/// Accepted focal lengths of a file over width and height. The upper bound also limits the principal point's distance
-/// from 0.
+/// Accepted focal lengths over width and height; the upper bound also limits the principal point's distance from 0.
 const INTRINSICS: RangeInclusive<f64> = 1e-3..=1e3;
 
-/// The JSON form of a pose file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct PoseFile {
@@ -142,7 +136,6 @@ struct TransformsFrame {
     transform_matrix: Vec<[f64; 4]>,
 }
 
-/// One pose of a pose file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FilePose {
@@ -228,7 +221,6 @@ mod tests {
 
     const K: Intrinsics = Intrinsics { fx: 40.0, fy: 41.0, cx: 16.0, cy: 12.0 };
 
-    /// A camera at `centre`, turned by `angle` about the y axis.
     fn view(centre: [f64; 3], angle: f64) -> PathView {
         PathView { c2w: Pose { rotation: DMat3::from_rotation_y(angle), translation: centre.into() }, intrinsics: K }
     }
@@ -292,8 +284,7 @@ mod tests {
         }
         assert!((path[0].c2w.translation.x - 0.7).abs() < 1e-12);
         assert!((path[3].c2w.translation.y - 0.1).abs() < 1e-12, "smallest radius for contexts on a line");
-        let parallel = [view([-1.0, 0.0, 0.0], 0.0), view([1.0, 0.0, 0.0], 0.0)];
-        assert_eq!(focus_distance(&parallel), FOCUS);
+        assert_eq!(focus_distance(&[view([-1.0, 0.0, 0.0], 0.0), view([1.0, 0.0, 0.0], 0.0)]), FOCUS, "parallel axes");
         assert!(orbit_path(&[], 3).is_empty());
     }
 

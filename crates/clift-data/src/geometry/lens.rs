@@ -92,9 +92,8 @@ impl Lens {
 
 #[cfg(test)]
 mod tests {
-    use proptest::prelude::*;
-
     use super::*;
+    use proptest::prelude::*;
 
     const PHONE: Lens = Lens { radial: [0.058, -0.081, 0.0], tangential: [-0.000_98, 0.000_16] };
 

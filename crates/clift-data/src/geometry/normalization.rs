@@ -99,7 +99,6 @@ impl PoseNormalization {
     }
 }
 
-/// Checks that a normalised pose lies within [`MAX_COORDINATE`].
 pub(crate) fn check_near(pose: &Pose) -> Result<(), DataError> {
     let coordinate = pose.translation.abs().max_element();
     if coordinate <= MAX_COORDINATE {
@@ -112,7 +111,6 @@ pub(crate) fn check_near(pose: &Pose) -> Result<(), DataError> {
     Err(DataError::BadCamera { what })
 }
 
-/// Returns the largest absolute coordinate.
 fn largest(points: impl Iterator<Item = DVec3>) -> f64 {
     points.fold(0.0, |largest, point| point.abs().max_element().max(largest))
 }
@@ -125,8 +123,7 @@ fn mean_quaternion(poses: &[Pose]) -> DMat3 {
     DMat3::from_quat(unit_quaternion(sum))
 }
 
-/// Returns the rotation of the mean viewing direction and the perpendicular part of the mean down direction, `None` if
-/// directions cancel.
+/// Returns the mean of [`PoseRotation::Axes`], `None` if directions cancel.
 fn mean_axes(poses: &[Pose]) -> Option<DMat3> {
     let sum = |axis: usize| poses.iter().map(|pose| pose.rotation.col(axis)).sum::<DVec3>();
     let forward = unit(sum(2), poses.len())?;
@@ -142,12 +139,10 @@ fn unit(sum: DVec3, count: usize) -> Option<DVec3> {
 
 #[cfg(test)]
 mod tests {
+    use super::*;
     use proptest::prelude::*;
     use safetensors::SafeTensors;
 
-    use super::*;
-
-    /// A pose turned by `angles` about the world's x, y and z axes.
     fn pose([x, y, z]: [f64; 3], translation: [f64; 3]) -> Pose {
         let rotation = DMat3::from_rotation_z(z) * DMat3::from_rotation_y(y) * DMat3::from_rotation_x(x);
         Pose { rotation, translation: translation.into() }
@@ -259,9 +254,8 @@ mod tests {
         assert!(find(&apart(0.55)).is_ok());
         assert!(find(&turned.map(|pose| Pose { translation: DVec3::ZERO, ..pose })).is_err());
         // Near the origin a tiny baseline of f64 centres is accepted.
-        assert!(
-            find(&walk().iter().map(|p| Pose { translation: p.translation * 1e-9, ..*p }).collect::<Vec<_>>()).is_ok()
-        );
+        let tiny: Vec<Pose> = walk().iter().map(|p| Pose { translation: p.translation * 1e-9, ..*p }).collect();
+        assert!(find(&tiny).is_ok());
     }
 
     #[test]

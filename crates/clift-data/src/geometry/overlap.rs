@@ -46,11 +46,10 @@ fn is_seen(motion: Pose, direction: DVec3, to: &Camera) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use glam::DMat3;
-
     use super::*;
     use crate::geometry::camera::IntrinsicsNorm;
     use crate::random::{step_rng, uniform_01};
+    use glam::DMat3;
 
     fn camera(turn_deg: f64, centre: [f64; 3]) -> Camera {
         let rotation = DMat3::from_rotation_y(turn_deg.to_radians());

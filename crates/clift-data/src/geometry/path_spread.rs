@@ -27,18 +27,16 @@ pub fn contexts_along_path(c2w: &[Pose], num_views: usize) -> Option<Vec<usize>>
         let first = frames.last().map_or(0, |frame| frame + 1);
         let last = num_frames - (num_views - view);
         let distance = |frame: usize| (travelled[frame] - share * length).abs();
-        let nearest = (first..=last).min_by(|&a, &b| distance(a).total_cmp(&distance(b)))?;
-        frames.push(nearest);
+        frames.push((first..=last).min_by(|&a, &b| distance(a).total_cmp(&distance(b)))?);
     }
     Some(frames)
 }
 
 #[cfg(test)]
 mod tests {
+    use super::*;
     use glam::DVec3;
     use proptest::prelude::*;
-
-    use super::*;
 
     fn at(places: &[f64]) -> Vec<Pose> {
         places.iter().map(|&x| Pose { translation: x * DVec3::X, ..Pose::IDENTITY }).collect()

@@ -105,7 +105,6 @@ impl Pose {
         difference.to_cols_array().into_iter().fold(0.0, |largest: f64, value| largest.max(value.abs()))
     }
 
-    /// Checks that all values are finite.
     pub(crate) fn check_finite(self) -> Result<(), DataError> {
         let mut values = self.rotation.to_rows_array().into_iter().chain(self.translation.to_array());
         match values.find(|value| !value.is_finite()) {
@@ -135,8 +134,7 @@ impl Pose {
     }
 }
 
-/// Normalises a quaternion with the rounding of existing files: glam's `normalize` sums `w` last and multiplies by a
-/// reciprocal.
+/// Normalises with the rounding of existing files: glam's `normalize` sums `w` last and multiplies by a reciprocal.
 pub(crate) fn unit_quaternion(q: DQuat) -> DQuat {
     q / DVec4::new(q.w, q.x, q.y, q.z).length()
 }

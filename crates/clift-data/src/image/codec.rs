@@ -19,7 +19,6 @@ pub const MAX_SIDE: u32 = 16_384;
 const MAX_DECODE_BYTES: u64 = 512 << 20;
 /// Bytes at the end of a file that are searched for the end marker before the whole file is read.
 const TAIL_BYTES: u64 = 512;
-/// End marker of a JPEG.
 const JPEG_END: &[u8] = &[0xff, 0xd9];
 /// End of a PNG: type and checksum of the last chunk.
 const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
@@ -118,9 +117,8 @@ pub(crate) fn apply_orientation(image: RgbImage, orientation: Orientation) -> Rg
     RgbImage { width: width as usize, height: height as usize, rgb: turned.into_raw() }
 }
 
-/// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated.
-///
-/// Reads only the last bytes, except of files with data after the image, such as a phone's film.
+/// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated. Reads the last bytes only, or the whole
+/// file where data follows the image, such as a phone's film.
 pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
     const READING: &str = "reading the end of an image";
     let io = || DataError::io(READING, path);

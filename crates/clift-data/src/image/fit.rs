@@ -43,8 +43,7 @@ pub fn fit_image(
     }
     let (scaled_width, scaled_height) = covering_size((image.width, image.height), (width, height));
     let (column, row) = ((scaled_width - width) / 2, (scaled_height - height) / 2);
-    let window = Window { column, row, width, height };
-    let cropped = resize_lanczos_window(image, scaled_width, scaled_height, window);
+    let cropped = resize_lanczos_window(image, scaled_width, scaled_height, Window { column, row, width, height });
     let in_scaled = intrinsics_norm.to_pixels(scaled_width, scaled_height);
     let (cx, cy) = if exact_principal_point {
         (in_scaled.cx - column as f64, in_scaled.cy - row as f64)

@@ -174,9 +174,8 @@ fn rows(rgb: &[u8], row_bytes: usize, top: usize, taps: &[Taps]) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use safetensors::SafeTensors;
-
     use super::*;
+    use safetensors::SafeTensors;
 
     #[test]
     fn resized_images_equal_pillow_bit_for_bit() {

@@ -46,9 +46,8 @@ impl Undistortion {
             bottom = bottom.min(ray(share, 1.0)?[1]);
         }
         if left.min(right).min(top).min(bottom) <= 0.0 {
-            return Err(bad(format!(
-                "the principal point ({cx}, {cy}) of a distorted camera lies outside of the image"
-            )));
+            let what = format!("the principal point ({cx}, {cy}) of a distorted camera lies outside of the image");
+            return Err(bad(what));
         }
         let needed = [cx / left / fx, (1.0 - cx) / right / fx, cy / top / fy, (1.0 - cy) / bottom / fy];
         let zoom = needed.into_iter().fold(0.0, f64::max);

@@ -79,20 +79,18 @@ impl ClipReader {
 
     fn fitted(&self, scene: usize, frame: usize, camera: &Camera) -> Result<(RgbImage, Intrinsics), DataError> {
         let ClipOptions { width, height, exact_principal_point, .. } = self.options;
-        let image = self.source.frame(scene, frame)?;
-        fit_image(&image, camera.intrinsics_norm, width, height, exact_principal_point)
+        fit_image(&self.source.frame(scene, frame)?, camera.intrinsics_norm, width, height, exact_principal_point)
             .map_err(DataError::in_frame(self.source.key(scene), frame))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::{AtomicUsize, Ordering};
-
     use super::*;
     use crate::geometry::pose::Pose;
     use crate::scene_source::Split;
     use crate::testing::{TestSource, re10k_mini};
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
     const OPTIONS: ClipOptions = ClipOptions {
         width: 32,

@@ -89,9 +89,8 @@ impl EvaluationIndex {
     /// [`DataError::MissingIndexKey`] for a key that is not in the index, [`DataError::BadIndex`] for a frame beyond the
     /// end of the scene.
     pub fn views(&self, key: &str, num_frames: usize) -> Result<Option<&ViewIndices>, DataError> {
-        let position = self.positions.get(key);
-        let position =
-            position.ok_or_else(|| DataError::MissingIndexKey { key: key.to_owned(), path: self.path.clone() })?;
+        let missing = || DataError::MissingIndexKey { key: key.to_owned(), path: self.path.clone() };
+        let position = self.positions.get(key).ok_or_else(missing)?;
         let Some(views) = &self.entries[*position].1 else { return Ok(None) };
         self.check_frames(key, views, num_frames)?;
         Ok(Some(views))
@@ -157,11 +156,9 @@ impl<'de> Deserialize<'de> for IndexFile {
         struct InOrder;
         impl<'de> Visitor<'de> for InOrder {
             type Value = IndexFile;
-
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 f.write_str("a map from scene keys")
             }
-
             fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<IndexFile, A::Error> {
                 let mut entries = Vec::new();
                 while let Some(entry) = map.next_entry()? {
@@ -305,12 +302,10 @@ mod tests {
             .collect();
         let index = index(&format!("{{{}}}", entries.join(","))).unwrap();
         let scenes = |items: &[EvaluationItem]| items.iter().map(|item| item.scene).collect::<Vec<_>>();
-
         let (items, report) = index.select(&source, 0);
         assert_eq!((scenes(&items), report.num_scenes), (vec![2, 3, 4], 5));
         assert!(report.skips[0].reason.contains("frame 8 of scene"), "{report}");
         assert_eq!(report.skips[1].reason, "bad camera: the pose holds NaN");
-
         let (items, report) = index.select(&source, 2);
         assert_eq!((scenes(&items), report.num_scenes, report.num_used()), (vec![2, 3], 4, 2));
     }

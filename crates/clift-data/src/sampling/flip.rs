@@ -44,8 +44,6 @@ fn mirrored_pose(Pose { rotation, translation }: Pose) -> Pose {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use super::*;
     use crate::geometry::normalization::{PoseRotation, PoseScale};
     use crate::image::rgb_image::RgbImage;
@@ -55,8 +53,8 @@ mod tests {
     use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::source::SyntheticSource;
     use crate::testing::TestSource;
+    use std::sync::Arc;
 
-    /// A source with mirrored frames and cameras.
     fn mirrored(source: SyntheticSource) -> TestSource {
         let mirrored = TestSource::new(source).with_cameras(|_, mut cameras| {
             for camera in &mut cameras {
@@ -72,7 +70,6 @@ mod tests {
         })
     }
 
-    /// One room with frames of 40 x 24 pixels.
     fn room() -> SyntheticSource {
         let config = SyntheticConfig { num_scenes: 1, num_frames: 9, width: 40, height: 24, ..Default::default() };
         SyntheticSource::new(config).unwrap()

@@ -26,10 +26,8 @@ impl InnerViews {
         self == Self::FarthestPoint
     }
 
-    /// Selects `count` different frames between `left` and `right`, in increasing order.
-    ///
-    /// `centres` are the camera centres of all frames of the scene; empty unless [`InnerViews::needs_centres`]. Expects
-    /// `count < right - left`.
+    /// Selects `count < right - left` different frames between `left` and `right`, in increasing order. `centres` are
+    /// the camera centres of all frames of the scene; empty unless [`InnerViews::needs_centres`].
     pub(crate) fn choose(
         self,
         rng: &mut impl Rng,

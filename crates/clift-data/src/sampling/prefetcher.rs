@@ -80,7 +80,6 @@ where
 
 impl<T, E: From<WorkerPanic>> Iterator for Prefetcher<T, E> {
     type Item = Result<T, E>;
-
     fn next(&mut self) -> Option<Self::Item> {
         let step = self.next_step;
         if step >= self.shared.end_step {
@@ -154,11 +153,10 @@ impl<T, E> Drop for Prefetcher<T, E> {
 
 #[cfg(test)]
 mod tests {
+    use super::*;
     use std::sync::atomic::{AtomicU64, Ordering};
     use std::sync::mpsc;
     use std::time::Duration;
-
-    use super::*;
 
     #[derive(Debug, PartialEq)]
     enum Failure {

@@ -20,7 +20,6 @@ pub struct SceneOrder {
 }
 
 impl SceneOrder {
-    /// Creates the order of `num_scenes` scenes in batches of `batch_size`.
     pub fn new(seed: u64, num_scenes: usize, batch_size: usize) -> Result<Self, DataError> {
         for (key, value) in [("num_scenes", num_scenes), ("batch_size", batch_size)] {
             check_config(value > 0, key, || "is 0; at least 1 is needed".into())?;
@@ -38,7 +37,6 @@ impl SceneOrder {
         self.permuted((position / num_scenes) as u64, (position % num_scenes) as u64) as usize
     }
 
-    /// Returns the number of slots per batch.
     pub fn batch_size(&self) -> usize {
         self.batch_size as usize
     }
@@ -68,11 +66,9 @@ impl SceneOrder {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
-
-    use proptest::prelude::*;
-
     use super::*;
+    use proptest::prelude::*;
+    use std::collections::BTreeSet;
 
     #[test]
     fn scene_order_is_reproducible() {

@@ -82,8 +82,7 @@ impl TrainingClips {
         let num_context = self.sampler.num_context(self.seed, step);
         let mut batch = ClipBatch { step, clips: Vec::new(), skipped: Vec::new() };
         for slot in 0..self.order.batch_size() {
-            let clip = self.fill_slot(step, slot, num_context, &mut batch.skipped)?;
-            batch.clips.push(clip);
+            batch.clips.push(self.fill_slot(step, slot, num_context, &mut batch.skipped)?);
         }
         Ok(batch)
     }

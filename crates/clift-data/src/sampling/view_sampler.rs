@@ -9,7 +9,6 @@ use crate::sampling::clip::ViewIndices;
 use crate::sampling::inner_views::InnerViews;
 use crate::scene_source::SceneSource;
 
-/// Largest number of context or target views of an item.
 const MAX_VIEWS: usize = 10_000;
 
 /// Returns the value at `step` of a linear warm-up from `init` to `last` in `warm_up_steps` steps:
@@ -20,8 +19,7 @@ pub fn linear_warm_up(init: usize, last: usize, warm_up_steps: u64, step: u64) -
     if warm_up_steps == 0 || step >= warm_up_steps {
         return last;
     }
-    let growth = last.saturating_sub(init) as u128 * u128::from(step) / u128::from(warm_up_steps);
-    init + growth as usize
+    init + (last.saturating_sub(init) as u128 * u128::from(step) / u128::from(warm_up_steps)) as usize
 }
 
 /// Samples a range of consecutive frames. The contexts are the two ends and some inner frames, the targets any frames
@@ -176,13 +174,11 @@ impl ViewSampler {
         let gap = uniform_between(rng, min_gap, max_gap.min(num_frames - 1));
         let left = uniform_below(rng, num_frames - gap);
         let right = left + gap;
-
         let target = if self.with_replacement {
             (0..self.num_targets).map(|_| uniform_between(rng, left, right)).collect()
         } else {
             sample_from(rng, (left..=right).collect(), self.num_targets)
         };
-
         let inner = self.inner.choose(rng, left, right, num_context - 2, centres);
         let context = std::iter::once(left).chain(inner).chain([right]).collect();
         Ok(ViewIndices { context, target })

@@ -65,7 +65,6 @@ pub(crate) struct SplitFolder<'a> {
 }
 
 impl<'a> SplitFolder<'a> {
-    /// Finds the folder of a split.
     pub fn find(root: &'a DatasetRoot, split: Split) -> Result<Self, DataError> {
         let base = if root.has_splits { root.path.join(split.to_string()) } else { root.path.clone() };
         let folder = Self { root, base, split };
@@ -96,8 +95,7 @@ impl<'a> SplitFolder<'a> {
         }
         if matches!(asked, SourceKind::Auto | SourceKind::Re10kTxt) {
             let texts: Vec<&String> = names.iter().filter(|name| has_ending(name, "txt")).collect();
-            let is_scene = scene_in(base).is_some();
-            if !is_scene && texts.iter().take(8).any(|name| looks_like_re10k(&base.join(name))) {
+            if scene_in(base).is_none() && texts.iter().take(8).any(|name| looks_like_re10k(&base.join(name))) {
                 return Ok(DetectedSource::Photos(SourceKind::Re10kTxt, Vec::new(), SkipReport::default()));
             }
         }
@@ -134,7 +132,6 @@ impl<'a> SplitFolder<'a> {
         Ok(DetectedSource::Photos(kind, scenes, report))
     }
 
-    /// Returns the kind of the scenes.
     fn recognise(&self, scenes: &[SceneFolder]) -> Result<SourceKind, DataError> {
         if scenes.iter().all(|scene| matches!(scene.files, SceneFiles::Re10kText { .. })) {
             return Ok(SourceKind::Re10kTxt);
@@ -181,8 +178,7 @@ impl<'a> SplitFolder<'a> {
         if !others.is_empty() {
             parts.push(format!("other data sets below it, to be opened separately: {}", first_few(others)));
         }
-        let what = parts.join("; ");
         let path = if self.base.exists() { self.base.clone() } else { self.root.path.clone() };
-        DataError::UnknownLayout { what, path }
+        DataError::UnknownLayout { what: parts.join("; "), path }
     }
 }

@@ -11,7 +11,6 @@ pub fn is_dl3dv_key(key: &str) -> bool {
     name.len() == HASH_LENGTH && name.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
-/// Returns the last part of a key that is a path.
 pub(crate) fn last_name(key: &str) -> &str {
     key.rsplit('/').next().unwrap_or_default()
 }

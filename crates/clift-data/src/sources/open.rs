@@ -119,7 +119,6 @@ impl SplitFolder<'_> {
         options: &SourceOptions,
         list: Option<&TestScenes>,
     ) -> Result<OpenedSource, DataError> {
-        let is_text = kind == SourceKind::Re10kTxt;
         let mut scenes = if scenes.is_empty() { self.re10k_clips(options)? } else { scenes };
         let keys: Vec<String> = scenes.iter().map(|scene| scene.key.clone()).collect();
         let mut kept = self.divide(list, &keys, options, &mut report).into_iter();
@@ -133,7 +132,7 @@ impl SplitFolder<'_> {
                 undistort: files.undistort.unwrap_or(kind == SourceKind::Captures),
             },
             filters: options.filters.clone(),
-            whole_scenes: (is_dl3dv || is_text) && !files.keep_incomplete,
+            whole_scenes: (is_dl3dv || kind == SourceKind::Re10kTxt) && !files.keep_incomplete,
             min_size: options.min_size,
             image_cache: options.image_cache.clone(),
         };
@@ -165,8 +164,10 @@ impl SplitFolder<'_> {
             let mut candidates = folders.iter().map(|folder| folder.join(key));
             let frames =
                 candidates.find(|frames| frames.is_dir()).unwrap_or_else(|| self.root.path.join("frames").join(key));
-            let files = SceneFiles::Re10kText { cameras: self.base.join(name), frames };
-            Some(SceneFolder { key: key.into(), files })
+            Some(SceneFolder {
+                key: key.into(),
+                files: SceneFiles::Re10kText { cameras: self.base.join(name), frames },
+            })
         };
         Ok(names.iter().filter_map(clip).collect())
     }
@@ -190,7 +191,6 @@ impl SplitFolder<'_> {
         kept
     }
 
-    /// Returns the keys of the scenes in `test/`.
     fn test_keys(&self, options: &SourceOptions) -> Result<Vec<String>, DataError> {
         let folder = SplitFolder::find(self.root, Split::Test)?;
         Ok(match folder.detect(options.kind)? {

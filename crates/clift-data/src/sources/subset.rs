@@ -35,27 +35,21 @@ impl SceneSource for SceneSubset {
     fn num_scenes(&self) -> usize {
         self.scenes.len()
     }
-
     fn key(&self, scene: usize) -> &str {
         self.source.key(self.scenes[scene])
     }
-
     fn find(&self, key: &str) -> Option<usize> {
         self.positions.get(&self.source.find(key)?).copied()
     }
-
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         self.source.num_frames(self.scenes[scene])
     }
-
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         self.source.cameras(self.scenes[scene])
     }
-
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
         self.source.timestamps(self.scenes[scene])
     }
-
     fn url(&self, scene: usize) -> Result<String, DataError> {
         self.source.url(self.scenes[scene])
     }
@@ -71,7 +65,6 @@ impl SceneSource for SceneSubset {
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         self.source.frame(self.scenes[scene], frame)
     }
-
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         self.source.encoded_frame(self.scenes[scene], frame)
     }

@@ -15,8 +15,7 @@ use crate::sources::keys::{last_name, plain_key};
 const MAX_BYTES: u64 = 256 << 20;
 /// Reason of skipping a test scene in the training split; no fault of the scene.
 pub const KEPT_FOR_TESTING: &str = "kept for testing";
-/// Reason of skipping a listed scene that lies only in `train/`, so that neither split has it. Starts with
-/// [`KEPT_FOR_TESTING`].
+/// Reason of skipping a listed scene that lies only in `train/`: no split has it. Starts with [`KEPT_FOR_TESTING`].
 pub(crate) const KEPT_AND_ABSENT: &str = "kept for testing by the list of test scenes, but not in test/";
 
 /// Keys of the test scenes, without the prefix of DepthSplat; for DL3DV scenes, without their path.
@@ -124,8 +123,7 @@ mod tests {
 
     #[test]
     fn training_and_test_scenes_are_disjoint() {
-        let list = read("b c").unwrap();
-        assert!(list.contains("b c"), "a line is a key");
+        assert!(read("b c").unwrap().contains("b c"), "a line is a key");
         let list = read("b\nc").unwrap();
         let keys = ["a", "dl3dv_b", "d"].map(String::from);
         let divided = |split, is_shared| {

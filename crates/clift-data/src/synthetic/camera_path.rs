@@ -29,15 +29,13 @@ pub(crate) struct CameraPath {
 
 /// Radius of the path of a camera that looks out, as a share of one that looks in.
 const INNER_RADIUS: f64 = 0.25;
-
 /// Amplitude of the radius over its mean.
 const RADIUS_SWING: f64 = 0.06;
 
 impl CameraPath {
     /// Samples a path of about `length` in a room of `half_size` (y is down).
     pub fn sample(rng: &mut impl Rng, half_size: DVec3, length: f64, looks: LookDirection) -> Self {
-        let widest = half_size.x.min(half_size.z) - CLEARANCE;
-        let radius = widest * (0.86 + 0.08 * uniform_01(rng));
+        let radius = (half_size.x.min(half_size.z) - CLEARANCE) * (0.86 + 0.08 * uniform_01(rng));
         let side = if uniform_01(rng) < 0.5 { -1.0 } else { 1.0 };
         let tall = half_size.y;
         let mut around = |size: f64| (2.0 * uniform_01(rng) - 1.0) * size;
@@ -63,7 +61,6 @@ impl CameraPath {
         [self.radius * (1.0 - RADIUS_SWING), self.radius * (1.0 + RADIUS_SWING)]
     }
 
-    /// Returns the camera centre.
     pub fn position(&self, time: f64) -> DVec3 {
         let (sin, cos) = (self.start + self.sweep * time).sin_cos();
         let radius = self.radius * (1.0 + RADIUS_SWING * (TAU * time + self.phase).sin());

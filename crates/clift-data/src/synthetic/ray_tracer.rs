@@ -32,9 +32,7 @@ struct Hit {
     object: Option<usize>,
 }
 
-/// Renders `room` with `side * side` rays per pixel.
-///
-/// `specular` in `[0, 1]` scales all light that depends on the viewing direction.
+/// Renders `room` with `side * side` rays per pixel. `specular` in `[0, 1]` scales all light that depends on the view.
 pub(crate) fn render(
     room: &Room,
     camera: &Camera,
@@ -77,7 +75,6 @@ fn trace(room: &Room, origin: Vec3, direction: Vec3, specular: f32, may_mirror: 
     let facing = hit.normal.dot(to_lamp).max(0.0);
     let reaching = if facing > 0.0 { LAMP * shadow(room, &hit, to_lamp) } else { 0.0 };
     let falloff = 1.0 / (1.0 + (distance / LAMP_REACH).powi(2));
-
     let diffuse = AMBIENT * openness(room, &hit) + reaching * facing * falloff;
     let mut light = hit.albedo * diffuse + lamp_glow(room, &hit);
     let shine = specular * hit.gloss;
@@ -97,7 +94,6 @@ fn trace(room: &Room, origin: Vec3, direction: Vec3, specular: f32, may_mirror: 
     light
 }
 
-/// Returns the nearest surface along a ray.
 fn nearest(room: &Room, origin: Vec3, direction: Vec3) -> Hit {
     let mut best = (f32::INFINITY, Vec3::ZERO, None);
     for (index, object) in room.objects.iter().enumerate() {
@@ -141,8 +137,7 @@ fn meet(object: &Object, origin: Vec3, direction: Vec3) -> Option<(f32, Vec3)> {
     }
 }
 
-/// Returns the distances at which a line enters and leaves a box around the origin, the axis of the entered face, and
-/// the slope of the line along that axis.
+/// Returns where a line enters and leaves a box around the origin, the axis of the entered face, and the slope there.
 fn slabs(origin: Vec3, direction: Vec3, half_size: Vec3) -> (f32, f32, usize, f32) {
     let (mut near, mut far, mut entered) = (f32::NEG_INFINITY, f32::INFINITY, 0);
     for axis in 0..3 {

@@ -12,20 +12,13 @@ use crate::synthetic::texture::Texture;
 /// Attempts to place an object, each 4 % smaller, before the room counts as full.
 const MAX_PLACEMENTS: u32 = 60;
 
-/// Geometry of an object.
+/// The turn of a block is about the vertical, as (cosine, sine); half sizes are half edge lengths.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Shape {
-    Ball {
-        radius: f32,
-    },
-    /// Half edge lengths, and the turn about the vertical as (cosine, sine).
-    Block {
-        half_size: Vec3,
-        turn: [f32; 2],
-    },
+    Ball { radius: f32 },
+    Block { half_size: Vec3, turn: [f32; 2] },
 }
 
-/// An object in the room.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Object {
     pub shape: Shape,
@@ -66,7 +59,6 @@ impl Room {
         let half_size = DVec3::new(wide, tall, deep);
         let path = CameraPath::sample(rng, half_size, config.path_length, config.looks);
         let lamp = DVec3::new(wide * swing(rng, 0.35), -tall + 0.12, deep * swing(rng, 0.35));
-
         // Without plain rooms no random number is sampled: rooms equal those from before this option.
         let is_plain = config.plain_share > 0.0 && uniform_01(rng) < config.plain_share;
         let hue = uniform_01(rng);
@@ -84,7 +76,6 @@ impl Room {
             };
             Texture::sample(rng, hue, saturation, value, frequency)
         });
-
         let mut room = Self { half_size: half_size.as_vec3(), walls, objects: Vec::new(), lamp: lamp.as_vec3(), path };
         let [fewest, most] = if is_plain { [0, 0] } else { config.num_objects };
         for _ in 0..uniform_between(rng, fewest, most) {
@@ -106,7 +97,6 @@ impl Room {
         } else {
             (Shape::Block { half_size: edges.into(), turn: [cos, sin] }, edges[1])
         };
-
         let Vec3 { x: wide, y: floor, z: deep } = self.half_size;
         let center = Vec3::new(wide * swing(rng, 1.0) as f32, floor - height, deep * swing(rng, 1.0) as f32);
         let hue = uniform_01(rng);

@@ -67,7 +67,6 @@ impl SceneSource for SyntheticSource {
     fn num_scenes(&self) -> usize {
         self.config.num_scenes
     }
-
     fn key(&self, scene: usize) -> &str {
         let (block, position) = (scene / KEYS_PER_BLOCK, scene % KEYS_PER_BLOCK);
         let keys = self.key_blocks[block].get_or_init(|| {
@@ -76,17 +75,14 @@ impl SceneSource for SyntheticSource {
         });
         &keys[position]
     }
-
     fn find(&self, key: &str) -> Option<usize> {
         let index = key.strip_prefix(&self.key_prefix())?.parse().ok()?;
         (index < self.num_scenes() && self.key(index) == key).then_some(index)
     }
-
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         let SyntheticConfig { num_scenes, num_frames, .. } = self.config;
         if scene < num_scenes { Ok(num_frames) } else { Err(DataError::NoSuchScene { scene, num_scenes }) }
     }
-
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         let room = self.room(scene)?;
         Ok((0..self.config.num_frames).map(|frame| self.camera(&room, frame)).collect())
@@ -109,10 +105,9 @@ impl SceneSource for SyntheticSource {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
-
     use super::*;
     use crate::synthetic::config::MAX_SCENES;
+    use std::collections::BTreeSet;
 
     fn source(change: impl FnOnce(&mut SyntheticConfig)) -> SyntheticSource {
         let mut config = SyntheticConfig::default();

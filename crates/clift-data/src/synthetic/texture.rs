@@ -29,9 +29,8 @@ pub(crate) struct Texture {
 }
 
 impl Texture {
-    /// Samples a texture around `hue` (in turns), with patterns of about `frequency` cycles per unit of length.
-    ///
-    /// `saturation` and `value` describe the brighter colour.
+    /// Samples a texture around `hue` (in turns), with about `frequency` cycles per unit of length. `saturation` and
+    /// `value` describe the brighter colour.
     pub fn sample(rng: &mut impl Rng, hue: f64, saturation: f64, value: f64, frequency: f64) -> Self {
         let pattern = [Pattern::Gradient, Pattern::Stripes, Pattern::Checkers, Pattern::Waves][uniform_below(rng, 4)];
         let turn = uniform_01(rng) * std::f64::consts::TAU;
@@ -46,7 +45,6 @@ impl Texture {
         }
     }
 
-    /// Returns a texture of one colour.
     #[cfg(test)]
     pub fn plain(color: Vec3) -> Self {
         Self { pattern: Pattern::Gradient, colors: [color; 2], axis: [1.0, 0.0], rate: 0.0, phase: 0.0 }

@@ -39,8 +39,7 @@ pub(crate) struct Checksums {
 }
 
 impl Checksums {
-    /// Reads the checksums of a folder that is new, empty or in progress, without changing the folder. Lines of missing
-    /// and of damaged files are dropped.
+    /// Reads the sums of a new, empty or unfinished folder without changing it. Drops lines of missing or bad files.
     pub fn open(folder: &Path, made_as: &str) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadOutput { what, path: folder.to_path_buf() };
         let path = folder.join(FILE_NAME);
@@ -104,9 +103,8 @@ impl Checksums {
             let name = entry.map_err(reading())?.file_name().to_string_lossy().into_owned();
             let is_ours = name == FILE_NAME || name.starts_with(TEMPORARY);
             if !is_ours && !self.sums.contains_key(&name) && !self.damaged.contains(&name) {
-                return Err(bad(format!(
-                    "it holds {name}, which is not listed in {FILE_NAME}; choose an empty folder"
-                )));
+                let what = format!("it holds {name}, which is not listed in {FILE_NAME}; choose an empty folder");
+                return Err(bad(what));
             }
         }
         Ok(())
@@ -217,7 +215,6 @@ mod tests {
         assert_eq!(checksums.sums["a"], hash_file(&path).unwrap());
     }
 
-    /// A folder with the files `a.torch`, `b.torch` and `c.torch`.
     fn three(folder: &Path) {
         let mut checksums = Checksums::open(folder, "chunks").unwrap();
         checksums.begin().unwrap();

@@ -294,7 +294,6 @@ impl<'a> Converter<'a> {
         Ok(())
     }
 
-    /// Returns the first unused chunk name.
     fn free_name(&self) -> String {
         let used: HashSet<&String> = self.index.values().collect();
         // One of `used.len() + 1` names is free.

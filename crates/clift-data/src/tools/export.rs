@@ -117,8 +117,7 @@ pub fn write_evaluation_index(
 ) -> Result<usize, DataError> {
     let mut entries = Vec::with_capacity(source.num_scenes());
     for scene in 0..source.num_scenes() {
-        let views = even_views(source.num_frames(scene)?, num_context, num_targets);
-        entries.push((source.key(scene), views));
+        entries.push((source.key(scene), even_views(source.num_frames(scene)?, num_context, num_targets)));
     }
     let num_usable = entries.iter().filter(|(_, views)| views.is_some()).count();
     write_index(path, entries)?;

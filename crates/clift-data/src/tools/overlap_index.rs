@@ -163,8 +163,6 @@ pub fn write_overlap_index(
 
 #[cfg(test)]
 mod tests {
-    use glam::DMat3;
-
     use super::*;
     use crate::geometry::camera::IntrinsicsNorm;
     use crate::geometry::pose::Pose;
@@ -172,6 +170,7 @@ mod tests {
     use crate::synthetic::config::SyntheticConfig;
     use crate::synthetic::source::SyntheticSource;
     use crate::testing::TestSource;
+    use glam::DMat3;
 
     fn rooms(num_frames: usize, path_length: f64) -> SyntheticSource {
         let config = SyntheticConfig { num_scenes: 20, num_frames, path_length, ..Default::default() };
@@ -223,7 +222,6 @@ mod tests {
         assert_eq!(report.to_string(), "19 of 20 scenes used; 1 shorter than 46 frames");
     }
 
-    /// Returns rooms of which the first has ten frames.
     fn first_is_short(rooms: SyntheticSource) -> TestSource {
         TestSource::new(rooms).with_cameras(|scene, mut cameras| {
             cameras.truncate(if scene == 0 { 10 } else { usize::MAX });

@@ -5,18 +5,15 @@ use crate::torch::values::{ElementType, Global};
 /// Treatment of objects whose classes are not on the allow-list.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum UnknownClasses {
-    /// The file is refused.
     #[default]
     Refuse,
     /// The objects are skipped, as [`Value::Opaque`](crate::torch::values::Value::Opaque).
     Skip,
 }
 
-/// Errors of reading a pickle.
 pub(crate) enum UnpickleError {
     /// A Python name that is not allowed.
     Refused(String),
-    /// Any other error.
     Bad(String),
 }
 
@@ -58,8 +55,7 @@ pub(crate) fn escaped_name(module: &str, name: &str) -> String {
     name.escape_debug().to_string()
 }
 
-/// Returns whether no training program writes this name into a checkpoint, so that the file is likely an attack on
-/// programs that execute pickles.
+/// Returns whether the file is likely an attack on programs that execute pickles: no training program writes this name.
 fn is_attack(module: &str, name: &str) -> bool {
     let package = module.split('.').next().unwrap_or_default();
     match package {

@@ -19,7 +19,6 @@ pub(crate) struct ByteSpan {
     header_start: u64,
     /// First byte within the member.
     start: u32,
-    /// Number of bytes.
     length: u32,
     /// Checksum of the whole member; not used for a part.
     crc32: u32,
@@ -27,7 +26,6 @@ pub(crate) struct ByteSpan {
 }
 
 impl ByteSpan {
-    /// Returns the number of bytes.
     pub fn len(&self) -> u64 {
         u64::from(self.length)
     }
@@ -46,7 +44,6 @@ impl ByteSpan {
         })
     }
 
-    /// Reads the bytes from the archive at `path`.
     pub fn read(&self, path: &Path) -> Result<Vec<u8>, DataError> {
         let bad = |what: &str| DataError::BadChunk {
             what: format!("the member at byte {} {what}; download the file again", self.header_start),
@@ -72,7 +69,6 @@ impl ByteSpan {
     }
 }
 
-/// The directory of one archive.
 pub(crate) struct Archive {
     members: HashMap<String, ByteSpan>,
 }

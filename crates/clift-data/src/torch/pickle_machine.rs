@@ -5,10 +5,8 @@ use std::collections::{BTreeSet, HashMap};
 use crate::torch::allow_list::{UnknownClasses, UnpickleError, escaped_name, global};
 use crate::torch::values::{MAX_VALUES, Value, ValueId};
 
-/// Largest number of recorded names of skipped objects.
 const MAX_SKIPPED_OBJECTS: usize = 256;
 
-/// The pickle machine: a stack, marks and a memo.
 #[derive(Default)]
 pub(crate) struct PickleMachine<'a> {
     pub bytes: &'a [u8],
@@ -23,7 +21,6 @@ pub(crate) struct PickleMachine<'a> {
 }
 
 impl<'a> PickleMachine<'a> {
-    /// Creates a machine at the first byte.
     pub fn new(bytes: &'a [u8], unknown: UnknownClasses) -> Self {
         Self { bytes, unknown, ..Self::default() }
     }
@@ -79,7 +76,6 @@ impl<'a> PickleMachine<'a> {
         Ok(self.stack.split_off(mark))
     }
 
-    /// Returns the top value without popping it.
     pub fn top(&self) -> Result<ValueId, UnpickleError> {
         let floor = self.marks.last().copied().unwrap_or(0);
         self.stack[floor..].last().copied().ok_or_else(|| "an opcode without its operands".into())
@@ -151,8 +147,7 @@ impl<'a> PickleMachine<'a> {
     }
 
     pub fn text(&mut self, length: usize) -> Result<String, UnpickleError> {
-        let bytes = self.take(length)?.to_vec();
-        String::from_utf8(bytes).map_err(|_| "a string that is not UTF-8".into())
+        String::from_utf8(self.take(length)?.to_vec()).map_err(|_| "a string that is not UTF-8".into())
     }
 
     /// Reads a line of text without its newline.

@@ -6,14 +6,12 @@ use zip::result::ZipResult;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-/// A pickle of protocol 2 and its storages.
 pub(crate) struct PickleWriter {
     bytes: Vec<u8>,
     storages: Vec<Vec<u8>>,
 }
 
 impl PickleWriter {
-    /// Starts a pickle.
     pub fn new() -> Self {
         Self { bytes: b"\x80\x02".to_vec(), storages: Vec::new() }
     }
@@ -46,7 +44,6 @@ impl PickleWriter {
         self.storages.push(storage);
     }
 
-    /// Writes a string.
     pub fn string(&mut self, text: &str) {
         self.raw(b"X");
         self.raw(&(text.len() as u32).to_le_bytes());
@@ -59,13 +56,11 @@ impl PickleWriter {
         self.raw(&(value as u64).to_le_bytes());
     }
 
-    /// Writes opcodes.
     pub fn raw(&mut self, bytes: &[u8]) {
         self.bytes.extend_from_slice(bytes);
     }
 
-    /// Returns the archive of the finished pickle and its storages, uncompressed and aligned to 64 bytes, with the top
-    /// folder `prefix`.
+    /// Returns the archive of pickle and storages, uncompressed, aligned to 64 bytes, with the top folder `prefix`.
     pub fn pack(self, prefix: &str) -> ZipResult<Vec<u8>> {
         let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
         let mut zip = ZipWriter::new(Cursor::new(Vec::new()));

@@ -19,7 +19,6 @@ use crate::torch::values::{ElementType, Tensor, Value};
 
 /// Readable number formats of weights.
 const FLOATS: [ElementType; 4] = [ElementType::F32, ElementType::F16, ElementType::BF16, ElementType::F64];
-
 /// Name of the dict beside the state dict in which [`write_state_dict`] stores the sizes of a network.
 const SIZES: &str = "clift";
 
@@ -263,7 +262,6 @@ mod tests {
         let state = StateDict::open(&path).unwrap();
         let read: Vec<_> = state.keys().map(|key| state.read(key)).collect();
         assert!(read.iter().any(|result| matches!(result, Err(DataError::BadCheckpoint { .. }))));
-
         let chunk = fixture("../re10k-mini/test/000000.torch");
         let message = StateDict::open(&chunk).map(|_| ()).unwrap_err().to_string();
         assert!(message.contains("the outermost object is no dict of tensors"), "{message}");

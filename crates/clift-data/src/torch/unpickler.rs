@@ -8,7 +8,6 @@ use crate::torch::values::{Global, MAX_BYTES, Storage, Tensor, Value, ValueId};
 const MAX_DEPTH: usize = 32;
 /// Deepest nesting in checkpoints, which contain configuration objects.
 const MAX_CHECKPOINT_DEPTH: usize = 256;
-/// Largest number of dimensions of a tensor.
 const MAX_DIMENSIONS: usize = 4;
 /// Longest name of a storage; `torch.save` numbers the storages.
 const MAX_STORAGE_KEY_BYTES: usize = 32;
@@ -48,9 +47,8 @@ impl PickleMachine<'_> {
                         || self.read_reference(opcode)?
                         || self.skips_unknown() && self.read_object(opcode)?;
                     if !known {
-                        return Err(UnpickleError::Bad(format!(
-                            "opcode {opcode:#04x}, which torch.save does not write"
-                        )));
+                        let what = format!("opcode {opcode:#04x}, which torch.save does not write");
+                        return Err(UnpickleError::Bad(what));
                     }
                 }
             }
@@ -120,8 +118,7 @@ impl PickleMachine<'_> {
                 self.extend_list(&items)?;
             }
             b's' => {
-                let value = self.pop()?;
-                let key = self.pop()?;
+                let (value, key) = (self.pop()?, self.pop()?);
                 self.extend_dict(&[key, value])?;
             }
             b'u' => {
@@ -165,8 +162,7 @@ impl PickleMachine<'_> {
             }
             b'R' => {
                 let (arguments, callee) = (self.pop()?, self.pop()?);
-                let value = self.call(callee, arguments);
-                let value = self.or_opaque(value)?;
+                let value = self.or_opaque(self.call(callee, arguments))?;
                 self.push(value)?;
             }
             _ => return Ok(false),
@@ -221,10 +217,8 @@ impl PickleMachine<'_> {
     fn counts(&self, id: ValueId) -> Result<Vec<u64>, UnpickleError> {
         let Value::Tuple(items) = self.get(id) else { return Err("a tensor whose sizes are no tuple".into()) };
         if items.len() > MAX_DIMENSIONS {
-            return Err(UnpickleError::Bad(format!(
-                "a tensor of {} dimensions, more than {MAX_DIMENSIONS}",
-                items.len()
-            )));
+            let what = format!("a tensor of {} dimensions, more than {MAX_DIMENSIONS}", items.len());
+            return Err(UnpickleError::Bad(what));
         }
         let count = |id: &ValueId| match self.get(*id) {
             Value::Int(count) => u64::try_from(*count).map_err(|_| "a tensor with a negative size or stride".into()),

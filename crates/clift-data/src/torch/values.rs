@@ -56,7 +56,6 @@ pub enum Global {
 /// A storage: a member of the archive beside the pickle.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Storage {
-    /// Element type.
     pub element_type: ElementType,
     /// Name of the archive member below `data/`.
     pub key: String,
@@ -67,7 +66,6 @@ pub struct Storage {
 /// A tensor as a view of a storage. Counts are in elements and not checked against the archive.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tensor {
-    /// Storage of the elements.
     pub storage: Storage,
     /// Index of the first element.
     pub offset: u64,
@@ -89,30 +87,20 @@ impl Tensor {
     }
 }
 
-/// One unpickled value.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {
-    /// `None`
     None,
-    /// `True` or `False`
     Bool(bool),
     /// An integer of at most 64 bits.
     Int(i64),
-    /// A float.
     Float(f64),
-    /// A string.
     Str(String),
-    /// A list.
     List(Vec<ValueId>),
-    /// A tuple.
     Tuple(Vec<ValueId>),
     /// A dict in order of insertion; of a key that occurs twice, the later value counts.
     Dict(Vec<(ValueId, ValueId)>),
-    /// A Python name.
     Global(Global),
-    /// A storage.
     Storage(Box<Storage>),
-    /// A tensor.
     Tensor(Box<Tensor>),
     /// A skipped object of an unknown class in a checkpoint.
     Opaque,

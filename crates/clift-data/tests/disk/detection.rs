@@ -10,7 +10,6 @@ use crate::open;
 
 const HASH: &str = "d6b00d693f813db59886beb214cc6e1939fe3d29fc1b4349616adf2d36ebdc6a";
 
-/// Copies a fixture of a layout.
 fn copy(part: &str, to: &Path) {
     copy_folder(&layout(part), to);
 }

@@ -5,17 +5,14 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// Returns the folder of the fixtures.
 pub fn fixtures() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures")
 }
 
-/// Returns the folder of a fixture of one scene.
 pub fn layout(name: &str) -> PathBuf {
     fixtures().join("layouts").join(name)
 }
 
-/// Returns a copy of a fixture of one scene.
 pub fn copy_of_layout(name: &str) -> TempDir {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&layout(name), root.path());
@@ -38,7 +35,6 @@ pub fn frame_at(x: f64, name: &str) -> Value {
     json!({"file_path": name, "transform_matrix": c2w})
 }
 
-/// Copies a folder with its contents.
 pub fn copy_folder(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).unwrap();
     for entry in std::fs::read_dir(from).unwrap() {

@@ -137,7 +137,6 @@ fn incomplete_scenes_are_skipped_unless_asked_for() {
     assert_eq!((source.num_scenes(), source.key(0)), (1, whole.as_str()));
     assert_eq!(report.skips[0].reason, "with frames that have no image");
     assert_eq!((&report.frames[0].key, report.frames[0].frame.as_str()), (&torn, "images/frame_00004.png"));
-
     let files = FileOptions { keep_incomplete: true, ..FileOptions::default() };
     let OpenedSource { source, report, .. } = open_with(root.path(), files).unwrap();
     let scene = source.find(&torn).unwrap();
@@ -203,7 +202,6 @@ fn scenes_and_chunks_open_without_an_index() {
     std::fs::write(root.path().join("test/invalid_keys.txt"), KEY).unwrap();
     let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
     assert_eq!((source.num_scenes(), report.to_string()), (0, "0 of 1 scenes used; 1 in invalid_keys.txt".into()));
-
     let chunks = copy_of_layout("chunks");
     std::fs::remove_file(chunks.path().join("test/index.json")).unwrap();
     std::fs::write(chunks.path().join("test/000001.torch"), "cut").unwrap();

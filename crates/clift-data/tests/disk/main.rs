@@ -12,22 +12,18 @@ use std::path::Path;
 
 use clift_data::{DatasetRoot, FileOptions, OpenedSource, SkipReport, SourceOptions, Split, open_source};
 
-/// Opens a split of the data set at a path; returns an error as text.
 fn open(root: &Path, split: Split, options: &SourceOptions) -> Result<OpenedSource, String> {
     DatasetRoot::find(root).and_then(|root| open_source(&root, split, options)).map_err(|error| error.to_string())
 }
 
-/// Opens the test split with the default options.
 fn open_test(root: &Path) -> Result<OpenedSource, String> {
     open(root, Split::Test, &SourceOptions::default())
 }
 
-/// Opens the test split with other file options.
 fn open_with(root: &Path, files: FileOptions) -> Result<OpenedSource, String> {
     open(root, Split::Test, &SourceOptions { files, ..SourceOptions::default() })
 }
 
-/// Returns the names of the skipped frames with the reasons.
 fn skipped_frames(report: &SkipReport) -> Vec<(&str, &str)> {
     report.frames.iter().map(|skip| (skip.frame.as_str(), skip.reason.as_str())).collect()
 }

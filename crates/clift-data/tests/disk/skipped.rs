@@ -15,7 +15,6 @@ fn image(width: usize, height: usize) -> RgbImage {
     RgbImage { width, height, rgb: (0..width * height * 3).map(|i| (i * i / 7) as u8).collect() }
 }
 
-/// Writes images, and a `transforms.json` with `frames`.
 fn write(root: &Path, images: &[(&str, Vec<u8>)], frames: &[&str]) {
     let frames: Vec<Value> = frames.iter().enumerate().map(|(x, name)| frame_at(x as f64, name)).collect();
     write_capture(root, images, &json!({"fl_x": 40, "w": 48, "h": 32, "frames": frames}));
@@ -41,8 +40,7 @@ fn truncated_images_are_skipped_at_opening() {
     let root = tempfile::tempdir().unwrap();
     write(root.path(), &images, &images.clone().map(|(name, _)| name));
     let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
-    let truncated = ["1.jpg", "3.png", "8.jpg"].map(|name| (name, "whose image is truncated"));
-    assert_eq!(skipped_frames(&report), truncated);
+    assert_eq!(skipped_frames(&report), ["1.jpg", "3.png", "8.jpg"].map(|name| (name, "whose image is truncated")));
     for frame in 0..source.num_frames(0).unwrap() {
         assert!(source.frame(0, frame).is_ok(), "{frame}");
     }
@@ -74,7 +72,6 @@ fn scenes_without_usable_images_report_the_reason() {
     assert_eq!(reason("missing"), "without any image");
     assert!(reason("turned").contains("may have been rotated or cropped"), "{report}");
     assert_eq!(report.num_used(), 1);
-
     // DL3DV: only the first image of a scene is checked.
     let root = tempfile::tempdir().unwrap();
     for key in ["a", "b"].map(|digit| digit.repeat(64)) {
@@ -100,17 +97,12 @@ fn unreadable_images_leave_other_frames_in_use() {
 fn images_without_cameras_are_counted() {
     let png = || encode_png(&image(48, 32)).unwrap();
     let root = tempfile::tempdir().unwrap();
-    write(
-        &root.path().join("a"),
-        &[("images/0.png", png()), ("images/1.png", png()), ("logo.png", png())],
-        &["images/0"],
-    );
-    let images = ["0", "1", "2"].map(|name| (name, png()));
-    let images = images.map(|(name, png)| (format!("images/{name}.png"), png));
+    let images = [("images/0.png", png()), ("images/1.png", png()), ("logo.png", png())];
+    write(&root.path().join("a"), &images, &["images/0"]);
+    let images = ["0", "1", "2"].map(|name| (format!("images/{name}.png"), png()));
     let images: Vec<(&str, Vec<u8>)> = images.iter().map(|(name, png)| (name.as_str(), png.clone())).collect();
     write(&root.path().join("b"), &images, &["images/2", "images/9"]);
     assert_eq!(open_test(root.path()).unwrap().report.notes[0], "3 images without a camera, not used: 1 of a, 2 of b");
-
     for (layout, frames) in [("colmap_bin/attic", "images/left"), ("re10k_folders", "")] {
         let copy = copy_of_layout(layout);
         let note = "1 image without a camera, not used: ";
@@ -126,7 +118,6 @@ fn images_without_cameras_are_counted() {
     }
 }
 
-/// Returns all files below a folder.
 fn walk(folder: &Path) -> Vec<std::path::PathBuf> {
     let paths = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
     paths.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()

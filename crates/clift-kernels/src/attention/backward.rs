@@ -74,9 +74,8 @@ fn backward_into(
     let AttentionSizes { num_queries, num_keys, num_heads, head_width, .. } = sizes;
     let blocks = num_keys.div_ceil(BACKWARD_KEYS);
     let parts = sizes.parts(blocks);
-    let tasks = sizes.batch * num_heads * parts;
     // Every part of the keys contributes to the gradients of all queries.
-    let partial: Vec<Vec<f32>> = (0..tasks)
+    let partial: Vec<Vec<f32>> = (0..sizes.batch * num_heads * parts)
         .into_par_iter()
         .map(|task| {
             let (head, part) = (task / parts, task % parts);
@@ -117,7 +116,6 @@ struct BackwardTask<'a> {
 impl<'a> Kernel for BackwardTask<'a> {
     /// Unscaled gradients of all queries from the task's keys, in rows of the padded head width.
     type Output = Vec<f32>;
-
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> Vec<f32> {
         let Self { sizes, inputs, grad_key, grad_value, scene, head, keys } = self;
@@ -149,7 +147,6 @@ impl<'a> Kernel for BackwardTask<'a> {
             *to = pairs.map(|(a, b)| a * b).sum();
         }
         let log_sum = &inputs.log_sum[(scene * num_heads + head) * num_queries..][..num_queries];
-
         for first_key in keys.clone().step_by(BACKWARD_KEYS) {
             let count = BACKWARD_KEYS.min(keys.end - first_key);
             let rows = first_key..first_key + count;

@@ -66,7 +66,6 @@ struct Forward<'a> {
 
 impl Kernel for Forward<'_> {
     type Output = ();
-
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { sizes, inputs: [query, key, value], output, log_sum, scene, head, queries } = self;
@@ -143,7 +142,6 @@ fn exponentials<S: Simd>(simd: S, scores: &mut [f32], scale: f32, highest: &mut 
     let former = *highest;
     let raised = if former > largest * scale { former } else { largest * scale };
     let shrink = if former == raised { 1.0 } else { (former - raised).exp2() };
-
     let (factor, shift) = (simd.splat(scale), simd.splat(-raised));
     let mut sum = simd.splat(0.0);
     for chunk in scores[..full].chunks_exact_mut(S::LANES) {

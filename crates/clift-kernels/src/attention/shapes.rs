@@ -19,18 +19,15 @@ pub struct AttentionSizes {
 }
 
 impl AttentionSizes {
-    /// Returns the width of all heads together.
     pub(crate) fn dim(&self) -> usize {
         self.num_heads * self.head_width
     }
 
-    /// Returns the factor of the scores, `1 / sqrt(head_width)`.
     pub(crate) fn scale(&self) -> f32 {
         (1.0 / (self.head_width as f64).sqrt()) as f32
     }
 
-    /// Returns the number of parts that the blocks of one head are divided into, enough for 16 threads. Depends on
-    /// the shape alone, because sums over parts depend on it.
+    /// Returns the parts that the blocks of a head are divided into, for 16 threads: by shape alone, for equal sums.
     pub(crate) fn parts(&self, blocks: usize) -> usize {
         16_usize.div_ceil((self.batch * self.num_heads).max(1)).clamp(1, blocks.max(1))
     }
@@ -48,7 +45,6 @@ pub struct StridedRows<'a> {
 }
 
 impl<'a> StridedRows<'a> {
-    /// Returns one head of one row.
     pub(crate) fn head(&self, sizes: &AttentionSizes, scene: usize, row: usize, head: usize) -> &'a [f32] {
         let start = scene * self.batch_stride + row * self.row_stride + head * sizes.head_width;
         &self.values[start..start + sizes.head_width]
@@ -94,7 +90,6 @@ impl HeadBlocks<'_> {
     }
 }
 
-/// Queries per block.
 pub(crate) const QUERY_BLOCK: usize = 96;
 /// Padding of a row of scores: rows a power of two apart would share cache sets.
 pub(crate) const ROW_PADDING: usize = 16;

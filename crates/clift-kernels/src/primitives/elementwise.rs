@@ -28,7 +28,6 @@ struct Piece<'a, F> {
 
 impl<F: Elementwise> Kernel for Piece<'_, F> {
     type Output = ();
-
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         for (from, to) in self.from.chunks(S::LANES).zip(self.to.chunks_mut(S::LANES)) {

@@ -23,13 +23,11 @@ pub(crate) struct Right<'a> {
     pub panel: usize,
 }
 
-/// Returns the columns of a full panel.
 #[inline(always)]
 pub(crate) fn panel_width<S: Simd>() -> usize {
     S::LANES * S::TILE_VECTORS
 }
 
-/// Rounds `columns` up to whole vectors.
 #[inline(always)]
 pub(crate) fn padded<S: Simd>(columns: usize) -> usize {
     columns.next_multiple_of(S::LANES)

@@ -23,7 +23,6 @@ impl Scratch {
         Self { values }
     }
 
-    /// Splits the buffer into parts of the given lengths.
     pub(crate) fn cut<const COUNT: usize>(&mut self, lens: [usize; COUNT]) -> [&mut [f32]; COUNT] {
         let mut slice = self.values.as_mut_slice();
         lens.map(|len| {

@@ -42,7 +42,6 @@ impl std::error::Error for InstructionSetError {}
 /// A computation that is generic over the instruction set. `run` must be `#[inline(always)]`.
 pub(crate) trait Kernel {
     type Output;
-
     fn run<S: Simd>(self, simd: S) -> Self::Output;
 }
 
@@ -160,8 +159,7 @@ mod tests {
         assert_eq!(InstructionSet::parse(""), Ok(None));
         assert_eq!(InstructionSet::parse("portable"), Ok(Some(InstructionSet::Portable)));
         for set in InstructionSet::ALL {
-            let parsed = InstructionSet::parse(set.name());
-            assert_eq!(parsed.is_ok(), set.is_available(), "{}", set.name());
+            assert_eq!(InstructionSet::parse(set.name()).is_ok(), set.is_available(), "{}", set.name());
         }
         let message = InstructionSet::parse("AVX2").unwrap_err().to_string();
         assert!(message.starts_with("unknown instruction set; use one of "), "{message}");

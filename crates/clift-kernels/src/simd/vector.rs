@@ -6,13 +6,11 @@
 
 /// Arithmetic on vectors of [`Simd::LANES`] values.
 pub trait Simd: Copy + Send + Sync + 'static {
-    /// Values per vector.
     const LANES: usize;
     /// Rows of the register tile of a matrix product.
     const TILE_ROWS: usize;
     /// Vectors side by side in the register tile of a matrix product.
     const TILE_VECTORS: usize;
-    /// A vector.
     type V: Copy;
 
     /// Returns a vector with the same value in every lane.
@@ -27,13 +25,9 @@ pub trait Simd: Copy + Send + Sync + 'static {
     /// # Safety
     /// The values must be writable at `to`.
     unsafe fn store(self, to: *mut f32, value: Self::V);
-    /// `a + b`
     fn add(self, a: Self::V, b: Self::V) -> Self::V;
-    /// `a - b`
     fn sub(self, a: Self::V, b: Self::V) -> Self::V;
-    /// `a * b`
     fn mul(self, a: Self::V, b: Self::V) -> Self::V;
-    /// `a / b`
     fn div(self, a: Self::V, b: Self::V) -> Self::V;
     /// `a * b + c`, with a single rounding if the processor has FMA.
     fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V;
@@ -47,12 +41,9 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn round(self, a: Self::V) -> Self::V;
     /// `a * 2^n` for integers `n` in `-126..=127`; for -127 zero or the exact result.
     fn scale_by_power(self, a: Self::V, n: Self::V) -> Self::V;
-    /// The sum of all lanes.
     fn sum(self, a: Self::V) -> f32;
-    /// The largest lane.
     fn largest(self, a: Self::V) -> f32;
-    /// Computes the full register tile of a matrix product: [`Simd::TILE_ROWS`] rows of
-    /// [`Simd::TILE_VECTORS`] vectors.
+    /// Computes the full register tile of a matrix product: [`Simd::TILE_ROWS`] rows of [`Simd::TILE_VECTORS`] vectors.
     ///
     /// # Safety
     /// As [`Tile::run`].
@@ -110,7 +101,6 @@ pub(crate) const MAX_LANES: usize = 16;
 /// A register tile: `C[M, N] = A[M, K] B[K, N]`, or `C += A B` if `accumulate`.
 #[derive(Clone, Copy, Debug)]
 pub struct Tile {
-    /// Inner size.
     pub inner: usize,
     /// First value of A.
     pub a: *const f32,
@@ -126,7 +116,6 @@ pub struct Tile {
     pub c: *mut f32,
     /// Values from one row of C to the next.
     pub c_row: usize,
-    /// Whether the product is added to C.
     pub accumulate: bool,
 }
 

@@ -1,11 +1,9 @@
 //! Sampled views stay within the bounds of the sampler, and equal those of an implementation in Python.
 
-use std::collections::BTreeSet;
-
-use proptest::prelude::*;
-
 use super::*;
 use crate::random::item_rng;
+use proptest::prelude::*;
+use std::collections::BTreeSet;
 
 fn sampler() -> ViewSampler {
     ViewSampler::default()
@@ -93,8 +91,7 @@ fn stage_two_targets_are_no_contexts_while_others_exist() {
     assert_eq!(sorted(&[3, 5], 3).unwrap(), [4, 4, 4]);
     let only_contexts = sorted(&[3, 4, 5], 6).unwrap();
     assert!(only_contexts.len() == 6 && only_contexts.iter().all(|target| (3..=5).contains(target)));
-    let message = sorted(&[3, 20], 3).unwrap_err().to_string();
-    assert_eq!(message, "not enough frames: 21 needed, 20 in the scene");
+    assert_eq!(sorted(&[3, 20], 3).unwrap_err().to_string(), "not enough frames: 21 needed, 20 in the scene");
     assert!(sorted(&[], 3).is_err());
 }
 

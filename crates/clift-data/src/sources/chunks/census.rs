@@ -77,8 +77,7 @@ impl Census {
     pub fn path(caches: &Path, folder: &Path) -> PathBuf {
         let folder = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
         let hash = Sha256::digest(folder.as_os_str().as_encoded_bytes());
-        let name: String = hash[..16].iter().map(|byte| format!("{byte:02x}")).collect();
-        caches.join("census").join(format!("{name}.json"))
+        caches.join("census").join(format!("{}.json", hex::encode(&hash[..16])))
     }
 
     /// Reads a census; without a readable one, the census is empty.

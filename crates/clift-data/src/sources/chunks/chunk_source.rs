@@ -65,7 +65,6 @@ impl Chunk {
     }
 }
 
-/// Key and chunk of a scene.
 struct Entry {
     key: String,
     chunk: usize,
@@ -129,7 +128,6 @@ impl ChunkSource {
         Ok(source)
     }
 
-    /// Reads the JPEG or PNG file of a frame.
     fn read_encoded(&self, scene: usize, frame: usize) -> Result<Vec<u8>, DataError> {
         let (path, table) = self.table(scene)?;
         let span = table.images.get(frame).ok_or_else(|| DataError::NoSuchFrame {
@@ -224,7 +222,6 @@ impl ChunkSource {
         filters.reason_to_skip(num_frames, || fov_deg.map_or_else(|| Ok(widest_fov_deg(&self.cameras(scene)?)), Ok))
     }
 
-    /// Returns the table of a scene and the path of its chunk.
     fn table(&self, scene: usize) -> Result<(&Path, &SceneTable), DataError> {
         let num_scenes = self.scenes.len();
         let Entry { key, chunk } = self.scenes.get(scene).ok_or(DataError::NoSuchScene { scene, num_scenes })?;
@@ -246,40 +243,32 @@ impl SceneSource for ChunkSource {
     fn num_scenes(&self) -> usize {
         self.scenes.len()
     }
-
     fn key(&self, scene: usize) -> &str {
         &self.scenes[scene].key
     }
-
     fn find(&self, key: &str) -> Option<usize> {
         // The training chunks of DepthSplat prefix the keys; its indices do not.
         let prefixed = || self.positions.get(&format!("{DL3DV_PREFIX}{key}"));
         let by_name = || find_by_name(self.scenes.iter().map(|entry| entry.key.as_str()), key);
         self.positions.get(key).or_else(prefixed).copied().or_else(by_name)
     }
-
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         self.census(scene).map_or_else(|| Ok(self.table(scene)?.1.images.len()), |census| Ok(census.num_frames))
     }
-
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
         let (path, table) = self.table(scene)?;
         table.read_timestamps(path)
     }
-
     fn url(&self, scene: usize) -> Result<String, DataError> {
         Ok(self.table(scene)?.1.url.clone())
     }
-
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         let (path, table) = self.table(scene)?;
         table.read_cameras(path)
     }
-
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         decode_image(&self.read_encoded(scene, frame)?, self.key(scene), frame)
     }
-
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         self.read_encoded(scene, frame).map(Some)
     }

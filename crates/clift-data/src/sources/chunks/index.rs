@@ -43,8 +43,7 @@ pub(crate) fn note_unlisted(folder: &Path, index: &BTreeMap<String, String>) -> 
     Ok((!files.is_empty()).then(note))
 }
 
-/// Returns the file of every scene in a folder without an index: for one file per scene from the file names, for chunks
-/// from their tables.
+/// Returns the file of every scene without an index: by file name for one file per scene, by table for chunks.
 pub(crate) fn index_of_files(folder: &Path, report: &mut SkipReport) -> Result<BTreeMap<String, String>, DataError> {
     let files = torch_files(folder)?;
     let stem = |file: &str| file.strip_suffix(".torch").unwrap_or(file).to_owned();
@@ -91,9 +90,8 @@ fn index_of_chunks(folder: &Path, files: &[String], report: &mut SkipReport) -> 
     }
     duplicates.sort_unstable();
     report.notes.extend(note_on(&duplicates, "scene", "in more than one file, the first of which is used"));
-    report
-        .notes
-        .push(format!("no index.json: the scenes of {} files were determined from their contents", files.len()));
+    let note = format!("no index.json: the scenes of {} files were determined from their contents", files.len());
+    report.notes.push(note);
     index
 }
 

@@ -16,7 +16,6 @@ use crate::torch::values::{ElementType, MAX_BYTES, MAX_VALUES, Value};
 /// a list of frames. Scenes without sharing have at least 8 values per frame, thus fewer frames than this.
 const MAX_FRAMES: usize = MAX_VALUES / 8;
 
-/// Byte ranges of one scene of a chunk.
 pub(crate) struct SceneTable {
     pub key: String,
     pub url: String,
@@ -26,7 +25,6 @@ pub(crate) struct SceneTable {
     pub images: Vec<ByteSpan>,
 }
 
-/// The scenes of one chunk, by key.
 pub(crate) struct ChunkTable {
     pub scenes: HashMap<String, SceneTable>,
 }
@@ -104,7 +102,6 @@ impl Builder<'_> {
 }
 
 impl SceneTable {
-    /// Reads every camera of the scene.
     pub fn read_cameras(&self, path: &Path) -> Result<Vec<Camera>, DataError> {
         let bytes = self.cameras.read(path)?;
         let numbers: Vec<f64> = match self.camera_type {
@@ -121,10 +118,8 @@ impl SceneTable {
         rows.iter().enumerate().map(camera).collect()
     }
 
-    /// Reads the time stamp of every frame.
     pub fn read_timestamps(&self, path: &Path) -> Result<Vec<i64>, DataError> {
-        let bytes = self.timestamps.read(path)?;
-        Ok(bytes.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect())
+        Ok(self.timestamps.read(path)?.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect())
     }
 
     /// Checks the image files without decoding them. Returns the unreadable ones with the reason.

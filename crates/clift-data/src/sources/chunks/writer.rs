@@ -28,7 +28,6 @@ pub struct SceneRecord {
 }
 
 impl SceneRecord {
-    /// Returns the bytes of all images.
     pub(crate) fn image_bytes(&self) -> u64 {
         self.images.iter().map(|image| image.len() as u64).sum()
     }
@@ -53,7 +52,6 @@ impl SceneRecord {
 /// Sizes of the scenes in a file.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ChunkFill {
-    /// Bytes of the images.
     image_bytes: u64,
     num_frames: usize,
     /// Upper bounds of the values and bytes of the pickle.
@@ -73,7 +71,6 @@ impl ChunkFill {
         }
     }
 
-    /// Adds a scene.
     pub fn add(&mut self, scene: &SceneRecord) {
         *self = self.with(scene);
     }
@@ -84,7 +81,6 @@ impl ChunkFill {
         num_values < MAX_VALUES && pickle_bytes < MAX_BYTES
     }
 
-    /// Returns whether the file has reached the target size.
     pub fn is_full(self, target_bytes: u64) -> bool {
         self.image_bytes >= target_bytes || self.num_frames >= MAX_CHUNK_FRAMES
     }
@@ -139,12 +135,10 @@ pub(crate) fn chunk_name(number: usize) -> String {
     format!("{number:06}.torch")
 }
 
-/// Writes a chunk.
 fn write_chunk(path: &Path, scenes: &[SceneRecord]) -> Result<(), DataError> {
     replace_file(path, &chunk_bytes(path, scenes)?).map_err(DataError::io("writing a chunk", path))
 }
 
-/// Returns the bytes of the chunk at `path`.
 pub(crate) fn chunk_bytes(path: &Path, scenes: &[SceneRecord]) -> Result<Vec<u8>, DataError> {
     let mut pickle = PickleWriter::new();
     pickle.raw(b"](");
@@ -228,13 +222,11 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let records = [record("b", 3), record("a", 5), record("c", 1)];
         // 303, 510 and 100 bytes of images: the second scene closes the first chunk.
-        let written = write_chunks(&folder.path().join("test"), records.clone().map(Ok), 400).unwrap();
-        assert_eq!(written, 3);
+        assert_eq!(write_chunks(&folder.path().join("test"), records.clone().map(Ok), 400).unwrap(), 3);
         let index = std::fs::read_to_string(folder.path().join("test/index.json")).unwrap();
         let index: BTreeMap<String, String> = serde_json::from_str(&index).unwrap();
         let expected = [("a", "000000.torch"), ("b", "000000.torch"), ("c", "000001.torch")];
         assert_eq!(index, expected.map(|(key, file)| (key.to_owned(), file.to_owned())).into());
-
         let source = ChunkSource::open(folder.path(), Split::Test, &SceneFilters::default()).unwrap();
         assert_eq!(source.num_scenes(), 3);
         for record in &records {
@@ -259,9 +251,8 @@ mod tests {
         let small = (0..20_000).map(|number| record(&format!("{number:05}"), 1));
         let folder = tempfile::tempdir().unwrap();
         write_chunks(&folder.path().join("test"), small.chain([record("long", most)]).map(Ok), u64::MAX).unwrap();
-        let source =
-            ChunkSource::open(folder.path(), Split::Test, &SceneFilters { min_frames: 1, ..Default::default() });
-        let source = source.unwrap();
+        let filters = SceneFilters { min_frames: 1, ..Default::default() };
+        let source = ChunkSource::open(folder.path(), Split::Test, &filters).unwrap();
         assert_eq!(source.report.to_string(), "20001 of 20001 scenes used");
         assert_eq!(source.num_frames(source.find("long").unwrap()).unwrap(), most);
         let message = write_chunks(&folder.path().join("train"), [Ok(record("a", most + 1))], 1).unwrap_err();

@@ -17,9 +17,7 @@ pub(crate) struct ImageFolders {
     folders: HashMap<PathBuf, Option<ImageFolder>>,
 }
 
-/// Image files of one folder.
 struct ImageFolder {
-    /// File names by stem.
     by_stem: HashMap<String, Vec<String>>,
     /// Files of other formats, by stem.
     unreadable: HashMap<String, String>,
@@ -58,7 +56,6 @@ impl ImageFolders {
         folders.map(|folder| folder.by_stem.len() - folder.requested.len()).sum()
     }
 
-    /// Returns whether a folder exists.
     pub fn has(&mut self, folder: &Path) -> bool {
         self.folder(folder).is_some()
     }
@@ -85,8 +82,7 @@ impl ImageFolder {
     }
 }
 
-/// Returns the images of a folder whose names are numbers (time stamps in RealEstate10K), by number. Of two names of one
-/// number (`77` and `077`), the first in order of names counts.
+/// Returns the images whose names are numbers (time stamps), by number; of `77` and `077`, the first in order of names.
 pub(crate) fn numbered_images(folder: &Path) -> Result<HashMap<i64, PathBuf>, DataError> {
     let mut numbered = HashMap::new();
     for name in file_names(folder)? {

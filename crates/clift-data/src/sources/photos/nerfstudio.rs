@@ -101,8 +101,7 @@ struct Optics<'a> {
 }
 
 impl<'a> Optics<'a> {
-    /// Returns the keys of a frame, with those of the top level where missing. A focal length of the frame overrides an
-    /// angle of the top level.
+    /// Fills missing keys of a frame from the top level. A focal length of the frame overrides an angle of that level.
     fn or(self, top: &Optics<'a>) -> Self {
         let either = |own: [Option<f64>; 2], top: [Option<f64>; 2]| [own[0].or(top[0]), own[1].or(top[1])];
         let has_focal = self.focal.iter().chain(&self.angle).any(Option::is_some);
@@ -212,7 +211,6 @@ fn explain(error: &serde_json::Error, text: &[u8]) -> String {
     format!("expected the format of nerfstudio, got {error}{hint}")
 }
 
-/// Locates the images of one scene.
 struct ImageLocator<'a> {
     folder: &'a Path,
     options: &'a PhotoOptions,
@@ -307,11 +305,9 @@ struct BoundedVisitor<T, const MAX: usize>(PhantomData<T>);
 
 impl<'de, T: Deserialize<'de>, const MAX: usize> Visitor<'de> for BoundedVisitor<T, MAX> {
     type Value = Bounded<T, MAX>;
-
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "a list of at most {MAX}")
     }
-
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Self::Value, A::Error> {
         let mut list = Vec::new();
         while let Some(item) = items.next_element()? {

@@ -13,15 +13,12 @@ use crate::image::codec::{apply_orientation, check_end, decode_image, exif_orien
 use crate::image::rgb_image::RgbImage;
 use crate::image::undistort::Undistortion;
 
-/// Largest number of frames of a scene.
 pub(crate) const MAX_FRAMES: usize = 100_000;
 /// Largest size of an image file, in bytes.
 const MAX_IMAGE_BYTES: u64 = 256 << 20;
-/// Largest relative error of an image's aspect ratio against its camera's: rounding of images scaled down to a few dozen
-/// pixels.
+/// Largest relative error of an image's aspect ratio against its camera's: rounding of images a few dozen pixels wide.
 const MAX_SHAPE_ERROR: f64 = 0.02;
 
-/// Options of locating and loading photos.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PhotoOptions {
     /// Image folder beside the camera file, instead of the folder in the camera file.
@@ -32,7 +29,6 @@ pub(crate) struct PhotoOptions {
     pub undistort: bool,
 }
 
-/// An image on disk with its camera.
 #[derive(Clone, Debug)]
 pub(crate) struct Photo {
     pub path: PathBuf,
@@ -88,15 +84,13 @@ impl Photo {
         intrinsics_norm.validate()?;
         let time = number_at_end(&path);
         if !undistort || lens.is_pinhole() {
-            let camera = Camera { intrinsics_norm, c2w };
-            return Ok(Self { path, camera, undistortion: None, shape: None, time });
+            return Ok(Self { path, camera: Camera { intrinsics_norm, c2w }, undistortion: None, shape: None, time });
         }
         let undistortion = Undistortion::new(intrinsics_norm, lens)?;
         let camera = Camera { intrinsics_norm: undistortion.intrinsics_norm(), c2w };
         Ok(Self { path, camera, undistortion: Some(Box::new(undistortion)), shape: None, time })
     }
 
-    /// Reads the image file.
     pub fn read(&self) -> Result<Vec<u8>, DataError> {
         read_bounded(&self.path, MAX_IMAGE_BYTES, "reading an image")
     }
@@ -164,7 +158,6 @@ fn number_at_end(path: &Path) -> Option<i64> {
 }
 
 impl PhotoScene {
-    /// Adds a frame without a usable image.
     pub fn skip(&mut self, name: impl Into<String>, reason: impl Into<String>) {
         self.missing.push(MissingPhoto { name: name.into(), reason: reason.into() });
     }

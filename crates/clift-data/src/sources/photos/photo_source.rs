@@ -18,11 +18,9 @@ use crate::sources::photos::scene_folder::SceneFolder;
 
 /// Largest number of photos in the cache, about 300 bytes each.
 const MAX_CACHED_PHOTOS: usize = 200_000;
-/// Largest number of scenes in the cache.
 const MAX_CACHED_SCENES: usize = 256;
 /// Largest number of frames named in the report; further frames are counted.
 const MAX_NAMED_FRAMES: usize = 10_000;
-/// Reason of a frame without an image file.
 const NO_IMAGE: &str = "without an image";
 
 /// Images that a note counts.
@@ -32,7 +30,6 @@ const COUNTED: [&str; 3] = [
     "with an EXIF orientation that is not applied, as the cameras have the stored size",
 ];
 
-/// Options of opening scenes of photos.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PhotoSourceOptions {
     pub photos: PhotoOptions,
@@ -126,8 +123,7 @@ impl PhotoSource {
     }
 
     fn entry(&self, scene: usize) -> Result<&Entry, DataError> {
-        let num_scenes = self.scenes.len();
-        self.scenes.get(scene).ok_or(DataError::NoSuchScene { scene, num_scenes })
+        self.scenes.get(scene).ok_or(DataError::NoSuchScene { scene, num_scenes: self.scenes.len() })
     }
 
     fn scene(&self, scene: usize) -> Result<Arc<PhotoScene>, DataError> {
@@ -171,7 +167,6 @@ impl PhotoSource {
     }
 }
 
-/// Examines whether a scene is usable.
 fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Findings, DataError> {
     let PhotoScene { photos, mut missing, num_without_camera, notes, .. } = folder.read(&options.photos)?;
     let num_listed = photos.len() + missing.len();
@@ -242,38 +237,30 @@ impl SceneSource for PhotoSource {
     fn num_scenes(&self) -> usize {
         self.scenes.len()
     }
-
     fn key(&self, scene: usize) -> &str {
         &self.scenes[scene].folder.key
     }
-
     fn find(&self, key: &str) -> Option<usize> {
         let by_name = || find_by_name(self.scenes.iter().map(|scene| scene.folder.key.as_str()), key);
         self.positions.get(key).copied().or_else(by_name)
     }
-
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.entry(scene)?.num_frames)
     }
-
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
         Ok(self.scene(scene)?.photos.iter().map(|photo| photo.camera).collect())
     }
-
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
         Ok(self.scene(scene)?.timestamps())
     }
-
     fn url(&self, scene: usize) -> Result<String, DataError> {
         Ok(self.scene(scene)?.url.clone())
     }
-
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         let photo = self.photo(scene, frame)?;
         let decode = || photo.decode(self.key(scene), frame);
         self.image_cache.as_ref().map_or_else(decode, |cache| cache.scaled(&photo, decode))
     }
-
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         let photo = self.photo(scene, frame)?;
         if photo.undistortion.is_some() || photo.header()?.is_turned {

@@ -11,7 +11,6 @@ use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoScene};
 
 /// Largest size of a file, in bytes: a hundred times the longest clip.
 const MAX_BYTES: u64 = 16 << 20;
-/// Largest number of stored characters of a URL.
 const MAX_URL_CHARS: usize = 1000;
 /// Number of columns of a line: a time stamp, four intrinsics, two zeros and a pose of 3 x 4.
 const NUM_COLUMNS: usize = 19;

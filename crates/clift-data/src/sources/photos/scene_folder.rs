@@ -15,17 +15,13 @@ use crate::sources::photos::re10k_text::{looks_like_re10k, read_re10k_text};
 
 /// Depth of the search below the root; scenes of DL3DV lie two folders down.
 const MAX_DEPTH: usize = 3;
-/// Largest number of searched folders.
 const MAX_FOLDERS: usize = 200_000;
 
-/// Camera files of a scene.
+/// Camera files of a scene: a `transforms.json`, a COLMAP model, or a text file of RealEstate10K.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum SceneFiles {
-    /// A `transforms.json`.
     Transforms(PathBuf),
-    /// A COLMAP model and the folder of its scene.
     Colmap { folder: PathBuf, model: PathBuf },
-    /// A text file of RealEstate10K and the folder of its frames.
     Re10kText { cameras: PathBuf, frames: PathBuf },
 }
 
@@ -37,7 +33,6 @@ pub(crate) struct SceneFolder {
 }
 
 impl SceneFolder {
-    /// Reads the cameras and locates the images.
     pub fn read(&self, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
         match &self.files {
             SceneFiles::Transforms(path) => read_transforms(path, options),
@@ -46,7 +41,6 @@ impl SceneFolder {
         }
     }
 
-    /// Returns the file or folder of the cameras.
     pub fn path(&self) -> &Path {
         match &self.files {
             SceneFiles::Transforms(path) | SceneFiles::Colmap { model: path, .. } => path,
@@ -94,7 +88,6 @@ fn re10k_in(folder: &Path) -> Option<SceneFiles> {
     Some(SceneFiles::Re10kText { cameras, frames })
 }
 
-/// Scenes and other data found below a folder.
 pub(crate) struct FoundScenes {
     /// Scenes sorted by key: the name of the scene folder, or its path if several folders have that name.
     pub scenes: Vec<SceneFolder>,
@@ -151,11 +144,8 @@ pub(crate) fn find_scenes(base: &Path) -> Result<FoundScenes, DataError> {
     }
     let mut notes = Vec::new();
     if !duplicates.is_empty() {
-        notes.push(format!(
-            "{} to scenes that are used already: {}",
-            plural(duplicates.len(), "link"),
-            first_few(&duplicates)
-        ));
+        let links = plural(duplicates.len(), "link");
+        notes.push(format!("{links} to scenes that are used already: {}", first_few(&duplicates)));
     }
     let mut paths: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for (way, _) in &found {
@@ -193,7 +183,6 @@ fn push_folders(
     Ok(())
 }
 
-/// Returns a description of the data of another layout in a folder.
 fn other_data_in(folder: &Path) -> Option<String> {
     let names = file_names(folder).ok()?;
     if names.iter().any(|name| has_ending(name, "torch")) {

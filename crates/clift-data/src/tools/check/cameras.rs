@@ -21,7 +21,6 @@ const MAX_DEFECT: f64 = 1e-3;
 /// Entry of `R^T R - I` above which a note is added; f32 files stay below.
 const NOTED_DEFECT: f64 = 1e-4;
 
-/// Checks intrinsics, rotations and centres.
 pub(crate) fn check_cameras(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     if cameras.is_empty() {
         check.reasons.push("the scene has no frames".into());
@@ -44,7 +43,6 @@ pub(crate) fn check_cameras(cameras: &[Camera], sizes: &Sizes, check: &mut Scene
     }
 }
 
-/// Checks fields of view, principal points and the aspect ratio of the pixels.
 fn check_intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     let frames_where = |test: &dyn Fn(&Camera) -> bool| -> Vec<usize> {
         cameras.iter().enumerate().filter(|(_, camera)| test(camera)).map(|(frame, _)| frame).collect()
@@ -63,9 +61,8 @@ fn check_intrinsics(cameras: &[Camera], sizes: &Sizes, check: &mut SceneCheck) {
     if let Some(&first) = implausible.first() {
         let [narrow, wide] = fields(&cameras[first]);
         let frames = list_frames(&implausible);
-        check
-            .reasons
-            .push(format!("fields of view of {narrow:.1} and {wide:.1} degrees in {frames}, expected {low} to {high}"));
+        let what = format!("fields of view of {narrow:.1} and {wide:.1} degrees in {frames}, expected {low} to {high}");
+        check.reasons.push(what);
     } else if widest > FILTERED_FOV_DEG {
         check.notes.push(format!(
             "a field of view of {widest:.1} degrees; published filters skip scenes above {FILTERED_FOV_DEG}"

@@ -6,7 +6,6 @@ use crate::image::rgb_image::RgbImage;
 use crate::tools::features::epipolar::{Correspondence, WIDTH, line, line_back};
 use crate::tools::features::image_features::reduced;
 
-/// Number of plotted corners.
 const NUM_PLOTTED: usize = 12;
 /// Columns between the frames.
 const GAP: usize = 12;
@@ -15,8 +14,7 @@ const DOT: f64 = 4.5;
 /// Half the width of a line in pixels.
 const LINE: f64 = 0.9;
 
-/// Plots some of the matches: in each frame a dot per corner, and in the same colour the epipolar line of the matching
-/// corner in the other frame.
+/// Plots some matches: a dot per corner, and in the same colour the epipolar line of the matching corner.
 pub(crate) fn epipolar_image(frames: &[RgbImage; 2], geometry: &DMat3, matches: &[Correspondence]) -> RgbImage {
     let frames = [reduced(&frames[0]), reduced(&frames[1])];
     let height = frames[0].height.max(frames[1].height);
@@ -39,8 +37,7 @@ pub(crate) fn epipolar_image(frames: &[RgbImage; 2], geometry: &DMat3, matches: 
             let mut paint = |distance: &dyn Fn(f64, f64) -> f64, colour: [u8; 3]| {
                 for y in 0..frame.height {
                     for x in 0..frame.width {
-                        let away = distance(x as f64 + 0.5, y as f64 + 0.5);
-                        let share = (0.5 - away).clamp(0.0, 1.0);
+                        let share = (0.5 - distance(x as f64 + 0.5, y as f64 + 0.5)).clamp(0.0, 1.0);
                         if share > 0.0 {
                             let at = (y * width + left + x) * 3;
                             blend(&mut canvas.rgb[at..at + 3], colour, share);
@@ -86,7 +83,6 @@ fn colour(index: usize, count: usize) -> [u8; 3] {
     })
 }
 
-/// Mixes a colour into a pixel.
 fn blend(pixel: &mut [u8], colour: [u8; 3], share: f64) {
     for (value, wanted) in pixel.iter_mut().zip(colour) {
         *value = (f64::from(*value) * (1.0 - share) + f64::from(wanted) * share).round() as u8;

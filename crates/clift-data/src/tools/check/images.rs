@@ -12,7 +12,6 @@ use crate::skip_report::plural;
 use crate::tools::check::result::SceneCheck;
 use crate::tools::features::image_features::Features;
 
-/// Largest number of frames listed in a message.
 const MAX_NAMED: usize = 5;
 /// Distance of two cameras over the extent of all centres above which equal images contradict the poses.
 const MAX_MOVE: f64 = 0.02;
@@ -65,7 +64,6 @@ pub(crate) fn check_images(
     (sizes, read.into_iter().step_by(step).map(|read| read.ok()?.features).collect())
 }
 
-/// Compares the cameras of equal images.
 fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {
     let extent = extent(cameras);
     let mut seen: HashMap<u64, usize> = HashMap::new();

@@ -1,7 +1,5 @@
 //! Converted scenes equal those of the source, and an interrupted conversion ends with the same files.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
-
 use super::*;
 use crate::scene_source::Split;
 use crate::skip_report::SkippedScene;
@@ -11,6 +9,7 @@ use crate::sources::options::SourceOptions;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
 use crate::testing::{TestSource, assert_same, fixture, names, re10k_mini};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 const CHUNKS: ConvertOptions = options(ConvertTo::Chunks { target_bytes: 1 });
 const SCENES: ConvertOptions = options(ConvertTo::Scenes);

@@ -10,8 +10,7 @@ const APART: usize = 4;
 const MARGIN: usize = 12;
 /// Smallest measure of a corner, in squared gray levels per pixel: above the noise of a JPEG.
 const MIN_MEASURE: f32 = 4.0;
-/// Approximate number of cells of an image. Each cell gets the same share of the corners, so that corners cover the
-/// image.
+/// Approximate number of cells of an image. Each gets the same share of the corners, so that they cover the image.
 const CELLS: usize = 96;
 
 /// Finds at most `count` corners as column and row. The centre of the first pixel is at (0.5, 0.5).

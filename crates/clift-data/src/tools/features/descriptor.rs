@@ -55,7 +55,6 @@ impl Descriptor {
         Some(Self { values, square })
     }
 
-    /// Returns the squared distance of two descriptors.
     pub fn squared_distance(&self, other: &Self) -> i32 {
         let product: i32 = self.values.iter().zip(&other.values).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum();
         self.square + other.square - 2 * product

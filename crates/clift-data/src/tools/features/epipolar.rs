@@ -151,8 +151,7 @@ mod tests {
             );
             Correspondence { first: seen(&cameras[0], point), second: seen(&cameras[1], point) }
         });
-        let matches = matches.collect();
-        (cameras, matches)
+        (cameras, matches.collect())
     }
 
     #[test]

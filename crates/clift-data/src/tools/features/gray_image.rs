@@ -12,11 +12,9 @@ pub(crate) struct GrayImage {
 impl GrayImage {
     /// Converts an image to gray: the mean of the channels with green counted twice.
     pub fn new(image: &RgbImage) -> Self {
-        let values = image.rgb.as_chunks::<3>().0.iter().map(|[r, g, b]| {
-            let sum = u16::from(*r) + 2 * u16::from(*g) + u16::from(*b);
-            f32::from(sum) / 4.0
-        });
-        Self { width: image.width, height: image.height, values: values.collect() }
+        let gray = |[r, g, b]: &[u8; 3]| f32::from(u16::from(*r) + 2 * u16::from(*g) + u16::from(*b)) / 4.0;
+        let values = image.rgb.as_chunks::<3>().0.iter().map(gray).collect();
+        Self { width: image.width, height: image.height, values }
     }
 
     /// Smooths the image with a binomial filter (1 4 6 4 1), about a Gaussian of one pixel.

@@ -24,7 +24,6 @@ pub struct Features {
 }
 
 impl Features {
-    /// Finds the corners of an image.
     pub fn detect(image: &RgbImage) -> Self {
         let large = reduced(image);
         let unit = WIDTH as f64 / large.width as f64;

@@ -5,8 +5,7 @@ use crate::tools::features::descriptor::Descriptor;
 /// Largest distance of the nearest descriptor over that of the second nearest (Lowe's ratio test).
 const RATIO: f64 = 0.8;
 
-/// Returns the pairs of mutual nearest descriptors that pass the ratio test in both directions, in the order of the
-/// first list.
+/// Returns the pairs of mutual nearest descriptors that pass the ratio test both ways, in the order of the first list.
 pub(crate) fn match_mutually(first: &[Descriptor], second: &[Descriptor]) -> Vec<(usize, usize)> {
     let mut forward = vec![Nearest::default(); first.len()];
     let mut backward = vec![Nearest::default(); second.len()];

@@ -1,15 +1,12 @@
 use super::*;
 use crate::attention::forward::attention_forward;
-use crate::simd::dispatch::InstructionSet;
 use crate::testing::{assert_close, attention_reference, random};
 
-/// Returns contiguous rows.
 fn rows(values: &[f32], sizes: &AttentionSizes, count: usize) -> StridedRows<'static> {
     let values: &'static [f32] = values.to_vec().leak();
     StridedRows { values, batch_stride: count * sizes.dim(), row_stride: sizes.dim() }
 }
 
-/// Computes the gradients of queries, keys and values and unpacks them.
 fn gradients(set: InstructionSet, sizes: AttentionSizes, saved: BackwardInputs<'_>) -> [Vec<f32>; 3] {
     let AttentionSizes { batch, num_queries, num_keys, .. } = sizes;
     let dim = sizes.dim();
@@ -18,12 +15,8 @@ fn gradients(set: InstructionSet, sizes: AttentionSizes, saved: BackwardInputs<'
     };
     let mut query = vec![f32::NAN; batch * num_queries * dim];
     let mut key_value = vec![f32::NAN; batch * num_keys * 2 * dim];
-    attention_backward(
-        set,
-        sizes,
-        saved,
-        AttentionGradients::Separate { query: &mut query, key_value: &mut key_value },
-    );
+    let to = AttentionGradients::Separate { query: &mut query, key_value: &mut key_value };
+    attention_backward(set, sizes, saved, to);
     let separate = [query, part(&key_value, 2, 0), part(&key_value, 2, 1)];
     if num_queries == num_keys {
         let mut packed = vec![f32::NAN; batch * num_queries * 3 * dim];

@@ -1,13 +1,11 @@
-use safetensors::SafeTensors;
-
 use super::*;
-use crate::sources::chunks::writer::{SceneRecord, scene_file_bytes, write_chunks};
+use crate::sources::chunks::writer::{SceneRecord, chunk_bytes, scene_file_bytes, write_chunks};
 use crate::testing::{fixture, re10k_mini};
 use crate::torch::pickle_writer::PickleWriter;
+use safetensors::SafeTensors;
 
 const ALL: SceneFilters = SceneFilters { min_frames: 0, max_fov_deg: None };
 
-/// A data set whose only training chunk has the given bytes and whose index lists the given scenes.
 fn with_chunk(bytes: &[u8], keys: &[&str]) -> (tempfile::TempDir, ChunkSource) {
     let folder = tempfile::tempdir().unwrap();
     std::fs::create_dir(folder.path().join("train")).unwrap();
@@ -30,9 +28,7 @@ fn chunks_of_torch_save_are_read_by_frame() {
     let scene = source.find("00000000000000a2").unwrap();
     assert_eq!(source.key(scene), "00000000000000a2");
     assert_eq!(source.url(scene).unwrap(), "https://example.org/00000000000000a2");
-    let times: Vec<i64> = (0..8).map(|frame| 1_000_000 + 33_367 * frame).collect();
-    assert_eq!(source.timestamps(scene).unwrap(), times);
-
+    assert_eq!(source.timestamps(scene).unwrap(), [0, 1, 2, 3, 4, 5, 6, 7].map(|frame| 1_000_000 + 33_367 * frame));
     let bytes = std::fs::read(fixture("reference/re10k_mini.safetensors")).unwrap();
     let tensors = SafeTensors::deserialize(&bytes).unwrap();
     let frame = source.frame(scene, 3).unwrap();
@@ -73,8 +69,7 @@ fn filters_skip_scenes_with_reasons() {
     assert_eq!((short.num_scenes(), short.find("00000000000000a1")), (0, None));
     assert_eq!(short.report.to_string(), "0 of 2 scenes used; 2 shorter than the 9 frames of data.filters.min_frames");
     // fx = 0.9 of the width: 58.1 degrees.
-    let wide = open(8, Some(58.0));
-    assert_eq!(wide.report.to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
+    assert_eq!(open(8, Some(58.0)).report.to_string(), "0 of 2 scenes used; 2 with a field of view above 58 degrees");
 }
 
 #[test]
@@ -253,24 +248,21 @@ fn shared_values_cannot_fill_the_memory() {
 /// Writes `num_chunks` chunks of `num_scenes` scenes each; frames are no images.
 fn write_made_up(folder: &Path, num_chunks: usize, num_scenes: usize, num_frames: usize) {
     let cameras = re10k_mini(Split::Train).cameras(0).unwrap();
+    let mut index = BTreeMap::new();
     for chunk in 0..num_chunks {
-        let part = folder.join("part");
-        let record = |scene: usize| {
-            Ok(SceneRecord {
-                key: format!("scene-{chunk:05}-{scene:03}"),
-                url: String::new(),
-                timestamps: (0..num_frames as i64).collect(),
-                cameras: (0..num_frames).map(|frame| cameras[frame % cameras.len()]).collect(),
-                images: vec![vec![0; 64]; num_frames],
-            })
+        let file = format!("{chunk:06}.torch");
+        let record = |scene: usize| SceneRecord {
+            key: format!("scene-{chunk:05}-{scene:03}"),
+            url: String::new(),
+            timestamps: (0..num_frames as i64).collect(),
+            cameras: (0..num_frames).map(|frame| cameras[frame % cameras.len()]).collect(),
+            images: vec![vec![0; 64]; num_frames],
         };
-        write_chunks(&part, (0..num_scenes).map(record), u64::MAX).unwrap();
-        std::fs::rename(part.join("000000.torch"), folder.join(format!("{chunk:06}.torch"))).unwrap();
-        std::fs::remove_dir_all(part).unwrap();
+        let scenes: Vec<SceneRecord> = (0..num_scenes).map(record).collect();
+        let path = folder.join(&file);
+        std::fs::write(&path, chunk_bytes(&path, &scenes).unwrap()).unwrap();
+        index.extend(scenes.into_iter().map(|scene| (scene.key, file.clone())));
     }
-    let key = |chunk: usize, scene: usize| format!("scene-{chunk:05}-{scene:03}");
-    let index = (0..num_chunks).flat_map(|chunk| (0..num_scenes).map(move |scene| (chunk, scene)));
-    let index: BTreeMap<_, _> = index.map(|(chunk, scene)| (key(chunk, scene), format!("{chunk:06}.torch"))).collect();
     std::fs::write(folder.join("index.json"), serde_json::to_vec(&index).unwrap()).unwrap();
 }
 
@@ -319,7 +311,7 @@ fn unchanged_chunks_are_not_read_again() {
 
 /// Figures of docs/results/performance.md.
 #[test]
-#[ignore = "writes 2 GB; run with --ignored --nocapture for the times"]
+#[ignore = "writes 3 GB; run with --ignored --nocapture for the times"]
 fn start_up_of_67000_scenes_takes_two_seconds() {
     let folder = tempfile::tempdir().unwrap();
     write_made_up(folder.path(), 6700, 10, 100);

@@ -30,7 +30,6 @@ pub(crate) const MODELS: [(&str, usize); 11] = [
     ("THIN_PRISM_FISHEYE", 12),
 ];
 
-/// A camera of a model.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ColmapCamera {
     pub model: String,
@@ -40,7 +39,6 @@ pub(crate) struct ColmapCamera {
 }
 
 impl ColmapCamera {
-    /// Returns normalised intrinsics and the lens.
     pub fn optics(&self) -> Result<(IntrinsicsNorm, Lens), String> {
         let (focal, centre, distortion) = match (self.model.as_str(), self.params.as_slice()) {
             ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], [0.0; 4]),
@@ -72,7 +70,6 @@ impl ColmapCamera {
     }
 }
 
-/// An image of a model.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ColmapImage {
     pub name: String,
@@ -82,7 +79,6 @@ pub(crate) struct ColmapImage {
 }
 
 impl ColmapImage {
-    /// Returns the pose, camera to world.
     pub fn c2w(&self) -> Result<Pose, DataError> {
         let bad = |what: String| DataError::BadCamera { what };
         if let Some(value) = self.w2c.iter().find(|value| !value.is_finite()) {
@@ -94,8 +90,7 @@ impl ColmapImage {
         if !(0.9..1.1).contains(&length) {
             return Err(bad(format!("the quaternion has length {length:.3}, expected 1")));
         }
-        let rotation = DMat3::from_quat(quaternion / length);
-        Ok(Pose { rotation, translation: DVec3::new(tx, ty, tz) }.inverse())
+        Ok(Pose { rotation: DMat3::from_quat(quaternion / length), translation: DVec3::new(tx, ty, tz) }.inverse())
     }
 }
 

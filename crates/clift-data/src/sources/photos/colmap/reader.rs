@@ -25,8 +25,7 @@ fn model_files(model: &Path) -> Option<([PathBuf; 2], bool)> {
     both.into_iter().find(|(files, _)| files.iter().all(|file| file.is_file()))
 }
 
-/// Reads the model in `model` and locates the images of the scene in `folder`. Frames are in the natural order of their
-/// names.
+/// Reads a model and locates the images of the scene in `folder`. Frames are in the natural order of their names.
 pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let Some(([cameras_path, images_path], is_binary)) = model_files(model) else {
         let what = "expected cameras.bin and images.bin, or cameras.txt and images.txt".into();
@@ -58,8 +57,7 @@ pub(crate) fn read_colmap(folder: &Path, model: &Path, options: &PhotoOptions) -
         };
         let in_frame = |error| PhotoScene::in_frame(&images_path, &image.name)(error);
         let Some((intrinsics_norm, lens)) = optics.get(&image.camera_id) else {
-            let what = format!("no camera {}", image.camera_id);
-            return Err(in_frame(DataError::BadCamera { what }));
+            return Err(in_frame(DataError::BadCamera { what: format!("no camera {}", image.camera_id) }));
         };
         let photo = image
             .c2w()

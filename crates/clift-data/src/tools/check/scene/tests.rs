@@ -13,7 +13,6 @@ use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
 use crate::tools::check::result::{MAX_EPIPOLAR_PX, Verdict};
 
-/// A room with rendered frames.
 struct RenderedRoom {
     cameras: Vec<Camera>,
     frames: Vec<RgbImage>,
@@ -42,7 +41,6 @@ fn rooms() -> &'static [RenderedRoom] {
     })
 }
 
-/// A room with changed cameras or frames.
 struct Changed<C, F> {
     room: &'static RenderedRoom,
     cameras: C,
@@ -106,18 +104,10 @@ fn cameras_that_contradict_the_images_fail() {
         assert!(check.reasons[0].contains("from their epipolar lines"), "{name}: {check:?}");
     };
     // A degree of a focal length of 417 pixels, at 640 columns, is 7 pixels.
-    flagged(
-        "random turns",
-        check(|frame, camera| {
-            camera.c2w = turned(camera.c2w, 0.8 * ((frame * 7919 % 13) as f64 / 6.0 - 1.0));
-        }),
-    );
-    flagged(
-        "OpenGL axes",
-        check(|_, camera| {
-            camera.c2w.rotation *= DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-        }),
-    );
+    let angle_deg = |frame: usize| 0.8 * ((frame * 7919 % 13) as f64 / 6.0 - 1.0);
+    flagged("random turns", check(|frame, camera| camera.c2w = turned(camera.c2w, angle_deg(frame))));
+    let opengl = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+    flagged("OpenGL axes", check(|_, camera| camera.c2w.rotation *= opengl));
     flagged("world to camera", check(|_, camera| camera.c2w = camera.c2w.inverse()));
     flagged("focal length of another camera", check(|_, camera| camera.intrinsics_norm.fx *= 1.25));
     let shuffled = Changed { room: &rooms()[0], cameras: |_, _: &mut _| (), frame: |frame| (frame * 5 + 2) % 12 };
@@ -214,10 +204,8 @@ fn repeated_and_unreadable_frames_are_reported() {
     assert_eq!(stuck.verdict, Verdict::Flagged);
     assert_eq!(stuck.reasons, ["2 frames (6, 7) repeat the image of an earlier frame that has another camera"]);
     let torn = of(|frame| if frame == 2 { usize::MAX } else { frame }, |_, _| ());
-    assert!(
-        torn.reasons[0].starts_with("1 frame (2) cannot be read; the first: frame 2 of scene k cannot"),
-        "{torn:?}"
-    );
+    let expected = "1 frame (2) cannot be read; the first: frame 2 of scene k cannot";
+    assert!(torn.reasons[0].starts_with(expected), "{torn:?}");
     // Images too small for corners add a note, no error.
     let small = of(|frame| frame, |_, _| ());
     assert!(small.verdict == Verdict::NotCompared && small.epipolar_px.is_none(), "{small:?}");
