@@ -105,6 +105,9 @@ enum State {
     Unreadable,
 }
 
+/// A file of the folder with the states of its scenes and its unreadable images.
+type Scanned = (String, Vec<(String, State)>, Vec<UnreadableImage>);
+
 /// A conversion of the scenes of a source into a folder.
 ///
 /// A file under its final name is always complete, and `SHA256SUMS` (for `sha256sum -c`) has its checksum. A run on a
@@ -172,7 +175,6 @@ impl<'a> Converter<'a> {
             let scenes = tables.into_iter().map(|table| table.key).zip(states).collect();
             Ok((name.to_owned(), scenes, images))
         };
-        type Scanned = (String, Vec<(String, State)>, Vec<UnreadableImage>);
         let files: Vec<Scanned> = names.into_par_iter().map(scan).collect::<Result<_, DataError>>()?;
         for (name, scenes, images) in files {
             let num_changed = scenes.iter().filter(|(_, state)| *state == State::Changed).count();

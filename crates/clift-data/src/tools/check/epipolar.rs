@@ -7,7 +7,7 @@ use crate::scene_source::SceneSource;
 use crate::skip_report::plural;
 use crate::statistics::{mean, median};
 use crate::tools::check::drawing::epipolar_image;
-use crate::tools::check::frames::{exchange_neighbours, reprojection_px, wrong_frames};
+use crate::tools::check::frames::{exchange_neighbours, frame_distances, triplet_distances, wrong_frames};
 use crate::tools::check::images::{Sizes, list_frames};
 use crate::tools::check::matches::{FramePair, match_frames};
 use crate::tools::check::mistakes::Mistake;
@@ -108,7 +108,7 @@ fn note_pairs(check: &mut SceneCheck) {
 /// Judges each frame by the corners that it shares with two others.
 fn check_frames(mut views: Vec<PixelCamera>, pairs: &[FramePair], step: usize, check: &mut SceneCheck) {
     let triplets = find_triplets(views.len(), pairs);
-    let distances = reprojection_px(&views, &triplets, &[]);
+    let distances = frame_distances(&triplets, &triplet_distances(&views, &triplets), &[]);
     let alone: Vec<usize> =
         (0..views.len()).filter(|frame| distances[*frame].is_none()).map(|frame| frame * step).collect();
     let known = distances.iter().enumerate();
@@ -127,7 +127,7 @@ fn check_frames(mut views: Vec<PixelCamera>, pairs: &[FramePair], step: usize, c
         ));
     }
     let wrong = wrong_frames(&views, &triplets);
-    if let Some((_, worst)) = wrong.first() {
+    if let Some(worst) = wrong.iter().map(|(_, px)| *px).reduce(f64::max) {
         let mut frames: Vec<usize> = wrong.iter().map(|(frame, _)| frame * step).collect();
         frames.sort_unstable();
         let typical = median(&check.frames.iter().map(|frame| frame.reprojection_px).collect::<Vec<f64>>());

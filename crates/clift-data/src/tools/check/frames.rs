@@ -51,31 +51,46 @@ fn exchanged(cameras: &[PixelCamera], triplets: &[Vec<Triplet>], frame: usize) -
     (share >= MIN_EXCHANGED_SHARE).then(|| Exchanged { frame, px: [median(&given), median(&new)] })
 }
 
-/// Returns the reprojection distance of every frame in pixels, the lower median of its triplets without those that
-/// `wrong` frames place; `None` for a frame without triplets.
-pub(crate) fn reprojection_px(cameras: &[PixelCamera], triplets: &[Vec<Triplet>], wrong: &[usize]) -> Vec<Option<f64>> {
-    let of_frame = |triplets: &Vec<Triplet>| {
-        let right = triplets.iter().filter(|triplet| !wrong.iter().any(|frame| triplet.is_placed_by(*frame)));
-        let mut distances: Vec<f64> = right.map(|triplet| triplet.reprojection_px(cameras)).collect();
-        distances.sort_by(f64::total_cmp);
-        distances.get(distances.len().saturating_sub(1) / 2).copied()
-    };
+/// Returns the reprojection distance of every triplet, by frame.
+pub(crate) fn triplet_distances(cameras: &[PixelCamera], triplets: &[Vec<Triplet>]) -> Vec<Vec<f64>> {
+    let of_frame = |triplets: &Vec<Triplet>| triplets.iter().map(|triplet| triplet.reprojection_px(cameras)).collect();
     triplets.iter().map(of_frame).collect()
 }
 
-/// Returns the frames whose cameras do not fit the others, the worst first, each with its reprojection distance in
-/// pixels. A wrong frame no longer places points for the others.
+/// Returns the reprojection distance of every frame in pixels, the lower median of its triplets without those that
+/// `wrong` frames place; `None` for a frame without triplets.
+pub(crate) fn frame_distances(triplets: &[Vec<Triplet>], distances: &[Vec<f64>], wrong: &[usize]) -> Vec<Option<f64>> {
+    let of_frame = |(triplets, distances): (&Vec<Triplet>, &Vec<f64>)| {
+        let is_right = |triplet: &Triplet| !wrong.iter().any(|frame| triplet.is_placed_by(*frame));
+        let right = triplets.iter().zip(distances).filter(|(triplet, _)| is_right(triplet));
+        let mut right: Vec<f64> = right.map(|(_, px)| *px).collect();
+        right.sort_by(f64::total_cmp);
+        right.get(right.len().saturating_sub(1) / 2).copied()
+    };
+    triplets.iter().zip(distances).map(of_frame).collect()
+}
+
+/// Returns the frames whose cameras do not fit the others, each with its reprojection distance in pixels.
+///
+/// A wrong frame also misplaces the points of its neighbours. Of the frames that do not fit, the one without which most
+/// others fit is wrong first, and no longer places points.
 pub(crate) fn wrong_frames(cameras: &[PixelCamera], triplets: &[Vec<Triplet>]) -> Vec<(usize, f64)> {
-    let mut wrong: Vec<(usize, f64)> = Vec::new();
+    let distances = triplet_distances(cameras, triplets);
+    let (mut wrong, mut names): (Vec<(usize, f64)>, Vec<usize>) = (Vec::new(), Vec::new());
     while wrong.len() <= cameras.len() / MIN_FRAMES_PER_WRONG {
-        let names: Vec<usize> = wrong.iter().map(|(frame, _)| *frame).collect();
-        let distances = reprojection_px(cameras, triplets, &names);
-        let known: Vec<f64> = distances.iter().flatten().copied().collect();
+        let known: Vec<f64> = frame_distances(triplets, &distances, &names).into_iter().flatten().collect();
         let bound = MAX_FRAME_PX.max(MAX_FRAME_RATIO * median(&known));
-        let rest = distances.into_iter().enumerate().filter(|(frame, _)| !names.contains(frame));
-        let worst = rest.filter_map(|(frame, px)| Some((frame, px?))).max_by(|a, b| a.1.total_cmp(&b.1));
-        let Some(worst) = worst.filter(|(_, px)| *px > bound) else { break };
-        wrong.push(worst);
+        let suspects = |names: &[usize]| -> Vec<(usize, f64)> {
+            let found = frame_distances(triplets, &distances, names).into_iter().enumerate();
+            let found = found.filter_map(|(frame, px)| Some((frame, px?)));
+            found.filter(|(frame, px)| *px > bound && !names.contains(frame)).collect()
+        };
+        let left_without = |frame: usize| suspects(&[&names[..], &[frame]].concat()).len();
+        let suspected = suspects(&names).into_iter().map(|(frame, px)| (left_without(frame), frame, px));
+        let worst = suspected.min_by(|a, b| a.0.cmp(&b.0).then(b.2.total_cmp(&a.2)));
+        let Some((_, frame, px)) = worst else { break };
+        names.push(frame);
+        wrong.push((frame, px));
     }
     wrong
 }

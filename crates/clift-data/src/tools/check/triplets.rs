@@ -50,10 +50,12 @@ impl Triplet {
     }
 }
 
+/// A frame that matches another, with its corners by the bits of the corners of the other, which are equal in every pair.
+type Partner = (usize, HashMap<[u64; 2], [f64; 2]>);
+
 /// Selects for each frame the triplets with many corners and wide gaps, best first.
 pub(crate) fn find_triplets(num_frames: usize, pairs: &[FramePair]) -> Vec<Vec<Triplet>> {
-    // For each frame and partner: the partner's corner by the corner of the frame, which is the same in every pair.
-    let mut partners: Vec<Vec<(usize, HashMap<[u64; 2], [f64; 2]>)>> = (0..num_frames).map(|_| Vec::new()).collect();
+    let mut partners: Vec<Vec<Partner>> = (0..num_frames).map(|_| Vec::new()).collect();
     let bits = |corner: [f64; 2]| corner.map(f64::to_bits);
     for FramePair { frames: [first, second], matches } in pairs {
         let forward = matches.iter().map(|pair| (bits(pair.first), pair.second)).collect();
@@ -61,7 +63,7 @@ pub(crate) fn find_triplets(num_frames: usize, pairs: &[FramePair]) -> Vec<Vec<T
         partners[*first].push((*second, forward));
         partners[*second].push((*first, backward));
     }
-    let of_frame = |(frame, partners): (usize, Vec<(usize, HashMap<[u64; 2], [f64; 2]>)>)| {
+    let of_frame = |(frame, partners): (usize, Vec<Partner>)| {
         let mut triplets = Vec::new();
         for (position, (a, in_a)) in partners.iter().enumerate() {
             for (b, in_b) in &partners[position + 1..] {

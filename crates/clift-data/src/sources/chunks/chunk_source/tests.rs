@@ -79,8 +79,17 @@ fn errors_of_truncated_chunks_name_the_file() {
         let (_folder, source) = with_chunk(&bytes[..length], &["00000000000000a1"]);
         let message = source.frame(0, 0).unwrap_err().to_string();
         assert!(message.starts_with("bad chunk: ") && message.ends_with("000000.torch"), "{length}: {message}");
-        assert!(message.contains("truncated"), "{length}: {message}");
+        let expected = if length == 0 { "an empty file" } else { "truncated" };
+        assert!(message.contains(expected), "{length}: {message}");
     }
+}
+
+#[test]
+fn legacy_chunks_are_named() {
+    let legacy = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.";
+    let (_folder, source) = with_chunk(legacy, &["00000000000000a1"]);
+    let message = source.frame(0, 0).unwrap_err().to_string();
+    assert!(message.starts_with("bad chunk: written by torch.save in the format from before PyTorch 1.6"), "{message}");
 }
 
 #[test]

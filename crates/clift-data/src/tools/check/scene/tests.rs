@@ -156,7 +156,7 @@ fn exchanged_neighbours_and_single_cameras_are_named() {
         assert!(exchanged.reasons[0].starts_with(&expected), "{exchanged:?}");
     }
     // A sideways turn on a sideways path: the epipolar lines stay.
-    for (wrong, angle_deg) in [(2, 2.0), (6, -2.0), (11, 2.0)] {
+    for (wrong, angle_deg) in [(2, 2.0), (9, -2.0), (11, 2.0)] {
         let single = check(move |frame, camera| {
             if frame == wrong {
                 camera.c2w.rotation *= DMat3::from_rotation_y(f64::to_radians(angle_deg));
@@ -165,7 +165,7 @@ fn exchanged_neighbours_and_single_cameras_are_named() {
         assert_eq!(single.reasons.len(), 1, "{single:?}");
         let expected = format!("the cameras of 1 frame ({wrong}) do not fit the other frames");
         assert!(single.reasons[0].starts_with(&expected), "{single:?}");
-        assert_eq!(single.frames.len(), 12);
+        assert_eq!(single.frames.len(), 11, "frame 0 has too few corners in common with two others");
     }
 }
 
