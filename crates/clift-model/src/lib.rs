@@ -19,7 +19,7 @@
 //!
 //! // All 8 tokens of the scene, condensed into 4 and rendered from the second camera's pose.
 //! let tokens = model.encode(&views);
-//! let clusters = KMeans::default().fit(tokens.clone(), 4, &[0])?.clusters.upload(&device);
+//! let clusters = KMeans::default().fit(tokens.values.clone(), 4, &[0])?.clusters.upload(&device);
 //! let tokens = model.compress(tokens, &clusters);
 //! let target = Cameras::upload(&pose, &intrinsics, [1, 1, 16, 16], &device)?;
 //! let image = model.render(tokens, &target);
@@ -64,8 +64,8 @@ pub use tokens::selection::selector::Selector;
 pub use tokens::selection::token_ray::TokenRay;
 pub use tokens::tiles::{Grouping, tile_clusters};
 // Networks
-pub use network::architecture::CliftVariant;
-pub use network::camera_encoding::{CameraEncoding, TokenTransforms};
+pub use network::architecture::{CameraEncoding, CliftVariant};
+pub use network::camera_encoding::TokenTransforms;
 pub use network::clift::Clift;
 pub use network::condenser::Condenser;
 pub use network::config::{CondenserConfig, ModelConfig};

@@ -6,8 +6,8 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
 
 use crate::device::name::DeviceName;
+use crate::network::architecture::CameraEncoding;
 use crate::network::architecture::CliftVariant;
-use crate::network::camera_encoding::CameraEncoding;
 use crate::network::config::{CondenserConfig, ModelConfig};
 
 /// Opens every device of this build: flex, ndarray, and wgpu if an adapter exists.

@@ -7,40 +7,14 @@
 // B scenes, V views, n patches of a view, N = V n tokens, E width of a head, L values of a transform
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use serde::{Deserialize, Serialize};
-use strum::{Display, IntoStaticStr, VariantArray};
 
+use crate::network::architecture::CameraEncoding;
 use crate::network::config::ModelConfig;
 use crate::ops::head_transform::{KEY_VALUE, OUTPUT, QUERY, QUERY_KEY_VALUE, transform_heads};
 use crate::views::upload::Cameras;
 
-/// How attention knows the cameras. The rays of all pixels are inputs of the networks in every case.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "lowercase")]
-#[strum(serialize_all = "lowercase")]
-pub enum CameraEncoding {
-    /// Plücker coordinates of the pixels' rays, in the input alone (paper section 3.1).
-    #[default]
-    Plucker,
-    /// Camera-relative attention by the poses of the cameras.
-    Gta,
-    /// Camera-relative attention by the projections of the cameras: pose and intrinsics.
-    Prope,
-}
-
-impl CameraEncoding {
-    /// All encodings, in the order of messages and help texts.
-    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
-
-    /// Whether attention is plain: files of such networks do not name the encoding.
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "called by serde")]
-    pub(crate) fn is_plucker(&self) -> bool {
-        *self == Self::Plucker
-    }
-}
-
 /// Wave lengths of the rotations by row and column, in patches: from `2 pi` to `2 pi * LONGEST`.
-const LONGEST: f32 = 100.0;
+const LONGEST: f64 = 100.0;
 
 /// Makes the transforms of tokens from cameras.
 #[derive(Clone, Copy, Debug)]
@@ -77,7 +51,7 @@ impl TransformMaker {
         let device = matrices.device();
         let angles = self.angles(rows, columns);
         let angles = TensorData::new(angles, [1, 1, rows * columns, self.head_width / 2]);
-        let angles = Tensor::<4>::from_data(angles, &device).cast(matrices.dtype());
+        let angles = Tensor::<4>::from_data(angles, (&device, matrices.dtype()));
         let matrices = matrices.reshape([batch, views, 1, 32]).expand([batch, views, rows * columns, 32]);
         let angles = angles.expand([batch, views, rows * columns, self.head_width / 2]);
         let len = 32 + self.head_width / 2;
@@ -85,14 +59,14 @@ impl TransformMaker {
     }
 
     /// Returns cosines, then sines of the angles of every patch: half of them by its row, half by its column.
-    fn angles(&self, rows: usize, columns: usize) -> Vec<f32> {
+    fn angles(&self, rows: usize, columns: usize) -> Vec<f64> {
         let count = self.head_width / 8;
-        let frequency = |i: usize| LONGEST.powf(-(i as f32) / count as f32);
+        let frequency = |i: usize| LONGEST.powf(-(i as f64) / count as f64);
         let mut values = Vec::with_capacity(rows * columns * 4 * count);
         for (row, column) in (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column))) {
-            let angles: Vec<f32> = [row, column]
+            let angles: Vec<f64> = [row, column]
                 .into_iter()
-                .flat_map(|place| (0..count).map(move |i| place as f32 * frequency(i)))
+                .flat_map(|place| (0..count).map(move |i| place as f64 * frequency(i)))
                 .collect();
             values.extend(angles.iter().map(|angle| angle.cos()));
             values.extend(angles.iter().map(|angle| angle.sin()));

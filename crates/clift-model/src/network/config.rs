@@ -3,8 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::ModelError;
+use crate::network::architecture::CameraEncoding;
 use crate::network::architecture::CliftVariant;
-use crate::network::camera_encoding::CameraEncoding;
 
 /// Sizes of the encoder, the condenser and the renderer. The defaults are the paper's.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -160,7 +160,7 @@ impl SceneRenderer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::network::camera_encoding::CameraEncoding;
+    use crate::network::architecture::CameraEncoding;
     use crate::network::clift::Clift;
     use crate::network::config::ModelConfig;
     use crate::scene::scene::tests::{camera, scene};

@@ -6,8 +6,8 @@
 
 use std::collections::BTreeMap;
 
+use crate::network::architecture::CameraEncoding;
 use crate::network::architecture::CliftVariant;
-use crate::network::camera_encoding::CameraEncoding;
 use crate::network::config::{CondenserConfig, ModelConfig};
 use crate::weights::published_keys::{linear_shape, published_tensors};
 

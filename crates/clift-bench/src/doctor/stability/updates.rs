@@ -38,8 +38,8 @@ pub(crate) const CASES: &[StabilityCase] = &[
     StabilityCase {
         name: "the same with camera-relative attention (gta)",
         breaks: "positions of 1e3 in the transforms of queries, keys and values",
-        bound: Bound::Most(1e-2),
-        reason: "scores and values add terms of 1e3 that cancel, so that f32 has three digits less of them",
+        bound: Bound::Most(1e-1),
+        reason: "scores and values add terms of 1e3 that cancel, twice in each attention; cameras of a clip are within 1",
         run: |devices| relative_views(devices, CameraEncoding::Gta, |clip| shift_cameras(clip, MAX_COORDINATE)),
     },
     gradient_case("camera-relative attention (gta)", "the transforms of queries, keys and values", |devices| {
