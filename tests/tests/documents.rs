@@ -264,8 +264,10 @@ fn prepare(base: &Path) {
     };
     train("runs/tiny", "eval.tokens=['f32', 'int8']");
     train("runs/re10k", SMALL_DATA);
-    for (from, to) in [("tiny", "a"), ("tiny", "b"), ("re10k", "dl3dv")] {
-        copy(&base.join("runs").join(from), &format!("runs/{to}"));
+    // An example replaces PATH.
+    train("runs/dl3dv", &SMALL_DATA.replace("PATH", "DIR"));
+    for name in ["runs/a", "runs/b"] {
+        copy(&base.join("runs/tiny"), name);
     }
     clift(&["import", "last.ckpt", "--variant", "released-re10k", "--num-heads", "3", "-o", "models/re10k"]);
     let tiny = ["encode", "runs/tiny", "--scene", "synthetic-0-test-00000", "-o", "room.clift"];
