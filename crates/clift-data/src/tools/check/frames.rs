@@ -15,6 +15,9 @@ const MIN_EXCHANGED_SHARE: f64 = 0.6;
 /// Frames over the largest number of wrong frames that are listed one by one.
 const MIN_FRAMES_PER_WRONG: usize = 4;
 
+/// Smallest number of triplets by which a frame is judged: one or two may match a repeating pattern with itself.
+const MIN_TRIPLETS: usize = 3;
+
 /// Two neighbours whose cameras fit better when they are exchanged.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Exchanged {
@@ -57,15 +60,18 @@ pub(crate) fn triplet_distances(cameras: &[PixelCamera], triplets: &[Vec<Triplet
     triplets.iter().map(of_frame).collect()
 }
 
-/// Returns the reprojection distance of every frame in pixels, the lower median of its triplets without those that
-/// `wrong` frames place; `None` for a frame without triplets.
+/// Returns the reprojection distance of every frame in pixels, the lower quartile of its triplets without those that
+/// `wrong` frames place; `None` for a frame with too few.
 pub(crate) fn frame_distances(triplets: &[Vec<Triplet>], distances: &[Vec<f64>], wrong: &[usize]) -> Vec<Option<f64>> {
     let of_frame = |(triplets, distances): (&Vec<Triplet>, &Vec<f64>)| {
         let is_right = |triplet: &Triplet| !wrong.iter().any(|frame| triplet.is_placed_by(*frame));
         let right = triplets.iter().zip(distances).filter(|(triplet, _)| is_right(triplet));
         let mut right: Vec<f64> = right.map(|(_, px)| *px).collect();
+        if right.len() < MIN_TRIPLETS {
+            return None;
+        }
         right.sort_by(f64::total_cmp);
-        right.get(right.len().saturating_sub(1) / 2).copied()
+        right.get((right.len() - 1) / 4).copied()
     };
     triplets.iter().zip(distances).map(of_frame).collect()
 }

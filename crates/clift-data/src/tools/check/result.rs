@@ -77,6 +77,6 @@ pub struct FrameCheck {
     /// Position of the frame.
     pub frame: usize,
     /// Distance of its corners from where two other frames place them, in pixels of an image 640 columns wide: the median
-    /// over the corners, and the lower median over at most six choices of the two.
+    /// over the corners, and the lower quartile over at most six choices of the two: in a repeating pattern some are wrong.
     pub reprojection_px: f64,
 }
