@@ -22,7 +22,7 @@ const SMALLER: [(&str, &str); 10] = [
     ("5aca87f95a9412c6", KEY),
     ("--scene KEY", "--scene 00000000000000b1"),
     ("chunks|scenes", "chunks"),
-    ("--distance 45..135", "--distance 3..7"),
+    ("--distance 45..135", "--distance 4..7"),
     ("--distance 6..20 --context 4 --targets 6", "--distance 2..6 --context 2 --targets 1"),
     ("--render 256", "--render 2"),
     ("--storage 256", "--storage 2"),
@@ -188,7 +188,7 @@ fn shrink(args: &mut Vec<String>) {
             set(args, &["data.root=PATH"]);
         }
         ("data", Some("index")) if !args.iter().any(|arg| arg == "--distance") => {
-            args.extend(["--distance".to_owned(), "3..7".to_owned()]);
+            args.extend(["--distance".to_owned(), "4..7".to_owned()]);
         }
         _ => {}
     }

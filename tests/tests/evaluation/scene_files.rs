@@ -283,7 +283,8 @@ fn scene_files_overwrite_only_scene_files() {
 #[test]
 fn encode_compares_a_frame_that_is_no_context() {
     let place = Place::with(&LONGER);
-    let encode = |flags: &str| place.clift(&format!("{ENCODE} DIR/room.clift --tokens f32 --storage 8 {flags}")).ok();
+    let encode =
+        |flags: &str| place.clift(&format!("{ENCODE} DIR/room.clift --tokens f32 --storage 8 {flags} --force")).ok();
     let ran = encode("--context 0,7");
     let check = ran.stdout.lines().find(|line| line.starts_with("check: frame 3, not a context: ")).expect("a check");
     let decibels: Vec<f64> = check.split(' ').filter_map(|word| word.parse().ok()).collect();

@@ -289,11 +289,12 @@ fn weights_of_two_trainings_are_not_evaluated_together() {
 }
 
 #[test]
-fn an_empty_cluster_cache_is_not_kept() {
+fn scenes_that_become_too_short_are_refused_before_training() {
     let place = Place::new();
-    // Scenes of 8 frames train in the first steps and are too short once the gaps have grown.
+    // Scenes of 8 frames would train in the first steps, until the gaps have grown.
     let views =
         "data.views={min_context=2, max_context=2, min_gap=[3, 8], max_gap=[6, 8], warm_up_steps=6, num_targets=2}";
-    place.train("run", &[views, "stage1.steps=6"]).fails_with(1, &["none could be clustered"]);
-    assert!(!place.at("run/clusters").exists());
+    let expected = "0 of 8 scenes used; 8 shorter than the 9 frames that data.views.min_gap needs";
+    place.train("run", &[views, "stage1.steps=6"]).fails_with(1, &[expected]);
+    assert!(!place.at("run/stage1").exists());
 }

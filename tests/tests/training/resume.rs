@@ -60,7 +60,8 @@ fn changed_settings_are_refused_unless_results_stay_equal() {
         let settings = format!("settings:\n{expected}\nresume");
         place.train("run", &[change]).fails_naming(2, &[&settings, "--fresh"], "/run");
     }
-    let settings = "settings:\n  --overfit: off -> 2\n  seed: 0 -> 1\n  stage1.steps: 6 -> 7\nresume";
+    let settings =
+        "settings:\n  --overfit: off -> 2\n  data.hold_out: 8 -> 0\n  seed: 0 -> 1\n  stage1.steps: 6 -> 7\nresume";
     place.train("run --overfit 2", &["seed=1", "stage1.steps=7"]).fails_with(2, &[settings]);
     assert!(files(&place.at("run")) == before, "a refusal changes nothing");
 

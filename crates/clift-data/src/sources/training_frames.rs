@@ -66,6 +66,14 @@ impl SceneSource for TrainingFrames {
         self.source.url(scene)
     }
 
+    fn frame_names(&self, scene: usize) -> Result<Vec<String>, DataError> {
+        Ok(self.kept(self.source.frame_names(scene)?))
+    }
+
+    fn image_size(&self, scene: usize, frame: usize) -> Result<[usize; 2], DataError> {
+        self.source.image_size(scene, self.in_source(frame))
+    }
+
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         self.source.frame(scene, self.in_source(frame))
     }

@@ -9,12 +9,13 @@ use crate::config::method::Method;
 use crate::statistics::summary::Summary;
 use crate::statistics::view_metrics::best_method;
 
-/// Largest number of token counts, which 80 columns hold.
+const MAX_COLUMNS: usize = 80;
+/// Largest number of token counts, which a line holds.
 const MAX_COUNTS: usize = 8;
 
 impl Summary {
     /// Returns PSNR over stored tokens of the main method, of K-means and of random tokens, and of the baselines: at most
-    /// five lines of at most 80 columns. Views are rendered from all stored tokens, in the finest number format; of many
+    /// five lines of at most 80 columns, and the split that was measured. Views are rendered from all stored tokens, in the finest number format; of many
     /// counts, those evenly spread are shown.
     pub fn headline(&self) -> String {
         let best = best_method(self.points.iter().map(|point| point.key));
@@ -43,14 +44,17 @@ impl Summary {
                 let _ = write!(text, " {:>6}", decibels(psnr(count)));
             }
         }
-        let Self { num_scenes, num_views, num_skipped, baselines, .. } = self;
+        let Self { num_scenes, num_views, num_skipped, split, baselines, .. } = self;
         let (views, scenes) = (plural(*num_views, "view"), plural(*num_scenes, "scene"));
         let (nearest, mean) = (decibels(baselines.nearest_view.psnr), decibels(baselines.mean_image.psnr));
-        let _ = write!(text, "\nnearest_view {nearest}, mean_image {mean}; {views} of {scenes}");
+        let mut line = format!("nearest_view {nearest}, mean_image {mean}; {views} of {scenes}");
         if *num_skipped > 0 {
-            let _ = write!(text, ", {num_skipped} skipped");
+            let _ = write!(line, ", {num_skipped} skipped");
         }
-        text
+        let split = split.map_or_else(String::new, |split| format!("({split})"));
+        let gap = if line.len() + split.len() < MAX_COLUMNS { " " } else { "\n" };
+        let _ = write!(text, "\n{line}{gap}{split}");
+        text.trim_end().to_owned()
     }
 }
 

@@ -202,7 +202,8 @@ mod tests {
     #[test]
     fn camera_relative_attention_equals_pytorch_in_f32_and_f64() {
         let fixture = Fixture::open("camera_attention");
-        let wide = cpu_devices().into_iter().map(|device| (device, DType::F64, 1e-12));
+        // Poses are f32 values, so that their transpose is the inverse to 1e-7 only.
+        let wide = cpu_devices().into_iter().map(|device| (device, DType::F64, 1e-6));
         let cases = devices().into_iter().map(|device| (device, DType::F32, 1e-5)).chain(wide);
         for (device, dtype, tolerance) in cases {
             let cameras = |prefix: &str| Cameras {
