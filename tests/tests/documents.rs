@@ -188,7 +188,7 @@ fn shrink(args: &mut Vec<String>) {
             set(args, &["data.root=PATH"]);
         }
         ("data", Some("index")) if !args.iter().any(|arg| arg == "--distance") => {
-            args.extend(["--distance".to_owned(), "4..7".to_owned()]);
+            args.extend(["--distance", "4..7", "--targets", "1"].map(str::to_owned));
         }
         _ => {}
     }

@@ -18,7 +18,7 @@ fn scenes_are_checked_converted_and_checked_again() {
     place.clift(check).ok().prints("2 scenes, 2 ok, 0 flagged");
     let report = place.json("check.json");
     let scene = &report["scenes"][0];
-    assert_eq!((&scene["ok"], &scene["num_frames"]), (&true.into(), &9.into()));
+    assert_eq!((&scene["verdict"], &scene["num_frames"]), (&"ok".into(), &9.into()));
     assert_eq!(scene["reasons"], serde_json::json!([]));
     assert!(number(scene, "epipolar_px") < 1.0, "{scene}");
     let key = scene["key"].as_str().unwrap();

@@ -15,8 +15,8 @@ const MAX_COUNTS: usize = 8;
 
 impl Summary {
     /// Returns PSNR over stored tokens of the main method, of K-means and of random tokens, and of the baselines: at most
-    /// five lines of at most 80 columns, and the split that was measured. Views are rendered from all stored tokens, in the finest number format; of many
-    /// counts, those evenly spread are shown.
+    /// five lines of at most 80 columns, then warnings about figures that mislead. Views are rendered from all stored
+    /// tokens, in the finest number format; of many counts, those evenly spread are shown.
     pub fn headline(&self) -> String {
         let best = best_method(self.points.iter().map(|point| point.key));
         let whole = self.points.iter().filter(|point| point.key.is_whole());
@@ -54,7 +54,11 @@ impl Summary {
         let split = split.map_or_else(String::new, |split| format!("({split})"));
         let gap = if line.len() + split.len() < MAX_COLUMNS { " " } else { "\n" };
         let _ = write!(text, "\n{line}{gap}{split}");
-        text.trim_end().to_owned()
+        text.truncate(text.trim_end().len());
+        for warning in self.warnings() {
+            let _ = write!(text, "\nwarning: {warning}");
+        }
+        text
     }
 }
 
