@@ -87,10 +87,10 @@ fn poses(cameras: &Cameras) -> Tensor<3> {
 /// the center, `[B, V, 32]`.
 fn projections(cameras: &Cameras) -> Tensor<3> {
     let [batch, views] = cameras.dims();
-    let size = |index: usize| if index % 2 == 0 { cameras.width } else { cameras.height } as f64;
+    let sizes = [cameras.width, cameras.height].map(|side| side as f64);
     let value = |index: usize| {
         let value = cameras.intrinsics.clone().narrow(2, index, 1).reshape([batch, views, 1, 1]);
-        value.mul_scalar(1.0 / size(index))
+        value.mul_scalar(1.0 / sizes[index % 2])
     };
     let [fx, fy] = [0, 1].map(value);
     let [cx, cy] = [2, 3].map(|index| value(index).sub_scalar(0.5));

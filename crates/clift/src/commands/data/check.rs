@@ -115,7 +115,7 @@ fn report_text(report: &Report) -> String {
     let num_scenes = plural(report.scenes.len(), "scene");
     let mut counts = format!("{num_scenes}, {ok} ok, {flagged} flagged");
     if not_compared > 0 {
-        counts += &format!(", {not_compared} not compared with the images");
+        counts = format!("{counts}, {not_compared} not compared with the images");
     }
     format!("{text}\n\n{counts}")
 }
