@@ -27,8 +27,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 # Keys of metrics.jsonl and summary.json that differ between equal runs: times, memory, and the Pareto front over times.
-TIMES = {"step_s", "render_s", "select_s", "render_median_s", "render_p95_s", "frame_median_s", "frame_p95_s"}
-TIMES |= {"peak_bytes", "pareto_time"}
+TIMES = {"step_s", "time", "render_s", "select_s", "render_median_s", "render_p95_s", "frame_median_s", "frame_p95_s"}
+TIMES |= {"peak_bytes", "pareto_time", "frame_quartiles_s"}
 
 # Small, so that a run takes seconds, and saving all the time.
 SETTINGS = [
@@ -83,7 +83,7 @@ def result(run: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for path in sorted(path for path in run.rglob("*") if path.is_file()):
         name = str(path.relative_to(run))
-        if name == "metrics.jsonl":
+        if name in ("metrics.jsonl", "validation.jsonl"):
             found[name] = [without_times(json.loads(line)) for line in path.read_text().splitlines()]
         elif name == "eval/summary.json":
             found[name] = without_times(json.loads(path.read_text()))

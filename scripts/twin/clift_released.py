@@ -8,7 +8,7 @@ released code. Modules carry the names that the checkpoints' keys have below
     output_norm, patch_to_image.0, squeezer.{cross_attn, linear1}
 
 Variants: `released-re10k`, `released-dl3dv` (adds `input_norm` and the q_norm, k_norm
-of every attention), and `paper`, whose condenser is clift_torch's, below `squeezer.blocks`.
+of every attention in encoder and decoder; the squeezer has none), and `paper`, whose condenser is clift_torch's, below `squeezer.blocks`.
 
     python scripts/twin/clift_released.py FILE            # loads an export strictly and prints its sizes
     python scripts/twin/clift_released.py FILE --same-as FIXTURE.ckpt   # and compares every value
@@ -44,8 +44,8 @@ class ReleasedConfig:
     num_condenser_blocks: int = 2  # of the variant `paper`
     condenser_residual: bool = True  # of the variant `paper`
     condenser: bool = True
-    # Which of linear_input, linear_target, patch_to_image.0 are 1x1 convolutions.
-    convolutions: tuple[str, ...] = ("linear_input", "linear_target")
+    # Which of the projections are 1x1 convolutions: all in the published module.
+    convolutions: tuple[str, ...] = ("linear_input", "linear_target", "patch_to_image.0")
 
     @property
     def has_norms(self) -> bool:
@@ -127,7 +127,7 @@ class EncoderLayer(nn.Module):
 class DecoderLayer(nn.Module):
     """A pre-norm layer named as nn.TransformerDecoderLayer; the memory is taken as it is."""
 
-    def __init__(self, c: ReleasedConfig, activation=F.gelu):
+    def __init__(self, c: ReleasedConfig, activation=F.gelu, attention=attention):
         super().__init__()
         self.self_attn = attention(c)
         self.multihead_attn = attention(c)
@@ -158,7 +158,7 @@ class Squeezer(nn.Module):
 
     def __init__(self, c: ReleasedConfig):
         super().__init__()
-        self.cross_attn = DecoderLayer(c, F.relu)
+        self.cross_attn = DecoderLayer(c, F.relu, lambda c: PlainAttention(c.dim, c.num_heads))
         self.linear1 = nn.Linear(c.dim, c.dim)
         nn.init.zeros_(self.linear1.weight)
         nn.init.zeros_(self.linear1.bias)

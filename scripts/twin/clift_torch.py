@@ -123,6 +123,53 @@ class FeedForward(nn.Module):
         return self.down(F.gelu(self.up(x)))
 
 
+# ------------------------------------------------ camera-relative attention
+
+
+def token_matrices(
+    encoding: str, intrinsics: Tensor, c2w: Tensor, height: int, width: int, head_dim: int
+) -> Tensor:
+    """The matrix `rho` of every patch as a dense matrix, `[B, V*h*w, E, E]` (GTA, PRoPE).
+
+    Channel `j*E/8 + k` of a head is coordinate j of the k-th 4-vector, on which the
+    world-to-camera matrix acts (`prope`: times the intrinsics in units of the image
+    size, principal point relative to the centre). Channels `E/2 + p` and `3E/4 + p`
+    are a pair that turns by the angle p: E/8 of them by the row, E/8 by the column.
+    """
+    rows, columns, count = height // PATCH_SIZE, width // PATCH_SIZE, head_dim // 8
+    batch, views = c2w.shape[:2]
+    g = torch.linalg.inv(c2w)
+    if encoding == "prope":
+        lens = torch.eye(4, dtype=c2w.dtype).repeat(batch, views, 1, 1)
+        lens[..., 0, 0], lens[..., 1, 1] = intrinsics[..., 0] / width, intrinsics[..., 1] / height
+        lens[..., 0, 2], lens[..., 1, 2] = intrinsics[..., 2] / width - 0.5, intrinsics[..., 3] / height - 0.5
+        g = lens @ g
+    rho = torch.zeros(batch, views, rows, columns, head_dim, head_dim, dtype=c2w.dtype)
+    for i in range(4):
+        for j in range(4):
+            for k in range(count):
+                rho[..., i * count + k, j * count + k] = g[:, :, None, None, i, j]
+    for row in range(rows):
+        for column in range(columns):
+            for p in range(2 * count):
+                place, index = (row, p) if p < count else (column, p - count)
+                angle = place * 100.0 ** (-index / count)
+                a, b = 4 * count + p, 6 * count + p
+                rho[:, :, row, column, a, a] = rho[:, :, row, column, b, b] = math.cos(angle)
+                rho[:, :, row, column, a, b] = -math.sin(angle)
+                rho[:, :, row, column, b, a] = math.sin(angle)
+    return rho.flatten(1, 3)
+
+
+def camera_attention(q: Tensor, k: Tensor, v: Tensor, rho_q: Tensor, rho_k: Tensor, num_heads: int) -> Tensor:
+    """Attention of `[B, M, D]` to `[B, N, D]` in the frames of the cameras: the score of a pair is
+    `q^T rho_q rho_k^-1 k`, and its value `rho_q rho_k^-1 v`."""
+    q, k, v = (x.unflatten(-1, (num_heads, -1)) for x in (q, k, v))  # [B, N, H, E]
+    relative = torch.einsum("bmij,bnjk->bmnik", rho_q, torch.linalg.inv(rho_k))  # [B, M, N, E, E]
+    scores = torch.einsum("bmhi,bmnij,bnhj->bhmn", q, relative, k) / math.sqrt(q.shape[-1])
+    return torch.einsum("bhmn,bmnij,bnhj->bmhi", scores.softmax(-1), relative, v).flatten(-2)
+
+
 # --------------------------------------------------------------- encoder
 
 

@@ -62,6 +62,23 @@ fn what_cannot_be_timed_is_wrong_usage() {
 }
 
 #[test]
+fn features_of_a_file_have_their_own_number_of_tokens() {
+    let place = Place::new();
+    // The config's scenes have 8 tokens.
+    let bytes: Vec<u8> = (0..40 * 4).flat_map(|i| ((i * 37 % 101) as f32).to_le_bytes()).collect();
+    let view = safetensors::tensor::TensorView::new(safetensors::Dtype::F32, vec![40, 4], &bytes).expect("fits");
+    let file = place.at("features.safetensors");
+    safetensors::serialize_to_file([("features", view)], None, &file).expect("writable");
+    let bench = |cases: &str, storage: usize| {
+        let flags = format!("--case {cases} --repeats 1 --features DIR/features.safetensors --storage {storage}");
+        place.clift(&format!("{BENCH} {flags}"))
+    };
+    bench("kmeans", 32).ok();
+    bench("kmeans", 41).fails_with(2, &["`--storage` = 41", "a scene has 40 tokens"]);
+    bench("kmeans,encode", 32).fails_with(2, &["a scene has 8 tokens; --case kmeans alone uses the tokens of"]);
+}
+
+#[test]
 fn an_interrupted_benchmark_writes_nothing() {
     let place = Place::new();
     for (name, code) in [("-INT", 130), ("-TERM", 143)] {

@@ -2,11 +2,13 @@
 //!
 //! `training` runs the stages, stops them and resumes them; `evaluation` measures, encodes and renders; `data` converts and
 //! checks data sets; `input` is wrong or damaged input; `bench` times the cases. `architecture`, `links` and `old_names` read
-//! the sources instead, `licences` reads the dependencies.
+//! the sources instead, `licences` reads the dependencies, and `documents`
+//! runs every command of the documents.
 
 mod architecture;
 mod bench;
 mod data;
+mod documents;
 mod evaluation;
 mod input;
 mod licences;

@@ -205,8 +205,9 @@ impl Place {
         start(Command::new(BINARY).args(self.words(words)))
     }
 
+    /// Evaluates the run of a name, which flags may follow, and replaces an existing evaluation.
     pub fn eval(&self, words: &str) -> Ran {
-        self.clift(&format!("eval DIR/{words}"))
+        self.clift(&format!("eval DIR/{words} --force"))
     }
 
     pub fn bytes(&self, name: &str) -> Vec<u8> {
@@ -230,10 +231,14 @@ impl Place {
         self.json_lines(&format!("{run}/metrics.jsonl"))
     }
 
+    /// The lines of a run's `metrics.jsonl` and `validation.jsonl` without times.
     pub fn metrics_but_time(&self, run: &str) -> Vec<Value> {
         let mut lines = self.metrics(run);
+        if self.at(&format!("{run}/validation.jsonl")).exists() {
+            lines.extend(self.json_lines(&format!("{run}/validation.jsonl")));
+        }
         for line in &mut lines {
-            line.as_object_mut().expect("an object").remove("step_s");
+            line.as_object_mut().expect("an object").retain(|key, _| key != "step_s" && key != "time");
         }
         lines
     }
@@ -266,7 +271,7 @@ impl Place {
             // The report holds the date, `views.csv` times, and `config.toml` the path of its run.
             files.retain(|path, _| {
                 let name = path.display().to_string();
-                let other = ["metrics.jsonl", "config.toml", "lock"].contains(&name.as_str());
+                let other = ["metrics.jsonl", "validation.jsonl", "config.toml", "lock"].contains(&name.as_str());
                 !other && !name.starts_with("eval/") && !name.contains("/checkpoints/")
             });
             files

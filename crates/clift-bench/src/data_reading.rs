@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use clift_data::{
-    ClipOptions, ClipReader, DataError, Prefetcher, SceneSource, ViewIndices, item_rng, p95, sample_distinct,
-    uniform_below, upper_median,
+    ClipOptions, ClipReader, DataError, Prefetcher, SceneSource, ViewIndices, item_rng, median, p95, sample_distinct,
+    uniform_below,
 };
 use serde::Serialize;
 
@@ -116,7 +116,7 @@ pub fn measure_reading(source: &Arc<dyn SceneSource>, options: &ThroughputOption
         size: [clip.width, clip.height],
         num_threads,
         sequential_clips_per_s: num_clips as f64 / sequential_s,
-        random_median_s: upper_median(&latencies),
+        random_median_s: median(&latencies),
         random_p95_s: p95(&latencies),
         random_clips_per_s: num_clips as f64 / random_s,
         sequential: named(in_order),

@@ -11,6 +11,7 @@ use crate::sampling::view_sampler::{ViewSampler, is_default};
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
 use crate::sources::options::FileOptions;
+use crate::sources::photos::image_cache::ImageCacheConfig;
 use crate::synthetic::config::SyntheticConfig;
 
 /// Data set, image size, pose normalisation and view sampling.
@@ -40,10 +41,15 @@ pub struct DataConfig {
     /// Whether stage 1 mirrors half of its clips left to right. Stage 2 never mirrors: its clusters are cached.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub flip: bool,
+    /// Where a data set has no test split: every n-th frame of a scene (0, n, 2 n, ..) is a target of the evaluation and
+    /// never read in training, as in the practice of `NeRF`; 0 holds out no frame, and training scenes are evaluated.
+    pub hold_out: usize,
     /// Filters of the scenes on disk.
     pub filters: SceneFilters,
     /// Options of the synthetic scenes.
     pub synthetic: SyntheticConfig,
+    /// Cache of decoded photos.
+    pub image_cache: ImageCacheConfig,
     /// Sampling of context and target frames for training.
     pub views: ViewSampler,
     /// Number of threads that prepare batches; 0 prepares them between the steps.
@@ -65,8 +71,10 @@ impl Default for DataConfig {
             exact_principal_point: false,
             crop: Crop::Protocol,
             flip: false,
+            hold_out: 8,
             filters: SceneFilters::default(),
             synthetic: SyntheticConfig::default(),
+            image_cache: ImageCacheConfig::default(),
             views: ViewSampler::default(),
             num_threads: 1,
             num_prefetch: 4,

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use crate::config::DataConfig;
 use crate::error::DataError;
 use crate::scene_source::{SceneSource, Split};
@@ -9,9 +11,10 @@ use crate::skip_report::SkipReport;
 use crate::sources::dataset_root::DatasetRoot;
 use crate::sources::keys::is_dl3dv_key;
 use crate::sources::kind::SourceKind;
-use crate::sources::open::{OpenedSource, open_source};
+use crate::sources::open::{OpenedSource, SAME_SCENES, open_source};
 use crate::sources::options::SourceOptions;
 use crate::sources::subset::SceneSubset;
+use crate::sources::training_frames::TrainingFrames;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
 
@@ -25,7 +28,13 @@ pub fn open_dataset(config: &DataConfig, split: Split) -> Result<OpenedSource, D
         SourceKind::Synthetic => {
             let source = SyntheticSource::new(SyntheticConfig { split, ..config.synthetic.clone() })?;
             let report = SkipReport::new(source.num_scenes());
-            OpenedSource { source: Arc::new(source), kind: config.source, has_splits: true, report }
+            OpenedSource {
+                source: Arc::new(source),
+                kind: config.source,
+                has_splits: true,
+                shares_scenes: false,
+                report,
+            }
         }
         kind => open_files(config, kind, split)?,
     };
@@ -40,38 +49,54 @@ fn open_files(config: &DataConfig, kind: SourceKind, split: Split) -> Result<Ope
     let root = config.root.as_deref();
     let root = root.ok_or_else(|| missing("data.root", "write the folder that holds train/ and test/"))?;
     let (filters, files) = (config.filters.clone(), config.files.clone());
-    let options = SourceOptions { kind, filters, files, min_size: [config.width, config.height], reads_chunks: false };
-    let opened = open_source(&DatasetRoot::find(root)?, split, &options)?;
-    let source = &opened.source;
-    let has_dl3dv = match opened.kind {
-        SourceKind::Dl3dv => true,
-        SourceKind::Captures => (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene))),
-        _ => false,
+    let options = SourceOptions {
+        kind,
+        filters,
+        files,
+        min_size: [config.width, config.height],
+        image_cache: Some(config.image_cache.clone()),
+        reads_chunks: false,
     };
-    if split == Split::Train && has_dl3dv && !opened.has_splits && config.files.test_scenes.is_none() {
+    let mut opened = open_source(&DatasetRoot::find(root)?, split, &options)?;
+    let source = &opened.source;
+    let has_dl3dv = || (0..source.num_scenes()).any(|scene| is_dl3dv_key(source.key(scene)));
+    let is_divided = opened.has_splits || config.files.test_scenes.is_some();
+    if split == Split::Train && !is_divided && (opened.kind == SourceKind::Dl3dv || has_dl3dv()) {
         let fix = "the folders also hold the benchmark scenes of DL3DV, which must be excluded from training: write \
                    the path of an evaluation index or of a file with one key per line (an empty file excludes none)";
         return Err(missing("data.files.test_scenes", fix));
     }
+    if opened.shares_scenes && config.hold_out > 0 {
+        opened.report.notes.retain(|note| note != SAME_SCENES);
+        let every = config.hold_out;
+        let note = format!("no test split: 1 of {every} frames (0, {every}, ..) is held out of training as a target");
+        opened.report.notes.push(note);
+    }
     Ok(opened)
 }
 
-/// Opens the training split as [`open_dataset`] does, and skips the scenes that are too short for `data.views`.
+/// Opens the training split as [`open_dataset`] does, without the frames of `data.hold_out` where the data set has no test
+/// split, and skips the scenes that are too short for `data.views` at `last_step`, when its gaps are largest.
 ///
 /// # Errors
 /// As [`open_dataset`].
-pub fn open_training_dataset(config: &DataConfig) -> Result<OpenedSource, DataError> {
+pub fn open_training_dataset(config: &DataConfig, last_step: u64) -> Result<OpenedSource, DataError> {
     let mut opened = open_dataset(config, Split::Train)?;
+    if opened.shares_scenes && config.hold_out > 0 {
+        opened.source = Arc::new(TrainingFrames::new(opened.source, config.hold_out));
+    }
     let source = opened.source.clone();
-    let needed = config.views.min_frames();
+    let needed = config.views.min_frames(last_step);
     // An unreadable scene is reported when it is sampled.
     let is_short = |scene: &usize| source.num_frames(*scene).is_ok_and(|num_frames| num_frames < needed);
-    let (short, long): (Vec<usize>, Vec<usize>) = (0..source.num_scenes()).partition(is_short);
+    let (short, long): (Vec<usize>, Vec<usize>) = (0..source.num_scenes()).into_par_iter().partition(is_short);
     if short.is_empty() {
         return Ok(opened);
     }
     for scene in short {
-        opened.report.skip(source.key(scene), format!("shorter than the {needed} frames that data.views needs"));
+        opened
+            .report
+            .skip(source.key(scene), format!("shorter than the {needed} frames that data.views.min_gap needs"));
     }
     if long.is_empty() {
         return Err(DataError::NoScenes { reason: format!("{}: {}", Split::Train, opened.report) });
@@ -82,11 +107,12 @@ pub fn open_training_dataset(config: &DataConfig) -> Result<OpenedSource, DataEr
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::item_rng;
     use crate::sampling::view_sampler::ViewSampler;
     use crate::sources::chunks::writer::{SceneRecord, write_chunks};
 
     #[test]
-    fn training_skips_scenes_too_short_for_any_step() {
+    fn training_skips_scenes_too_short_for_its_last_step() {
         let rooms =
             SyntheticSource::new(SyntheticConfig { num_frames: 8, num_scenes: 2, ..Default::default() }).unwrap();
         let folder = tempfile::tempdir().unwrap();
@@ -103,18 +129,31 @@ mod tests {
             let split_folder = folder.path().join(split.to_string());
             write_chunks(&split_folder, [(0, 4), (1, 5), (0, 8)].into_iter().map(record), 1).unwrap();
         }
-        // Two contexts may lie 4 apart, three 8.
-        let views =
-            ViewSampler { min_context: 2, max_context: 4, min_gap: [8, 9], max_gap: [8, 9], ..Default::default() };
+        // Over four steps, the gap of four contexts grows from 3 to 5 frames; two contexts lie half as far apart.
+        let views = ViewSampler {
+            min_context: 2,
+            max_context: 4,
+            min_gap: [3, 5],
+            max_gap: [4, 6],
+            warm_up_steps: 4,
+            ..Default::default()
+        };
         let mut data = DataConfig { views, source: SourceKind::Chunks, ..DataConfig::default() };
         data.root = Some(folder.path().to_owned());
-        let OpenedSource { source, report, .. } = open_training_dataset(&data).unwrap();
+        assert_eq!(open_training_dataset(&data, 0).unwrap().source.num_scenes(), 3);
+        let OpenedSource { source, report, .. } = open_training_dataset(&data, 2).unwrap();
         assert_eq!((source.num_scenes(), source.key(0), source.find("of-8")), (2, "of-5", Some(1)));
-        assert_eq!(report.to_string(), "2 of 3 scenes used; 1 shorter than the 5 frames that data.views needs");
+        let expected = "2 of 3 scenes used; 1 shorter than the 5 frames that data.views.min_gap needs";
+        assert_eq!(report.to_string(), expected);
         assert_eq!(report.skips[0].key, "of-4");
+        let OpenedSource { source, report, .. } = open_training_dataset(&data, 4).unwrap();
+        assert_eq!((source.num_scenes(), source.key(0)), (1, "of-8"));
+        assert!(report.to_string().contains("2 shorter than the 6 frames"), "{report}");
+        let too_short = data.views.sample_frames(5, &[], 4, 4, &mut item_rng(1, 0, 0, 0, "test")).unwrap_err();
+        assert_eq!(too_short.to_string(), "not enough frames: 6 needed, 5 in the scene");
         assert_eq!(open_dataset(&data, Split::Train).unwrap().source.num_scenes(), 3);
         data.views = ViewSampler { min_gap: [9, 9], max_gap: [9, 9], ..Default::default() };
-        let message = open_training_dataset(&data).err().unwrap().to_string();
+        let message = open_training_dataset(&data, 0).err().unwrap().to_string();
         assert!(message.contains("train: 0 of 3 scenes used; 3 shorter than the 10 frames"), "{message}");
     }
 }

@@ -62,6 +62,14 @@ pub enum DataError {
         /// File.
         path: PathBuf,
     },
+    /// A folder cannot take the output of a command: it holds other files, or was written with other options.
+    #[error("the output folder cannot be used: {what}: {path}", path = path.display())]
+    BadOutput {
+        /// Problem and remedy.
+        what: String,
+        /// Folder, or the file in it.
+        path: PathBuf,
+    },
     /// A folder or file holds no scenes in a known layout, or none in the requested layout.
     #[error("no scenes found: {what}: {path}", path = path.display())]
     UnknownLayout {

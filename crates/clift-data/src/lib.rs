@@ -50,15 +50,17 @@ pub use sources::keys::is_dl3dv_key;
 pub use sources::kind::SourceKind;
 pub use sources::open::{OpenedSource, SAME_SCENES, open_source};
 pub use sources::options::{FileOptions, SourceOptions};
+pub use sources::photos::image_cache::ImageCacheConfig;
 pub use sources::subset::SceneSubset;
 pub use sources::test_scenes::{KEPT_FOR_TESTING, TestScenes};
+pub use sources::training_frames::is_held_out;
 pub use synthetic::config::SyntheticConfig;
 pub use synthetic::source::SyntheticSource;
 
 // Clips and batches.
 pub use sampling::clip::{Clip, ClipViews, ViewIndices};
 pub use sampling::clip_reader::{ClipOptions, ClipReader};
-pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views};
+pub use sampling::evaluation_index::{EvaluationIndex, EvaluationItem, even_views, even_views_of};
 pub use sampling::inner_views::InnerViews;
 pub use sampling::prefetcher::Prefetcher;
 pub use sampling::slot_filler::{NoUsableScene, SlotFiller};
@@ -82,10 +84,10 @@ pub use image::rgb_image::RgbImage;
 pub use image::undistort::Undistortion;
 
 // Tools for data sets: describe, check, convert, index.
-pub use tools::check::result::SceneCheck;
+pub use tools::check::result::{FrameCheck, PairCheck, SceneCheck, Verdict};
 pub use tools::check::scene::{CheckedScene, check_scene, note_skipped_frames, skipped_scenes};
 pub use tools::checksums::hash_file;
-pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter};
+pub use tools::convert::{ConversionReport, ConvertOptions, ConvertTo, Converter, UnreadableImage};
 pub use tools::export::{ImageEncoding, write_evaluation_index, write_source};
 pub use tools::index_census::IndexCensus;
 pub use tools::info::SourceInfo;
@@ -100,4 +102,4 @@ pub use torch::values::ElementType;
 pub use files::atomic::{TEMPORARY, make_folder, publish_folder, remove_folder, remove_leftovers, replace_file};
 pub use files::staged_dir::{StagedDir, is_empty_folder};
 pub use random::{derive_seed, item_rng, sample_distinct, step_rng, uniform_below};
-pub use statistics::{MinMedianMax, mean, median, p95, standard_error, upper_median};
+pub use statistics::{MinMedianMax, mean, median, p95, quartiles, standard_error};

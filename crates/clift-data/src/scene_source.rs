@@ -33,15 +33,29 @@ pub trait SceneSource: Send + Sync {
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
         Ok(self.cameras(scene)?.len())
     }
+
     /// Returns the time stamp of every frame: microseconds in RealEstate10K, frame numbers otherwise. The default returns
     /// the frame indices.
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {
         Ok((0..self.num_frames(scene)? as i64).collect())
     }
+
     /// Returns the URL of a scene; empty if unknown.
     fn url(&self, _scene: usize) -> Result<String, DataError> {
         Ok(String::new())
     }
+
+    /// Returns the file name of every frame; empty for frames without files of their own.
+    fn frame_names(&self, _scene: usize) -> Result<Vec<String>, DataError> {
+        Ok(Vec::new())
+    }
+
+    /// Returns columns and rows of a frame. The default decodes the frame.
+    fn image_size(&self, scene: usize, frame: usize) -> Result<[usize; 2], DataError> {
+        let image = self.frame(scene, frame)?;
+        Ok([image.width, image.height])
+    }
+
     /// Decodes one frame.
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError>;
     /// Returns the bytes of the JPEG or PNG file of a frame; `None` for images that are computed, or resampled on load.

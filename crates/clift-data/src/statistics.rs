@@ -15,14 +15,6 @@ pub fn median(values: &[f64]) -> f64 {
     }
 }
 
-/// Returns the upper median, which is always one of the values: for an even count the larger of the two middle ones,
-/// NaN for no values.
-pub fn upper_median(values: &[f64]) -> f64 {
-    let mut values = values.to_vec();
-    let middle = values.len() / 2;
-    if values.is_empty() { f64::NAN } else { *values.select_nth_unstable_by(middle, f64::total_cmp).1 }
-}
-
 /// Returns the mean, summed in the given order; `None` for no values.
 pub fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
@@ -44,6 +36,18 @@ pub fn p95(values: &[f64]) -> f64 {
     // Integer arithmetic: 0.95 * 20 exceeds 19 in binary.
     let rank = (sorted.len() * 95).div_ceil(100);
     rank.checked_sub(1).map_or(f64::NAN, |index| sorted[index])
+}
+
+/// Returns the first and the third quartile, interpolated linearly between neighbouring values; `None` for no values.
+pub fn quartiles(values: &[f64]) -> Option<[f64; 2]> {
+    let sorted = sorted(values);
+    let last = sorted.len().checked_sub(1)?;
+    Some([0.25, 0.75].map(|share| {
+        let position = share * last as f64;
+        let below = position.floor() as usize;
+        let above = (below + 1).min(last);
+        sorted[below] + (sorted[above] - sorted[below]) * (position - below as f64)
+    }))
 }
 
 /// Smallest value, median and largest value. Prints as `1.0 / 2.5 / 4.0`, with the precision of the format string.
@@ -85,12 +89,10 @@ mod tests {
 
     #[test]
     fn medians_ignore_the_order_of_the_values() {
-        for (values, middle, upper) in
-            [(&[3.0, 1.0, 2.0][..], 2.0, 2.0), (&[4.0, 1.0, 3.0, 2.0], 2.5, 3.0), (&[7.0], 7.0, 7.0)]
-        {
-            assert_eq!((median(values), upper_median(values)), (middle, upper));
+        for (values, middle) in [(&[3.0, 1.0, 2.0][..], 2.0), (&[4.0, 1.0, 3.0, 2.0], 2.5), (&[7.0], 7.0)] {
+            assert_eq!(median(values), middle);
         }
-        assert!(median(&[]).is_nan() && upper_median(&[]).is_nan());
+        assert!(median(&[]).is_nan());
     }
 
     #[test]
@@ -101,6 +103,13 @@ mod tests {
             assert_eq!(p95(&values(count)), expected, "of {count}");
         }
         assert!(p95(&[]).is_nan());
+    }
+
+    #[test]
+    fn quartiles_are_interpolated() {
+        assert_eq!(quartiles(&[5.0, 1.0, 3.0, 2.0, 4.0]), Some([2.0, 4.0]));
+        assert_eq!(quartiles(&[4.0, 1.0, 2.0, 3.0]), Some([1.75, 3.25]));
+        assert_eq!((quartiles(&[7.0]), quartiles(&[])), (Some([7.0; 2]), None));
     }
 
     #[test]

@@ -4,8 +4,8 @@
 use burn::tensor::Tensor;
 use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices, contexts_along_path, derive_seed};
 use clift_model::{
-    Clusters, Grouping, KMeans, ModelError, Scene, SceneModel, SceneNormalization, TokenCount, TokenKind, TrainedModel,
-    total_variance,
+    Clusters, Grouping, KMeans, ModelError, Scene, SceneClusters, SceneModel, SceneNormalization, TokenCount,
+    TokenKind, TrainedModel, total_variance,
 };
 
 use crate::error::EvalError;
@@ -26,7 +26,7 @@ pub struct EncodeOptions {
     pub kmeans: KMeans,
     /// Seed of the run.
     pub seed: u64,
-    /// Path of the model as given by the user, for the scene file.
+    /// Path of the model for the scene file, see [`Scene::model_path_for`].
     pub model_path: String,
 }
 
@@ -39,6 +39,8 @@ pub struct EncodedScene {
     pub num_lift_tokens: usize,
     /// Variance within clusters as a share of the total variance of the tokens.
     pub cluster_error: f64,
+    /// Clusters of the tokens.
+    pub clusters: SceneClusters,
 }
 
 /// Encodes a scene of `reader`. The clusters equal those of `clift eval` for the same contexts and count.
@@ -68,15 +70,16 @@ pub fn encode(
     let lift = model.network.encode(&upload_views(&[&clip.context], &model.device)?); // [1, N, D]
     let [_, num_lift_tokens, dim] = lift.dims();
     let seed = derive_seed(derive_seed(options.seed, "eval"), key);
-    let (clusters, cluster_error) = cluster(&options.kmeans, &lift, options.storage, seed)?;
+    let (clusters, cluster_error) = cluster(&options.kmeans, &lift.values, options.storage, seed)?;
     let index = clusters.upload(&model.device);
     let (kind, tokens) = if model.has_condenser {
         (TokenKind::Clift, model.network.compress(lift, &index))
     } else {
-        (TokenKind::Kmeans, index.gather_centroids(lift))
+        (TokenKind::Kmeans, lift.centroids(&index))
     };
-    let tokens = tokens.into_data().convert::<f32>().try_to_vec::<f32>().map_err(EvalError::tensor)?;
-    let token_ids = clusters.scenes()[0].centroid_index().to_vec();
+    let tokens = tokens.values.into_data().convert::<f32>().try_to_vec::<f32>().map_err(EvalError::tensor)?;
+    let clusters = clusters.scenes()[0].clone();
+    let token_ids = clusters.centroid_index().to_vec();
     debug_assert_eq!(tokens.len(), token_ids.len() * dim, "a row per centroid");
     let scene = Scene {
         key: key.into(),
@@ -92,7 +95,7 @@ pub fn encode(
         token_ids,
         tokens,
     };
-    Ok(EncodedScene { scene, num_lift_tokens, cluster_error })
+    Ok(EncodedScene { scene, num_lift_tokens, cluster_error, clusters })
 }
 
 /// Checks the requested context frames, or chooses `num_views` frames along the camera path.

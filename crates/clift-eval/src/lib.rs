@@ -51,16 +51,19 @@ pub use metrics::vgg::VggShape;
 pub use config::eval_config::EvalConfig;
 pub use config::experiment::Experiment;
 pub use config::method::{Method, MethodName};
+pub use config::split::{EvalFrames, EvalSplit};
 pub use config::token_selection::Selection;
 
 // A complete evaluation with its files.
 pub use evaluator::evaluator::{Evaluator, Progress, SceneLimits, write_skip_report};
 pub use evaluator::items::evaluation_items;
 pub use report::page::RunDescription;
+pub use report::training::TrainingCurve;
 
 // One scene with every method and token count.
 pub use sweep::eval_models::{EvalModels, stage2_method};
 pub use sweep::evaluate_scene::evaluate_scene;
+pub use sweep::held_out_frame::HeldOutFrame;
 pub use sweep::predictions::ExternalMethod;
 pub use sweep::rendered_views::SceneResults;
 pub use sweep::sweep::Sweep;

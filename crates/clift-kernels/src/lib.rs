@@ -24,6 +24,7 @@
 mod attention;
 mod cluster_attention;
 mod gelu;
+mod head_transform;
 mod layer_norm;
 mod linear;
 mod primitives;
@@ -39,6 +40,8 @@ pub use attention::forward::attention_forward;
 pub use attention::shapes::{AttentionGradients, AttentionSizes, StridedRows};
 // Attention inside clusters
 pub use cluster_attention::{ClusterSegments, cluster_attention_backward, cluster_attention_forward};
+// Camera-relative attention
+pub use head_transform::{HeadTransform, transform_heads, transform_len};
 // Layers
 pub use gelu::{gelu_backward, gelu_forward};
 pub use layer_norm::{layer_norm_backward, layer_norm_forward, sum_rows};

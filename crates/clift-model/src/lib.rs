@@ -19,7 +19,7 @@
 //!
 //! // All 8 tokens of the scene, condensed into 4 and rendered from the second camera's pose.
 //! let tokens = model.encode(&views);
-//! let clusters = KMeans::default().fit(tokens.clone(), 4, &[0])?.clusters.upload(&device);
+//! let clusters = KMeans::default().fit(tokens.values.clone(), 4, &[0])?.clusters.upload(&device);
 //! let tokens = model.compress(tokens, &clusters);
 //! let target = Cameras::upload(&pose, &intrinsics, [1, 1, 16, 16], &device)?;
 //! let image = model.render(tokens, &target);
@@ -64,7 +64,8 @@ pub use tokens::selection::selector::Selector;
 pub use tokens::selection::token_ray::TokenRay;
 pub use tokens::tiles::{Grouping, tile_clusters};
 // Networks
-pub use network::architecture::CliftVariant;
+pub use network::architecture::{CameraEncoding, CliftVariant};
+pub use network::camera_encoding::TokenTransforms;
 pub use network::clift::Clift;
 pub use network::condenser::Condenser;
 pub use network::config::{CondenserConfig, ModelConfig};
@@ -73,6 +74,7 @@ pub use network::init::Init;
 pub use network::render_tokens::{KeyValueCache, RenderTokens};
 pub use network::renderer::Renderer;
 pub use network::scene_model::SceneModel;
+pub use network::tokens::Tokens;
 // Layers and operations of the networks
 pub use network::blocks::attention::SelfAttention;
 pub use network::blocks::block::{DecoderBlock, EncoderBlock};
@@ -94,7 +96,7 @@ pub use weights::file::{first_not_f32, load_part, save_part, save_weights, sorte
 pub use weights::hash::weights_hash;
 pub use weights::model_path::{ModelPath, check_heads, refuse_checkpoint};
 pub use weights::published_keys::{
-    CONVOLUTIONS, PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
+    PERCEPTUAL_PREFIX, PREFIX, PROJECTIONS, PublishedTensor, canonical_key, published_tensors,
 };
 pub use weights::published_sizes::{InferredConfig, infer_config};
 pub use weights::trained_model::TrainedModel;

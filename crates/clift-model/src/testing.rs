@@ -6,6 +6,7 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 use safetensors::{Dtype, SafeTensors};
 
 use crate::device::name::DeviceName;
+use crate::network::architecture::CameraEncoding;
 use crate::network::architecture::CliftVariant;
 use crate::network::config::{CondenserConfig, ModelConfig};
 
@@ -29,6 +30,7 @@ pub fn small_config(variant: CliftVariant) -> ModelConfig {
         num_encoder_blocks: 1,
         num_renderer_blocks: 3,
         patch_size: 8,
+        camera_encoding: CameraEncoding::Plucker,
         condenser: CondenserConfig::of(variant),
     }
 }

@@ -123,12 +123,22 @@ pub enum TrainError {
         /// The remedy.
         fix: String,
     },
-    /// Another process uses the run directory.
-    #[error("run directory {path} is in use by {holder}; wait until it exits or set another `run_dir`", path = path.display())]
+    /// Another process uses the run directory or the output folder.
+    #[error("{what} {path} is in use by {holder}; wait until it exits or set {elsewhere}", path = path.display())]
     Locked {
+        /// Kind of the folder.
+        what: &'static str,
         /// The process, if known.
         holder: String,
-        /// The run directory.
+        /// The setting of another folder.
+        elsewhere: &'static str,
+        /// The folder.
+        path: PathBuf,
+    },
+    /// The run directory was moved or removed while the run was training.
+    #[error("the run directory was moved or removed during training; resume at its new place with --set run_dir: {path}", path = path.display())]
+    Moved {
+        /// The former path.
         path: PathBuf,
     },
     /// No scene is left to train or evaluate on.

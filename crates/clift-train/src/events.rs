@@ -26,7 +26,7 @@ impl Stage {
     }
 }
 
-/// One optimizer update; a line of `metrics.jsonl`, where NaN and infinity are written as `null`.
+/// One optimizer update; with its time a line of `metrics.jsonl`, where NaN and infinity are written as `null`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct StepEvent {
     /// Step of the stage, from 1.

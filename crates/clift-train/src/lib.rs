@@ -34,23 +34,26 @@ mod testing;
 
 // Configuration
 pub use config::config::{
-    CheckpointConfig, ClustersConfig, Config, LossConfig, OptimizerConfig, Stage1Config, Stage2Config,
+    Algorithm, CheckpointConfig, ClustersConfig, Config, LossConfig, OptimizerConfig, Schedule, Stage1Config,
+    Stage2Config,
 };
 pub use config::overrides::Override;
 pub use config::parse::{ConfigError, parse_config, read_checked_config, read_config};
 // A run, its events and errors
 pub use error::TrainError;
 pub use events::{Event, Sink, Stage, StepEvent};
+pub use run::eval_folder::EvalFolder;
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::{Run, RunOptions};
+pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
 // One update
 pub use step::batch::{StageBatch, TokenSelection};
 pub use step::device_batch::{DeviceBatch, render_loss};
 pub use step::loss::{ImageLoss, Loss, LossParts, mse, psnr_of_mse};
 pub use step::loss_scale::LossScale;
-pub use step::optimizer::{adamw, clip_global_norm, global_norm};
-pub use step::schedule::warm_up_cosine;
+pub use step::optimizer::{clip_global_norm, global_norm, make_optimizer};
+pub use step::schedule::learning_rate;
 pub use step::step_guard::StepAnomaly;
 pub use step::train_state::{TrainState, Update};
 // Results of the stages

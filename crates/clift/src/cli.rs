@@ -4,6 +4,7 @@ use clap::{Parser, Subcommand};
 
 use crate::commands::bench::cases::BenchArgs;
 use crate::commands::compare::CompareArgs;
+use crate::commands::completions::CompletionsArgs;
 use crate::commands::data::command::DataCommand;
 use crate::commands::doctor::run::DoctorArgs;
 use crate::commands::encode::EncodeArgs;
@@ -11,9 +12,11 @@ use crate::commands::eval::EvalArgs;
 use crate::commands::export::ExportArgs;
 use crate::commands::flops::FlopsArgs;
 use crate::commands::import::ImportArgs;
+use crate::commands::metrics::MetricsArgs;
 use crate::commands::plan::PlanArgs;
 use crate::commands::render::args::RenderArgs;
 use crate::commands::train::TrainArgs;
+use crate::output::verbosity::Verbosity;
 
 /// Train, compress, render and evaluate scenes of compressive light-field tokens
 #[derive(Debug, Parser)]
@@ -30,12 +33,29 @@ Exit codes:
   130  Ctrl-C, after the state was saved
   143  SIGTERM, after the state was saved
 
-A second signal ends the process at once."
+A second signal, a second or more after the first, ends the process at once."
 )]
 pub struct Args {
     /// Command to run.
     #[command(subcommand)]
     pub command: Command,
+    /// Print results, warnings and errors only
+    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    pub quiet: bool,
+    /// Print a line for every training step
+    #[arg(short, long, global = true)]
+    pub verbose: bool,
+}
+
+impl Args {
+    /// Returns the amount of notes and progress.
+    pub fn verbosity(&self) -> Verbosity {
+        match (self.quiet, self.verbose) {
+            (true, _) => Verbosity::Quiet,
+            (_, true) => Verbosity::Verbose,
+            _ => Verbosity::Normal,
+        }
+    }
 }
 
 /// The commands.
@@ -51,9 +71,9 @@ External methods:
   letters, digits, - _ and . are replaced by _.
 
 Examples:
-  clift eval runs/tiny --storage 8,1/4,1.0 --tokens f32,f16,int8
-  clift eval runs/re10k --index INDEX.json --set 'eval.lpips_weights=\"lpips-vgg.safetensors\"'
-  clift eval runs/re10k --index INDEX.json --predictions out/mvsplat --name MVSplat --data-size 12MB")]
+  clift eval runs/tiny --storage 8,1/4,1.0 --tokens f32,f16,int8 --out runs/tiny/formats
+  clift eval runs/re10k --index INDEX.json --set 'eval.lpips_weights=\"lpips-vgg.safetensors\"' --out lpips
+  clift eval runs/re10k --index INDEX.json --predictions out/mvsplat --name MVSplat --data-size 12MB --force")]
     Eval(EvalArgs),
     /// Compare two evaluations view by view, with confidence intervals
     ///
@@ -85,8 +105,8 @@ Examples:
     Encode(EncodeArgs),
     /// Render a scene file along a camera path
     ///
-    /// Writes frame-00000.png and so on, animation.png (an animated PNG for browsers) and render.json (token counts and
-    /// times) to a new folder.
+    /// Writes frame-00000.png and so on, animation.png (an animated PNG for browsers) and render.json (token
+    /// counts, times and the tokens of each frame) to a folder.
     #[command(after_help = "\
 Paths:
   interpolate   through the context views
@@ -108,6 +128,14 @@ Examples:
         #[command(subcommand)]
         command: DataCommand,
     },
+    /// Write the training curves of a run as CSV or for TensorBoard
+    ///
+    /// Reads metrics.jsonl and validation.jsonl. Event files have a folder per stage, for `tensorboard --logdir DIR`.
+    #[command(after_help = "\
+Examples:
+  clift metrics runs/tiny --csv tiny.csv
+  clift metrics runs/tiny --tensorboard board --force")]
+    Metrics(MetricsArgs),
     /// Estimate parameters, memory and time of a run
     ///
     /// Covers both stages, the cluster cache and the evaluation. Counts parameters exactly and memory from the tensors
@@ -145,17 +173,32 @@ Examples:
   clift export models/re10k --format pytorch -o re10k.ckpt
   clift export runs/tiny/stage1/model.safetensors --format safetensors -o tiny.safetensors")]
     Export(ExportArgs),
+    /// Print the completion script of a shell
+    #[command(after_help = "\
+Examples:
+  clift completions bash > ~/.local/share/bash-completion/completions/clift
+  clift completions fish > ~/.config/fish/completions/clift.fish")]
+    Completions(CompletionsArgs),
 }
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
+    use clap::{CommandFactory, ValueEnum};
 
     use super::*;
+    use crate::commands::completions;
 
     #[test]
     fn command_tree_is_consistent() {
         Args::command().debug_assert();
+    }
+
+    #[test]
+    fn completion_scripts_of_all_shells_have_the_commands() {
+        for shell in clap_complete::Shell::value_variants() {
+            let script = completions::script(*shell, Args::command());
+            assert!(["encode", "convert", "storage"].iter().all(|word| script.contains(word)), "{shell}");
+        }
     }
 
     #[test]
@@ -176,6 +219,7 @@ mod tests {
     fn wrong_command_lines_are_refused() {
         for line in [
             "train a.toml --overfit 0",
+            "train a.toml -q -v",
             "eval",
             "eval --checkpoint model",
             "eval run --checkpoint model --data re10k",

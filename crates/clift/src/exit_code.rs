@@ -61,8 +61,8 @@ fn train_exit_code(error: &TrainError) -> u8 {
 }
 
 fn data_exit_code(error: &clift_data::DataError) -> u8 {
-    use clift_data::DataError::{BadConfig, UnknownLayout};
-    if matches!(error, BadConfig { .. } | UnknownLayout { .. }) { USAGE } else { FAILED }
+    use clift_data::DataError::{BadConfig, BadOutput, UnknownLayout};
+    if matches!(error, BadConfig { .. } | BadOutput { .. } | UnknownLayout { .. }) { USAGE } else { FAILED }
 }
 
 fn eval_exit_code(error: &EvalError) -> u8 {

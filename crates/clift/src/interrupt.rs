@@ -1,42 +1,65 @@
-//! Ctrl-C, SIGTERM and SIGHUP: the first signal requests a stop after the state is saved, the second ends the process.
+//! Ctrl-C, SIGTERM and SIGHUP: the first signal requests a stop after the state is saved, a later one ends the process.
 
-use std::sync::atomic::{AtomicBool, AtomicUsize};
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicI32, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use signal_hook::consts::{SIGINT, SIGTERM};
-use signal_hook::flag;
+use signal_hook::low_level;
 
 /// Offset of exit codes of signals, as in shells.
-const SIGNALLED: u8 = 128;
+const SIGNALLED: i32 = 128;
+/// Signals within this time after the first belong to it: GNU `timeout` signals the process and then its group.
+const REPEAT: Duration = Duration::from_secs(1);
 
-/// Number of the last signal; 0 for none.
-static LAST_SIGNAL: OnceLock<Arc<AtomicUsize>> = OnceLock::new();
+/// Number of the first signal; 0 for none.
+static FIRST_SIGNAL: AtomicI32 = AtomicI32::new(0);
 
 /// Listens for signals and returns a flag that the first one sets.
 pub fn flag() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
-    let last = LAST_SIGNAL.get_or_init(Arc::default);
+    let started = Instant::now();
+    let first_ms = Arc::new(AtomicU64::new(u64::MAX));
     let listen = |signal: i32| {
-        // The shutdown is registered before the flag: it must only see a flag that an earlier signal has set.
-        flag::register_conditional_shutdown(signal, i32::from(SIGNALLED) + signal, stop.clone())?;
-        flag::register_usize(signal, last.clone(), signal as usize)?;
-        flag::register(signal, stop.clone())
+        let (stop, first_ms) = (stop.clone(), first_ms.clone());
+        let handle = move || {
+            let now_ms = started.elapsed().as_millis() as u64;
+            match first_ms.compare_exchange(u64::MAX, now_ms, Ordering::SeqCst, Ordering::SeqCst) {
+                Ok(_) => {
+                    FIRST_SIGNAL.store(signal, Ordering::SeqCst);
+                    stop.store(true, Ordering::SeqCst);
+                }
+                Err(first_ms) if is_repeat(first_ms, now_ms) => {}
+                Err(_) => low_level::exit(SIGNALLED + signal),
+            }
+        };
+        // SAFETY: the handler reads the clock, writes atomics and calls `_exit`, which are async-signal-safe; it neither
+        // allocates, locks nor panics.
+        unsafe { low_level::register(signal, handle) }.context("listening for signals")
     };
     for signal in [SIGINT, SIGTERM] {
-        listen(signal).context("listening for signals")?;
+        listen(signal)?;
     }
     #[cfg(unix)]
     if !is_ignored(signal_hook::consts::SIGHUP) {
-        listen(signal_hook::consts::SIGHUP).context("listening for signals")?;
+        listen(signal_hook::consts::SIGHUP)?;
     }
     Ok(stop)
 }
 
-/// Returns the exit code of an interrupted process: 128 plus the number of the signal.
+/// Whether a signal belongs to the first one.
+fn is_repeat(first_ms: u64, now_ms: u64) -> bool {
+    Duration::from_millis(now_ms.saturating_sub(first_ms)) < REPEAT
+}
+
+/// Returns the exit code of an interrupted process: 128 plus the number of the first signal, or of Ctrl-C.
 pub fn exit_code() -> u8 {
-    let last = LAST_SIGNAL.get().map_or(0, |last| last.load(std::sync::atomic::Ordering::SeqCst));
-    SIGNALLED + u8::try_from(last).ok().filter(|last| *last != 0).unwrap_or(SIGINT as u8)
+    let signal = match FIRST_SIGNAL.load(Ordering::SeqCst) {
+        0 => SIGINT,
+        signal => signal,
+    };
+    (SIGNALLED + signal) as u8
 }
 
 /// Returns whether the process ignores a signal from its start, as `nohup` sets for SIGHUP. Linux only; `false` elsewhere.
@@ -61,6 +84,12 @@ mod tests {
         let status = "Name:\tclift\nSigBlk:\tffffffffffffffff\nSigIgn:\t0000000000001001\nSigCgt:\t0\n";
         assert!(ignores(status, 1) && ignores(status, 13));
         assert!(!ignores(status, 2) && !ignores("", 1));
+    }
+
+    #[test]
+    fn signals_within_a_second_are_repeats() {
+        assert!(is_repeat(5, 5) && is_repeat(5, 1004) && is_repeat(5, 4));
+        assert!(!is_repeat(5, 1005));
     }
 
     #[test]

@@ -18,22 +18,27 @@ mod reference;
 
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 
 use crate::cli::{Args, Command};
 use crate::commands::bench::cases::{BenchArgs, BenchCommand};
 use crate::commands::data::command::DataCommand;
-use crate::commands::{bench, compare, data, doctor, encode, eval, export, flops, import, plan, render, train};
+use crate::commands::{
+    bench, compare, completions, data, doctor, encode, eval, export, flops, import, metrics, plan, render, train,
+};
 use crate::exit_code::{DONE, error_message, exit_code};
 use crate::output::stdout;
 
 /// Runs the command line of this process and returns the exit code: 0 done, 1 failed, 2 invalid command line, config or
 /// model, 129 (closed terminal), 130 (Ctrl-C) or 143 (SIGTERM) interrupted.
 pub fn main() -> ExitCode {
-    let result = match Args::parse().command {
+    let args = Args::parse();
+    args.verbosity().choose();
+    let result = match args.command {
         Command::Train(args) => train::run(&args),
         Command::Eval(args) => eval::run(&args),
         Command::Compare(args) => compare::run(&args),
+        Command::Completions(args) => completions::run(&args, Args::command()),
         Command::Flops(args) => flops::run(&args),
         Command::Encode(args) => encode::run(&args),
         Command::Render(args) => render::run::run(&args),
@@ -42,6 +47,7 @@ pub fn main() -> ExitCode {
         Command::Data { command: DataCommand::Check(args) } => data::check::run(&args),
         Command::Data { command: DataCommand::Index(args) } => data::index::run(&args),
         Command::Data { command: DataCommand::Convert(args) } => data::convert::run(&args),
+        Command::Metrics(args) => metrics::run(&args),
         Command::Plan(args) => plan::run(&args),
         Command::Doctor(args) => doctor::run::run(&args),
         Command::Bench(BenchArgs { command: Some(BenchCommand::Data(args)), .. }) => bench::data::run(&args),
@@ -53,7 +59,7 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::from(DONE),
         Err(error) => {
-            stdout::print_note(&format!("error: {}", error_message(&error)));
+            stdout::print_problem(&format!("error: {}", error_message(&error)));
             ExitCode::from(exit_code(&error))
         }
     }

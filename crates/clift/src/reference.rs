@@ -38,7 +38,10 @@ fn add_command(command: &Command, page: &mut String) {
     let (name, about) = (command.get_bin_name().unwrap_or("clift"), command.get_long_about().or(command.get_about()));
     let usage = command.clone().render_usage().to_string().replace("Usage: ", "");
     write!(page, "\n## {name}\n\n{}\n\n```text\n{}\n```\n", text(about), usage.trim()).unwrap();
-    let is_listed = |arg: &&Arg| !["help", "version"].contains(&arg.get_id().as_str());
+    // Options of every command are listed once.
+    let is_root = command.get_bin_name().is_none_or(|name| name == "clift");
+    let is_listed =
+        |arg: &&Arg| !["help", "version"].contains(&arg.get_id().as_str()) && (is_root || !arg.is_global_set());
     let arguments = command.get_arguments().filter(is_listed).map(|arg| (argument(arg), help(arg)));
     let children: Vec<&Command> = command.get_subcommands().filter(|child| child.get_name() != "help").collect();
     let commands = children.iter().map(|child| (child.get_bin_name().unwrap().to_owned(), text(child.get_about())));

@@ -154,6 +154,7 @@ pub fn clusters(setup: &Setup, file: &'static str) -> Read {
 pub fn run_file(setup: &Setup, name: &'static str) -> Read {
     let run = setup.fresh("run-file");
     let config = Config { run_dir: run.clone(), ..setup.config.clone() };
+    std::fs::copy(setup.config.run_dir.join("config.toml"), run.join("config.toml")).expect("a run has a config");
     Box::new(move |bytes| {
         write(&run.join(name), bytes);
         done(Run::reopen(config.clone()))

@@ -10,7 +10,7 @@ const MINI: &str = "REPO/data-fixtures/re10k-mini";
 #[test]
 fn indices_of_both_splits_hold_all_scenes() {
     let place = Place::new();
-    let flags = "--distance 4..7 --targets 2 --overlap 0 --split both";
+    let flags = "--distance 4..7 --targets 1 --overlap 0 --split both";
     let ran = place.clift(&format!("data index {MINI} -o DIR/index.json {flags}")).ok();
     ran.prints("3 scenes of 3 with views");
     let index = place.json("index.json");
@@ -23,9 +23,12 @@ fn conversion_into_other_data_is_refused_unwritten() {
     let place = Place::new();
     let convert = |words: &str| place.clift(&format!("data convert {words}"));
     place.write("other/test/thesis.txt", "");
-    convert(&format!("{MINI} DIR/other --to scenes")).fails_with(1, &["it holds thesis.txt"]);
+    let expected = ["the output folder cannot be used: it holds thesis.txt"];
+    convert(&format!("{MINI} DIR/other --to scenes")).fails_with(2, &expected);
     assert!(!place.at("other/train").exists(), "the other half is not begun");
     convert(&format!("{MINI} DIR/out --to chunks")).ok();
+    let expected = ["the output folder cannot be used: its files were made as: chunks", "choose another folder"];
+    convert(&format!("{MINI} DIR/out --to scenes")).fails_with(2, &expected);
     for words in ["DIR/out DIR/out/scenes --to scenes", "DIR/out DIR/out --to chunks"] {
         convert(words).fails_with(2, &["choose an output folder outside the input"]);
     }
@@ -61,10 +64,53 @@ fn scenes_skipped_at_opening_are_listed() {
     std::fs::remove_dir_all(data.join("empty/images")).unwrap();
     let ran = place.clift("data convert DIR/data DIR/out --to chunks").ok();
     ran.notes("skipped empty: without any image").notes("skipped.json");
-    let skipped = place.json("out/test/skipped.json");
+    let skipped = place.json("out/skipped.json");
     assert_eq!((&skipped["num_scenes"], &skipped["skips"][0]["key"]), (&2.into(), &"empty".into()));
+    place.clift("data info DIR/out").ok().prints("chunks").prints("all               1 scene");
     let frame = &skipped["frames"][0];
     assert_eq!((&frame["key"], &frame["frame"]), (&"attic".into(), &"./images/99".into()));
+}
+
+/// Writes a scene of the test split whose images are changed.
+fn write_changed(place: &Place, key: &str, change: impl Fn(usize, Vec<u8>) -> Vec<u8>) {
+    let source =
+        ChunkSource::open(&repository("data-fixtures/re10k-mini"), Split::Test, &SceneFilters::default()).unwrap();
+    let cameras = source.cameras(0).unwrap();
+    let image = |frame| change(frame, source.encoded_frame(0, frame).unwrap().unwrap());
+    let images = (0..cameras.len()).map(image).collect();
+    let timestamps = source.timestamps(0).unwrap();
+    let record = SceneRecord { key: key.into(), url: String::new(), timestamps, cameras, images };
+    write_chunks(&place.at("data/test"), [Ok(record)], 1).unwrap();
+}
+
+#[test]
+fn unreadable_images_are_counted_and_fail() {
+    let place = Place::new();
+    write_changed(&place, "kitchen", |frame, image| match frame {
+        1 => image[..image.len() / 2].to_vec(),
+        3 => b"RIFF....WEBPVP8 ".to_vec(),
+        6 => Vec::new(),
+        _ => image,
+    });
+    // A second run finds the same images in the finished folder.
+    for written in ["8 frames written, 8 copied and 0 encoded, 3 unreadable", "0 frames written"] {
+        let ran = place.clift("data convert DIR/data DIR/out --to chunks").prints(written);
+        let ran = ran.notes("unreadable: frame 3 of scene kitchen: the 16 bytes are neither JPEG nor PNG");
+        ran.fails_with(1, &["frame 1 of scene kitchen", "3 images unreadable, copied as found"]);
+        let listed = place.json("out/test/unreadable.json");
+        let frames: Vec<_> = listed.as_array().unwrap().iter().map(|image| image["frame"].as_u64()).collect();
+        assert_eq!(frames, [Some(1), Some(3), Some(6)]);
+    }
+}
+
+#[test]
+fn control_characters_of_keys_do_not_reach_the_terminal() {
+    let place = Place::new();
+    write_changed(&place, "a\u{1b}[2J\u{7}b\nc", |_, _| Vec::new());
+    let ran = place.clift("data check DIR/data").prints("test/a\\u{1b}[2J\\u{7}b\\nc  8");
+    assert!(!ran.stdout.contains(['\u{1b}', '\u{7}']) && !ran.stderr.contains(['\u{1b}', '\u{7}']), "{}", ran.stdout);
+    let ran = place.clift("data convert DIR/data DIR/out --to chunks").notes("scene a\\u{1b}[2J\\u{7}b\\nc: ");
+    assert!(!ran.stderr.contains(['\u{1b}', '\u{7}']), "{}", ran.stderr);
 }
 
 #[test]

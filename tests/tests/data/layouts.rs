@@ -16,7 +16,7 @@ fn data(source: &str, layout: &str, more: &str) -> String {
 fn captures_train_and_render_and_name_missing_frames() {
     let place = Place::new();
     let ran = place.train("run", &[&data("auto", "capture", ""), "clusters.num_scenes=0"]).ok();
-    ran.notes("train: 1 of 1 scenes used; 1 frame without an image (./images/99); no folders train/ and test/");
+    ran.notes("train: 1 of 1 scenes used; 1 frame without an image (./images/99); no test split: 1 of 8 frames");
     let frame = &place.json("run/skipped-train.json")["frames"][0];
     assert_eq!((&frame["key"], &frame["frame"]), (&"attic".into(), &"./images/99".into()));
     let encode = "encode DIR/run REPO/data-fixtures/layouts/colmap_txt/attic -o DIR/attic.clift";
@@ -36,11 +36,11 @@ fn dl3dv_training_requires_a_test_scene_list() {
     place.write("none.txt", "");
     let files = format!("files={{test_scenes='{}'}},", place.at("none.txt").display());
     let ran = place.train("run --only stage1", &[&data("dl3dv", "dl3dv", &files)]).ok();
-    ran.notes("both splits are the same scenes");
+    ran.notes("no test split: 1 of 8 frames (0, 8, ..) is held out of training");
     let files = format!("{files} filters={{min_frames=9}},");
     place
         .train("other", &[&data("auto", "dl3dv", &files)])
-        .fails_with(1, &["0 of 1 scenes used; 1 shorter than 9 frames"]);
+        .fails_with(1, &["0 of 1 scenes used; 1 shorter than the 9 frames of data.filters.min_frames"]);
 }
 
 #[test]

@@ -25,7 +25,7 @@ fn import(place: &Place, file: &str, variant: &str, num_heads: &str, name: &str)
 
 /// Evaluates a model on the test scene of the small data set.
 fn evaluate(place: &Place, model: &str, out: &str, flags: &str) -> serde_json::Value {
-    place.clift(&format!("eval --checkpoint {model} {DATA} {INDEX} --out DIR/{out} {SMALL} {flags}")).ok();
+    place.clift(&format!("eval --checkpoint {model} {DATA} {INDEX} --out DIR/{out} --force {SMALL} {flags}")).ok();
     place.json(&format!("{out}/summary.json"))
 }
 
@@ -202,7 +202,7 @@ fn checkpoints_not_imported_are_refused_with_the_command() {
 fn an_evaluation_without_the_published_index_says_so() {
     let place = Place::new();
     let model = import(&place, &checkpoint("re10k_first"), "released-re10k", "5", "model");
-    let words = format!("eval --checkpoint {model} {DATA} --out DIR/eval --storage 6 {SMALL}");
+    let words = format!("eval --checkpoint {model} {DATA} --out DIR/eval --force --storage 6 {SMALL}");
     let note = "published figures use an evaluation index";
     place.clift(&format!("{words} --set eval.num_context=2")).ok().notes(note);
     let ran = place.clift(&format!("{words} {INDEX}")).ok();

@@ -22,7 +22,7 @@ fn views(place: &Place, folder: &str) -> Vec<(String, String)> {
 }
 
 /// Writes a file in the form of `scripts/tools/convert_vgg.py`, with small random weights.
-fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) {
+pub fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) {
     let mut state = 1_u32;
     let mut random = |count: usize, scale: f32| -> Vec<u8> {
         let mut value = || {
@@ -59,7 +59,7 @@ fn write_vgg(path: &Path, format: &str, convs: [usize; 5], has_heads: bool) {
 fn every_format_and_count_has_speed_and_fronts() {
     let place = Place::with(&WHOLE);
     let ran = place.eval("run --tokens f32,f16,int8 --render 1/2 --out DIR/formats").ok();
-    ran.prints("t: no other point has this PSNR");
+    ran.prints("t: no other point has a higher PSNR");
     let points = place.points("formats");
     let of = |variant: &str, format: &str| {
         points.iter().filter(move |point| point["variant"] == variant && point["tokens"] == format).count()
@@ -230,9 +230,9 @@ fn the_papers_counts_come_out_of_the_command() {
     ran.prints("render  4096    70.59").prints("render  512     45.23");
     place.clift("flops REPO/configs/tiny.toml --render 16,1.0 --json DIR/flops.json").ok();
     let counts = place.json("flops.json");
-    assert_eq!((&counts["convention"], &counts["num_tokens"]), (&"macs".into(), &64.into()));
+    assert_eq!((&counts["convention"], &counts["num_tokens"]), (&"macs".into(), &256.into()));
     let rendered = list(&counts["rows"]).iter().filter(|row| row["work"] == "render");
-    assert_eq!(rendered.map(|row| &row["num_tokens"]).collect::<Vec<_>>(), [16, 64]);
+    assert_eq!(rendered.map(|row| &row["num_tokens"]).collect::<Vec<_>>(), [16, 256]);
     place.clift("flops --convention flop").fails_with(2, &["flop"]);
     place.clift("flops --render 5000").fails_with(2, &["a scene has 4096 tokens"]);
 }

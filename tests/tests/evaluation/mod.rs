@@ -1,7 +1,8 @@
 //! Evaluations and what they write, scene files, published checkpoints.
 
 mod checkpoints;
-mod eval;
+pub mod eval;
 mod report;
 mod scene_files;
+mod splits;
 mod tiles;

@@ -9,8 +9,20 @@ fn reports_need_no_other_file() {
     for part in ["<title>run", "synthetic-0-test-00000", "3 of 3 scenes were evaluated", "num_encoder_blocks = 1"] {
         assert!(html.contains(part), "{part}");
     }
-    for section in ["Quality and cost", "All points", "Scenes", "Skipped scenes", "Machine", "Config"] {
+    for section in [
+        "Quality and cost",
+        "All points",
+        "Scene by scene",
+        "Images of scenes",
+        "Training",
+        "Skipped scenes",
+        "Command and machine",
+        "Config",
+    ] {
         assert!(html.contains(&format!("<h2>{section}</h2>")), "{section}");
+    }
+    for part in ["validation, step 6: ", "error, 8 tokens", "test split", "micro.toml"] {
+        assert!(html.contains(part), "{part}");
     }
     assert!(!html.contains("http") && !html.contains("tokens selected"));
     assert_eq!(html.matches("<article").count(), 1, "eval.num_sheets = 1");

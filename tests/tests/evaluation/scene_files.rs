@@ -1,15 +1,21 @@
 //! Scene files through the command line: encoded, rendered, measured.
 
-use clift_data::{Clip, ClipReader, Split, even_views, open_dataset};
+use std::process::Command;
+
+use clift_data::{Clip, ClipReader, Split, ViewIndices, even_views, open_dataset};
 use clift_eval::{Canvas, psnr, ssim, view_cameras};
 use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenFormat, TokenKind, load_renderer};
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
-use crate::support::{Place, STAGE_1, Shared, WHOLE, finish, number, point, signal, wait_until};
+use crate::support::{
+    BINARY, Place, STAGE_1, Shared, WHOLE, files, finish, list, number, point, signal, start, wait_until,
+};
 
 /// A run whose methods differ by more than rounding.
 static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
+/// The same with camera-relative attention.
+static RELATIVE: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20", "model.camera_encoding=\"gta\""]);
 
 const KEY: &str = "synthetic-0-test-00000";
 /// Encodes this scene of the run `run`.
@@ -117,17 +123,26 @@ fn scene_files_reproduce_the_evaluation() {
 
 #[test]
 fn evaluation_of_selected_tokens_equals_rendering_the_file() {
-    let place = Place::with(&LONGER);
-    let (clip, _) = first_clip(&place, "run");
-    place.clift(&format!("{ENCODE} DIR/room.clift --context 0,7 --storage 8 --tokens f32")).ok();
-    for preset in SelectionPreset::ALL {
-        let name = preset.name();
-        place.eval(&format!("run --render 3,1/4 --selection {name} --out DIR/{name}")).ok();
-        for count in [2, 3] {
-            let from_file = measure(&clip, &drawn(open(&place, "room.clift", preset), &clip, count));
-            assert_eq!(from_file, evaluated(&place, name, 8, count), "{name}, {count}");
+    for run in [&LONGER, &RELATIVE] {
+        let place = Place::with(run);
+        let (clip, _) = first_clip(&place, "run");
+        place.clift(&format!("{ENCODE} DIR/room.clift --context 0,7 --storage 4 --tokens f32")).ok();
+        for preset in SelectionPreset::ALL {
+            let name = preset.name();
+            place.eval(&format!("run --render 3,1/2 --selection {name} --out DIR/{name}")).ok();
+            for count in [2, 3] {
+                let from_file = measure(&clip, &drawn(open(&place, "room.clift", preset), &clip, count));
+                assert_eq!(from_file, evaluated(&place, name, 4, count), "{name}, {count}");
+            }
         }
     }
+}
+
+#[test]
+fn camera_relative_networks_have_no_published_form() {
+    let place = Place::with(&RELATIVE);
+    let expected = "`model.camera_encoding` = gta: published networks have plain attention";
+    place.clift("export DIR/run --format pytorch -o DIR/run.ckpt").fails_with(2, &[expected]);
 }
 
 #[test]
@@ -145,7 +160,10 @@ fn paths_render_to_frames_and_animation_by_count() {
         ("in-time", (16, 16), "--path orbit --budget-ms 60000", 8),
     ] {
         let ran = place.clift(&format!("render DIR/room.clift --out DIR/{out} {flags} --frames 10 --fps 12")).ok();
-        ran.prints(&format!("10 frames of {} x {}, each from {num_render_tokens} of 8 tokens", size.0, size.1));
+        let ran =
+            ran.prints(&format!("10 frames of {} x {}, each from {num_render_tokens} of 8 tokens", size.0, size.1));
+        let warning = "warning: the network was trained on images of 16 x 16; frames of 48 x 32 show its patches";
+        assert_eq!(ran.stderr.contains(warning), out == "large", "{}", ran.stderr);
         let mut expected: Vec<String> = (0..10).map(|frame| format!("frame-{frame:05}.png")).collect();
         expected.insert(0, "animation.png".into());
         expected.push("render.json".into());
@@ -155,6 +173,12 @@ fn paths_render_to_frames_and_animation_by_count() {
         }
         let report = place.json(&format!("{out}/render.json"));
         assert_eq!((&report["num_frames"], &report["num_render_tokens"]), (&10.into(), &num_render_tokens.into()));
+        let tokens = &report["tokens"];
+        assert_eq!(tokens.is_null(), num_render_tokens == 8, "{report}");
+        for frame in tokens.as_array().into_iter().flatten() {
+            let ids: Vec<u64> = list(frame).iter().map(|id| id.as_u64().expect("an index")).collect();
+            assert!(ids.len() == num_render_tokens && ids.is_sorted_by(|a, b| a < b) && ids.iter().all(|id| *id < 8));
+        }
         assert_eq!(report["calibration"].is_array(), out == "in-time", "{report}");
         assert_eq!(number(&report, "select_s") > 0.0, num_render_tokens < 8, "{report}");
         let selection = match out {
@@ -204,11 +228,16 @@ fn what_cannot_be_drawn_says_what_to_do() {
     render("--path DIR/poses.json --frames 3").fails_with(2, &[counted]);
     assert!(!place.at("out").exists(), "nothing is left of what was refused");
     place.write("out/notes.txt", "");
-    render(orbit).fails_with(2, &["is not empty; choose another folder"]);
+    render(&format!("{orbit} --force")).fails_with(2, &["is not empty and holds no frames; choose another folder"]);
     std::fs::remove_file(place.at("out/notes.txt")).unwrap();
     std::fs::rename(place.at("run"), place.at("moved")).unwrap();
     render(orbit).fails_with(2, &["the weights of the scene are not found at ", "; set --model RUN"]);
     render(&format!("{orbit} --model DIR/moved")).ok();
+    let before = files(&place.at("out"));
+    render(&format!("{orbit} --model DIR/moved")).fails_with(2, &["holds frames; replace them with --force"]);
+    assert!(files(&place.at("out")) == before);
+    render("--path orbit --frames 1 --model DIR/moved --force").ok();
+    assert_eq!(place.names("out"), ["animation.png", "frame-00000.png", "render.json"]);
 
     place.truncate("room.clift");
     let again = |scene: &str| place.clift(&format!("render DIR/{scene} --out DIR/again {orbit}"));
@@ -241,7 +270,8 @@ fn scene_files_overwrite_only_scene_files() {
     assert_eq!(place.bytes("run/stage1/model.safetensors"), weights);
     encode("no/room.clift").fails_with(2, &["no folder "]);
     encode("room.clift").ok();
-    encode("room.clift --storage 8").ok();
+    encode("room.clift --storage 8").fails_with(2, &["room.clift exists; replace it with --force"]);
+    encode("room.clift --storage 8 --force").ok();
     assert_eq!(Scene::read(&place.at("room.clift")).unwrap().0.num_tokens(), 8);
     // Another number of heads fits the same weights and would change every image.
     for change in ["model.num_heads=1", "model={num_heads=1}"] {
@@ -251,9 +281,52 @@ fn scene_files_overwrite_only_scene_files() {
 }
 
 #[test]
+fn encode_compares_a_frame_that_is_no_context() {
+    let place = Place::with(&LONGER);
+    let encode =
+        |flags: &str| place.clift(&format!("{ENCODE} DIR/room.clift --tokens f32 --storage 8 {flags} --force")).ok();
+    let ran = encode("--context 0,7");
+    let check = ran.stdout.lines().find(|line| line.starts_with("check: frame 3, not a context: ")).expect("a check");
+    let decibels: Vec<f64> = check.split(' ').filter_map(|word| word.parse().ok()).collect();
+    // The frame of the scene file, rendered as `clift eval` does.
+    let (mut clip, reader) = first_clip(&place, "run");
+    clip.target = reader.read(0, &ViewIndices { context: vec![0, 7], target: vec![3] }).unwrap().target;
+    let rendered = drawn(open(&place, "room.clift", SelectionPreset::Paper), &clip, 8);
+    let expected = measure(&clip, &rendered)[0].0;
+    assert!((decibels[0] - expected).abs() < 0.006, "{check}, expected {expected}");
+    let warning = "warning: the rendering of frame ";
+    assert!(decibels[0] > decibels[1] && !ran.stderr.contains(warning), "{check}");
+    // The frames beside it are better copies than sixty steps of training.
+    encode("--context 4,6")
+        .prints("check: frame 5, not a context: ")
+        .notes(&format!("{warning}5 is worse than a copy"));
+    encode("--context 0,1,2,3,4,5,6,7").prints("check: no frame beside the contexts");
+}
+
+#[test]
+fn scene_and_run_move_together() {
+    let place = Place::new();
+    place.copy(&STAGE_1, "home/run");
+    std::fs::create_dir_all(place.at("home/scenes")).unwrap();
+    let clift = |folder: &str, words: &str| {
+        finish(start(Command::new(BINARY).current_dir(place.at(folder)).args(words.split(' '))))
+    };
+    clift("home", &format!("encode run --scene {KEY} -o scenes/room.clift")).ok();
+    assert_eq!(Scene::read(&place.at("home/scenes/room.clift")).unwrap().0.model_path, "../run");
+    std::fs::rename(place.at("home"), place.at("moved")).unwrap();
+    clift("", "render moved/scenes/room.clift --path orbit --frames 2 --out out").ok();
+    clift("moved/scenes", "render room.clift --path orbit --frames 2 --out out").ok();
+    // A file of an earlier version holds the path as its writer saw it.
+    let (mut scene, format) = Scene::read(&place.at("moved/scenes/room.clift")).unwrap();
+    scene.model_path = "moved/run".into();
+    scene.write(&place.at("moved/scenes/old.clift"), format).unwrap();
+    clift("", "render moved/scenes/old.clift --path orbit --frames 2 --out old").ok();
+}
+
+#[test]
 fn encode_chooses_scenes_by_key_context_and_count() {
     let place = Place::with(&STAGE_1);
-    let encode = |words: &str| place.clift(&format!("encode DIR/run --out DIR/room.clift {words}"));
+    let encode = |words: &str| place.clift(&format!("encode DIR/run --out DIR/room.clift --force {words}"));
     encode("").fails_with(2, &["scenes; choose one with --scene: synthetic-0-test-00000, "]);
     encode("--scene attic").fails_with(2, &["no scene attic; the "]);
     let one = |flags: &str| encode(&format!("--scene {KEY} {flags}"));
@@ -261,9 +334,18 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     one("--storage 9").fails_with(2, &["a scene has 8 tokens"]);
 
     // Without stage 2, tokens are those nearest to the cluster centres; all of them leave no variance within clusters.
-    let ran = one("--storage 8").ok().prints("8 of 8 tokens (kmeans, f16)");
-    assert!(ran.stdout.ends_with("     8  0.0000\n"), "{}", ran.stdout);
-    one("--storage 1/2").ok().prints("4 of 8 tokens");
+    let ran = one("--storage 8 --context 0,7").ok().prints("8 of 8 tokens (kmeans, f16)");
+    ran.prints("     8  0.0000\ncheck: frame 3, not a context: ");
+    one("--storage 1/2 --save-clusters DIR/clusters.json").ok().prints("4 of 8 tokens");
+    let clusters = place.json("clusters.json");
+    assert_eq!((list(&clusters["assignment"]).len(), list(&clusters["centroids"]).len()), (8, 4));
+    assert_eq!((&clusters["rows"], &clusters["columns"]), (&2.into(), &2.into()));
+    // A centroid is a token of its own cluster, and a token of the scene file.
+    let centroids: Vec<u32> = list(&clusters["centroids"]).iter().map(|id| id.as_u64().unwrap() as u32).collect();
+    assert_eq!(centroids, Scene::read(&place.at("room.clift")).unwrap().0.token_ids);
+    for (cluster, &token) in centroids.iter().enumerate() {
+        assert_eq!(clusters["assignment"][token as usize], cluster);
+    }
     let ran = place.clift("render DIR/room.clift --out DIR/out --path orbit --frames 2").ok();
     ran.prints("2 frames of 16 x 16");
 
@@ -274,7 +356,8 @@ fn encode_chooses_scenes_by_key_context_and_count() {
     let second = encode(&format!("{mini} --split train --scene 00000000000000a2")).ok();
     second.prints("scene 00000000000000a2");
     encode("DIR/run").fails_with(2, &["no scenes found: expected index.json with chunks, "]);
-    let by = |model: &str| place.clift(&format!("encode DIR/{model} {mini} -o DIR/from-file.clift"));
+
+    let by = |model: &str| place.clift(&format!("encode DIR/{model} {mini} -o DIR/from-file.clift --force"));
     by("run/stage1/model.safetensors").ok();
     let file = place.at("run/stage1/model.safetensors");
     assert_eq!(Scene::read(&place.at("from-file.clift")).unwrap().0.model_path, file.display().to_string());

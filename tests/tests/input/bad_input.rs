@@ -204,7 +204,7 @@ fn too_short_scenes_are_skipped_at_the_start() {
         scene.timestamps.truncate(3);
     });
     let ran = train_on(&place, "run --only stage1", &data, &[]).ok();
-    let ran = ran.notes("train: 1 of 2 scenes used; 1 shorter than the 4 frames that data.views needs");
+    let ran = ran.notes("train: 1 of 2 scenes used; 1 shorter than the 4 frames that data.views.min_gap needs");
     assert!(!ran.stderr.contains("skipped "), "{}", ran.stderr);
     assert_eq!(place.json("run/skipped-train.json")["skips"][0]["key"], KEYS[1]);
 }
@@ -289,11 +289,12 @@ fn weights_of_two_trainings_are_not_evaluated_together() {
 }
 
 #[test]
-fn an_empty_cluster_cache_is_not_kept() {
+fn scenes_that_become_too_short_are_refused_before_training() {
     let place = Place::new();
-    // Scenes of 8 frames train in the first steps and are too short once the gaps have grown.
+    // Scenes of 8 frames would train in the first steps, until the gaps have grown.
     let views =
         "data.views={min_context=2, max_context=2, min_gap=[3, 8], max_gap=[6, 8], warm_up_steps=6, num_targets=2}";
-    place.train("run", &[views, "stage1.steps=6"]).fails_with(1, &["none could be clustered"]);
-    assert!(!place.at("run/clusters").exists());
+    let expected = "0 of 8 scenes used; 8 shorter than the 9 frames that data.views.min_gap needs";
+    place.train("run", &[views, "stage1.steps=6"]).fails_with(1, &[expected]);
+    assert!(!place.at("run/stage1").exists());
 }

@@ -55,6 +55,25 @@ fn f16_training_resumes_with_its_loss_scale() {
 }
 
 #[test]
+fn runs_with_camera_relative_attention_and_muon_resume_exactly() {
+    let place = Place::new();
+    let muon = "optimizer={algorithm=\"muon\", learning_rate=1e-3, warm_up_steps=2}";
+    let [stage1, stage2] = ["stage1", "stage2"].map(|stage| format!("{stage}.{muon}"));
+    for encoding in ["gta", "prope"] {
+        let encoding_key = format!("model.camera_encoding=\"{encoding}\"");
+        let set = [&THIRTY[..], &[&encoding_key, &stage1, &stage2]].concat();
+        let [whole, parts] = ["whole", "parts"].map(|name| format!("{name}-{encoding}"));
+        place.train(&whole, &set).ok();
+        place.kill_at("step/stage1/25", &parts, &set);
+        place.kill_at("saved/stage2/17", &parts, &set);
+        place.train(&parts, &set).ok();
+        place.assert_same_run(&parts, &whole);
+    }
+    let last_loss = |run: &str| number(place.metrics(run).last().expect("a step"), "loss");
+    assert_ne!(last_loss("whole-gta"), last_loss("whole-prope"));
+}
+
+#[test]
 fn what_killed_saves_leave_is_cleared_away() {
     let place = Place::new();
     place.copy(&UNDISTURBED, "whole");

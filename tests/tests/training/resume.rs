@@ -60,7 +60,8 @@ fn changed_settings_are_refused_unless_results_stay_equal() {
         let settings = format!("settings:\n{expected}\nresume");
         place.train("run", &[change]).fails_naming(2, &[&settings, "--fresh"], "/run");
     }
-    let settings = "settings:\n  --overfit: off -> 2\n  seed: 0 -> 1\n  stage1.steps: 6 -> 7\nresume";
+    let settings =
+        "settings:\n  --overfit: off -> 2\n  data.hold_out: 8 -> 0\n  seed: 0 -> 1\n  stage1.steps: 6 -> 7\nresume";
     place.train("run --overfit 2", &["seed=1", "stage1.steps=7"]).fails_with(2, &[settings]);
     assert!(files(&place.at("run")) == before, "a refusal changes nothing");
 
@@ -86,7 +87,17 @@ fn an_evaluation_can_be_interrupted() {
     let place = Place::new();
     place.train("run", &["data.synthetic.num_scenes=400"]).ok();
     // Hundreds of scenes with rows of targets: far longer than the signal takes.
-    let mut child = place.start("eval DIR/run --set eval.num_scenes=0 --set eval.num_sheets=400");
+    let words = "eval DIR/run --set eval.num_scenes=0 --set eval.num_sheets=400";
+    let before = files(&place.at("run/eval"));
+    place.clift(words).fails_with(2, &["/run/eval: the folder holds an evaluation; replace it with --force"]);
+    // A finished run is not evaluated again either.
+    place
+        .train("run", &["data.synthetic.num_scenes=400", "eval.num_scenes=4"])
+        .ok()
+        .notes("--force` evaluates it again");
+    assert!(files(&place.at("run/eval")) == before, "nothing is replaced unasked");
+
+    let mut child = place.start(&format!("{words} --force"));
     let names = || place.names("run/eval/sheets");
     let (before, summary) = (names(), place.bytes("run/eval/summary.json"));
     // Sheets are made in a folder of their own, and take the place of the former ones all together.
@@ -96,6 +107,8 @@ fn an_evaluation_can_be_interrupted() {
         items.map(|items| items.map_or(0, Iterator::count)).sum::<usize>()
     };
     wait_until(&mut child, "three sheets", || num_new() >= 3);
+    // A second evaluation into the folder does not start.
+    place.eval("run").fails_with(1, &["output folder ", "/run/eval is in use by process ", "set another --out"]);
     signal(&child, "-INT");
     finish(child).fails_with(130, &["interrupted during the evaluation, after ", " scenes; no results were written"]);
     assert_eq!((names(), place.bytes("run/eval/summary.json")), (before, summary));

@@ -29,6 +29,8 @@ fn signals_save_and_runs_resume_to_the_same_result() {
         }
         let mut child = place.start_train("run", &set);
         place.wait_for_steps("run", &mut child, count);
+        // GNU `timeout` signals the process and its group.
+        signal(&child, name);
         signal(&child, name);
         let ran = finish(child);
         let last = place.metrics("run").pop().expect("a step");
@@ -43,7 +45,7 @@ fn signals_save_and_runs_resume_to_the_same_result() {
 }
 
 #[test]
-fn second_signals_end_runs_without_saving() {
+fn second_signals_end_runs_after_a_second() {
     let place = Place::new();
     // The first batch takes far longer than two signals.
     let set = [&LONG[..], &["stage1.batch_size=50000"]].concat();
@@ -52,8 +54,9 @@ fn second_signals_end_runs_without_saving() {
     let id = child.id().to_string();
     wait_until(&mut child, "the lock", || std::fs::read_to_string(place.at("run/lock")).unwrap_or_default() == id);
     signal(&child, "-TERM");
-    std::thread::sleep(Duration::from_millis(200));
-    assert!(child.try_wait().expect("a child").is_none(), "the first signal waits for the step");
+    signal(&child, "-TERM");
+    std::thread::sleep(Duration::from_millis(1500));
+    assert!(child.try_wait().expect("a child").is_none(), "two signals at once wait for the step");
     signal(&child, "-TERM");
     let started = Instant::now();
     let ran = finish(child);
@@ -73,6 +76,25 @@ fn a_run_started_by_nohup_outlives_its_terminal() {
     place.wait_for_steps("run", &mut child, steps + 20);
     signal(&child, "-TERM");
     finish(child).fails(143);
+}
+
+#[test]
+fn a_run_that_is_moved_stops_and_resumes_elsewhere() {
+    let place = Place::new();
+    let set = [&LONG[..3], &["checkpoint.every=20", "data.num_threads=0"]].concat();
+    let mut child = place.start_train("run", &set);
+    place.wait_for_steps("run", &mut child, 25);
+    std::fs::rename(place.at("run"), place.at("moved")).expect("renames");
+    let moved = "the run directory was moved or removed during training; resume at its new place";
+    finish(child).fails_naming(1, &[moved], "/run");
+    assert!(!place.at("run").exists(), "no second run directory without a config is made");
+    assert!(place.checkpoints("moved", "stage1").last().is_some_and(|step| step % 20 == 0));
+    // Removed, since the next wait counts lines.
+    std::fs::remove_file(place.at("moved/metrics.jsonl")).expect("removes");
+    let mut child = place.start_train("moved", &set);
+    place.wait_for_steps("moved", &mut child, 5);
+    signal(&child, "-INT");
+    finish(child).fails_with(130, &[]);
 }
 
 #[test]

@@ -27,7 +27,7 @@ impl KMeansCase {
     pub fn new(context: &BenchContext) -> Result<Self, TrainError> {
         let tokens = match &context.features {
             Some(path) => read_features(path, &context.device)?,
-            None => context.lift()?,
+            None => context.lift()?.values,
         };
         let num_clusters = context.stored_of(tokens.dims()[1])?;
         let kmeans = context.config.clusters.kmeans.clone();

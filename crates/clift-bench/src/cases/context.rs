@@ -4,10 +4,10 @@ use std::cell::OnceCell;
 use std::path::PathBuf;
 
 use burn::module::Module;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Device;
 use clift_data::{Clip, DataConfig, SourceKind, SyntheticConfig, ViewSampler};
 use clift_eval::upload_views;
-use clift_model::{Clift, DeviceName, ModelConfig, SceneModel, TokenCount};
+use clift_model::{Clift, DeviceName, ModelConfig, SceneModel, TokenCount, Tokens};
 use clift_train::{ClipShape, Config, Stage1Config, TrainError, seeded_clip, seeded_model};
 
 use crate::cases::case::BenchCase;
@@ -54,7 +54,7 @@ pub struct BenchContext {
     render: Option<TokenCount>,
     pub features: Option<PathBuf>,
     /// Tokens of one scene, computed once.
-    lift: OnceCell<Tensor<3>>,
+    lift: OnceCell<Tokens>,
 }
 
 impl BenchContext {
@@ -77,7 +77,10 @@ impl BenchContext {
             lift: OnceCell::new(),
             config,
         };
-        context.num_storage_tokens()?;
+        // K-means of a file clusters the tokens of the file.
+        if options.features.is_none() || options.cases.iter().any(|case| *case != BenchCase::Kmeans) {
+            context.num_storage_tokens()?;
+        }
         context.num_render_tokens()?;
         Ok(context)
     }
@@ -143,7 +146,10 @@ impl BenchContext {
     }
 
     pub fn stored_of(&self, num_tokens: usize) -> Result<usize, TrainError> {
-        self.storage.of(num_tokens).map_err(|error| self.bad_storage(&error.to_string()))
+        self.storage.of(num_tokens).map_err(|error| {
+            let hint = if self.features.is_some() { "; --case kmeans alone uses the tokens of --features" } else { "" };
+            self.bad_storage(&format!("{error}{hint}"))
+        })
     }
 
     pub fn bad_storage(&self, fix: &str) -> TrainError {
@@ -164,7 +170,7 @@ impl BenchContext {
     }
 
     /// Returns the tokens of one scene, `[1, N, D]`, computed by the seeded encoder.
-    pub fn lift(&self) -> Result<Tensor<3>, TrainError> {
+    pub fn lift(&self) -> Result<Tokens, TrainError> {
         if let Some(lift) = self.lift.get() {
             return Ok(lift.clone());
         }

@@ -5,7 +5,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use clift_data::{step_rng, uniform_below};
 use clift_eval::{upload_cameras, upload_views};
-use clift_model::{Cameras, ClusterIndex, Clusters, Condenser, Encoder, Renderer, Views, cluster_attention};
+use clift_model::{Cameras, ClusterIndex, Clusters, Condenser, Encoder, Renderer, Tokens, Views, cluster_attention};
 use clift_train::{TrainError, seeded_clusters, seeded_uniform};
 
 use crate::cases::context::BenchContext;
@@ -53,7 +53,7 @@ impl<I: ToF64> BenchTask for Forward<I> {
 pub fn encode(context: &BenchContext) -> Result<Forward<(Network<Encoder>, Views)>, TrainError> {
     let views = upload_views(&[&context.clip(1).context], &context.device)?;
     let encoder = Network(context.model().encoder.valid());
-    Ok(Forward::new((encoder, views), |(encoder, views)| encoder.0.forward(views).flatten(0, 2)))
+    Ok(Forward::new((encoder, views), |(encoder, views)| encoder.0.forward(views).values.flatten(0, 2)))
 }
 
 /// Clusters with their indices on a device.
@@ -69,16 +69,14 @@ impl ToF64 for UploadedClusters {
 }
 
 /// Condenser: tokens and clusters to condensed tokens.
-pub fn condense(
-    context: &BenchContext,
-) -> Result<Forward<(Network<Condenser>, Tensor<3>, UploadedClusters)>, TrainError> {
+pub fn condense(context: &BenchContext) -> Result<Forward<(Network<Condenser>, Tokens, UploadedClusters)>, TrainError> {
     let lift = context.lift()?;
     let count = context.num_storage_tokens()?;
     let clusters = Clusters::new(vec![seeded_clusters(lift.dims()[1], count, context.config.seed, 0)?])?;
     let clusters = UploadedClusters { index: clusters.upload(&context.device), clusters };
     let condenser = Network(context.model().condenser.valid());
     Ok(Forward::new((condenser, lift, clusters), |(condenser, lift, clusters)| {
-        condenser.0.forward(lift.clone(), &clusters.index).flatten(0, 2)
+        condenser.0.forward(lift.clone(), &clusters.index).values.flatten(0, 2)
     }))
 }
 
@@ -110,9 +108,9 @@ pub fn attention_in_clusters(context: &BenchContext) -> Result<Forward<Attention
 pub fn render(
     context: &BenchContext,
     num_views: usize,
-) -> Result<Forward<(Network<Renderer>, Tensor<3>, Cameras)>, TrainError> {
-    let [_, _, dim] = context.lift()?.dims();
-    let lift = context.lift()?.slice([0..1, 0..context.num_render_tokens()?, 0..dim]);
+) -> Result<Forward<(Network<Renderer>, Tokens, Cameras)>, TrainError> {
+    let ids: Vec<u32> = (0..context.num_render_tokens()? as u32).collect();
+    let lift = context.lift()?.select(&ids);
     let targets = upload_cameras(&[&context.clip(num_views).target], &context.device)?;
     let renderer = Network(context.model().renderer.valid());
     let render = Forward::new((renderer, lift, targets), |(renderer, lift, targets)| {

@@ -3,7 +3,7 @@
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{DType, Device, Int, Tensor};
-use clift_model::{Cameras, Views};
+use clift_model::{Cameras, Tokens, Views};
 
 pub trait ToF64 {
     /// Returns the same values in f64 on the reference device.
@@ -26,6 +26,13 @@ impl<T: ToF64> ToF64 for [T; 2] {
 impl ToF64 for Tensor<1, Int> {
     fn in_f64(&self, reference: &Device) -> Self {
         self.clone().to_device(reference)
+    }
+}
+
+impl ToF64 for Tokens {
+    fn in_f64(&self, reference: &Device) -> Self {
+        let transforms = self.transforms.as_ref().map(|transforms| transforms.map(|tensor| tensor.in_f64(reference)));
+        Self { values: self.values.in_f64(reference), transforms }
     }
 }
 

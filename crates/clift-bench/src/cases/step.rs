@@ -5,8 +5,8 @@ use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
 use clift_model::{Clift, Precision};
 use clift_train::{
-    DeviceBatch, Loss, LossScale, Stage, StageBatch, StageSettings, StepAnomaly, TrainError, TrainState, adamw, freeze,
-    render_loss, seeded_batch, warm_up_cosine,
+    DeviceBatch, Loss, LossScale, Stage, StageBatch, StageSettings, StepAnomaly, TrainError, TrainState, freeze,
+    learning_rate, make_optimizer, render_loss, seeded_batch,
 };
 
 use crate::cases::context::BenchContext;
@@ -34,7 +34,7 @@ impl StepCase {
             state: Some(train_state(context, stage)),
             batch: stage_batch(context, stage, batch_size)?,
             accumulate,
-            rate: warm_up_cosine(1, optimizer.learning_rate, optimizer.warm_up_steps, steps),
+            rate: learning_rate(optimizer, 1, steps),
             max_grad_norm: optimizer.max_grad_norm,
             reduced: context.reduced()?,
         })
@@ -45,7 +45,7 @@ impl StepCase {
 pub(crate) fn train_state(context: &BenchContext, stage: Stage) -> TrainState {
     TrainState {
         model: freeze(stage, context.model()),
-        optimizer: adamw(context.config.stage(stage).optimizer),
+        optimizer: make_optimizer(context.config.stage(stage).optimizer),
         device: context.device.clone().autodiff(),
         loss: Loss::default(),
         activation_checkpointing: context.config.activation_checkpointing,

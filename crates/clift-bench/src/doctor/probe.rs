@@ -101,7 +101,7 @@ fn gradient(device: &Device) -> anyhow::Result<Gradient> {
     let num_tokens = lift.dims()[1];
     // The result of K-means is not used: the nearest token may depend on the last bit of a distance.
     let num_clusters = num_tokens / 4;
-    KMeans::default().fit(lift.clone().inner(), num_clusters, &[0])?;
+    KMeans::default().fit(lift.values.clone().inner(), num_clusters, &[0])?;
     let assignment = (0..num_tokens).map(|token| (token % num_clusters) as u32).collect();
     let scene = SceneClusters::new(assignment, (0..num_clusters as u32).collect())?;
     let index = Clusters::new(vec![scene])?.upload(&device);

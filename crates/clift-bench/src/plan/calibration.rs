@@ -5,8 +5,8 @@ use std::time::Instant;
 use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
-use clift_data::{ClipReader, Split, item_rng, open_dataset, step_rng, upper_median};
-use clift_eval::{EvalModels, EvalResults, Lpips, Sweep, evaluate_scene, upload_cameras, upload_views};
+use clift_data::{ClipReader, Split, item_rng, median, open_dataset, step_rng};
+use clift_eval::{EvalModels, EvalResults, Lpips, Perceptual, Sweep, evaluate_scene, upload_cameras, upload_views};
 use clift_model::{FlopConvention, ModelConfig, Parameters, Part, SceneModel, SceneSizes, TokenCount, TrainedModel};
 use clift_train::{
     ClipShape, Config, DeviceBatch, Loss, Stage, StageBatch, TokenSelection, TrainError, TypicalStep, clip_global_norm,
@@ -65,7 +65,7 @@ impl Timed {
             seconds.push(started.elapsed().as_secs_f64());
         }
         let busy = cpu.elapsed().as_secs_f64() / begun.elapsed().as_secs_f64();
-        Ok((state, Self { seconds: upper_median(&seconds), busy }))
+        Ok((state, Self { seconds: median(&seconds), busy }))
     }
 }
 
@@ -155,10 +155,12 @@ pub fn update_rates(config: &Config, stage: Stage, typical: &TypicalStep) -> Res
 
 /// Returns the seconds of the perceptual term of one image and of its gradient.
 fn perceptual_s(config: &Config, context: &BenchContext) -> Result<f64, TrainError> {
-    if config.loss.weights()?.is_none() {
+    let weight = config.loss.perceptual_weight;
+    if weight == 0.0 {
         return Ok(0.0);
     }
-    let loss = Loss::load(&config.loss, &context.device)?;
+    // The values of the weights do not change the time: the file need not exist.
+    let loss = Loss::default().with_term(weight, Perceptual::random(&context.device));
     let size = [1, 1, config.data.height, config.data.width, 3];
     let image = |value: f64| Tensor::<5>::full(size, value, &context.device.clone().autodiff());
     let timed = Timed::of(|| {
@@ -207,7 +209,7 @@ pub fn inference_rates(
     let scene = scene_with_all_tokens(config, num_context, num_targets)?;
     let [encode_macs, render_macs] =
         [Part::Encoder, Part::Renderer].map(|network| part_macs(&shallow.model, network, &scene));
-    let encode_s = Timed::of(|| wait_for(model.encode(&views)))?.seconds;
+    let encode_s = Timed::of(|| wait_for(model.encode(&views).values))?.seconds;
     let lift = model.encode(&views);
     let render_s = Timed::of(|| wait_for(model.renderer.forward(lift.clone(), &cameras).flatten(0, 2)))?.seconds;
     let mut kmeans = Vec::new();
@@ -219,7 +221,7 @@ pub fn inference_rates(
                 (0..3).map(|seed| step_rng(context.config.seed, seed, "plan clusters").random()).collect();
             let timed = Timed::of(|| {
                 for &seed in &seeds {
-                    config.clusters.kmeans.fit(lift.clone(), count, &[seed])?;
+                    config.clusters.kmeans.fit(lift.values.clone(), count, &[seed])?;
                 }
                 Ok(())
             })?;
@@ -228,7 +230,7 @@ pub fn inference_rates(
     } else {
         let stage2 = TrainedModel::snapshot(&model, &shallow.model, true);
         let models = EvalModels { stage2: Some(stage2.clone()), ..EvalModels::new(stage2) };
-        let lpips = config.eval.lpips_path().filter(|_| measures_lpips(config));
+        let lpips = config.eval.lpips_path().filter(|path| measures_lpips(config) && path.is_file());
         let lpips = lpips.map(|path| Lpips::load(path, &context.device)).transpose()?;
         let sweep = Sweep { model: shallow.model.clone(), lpips, ..eval_sizes(config) };
         // Shared by the repetitions: warm-up views are rendered only for the first one.

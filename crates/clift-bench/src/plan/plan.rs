@@ -144,6 +144,17 @@ pub fn check_plan(config: &Config) -> Result<(), TrainError> {
     config.validate()
 }
 
+/// Lists the weight files that training or evaluation needs and does not find. A plan does without them.
+pub fn missing_weights(config: &Config) -> Vec<String> {
+    let perceptual = config.loss.weights().err();
+    let perceptual = perceptual.map(|error| format!("{error}; the plan times random weights, `clift train` stops"));
+    let lpips = config.eval.lpips_path().filter(|path| !path.is_file());
+    let lpips = lpips.map(|path| {
+        format!("`eval.lpips_weights` = {}: file not found; LPIPS is not timed, `clift train` stops", path.display())
+    });
+    perceptual.into_iter().chain(lpips).collect()
+}
+
 fn update(config: &Config, stage: Stage, parameters: &Parameters, is_timed: bool) -> Result<PartPlan, TrainError> {
     let StageSettings { steps, batch_size, .. } = config.stage(stage);
     let all = possible_sizes(config, stage)?;
@@ -316,8 +327,12 @@ mod tests {
         (config.model.dim, config.model.num_heads, config.model.feed_forward_dim) = (16, 2, 24);
         (config.stage1.batch_size, config.stage2.batch_size) = (2, 2);
         config.clusters.grid = vec![TokenCount::Share(0.25), TokenCount::Share(0.5)];
+        config.loss.perceptual_weight = 0.5;
+        config.eval.lpips_weights = Some("no/such/file".into());
         for device in [DeviceName::Flex, DeviceName::Ndarray] {
-            let plan = plan(&Config { device, ..config.clone() }, true).expect("runs");
+            let config = Config { device, ..config.clone() };
+            assert_eq!(missing_weights(&config).len(), 2);
+            let plan = plan(&config, true).expect("runs without weight files");
             for part in plan.parts {
                 let seconds = part.seconds.expect("timed");
                 assert!(seconds > 0.0 && seconds < 60.0, "{device} {}: {seconds}", part.part);

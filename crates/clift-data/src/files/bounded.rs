@@ -1,7 +1,9 @@
-//! Reading whole files with a size limit.
+//! Reading whole files with a size limit, and JSON.
 
 use std::io::Read;
 use std::path::Path;
+
+use serde::de::DeserializeOwned;
 
 use crate::error::DataError;
 
@@ -20,6 +22,11 @@ pub(crate) fn read_bounded(path: &Path, limit: u64, action: &'static str) -> Res
     // A file that grows in the meantime is read up to its former size.
     file.take(metadata.len()).read_to_end(&mut bytes).map_err(DataError::io(action, path))?;
     Ok(bytes)
+}
+
+/// Parses JSON. A byte order mark in front, which editors on Windows write, is skipped.
+pub(crate) fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, serde_json::Error> {
+    serde_json::from_slice(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
 }
 
 #[cfg(test)]

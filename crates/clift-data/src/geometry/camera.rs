@@ -106,6 +106,11 @@ impl Camera {
     }
 }
 
+/// Returns the largest field of view of the cameras along either axis, in degrees; 0 for no cameras.
+pub(crate) fn widest_fov_deg(cameras: &[Camera]) -> f64 {
+    cameras.iter().map(Camera::fov_deg).fold(0.0, |widest, (x, y)| widest.max(x).max(y))
+}
+
 /// Returns the angle in degrees. `atan2` is accurate for small angles, where `acos` loses half the digits.
 fn angle_deg(a: DVec3, b: DVec3) -> f64 {
     a.cross(b).length().atan2(a.dot(b)).to_degrees()

@@ -5,8 +5,11 @@ use std::path::Path;
 
 use glam::{DMat3, DVec3};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 
 use crate::error::DataError;
+use crate::files::bounded::parse_json;
+use crate::files::listing::natural_order;
 use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::normalization::{PoseNormalization, check_near};
 use crate::geometry::pose::Pose;
@@ -111,6 +114,28 @@ struct PoseFile {
     poses: Vec<FilePose>,
 }
 
+/// The keys that tell the form of a file.
+#[derive(Deserialize)]
+struct FileForm {
+    poses: Option<IgnoredAny>,
+    frames: Option<IgnoredAny>,
+}
+
+/// The poses of a `transforms.json`.
+#[derive(Deserialize)]
+struct TransformsFile {
+    frames: Vec<TransformsFrame>,
+}
+
+/// One frame of a `transforms.json`.
+#[derive(Deserialize)]
+struct TransformsFrame {
+    #[serde(default)]
+    file_path: String,
+    /// Three or four rows of a camera-to-world matrix, OpenGL axes.
+    transform_matrix: Vec<[f64; 4]>,
+}
+
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct FilePose {
@@ -126,6 +151,9 @@ struct FilePose {
 /// Poses are camera to world in the world of the capture's files, OpenCV axes. Images have `width` by `height` pixels.
 /// A pose without intrinsics gets `default`.
 ///
+/// The file may also be the `transforms.json` of the capture: its poses in the natural order of the image names, all with
+/// the intrinsics `default`.
+///
 /// # Errors
 /// [`DataError::Io`], and [`DataError::BadPoses`] for another form or an invalid pose, with the position of the pose.
 pub fn read_poses(
@@ -137,11 +165,24 @@ pub fn read_poses(
 ) -> Result<Vec<PathView>, DataError> {
     let text = std::fs::read(path).map_err(DataError::io("reading the poses", path))?;
     let bad = |what: String| DataError::BadPoses { what, path: path.to_path_buf() };
-    let file: PoseFile = serde_json::from_slice(&text)
-        .map_err(|error| bad(format!("expected {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}")))?;
-    if !(1..=MAX_POSES).contains(&file.poses.len()) {
-        return Err(bad(format!("{} poses, expected 1 to {MAX_POSES}", file.poses.len())));
+    let wrong_form = |error: serde_json::Error| {
+        bad(format!("expected a transforms.json or {{\"poses\": [{{\"c2w\": [[4 numbers] x 3]}}, ..]}}, got {error}"))
+    };
+    let form = parse_json(&text).unwrap_or(FileForm { poses: None, frames: None });
+    let is_transforms = form.frames.is_some() && form.poses.is_none();
+    let poses: Vec<FilePose> = if is_transforms {
+        let mut file: TransformsFile = parse_json(&text).map_err(wrong_form)?;
+        file.frames.sort_by(|a, b| natural_order(&a.file_path, &b.file_path));
+        let pose = |frame: TransformsFrame| FilePose { c2w: frame.transform_matrix, intrinsics_norm: None };
+        file.frames.into_iter().map(pose).collect()
+    } else {
+        let file: PoseFile = parse_json(&text).map_err(wrong_form)?;
+        file.poses
+    };
+    if !(1..=MAX_POSES).contains(&poses.len()) {
+        return Err(bad(format!("{} poses, expected 1 to {MAX_POSES}", poses.len())));
     }
+    let from_rows = if is_transforms { Pose::from_opengl } else { Pose::from_rows };
     let is_near = |cx: f64, cy: f64| [cx, cy].iter().all(|centre| centre.abs() <= *INTRINSICS.end());
     let view = |(position, pose): (usize, FilePose)| {
         let bad = |what: String| bad(format!("pose {position}: {what}"));
@@ -153,7 +194,7 @@ pub fn read_poses(
         if last != [0.0, 0.0, 0.0, 1.0] {
             return Err(bad(format!("the last row is {last:?}, expected [0, 0, 0, 1]")));
         }
-        let c2w = normalization.normalize(Pose::from_rows(&rows).map_err(|error| bad(error.to_string()))?);
+        let c2w = normalization.normalize(from_rows(&rows).map_err(|error| bad(error.to_string()))?);
         check_near(&c2w).map_err(|error| bad(error.to_string()))?;
         let intrinsics = match pose.intrinsics_norm {
             None => default,
@@ -170,7 +211,7 @@ pub fn read_poses(
         };
         Ok(PathView { c2w, intrinsics })
     };
-    file.poses.into_iter().enumerate().map(view).collect()
+    poses.into_iter().enumerate().map(view).collect()
 }
 
 #[cfg(test)]
@@ -266,9 +307,22 @@ mod tests {
     }
 
     #[test]
+    fn poses_of_a_transforms_file_have_opengl_axes() {
+        let views = read(
+            r#"{"w": 64, "frames": [
+                {"file_path": "b/10.jpg", "transform_matrix": [[1,0,0,5],[0,-1,0,0],[0,0,-1,2],[0,0,0,1]]},
+                {"file_path": "b/9.jpg", "transform_matrix": [[1,0,0,1],[0,-1,0,0],[0,0,-1,0],[0,0,0,1]]}]}"#,
+        )
+        .unwrap();
+        assert_close(&views[0], &view([0.0; 3], 0.0), 1e-12);
+        assert_close(&views[1], &view([8.0, 0.0, 4.0], 0.0), 1e-12);
+        assert_eq!(views[1].intrinsics, K);
+    }
+
+    #[test]
     fn invalid_pose_files_name_pose_and_problem() {
         for (json, part) in [
-            ("[]", "expected {\"poses\": "),
+            ("[]", "expected a transforms.json or {\"poses\": "),
             (r#"{"poses": []}"#, "0 poses, expected 1 to 100000"),
             (r#"{"poses": [{"c2w": [[1,0,0,0]]}]}"#, "pose 0: 1 rows, expected 3 or 4"),
             (r#"{"poses": [{"c2w": [[2,0,0,0],[0,1,0,0],[0,0,1,0]]}]}"#, "pose 0: bad camera: the rotation is off"),
@@ -286,6 +340,8 @@ mod tests {
                 "pose 0: bad camera: the camera is 1010 times the contexts' extent away",
             ),
             (r#"{"poses": [], "frames": []}"#, "unknown field `frames`"),
+            (r#"{"frames": []}"#, "0 poses, expected 1 to 100000"),
+            (r#"{"frames": [{"file_path": "a.jpg"}]}"#, "missing field `transform_matrix`"),
         ] {
             let message = read(json).unwrap_err().to_string();
             assert!(message.contains(part) && message.ends_with("poses.json"), "{message}");

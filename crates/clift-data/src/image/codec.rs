@@ -6,7 +6,8 @@ use std::path::Path;
 
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
-use image::{ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
+use image::metadata::Orientation;
+use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits};
 
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
@@ -29,12 +30,7 @@ const PNG_END: &[u8] = b"IEND\xae\x42\x60\x82";
 /// 16,384 pixels.
 pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, DataError> {
     let bad = |what: String| DataError::BadImage { key: key.to_owned(), frame, what };
-    let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {
-        return Err(bad(format!("the {} bytes are neither JPEG nor PNG", bytes.len())));
-    };
-    if format == ImageFormat::Jpeg && !has_jpeg_end(bytes) {
-        return Err(bad(format!("the JPEG data of {} bytes is truncated", bytes.len())));
-    }
+    let format = known_format(bytes).map_err(bad)?;
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_SIDE);
     limits.max_image_height = Some(MAX_SIDE);
@@ -49,8 +45,37 @@ pub fn decode_image(bytes: &[u8], key: &str, frame: usize) -> Result<RgbImage, D
     Ok(RgbImage { width: width as usize, height: height as usize, rgb: image.into_raw() })
 }
 
-/// Reads the columns and rows of a JPEG or PNG file from its header.
-pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
+/// Checks format, header and end of a JPEG or PNG file without decoding the image, which takes a hundred times as long.
+pub(crate) fn check_encoded(bytes: &[u8]) -> Result<(), String> {
+    let format = known_format(bytes)?;
+    let size = ImageReader::with_format(Cursor::new(bytes), format).into_dimensions();
+    let (width, height) = size.map_err(|error| error.to_string().trim_end().to_owned())?;
+    if width == 0 || height == 0 { Err(format!("the image is {width}x{height}")) } else { Ok(()) }
+}
+
+/// Returns the format of a JPEG or PNG file with an end marker.
+fn known_format(bytes: &[u8]) -> Result<ImageFormat, String> {
+    let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png)) = image::guess_format(bytes) else {
+        return Err(format!("the {} bytes are neither JPEG nor PNG", bytes.len()));
+    };
+    if has_end(bytes, format) {
+        return Ok(format);
+    }
+    let name = if format == ImageFormat::Png { "PNG" } else { "JPEG" };
+    Err(format!("the {name} data of {} bytes is truncated", bytes.len()))
+}
+
+/// Returns whether the data of a JPEG or PNG file has its end marker.
+fn has_end(bytes: &[u8], format: ImageFormat) -> bool {
+    if format == ImageFormat::Png {
+        bytes.windows(PNG_END.len()).rev().any(|part| part == PNG_END)
+    } else {
+        has_jpeg_end(bytes)
+    }
+}
+
+/// Reads the columns and rows of a JPEG or PNG file, as stored, and its EXIF orientation.
+pub(crate) fn read_header(path: &Path) -> Result<([usize; 2], Orientation), DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let metadata = std::fs::metadata(path).map_err(DataError::io("opening an image", path))?;
     if !metadata.is_file() {
@@ -61,13 +86,35 @@ pub(crate) fn read_size(path: &Path) -> Result<[usize; 2], DataError> {
     if !matches!(reader.format(), Some(ImageFormat::Jpeg | ImageFormat::Png)) {
         return Err(bad("the image is neither JPEG nor PNG".into()));
     }
-    let (width, height) = reader
-        .into_dimensions()
+    let mut decoder = reader
+        .into_decoder()
         .map_err(|error| bad(format!("the image cannot be read: {}", error.to_string().trim_end())))?;
+    let (width, height) = decoder.dimensions();
     if width == 0 || height == 0 {
         return Err(bad(format!("the image is {width}x{height}")));
     }
-    Ok([width as usize, height as usize])
+    // Broken EXIF data does not affect the pixels.
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    Ok(([width as usize, height as usize], orientation))
+}
+
+/// Returns the EXIF orientation of a JPEG or PNG file in memory.
+pub(crate) fn exif_orientation(bytes: &[u8]) -> Orientation {
+    let decoder =
+        ImageReader::new(Cursor::new(bytes)).with_guessed_format().ok().and_then(|reader| reader.into_decoder().ok());
+    decoder.and_then(|mut decoder| decoder.orientation().ok()).unwrap_or(Orientation::NoTransforms)
+}
+
+/// Turns or mirrors an image by its EXIF orientation.
+pub(crate) fn apply_orientation(image: RgbImage, orientation: Orientation) -> RgbImage {
+    let RgbImage { width, height, rgb } = image;
+    // A decoded image has three values per pixel, so that none is lost here.
+    let pixels = image::RgbImage::from_raw(width as u32, height as u32, rgb).unwrap_or_default();
+    let mut turned = DynamicImage::ImageRgb8(pixels);
+    turned.apply_orientation(orientation);
+    let turned = turned.into_rgb8();
+    let (width, height) = turned.dimensions();
+    RgbImage { width: width as usize, height: height as usize, rgb: turned.into_raw() }
 }
 
 /// Checks that a JPEG or PNG file of at most `limit` bytes is not truncated. Reads the last bytes only, or the whole
@@ -86,19 +133,11 @@ pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
         return Ok(());
     }
     let bytes = read_bounded(path, limit, READING)?;
-    let is_png = image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Png);
-    let is_whole = if is_png { bytes.windows(PNG_END.len()).any(|part| part == PNG_END) } else { has_jpeg_end(&bytes) };
-    if is_whole {
+    if has_end(&bytes, image::guess_format(&bytes).unwrap_or(ImageFormat::Jpeg)) {
         return Ok(());
     }
     let what = format!("the image is truncated: its {num_bytes} bytes have no end marker");
     Err(DataError::BadScene { what, path: path.to_owned() })
-}
-
-/// Reads the EXIF orientation of an image file, 2 to 8. Returns `None` for 1 (upright) and for no orientation.
-pub(crate) fn exif_orientation(path: &Path) -> Option<u8> {
-    let mut decoder = ImageReader::open(path).ok()?.with_guessed_format().ok()?.into_decoder().ok()?;
-    decoder.orientation().ok().map(image::metadata::Orientation::to_exif).filter(|orientation| *orientation != 1)
 }
 
 /// Returns whether the JPEG data has its end marker. The decoder fills the missing part of a truncated JPEG with gray.
@@ -189,6 +228,22 @@ mod tests {
         assert_eq!(decode_image(&[&jpeg[..], &[0; 9]].concat(), "00ff", 7).unwrap().width, 40); // padding is common
         let message = decode_image(b"GIF89a....", "00ff", 7).unwrap_err().to_string();
         assert!(message.ends_with("the 10 bytes are neither JPEG nor PNG"), "{message}");
+    }
+
+    #[test]
+    fn unreadable_data_is_found_without_decoding() {
+        for image in [encode_jpeg(&ramp(40, 24), 90).unwrap(), encode_png(&ramp(40, 24)).unwrap()] {
+            assert_eq!(check_encoded(&image), Ok(()));
+            let half = check_encoded(&image[..image.len() / 2]).unwrap_err();
+            assert!(half.contains("is truncated"), "{half}");
+        }
+        for (bytes, expected) in [
+            (&b""[..], "the 0 bytes are neither JPEG nor PNG"),
+            (b"RIFF....WEBPVP8 ", "the 16 bytes are neither JPEG nor PNG"),
+        ] {
+            assert_eq!(check_encoded(bytes).unwrap_err(), expected);
+        }
+        assert!(check_encoded(b"\xff\xd8\xff\xe0\x00\x04\xff\xda\x00\x02\xff\xd9").is_err(), "no size");
     }
 
     #[test]

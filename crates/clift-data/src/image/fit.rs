@@ -56,7 +56,7 @@ pub fn fit_image(
 }
 
 /// Returns the smallest size with the aspect ratio of `from` that covers `to`, all as (width, height).
-fn covering_size(from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
+pub(crate) fn covering_size(from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
     let scale = (to.1 as f64 / from.1 as f64).max(to.0 as f64 / from.0 as f64);
     let side = |from: usize| (from as f64 * scale).round_ties_even() as usize;
     (side(from.0), side(from.1))

@@ -12,6 +12,13 @@ pub struct ViewIndices {
     pub target: Vec<usize>,
 }
 
+impl ViewIndices {
+    /// Returns the number of targets that are also contexts. The input holds the image of such a target.
+    pub fn num_context_targets(&self) -> usize {
+        self.target.iter().filter(|frame| self.context.contains(frame)).count()
+    }
+}
+
 /// Posed views of one scene at the model's resolution, in the scene's normalised frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ClipViews {

@@ -8,6 +8,7 @@ use serde::Deserialize;
 use serde::de::{Deserializer, MapAccess, Visitor};
 
 use crate::error::DataError;
+use crate::files::bounded::parse_json;
 use crate::sampling::clip::ViewIndices;
 use crate::scene_source::SceneSource;
 use crate::skip_report::SkipReport;
@@ -39,7 +40,7 @@ impl EvaluationIndex {
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let text = std::fs::read(path).map_err(DataError::io("reading the evaluation index", path))?;
         let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
-        let file: IndexFile = serde_json::from_slice(&text).map_err(|error| {
+        let file: IndexFile = parse_json(&text).map_err(|error| {
             bad(format!("expected {{key: {{\"context\": [..], \"target\": [..]}} or null}}, got {error}"))
         })?;
         let mut positions = HashMap::with_capacity(file.0.len());
@@ -60,6 +61,16 @@ impl EvaluationIndex {
             entries.push((key, views));
         }
         Ok(Self { path: path.to_path_buf(), entries, positions })
+    }
+
+    /// Removes the targets that are also contexts. Scenes without another target are skipped by [`select`](Self::select).
+    #[must_use]
+    pub fn without_context_targets(mut self) -> Self {
+        for views in self.entries.iter_mut().filter_map(|(_, views)| views.as_mut()) {
+            let ViewIndices { context, target } = views;
+            target.retain(|frame| !context.contains(frame));
+        }
+        self
     }
 
     /// Returns the number of keys, null and empty entries included.
@@ -87,7 +98,7 @@ impl EvaluationIndex {
 
     /// Selects the first `limit` evaluable scenes of `source` (0: all), in file order.
     ///
-    /// The report lists the skipped entries: null or empty ones, keys that the source does not have, scenes with
+    /// The report lists the skipped entries: null or empty ones, entries without targets, keys that the source does not have, scenes with
     /// unreadable cameras, and scenes with too few frames. `num_scenes` of the report counts the examined entries.
     pub fn select(&self, source: &dyn SceneSource, limit: usize) -> (Vec<EvaluationItem>, SkipReport) {
         let mut report = SkipReport::default();
@@ -101,6 +112,10 @@ impl EvaluationIndex {
                 report.skip(key, "without views in the evaluation index");
                 continue;
             };
+            if views.target.is_empty() {
+                report.skip(key, "with contexts as its only targets");
+                continue;
+            }
             let Some(scene) = source.find(key) else {
                 report.skip(key, "not in the data");
                 continue;
@@ -161,13 +176,28 @@ impl<'de> Deserialize<'de> for IndexFile {
 ///
 /// Returns `None` for fewer frames than views, and for fewer than 2 contexts.
 pub fn even_views(num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
-    let num_views = num_context.checked_add(num_targets)?;
-    if num_context < 2 || num_frames < num_views {
+    even_views_of(&(0..num_frames).collect::<Vec<_>>(), None, num_context, num_targets)
+}
+
+/// Spreads contexts evenly over `frames`, and targets over `targets`, or over the other `frames` without `targets`. Frames
+/// ascend; `targets` holds none of `frames` and may have fewer than `num_targets`.
+///
+/// Returns `None` for fewer frames than views, and for fewer than 2 contexts.
+pub fn even_views_of(
+    frames: &[usize],
+    targets: Option<&[usize]>,
+    num_context: usize,
+    num_targets: usize,
+) -> Option<ViewIndices> {
+    let num_targets = targets.map_or(num_targets, |targets| num_targets.min(targets.len()));
+    let needed = if targets.is_some() { num_context } else { num_context.checked_add(num_targets)? };
+    if num_context < 2 || num_targets == 0 || frames.len() < needed {
         return None;
     }
     let spread = |view: usize, count: usize, of: usize| (view * (of - 1) + (count - 1) / 2) / (count - 1);
-    let context: Vec<usize> = (0..num_context).map(|view| spread(view, num_context, num_frames)).collect();
-    let rest: Vec<usize> = (0..num_frames).filter(|frame| !context.contains(frame)).collect();
+    let context: Vec<usize> = (0..num_context).map(|view| frames[spread(view, num_context, frames.len())]).collect();
+    let rest = targets.unwrap_or(frames).iter().copied().filter(|frame| !context.contains(frame));
+    let rest: Vec<usize> = rest.collect();
     // With two frames to spare, the outermost ones, next to a context, are no targets.
     let has_spare = rest.len() >= num_targets + 2;
     let position = |target: usize| if has_spare { spread(target + 1, num_targets + 2, rest.len()) } else { target };
@@ -198,6 +228,11 @@ mod tests {
         }
         assert_eq!(even_views(16, 4, 3).unwrap().context, [0, 5, 10, 15]);
         assert!([even_views(6, 4, 3), even_views(9, 1, 3), even_views(0, 0, 0)].iter().all(Option::is_none));
+        // Of 21 frames every 8th is a target only.
+        let frames: Vec<usize> = (0..21).filter(|frame| frame % 8 != 0).collect();
+        let views = even_views_of(&frames, Some(&[0, 8, 16]), 4, 5).unwrap();
+        assert_eq!((views.context, views.target), (vec![1, 7, 13, 20], vec![0, 8, 16]));
+        assert_eq!(even_views_of(&frames, Some(&[]), 4, 3), None);
         assert!([even_views(9, 2, usize::MAX), even_views(9, usize::MAX, 2)].iter().all(Option::is_none));
     }
 
@@ -217,6 +252,20 @@ mod tests {
         assert!(missing.starts_with("scene 00ff is not in the evaluation index: "), "{missing}");
         let message = index.views("c", 5).unwrap_err().to_string();
         assert!(message.contains("frame 5 of scene c does not exist, the scene has 5 frames"), "{message}");
+    }
+
+    #[test]
+    fn context_targets_are_counted_and_removed() {
+        let source = SyntheticSource::new(SyntheticConfig { num_scenes: 2, ..Default::default() }).unwrap();
+        let (a, b) = (source.key(0), source.key(1));
+        let text = format!(
+            r#"{{"{a}": {{"context": [0, 5], "target": [5, 2, 0]}}, "{b}": {{"context": [0, 5], "target": [0]}}}}"#
+        );
+        let index = index(&text).unwrap();
+        assert_eq!(index.usable().map(|(_, views)| views.num_context_targets()).collect::<Vec<_>>(), [2, 1]);
+        let (items, report) = index.without_context_targets().select(&source, 0);
+        assert_eq!(items, [EvaluationItem { scene: 0, views: ViewIndices { context: vec![0, 5], target: vec![2] } }]);
+        assert_eq!(report.to_string(), "1 of 2 scenes used; 1 with contexts as its only targets");
     }
 
     #[test]

@@ -119,10 +119,11 @@ impl ViewSampler {
             .map(|[init, last]| linear_warm_up(init, last, self.warm_up_steps, step) / self.gap_divisor(num_context))
     }
 
-    /// Returns the smallest number of frames of a usable scene.
-    pub fn min_frames(&self) -> usize {
-        let gaps = (self.min_context..=self.max_context).map(|num_context| self.gap_bounds(0, num_context)[0]);
-        gaps.min().unwrap_or(0) + 1
+    /// Returns the smallest number of frames of a scene that is long enough at every step up to `last_step`, for every
+    /// number of contexts.
+    pub fn min_frames(&self, last_step: u64) -> usize {
+        let gaps = (self.min_context..=self.max_context).map(|num_context| self.gap_bounds(last_step, num_context)[0]);
+        gaps.max().unwrap_or(0) + 1
     }
 
     /// Samples the views of one item from a scene of `source`. Cameras are read only if [`InnerViews::needs_centres`].

@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 use crate::error::DataError;
 use crate::files::listing::{file_names, has_ending};
 use crate::scene_source::Split;
-use crate::skip_report::{SkipReport, first_few};
+use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::kind::SourceKind;
+use crate::sources::photos::image_folder::num_images;
 use crate::sources::photos::re10k_text::looks_like_re10k;
 use crate::sources::photos::scene_folder::{
     FoundScenes, SceneFiles, SceneFolder, find_scenes, scene_in, transforms_in,
@@ -165,6 +166,15 @@ impl<'a> SplitFolder<'a> {
                 first_few(&files)
             )
         }));
+        let num_photos = num_images(&self.base);
+        if num_photos > 0 {
+            parts.push(format!(
+                "{} without cameras: compute poses first, with COLMAP (images in DIR/images; `colmap \
+                 automatic_reconstructor --workspace_path DIR --image_path DIR/images`) or nerfstudio (`ns-process-data \
+                 images --data PHOTOS --output-dir DIR`), then open DIR",
+                plural(num_photos, "image")
+            ));
+        }
         if !others.is_empty() {
             parts.push(format!("other data sets below it, to be opened separately: {}", first_few(others)));
         }

@@ -3,7 +3,6 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::{DataError, check_config};
-use crate::geometry::camera::Camera;
 
 /// Filters of the scenes of a data set. Skipped scenes are listed in the skip report.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -32,20 +31,16 @@ impl SceneFilters {
         *self != Self::default()
     }
 
-    /// Returns the reason to skip a scene. Cameras are read only for the field of view.
+    /// Returns the reason to skip a scene. `fov_deg` returns the largest field of view of any frame, in degrees.
     pub(crate) fn reason_to_skip(
         &self,
         num_frames: usize,
-        cameras: impl FnOnce() -> Result<Vec<Camera>, DataError>,
+        fov_deg: impl FnOnce() -> Result<f64, DataError>,
     ) -> Result<Option<String>, DataError> {
         if num_frames < self.min_frames {
-            return Ok(Some(format!("shorter than {} frames", self.min_frames)));
+            return Ok(Some(format!("shorter than the {} frames of data.filters.min_frames", self.min_frames)));
         }
         let Some(limit) = self.max_fov_deg else { return Ok(None) };
-        let is_wide = cameras()?.iter().any(|camera| {
-            let (x, y) = camera.fov_deg();
-            x.max(y) > limit
-        });
-        Ok(is_wide.then(|| format!("with a field of view above {limit} degrees")))
+        Ok((fov_deg()? > limit).then(|| format!("with a field of view above {limit} degrees")))
     }
 }

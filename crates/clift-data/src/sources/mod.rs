@@ -6,6 +6,7 @@
 //! - `keys`: scene keys: DL3DV hashes, look-up
 //! - `test_scenes`: scenes reserved for testing
 //! - `subset`: some scenes of a source
+//! - `training_frames`: scenes without the frames held out of training
 //! - `dataset_root`: split folders, detection of the layout
 //! - `open`: opening any layout as a source
 //! - `chunks`: pixelSplat chunks
@@ -21,3 +22,4 @@ pub(crate) mod options;
 pub(crate) mod photos;
 pub(crate) mod subset;
 pub(crate) mod test_scenes;
+pub(crate) mod training_frames;

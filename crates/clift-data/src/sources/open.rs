@@ -5,9 +5,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::error::DataError;
+use crate::files::caches::cache_folder;
 use crate::files::listing::file_names;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::SkipReport;
+use crate::sources::chunks::census::Census;
 use crate::sources::chunks::chunk_source::ChunkSource;
 use crate::sources::chunks::index::{index_of_files, note_unlisted, read_index};
 use crate::sources::dataset_root::{DatasetRoot, DetectedSource, SplitFolder};
@@ -21,6 +23,9 @@ use crate::sources::test_scenes::{KEPT_AND_ABSENT, TestScenes};
 /// Image folders of DL3DV scenes, by preference: 480 x 270, then larger.
 const DL3DV_FOLDERS: &[&str] = &["images_8", "images_4", "images_2"];
 
+/// Smallest number of chunks with a cached census; fewer are read in a second.
+const MIN_CENSUS_CHUNKS: usize = 100;
+
 /// Note on a data set whose splits are not separated; irrelevant if only one split is opened.
 pub const SAME_SCENES: &str = "no folders train/ and test/ and no list of test scenes: both splits are the same scenes";
 
@@ -32,6 +37,8 @@ pub struct OpenedSource {
     pub kind: SourceKind,
     /// Whether training and test scenes are separate without a list: in folders `train/` and `test/`, or synthetic.
     pub has_splits: bool,
+    /// Whether both splits are the same scenes.
+    pub shares_scenes: bool,
     /// Skipped scenes and frames.
     pub report: SkipReport,
 }
@@ -59,7 +66,8 @@ pub fn open_source(root: &DatasetRoot, split: Split, options: &SourceOptions) ->
             folder.open_photos(kind, scenes, report, options, list.as_ref())?
         }
     };
-    if !opened.has_splits && list.is_none() {
+    opened.shares_scenes = !opened.has_splits && list.is_none();
+    if opened.shares_scenes {
         opened.report.notes.push(SAME_SCENES.into());
     }
     Ok(opened)
@@ -85,12 +93,22 @@ impl SplitFolder<'_> {
         let kept: HashSet<&str> =
             keys.iter().zip(kept).filter(|(_, kept)| *kept).map(|(key, _)| key.as_str()).collect();
         let is_kept = |key: &str| kept.contains(key);
-        let mut source = ChunkSource::of_index(&self.base, &index, is_kept, &options.filters, options.reads_chunks)?;
+        let num_chunks = index.values().collect::<HashSet<_>>().len();
+        let caches = cache_folder().filter(|_| num_chunks >= MIN_CENSUS_CHUNKS);
+        let census = caches.map(|caches| Census::path(&caches, &self.base));
+        let (filters, reads_all) = (&options.filters, options.reads_chunks);
+        let mut source = ChunkSource::of_index(&self.base, &index, is_kept, filters, reads_all, census.as_deref())?;
         if kind == SourceKind::Chunks {
             source.record_unlisted(&self.base, &index);
         }
         report.append(source.report.clone());
-        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits, report })
+        Ok(OpenedSource {
+            source: Arc::new(source),
+            kind,
+            has_splits: self.root.has_splits,
+            shares_scenes: false,
+            report,
+        })
     }
 
     fn open_photos(
@@ -116,10 +134,17 @@ impl SplitFolder<'_> {
             filters: options.filters.clone(),
             whole_scenes: (is_dl3dv || kind == SourceKind::Re10kTxt) && !files.keep_incomplete,
             min_size: options.min_size,
+            image_cache: options.image_cache.clone(),
         };
         let source = PhotoSource::open(scenes, &source_options)?;
         report.append(source.report.clone());
-        Ok(OpenedSource { source: Arc::new(source), kind, has_splits: self.root.has_splits, report })
+        Ok(OpenedSource {
+            source: Arc::new(source),
+            kind,
+            has_splits: self.root.has_splits,
+            shares_scenes: false,
+            report,
+        })
     }
 
     /// Returns the clips of RealEstate10K as text files, with the folders of their frames.

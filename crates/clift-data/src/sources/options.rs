@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::sources::filters::SceneFilters;
 use crate::sources::kind::SourceKind;
+use crate::sources::photos::image_cache::ImageCacheConfig;
 
 /// Paths of the parts of a layout, where they differ from the default.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -35,6 +36,8 @@ pub struct SourceOptions {
     pub files: FileOptions,
     /// Smallest columns and rows of an image; for layouts with one file per frame.
     pub min_size: [usize; 2],
+    /// Cache of large photos at `min_size`; `None` decodes them at every use.
+    pub image_cache: Option<ImageCacheConfig>,
     /// Whether every chunk is read even without filters, so that unreadable scenes and scenes missing from `index.json`
     /// are reported.
     pub reads_chunks: bool,

@@ -60,6 +60,14 @@ impl SceneSource for SceneSubset {
         self.source.url(self.scenes[scene])
     }
 
+    fn frame_names(&self, scene: usize) -> Result<Vec<String>, DataError> {
+        self.source.frame_names(self.scenes[scene])
+    }
+
+    fn image_size(&self, scene: usize, frame: usize) -> Result<[usize; 2], DataError> {
+        self.source.image_size(self.scenes[scene], frame)
+    }
+
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         self.source.frame(self.scenes[scene], frame)
     }

@@ -92,6 +92,10 @@ impl SceneSource for SyntheticSource {
         Ok((0..self.config.num_frames).map(|frame| self.camera(&room, frame)).collect())
     }
 
+    fn image_size(&self, _scene: usize, _frame: usize) -> Result<[usize; 2], DataError> {
+        Ok([self.config.width, self.config.height])
+    }
+
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
         let room = self.room(scene)?;
         let SyntheticConfig { num_frames, width, height, samples_per_pixel, specular, .. } = self.config;

@@ -19,7 +19,10 @@ const MADE_AS: &str = "# made as: ";
 pub(crate) const INDEX: &str = "index.json";
 /// Name of the file with the [`SkipReport`](crate::skip_report::SkipReport) of the conversion.
 pub(crate) const SKIPPED: &str = "skipped.json";
-const LISTS: [&str; 2] = [INDEX, SKIPPED];
+/// Name of the file with the unreadable images of the folder.
+pub(crate) const UNREADABLE: &str = "unreadable.json";
+/// Files beside the scenes.
+const LISTS: [&str; 3] = [INDEX, SKIPPED, UNREADABLE];
 
 /// The checksums of a folder in progress.
 ///
@@ -38,7 +41,7 @@ pub(crate) struct Checksums {
 impl Checksums {
     /// Reads the sums of a new, empty or unfinished folder without changing it. Drops lines of missing or bad files.
     pub fn open(folder: &Path, made_as: &str) -> Result<Self, DataError> {
-        let bad = |what: String| DataError::BadIndex { what, path: folder.to_path_buf() };
+        let bad = |what: String| DataError::BadOutput { what, path: folder.to_path_buf() };
         let path = folder.join(FILE_NAME);
         let mut checksums = Self {
             folder: folder.to_path_buf(),
@@ -85,7 +88,7 @@ impl Checksums {
     /// Refuses a folder with a file without a line, and with a damaged file that no conversion writes.
     fn refuse_others(&self) -> Result<(), DataError> {
         let folder = &self.folder;
-        let bad = |what: String| DataError::BadIndex { what, path: folder.clone() };
+        let bad = |what: String| DataError::BadOutput { what, path: folder.clone() };
         let reading = || DataError::io("reading the folder", folder);
         if let Some(name) =
             self.damaged.iter().find(|name| !has_ending(name, "torch") && !LISTS.contains(&name.as_str()))

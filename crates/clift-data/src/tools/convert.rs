@@ -4,16 +4,18 @@ use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
+use serde::Serialize;
 
 use crate::error::DataError;
 use crate::files::listing::has_ending;
+use crate::image::codec::check_encoded;
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, note_on};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::chunks::writer::{ChunkFill, SceneRecord, chunk_bytes, chunk_name, scene_file_bytes};
 use crate::sources::test_scenes::KEPT_FOR_TESTING;
-use crate::tools::checksums::{Checksums, INDEX, SKIPPED};
+use crate::tools::checksums::{Checksums, INDEX, SKIPPED, UNREADABLE};
 use crate::tools::export::{ImageEncoding, read_scene};
 
 /// Longest key in bytes that names a file; file systems allow 255 with the ending.
@@ -36,8 +38,11 @@ pub enum ConvertTo {
 pub struct ConvertOptions {
     /// Format of the files.
     pub to: ConvertTo,
-    /// Encoding of frames without an image file: computed and undistorted ones. Image files are copied unchanged.
+    /// Encoding of frames without an image file of their size: computed, undistorted and reduced ones. Other image files
+    /// are copied unchanged.
     pub encoding: ImageEncoding,
+    /// Largest side of an image in pixels; larger images are reduced.
+    pub max_size: Option<usize>,
     /// Options with which the source was opened, on one line; empty for the defaults.
     pub opened_with: String,
 }
@@ -53,8 +58,9 @@ impl ConvertOptions {
             ImageEncoding::Png => "PNG".into(),
             ImageEncoding::Jpeg(quality) => format!("JPEG of quality {quality}"),
         };
+        let size = self.max_size.map_or(String::new(), |size| format!(", at most {size} pixels a side"));
         let with = if self.opened_with.is_empty() { "" } else { ", with " };
-        format!("{form}, {images}{with}{}", self.opened_with)
+        format!("{form}, {images}{size}{with}{}", self.opened_with)
     }
 }
 
@@ -73,8 +79,21 @@ pub struct ConversionReport {
     pub num_encoded: usize,
     /// Bytes of the images written by this run.
     pub image_bytes: u64,
+    /// Frames of the folder whose image file cannot be read. They are copied, because evaluation indices count frames.
+    pub unreadable: Vec<UnreadableImage>,
     /// Scenes and frames skipped when the source was opened, and unreadable scenes.
     pub skipped: SkipReport,
+}
+
+/// A copied image file that is no complete JPEG or PNG.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+pub struct UnreadableImage {
+    /// Scene key.
+    pub key: String,
+    /// Frame index in the scene.
+    pub frame: usize,
+    /// Reason.
+    pub reason: String,
 }
 
 /// State of a scene found in the folder, compared with the source.
@@ -85,6 +104,9 @@ enum State {
     /// Skipped when the source was opened.
     Unreadable,
 }
+
+/// A file of the folder with the states of its scenes and its unreadable images.
+type Scanned = (String, Vec<(String, State)>, Vec<UnreadableImage>);
 
 /// A conversion of the scenes of a source into a folder.
 ///
@@ -112,7 +134,7 @@ impl<'a> Converter<'a> {
     /// Reads the state of `folder` and writes nothing. `skipped` is the report of opening `source`.
     ///
     /// # Errors
-    /// [`DataError::BadIndex`] for a folder with other files, with other scenes, and of a conversion with other options.
+    /// [`DataError::BadOutput`] for a folder with other files, with other scenes, and of a conversion with other options.
     pub fn open(
         source: &'a dyn SceneSource,
         skipped: &SkipReport,
@@ -148,18 +170,20 @@ impl<'a> Converter<'a> {
             let tables: Vec<SceneTable> = ChunkTable::read(&path)?.scenes.into_values().collect();
             let states = tables.iter().map(|table| self.state(table, &path, &unreadable));
             let states = states.collect::<Result<Vec<State>, DataError>>()?;
+            let images = tables.iter().flat_map(|table| unreadable_images(&table.key, table.unreadable_images(&path)));
+            let images = images.collect();
             let scenes = tables.into_iter().map(|table| table.key).zip(states).collect();
-            Ok((name.to_owned(), scenes))
+            Ok((name.to_owned(), scenes, images))
         };
-        let files: Vec<(String, Vec<(String, State)>)> =
-            names.into_par_iter().map(scan).collect::<Result<_, DataError>>()?;
-        for (name, scenes) in files {
+        let files: Vec<Scanned> = names.into_par_iter().map(scan).collect::<Result<_, DataError>>()?;
+        for (name, scenes, images) in files {
             let num_changed = scenes.iter().filter(|(_, state)| *state == State::Changed).count();
             self.report.num_changed += num_changed;
             if num_changed > 0 {
                 self.stale.insert(name);
                 continue;
             }
+            self.report.unreadable.extend(images);
             for (key, state) in scenes {
                 if state == State::Unreadable {
                     self.unreadable.insert(key.clone());
@@ -179,7 +203,7 @@ impl<'a> Converter<'a> {
                 return Ok(State::Unreadable);
             }
             let what = format!("it holds scene {key}, which the source does not have; choose another folder");
-            return Err(DataError::BadIndex { what, path: path.to_owned() });
+            return Err(DataError::BadOutput { what, path: path.to_owned() });
         };
         let now = self.source.timestamps(scene).and_then(|times| Ok((times, self.source.cameras(scene)?)));
         // A converted scene that the source can no longer read is kept.
@@ -189,7 +213,8 @@ impl<'a> Converter<'a> {
 
     /// Writes the missing scenes, and calls `progress` with the number of finished scenes.
     ///
-    /// Unreadable scenes are skipped, with the reason in the result and in `skipped.json`.
+    /// Unreadable scenes are skipped, with the reason in the result and in `skipped.json`. Unreadable image files are
+    /// copied, with the reason in the result and in `unreadable.json`.
     ///
     /// # Errors
     /// [`DataError::Io`] from writing.
@@ -204,7 +229,7 @@ impl<'a> Converter<'a> {
         for scene in 0..self.source.num_scenes() {
             let key = self.source.key(scene);
             if !self.index.contains_key(key) && !self.pending_keys.contains(key) {
-                match read_scene(self.source, scene, self.options.encoding) {
+                match read_scene(self.source, scene, self.options.encoding, self.options.max_size) {
                     Ok((record, num_encoded)) => self.add(record, num_encoded)?,
                     Err(error) => self.report.skipped.skip(key, error.to_string()),
                 }
@@ -234,6 +259,9 @@ impl<'a> Converter<'a> {
         if !self.fill.has_room(&record) {
             self.flush()?;
         }
+        let unreadable = record.images.par_iter().enumerate();
+        let unreadable = unreadable.filter_map(|(frame, bytes)| Some((frame, check_encoded(bytes).err()?))).collect();
+        self.report.unreadable.extend(unreadable_images(&record.key, unreadable));
         self.report.num_frames += record.images.len();
         self.report.num_encoded += num_encoded;
         self.report.image_bytes += record.image_bytes();
@@ -284,7 +312,10 @@ impl<'a> Converter<'a> {
         let index = (is_chunks && !self.index.is_empty()).then(|| serde_json::to_vec_pretty(&self.index));
         let skipped = &self.report.skipped;
         let skipped = skipped.has_skips().then(|| serde_json::to_vec_pretty(skipped));
-        for (name, text) in [(INDEX, index), (SKIPPED, skipped)] {
+        self.report.unreadable.sort_unstable();
+        let unreadable = &self.report.unreadable;
+        let unreadable = (!unreadable.is_empty()).then(|| serde_json::to_vec_pretty(unreadable));
+        for (name, text) in [(INDEX, index), (SKIPPED, skipped), (UNREADABLE, unreadable)] {
             let Some(text) = text else {
                 // The list of an earlier run is outdated.
                 self.checksums.remove_all([name])?;
@@ -297,6 +328,10 @@ impl<'a> Converter<'a> {
         self.report.num_scenes = self.index.len();
         Ok(self.report)
     }
+}
+
+fn unreadable_images(key: &str, frames: Vec<(usize, String)>) -> impl Iterator<Item = UnreadableImage> {
+    frames.into_iter().map(|(frame, reason)| UnreadableImage { key: key.to_owned(), frame, reason })
 }
 
 /// Returns whether a key is a valid file name on all operating systems.

@@ -9,6 +9,7 @@ use serde::Serialize;
 use crate::error::DataError;
 use crate::files::atomic::replace_file;
 use crate::image::codec::{encode_jpeg, encode_png};
+use crate::image::lanczos::resize_lanczos;
 use crate::image::rgb_image::RgbImage;
 use crate::sampling::clip::ViewIndices;
 use crate::sampling::evaluation_index::even_views;
@@ -60,7 +61,7 @@ pub fn write_source(
 ) -> Result<ExportReport, DataError> {
     let mut total = ExportReport::default();
     let scenes = (0..source.num_scenes()).map(|scene| {
-        let (record, _) = read_scene(source, scene, encoding)?;
+        let (record, _) = read_scene(source, scene, encoding, None)?;
         total.num_scenes += 1;
         total.num_frames += record.images.len();
         total.image_bytes += record.image_bytes();
@@ -71,15 +72,26 @@ pub fn write_source(
     Ok(total)
 }
 
-/// Reads a scene on all cores: copies image files, encodes other frames. Returns it and the number of encoded frames.
+/// Reads a scene, its frames on all cores. Image files are copied; other frames, and images with a side above `max_size`
+/// pixels after their reduction, are encoded. Returns the scene and the number of encoded frames.
 pub(crate) fn read_scene(
     source: &dyn SceneSource,
     scene: usize,
     encoding: ImageEncoding,
+    max_size: Option<usize>,
 ) -> Result<(SceneRecord, usize), DataError> {
     let cameras = source.cameras(scene)?;
     let timestamps = source.timestamps(scene)?;
     let read = |frame: usize| {
+        if let Some(max_size) = max_size {
+            let [width, height] = source.image_size(scene, frame)?;
+            let scale = max_size as f64 / width.max(height) as f64;
+            if scale < 1.0 {
+                let side = |side: usize| ((side as f64 * scale).round() as usize).max(1);
+                let reduced = resize_lanczos(&source.frame(scene, frame)?, side(width), side(height));
+                return Ok((encoding.encode(&reduced)?, 1));
+            }
+        }
         Ok(match source.encoded_frame(scene, frame)? {
             Some(bytes) => (bytes, 0),
             None => (encoding.encode(&source.frame(scene, frame)?)?, 1),

@@ -15,7 +15,8 @@ use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, note_on};
 use crate::tools::export::write_index;
 
-/// Options of an overlap index. The defaults are those of the published RealEstate10K index with four contexts.
+/// Options of an overlap index. The defaults are those of the published RealEstate10K index with four contexts, except
+/// that no target is a context.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct OverlapOptions {
     /// Number of context frames per scene, at least 2.
@@ -26,13 +27,22 @@ pub struct OverlapOptions {
     pub distance: [usize; 2],
     /// Smallest [`overlap`] of the first and the last context, in both directions.
     pub min_overlap: f64,
+    /// Whether a target may also be a context, as in the published index. The input holds the image of such a target.
+    pub context_targets: bool,
     /// Seed of the selection among the possible frames.
     pub seed: u64,
 }
 
 impl Default for OverlapOptions {
     fn default() -> Self {
-        Self { num_context: 4, num_targets: 3, distance: [45, 135], min_overlap: 0.6, seed: 123 }
+        Self {
+            num_context: 4,
+            num_targets: 3,
+            distance: [45, 135],
+            min_overlap: 0.6,
+            context_targets: false,
+            seed: 123,
+        }
     }
 }
 
@@ -46,11 +56,17 @@ impl OverlapOptions {
         check_config((2..=10_000).contains(&num_context), "num_context", || {
             format!("is {num_context}; use 2 or more")
         })?;
-        check_config(near + 1 >= num_context && far >= near, "distance", || {
-            format!("is {near} to {far}; {num_context} contexts need a gap of {} or more", num_context - 1)
+        let least = num_context - usize::from(self.context_targets);
+        check_config(near >= least && far >= near, "distance", || {
+            format!("is {near} to {far}; {num_context} contexts and a target need a gap of {least} or more")
         })?;
-        check_config((1..=near + 1).contains(&num_targets), "num_targets", || {
-            format!("is {num_targets}; use 1 to {}, the frames of the smallest gap", near + 1)
+        let (most, frames) = if self.context_targets {
+            (near + 1, "the frames of the smallest gap")
+        } else {
+            (near + 1 - num_context, "the frames of the smallest gap that are no contexts")
+        };
+        check_config((1..=most).contains(&num_targets), "num_targets", || {
+            format!("is {num_targets}; use 1 to {most}, {frames}")
         })?;
         check_config((0.0..=1.0).contains(&min_overlap), "min_overlap", || format!("is {min_overlap}; use 0 to 1"))
     }
@@ -59,7 +75,7 @@ impl OverlapOptions {
     ///
     /// Frames are visited in random order. The partner of a frame is uniform among the frames at increasing distance, in
     /// both directions, up to the first without enough overlap. The first frame with a partner is used. Targets are
-    /// distinct, sorted, and may be contexts; inner contexts are distinct and uniform.
+    /// distinct and sorted; inner contexts are distinct and uniform.
     fn sample_views(&self, key: &str, cameras: &[Camera]) -> Result<ViewIndices, String> {
         let num_frames = cameras.len();
         let [near, far] = self.distance;
@@ -80,11 +96,12 @@ impl OverlapOptions {
             }
             let partner = partners[uniform_between(&mut rng, 0, partners.len() - 1)];
             let (left, right) = (frame.min(partner), frame.max(partner));
-            let mut target = sample_from(&mut rng, (left..=right).collect(), self.num_targets);
-            target.sort_unstable();
             let inner = sample_distinct(&mut rng, right - left - 1, self.num_context - 2);
             let inner = inner.into_iter().map(|offset| left + 1 + offset);
-            let context = [left].into_iter().chain(inner).chain([right]).collect();
+            let context: Vec<usize> = [left].into_iter().chain(inner).chain([right]).collect();
+            let candidates = (left..=right).filter(|frame| self.context_targets || !context.contains(frame));
+            let mut target = sample_from(&mut rng, candidates.collect(), self.num_targets);
+            target.sort_unstable();
             return Ok(ViewIndices { context, target });
         }
         Err(format!("without two frames {near} to {far} apart that overlap by {}", self.min_overlap))
@@ -182,10 +199,13 @@ mod tests {
             assert!(context.is_sorted_by(|a, b| a < b) && target.is_sorted_by(|a, b| a < b));
             let (left, right) = (context[0], context[3]);
             assert!((8..=30).contains(&(right - left)) && target.iter().all(|frame| (left..=right).contains(frame)));
+            assert_eq!(item.views.num_context_targets(), 0);
             let (a, b) = (&cameras[left], &cameras[right]);
             assert!(overlap(a, b) >= 0.6 && overlap(b, a) >= 0.6);
             spans.push(right - left);
         }
+        let published = index(&source, &OverlapOptions { context_targets: true, ..options }).0;
+        assert!(published.usable().any(|(_, views)| views.num_context_targets() > 0));
         spans.sort_unstable();
         assert!(spans[0] < spans[spans.len() - 1], "not always the nearest: {spans:?}");
     }
@@ -218,7 +238,7 @@ mod tests {
             Camera { intrinsics_norm, c2w: Pose { rotation, ..Pose::IDENTITY } }
         };
         let cameras: Vec<Camera> = (0..60).map(camera).collect();
-        let options = |near, far| OverlapOptions { distance: [near, far], ..OverlapOptions::default() };
+        let options = |near, far| OverlapOptions { num_targets: 1, distance: [near, far], ..OverlapOptions::default() };
         for key in ["a", "b", "c", "d", "e", "f"] {
             let ViewIndices { context, .. } = options(4, 50).sample_views(key, &cameras).unwrap();
             assert!((4..=12).contains(&(context[3] - context[0])), "{context:?}");
@@ -290,8 +310,12 @@ mod tests {
         for (options, expected) in [
             (OverlapOptions { num_context: 1, ..valid() }, "num_context is 1"),
             (OverlapOptions { num_targets: 0, ..valid() }, "num_targets is 0"),
+            (OverlapOptions { num_targets: 43, ..valid() }, "num_targets is 43; use 1 to 42, "),
             (OverlapOptions { num_targets: 47, ..valid() }, "num_targets is 47"),
-            (OverlapOptions { distance: [2, 9], ..valid() }, "distance is 2 to 9; 4 contexts need a gap of 3 or more"),
+            (
+                OverlapOptions { distance: [2, 9], ..valid() },
+                "distance is 2 to 9; 4 contexts and a target need a gap of 4 or more",
+            ),
             (OverlapOptions { distance: [9, 8], ..valid() }, "distance is 9 to 8"),
             (OverlapOptions { min_overlap: f64::NAN, ..valid() }, "min_overlap is NaN"),
         ] {

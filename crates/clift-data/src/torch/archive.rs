@@ -8,6 +8,7 @@ use std::path::Path;
 use zip::{CompressionMethod, ZipArchive};
 
 use crate::error::DataError;
+use crate::torch::file_kind::other_format;
 use crate::torch::values::MAX_BYTES;
 
 /// Byte range of a member of an archive, or of a part of a member. It takes 24 bytes, because a data set has millions.
@@ -79,7 +80,10 @@ impl Archive {
         let file = File::open(path).map_err(DataError::io("opening the chunk", path))?;
         let file_bytes = file.metadata().map_err(DataError::io("opening the chunk", path))?.len();
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|error| {
-            bad(format!("the file of {file_bytes} bytes is no readable ZIP archive, perhaps truncated ({error})"))
+            bad(other_format(path).map_or_else(
+                || format!("the file of {file_bytes} bytes is no readable ZIP archive, perhaps truncated ({error})"),
+                str::to_owned,
+            ))
         })?;
         let mut members = HashMap::with_capacity(archive.len());
         for index in 0..archive.len() {

@@ -1,4 +1,4 @@
-//! Recognition of files that are no checkpoint of `torch.save`, with the remedy.
+//! Recognition of files that are not written by `torch.save`, with the remedy.
 
 use std::fs::File;
 use std::io::Read;
@@ -11,8 +11,8 @@ const NUM_BYTES: u64 = 512;
 /// Start of the files of `torch.save` before `PyTorch` 1.6: a magic number as a pickle of protocol 2.
 const LEGACY: &[u8] = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.";
 
-/// Refuses files of known other formats.
-pub(crate) fn refuse_others(path: &Path) -> Result<(), DataError> {
+/// Refuses folders, pipes and devices.
+pub(crate) fn require_file(path: &Path) -> Result<(), DataError> {
     let bad = |what: &str| Err(DataError::BadCheckpoint { what: what.into(), path: path.to_path_buf() });
     let opening = "opening the checkpoint";
     let metadata = std::fs::metadata(path).map_err(DataError::io(opening, path))?;
@@ -26,10 +26,16 @@ pub(crate) fn refuse_others(path: &Path) -> Result<(), DataError> {
     if !metadata.is_file() {
         return bad("a pipe or a device, no regular file; give a file");
     }
+    Ok(())
+}
+
+/// Returns a description of a file that is no ZIP archive; `None` for an unknown format.
+pub(crate) fn other_format(path: &Path) -> Option<&'static str> {
     let mut start = Vec::new();
-    let file = File::open(path).map_err(DataError::io(opening, path))?;
-    file.take(NUM_BYTES).read_to_end(&mut start).map_err(DataError::io(opening, path))?;
-    other_kind(&start, metadata.len()).map_or(Ok(()), bad)
+    let file = File::open(path).ok()?;
+    let num_bytes = file.metadata().ok()?.len();
+    file.take(NUM_BYTES).read_to_end(&mut start).ok()?;
+    other_kind(&start, num_bytes)
 }
 
 /// Returns a description of a file with this start; `None` if the format is unknown or a ZIP archive.
@@ -67,6 +73,7 @@ fn other_kind(start: &[u8], num_bytes: u64) -> Option<&'static str> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::torch::archive::Archive;
 
     #[test]
     fn other_formats_are_named_with_the_remedy() {
@@ -83,15 +90,17 @@ mod tests {
             (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
         ] {
             std::fs::write(&path, bytes).unwrap();
-            let message = refuse_others(&path).unwrap_err().to_string();
+            let message = Archive::open(&path).err().unwrap().to_string();
             assert!(message.contains(what) && message.ends_with("a.ckpt"), "{message}");
+            assert!(!message.contains("truncated"), "{message}");
         }
-        // ZIP archives and unknown formats are left to the reader of archives.
+        // A truncated ZIP archive, and unknown formats.
         for bytes in [&b"PK\x03\x04...."[..], b"P", b"something else"] {
             std::fs::write(&path, bytes).unwrap();
-            refuse_others(&path).unwrap();
+            let message = Archive::open(&path).err().unwrap().to_string();
+            assert!(message.contains("perhaps truncated"), "{message}");
         }
-        let refused = |path: &Path| refuse_others(path).unwrap_err().to_string();
+        let refused = |path: &Path| require_file(path).unwrap_err().to_string();
         assert!(refused(root.path()).contains("a directory; give the checkpoint file in it"));
         std::fs::write(root.path().join("model.safetensors"), "").unwrap();
         assert!(refused(root.path()).contains("needs no import"));
@@ -103,7 +112,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("pipe");
         assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
-        let message = refuse_others(&path).unwrap_err().to_string();
+        let message = require_file(&path).unwrap_err().to_string();
         assert!(message.contains("no regular file"), "{message}");
     }
 }

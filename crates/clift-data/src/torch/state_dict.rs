@@ -11,7 +11,7 @@ use half::{bf16, f16};
 use crate::error::DataError;
 use crate::files::atomic::replace_file;
 use crate::torch::archive::{Archive, ByteSpan};
-use crate::torch::file_kind::refuse_others;
+use crate::torch::file_kind::require_file;
 use crate::torch::pickle::Pickle;
 use crate::torch::pickle_writer::PickleWriter;
 use crate::torch::tensor_span::{in_row_major_order, storage_stretch, tensor_span};
@@ -43,7 +43,7 @@ impl StateDict {
     /// [`DataError::BadPickle`] for a malformed pickle, and [`DataError::RefusedGlobal`] for an attack.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let bad = |what: String| DataError::BadCheckpoint { what, path: path.to_path_buf() };
-        refuse_others(path)?;
+        require_file(path)?;
         let num_bytes = std::fs::metadata(path).map_err(DataError::io("opening the checkpoint", path))?.len();
         let archive = Archive::open(path).map_err(as_checkpoint)?;
         let bytes = archive.read_pickle(path).map_err(as_checkpoint)?;

@@ -65,7 +65,7 @@ fn all_layouts_give_the_same_clip() {
             let info = SourceInfo::read(source.as_ref()).unwrap();
             // atan(0.515625 / 0.875) + atan(0.484375 / 0.875), by hand
             let fov_deg = format!("{:.1}", info.fov_deg.unwrap().max);
-            assert_eq!((info.num_scenes, info.image_size, fov_deg.as_str()), (1, Some([32, 18]), "59.5"), "{name}");
+            assert_eq!((info.num_scenes, info.image_sizes["32x18"], fov_deg.as_str()), (1, 1, "59.5"), "{name}");
             let clip = clip(source.clone());
             assert_eq!(clip.context.images, expected.context.images, "{name}");
             assert_eq!(clip.target.images, expected.target.images, "{name}");
@@ -159,7 +159,10 @@ fn filters_and_sizes_skip_scenes_with_reasons() {
     let none = SceneFilters::default;
     assert_eq!(report(none(), [32, 18]), [] as [&str; 0]);
     assert_eq!(report(none(), [32, 19]), ["with images smaller than 32x19"]);
-    assert_eq!(report(SceneFilters { min_frames: 7, ..none() }, [0, 0]), ["shorter than 7 frames"]);
+    assert_eq!(
+        report(SceneFilters { min_frames: 7, ..none() }, [0, 0]),
+        ["shorter than the 7 frames of data.filters.min_frames"]
+    );
     let narrow = SceneFilters { max_fov_deg: Some(40.0), ..none() };
     assert_eq!(report(narrow, [0, 0]), ["with a field of view above 40 degrees"]);
 }

@@ -3,7 +3,9 @@
 use std::fs;
 use std::path::Path;
 
-use clift_data::{FileOptions, OpenedSource, RgbImage, SourceKind, SourceOptions, Split, encode_jpeg, encode_png};
+use clift_data::{
+    FileOptions, OpenedSource, RgbImage, SourceKind, SourceOptions, Split, decode_image, encode_jpeg, encode_png,
+};
 use serde_json::{Value, json};
 
 use crate::files::{copy_folder, copy_of_layout, fixtures, frame_at, write_capture};
@@ -162,25 +164,53 @@ fn images_are_found_by_the_end_of_paths() {
 }
 
 #[test]
-fn exif_orientation_is_reported_for_wrong_aspect_ratios() {
-    // Phones store sensor rows, with a tag for the rotation.
+fn exif_orientation_follows_the_aspect_ratio_of_the_camera() {
+    // Phones store sensor rows, with a tag for the rotation: 6 is a quarter turn clockwise.
     let tagged = |frame: &RgbImage| {
         let jpeg = encode_jpeg(frame, 90).unwrap();
         let exif = b"\xff\xe1\x00\x22Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
         [&jpeg[..2], exif, &jpeg[2..]].concat()
     };
     let root = tempfile::tempdir().unwrap();
-    let images = [("0.jpg", tagged(&image(48, 32))), ("1.jpg", tagged(&image(32, 48)))];
-    write(root.path(), &images, &["0.jpg", "1.jpg"]);
-    let opened = open_test(root.path()).unwrap();
-    let expected =
-        "whose image has another aspect ratio than its camera, and an EXIF orientation, which is not applied";
-    assert_eq!(skipped_frames(&opened.report), [("1.jpg", expected)]);
-    let frame = opened.source.frame(0, 0).unwrap();
-    assert_eq!((frame.width, frame.height), (48, 32), "as stored");
-    fs::remove_file(root.path().join("0.jpg")).unwrap();
+    let (upright, lying) = (tagged(&image(48, 32)), tagged(&image(32, 48)));
+    let images = [("0.jpg", upright.clone()), ("1.jpg", lying.clone()), ("2.jpg", tagged(&image(40, 40)))];
+    write(root.path(), &images, &["0.jpg", "1.jpg", "2.jpg"]);
+    let OpenedSource { source, report, .. } = open_test(root.path()).unwrap();
+    assert_eq!(skipped_frames(&report), [("2.jpg", "whose image has another aspect ratio than its camera")]);
+    let key = source.key(0);
+    let notes = [
+        format!("1 image turned by the EXIF orientation, as the size of the cameras requires: 1 of {key}"),
+        format!(
+            "1 image with an EXIF orientation that is not applied, as the cameras have the stored size: 1 of {key}"
+        ),
+    ];
+    assert_eq!(report.notes[..2], notes);
+    assert_eq!(source.frame(0, 0).unwrap(), decode_image(&upright, "0", 0).unwrap(), "as stored");
+    let (turned, stored) = (source.frame(0, 1).unwrap(), decode_image(&lying, "1", 0).unwrap());
+    assert_eq!((turned.width, turned.height, source.image_size(0, 1).unwrap()), (48, 32, [48, 32]));
+    let pixel =
+        |image: &RgbImage, column: usize, row: usize| image.rgb[3 * (row * image.width + column)..][..3].to_vec();
+    for (column, row) in [(0, 0), (47, 0), (0, 31), (20, 9)] {
+        assert_eq!(pixel(&turned, column, row), pixel(&stored, row, 47 - column), "{column} {row}");
+    }
+    assert_eq!(source.encoded_frame(0, 0).unwrap(), Some(upright));
+    assert_eq!(source.encoded_frame(0, 1).unwrap(), None, "a copy of the file would lie on its side");
+}
+
+#[test]
+fn photos_without_cameras_name_the_tools_for_poses() {
+    let root = tempfile::tempdir().unwrap();
+    for folder in ["images", "more"] {
+        fs::create_dir(root.path().join(folder)).unwrap();
+        fs::write(root.path().join(folder).join("IMG_1.JPG"), "").unwrap();
+    }
     let message = open_test(root.path()).err().unwrap();
-    assert!(message.contains("the EXIF orientation 6 is not applied"), "{message}");
+    for part in ["2 images without cameras", "colmap automatic_reconstructor", "ns-process-data images"] {
+        assert!(message.contains(part), "{message}");
+    }
+    fs::remove_dir_all(root.path().join("images")).unwrap();
+    fs::remove_dir_all(root.path().join("more")).unwrap();
+    assert!(!open_test(root.path()).err().unwrap().contains("colmap"));
 }
 
 #[test]

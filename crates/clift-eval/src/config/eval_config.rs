@@ -28,8 +28,10 @@ pub struct EvalConfig {
     /// LPIPS weights, converted by `scripts/tools/convert_vgg.py`. LPIPS is not measured without weights.
     pub lpips_weights: Option<PathBuf>,
     /// Evaluation index with the context and target frames of every scene. Without an index, contexts are spread evenly
-    /// over a scene, with targets between the contexts.
+    /// over a scene, with targets between the contexts (held-out frames, where `data.hold_out` applies).
     pub index: Option<PathBuf>,
+    /// Whether targets of the index that are also contexts are left out: the input holds their images.
+    pub drop_context_targets: bool,
     /// Largest number of evaluated scenes; 0 for all.
     pub num_scenes: usize,
     /// Context views of a scene without an index.
@@ -87,6 +89,7 @@ impl Default for EvalConfig {
             tokens: vec![TokenFormat::F32],
             lpips_weights: None,
             index: None,
+            drop_context_targets: false,
             num_scenes: 0,
             num_context: 4,
             num_targets: 3,

@@ -3,24 +3,30 @@
 use std::path::Path;
 
 use burn::tensor::Device;
-use clift_data::{ClipReader, EvaluationItem, SkipReport, replace_file};
+use clift_data::{ClipReader, EvaluationItem, SkipReport, plural, replace_file};
 use clift_model::ModelError;
 
 use crate::config::eval_config::EvalConfig;
 use crate::config::method::Method;
+use crate::config::split::{EvalFrames, EvalSplit};
 use crate::error::EvalError;
 use crate::evaluator::items::evaluation_items;
 use crate::evaluator::sheets::Sheets;
 use crate::figures::scene_figure::SceneFigures;
 use crate::metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
 use crate::report::page::{MAX_FIGURES, Report, RunDescription};
+use crate::report::training::TrainingCurve;
 use crate::statistics::csv_files::{write_scenes, write_views};
 use crate::statistics::eval_results::EvalResults;
-use crate::statistics::summary::Summary;
+use crate::statistics::scene_scores::SceneScores;
+use crate::statistics::summary::{Summary, context_targets_note};
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::evaluate_scene::evaluate_scene;
 use crate::sweep::predictions::{ExternalMethod, image_name};
 use crate::sweep::sweep::Sweep;
+
+/// Smallest number of timed views of a point: quartiles of fewer mean little.
+const MIN_TIMED_VIEWS: usize = 20;
 
 /// The scenes and views of an evaluation, and the settings of every scene.
 pub struct Evaluator {
@@ -30,13 +36,14 @@ pub struct Evaluator {
     description: RunDescription,
     reader: ClipReader,
     items: Vec<EvaluationItem>,
+    split: EvalSplit,
     /// The scenes that were skipped when the views were chosen.
     pub skip_report: SkipReport,
     device: Device,
 }
 
 impl Evaluator {
-    /// Chooses the scenes and views of `eval` from `reader`. `sweep` has the settings of every scene; token counts and
+    /// Chooses the scenes and views of `eval` from the `frames` of `reader`. `sweep` has the settings of every scene; token counts and
     /// formats equal those of `eval`. [`evaluate`](Self::evaluate) adds methods, LPIPS and external methods.
     ///
     /// # Errors
@@ -47,19 +54,29 @@ impl Evaluator {
         sweep: Sweep,
         description: RunDescription,
         reader: ClipReader,
+        frames: EvalFrames,
         device: &Device,
     ) -> Result<Self, EvalError> {
         eval.precision.check("eval.precision", device)?;
-        let (items, skip_report) = evaluation_items(&eval, &reader)?;
+        let (items, skip_report, split) = evaluation_items(&eval, &reader, frames)?;
         // An early check: a run must not fail after training.
         let tokens_per_view = sweep.model.num_tokens(1, reader.options.height, reader.options.width)?;
         let fewest_views = items.iter().map(|item| item.views.context.len()).min().unwrap_or_default();
         check_counts(&eval, fewest_views * tokens_per_view)?;
-        Ok(Self { eval, sweep, description, reader, items, skip_report, device: device.clone() })
+        Ok(Self { eval, sweep, description, reader, items, split, skip_report, device: device.clone() })
+    }
+
+    /// Returns what is measured: scenes, targets and split, then warnings about figures that mislead.
+    pub fn describe(&self) -> (String, Vec<String>) {
+        let num_targets: usize = self.items.iter().map(|item| item.views.target.len()).sum();
+        let num_given = self.items.iter().map(|item| item.views.num_context_targets()).sum();
+        let num_scenes = plural(self.items.len(), "scene");
+        let text = format!("evaluation: {num_scenes}, {}: {}", plural(num_targets, "target view"), self.split);
+        (text, self.split.warning().map(str::to_owned).into_iter().chain(context_targets_note(num_given)).collect())
     }
 
     /// Measures every scene and writes `report.html`, `summary.json`, `scenes.csv`, `views.csv`, `skipped.json` and the
-    /// contact sheets to `folder`. Scores the images of `external_methods` too.
+    /// contact sheets to `folder`. Scores the images of `external_methods` too. The report has the curves of `training`.
     ///
     /// # Errors
     /// As [`measure`](Self::measure), [`EvalError::BadWeights`] for unusable LPIPS weights, [`ModelError::BadConfig`] for a
@@ -69,6 +86,7 @@ impl Evaluator {
         &self,
         models: &EvalModels,
         external_methods: &[ExternalMethod],
+        training: Vec<TrainingCurve>,
         folder: &Path,
         progress: &mut dyn Progress,
     ) -> Result<Summary, EvalError> {
@@ -78,6 +96,7 @@ impl Evaluator {
             methods,
             lpips: lpips.clone().ok(),
             external_methods: external_methods.to_vec(),
+            min_timed_views: MIN_TIMED_VIEWS,
             ..self.sweep.clone()
         };
         progress.done(0, self.items.len());
@@ -103,12 +122,15 @@ impl Evaluator {
             self.require_images(external, &summary)?;
         }
         sheets.keep()?;
-        summary.write(&folder.join("summary.json"))?;
         write_scenes(&measured, &folder.join("scenes.csv"))?;
         write_views(&measured, &folder.join("views.csv"))?;
         write_skip_report(&skipped, &folder.join("skipped.json"))?;
-        let report = Report { run: self.description.clone(), summary: summary.clone(), skipped, figures };
+        let scenes = SceneScores::new(&measured);
+        let report =
+            Report { run: self.description.clone(), summary: summary.clone(), training, scenes, skipped, figures };
         report.write(&folder.join("report.html"))?;
+        // Last: an evaluation with a summary is complete.
+        summary.write(&folder.join("summary.json"))?;
         Ok(summary)
     }
 
@@ -127,6 +149,7 @@ impl Evaluator {
     ) -> Result<(EvalResults, SkipReport), EvalError> {
         let _precision = self.eval.precision.scope();
         let (mut measured, mut skip_report) = (EvalResults::default(), self.skip_report.clone());
+        measured.split = Some(self.split);
         measured.skipped.extend(skip_report.skips.iter().map(|skip| skip.key.clone()));
         let total = self.items.len().min(limits.num_scenes);
         for (i, item) in self.items.iter().take(total).enumerate() {

@@ -1,11 +1,13 @@
 //! The evaluated scenes and views.
 
-use clift_data::{ClipReader, EvaluationIndex, EvaluationItem, SkipReport, even_views};
+use clift_data::{ClipReader, EvaluationIndex, EvaluationItem, SkipReport};
 
 use crate::config::eval_config::EvalConfig;
+use crate::config::split::{EvalFrames, EvalSplit};
 use crate::error::EvalError;
 
-/// Chooses the scenes and views of an evaluation: from the index, or evenly spread views.
+/// Chooses the scenes and views of an evaluation, and returns what they measure: from the index, or evenly spread views of
+/// `frames`.
 ///
 /// Takes at most `eval.num_scenes` scenes (0: all), in the order of the index or the source. Unusable scenes are in the skip
 /// report.
@@ -15,17 +17,20 @@ use crate::error::EvalError;
 pub fn evaluation_items(
     eval: &EvalConfig,
     reader: &ClipReader,
-) -> Result<(Vec<EvaluationItem>, SkipReport), EvalError> {
+    frames: EvalFrames,
+) -> Result<(Vec<EvaluationItem>, SkipReport, EvalSplit), EvalError> {
     let source = &reader.source;
     let (items, skip_report) = if let Some(index) = &eval.index {
-        EvaluationIndex::read(index)?.select(source.as_ref(), eval.num_scenes)
+        let index = EvaluationIndex::read(index)?;
+        let index = if eval.drop_context_targets { index.without_context_targets() } else { index };
+        index.select(source.as_ref(), eval.num_scenes)
     } else {
         let limit = if eval.num_scenes == 0 { usize::MAX } else { eval.num_scenes };
         let count = source.num_scenes().min(limit);
         let mut skip_report = SkipReport::new(count);
         let mut items = Vec::with_capacity(count);
         for scene in 0..count {
-            match source.num_frames(scene).map(|count| even_views(count, eval.num_context, eval.num_targets)) {
+            match source.num_frames(scene).map(|count| frames.views(count, eval.num_context, eval.num_targets)) {
                 Ok(Some(views)) => items.push(EvaluationItem { scene, views }),
                 Ok(None) => skip_report.skip(source.key(scene), "too few frames for its views"),
                 Err(error) => skip_report.skip(source.key(scene), error.to_string()),
@@ -36,5 +41,6 @@ pub fn evaluation_items(
     if items.is_empty() {
         return Err(EvalError::NoScenes { reason: format!("evaluation: {skip_report}") });
     }
-    Ok((items, skip_report))
+    let split = frames.of_views(items.iter().map(|item| &item.views));
+    Ok((items, skip_report, split))
 }

@@ -55,6 +55,8 @@ pub struct FigureImage {
     pub psnr: f64,
     /// The rendering.
     pub image: Canvas,
+    /// The error map, of the main method and the nearest context view.
+    pub error: Option<Canvas>,
 }
 
 /// The stored tokens of a scene, and the tokens selected for the target view.
@@ -84,11 +86,15 @@ impl SceneFigures {
 impl SceneFigure {
     fn new(clip: &Clip, results: &SceneResults, view: usize, patch_size: usize) -> Result<Self, EvalError> {
         let (height, width) = (clip.target.height, clip.target.width);
+        let target = view_image(&clip.target, view);
+        let best = best_method(results.renderings.iter().map(|rendering| rendering.key));
         let mut images = Vec::new();
         for rendering in &results.renderings {
             if let (Some(pixels), Some(metrics)) = (rendering.images.get(&view), rendering.metrics.get(&view)) {
                 let image = small(Canvas::from_unit(pixels, height, width)?);
-                images.push(FigureImage { key: rendering.key, psnr: metrics.psnr, image });
+                let has_error = [best, Some(Method::NearestView)].contains(&Some(rendering.key.method));
+                let error = has_error.then(|| error_map(pixels, &target, height, width).map(small)).transpose()?;
+                images.push(FigureImage { key: rendering.key, psnr: metrics.psnr, image, error });
             }
         }
         images.sort_by_key(|image| image.key);
@@ -108,7 +114,7 @@ impl SceneFigure {
             grid: [height / patch_size, width / patch_size],
             context: canvases(&clip.context)?.into_iter().map(small).collect(),
             context_frames: clip.context.frame_index.clone(),
-            target: small(Canvas::from_unit(&view_image(&clip.target, view), height, width)?),
+            target: small(Canvas::from_unit(&target, height, width)?),
             target_frame: clip.target.frame_index[view],
             images,
             clusters,

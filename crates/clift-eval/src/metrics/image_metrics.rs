@@ -27,7 +27,8 @@ pub fn psnr(pred: &[f32], target: &[f32]) -> Result<f64, EvalError> {
         .zip(target)
         .map(|(p, t)| (f64::from(p.clamp(0.0, 1.0)) - f64::from(t.clamp(0.0, 1.0))).powi(2))
         .sum();
-    Ok(-10.0 * (squared_error / target.len() as f64).log10())
+    // Of opposite images, a difference: a product would be -0.
+    Ok(0.0 - 10.0 * (squared_error / target.len() as f64).log10())
 }
 
 /// Measures the structural similarity of two `[height, width, 3]` images; 1 for identical images.
@@ -143,6 +144,7 @@ mod tests {
     fn psnr_clamps_and_is_exact() {
         // 0.75 - 0.25 is exact in f32, so the mean squared error is exactly 1/4.
         assert_eq!(psnr(&[0.75; 12], &[0.25; 12]).unwrap(), -10.0 * 0.25_f64.log10());
+        assert_eq!(psnr(&[0.0; 12], &[1.0; 12]).unwrap().to_string(), "0");
         assert_eq!(psnr(&[1.5, -0.25, 1.0], &[1.0, 0.0, 1.0]).unwrap(), f64::INFINITY);
     }
 

@@ -47,8 +47,13 @@ impl Perceptual {
     fn with_shape(path: &Path, shape: VggShape, options: (&Device, DType)) -> Result<Self, EvalError> {
         let mut file = NetworkFile::read(path, WANTED)?;
         let vgg = Vgg::take(&mut file, shape, options)?.no_grad();
-        let mean = Tensor::<1>::from_data(TensorData::new(MEAN_RGB.to_vec(), [3]), options).reshape([1, 3, 1, 1]);
-        Ok(Self { vgg, mean, sha256: file.finish()? })
+        Ok(Self { vgg, mean: mean_colour(options), sha256: file.finish()? })
+    }
+
+    /// Makes the loss with random weights: it takes the time of the real one, and nothing else of it holds.
+    pub fn random(device: &Device) -> Self {
+        let vgg = Vgg::random(VggShape::VGG19, device).no_grad();
+        Self { vgg, mean: mean_colour((device, DType::F32)), sha256: String::new() }
     }
 
     /// Returns the SHA-256 of the weight file, 64 hexadecimal digits.
@@ -84,6 +89,11 @@ impl Perceptual {
         features.extend(self.vgg.features(input));
         features
     }
+}
+
+/// Returns the mean colour, `[1, 3, 1, 1]`.
+fn mean_colour(options: (&Device, DType)) -> Tensor<4> {
+    Tensor::<1>::from_data(TensorData::new(MEAN_RGB.to_vec(), [3]), options).reshape([1, 3, 1, 1])
 }
 
 #[cfg(test)]

@@ -101,25 +101,30 @@ pub struct Vgg {
 }
 
 impl Vgg {
+    /// Makes a network with random weights.
+    pub fn random(shape: VggShape, device: &Device) -> Self {
+        let mut inputs = 3;
+        let mut conv = |outputs| {
+            let config = Conv2dConfig::new([inputs, outputs], [3, 3]);
+            inputs = outputs;
+            config.with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1)).init(device)
+        };
+        let stages = shape.convs.iter().zip(&shape.widths);
+        Self { stages: stages.map(|(&count, &outputs)| (0..count).map(|_| conv(outputs)).collect()).collect(), shape }
+    }
+
     /// Takes the tensors `convS_I.weight` `[out, in, 3, 3]` and `convS_I.bias` out of a file.
     pub fn take(file: &mut NetworkFile, shape: VggShape, options: (&Device, DType)) -> Result<Self, EvalError> {
-        let mut inputs = 3;
-        let mut stages = Vec::new();
-        for (stage, (&count, &outputs)) in shape.convs.iter().zip(&shape.widths).enumerate() {
-            let mut convs = Vec::new();
-            for i in 1..=count {
-                let name = format!("conv{}_{i}", stage + 1);
-                let mut conv = Conv2dConfig::new([inputs, outputs], [3, 3])
-                    .with_padding(PaddingConfig2d::Explicit(1, 1, 1, 1))
-                    .init(options.0);
-                conv.weight = frozen(file.take(&format!("{name}.weight"), [outputs, inputs, 3, 3], options)?);
-                conv.bias = Some(frozen(file.take(&format!("{name}.bias"), [outputs], options)?));
-                convs.push(conv);
-                inputs = outputs;
+        let mut vgg = Self::random(shape, options.0);
+        for (stage, convs) in vgg.stages.iter_mut().enumerate() {
+            for (i, conv) in convs.iter_mut().enumerate() {
+                let name = format!("conv{}_{}", stage + 1, i + 1);
+                let dims = conv.weight.dims();
+                conv.weight = frozen(file.take(&format!("{name}.weight"), dims, options)?);
+                conv.bias = Some(frozen(file.take(&format!("{name}.bias"), [dims[0]], options)?));
             }
-            stages.push(convs);
         }
-        Ok(Self { stages, shape })
+        Ok(vgg)
     }
 
     /// # Shapes

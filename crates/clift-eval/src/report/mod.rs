@@ -4,6 +4,8 @@
 //! - `html`: data URIs; escaping by maud
 //! - `plot`: SVG plots
 //! - `plots`: plots of a summary
+//! - `training`: training curves
+//! - `scene_list`: the distribution over scenes
 //! - `scene_section`: one scene on the page
 //! - `date`: time of a report
 //! - `tables`: tables of the page
@@ -15,5 +17,7 @@ pub(crate) mod html;
 pub(crate) mod page;
 pub(crate) mod plot;
 pub(crate) mod plots;
+pub(crate) mod scene_list;
 pub(crate) mod scene_section;
 pub(crate) mod tables;
+pub(crate) mod training;

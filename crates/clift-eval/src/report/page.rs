@@ -11,7 +11,9 @@ use crate::figures::scene_figure::SceneFigure;
 use crate::report::axis::{grouped, milliseconds};
 use crate::report::html::{count, number};
 use crate::report::plots::plots;
-use crate::report::{date, scene_section, tables};
+use crate::report::training::{self, TrainingCurve};
+use crate::report::{date, scene_list, scene_section, tables};
+use crate::statistics::scene_scores::SceneScores;
 use crate::statistics::summary::{Summary, SummaryPoint};
 
 const STYLE: &str = include_str!("style.css");
@@ -21,7 +23,7 @@ pub const MAX_FIGURES: usize = 6;
 
 const SCENES_NOTE: &str = "The middle target view of each scene, rendered by every method. In the maps, a patch of the \
                            context views has the colour of its cluster; rings mark the centroids, which are the \
-                           stored tokens.";
+                           stored tokens. Error maps: the largest channel's absolute difference, brightest from 0.25 on.";
 
 const SELECTION_NOTE: &str = "For views rendered from fewer tokens than stored, dots mark the tokens selected for the \
                               target and rings mark the other stored tokens.";
@@ -39,12 +41,19 @@ pub struct RunDescription {
     pub config: String,
     /// Name of the device.
     pub device: String,
+    /// The command line.
+    pub command: String,
 }
 
 #[derive(Clone, Debug)]
 pub struct Report {
     pub run: RunDescription,
     pub summary: Summary,
+    /// Training curves of the run, by stage; may be empty.
+    pub training: Vec<TrainingCurve>,
+    /// The scenes from worst to best.
+    pub scenes: SceneScores,
+    /// Skipped scenes with their reasons.
     pub skipped: SkipReport,
     /// Figures of scenes; the report has the first [`MAX_FIGURES`].
     pub figures: Vec<SceneFigure>,
@@ -58,7 +67,7 @@ impl Report {
     }
 
     pub fn to_html(&self) -> io::Result<String> {
-        let RunDescription { name, config, device } = &self.run;
+        let RunDescription { name, config, device, command } = &self.run;
         let page = html! {
             (DOCTYPE)
             html lang="en" {
@@ -71,14 +80,20 @@ impl Report {
                 body {
                     main {
                         h1 { (name) }
-                        p.soft { "clift evaluation, " (date::now()) }
+                        p.soft {
+                            "clift evaluation, " (date::now())
+                            @if let Some(split) = self.summary.split { " \u{b7} measured on: " strong { (split) } }
+                        }
+                        @for warning in self.summary.warnings() { p.warning { "Warning: " (warning) } }
                         (self.headline())
                         (self.quality_and_cost())
                         (tables::points(&self.summary))
                         (tables::differences(&self.summary.differences))
-                        (self.scenes()?)
+                        (scene_list::section(&self.scenes))
+                        (self.figures()?)
+                        (training::section(&self.training))
                         (tables::skipped(self.summary.num_scenes, &self.skipped))
-                        (tables::machine(device))
+                        (tables::machine(device, command))
                         h2 { "Config" }
                         details { summary { "Every key, resolved" } pre { (config) } }
                         footer { p { (FOOTNOTE) } }
@@ -104,7 +119,12 @@ impl Report {
                     "."
                     @if let Some(gain) = last.psnr.zip(nearest).map(|(psnr, nearest)| psnr - nearest) {
                         " The latter is " (grouped(gain.abs(), 2)) " dB "
-                        (if gain < 0.0 { "below" } else { "above" }) " a copy of the nearest context view."
+                        (if gain < 0.0 { "below" } else { "above" }) " a copy of the nearest context view"
+                        @if baselines.nearest_view.num_identical_views > 0 {
+                            ", which is the target itself for " (count(baselines.nearest_view.num_identical_views))
+                            " of " (count(*num_views)) " views"
+                        }
+                        "."
                     }
                 }
             }
@@ -113,7 +133,7 @@ impl Report {
                     @let error = point.psnr_stderr.map(|error| format!("\u{b1} {error:.2}")).unwrap_or_default();
                     (tile(&format!("{}, {}", point.key.method.name(), tokens(point)), &number(point.psnr, 2), "dB", &error))
                 }
-                (tile("nearest view", &number(nearest, 2), "dB", "a copy, no model"))
+                (tile("nearest view", &number(nearest, 2), "dB", &copies(baselines.nearest_view.num_identical_views)))
                 @if let Some((point, kb)) = first.and_then(|point| Some((point, point.cost.scene_kb()?))) {
                     (tile("a scene file", &grouped(kb, 1), "kB", &tokens(point)))
                 }
@@ -146,10 +166,10 @@ impl Report {
         }
     }
 
-    fn scenes(&self) -> io::Result<Markup> {
+    fn figures(&self) -> io::Result<Markup> {
         let has_selections = self.figures.iter().any(|figure| !figure.selections.is_empty());
         Ok(html! {
-            h2 { "Scenes" }
+            h2 { "Images of scenes" }
             @if self.figures.is_empty() {
                 p.none { "No figures: " code { "eval.num_sheets" } " is 0." }
             } @else {
@@ -172,6 +192,15 @@ impl Report {
 
 fn psnr_at(point: &SummaryPoint) -> Markup {
     html! { strong { (number(point.psnr, 2)) " dB" } " with " (count(point.key.num_storage_tokens)) " stored tokens" }
+}
+
+/// Returns the note on the baseline of copied context views.
+fn copies(num_identical: usize) -> String {
+    if num_identical == 0 {
+        "a copy, no model".into()
+    } else {
+        format!("{} of the target itself", count(num_identical))
+    }
 }
 
 fn tile(name: &str, value: &str, unit: &str, more: &str) -> Markup {

@@ -32,6 +32,9 @@ impl Look {
         Self { class: "c4", marker: "M-5 -3.8H5L0 5.2z" },
     ];
 
+    /// A line without markers.
+    pub const LINE: Self = Self { class: "c2", marker: "M0 0" };
+
     /// Looks of external methods.
     pub const OTHERS: [Self; 3] = [
         Self { class: "c5", marker: "M-5 -1.6H-1.6V-5H1.6V-1.6H5V1.6H1.6V5H-1.6V1.6H-5z" },

@@ -69,6 +69,7 @@ fn image_rows(figure: &SceneFigure) -> io::Result<Markup> {
         (row("target", target))
         @for method in [Method::Clift, Method::Kmeans, Method::PatchClift, Method::Patch, Method::Random] {
             (strip(method.name(), &of(method).filter(|image| image.key.is_whole()).collect::<Vec<_>>())?)
+            @if Some(method) == best { (errors(&figure.images)?) }
         }
         @for other in &figure.images {
             @if let Method::External(name) = other.key.method {
@@ -88,6 +89,26 @@ fn strip(heading: &str, images: &[&FigureImage]) -> io::Result<Markup> {
         @for i in spread(images.len(), MAX_COUNTS) { (rendering(images[i], &tokens(images[i].key))?) }
     };
     Ok(if images.is_empty() { Markup::default() } else { row(heading, content) })
+}
+
+/// Returns the error maps of the nearest view and of the main method with its fewest and its most tokens.
+fn errors(images: &[FigureImage]) -> io::Result<Markup> {
+    let (nearest, rendered): (Vec<_>, Vec<_>) = images
+        .iter()
+        .filter(|image| image.key.is_whole())
+        .filter_map(|image| Some((image, image.error.as_ref()?)))
+        .partition(|(image, _)| image.key.method == Method::NearestView);
+    let ends = spread(rendered.len(), 2).into_iter().map(|i| rendered[i]);
+    let content = html! {
+        @for (image, error) in nearest.into_iter().chain(ends) {
+            @let of = match image.key.num_storage_tokens {
+                0 => "nearest view".to_owned(),
+                count => format!("{count} tokens"),
+            };
+            (image_html(error, &format!("Error map of {of}"), html! { "error, " (of) })?)
+        }
+    };
+    Ok(row("error maps", content))
 }
 
 fn rendering(image: &FigureImage, what: &str) -> io::Result<Markup> {

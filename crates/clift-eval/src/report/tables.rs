@@ -10,7 +10,7 @@ use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Summary, SummaryPoint};
 use crate::system::machine::machine_rows;
 
-const POINTS_HEAD: [&str; 17] = [
+const POINTS_HEAD: [&str; 18] = [
     "method",
     "stored\ntokens",
     "rendered\ntokens",
@@ -22,6 +22,7 @@ const POINTS_HEAD: [&str; 17] = [
     "render\nms",
     "p95\nms",
     "frame\nms",
+    "half of\nframes, ms",
     "p95\nms",
     "GMAC\n\u{a0}",
     "scene\nkB",
@@ -31,8 +32,10 @@ const POINTS_HEAD: [&str; 17] = [
 ];
 
 const POINTS_NOTE: &str = "Each view is rendered in a call of its own, including the keys and values of its tokens. Frame: token \
-                           selection and rendering. Times are medians and 95th percentiles over views. A point is on a \
-                           front if no other point has its PSNR in as little time per frame, or in as few bytes. Memory: \
+                           selection and rendering. Times are medians, the middle half and 95th percentiles over views; the \
+                           points take turns at every view, and those of equal token counts, which compute the same, share \
+                           their times. A point is on the front of time if no point of a higher PSNR has a middle half that \
+                           overlaps or lies below, on that of bytes if none has its PSNR in as few bytes. Memory: \
                            peak of the whole process. GMAC: multiply-accumulates per view, attention included.";
 
 const DIFFERENCES_HEAD: [&str; 7] =
@@ -52,7 +55,12 @@ pub fn points(summary: &Summary) -> Markup {
                 tbody {
                     @for (name, quality) in [("nearest view", baselines.nearest_view), ("mean image", baselines.mean_image)] {
                         tr {
-                            td { (name) }
+                            td {
+                                (name)
+                                @if quality.num_identical_views > 0 {
+                                    " (" (count(quality.num_identical_views)) " views identical to the target)"
+                                }
+                            }
                             td {} td {} td {}
                             td { (number(quality.psnr, 2)) }
                             td {}
@@ -86,7 +94,7 @@ pub fn points(summary: &Summary) -> Markup {
 }
 
 /// Returns the cells of a point after the method.
-fn cells(point: &SummaryPoint) -> [String; 16] {
+fn cells(point: &SummaryPoint) -> [String; 17] {
     let tokens = |tokens: usize| if tokens == 0 { DASH.to_owned() } else { count(tokens) };
     let ms = |seconds: Option<f64>| seconds.map_or_else(|| DASH.into(), milliseconds);
     let dot = |is_front: bool| if is_front { "\u{25cf}".to_owned() } else { String::new() };
@@ -101,6 +109,9 @@ fn cells(point: &SummaryPoint) -> [String; 16] {
         ms(point.render_median_s),
         ms(point.render_p95_s),
         ms(point.frame_median_s),
+        point
+            .frame_quartiles_s
+            .map_or_else(|| DASH.into(), |[low, high]| format!("{} .. {}", milliseconds(low), milliseconds(high))),
         ms(point.frame_p95_s),
         number(point.cost.gflops, point.cost.gflops_decimals()),
         number(point.cost.scene_kb(), 1),
@@ -114,7 +125,7 @@ fn cells(point: &SummaryPoint) -> [String; 16] {
 pub fn differences(differences: &[PairedDifference]) -> Markup {
     html! {
         @if !differences.is_empty() {
-            h2 { "Scene by scene" }
+            h2 { "Differences between methods" }
             p.note { (DIFFERENCES_NOTE) }
             div.scroll {
                 table {
@@ -146,10 +157,12 @@ pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
         @if skip_report.skips.is_empty() {
             p { "No scene was skipped." }
         } @else {
-            table.plain {
-                thead { tr { th { "scenes" } th { "reason" } } }
-                tbody {
-                    @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (reason) } } }
+            div.scroll {
+                table.plain {
+                    thead { tr { th { "scenes" } th { "reason" } } }
+                    tbody {
+                        @for (reason, count) in skip_report.counts() { tr { td { (count) } td { (reason) } } }
+                    }
                 }
             }
             p.note { "All names: " code { "skipped.json" } "." }
@@ -157,13 +170,19 @@ pub fn skipped(num_evaluated: usize, skip_report: &SkipReport) -> Markup {
     }
 }
 
-pub fn machine(device: &str) -> Markup {
-    let program = [("clift", env!("CARGO_PKG_VERSION").to_owned()), ("device", device.to_owned())];
+/// Returns the table of command line, program version, device and machine.
+pub fn machine(device: &str, command: &str) -> Markup {
+    let version = env!("CARGO_PKG_VERSION").to_owned();
+    let program = [("command", command.to_owned()), ("clift", version), ("device", device.to_owned())];
     html! {
-        h2 { "Machine" }
-        table.plain {
-            tbody {
-                @for (name, value) in program.into_iter().chain(machine_rows()) { tr { td { (name) } td { (value) } } }
+        h2 { "Command and machine" }
+        div.scroll {
+            table.plain {
+                tbody {
+                    @for (name, value) in program.into_iter().chain(machine_rows()) {
+                        tr { td { (name) } td { (value) } }
+                    }
+                }
             }
         }
     }

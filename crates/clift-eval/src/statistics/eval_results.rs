@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::MethodName;
+use crate::config::split::EvalSplit;
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
 use crate::statistics::view_metrics::{Cost, EvalKey, ViewMetrics};
@@ -34,6 +35,10 @@ pub struct EvalResults {
     pub(crate) lpips_sha256: Option<String>,
     /// How rendered tokens were selected; `None` where every view was rendered from all stored tokens.
     pub(crate) selection: Option<Selection>,
+    /// What the views are taken from; `None` if unknown.
+    pub(crate) split: Option<EvalSplit>,
+    /// Scene and frame of the targets that are also contexts.
+    pub(crate) context_targets: BTreeSet<(String, usize)>,
 }
 
 impl EvalResults {

@@ -5,7 +5,9 @@
 //! - `student_t`: Student's t quantile
 //! - `pareto`: Pareto front
 //! - `paired`: paired differences of methods
+//! - `scene_scores`: scenes from worst to best
 //! - `summary`: summary.json
+//! - `headline`: the result in a few lines
 //! - `csv_files`: views.csv and scenes.csv
 //! - `table`: the terminal table
 //! - `compare`: two evaluations, view by view
@@ -15,8 +17,10 @@ pub(crate) mod compare;
 pub(crate) mod compare_table;
 pub(crate) mod csv_files;
 pub(crate) mod eval_results;
+pub(crate) mod headline;
 pub(crate) mod paired;
 pub(crate) mod pareto;
+pub(crate) mod scene_scores;
 pub(crate) mod student_t;
 pub(crate) mod summary;
 pub(crate) mod table;

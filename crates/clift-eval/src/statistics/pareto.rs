@@ -1,18 +1,19 @@
 //! The Pareto front of cost and quality.
 
-/// Returns the indices of the points `(cost, quality)` on the front, by ascending cost: no other point has at most the cost
-/// and at least the quality. Of equal points the first counts; points with a NaN or an infinity are ignored.
-pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
-    let is_finite = |&i: &usize| points[i].0.is_finite() && points[i].1.is_finite();
-    let mut order: Vec<usize> = (0..points.len()).filter(is_finite).collect();
-    order.sort_by(|&a, &b| points[a].0.total_cmp(&points[b].0).then(points[b].1.total_cmp(&points[a].1)));
-    let mut best = f64::NEG_INFINITY;
-    order.retain(|&i| {
-        let is_better = points[i].1 > best;
-        best = best.max(points[i].1);
-        is_better
-    });
-    order
+/// Returns the indices of the points `(cost, quality)` on the front, ascending. The cost is an interval, such as its
+/// quartiles: costs whose intervals overlap do not differ. A point is on the front if every other point has a lower quality or
+/// a higher cost. Of points with equal quality the cheapest counts, by the middle of its interval; points with a NaN or an infinity
+/// are ignored.
+pub fn pareto_front(points: &[([f64; 2], f64)]) -> Vec<usize> {
+    let is_finite = |&i: &usize| points[i].0.iter().all(|cost| cost.is_finite()) && points[i].1.is_finite();
+    let finite: Vec<usize> = (0..points.len()).filter(is_finite).collect();
+    let middle = |i: usize| f64::midpoint(points[i].0[0], points[i].0[1]);
+    let beats = |other: usize, i: usize| {
+        let (([low, _], quality), ([_, high], least)) = (points[other], points[i]);
+        let is_first = middle(other).total_cmp(&middle(i)).then(other.cmp(&i)).is_lt();
+        (quality > least && low <= high) || (quality == least && is_first)
+    };
+    finite.iter().copied().filter(|&i| !finite.iter().any(|&other| other != i && beats(other, i))).collect()
 }
 
 #[cfg(test)]
@@ -30,8 +31,20 @@ mod tests {
         expected.sort_by(|a, b| a.0.total_cmp(&b.0));
         expected.dedup();
         assert!(expected.len() > 1, "{expected:?}");
-        assert_eq!(pareto_front(&points).into_iter().map(|i| points[i]).collect::<Vec<_>>(), expected);
-        assert_eq!(pareto_front(&[(1.0, 2.0), (1.0, 2.0), (f64::NAN, 9.0), (0.5, f64::NAN)]), [0]);
+        let exact: Vec<_> = points.iter().map(|&(cost, quality)| ([cost; 2], quality)).collect();
+        let mut found: Vec<_> = pareto_front(&exact).into_iter().map(|i| points[i]).collect();
+        found.sort_by(|a, b| a.0.total_cmp(&b.0));
+        assert_eq!(found, expected);
+        let nan = f64::NAN;
+        assert_eq!(pareto_front(&[([1.0; 2], 2.0), ([1.0; 2], 2.0), ([nan; 2], 9.0), ([0.5; 2], nan)]), [0]);
         assert_eq!(pareto_front(&[]), [0; 0]);
+    }
+
+    #[test]
+    fn overlapping_costs_do_not_differ() {
+        let front = |costs: [[f64; 2]; 2]| pareto_front(&[(costs[0], 20.0), (costs[1], 21.0)]);
+        assert_eq!(front([[1.0, 2.0], [1.5, 2.5]]), [1], "the first is not clearly cheaper");
+        assert_eq!(front([[1.0, 2.0], [2.1, 2.5]]), [0, 1]);
+        assert_eq!(front([[2.1, 2.5], [1.0, 2.0]]), [1]);
     }
 }

@@ -3,19 +3,20 @@
 //! Means are over the views of a scene, then over the scenes, so every scene has the same weight. Fields `.._per_view` are
 //! means over all views.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use clift_data::{mean, median, p95, replace_file, standard_error};
+use clift_data::{mean, median, p95, quartiles, replace_file, standard_error};
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
+use crate::config::split::EvalSplit;
 use crate::config::token_selection::Selection;
 use crate::error::EvalError;
 use crate::statistics::eval_results::{EvalResults, NotMeasured, SceneViews};
 use crate::statistics::paired::{PairedDifference, differences};
 use crate::statistics::pareto::pareto_front;
-use crate::statistics::view_metrics::{Cost, EvalKey, ViewMetrics, best_method};
+use crate::statistics::view_metrics::{Cost, EvalKey, PSNR_CAP_DB, ViewMetrics, best_method};
 
 /// Means of a baseline.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -26,6 +27,9 @@ pub struct Quality {
     pub ssim: Option<f64>,
     /// Mean over scenes of the scene's mean LPIPS.
     pub lpips_vgg: Option<f64>,
+    /// Views whose PSNR is infinite, counted as [`crate::statistics::view_metrics::PSNR_CAP_DB`] in the means.
+    #[serde(default)]
+    pub num_identical_views: usize,
 }
 
 /// Quality of the baselines, which every method must exceed.
@@ -73,10 +77,14 @@ pub struct SummaryPoint {
     pub frame_median_s: Option<f64>,
     /// 95th percentile of the time per frame, in seconds.
     pub frame_p95_s: Option<f64>,
+    /// Quartiles of the time per frame, in seconds: half of the frames take between the two.
+    #[serde(default)]
+    pub frame_quartiles_s: Option<[f64; 2]>,
     /// Multiply-accumulates, bytes and memory.
     #[serde(flatten)]
     pub cost: Cost,
-    /// Whether no other point is as good in PSNR for as little time per frame (`frame_median_s`).
+    /// Whether no other point has a higher PSNR in a time per frame that is not clearly longer: whose quartiles
+    /// (`frame_quartiles_s`) do not lie above those of this point.
     pub pareto_time: bool,
     /// Whether no other point is as good in PSNR for as few bytes (`scene_bytes`).
     pub pareto_bytes: bool,
@@ -104,6 +112,12 @@ pub struct Summary {
     pub num_views: usize,
     /// Skipped scenes; `skipped.json` has the reasons.
     pub num_skipped: usize,
+    /// What was measured on; `null` in files of earlier versions.
+    #[serde(default)]
+    pub split: Option<EvalSplit>,
+    /// Target views that are also contexts: the input holds their images.
+    #[serde(default)]
+    pub num_context_targets: usize,
     /// Selection of the rendered tokens; `null` if every view is rendered from all stored tokens.
     pub selection: Option<Selection>,
     /// SHA-256 of the LPIPS weights.
@@ -145,6 +159,8 @@ impl Summary {
             num_scenes: scenes.len(),
             num_views: views.len(),
             num_skipped: results.skipped.len(),
+            split: results.split,
+            num_context_targets: results.context_targets.len(),
             selection: results.selection,
             lpips_weights_sha256: results.lpips_sha256.clone(),
             not_measured: results.not_measured.clone(),
@@ -153,6 +169,12 @@ impl Summary {
             points,
             differences: differences(results),
         }
+    }
+
+    /// Returns warnings about figures that mislead.
+    pub(crate) fn warnings(&self) -> impl Iterator<Item = String> {
+        let split = self.split.and_then(EvalSplit::warning).map(str::to_owned);
+        split.into_iter().chain(context_targets_note(self.num_context_targets))
     }
 
     /// Returns the points of the main method in its finest number format.
@@ -175,6 +197,17 @@ impl Summary {
     }
 }
 
+/// Returns the note on targets that are also contexts; `None` for no such target.
+pub(crate) fn context_targets_note(num_given: usize) -> Option<String> {
+    (num_given > 0).then(|| {
+        let targets = if num_given == 1 { "target is also a context" } else { "targets are also contexts" };
+        format!(
+            "{num_given} {targets}: nearest_view copies such an image and scores {PSNR_CAP_DB} dB; leave them out with \
+             --drop-context-targets"
+        )
+    })
+}
+
 /// Returns the mean over the views of each scene, for the scenes that have a value.
 fn scene_means(views: &SceneViews, value: fn(&ViewMetrics) -> Option<f64>) -> Vec<f64> {
     views.values().filter_map(|frames| mean(&frames.values().filter_map(value).collect::<Vec<_>>())).collect()
@@ -186,26 +219,27 @@ impl Quality {
             psnr: mean(&scene_means(views, |view| Some(view.capped_psnr()))),
             ssim: mean(&scene_means(views, |view| view.ssim)),
             lpips_vgg: mean(&scene_means(views, |view| view.lpips_vgg)),
+            num_identical_views: views.values().flat_map(BTreeMap::values).filter(|view| view.is_identical()).count(),
         }
     }
 }
 
 impl SummaryPoint {
     fn new(results: &EvalResults, key: EvalKey, scenes: &SceneViews) -> Self {
-        let Quality { psnr, ssim, lpips_vgg } = Quality::new(scenes);
+        let Quality { psnr, ssim, lpips_vgg, num_identical_views } = Quality::new(scenes);
         let views: Vec<&ViewMetrics> = scenes.values().flat_map(|frames| frames.values()).collect();
         let values = |value: fn(&ViewMetrics) -> Option<f64>| -> Vec<f64> {
             views.iter().filter_map(|view| value(view)).collect()
         };
         let statistic = |values: &[f64], statistic: fn(&[f64]) -> f64| (!values.is_empty()).then(|| statistic(values));
-        let (render_s, frame_s) = (values(|view| view.render_s), values(ViewMetrics::frame_s));
+        let (render_s, select_s, frame_s) = timed(results, key);
         Self {
             key,
             num_views: views.len(),
             psnr,
             psnr_stderr: standard_error(&scene_means(scenes, |view| Some(view.capped_psnr()))),
             psnr_per_view: mean(&values(|view| Some(view.capped_psnr()))),
-            num_identical_views: views.iter().filter(|view| view.psnr == f64::INFINITY).count(),
+            num_identical_views,
             ssim,
             ssim_per_view: mean(&values(|view| view.ssim)),
             lpips_vgg,
@@ -213,9 +247,10 @@ impl SummaryPoint {
             render_s: mean(&render_s),
             render_median_s: statistic(&render_s, median),
             render_p95_s: statistic(&render_s, p95),
-            select_s: mean(&values(|view| view.select_s)),
+            select_s: mean(&select_s),
             frame_median_s: statistic(&frame_s, median),
             frame_p95_s: statistic(&frame_s, p95),
+            frame_quartiles_s: quartiles(&frame_s),
             cost: results.costs.get(&key).copied().unwrap_or_default(),
             pareto_time: false,
             pareto_bytes: false,
@@ -223,15 +258,29 @@ impl SummaryPoint {
     }
 }
 
+/// Returns the times of rendering, of token selection and of both, of all views that are the same computation as those of
+/// `key`: methods and number formats with equal token counts differ in the values of their tokens only.
+fn timed(results: &EvalResults, key: EvalKey) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
+    let is_same = |other: EvalKey| {
+        let has_same_selection =
+            other.is_whole() && key.is_whole() || other.num_storage_tokens == key.num_storage_tokens;
+        other.num_render_tokens == key.num_render_tokens && has_same_selection && other.num_render_tokens > 0
+    };
+    let views = results.views().filter(|(other, _)| is_same(*other)).flat_map(|(_, scenes)| scenes.values());
+    let views: Vec<&ViewMetrics> = views.flat_map(BTreeMap::values).collect();
+    let values = |value: fn(&ViewMetrics) -> Option<f64>| views.iter().filter_map(|view| value(view)).collect();
+    (values(|view| view.render_s), values(|view| view.select_s), values(ViewMetrics::frame_s))
+}
+
 fn mark_fronts(points: &mut [SummaryPoint]) {
-    let of = |points: &[SummaryPoint], cost: fn(&SummaryPoint) -> Option<f64>| {
-        let position = |point: &SummaryPoint| (cost(point).unwrap_or(f64::NAN), point.psnr.unwrap_or(f64::NAN));
+    let of = |points: &[SummaryPoint], cost: fn(&SummaryPoint) -> Option<[f64; 2]>| {
+        let position = |point: &SummaryPoint| (cost(point).unwrap_or([f64::NAN; 2]), point.psnr.unwrap_or(f64::NAN));
         pareto_front(&points.iter().map(position).collect::<Vec<_>>())
     };
-    for i in of(points, |point| point.frame_median_s) {
+    for i in of(points, |point| point.frame_quartiles_s) {
         points[i].pareto_time = true;
     }
-    for i in of(points, |point| point.cost.scene_bytes.map(|bytes| bytes as f64)) {
+    for i in of(points, |point| point.cost.scene_bytes.map(|bytes| [bytes as f64; 2])) {
         points[i].pareto_bytes = true;
     }
 }
@@ -239,6 +288,8 @@ fn mark_fronts(points: &mut [SummaryPoint]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clift_model::TokenFormat;
+
     use crate::testing::CLIFT;
 
     fn results(views: &[(&str, usize, f64)]) -> EvalResults {
@@ -271,7 +322,10 @@ mod tests {
     #[test]
     fn the_file_has_the_documented_names() {
         let mut views = results(&[("a", 0, 20.0)]);
-        views.add("a", 0, EvalKey::baseline(Method::NearestView), ViewMetrics::quality(18.0, Some(0.5))).unwrap();
+        let copy = ViewMetrics::quality(f64::INFINITY, Some(1.0));
+        views.add("a", 0, EvalKey::baseline(Method::NearestView), copy).unwrap();
+        views.split = Some(EvalSplit::HeldOutFrames);
+        views.context_targets.insert(("a".into(), 0));
         let cost = Cost { gflops: Some(2.5), scene_bytes: Some(99_000), peak_bytes: Some(1 << 20) };
         views.costs.insert(CLIFT, cost);
         views.skipped.insert("c".into());
@@ -281,20 +335,20 @@ mod tests {
         summary.write(&folder.path().join("summary.json")).unwrap();
         let text = std::fs::read_to_string(folder.path().join("summary.json")).unwrap();
         let expected = serde_json::json!({
-            "num_scenes": 1, "num_views": 1, "num_skipped": 1,
+            "num_scenes": 1, "num_views": 1, "num_skipped": 1, "split": "held_out_frames", "num_context_targets": 1,
             "selection": null, "lpips_weights_sha256": null,
             "not_measured": [{"metric": "lpips_vgg", "reason": "no weights"}],
             "missing": [],
             "baselines": {
-                "nearest_view": {"psnr": 18.0, "ssim": 0.5, "lpips_vgg": null},
-                "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null}
+                "nearest_view": {"psnr": 100.0, "ssim": 1.0, "lpips_vgg": null, "num_identical_views": 1},
+                "mean_image": {"psnr": null, "ssim": null, "lpips_vgg": null, "num_identical_views": 0}
             },
             "points": [{
                 "variant": "clift", "num_storage_tokens": 64, "num_render_tokens": 32, "tokens": "f16",
                 "num_views": 1, "psnr": 20.0, "psnr_stderr": null, "psnr_per_view": 20.0, "num_identical_views": 0,
                 "ssim": 0.2, "ssim_per_view": 0.2, "lpips_vgg": null, "lpips_vgg_per_view": null,
                 "render_s": null, "render_median_s": null, "render_p95_s": null,
-                "select_s": null, "frame_median_s": null, "frame_p95_s": null,
+                "select_s": null, "frame_median_s": null, "frame_p95_s": null, "frame_quartiles_s": null,
                 "gflops": 2.5, "scene_bytes": 99_000, "peak_bytes": 1_048_576,
                 "pareto_time": false, "pareto_bytes": true
             }],
@@ -323,6 +377,29 @@ mod tests {
         assert!(near(point.render_median_s, 0.0115) && near(point.render_p95_s, 0.020), "{point:?}");
         assert!(near(point.frame_median_s, 0.5115) && near(point.frame_p95_s, 0.520), "{point:?}");
         assert!(near(point.select_s, 0.5), "{point:?}");
+    }
+
+    #[test]
+    fn equal_computations_share_their_times() {
+        let mut views = EvalResults::default();
+        let timed = |ms: f64, psnr| ViewMetrics { render_s: Some(ms * 1e-3), ..ViewMetrics::quality(psnr, None) };
+        let [f16, int8] = [TokenFormat::F16, TokenFormat::Int8].map(|tokens| EvalKey { tokens: Some(tokens), ..CLIFT });
+        let random = EvalKey { method: Method::Random, ..f16 };
+        let all = EvalKey { num_storage_tokens: 32, ..f16 };
+        for frame in 0..8 {
+            // Noise of the machine alone: the one with the lowest PSNR happens to be the fastest.
+            let ms = 10.0 + frame as f64;
+            for (key, ms, psnr) in [(f16, ms, 22.0), (int8, ms - 0.5, 21.0), (random, ms - 0.9, 20.0), (all, 2.0, 19.0)]
+            {
+                views.add("a", frame, key, timed(ms, psnr)).unwrap();
+            }
+        }
+        let points = Summary::new(&views).points;
+        let of = |key| points.iter().find(|point| point.key == key).unwrap();
+        assert_eq!(of(f16).frame_median_s, of(random).frame_median_s);
+        assert_eq!(of(f16).frame_quartiles_s, of(int8).frame_quartiles_s);
+        assert_eq!(of(all).frame_quartiles_s, Some([0.002; 2]), "another computation: no selection");
+        assert_eq!([f16, int8, random, all].map(|key| of(key).pareto_time), [true, false, false, true]);
     }
 
     #[test]

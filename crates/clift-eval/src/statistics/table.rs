@@ -21,16 +21,21 @@ const HEADERS: [&str; 12] = [
     "LPIPS",
     "render ms",
     "frame ms",
-    "p95 ms",
+    "half ms",
     "GMAC",
     "scene kB",
 ];
-const WIDTHS: [usize; 12] = [7, 9, 6, 8, 6, 6, 6, 10, 9, 7, 7, 9];
+const WIDTHS: [usize; 12] = [7, 9, 6, 8, 6, 6, 6, 10, 9, 13, 7, 9];
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { num_scenes, num_views, num_skipped, baselines, points, differences, .. } = self;
-        writeln!(f, "{num_views} views of {num_scenes} scenes, {num_skipped} scenes skipped\n")?;
+        let split = self.split.map_or_else(String::new, |split| format!(" ({split})"));
+        writeln!(f, "{num_views} views of {num_scenes} scenes{split}, {num_skipped} scenes skipped")?;
+        for warning in self.warnings() {
+            writeln!(f, "warning: {warning}")?;
+        }
+        writeln!(f)?;
         let names = points.iter().map(|point| point.key.method.name().chars().count());
         let width = names.chain([Method::NearestView.name().len()]).max().unwrap_or_default();
         let mut row = |name: &str, cells: [String; 12], mark: &str| {
@@ -41,12 +46,13 @@ impl fmt::Display for Summary {
             writeln!(f, "{mark}")
         };
         row("method", HEADERS.map(str::to_owned), "")?;
-        for (method, Quality { psnr, ssim, lpips_vgg }) in
+        for (method, Quality { psnr, ssim, lpips_vgg, num_identical_views }) in
             [(Method::NearestView, baselines.nearest_view), (Method::MeanImage, baselines.mean_image)]
         {
             let mut cells = std::array::from_fn(|_| cell(None, 0));
             (cells[3], cells[5], cells[6]) = (cell(psnr, 2), cell(ssim, 3), cell(lpips_vgg, 3));
-            row(method.name(), cells, "")?;
+            let identical = format!(" {num_identical_views} of {num_views} views identical to the target");
+            row(method.name(), cells, if num_identical_views > 0 { &identical } else { "" })?;
         }
         for point in points {
             let count = |count: usize| if count == 0 { cell(None, 0) } else { count.to_string() };
@@ -61,7 +67,9 @@ impl fmt::Display for Summary {
                 cell(point.lpips_vgg, 3),
                 ms(point.render_median_s),
                 ms(point.frame_median_s),
-                ms(point.frame_p95_s),
+                point
+                    .frame_quartiles_s
+                    .map_or("-".into(), |[low, high]| format!("{:.1}..{:.1}", low * 1e3, high * 1e3)),
                 cell(point.cost.gflops, point.cost.gflops_decimals()),
                 cell(point.cost.scene_kb(), 1),
             ];
@@ -74,7 +82,10 @@ impl fmt::Display for Summary {
             row(point.key.method.name(), cells, mark)?;
         }
         if points.iter().any(|point| point.pareto_time || point.pareto_bytes) {
-            writeln!(f, "\nt: no other point has this PSNR in this time per frame (median); b: in as few bytes")?;
+            writeln!(
+                f,
+                "\nframe ms: median, half ms: the middle half of the frames; methods of equal token counts share their times\nt: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes"
+            )?;
         }
         if let Some(selection) = self.selection {
             writeln!(f, "\nrendered tokens were selected by {selection}")?;
@@ -137,13 +148,14 @@ mod tests {
         let expected = "\
 2 views of 2 scenes, 0 scenes skipped
 
-method        stored  rendered format  PSNR dB  +- dB   SSIM  LPIPS  render ms  frame ms  p95 ms    GMAC  scene kB
-nearest_view       -         -      -    18.00      -  0.500      -          -         -       -       -         -
-mean_image         -         -      -        -      -      -      -          -         -       -       -         -
-clift             64        32   int8    20.50   0.50  0.205      -        1.5      11.5    12.0    45.2      99.0 tb
-DepthSplat         -         -      -    19.00      -      -  0.250          -         -       -       -         -
+method        stored  rendered format  PSNR dB  +- dB   SSIM  LPIPS  render ms  frame ms       half ms    GMAC  scene kB
+nearest_view       -         -      -    18.00      -  0.500      -          -         -             -       -         -
+mean_image         -         -      -        -      -      -      -          -         -             -       -         -
+clift             64        32   int8    20.50   0.50  0.205      -        1.5      11.5    11.2..11.8    45.2      99.0 tb
+DepthSplat         -         -      -    19.00      -      -  0.250          -         -             -       -         -
 
-t: no other point has this PSNR in this time per frame (median); b: in as few bytes
+frame ms: median, half ms: the middle half of the frames; methods of equal token counts share their times
+t: no other point has a higher PSNR without taking clearly longer per frame; b: in as few bytes
 DepthSplat: 1 of 2 images are missing; means are over the others: b/000000.png
 lpips_vgg is not measured: no weights
 ";

@@ -74,6 +74,11 @@ impl ViewMetrics {
         self.psnr.min(PSNR_CAP_DB)
     }
 
+    /// Returns whether the rendering equals the target.
+    pub fn is_identical(&self) -> bool {
+        self.psnr == f64::INFINITY
+    }
+
     /// Returns the time per frame: token selection, if any, and rendering.
     pub fn frame_s(&self) -> Option<f64> {
         self.render_s.map(|render_s| render_s + self.select_s.unwrap_or_default())

@@ -1,9 +1,9 @@
 //! The stored tokens of a scene, by method, and the model that renders them.
 // N encoder tokens, S stored tokens, R rendered tokens, D width
 
-use burn::tensor::{Int, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use clift_data::item_rng;
-use clift_model::{SceneModel, TokenFormat, TrainedModel};
+use clift_model::{SceneModel, TokenFormat, Tokens, TrainedModel};
 use rand::Rng;
 use rand::seq::SliceRandom;
 
@@ -14,7 +14,7 @@ use crate::sweep::lazy_clusters::LazyClusters;
 
 pub(crate) struct CompressedTokens<'a> {
     /// `[1, S, D]`
-    pub tokens: Tensor<3>,
+    pub tokens: Tokens,
     /// The patch of the context views of every token, `[S]`.
     pub ids: Vec<u32>,
     pub model: &'a TrainedModel,
@@ -25,32 +25,25 @@ impl<'a> CompressedTokens<'a> {
     pub fn new(
         method: Method,
         models: &'a EvalModels,
-        lift: &Tensor<3>,
+        lift: &Tokens,
         index: &LazyClusters,
         storage: TokenFormat,
     ) -> Result<Self, EvalError> {
         let model = models.for_method(method).ok_or(EvalError::NoModel { method: method.name() })?;
         if method == Method::Random {
             let ids = random_subset(lift.dims()[1], index.num_clusters, item_rng(index.seed, 0, 0, 0, "random subset"));
-            return Ok(Self { tokens: select_tokens(lift, &ids), ids, model });
+            return Ok(Self { tokens: lift.select(&ids), ids, model });
         }
         let is_tiled = matches!(method, Method::Patch | Method::PatchClift);
         let clusters = if is_tiled { index.tiles()? } else { index.clusters()? };
         let uploaded = clusters.upload(&model.device);
         let tokens = match method {
             Method::Clift | Method::PatchClift => model.network.compress(lift.clone(), &uploaded),
-            _ => uploaded.gather_centroids(lift.clone()),
+            _ => lift.centroids(&uploaded),
         };
         let ids = clusters.scenes()[0].centroid_index().to_vec();
         Ok(Self { tokens: rounded(tokens, storage)?, ids, model })
     }
-}
-
-/// Returns the tokens `ids` of one scene, `[1, N, D]` to `[1, R, D]`.
-pub(crate) fn select_tokens(tokens: &Tensor<3>, ids: &[u32]) -> Tensor<3> {
-    let index: Vec<i64> = ids.iter().map(|&id| i64::from(id)).collect();
-    let index = Tensor::<1, Int>::from_data(TensorData::new(index, [ids.len()]), &tokens.device());
-    tokens.clone().select(1, index)
 }
 
 /// Samples `count` of `num_tokens` ids without replacement, ascending.
@@ -63,20 +56,19 @@ pub(crate) fn random_subset(num_tokens: usize, count: usize, mut rng: impl Rng) 
 }
 
 /// Rounds tokens `[1, S, D]` like a scene file of the format.
-fn rounded(tokens: Tensor<3>, storage: TokenFormat) -> Result<Tensor<3>, EvalError> {
+fn rounded(tokens: Tokens, storage: TokenFormat) -> Result<Tokens, EvalError> {
     if storage == TokenFormat::F32 {
         return Ok(tokens);
     }
-    let (shape, device) = (tokens.dims(), tokens.device());
-    let values: Vec<f32> = tokens.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)?;
+    let (shape, device) = (tokens.dims(), tokens.values.device());
+    let values: Vec<f32> =
+        tokens.values.clone().into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)?;
     let values = storage.round(&values, shape[2])?;
-    Ok(Tensor::from_data(TensorData::new(values, shape), &device))
+    Ok(tokens.with_values(Tensor::from_data(TensorData::new(values, shape), &device)))
 }
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::Device;
-
     use super::*;
 
     #[test]
@@ -86,12 +78,5 @@ mod tests {
         assert!(few.iter().all(|token| more.contains(token)));
         assert!(more.windows(2).all(|pair| pair[0] < pair[1]));
         assert_ne!(few, subset(5, 2));
-    }
-
-    #[test]
-    fn tokens_are_selected_by_id() {
-        let tokens = Tensor::<1, Int>::arange(0..6, &Device::flex()).float().reshape([1, 3, 2]);
-        let rows: Vec<f32> = select_tokens(&tokens, &[0, 2]).into_data().try_to_vec().expect("f32");
-        assert_eq!(rows, [0.0, 1.0, 4.0, 5.0]);
     }
 }

@@ -1,17 +1,17 @@
 //! The sweep of one scene: encoded once, rendered by every method at every token count.
 
+use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::time::Instant;
 
-use burn::tensor::Tensor;
-use clift_data::{Clip, derive_seed};
-use clift_model::{Cameras, FlopConvention, SceneModel, scene_file_bytes};
+use clift_data::{Clip, derive_seed, median};
+use clift_model::{Cameras, FlopConvention, SceneModel, Tokens, TrainedModel, scene_file_bytes};
 
 use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::statistics::eval_results::EvalResults;
 use crate::statistics::view_metrics::{Cost, EvalKey};
-use crate::sweep::compressed_tokens::{CompressedTokens, select_tokens};
+use crate::sweep::compressed_tokens::CompressedTokens;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
 use crate::sweep::rendered_views::{MAX_KEPT_VIEWS, SceneResults, ScoredViews, baselines, spread};
@@ -20,6 +20,9 @@ use crate::sweep::token_choice::{SelectedTokens, select_for_views};
 use crate::sweep::view_scorer::ViewScorer;
 use crate::system::memory;
 use crate::upload::{upload_cameras, upload_views};
+
+/// Largest time of the repeated renderings of one scene, in seconds.
+const MAX_REPETITION_S: f64 = 5.0;
 
 /// Renders and scores the target views of one scene, and adds their metrics to `metrics`.
 ///
@@ -39,7 +42,7 @@ pub fn evaluate_scene(
     let (stage1, device) = (&models.stage1.network, &models.stage1.device);
     let features = stage1.features(&upload_views(&[&clip.context], device)?);
     // A stage 2 with its own token norm clusters and condenses the tokens of its own norm.
-    let normed: Vec<(Method, Tensor<3>)> = [Method::Clift, Method::PatchClift]
+    let normed: Vec<(Method, Tokens)> = [Method::Clift, Method::PatchClift]
         .into_iter()
         .filter_map(|method| Some((method, &models.for_method(method)?.network)))
         .filter(|(_, network)| network.has_token_norm())
@@ -58,12 +61,17 @@ pub fn evaluate_scene(
     for rendering in &results.renderings {
         record(clip, rendering, metrics)?;
     }
+    let given = clip.target.frame_index.iter().filter(|frame| clip.context.frame_index.contains(frame));
+    metrics.context_targets.extend(given.map(|&frame| (clip.key.clone(), frame)));
+    let mut jobs = Vec::new();
     for &count in &sweep.storage {
         let num_storage_tokens = count.of(num_tokens)?;
-        let index = LazyClusters::new(&sweep.kmeans, &lift, views, num_storage_tokens, seed);
+        let index = LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed);
         let own_norm: Vec<_> = normed
             .iter()
-            .map(|(of, lift)| (*of, lift, LazyClusters::new(&sweep.kmeans, lift, views, num_storage_tokens, seed)))
+            .map(|(of, lift)| {
+                (*of, lift, LazyClusters::new(&sweep.kmeans, &lift.values, views, num_storage_tokens, seed))
+            })
             .collect();
         for &method in &sweep.methods {
             let own = own_norm.iter().find(|(of, ..)| *of == method);
@@ -73,7 +81,10 @@ pub fn evaluate_scene(
                 let stored = CompressedTokens::new(method, models, lift, index, tokens)?;
                 let whole =
                     EvalKey { method, num_storage_tokens, num_render_tokens: num_storage_tokens, tokens: Some(tokens) };
-                let mut renderings = vec![renderer.render(&stored, None, whole, kept_views, metrics)?];
+                let first = jobs.len();
+                let all = RenderJob::new(whole, &stored, None, kept_views);
+                renderer.warm_up(&all, metrics)?;
+                jobs.push(all);
                 let can_select = stored.model.network.supports_selection();
                 for num_render_tokens in
                     render_counts(&sweep.render, num_storage_tokens).into_iter().filter(|_| can_select)
@@ -83,20 +94,16 @@ pub fn evaluate_scene(
                     metrics.selection = Some(sweep.selection);
                     let selected =
                         select_for_views(sweep.selection, clip, &stored.ids, patch_size, num_render_tokens, seed)?;
-                    renderings.push(renderer.render(&stored, Some(&selected), some, kept_views, metrics)?);
                     if !kept_views.is_empty() {
-                        results.selections.push((some, stored.ids.clone(), selected));
+                        results.selections.push((some, stored.ids.clone(), selected.clone()));
                     }
+                    let some = RenderJob::new(some, &stored, Some(selected), kept_views);
+                    renderer.warm_up(&some, metrics)?;
+                    jobs.push(some);
                 }
-                let bytes = scene_file_bytes(num_storage_tokens, dim, clip.context.num_views(), tokens);
-                for rendering in renderings {
-                    record(clip, &rendering, metrics)?;
-                    if method != Method::Random {
-                        metrics.add_scene_bytes(rendering.key, bytes);
-                    }
-                    if !kept_views.is_empty() {
-                        results.renderings.push(rendering);
-                    }
+                if method != Method::Random {
+                    let bytes = scene_file_bytes(num_storage_tokens, dim, clip.context.num_views(), tokens);
+                    jobs[first..].iter().for_each(|job| metrics.add_scene_bytes(job.key, bytes));
                 }
             }
         }
@@ -104,6 +111,14 @@ pub fn evaluate_scene(
             let own = own_norm.iter().find(|(of, ..)| *of == Method::Clift);
             let index = own.map_or(&index, |(.., index)| index);
             results.clusters.push(index.clusters()?.scenes()[0].clone());
+        }
+    }
+    let num_timed =
+        jobs.first().and_then(|job| metrics.of(job.key)).map_or(0, |scenes| scenes.values().map(BTreeMap::len).sum());
+    for (job, rendering) in jobs.iter().zip(renderer.render(&jobs, num_timed)?) {
+        record(clip, &rendering, metrics)?;
+        if !job.kept_views.is_empty() {
+            results.renderings.push(rendering);
         }
     }
     for external in &sweep.external_methods {
@@ -125,7 +140,29 @@ fn record(clip: &Clip, rendering: &ScoredViews, metrics: &mut EvalResults) -> Re
     Ok(())
 }
 
-/// Renders and times the target views of a scene, key by key.
+/// Renderings of all target views under one key.
+struct RenderJob<'a> {
+    key: EvalKey,
+    /// Stored tokens, `[1, S, D]`.
+    tokens: Tokens,
+    model: &'a TrainedModel,
+    /// The tokens selected for every target; `None` for all stored tokens.
+    selected: Option<Vec<SelectedTokens>>,
+    kept_views: &'a [usize],
+}
+
+impl<'a> RenderJob<'a> {
+    fn new(
+        key: EvalKey,
+        stored: &CompressedTokens<'a>,
+        selected: Option<Vec<SelectedTokens>>,
+        kept_views: &'a [usize],
+    ) -> Self {
+        Self { key, tokens: stored.tokens.clone(), model: stored.model, selected, kept_views }
+    }
+}
+
+/// Renders and times the target views of a scene.
 struct TargetRenderer<'a> {
     clip: &'a Clip,
     scorer: &'a ViewScorer<'a>,
@@ -134,48 +171,78 @@ struct TargetRenderer<'a> {
 }
 
 impl TargetRenderer<'_> {
-    /// Renders every target view in a call of its own, from all stored tokens or from the tokens selected for the view.
-    /// The measured time is from tokens on the device to pixels on the host. Views share no work, so the times of any two
-    /// keys are comparable. A viewer that keeps the keys and values of a scene's tokens between frames is faster.
-    fn render(
-        &self,
-        stored: &CompressedTokens,
-        selected: Option<&[SelectedTokens]>,
-        key: EvalKey,
-        kept_views: &[usize],
-        metrics: &mut EvalResults,
-    ) -> Result<ScoredViews, EvalError> {
-        let target = &self.clip.target;
-        let device = stored.tokens.device();
-        let render = |view: usize| -> Result<Vec<f32>, EvalError> {
-            let tokens: Tensor<3> = match selected {
-                Some(selected) => select_tokens(&stored.tokens, &selected[view].tokens), // [1, S, D] -> [1, R, D]
-                None => stored.tokens.clone(),
-            };
-            let image = stored.model.network.render(tokens, &camera_of(&self.cameras, view)); // [1, 1, H, W, 3]
-            image.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
+    /// Renders one target view in a call of its own.
+    fn render_view(&self, job: &RenderJob, view: usize) -> Result<Vec<f32>, EvalError> {
+        let tokens = match &job.selected {
+            Some(selected) => job.tokens.select(&selected[view].tokens), // [1, S, D] -> [1, R, D]
+            None => job.tokens.clone(),
         };
-        // Queued work must not count as rendering time.
-        device.sync().map_err(EvalError::tensor)?;
-        if let Entry::Vacant(cost) = metrics.costs.entry(key) {
-            // One untimed view per key: one-time work of the device, and the peak memory.
-            let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
-            render(0)?;
-            let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
-            let macs = self.sweep.model.render_macs(target.height, target.width, key.num_render_tokens)?;
-            let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
-            cost.insert(Cost { gflops, peak_bytes, scene_bytes: None });
+        let image = job.model.network.render(tokens, &camera_of(&self.cameras, view)); // [1, 1, H, W, 3]
+        image.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
+    }
+
+    /// Renders one untimed view of a key that has no cost yet: one-time work of the device, and the peak memory.
+    fn warm_up(&self, job: &RenderJob, metrics: &mut EvalResults) -> Result<(), EvalError> {
+        let Entry::Vacant(cost) = metrics.costs.entry(job.key) else { return Ok(()) };
+        // Queued work must not count as rendering.
+        job.tokens.values.device().sync().map_err(EvalError::tensor)?;
+        let has_peak = self.sweep.is_cpu && memory::start_peak().is_some();
+        self.render_view(job, 0)?;
+        let peak_bytes = if has_peak { memory::peak_bytes() } else { None };
+        let target = &self.clip.target;
+        let macs = self.sweep.model.render_macs(target.height, target.width, job.key.num_render_tokens)?;
+        let gflops = Some(macs.count(FlopConvention::Macs) as f64 / 1e9);
+        cost.insert(Cost { gflops, peak_bytes, scene_bytes: None });
+        Ok(())
+    }
+
+    /// Renders every target view with every job, and returns the scored views of each job.
+    ///
+    /// The measured time is from tokens on the device to pixels on the host. Views share no work, so the times of any two
+    /// keys are comparable. A viewer that keeps the keys and values of a scene's tokens between frames is faster. The jobs
+    /// take turns at every view, in alternating order, so that a change in the load of the machine meets all of them. While
+    /// the evaluation has fewer than `min_timed_views` timed views, `num_timed` before this scene, the views are rendered
+    /// again, and the time of a view is the median.
+    fn render(&self, jobs: &[RenderJob], num_timed: usize) -> Result<Vec<ScoredViews>, EvalError> {
+        let num_views = self.clip.target.num_views();
+        let mut scored: Vec<ScoredViews> = jobs.iter().map(|job| ScoredViews::new(job.key)).collect();
+        let mut seconds = vec![vec![Vec::new(); jobs.len()]; num_views];
+        if let Some(job) = jobs.first() {
+            job.tokens.values.device().sync().map_err(EvalError::tensor)?;
         }
-        let mut rendered = ScoredViews::new(key);
-        for view in 0..target.num_views() {
-            let started = Instant::now();
-            let pixels = render(view)?;
-            let render_s = started.elapsed().as_secs_f64();
-            let measured = rendered.add(view, pixels, self.scorer, kept_views)?;
-            measured.render_s = Some(render_s);
-            measured.select_s = selected.map(|selected| selected[view].select_s);
+        let missing = self.sweep.min_timed_views.saturating_sub(num_timed);
+        let num_rounds = missing.div_ceil(num_views.max(1)).max(1);
+        let started = Instant::now();
+        let mut first_round_s = 0.0;
+        for round in 0..num_rounds {
+            if round > 0 && started.elapsed().as_secs_f64() > first_round_s + MAX_REPETITION_S {
+                break;
+            }
+            for (view, times) in seconds.iter_mut().enumerate() {
+                let mut order: Vec<usize> = (0..jobs.len()).collect();
+                if (round + view) % 2 == 1 {
+                    order.reverse();
+                }
+                for i in order {
+                    let now = Instant::now();
+                    let pixels = self.render_view(&jobs[i], view)?;
+                    times[i].push(now.elapsed().as_secs_f64());
+                    if round == 0 {
+                        scored[i].add(view, pixels, self.scorer, jobs[i].kept_views)?;
+                    }
+                }
+            }
+            if round == 0 {
+                first_round_s = started.elapsed().as_secs_f64();
+            }
         }
-        Ok(rendered)
+        for (i, job) in jobs.iter().enumerate() {
+            for (&view, measured) in &mut scored[i].metrics {
+                measured.render_s = Some(median(&seconds[view][i]));
+                measured.select_s = job.selected.as_ref().map(|selected| selected[view].select_s);
+            }
+        }
+        Ok(scored)
     }
 }
 

@@ -9,12 +9,14 @@
 //! - `view_scorer`: score renderings of a scene
 //! - `rendered_views`: scored views of one `EvalKey`, results of one scene
 //! - `predictions`: images of another method, scored
+//! - `held_out_frame`: a check of an encoded scene
 //! - `evaluate_scene`: encode once, render every key
 
 pub(crate) mod baselines;
 pub(crate) mod compressed_tokens;
 pub(crate) mod eval_models;
 pub(crate) mod evaluate_scene;
+pub(crate) mod held_out_frame;
 pub(crate) mod lazy_clusters;
 pub(crate) mod predictions;
 pub(crate) mod rendered_views;

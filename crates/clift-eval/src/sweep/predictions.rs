@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::Clip;
+use clift_data::{Clip, derive_seed};
 use image::{DynamicImage, ImageReader, Limits};
 
 use crate::config::method::{Method, MethodName};
@@ -67,11 +67,16 @@ pub fn image_name(key: &str, frame: usize) -> String {
     format!("{}/{frame:06}.png", file_name(key))
 }
 
+/// Largest number of characters of a scene key in a file name. File systems allow 255 bytes, with the ending.
+const MAX_KEY_CHARS: usize = 120;
+
 /// Returns a scene key as a file name: every character except letters, digits, `-`, `_` and `.` becomes `_`, and a
-/// leading dot does too.
+/// leading dot does too. Of a longer key the name has the first 120 characters, `-` and a hash of the key as 16 hexadecimal
+/// digits.
 pub fn file_name(key: &str) -> String {
     let name = key.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' });
-    name.enumerate().map(|(i, c)| if i == 0 && c == '.' { '_' } else { c }).collect()
+    let name: String = name.enumerate().map(|(i, c)| if i == 0 && c == '.' { '_' } else { c }).collect();
+    if name.len() <= MAX_KEY_CHARS { name } else { format!("{}-{:016x}", &name[..MAX_KEY_CHARS], derive_seed(0, key)) }
 }
 
 /// Reads an opaque PNG of 8 or 16 bits as `[height, width, 3]` in `[0, 1]`.
@@ -144,5 +149,12 @@ mod tests {
     #[test]
     fn file_names_stay_in_the_folder() {
         assert_eq!(["..", "../x", "/etc", "a b"].map(file_name), ["_.", "_._x", "_etc", "a_b"]);
+    }
+
+    #[test]
+    fn long_keys_have_short_distinct_names() {
+        let [a, b] = ["a", "b"].map(|end| file_name(&format!("{}{end}", "room".repeat(1250))));
+        assert!(a.len() < 200 && b.len() == a.len() && a != b, "{a} {b}");
+        assert_eq!(file_name(&"x".repeat(120)), "x".repeat(120));
     }
 }

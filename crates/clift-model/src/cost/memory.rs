@@ -55,6 +55,8 @@ pub struct UpdateSizes {
     pub is_accumulated: bool,
     /// Whether every block stores only its input and recomputes the rest.
     pub activation_checkpointing: bool,
+    /// Moments per value of a block's weight matrices: two with `AdamW`, one with Muon.
+    pub matrix_moments: usize,
     /// Sizes of one scene.
     pub scene: SceneSizes,
     /// Values of a scene's context and target images.
@@ -81,8 +83,11 @@ pub fn update_bytes(config: &ModelConfig, sizes: &UpdateSizes) -> f64 {
     let largest_matrix = in_blocks.map(matrix_len).max().unwrap_or_default() as f64;
     // Gradients, and the copies of a block's largest matrix during its update.
     let optimizer = trained + 5.0 * largest_matrix;
-    // Weights, and two moments of the trained ones.
-    let weights = parameters.total as f64 + sizes.loss_parameters + 2.0 * trained;
+    let in_trained_blocks =
+        layers.iter().filter(|layer| layer.block.is_some() && sizes.trained.contains(&layer.part)).map(matrix_len);
+    // Two moments of the trained weights, or fewer of matrices.
+    let moments = 2.0 * trained - (2 - sizes.matrix_moments) as f64 * in_trained_blocks.sum::<usize>() as f64;
+    let weights = parameters.total as f64 + sizes.loss_parameters + moments;
     F32 * (weights + backward.max(optimizer))
 }
 
@@ -257,6 +262,7 @@ mod tests {
             num_scenes: 1,
             is_accumulated: false,
             activation_checkpointing,
+            matrix_moments: 2,
             scene: if trained == STAGE2 { stored } else { scene },
             num_image_values: 5 * 256 * 256 * 3,
             loss: Segment::default(),
@@ -278,6 +284,8 @@ mod tests {
             let predicted = update_bytes(&config, &one) + 26e6;
             let error = (predicted / measured - 1.0).abs();
             assert!(error < 0.15, "{trained:?} {checkpointing}: {predicted:.3e} for {measured:.3e}");
+            let muon = UpdateSizes { matrix_moments: 1, ..one };
+            assert!(update_bytes(&config, &muon) < update_bytes(&config, &one), "one moment less per matrix");
             for more in [UpdateSizes { num_scenes: 2, ..one }, UpdateSizes { is_accumulated: true, ..one }] {
                 assert!(update_bytes(&config, &more) > update_bytes(&config, &one), "{more:?}");
             }

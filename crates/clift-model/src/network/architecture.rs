@@ -1,4 +1,4 @@
-//! The variants of the network, by name.
+//! The variants of the network and of its attention, by name.
 
 use serde::{Deserialize, Serialize};
 use strum::{Display, IntoStaticStr, VariantArray};
@@ -17,7 +17,7 @@ pub enum CliftVariant {
     /// and values are all tokens of the cluster without a norm, followed by a gate with bias.
     ReleasedRe10k,
     /// The released code's network for DL3DV: [`CliftVariant::ReleasedRe10k`] with an RMS norm of every head's queries and
-    /// keys in all attention, and a layer norm after the encoder.
+    /// keys in encoder and renderer, and a layer norm after the encoder.
     ReleasedDl3dv,
 }
 
@@ -35,9 +35,34 @@ impl CliftVariant {
         self != Self::Paper
     }
 
-    /// Whether the heads of queries and keys and the encoder's tokens have norms.
+    /// Whether the heads of queries and keys in encoder and renderer, and the encoder's tokens, have norms.
     pub fn has_norms(self) -> bool {
         self == Self::ReleasedDl3dv
+    }
+}
+
+/// How attention knows the cameras. The rays of all pixels are inputs of the networks in every case.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, Display, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
+pub enum CameraEncoding {
+    /// Plücker coordinates of the pixels' rays, in the input alone (paper section 3.1).
+    #[default]
+    Plucker,
+    /// Camera-relative attention by the poses of the cameras.
+    Gta,
+    /// Camera-relative attention by the projections of the cameras: pose and intrinsics.
+    Prope,
+}
+
+impl CameraEncoding {
+    /// All encodings, in the order of messages and help texts.
+    pub const ALL: [Self; 3] = *Self::VARIANTS.as_array().expect("three variants");
+
+    /// Whether attention is plain: files of such networks do not name the encoding.
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "called by serde")]
+    pub(crate) fn is_plucker(&self) -> bool {
+        *self == Self::Plucker
     }
 }
 

@@ -12,6 +12,7 @@ use crate::network::init::Init;
 use crate::network::render_tokens::RenderTokens;
 use crate::network::renderer::Renderer;
 use crate::network::scene_model::SceneModel;
+use crate::network::tokens::Tokens;
 use crate::tokens::clusters::ClusterIndex;
 use crate::views::upload::{Cameras, Views};
 
@@ -52,7 +53,7 @@ pub(crate) fn is_condenser(path: &str) -> bool {
 }
 
 impl SceneModel for Clift {
-    fn features(&self, context: &Views) -> Tensor<3> {
+    fn features(&self, context: &Views) -> Tokens {
         self.encoder.forward(context)
     }
 
@@ -60,11 +61,12 @@ impl SceneModel for Clift {
         self.lift_norm.is_norm()
     }
 
-    fn normalize(&self, features: Tensor<3>) -> Tensor<3> {
-        self.lift_norm.forward(features)
+    fn normalize(&self, features: Tokens) -> Tokens {
+        let values = self.lift_norm.forward(features.values);
+        Tokens { values, ..features }
     }
 
-    fn compress(&self, tokens: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
+    fn compress(&self, tokens: Tokens, clusters: &ClusterIndex) -> Tokens {
         self.condenser.forward(tokens, clusters)
     }
 
@@ -107,7 +109,7 @@ mod tests {
             let context =
                 Views { images: fixture.tensor("input.context_images", &device), cameras: cameras("context") };
             let lift = encoder.forward(&context);
-            assert_close(&lift.clone().inner(), &fixture.tensor::<3>("output.lift", &device).inner(), 1e-5);
+            assert_close(&lift.values.clone().inner(), &fixture.tensor::<3>("output.lift", &device).inner(), 1e-5);
             let rendering = renderer.forward(lift, &cameras("target"));
             let expected = fixture.tensor::<5>("output.rendering", &device);
             assert_close(&rendering.clone().inner(), &expected.inner(), 1e-5);

@@ -7,9 +7,11 @@ use burn::tensor::{Tensor, assert_shape};
 
 use crate::network::blocks::attention::{CrossAttention, SelfAttention};
 use crate::network::blocks::feed_forward::FeedForward;
+use crate::network::camera_encoding::TokenTransforms;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::released_condenser::ReleasedCondenser;
+use crate::network::tokens::Tokens;
 use crate::ops::cluster_attention::operation::cluster_attention;
 use crate::ops::mac_counter;
 use crate::tokens::clusters::ClusterIndex;
@@ -55,16 +57,18 @@ impl Condenser {
     /// # Shapes
     /// - `lift`: `[batch, num_tokens, dim]`, encoder output after [`LiftNorm`](crate::LiftNorm)
     /// - returns `[batch, num_storage_tokens, dim]`
-    pub fn forward(&self, lift: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
+    pub fn forward(&self, lift: impl Into<Tokens>, clusters: &ClusterIndex) -> Tokens {
+        let lift = lift.into();
         let [_batch, _num_tokens, dim] = lift.dims();
-        let centroids = clusters.gather_centroids(lift.clone()); // [B, N, D] -> [B, S, D]
-        assert_shape!(centroids, [clusters.batch, clusters.num_storage_tokens, dim]);
+        let centroids = lift.centroids(clusters); // [B, N, D] -> [B, S, D]
+        assert_shape!(centroids.values, [clusters.batch, clusters.num_storage_tokens, dim]);
         if let Some(released) = &self.released {
-            return released.forward(centroids, lift, clusters);
+            return released.forward(centroids.values, lift.values, clusters).into();
         }
         // "The remaining LiFTs": a centroid is not among its keys.
-        let members = clusters.members.as_ref().map(|members| clusters.gather(lift, &members.token)); // [B, M, D]
-        self.blocks.iter().fold(centroids, |centroids, block| block.forward(centroids, members.as_ref(), clusters))
+        let members = clusters.members.as_ref().map(|members| lift.gather(clusters, &members.token)); // [B, M, D]
+        let forward = |centroids, block: &CondenserBlock| block.forward(centroids, members.as_ref(), clusters);
+        self.blocks.iter().fold(centroids, forward)
     }
 }
 
@@ -84,24 +88,32 @@ impl CondenserBlock {
     }
 
     /// Applies equations 1 to 4. Without members, every cluster is one token and equation 2 does nothing.
-    fn forward(&self, centroids: Tensor<3>, members: Option<&Tensor<3>>, clusters: &ClusterIndex) -> Tensor<3> {
-        let eq1 = self.residual(&centroids, self.self_attn.forward(&self.norm_self, centroids.clone()));
+    fn forward(&self, centroids: Tokens, members: Option<&Tokens>, clusters: &ClusterIndex) -> Tokens {
+        let Tokens { values: centroids, transforms } = centroids;
+        let attended = self.self_attn.forward(&self.norm_self, centroids.clone(), transforms.as_ref());
+        let eq1 = self.residual(&centroids, attended);
         let eq2 = match members {
-            Some(members) => self.attend_members(eq1, members.clone(), clusters),
+            Some(members) => self.attend_members(eq1, transforms.as_ref(), members.clone(), clusters),
             None => eq1,
         };
         let eq3 = self.residual(&eq2, self.feed_forward.forward(&self.norm_ff, eq2.clone()));
-        centroids + self.gate(eq3) // equation 4
+        Tokens { values: centroids + self.gate(eq3), transforms } // equation 4
     }
 
     /// Equation 2: each centroid attends to the members of its cluster. A cluster of one token has no keys and keeps the
     /// value of equation 1.
-    fn attend_members(&self, eq1: Tensor<3>, members: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
+    fn attend_members(
+        &self,
+        eq1: Tensor<3>,
+        transforms: Option<&TokenTransforms>,
+        members: Tokens,
+        clusters: &ClusterIndex,
+    ) -> Tensor<3> {
         let segment = clusters.members.as_ref().expect("there are members").segment.clone();
         let key_value = self.cluster_attn.project_key_value(Some(&self.norm_memory), members);
-        let query = self.cluster_attn.project_query(self.norm_cross.as_ref(), eq1.clone());
+        let query = self.cluster_attn.project_query(self.norm_cross.as_ref(), eq1.clone(), transforms);
         let attended = cluster_attention(query, key_value, segment, self.cluster_attn.num_heads());
-        let eq2 = self.residual(&eq1, self.cluster_attn.project_out(attended));
+        let eq2 = self.residual(&eq1, self.cluster_attn.project_out(attended, transforms));
         match &clusters.singleton {
             Some(singleton) => eq2.clone().mask_where(singleton.clone().expand(eq2.dims()), eq1),
             None => eq2,
@@ -160,7 +172,7 @@ mod tests {
                 let condenser = Condenser::new(&config, &mut Init::new(0, &device));
                 let condenser = load_weights(condenser, &fixture, "weight.");
                 let lift = fixture.tensor::<3>("input.lift", &device).require_grad();
-                let output = condenser.forward(lift.clone(), &clusters.upload(&device));
+                let output = condenser.forward(lift.clone(), &clusters.upload(&device)).values;
                 let expected = fixture.tensor::<3>("output.clift", &device).inner();
                 assert_close(&output.clone().inner(), &expected, 1e-5);
                 let grads = (output * fixture.tensor("input.cotangent", &device)).sum().backward();
@@ -190,7 +202,7 @@ mod tests {
                 let tokens = random([1, distinct, 16], 2, &device).cast(DType::F32);
                 let lift = tokens.expand([1, 5, 16]).detach().require_grad();
                 let index = Clusters::new(vec![scene.clone()]).expect("one scene").upload(&device);
-                let output = condenser.forward(lift.clone(), &index);
+                let output = condenser.forward(lift.clone(), &index).values;
                 let gradient = lift.grad(&output.clone().square().sum().backward()).expect("tracked");
                 for values in [output.inner(), gradient] {
                     let sum = values.abs().sum().into_scalar::<f32>();
@@ -226,9 +238,9 @@ mod tests {
                 let forward = |lift: Tensor<3>| {
                     let device = lift.device();
                     if lift.is_autodiff() {
-                        condenser.clone().train().forward(lift, &clusters.upload(&device.autodiff()))
+                        condenser.clone().train().forward(lift, &clusters.upload(&device.autodiff())).values
                     } else {
-                        condenser.clone().forward(lift, &clusters.upload(&device))
+                        condenser.clone().forward(lift, &clusters.upload(&device)).values
                     }
                 };
                 check_gradients([random([1, 5, 16], 6, &device)], |[lift]| forward(lift), 1e-6);
@@ -245,7 +257,7 @@ mod tests {
             let scene = SceneClusters::new(vec![0, 1, 1, 0, 0, 1], vec![3, 2]).expect("valid");
             let index = Clusters::new(vec![scene.clone(), scene]).expect("equal").upload(&device);
             let expected = index.gather_centroids(lift.clone());
-            assert_close(&condenser.forward(lift, &index), &expected, 0.0);
+            assert_close(&condenser.forward(lift, &index).values, &expected, 0.0);
         }
     }
 }

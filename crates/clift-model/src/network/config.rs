@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::ModelError;
+use crate::network::architecture::CameraEncoding;
 use crate::network::architecture::CliftVariant;
 
 /// Sizes of the encoder, the condenser and the renderer. The defaults are the paper's.
@@ -23,6 +24,9 @@ pub struct ModelConfig {
     pub num_renderer_blocks: usize,
     /// Side of a patch in pixels; every patch is one token.
     pub patch_size: usize,
+    /// How attention knows the cameras.
+    #[serde(skip_serializing_if = "CameraEncoding::is_plucker")]
+    pub camera_encoding: CameraEncoding,
     /// The condenser of stage 2.
     pub condenser: CondenserConfig,
 }
@@ -61,6 +65,7 @@ struct ModelSection {
     num_encoder_blocks: usize,
     num_renderer_blocks: usize,
     patch_size: usize,
+    camera_encoding: CameraEncoding,
     condenser: CondenserSection,
 }
 
@@ -82,6 +87,7 @@ impl Default for ModelSection {
             num_encoder_blocks: 6,
             num_renderer_blocks: 6,
             patch_size: 8,
+            camera_encoding: CameraEncoding::Plucker,
             condenser: CondenserSection::default(),
         }
     }
@@ -98,6 +104,7 @@ impl From<ModelSection> for ModelConfig {
             num_encoder_blocks: section.num_encoder_blocks,
             num_renderer_blocks: section.num_renderer_blocks,
             patch_size: section.patch_size,
+            camera_encoding: section.camera_encoding,
             condenser: CondenserConfig {
                 num_blocks: section.condenser.num_blocks.unwrap_or(defaults.num_blocks),
                 residual: section.condenser.residual.unwrap_or(defaults.residual),
@@ -160,6 +167,18 @@ impl ModelConfig {
         if !dim.is_multiple_of(num_heads) {
             let fix = format!("write a divisor of model.dim = {dim}, such as {}", near_divisors(dim, num_heads));
             return bad("model.num_heads", num_heads.to_string(), fix);
+        }
+        if self.camera_encoding != CameraEncoding::Plucker {
+            let key = "model.camera_encoding";
+            if variant.is_released() {
+                let fix = format!("model.variant = \"{variant}\" has \"plucker\": leave the key out");
+                return bad(key, self.camera_encoding.to_string(), fix);
+            }
+            if !(dim / num_heads).is_multiple_of(8) {
+                let fix =
+                    format!("needs heads of a multiple of 8 channels, not {}: change model.num_heads", dim / num_heads);
+                return bad(key, self.camera_encoding.to_string(), fix);
+            }
         }
         let CondenserConfig { num_blocks, residual } = self.condenser;
         if variant.is_released() && num_blocks != 1 {

@@ -6,12 +6,14 @@ use burn::nn::Linear;
 use burn::tensor::Tensor;
 
 use crate::network::blocks::block::EncoderBlock;
+use crate::network::camera_encoding::{TokenTransforms, TransformMaker};
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
+use crate::network::tokens::Tokens;
 use crate::ops::linear::linear_in_f32;
 use crate::views::patch::patchify;
 use crate::views::rays::plucker;
-use crate::views::upload::Views;
+use crate::views::upload::{Cameras, Views};
 
 /// Patch embedding and self-attention over the tokens of all views. The result is the residual stream without a norm;
 /// one variant applies a [`LiftNorm`](crate::LiftNorm) to it.
@@ -21,6 +23,8 @@ pub struct Encoder {
     blocks: Vec<EncoderBlock>,
     #[module(skip)]
     patch_size: usize,
+    #[module(skip)]
+    transforms: TransformMaker,
 }
 
 impl Encoder {
@@ -30,6 +34,7 @@ impl Encoder {
             patch_embed: init.linear(config.context_patch_len(), config.dim),
             blocks: (0..config.num_encoder_blocks).map(|_| EncoderBlock::new(config, init)).collect(),
             patch_size: config.patch_size,
+            transforms: TransformMaker::new(config),
         }
     }
 
@@ -37,8 +42,15 @@ impl Encoder {
     ///
     /// # Shapes
     /// - returns `[batch, views * (height / patch) * (width / patch), dim]`, ordered by view, row, column
-    pub fn forward(&self, context: &Views) -> Tensor<3> {
-        self.blocks.iter().fold(self.embed(context), |tokens, block| block.forward(tokens))
+    pub fn forward(&self, context: &Views) -> Tokens {
+        let transforms = self.transforms(&context.cameras);
+        let values = self.blocks.iter().fold(self.embed(context), |x, block| block.forward(x, transforms.as_ref()));
+        Tokens { values, transforms }
+    }
+
+    /// Makes the transforms of the tokens for camera-relative attention; `None` without it.
+    pub fn transforms(&self, context: &Cameras) -> Option<TokenTransforms> {
+        self.transforms.of_views(context)
     }
 
     /// Embeds patches and rays: the input of the first block, in the shape of [`forward`](Self::forward)'s result.

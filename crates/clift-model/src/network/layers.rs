@@ -211,7 +211,7 @@ impl LayerList<'_> {
     fn attention_output(&mut self, name: &str, rows: Sequence, keys: Sequence) {
         let ModelConfig { dim, num_heads: heads, variant, .. } = *self.config;
         self.linear(&format!("{name}.out_proj"), [dim, dim], rows, true);
-        if variant.has_norms() {
+        if variant.has_norms() && self.part != Part::Condenser {
             let norm = LayerKind::HeadNorm { width: dim / heads, heads };
             self.push(&format!("{name}.qk_norm.query"), norm, rows, true);
             self.push(&format!("{name}.qk_norm.key"), norm, keys, true);

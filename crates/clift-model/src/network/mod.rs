@@ -5,11 +5,14 @@
 //! `released_condenser` is the one of the published checkpoints; `render_tokens` holds the tokens of target views, and
 //! `renderer` decodes images from them; `clift` joins the three networks behind the interface of `scene_model`.
 //!
+//! `tokens` are tokens with the transforms of camera-relative attention, which `camera_encoding` makes of the cameras.
+//!
 //! `blocks` holds the transformer layers, `init` their initial weights, and `layers` the description of every layer
 //! from which costs and parameter names are derived.
 
 pub(crate) mod architecture;
 pub(crate) mod blocks;
+pub(crate) mod camera_encoding;
 pub(crate) mod clift;
 pub(crate) mod condenser;
 pub(crate) mod config;
@@ -20,3 +23,4 @@ pub(crate) mod released_condenser;
 pub(crate) mod render_tokens;
 pub(crate) mod renderer;
 pub(crate) mod scene_model;
+pub(crate) mod tokens;

@@ -5,6 +5,7 @@ use burn::module::Module;
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 
+use crate::network::architecture::CliftVariant;
 use crate::network::blocks::attention::{CrossAttention, SelfAttention};
 use crate::network::blocks::feed_forward::{Activation, FeedForward};
 use crate::network::config::ModelConfig;
@@ -31,6 +32,8 @@ pub(crate) struct ReleasedCondenser {
 
 impl ReleasedCondenser {
     pub fn new(config: &ModelConfig, init: &mut Init) -> Self {
+        // The network for DL3DV has the same condenser: only its encoder and renderer have norms of queries and keys.
+        let config = &ModelConfig { variant: CliftVariant::ReleasedRe10k, ..config.clone() };
         let dim = config.dim;
         Self {
             norm_self: init.layer_norm(dim),
@@ -49,12 +52,12 @@ impl ReleasedCondenser {
     /// - `centroids` and the result: `[batch, num_storage_tokens, dim]`
     /// - `lift`: `[batch, num_tokens, dim]`
     pub fn forward(&self, centroids: Tensor<3>, lift: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3> {
-        let x = centroids.clone() + self.self_attn.forward(&self.norm_self, centroids.clone());
+        let x = centroids.clone() + self.self_attn.forward(&self.norm_self, centroids.clone(), None);
 
-        let key_value = self.cluster_attn.project_key_value(None, lift);
-        let query = self.cluster_attn.project_query(Some(&self.norm_cross), x.clone());
+        let key_value = self.cluster_attn.project_key_value(None, lift.into());
+        let query = self.cluster_attn.project_query(Some(&self.norm_cross), x.clone(), None);
         let attended = cluster_attention(query, key_value, clusters.segment.clone(), self.cluster_attn.num_heads());
-        let x = x + self.cluster_attn.project_out(attended);
+        let x = x + self.cluster_attn.project_out(attended, None);
 
         let x = x.clone() + self.feed_forward.forward(&self.norm_ff, x);
         centroids + linear(&self.gate, x)

@@ -3,6 +3,8 @@
 use burn::tensor::{Int, Tensor, TensorData};
 
 use crate::network::blocks::block::DecoderBlock;
+use crate::network::camera_encoding::upload_ids;
+use crate::network::tokens::Tokens;
 
 /// Keys and values of a scene's tokens in every block of a renderer.
 #[derive(Clone, Debug)]
@@ -19,8 +21,7 @@ impl KeyValueCache {
         let Some(first) = self.blocks.first() else {
             return self.clone();
         };
-        let indices: Vec<i64> = tokens.iter().map(|&token| i64::from(token)).collect();
-        let indices = Tensor::<1, Int>::from_data(TensorData::new(indices, [tokens.len()]), &first.device());
+        let indices = upload_ids(tokens, &first.device());
         let blocks = self.blocks.iter().map(|key_value| key_value.clone().select(1, indices.clone())).collect();
         Self { blocks, num_render_tokens: tokens.len() }
     }
@@ -29,16 +30,15 @@ impl KeyValueCache {
 /// The tokens from which target views are rendered.
 #[derive(Clone, Debug)]
 pub struct RenderTokens {
-    /// `[batch, num_tokens, dim]`
-    tokens: Tensor<3>,
+    tokens: Tokens,
     /// With one token set per target view: the rows of each set in the tokens of all scenes, `[groups, R]`.
     rows: Option<Tensor<2, Int>>,
 }
 
-impl From<Tensor<3>> for RenderTokens {
+impl<T: Into<Tokens>> From<T> for RenderTokens {
     /// Takes one set per scene, `[batch, num_render_tokens, dim]`, or per target view, `[batch * views, ..]`.
-    fn from(tokens: Tensor<3>) -> Self {
-        Self { tokens, rows: None }
+    fn from(tokens: T) -> Self {
+        Self { tokens: tokens.into(), rows: None }
     }
 }
 
@@ -48,7 +48,8 @@ impl RenderTokens {
     ///
     /// # Shapes
     /// - `tokens`: `[batch, num_tokens, dim]`
-    pub fn subsets(tokens: Tensor<3>, subsets: &[Vec<Vec<u32>>]) -> Self {
+    pub fn subsets(tokens: impl Into<Tokens>, subsets: &[Vec<Vec<u32>>]) -> Self {
+        let tokens = tokens.into();
         let [batch, num_tokens, _dim] = tokens.dims();
         let groups: usize = subsets.iter().map(Vec::len).sum();
         let rows: Vec<i64> = subsets
@@ -58,22 +59,28 @@ impl RenderTokens {
             .map(|(scene, token)| (scene * num_tokens) as i64 + i64::from(token))
             .collect();
         let count = rows.len();
-        let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [count]), &tokens.device());
+        let rows = Tensor::<1, Int>::from_data(TensorData::new(rows, [count]), &tokens.values.device());
         let rows = rows.reshape([groups, count / groups]);
         // Keys and values are projected from whichever has fewer rows: the tokens, or all subsets together.
-        if count < batch * num_tokens { gather(tokens, rows).into() } else { Self { tokens, rows: Some(rows) } }
+        if count < batch * num_tokens {
+            let transforms = tokens.transforms.as_ref();
+            let transforms = transforms.map(|transforms| transforms.gather(rows.clone().reshape([count]), groups));
+            Tokens { values: gather(tokens.values, rows), transforms }.into()
+        } else {
+            Self { tokens, rows: Some(rows) }
+        }
     }
 
-    /// Returns the same sets of other tokens, tracked by autodiff if `tokens` is.
+    /// Returns the same sets of tokens with other values, tracked by autodiff if `values` are.
     #[must_use]
-    pub fn with_tokens(&self, tokens: Tensor<3>) -> Self {
-        let rows = self.rows.clone().map(|rows| if tokens.is_autodiff() { rows.autodiff() } else { rows });
-        Self { tokens, rows }
+    pub fn with_values(&self, values: Tensor<3>) -> Self {
+        let rows = self.rows.clone().map(|rows| if values.is_autodiff() { rows.autodiff() } else { rows });
+        Self { tokens: self.tokens.with_values(values), rows }
     }
 
-    /// Returns the tokens that keys and values are projected from.
-    pub fn tokens(&self) -> &Tensor<3> {
-        &self.tokens
+    /// Returns the values of the tokens that keys and values are projected from.
+    pub fn values(&self) -> &Tensor<3> {
+        &self.tokens.values
     }
 
     /// Projects the keys and values of every set for a block, `[groups, num_render_tokens, 2 dim]`.

@@ -7,9 +7,11 @@ use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
 
 use crate::network::blocks::block::DecoderBlock;
+use crate::network::camera_encoding::{TokenTransforms, TransformMaker};
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
 use crate::network::render_tokens::{KeyValueCache, RenderTokens};
+use crate::network::tokens::Tokens;
 use crate::ops::linear::{linear_in_f32, norm_linear};
 use crate::views::patch::{patchify, unpatchify};
 use crate::views::rays::plucker;
@@ -24,6 +26,8 @@ pub struct Renderer {
     to_pixels: Linear,
     #[module(skip)]
     patch_size: usize,
+    #[module(skip)]
+    transforms: TransformMaker,
 }
 
 impl Renderer {
@@ -35,6 +39,7 @@ impl Renderer {
             output_norm: init.layer_norm(config.dim),
             to_pixels: init.linear(config.dim, config.rgb_patch_len()),
             patch_size: config.patch_size,
+            transforms: TransformMaker::new(config),
         }
     }
 
@@ -50,16 +55,23 @@ impl Renderer {
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn forward(&self, tokens: impl Into<RenderTokens>, targets: &Cameras) -> Tensor<5> {
         let tokens = tokens.into();
-        let x = self.embed(targets);
-        let x = self.blocks.iter().fold(x, |x, block| block.forward(x, tokens.project(block)));
-        self.to_image(x, targets)
+        let transforms = self.transforms(targets);
+        let forward = |x, block: &DecoderBlock| block.forward(x, tokens.project(block), transforms.as_ref());
+        self.to_image(self.blocks.iter().fold(self.embed(targets), forward), targets)
+    }
+
+    /// Makes the transforms of the patches of target views for camera-relative attention, one sequence per view; `None`
+    /// without it.
+    pub fn transforms(&self, targets: &Cameras) -> Option<TokenTransforms> {
+        let [batch, views] = targets.dims();
+        self.transforms.of_views(targets).map(|transforms| transforms.regroup(batch * views))
     }
 
     /// Projects a scene's tokens to keys and values in every block, for rendering many views of the scene.
     ///
     /// # Shapes
     /// - `tokens`: `[batch, num_render_tokens, dim]`
-    pub fn project_tokens(&self, tokens: &Tensor<3>) -> KeyValueCache {
+    pub fn project_tokens(&self, tokens: &Tokens) -> KeyValueCache {
         let blocks = self.blocks.iter().map(|block| block.project_tokens(tokens.clone())).collect();
         KeyValueCache { blocks, num_render_tokens: tokens.dims()[1] }
     }
@@ -71,8 +83,9 @@ impl Renderer {
     /// - returns RGB in `(0, 1)`, `[batch, views, height, width, 3]`
     pub fn render_cached(&self, cache: &KeyValueCache, targets: &Cameras) -> Tensor<5> {
         let x = self.embed(targets);
+        let transforms = self.transforms(targets);
         let blocks = self.blocks.iter().zip(&cache.blocks);
-        let x = blocks.fold(x, |x, (block, key_value)| block.forward(x, key_value.clone()));
+        let x = blocks.fold(x, |x, (block, key_value)| block.forward(x, key_value.clone(), transforms.as_ref()));
         self.to_image(x, targets)
     }
 

@@ -3,6 +3,7 @@
 use burn::tensor::Tensor;
 
 use crate::network::render_tokens::RenderTokens;
+use crate::network::tokens::Tokens;
 use crate::tokens::clusters::ClusterIndex;
 use crate::views::upload::{Cameras, Views};
 
@@ -14,7 +15,7 @@ pub trait SceneModel {
     ///
     /// # Shapes
     /// - returns `[batch, num_tokens, dim]`
-    fn features(&self, context: &Views) -> Tensor<3>;
+    fn features(&self, context: &Views) -> Tokens;
 
     /// Whether [`normalize`](Self::normalize) changes the features.
     fn has_token_norm(&self) -> bool;
@@ -23,13 +24,13 @@ pub trait SceneModel {
     ///
     /// # Shapes
     /// - `features` and the result: `[batch, num_tokens, dim]`
-    fn normalize(&self, features: Tensor<3>) -> Tensor<3>;
+    fn normalize(&self, features: Tokens) -> Tokens;
 
     /// Returns the tokens of context views: [`normalize`](Self::normalize) of the [`features`](Self::features).
     ///
     /// # Shapes
     /// - returns `[batch, num_tokens, dim]`
-    fn encode(&self, context: &Views) -> Tensor<3> {
+    fn encode(&self, context: &Views) -> Tokens {
         self.normalize(self.features(context))
     }
 
@@ -38,7 +39,7 @@ pub trait SceneModel {
     /// # Shapes
     /// - `tokens`: `[batch, num_tokens, dim]`
     /// - returns `[batch, num_storage_tokens, dim]`
-    fn compress(&self, tokens: Tensor<3>, clusters: &ClusterIndex) -> Tensor<3>;
+    fn compress(&self, tokens: Tokens, clusters: &ClusterIndex) -> Tokens;
 
     /// Renders target views.
     ///

@@ -12,12 +12,14 @@
 //! - `linear`: linear layer, alone or fused with a layer norm or GELU
 //! - `attention`: softmax attention
 //! - `cluster_attention`: attention inside clusters, linear in the number of tokens
+//! - `head_transform`: heads in the frame of a token's camera, for camera-relative attention
 
 pub(crate) mod attention;
 pub(crate) mod autodiff;
 pub(crate) mod cluster_attention;
 pub(crate) mod flex;
 pub(crate) mod gelu;
+pub(crate) mod head_transform;
 pub(crate) mod layer_norm;
 pub(crate) mod linear;
 pub(crate) mod mac_counter;

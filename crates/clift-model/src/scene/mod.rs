@@ -1,10 +1,11 @@
 //! The scene file, and rendering from it.
 //!
 //! `scene` holds a stored scene and documents the bytes of its file; `check` the rules of a valid scene; `read` and
-//! `write` the file itself, with the tokens in a `token_format`. `scene_renderer` renders frames of a scene on a device,
+//! `write` the file itself, with the tokens in a `token_format`; `model_place` the path of its model. `scene_renderer` renders frames of a scene on a device,
 //! and `render_budget` measures how many tokens a time per frame allows.
 
 pub(crate) mod check;
+pub(crate) mod model_place;
 pub(crate) mod read;
 pub(crate) mod render_budget;
 #[allow(clippy::module_inception)] // the file of the type `Scene`

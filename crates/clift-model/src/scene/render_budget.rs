@@ -102,13 +102,23 @@ fn median_s(
         renderer.render(views, height, width, count)?;
         seconds.push(now.elapsed().as_secs_f64() / views.len() as f64);
     }
-    seconds.sort_by(f64::total_cmp);
-    Ok(seconds[seconds.len() / 2])
+    Ok(median(&mut seconds))
+}
+
+/// Returns the median of at least one value: the mean of the two middle values for an even count.
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    f64::midpoint(values[(values.len() - 1) / 2], values[values.len() / 2])
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn median_of_two_times_is_their_mean() {
+        assert_eq!([&mut [3.0, 1.0][..], &mut [5.0, 1.0, 2.0], &mut [7.0]].map(median), [2.0, 2.0, 7.0]);
+    }
 
     #[test]
     fn most_tokens_interpolates_measured_times() {

@@ -17,8 +17,8 @@
 //! | `tokens` | F32, F16 or I8 | `[tokens, dim]` |
 //!
 //! `__metadata__` holds strings: `format` = `clift-scene`, `version`, `key` of the scene, `kind` of its tokens, `model`
-//! (sizes and variant of the network as JSON), `renderer` (hash of the renderer's weights), `model_path` (path of the model
-//! at the time of encoding), `height` and `width` of the context views.
+//! (sizes and variant of the network as JSON), `renderer` (hash of the renderer's weights), `model_path` (path of the model,
+//! relative to the folder of the file or absolute), `height` and `width` of the context views.
 // S storage tokens, V context views, D width
 
 use crate::network::config::ModelConfig;
@@ -54,7 +54,8 @@ pub struct Scene {
     pub model: ModelConfig,
     /// Hash of the renderer, see [`TrainedModel::renderer_hash`](crate::TrainedModel::renderer_hash).
     pub renderer_hash: String,
-    /// Path of the run or weight file that encoded the scene, as the user wrote it: the default path of the renderer.
+    /// Path of the run or weight file that encoded the scene, relative to the folder of the scene file, or absolute. See
+    /// [`Scene::find_model`].
     pub model_path: String,
     /// Height of the context views in pixels.
     pub height: usize,

@@ -7,8 +7,10 @@ use std::time::Instant;
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::error::ModelError;
+use crate::network::camera_encoding::TransformMaker;
 use crate::network::render_tokens::KeyValueCache;
 use crate::network::renderer::Renderer;
+use crate::network::tokens::Tokens;
 use crate::scene::scene::Scene;
 use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::selector::Selector;
@@ -71,7 +73,11 @@ impl SceneRenderer {
     /// [`ModelError::BadRay`] for a scene with rays that are not finite; [`Scene::read`] returns no such scene.
     pub fn new(scene: &Scene, renderer: Renderer, rules: SelectionRules, device: &Device) -> Result<Self, ModelError> {
         let shape = [1, scene.num_tokens(), scene.model.dim];
-        let tokens = Tensor::from_data(TensorData::new(scene.tokens.clone(), shape), device);
+        let values = Tensor::from_data(TensorData::new(scene.tokens.clone(), shape), device);
+        let context = Cameras::of_views(&scene.context, scene.height, scene.width, device)?;
+        let transforms = TransformMaker::new(&scene.model).of_views(&context);
+        let transforms = transforms.map(|transforms| transforms.select(&scene.token_ids));
+        let tokens = Tokens { values, transforms };
         let selector = Selector::new(rules, &scene.token_rays())?;
         Ok(Self { cache: renderer.project_tokens(&tokens), renderer, selector, device: device.clone() })
     }
@@ -154,6 +160,7 @@ impl SceneRenderer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::network::architecture::CameraEncoding;
     use crate::network::clift::Clift;
     use crate::network::config::ModelConfig;
     use crate::scene::scene::tests::{camera, scene};
@@ -162,7 +169,12 @@ mod tests {
     use crate::weights::file::save_weights;
 
     fn config() -> ModelConfig {
+        encoded(CameraEncoding::Plucker)
+    }
+
+    fn encoded(camera_encoding: CameraEncoding) -> ModelConfig {
         ModelConfig {
+            camera_encoding,
             dim: 16,
             num_heads: 2,
             feed_forward_dim: 24,
@@ -173,19 +185,27 @@ mod tests {
     }
 
     /// A scene with all 12 tokens of two views of 24 x 16 pixels.
-    fn whole_scene(renderer: &Renderer) -> Scene {
+    fn whole_scene(renderer: &Renderer, config: &ModelConfig) -> Scene {
         let tokens = (0..12 * 16).map(|i| ((i * 37 % 101) as f32 - 50.0) * 0.02).collect();
-        let renderer_hash = renderer_hash(renderer, &config());
-        Scene { model: config(), renderer_hash, tokens, token_ids: (0..12).collect(), ..scene() }
+        let renderer_hash = renderer_hash(renderer, config);
+        Scene { model: config.clone(), renderer_hash, tokens, token_ids: (0..12).collect(), ..scene() }
     }
 
     fn path(num_frames: usize) -> Vec<ViewCamera> {
         (0..num_frames).map(|i| camera(-0.5 + 0.1 * i as f64, 0.1 - 0.02 * i as f64)).collect()
     }
 
-    fn assert_equals_single_frames(device: &Device, preset: SelectionPreset, count: usize, tolerance: f32) {
-        let renderer = Clift::new(&config(), 3, device).renderer;
-        let scene = whole_scene(&renderer);
+    fn assert_equals_single_frames(
+        device: &Device,
+        config: &ModelConfig,
+        preset: SelectionPreset,
+        count: usize,
+        tolerance: f32,
+    ) {
+        let renderer = Clift::new(config, 3, device).renderer;
+        let scene = whole_scene(&renderer, config);
+        let context = Cameras::of_views(&scene.context, scene.height, scene.width, device).unwrap();
+        let transforms = TransformMaker::new(config).of_views(&context);
         let mut scene_renderer = SceneRenderer::new(&scene, renderer.clone(), preset.rules(), device).unwrap();
         let mut selector = Selector::new(preset.rules(), &scene.token_rays()).unwrap();
         let rendered = scene_renderer.render(&path(11), 16, 24, count).unwrap();
@@ -195,8 +215,9 @@ mod tests {
             assert_eq!(rendered.tokens, selected);
             let ids = selected.unwrap_or_else(|| (0..12).collect());
             let values = ids.iter().flat_map(|&id| &scene.tokens[id as usize * 16..][..16]).copied();
-            let tokens: Tensor<3> =
-                Tensor::from_data(TensorData::new(values.collect::<Vec<f32>>(), [1, count, 16]), device);
+            let values = TensorData::new(values.collect::<Vec<f32>>(), [1, count, 16]);
+            let transforms = transforms.as_ref().map(|transforms| transforms.select(&ids));
+            let tokens = Tokens { values: Tensor::from_data(values, device), transforms };
             let cameras = Cameras::of_views(&[*view], 16, 24, device).unwrap();
             let alone = renderer.forward(tokens, &cameras).into_data().convert::<f32>();
             let alone = alone.as_slice::<f32>().unwrap();
@@ -208,12 +229,14 @@ mod tests {
 
     #[test]
     fn frames_equal_images_of_their_tokens_alone() {
-        for device in devices() {
-            // Matrix products of eight views have other block sizes than those of one view.
-            assert_equals_single_frames(&device, SelectionPreset::Paper, 12, 1e-5);
-        }
-        for preset in SelectionPreset::ALL {
-            assert_equals_single_frames(&Device::flex(), preset, 5, 0.0);
+        for config in CameraEncoding::ALL.map(encoded) {
+            for device in devices() {
+                // Matrix products of eight views have other block sizes than those of one view.
+                assert_equals_single_frames(&device, &config, SelectionPreset::Paper, 12, 1e-5);
+            }
+            for preset in SelectionPreset::ALL {
+                assert_equals_single_frames(&Device::flex(), &config, preset, 5, 0.0);
+            }
         }
     }
 
@@ -230,7 +253,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
         let model = Clift::new(&config(), 3, &device);
-        let scene = whole_scene(&model.renderer);
+        let scene = whole_scene(&model.renderer, &config());
         save_weights(&model, &path).unwrap();
         let renderer = load_renderer(&scene, &path, &device).unwrap();
         assert_eq!(renderer_hash(&renderer, &config()), scene.renderer_hash);
@@ -243,6 +266,8 @@ mod tests {
         // The weights have the same shapes with one head as with two.
         let expected = format!("the scene was made for the renderer {}, this", &scene.renderer_hash[..12]);
         assert_refused(|model| model.num_heads = 1, &expected);
+        // The same holds for camera-relative attention, which has no weights.
+        assert_refused(|model| model.camera_encoding = CameraEncoding::Gta, &expected);
         save_weights(&Clift::new(&config(), 4, &device), &path).unwrap();
         assert_refused(|_| (), &expected);
         save_weights(&model.encoder, &path).unwrap();

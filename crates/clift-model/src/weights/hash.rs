@@ -21,11 +21,13 @@ pub fn weights_hash<M: Module>(module: &M) -> String {
     hex::encode(sha.finalize())
 }
 
-/// Hashes a renderer's weights ([`weights_hash`]) together with variant and number of heads, which tensor shapes do not
-/// determine.
+/// Hashes a renderer's weights ([`weights_hash`]) together with variant, number of heads and camera encoding, which tensor
+/// shapes do not determine.
 pub fn renderer_hash(renderer: &Renderer, config: &ModelConfig) -> String {
-    let ModelConfig { variant, num_heads, .. } = config;
-    hex::encode(Sha256::digest(format!("{variant} {num_heads} {}", weights_hash(renderer))))
+    let ModelConfig { variant, num_heads, camera_encoding, .. } = config;
+    // Renderers of former versions keep their hashes.
+    let encoding = if camera_encoding.is_plucker() { String::new() } else { format!("{camera_encoding} ") };
+    hex::encode(Sha256::digest(format!("{variant} {num_heads} {encoding}{}", weights_hash(renderer))))
 }
 
 /// Calls `f` with path, shape and values of every parameter, in the module's order.
@@ -38,9 +40,11 @@ pub(crate) fn visit<M: Module>(module: &M, f: impl FnMut(&str, &[usize], &Tensor
         fn enter_module(&mut self, name: &str, _container: &str) {
             self.path.push(name.into());
         }
+
         fn exit_module(&mut self, _name: &str, _container: &str) {
             self.path.pop();
         }
+
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             (self.f)(&self.path.join("."), &param.val().dims(), &param.val().into_data());
         }

@@ -82,7 +82,7 @@ impl ClusterBuilder<'_> {
             Grouping::Kmeans => {
                 // Tokens before the token norm, as in the reference: stage 2 trains this norm.
                 let lift = encoder.forward(&upload_views(&[&clip.context], device)?);
-                let fit = kmeans.fit(lift, count, &[derive_seed(seed, &clip.key)])?;
+                let fit = kmeans.fit(lift.values, count, &[derive_seed(seed, &clip.key)])?;
                 fit.clusters.scenes()[0].clone()
             }
             Grouping::Tile => {

@@ -23,6 +23,9 @@ impl Config {
         self.validate_token_counts()?;
         validate_data(&self.data)?;
         self.validate_loss()?;
+        if self.data.hold_out == 1 {
+            return Err(bad("data.hold_out", 1, "no frame would be left to train on: write 2 or more, or 0 for none"));
+        }
         let Self { stage1, stage2, clusters, eval, checkpoint, .. } = self;
         for settings in [Stage::Stage1, Stage::Stage2].map(|stage| self.stage(stage)) {
             let name = settings.stage.name();
@@ -128,6 +131,7 @@ fn validate_data(data: &DataConfig) -> Result<(), TrainError> {
     if data.root.is_none() {
         return Err(bad("data.root", "missing", "write the folder with train/ and test/"));
     }
+    data.image_cache.validate().map_err(in_section("data.image_cache"))?;
     data.filters.validate().map_err(in_section("data.filters"))
 }
 

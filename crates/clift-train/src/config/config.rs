@@ -60,6 +60,7 @@ impl Config {
     pub(crate) fn sweep(&self, storage: Vec<TokenCount>, methods: Vec<Method>) -> Sweep {
         let Self { seed, eval, clusters, model, device, .. } = self;
         Sweep {
+            min_timed_views: 0,
             storage,
             render: eval.render.clone(),
             selection: eval.selection,
@@ -104,10 +105,47 @@ impl LossConfig {
     }
 }
 
-/// AdamW with warm-up and cosine decay.
+/// Optimizer of the weight matrices of transformer blocks. All other parameters have AdamW.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Algorithm {
+    /// AdamW, as in the paper.
+    #[default]
+    Adamw,
+    /// Muon: momentum, then the nearest orthogonal matrix by five Newton-Schulz steps.
+    Muon,
+}
+
+impl Algorithm {
+    /// Returns the moments per value of a weight matrix of a block.
+    pub const fn matrix_moments(self) -> usize {
+        match self {
+            Self::Adamw => 2,
+            Self::Muon => 1,
+        }
+    }
+}
+
+/// Learning rate after the warm-up.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Schedule {
+    /// Half a cosine down to 0.
+    #[default]
+    Cosine,
+    /// Warm-up, stable, decay: constant, and linear to 0 in the last half of the steps (arXiv 2404.06395).
+    Wsd,
+}
+
+/// AdamW or Muon, with warm-up and decay.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OptimizerConfig {
+    /// Optimizer of the weight matrices of transformer blocks: `adamw`, or `muon`, which learns more per step.
+    pub algorithm: Algorithm,
+    /// Decay of the learning rate after the warm-up: `cosine`, or `wsd`: constant, and linear to 0 in the last half of the
+    /// steps.
+    pub schedule: Schedule,
     /// Highest learning rate.
     pub learning_rate: f64,
     /// Steps until this rate is reached.
@@ -126,6 +164,8 @@ pub struct OptimizerConfig {
 impl Default for OptimizerConfig {
     fn default() -> Self {
         Self {
+            algorithm: Algorithm::Adamw,
+            schedule: Schedule::Cosine,
             learning_rate: 4e-4,
             warm_up_steps: 2500,
             weight_decay: 0.05,

@@ -4,12 +4,12 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use clift_data::{replace_file, write_state_dict};
-use clift_model::{CONVOLUTIONS, ModelConfig, ModelPath, PREFIX, published_tensors};
+use clift_model::{CameraEncoding, ModelConfig, ModelPath, PREFIX, PROJECTIONS, published_tensors};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
 use crate::config::config::Config;
-use crate::error::TrainError;
+use crate::error::{TrainError, bad};
 use crate::interchange::model_dir::{HostTensor, require_absent, to_safetensors};
 use crate::interchange::record::ImportRecord;
 
@@ -36,14 +36,18 @@ pub struct Exported {
 /// Writes a model's weights under the keys of a published checkpoint, `transformer.` before each.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] if `out` exists, [`TrainError::BadFile`] if the weight file does not fit the config, and those of
+/// [`TrainError::BadConfig`] if `out` exists or the network has camera-relative attention, [`TrainError::BadFile`] if the weight file does not fit the config, and those of
 /// reading and writing.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
     require_absent(out)?;
     config.model.validate()?;
+    if config.model.camera_encoding != CameraEncoding::Plucker {
+        let fix = "published networks have plain attention; only runs with \"plucker\" are exported";
+        return Err(bad("model.camera_encoding", config.model.camera_encoding, fix));
+    }
     let convolutions = match ImportRecord::read(&model.dir)? {
         Some(imported) => imported.convolutions,
-        None => CONVOLUTIONS.map(String::from).into(),
+        None => PROJECTIONS.map(String::from).into(),
     };
     let mut ours = read_parameters(&model.weights)?;
     let bad = |reason: String| TrainError::bad_file("weight file", &model.weights)(reason);

@@ -1,21 +1,20 @@
 //! Evaluation of a model without a run: an imported model or a weight file.
 
-use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use clift_data::{ClipReader, OpenedSource, Split, open_dataset};
-use clift_eval::{EvalModels, ExternalMethod, Method, Summary};
+use clift_data::{ClipReader, open_dataset};
+use clift_eval::{EvalFrames, EvalModels, Method, Summary};
 use clift_model::{ModelPath, TrainedModel};
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink};
-use crate::run::validation::Validation;
+use crate::run::validation::{EvalRequest, Validation};
 
-/// Evaluates a model with the data and settings of `config`, and writes the results to `folder`.
+/// Evaluates a model with the data and settings of `config`.
 ///
 /// A model with a condenser is measured on condensed tokens only, unless `stage1` is given: the model it was trained from,
-/// which renders the other methods. `external` methods are measured beside it.
+/// which renders the other methods.
 ///
 /// # Errors
 /// [`TrainError::BadFile`] when `stage1` has another encoder, [`TrainError::BadConfig`] for methods that
@@ -24,8 +23,7 @@ pub fn evaluate_model(
     mut config: Config,
     model: &ModelPath,
     stage1: Option<&ModelPath>,
-    external: &[ExternalMethod],
-    folder: &Path,
+    request: &EvalRequest,
     stop: &AtomicBool,
     sink: &mut dyn Sink,
 ) -> Result<Summary, TrainError> {
@@ -54,10 +52,13 @@ pub fn evaluate_model(
     if last.has_condenser {
         models.set_stage2(config.clusters.grouping, last);
     }
-    let OpenedSource { source, report, .. } = open_dataset(&config.data, Split::Test)?;
-    sink.event(&Event::Message(format!("{}: {report}", Split::Test)));
-    let reader = ClipReader { source, options: config.data.clip_options() };
-    let validation = Validation::new(&config, config.eval.clone(), reader, &device, sink)?;
-    std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
-    validation.evaluate(&models, external, folder, stop, sink)
+    let split = request.split;
+    // No frame of this data set is held out of the training of a foreign model.
+    config.data.hold_out = 0;
+    let opened = open_dataset(&config.data, split)?;
+    sink.event(&Event::Message(format!("{split}: {}", opened.report)));
+    let frames = EvalFrames::new(&opened, split, 0, false);
+    let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
+    let validation = Validation::new(&config, config.eval.clone(), reader, frames, &device, sink)?;
+    validation.evaluate(&models, request, stop, sink)
 }

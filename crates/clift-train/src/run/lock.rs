@@ -1,4 +1,4 @@
-//! One process per run directory.
+//! One process per run directory, and per output folder of an evaluation.
 
 use std::fs::{File, TryLockError};
 use std::io::{Read, Seek, Write};
@@ -7,7 +7,26 @@ use std::path::Path;
 use crate::error::TrainError;
 use crate::events::{Event, Sink};
 
-/// Lock of a run directory. The operating system releases the lock when the process ends; a remaining file `lock` has no
+/// A folder that only one process may write to.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum LockedFolder {
+    /// A run directory.
+    Run,
+    /// The output folder of an evaluation.
+    Evaluation,
+}
+
+impl LockedFolder {
+    /// Returns what the folder is, and where else to write.
+    const fn describe(self) -> (&'static str, &'static str) {
+        match self {
+            Self::Run => ("run directory", "another `run_dir`"),
+            Self::Evaluation => ("output folder", "another --out"),
+        }
+    }
+}
+
+/// Lock of a folder. The operating system releases the lock when the process ends; a remaining file `lock` has no
 /// effect.
 #[derive(Debug)]
 pub struct RunLock {
@@ -22,11 +41,14 @@ impl Drop for RunLock {
 }
 
 impl RunLock {
-    /// Locks the run in the existing `folder`. A file system without locks gives a warning only.
-    pub fn take(folder: &Path, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+    /// Locks the existing `folder`. A file system without locks gives a warning only.
+    ///
+    /// # Errors
+    /// [`TrainError::Locked`] if another process has the lock, [`TrainError::Io`] if the file cannot be opened.
+    pub fn take(folder: &Path, kind: LockedFolder, sink: &mut dyn Sink) -> Result<Self, TrainError> {
         let path = folder.join("lock");
         let opened = File::options().read(true).write(true).create(true).truncate(false).open(&path);
-        let mut file = opened.map_err(TrainError::io("opening the lock of the run directory", &path))?;
+        let mut file = opened.map_err(TrainError::io("opening the lock of the folder", &path))?;
         match file.try_lock() {
             Ok(()) => {
                 // The process id is for error messages; the lock also works without it.
@@ -38,10 +60,12 @@ impl RunLock {
                 let _ = file.rewind().and_then(|()| file.read_to_string(&mut holder));
                 let is_id = !holder.is_empty() && holder.bytes().all(|byte| byte.is_ascii_digit());
                 let holder = if is_id { format!("process {holder}") } else { "another process".into() };
-                return Err(TrainError::Locked { holder, path: folder.into() });
+                let (what, elsewhere) = kind.describe();
+                return Err(TrainError::Locked { what, holder, elsewhere, path: folder.into() });
             }
             Err(TryLockError::Error(error)) => {
-                let text = format!("the run directory cannot be locked, do not start a second process in it: {error}");
+                let text =
+                    format!("the {} cannot be locked, do not start a second process in it: {error}", kind.describe().0);
                 sink.event(&Event::Warning(text));
             }
         }

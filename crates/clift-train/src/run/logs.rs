@@ -1,15 +1,16 @@
-//! Logs of a run: `metrics.jsonl`, `bad_steps.jsonl` and `skipped.jsonl`.
+//! Logs of a run: `metrics.jsonl`, `validation.jsonl`, `bad_steps.jsonl` and `skipped.jsonl`.
 
 use std::collections::HashSet;
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use clift_data::SkippedScene;
 use serde::{Deserialize, Serialize};
 
 use crate::error::TrainError;
-use crate::events::{Event, Sink, Stage};
+use crate::events::{Event, Sink, Stage, StepEvent};
 use crate::step::step_guard::SkippedStep;
 
 /// A file of JSON lines, at most one per step. Every line is flushed; a killed run loses at most the last one.
@@ -104,11 +105,40 @@ pub struct SkipLine {
     pub skip: SkippedScene,
 }
 
-/// The logs of a stage in front of another sink: a line per step in `metrics.jsonl`, per skipped step in `bad_steps.jsonl`,
-/// and per skipped scene in `skipped.jsonl`.
+/// A line of `metrics.jsonl`: an update, and when it ended.
+#[derive(Serialize)]
+struct StepLine<'a> {
+    #[serde(flatten)]
+    step: &'a StepEvent,
+    /// Seconds since 1970, UTC.
+    time: f64,
+}
+
+/// A line of `validation.jsonl`.
+#[derive(Serialize)]
+struct ValidationLine {
+    step: u64,
+    stage: Stage,
+    /// Mean over views, in dB.
+    psnr: f64,
+    /// `null` for images below 11 pixels.
+    ssim: Option<f64>,
+    num_views: usize,
+    /// Seconds since 1970, UTC.
+    time: f64,
+}
+
+/// Returns the seconds since 1970, to the millisecond.
+fn now() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_millis() as f64 / 1e3)
+}
+
+/// The logs of a stage in front of another sink: a line per step in `metrics.jsonl`, per validation in `validation.jsonl`,
+/// per skipped step in `bad_steps.jsonl`, and per skipped scene in `skipped.jsonl`.
 pub struct RunLog<'a> {
     sink: &'a mut dyn Sink,
     metrics: StepLines,
+    validations: StepLines,
     bad_steps: StepLines,
     skips: StepLines,
     /// Scenes that have a line.
@@ -116,15 +146,26 @@ pub struct RunLog<'a> {
 }
 
 impl<'a> RunLog<'a> {
-    /// Opens the files in `run_dir` after `step` updates of `stage`, as [`StepLines::open`].
-    pub fn open(run_dir: &Path, stage: Stage, step: u64, sink: &'a mut dyn Sink) -> Result<Self, TrainError> {
-        let open = |name: &str| {
+    /// Opens the files in `run_dir` after `step` updates of `stage`, the last validated one of which is `validated`, as
+    /// [`StepLines::open`].
+    ///
+    /// # Errors
+    /// [`TrainError::Io`].
+    pub fn open(
+        run_dir: &Path,
+        stage: Stage,
+        [step, validated]: [u64; 2],
+        sink: &'a mut dyn Sink,
+    ) -> Result<Self, TrainError> {
+        let open = |name: &str, step: u64| {
             let path = run_dir.join(name);
             StepLines::open(&path, stage, step).map_err(TrainError::io("opening the log of steps", &path))
         };
-        let skips = open("skipped.jsonl")?;
+        let skips = open("skipped.jsonl", step)?;
         let skipped = read_skips(skips.path()).map_err(TrainError::io("reading the log of scenes", skips.path()))?;
-        Ok(Self { sink, metrics: open("metrics.jsonl")?, bad_steps: open("bad_steps.jsonl")?, skips, skipped })
+        // A validation after the last saved one is made again.
+        let (metrics, validations) = (open("metrics.jsonl", step)?, open("validation.jsonl", validated)?);
+        Ok(Self { sink, metrics, validations, bad_steps: open("bad_steps.jsonl", step)?, skips, skipped })
     }
 
     /// Reports and logs a scene that `step` could not use, once per run.
@@ -141,7 +182,7 @@ impl<'a> RunLog<'a> {
 
     /// Flushes all lines to the disk. Must succeed before a checkpoint is saved, or a resumed run would lack lines.
     pub fn check(&mut self) -> Result<(), TrainError> {
-        for lines in [&mut self.metrics, &mut self.bad_steps, &mut self.skips] {
+        for lines in [&mut self.metrics, &mut self.validations, &mut self.bad_steps, &mut self.skips] {
             lines.check().map_err(TrainError::io("writing the log of steps", lines.path()))?;
         }
         Ok(())
@@ -160,8 +201,12 @@ fn read_skips(path: &Path) -> std::io::Result<HashSet<String>> {
 impl Sink for RunLog<'_> {
     fn event(&mut self, event: &Event) {
         self.sink.event(event);
-        if let Event::Step(step) = event {
-            self.metrics.write(step);
+        match *event {
+            Event::Step(ref step) => self.metrics.write(&StepLine { step, time: now() }),
+            Event::Evaluated { stage, step, psnr, ssim, num_views } if psnr.is_finite() => {
+                self.validations.write(&ValidationLine { step, stage, psnr, ssim, num_views, time: now() });
+            }
+            _ => {}
         }
     }
 }
@@ -169,7 +214,6 @@ impl Sink for RunLog<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::events::StepEvent;
     use crate::step::step_guard::StepAnomaly;
 
     const STEP: StepEvent = StepEvent {
@@ -195,7 +239,7 @@ mod tests {
     /// Writes steps to `metrics.jsonl` of a run that resumes at `from`.
     fn write(path: &Path, from: (Stage, u64), steps: &[(Stage, u64)]) {
         let mut count = Count::default();
-        let mut log = RunLog::open(path.parent().unwrap(), from.0, from.1, &mut count).unwrap();
+        let mut log = RunLog::open(path.parent().unwrap(), from.0, [from.1; 2], &mut count).unwrap();
         for &(stage, step) in steps {
             log.event(&Event::Step(StepEvent { step, stage, ..STEP }));
         }
@@ -213,7 +257,7 @@ mod tests {
     fn lines_have_documented_names_and_null_for_non_finite_values() {
         let folder = tempfile::tempdir().unwrap();
         let mut count = Count::default();
-        let mut log = RunLog::open(folder.path(), Stage::Stage1, 0, &mut count).unwrap();
+        let mut log = RunLog::open(folder.path(), Stage::Stage1, [0; 2], &mut count).unwrap();
         log.event(&Event::Message("not a step".into()));
         log.event(&Event::Step(STEP));
         let bad = |step| SkippedStep {
@@ -231,12 +275,16 @@ mod tests {
         log.bad_step(&bad(3));
         log.bad_step(&bad(5));
         // Before `check`: every line is flushed. Resuming after step 4 drops the line of step 5.
-        RunLog::open(folder.path(), Stage::Stage1, 4, &mut Count::default()).unwrap();
+        RunLog::open(folder.path(), Stage::Stage1, [4; 2], &mut Count::default()).unwrap();
         let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
+        let text = read("metrics.jsonl");
+        let (line, time) = text.split_once(",\"time\":").unwrap();
         assert_eq!(
-            read("metrics.jsonl"),
-            "{\"step\":1,\"stage\":\"stage1\",\"loss\":null,\"psnr\":null,\"lr\":0.001,\"grad_norm\":2.0,\"step_s\":0.25}\n"
+            line,
+            "{\"step\":1,\"stage\":\"stage1\",\"loss\":null,\"psnr\":null,\"lr\":0.001,\"grad_norm\":2.0,\"step_s\":0.25"
         );
+        let time: f64 = time.trim_end_matches("}\n").parse().unwrap();
+        assert!((now() - time).abs() < 60.0, "{time}");
         assert_eq!(
             read("bad_steps.jsonl"),
             "{\"step\":3,\"stage\":\"stage1\",\"reason\":\"loss_spike\",\"loss\":2.0,\"grad_norm\":null,\
@@ -262,6 +310,29 @@ mod tests {
             write(&path, (one, 5), &[]);
             assert_eq!(steps(&path), [(one, 1), (one, 2), (one, 3)]);
         }
+    }
+
+    #[test]
+    fn validations_after_the_saved_one_are_made_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("validation.jsonl");
+        let mut count = Count::default();
+        let validation =
+            |step, psnr| Event::Evaluated { stage: Stage::Stage1, step, psnr, ssim: Some(0.5), num_views: 3 };
+        let mut log = RunLog::open(folder.path(), Stage::Stage1, [0; 2], &mut count).unwrap();
+        for (step, psnr) in [(2, 20.5), (4, f64::NAN), (6, 21.0)] {
+            log.event(&validation(step, psnr));
+        }
+        log.check().unwrap();
+        assert!(
+            std::fs::read_to_string(&path)
+                .unwrap()
+                .starts_with("{\"step\":2,\"stage\":\"stage1\",\"psnr\":20.5,\"ssim\":0.5,\"num_views\":3,\"time\":")
+        );
+        assert_eq!(steps(&path), [(Stage::Stage1, 2), (Stage::Stage1, 6)], "a result without value is none");
+        // The checkpoint of step 6 was saved before its validation.
+        RunLog::open(folder.path(), Stage::Stage1, [6, 2], &mut count).unwrap();
+        assert_eq!(steps(&path), [(Stage::Stage1, 2)]);
     }
 
     #[test]
@@ -291,14 +362,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let skip = |key: &str, reason: &str| SkippedScene { key: key.into(), reason: reason.into() };
         let mut count = Count::default();
-        let mut log = RunLog::open(folder.path(), Stage::Stage1, 0, &mut count).unwrap();
+        let mut log = RunLog::open(folder.path(), Stage::Stage1, [0; 2], &mut count).unwrap();
         log.skip(Stage::Stage1, 1, &skip("a", "torn"));
         log.skip(Stage::Stage1, 2, &skip("a", "torn at another frame"));
         log.skip(Stage::Stage1, 3, &skip("b", "torn"));
         log.check().unwrap();
         assert_eq!(count.0, 2);
         // Resumed after step 2: the line of step 3 is dropped and written again.
-        let mut log = RunLog::open(folder.path(), Stage::Stage1, 2, &mut count).unwrap();
+        let mut log = RunLog::open(folder.path(), Stage::Stage1, [2; 2], &mut count).unwrap();
         log.skip(Stage::Stage1, 3, &skip("b", "torn"));
         log.skip(Stage::Stage1, 4, &skip("a", "torn"));
         log.check().unwrap();

@@ -10,7 +10,7 @@ use clift_data::{
     ClipReader, OpenedSource, SceneSource, SceneSubset, Split, make_folder, open_dataset, open_training_dataset,
     remove_leftovers,
 };
-use clift_eval::{EvalModels, ExternalMethod, LPIPS_COMMAND, Summary, write_skip_report};
+use clift_eval::{EvalFrames, EvalModels, EvalSplit, LPIPS_COMMAND, Summary, write_skip_report};
 use clift_model::{
     Clift, ModelError, ModelPath, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
 };
@@ -23,11 +23,13 @@ use crate::error::{TrainError, bad};
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::footprint::scene_sizes::PARTS;
+use crate::run::eval_folder::{EvalFolder, SUMMARY};
 use crate::run::init_from::init_from;
-use crate::run::lock::RunLock;
-use crate::run::run_file::{RunFile, compare_settings, write_config};
+use crate::run::lock::{LockedFolder, RunLock};
+use crate::run::run_file::{RunFile, compare_settings, require_run, write_config};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
-use crate::run::validation::Validation;
+use crate::run::training_data::TrainingData;
+use crate::run::validation::{EvalRequest, Validation};
 use crate::stage::stage1_batches::Stage1Batches;
 use crate::stage::stage2_batches::Stage2Batches;
 
@@ -51,6 +53,8 @@ pub struct Run {
     config: Config,
     overfit: Option<usize>,
     device: Device,
+    /// Whether `config` reads the data set that the run was trained on.
+    is_training_data: bool,
     /// `None` for a run opened for evaluation.
     lock: Option<RunLock>,
 }
@@ -62,7 +66,11 @@ impl Run {
     /// # Errors
     /// [`TrainError::OtherRun`] if the directory contains a run with other settings, [`TrainError::Locked`] if another process
     /// uses it, and those of config, device and disk.
-    pub fn open(config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+    pub fn open(mut config: Config, options: &RunOptions, sink: &mut dyn Sink) -> Result<Self, TrainError> {
+        if options.overfit.is_some() {
+            // The training scenes themselves are evaluated.
+            config.data.hold_out = 0;
+        }
         config.validate()?;
         let device = config.device.open()?;
         config.precision.check("precision", &device)?;
@@ -80,19 +88,24 @@ impl Run {
         }
         if options.fresh && folder.exists() {
             // Refuses a directory in use. Dropped before the rename, which Windows refuses otherwise.
-            drop(RunLock::take(folder, sink)?);
+            drop(RunLock::take(folder, LockedFolder::Run, sink)?);
             let moved = free_name(folder);
             std::fs::rename(folder, &moved).map_err(TrainError::io("renaming the existing run", folder))?;
             sink.event(&Event::Message(format!("renamed the existing run to {}", moved.display())));
         }
         make_folder(folder).map_err(TrainError::io("making the run directory", folder))?;
-        let lock = RunLock::take(folder, sink)?;
+        let lock = RunLock::take(folder, LockedFolder::Run, sink)?;
         remove_leftovers(folder).map_err(TrainError::io("removing temporary files of a killed process", folder))?;
         // A run that failed before its first stage may get other settings.
         let has_begun = STAGES.iter().any(|stage| folder.join(stage.name()).exists());
         let mut file = RunFile::new(options.overfit);
         if folder.join("config.toml").exists() && has_begun {
             let found = RunFile::read(folder)?;
+            if !TrainingData::read(&config.run_dir)?.has_key {
+                // A run from before the key resumes with the frames that it was started with.
+                config.data.hold_out = 0;
+            }
+            let folder = &config.run_dir;
             let extensions = compare_settings(folder, &found, &config, options.overfit, options.extend)?;
             file.extended = found.extended;
             for extension in extensions {
@@ -101,7 +114,7 @@ impl Run {
         }
         file.write(folder)?;
         write_config(&config)?;
-        Ok(Self { config, overfit: options.overfit, device, lock: Some(lock) })
+        Ok(Self { config, overfit: options.overfit, device, is_training_data: true, lock: Some(lock) })
     }
 
     /// Opens an existing run for evaluation.
@@ -109,15 +122,19 @@ impl Run {
     /// # Errors
     /// [`TrainError::BadFile`] for a damaged `run.json`, [`TrainError::Model`] for other heads than those of the run, and those
     /// of the device.
-    pub fn reopen(config: Config) -> Result<Self, TrainError> {
+    pub fn reopen(mut config: Config) -> Result<Self, TrainError> {
+        let trained = TrainingData::read(&config.run_dir)?;
+        config.data.hold_out = trained.hold_out;
+        let is_training_data = trained.is_of(&config);
         config.validate()?;
         check_heads(&config.model, &config.run_dir)?;
         let run = RunFile::read(&config.run_dir)?;
         let device = config.device.open()?;
-        Ok(Self { config, overfit: run.overfit, device, lock: None })
+        Ok(Self { config, overfit: run.overfit, device, is_training_data, lock: None })
     }
 
-    /// Trains the remaining steps of the run, or of one stage, and evaluates. Returns the evaluation of a whole run.
+    /// Trains the remaining steps of the run, or of one stage, and evaluates. Returns the evaluation of a whole run; the
+    /// existing one if the run was trained and evaluated before.
     ///
     /// # Errors
     /// [`TrainError::Missing`] if `only` is a stage whose predecessor has not run, and those of the stages.
@@ -128,8 +145,24 @@ impl Run {
         sink: &mut dyn Sink,
     ) -> Result<Option<Summary>, TrainError> {
         let wanted = |stage: Stage| only.is_none_or(|only| only == stage);
-        let reader = self.reader(Split::Train, sink)?;
-        let validation = self.validation(sink)?;
+        let is_trained = [Stage::Stage1, Stage::Stage2].into_iter().all(|stage| self.weights(stage).exists());
+        let summary = self.folder("eval").join(SUMMARY);
+        if only.is_none() && is_trained && summary.exists() {
+            let run = self.config.run_dir.display();
+            sink.event(&Event::Message(format!(
+                "the run is trained and evaluated; `clift eval {run} --force` evaluates it again"
+            )));
+            let text = std::fs::read(&summary).map_err(TrainError::io("reading the evaluation", &summary))?;
+            return serde_json::from_slice(&text).map(Some).map_err(TrainError::bad_file("evaluation", &summary));
+        }
+        if !is_trained && summary.exists() {
+            // Of former weights: of stage 1 alone, or before `--extend`.
+            std::fs::remove_file(&summary).map_err(TrainError::io("removing the former evaluation", &summary))?;
+        }
+        self.report_opening(Split::Train, sink);
+        let opened = open_training_dataset(&self.config.data, self.config.stage1.steps)?;
+        let reader = self.reader(opened, Split::Train, sink)?;
+        let validation = self.validation(Split::Test, sink)?;
 
         let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
             self.train_stage1(&reader, &validation, stop, sink)?
@@ -146,26 +179,28 @@ impl Run {
         if only.is_some() {
             return Ok(None);
         }
-        validation.evaluate(&self.models(sink)?, &[], &self.folder("eval"), stop, sink).map(Some)
+        require_run(&self.config.run_dir)?;
+        let folder = EvalFolder::open(&self.folder("eval"), true, sink)?;
+        let request = EvalRequest { split: Split::Test, external: &[], folder: &folder };
+        validation.evaluate(&self.models(sink)?, &request, stop, sink).map(Some)
     }
 
-    /// Evaluates the run, and the images of `external` methods beside it, and writes the results to `folder`. `beside` is
-    /// another run with the same stage 1 whose stage 2 was trained on other groups of tokens, evaluated on the same views.
+    /// Evaluates the run. `beside` is another run with the same stage 1 whose stage 2 was trained on other groups of tokens,
+    /// evaluated on the same views.
     ///
     /// # Errors
     /// [`TrainError::Missing`] without the weights of stage 1, [`TrainError::OtherEncoder`] if stage 2 was trained on another
     /// encoder, [`TrainError::Locked`] if `folder` is in a run directory that another process uses, and those of the evaluation.
     pub fn evaluate(
         &self,
-        external: &[ExternalMethod],
-        folder: &Path,
+        request: &EvalRequest,
         beside: Option<&Config>,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
-        let is_inside = self.lock.is_none() && folder.starts_with(&self.config.run_dir);
-        let _lock = is_inside.then(|| RunLock::take(&self.config.run_dir, sink)).transpose()?;
-        std::fs::create_dir_all(folder).map_err(TrainError::io("making a folder", folder))?;
+        let run_dir = &self.config.run_dir;
+        let is_inside = self.lock.is_none() && request.folder.is_in(run_dir);
+        let _lock = is_inside.then(|| RunLock::take(run_dir, LockedFolder::Run, sink)).transpose()?;
         let mut models = self.models(sink)?;
         if let Some(other) = beside {
             if other.clusters.grouping == self.config.clusters.grouping {
@@ -175,7 +210,7 @@ impl Run {
             }
             models.set_stage2(other.clusters.grouping, self.open_stage2(other, &models.stage1)?);
         }
-        self.validation(sink)?.evaluate(&models, external, folder, stop, sink)
+        self.validation(request.split, sink)?.evaluate(&models, request, stop, sink)
     }
 
     /// Opens the trained models of both stages, or of stage 1 only.
@@ -207,14 +242,23 @@ impl Run {
         if model.has_encoder_of(stage1) { Ok(model) } else { Err(TrainError::OtherEncoder { path }) }
     }
 
-    fn validation(&self, sink: &mut dyn Sink) -> Result<Validation<'_>, TrainError> {
+    /// Opens the evaluated views of a split.
+    fn validation(&self, split: Split, sink: &mut dyn Sink) -> Result<Validation<'_>, TrainError> {
         let mut eval = self.config.eval.clone();
         if self.overfit.is_some() && eval.index.take().is_some() {
             sink.event(&Event::Message("--overfit evaluates the training scenes: eval.index is not used".into()));
         }
-        // The test split, or the training scenes themselves under --overfit.
-        let reader = self.reader(if self.overfit.is_some() { Split::Train } else { Split::Test }, sink)?;
-        Validation::new(&self.config, eval, reader, &self.device, sink)
+        self.report_opening(split, sink);
+        let data = &self.config.data;
+        let (opened, split, frames) = if self.overfit.is_some() {
+            (open_training_dataset(data, self.config.stage1.steps)?, Split::Train, EvalFrames::whole(EvalSplit::Train))
+        } else {
+            let opened = open_dataset(data, split)?;
+            let frames = EvalFrames::new(&opened, split, data.hold_out, self.is_training_data);
+            (opened, split, frames)
+        };
+        let reader = self.reader(opened, split, sink)?;
+        Validation::new(&self.config, eval, reader, frames, &self.device, sink)
     }
 
     fn train_stage1(
@@ -309,12 +353,15 @@ impl Run {
         Err(TrainError::Missing { stage: stage.name(), what, first: "--only stage1", path })
     }
 
-    fn reader(&self, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
-        let data = &self.config.data;
-        let OpenedSource { source, report, .. } = match split {
-            Split::Train => open_training_dataset(data)?,
-            Split::Test => open_dataset(data, split)?,
-        };
+    /// Reports that a data set is opened: the first time, thousands of files are read.
+    fn report_opening(&self, split: Split, sink: &mut dyn Sink) {
+        if let Some(root) = &self.config.data.root {
+            sink.event(&Event::Message(format!("{split}: opening {}", root.display())));
+        }
+    }
+
+    fn reader(&self, opened: OpenedSource, split: Split, sink: &mut dyn Sink) -> Result<ClipReader, TrainError> {
+        let OpenedSource { source, report, .. } = opened;
         sink.event(&Event::Message(format!("{split}: {report}")));
         if report.has_skips() && self.config.run_dir.is_dir() {
             write_skip_report(&report, &self.folder(&format!("skipped-{split}.json")))?;

@@ -11,12 +11,23 @@ use crate::config::parse::parse_config;
 use crate::error::TrainError;
 use crate::events::Stage;
 use crate::run::extend::{ExtensionRecord, StepExtension};
+use crate::run::training_data::TrainingData;
 
+const FILE: &str = "run.json";
 const VERSION: u32 = 1;
 
 /// Keys that may change when a run is resumed.
-const FREE_KEYS: [&str; 7] =
-    ["run_dir", "device", "activation_checkpointing", "data.num_threads", "data.num_prefetch", "checkpoint.", "eval."];
+const FREE_KEYS: [&str; 8] = [
+    "run_dir",
+    "device",
+    "activation_checkpointing",
+    "data.num_threads",
+    "data.num_prefetch",
+    "data.image_cache.",
+    "checkpoint.",
+    "eval.",
+];
+
 /// Keys that `--extend` may increase.
 const STEP_COUNTS: [(&str, Stage); 2] = [("stage1.steps", Stage::Stage1), ("stage2.steps", Stage::Stage2)];
 
@@ -38,7 +49,7 @@ impl RunFile {
     }
 
     pub fn read(folder: &Path) -> Result<Self, TrainError> {
-        let path = folder.join("run.json");
+        let path = folder.join(FILE);
         let text = std::fs::read(&path).map_err(TrainError::io("reading the run file", &path))?;
         let run: Self = serde_json::from_slice(&text).map_err(TrainError::bad_file("run file", &path))?;
         if run.version != VERSION {
@@ -49,10 +60,18 @@ impl RunFile {
     }
 
     pub fn write(&self, folder: &Path) -> Result<(), TrainError> {
-        let path = folder.join("run.json");
+        let path = folder.join(FILE);
         let json = serde_json::to_vec_pretty(self).map_err(TrainError::bad_file("run file", &path))?;
         replace_file(&path, &json).map_err(TrainError::io("writing the run file", &path))
     }
+}
+
+/// Checks that a run directory is still at its path: a process that has it open must not make a second one there.
+///
+/// # Errors
+/// [`TrainError::Moved`].
+pub(crate) fn require_run(folder: &Path) -> Result<(), TrainError> {
+    if folder.join(FILE).exists() { Ok(()) } else { Err(TrainError::Moved { path: folder.into() }) }
 }
 
 /// Writes every key of a config to its run directory.
@@ -78,7 +97,10 @@ pub(crate) fn compare_settings(
     let bad = || TrainError::bad_file("config", &path);
     // Keys that an older version did not write have their defaults; keys unknown to this version are differences.
     let old = match parse_config::<Config>(&path, &text, &[]) {
-        Ok((old, _)) => toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?,
+        Ok((mut old, _)) => {
+            old.data.hold_out = TrainingData::read(folder)?.hold_out;
+            toml::Table::try_from(&old).map_err(|error| bad()(error.to_string()))?
+        }
         Err(_) => text.parse().map_err(|error: toml::de::Error| bad()(error.message().to_owned()))?,
     };
     let new = toml::Table::try_from(config).map_err(|error| bad()(error.to_string()))?;

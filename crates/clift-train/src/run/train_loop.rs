@@ -11,14 +11,16 @@ use crate::checkpoint::checkpoints::Checkpoints;
 use crate::checkpoint::progress::{Best, Progress};
 use crate::error::TrainError;
 use crate::events::{Event, Sink, StepEvent};
+use crate::run::batch_wait::BatchWait;
 use crate::run::logs::RunLog;
+use crate::run::run_file::require_run;
 use crate::run::stage_plan::StagePlan;
 use crate::run::validation::Validation;
 use crate::stage::settings::{StageSettings, freeze};
 use crate::step::batch::StageBatch;
 use crate::step::loss::{Loss, psnr_of_mse};
 use crate::step::loss_scale::LossScale;
-use crate::step::schedule::warm_up_cosine;
+use crate::step::schedule::learning_rate;
 use crate::step::step_guard::{SkippedStep, SkippedStepScene, StepAnomaly};
 use crate::step::train_state::{TrainState, Update};
 
@@ -31,6 +33,7 @@ impl StagePlan<'_> {
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Clift, TrainError> {
+        require_run(&self.config.run_dir)?;
         let started = Instant::now();
         let Self { settings, config, folder, device, .. } = self;
         let StageSettings { stage, steps: num_steps, optimizer, .. } = *settings;
@@ -54,7 +57,7 @@ impl StagePlan<'_> {
         let progress = checkpoints.resume(&mut train_state)?.unwrap_or_default();
         train_state.model = freeze(stage, train_state.model);
         make_folder(folder).map_err(TrainError::io("making a folder", folder))?;
-        let mut log = RunLog::open(&config.run_dir, stage, progress.step, sink)?;
+        let mut log = RunLog::open(&config.run_dir, stage, [progress.step, progress.validated], sink)?;
         log.event(&Event::StageStarted { stage, done: progress.step, num_steps });
 
         let mut training = TrainLoop::new(self, checkpoints, progress, validation, stop, log);
@@ -92,7 +95,14 @@ impl<'a> TrainLoop<'a> {
     pub fn run(&mut self, mut train_state: TrainState) -> Result<Clift, TrainError> {
         // The process may have been killed between a checkpoint and the validation of its step.
         self.validate_if_due(&train_state)?;
-        for batch in self.plan.prefetch(self.progress.step) {
+        let mut batches = self.plan.prefetch(self.progress.step);
+        let mut batch_wait = BatchWait::new();
+        loop {
+            let asked = Instant::now();
+            let Some(batch) = batches.next() else { break };
+            if let Some(hint) = batch_wait.add(asked.elapsed(), &self.plan.config.data) {
+                self.log.event(&Event::Message(hint));
+            }
             let batch = match batch {
                 Ok(batch) => batch,
                 Err(error) => return Err(self.save_before(error, &train_state)),
@@ -120,7 +130,7 @@ impl<'a> TrainLoop<'a> {
         }
         let StageSettings { steps: num_steps, accumulate, optimizer, .. } = self.plan.settings;
         let step = self.progress.step + 1;
-        let lr = warm_up_cosine(step, optimizer.learning_rate, optimizer.warm_up_steps, num_steps);
+        let lr = learning_rate(optimizer, step, num_steps);
         let (rate, recent) = (self.plan.learning_rate(lr), &self.progress.recent);
         let mut anomaly = None;
         // Checked before the update: a skipped step does not change the weights.
@@ -192,6 +202,7 @@ impl<'a> TrainLoop<'a> {
     }
 
     fn save(&mut self, train_state: &TrainState) -> Result<(), TrainError> {
+        require_run(&self.plan.config.run_dir)?;
         // A resumed run does not write the lines of these steps again.
         self.log.check()?;
         let path = self.checkpoints.save(train_state, &self.progress)?;
@@ -218,6 +229,7 @@ impl<'a> TrainLoop<'a> {
             return Ok(());
         }
         let (stage, samples) = (self.plan.settings.stage, self.plan.folder.join("samples"));
+        require_run(&self.plan.config.run_dir)?;
         let model = train_state.model.valid();
         let psnr = self.validation.validate(&model, stage, step, &samples, self.stop, &mut self.log)?;
         if psnr.is_none() && self.stop.load(Ordering::Relaxed) {
@@ -253,8 +265,9 @@ impl<'a> TrainLoop<'a> {
 
     /// Adds the last step and the newest checkpoint to an error.
     pub fn name_checkpoint(&self, error: TrainError) -> TrainError {
-        let has_step = matches!(error, TrainError::Interrupted { .. } | TrainError::Diverged { .. });
-        if has_step || self.progress.step == 0 {
+        let is_complete =
+            matches!(error, TrainError::Interrupted { .. } | TrainError::Diverged { .. } | TrainError::Moved { .. });
+        if is_complete || self.progress.step == 0 {
             return error;
         }
         TrainError::Stopped {

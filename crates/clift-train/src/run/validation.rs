@@ -5,10 +5,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use burn::tensor::Device;
-use clift_data::ClipReader;
+use clift_data::{ClipReader, Split};
 use clift_eval::{
-    EvalConfig, EvalError, EvalModels, Evaluator, ExternalMethod, Method, Progress, RunDescription, SceneFigures,
-    SceneLimits, Summary, Sweep, stage2_method,
+    EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, Progress, RunDescription,
+    SceneFigures, SceneLimits, Summary, Sweep, stage2_method,
 };
 use clift_model::{Clift, TokenCount, TrainedModel};
 
@@ -16,6 +16,19 @@ use crate::config::config::Config;
 use crate::error::TrainError;
 use crate::events::{Event, Sink, Stage};
 use crate::footprint::largest_tensor;
+use crate::run::eval_folder::EvalFolder;
+use crate::run::training_curves::training_curves;
+
+/// What an evaluation measures, and where its results are written.
+#[derive(Clone, Copy, Debug)]
+pub struct EvalRequest<'a> {
+    /// The split of the data set.
+    pub split: Split,
+    /// Methods of other programs, measured beside the model.
+    pub external: &'a [ExternalMethod],
+    /// Folder of the results.
+    pub folder: &'a EvalFolder,
+}
 
 /// The validation and test views of a run.
 pub struct Validation<'a> {
@@ -24,11 +37,15 @@ pub struct Validation<'a> {
 }
 
 impl<'a> Validation<'a> {
-    /// Chooses the scenes and views of `reader` by `eval`, for an evaluation on `device`.
+    /// Chooses the scenes and views among the `frames` of `reader` by `eval`, for an evaluation on `device`.
+    ///
+    /// # Errors
+    /// As [`Evaluator::new`], and [`TrainError::BadConfig`] for tensors that the device cannot hold.
     pub fn new(
         config: &'a Config,
         eval: EvalConfig,
         reader: ClipReader,
+        frames: EvalFrames,
         device: &Device,
         sink: &mut dyn Sink,
     ) -> Result<Self, TrainError> {
@@ -38,11 +55,17 @@ impl<'a> Validation<'a> {
             name: run_dir.file_name().unwrap_or(run_dir.as_os_str()).to_string_lossy().into_owned(),
             config: toml::to_string_pretty(config).map_err(TrainError::bad_file("config", run_dir))?,
             device: config.device.to_string(),
+            command: std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect::<Vec<_>>().join(" "),
         };
         let sweep = config.sweep(eval.storage.clone(), Vec::new());
-        let evaluator = Evaluator::new(eval, sweep, description, reader, device)?;
+        let evaluator = Evaluator::new(eval, sweep, description, reader, frames, device)?;
         if !evaluator.skip_report.skips.is_empty() {
             sink.event(&Event::Message(format!("evaluation: {}", evaluator.skip_report)));
+        }
+        let (text, warnings) = evaluator.describe();
+        sink.event(&Event::Message(text));
+        for warning in warnings {
+            sink.event(&Event::Warning(warning));
         }
         Ok(Self { config, evaluator })
     }
@@ -98,18 +121,22 @@ impl<'a> Validation<'a> {
         Ok(point.psnr.filter(|psnr| psnr.is_finite()))
     }
 
-    /// Evaluates models, and external methods beside them, and writes the results to `folder`.
+    /// Evaluates models on the views of this validation.
+    ///
+    /// # Errors
+    /// As [`Evaluator::evaluate`].
     pub fn evaluate(
         &self,
         models: &EvalModels,
-        external: &[ExternalMethod],
-        folder: &Path,
+        request: &EvalRequest,
         stop: &AtomicBool,
         sink: &mut dyn Sink,
     ) -> Result<Summary, TrainError> {
         let started = Instant::now();
         let mut progress = EvalEvents { stop, sink, is_stage: true };
-        let summary = self.evaluator.evaluate(models, external, folder, &mut progress)?;
+        let training = training_curves(&self.config.run_dir);
+        let summary =
+            self.evaluator.evaluate(models, request.external, training, request.folder.path(), &mut progress)?;
         sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
     }

@@ -7,7 +7,7 @@
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Gradients, Tensor};
-use clift_model::{Cameras, Clift, EncoderBlock, Views};
+use clift_model::{Cameras, Clift, EncoderBlock, SceneModel, Tokens, Views};
 
 use crate::error::TrainError;
 use crate::step::batch::TokenSelection;
@@ -32,11 +32,14 @@ pub(crate) fn backward(
         cameras: untracked(&device_batch.context.cameras),
     };
     let targets = untracked(&device_batch.targets);
-    let (encoder_inputs, lift) =
-        block_inputs(plain.encoder.embed(&context), plain.encoder.blocks(), EncoderBlock::forward);
-    let tokens = selection.apply(&plain.condenser, plain.lift_norm.forward(lift.clone()))?;
+    let context_transforms = plain.encoder.transforms(&context.cameras);
+    let target_transforms = plain.renderer.transforms(&targets);
+    let encode = |block: &EncoderBlock, x: Tensor<3>| block.forward(x, context_transforms.as_ref());
+    let (encoder_inputs, lift) = block_inputs(plain.encoder.embed(&context), plain.encoder.blocks(), encode);
+    let lift = Tokens { values: lift, transforms: context_transforms.clone() };
+    let tokens = selection.apply(&plain.condenser, plain.normalize(lift.clone()))?;
     let (renderer_inputs, x) = block_inputs(plain.renderer.embed(&targets), plain.renderer.blocks(), |block, x| {
-        block.forward(x, tokens.project(block))
+        block.forward(x, tokens.project(block), target_transforms.as_ref())
     });
 
     // Backward, one block after the other.
@@ -48,9 +51,11 @@ pub(crate) fn backward(
     add(grads);
 
     let mut grad_tokens: Option<Tensor<3>> = None;
+    let target_transforms = model.renderer.transforms(&device_batch.targets);
     for (block, input) in model.renderer.blocks().iter().zip(renderer_inputs).rev() {
-        let (x, block_tokens) = (leaf(input), leaf(tokens.tokens().clone()));
-        let output = block.forward(x.clone(), tokens.with_tokens(block_tokens.clone()).project(block));
+        let (x, block_tokens) = (leaf(input), leaf(tokens.values().clone()));
+        let key_value = tokens.with_values(block_tokens.clone()).project(block);
+        let output = block.forward(x.clone(), key_value, target_transforms.as_ref());
         let mut grads = backward_from(output, grad_x);
         grad_x = take_gradient(&x, &mut grads);
         let grad = take_gradient(&block_tokens, &mut grads);
@@ -65,17 +70,17 @@ pub(crate) fn backward(
         return Ok(parts); // a renderer without blocks reads no token
     };
 
-    let lift = leaf(lift);
-    let output = selection.apply(&model.condenser, model.lift_norm.forward(lift.clone()))?.tokens().clone();
+    let lift = lift.with_values(leaf(lift.values.clone()));
+    let output = selection.apply(&model.condenser, model.normalize(lift.clone()))?.values().clone();
     let mut grads = backward_from(output, grad_tokens);
-    let mut grad_x = take_gradient(&lift, &mut grads);
+    let mut grad_x = take_gradient(&lift.values, &mut grads);
     add(grads);
     if !trains(&model.encoder) {
         return Ok(parts);
     }
     for (block, input) in model.encoder.blocks().iter().zip(encoder_inputs).rev() {
         let x = leaf(input);
-        let mut grads = backward_from(block.forward(x.clone()), grad_x);
+        let mut grads = backward_from(block.forward(x.clone(), lift.transforms.as_ref()), grad_x);
         grad_x = take_gradient(&x, &mut grads);
         add(grads);
     }
@@ -128,7 +133,7 @@ fn trains<M: Module>(module: &M) -> bool {
 #[cfg(test)]
 mod tests {
     use burn::tensor::Device;
-    use clift_model::{CliftVariant, CondenserConfig, ModelConfig};
+    use clift_model::{CameraEncoding, CliftVariant, CondenserConfig, ModelConfig};
 
     use super::*;
     use crate::events::Stage;
@@ -143,7 +148,7 @@ mod tests {
 
     /// Returns the gradient of every parameter by the plain and by the checkpointed backward.
     fn both(
-        variant: CliftVariant,
+        (variant, camera_encoding): (CliftVariant, CameraEncoding),
         stage: Stage,
         batch: &StageBatch,
         loss: &Loss,
@@ -164,9 +169,10 @@ mod tests {
         }
         let config = ModelConfig {
             variant,
+            camera_encoding,
             condenser: CondenserConfig::of(variant),
             dim: 16,
-            num_heads: 4,
+            num_heads: 2,
             feed_forward_dim: 24,
             num_encoder_blocks: 2,
             num_renderer_blocks: 2,
@@ -199,9 +205,11 @@ mod tests {
         let few = StageBatch { tokens: subsets(2), ..all.clone() };
         let many = StageBatch { tokens: subsets(7), ..all.clone() };
         let cases = [(Stage::Stage1, all), (Stage::Stage1, few), (Stage::Stage1, many), (Stage::Stage2, stored)];
-        for variant in CliftVariant::ALL {
+        let plain = CliftVariant::ALL.map(|variant| (variant, CameraEncoding::Plucker));
+        let relative = [CameraEncoding::Gta, CameraEncoding::Prope].map(|encoding| (CliftVariant::Paper, encoding));
+        for network @ (variant, _) in plain.into_iter().chain(relative) {
             for (stage, batch) in &cases {
-                let pairs = both(variant, *stage, batch, &Loss::default(), &Device::flex());
+                let pairs = both(network, *stage, batch, &Loss::default(), &Device::flex());
                 let largest = |values: &[f32]| values.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
                 let scale = pairs.iter().map(|(plain, _)| largest(plain)).fold(0.0, f32::max);
                 for (plain, again) in pairs {
@@ -211,7 +219,7 @@ mod tests {
                     // Burn adds the gradients of a composed norm in the order of the whole graph. The floor covers
                     // biases with a gradient near zero.
                     let error = plain.iter().zip(&again).fold(0.0_f32, |error, (a, b)| error.max((a - b).abs()));
-                    assert!(error <= 1e-5 * largest(&plain) + 1e-7 * scale, "{variant}: {error:e} of {scale:e}");
+                    assert!(error <= 1e-5 * largest(&plain) + 1e-7 * scale, "{network:?}: {error:e} of {scale:e}");
                 }
             }
         }

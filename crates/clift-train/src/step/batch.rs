@@ -1,9 +1,8 @@
 //! The host batch of one update.
 // N tokens, K kept tokens, D width
 
-use burn::tensor::Tensor;
 use clift_data::{Clip, SkippedScene};
-use clift_model::{Clusters, Condenser, RenderTokens, SceneClusters};
+use clift_model::{Clusters, Condenser, RenderTokens, SceneClusters, Tokens};
 
 use crate::error::TrainError;
 
@@ -46,13 +45,13 @@ impl StageBatch {
 }
 
 impl TokenSelection {
-    /// Selects the tokens of the renderer from the encoder's tokens, `[B, N, D]`.
-    pub(crate) fn apply(&self, condenser: &Condenser, lift: Tensor<3>) -> Result<RenderTokens, TrainError> {
+    /// Selects the tokens of the renderer from the encoder's tokens.
+    pub(crate) fn apply(&self, condenser: &Condenser, lift: Tokens) -> Result<RenderTokens, TrainError> {
         Ok(match self {
             Self::All => lift.into(),
             Self::Subsets(subsets) => RenderTokens::subsets(lift, subsets),
             Self::Clusters(clusters) => {
-                let index = Clusters::new(clusters.clone())?.upload(&lift.device());
+                let index = Clusters::new(clusters.clone())?.upload(&lift.values.device());
                 condenser.forward(lift, &index).into()
             }
         })

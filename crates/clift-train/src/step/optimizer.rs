@@ -1,19 +1,34 @@
-//! AdamW, global gradient norm and clipping.
+//! AdamW and Muon, global gradient norm and clipping.
 
-use burn::module::{Module, ModuleVisitor, Param};
-use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
+use burn::module::{Module, ModuleVisitor, Param, ParamGroup};
+use burn::optim::decay::WeightDecayConfig;
+use burn::optim::{AdamWConfig, AdjustLrFn, GradientsParams, ModuleOptimizer, MuonConfig};
 use burn::tensor::Tensor;
 
-use crate::config::config::OptimizerConfig;
+use crate::config::config::{Algorithm, OptimizerConfig};
 
-/// Makes AdamW with the moments (0.9, 0.95) and epsilon 1e-8 of the reference. Weight decay applies to every parameter.
-pub fn adamw(config: &OptimizerConfig) -> ModuleOptimizer {
-    AdamWConfig::new()
-        .with_beta_1(0.9)
-        .with_beta_2(0.95)
-        .with_epsilon(1e-8)
-        .with_weight_decay(config.weight_decay as f32)
-        .init()
+/// Makes the optimizer of a config: AdamW with the moments (0.9, 0.95) and epsilon 1e-8 of the reference, and, if the config
+/// names Muon, Muon for the weight matrices of the transformer blocks. Weight decay applies to every parameter.
+///
+/// Muon's updates are scaled to the size of AdamW's (`0.2 sqrt(max(rows, columns))`, arXiv 2502.16982), so that both
+/// optimizers share learning rate and weight decay.
+///
+/// # Panics
+/// Never: the pattern of the paths is valid.
+pub fn make_optimizer(config: &OptimizerConfig) -> ModuleOptimizer {
+    let weight_decay = config.weight_decay as f32;
+    let adamw =
+        AdamWConfig::new().with_beta_1(0.9).with_beta_2(0.95).with_epsilon(1e-8).with_weight_decay(weight_decay);
+    match config.algorithm {
+        Algorithm::Adamw => adamw.init(),
+        Algorithm::Muon => {
+            let muon = MuonConfig::new()
+                .with_adjust_lr_fn(AdjustLrFn::MatchRmsAdamW)
+                .with_weight_decay(Some(WeightDecayConfig::new(weight_decay)));
+            let matrices = ParamGroup::from_regex(r"(^|\.)blocks\..*\.weight$").expect("a valid pattern");
+            adamw.init().with_group(matrices, muon.build(), None)
+        }
+    }
 }
 
 /// Returns the norm of all gradients of a module, on the host.
@@ -100,7 +115,7 @@ mod tests {
         let device = Device::flex();
         // Parameters that train live with autodiff, their gradients without.
         let mut model = toy(&fixture, &device.clone().autodiff());
-        let mut optimizer = adamw(&OptimizerConfig::default());
+        let mut optimizer = make_optimizer(&OptimizerConfig::default());
         let grads_a: Tensor<3> = fixture.tensor("input.grad_a", &device);
         let grads_b: Tensor<2> = fixture.tensor("input.grad_b", &device);
         for (step, rate) in fixture.values("output.lr").into_iter().take(5).enumerate() {
@@ -113,6 +128,57 @@ mod tests {
             assert_close(model.a.val().inner(), expected.squeeze_dim::<2>(0), 1e-6);
             let expected = fixture.tensor::<2>("output.param_b", &device).narrow(0, step, 1);
             assert_close(model.b.val().inner(), expected.squeeze_dim::<1>(0), 1e-6);
+        }
+    }
+
+    /// Weight matrices of transformer blocks, and one outside of them.
+    #[derive(Module, Debug)]
+    struct Matrices {
+        blocks: Vec<Block>,
+        outside: Block,
+    }
+
+    #[derive(Module, Debug)]
+    struct Block {
+        layer: Weight,
+    }
+
+    #[derive(Module, Debug)]
+    struct Weight {
+        weight: Param<Tensor<2>>,
+    }
+
+    #[test]
+    fn five_updates_of_muon_equal_the_definition_in_f64() {
+        let fixture = Reference::open("reference/muon");
+        let device = Device::flex();
+        let rate = fixture.values("output.lr")[0];
+        let block = |name: &str| {
+            let weight = fixture.tensor(&format!("input.param_{name}"), &device.clone().autodiff());
+            Block { layer: Weight { weight: Param::from_tensor(weight) } }
+        };
+        let names = ["wide", "tall", "wide"];
+        let mut model = Matrices { blocks: vec![block("wide"), block("tall")], outside: block("wide") };
+        let config = OptimizerConfig { algorithm: Algorithm::Muon, ..OptimizerConfig::default() };
+        let mut optimizer = make_optimizer(&config);
+        for step in 0..5 {
+            let of_step = |kind: &str, name: &str| {
+                let all: Tensor<3> = fixture.tensor(&format!("{kind}_{name}"), &device);
+                all.narrow(0, step, 1).squeeze_dim::<2>(0)
+            };
+            let weights = |model: &Matrices| {
+                let blocks = [&model.blocks[0], &model.blocks[1], &model.outside];
+                blocks.map(|block| block.layer.weight.clone())
+            };
+            let mut grads = GradientsParams::new();
+            for (weight, name) in weights(&model).iter().zip(names) {
+                grads.register(weight.id, of_step("input.grad", name));
+            }
+            model = optimizer.step(rate, model, grads);
+            let [wide, tall, outside] = weights(&model).map(|weight| weight.val().inner());
+            assert_close(wide.clone(), of_step("output.param", "wide"), 2e-6);
+            assert_close(tall, of_step("output.param", "tall"), 2e-6);
+            assert!((wide - outside).abs().max().into_scalar::<f32>() > 1e-3, "AdamW updates it");
         }
     }
 

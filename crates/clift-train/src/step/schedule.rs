@@ -1,23 +1,46 @@
 //! Learning rate of each step.
 
+use crate::config::config::{OptimizerConfig, Schedule};
+
 /// Learning rate at the start of the warm-up.
 const START: f64 = 1e-8;
 
-/// Returns the learning rate of `step` = 1, 2, ..: linear from 1e-8 to `base` during the warm-up, then half a cosine down to
-/// 0 at `num_steps` and later.
-pub fn warm_up_cosine(step: u64, base: f64, num_warm_up_steps: u64, num_steps: u64) -> f64 {
-    if step <= num_warm_up_steps {
-        return START + (base - START) * step as f64 / num_warm_up_steps as f64;
+/// Share of the steps in which [`Schedule::Wsd`] lowers the rate.
+const DECAY_SHARE: f64 = 0.5;
+
+/// Returns the learning rate of `step` = 1, 2, ..: linear from 1e-8 to `optimizer.learning_rate` during the warm-up, then by
+/// the schedule down to 0 at `num_steps` and later.
+pub fn learning_rate(optimizer: &OptimizerConfig, step: u64, num_steps: u64) -> f64 {
+    let OptimizerConfig { learning_rate: base, warm_up_steps, schedule, .. } = *optimizer;
+    if step <= warm_up_steps {
+        return START + (base - START) * step as f64 / warm_up_steps as f64;
     }
-    let num_decay_steps = num_steps.saturating_sub(num_warm_up_steps).max(1) as f64;
-    let progress = ((step - num_warm_up_steps) as f64 / num_decay_steps).min(1.0);
-    base * 0.5 * (1.0 + (std::f64::consts::PI * progress).cos())
+    match schedule {
+        Schedule::Cosine => {
+            let num_decay_steps = num_steps.saturating_sub(warm_up_steps).max(1) as f64;
+            let progress = ((step - warm_up_steps) as f64 / num_decay_steps).min(1.0);
+            base * 0.5 * (1.0 + (std::f64::consts::PI * progress).cos())
+        }
+        Schedule::Wsd => {
+            let num_decay_steps = (DECAY_SHARE * num_steps as f64).max(1.0);
+            base * (num_steps.saturating_sub(step) as f64 / num_decay_steps).min(1.0)
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::testing::Reference;
+
+    fn rate(schedule: Schedule, step: u64, learning_rate: f64, warm_up_steps: u64, num_steps: u64) -> f64 {
+        let optimizer = OptimizerConfig { schedule, learning_rate, warm_up_steps, ..OptimizerConfig::default() };
+        super::learning_rate(&optimizer, step, num_steps)
+    }
+
+    fn warm_up_cosine(step: u64, base: f64, num_warm_up_steps: u64, num_steps: u64) -> f64 {
+        rate(Schedule::Cosine, step, base, num_warm_up_steps, num_steps)
+    }
 
     #[test]
     fn rates_equal_those_of_pytorch() {
@@ -33,5 +56,15 @@ mod tests {
         assert_eq!(warm_up_cosine(90_001, 4e-4, 2500, 90_000), warm_up_cosine(90_000, 4e-4, 2500, 90_000));
         assert!(warm_up_cosine(1, 1e-3, 0, 30) < 1e-3 && warm_up_cosine(30, 1e-3, 100, 30) < 1e-3);
         assert!(warm_up_cosine(101, 1e-3, 100, 30).is_finite());
+    }
+
+    #[test]
+    fn wsd_is_constant_and_then_linear_to_zero() {
+        let rates = [1, 10, 20, 50, 60, 75, 99, 100, 101].map(|step| rate(Schedule::Wsd, step, 2e-3, 20, 100));
+        let expected = [1e-4, 1e-3, 2e-3, 2e-3, 1.6e-3, 1e-3, 4e-5, 0.0, 0.0];
+        for (rate, expected) in rates.into_iter().zip(expected) {
+            assert!((rate - expected).abs() < 1e-8, "{rate} is not {expected}");
+        }
+        assert!(rate(Schedule::Wsd, 1, 1e-3, 0, 1).abs() < 1e-20);
     }
 }

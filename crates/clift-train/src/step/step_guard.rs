@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use clift_data::upper_median;
+use clift_data::median;
 use serde::{Deserialize, Serialize};
 
 use crate::config::config::OptimizerConfig;
@@ -62,12 +62,10 @@ impl LossHistory {
         }
     }
 
-    /// Returns the upper medians of loss and gradient norm, which are values of the window; `None` for fewer than 20
-    /// steps.
+    /// Returns the medians of loss and gradient norm; `None` for fewer than 20 steps.
     pub fn medians(&self) -> [Option<f64>; 2] {
-        [&self.losses, &self.grad_norms].map(|window| {
-            (window.len() >= MIN_STEPS).then(|| upper_median(&window.iter().copied().collect::<Vec<_>>()))
-        })
+        [&self.losses, &self.grad_norms]
+            .map(|window| (window.len() >= MIN_STEPS).then(|| median(&window.iter().copied().collect::<Vec<_>>())))
     }
 }
 

@@ -12,7 +12,7 @@ use crate::step::batch::StageBatch;
 use crate::step::device_batch::{DeviceBatch, render_loss};
 use crate::step::loss::{Loss, LossParts};
 use crate::step::loss_scale::LossScale;
-use crate::step::optimizer::{adamw, clip_factor, norm_on_device, scale_gradients};
+use crate::step::optimizer::{clip_factor, make_optimizer, norm_on_device, scale_gradients};
 
 /// A model with its optimizer on an autodiff device.
 pub struct TrainState {
@@ -46,7 +46,7 @@ pub struct Update {
 impl TrainState {
     /// Makes the state before the first update: mean squared error, f32, activations stored.
     pub fn new(model: Clift, optimizer: &OptimizerConfig, device: Device) -> Self {
-        let (optimizer, loss) = (adamw(optimizer), Loss::default());
+        let (optimizer, loss) = (make_optimizer(optimizer), Loss::default());
         Self { model, optimizer, device, loss, activation_checkpointing: false, loss_scale: None }
     }
 

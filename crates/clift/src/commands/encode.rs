@@ -4,16 +4,18 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clift_data::{
-    ClipReader, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions, Split,
-    open_dataset, open_source, plural,
+    ClipReader, DataError, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions,
+    Split, open_dataset, open_source, plural,
 };
-use clift_eval::{EncodeOptions, EncodedScene, encode};
-use clift_model::{ModelPath, TokenCount, TokenFormat, TrainedModel, check_output_path};
+use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode};
+use clift_model::{ModelPath, Scene, TokenCount, TokenFormat, TrainedModel, check_output_path};
 use clift_train::{Config, Override};
+use serde::Serialize;
 
 use crate::commands::parse::parse_split;
 use crate::commands::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::{UsageError, usage_bail};
+use crate::output::json::write_json;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::units::file_size;
 
@@ -30,27 +32,71 @@ pub struct EncodeArgs {
     /// Scene file to write
     #[arg(long, short, value_name = "FILE")]
     pub out: PathBuf,
+    /// Replace existing files
+    #[arg(long)]
+    pub force: bool,
     /// Key of the scene, if the data set has several
     #[arg(long, value_name = "KEY")]
     pub scene: Option<String>,
     /// Split of the data set: train or test
     #[arg(long, value_name = "SPLIT", default_value = "test", value_parser = parse_split)]
     pub split: Split,
-    /// Context frames, e.g. 0,5,9 [default: as many as in training, evenly spread]
+    /// Context frames by position or file name [default: as many as in training]
+    ///
+    /// Positions count from 0 in the order of the scene; names are those of the image files, with or without extension:
+    /// `--context 0,5,9` or `--context IMG_1.jpg,IMG_7.jpg`. The default is spread along the camera path.
     #[arg(long, value_name = "FRAMES", value_delimiter = ',')]
-    pub context: Vec<usize>,
+    pub context: Vec<String>,
     /// Tokens to store, as a number or a share
     #[arg(long, value_name = "COUNT", default_value = "1/4")]
     pub storage: TokenCount,
     /// Number format of the tokens in the file: f32, f16 or int8
     #[arg(long, value_name = "FORMAT", default_value_t)]
     pub tokens: TokenFormat,
+    /// Also write the cluster of every token, as JSON
+    #[arg(long, value_name = "FILE")]
+    pub save_clusters: Option<PathBuf>,
     #[command(flatten)]
     pub overrides: ConfigArgs,
 }
 
+/// Content of `--save-clusters`.
+#[derive(Debug, Serialize)]
+struct ClustersFile<'a> {
+    scene: &'a str,
+    /// Context frames; tokens are ordered by frame, row and column of the patch.
+    frames: &'a [u32],
+    rows: usize,
+    columns: usize,
+    /// Cluster of each token, which is the index of a token of the scene file.
+    assignment: &'a [u32],
+    /// Token nearest to the centre of each cluster.
+    centroids: &'a [u32],
+}
+
+impl<'a> ClustersFile<'a> {
+    fn of(encoded: &'a EncodedScene) -> Self {
+        let EncodedScene { scene, clusters, .. } = encoded;
+        let patch_size = scene.model.patch_size;
+        Self {
+            scene: &scene.key,
+            frames: &scene.context_frames,
+            rows: scene.height / patch_size,
+            columns: scene.width / patch_size,
+            assignment: clusters.assignment(),
+            centroids: clusters.centroid_index(),
+        }
+    }
+}
+
+/// Encodes one scene and writes its file.
 pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
     check_output_path(&args.out).map_err(|error| UsageError(error.to_string()))?;
+    for path in [Some(&args.out), args.save_clusters.as_ref()].into_iter().flatten() {
+        if !args.force && path.exists() {
+            usage_bail!("the file {} exists; replace it with --force or choose another name", path.display());
+        }
+    }
     let model = ModelPath::find(&args.model)?;
     let (mut config, overrides) = read_config(&model.dir.join("config.toml"), &args.overrides.set, |_| Ok(()))?;
     // Tensor shapes do not determine the number of heads: a wrong one would silently change the tokens.
@@ -69,24 +115,71 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         None => open_dataset(&config.data, args.split)?.source,
     };
     let scene = find_scene(source.as_ref(), args.scene.as_deref())?;
+    let context = frame_positions(&args.context, || source.frame_names(scene))?;
     let reader = ClipReader { source, options: config.data.clip_options() };
     let options = EncodeOptions {
-        context: (!args.context.is_empty()).then(|| args.context.clone()),
+        context: (!args.context.is_empty()).then_some(context),
         num_context: config.data.views.max_context,
         storage: args.storage,
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
-        model_path: args.model.to_string_lossy().into_owned(),
+        model_path: Scene::model_path_for(&args.model, &args.out),
     };
     let model = TrainedModel::open(&model, &config.model, &config.device.open()?)?;
     let encoded = encode(&model, &reader, scene, &options)?;
     encoded.scene.write(&args.out, args.tokens)?;
-    print_result(&describe(&encoded, args.tokens, &args.out))
+    if let Some(path) = &args.save_clusters {
+        write_json(&ClustersFile::of(&encoded), path)?;
+    }
+    print_result(&describe(&encoded, args.tokens, &args.out))?;
+    print_check(HeldOutFrame::render(&model, &reader, scene, &encoded.scene)?, &args.model)
+}
+
+/// Prints how a frame that is no context is rendered, with a warning if a copy of a context view is nearer to it.
+fn print_check(check: Option<HeldOutFrame>, model: &Path) -> anyhow::Result<()> {
+    let Some(HeldOutFrame { frame, psnr, nearest_psnr }) = check else {
+        return print_result("check: no frame beside the contexts to compare a rendering with");
+    };
+    print_result(&format!(
+        "check: frame {frame}, not a context: {psnr:.2} dB rendered, {nearest_psnr:.2} dB copied from the nearest context"
+    ))?;
+    if psnr < nearest_psnr {
+        print_note(&format!(
+            "warning: the rendering of frame {frame} is worse than a copy of the nearest context view; the scene differs \
+             from the training scenes of {}, or the run is not trained enough",
+            model.display()
+        ));
+    }
+    Ok(())
+}
+
+/// Returns the positions of frames that are given by position or file name.
+fn frame_positions(
+    frames: &[String],
+    names: impl FnOnce() -> Result<Vec<String>, DataError>,
+) -> anyhow::Result<Vec<usize>> {
+    if let Ok(positions) = frames.iter().map(|frame| frame.parse()).collect() {
+        return Ok(positions);
+    }
+    let names = names()?;
+    let position = |frame: &String| {
+        let has_stem = |name: &String| name.rsplit_once('.').is_some_and(|(stem, _)| stem == frame);
+        let named = names.iter().position(|name| name == frame).or_else(|| names.iter().position(has_stem));
+        let Some(position) = named.or_else(|| frame.parse().ok()) else {
+            let first = names.iter().take(MAX_LISTED_KEYS).map(String::as_str).collect::<Vec<_>>().join(", ");
+            match names.len() {
+                0 => usage_bail!("--context {frame}: the frames of this data set have no file names; write positions"),
+                count => usage_bail!("--context: no frame {frame}; the {count} frames start with {first}"),
+            }
+        };
+        Ok(position)
+    };
+    frames.iter().map(position).collect()
 }
 
 fn describe(encoded: &EncodedScene, format: TokenFormat, path: &Path) -> String {
-    let EncodedScene { scene, num_lift_tokens, cluster_error } = encoded;
+    let EncodedScene { scene, num_lift_tokens, cluster_error, .. } = encoded;
     let num_tokens = scene.num_tokens();
     let frames = scene.context_frames.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
     format!(
@@ -134,5 +227,27 @@ fn find_scene(source: &dyn SceneSource, key: Option<&str>) -> anyhow::Result<usi
         (Some(key), None) => usage_bail!("no scene {key}; the {num_scenes} scenes are: {keys}"),
         (None, None) if num_scenes == 1 => Ok(0),
         (None, None) => usage_bail!("{num_scenes} scenes; choose one with --scene: {keys}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn context_frames_are_positions_or_file_names() {
+        let positions = |frames: &[&str]| {
+            let frames: Vec<String> = frames.iter().map(ToString::to_string).collect();
+            let names = || Ok(["a.jpg", "b.v2.png", "7.png", "0"].map(String::from).to_vec());
+            frame_positions(&frames, names).map_err(|error| error.to_string())
+        };
+        assert_eq!(positions(&["7", "0"]).unwrap(), [7, 0], "numbers alone are positions");
+        assert_eq!(positions(&["b.v2.png", "a", "7.png", "2"]).unwrap(), [1, 0, 2, 2]);
+        assert_eq!(
+            positions(&["a.jpg", "c.jpg"]).unwrap_err(),
+            "--context: no frame c.jpg; the 4 frames start with a.jpg, b.v2.png, 7.png, 0"
+        );
+        let message = frame_positions(&["a.jpg".into()], || Ok(Vec::new())).unwrap_err().to_string();
+        assert!(message.contains("write positions"), "{message}");
     }
 }

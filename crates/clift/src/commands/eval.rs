@@ -2,17 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use clift_data::SourceKind;
+use clift_data::{SourceKind, Split};
 use clift_eval::{Experiment, ExternalMethod, MethodName, Selection};
 use clift_model::{ModelPath, TokenCount, TokenFormat};
-use clift_train::{Config, Run, evaluate_model};
+use clift_train::{Config, EvalFolder, EvalRequest, Run, evaluate_model};
 
-use crate::commands::parse::parse_bytes;
+use crate::commands::parse::{parse_bytes, parse_split};
 use crate::commands::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::bar::progress_sink;
-use crate::output::stdout::{print_evaluation, print_note};
+use crate::output::stdout::{print_evaluation, print_warning};
 
 pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let external = external_methods(args)?;
@@ -23,7 +23,8 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
         (None, None) => unreachable!("clap requires a run or --checkpoint"),
     };
     let config = eval_config(args, folder)?;
-    let out: PathBuf = args.out.clone().unwrap_or_else(|| folder.join("eval"));
+    let results = if args.split == Split::Train { "eval-train" } else { "eval" };
+    let out: PathBuf = args.out.clone().unwrap_or_else(|| folder.join(results));
     let with = args.with.as_ref().map(|run| -> anyhow::Result<Config> {
         let (mut config, _) = read_config(&run.join("config.toml"), &[], |_| Ok(()))?;
         config.run_dir.clone_from(run);
@@ -31,18 +32,20 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<()> {
     });
     let with = with.transpose()?;
     if model.is_some() && config.eval.index.is_none() {
-        print_note(
-            "warning: without --index, contexts and targets are spread evenly over each scene; published figures use an \
+        print_warning(
+            "without --index, contexts and targets are spread evenly over each scene; published figures use an \
              evaluation index with four contexts and are not comparable",
         );
     }
     let mut sink = progress_sink();
     let stop = interrupt::flag()?;
+    let folder = EvalFolder::open(&out, args.force, sink.as_mut())?;
+    let request = EvalRequest { split: args.split, external: &external, folder: &folder };
     let summary = match &model {
-        None => Run::reopen(config)?.evaluate(&external, &out, with.as_ref(), &stop, sink.as_mut())?,
+        None => Run::reopen(config)?.evaluate(&request, with.as_ref(), &stop, sink.as_mut())?,
         Some(model) => {
             let stage1 = args.stage1.as_deref().map(ModelPath::find).transpose()?;
-            evaluate_model(config, model, stage1.as_ref(), &external, &out, &stop, sink.as_mut())?
+            evaluate_model(config, model, stage1.as_ref(), &request, &stop, sink.as_mut())?
         }
     };
     drop(sink);
@@ -75,6 +78,7 @@ fn eval_config(args: &EvalArgs, folder: &Path) -> anyhow::Result<Config> {
     if args.index.is_some() {
         config.eval.index.clone_from(&args.index);
     }
+    config.eval.drop_context_targets |= args.drop_context_targets;
     Ok(config)
 }
 
@@ -150,7 +154,16 @@ pub struct EvalArgs {
     pub index: Option<PathBuf>,
     #[command(flatten)]
     pub overrides: ConfigArgs,
-    /// Output folder [default: `eval` in the run]
+    /// Leave out targets of the index that are also contexts
+    #[arg(long)]
+    pub drop_context_targets: bool,
+    /// Evaluate this split: test or train
+    #[arg(long, value_name = "SPLIT", default_value = "test", value_parser = parse_split)]
+    pub split: Split,
+    /// Output folder [default: `eval` in the run, `eval-train` for --split train]
     #[arg(long, short, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Replace the evaluation in the output folder
+    #[arg(long)]
+    pub force: bool,
 }

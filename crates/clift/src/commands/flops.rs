@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use clift_bench::check_plan;
 use clift_model::{FlopConvention, Macs, ModelConfig, TokenCount};
 use clift_train::Config;
 use serde::Serialize;
@@ -58,7 +59,7 @@ fn sizes(args: &FlopsArgs) -> anyhow::Result<Sizes> {
         let counts = given(PAPER_TOKENS.map(TokenCount::Count).into());
         return Ok(Sizes { model: ModelConfig::default(), height: 256, width: 256, num_context: 4, counts });
     };
-    let (Config { model, data, eval, .. }, _) = read_config(path, &args.set, Config::validate)?;
+    let (Config { model, data, eval, .. }, _) = read_config(path, &args.set, check_plan)?;
     let counts = given(eval.storage.into_iter().rev().collect());
     Ok(Sizes { model, height: data.height, width: data.width, num_context: eval.num_context, counts })
 }
@@ -128,6 +129,20 @@ mod tests {
         let json = JsonArg { path: None };
         let args = FlopsArgs { config: None, convention, render: Vec::new(), set: Vec::new(), json };
         count(&sizes(&args).unwrap(), convention).unwrap()
+    }
+
+    #[test]
+    fn configs_need_no_data() {
+        let config = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/re10k.toml").into();
+        let json = JsonArg { path: None };
+        let args = FlopsArgs {
+            config: Some(config),
+            convention: FlopConvention::Macs,
+            render: Vec::new(),
+            set: Vec::new(),
+            json,
+        };
+        assert_eq!(sizes(&args).unwrap().model, ModelConfig::default());
     }
 
     #[test]

@@ -4,6 +4,7 @@
 
 pub(crate) mod bench;
 pub(crate) mod compare;
+pub(crate) mod completions;
 pub(crate) mod data;
 pub(crate) mod doctor;
 pub(crate) mod encode;
@@ -11,6 +12,7 @@ pub(crate) mod eval;
 pub(crate) mod export;
 pub(crate) mod flops;
 pub(crate) mod import;
+pub(crate) mod metrics;
 pub(crate) mod parse;
 pub(crate) mod plan;
 pub(crate) mod render;

@@ -2,23 +2,26 @@
 
 use std::path::PathBuf;
 
-use clift_bench::{PartPlan, Plan, check_plan, plan};
+use clift_bench::{PartPlan, Plan, check_plan, missing_weights, plan};
 use clift_model::max_tensor_bytes;
 use clift_train::{Config, LargestTensor, PARTS, largest_tensor, memory_warning};
 
 use crate::commands::shared_args::{ConfigArgs, JsonArg};
-use crate::output::stdout::{print_note, print_result};
+use crate::output::stdout::{print_result, print_warning};
 use crate::output::table::table;
 use crate::output::units::{duration, memory_size, seconds};
 
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, check_plan)?;
     args.json.check_folder()?;
+    for missing in missing_weights(&config) {
+        print_warning(missing);
+    }
     let plan = plan(&config, !args.no_time)?;
     print_result(&report_text(&plan))?;
     print_result(&largest_tensors(&config)?)?;
     if let Some(warning) = memory_warning(&config, plan.available_bytes)? {
-        print_note(&format!("warning: {warning}"));
+        print_warning(warning);
     }
     args.json.write(&plan)
 }

@@ -47,7 +47,8 @@ pub fn read_config(
 #[derive(Debug, clap::Args)]
 pub struct JsonArg {
     /// Write the results as JSON
-    #[arg(long = "json", value_name = "FILE")]
+    // Another id than the field's, which arguments with this one flattened may have themselves.
+    #[arg(id = "json", long, value_name = "FILE")]
     pub path: Option<PathBuf>,
 }
 

@@ -9,13 +9,13 @@ use crate::commands::parse::{parse_count, parse_stage};
 use crate::commands::shared_args::ConfigArgs;
 use crate::interrupt;
 use crate::output::bar::progress_sink;
-use crate::output::stdout::{print_evaluation, print_note};
+use crate::output::stdout::{print_run, print_warning};
 
 pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let config = args.overrides.read(&args.config, Config::validate)?;
     // Before the system ends a run for its memory after hours of training.
     if let Ok(Some(warning)) = memory_warning(&config, available_bytes(config.device)) {
-        print_note(&format!("warning: {warning}"));
+        print_warning(warning);
     }
     let stop = interrupt::flag()?;
     let options = RunOptions { only: args.only, overfit: args.overfit, fresh: args.fresh, extend: args.extend };
@@ -24,7 +24,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let run = Run::open(config, &options, sink.as_mut())?;
     let summary = run.train(args.only, &stop, sink.as_mut())?;
     drop(sink);
-    summary.map_or(Ok(()), |summary| print_evaluation(&summary, &run_dir.join("eval")))
+    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir.join("eval")))
 }
 
 #[derive(Debug, clap::Args)]

@@ -8,14 +8,23 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 use crate::output::event_line::{event_line, step_metrics};
 use crate::output::plain::PlainLines;
-use crate::output::stdout::print_note;
+use crate::output::stdout::{print_note, print_warning};
 use crate::output::units::{duration, rate};
+use crate::output::verbosity::Verbosity;
+use crate::output::visible::visible;
 
+/// Creates a progress bar if the standard error is a terminal, progress lines otherwise; warnings alone for `--quiet`, and
+/// a line for every step for `--verbose`.
 pub fn progress_sink() -> Box<dyn Sink> {
-    if std::io::stderr().is_terminal() {
-        Box::new(Bar::default())
-    } else {
-        Box::new(PlainLines::new(std::io::stderr()))
+    match Verbosity::chosen() {
+        Verbosity::Quiet => Box::new(|event: &Event| {
+            if let Event::Warning(text) = event {
+                print_warning(text);
+            }
+        }),
+        Verbosity::Verbose => Box::new(PlainLines::new(std::io::stderr()).every_step()),
+        Verbosity::Normal if std::io::stderr().is_terminal() => Box::new(Bar::default()),
+        Verbosity::Normal => Box::new(PlainLines::new(std::io::stderr())),
     }
 }
 
@@ -34,7 +43,7 @@ impl Sink for Bar {
         }
         if let Some(line) = event_line(event) {
             match &self.bar {
-                Some(bar) => bar.println(line),
+                Some(bar) => bar.println(visible(&line)),
                 None => print_note(&line),
             }
         }

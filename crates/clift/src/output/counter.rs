@@ -8,6 +8,8 @@ use indicatif::ProgressBar;
 use crate::output::bar::progress_bar;
 use crate::output::stdout::print_note;
 use crate::output::units::{duration, rate};
+use crate::output::verbosity::Verbosity;
+use crate::output::visible::visible;
 
 const INTERVAL_S: f64 = 10.0;
 
@@ -22,7 +24,8 @@ pub struct Counter {
 
 impl Counter {
     pub fn new(name: &str, total: u64) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| progress_bar(name, 0, total));
+        let has_bar = std::io::stderr().is_terminal() && Verbosity::chosen() != Verbosity::Quiet;
+        let bar = has_bar.then(|| progress_bar(name, 0, total));
         let now = Instant::now();
         Self { name: name.into(), total, bar, started: now, last_line: now }
     }
@@ -41,7 +44,7 @@ impl Counter {
 
     pub fn note(&self, line: &str) {
         match &self.bar {
-            Some(bar) => bar.println(line),
+            Some(bar) => bar.println(visible(line)),
             None => print_note(line),
         }
     }

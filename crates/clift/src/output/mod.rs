@@ -1,8 +1,11 @@
 //! Results, notes and progress for people: results go to the standard output, everything else to the standard error.
 //!
 //! - `units`: seconds, bytes, counts
+//! - `visible`: control characters escaped
 //! - `table`: aligned columns
 //! - `json`: results as JSON files
+//! - `tensorboard`: event files
+//! - `verbosity`: `--quiet` and `--verbose`
 //! - `stdout`: results to stdout, notes to stderr
 //! - `event_line`: an event as one line
 //! - `plain`: progress lines for log files
@@ -16,4 +19,7 @@ pub(crate) mod json;
 pub(crate) mod plain;
 pub(crate) mod stdout;
 pub(crate) mod table;
+pub(crate) mod tensorboard;
 pub(crate) mod units;
+pub(crate) mod verbosity;
+pub(crate) mod visible;

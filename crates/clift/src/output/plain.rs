@@ -6,6 +6,7 @@ use clift_train::{Event, Sink, StepEvent};
 
 use crate::output::event_line::{event_line, step_metrics};
 use crate::output::units::duration;
+use crate::output::visible::visible;
 
 /// Seconds of training between two progress lines.
 const INTERVAL_S: f64 = 10.0;
@@ -17,17 +18,24 @@ pub struct PlainLines<W> {
     /// Steps and seconds since the stage started or resumed.
     pace: (u64, f64),
     printed_tenth: u64,
+    /// Seconds of training between two lines.
+    interval_s: f64,
 }
 
 impl<W: Write> PlainLines<W> {
     pub fn new(out: W) -> Self {
-        Self { out, since_line_s: 0.0, pace: (0, 0.0), printed_tenth: 0 }
+        Self { out, since_line_s: 0.0, pace: (0, 0.0), printed_tenth: 0, interval_s: INTERVAL_S }
+    }
+
+    /// Prints a line for every step.
+    pub fn every_step(self) -> Self {
+        Self { interval_s: 0.0, ..self }
     }
 
     fn step_line(&mut self, event: &StepEvent) -> Option<String> {
         self.pace = (self.pace.0 + 1, self.pace.1 + event.step_s);
         self.since_line_s += event.step_s;
-        let is_due = self.pace.0 == 1 || event.step == event.num_steps || self.since_line_s >= INTERVAL_S;
+        let is_due = self.pace.0 == 1 || event.step == event.num_steps || self.since_line_s >= self.interval_s;
         if !is_due {
             return None;
         }
@@ -59,7 +67,7 @@ impl<W: Write> Sink for PlainLines<W> {
             (self.pace, self.since_line_s, self.printed_tenth) = ((0, 0.0), 0.0, 0);
         }
         if let Some(line) = line {
-            drop(writeln!(self.out, "{line}")); // no other stream could report the failure
+            drop(writeln!(self.out, "{}", visible(&line))); // no other stream could report the failure
         }
     }
 }

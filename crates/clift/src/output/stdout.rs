@@ -1,14 +1,23 @@
 //! Results to stdout, notes to stderr.
 
+use std::fmt::Display;
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 
 use anyhow::Context;
 use clift_eval::Summary;
 
+use crate::output::verbosity::Verbosity;
+use crate::output::visible::visible;
+
 /// Writes lines to the standard output and flushes them. A closed pipe, as `head` leaves behind, is no error.
 pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
+}
+
+/// Writes the result of a run and the path of its report, which has the whole table: six lines for a small terminal.
+pub fn print_run(summary: &Summary, folder: &Path) -> anyhow::Result<()> {
+    print_result(&format!("{}\nreport: {}", summary.headline(), folder.join("report.html").display()))
 }
 
 /// Writes the table of an evaluation and the paths of its report and files.
@@ -18,15 +27,27 @@ pub fn print_evaluation(summary: &Summary, folder: &Path) -> anyhow::Result<()> 
 }
 
 fn write_result(mut out: impl Write, text: &str) -> anyhow::Result<()> {
-    match writeln!(out, "{text}").and_then(|()| out.flush()) {
+    match writeln!(out, "{}", visible(text)).and_then(|()| out.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
         written => written.context("writing to the standard output"),
     }
 }
 
-/// Writes a line to the standard error. A failure is ignored: no other stream could report it.
+/// Writes a line to the standard error, unless the command is quiet.
 pub fn print_note(text: &str) {
-    drop(writeln!(std::io::stderr(), "{text}"));
+    if Verbosity::chosen() != Verbosity::Quiet {
+        print_problem(text);
+    }
+}
+
+/// Writes a warning to the standard error.
+pub fn print_warning(text: impl Display) {
+    print_problem(&format!("warning: {text}"));
+}
+
+/// Writes a line to the standard error. A failure is ignored: no other stream could report it.
+pub fn print_problem(text: &str) {
+    drop(writeln!(std::io::stderr(), "{}", visible(text)));
 }
 
 #[cfg(test)]
@@ -53,5 +74,8 @@ mod tests {
         let mut out = Vec::new();
         write_result(&mut out, "row").unwrap();
         assert_eq!(out, b"row\n");
+        out.clear();
+        write_result(&mut out, "key\u{1b}[2J").unwrap();
+        assert_eq!(out, b"key\\u{1b}[2J\n");
     }
 }

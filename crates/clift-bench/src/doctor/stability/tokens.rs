@@ -67,11 +67,11 @@ fn render_error(devices: &CaseDevices, storage: TokenFormat) -> Result<Outcome, 
     let clip = seeded_clip(shape(devices, 4), 0, 0);
     let lift = networks.encoder.forward(&upload_views(&[&clip.context], &devices.device)?);
     let shape = lift.dims();
-    let tokens: Vec<f32> = values(lift.clone()).into_iter().map(|value| value as f32).collect();
+    let tokens: Vec<f32> = values(lift.values.clone()).into_iter().map(|value| value as f32).collect();
     let rounded = TensorData::new(storage.round(&tokens, config.dim)?, shape);
     let rounded: Tensor<3> = Tensor::from_data(rounded, &devices.device);
     let cameras = upload_cameras(&[&clip.target], &devices.device)?;
-    let rendering = networks.renderer.forward(rounded, &cameras);
+    let rendering = networks.renderer.forward(lift.with_values(rounded), &cameras);
     let renderer = module_in_f64(&networks.renderer, &devices.reference);
     let expected = renderer.forward(lift.in_f64(&devices.reference), &cameras.in_f64(&devices.reference));
     let pairs = values(rendering).into_iter().zip(values(expected));

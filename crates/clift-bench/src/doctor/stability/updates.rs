@@ -1,7 +1,7 @@
 //! Whole updates, loss and gradients, on extreme views.
 
 use clift_data::{Clip, ClipViews, MAX_COORDINATE};
-use clift_model::ModelConfig;
+use clift_model::{CameraEncoding, ModelConfig};
 use clift_train::{ClipShape, Stage, StageBatch, TrainError, freeze, seeded_batch, seeded_model};
 
 use crate::cases::step::update_error;
@@ -33,14 +33,23 @@ pub(crate) const CASES: &[StabilityCase] = &[
         breaks: "moments of 1e3 beside colours of 1",
         bound: Bound::Most(1e-3),
         reason: "the first layer adds colours to a thousand times as much, so that f32 has three digits less of them",
-        run: |devices| {
-            changed_views(devices, 4, |clip| {
-                for pose in clip.context.c2w.iter_mut().chain(&mut clip.target.c2w) {
-                    pose.translation += MAX_COORDINATE;
-                }
-            })
-        },
+        run: |devices| changed_views(devices, 4, |clip| shift_cameras(clip, MAX_COORDINATE)),
     },
+    StabilityCase {
+        name: "the same with camera-relative attention (gta)",
+        breaks: "positions of 1e3 in the transforms of queries, keys and values",
+        bound: Bound::Most(1e-1),
+        reason: "scores and values add terms of 1e3 that cancel, twice in each attention; cameras of a clip are within 1",
+        run: |devices| relative_views(devices, CameraEncoding::Gta, |clip| shift_cameras(clip, MAX_COORDINATE)),
+    },
+    gradient_case("camera-relative attention (gta)", "the transforms of queries, keys and values", |devices| {
+        relative_views(devices, CameraEncoding::Gta, |_| ())
+    }),
+    gradient_case(
+        "camera-relative attention (prope), field of view of 5 degrees",
+        "focal lengths in both",
+        |devices| relative_views(devices, CameraEncoding::Prope, |clip| field_of_view(clip, 5.0)),
+    ),
     gradient_case("field of view of 5 degrees", "rays that are nearly parallel", |devices| {
         changed_views(devices, 4, |clip| field_of_view(clip, 5.0))
     }),
@@ -103,6 +112,19 @@ fn changed_views(devices: &CaseDevices, num_context: usize, change: impl Fn(&mut
     stage_error(devices, Stage::Stage1, &batch)
 }
 
+/// Returns the error of an update on changed views with camera-relative attention; heads of 8 or 16 channels.
+fn relative_views(
+    devices: &CaseDevices,
+    camera_encoding: CameraEncoding,
+    change: impl Fn(&mut Clip),
+) -> Result<Outcome, TrainError> {
+    let mut batch = seeded_batch(shape(devices, 4), 1, num_tokens(devices, 4), None, 0)?;
+    batch.clips.iter_mut().for_each(change);
+    let config = ModelConfig { camera_encoding, num_heads: devices.size.pick(2, 4), ..network(devices) };
+    let model = freeze(Stage::Stage1, seeded_model(&config, 0, &devices.device));
+    Ok(Outcome::Error(update_error(&model, &batch, &devices.device, &devices.reference, NOISE_SHARE)?))
+}
+
 pub(crate) fn stage_error(devices: &CaseDevices, stage: Stage, batch: &StageBatch) -> Result<Outcome, TrainError> {
     let model = freeze(stage, seeded_model(&network(devices), 0, &devices.device));
     Ok(Outcome::Error(update_error(&model, batch, &devices.device, &devices.reference, NOISE_SHARE)?))
@@ -115,6 +137,12 @@ fn all_views(clip: &mut Clip) -> [&mut ClipViews; 2] {
 fn move_cameras(clip: &mut Clip, to: impl Fn(f64) -> f64) {
     for pose in all_views(clip).into_iter().flat_map(|views| &mut views.c2w) {
         pose.translation = pose.translation.map(&to);
+    }
+}
+
+fn shift_cameras(clip: &mut Clip, by: f64) {
+    for pose in all_views(clip).into_iter().flat_map(|views| &mut views.c2w) {
+        pose.translation += by;
     }
 }
 

@@ -7,11 +7,12 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
+use crate::geometry::camera::{Camera, widest_fov_deg};
 use crate::image::codec::decode_image;
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::{SceneSource, Split};
 use crate::skip_report::{SkipReport, note_on};
+use crate::sources::chunks::census::{Census, ChunkCensus, SceneCensus};
 use crate::sources::chunks::index::read_index;
 use crate::sources::chunks::table::{ChunkTable, SceneTable};
 use crate::sources::filters::SceneFilters;
@@ -21,6 +22,8 @@ use crate::sources::keys::{DL3DV_PREFIX, find_by_name};
 struct Chunk {
     path: PathBuf,
     table: OnceLock<ChunkTable>,
+    /// Counts of a cached or new census.
+    census: Option<ChunkCensus>,
 }
 
 impl Chunk {
@@ -33,6 +36,23 @@ impl Chunk {
             return Err(DataError::BadChunk { what, path: self.path.clone() });
         }
         Ok(())
+    }
+
+    /// Returns the cached census if it is current, and otherwise reads the table and makes one.
+    fn examine(&self, cached: Option<&ChunkCensus>, needs_fov: bool) -> Result<ChunkCensus, DataError> {
+        match cached {
+            Some(census) if census.is_current(&self.path, needs_fov) => Ok(census.clone()),
+            _ => ChunkCensus::of(&self.path, || self.table(), needs_fov),
+        }
+    }
+
+    /// Returns the keys of all scenes of the file, as far as they are in memory.
+    fn keys(&self) -> Vec<&String> {
+        match (&self.census, self.table.get()) {
+            (Some(census), _) => census.scenes.keys().collect(),
+            (None, Some(table)) => table.scenes.keys().collect(),
+            (None, None) => Vec::new(),
+        }
     }
 
     fn table(&self) -> Result<&ChunkTable, DataError> {
@@ -73,18 +93,20 @@ impl ChunkSource {
     pub fn open(root: &Path, split: Split, filters: &SceneFilters) -> Result<Self, DataError> {
         let folder = root.join(split.to_string());
         let index = read_index(&folder.join("index.json"))?;
-        let mut source = Self::of_index(&folder, &index, |_| true, filters, false)?;
+        let mut source = Self::of_index(&folder, &index, |_| true, filters, false, None)?;
         source.record_unlisted(&folder, &index);
         Ok(source)
     }
 
-    /// Opens the scenes of `index` (keys to files in `folder`) for which `kept` is true. `reads_all` reads all tables.
+    /// Opens the scenes of `index`, a map from keys to files in `folder`, for which `kept` is true. With `reads_all`, the
+    /// table of every chunk is read even without filters. The file `census` caches what the filters depend on.
     pub(crate) fn of_index(
         folder: &Path,
         index: &BTreeMap<String, String>,
         kept: impl Fn(&str) -> bool,
         filters: &SceneFilters,
         reads_all: bool,
+        census: Option<&Path>,
     ) -> Result<Self, DataError> {
         filters.validate()?;
         let mut chunk_ids = BTreeMap::new();
@@ -92,12 +114,15 @@ impl ChunkSource {
         let mut scenes = Vec::with_capacity(index.len());
         for (key, file) in index.iter().filter(|(key, _)| kept(key)) {
             let chunk = *chunk_ids.entry(file).or_insert_with_key(|file| {
-                chunks.push(Chunk { path: folder.join(file), table: OnceLock::new() });
+                chunks.push(Chunk { path: folder.join(file), table: OnceLock::new(), census: None });
                 chunks.len() - 1
             });
             scenes.push(Entry { key: key.clone(), chunk });
         }
         let mut source = Self { chunks, report: SkipReport::new(scenes.len()), scenes, positions: HashMap::new() };
+        if let Some(path) = census.filter(|_| filters.is_any_set() && !reads_all) {
+            source.take_census(path, filters.max_fov_deg.is_some());
+        }
         source.skip_scenes(filters, reads_all || filters.is_any_set())?;
         source.positions = source.scenes.iter().enumerate().map(|(i, entry)| (entry.key.clone(), i)).collect();
         Ok(source)
@@ -113,11 +138,32 @@ impl ChunkSource {
         span.read(path)
     }
 
+    /// Counts the scenes of all readable chunks, of unchanged ones from the file at `path`, and updates the file.
+    fn take_census(&mut self, path: &Path, needs_fov: bool) {
+        let name = |chunk: &Chunk| chunk.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let cached = Census::read(path).chunks;
+        let examine = |chunk: &mut Chunk| chunk.census = chunk.examine(cached.get(&name(chunk)), needs_fov).ok();
+        self.chunks.par_iter_mut().for_each(examine);
+        let chunks = self.chunks.iter().filter_map(|chunk| Some((name(chunk), chunk.census.clone()?)));
+        // The other split may have its chunks in the same folder.
+        let mut updated = cached.clone();
+        updated.extend(chunks);
+        if updated != cached {
+            Census::write(updated, path);
+        }
+    }
+
+    /// Returns the census of a scene.
+    fn census(&self, scene: usize) -> Option<&SceneCensus> {
+        let Entry { key, chunk } = self.scenes.get(scene)?;
+        self.chunks[*chunk].census.as_ref()?.scenes.get(key)
+    }
+
     /// Moves the scenes of failing chunks and the filtered scenes to the report.
     fn skip_scenes(&mut self, filters: &SceneFilters, reads_tables: bool) -> Result<(), DataError> {
         let open = |chunk: &Chunk| {
             chunk.find()?;
-            if reads_tables { chunk.table().map(|_| ()) } else { Ok(()) }
+            if reads_tables && chunk.census.is_none() { chunk.table().map(|_| ()) } else { Ok(()) }
         };
         let opened: Vec<Result<(), DataError>> = self.chunks.par_iter().map(open).collect();
         let failures: Vec<_> = opened.iter().map(|opened| opened.as_ref().err().map(ToString::to_string)).collect();
@@ -127,7 +173,7 @@ impl ChunkSource {
         let reason = |scene: usize| {
             let failure = failures[self.scenes[scene].chunk].clone();
             let filter = || {
-                if reads_tables {
+                if reads_tables && self.census(scene).is_none() {
                     self.table(scene)?;
                 }
                 self.reason_to_skip(scene, filters)
@@ -145,11 +191,11 @@ impl ChunkSource {
         Ok(())
     }
 
-    /// Reports the scenes of chunks that `index` does not list. Only tables that are in memory are examined.
+    /// Reports the scenes of chunks that `index` does not list. Only chunks whose keys are in memory are examined.
     pub(crate) fn record_unlisted(&mut self, folder: &Path, index: &BTreeMap<String, String>) {
         let (mut unlisted, mut elsewhere) = (BTreeSet::new(), BTreeSet::new());
         for chunk in &self.chunks {
-            for key in chunk.table.get().iter().flat_map(|table| table.scenes.keys()) {
+            for key in chunk.keys() {
                 match index.get(key) {
                     None => {
                         unlisted.insert(key.clone());
@@ -172,7 +218,8 @@ impl ChunkSource {
 
     fn reason_to_skip(&self, scene: usize, filters: &SceneFilters) -> Result<Option<String>, DataError> {
         let num_frames = if filters.min_frames > 0 { self.num_frames(scene)? } else { 0 };
-        filters.reason_to_skip(num_frames, || self.cameras(scene))
+        let fov_deg = self.census(scene).and_then(|census| census.fov_deg);
+        filters.reason_to_skip(num_frames, || fov_deg.map_or_else(|| Ok(widest_fov_deg(&self.cameras(scene)?)), Ok))
     }
 
     fn table(&self, scene: usize) -> Result<(&Path, &SceneTable), DataError> {
@@ -184,6 +231,10 @@ impl ChunkSource {
             what: format!("expected scene {key}, found {} other scenes", table.scenes.len()),
             path: chunk.path.clone(),
         })?;
+        if scene.images.is_empty() {
+            let what = format!("scene {key} has no frames");
+            return Err(DataError::BadChunk { what, path: chunk.path.clone() });
+        }
         Ok((&chunk.path, scene))
     }
 }
@@ -205,7 +256,7 @@ impl SceneSource for ChunkSource {
     }
 
     fn num_frames(&self, scene: usize) -> Result<usize, DataError> {
-        Ok(self.table(scene)?.1.images.len())
+        self.census(scene).map_or_else(|| Ok(self.table(scene)?.1.images.len()), |census| Ok(census.num_frames))
     }
 
     fn timestamps(&self, scene: usize) -> Result<Vec<i64>, DataError> {

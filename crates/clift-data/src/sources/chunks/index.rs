@@ -7,6 +7,7 @@ use std::path::{Component, Path};
 use rayon::prelude::*;
 
 use crate::error::DataError;
+use crate::files::bounded::parse_json;
 use crate::files::listing::{file_names, has_ending};
 use crate::skip_report::{SkipReport, first_few, note_on, plural};
 use crate::sources::chunks::table::ChunkTable;
@@ -19,7 +20,7 @@ const INVALID_KEYS: &str = "invalid_keys.txt";
 pub(crate) fn read_index(path: &Path) -> Result<BTreeMap<String, String>, DataError> {
     let bad = |what: String| DataError::BadIndex { what, path: path.to_path_buf() };
     let text = std::fs::read(path).map_err(DataError::io("reading the scene index", path))?;
-    let index: BTreeMap<String, String> = serde_json::from_slice(&text)
+    let index: BTreeMap<String, String> = parse_json(&text)
         .map_err(|error| bad(format!("expected a map from scene keys to chunk files, got {error}")))?;
     for (key, file) in &index {
         if file.is_empty() || !Path::new(file).components().all(|part| matches!(part, Component::Normal(_))) {
@@ -104,6 +105,14 @@ fn torch_files(folder: &Path) -> Result<Vec<String>, DataError> {
 mod tests {
     use super::*;
     use crate::sources::chunks::writer::{SceneRecord, scene_file_bytes};
+
+    #[test]
+    fn byte_order_mark_of_an_index_is_skipped() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("index.json");
+        std::fs::write(&path, "\u{feff}{\"a\": \"000000.torch\"}").unwrap();
+        assert_eq!(read_index(&path).unwrap(), BTreeMap::from([("a".to_owned(), "000000.torch".to_owned())]));
+    }
 
     #[test]
     fn keys_may_end_in_the_file_extension() {

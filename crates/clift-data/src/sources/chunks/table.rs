@@ -5,6 +5,7 @@ use std::path::Path;
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
+use crate::image::codec::check_encoded;
 use crate::sources::chunks::writer::{camera_bytes, timestamp_bytes};
 use crate::torch::archive::{Archive, ByteSpan};
 use crate::torch::pickle::Pickle;
@@ -119,6 +120,15 @@ impl SceneTable {
 
     pub fn read_timestamps(&self, path: &Path) -> Result<Vec<i64>, DataError> {
         Ok(self.timestamps.read(path)?.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)).collect())
+    }
+
+    /// Checks the image files without decoding them. Returns the unreadable ones with the reason.
+    pub fn unreadable_images(&self, path: &Path) -> Vec<(usize, String)> {
+        let reason = |span: &ByteSpan| match span.read(path) {
+            Ok(bytes) => check_encoded(&bytes).err(),
+            Err(error) => Some(error.to_string()),
+        };
+        self.images.iter().enumerate().filter_map(|(frame, span)| Some((frame, reason(span)?))).collect()
     }
 
     /// Returns whether these time stamps and cameras, one per frame, equal those of the file after rounding to f32.

@@ -32,12 +32,15 @@ impl SceneRecord {
         self.images.iter().map(|image| image.len() as u64).sum()
     }
 
-    /// Checks that the lists have equal lengths and that the scene fits into one file.
+    /// Checks that the lists have equal lengths, that there are frames, and that the scene fits into one file.
     pub(crate) fn check(&self) -> Result<(), String> {
         let Self { key, timestamps, cameras, images, .. } = self;
         let (timestamps, cameras, images) = (timestamps.len(), cameras.len(), images.len());
         if timestamps != images || cameras != images {
             return Err(format!("scene {key} has {images} images, {cameras} cameras, {timestamps} time stamps"));
+        }
+        if images == 0 {
+            return Err(format!("scene {key} has no frames"));
         }
         if ChunkFill::default().has_room(self) {
             return Ok(());
@@ -87,8 +90,8 @@ impl ChunkFill {
 /// closed once its images have `target_bytes` or more. Every file is written atomically.
 ///
 /// # Errors
-/// Errors of the items, [`DataError::Io`] from writing, and [`DataError::BadIndex`] for an existing `index.json`, a
-/// duplicate key or an invalid scene.
+/// Errors of the items, [`DataError::Io`] from writing, [`DataError::BadOutput`] for an existing `index.json`, and
+/// [`DataError::BadIndex`] for a duplicate key or an invalid scene.
 pub fn write_chunks(
     folder: &Path,
     scenes: impl IntoIterator<Item = Result<SceneRecord, DataError>>,
@@ -98,7 +101,8 @@ pub fn write_chunks(
     let index_path = folder.join("index.json");
     let bad = |what: String| DataError::BadIndex { what, path: index_path.clone() };
     if index_path.exists() {
-        return Err(bad("the file exists; choose an empty folder".into()));
+        let what = "it holds an index.json; choose an empty folder".into();
+        return Err(DataError::BadOutput { what, path: folder.to_owned() });
     }
     let mut index = BTreeMap::new();
     let mut num_chunks = 0;
@@ -267,6 +271,6 @@ mod tests {
         assert!(message.contains("scene a occurs twice"), "{message}");
         write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap();
         let message = write_chunks(folder.path(), [Ok(record("a", 1))], 1).unwrap_err().to_string();
-        assert!(message.contains("the file exists"), "{message}");
+        assert!(message.contains("it holds an index.json; choose an empty folder"), "{message}");
     }
 }

@@ -95,6 +95,14 @@ pub(crate) fn numbered_images(folder: &Path) -> Result<HashMap<i64, PathBuf>, Da
     Ok(numbered)
 }
 
+/// Returns the number of images in a folder and its subfolders, of other formats too.
+pub(crate) fn num_images(folder: &Path) -> usize {
+    let count = |names: &[String]| names.iter().filter(|name| split_name(name).1.is_some()).count();
+    let names = file_names(folder).unwrap_or_default();
+    let below = names.iter().map(|name| count(&file_names(&folder.join(name)).unwrap_or_default()));
+    count(&names) + below.sum::<usize>()
+}
+
 /// Returns stem and extension of a name; the extension only if it is one of an image format.
 fn split_name(name: &str) -> (&str, Option<&str>) {
     match name.rsplit_once('.') {

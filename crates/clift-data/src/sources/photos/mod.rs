@@ -5,10 +5,12 @@
 //! - `nerfstudio`: transforms.json (nerfstudio, DL3DV)
 //! - `re10k_text`: RealEstate10K camera text files
 //! - `scene_folder`: folders that hold one scene
+//! - `image_cache`: decoded and scaled photos on disk
 //! - `photo_source`: scenes of one file per frame
 //! - `colmap`: COLMAP models
 
 pub(crate) mod colmap;
+pub(crate) mod image_cache;
 pub(crate) mod image_folder;
 pub(crate) mod nerfstudio;
 pub(crate) mod photo;

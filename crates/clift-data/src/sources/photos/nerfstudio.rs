@@ -11,12 +11,12 @@ use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
 use crate::error::DataError;
-use crate::files::bounded::read_bounded;
+use crate::files::bounded::{parse_json, read_bounded};
 use crate::files::listing::natural_order;
 use crate::geometry::camera::{Intrinsics, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
-use crate::image::codec::read_size;
+use crate::image::codec::read_header;
 use crate::sources::photos::image_folder::ImageFolders;
 use crate::sources::photos::photo::{MAX_FRAMES, Photo, PhotoOptions, PhotoScene};
 
@@ -161,9 +161,7 @@ impl<'a> Optics<'a> {
 pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<PhotoScene, DataError> {
     let bad = |what: String| DataError::BadScene { what, path: path.to_owned() };
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
-    // Editors on Windows put a byte order mark in front.
-    let json = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&text);
-    let document: Document = serde_json::from_slice(json).map_err(|error| bad(explain(&error, json)))?;
+    let document: Document = parse_json(&text).map_err(|error| bad(explain(&error, &text)))?;
     drop(text);
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut entries: Vec<&Entry> = document.frames.0.iter().collect();
@@ -188,7 +186,7 @@ pub(crate) fn read_transforms(path: &Path, options: &PhotoOptions) -> Result<Pho
         let optics = entry.optics().or(&top);
         let lens = optics.lens().map_err(in_frame)?;
         let given = optics.size().map_err(in_frame)?;
-        let size = given.map_or_else(|| read_size(&image).map(|size| size.map(|side| side as f64)), Ok);
+        let size = given.map_or_else(|| read_header(&image).map(|(size, _)| size.map(|side| side as f64)), Ok);
         let Ok(size) = size else {
             scene.skip(name, "whose image cannot be read");
             continue;

@@ -2,12 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
+use image::metadata::Orientation;
+
 use crate::error::DataError;
 use crate::files::bounded::read_bounded;
 use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::lens::Lens;
 use crate::geometry::pose::Pose;
-use crate::image::codec::{check_end, decode_image, exif_orientation, read_size};
+use crate::image::codec::{apply_orientation, check_end, decode_image, exif_orientation, read_header};
 use crate::image::rgb_image::RgbImage;
 use crate::image::undistort::Undistortion;
 
@@ -38,6 +40,16 @@ pub(crate) struct Photo {
     pub shape: Option<f64>,
     /// Time stamp in microseconds, or the number at the end of the file name.
     pub time: Option<i64>,
+}
+
+/// Header of a photo.
+pub(crate) struct PhotoHeader {
+    /// Columns and rows in the orientation of the camera.
+    pub size: [usize; 2],
+    /// Whether the EXIF orientation is applied.
+    pub is_turned: bool,
+    /// Whether there is an EXIF orientation that is not applied.
+    pub has_unused_orientation: bool,
 }
 
 /// A frame without a usable image, by its name in the camera file.
@@ -83,39 +95,52 @@ impl Photo {
         read_bounded(&self.path, MAX_IMAGE_BYTES, "reading an image")
     }
 
-    /// Reads columns and rows from the header, and checks the aspect ratio and the end of the file.
-    pub fn size(&self) -> Result<[usize; 2], DataError> {
-        let size = read_size(&self.path)?;
-        self.check_shape(size).map_err(|error| match (error, exif_orientation(&self.path)) {
-            (DataError::BadScene { what, path }, Some(orientation)) => {
-                let what = format!(
-                    "{what}; the EXIF orientation {orientation} is not applied, because cameras refer to the stored \
-                     pixels"
-                );
-                DataError::BadScene { what, path }
-            }
-            (error, _) => error,
-        })?;
+    /// Reads the header and the end of the image file, and checks the aspect ratio.
+    pub fn header(&self) -> Result<PhotoHeader, DataError> {
+        let (stored, tag) = read_header(&self.path)?;
+        let orientation = self.orientation(stored, || tag)?;
         check_end(&self.path, MAX_IMAGE_BYTES)?;
-        Ok(size)
+        let [width, height] = stored;
+        let is_turned = orientation != Orientation::NoTransforms;
+        Ok(PhotoHeader {
+            size: if is_turned { [height, width] } else { stored },
+            is_turned,
+            has_unused_orientation: !is_turned && tag != Orientation::NoTransforms,
+        })
     }
 
-    /// Decodes and undistorts the image.
+    /// Decodes the image, turns it to the orientation of its camera and undistorts it.
     pub fn decode(&self, key: &str, frame: usize) -> Result<RgbImage, DataError> {
-        let image = decode_image(&self.read()?, key, frame)?;
-        self.check_shape([image.width, image.height])?;
+        let bytes = self.read()?;
+        let image = decode_image(&bytes, key, frame)?;
+        let orientation = self.orientation([image.width, image.height], || exif_orientation(&bytes))?;
+        let image = match orientation {
+            Orientation::NoTransforms => image,
+            orientation => apply_orientation(image, orientation),
+        };
         Ok(match &self.undistortion {
             Some(undistortion) => undistortion.apply(&image),
             None => image,
         })
     }
 
-    /// Checks the aspect ratio against the camera, which is wrong for an image that was rotated later.
-    fn check_shape(&self, [width, height]: [usize; 2]) -> Result<(), DataError> {
-        let Some(expected) = self.shape else { return Ok(()) };
+    /// Returns how the stored pixels are turned: not at all if their aspect ratio is that of the camera, and by the EXIF
+    /// orientation if only the turned image has it. Some tools compute cameras from stored pixels, others turn them first.
+    fn orientation(
+        &self,
+        [width, height]: [usize; 2],
+        tag: impl FnOnce() -> Orientation,
+    ) -> Result<Orientation, DataError> {
+        let Some(expected) = self.shape else { return Ok(Orientation::NoTransforms) };
         let shape = width as f64 / height as f64;
-        if (shape / expected - 1.0).abs() <= MAX_SHAPE_ERROR {
-            return Ok(());
+        let fits = |shape: f64| (shape / expected - 1.0).abs() <= MAX_SHAPE_ERROR;
+        if fits(shape) {
+            return Ok(Orientation::NoTransforms);
+        }
+        let tag = tag();
+        // Orientations of 5 and more exchange columns and rows.
+        if tag.to_exif() >= 5 && fits(1.0 / shape) {
+            return Ok(tag);
         }
         let what = format!(
             "the image is {width}x{height}, aspect ratio {shape:.3}, but its camera has {expected:.3}; the image may have \

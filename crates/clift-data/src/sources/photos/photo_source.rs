@@ -6,13 +6,14 @@ use std::sync::{Arc, Mutex};
 use rayon::prelude::*;
 
 use crate::error::DataError;
-use crate::geometry::camera::Camera;
+use crate::geometry::camera::{Camera, widest_fov_deg};
 use crate::image::rgb_image::RgbImage;
 use crate::scene_source::SceneSource;
 use crate::skip_report::{SkipReport, first_few, plural};
 use crate::sources::filters::SceneFilters;
 use crate::sources::keys::find_by_name;
-use crate::sources::photos::photo::{MissingPhoto, Photo, PhotoOptions, PhotoScene};
+use crate::sources::photos::image_cache::{ImageCache, ImageCacheConfig};
+use crate::sources::photos::photo::{MissingPhoto, Photo, PhotoHeader, PhotoOptions, PhotoScene};
 use crate::sources::photos::scene_folder::SceneFolder;
 
 /// Largest number of photos in the cache, about 300 bytes each.
@@ -22,6 +23,13 @@ const MAX_CACHED_SCENES: usize = 256;
 const MAX_NAMED_FRAMES: usize = 10_000;
 const NO_IMAGE: &str = "without an image";
 
+/// Images that a note counts.
+const COUNTED: [&str; 3] = [
+    "without a camera, not used",
+    "turned by the EXIF orientation, as the size of the cameras requires",
+    "with an EXIF orientation that is not applied, as the cameras have the stored size",
+];
+
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PhotoSourceOptions {
     pub photos: PhotoOptions,
@@ -30,6 +38,8 @@ pub(crate) struct PhotoSourceOptions {
     pub whole_scenes: bool,
     /// Smallest columns and rows of an image.
     pub min_size: [usize; 2],
+    /// Cache of large photos, scaled to cover `min_size`.
+    pub image_cache: Option<ImageCacheConfig>,
 }
 
 /// Scenes of photos, sorted by key. Cameras are read on use, and cached for the scenes used last.
@@ -38,6 +48,7 @@ pub(crate) struct PhotoSource {
     positions: HashMap<String, usize>,
     options: PhotoOptions,
     pub report: SkipReport,
+    image_cache: Option<ImageCache>,
     /// Scenes used last, with their indices; the latest at the end.
     cache: Mutex<Vec<(usize, Arc<PhotoScene>)>>,
 }
@@ -55,7 +66,8 @@ struct Findings {
     num_frames: usize,
     unusable: Vec<usize>,
     missing: Vec<MissingPhoto>,
-    num_without_camera: usize,
+    /// Numbers of images, as in [`COUNTED`].
+    counts: [usize; COUNTED.len()],
     notes: Vec<String>,
     /// Reason of skipping the scene, with the error to return if all scenes fail.
     reason: Option<(String, Option<DataError>)>,
@@ -69,21 +81,21 @@ impl PhotoSource {
         let findings: Vec<_> = folders.par_iter().map(|folder| examine(folder, options)).collect();
         let mut report = SkipReport::new(folders.len());
         let (mut scenes, mut first_error, mut num_unnamed) = (Vec::new(), None, 0);
-        let (mut num_spare, mut spare) = (0, Vec::new());
+        let mut counted: [(usize, Vec<String>); COUNTED.len()] = Default::default();
         for (folder, findings) in folders.into_iter().zip(findings) {
             let failed =
                 |error: DataError| Findings { reason: Some((error.to_string(), Some(error))), ..Findings::default() };
             let findings = findings.unwrap_or_else(failed);
-            let Findings { num_frames, unusable, missing, num_without_camera, notes, reason } = findings;
+            let Findings { num_frames, unusable, missing, counts, notes, reason } = findings;
             let has_photos = num_frames > 0;
             if let Some((reason, error)) = reason {
                 report.skip(&folder.key, reason);
                 first_error = first_error.or(error);
             } else {
                 report.notes.extend(notes);
-                if num_without_camera > 0 {
-                    num_spare += num_without_camera;
-                    spare.push(format!("{num_without_camera} of {}", folder.key));
+                for ((total, scenes), count) in counted.iter_mut().zip(counts) {
+                    *total += count;
+                    scenes.extend((count > 0).then(|| format!("{count} of {}", folder.key)));
                 }
                 scenes.push(Entry { folder: folder.clone(), num_frames, unusable });
             }
@@ -99,15 +111,15 @@ impl PhotoSource {
         if num_unnamed > 0 {
             report.notes.push(format!("{num_unnamed} more frames skipped"));
         }
-        if num_spare > 0 {
-            let note = format!("{} without a camera, not used: {}", plural(num_spare, "image"), first_few(&spare));
-            report.notes.push(note);
+        for (what, (total, scenes)) in COUNTED.iter().zip(counted).filter(|(_, (total, _))| *total > 0) {
+            report.notes.push(format!("{} {what}: {}", plural(total, "image"), first_few(&scenes)));
         }
         if let (true, Some(error)) = (scenes.is_empty(), first_error) {
             return Err(error);
         }
         let positions = scenes.iter().enumerate().map(|(i, scene)| (scene.folder.key.clone(), i)).collect();
-        Ok(Self { scenes, positions, options: options.photos.clone(), report, cache: Mutex::default() })
+        let image_cache = options.image_cache.as_ref().and_then(|config| ImageCache::open(config, options.min_size));
+        Ok(Self { scenes, positions, options: options.photos.clone(), report, image_cache, cache: Mutex::default() })
     }
 
     fn entry(&self, scene: usize) -> Result<&Entry, DataError> {
@@ -159,16 +171,18 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
     let PhotoScene { photos, mut missing, num_without_camera, notes, .. } = folder.read(&options.photos)?;
     let num_listed = photos.len() + missing.len();
     let (mut unusable, mut first_error, mut is_small) = (Vec::new(), None, false);
+    let (mut num_turned, mut num_unturned) = (0, 0);
     let num_checked = if options.whole_scenes { 1 } else { photos.len() };
     for (position, photo) in photos.iter().enumerate().take(num_checked) {
-        match photo.size() {
-            Ok([width, height]) => is_small |= width < options.min_size[0] || height < options.min_size[1],
+        match photo.header() {
+            Ok(PhotoHeader { size: [width, height], is_turned, has_unused_orientation }) => {
+                is_small |= width < options.min_size[0] || height < options.min_size[1];
+                num_turned += usize::from(is_turned);
+                num_unturned += usize::from(has_unused_orientation);
+            }
             Err(error) => {
                 let name = photo.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 let reason = match &error {
-                    DataError::BadScene { what, .. } if what.contains("EXIF orientation") => {
-                        "whose image has another aspect ratio than its camera, and an EXIF orientation, which is not applied"
-                    }
                     DataError::BadScene { what, .. } if what.contains("rotated or cropped") => {
                         "whose image has another aspect ratio than its camera"
                     }
@@ -210,12 +224,13 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
         let [width, height] = options.min_size;
         Some((format!("with images smaller than {width}x{height}"), None))
     } else {
-        let cameras = || Ok(photos.iter().map(|photo| photo.camera).collect());
-        options.filters.reason_to_skip(num_frames, cameras)?.map(|reason| (reason, None))
+        let fov_deg = || Ok(widest_fov_deg(&photos.iter().map(|photo| photo.camera).collect::<Vec<_>>()));
+        options.filters.reason_to_skip(num_frames, fov_deg)?.map(|reason| (reason, None))
     };
     // Without extracted frames, a data set has millions of missing ones.
     missing.truncate(if photos.is_empty() { 1 } else { MAX_NAMED_FRAMES });
-    Ok(Findings { num_frames, unusable, missing, num_without_camera, notes, reason })
+    let counts = [num_without_camera, num_turned, num_unturned];
+    Ok(Findings { num_frames, unusable, missing, counts, notes, reason })
 }
 
 impl SceneSource for PhotoSource {
@@ -249,14 +264,25 @@ impl SceneSource for PhotoSource {
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-        self.photo(scene, frame)?.decode(self.key(scene), frame)
+        let photo = self.photo(scene, frame)?;
+        let decode = || photo.decode(self.key(scene), frame);
+        self.image_cache.as_ref().map_or_else(decode, |cache| cache.scaled(&photo, decode))
     }
 
     fn encoded_frame(&self, scene: usize, frame: usize) -> Result<Option<Vec<u8>>, DataError> {
         let photo = self.photo(scene, frame)?;
-        if photo.undistortion.is_some() {
+        if photo.undistortion.is_some() || photo.header()?.is_turned {
             return Ok(None);
         }
         photo.read().map(Some)
+    }
+
+    fn image_size(&self, scene: usize, frame: usize) -> Result<[usize; 2], DataError> {
+        Ok(self.photo(scene, frame)?.header()?.size)
+    }
+
+    fn frame_names(&self, scene: usize) -> Result<Vec<String>, DataError> {
+        let name = |photo: &Photo| photo.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(self.scene(scene)?.photos.iter().map(name).collect())
     }
 }

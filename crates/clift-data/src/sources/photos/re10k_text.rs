@@ -21,7 +21,8 @@ pub(crate) fn read_re10k_text(path: &Path, frames: &Path) -> Result<PhotoScene, 
     let text = read_bounded(path, MAX_BYTES, "reading the cameras")?;
     let text = String::from_utf8(text)
         .map_err(|_| DataError::BadScene { what: "the file is not UTF-8".into(), path: path.to_owned() })?;
-    parse(&text, &images).map_err(|what| DataError::BadScene { what, path: path.to_owned() })
+    parse(text.trim_start_matches('\u{feff}'), &images)
+        .map_err(|what| DataError::BadScene { what, path: path.to_owned() })
 }
 
 fn parse(text: &str, images: &HashMap<i64, PathBuf>) -> Result<PhotoScene, String> {

@@ -10,6 +10,7 @@ use crate::geometry::camera::Camera;
 use crate::scene_source::SceneSource;
 use crate::skip_report::plural;
 use crate::tools::check::result::SceneCheck;
+use crate::tools::features::image_features::Features;
 
 const MAX_NAMED: usize = 5;
 /// Distance of two cameras over the extent of all centres above which equal images contradict the poses.
@@ -20,27 +21,36 @@ const MAX_TURN_DEG: f64 = 1.0;
 /// Columns and rows of every frame, `None` for an unreadable frame.
 pub(crate) type Sizes = Vec<Option<[usize; 2]>>;
 
-/// Decodes every frame, on all cores, and returns the sizes.
+/// What the checks need of a decoded image.
+struct SeenImage {
+    size: [usize; 2],
+    hash: u64,
+    features: Option<Features>,
+}
+
+/// Decodes every frame, on all cores. Returns the sizes, and the corners of every `step`-th frame.
 pub(crate) fn check_images(
     source: &dyn SceneSource,
     scene: usize,
     cameras: &[Camera],
+    step: usize,
     check: &mut SceneCheck,
-) -> Sizes {
+) -> (Sizes, Vec<Option<Features>>) {
     let read = (0..cameras.len()).into_par_iter().map(|frame| {
         let image = source.frame(scene, frame)?;
         let mut hasher = DefaultHasher::new();
         image.rgb.hash(&mut hasher);
-        Ok(([image.width, image.height], hasher.finish()))
+        let features = frame.is_multiple_of(step).then(|| Features::detect(&image));
+        Ok(SeenImage { size: [image.width, image.height], hash: hasher.finish(), features })
     });
-    let read: Vec<Result<([usize; 2], u64), DataError>> = read.collect();
+    let read: Vec<Result<SeenImage, DataError>> = read.collect();
     let failures: Vec<(usize, String)> =
         read.iter().enumerate().filter_map(|(frame, read)| Some((frame, read.as_ref().err()?.to_string()))).collect();
     if let Some((_, first)) = failures.first() {
         let frames: Vec<usize> = failures.iter().map(|(frame, _)| *frame).collect();
         check.reasons.push(format!("{} cannot be read; the first: {first}", list_frames(&frames)));
     }
-    let sizes: Sizes = read.iter().map(|read| Some(read.as_ref().ok()?.0)).collect();
+    let sizes: Sizes = read.iter().map(|read| Some(read.as_ref().ok()?.size)).collect();
     let mut counts: BTreeMap<[usize; 2], usize> = BTreeMap::new();
     sizes.iter().flatten().for_each(|size| *counts.entry(*size).or_default() += 1);
     check.image_size = counts.iter().max_by_key(|(_, count)| **count).map(|(size, _)| *size);
@@ -49,9 +59,9 @@ pub(crate) fn check_images(
             counts.iter().map(|([width, height], count)| format!("{width}x{height} ({count})")).collect();
         check.notes.push(format!("frames have {} sizes: {}", counts.len(), list.join(", ")));
     }
-    let hashes: Vec<Option<u64>> = read.iter().map(|read| Some(read.as_ref().ok()?.1)).collect();
+    let hashes: Vec<Option<u64>> = read.iter().map(|read| Some(read.as_ref().ok()?.hash)).collect();
     check_repeated_images(&hashes, cameras, check);
-    sizes
+    (sizes, read.into_iter().step_by(step).map(|read| read.ok()?.features).collect())
 }
 
 fn check_repeated_images(hashes: &[Option<u64>], cameras: &[Camera], check: &mut SceneCheck) {

@@ -3,6 +3,10 @@
 //! - `result`: findings of one scene
 //! - `cameras`: plausible intrinsics and poses
 //! - `images`: readable, equal-sized, distinct images
+//! - `matches`: corners matched between frames
+//! - `triplets`: corners seen in three frames
+//! - `mistakes`: cameras changed by the usual mistakes
+//! - `frames`: each frame against the others
 //! - `epipolar`: poses against matched corners
 //! - `drawing`: two frames with epipolar lines
 //! - `scene`: check one scene
@@ -10,6 +14,10 @@
 pub(crate) mod cameras;
 pub(crate) mod drawing;
 pub(crate) mod epipolar;
+pub(crate) mod frames;
 pub(crate) mod images;
+pub(crate) mod matches;
+pub(crate) mod mistakes;
 pub(crate) mod result;
 pub(crate) mod scene;
+pub(crate) mod triplets;

@@ -5,13 +5,29 @@ use serde::{Deserialize, Serialize};
 /// Median symmetric epipolar distance above which a scene is flagged, in pixels of an image 640 columns wide.
 pub const MAX_EPIPOLAR_PX: f64 = 1.0;
 
+/// Verdict on a scene.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, strum::Display, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// No error was found, and the poses were compared with the images.
+    #[strum(to_string = "ok")]
+    Ok,
+    /// `reasons` lists errors.
+    #[strum(to_string = "FLAGGED")]
+    Flagged,
+    /// No error was found, but too few corners match to compare the poses with the images.
+    #[default]
+    #[strum(to_string = "not compared")]
+    NotCompared,
+}
+
 /// Results of the check of one scene.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SceneCheck {
     /// Key of the scene.
     pub key: String,
-    /// Whether `reasons` is empty.
-    pub ok: bool,
+    /// Verdict.
+    pub verdict: Verdict,
     /// Errors of the scene, empty if the scene passes.
     pub reasons: Vec<String>,
     /// Number of frames.
@@ -29,6 +45,19 @@ pub struct SceneCheck {
     pub rotation_defect: Option<f64>,
     /// Pairs of frames with matched corners.
     pub pairs: Vec<PairCheck>,
+    /// Frames that share enough corners with two others. Empty if a mistake of all cameras was found.
+    pub frames: Vec<FrameCheck>,
+}
+
+impl SceneCheck {
+    /// Sets the verdict from the findings.
+    pub(crate) fn judge(&mut self) {
+        self.verdict = match (self.reasons.is_empty(), self.epipolar_px) {
+            (false, _) => Verdict::Flagged,
+            (true, Some(_)) => Verdict::Ok,
+            (true, None) => Verdict::NotCompared,
+        };
+    }
 }
 
 /// Two frames with matched corners.
@@ -40,4 +69,14 @@ pub struct PairCheck {
     pub num_matches: usize,
     /// Median of their symmetric epipolar distances, in pixels of an image 640 columns wide.
     pub epipolar_px: f64,
+}
+
+/// A frame whose corners two other frames place.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FrameCheck {
+    /// Position of the frame.
+    pub frame: usize,
+    /// Distance of its corners from where two other frames place them, in pixels of an image 640 columns wide: the median
+    /// over the corners, and the lower quartile over at most six choices of the two: in a repeating pattern some are wrong.
+    pub reprojection_px: f64,
 }

@@ -15,7 +15,7 @@ const CHUNKS: ConvertOptions = options(ConvertTo::Chunks { target_bytes: 1 });
 const SCENES: ConvertOptions = options(ConvertTo::Scenes);
 
 const fn options(to: ConvertTo) -> ConvertOptions {
-    ConvertOptions { to, encoding: ImageEncoding::Png, opened_with: String::new() }
+    ConvertOptions { to, encoding: ImageEncoding::Png, max_size: None, opened_with: String::new() }
 }
 
 fn convert_all(
@@ -47,6 +47,20 @@ fn rooms(num_scenes: usize) -> SyntheticSource {
 fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let file = |name: String| (name.clone(), std::fs::read(folder.join(name)).unwrap());
     names(folder).into_iter().map(file).collect()
+}
+
+#[test]
+fn large_images_are_reduced_with_their_field_of_view() {
+    let source = re10k_mini(Split::Train); // 64 x 36
+    for (max_size, expected, num_encoded) in [(48, [48, 27], 16), (64, [64, 36], 0)] {
+        let folder = tempfile::tempdir().unwrap();
+        let options = ConvertOptions { max_size: Some(max_size), ..CHUNKS };
+        let report = convert_all(&source, folder.path(), &options).unwrap();
+        assert_eq!((report.num_frames, report.num_encoded), (16, num_encoded));
+        let reduced = open(folder.path(), Split::Train).source;
+        assert_eq!(reduced.image_size(1, 3).unwrap(), expected);
+        assert_eq!(reduced.cameras(1).unwrap(), source.cameras(1).unwrap());
+    }
 }
 
 #[test]
@@ -157,6 +171,36 @@ fn skipped_scenes_are_reported_and_converted_later() {
 }
 
 #[test]
+fn unreadable_images_are_listed_in_every_run() {
+    let torn = TestSource::new(rooms(3)).with_encoded_frames(|scene, frame| {
+        let image = ImageEncoding::Png.encode(&rooms(3).frame(scene, frame).unwrap()).unwrap();
+        Some(if scene == 1 && frame > 0 { image[..image.len() - 1].to_vec() } else { image })
+    });
+    for options in [CHUNKS, SCENES] {
+        let folder = tempfile::tempdir().unwrap();
+        for num_found in [0, 3] {
+            let report = convert_all(&torn, folder.path(), &options).unwrap();
+            assert_eq!((report.num_scenes, report.num_found), (3, num_found));
+            let unreadable: Vec<(&str, usize)> =
+                report.unreadable.iter().map(|image| (&*image.key, image.frame)).collect();
+            assert_eq!(unreadable, [(rooms(3).key(1), 1), (rooms(3).key(1), 2)]);
+            assert!(report.unreadable[0].reason.contains("the PNG data of"), "{}", report.unreadable[0].reason);
+            assert!(names(folder.path()).contains(&"unreadable.json".to_owned()));
+        }
+    }
+}
+
+#[test]
+fn scene_without_frames_is_skipped() {
+    let folder = tempfile::tempdir().unwrap();
+    let empty =
+        TestSource::new(rooms(2)).with_cameras(|scene, cameras| Ok(if scene == 0 { Vec::new() } else { cameras }));
+    let report = convert_all(&empty, folder.path(), &CHUNKS).unwrap();
+    assert_eq!((report.num_scenes, report.skipped.skips.len()), (1, 1));
+    assert!(report.skipped.skips[0].reason.contains("has no frames"), "{:?}", report.skipped.skips);
+}
+
+#[test]
 fn folder_of_other_scenes_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     convert_all(&rooms(3), folder.path(), &SCENES).unwrap();
@@ -228,6 +272,7 @@ fn folder_with_other_options_is_refused_unchanged() {
         SCENES,
         options(ConvertTo::Chunks { target_bytes: 2 }),
         ConvertOptions { encoding: ImageEncoding::Jpeg(90), ..CHUNKS },
+        ConvertOptions { max_size: Some(48), ..CHUNKS },
         ConvertOptions { opened_with: "data.files.undistort=false".into(), ..CHUNKS },
     ];
     for other in others {

@@ -1,9 +1,7 @@
-//! Fundamental matrices: of two cameras, and of matched corners by RANSAC.
+//! Epipolar lines, and fundamental matrices of matched corners by RANSAC.
 
 use glam::{DMat3, DVec3};
 
-use crate::geometry::camera::Camera;
-use crate::geometry::pose::Pose;
 use crate::random::{step_rng, uniform_below};
 
 /// Number of columns to which wider images are reduced. Distances are in pixels of this width.
@@ -28,23 +26,6 @@ const MAX_FAILURE: f64 = 1e-4;
 const MIN_INLIERS: usize = 20;
 /// Smallest share of inliers; about 2 % of wrong matches lie on their line by chance.
 const MIN_INLIER_SHARE: f64 = 0.25;
-
-/// Returns the fundamental matrix of two cameras whose images have the given columns and rows, in the units of
-/// [`Correspondence`]: `second^T F first = 0` for a point seen at `first` and `second`.
-pub fn fundamental_from_cameras(cameras: [&Camera; 2], sizes: [[usize; 2]; 2]) -> DMat3 {
-    // Both images are WIDTH wide; their height keeps the shape of the pixels.
-    let inverse_intrinsics = |i: usize| {
-        let [columns, rows] = sizes[i].map(|side| side as f64);
-        let k = cameras[i].intrinsics_norm;
-        let (width, height) = (WIDTH as f64, WIDTH as f64 * rows / columns);
-        let (fx, fy, cx, cy) = (k.fx * width, k.fy * height, k.cx * width, k.cy * height);
-        DMat3::from_rows_array(&[1.0 / fx, 0.0, -cx / fx, 0.0, 1.0 / fy, -cy / fy, 0.0, 0.0, 1.0])
-    };
-    let Pose { rotation, translation: t } = cameras[1].c2w.inverse().after(cameras[0].c2w);
-    // E = [t]x R, column by column.
-    let essential = DMat3::from_cols(t.cross(rotation.x_axis), t.cross(rotation.y_axis), t.cross(rotation.z_axis));
-    inverse_intrinsics(1).transpose() * essential * inverse_intrinsics(0)
-}
 
 /// Returns the epipolar line `a x + b y + c = 0` in the second image of a point in the first, as `(a, b, c)` with unit
 /// normal `(a, b)`; `None` for a point at the epipole.
@@ -146,8 +127,10 @@ fn null_vector(mut rows: [[f64; 9]; 8]) -> [f64; 9] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::camera::IntrinsicsNorm;
+    use crate::geometry::camera::{Camera, IntrinsicsNorm};
+    use crate::geometry::pose::Pose;
     use crate::random::uniform_01;
+    use crate::tools::features::pixel_camera::PixelCamera;
 
     /// Returns two overlapping cameras, and points that both see.
     fn scene(num_points: u64) -> ([Camera; 2], Vec<Correspondence>) {
@@ -174,7 +157,8 @@ mod tests {
     #[test]
     fn points_of_both_cameras_lie_on_epipolar_lines() {
         let (cameras, matches) = scene(50);
-        let geometry = fundamental_from_cameras([&cameras[0], &cameras[1]], [[320, 240], [1280, 960]]);
+        let cameras = [PixelCamera::new(&cameras[0], [320, 240]), PixelCamera::new(&cameras[1], [1280, 960])];
+        let geometry = PixelCamera::fundamental(&cameras[0], &cameras[1]);
         for pair in &matches {
             assert!(epipolar_distance(&geometry, pair) < 1e-9, "{pair:?}");
             let line = line(&geometry, pair.first).unwrap();

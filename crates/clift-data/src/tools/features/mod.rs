@@ -4,7 +4,8 @@
 //! - `corners`: Shi-Tomasi corners
 //! - `descriptor`: gradient histograms
 //! - `matching`: mutual nearest descriptors
-//! - `epipolar`: correspondences of corners, fundamental matrices, RANSAC
+//! - `epipolar`: correspondences of corners, epipolar lines, RANSAC
+//! - `pixel_camera`: cameras in the pixels of corners
 //! - `image_features`: corners of an image, matched
 
 pub(crate) mod corners;
@@ -13,3 +14,4 @@ pub(crate) mod epipolar;
 pub(crate) mod gray_image;
 pub(crate) mod image_features;
 pub(crate) mod matching;
+pub(crate) mod pixel_camera;

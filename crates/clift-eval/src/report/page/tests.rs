@@ -5,6 +5,7 @@ use crate::config::method::{Method, MethodName};
 use crate::figures::canvas::Canvas;
 use crate::figures::scene_figure::{FigureImage, FigureTokens};
 use crate::statistics::eval_results::EvalResults;
+use crate::statistics::scene_scores::SceneScore;
 use crate::statistics::view_metrics::{EvalKey, ViewMetrics};
 use crate::testing::f32_key as key;
 
@@ -36,7 +37,7 @@ fn summary() -> Summary {
 /// A scene of two views of 2 x 2 patches.
 fn figure() -> SceneFigure {
     let image = |level| Canvas::new(16, 16, [level; 3]);
-    let rendering = |key| FigureImage { key, psnr: 17.25, image: image(90) };
+    let rendering = |key| FigureImage { key, psnr: 17.25, image: image(90), error: Some(image(200)) };
     SceneFigure {
         scene: HOSTILE.into(),
         grid: [2, 2],
@@ -70,8 +71,14 @@ fn report() -> Report {
             name: format!("run {HOSTILE}"),
             config: format!("data.root = \"{HOSTILE}\""),
             device: "flex".into(),
+            command: format!("clift eval {HOSTILE}"),
         },
         summary: summary(),
+        training: vec![TrainingCurve { stage: "stage1", training: vec![(1, 9.0)], validation: vec![(1, 8.0)] }],
+        scenes: SceneScores {
+            key: Some(key(Method::Clift, 8, 8)),
+            scenes: ["a", "b"].map(|scene| SceneScore { scene: scene.into(), psnr: 18.0, nearest_psnr: None }).into(),
+        },
         skipped,
         figures: vec![figure()],
     }
@@ -94,6 +101,10 @@ fn pages_have_all_sections_and_no_external_resources() {
         "4 clusters",
         "2 of 8 tokens selected for the target",
         "2 of 3 scenes were evaluated",
+        "Scene by scene",
+        "validation, step 1: 8.00 dB",
+        "error, 8 tokens",
+        "clift eval ",
         env!("CARGO_PKG_VERSION"),
         "data.root = ",
     ] {
@@ -107,9 +118,10 @@ fn pages_have_all_sections_and_no_external_resources() {
     }
     assert_eq!(html.matches("<img").count(), html.matches(" alt=\"").count(), "a text for every image");
     assert_eq!(html.matches("role=\"img\"").count(), html.matches("role=\"img\" aria-label=\"").count());
-    // Title, heading, scene, skip reason and config.
-    assert_eq!(html.matches("&lt;script&gt;alert('room')&lt;/script&gt;").count(), 5);
-    // Time: 1 ms and 15 dB, 2 ms and 16.5 dB, 3 ms and 18.5 dB; the random subset is slower and worse than the second.
+    // Title, heading, scene, skip reason, command and config.
+    assert_eq!(html.matches("&lt;script&gt;alert('room')&lt;/script&gt;").count(), 6);
+    assert_eq!(html.matches("<table").count(), html.matches("<div class=\"scroll\"><table").count(), "tables scroll");
+    // Time: 1 ms and 15 dB, 2 ms and 16.5 dB, 3 ms and 18.5 dB; the random subset shares the time of the second.
     // Bytes: 4,000 and 16.5 dB, 8,000 and 18.5 dB; the point with 15 dB has 8,000 bytes too.
     assert_eq!(html.matches("<td>\u{25cf}</td>").count(), 3 + 2);
     let random = html.split("<tr").find(|row| row.contains("<td>random</td>")).unwrap();
@@ -147,7 +159,12 @@ fn pages_of_many_large_scenes_stay_below_ten_megabytes() {
     scene.images.clear();
     for method in [Method::Clift, Method::Kmeans, Method::Random] {
         for stored in [256, 512, 1024, 2048, 3072, 4096] {
-            scene.images.push(FigureImage { key: key(method, stored, stored), psnr: 20.0, image: noise() });
+            scene.images.push(FigureImage {
+                key: key(method, stored, stored),
+                psnr: 20.0,
+                image: noise(),
+                error: Some(noise()),
+            });
         }
     }
     large.figures = vec![scene; 100];
@@ -168,7 +185,7 @@ fn external_methods_are_escaped_everywhere_and_missing_images_noted() {
     let summary = Summary::new(&results);
     other.summary.points.extend(summary.points);
     (other.summary.missing, other.summary.not_measured) = (summary.missing, summary.not_measured);
-    other.figures[0].images.push(FigureImage { key, psnr: 17.0, image: Canvas::new(16, 16, [9; 3]) });
+    other.figures[0].images.push(FigureImage { key, psnr: 17.0, image: Canvas::new(16, 16, [9; 3]), error: None });
     other.run.name = "a\u{7}&".into();
     let html = page(&other);
     let escaped = "&lt;b&gt;&quot; onload=&quot;MVSplat";

@@ -5,8 +5,10 @@ use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 
 use crate::network::blocks::norms::QkNorm;
+use crate::network::camera_encoding::TokenTransforms;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
+use crate::network::tokens::Tokens;
 use crate::ops::attention::sdpa::self_sdpa;
 use crate::ops::linear::{linear, norm_linear};
 
@@ -36,13 +38,20 @@ impl SelfAttention {
     ///
     /// # Shapes
     /// - `x` and the result: `[batch, count, dim]`
-    pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>) -> Tensor<3> {
+    pub fn forward(&self, norm: &LayerNorm, x: Tensor<3>, transforms: Option<&TokenTransforms>) -> Tensor<3> {
         let packed = norm_linear(norm, &self.in_proj, x);
         let packed = match &self.qk_norm {
             Some(qk_norm) => qk_norm.query_key_value(packed),
             None => packed,
         };
-        linear(&self.out_proj, self_sdpa(packed, self.num_heads))
+        let attended = match transforms {
+            Some(transforms) => {
+                let packed = transforms.query_key_value(packed, self.num_heads);
+                transforms.output(self_sdpa(packed, self.num_heads), self.num_heads)
+            }
+            None => self_sdpa(packed, self.num_heads),
+        };
+        linear(&self.out_proj, attended)
     }
 }
 
@@ -71,25 +80,42 @@ impl CrossAttention {
     }
 
     /// Projects queries, `[batch, num_queries, dim]`.
-    pub(crate) fn project_query(&self, norm: Option<&LayerNorm>, x: Tensor<3>) -> Tensor<3> {
+    pub(crate) fn project_query(
+        &self,
+        norm: Option<&LayerNorm>,
+        x: Tensor<3>,
+        transforms: Option<&TokenTransforms>,
+    ) -> Tensor<3> {
         let query = project(norm, &self.q_proj, x);
-        match &self.qk_norm {
+        let query = match &self.qk_norm {
             Some(qk_norm) => qk_norm.query(query),
+            None => query,
+        };
+        match transforms {
+            Some(transforms) => transforms.query(query, self.num_heads),
             None => query,
         }
     }
 
     /// Projects tokens to keys and values side by side, `[batch, num_keys, 2 dim]`.
-    pub(crate) fn project_key_value(&self, norm: Option<&LayerNorm>, tokens: Tensor<3>) -> Tensor<3> {
-        let key_value = project(norm, &self.kv_proj, tokens);
-        match &self.qk_norm {
+    pub(crate) fn project_key_value(&self, norm: Option<&LayerNorm>, tokens: Tokens) -> Tensor<3> {
+        let key_value = project(norm, &self.kv_proj, tokens.values);
+        let key_value = match &self.qk_norm {
             Some(qk_norm) => qk_norm.key_value(key_value),
+            None => key_value,
+        };
+        match tokens.transforms {
+            Some(transforms) => transforms.key_value(key_value, self.num_heads),
             None => key_value,
         }
     }
 
-    /// Projects the concatenated heads.
-    pub(crate) fn project_out(&self, x: Tensor<3>) -> Tensor<3> {
+    /// Projects the concatenated heads of the queries.
+    pub(crate) fn project_out(&self, x: Tensor<3>, transforms: Option<&TokenTransforms>) -> Tensor<3> {
+        let x = match transforms {
+            Some(transforms) => transforms.output(x, self.num_heads),
+            None => x,
+        };
         linear(&self.out_proj, x)
     }
 

@@ -7,8 +7,10 @@ use burn::tensor::Tensor;
 
 use crate::network::blocks::attention::{CrossAttention, SelfAttention};
 use crate::network::blocks::feed_forward::FeedForward;
+use crate::network::camera_encoding::TokenTransforms;
 use crate::network::config::ModelConfig;
 use crate::network::init::Init;
+use crate::network::tokens::Tokens;
 use crate::ops::attention::sdpa::cross_sdpa;
 
 /// Self-attention and feed-forward network, each with a norm before and a residual connection.
@@ -35,8 +37,8 @@ impl EncoderBlock {
     ///
     /// # Shapes
     /// - `x` and the result: `[batch, num_tokens, dim]`
-    pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        let x = x.clone() + self.attn.forward(&self.norm_attn, x);
+    pub fn forward(&self, x: Tensor<3>, transforms: Option<&TokenTransforms>) -> Tensor<3> {
+        let x = x.clone() + self.attn.forward(&self.norm_attn, x, transforms);
         x.clone() + self.feed_forward.forward(&self.norm_ff, x)
     }
 }
@@ -71,7 +73,7 @@ impl DecoderBlock {
     /// # Shapes
     /// - `tokens`: `[groups, num_render_tokens, dim]`
     /// - returns `[groups, num_render_tokens, 2 dim]`, keys and values side by side
-    pub fn project_tokens(&self, tokens: Tensor<3>) -> Tensor<3> {
+    pub fn project_tokens(&self, tokens: Tokens) -> Tensor<3> {
         self.cross_attn.project_key_value(None, tokens)
     }
 
@@ -81,16 +83,16 @@ impl DecoderBlock {
     /// # Shapes
     /// - `x` and the result: `[views, num_queries, dim]`
     /// - `key_value`: `[groups, num_render_tokens, 2 dim]`
-    pub fn forward(&self, x: Tensor<3>, key_value: Tensor<3>) -> Tensor<3> {
+    pub fn forward(&self, x: Tensor<3>, key_value: Tensor<3>, transforms: Option<&TokenTransforms>) -> Tensor<3> {
         let [views, num_queries, dim] = x.dims();
         let [groups, _, _] = key_value.dims();
-        let x = x.clone() + self.self_attn.forward(&self.norm_self, x);
+        let x = x.clone() + self.self_attn.forward(&self.norm_self, x, transforms);
 
         // Queries are independent of each other, so that the views of a group form one sequence of queries.
-        let query = self.cross_attn.project_query(Some(&self.norm_cross), x.clone());
+        let query = self.cross_attn.project_query(Some(&self.norm_cross), x.clone(), transforms);
         let query = query.reshape([groups, views / groups * num_queries, dim]); // [T, Q, D] -> [G, TQ / G, D]
         let attended = cross_sdpa(query, key_value, self.cross_attn.num_heads()).reshape([views, num_queries, dim]);
-        let x = x + self.cross_attn.project_out(attended);
+        let x = x + self.cross_attn.project_out(attended, transforms);
 
         x.clone() + self.feed_forward.forward(&self.norm_ff, x)
     }
@@ -130,10 +132,10 @@ mod tests {
     #[test]
     fn blocks_equal_pytorch_with_gradients() {
         assert_equals_pytorch("encoder_block", &["x"], EncoderBlock::new, |block, inputs| {
-            block.forward(inputs[0].clone())
+            block.forward(inputs[0].clone(), None)
         });
         assert_equals_pytorch("decoder_block", &["x", "memory"], DecoderBlock::new, |block, inputs| {
-            block.forward(inputs[0].clone(), block.project_tokens(inputs[1].clone()))
+            block.forward(inputs[0].clone(), block.project_tokens(inputs[1].clone().into()), None)
         });
     }
 }

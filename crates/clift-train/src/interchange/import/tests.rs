@@ -5,7 +5,8 @@ use std::sync::atomic::AtomicBool;
 use burn::tensor::{Device, Tensor};
 use clift_data::write_state_dict;
 use clift_model::{
-    Cameras, CliftVariant, Clusters, DeviceName, ModelPath, PREFIX, SceneClusters, SceneModel, TrainedModel, Views,
+    Cameras, Clift, CliftVariant, Clusters, DeviceName, ModelPath, PREFIX, SceneClusters, SceneModel, TrainedModel,
+    Views, save_weights,
 };
 use safetensors::SafeTensors;
 
@@ -68,14 +69,14 @@ fn assert_computes(folder: &Path, name: &str) {
         let (network, device) = (&trained.network, &trained.device);
         let images = reference.tensor("input.context_images", device);
         let features = network.features(&Views { images, cameras: cameras(&reference, "context", device) });
-        assert_close(&reference, "output.features", &features);
+        assert_close(&reference, "output.features", &features.values);
         let mut tokens = network.normalize(features);
         if trained.has_condenser {
             let [assignment, centroid_index] = ["input.assignment", "input.centroid_index"]
                 .map(|name| reference.values(name).into_iter().map(|index| index as u32).collect());
             let scene = SceneClusters::new(assignment, centroid_index).unwrap();
             tokens = network.compress(tokens, &Clusters::new(vec![scene]).unwrap().upload(device));
-            assert_close(&reference, "output.clift", &tokens);
+            assert_close(&reference, "output.clift", &tokens.values);
         } else {
             assert!(reference.data("output.clift").is_none(), "{name}: the condenser is missing");
         }
@@ -184,6 +185,32 @@ fn re10k_tensors(rename: impl Fn(&str) -> String) -> Vec<HostTensor> {
 fn assert_says(message: &str, parts: &[&str]) {
     for part in parts {
         assert!(message.contains(part), "{part}\nis not in\n{message}");
+    }
+}
+
+#[test]
+fn exports_of_new_models_have_the_published_shapes() {
+    let place = tempfile::tempdir().unwrap();
+    for (name, variant, num_heads) in
+        CHECKPOINTS.into_iter().filter(|(name, ..)| ["re10k", "dl3dv", "paper"].contains(name))
+    {
+        let published = StateDict::open(&fixture(&format!("checkpoints/{name}.ckpt"))).unwrap();
+        let imported = place.path().join(name);
+        let (config, _) = import(&published.path, &imported, &options(variant, num_heads)).unwrap();
+        // A model that was never imported.
+        let weights = place.path().join(format!("{name}.safetensors"));
+        save_weights(&Clift::new(&config.model, 0, &Device::flex()), &weights).unwrap();
+        let model = ModelPath { dir: place.path().into(), weights };
+        let out = place.path().join(format!("{name}.ckpt"));
+        export(&config, &model, ExportFormat::Pytorch, &out).unwrap();
+        let shapes = |state: &StateDict| -> BTreeMap<String, Vec<u64>> {
+            let keys = state.keys().filter(|key| key.starts_with(PREFIX));
+            keys.map(|key| (key.to_owned(), state.tensor(key).unwrap().1.to_vec())).collect()
+        };
+        let exported = shapes(&StateDict::open(&out).unwrap());
+        assert_eq!(exported, shapes(&published), "{name}");
+        let dim = config.model.dim as u64;
+        assert_eq!(exported["transformer.patch_to_image.0.weight"], [192, dim, 1, 1]);
     }
 }
 

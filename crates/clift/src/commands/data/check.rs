@@ -5,7 +5,8 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clift_data::{
-    CheckedScene, SceneCheck, Split, check_scene, encode_png, note_skipped_frames, plural, replace_file, skipped_scenes,
+    CheckedScene, SceneCheck, Split, Verdict, check_scene, encode_png, note_skipped_frames, plural, replace_file,
+    skipped_scenes,
 };
 use serde::Serialize;
 
@@ -14,6 +15,7 @@ use crate::commands::splits::{SourceArgs, SplitSource, Splits};
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::table::table;
+use crate::output::visible::visible_line;
 
 #[derive(Debug, Serialize)]
 struct Row {
@@ -31,8 +33,8 @@ struct Report {
 }
 
 impl Report {
-    fn num_flagged(&self) -> usize {
-        self.scenes.iter().filter(|row| !row.check.ok).count()
+    fn count(&self, verdict: Verdict) -> usize {
+        self.scenes.iter().filter(|row| row.check.verdict == verdict).count()
     }
 }
 
@@ -48,7 +50,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     print_result(&report_text(&report))?;
     args.json.write(&report)?;
     anyhow::ensure!(!report.scenes.is_empty(), "no scenes to check in {}", args.source.dir.display());
-    let flagged = report.num_flagged();
+    let flagged = report.count(Verdict::Flagged);
     anyhow::ensure!(
         flagged == 0,
         "{flagged} of {} flagged; the table above lists the reasons",
@@ -91,6 +93,7 @@ fn report_text(report: &Report) -> String {
     let mut sentences = Vec::new();
     for Row { split, check } in &report.scenes {
         let name = split.map_or_else(|| check.key.clone(), |split| format!("{split}/{}", check.key));
+        let name = visible_line(&name).into_owned();
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".into());
         rows.push([
             name.clone(),
@@ -98,7 +101,7 @@ fn report_text(report: &Report) -> String {
             or_dash(check.image_size.map(|[width, height]| format!("{width}x{height}"))),
             or_dash(check.fov_deg.map(|fov| format!("{fov:.1} deg"))),
             or_dash(check.epipolar_px.map(|px| format!("{px:.2} px"))),
-            if check.ok { "ok" } else { "FLAGGED" }.into(),
+            check.verdict.to_string(),
         ]);
         sentences.extend(check.reasons.iter().map(|reason| format!("{name}: {reason}")));
         sentences.extend(check.notes.iter().map(|note| format!("{name}: note: {note}")));
@@ -107,8 +110,14 @@ fn report_text(report: &Report) -> String {
     if !sentences.is_empty() {
         text = format!("{text}\n\n{}", sentences.join("\n"));
     }
-    let (num_scenes, flagged) = (report.scenes.len(), report.num_flagged());
-    format!("{text}\n\n{}, {} ok, {flagged} flagged", plural(num_scenes, "scene"), num_scenes - flagged)
+    let [ok, flagged, not_compared] =
+        [Verdict::Ok, Verdict::Flagged, Verdict::NotCompared].map(|verdict| report.count(verdict));
+    let num_scenes = plural(report.scenes.len(), "scene");
+    let mut counts = format!("{num_scenes}, {ok} ok, {flagged} flagged");
+    if not_compared > 0 {
+        counts = format!("{counts}, {not_compared} not compared with the images");
+    }
+    format!("{text}\n\n{counts}")
 }
 
 #[derive(Debug, clap::Args)]
@@ -136,7 +145,7 @@ mod tests {
     fn table_has_rows_and_reasons() {
         let good = SceneCheck {
             key: "a".into(),
-            ok: true,
+            verdict: Verdict::Ok,
             num_frames: 36,
             epipolar_px: Some(0.312),
             image_size: Some([576, 320]),
@@ -144,20 +153,27 @@ mod tests {
             ..SceneCheck::default()
         };
         let reasons = vec!["it has no frames".to_owned()];
-        let bad = SceneCheck { key: "b".into(), reasons, notes: vec!["so much".into()], ..SceneCheck::default() };
+        let notes = vec!["so much".into()];
+        let bad = SceneCheck { key: "b".into(), verdict: Verdict::Flagged, reasons, notes, ..SceneCheck::default() };
+        let small = SceneCheck { key: "c".into(), num_frames: 3, ..SceneCheck::default() };
         let report = Report {
-            scenes: vec![Row { split: Some(Split::Train), check: good }, Row { split: None, check: bad }],
+            scenes: vec![
+                Row { split: Some(Split::Train), check: good },
+                Row { split: None, check: bad },
+                Row { split: None, check: small },
+            ],
             notes: Vec::new(),
         };
         let expected = "\
 scene    frames  size     field of view  epipolar
 train/a  36      576x320  93.0 deg       0.31 px   ok
 b        0       -        -              -         FLAGGED
+c        3       -        -              -         not compared
 
 b: it has no frames
 b: note: so much
 
-2 scenes, 1 ok, 1 flagged";
+3 scenes, 1 ok, 1 flagged, 1 not compared with the images";
         assert_eq!(report_text(&report), expected);
     }
 

@@ -61,13 +61,14 @@ Examples:
     Index(IndexArgs),
     /// Convert any layout to pixelSplat chunks or to one file per scene
     ///
-    /// Writes the splits of DIR to OUT/train and OUT/test. A data set without splits becomes OUT/test, unless
-    /// `data.files.test_scenes` divides it. Image files are copied byte by byte, unless their lens distortion is removed.
+    /// Writes the splits of DIR to OUT/train and OUT/test. A data set without splits, such as captures, becomes OUT itself,
+    /// unless `data.files.test_scenes` divides it. Image files are copied byte by byte, unless their lens distortion is
+    /// removed or --max-size reduces them.
     /// An interrupted conversion resumes: SHA256SUMS lists the complete files, and `sha256sum -c SHA256SUMS` verifies
     /// them at any time. Exits with 1 if no scene of a split can be converted.
     #[command(after_help = "\
 Examples:
-  clift data convert captures/fox fox-chunks --to chunks
+  clift data convert captures/fox fox-chunks --to chunks --max-size 512 --quality 95
   clift data convert /data/re10k-txt /data/re10k --to chunks --split test
   clift data convert /data/re10k /data/re10k-scenes --to scenes
   clift data convert /data/dl3dv /data/dl3dv-chunks --to chunks --set data.files.test_scenes=benchmark.txt")]

@@ -6,20 +6,24 @@ use std::time::Instant;
 use anyhow::Context;
 use clap::ValueEnum;
 use clift_data::{
-    ConversionReport, ConvertOptions, ConvertTo, Converter, KEPT_FOR_TESTING, SkipReport, SkippedScene, Split, plural,
+    ConversionReport, ConvertOptions, ConvertTo, Converter, KEPT_FOR_TESTING, SkipReport, SkippedScene,
+    UnreadableImage, plural,
 };
 
+use crate::commands::parse::parse_count;
 use crate::commands::shared_args::ChunkArgs;
 use crate::commands::splits::{SourceArgs, SplitSource, Splits, open_splits};
 use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::units::file_size;
+use crate::output::visible::visible_line;
 
-/// Most skipped scenes that are printed; `skipped.json` lists all.
-const MAX_LISTED_SKIPS: usize = 50;
+/// Most skipped scenes, and most unreadable images, that are printed; `skipped.json` and `unreadable.json` list all.
+const MAX_LISTED: usize = 50;
 
-/// Converts the splits and prints the skipped scenes; fails if no scene of a split can be converted.
+/// Converts the splits and prints the skipped scenes; fails if no scene of a split can be converted, and if an image file is
+/// unreadable.
 pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     let to = match args.to {
         ConvertForm::Chunks => ConvertTo::Chunks { target_bytes: args.chunks.target_bytes() },
@@ -30,42 +34,75 @@ pub fn run(args: &ConvertArgs) -> anyhow::Result<()> {
     changes.retain(|change| change.key != "data.files.test_scenes");
     changes.sort_by(|a, b| a.key.cmp(&b.key));
     let opened_with = changes.iter().map(|change| format!("{}={}", change.key, change.to)).collect::<Vec<_>>();
-    let options = ConvertOptions { to, encoding: args.chunks.encoding(), opened_with: opened_with.join(" ") };
+    let opened_with = opened_with.join(" ");
+    let options = ConvertOptions { to, encoding: args.chunks.encoding(), max_size: args.max_size, opened_with };
+
     let dir = &args.source.dir;
     let splits = open_splits(dir, args.split, &files)?;
     // Every output folder is checked before the first is written.
     let mut converters = Vec::new();
     for split in &splits {
         split.print_report();
-        // A data set without splits becomes the test split, which `clift eval` and `clift encode` read.
-        let folder = args.out.join(split.split.unwrap_or(Split::Test).to_string());
+        // A data set without splits stays one.
+        let folder = split.split.map_or_else(|| args.out.clone(), |split| args.out.join(split.to_string()));
         require_disjoint(dir, &folder)?;
         let opened = &split.opened;
         converters.push((split, Converter::open(opened.source.as_ref(), &opened.report, &folder, &options)?, folder));
     }
-    let mut empty = Vec::new();
+    let (mut empty, mut num_unreadable) = (Vec::new(), 0);
     for (split, converter, folder) in converters {
         let started = Instant::now();
         let mut counter = Counter::new(&split.name(), split.opened.source.num_scenes() as u64);
         let report = converter.run(|done| counter.set(done as u64))?;
         drop(counter);
         print_skips(&report.skipped, &folder);
+        print_unreadable(&report.unreadable, &folder);
+        num_unreadable += report.unreadable.len();
         print_result(&describe(split, &report, started.elapsed().as_secs_f64(), &folder))?;
         if report.num_scenes == 0 {
             empty.push(split.name());
         }
     }
     anyhow::ensure!(empty.is_empty(), "no scene of {} could be converted: {}", empty.join(", "), dir.display());
+    anyhow::ensure!(
+        num_unreadable == 0,
+        "{} unreadable, copied as found and listed above; replace the files in {} and convert to a new folder",
+        plural(num_unreadable, "image"),
+        dir.display()
+    );
     Ok(())
 }
 
+fn print_unreadable(images: &[UnreadableImage], folder: &Path) {
+    for UnreadableImage { key, frame, reason } in images.iter().take(MAX_LISTED) {
+        print_note(&format!("unreadable: frame {frame} of scene {}: {reason}", visible_line(key)));
+    }
+    let num_more = images.len().saturating_sub(MAX_LISTED);
+    if num_more > 0 {
+        print_note(&format!("unreadable: {}", plural(num_more, "more image")));
+    }
+    if !images.is_empty() {
+        print_note(&format!("all unreadable images: {}", folder.join("unreadable.json").display()));
+    }
+}
+
 fn describe(split: &SplitSource, report: &ConversionReport, seconds: f64, folder: &Path) -> String {
-    let ConversionReport { num_scenes, num_found, num_changed, num_frames, num_encoded, image_bytes, skipped } = report;
+    let ConversionReport {
+        num_scenes,
+        num_found,
+        num_changed,
+        num_frames,
+        num_encoded,
+        image_bytes,
+        unreadable,
+        skipped,
+    } = report;
     let optional = |number: usize, text: &str| if number > 0 { format!(", {number} {text}") } else { String::new() };
     let found = optional(*num_found, "of them already complete");
     let changed = optional(*num_changed, "rewritten, because cameras or frames changed");
+    let unreadable = optional(unreadable.len(), "unreadable");
     format!(
-        "{}: {} of {}{found}{changed}; {} written, {} copied and {num_encoded} encoded, {} in {seconds:.1} s: {}",
+        "{}: {} of {}{found}{changed}; {} written, {} copied and {num_encoded} encoded{unreadable}, {} in {seconds:.1} s: {}",
         split.name(),
         plural(*num_scenes, "scene"),
         skipped.num_scenes,
@@ -79,10 +116,10 @@ fn describe(split: &SplitSource, report: &ConversionReport, seconds: f64, folder
 fn print_skips(report: &SkipReport, folder: &Path) {
     // Scenes reserved for testing are part of the other split.
     let skips: Vec<&SkippedScene> = report.skips.iter().filter(|skip| skip.reason != KEPT_FOR_TESTING).collect();
-    for skip in skips.iter().take(MAX_LISTED_SKIPS) {
-        print_note(&format!("skipped {}: {}", skip.key, skip.reason));
+    for skip in skips.iter().take(MAX_LISTED) {
+        print_note(&format!("skipped {}: {}", visible_line(&skip.key), skip.reason));
     }
-    let num_more = skips.len().saturating_sub(MAX_LISTED_SKIPS);
+    let num_more = skips.len().saturating_sub(MAX_LISTED);
     if num_more > 0 {
         print_note(&format!("skipped {num_more} more"));
     }
@@ -129,6 +166,9 @@ pub struct ConvertArgs {
     /// Convert this split, if there are two
     #[arg(long, value_enum, default_value_t = Splits::Both)]
     pub split: Splits,
+    /// Reduce images with a side of more than N pixels, and encode them
+    #[arg(long, value_name = "N", value_parser = parse_count)]
+    pub max_size: Option<usize>,
     #[command(flatten)]
     pub chunks: ChunkArgs,
 }

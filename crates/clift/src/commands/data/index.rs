@@ -15,6 +15,7 @@ pub fn run(args: &IndexArgs) -> anyhow::Result<()> {
         num_targets: args.targets,
         distance: args.distance,
         min_overlap: args.overlap,
+        context_targets: args.context_targets,
         seed: args.seed,
     };
     options.validate()?;
@@ -64,6 +65,9 @@ pub struct IndexArgs {
     /// Minimum overlap of the first and the last context
     #[arg(long, value_name = "SHARE", default_value_t = 0.6)]
     pub overlap: f64,
+    /// Allow contexts as targets, as published indices do
+    #[arg(long)]
+    pub context_targets: bool,
     /// Seed of the sampled frames
     #[arg(long, value_name = "S", default_value_t = 123)]
     pub seed: u64,

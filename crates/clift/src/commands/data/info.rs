@@ -9,7 +9,7 @@ use clift_data::{
     ClipReader, DataError, DatasetRoot, EvaluationIndex, IndexCensus, OpenedSource, SceneSource, SceneSubset,
     SkipReport, SourceInfo, SourceKind, Split, open_dataset, open_source,
 };
-use clift_eval::evaluation_items;
+use clift_eval::{EvalFrames, evaluation_items};
 use clift_train::Config;
 
 use crate::commands::data::info_report::{EvaluationReport, Report, SplitReport};
@@ -70,10 +70,12 @@ fn describe_config(path: &Path, config: &Config) -> anyhow::Result<Report> {
     let data = &config.data;
     let mut report = Report { path: path.to_owned(), ..Report::default() };
     for split in [Split::Train, Split::Test] {
-        let described = open_dataset(data, split).and_then(|OpenedSource { source, report: skips, .. }| {
+        let described = open_dataset(data, split).and_then(|opened| {
             if split == Split::Test {
-                report.evaluation = Some(evaluation(config, source.clone()));
+                let frames = EvalFrames::new(&opened, split, data.hold_out, true);
+                report.evaluation = Some(evaluation(config, opened.source.clone(), frames));
             }
+            let OpenedSource { source, report: skips, .. } = opened;
             let source: Arc<dyn SceneSource> = match data.source {
                 SourceKind::Synthetic => Arc::new(SceneSubset::first(source, MAX_SYNTHETIC)),
                 _ => source,
@@ -101,6 +103,7 @@ fn describe_split(source: &dyn SceneSource, skips: &SkipReport) -> Result<SplitR
         frames: skips.frames.clone(),
         notes: skips.notes.clone(),
         num_described: source.num_scenes(),
+        keys: (0..source.num_scenes()).map(|scene| source.key(scene).to_owned()).collect(),
         info: Some(SourceInfo::read(source)?),
         views: None,
     })
@@ -116,9 +119,7 @@ fn or_error<E: fmt::Display>(described: Result<SplitReport, E>) -> SplitReport {
 
 /// Returns the frames that `data.views` needs, and the number of scenes that have them.
 fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
-    let views = &config.data.views;
-    let gaps = (views.min_context..=views.max_context).map(|num_context| views.gap_bounds(u64::MAX, num_context)[0]);
-    let needed = gaps.max().unwrap_or(0) + 1;
+    let needed = config.data.views.min_frames(config.stage1.steps);
     let mut num_long = 0;
     for scene in 0..source.num_scenes() {
         // Unreadable scenes are part of the description.
@@ -127,11 +128,12 @@ fn long_enough(config: &Config, source: &dyn SceneSource) -> [usize; 2] {
     [needed, num_long]
 }
 
-fn evaluation(config: &Config, source: Arc<dyn SceneSource>) -> EvaluationReport {
+fn evaluation(config: &Config, source: Arc<dyn SceneSource>, frames: EvalFrames) -> EvaluationReport {
     let reader = ClipReader { source, options: config.data.clip_options() };
-    match evaluation_items(&config.eval, &reader) {
-        Ok((items, skips)) => EvaluationReport {
+    match evaluation_items(&config.eval, &reader, frames) {
+        Ok((items, skips, split)) => EvaluationReport {
             error: None,
+            split: Some(split),
             num_scenes: items.len(),
             num_views: items.iter().map(|item| item.views.target.len()).sum(),
             skipped: counts(&skips),
@@ -154,6 +156,8 @@ pub struct InfoArgs {
 
 #[cfg(test)]
 mod tests {
+    use clift_data::{RgbImage, encode_png};
+
     use super::*;
 
     fn fixtures() -> PathBuf {
@@ -165,6 +169,7 @@ mod tests {
         let text = describe_folder(&fixtures()).unwrap().to_string();
         let expected = "layout            chunks
 train             2 scenes
+  keys            00000000000000a1, 00000000000000a2
   frames          8 / 8 / 8 (smallest / median / largest)
   image           64x36
   field of view   58.1 / 58.1 / 58.1 deg
@@ -182,15 +187,38 @@ test              1 scene
         config.data.filters.min_frames = 8;
         config.eval.index = Some(fixtures().join("evaluation_index.json"));
         let text = describe_config(Path::new("a.toml"), &config).unwrap().to_string();
-        assert!(text.contains("  long enough     0 of 2: data.views needs 46 frames"), "{text}");
-        assert!(text.contains("evaluation        4 views of 1 scene\n  skipped         2 without views"), "{text}");
+        assert!(text.contains("  long enough     0 of 2: data.views.min_gap needs 46 frames"), "{text}");
+        assert!(
+            text.contains("evaluation        4 views of 1 scene, test split\n  skipped         2 without views"),
+            "{text}"
+        );
         assert!(text.ends_with("tokens per scene  96 to 144"), "{text}");
 
         config.data.filters.min_frames = 9;
         let report = describe_config(Path::new("a.toml"), &config).unwrap();
         let error = report.splits["train"].error.as_deref().unwrap();
-        assert!(error.contains("0 of 2 scenes used; 2 shorter than 9 frames"), "{error}");
+        assert!(
+            error.contains("0 of 2 scenes used; 2 shorter than the 9 frames of data.filters.min_frames"),
+            "{error}"
+        );
         assert!(report.evaluation.is_none());
+    }
+
+    #[test]
+    fn captures_are_listed_with_keys_and_every_size() {
+        let root = tempfile::tempdir().unwrap();
+        for (key, width) in [("attic", 32), ("barn", 48), ("cellar", 48)] {
+            let folder = root.path().join(key);
+            std::fs::create_dir(&folder).unwrap();
+            let image = RgbImage { width, height: 24, rgb: vec![9; width * 24 * 3] };
+            std::fs::write(folder.join("0.png"), encode_png(&image).unwrap()).unwrap();
+            let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]";
+            let frames = format!(r#"{{"fl_x": 20, "frames": [{{"file_path": "0.png", "transform_matrix": {pose}}}]}}"#);
+            std::fs::write(folder.join("transforms.json"), frames).unwrap();
+        }
+        let text = describe_folder(root.path()).unwrap().to_string();
+        assert!(text.contains("\n  keys            attic, barn, cellar\n"), "{text}");
+        assert!(text.contains("\n  image           48x24 (2 scenes), 32x24 (1 scene)\n"), "{text}");
     }
 
     #[test]

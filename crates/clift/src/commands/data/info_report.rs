@@ -5,8 +5,11 @@ use std::fmt;
 use std::path::PathBuf;
 
 use clift_data::{SkippedFrame, SkippedScene, SourceInfo, SourceKind, plural};
+use clift_eval::EvalSplit;
 use serde::Serialize;
 
+/// Most keys, and most image sizes, that the table lists.
+const MAX_LISTED_KEYS: usize = 8;
 /// Most scenes, and groups of scenes, that the table lists; the JSON lists all.
 const MAX_LISTED_SCENES: usize = 20;
 /// Most frames of one scene that the table lists.
@@ -37,6 +40,8 @@ pub struct SplitReport {
     pub notes: Vec<String>,
     /// Number of scenes that `info` describes: all used scenes, or the first synthetic ones.
     pub num_described: usize,
+    /// Keys of these scenes.
+    pub keys: Vec<String>,
     /// Sizes and extents of these scenes.
     pub info: Option<SourceInfo>,
     /// Frames that `data.views` needs, and the number of described scenes that have them; for training scenes.
@@ -47,6 +52,8 @@ pub struct SplitReport {
 pub struct EvaluationReport {
     /// Reason why no scene can be evaluated.
     pub error: Option<String>,
+    /// What is measured on.
+    pub split: Option<EvalSplit>,
     pub num_scenes: usize,
     pub num_views: usize,
     pub skipped: BTreeMap<String, usize>,
@@ -68,7 +75,8 @@ impl fmt::Display for Report {
         if let Some(evaluation) = &self.evaluation {
             let counted =
                 format!("{} of {}", plural(evaluation.num_views, "view"), plural(evaluation.num_scenes, "scene"));
-            rows.push(("evaluation", evaluation.error.clone().unwrap_or(counted)));
+            let split = evaluation.split.map_or_else(String::new, |split| format!(", {split}"));
+            rows.push(("evaluation", evaluation.error.clone().unwrap_or(counted + &split)));
             rows.extend(evaluation.skipped.iter().map(|(reason, count)| ("  skipped", format!("{count} {reason}"))));
         }
         match self.num_tokens {
@@ -85,6 +93,21 @@ impl fmt::Display for Report {
 fn first_names(names: &[&str], most: usize) -> String {
     let more = if names.len() > most { ", .." } else { "" };
     format!("{}{more}", names[..names.len().min(most)].join(", "))
+}
+
+/// Lists the image sizes, the most frequent first, with their numbers of scenes if there are several.
+fn image_row(sizes: &BTreeMap<String, usize>) -> Option<String> {
+    let mut sizes: Vec<(&String, &usize)> = sizes.iter().collect();
+    sizes.sort_by_key(|(_, count)| std::cmp::Reverse(**count));
+    match sizes[..] {
+        [] => None,
+        [(size, _)] => Some(size.clone()),
+        _ => {
+            let listed = sizes.iter().map(|(size, count)| format!("{size} ({})", plural(**count, "scene")));
+            let listed: Vec<String> = listed.take(MAX_LISTED_KEYS + 1).collect();
+            Some(first_names(&listed.iter().map(String::as_str).collect::<Vec<_>>(), MAX_LISTED_KEYS))
+        }
+    }
 }
 
 /// Appends the skipped scenes by reason, then the skipped frames by scene and reason.
@@ -124,6 +147,10 @@ impl SplitReport {
         let first = format!("; described by the first {}", self.num_described);
         let first = if self.num_described < self.num_used { first.as_str() } else { "" };
         rows.push((name, format!("{used}{}{first}", plural(self.num_scenes, "scene"))));
+        let keys: Vec<&str> = self.keys.iter().map(String::as_str).take(MAX_LISTED_KEYS + 1).collect();
+        if !keys.is_empty() {
+            rows.push(("  keys", first_names(&keys, MAX_LISTED_KEYS)));
+        }
         skipped_rows(&self.left_out, &self.frames, rows);
         rows.extend(self.notes.iter().map(|note| ("  note", note.clone())));
         let Some(info) = &self.info else { return };
@@ -136,9 +163,7 @@ impl SplitReport {
         if let Some(frames) = info.num_frames {
             rows.push(("  frames", format!("{frames} (smallest / median / largest)")));
         }
-        if let Some([width, height]) = info.image_size {
-            rows.push(("  image", format!("{width}x{height}")));
-        }
+        rows.extend(image_row(&info.image_sizes).map(|sizes| ("  image", sizes)));
         if let Some(fov) = info.fov_deg {
             rows.push(("  field of view", format!("{fov:.1} deg")));
         }
@@ -147,7 +172,10 @@ impl SplitReport {
         }
         if let Some([needed, num_long]) = self.views {
             let of = self.num_described;
-            rows.push(("  long enough", format!("{num_long} of {of}: data.views needs {}", plural(needed, "frame"))));
+            rows.push((
+                "  long enough",
+                format!("{num_long} of {of}: data.views.min_gap needs {}", plural(needed, "frame")),
+            ));
         }
     }
 }

@@ -17,7 +17,7 @@ use crate::commands::shared_args::ChunkArgs;
 use crate::commands::splits::Splits;
 use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
-use crate::output::stdout::{print_note, print_result};
+use crate::output::stdout::{print_result, print_warning};
 use crate::output::units::file_size;
 
 /// Fewest frames for training and evaluation: two contexts and another frame as target.
@@ -34,8 +34,8 @@ pub fn run(args: &SynthArgs) -> anyhow::Result<()> {
     let (size, [width, height]) = ([config.width, config.height], cropped(&config));
     if size != [width, height] && width > 0 && height > 0 {
         let (size, patch) = (format!("{}x{}", size[0], size[1]), patch_size());
-        print_note(&format!(
-            "warning: {size} is no multiple of the {patch}x{patch} patch: training crops images to {width}x{height}"
+        print_warning(format!(
+            "{size} is no multiple of the {patch}x{patch} patch: training crops images to {width}x{height}"
         ));
     }
     for &split in args.split.list() {
@@ -71,9 +71,7 @@ fn write_split(args: &SynthArgs, config: &SyntheticConfig, split: Split) -> anyh
         let path = args.out.join(INDEX);
         if write_evaluation_index(&path, &source, num_context, num_targets)? == 0 {
             let needed = num_context + num_targets;
-            print_note(&format!(
-                "warning: the index has no views: {frames} are too few; use at least --frames {needed}"
-            ));
+            print_warning(format!("the index has no views: {frames} are too few; use at least --frames {needed}"));
         } else {
             let path = path.display();
             print_result(&format!("index: {num_context} contexts and {num_targets} targets per scene: {path}"))?;

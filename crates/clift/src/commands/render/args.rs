@@ -15,12 +15,15 @@ pub struct RenderArgs {
     /// Scene file from `clift encode`
     #[arg(value_name = "SCENE")]
     pub scene: PathBuf,
-    /// Camera path: interpolate, orbit, or a file of poses (JSON)
+    /// Camera path: interpolate, orbit, a transforms.json or a file of poses
     #[arg(long, value_name = "PATH")]
     pub path: CameraPath,
-    /// Output folder; must be empty or absent
+    /// Output folder
     #[arg(long, short, value_name = "DIR")]
     pub out: PathBuf,
+    /// Replace the frames in the output folder
+    #[arg(long)]
+    pub force: bool,
     /// Run or weight file [default: the one the scene was encoded with]
     #[arg(long, value_name = "RUN|MODEL")]
     pub model: Option<PathBuf>,

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
-use clift_data::{is_empty_folder, upper_median};
+use clift_data::{is_empty_folder, median};
 use clift_eval::{Animation, Canvas};
 use clift_model::{SceneRenderer, ViewCamera};
 use clift_train::TrainError;
@@ -20,6 +20,15 @@ pub struct Timing {
     pub render_s: f64,
 }
 
+/// Times and tokens of the rendered frames.
+pub struct Rendered {
+    /// Median seconds.
+    pub timing: Timing,
+    /// Indices of the tokens of each frame, ascending; `None` if every frame uses all tokens.
+    pub tokens: Option<Vec<Vec<u32>>>,
+}
+
+/// Settings of all frames.
 pub struct Frames {
     pub height: usize,
     pub width: usize,
@@ -27,12 +36,35 @@ pub struct Frames {
     pub fps: u16,
 }
 
-/// Checks that the output folder is empty or absent: frames of another path would mix with the new ones.
-pub fn require_empty(out: &Path) -> anyhow::Result<()> {
+/// File of the path, token counts and times of the frames.
+pub const REPORT: &str = "render.json";
+
+/// Checks that the output folder is empty or absent, or holds frames that `replace` allows to replace.
+pub fn check_out(out: &Path, replace: bool) -> anyhow::Result<()> {
     if is_empty_folder(out).with_context(|| format!("reading {}", out.display()))? {
         return Ok(());
     }
-    usage_bail!("output folder {} is not empty; choose another folder or move it away", out.display())
+    let out_text = out.display();
+    match (out.join(REPORT).is_file(), replace) {
+        (true, true) => Ok(()),
+        (true, false) => {
+            usage_bail!("output folder {out_text} holds frames; replace them with --force or choose another")
+        }
+        (false, _) => usage_bail!("output folder {out_text} is not empty and holds no frames; choose another folder"),
+    }
+}
+
+/// Removes the frames of a longer path that was replaced by one of `num_frames`.
+pub fn remove_later_frames(out: &Path, num_frames: usize) -> std::io::Result<()> {
+    for item in std::fs::read_dir(out)? {
+        let item = item?;
+        let name = item.file_name();
+        let number = name.to_str().and_then(|name| name.strip_prefix("frame-")?.strip_suffix(".png")?.parse().ok());
+        if number.is_some_and(|number: usize| number >= num_frames) {
+            std::fs::remove_file(item.path())?;
+        }
+    }
+    Ok(())
 }
 
 /// Renders every view and writes the frames and the animation to `folder`, until `stop` is set.
@@ -42,11 +74,11 @@ pub fn write_frames(
     frames: &Frames,
     folder: &Path,
     stop: &AtomicBool,
-) -> anyhow::Result<Timing> {
+) -> anyhow::Result<Rendered> {
     let &Frames { height, width, num_render_tokens, fps } = frames;
     let mut animation = Animation::new(&folder.join("animation.png"), width, height, views.len(), fps)?;
     let mut counter = Counter::new("frames", views.len() as u64);
-    let (mut select_s, mut render_s) = (Vec::new(), Vec::new());
+    let (mut select_s, mut render_s, mut tokens) = (Vec::new(), Vec::new(), Vec::new());
     for some in views.chunks(renderer.frames_per_call(height, width)) {
         let first = render_s.len();
         if stop.load(Ordering::Relaxed) {
@@ -60,9 +92,11 @@ pub fn write_frames(
             animation.add(&image)?;
             select_s.push(view.select_s);
             render_s.push(view.render_s);
+            tokens.push(view.tokens);
         }
         counter.set(render_s.len() as u64);
     }
     animation.finish()?;
-    Ok(Timing { select_s: upper_median(&select_s), render_s: upper_median(&render_s) })
+    let timing = Timing { select_s: median(&select_s), render_s: median(&render_s) };
+    Ok(Rendered { timing, tokens: tokens.into_iter().collect() })
 }

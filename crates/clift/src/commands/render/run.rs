@@ -12,7 +12,7 @@ use clift_model::{
 use serde::Serialize;
 
 use crate::commands::render::args::{CameraPath, RenderArgs};
-use crate::commands::render::frames::{self, Frames, Timing};
+use crate::commands::render::frames::{self, Frames, Rendered, Timing};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::json::write_json;
@@ -37,6 +37,8 @@ struct Report {
     num_render_tokens: usize,
     #[serde(flatten)]
     timing: Timing,
+    /// Tokens of the scene file that each frame is rendered from; `null` if every frame uses all.
+    tokens: Option<Vec<Vec<u32>>>,
     /// Token counts and their seconds per frame, measured for `--budget-ms`.
     calibration: Option<Vec<(usize, f64)>>,
 }
@@ -46,9 +48,15 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let [width, height] = args.size.unwrap_or([scene.width, scene.height]);
     let device = args.device.unwrap_or_default();
     check_size(&scene, [width, height], args.render.is_some(), device)?;
-    frames::require_empty(&args.out)?;
+    if [width, height] != [scene.width, scene.height] {
+        print_note(&format!(
+            "warning: the network was trained on images of {} x {}; frames of {width} x {height} show its patches as a grid",
+            scene.width, scene.height
+        ));
+    }
+    frames::check_out(&args.out, args.force)?;
     let views = path_cameras(&scene, args, height, width)?;
-    let model = args.model.clone().unwrap_or_else(|| scene.model_path.clone().into());
+    let model = args.model.clone().unwrap_or_else(|| scene.find_model(&args.scene));
     let weights = ModelPath::for_tokens(&model, scene.kind);
     if args.model.is_none() && !weights.exists() {
         // The path comes from an untrusted file: control characters must not reach the terminal.
@@ -65,7 +73,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let creating = || format!("creating {}", args.out.display());
     let files = StagedDir::new(&args.out).with_context(creating)?;
     let frames = Frames { height, width, num_render_tokens, fps: args.fps };
-    let timing = frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
+    let Rendered { timing, tokens } = frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
     let Timing { select_s, render_s } = timing;
     let report = Report {
         scene: scene.key.clone(),
@@ -78,10 +86,12 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         num_storage_tokens: scene.num_tokens(),
         num_render_tokens,
         timing,
+        tokens,
         calibration: calibration.map(|times| times.some.into_iter().chain([times.all]).collect()),
     };
-    write_json(&report, &files.path().join("render.json"))?;
+    write_json(&report, &files.path().join(frames::REPORT))?;
     files.commit().with_context(creating)?;
+    frames::remove_later_frames(&args.out, views.len()).with_context(creating)?;
     print_result(&format!(
         "{}: {} frames of {width} x {height}, each from {num_render_tokens} of {} tokens\n\
          {:.1} ms per frame on {device} (median): {:.1} ms token selection, {:.1} ms rendering",

@@ -1,15 +1,17 @@
 //! Scenes with correct cameras pass, scenes with wrong cameras fail.
 
+use std::sync::OnceLock;
+
+use glam::{DMat3, DVec3};
+use rayon::prelude::*;
+
 use super::*;
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::geometry::pose::Pose;
 use crate::synthetic::config::SyntheticConfig;
 use crate::synthetic::source::SyntheticSource;
-use crate::tools::check::result::MAX_EPIPOLAR_PX;
-use glam::{DMat3, DVec3};
-use rayon::prelude::*;
-use std::sync::OnceLock;
+use crate::tools::check::result::{MAX_EPIPOLAR_PX, Verdict};
 
 struct RenderedRoom {
     cameras: Vec<Camera>,
@@ -90,7 +92,7 @@ fn rooms_with_correct_cameras_pass() {
     for room in rooms() {
         let source = Changed { room, cameras: |_, _: &mut _| (), frame: |frame| frame };
         let CheckedScene { check, image } = check_scene(&source, 0);
-        assert!(check.ok && check.reasons.is_empty(), "{check:?}");
+        assert!(check.verdict == Verdict::Ok && check.reasons.is_empty(), "{check:?}");
         assert_eq!((check.num_frames, check.image_size), (12, Some([320, 240])));
         assert!(check.epipolar_px.is_some_and(|px| px < 0.7), "{check:?}");
         assert!(check.pairs.len() >= 5, "{check:?}");
@@ -101,7 +103,7 @@ fn rooms_with_correct_cameras_pass() {
 #[test]
 fn cameras_that_contradict_the_images_fail() {
     let flagged = |name: &str, check: SceneCheck| {
-        assert!(!check.ok, "{name}: {check:?}");
+        assert_eq!(check.verdict, Verdict::Flagged, "{name}: {check:?}");
         assert!(check.epipolar_px.is_some_and(|px| px > MAX_EPIPOLAR_PX), "{name}: {check:?}");
         assert!(check.reasons[0].contains("from their epipolar lines"), "{name}: {check:?}");
     };
@@ -117,9 +119,64 @@ fn cameras_that_contradict_the_images_fail() {
 }
 
 #[test]
+fn usual_mistakes_are_named() {
+    let named = |check: SceneCheck, expected: &str| {
+        let text = check.reasons.join("; ");
+        assert!(text.contains(&format!("the images fit better with {expected}")), "{expected}: {text}");
+        assert!(check.frames.is_empty());
+    };
+    let opposite = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+    named(check(|_, camera| camera.c2w.rotation *= opposite), "the y and z axes of every camera reversed");
+    named(check(|_, camera| camera.c2w = camera.c2w.inverse()), "every pose inverted (");
+    let view_matrix = |_: usize, camera: &mut Camera| {
+        camera.c2w.rotation *= opposite;
+        camera.c2w = camera.c2w.inverse();
+    };
+    named(check(view_matrix), "every pose inverted, then its y and z axes reversed");
+    for (scale, expected) in [(1.1, "focal lengths times 0.9"), (0.9, "focal lengths times 1.1")] {
+        let scaled = move |_: usize, camera: &mut Camera| {
+            camera.intrinsics_norm.fx *= scale;
+            camera.intrinsics_norm.fy *= scale;
+        };
+        named(check(scaled), expected);
+    }
+    named(
+        check(|_, camera| camera.c2w = turned(camera.c2w, 4.0)),
+        "every camera turned by 4 degrees about its own axis (-1, 0, 0)",
+    );
+}
+
+#[test]
+fn exchanged_neighbours_and_single_cameras_are_named() {
+    let original = &rooms()[0].cameras;
+    for first in [2, 4, 9] {
+        let exchanged = check(move |frame, camera| {
+            if frame == first || frame == first + 1 {
+                camera.c2w = original[2 * first + 1 - frame].c2w;
+            }
+        });
+        assert_eq!(exchanged.reasons.len(), 1, "{exchanged:?}");
+        let expected = format!("the cameras of frames {first} and {} are exchanged: ", first + 1);
+        assert!(exchanged.reasons[0].starts_with(&expected), "{exchanged:?}");
+    }
+    // A sideways turn on a sideways path: the epipolar lines stay.
+    for (wrong, angle_deg) in [(2, 2.0), (9, -2.0), (11, 2.0)] {
+        let single = check(move |frame, camera| {
+            if frame == wrong {
+                camera.c2w.rotation *= DMat3::from_rotation_y(f64::to_radians(angle_deg));
+            }
+        });
+        assert_eq!(single.reasons.len(), 1, "{single:?}");
+        let expected = format!("the cameras of 1 frame ({wrong}) do not fit the other frames");
+        assert!(single.reasons[0].starts_with(&expected), "{single:?}");
+        assert!(single.frames.len() >= 8, "{single:?}");
+    }
+}
+
+#[test]
 fn implausible_cameras_fail_with_the_reason() {
     let reasons = |check: SceneCheck| {
-        assert!(!check.ok);
+        assert_eq!(check.verdict, Verdict::Flagged);
         check.reasons.join("; ")
     };
     let text = reasons(check(|_, camera| camera.intrinsics_norm.cx = 0.9));
@@ -148,16 +205,18 @@ fn repeated_and_unreadable_frames_are_reported() {
         check_scene(&Changed { room, cameras, frame }, 0).check
     };
     let stuck = of(|frame| frame.min(5), |_, _| ());
-    assert!(!stuck.ok);
+    assert_eq!(stuck.verdict, Verdict::Flagged);
     assert_eq!(stuck.reasons, ["2 frames (6, 7) repeat the image of an earlier frame that has another camera"]);
     let torn = of(|frame| if frame == 2 { usize::MAX } else { frame }, |_, _| ());
     let expected = "1 frame (2) cannot be read; the first: frame 2 of scene k cannot";
     assert!(torn.reasons[0].starts_with(expected), "{torn:?}");
     // Images too small for corners add a note, no error.
     let small = of(|frame| frame, |_, _| ());
-    assert!(small.ok && small.epipolar_px.is_none(), "{small:?}");
-    let expected = "poses were not compared with the images: only 0 matching corners";
-    assert!(small.notes[0].starts_with(expected), "{small:?}");
+    assert!(small.verdict == Verdict::NotCompared && small.epipolar_px.is_none(), "{small:?}");
+    assert!(
+        small.notes[0].starts_with("poses were not compared with the images: only 0 matching corners"),
+        "{small:?}"
+    );
 }
 
 #[test]
@@ -169,10 +228,10 @@ fn skipped_scenes_fail_with_the_reason() {
     }
     let checks = skipped_scenes(&report);
     assert_eq!(checks.len(), 1);
-    assert!(!checks[0].ok && checks[0].key == "a" && checks[0].reasons == ["not a scene"]);
+    assert!(checks[0].verdict == Verdict::Flagged && checks[0].key == "a" && checks[0].reasons == ["not a scene"]);
     assert!(checks[0].notes.is_empty());
-    let mut check = SceneCheck { key: "b".into(), ok: true, ..SceneCheck::default() };
+    let mut check = SceneCheck { key: "b".into(), ..SceneCheck::default() };
     note_skipped_frames(&report, &mut check);
-    assert!(check.ok);
+    assert!(check.reasons.is_empty());
     assert_eq!(check.notes, ["2 frames skipped, no such file: 0005.jpg, 0010.jpg"]);
 }

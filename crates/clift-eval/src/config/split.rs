@@ -1,0 +1,110 @@
+//! The evaluated scenes and frames, as related to training.
+
+use std::fmt;
+
+use clift_data::{OpenedSource, Split, ViewIndices, even_views, even_views_of, is_held_out};
+use serde::{Deserialize, Serialize};
+
+/// What the figures of an evaluation were measured on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EvalSplit {
+    /// Scenes of the test split.
+    Test,
+    /// Frames of the training scenes that training never reads (`data.hold_out`).
+    HeldOutFrames,
+    /// Training scenes, with frames that training reads.
+    Train,
+    /// A data set without splits that is not the training data.
+    OtherData,
+}
+
+impl EvalSplit {
+    /// Returns a warning if the figures do not measure generalization.
+    pub fn warning(self) -> Option<&'static str> {
+        (self == Self::Train).then_some("measured on training scenes: the figures do not show how the run generalizes")
+    }
+}
+
+impl fmt::Display for EvalSplit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Test => "test split",
+            Self::HeldOutFrames => "held-out frames of training scenes",
+            Self::Train => "training scenes",
+            Self::OtherData => "data set without splits",
+        })
+    }
+}
+
+/// The scenes of an evaluation, and their frames that it may use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct EvalFrames {
+    /// The evaluated split.
+    pub split: EvalSplit,
+    /// Every n-th frame of a scene is held out of training; 0 for none.
+    pub hold_out: usize,
+}
+
+impl EvalFrames {
+    /// Scenes without frames held out of training.
+    pub const fn whole(split: EvalSplit) -> Self {
+        Self { split, hold_out: 0 }
+    }
+
+    /// Returns the frames of an opened split. `hold_out` is the `data.hold_out` of the run; `is_training_data` whether the
+    /// run was trained on the data set.
+    pub fn new(opened: &OpenedSource, split: Split, hold_out: usize, is_training_data: bool) -> Self {
+        match (split, opened.shares_scenes) {
+            (Split::Test, false) => Self::whole(EvalSplit::Test),
+            (Split::Train, false) => Self::whole(EvalSplit::Train),
+            _ if !is_training_data => Self::whole(EvalSplit::OtherData),
+            (Split::Test, true) if hold_out > 0 => Self { split: EvalSplit::HeldOutFrames, hold_out },
+            _ => Self { split: EvalSplit::Train, hold_out },
+        }
+    }
+
+    /// Spreads the views of a scene without an index: held-out frames are targets only, and no views of training frames.
+    pub(crate) fn views(&self, num_frames: usize, num_context: usize, num_targets: usize) -> Option<ViewIndices> {
+        if self.hold_out == 0 {
+            return even_views(num_frames, num_context, num_targets);
+        }
+        let is_target = |frame: &usize| is_held_out(*frame, self.hold_out);
+        let (held_out, rest): (Vec<usize>, Vec<usize>) = (0..num_frames).partition(is_target);
+        let targets = (self.split == EvalSplit::HeldOutFrames).then_some(&held_out[..]);
+        even_views_of(&rest, targets, num_context, num_targets)
+    }
+
+    /// Returns the split of the views of an index: frames that training reads are no held-out frames.
+    pub(crate) fn of_views<'a>(&self, mut views: impl Iterator<Item = &'a ViewIndices>) -> EvalSplit {
+        let is_held_out = |views: &ViewIndices| views.target.iter().all(|frame| is_held_out(*frame, self.hold_out));
+        if self.split == EvalSplit::HeldOutFrames && !views.all(is_held_out) { EvalSplit::Train } else { self.split }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn held_out_frames_are_targets_and_no_contexts() {
+        let views = |split| EvalFrames { split, hold_out: 8 }.views(50, 4, 3).unwrap();
+        let held_out = views(EvalSplit::HeldOutFrames);
+        assert!(held_out.target.iter().all(|frame| frame % 8 == 0) && held_out.target.len() == 3);
+        let train = views(EvalSplit::Train);
+        assert!(held_out.context.iter().chain(&train.context).chain(&train.target).all(|frame| frame % 8 != 0));
+        let few = EvalFrames { split: EvalSplit::HeldOutFrames, hold_out: 8 }.views(10, 4, 3).unwrap();
+        assert_eq!(few.target, [0, 8], "as many as there are");
+    }
+
+    #[test]
+    fn index_with_a_training_frame_measures_training_scenes() {
+        let held_out = EvalFrames { split: EvalSplit::HeldOutFrames, hold_out: 4 };
+        let of = |frames: EvalFrames, target: &[usize]| {
+            frames.of_views([ViewIndices { context: vec![1, 2], target: target.to_vec() }].iter())
+        };
+        assert_eq!(of(held_out, &[0, 4]), EvalSplit::HeldOutFrames);
+        assert_eq!(of(held_out, &[0, 5]), EvalSplit::Train);
+        assert_eq!(of(EvalFrames::whole(EvalSplit::Test), &[0, 5]), EvalSplit::Test);
+    }
+}

@@ -1,0 +1,34 @@
+//! The path of a scene's model, which holds after scene and model are moved together.
+
+use std::path::{Component, Path, PathBuf};
+
+use crate::scene::scene::Scene;
+
+impl Scene {
+    /// Returns the `model_path` of a scene file at `file`: relative to the folder of the file for a relative `model`, so that
+    /// both can be moved together and read from any folder; an absolute `model` as it is.
+    pub fn model_path_for(model: &Path, file: &Path) -> String {
+        let relative = || {
+            let from = folder(file).canonicalize().ok()?;
+            let to = model.canonicalize().ok()?;
+            let shared = from.components().zip(to.components()).take_while(|(a, b)| a == b).count();
+            let up = from.components().skip(shared).map(|_| Component::ParentDir);
+            let path: PathBuf = up.chain(to.components().skip(shared)).collect();
+            Some(path)
+        };
+        let path = if model.is_absolute() { None } else { relative() };
+        path.unwrap_or_else(|| model.into()).to_string_lossy().into_owned()
+    }
+
+    /// Returns the path of the model of the scene that was read from `file`: beside the file, else in the current folder, as in
+    /// files of earlier versions. The path need not exist.
+    pub fn find_model(&self, file: &Path) -> PathBuf {
+        let beside = folder(file).join(&self.model_path);
+        let here = PathBuf::from(&self.model_path);
+        if !beside.exists() && here.exists() { here } else { beside }
+    }
+}
+
+fn folder(file: &Path) -> &Path {
+    file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}

@@ -1,0 +1,34 @@
+//! How much goes to the standard error: the options `--quiet` and `--verbose`.
+
+use std::sync::atomic::{AtomicU8, Ordering};
+
+/// Amount of notes and progress.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Verbosity {
+    /// Errors and warnings only.
+    Quiet = 0,
+    /// Notes and progress, too.
+    #[default]
+    Normal = 1,
+    /// A line for every training step instead of a bar.
+    Verbose = 2,
+}
+
+static CHOSEN: AtomicU8 = AtomicU8::new(Verbosity::Normal as u8);
+
+impl Verbosity {
+    /// Sets the verbosity of this process.
+    pub fn choose(self) {
+        CHOSEN.store(self as u8, Ordering::Relaxed);
+    }
+
+    /// Returns the verbosity of this process.
+    pub fn chosen() -> Self {
+        match CHOSEN.load(Ordering::Relaxed) {
+            0 => Self::Quiet,
+            2 => Self::Verbose,
+            _ => Self::Normal,
+        }
+    }
+}

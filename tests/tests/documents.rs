@@ -1,0 +1,275 @@
+//! Every command of the README, the guides and the help texts runs as it is printed, with small settings on small data.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::process::Command;
+
+use clift_data::{StateDict, write_state_dict};
+use serde_json::json;
+
+use crate::evaluation::eval::write_vgg;
+use crate::support::{BINARY, Place, copy_folder, finish, repository, sources, start};
+
+/// The key of the test scene of `re10k-mini`, for the keys of the documents.
+const KEY: &str = "00000000000000b1";
+
+/// Words of the documents, and those for small data.
+const SMALLER: [(&str, &str); 10] = [
+    ("target/release/clift ", "clift "),
+    // Later examples read the other data.
+    (" /data/re10k-txt /data/re10k ", " /data/re10k-txt /data/converted "),
+    (" /data/", " data/"),
+    ("5aca87f95a9412c6", KEY),
+    ("--scene KEY", "--scene 00000000000000b1"),
+    ("chunks|scenes", "chunks"),
+    ("--distance 45..135", "--distance 4..7"),
+    ("--distance 6..20 --context 4 --targets 6", "--distance 2..6 --context 2 --targets 1"),
+    ("--render 256", "--render 2"),
+    ("--storage 256", "--storage 2"),
+];
+
+/// Keys of a config whose training takes a second on six frames.
+const SMALL_RUN: [&str; 24] = [
+    "run_dir=trained",
+    "data.width=16",
+    "data.height=16",
+    "data.synthetic.num_scenes=4",
+    "data.filters.min_frames=6",
+    "data.views={min_context=2, max_context=2, min_gap=[3, 3], max_gap=[5, 5], warm_up_steps=0, num_targets=2}",
+    "model.dim=16",
+    "model.num_heads=2",
+    "model.feed_forward_dim=24",
+    "model.num_encoder_blocks=1",
+    "model.num_renderer_blocks=1",
+    "clusters.grid=[0.5]",
+    "clusters.num_scenes=2",
+    "clusters.num_passes=1",
+    "stage1.batch_size=2",
+    "stage1.accumulate=1",
+    "stage2.batch_size=2",
+    "stage2.accumulate=1",
+    "eval.storage=[0.5]",
+    "eval.validation_storage=0.5",
+    "eval.num_scenes=1",
+    "eval.num_context=2",
+    "eval.num_targets=2",
+    "eval.every=0",
+];
+
+/// The same as a layout of two views, for the micro run.
+const SMALL_DATA: &str = "data={source='auto', root='PATH', width=16, height=16, views={min_context=2, max_context=2, \
+    min_gap=[3, 3], max_gap=[5, 5], warm_up_steps=0, num_targets=2}}";
+
+#[test]
+fn every_documented_command_runs() {
+    let mut documents = sources(&["docs/guide"], &["md"]);
+    for name in ["README.md", "docs/reference/cli.md"] {
+        documents.insert(name.into(), std::fs::read_to_string(repository(name)).expect(name));
+    }
+    let place = Place::new();
+    let base = place.at("base");
+    prepare(&base);
+    let (mut failures, mut names, mut count) = (Vec::new(), BTreeSet::new(), 0);
+    for (i, (document, text)) in documents.iter().enumerate() {
+        let folder = place.at(&format!("document-{i}"));
+        copy_folder(&base, &folder);
+        for line in commands(text) {
+            let mut args = shlex::split(&line).unwrap_or_else(|| panic!("{document}: no shell command: {line}"));
+            args.remove(0);
+            if let Some(end) = args.iter().position(|arg| arg == ">") {
+                args.truncate(end);
+            }
+            names.insert(args[0].clone());
+            make_room(&folder, &args);
+            shrink(&mut args);
+            let ran = finish(start(Command::new(BINARY).args(&args).current_dir(&folder)));
+            // A check with a flagged scene is a result.
+            let is_flagged =
+                args.starts_with(&["data".into(), "check".into()]) && ran.code == Some(1) && !ran.stdout.is_empty();
+            if ran.code != Some(0) && !is_flagged {
+                failures.push(format!("{document}: {line}\n  ran {args:?}\n{}", ran.stderr));
+            }
+            count += 1;
+        }
+    }
+    assert!(failures.is_empty(), "{} of {count} commands fail:\n{}", failures.len(), failures.join("\n"));
+    let expected = "compare completions data doctor encode eval export flops import metrics plan render train";
+    assert_eq!(names.into_iter().collect::<Vec<_>>().join(" "), expected, "commands with an example");
+}
+
+/// The commands in the code blocks of a document, without optional arguments that are placeholders.
+fn commands(text: &str) -> Vec<String> {
+    let (mut found, mut is_code, mut open) = (Vec::new(), false, None::<String>);
+    for line in text.lines().map(str::trim) {
+        if line.starts_with("```") {
+            is_code = !is_code;
+            continue;
+        }
+        let is_command = line.starts_with("clift ") || line.starts_with("target/release/clift ");
+        let Some(line) = (match open.take() {
+            Some(begun) => Some(begun + line),
+            None => (is_code && is_command).then(|| line.to_owned()),
+        }) else {
+            continue;
+        };
+        match line.strip_suffix('\\') {
+            Some(begun) => open = Some(begun.to_owned()),
+            // The others are forms: clift train [OPTIONS] <CONFIG>.
+            None if !line.contains("[OPTIONS]") && !line.contains('<') => found.push(smaller(&line)),
+            None => {}
+        }
+    }
+    found
+}
+
+fn smaller(line: &str) -> String {
+    let mut line = SMALLER.iter().fold(line.to_owned(), |line, (from, to)| line.replace(from, to));
+    // [--seed 123] is an option, [--split S] has a placeholder.
+    while let Some((before, rest)) = line.split_once(" [--") {
+        let (option, after) = rest.split_once(']').expect("a closing bracket");
+        let has_placeholder = option.ends_with(|last: char| last.is_ascii_uppercase());
+        let option = if has_placeholder { String::new() } else { format!(" --{option}") };
+        line = format!("{before}{option}{after}");
+    }
+    line
+}
+
+/// Removes what an earlier example wrote where this one writes. Evaluations of runs stay: a user has them, too.
+fn make_room(folder: &Path, args: &[String]) {
+    let flag = args.iter().position(|arg| arg == "-o" || arg == "--out").and_then(|at| args.get(at + 1));
+    let positional = match [args[0].as_str(), args.get(1).map_or("", String::as_str)] {
+        ["data", "synth"] => args.get(2),
+        ["data", "convert"] => args.get(3),
+        _ => None,
+    };
+    for path in flag.into_iter().chain(positional) {
+        let path = folder.join(path);
+        drop(if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) });
+    }
+    drop(std::fs::remove_dir_all(folder.join("trained")));
+}
+
+/// Adds small settings.
+fn shrink(args: &mut Vec<String>) {
+    let command = args[0].clone();
+    let set = |args: &mut Vec<String>, keys: &[&str]| {
+        args.extend(keys.iter().flat_map(|key| ["--set".to_owned(), (*key).to_owned()]));
+    };
+    let default = |args: &mut Vec<String>, flag: &str, value: &str| match args.iter().position(|arg| arg == flag) {
+        Some(at) => value.clone_into(&mut args[at + 1]),
+        None => args.extend([flag.to_owned(), value.to_owned()]),
+    };
+    match (command.as_str(), args.get(1).map(String::as_str)) {
+        ("train", _) => {
+            default(args, "--device", "flex");
+            set(args, &SMALL_RUN);
+            set(args, &["loss.perceptual_weight=0", "stage1.steps=1", "stage2.steps=1"]);
+        }
+        ("plan", _) => set(args, &SMALL_RUN),
+        ("eval", _) if args.iter().any(|arg| arg == "--checkpoint") => {
+            set(args, &["data.width=24", "data.height=16"]);
+        }
+        ("import", _) => {
+            // The shapes of the DL3DV network determine its heads.
+            if !args.iter().any(|arg| arg == "released-dl3dv") {
+                default(args, "--num-heads", "3");
+            } else if let Some(file) = args.get_mut(1) {
+                *file = format!("dl3dv-{file}");
+            }
+        }
+        ("render", _) if !args.iter().any(|arg| arg == "poses.json") => default(args, "--frames", "2"),
+        ("data", Some("synth")) => {
+            default(args, "--scenes", "2");
+            default(args, "--frames", "8");
+            default(args, "--size", "32x32");
+        }
+        ("data", Some("info")) if args.iter().any(|arg| arg == "configs/re10k.toml") => {
+            set(args, &SMALL_RUN[1..6]);
+            set(args, &["data.root=PATH"]);
+        }
+        ("data", Some("index")) if !args.iter().any(|arg| arg == "--distance") => {
+            args.extend(["--distance", "4..7", "--targets", "1"].map(str::to_owned));
+        }
+        _ => {}
+    }
+}
+
+/// Makes the runs, models, data and files that the documents name.
+fn prepare(base: &Path) {
+    let fixture = |name: &str| repository("data-fixtures").join(name);
+    let copy = |from: &Path, to: &str| {
+        let to = base.join(to);
+        std::fs::create_dir_all(to.parent().expect("a folder")).expect("writable");
+        if from.is_dir() {
+            copy_folder(from, &to);
+        } else {
+            std::fs::copy(from, to).expect("copies");
+        }
+    };
+    copy(&repository("configs"), "configs");
+    for name in ["PATH", "DIR", "data/re10k"] {
+        copy(&fixture("re10k-mini"), name);
+    }
+    for name in ["captures/attic", "captures/fox"] {
+        copy(&fixture("layouts/colmap_txt/attic"), name);
+    }
+    copy(&fixture("layouts/re10k_txt"), "data/re10k-txt");
+    copy(&fixture("layouts/dl3dv"), "data/dl3dv");
+    copy(&fixture("layouts/dl3dv"), "DL3DV-ALL-480P");
+    // A scene to train on beside that of the list of test scenes.
+    let scene =
+        std::fs::read_dir(fixture("layouts/dl3dv/1K")).expect("a folder").next().expect("a scene").expect("readable");
+    let test_key = "f".repeat(64);
+    copy(&scene.path(), &format!("DL3DV-ALL-480P/1K/{test_key}"));
+    std::fs::write(base.join("benchmark.txt"), "").expect("writable");
+
+    let index = fixture("re10k-mini/evaluation_index.json");
+    for name in ["evaluation_index_re10k_context4", "evaluation_index_re10k_video_context4_data_100", "INDEX"] {
+        copy(&index, &format!("{name}.json"));
+    }
+    copy(&index, "PATH/evaluation_index_re10k_context4.json");
+    let mut dl3dv: serde_json::Value = serde_json::from_slice(&std::fs::read(&index).expect("an index")).expect("JSON");
+    // `runs/dl3dv` has the scene of re10k-mini, the data the other.
+    dl3dv[&test_key] = json!({"context": [0, 5], "target": [2]});
+    std::fs::write(base.join("dl3dv_start_0_distance_50_ctx_4v_video_0_50.json"), dl3dv.to_string()).expect("writable");
+    let pose = json!({"c2w": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]});
+    std::fs::write(base.join("poses.json"), json!({"poses": [pose]}).to_string()).expect("writable");
+    let image = base.join("out/mvsplat").join(KEY).join("000001.png");
+    std::fs::create_dir_all(image.parent().expect("a folder")).expect("writable");
+    image::RgbImage::new(16, 16).save(image).expect("writable");
+    write_vgg(&base.join("lpips-vgg.safetensors"), "clift-lpips-vgg-1", [2, 2, 3, 3, 3], true);
+
+    for name in ["second_stage.ckpt", "last.ckpt"] {
+        copy(&fixture("checkpoints/re10k.ckpt"), name);
+    }
+    let changed = |from: &str, to: &str, change: &dyn Fn(&str) -> Option<String>| {
+        let state = StateDict::open(&fixture(from)).expect("a checkpoint");
+        let keys = state.keys().filter_map(|key| Some((key, change(key)?)));
+        let tensors = keys.map(|(key, name)| {
+            let shape = state.tensor(key).expect("a tensor").1.iter().map(|&size| size as usize).collect();
+            (name, shape, state.read(key).expect("a tensor"))
+        });
+        write_state_dict(&base.join(to), &tensors.collect::<Vec<_>>(), &[]).expect("writable");
+    };
+    let first = |key: &str| (!key.contains("squeezer")).then(|| key.to_owned());
+    changed("checkpoints/re10k.ckpt", "first_stage.ckpt", &first);
+    let renamed = |key: &str| Some(key.replace("attn.q_norm", "attn.query_rms").replace("attn.k_norm", "attn.key_rms"));
+    changed("checkpoints/dl3dv.ckpt", "dl3dv-last.ckpt", &renamed);
+
+    let clift = |args: &[&str]| drop(finish(start(Command::new(BINARY).args(args).current_dir(base))).ok());
+    let config = repository("tests/micro.toml");
+    let train = |run: &str, key: &str| {
+        let run_dir = format!("run_dir={run}");
+        clift(&["train", config.to_str().expect("text"), "--set", &run_dir, "--set", key]);
+    };
+    train("runs/tiny", "eval.tokens=['f32', 'int8']");
+    train("runs/re10k", SMALL_DATA);
+    // An example replaces PATH.
+    train("runs/dl3dv", &SMALL_DATA.replace("PATH", "DIR"));
+    for name in ["runs/a", "runs/b"] {
+        copy(&base.join("runs/tiny"), name);
+    }
+    clift(&["import", "last.ckpt", "--variant", "released-re10k", "--num-heads", "3", "-o", "models/re10k"]);
+    let tiny = ["encode", "runs/tiny", "--scene", "synthetic-0-test-00000", "-o", "room.clift"];
+    clift(&tiny);
+}
