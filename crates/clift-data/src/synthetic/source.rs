@@ -1,27 +1,42 @@
-//! Synthetic scenes from seeds: textured rooms with boxes and balls, ray traced on demand.
+//! Synthetic scenes from seeds, ray traced on demand.
 //!
 //! A scene is a pure function of (seed, split, index), a frame of (scene, frame). Unused scenes cost nothing, threads
 //! need no coordination, and cameras are exact.
 
-use std::sync::OnceLock;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::random::step_rng;
 use crate::scene_source::{SceneSource, Split};
-use crate::synthetic::config::SyntheticConfig;
+use crate::synthetic::config::{Look, SyntheticConfig};
 use crate::synthetic::ray_tracer;
+use crate::synthetic::real::scene::RealScene;
 use crate::synthetic::room::Room;
 
 /// Number of keys per block. The keys of a block are formatted together on first use.
 const KEYS_PER_BLOCK: usize = 1024;
 
-/// A source of synthetic scenes, rendered on demand. Keys are `synthetic-<seed>-<split>-<index>`.
+/// Number of scenes kept for their further frames: more than threads read clips at once.
+const KEPT_SCENES: usize = 16;
+
+/// A source of synthetic scenes, rendered on demand. Keys are `synthetic-<seed>-<split>-<index>`, and
+/// `synthetic-real-<seed>-<split>-<index>` for `look = "real"`.
 #[derive(Debug)]
 pub struct SyntheticSource {
     config: SyntheticConfig,
     key_blocks: Vec<OnceLock<Vec<String>>>,
+    /// Scenes that were read last, the newest at the end. A scene is a function of its number: what is kept changes no frame.
+    kept: Mutex<VecDeque<(usize, Arc<Scene>)>>,
+}
+
+/// A scene of either kind.
+#[derive(Debug, PartialEq)]
+enum Scene {
+    Room(Box<Room>),
+    Real(Box<RealScene>),
 }
 
 impl SyntheticSource {
@@ -32,7 +47,7 @@ impl SyntheticSource {
     pub fn new(config: SyntheticConfig) -> Result<Self, DataError> {
         config.validate()?;
         let num_blocks = config.num_scenes.div_ceil(KEYS_PER_BLOCK);
-        Ok(Self { config, key_blocks: (0..num_blocks).map(|_| OnceLock::new()).collect() })
+        Ok(Self { config, key_blocks: (0..num_blocks).map(|_| OnceLock::new()).collect(), kept: Mutex::default() })
     }
 
     /// Returns the options of the scenes.
@@ -41,25 +56,51 @@ impl SyntheticSource {
     }
 
     fn key_prefix(&self) -> String {
-        format!("synthetic-{}-{}-", self.config.seed, self.config.split)
+        let SyntheticConfig { look, seed, split, .. } = self.config;
+        let kind = if look == Look::Real { "real-" } else { "" };
+        format!("synthetic-{kind}{seed}-{split}-")
     }
 
-    fn room(&self, scene: usize) -> Result<Room, DataError> {
+    fn scene(&self, scene: usize) -> Result<Arc<Scene>, DataError> {
         let num_scenes = self.config.num_scenes;
         if scene >= num_scenes {
             return Err(DataError::NoSuchScene { scene, num_scenes });
         }
-        let purpose = match self.config.split {
-            Split::Train => "synthetic train scene",
-            Split::Test => "synthetic test scene",
-        };
-        let mut rng = step_rng(self.config.seed, scene as u64, purpose);
-        Ok(Room::sample(&mut rng, &self.config))
+        let kept = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, found)) = kept().iter().find(|(number, _)| *number == scene) {
+            return Ok(Arc::clone(found));
+        }
+        let made = Arc::new(self.sample(scene));
+        let mut kept = kept();
+        if kept.len() == KEPT_SCENES {
+            kept.pop_front();
+        }
+        kept.push_back((scene, Arc::clone(&made)));
+        Ok(made)
     }
 
-    fn camera(&self, room: &Room, frame: usize) -> Camera {
-        let time = frame as f64 / (self.config.num_frames - 1).max(1) as f64;
-        room.path.camera(time, self.config.fov_deg, self.config.width as f64 / self.config.height as f64)
+    fn sample(&self, scene: usize) -> Scene {
+        let purpose = match (self.config.look, self.config.split) {
+            (Look::Rooms, Split::Train) => "synthetic train scene",
+            (Look::Rooms, Split::Test) => "synthetic test scene",
+            (Look::Real, Split::Train) => "synthetic real train scene",
+            (Look::Real, Split::Test) => "synthetic real test scene",
+        };
+        let mut rng = step_rng(self.config.seed, scene as u64, purpose);
+        match self.config.look {
+            Look::Rooms => Scene::Room(Box::new(Room::sample(&mut rng, &self.config))),
+            Look::Real => Scene::Real(Box::new(RealScene::sample(rng))),
+        }
+    }
+
+    fn camera(&self, scene: &Scene, frame: usize) -> Camera {
+        let SyntheticConfig { num_frames, width, height, fov_deg, .. } = self.config;
+        let time = frame as f64 / (num_frames - 1).max(1) as f64;
+        let aspect = width as f64 / height as f64;
+        match scene {
+            Scene::Room(room) => room.path.camera(time, fov_deg, aspect),
+            Scene::Real(scene) => scene.camera(time, aspect, frame),
+        }
     }
 }
 
@@ -88,8 +129,8 @@ impl SceneSource for SyntheticSource {
     }
 
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        let room = self.room(scene)?;
-        Ok((0..self.config.num_frames).map(|frame| self.camera(&room, frame)).collect())
+        let scene = self.scene(scene)?;
+        Ok((0..self.config.num_frames).map(|frame| self.camera(&scene, frame)).collect())
     }
 
     fn image_size(&self, _scene: usize, _frame: usize) -> Result<[usize; 2], DataError> {
@@ -97,13 +138,18 @@ impl SceneSource for SyntheticSource {
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-        let room = self.room(scene)?;
+        let found = self.scene(scene)?;
         let SyntheticConfig { num_frames, width, height, samples_per_pixel, specular, .. } = self.config;
         if frame >= num_frames {
             return Err(DataError::NoSuchFrame { key: self.key(scene).to_owned(), frame, num_frames });
         }
-        let camera = self.camera(&room, frame);
-        Ok(ray_tracer::render(&room, &camera, width, height, samples_per_pixel.isqrt(), specular as f32))
+        let camera = self.camera(&found, frame);
+        Ok(match &*found {
+            Scene::Room(room) => {
+                ray_tracer::render(room, &camera, width, height, samples_per_pixel.isqrt(), specular as f32)
+            }
+            Scene::Real(scene) => scene.render(&camera, [width, height]),
+        })
     }
 }
 

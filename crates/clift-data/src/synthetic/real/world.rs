@@ -1,0 +1,101 @@
+//! All surfaces of a scene: solids above an endless ground.
+
+use glam::{Vec3, Vec4};
+
+use crate::synthetic::real::solid::{Rays, Solid};
+use crate::synthetic::real::surface::Surface;
+use crate::synthetic::real::tree::Tree;
+
+/// Number of the ground among the solids.
+pub(crate) const GROUND: usize = usize::MAX - 1;
+/// Number of the sky among the solids.
+pub(crate) const SKY: usize = usize::MAX;
+
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct World {
+    pub solids: Vec<Solid>,
+    pub surfaces: Vec<Surface>,
+    /// Height of the ground, downwards, and its surface.
+    pub ground: (f32, usize),
+    tree: Tree,
+}
+
+impl World {
+    pub fn new(mut solids: Vec<Solid>, surfaces: Vec<Surface>, ground: (f32, usize)) -> Self {
+        let tree = Tree::new(&mut solids);
+        Self { solids, surfaces, ground, tree }
+    }
+
+    /// Returns the distances at which four rays end, and the number of the solid there.
+    pub fn nearest(&self, rays: &Rays) -> (Vec4, [usize; 4]) {
+        let mut numbers = [SKY; 4];
+        let mut best = Vec4::INFINITY;
+        for lane in 0..4 {
+            let down = (self.ground.0 - rays.origin[1][lane]) / rays.direction[1][lane];
+            if down > 0.0 && down.is_finite() {
+                (best[lane], numbers[lane]) = (down, GROUND);
+            }
+        }
+        self.tree.walk(rays, best, |number, ends| {
+            let spans = self.solids[number].spans(rays);
+            let hit = spans.is_hit() & spans.near.cmpgt(Vec4::ZERO) & spans.near.cmplt(ends);
+            let mask = hit.bitmask();
+            if mask == 0 {
+                return ends;
+            }
+            for (lane, found) in numbers.iter_mut().enumerate() {
+                if mask >> lane & 1 == 1 {
+                    *found = number;
+                }
+            }
+            best = Vec4::select(hit, spans.near, best);
+            best
+        });
+        (best, numbers)
+    }
+
+    /// Returns the distance at which one ray ends, and the number of the solid there.
+    pub fn first(&self, origin: Vec3, direction: Vec3) -> (f32, usize) {
+        let (distances, numbers) = self.nearest(&Rays::new(origin, [direction; 4]));
+        (distances.x, numbers[0])
+    }
+
+    /// Returns the share of light that reaches the origin along four rays of the lengths `ends`. The first ray leads to a
+    /// lamp of the angular size `softness`; of the others, nearer solids hide more.
+    pub fn light_along(&self, rays: &Rays, ends: Vec4, softness: f32) -> Vec4 {
+        let mut share = Vec4::ONE;
+        let per_end = ends.max(Vec4::splat(1e-3)).recip();
+        self.tree.walk(rays, ends, |number, ends| {
+            let spans = self.solids[number].spans(rays);
+            let hit = spans.is_hit() & spans.near.cmpgt(Vec4::ZERO) & spans.near.cmplt(ends);
+            if hit.any() {
+                let mut open = spans.near * per_end;
+                open.x = 1.0 - (spans.far.x - spans.near.x) / (softness * spans.near.x + 1e-3);
+                share = Vec4::select(hit, share.min(open.max(Vec4::ZERO)), share);
+            }
+            if share.x <= 0.0 { ends.with_x(0.0) } else { ends }
+        });
+        share
+    }
+
+    /// Returns the normal at a point of the surface with this number.
+    pub fn normal(&self, number: usize, point: Vec3) -> Vec3 {
+        if number == GROUND { Vec3::NEG_Y } else { self.solids[number].normal(point) }
+    }
+
+    /// Returns the surface with this number and the colour at a point of it, averaged over `width`.
+    pub fn color(&self, number: usize, point: Vec3, normal: Vec3, width: f32) -> (&Surface, Vec3) {
+        let (surface, [u, v]) = if number == GROUND {
+            (&self.surfaces[self.ground.1], [point.x, point.z])
+        } else {
+            let solid = &self.solids[number];
+            (&self.surfaces[solid.surface], solid.coordinates(point, normal))
+        };
+        (surface, surface.color(u, v, width))
+    }
+
+    /// Returns whether every solid and the ground are at least `clearance` away from a point.
+    pub fn is_clear(&self, point: Vec3, clearance: f32) -> bool {
+        point.y + clearance < self.ground.0 && self.solids.iter().all(|solid| solid.distance(point) > clearance)
+    }
+}
