@@ -22,7 +22,7 @@ impl Builder {
                 self.block(place, [x - leg, x + leg], [0.0, height - thick], [z - leg, z + leg], top);
             }
         }
-        let things = self.dice.count(0, 5);
+        let things = self.dice.count(1, 9);
         self.things_on(place, [wide * 0.8, deep * 0.8], height, things);
     }
 
@@ -128,7 +128,7 @@ impl Builder {
                 let front = deep * self.dice.between(0.6, 0.9);
                 self.block(place, [from, to], [base + 0.03, top], [0.02, front], books);
             } else {
-                let count = self.dice.count(0, 3);
+                let count = self.dice.count(1, 6);
                 self.things_on(&place.then(0.0, 0.0, deep * 0.5, 0.0), [wide * 0.8, deep * 0.3], base + 0.03, count);
             }
         }
@@ -153,7 +153,7 @@ impl Builder {
             }
         }
         self.block(place, [-wide - 0.02, wide + 0.02], [high, high + 0.04], [0.0, deep + 0.04], top);
-        let count = self.dice.count(0, 5);
+        let count = self.dice.count(1, 9);
         self.things_on(&place.then(0.0, 0.0, deep * 0.5, 0.0), [wide * 0.9, deep * 0.3], high + 0.04, count);
     }
 

@@ -70,7 +70,8 @@ impl Builder {
     fn room(&mut self, plan: &Plan, finish: &Finish, depth: usize, from: Option<usize>, windows: &mut Vec<Vec3>) {
         let Plan { center: [x, z], half: [wide, deep], height } = *plan;
         let whole = Place::facing(Vec3::new(x, 0.0, z), [0.0, 1.0]);
-        let (across, along) = ([-wide - THICK, wide + THICK], [-deep - THICK, deep + THICK]);
+        // Up to the middle of the walls, where the floor of a neighbour begins.
+        let [across, along] = [wide, deep].map(|half| [-half - 0.5 * THICK, half + 0.5 * THICK]);
         self.piece(&whole, across, [-0.1, 0.0], along, finish.floor);
         self.piece(&whole, across, [height, height + 0.2], along, finish.ceiling);
         self.on_ceiling(&whole, plan, finish);

@@ -53,6 +53,7 @@ pub(crate) struct Light {
 }
 
 /// A point where a ray ends.
+#[derive(Clone, Copy)]
 pub(crate) struct End {
     pub origin: Vec3,
     pub direction: Vec3,
@@ -62,33 +63,65 @@ pub(crate) struct End {
     pub normal: Vec3,
 }
 
+impl End {
+    /// Returns a point slightly above the surface, from which rays start.
+    fn start(&self) -> Vec3 {
+        self.origin + self.direction * self.distance + self.normal * (OFFSET + 1e-4 * self.distance)
+    }
+}
+
 impl Light {
-    /// Returns the linear light that comes along a ray of the angular width `pixel`.
-    pub fn seen(&self, world: &World, end: &End, pixel: f32) -> Vec3 {
-        let &End { origin, direction, distance, number, normal } = end;
-        if number == SKY {
-            return self.of_sky(direction, pixel);
+    /// Returns the linear light along up to four rays that end on one surface, `None` for no ray. `pixel` is the angle
+    /// between neighbouring pixels. The ambient light of all is that of the first.
+    pub fn seen(&self, world: &World, ends: [Option<End>; 4], pixel: f32) -> [Vec3; 4] {
+        let Some(first) = ends.iter().flatten().next() else { return [Vec3::ZERO; 4] };
+        if first.number == SKY {
+            return ends.map(|end| end.map_or(Vec3::ZERO, |end| self.of_sky(end.direction, pixel)));
         }
-        let point = origin + direction * distance;
+        let start = first.start();
+        let around = Rays::new([start; 4], around(first.normal));
+        let free = world.free_share(&around, self.reach);
+        let open = 0.12 + 0.22 * free.element_sum();
+
+        let starts = ends.map(|end| end.map_or(start, |end| end.start()));
+        let keys = [0, 1, 2, 3].map(|lane| match &ends[lane] {
+            Some(end) => self.towards_key(starts[lane], end.normal),
+            None => (first.normal, -1.0, 0.0),
+        });
+        let to_key = Rays::new(starts, keys.map(|(towards, ..)| towards));
+        let shares = world.lamp_share(&to_key, Vec4::from_array(keys.map(|(_, far, _)| far)), self.softness);
+
+        [0, 1, 2, 3].map(|lane| {
+            let Some(end) = &ends[lane] else { return Vec3::ZERO };
+            let (towards, _, strength) = keys[lane];
+            self.reflected(world, end, starts[lane], pixel, open, towards, strength * shares[lane])
+        })
+    }
+
+    /// Returns the light from the end of a ray. `open` is the share of the ambient light there, `strength` that of the key
+    /// light.
+    #[expect(clippy::too_many_arguments, reason = "the parts of the light at one point")]
+    fn reflected(
+        &self,
+        world: &World,
+        end: &End,
+        start: Vec3,
+        pixel: f32,
+        open: f32,
+        towards: Vec3,
+        strength: f32,
+    ) -> Vec3 {
+        let &End { direction, distance, number, normal, .. } = end;
         let facing = -direction.dot(normal);
         let width = distance * pixel / facing.max(0.15).sqrt();
-        let (surface, color) = world.color(number, point, normal, width);
-
-        let start = point + normal * (OFFSET + 1e-4 * distance);
-        let (towards, far, strength) = self.towards_key(start);
-        let lit = normal.dot(towards).max(0.0) * strength;
-        let [one, two, three] = around(normal);
-        let rays = Rays::new(start, [towards, one, two, three]);
-        let ends = Vec4::new(if lit > 0.0 { far } else { 0.0 }, self.reach, self.reach, self.reach);
-        let shares = world.light_along(&rays, ends, self.softness);
-        let open = 0.2 + 0.8 / 3.0 * (shares.y + shares.z + shares.w);
-        let key = self.key_color * shares.x;
-
+        let (surface, color) = world.color(number, start, normal, width);
+        let key = self.key_color * strength;
+        let lit = normal.dot(towards).max(0.0);
         let mut light = color * (self.soft(start, normal) * open + key * lit + Vec3::splat(surface.glow));
         if surface.gloss > 0.0 {
             let mirrored = direction.reflect(normal);
             let glint = mirrored.dot(towards).max(0.0).powi(4 + (60.0 * surface.gloss) as i32);
-            light += key * (strength * surface.gloss * glint);
+            light += key * (surface.gloss * glint);
             let grazing = (1.0 - facing).clamp(0.0, 1.0);
             let weight = surface.gloss * (0.05 + 0.6 * grazing.powi(4));
             if weight > LEAST_MIRROR {
@@ -110,9 +143,9 @@ impl Light {
         light
     }
 
-    /// Returns direction, distance and strength of the key light.
-    fn towards_key(&self, point: Vec3) -> (Vec3, f32, f32) {
-        match self.key {
+    /// Returns direction, distance and strength of the key light; the distance is negative where it shines from behind.
+    fn towards_key(&self, point: Vec3, normal: Vec3) -> (Vec3, f32, f32) {
+        let (towards, distance, strength) = match self.key {
             Key::Sun { towards } => (towards, 1e4, 1.0),
             Key::Lamp { at, reach } => {
                 let way = at - point;
@@ -120,7 +153,8 @@ impl Light {
                 // The lamp itself casts no shadow.
                 (way / distance, (distance - 0.25).max(0.0), 1.0 / (1.0 + (distance / reach).powi(2)))
             }
-        }
+        };
+        if normal.dot(towards) > 0.0 { (towards, distance, strength) } else { (towards, -1.0, 0.0) }
     }
 
     /// Returns what a polished surface mirrors, in soft light only.
@@ -147,8 +181,9 @@ impl Light {
     }
 }
 
-/// Returns three directions around a normal, 120 degrees apart and 45 degrees off.
-fn around(normal: Vec3) -> [Vec3; 3] {
-    let [one, other] = [normal.any_orthonormal_vector(), normal.cross(normal.any_orthonormal_vector())];
-    [(1.0, 0.0), (-0.5, 0.866), (-0.5, -0.866)].map(|(a, b)| (normal + one * a + other * b) * 0.7071)
+/// Returns four directions around a normal, 90 degrees apart and 50 degrees off.
+fn around(normal: Vec3) -> [Vec3; 4] {
+    let one = normal.any_orthonormal_vector();
+    let other = normal.cross(one);
+    [one, other, -one, -other].map(|side| normal * 0.64 + side * 0.77)
 }

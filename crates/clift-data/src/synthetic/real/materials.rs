@@ -12,7 +12,7 @@ impl Builder {
     /// Returns a surface in these colours with some noise on its brightness.
     fn patterned(&mut self, pattern: Pattern, colors: [Vec3; 3], rate: f32, noise: f32) -> Surface {
         let dice = &mut self.dice;
-        let grain = if dice.chance(0.7) { dice.between(0.3, 1.0) * noise } else { 0.0 };
+        let grain = dice.between(0.2, 1.0) * noise;
         Surface {
             pattern,
             colors,
@@ -26,7 +26,7 @@ impl Builder {
 
     /// Adds a surface of one colour, with slight noise.
     pub fn painted(&mut self, color: Vec3, gloss: f32) -> usize {
-        let surface = self.patterned(Pattern::Plain, [color; 3], 1.0, 0.12);
+        let surface = self.patterned(Pattern::Plain, [color; 3], 1.0, 0.2);
         self.surface(Surface { gloss, ..surface })
     }
 
@@ -57,7 +57,7 @@ impl Builder {
             _ => (Pattern::Plain, 1.0),
         };
         let third = if pattern == Pattern::Discs { third } else { base * self.dice.between(0.5, 1.1) };
-        let surface = self.patterned(pattern, [base, second, third], rate, 0.12);
+        let surface = self.patterned(pattern, [base, second, third], rate, 0.18);
         self.surface(surface)
     }
 

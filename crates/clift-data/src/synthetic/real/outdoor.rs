@@ -10,10 +10,10 @@ use crate::synthetic::real::solid::Shape;
 impl Builder {
     /// Adds houses, hills, trees and fences on a ground at height `ground` (y is down), from `near` on outwards.
     pub fn surroundings(&mut self, ground: f32, near: f32, count: usize) {
-        let town = self.dice.chance(0.6);
+        let town = self.dice.chance(0.7);
         for index in 0..count {
             let angle = TAU * (index as f32 + self.dice.between(0.0, 0.8)) / count as f32;
-            let distance = near * self.dice.scale(1.0, 5.0);
+            let distance = near * self.dice.scale(1.0, 2.8);
             let at = Vec3::new(angle.sin() * distance, ground, angle.cos() * distance);
             let turn = angle + if self.dice.chance(0.7) { 0.0 } else { self.dice.swing(0.8) };
             let place = Place::turned(at, turn);
@@ -83,7 +83,7 @@ impl Builder {
     /// Adds a garden, square or street around the origin, without its surroundings; returns the radius that is taken.
     pub fn open_place(&mut self) -> f32 {
         let radius = self.dice.between(3.0, 7.0);
-        for _ in 0..self.dice.count(2, 9) {
+        for _ in 0..self.dice.count(5, 14) {
             let at = Vec3::new(self.dice.swing(radius), 0.0, self.dice.swing(radius));
             let place = Place::turned(at, self.dice.between(0.0, TAU));
             match self.dice.count(0, 8) {

@@ -15,20 +15,20 @@ pub(crate) struct Palette {
 impl Palette {
     pub fn sample(dice: &mut Dice) -> Self {
         let hues = [(); 3].map(|()| hue(dice));
-        Self { hues, strength: dice.between(0.15, 0.75) }
+        Self { hues, strength: dice.between(0.3, 1.0) }
     }
 
     /// Samples a colour of any brightness: usually muted, sometimes saturated.
     pub fn any(&self, dice: &mut Dice) -> Vec3 {
-        let vivid = dice.chance(0.22);
+        let vivid = dice.chance(0.28);
         let value = dice.between(0.12, 0.95);
-        let saturation = if vivid { dice.between(0.45, 0.95) } else { self.strength * dice.between(0.0, 0.7) };
+        let saturation = if vivid { dice.between(0.45, 0.95) } else { self.strength * dice.between(0.05, 0.8) };
         self.shade(dice, saturation, value)
     }
 
     /// Samples a colour of about this brightness (display value) that is muted.
     pub fn muted(&self, dice: &mut Dice, value: [f32; 2]) -> Vec3 {
-        let saturation = self.strength * dice.between(0.0, 0.5);
+        let saturation = self.strength * dice.between(0.0, 0.6);
         let value = dice.between(value[0], value[1]);
         self.shade(dice, saturation, value)
     }

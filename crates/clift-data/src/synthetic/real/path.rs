@@ -2,18 +2,19 @@
 
 use std::f32::consts::TAU;
 
-use glam::{DMat3, DVec3, Vec3};
+use glam::{DMat3, Vec3};
 
 use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::pose::Pose;
 use crate::synthetic::real::dice::Dice;
 use crate::synthetic::real::noise::{byte, hash};
-use crate::synthetic::real::world::{SKY, World};
+use crate::synthetic::real::solid::Rays;
+use crate::synthetic::real::world::{GROUND, SKY, World};
 
 /// Attempts to find a path on which the camera sees enough; afterwards the best one found counts.
 const ATTEMPTS: usize = 40;
-/// Times at which a path is checked.
-const CHECKS: usize = 9;
+/// Number of rays along each side of the views that check a path.
+const GLANCE: usize = 6;
 
 /// Where a camera may go.
 pub(crate) struct Area {
@@ -66,12 +67,12 @@ impl Path {
     }
 
     fn propose(dice: &mut Dice, world: &World, area: &Area) -> Self {
-        let fov_deg = if dice.chance(0.7) { dice.between(48.0, 75.0) } else { dice.between(40.0, 100.0) };
+        let fov_deg = if dice.chance(0.7) { dice.between(42.0, 72.0) } else { dice.between(40.0, 100.0) };
         let is_arc = area.thing.is_some() && dice.chance(0.8);
         let route = match area.thing {
             Some((center, radius)) if is_arc => {
                 let side = dice.pick(&[-1.0, 1.0]);
-                let sweep = dice.scale(0.2, 1.9);
+                let sweep = dice.scale(0.3, 2.0);
                 let distance = radius + radius * dice.scale(0.5, 3.0);
                 let angle = [dice.between(0.0, TAU), side * sweep];
                 let height = [distance * dice.between(-0.1, 0.7), distance * dice.swing(0.2)];
@@ -101,7 +102,7 @@ impl Path {
         let (depth, _) = world.first(start, forward);
         let depth = depth.clamp(1.0, 12.0);
         let still = dice.chance(0.15);
-        let length = depth * if still { dice.between(0.0, 0.05) } else { dice.scale(0.06, 0.6) };
+        let length = depth * if still { dice.between(0.0, 0.05) } else { dice.scale(0.12, 0.8) };
         // Forwards, sideways, backwards.
         let way = match dice.count(0, 9) {
             0..=4 => dice.swing(0.5),
@@ -111,36 +112,54 @@ impl Path {
         let velocity = (forward * way.cos() + right * way.sin()) * length + Vec3::Y * (0.06 * length * dice.swing(1.0));
         let bend = (right * way.cos() - forward * way.sin()) * (length * dice.swing(0.35));
         // A pan keeps most of the first view in sight.
-        let pan = fov_deg.to_radians() * if still { dice.between(0.25, 0.75) } else { dice.between(0.0, 0.5) };
+        let pan = fov_deg.to_radians() * if still { dice.between(0.3, 0.9) } else { dice.between(0.0, 0.6) };
         let turn = [dice.pick(&[-1.0, 1.0]) * pan, dice.swing(0.1)];
         Route::Move { at: [start, velocity, bend], look: [yaw, pitch], turn }
     }
 
-    /// Returns 1 or more for a good path: clear of surfaces, things in sight, few of them very near.
+    /// Returns 1 or more for a good path: clear of surfaces, many things in sight, few of them very near.
     fn score(&self, world: &World, clearance: f32) -> f32 {
-        let mut clear = 0;
+        let times = [0, 4, 8, 2, 6, 1, 3, 5, 7].map(|check| check as f32 / 8.0);
+        let clear = times.iter().take_while(|&&time| world.is_clear(self.position(time), clearance)).count();
+        if clear < times.len() {
+            return clear as f32 / times.len() as f32 - 2.0;
+        }
         let (mut near, mut empty, mut rays) = (0.0, 0.0, 0.0);
-        for check in 0..CHECKS {
-            let time = check as f32 / (CHECKS - 1) as f32;
-            clear += usize::from(world.is_clear(self.position(time), clearance));
-            if check % 4 != 0 {
-                continue;
-            }
-            let camera = self.camera(time, 1.0, 0);
-            for index in 0..25 {
-                let (x, y) = ((index % 5) as f64 - 2.0, (index / 5) as f64 - 2.0);
-                let reach = 0.2 / camera.intrinsics_norm.fx;
-                let direction = camera.c2w.rotation * DVec3::new(x * reach, y * reach, 1.0);
-                let (distance, number) = world.first(camera.c2w.translation.as_vec3(), direction.as_vec3().normalize());
-                near += smaller(distance, 4.0 * clearance);
-                empty += f32::from(number == SKY);
+        let mut seen = Vec::new();
+        for time in [0.0, 0.5, 1.0] {
+            for (.., distance, number) in self.glance::<GLANCE>(world, time) {
+                near += smaller(distance, 5.0 * clearance);
+                empty += f32::from(number == SKY || number == GROUND || distance > 40.0);
                 rays += 1.0;
+                if !seen.contains(&number) {
+                    seen.push(number);
+                }
             }
         }
-        if clear < CHECKS {
-            return clear as f32 / CHECKS as f32 - 2.0;
-        }
-        1.0 + (0.25 - near / rays).min(0.0) + (0.6 - empty / rays).min(0.0)
+        let variety = (seen.len() as f32 / 16.0 - 1.0).min(0.0);
+        1.0 + (0.15 - near / rays).min(0.0) + (0.5 - empty / rays).min(0.0) + variety
+    }
+
+    /// Returns origin, direction, distance and number of the solid of `SIDE` x `SIDE` rays, rounded up to a multiple of 4,
+    /// of a square view.
+    pub fn glance<const SIDE: usize>(
+        &self,
+        world: &World,
+        time: f32,
+    ) -> impl Iterator<Item = (Vec3, Vec3, f32, usize)> {
+        let camera = self.camera(time, 1.0, 0);
+        let origin = camera.c2w.translation.as_vec3();
+        let rotation = camera.c2w.rotation.as_mat3();
+        let scale = 1.0 / (camera.intrinsics_norm.fx as f32 * SIDE as f32);
+        (0..SIDE * SIDE).step_by(4).flat_map(move |first| {
+            let directions = [0, 1, 2, 3].map(|lane| {
+                let at = |step: usize| (step as f32 + 0.5 - 0.5 * SIDE as f32) * scale;
+                let (x, y) = (at((first + lane) % SIDE), at((first + lane) / SIDE));
+                (rotation * Vec3::new(x, y, 1.0)).normalize()
+            });
+            let (distances, numbers) = world.nearest(&Rays::new([origin; 4], directions));
+            [0, 1, 2, 3].map(|lane| (origin, directions[lane], distances[lane], numbers[lane]))
+        })
     }
 
     fn position(&self, time: f32) -> Vec3 {

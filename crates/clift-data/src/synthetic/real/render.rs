@@ -1,6 +1,6 @@
-//! Frames: four rays per pixel, one shading per surface of a pixel.
+//! Frames: four rays per pixel, one shading per surface and pixel, in blocks of 2 x 2 pixels.
 
-use glam::{DVec3, Vec3};
+use glam::Vec3;
 
 use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
@@ -9,7 +9,7 @@ use crate::synthetic::real::solid::Rays;
 use crate::synthetic::real::world::{SKY, World};
 
 /// Offsets of the four rays of a pixel: a turned square, so that upright and level edges have four steps.
-const OFFSETS: [[f64; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
+const OFFSETS: [[f32; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
 /// Smallest cosine between normals that one shading stands for.
 const SAME_NORMAL: f32 = 0.95;
 
@@ -35,6 +35,21 @@ impl Exposure {
     }
 }
 
+/// What is seen of one surface in a block of 2 x 2 pixels.
+#[derive(Clone, Copy)]
+struct Part {
+    number: usize,
+    normal: Vec3,
+    /// Per pixel: sums of directions and distances, and number of rays.
+    pixels: [(Vec3, f32, f32); 4],
+}
+
+/// The parts of a block: at most one per ray.
+struct Parts {
+    parts: [Part; 16],
+    count: usize,
+}
+
 pub(crate) fn render(
     world: &World,
     light: &Light,
@@ -44,56 +59,78 @@ pub(crate) fn render(
 ) -> RgbImage {
     let intrinsics = camera.intrinsics_norm.to_pixels(width, height);
     let origin = camera.c2w.translation.as_vec3();
+    let rotation = camera.c2w.rotation.as_mat3();
     let pixel = (1.0 / intrinsics.fx) as f32;
-    let mut rgb = Vec::with_capacity(width * height * 3);
-    for row in 0..height {
-        for column in 0..width {
-            let directions = OFFSETS.map(|[x, y]| {
-                let x = (column as f64 + x - intrinsics.cx) / intrinsics.fx;
-                let y = (row as f64 + y - intrinsics.cy) / intrinsics.fy;
-                (camera.c2w.rotation * DVec3::new(x, y, 1.0)).as_vec3().normalize()
-            });
-            let sum = pixel_sum(world, light, exposure, origin, directions, pixel);
-            rgb.extend((sum * (255.0 / 4.0)).to_array().map(|value| (value + 0.5) as u8));
+    let [cx, cy] = [intrinsics.cx as f32, intrinsics.cy as f32];
+    let per_row = (1.0 / intrinsics.fy) as f32;
+    let mut rgb = vec![0; width * height * 3];
+    for top in (0..height).step_by(2) {
+        for left in (0..width).step_by(2) {
+            let place = |index: usize| (left + index % 2, top + index / 2);
+            let mut block = Parts::new();
+            for index in 0..4 {
+                let (column, row) = place(index);
+                if column == width || row == height {
+                    continue;
+                }
+                let directions = OFFSETS.map(|[x, y]| {
+                    let (x, y) = ((column as f32 + x - cx) * pixel, (row as f32 + y - cy) * per_row);
+                    (rotation * Vec3::new(x, y, 1.0)).normalize()
+                });
+                block.add(world, origin, directions, index);
+            }
+            let colors = block.colors(world, light, exposure, origin, pixel);
+            for (index, color) in colors.into_iter().enumerate() {
+                let (column, row) = place(index);
+                if column < width && row < height {
+                    let values = color.to_array().map(|value| (value * (255.0 / 4.0) + 0.5) as u8);
+                    rgb[(row * width + column) * 3..][..3].copy_from_slice(&values);
+                }
+            }
         }
     }
     RgbImage { width, height, rgb }
 }
 
-/// Returns the sum of the display values along four rays.
-fn pixel_sum(
-    world: &World,
-    light: &Light,
-    exposure: &Exposure,
-    origin: Vec3,
-    directions: [Vec3; 4],
-    pixel: f32,
-) -> Vec3 {
-    let (distances, numbers) = world.nearest(&Rays::new(origin, directions));
-    let mut sum = Vec3::ZERO;
-    let mut done = [false; 4];
-    let normals = [0, 1, 2, 3].map(|lane| match numbers[lane] {
-        SKY => Vec3::ZERO,
-        number => world.normal(number, origin + directions[lane] * distances[lane]),
-    });
-    for lane in 0..4 {
-        if done[lane] {
-            continue;
+impl Parts {
+    fn new() -> Self {
+        let part = Part { number: SKY, normal: Vec3::ZERO, pixels: [(Vec3::ZERO, 0.0, 0.0); 4] };
+        Self { parts: [part; 16], count: 0 }
+    }
+
+    /// Adds the ends of the four rays of a pixel.
+    fn add(&mut self, world: &World, origin: Vec3, directions: [Vec3; 4], pixel: usize) {
+        let (distances, numbers) = world.nearest(&Rays::new([origin; 4], directions));
+        for lane in 0..4 {
+            let (number, direction, distance) = (numbers[lane], directions[lane], distances[lane]);
+            let normal = match number {
+                SKY => Vec3::ZERO,
+                number => world.normal(number, origin + direction * distance),
+            };
+            let same = |part: &Part| part.number == number && (number == SKY || part.normal.dot(normal) > SAME_NORMAL);
+            let position = self.parts[..self.count].iter().position(same).unwrap_or_else(|| {
+                self.parts[self.count] = Part { number, normal, ..self.parts[15] };
+                self.count += 1;
+                self.count - 1
+            });
+            let (sum, far, count) = &mut self.parts[position].pixels[pixel];
+            (*sum, *far, *count) = (*sum + direction, *far + distance, *count + 1.0);
         }
-        let (number, normal) = (numbers[lane], normals[lane]);
-        let (mut direction, mut distance, mut count) = (Vec3::ZERO, 0.0, 0.0);
-        for other in lane..4 {
-            let same = number == SKY || normal.dot(normals[other]) > SAME_NORMAL;
-            if numbers[other] == number && same && !done[other] {
-                done[other] = true;
-                direction += directions[other];
-                distance += distances[other];
-                count += 1.0;
+    }
+
+    /// Returns the sums of the display values of the rays of each pixel.
+    fn colors(&self, world: &World, light: &Light, exposure: &Exposure, origin: Vec3, pixel: f32) -> [Vec3; 4] {
+        let mut sums = [Vec3::ZERO; 4];
+        for &Part { number, normal, pixels } in &self.parts[..self.count] {
+            let ends = pixels.map(|(direction, distance, count)| {
+                let direction = direction.normalize_or_zero();
+                (count > 0.0).then(|| End { origin, direction, distance: distance / count, number, normal })
+            });
+            let seen = light.seen(world, ends, pixel);
+            for (index, (.., count)) in pixels.into_iter().enumerate().filter(|(_, (.., count))| *count > 0.0) {
+                sums[index] += exposure.display(seen[index]) * count;
             }
         }
-        let direction = direction.normalize();
-        let end = End { origin, direction, distance: distance / count, number, normal };
-        sum += exposure.display(light.seen(world, &end, pixel)) * count;
+        sums
     }
-    sum
 }

@@ -15,8 +15,8 @@ use crate::synthetic::real::path::{Area, Path};
 use crate::synthetic::real::render::{Exposure, render};
 use crate::synthetic::real::world::{SKY, World};
 
-/// Rays along each side of the views that set the exposure.
-const METER: usize = 7;
+/// Number of rays along each side of the views that set the exposure.
+const METER: usize = 6;
 
 /// Solids, light and camera path of a scene. Lengths are about metres, y is down, the floor is at 0.
 #[derive(Clone, Debug, PartialEq)]
@@ -78,13 +78,13 @@ fn interior(builder: &mut Builder) -> (Light, Area, (f32, usize)) {
         Key::Lamp { at, reach: dice.between(1.5, 4.0) }
     };
     let is_sun = matches!(key, Key::Sun { .. });
-    let bounce = dice.between(0.15, 0.45);
+    let bounce = dice.between(0.12, 0.35);
     let light = Light {
         key,
         key_color: if is_sun {
             Vec3::new(1.0, 0.92, 0.8) * dice.between(2.0, 5.0)
         } else {
-            warm * dice.between(0.4, 1.6)
+            warm * dice.between(0.6, 2.4)
         },
         softness: if is_sun { 0.02 } else { dice.between(0.1, 0.4) },
         ambient: [warm * bounce, warm * (bounce * dice.between(0.5, 1.0))],
@@ -105,7 +105,7 @@ fn interior(builder: &mut Builder) -> (Light, Area, (f32, usize)) {
 
 fn outdoors(builder: &mut Builder) -> (Light, Area, (f32, usize)) {
     let radius = builder.open_place();
-    let count = builder.dice.count(8, 26);
+    let count = builder.dice.count(14, 30);
     builder.surroundings(0.0, radius + 1.5, count);
     let surface = builder.ground_surface();
     let eye = builder.dice.between(1.2, 2.2);
@@ -158,7 +158,7 @@ fn outside(dice: &mut Dice, bright: f32) -> Light {
     let strength = dice.between(0.35, 0.7);
     Light {
         key: sun(dice),
-        key_color: Vec3::new(1.0, 0.94, 0.84) * (clear * dice.between(0.4, 1.6)),
+        key_color: Vec3::new(1.0, 0.94, 0.84) * (clear * dice.between(0.8, 2.6)),
         softness: if clear > 0.4 { 0.03 } else { 0.3 },
         ambient: [blue.lerp(Vec3::ONE, 0.5) * strength, Vec3::new(1.0, 0.95, 0.88) * (strength * 0.4)],
         reach: dice.between(1.0, 2.5),
@@ -170,27 +170,21 @@ fn outside(dice: &mut Dice, bright: f32) -> Light {
     }
 }
 
-/// Sets the exposure by a few rays of three views, as a camera does, with white balance and contrast of its own.
+/// Sets the exposure by a few rays of two views, as a camera does, with white balance and contrast of its own.
 fn expose(dice: &mut Dice, world: &World, light: &Light, path: &Path) -> Exposure {
     let (mut sum, mut count) = (0.0, 0.0);
-    for time in [0.0, 0.5, 1.0] {
-        let camera = path.camera(time, 1.0, 0);
-        let origin = camera.c2w.translation.as_vec3();
-        for index in 0..METER * METER {
-            let at = |step: usize| (step as f64 + 0.5) / METER as f64 - 0.5;
-            let (x, y) = (at(index % METER), at(index / METER));
-            let fx = camera.intrinsics_norm.fx;
-            let direction = (camera.c2w.rotation * glam::DVec3::new(x / fx, y / fx, 1.0)).as_vec3().normalize();
-            let (distance, number) = world.first(origin, direction);
+    for time in [0.2, 0.8] {
+        for (origin, direction, distance, number) in path.glance::<METER>(world, time) {
             let normal = if number == SKY { Vec3::ZERO } else { world.normal(number, origin + direction * distance) };
             let end = End { origin, direction, distance, number, normal };
             // Bright sky counts little: cameras are set for the place.
-            sum += light.seen(world, &end, 0.05).dot(Vec3::new(0.3, 0.6, 0.1)).clamp(0.005, 1.5).ln();
+            let seen = light.seen(world, [Some(end), None, None, None], 0.05)[0];
+            sum += seen.dot(Vec3::new(0.3, 0.6, 0.1)).clamp(0.005, 1.5).ln();
             count += 1.0;
         }
     }
     let mean: f32 = sum / count;
-    let balance = Vec3::new(dice.swing(0.1), dice.swing(0.03), dice.swing(0.1)).map(f32::exp);
-    let target = dice.scale(0.14, 0.34);
-    Exposure { gain: balance * (target / mean.exp()), contrast: dice.between(0.0, 0.6), fade: dice.between(0.0, 0.35) }
+    let balance = Vec3::new(dice.swing(0.12), dice.swing(0.03), dice.swing(0.14)).map(f32::exp);
+    let target = dice.scale(0.16, 0.36);
+    Exposure { gain: balance * (target / mean.exp()), contrast: dice.between(0.2, 1.0), fade: dice.between(-0.25, 0.2) }
 }

@@ -24,9 +24,10 @@ pub(crate) struct Rays {
 }
 
 impl Rays {
-    pub fn new(origin: Vec3, directions: [Vec3; 4]) -> Self {
-        let along = |axis: usize| Vec4::from_array(directions.map(|direction| direction[axis]));
-        Self { origin: origin.to_array().map(Vec4::splat), direction: [along(0), along(1), along(2)] }
+    /// Returns rays from these origins.
+    pub fn new(origins: [Vec3; 4], directions: [Vec3; 4]) -> Self {
+        let lanes = |v: [Vec3; 4]| [0, 1, 2].map(|axis| Vec4::from_array(v.map(|v| v[axis])));
+        Self { origin: lanes(origins), direction: lanes(directions) }
     }
 }
 

@@ -56,26 +56,37 @@ impl World {
 
     /// Returns the distance at which one ray ends, and the number of the solid there.
     pub fn first(&self, origin: Vec3, direction: Vec3) -> (f32, usize) {
-        let (distances, numbers) = self.nearest(&Rays::new(origin, [direction; 4]));
+        let (distances, numbers) = self.nearest(&Rays::new([origin; 4], [direction; 4]));
         (distances.x, numbers[0])
     }
 
-    /// Returns the share of light that reaches the origin along four rays of the lengths `ends`. The first ray leads to a
-    /// lamp of the angular size `softness`; of the others, nearer solids hide more.
-    pub fn light_along(&self, rays: &Rays, ends: Vec4, softness: f32) -> Vec4 {
+    /// Returns the share of a lamp of the angular size `softness` that is seen along four rays to it of the lengths `ends`.
+    /// The penumbra is estimated from the length of a ray inside a solid; no rays are sampled.
+    pub fn lamp_share(&self, rays: &Rays, ends: Vec4, softness: f32) -> Vec4 {
         let mut share = Vec4::ONE;
-        let per_end = ends.max(Vec4::splat(1e-3)).recip();
         self.tree.walk(rays, ends, |number, ends| {
             let spans = self.solids[number].spans(rays);
             let hit = spans.is_hit() & spans.near.cmpgt(Vec4::ZERO) & spans.near.cmplt(ends);
-            if hit.any() {
-                let mut open = spans.near * per_end;
-                open.x = 1.0 - (spans.far.x - spans.near.x) / (softness * spans.near.x + 1e-3);
-                share = Vec4::select(hit, share.min(open.max(Vec4::ZERO)), share);
+            if !hit.any() {
+                return ends;
             }
-            if share.x <= 0.0 { ends.with_x(0.0) } else { ends }
+            let open = Vec4::ONE - (spans.far - spans.near) / (spans.near * softness + 1e-3);
+            share = Vec4::select(hit, share.min(open.max(Vec4::ZERO)), share);
+            Vec4::select(share.cmpgt(Vec4::ZERO), ends, Vec4::NEG_ONE)
         });
         share
+    }
+
+    /// Returns how far four rays get, as a share of `reach`.
+    pub fn free_share(&self, rays: &Rays, reach: f32) -> Vec4 {
+        let mut free = Vec4::splat(reach);
+        self.tree.walk(rays, free, |number, _| {
+            let spans = self.solids[number].spans(rays);
+            let hit = spans.is_hit() & spans.near.cmpgt(Vec4::ZERO);
+            free = Vec4::select(hit, free.min(spans.near), free);
+            free
+        });
+        free / reach
     }
 
     /// Returns the normal at a point of the surface with this number.
