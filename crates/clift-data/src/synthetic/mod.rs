@@ -6,6 +6,7 @@
 //! - `texture`: procedural surface colours
 //! - `ray_tracer`: small deterministic ray tracer
 //! - `real`: scenes with the statistics of photos
+//! - `tracing`: solids, patterns and light of `real`
 //! - `source`: scenes from seeds as a source
 
 pub(crate) mod camera_path;
@@ -15,3 +16,4 @@ pub(crate) mod real;
 pub(crate) mod room;
 pub(crate) mod source;
 pub(crate) mod texture;
+pub(crate) mod tracing;

@@ -6,8 +6,8 @@ use glam::{EulerRot, Mat3, Vec3};
 
 use crate::synthetic::real::dice::Dice;
 use crate::synthetic::real::palette::Palette;
-use crate::synthetic::real::solid::{Shape, Solid};
-use crate::synthetic::real::surface::Surface;
+use crate::synthetic::tracing::solid::{Shape, Solid};
+use crate::synthetic::tracing::surface::Surface;
 
 /// A spot on a floor with its own right and forward; heights are upwards.
 #[derive(Clone, Copy, Debug)]

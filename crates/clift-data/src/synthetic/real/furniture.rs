@@ -5,7 +5,7 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 
 use crate::synthetic::real::builder::{Builder, Place};
-use crate::synthetic::real::solid::Shape;
+use crate::synthetic::tracing::solid::Shape;
 
 impl Builder {
     /// Adds a table with four legs and things on it.
@@ -171,10 +171,10 @@ impl Builder {
     pub fn plant(&mut self, place: &Place, size: f32) {
         let (pot, leaves) = (self.any_paint(), self.foliage());
         self.column(place, [0.0, 0.0], [0.0, 0.35 * size], 0.2 * size, pot);
-        for _ in 0..self.dice.count(2, 6) {
+        for _ in 0..self.dice.count(3, 8) {
             let (x, z) = (self.dice.swing(0.25 * size), self.dice.swing(0.25 * size));
-            let height = self.dice.between(0.45, 0.95) * size;
-            let half = [(); 3].map(|()| self.dice.between(0.06, 0.25) * size);
+            let height = self.dice.between(0.42, 1.0) * size;
+            let half = [(); 3].map(|()| self.dice.scale(0.03, 0.22) * size);
             self.ball(place, [x, height, z], half, leaves);
         }
     }
@@ -185,11 +185,13 @@ impl Builder {
         let trunk = 0.03 * size * self.dice.between(0.6, 1.5);
         let lean = [self.dice.swing(0.1) * size, self.dice.swing(0.1) * size];
         self.rod(place, [0.0, 0.0, 0.0], [lean[0], 0.6 * size, lean[1]], trunk, bark);
-        for _ in 0..self.dice.count(2, 7) {
-            let (x, z) = (lean[0] + self.dice.swing(0.25 * size), lean[1] + self.dice.swing(0.25 * size));
-            let height = self.dice.between(0.5, 0.95) * size;
-            let half = [(); 3].map(|()| self.dice.between(0.1, 0.28) * size);
-            self.rod(place, [lean[0], 0.4 * size, lean[1]], [x, height, z], 0.4 * trunk, bark);
+        for branch in 0..self.dice.count(4, 12) {
+            let (x, z) = (lean[0] + self.dice.swing(0.32 * size), lean[1] + self.dice.swing(0.32 * size));
+            let height = self.dice.between(0.45, 0.95) * size;
+            let half = [(); 3].map(|()| self.dice.between(0.06, 0.2) * size);
+            if branch < 4 {
+                self.rod(place, [lean[0], 0.4 * size, lean[1]], [x, height, z], 0.4 * trunk, bark);
+            }
             self.ball(place, [x, height, z], half, leaves);
         }
     }

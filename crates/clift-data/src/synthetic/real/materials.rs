@@ -6,7 +6,7 @@ use glam::Vec3;
 
 use crate::synthetic::real::builder::Builder;
 use crate::synthetic::real::palette::{leaf, stone, wood};
-use crate::synthetic::real::surface::{Pattern, Surface};
+use crate::synthetic::tracing::surface::{Pattern, Surface};
 
 impl Builder {
     /// Returns a surface in these colours with some noise on its brightness.
@@ -26,7 +26,7 @@ impl Builder {
 
     /// Adds a surface of one colour, with slight noise.
     pub fn painted(&mut self, color: Vec3, gloss: f32) -> usize {
-        let surface = self.patterned(Pattern::Plain, [color; 3], 1.0, 0.2);
+        let surface = self.patterned(Pattern::Plain, [color; 3], 1.0, 0.16);
         self.surface(Surface { gloss, ..surface })
     }
 
@@ -42,11 +42,10 @@ impl Builder {
 
     /// Adds a wall: mostly pale and plain, sometimes papered, panelled or of bricks.
     pub fn wall_surface(&mut self) -> usize {
-        let pale = if self.dice.chance(0.75) { [0.72, 0.97] } else { [0.25, 0.75] };
-        let base = self.palette.muted(&mut self.dice, pale);
+        let base = self.palette.wall(&mut self.dice);
         let second = base * self.dice.between(0.5, 0.92);
         let third = self.palette.any(&mut self.dice);
-        let (pattern, rate) = match self.dice.count(0, 19) {
+        let (pattern, rate) = match self.dice.count(0, 15) {
             0 => (Pattern::Stripes { duty: self.dice.between(0.2, 0.8) }, self.dice.scale(1.5, 12.0)),
             1 => (Pattern::Bricks { stretch: 2.5, joint: 0.12, shift: 0.0 }, self.dice.scale(5.0, 13.0)),
             2 => (Pattern::Bricks { stretch: 1.0, joint: 0.04, shift: 0.0 }, self.dice.scale(2.0, 9.0)),
@@ -57,7 +56,7 @@ impl Builder {
             _ => (Pattern::Plain, 1.0),
         };
         let third = if pattern == Pattern::Discs { third } else { base * self.dice.between(0.5, 1.1) };
-        let surface = self.patterned(pattern, [base, second, third], rate, 0.18);
+        let surface = self.patterned(pattern, [base, second, third], rate, 0.12);
         self.surface(surface)
     }
 
@@ -107,7 +106,7 @@ impl Builder {
         };
         let pattern = if self.dice.chance(0.6) { Pattern::Grain } else { Pattern::Plain };
         let (rate, dark) = (self.dice.scale(4.0, 20.0), self.dice.between(0.4, 0.85));
-        let surface = self.patterned(pattern, [base, base * dark, base], rate, 0.2);
+        let surface = self.patterned(pattern, [base, base * dark, base], rate, 0.3);
         let gloss = if self.dice.chance(0.4) { self.dice.between(0.05, 0.6) } else { 0.0 };
         self.surface(Surface { gloss, ..surface })
     }
@@ -122,6 +121,8 @@ impl Builder {
             1 => (Pattern::Plaid { duty }, self.dice.scale(3.0, 15.0)),
             2 => (Pattern::Discs, self.dice.scale(2.0, 12.0)),
             3 => (Pattern::Clouds { gain: 0.7, sharp: 2.5 }, self.dice.scale(1.5, 8.0)),
+            4 => (Pattern::Mosaic, self.dice.scale(0.8, 3.0)),
+            5 => (Pattern::Checks, self.dice.scale(3.0, 15.0)),
             _ => (Pattern::Plain, 1.0),
         };
         let surface = self.patterned(pattern, [base, others[0], others[1]], rate, 0.3);
@@ -157,8 +158,8 @@ impl Builder {
 
     pub fn foliage(&mut self) -> usize {
         let [base, second] = [(); 2].map(|()| leaf(&mut self.dice));
-        let rate = self.dice.scale(1.5, 9.0);
-        let pattern = Pattern::Clouds { gain: 0.85, sharp: 2.2 };
+        let rate = self.dice.scale(3.0, 14.0);
+        let pattern = Pattern::Clouds { gain: 0.9, sharp: 2.0 };
         let surface = self.patterned(pattern, [base * 0.3, second * 1.3, base], rate, 0.7);
         self.surface(surface)
     }

@@ -5,7 +5,7 @@ use std::f32::consts::TAU;
 use glam::Vec3;
 
 use crate::synthetic::real::builder::{Builder, Place};
-use crate::synthetic::real::solid::Shape;
+use crate::synthetic::tracing::solid::Shape;
 
 impl Builder {
     /// Adds houses, hills, trees and fences on a ground at height `ground` (y is down), from `near` on outwards.

@@ -33,6 +33,13 @@ impl Palette {
         self.shade(dice, saturation, value)
     }
 
+    /// Samples a colour of a wall: pale, grey or beige, seldom of a strong colour.
+    pub fn wall(&self, dice: &mut Dice) -> Vec3 {
+        let value = if dice.chance(0.75) { dice.between(0.68, 0.97) } else { dice.between(0.25, 0.75) };
+        let saturation = if dice.chance(0.15) { dice.between(0.3, 0.75) } else { dice.between(0.0, 0.22) };
+        self.shade(dice, saturation, value)
+    }
+
     fn shade(&self, dice: &mut Dice, saturation: f32, value: f32) -> Vec3 {
         let hue = if dice.chance(0.8) { dice.pick(&self.hues) + dice.swing(0.03) } else { hue(dice) };
         color(hue, saturation, value)
@@ -41,7 +48,7 @@ impl Palette {
 
 /// Samples a colour of wood, from pale to dark.
 pub(crate) fn wood(dice: &mut Dice) -> Vec3 {
-    color(dice.between(0.045, 0.11), dice.between(0.25, 0.65), dice.between(0.2, 0.85))
+    color(dice.between(0.035, 0.11), dice.between(0.25, 0.85), dice.between(0.2, 0.9))
 }
 
 /// Samples a colour of leaves.

@@ -7,9 +7,9 @@ use glam::{DMat3, Vec3};
 use crate::geometry::camera::{Camera, IntrinsicsNorm};
 use crate::geometry::pose::Pose;
 use crate::synthetic::real::dice::Dice;
-use crate::synthetic::real::noise::{byte, hash};
-use crate::synthetic::real::solid::Rays;
-use crate::synthetic::real::world::{GROUND, SKY, World};
+use crate::synthetic::tracing::noise::{byte, hash};
+use crate::synthetic::tracing::solid::Rays;
+use crate::synthetic::tracing::world::{GROUND, SKY, World};
 
 /// Attempts to find a path on which the camera sees enough; afterwards the best one found counts.
 const ATTEMPTS: usize = 40;
@@ -152,12 +152,11 @@ impl Path {
         let rotation = camera.c2w.rotation.as_mat3();
         let scale = 1.0 / (camera.intrinsics_norm.fx as f32 * SIDE as f32);
         (0..SIDE * SIDE).step_by(4).flat_map(move |first| {
-            let directions = [0, 1, 2, 3].map(|lane| {
-                let at = |step: usize| (step as f32 + 0.5 - 0.5 * SIDE as f32) * scale;
-                let (x, y) = (at((first + lane) % SIDE), at((first + lane) / SIDE));
-                (rotation * Vec3::new(x, y, 1.0)).normalize()
-            });
-            let (distances, numbers) = world.nearest(&Rays::new([origin; 4], directions));
+            let at = |step: usize| (step as f32 + 0.5 - 0.5 * SIDE as f32) * scale;
+            let lanes = [0, 1, 2, 3].map(|lane| first + lane);
+            let (x, y) = (lanes.map(|lane| at(lane % SIDE)), lanes.map(|lane| at(lane / SIDE)));
+            let rays = Rays::through(origin, &rotation, x.into(), y.into());
+            let ((distances, numbers), directions) = (world.nearest(&rays), rays.directions());
             [0, 1, 2, 3].map(|lane| (origin, directions[lane], distances[lane], numbers[lane]))
         })
     }

@@ -9,11 +9,11 @@ use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::synthetic::real::builder::{Builder, Place};
 use crate::synthetic::real::dice::Dice;
-use crate::synthetic::real::light::{End, Fill, Key, Light};
+use crate::synthetic::tracing::light::{End, Fill, Key, Light};
 use crate::synthetic::real::palette::color;
 use crate::synthetic::real::path::{Area, Path};
-use crate::synthetic::real::render::{Exposure, render};
-use crate::synthetic::real::world::{SKY, World};
+use crate::synthetic::tracing::render::{Exposure, render};
+use crate::synthetic::tracing::world::{SKY, World};
 
 /// Number of rays along each side of the views that set the exposure.
 const METER: usize = 6;
@@ -166,7 +166,7 @@ fn outside(dice: &mut Dice, bright: f32) -> Light {
         sky: [pale * bright, blue * bright],
         clouds: if dice.chance(0.5) { dice.between(0.5, 2.0) } else { 0.0 },
         seed: dice.bits(),
-        haze: dice.scale(100.0, 1500.0),
+        haze: dice.scale(250.0, 3000.0),
     }
 }
 

@@ -2,9 +2,9 @@
 
 use glam::{Vec3, Vec4};
 
-use crate::synthetic::real::noise::octaves;
-use crate::synthetic::real::solid::Rays;
-use crate::synthetic::real::world::{SKY, World};
+use crate::synthetic::tracing::noise::octaves;
+use crate::synthetic::tracing::solid::Rays;
+use crate::synthetic::tracing::world::{SKY, World};
 
 /// Distance between a surface and the rays that start there.
 const OFFSET: f32 = 2e-3;

@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 
-use crate::synthetic::real::noise::{byte, edge, floor, hash, octaves, pulse, value_noise};
+use crate::synthetic::tracing::noise::{byte, edge, floor, hash, octaves, pulse, value_noise};
 
 /// Pattern of a surface; lengths are in periods of the pattern.
 #[derive(Clone, Copy, Debug, PartialEq)]

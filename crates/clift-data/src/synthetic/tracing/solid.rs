@@ -24,6 +24,20 @@ pub(crate) struct Rays {
 }
 
 impl Rays {
+    /// Returns rays from one origin through the points `(x, y, 1)` of the axes of a camera.
+    pub fn through(origin: Vec3, axes: &Mat3, x: Vec4, y: Vec4) -> Self {
+        let along = |axis: usize| x * axes.x_axis[axis] + y * axes.y_axis[axis] + axes.z_axis[axis];
+        let [a, b, c] = [along(0), along(1), along(2)];
+        let scale = (a * a + b * b + c * c).map(f32::sqrt).recip();
+        Self { origin: origin.to_array().map(Vec4::splat), direction: [a * scale, b * scale, c * scale] }
+    }
+
+    /// Returns the directions of the four rays.
+    pub fn directions(&self) -> [Vec3; 4] {
+        let [a, b, c] = self.direction.map(|lanes| lanes.to_array());
+        [0, 1, 2, 3].map(|lane| Vec3::new(a[lane], b[lane], c[lane]))
+    }
+
     /// Returns rays from these origins.
     pub fn new(origins: [Vec3; 4], directions: [Vec3; 4]) -> Self {
         let lanes = |v: [Vec3; 4]| [0, 1, 2].map(|axis| Vec4::from_array(v.map(|v| v[axis])));
@@ -146,7 +160,7 @@ impl Solid {
     pub fn normal(&self, point: Vec3) -> Vec3 {
         let own = self.to_own * (point - self.center);
         let outwards = match self.shape {
-            Shape::Block => largest_axis(own),
+            Shape::Block => return self.axes * largest_axis(own),
             Shape::Ball => own,
             Shape::Column if own.y.abs() > own.x.hypot(own.z) => Vec3::Y * own.y.signum(),
             Shape::Column => Vec3::new(own.x, 0.0, own.z),

@@ -2,7 +2,7 @@
 
 use glam::{Vec3, Vec4};
 
-use crate::synthetic::real::solid::{Rays, Solid};
+use crate::synthetic::tracing::solid::{Rays, Solid};
 
 /// Largest number of solids in a leaf.
 const LEAF: usize = 3;

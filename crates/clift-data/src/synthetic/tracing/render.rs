@@ -1,15 +1,16 @@
 //! Frames: four rays per pixel, one shading per surface and pixel, in blocks of 2 x 2 pixels.
 
-use glam::Vec3;
+use glam::{Vec3, Vec4};
 
 use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
-use crate::synthetic::real::light::{End, Light};
-use crate::synthetic::real::solid::Rays;
-use crate::synthetic::real::world::{SKY, World};
+use crate::synthetic::tracing::light::{End, Light};
+use crate::synthetic::tracing::solid::Rays;
+use crate::synthetic::tracing::world::{SKY, World};
 
 /// Offsets of the four rays of a pixel: a turned square, so that upright and level edges have four steps.
-const OFFSETS: [[f32; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
+const OFFSETS_X: Vec4 = Vec4::new(0.375, 0.875, 0.125, 0.625);
+const OFFSETS_Y: Vec4 = Vec4::new(0.125, 0.375, 0.625, 0.875);
 /// Smallest cosine between normals that one shading stands for.
 const SAME_NORMAL: f32 = 0.95;
 
@@ -73,11 +74,9 @@ pub(crate) fn render(
                 if column == width || row == height {
                     continue;
                 }
-                let directions = OFFSETS.map(|[x, y]| {
-                    let (x, y) = ((column as f32 + x - cx) * pixel, (row as f32 + y - cy) * per_row);
-                    (rotation * Vec3::new(x, y, 1.0)).normalize()
-                });
-                block.add(world, origin, directions, index);
+                let x = (Vec4::splat(column as f32 - cx) + OFFSETS_X) * pixel;
+                let y = (Vec4::splat(row as f32 - cy) + OFFSETS_Y) * per_row;
+                block.add(world, origin, &Rays::through(origin, &rotation, x, y), index);
             }
             let colors = block.colors(world, light, exposure, origin, pixel);
             for (index, color) in colors.into_iter().enumerate() {
@@ -99,8 +98,9 @@ impl Parts {
     }
 
     /// Adds the ends of the four rays of a pixel.
-    fn add(&mut self, world: &World, origin: Vec3, directions: [Vec3; 4], pixel: usize) {
-        let (distances, numbers) = world.nearest(&Rays::new([origin; 4], directions));
+    fn add(&mut self, world: &World, origin: Vec3, rays: &Rays, pixel: usize) {
+        let (distances, numbers) = world.nearest(rays);
+        let (distances, directions) = (distances.to_array(), rays.directions());
         for lane in 0..4 {
             let (number, direction, distance) = (numbers[lane], directions[lane], distances[lane]);
             let normal = match number {

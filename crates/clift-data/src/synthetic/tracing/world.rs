@@ -2,9 +2,9 @@
 
 use glam::{Vec3, Vec4};
 
-use crate::synthetic::real::solid::{Rays, Solid};
-use crate::synthetic::real::surface::Surface;
-use crate::synthetic::real::tree::Tree;
+use crate::synthetic::tracing::solid::{Rays, Solid};
+use crate::synthetic::tracing::surface::Surface;
+use crate::synthetic::tracing::tree::Tree;
 
 /// Number of the ground among the solids.
 pub(crate) const GROUND: usize = usize::MAX - 1;

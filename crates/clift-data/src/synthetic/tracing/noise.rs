@@ -54,8 +54,8 @@ pub(crate) fn value_noise(x: f32, y: f32, seed: u32) -> f32 {
 /// further one. Octaves finer than two pixels of `width` fade out.
 pub(crate) fn octaves(x: f32, y: f32, seed: u32, gain: f32, width: f32) -> f32 {
     let (mut sum, mut amplitude, mut frequency) = (0.0, 1.0, 1.0);
-    for octave in 0..5 {
-        let visible = (1.6 - 1.6 * frequency * width).min(1.0);
+    for octave in 0..4 {
+        let visible = (2.0 - 2.0 * frequency * width).min(1.0);
         if visible <= 0.0 {
             break;
         }
@@ -64,7 +64,7 @@ pub(crate) fn octaves(x: f32, y: f32, seed: u32, gain: f32, width: f32) -> f32 {
         let noise = value_noise(x * frequency + shift, y * frequency - shift, seed ^ octave);
         sum += visible * amplitude * (2.0 * noise - 1.0);
         amplitude *= gain;
-        frequency *= 2.1;
+        frequency *= 2.3;
     }
     sum
 }
