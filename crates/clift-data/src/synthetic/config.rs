@@ -197,6 +197,15 @@ mod tests {
     }
 
     #[test]
+    fn keys_of_rooms_are_refused_for_the_other_look() {
+        let real: SyntheticConfig = serde_json::from_str(r#"{"look": "real", "num_frames": 32}"#).unwrap();
+        real.validate().unwrap();
+        let message = SyntheticConfig { fov_deg: 60.0, ..real }.validate().unwrap_err().to_string();
+        assert!(message.starts_with("fov_deg is set, but look = \"real\" does not use it; remove it"), "{message}");
+        assert!(!serde_json::to_string(&SyntheticConfig::default()).unwrap().contains("\"look\""));
+    }
+
+    #[test]
     fn unknown_key_is_refused_and_missing_key_has_default() {
         let parsed: Result<SyntheticConfig, _> = serde_json::from_str(r#"{"sed": 1}"#);
         assert!(parsed.unwrap_err().to_string().contains("sed"));

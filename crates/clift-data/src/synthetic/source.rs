@@ -159,6 +159,13 @@ mod tests {
     use crate::synthetic::config::MAX_SCENES;
     use std::collections::BTreeSet;
 
+    fn real(change: impl FnOnce(&mut SyntheticConfig)) -> SyntheticSource {
+        source(|c| {
+            c.look = Look::Real;
+            change(c);
+        })
+    }
+
     fn source(change: impl FnOnce(&mut SyntheticConfig)) -> SyntheticSource {
         let mut config = SyntheticConfig::default();
         change(&mut config);
@@ -177,16 +184,53 @@ mod tests {
     }
 
     #[test]
+    fn real_frames_depend_on_seed_and_position_alone() {
+        let first = real(|_| ()).frame(7, 3).unwrap();
+        // More scenes than are kept lie between the two reads.
+        let again = real(|c| c.num_scenes = 100);
+        for scene in (0..2 * KEPT_SCENES).rev() {
+            again.cameras(scene).unwrap();
+        }
+        assert_eq!(first, again.frame(7, 3).unwrap());
+        assert_eq!(first, again.frame(7, 3).unwrap());
+        assert_eq!(again.kept.lock().unwrap().len(), KEPT_SCENES);
+        for other in [real(|_| ()).frame(7, 4), real(|_| ()).frame(8, 3), real(|c| c.seed = 1).frame(7, 3)] {
+            assert_ne!(first, other.unwrap());
+        }
+        // Any size, odd ones too; the view is the same.
+        let wide = real(|c| (c.width, c.height) = (35, 21));
+        assert_eq!(wide.frame(7, 3).unwrap().rgb.len(), 35 * 21 * 3);
+        let (camera, square) = (wide.cameras(7).unwrap()[3], real(|_| ()).cameras(7).unwrap()[3]);
+        assert_eq!((camera.c2w, camera.intrinsics_norm.fx), (square.c2w, square.intrinsics_norm.fx));
+        let pixels = camera.intrinsics_norm.to_pixels(35, 21);
+        assert!((pixels.fx - pixels.fy).abs() < 1e-9);
+    }
+
+    #[test]
     fn splits_and_seeds_share_no_scene() {
-        let mut seen = Vec::new();
-        for split in [Split::Train, Split::Test] {
-            for seed in 0..3 {
-                let source = source(|c| (c.split, c.seed) = (split, seed));
-                seen.extend((0..100).map(|scene| source.room(scene).unwrap()));
+        let scenes = |look, count| {
+            let mut seen = Vec::new();
+            for split in [Split::Train, Split::Test] {
+                for seed in 0..3 {
+                    let source = source(|c| (c.look, c.split, c.seed) = (look, split, seed));
+                    seen.extend((0..count).map(|scene| source.sample(scene)));
+                }
+            }
+            seen
+        };
+        let seen = scenes(Look::Rooms, 100);
+        for (i, scene) in seen.iter().enumerate() {
+            let Scene::Room(room) = scene else { panic!("not a room") };
+            for other in &seen[i + 1..] {
+                assert!(matches!(other, Scene::Room(other) if other.path != room.path && other.walls != room.walls));
             }
         }
+        let seen = scenes(Look::Real, 20);
         for (i, scene) in seen.iter().enumerate() {
-            assert!(seen[i + 1..].iter().all(|other| other.path != scene.path && other.walls != scene.walls));
+            let Scene::Real(real) = scene else { panic!("not a scene of look real") };
+            for other in &seen[i + 1..] {
+                assert!(matches!(other, Scene::Real(other) if other.shares_nothing_with(real)));
+            }
         }
     }
 
@@ -196,6 +240,9 @@ mod tests {
         let keys: BTreeSet<&str> = (0..3_000).map(|scene| source.key(scene)).collect();
         assert_eq!(keys.len(), 3_000);
         assert_eq!(source.key(42), "synthetic-7-train-00042");
+        let real = real(|c| (c.seed, c.split) = (7, Split::Test));
+        assert_eq!(real.key(42), "synthetic-real-7-test-00042");
+        assert_eq!((real.find(real.key(42)), real.find("synthetic-7-test-00042")), (Some(42), None));
         assert!((0..3_000).all(|scene| source.find(source.key(scene)) == Some(scene)));
         for wrong in
             ["synthetic-7-train-03000", "synthetic-7-train-42", "synthetic-7-test-00042", "synthetic-7-train-+0042", ""]

@@ -117,6 +117,11 @@ impl Path {
         Route::Move { at: [start, velocity, bend], look: [yaw, pitch], turn }
     }
 
+    /// Returns positions along the path.
+    pub fn positions(&self) -> Vec<Vec3> {
+        (0..=64).map(|step| self.position(step as f32 / 64.0)).collect()
+    }
+
     /// Returns 1 or more for a good path: clear of surfaces, many things in sight, few of them very near.
     fn score(&self, world: &World, clearance: f32) -> f32 {
         let times = [0, 4, 8, 2, 6, 1, 3, 5, 7].map(|check| check as f32 / 8.0);

@@ -9,12 +9,14 @@ use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::synthetic::real::builder::{Builder, Place};
 use crate::synthetic::real::dice::Dice;
-use crate::synthetic::tracing::light::{End, Fill, Key, Light};
 use crate::synthetic::real::palette::color;
 use crate::synthetic::real::path::{Area, Path};
+use crate::synthetic::tracing::light::{End, Fill, Key, Light};
 use crate::synthetic::tracing::render::{Exposure, render};
 use crate::synthetic::tracing::world::{SKY, World};
 
+/// Smallest distance between the camera and any surface.
+pub(crate) const CLEARANCE: f32 = 0.1;
 /// Number of rays along each side of the views that set the exposure.
 const METER: usize = 6;
 
@@ -38,8 +40,17 @@ impl RealScene {
         let Builder { mut dice, solids, surfaces, .. } = builder;
         let world = World::new(solids, surfaces, ground);
         let path = Path::sample(&mut dice, &world, &area);
+        // Where no path was clear, or a thin thing stands between the places that were checked.
+        let positions = path.positions();
+        let is_clear = positions.iter().all(|&position| world.is_clear(position, CLEARANCE));
+        let world = if is_clear { world } else { world.clear_away(&positions, CLEARANCE) };
         let exposure = expose(&mut dice, &world, &light, &path);
         Self { world, light, exposure, path }
+    }
+
+    #[cfg(test)]
+    pub fn shares_nothing_with(&self, other: &Self) -> bool {
+        self.path != other.path && self.world.solids != other.world.solids && self.exposure != other.exposure
     }
 
     /// Returns the camera of a frame; `time` runs from 0 to 1.
@@ -187,4 +198,47 @@ fn expose(dice: &mut Dice, world: &World, light: &Light, path: &Path) -> Exposur
     let balance = Vec3::new(dice.swing(0.12), dice.swing(0.03), dice.swing(0.14)).map(f32::exp);
     let target = dice.scale(0.16, 0.36);
     Exposure { gain: balance * (target / mean.exp()), contrast: dice.between(0.2, 1.0), fade: dice.between(-0.25, 0.2) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::step_rng;
+
+    fn scene(number: u64) -> RealScene {
+        RealScene::sample(step_rng(4, number, "test"))
+    }
+
+    #[test]
+    fn camera_stays_clear_of_all_surfaces_and_upright() {
+        for number in 0..200 {
+            let scene = scene(number);
+            for position in scene.path.positions() {
+                assert!(scene.world.is_clear(position, CLEARANCE), "scene {number}: {position}");
+            }
+            for frame in 0..20 {
+                let camera = scene.camera(f64::from(frame) / 19.0, 1.0, frame as usize);
+                assert!(camera.c2w.orthonormality_defect() < 1e-6);
+                assert!(camera.c2w.rotation.y_axis.y > 0.3, "scene {number} is upside down");
+                let fov = 2.0 * (0.5 / camera.intrinsics_norm.fx).atan().to_degrees();
+                assert!((39.9..100.1).contains(&fov), "{fov}");
+            }
+        }
+    }
+
+    #[test]
+    fn frames_are_exposed_and_have_contrast() {
+        let mut means = Vec::new();
+        for number in 0..100 {
+            let scene = scene(number);
+            let frame = scene.render(&scene.camera(0.5, 1.0, 8), [32, 32]);
+            let values = || frame.rgb.iter().map(|&value| f64::from(value) / 255.0);
+            let mean = values().sum::<f64>() / 3072.0;
+            let deviation = (values().map(|value| (value - mean).powi(2)).sum::<f64>() / 3072.0).sqrt();
+            assert!(deviation > 0.04, "scene {number}: {deviation:.3}");
+            means.push(mean);
+        }
+        let mean = means.iter().sum::<f64>() / 100.0;
+        assert!((0.4..0.6).contains(&mean), "{mean:.2}");
+    }
 }

@@ -11,6 +11,8 @@ use crate::synthetic::tracing::world::{SKY, World};
 /// Offsets of the four rays of a pixel: a turned square, so that upright and level edges have four steps.
 const OFFSETS_X: Vec4 = Vec4::new(0.375, 0.875, 0.125, 0.625);
 const OFFSETS_Y: Vec4 = Vec4::new(0.125, 0.375, 0.625, 0.875);
+/// Pixels along each side of a square that shares a list of solids; even.
+const TILE: usize = 8;
 /// Smallest cosine between normals that one shading stands for.
 const SAME_NORMAL: f32 = 0.95;
 
@@ -64,24 +66,28 @@ pub(crate) fn render(
     let pixel = (1.0 / intrinsics.fx) as f32;
     let [cx, cy] = [intrinsics.cx as f32, intrinsics.cy as f32];
     let per_row = (1.0 / intrinsics.fy) as f32;
+    let slope = |column: usize, row: usize| Vec3::new((column as f32 - cx) * pixel, (row as f32 - cy) * per_row, 1.0);
     let mut rgb = vec![0; width * height * 3];
-    for top in (0..height).step_by(2) {
-        for left in (0..width).step_by(2) {
-            let place = |index: usize| (left + index % 2, top + index / 2);
-            let mut block = Parts::new();
-            for index in 0..4 {
-                let (column, row) = place(index);
-                if column == width || row == height {
-                    continue;
+    let mut ahead = Vec::new();
+    for top in (0..height).step_by(TILE) {
+        for left in (0..width).step_by(TILE) {
+            let corners =
+                [(0, 0), (TILE, 0), (0, TILE), (TILE, TILE)].map(|(x, y)| rotation * slope(left + x, top + y));
+            let low = corners.into_iter().fold(Vec3::INFINITY, Vec3::min);
+            let high = corners.into_iter().fold(Vec3::NEG_INFINITY, Vec3::max);
+            world.ahead(origin, [low, high], &mut ahead);
+            for (left, top) in (0..TILE * TILE / 4).map(|at| (left + at % (TILE / 2) * 2, top + at / (TILE / 2) * 2)) {
+                let places = [0, 1, 2, 3].map(|index| (left + index % 2, top + index / 2));
+                let inside = |(column, row): (usize, usize)| column < width && row < height;
+                let mut block = Parts::new();
+                for (index, (column, row)) in places.into_iter().enumerate().filter(|&(_, place)| inside(place)) {
+                    let x = (Vec4::splat(column as f32 - cx) + OFFSETS_X) * pixel;
+                    let y = (Vec4::splat(row as f32 - cy) + OFFSETS_Y) * per_row;
+                    let rays = Rays::through(origin, &rotation, x, y);
+                    block.add(world, origin, &rays, world.nearest_of(&rays, &ahead), index);
                 }
-                let x = (Vec4::splat(column as f32 - cx) + OFFSETS_X) * pixel;
-                let y = (Vec4::splat(row as f32 - cy) + OFFSETS_Y) * per_row;
-                block.add(world, origin, &Rays::through(origin, &rotation, x, y), index);
-            }
-            let colors = block.colors(world, light, exposure, origin, pixel);
-            for (index, color) in colors.into_iter().enumerate() {
-                let (column, row) = place(index);
-                if column < width && row < height {
+                let colors = block.colors(world, light, exposure, origin, pixel);
+                for ((column, row), color) in places.into_iter().zip(colors).filter(|&(place, _)| inside(place)) {
                     let values = color.to_array().map(|value| (value * (255.0 / 4.0) + 0.5) as u8);
                     rgb[(row * width + column) * 3..][..3].copy_from_slice(&values);
                 }
@@ -98,8 +104,8 @@ impl Parts {
     }
 
     /// Adds the ends of the four rays of a pixel.
-    fn add(&mut self, world: &World, origin: Vec3, rays: &Rays, pixel: usize) {
-        let (distances, numbers) = world.nearest(rays);
+    fn add(&mut self, world: &World, origin: Vec3, rays: &Rays, ends: (Vec4, [usize; 4]), pixel: usize) {
+        let (distances, numbers) = ends;
         let (distances, directions) = (distances.to_array(), rays.directions());
         for lane in 0..4 {
             let (number, direction, distance) = (numbers[lane], directions[lane], distances[lane]);

@@ -214,3 +214,50 @@ fn largest_axis(v: Vec3) -> Vec3 {
         Vec3::Z * v.z.signum()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::step_rng;
+    use crate::synthetic::real::dice::Dice;
+
+    /// Returns whether a point lies in the shape, by its definition.
+    fn contains(solid: &Solid, point: Vec3) -> bool {
+        let Vec3 { x, y, z } = solid.axes.transpose() * (point - solid.center) / solid.half;
+        match solid.shape {
+            Shape::Block => x.abs().max(y.abs()).max(z.abs()) < 1.0,
+            Shape::Ball => x * x + y * y + z * z < 1.0,
+            Shape::Column => x * x + z * z < 1.0 && y.abs() < 1.0,
+            Shape::Roof => z.abs() < 1.0 && y < 1.0 && x.abs() < 0.5 * (y + 1.0),
+        }
+    }
+
+    #[test]
+    fn rays_enter_and_leave_where_the_shape_begins_and_ends() {
+        let mut dice = Dice(step_rng(2, 0, "test"));
+        let mut hits = 0;
+        for shape in [Shape::Block, Shape::Ball, Shape::Column, Shape::Roof] {
+            for _ in 0..300 {
+                let mut point = |size: f32| Vec3::new(dice.swing(size), dice.swing(size), dice.swing(size));
+                let axes = Mat3::from_rotation_y(point(3.0).x) * Mat3::from_rotation_z(point(3.0).y);
+                let solid = Solid::new(shape, point(1.0), point(1.0).abs() + 0.2, axes, 0);
+                let origin = point(1.0).normalize() * 6.0;
+                let direction = (point(1.0) - origin).normalize();
+                let spans = solid.spans(&Rays::new([origin; 4], [direction; 4]));
+                let at = |distance: f32| contains(&solid, origin + direction * distance);
+                let (near, far) = (spans.near.x, spans.far.x);
+                if near > far - 0.01 {
+                    continue;
+                }
+                hits += 1;
+                assert!(!at(near - 2e-3) && at(near + 2e-3) && at(far - 2e-3) && !at(far + 2e-3), "{solid:?}");
+                let entry = origin + direction * near;
+                let normal = solid.normal(entry);
+                assert!((normal.length() - 1.0).abs() < 1e-4 && normal.dot(direction) < 1e-3, "{normal}");
+                assert!(!contains(&solid, entry + normal * 2e-3), "the normal points outwards: {solid:?}");
+                assert!(solid.distance(entry) < 1e-3 && solid.distance(origin) < near + 1e-3);
+            }
+        }
+        assert!(hits > 400, "{hits}");
+    }
+}

@@ -243,3 +243,35 @@ fn glyphs(x: f32, y: f32, seed: u32, width: f32) -> f32 {
     // 25 of 64 dots of a sign are inked on average.
     0.22 + visible * (sharp - 0.22)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn patterns_have_contrast_near_and_none_far_away() {
+        let colors = [Vec3::splat(0.2), Vec3::splat(0.7), Vec3::splat(0.05)];
+        for pattern in [
+            Pattern::Stripes { duty: 0.4 },
+            Pattern::Plaid { duty: 0.4 },
+            Pattern::Checks,
+            Pattern::Bricks { stretch: 2.0, joint: 0.1, shift: 0.0 },
+            Pattern::Clouds { gain: 0.7, sharp: 2.0 },
+            Pattern::Grain,
+            Pattern::Glyphs,
+            Pattern::Discs,
+            Pattern::Books,
+            Pattern::Panes { width: 0.6, height: 0.6 },
+        ] {
+            let surface = Surface { pattern, colors, seed: 3, ..Surface::plain(colors[0]) };
+            let deviation = |width: f32| {
+                let values: Vec<f32> =
+                    (0..1000).map(|i| surface.color(i as f32 * 0.173, i as f32 * 0.091, width).y).collect();
+                let mean = values.iter().sum::<f32>() / 1000.0;
+                (values.iter().map(|value| (value - mean).powi(2)).sum::<f32>() / 1000.0).sqrt()
+            };
+            let (near, far) = (deviation(0.01), deviation(16.0));
+            assert!(near > 0.02 && far < 0.15 * near, "{pattern:?}: {near} near, {far} far");
+        }
+    }
+}

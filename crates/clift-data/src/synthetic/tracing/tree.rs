@@ -76,6 +76,47 @@ impl Tree {
         self.add(other, first + left as u32);
     }
 
+    /// Lists the solids whose boxes a pyramid of rays may meet, nearest first, with the distances to the boxes. The rays
+    /// start at `origin`; their directions, not of length 1, lie between `low` and `high`, and distances are in these units.
+    pub fn ahead(&self, solids: &[Solid], origin: Vec3, [low, high]: [Vec3; 2], found: &mut Vec<(f32, usize)>) {
+        found.clear();
+        let may_meet = |[from, to]: [Vec3; 2]| {
+            let (mut near, mut far) = (0.0_f32, f32::INFINITY);
+            for axis in 0..3 {
+                let (from, to) = (from[axis] - origin[axis], to[axis] - origin[axis]);
+                let (slow, fast) = (low[axis], high[axis]);
+                // Along this axis, the rays are between `slow * t` and `fast * t` at the distance `t`.
+                let limits = [(to, slow), (-from, -fast)];
+                for (bound, slope) in limits {
+                    if slope > 0.0 {
+                        far = far.min(bound / slope);
+                    } else if bound < 0.0 {
+                        near = near.max(if slope < 0.0 { bound / slope } else { f32::INFINITY });
+                    }
+                }
+            }
+            (near <= far).then_some(near)
+        };
+        let mut stack = [0_u32; DEPTH];
+        let mut waiting = 1;
+        while waiting > 0 {
+            waiting -= 1;
+            let here = stack[waiting];
+            let node = &self.nodes[here as usize];
+            if may_meet([node.low, node.high]).is_none() {
+                continue;
+            }
+            if node.count > 0 || node.next == 0 {
+                let all = node.next as usize..node.next as usize + usize::from(node.count);
+                found.extend(all.filter_map(|number| Some((may_meet(solids[number].bounds())?, number))));
+            } else {
+                (stack[waiting], stack[waiting + 1]) = (node.next, here + 1);
+                waiting += 2;
+            }
+        }
+        found.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    }
+
     /// Calls `visit` with the position of every solid whose box a ray meets before its end. `visit` returns the new ends;
     /// a negative end ends a ray.
     pub fn walk(&self, rays: &Rays, mut ends: Vec4, mut visit: impl FnMut(usize, Vec4) -> Vec4) {
@@ -169,4 +210,42 @@ fn divide(order: &mut [([Vec3; 2], u32)]) -> (usize, usize) {
     let axis = (high - low).max_position();
     order.sort_by(|a, b| middle(a)[axis].total_cmp(&middle(b)[axis]));
     (axis, order.len() / 2)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Mat3;
+
+    use crate::random::step_rng;
+    use crate::synthetic::real::dice::Dice;
+    use crate::synthetic::tracing::solid::Shape;
+    use crate::synthetic::tracing::world::World;
+
+    #[test]
+    fn walks_and_lists_find_the_nearest_of_all_solids() {
+        let mut dice = Dice(step_rng(1, 0, "test"));
+        let shapes = [Shape::Block, Shape::Ball, Shape::Column, Shape::Roof];
+        for count in [0, 1, 5, 60, 300] {
+            let mut point = |size: f32| Vec3::new(dice.swing(size), dice.swing(size), dice.swing(size));
+            let solid = |number: usize| {
+                let axes = Mat3::from_rotation_y(point(3.0).x) * Mat3::from_rotation_x(point(3.0).y);
+                Solid::new(shapes[number % 4], point(5.0), point(0.8).abs(), axes, number)
+            };
+            let world = World::new((0..count).map(solid).collect(), Vec::new(), (9.0, 0));
+            for _ in 0..100 {
+                let (origin, middle) = (point(6.0), point(1.0));
+                let directions = [(); 4].map(|()| middle + point(0.1));
+                let low = directions.into_iter().reduce(Vec3::min).unwrap();
+                let high = directions.into_iter().reduce(Vec3::max).unwrap();
+                let length = directions.map(Vec3::length).into_iter().reduce(f32::min).unwrap();
+                let rays = Rays::new([origin; 4], directions.map(Vec3::normalize));
+                let mut all: Vec<(f32, usize)> = (0..count).map(|number| (0.0, number)).collect();
+                let expected = world.nearest_of(&rays, &all);
+                assert_eq!(world.nearest(&rays), expected);
+                world.ahead(origin, [low / length, high / length], &mut all);
+                assert_eq!(world.nearest_of(&rays, &all), expected);
+            }
+        }
+    }
 }

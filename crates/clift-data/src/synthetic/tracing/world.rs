@@ -28,30 +28,59 @@ impl World {
 
     /// Returns the distances at which four rays end, and the number of the solid there.
     pub fn nearest(&self, rays: &Rays) -> (Vec4, [usize; 4]) {
-        let mut numbers = [SKY; 4];
-        let mut best = Vec4::INFINITY;
-        for lane in 0..4 {
-            let down = (self.ground.0 - rays.origin[1][lane]) / rays.direction[1][lane];
-            if down > 0.0 && down.is_finite() {
-                (best[lane], numbers[lane]) = (down, GROUND);
+        let mut ends = self.to_ground(rays);
+        let best = ends.0;
+        self.tree.walk(rays, best, |number, _| {
+            self.meet(rays, number, &mut ends);
+            ends.0
+        });
+        ends
+    }
+
+    /// As [`World::nearest`] for rays in the pyramid of a list of [`Tree::ahead`]. Its directions are at least 1 long: its
+    /// distances are lower bounds.
+    pub fn nearest_of(&self, rays: &Rays, ahead: &[(f32, usize)]) -> (Vec4, [usize; 4]) {
+        let mut ends = self.to_ground(rays);
+        let mut last = ends.0.max_element();
+        for &(near, number) in ahead {
+            if near > last {
+                break;
+            }
+            if self.meet(rays, number, &mut ends) {
+                last = ends.0.max_element();
             }
         }
-        self.tree.walk(rays, best, |number, ends| {
-            let spans = self.solids[number].spans(rays);
-            let hit = spans.is_hit() & spans.near.cmpgt(Vec4::ZERO) & spans.near.cmplt(ends);
-            let mask = hit.bitmask();
-            if mask == 0 {
-                return ends;
+        ends
+    }
+
+    /// Lists the solids that a pyramid of rays may meet; see [`Tree::ahead`].
+    pub fn ahead(&self, origin: Vec3, directions: [Vec3; 2], found: &mut Vec<(f32, usize)>) {
+        self.tree.ahead(&self.solids, origin, directions, found);
+    }
+
+    fn to_ground(&self, rays: &Rays) -> (Vec4, [usize; 4]) {
+        let down = (Vec4::splat(self.ground.0) - rays.origin[1]) / rays.direction[1];
+        let hit = down.cmpgt(Vec4::ZERO) & down.cmplt(Vec4::splat(1e6));
+        let mask = hit.bitmask();
+        let numbers = [0, 1, 2, 3].map(|lane| if mask >> lane & 1 == 1 { GROUND } else { SKY });
+        (Vec4::select(hit, down, Vec4::INFINITY), numbers)
+    }
+
+    /// Moves the ends of the rays that meet a solid before; returns whether any does.
+    fn meet(&self, rays: &Rays, number: usize, (ends, numbers): &mut (Vec4, [usize; 4])) -> bool {
+        let spans = self.solids[number].spans(rays);
+        let hit = spans.is_hit() & spans.near.cmpgt(Vec4::ZERO) & spans.near.cmplt(*ends);
+        let mask = hit.bitmask();
+        if mask == 0 {
+            return false;
+        }
+        for (lane, found) in numbers.iter_mut().enumerate() {
+            if mask >> lane & 1 == 1 {
+                *found = number;
             }
-            for (lane, found) in numbers.iter_mut().enumerate() {
-                if mask >> lane & 1 == 1 {
-                    *found = number;
-                }
-            }
-            best = Vec4::select(hit, spans.near, best);
-            best
-        });
-        (best, numbers)
+        }
+        *ends = Vec4::select(hit, spans.near, *ends);
+        true
     }
 
     /// Returns the distance at which one ray ends, and the number of the solid there.
@@ -103,6 +132,13 @@ impl World {
             (&self.surfaces[solid.surface], solid.coordinates(point, normal))
         };
         (surface, surface.color(u, v, width))
+    }
+
+    /// Removes the solids that are nearer than `clearance` to one of the points.
+    pub fn clear_away(self, points: &[Vec3], clearance: f32) -> Self {
+        let Self { mut solids, surfaces, ground, .. } = self;
+        solids.retain(|solid| points.iter().all(|&point| solid.distance(point) > clearance));
+        Self::new(solids, surfaces, ground)
     }
 
     /// Returns whether every solid and the ground are at least `clearance` away from a point.
