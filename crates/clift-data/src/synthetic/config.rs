@@ -95,6 +95,7 @@ impl Default for SyntheticConfig {
 }
 
 /// Returns whether serde skips the key: settings files from before it then compare equal.
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
 fn is_rooms(look: &Look) -> bool {
     *look == Look::Rooms
 }

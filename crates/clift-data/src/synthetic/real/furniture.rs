@@ -140,7 +140,7 @@ impl Builder {
         let (deep, high) = (self.dice.between(0.4, 0.65), self.dice.between(0.6, 1.0));
         let doors = self.dice.count(2, 5);
         let upper = self.dice.chance(0.45);
-        let rows = [Some([0.0, high]), upper.then(|| [high + 0.55, high + 1.2])];
+        let rows = [Some([0.0, high]), upper.then_some([high + 0.55, high + 1.2])];
         for (row, [low, high]) in rows.into_iter().flatten().enumerate() {
             let deep = if row == 0 { deep } else { 0.6 * deep };
             self.block(place, [-wide, wide], [low, high], [0.0, deep], metal);

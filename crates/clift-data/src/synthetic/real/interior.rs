@@ -81,11 +81,11 @@ impl Builder {
             let (place, long) = plan.side(side);
             let surface = if side == accent { other } else { finish.wall };
             let choice = self.dice.between(0.0, 1.0) + 0.15 * depth as f32;
-            let openings = if choice < 0.4 && depth < 2 {
+            let openings = if choice < 0.38 && depth < 2 {
                 let opening = self.passage(long, height);
                 self.neighbour(plan, side, opening, finish, depth, windows);
                 vec![opening]
-            } else if choice < 0.8 {
+            } else if choice < 0.7 {
                 self.windows(&place, long, height, finish, windows)
             } else {
                 Vec::new()

@@ -19,7 +19,7 @@ impl Builder {
             rate,
             seed: dice.bits(),
             grain,
-            grain_rate: dice.scale(0.4, 5.0),
+            grain_rate: dice.scale(0.4, 9.0),
             ..Surface::plain(colors[0])
         }
     }
@@ -56,7 +56,7 @@ impl Builder {
             _ => (Pattern::Plain, 1.0),
         };
         let third = if pattern == Pattern::Discs { third } else { base * self.dice.between(0.5, 1.1) };
-        let surface = self.patterned(pattern, [base, second, third], rate, 0.12);
+        let surface = self.patterned(pattern, [base, second, third], rate, 0.14);
         self.surface(surface)
     }
 
@@ -158,7 +158,7 @@ impl Builder {
 
     pub fn foliage(&mut self) -> usize {
         let [base, second] = [(); 2].map(|()| leaf(&mut self.dice));
-        let rate = self.dice.scale(3.0, 14.0);
+        let rate = self.dice.scale(5.0, 20.0);
         let pattern = Pattern::Clouds { gain: 0.9, sharp: 2.0 };
         let surface = self.patterned(pattern, [base * 0.3, second * 1.3, base], rate, 0.7);
         self.surface(surface)

@@ -53,7 +53,7 @@ pub(crate) fn wood(dice: &mut Dice) -> Vec3 {
 
 /// Samples a colour of leaves.
 pub(crate) fn leaf(dice: &mut Dice) -> Vec3 {
-    color(dice.between(0.18, 0.36), dice.between(0.25, 0.7), dice.between(0.2, 0.65))
+    color(dice.between(0.16, 0.34), dice.between(0.15, 0.55), dice.between(0.2, 0.7))
 }
 
 /// Samples a colour of stone, earth or concrete.

@@ -12,7 +12,9 @@ use crate::synthetic::tracing::solid::Rays;
 use crate::synthetic::tracing::world::{GROUND, SKY, World};
 
 /// Attempts to find a path on which the camera sees enough; afterwards the best one found counts.
-const ATTEMPTS: usize = 40;
+const ATTEMPTS: usize = 24;
+/// Score at which no better path is looked for.
+const GOOD: f32 = 0.85;
 /// Number of rays along each side of the views that check a path.
 const GLANCE: usize = 6;
 
@@ -59,7 +61,7 @@ impl Path {
             if score > best.0 {
                 best = (score, Some(path));
             }
-            if score >= 1.0 {
+            if score >= GOOD {
                 break;
             }
         }

@@ -47,6 +47,8 @@ struct Part {
     pixels: [(Vec3, f32, f32); 4],
 }
 
+const NOTHING: Part = Part { number: SKY, normal: Vec3::ZERO, pixels: [(Vec3::ZERO, 0.0, 0.0); 4] };
+
 /// The parts of a block: at most one per ray.
 struct Parts {
     parts: [Part; 16],
@@ -68,7 +70,7 @@ pub(crate) fn render(
     let per_row = (1.0 / intrinsics.fy) as f32;
     let slope = |column: usize, row: usize| Vec3::new((column as f32 - cx) * pixel, (row as f32 - cy) * per_row, 1.0);
     let mut rgb = vec![0; width * height * 3];
-    let mut ahead = Vec::new();
+    let (mut ahead, mut block) = (Vec::new(), Parts { parts: [NOTHING; 16], count: 0 });
     for top in (0..height).step_by(TILE) {
         for left in (0..width).step_by(TILE) {
             let corners =
@@ -79,7 +81,7 @@ pub(crate) fn render(
             for (left, top) in (0..TILE * TILE / 4).map(|at| (left + at % (TILE / 2) * 2, top + at / (TILE / 2) * 2)) {
                 let places = [0, 1, 2, 3].map(|index| (left + index % 2, top + index / 2));
                 let inside = |(column, row): (usize, usize)| column < width && row < height;
-                let mut block = Parts::new();
+                block.count = 0;
                 for (index, (column, row)) in places.into_iter().enumerate().filter(|&(_, place)| inside(place)) {
                     let x = (Vec4::splat(column as f32 - cx) + OFFSETS_X) * pixel;
                     let y = (Vec4::splat(row as f32 - cy) + OFFSETS_Y) * per_row;
@@ -98,11 +100,6 @@ pub(crate) fn render(
 }
 
 impl Parts {
-    fn new() -> Self {
-        let part = Part { number: SKY, normal: Vec3::ZERO, pixels: [(Vec3::ZERO, 0.0, 0.0); 4] };
-        Self { parts: [part; 16], count: 0 }
-    }
-
     /// Adds the ends of the four rays of a pixel.
     fn add(&mut self, world: &World, origin: Vec3, rays: &Rays, ends: (Vec4, [usize; 4]), pixel: usize) {
         let (distances, numbers) = ends;
@@ -115,7 +112,7 @@ impl Parts {
             };
             let same = |part: &Part| part.number == number && (number == SKY || part.normal.dot(normal) > SAME_NORMAL);
             let position = self.parts[..self.count].iter().position(same).unwrap_or_else(|| {
-                self.parts[self.count] = Part { number, normal, ..self.parts[15] };
+                self.parts[self.count] = Part { number, normal, ..NOTHING };
                 self.count += 1;
                 self.count - 1
             });
