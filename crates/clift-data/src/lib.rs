@@ -54,7 +54,7 @@ pub use sources::photos::image_cache::ImageCacheConfig;
 pub use sources::subset::SceneSubset;
 pub use sources::test_scenes::{KEPT_FOR_TESTING, TestScenes};
 pub use sources::training_frames::is_held_out;
-pub use synthetic::config::SyntheticConfig;
+pub use synthetic::config::{Look, SyntheticConfig};
 pub use synthetic::source::SyntheticSource;
 
 // Clips and batches.

@@ -19,10 +19,25 @@ pub enum LookDirection {
     Out,
 }
 
+/// Kind of synthetic scenes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Look {
+    /// Rooms with boxes and balls in plain patterns.
+    #[default]
+    Rooms,
+    /// Scenes with the statistics of photos: interiors, places outdoors, things; fields of view from 40 to 100 degrees.
+    Real,
+}
+
 /// Options of synthetic scenes. Lengths are in units of the scene; a default room is 3 to 4 units wide.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SyntheticConfig {
+    /// Kind of scenes: `"rooms"`, or `"real"`, which has the statistics of photos and samples all that the keys from
+    /// `fov_deg` on set for rooms.
+    #[serde(skip_serializing_if = "is_rooms")]
+    pub look: Look,
     /// Seed of all scenes. Different seeds share no scene.
     pub seed: u64,
     /// Split, `"train"` or `"test"`. The splits share no scene, for any seed.
@@ -59,6 +74,7 @@ pub struct SyntheticConfig {
 impl Default for SyntheticConfig {
     fn default() -> Self {
         Self {
+            look: Look::Rooms,
             seed: 0,
             split: Split::Train,
             num_scenes: 10_000,
@@ -76,6 +92,12 @@ impl Default for SyntheticConfig {
             samples_per_pixel: 4,
         }
     }
+}
+
+/// Returns whether serde skips the key: settings files from before it then compare equal.
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_rooms(look: &Look) -> bool {
+    *look == Look::Rooms
 }
 
 impl SyntheticConfig {
@@ -109,11 +131,33 @@ impl SyntheticConfig {
         ] {
             check_config((low..=high).contains(&value), key, || format!("is {value}; use {low} to {high}"))?;
         }
+        if self.look == Look::Real {
+            self.check_unset()?;
+        }
         let samples = self.samples_per_pixel;
         let is_square = samples.isqrt().pow(2) == samples;
         check_config((1..=256).contains(&samples) && is_square, "samples_per_pixel", || {
             format!("is {samples}; use a square number such as 1, 4, 9 or 16")
         })
+    }
+
+    /// Checks that no key is set that has a meaning for rooms only.
+    fn check_unset(&self) -> Result<(), DataError> {
+        let unset = Self::default();
+        for (key, is_unset) in [
+            ("fov_deg", self.fov_deg == unset.fov_deg),
+            ("room_half_size", self.room_half_size == unset.room_half_size),
+            ("num_objects", self.num_objects == unset.num_objects),
+            ("looks", self.looks == unset.looks),
+            ("path_length", self.path_length == unset.path_length),
+            ("texture_frequency", self.texture_frequency == unset.texture_frequency),
+            ("plain_share", self.plain_share == unset.plain_share),
+            ("specular", self.specular == unset.specular),
+            ("samples_per_pixel", self.samples_per_pixel == unset.samples_per_pixel),
+        ] {
+            check_config(is_unset, key, || "is set, but look = \"real\" does not use it; remove it".to_owned())?;
+        }
+        Ok(())
     }
 }
 
@@ -151,6 +195,15 @@ mod tests {
             let message = config.validate().unwrap_err().to_string();
             assert!(message.starts_with(expected), "{message}");
         }
+    }
+
+    #[test]
+    fn keys_of_rooms_are_refused_for_the_other_look() {
+        let real: SyntheticConfig = serde_json::from_str(r#"{"look": "real", "num_frames": 32}"#).unwrap();
+        real.validate().unwrap();
+        let message = SyntheticConfig { fov_deg: 60.0, ..real }.validate().unwrap_err().to_string();
+        assert!(message.starts_with("fov_deg is set, but look = \"real\" does not use it; remove it"), "{message}");
+        assert!(!serde_json::to_string(&SyntheticConfig::default()).unwrap().contains("\"look\""));
     }
 
     #[test]

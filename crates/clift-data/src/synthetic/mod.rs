@@ -5,11 +5,15 @@
 //! - `camera_path`: the camera's arc through a room
 //! - `texture`: procedural surface colours
 //! - `ray_tracer`: small deterministic ray tracer
+//! - `real`: scenes with the statistics of photos
+//! - `tracing`: solids, patterns and light of `real`
 //! - `source`: scenes from seeds as a source
 
 pub(crate) mod camera_path;
 pub(crate) mod config;
 pub(crate) mod ray_tracer;
+pub(crate) mod real;
 pub(crate) mod room;
 pub(crate) mod source;
 pub(crate) mod texture;
+pub(crate) mod tracing;

@@ -1,27 +1,42 @@
-//! Synthetic scenes from seeds: textured rooms with boxes and balls, ray traced on demand.
+//! Synthetic scenes from seeds, ray traced on demand.
 //!
 //! A scene is a pure function of (seed, split, index), a frame of (scene, frame). Unused scenes cost nothing, threads
 //! need no coordination, and cameras are exact.
 
-use std::sync::OnceLock;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use crate::error::DataError;
 use crate::geometry::camera::Camera;
 use crate::image::rgb_image::RgbImage;
 use crate::random::step_rng;
 use crate::scene_source::{SceneSource, Split};
-use crate::synthetic::config::SyntheticConfig;
+use crate::synthetic::config::{Look, SyntheticConfig};
 use crate::synthetic::ray_tracer;
+use crate::synthetic::real::scene::RealScene;
 use crate::synthetic::room::Room;
 
 /// Number of keys per block. The keys of a block are formatted together on first use.
 const KEYS_PER_BLOCK: usize = 1024;
 
-/// A source of synthetic scenes, rendered on demand. Keys are `synthetic-<seed>-<split>-<index>`.
+/// Number of scenes kept for their further frames: more than threads read clips at once.
+const KEPT_SCENES: usize = 16;
+
+/// A source of synthetic scenes, rendered on demand. Keys are `synthetic-<seed>-<split>-<index>`, and
+/// `synthetic-real-<seed>-<split>-<index>` for `look = "real"`.
 #[derive(Debug)]
 pub struct SyntheticSource {
     config: SyntheticConfig,
     key_blocks: Vec<OnceLock<Vec<String>>>,
+    /// Scenes that were read last, the newest at the end. A scene is a function of its number: what is kept changes no frame.
+    kept: Mutex<VecDeque<(usize, Arc<Scene>)>>,
+}
+
+/// A scene of either kind.
+#[derive(Debug, PartialEq)]
+enum Scene {
+    Room(Box<Room>),
+    Real(Box<RealScene>),
 }
 
 impl SyntheticSource {
@@ -32,7 +47,7 @@ impl SyntheticSource {
     pub fn new(config: SyntheticConfig) -> Result<Self, DataError> {
         config.validate()?;
         let num_blocks = config.num_scenes.div_ceil(KEYS_PER_BLOCK);
-        Ok(Self { config, key_blocks: (0..num_blocks).map(|_| OnceLock::new()).collect() })
+        Ok(Self { config, key_blocks: (0..num_blocks).map(|_| OnceLock::new()).collect(), kept: Mutex::default() })
     }
 
     /// Returns the options of the scenes.
@@ -41,25 +56,51 @@ impl SyntheticSource {
     }
 
     fn key_prefix(&self) -> String {
-        format!("synthetic-{}-{}-", self.config.seed, self.config.split)
+        let SyntheticConfig { look, seed, split, .. } = self.config;
+        let kind = if look == Look::Real { "real-" } else { "" };
+        format!("synthetic-{kind}{seed}-{split}-")
     }
 
-    fn room(&self, scene: usize) -> Result<Room, DataError> {
+    fn scene(&self, scene: usize) -> Result<Arc<Scene>, DataError> {
         let num_scenes = self.config.num_scenes;
         if scene >= num_scenes {
             return Err(DataError::NoSuchScene { scene, num_scenes });
         }
-        let purpose = match self.config.split {
-            Split::Train => "synthetic train scene",
-            Split::Test => "synthetic test scene",
-        };
-        let mut rng = step_rng(self.config.seed, scene as u64, purpose);
-        Ok(Room::sample(&mut rng, &self.config))
+        let kept = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, found)) = kept().iter().find(|(number, _)| *number == scene) {
+            return Ok(Arc::clone(found));
+        }
+        let made = Arc::new(self.sample(scene));
+        let mut kept = kept();
+        if kept.len() == KEPT_SCENES {
+            kept.pop_front();
+        }
+        kept.push_back((scene, Arc::clone(&made)));
+        Ok(made)
     }
 
-    fn camera(&self, room: &Room, frame: usize) -> Camera {
-        let time = frame as f64 / (self.config.num_frames - 1).max(1) as f64;
-        room.path.camera(time, self.config.fov_deg, self.config.width as f64 / self.config.height as f64)
+    fn sample(&self, scene: usize) -> Scene {
+        let purpose = match (self.config.look, self.config.split) {
+            (Look::Rooms, Split::Train) => "synthetic train scene",
+            (Look::Rooms, Split::Test) => "synthetic test scene",
+            (Look::Real, Split::Train) => "synthetic real train scene",
+            (Look::Real, Split::Test) => "synthetic real test scene",
+        };
+        let mut rng = step_rng(self.config.seed, scene as u64, purpose);
+        match self.config.look {
+            Look::Rooms => Scene::Room(Box::new(Room::sample(&mut rng, &self.config))),
+            Look::Real => Scene::Real(Box::new(RealScene::sample(rng))),
+        }
+    }
+
+    fn camera(&self, scene: &Scene, frame: usize) -> Camera {
+        let SyntheticConfig { num_frames, width, height, fov_deg, .. } = self.config;
+        let time = frame as f64 / (num_frames - 1).max(1) as f64;
+        let aspect = width as f64 / height as f64;
+        match scene {
+            Scene::Room(room) => room.path.camera(time, fov_deg, aspect),
+            Scene::Real(scene) => scene.camera(time, aspect, frame),
+        }
     }
 }
 
@@ -88,8 +129,8 @@ impl SceneSource for SyntheticSource {
     }
 
     fn cameras(&self, scene: usize) -> Result<Vec<Camera>, DataError> {
-        let room = self.room(scene)?;
-        Ok((0..self.config.num_frames).map(|frame| self.camera(&room, frame)).collect())
+        let scene = self.scene(scene)?;
+        Ok((0..self.config.num_frames).map(|frame| self.camera(&scene, frame)).collect())
     }
 
     fn image_size(&self, _scene: usize, _frame: usize) -> Result<[usize; 2], DataError> {
@@ -97,13 +138,18 @@ impl SceneSource for SyntheticSource {
     }
 
     fn frame(&self, scene: usize, frame: usize) -> Result<RgbImage, DataError> {
-        let room = self.room(scene)?;
+        let found = self.scene(scene)?;
         let SyntheticConfig { num_frames, width, height, samples_per_pixel, specular, .. } = self.config;
         if frame >= num_frames {
             return Err(DataError::NoSuchFrame { key: self.key(scene).to_owned(), frame, num_frames });
         }
-        let camera = self.camera(&room, frame);
-        Ok(ray_tracer::render(&room, &camera, width, height, samples_per_pixel.isqrt(), specular as f32))
+        let camera = self.camera(&found, frame);
+        Ok(match &*found {
+            Scene::Room(room) => {
+                ray_tracer::render(room, &camera, width, height, samples_per_pixel.isqrt(), specular as f32)
+            }
+            Scene::Real(scene) => scene.render(&camera, [width, height]),
+        })
     }
 }
 
@@ -112,6 +158,13 @@ mod tests {
     use super::*;
     use crate::synthetic::config::MAX_SCENES;
     use std::collections::BTreeSet;
+
+    fn real(change: impl FnOnce(&mut SyntheticConfig)) -> SyntheticSource {
+        source(|c| {
+            c.look = Look::Real;
+            change(c);
+        })
+    }
 
     fn source(change: impl FnOnce(&mut SyntheticConfig)) -> SyntheticSource {
         let mut config = SyntheticConfig::default();
@@ -131,16 +184,53 @@ mod tests {
     }
 
     #[test]
+    fn real_frames_depend_on_seed_and_position_alone() {
+        let first = real(|_| ()).frame(7, 3).unwrap();
+        // More scenes than are kept lie between the two reads.
+        let again = real(|c| c.num_scenes = 100);
+        for scene in (0..2 * KEPT_SCENES).rev() {
+            again.cameras(scene).unwrap();
+        }
+        assert_eq!(first, again.frame(7, 3).unwrap());
+        assert_eq!(first, again.frame(7, 3).unwrap());
+        assert_eq!(again.kept.lock().unwrap().len(), KEPT_SCENES);
+        for other in [real(|_| ()).frame(7, 4), real(|_| ()).frame(8, 3), real(|c| c.seed = 1).frame(7, 3)] {
+            assert_ne!(first, other.unwrap());
+        }
+        // Any size, odd ones too; the view is the same.
+        let wide = real(|c| (c.width, c.height) = (35, 21));
+        assert_eq!(wide.frame(7, 3).unwrap().rgb.len(), 35 * 21 * 3);
+        let (camera, square) = (wide.cameras(7).unwrap()[3], real(|_| ()).cameras(7).unwrap()[3]);
+        assert_eq!((camera.c2w, camera.intrinsics_norm.fx), (square.c2w, square.intrinsics_norm.fx));
+        let pixels = camera.intrinsics_norm.to_pixels(35, 21);
+        assert!((pixels.fx - pixels.fy).abs() < 1e-9);
+    }
+
+    #[test]
     fn splits_and_seeds_share_no_scene() {
-        let mut seen = Vec::new();
-        for split in [Split::Train, Split::Test] {
-            for seed in 0..3 {
-                let source = source(|c| (c.split, c.seed) = (split, seed));
-                seen.extend((0..100).map(|scene| source.room(scene).unwrap()));
+        let scenes = |look, count| {
+            let mut seen = Vec::new();
+            for split in [Split::Train, Split::Test] {
+                for seed in 0..3 {
+                    let source = source(|c| (c.look, c.split, c.seed) = (look, split, seed));
+                    seen.extend((0..count).map(|scene| source.sample(scene)));
+                }
+            }
+            seen
+        };
+        let seen = scenes(Look::Rooms, 100);
+        for (i, scene) in seen.iter().enumerate() {
+            let Scene::Room(room) = scene else { panic!("not a room") };
+            for other in &seen[i + 1..] {
+                assert!(matches!(other, Scene::Room(other) if other.path != room.path && other.walls != room.walls));
             }
         }
+        let seen = scenes(Look::Real, 20);
         for (i, scene) in seen.iter().enumerate() {
-            assert!(seen[i + 1..].iter().all(|other| other.path != scene.path && other.walls != scene.walls));
+            let Scene::Real(real) = scene else { panic!("not a scene of look real") };
+            for other in &seen[i + 1..] {
+                assert!(matches!(other, Scene::Real(other) if other.shares_nothing_with(real)));
+            }
         }
     }
 
@@ -150,6 +240,9 @@ mod tests {
         let keys: BTreeSet<&str> = (0..3_000).map(|scene| source.key(scene)).collect();
         assert_eq!(keys.len(), 3_000);
         assert_eq!(source.key(42), "synthetic-7-train-00042");
+        let real = real(|c| (c.seed, c.split) = (7, Split::Test));
+        assert_eq!(real.key(42), "synthetic-real-7-test-00042");
+        assert_eq!((real.find(real.key(42)), real.find("synthetic-7-test-00042")), (Some(42), None));
         assert!((0..3_000).all(|scene| source.find(source.key(scene)) == Some(scene)));
         for wrong in
             ["synthetic-7-train-03000", "synthetic-7-train-42", "synthetic-7-test-00042", "synthetic-7-train-+0042", ""]

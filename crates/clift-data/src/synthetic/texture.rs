@@ -71,7 +71,7 @@ fn soft_edge(wave: f32) -> f32 {
 }
 
 /// Converts hue (in turns), saturation and value to a linear colour, for a display gamma of 2.
-fn linear_color(hue: f64, saturation: f64, value: f64) -> Vec3 {
+pub(crate) fn linear_color(hue: f64, saturation: f64, value: f64) -> Vec3 {
     let channels = [0.0, 2.0 / 3.0, 1.0 / 3.0].map(|offset: f64| {
         let distance = ((hue + offset).rem_euclid(1.0) * 6.0 - 3.0).abs() - 1.0;
         let shade = value * (1.0 - saturation * (1.0 - distance.clamp(0.0, 1.0)));

@@ -13,7 +13,7 @@ use crate::commands::data::synth::SynthArgs;
 pub enum DataCommand {
     /// Create synthetic scenes as RealEstate10K-style chunks
     ///
-    /// Ray-traced rooms with exact cameras are written to OUT/train and OUT/test as NNNNNN.torch files, which
+    /// Ray-traced scenes with exact cameras are written to OUT/train and OUT/test as NNNNNN.torch files, which
     /// `torch.load` reads too, with an index.json per folder. The test split also gets `OUT/evaluation_index.json`, for
     /// `clift eval --index`. The command prints the config section that trains on these scenes.
     #[command(after_help = "\
@@ -22,9 +22,11 @@ Examples:
   clift data synth /data/rooms --scenes 2000 --frames 24 --size 64x64 --seed 7
   clift data synth /data/rooms --split test --scenes 50 --quality 95
   clift data synth /data/rooms --set specular=0.8 --set 'num_objects=[4, 8]'
+  clift data synth /data/real --look real --frames 32 --size 64x64
 
-Keys of --set, as in [data.synthetic] of a config: fov_deg, room_half_size,
-num_objects, path_length, texture_frequency, specular, samples_per_pixel.")]
+Keys of --set for rooms, as in [data.synthetic] of a config: fov_deg,
+room_half_size, num_objects, path_length, texture_frequency, specular,
+samples_per_pixel.")]
     Synth(SynthArgs),
     /// Describe a data set, a config's use of it, or an evaluation index
     ///

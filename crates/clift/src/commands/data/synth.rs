@@ -85,6 +85,7 @@ fn config(args: &SynthArgs) -> anyhow::Result<SyntheticConfig> {
     let options = [("num_frames", args.frames), ("width", width), ("height", height)];
     let options = options.into_iter().filter_map(|(key, value)| Some(format!("{key}={}", value?)));
     let mut overrides = vec![format!("num_scenes={}", args.scenes.unwrap_or(DEFAULT_SCENES))];
+    overrides.extend(args.look.as_ref().map(|look| format!("look=\"{look}\"")));
     overrides.extend(options);
     overrides.extend(args.seed.map(|seed| format!("seed={seed}")));
     overrides.extend(args.set.iter().cloned());
@@ -203,6 +204,9 @@ num_targets = 3{eval}"
 pub struct SynthArgs {
     /// Output folder: new, or with only the other split, of the same size
     pub out: PathBuf,
+    /// Kind of scenes: plain rooms, or scenes with the statistics of photos
+    #[arg(long, value_parser = ["rooms", "real"])]
+    pub look: Option<String>,
     /// Scenes of each split [default: 100]
     #[arg(long, value_name = "N")]
     pub scenes: Option<usize>,
@@ -227,7 +231,7 @@ pub struct SynthArgs {
 
 #[cfg(test)]
 mod tests {
-    use clift_data::{ImageEncoding, even_views};
+    use clift_data::{ImageEncoding, Look, even_views};
     use clift_train::Config;
 
     use super::*;
@@ -243,6 +247,16 @@ mod tests {
         let line = "synth out --scenes 3 --size 16x8 --set width=24 --set specular=0.9";
         let config = config(&<Parsed as clap::Parser>::parse_from(line.split(' ')).synth).unwrap();
         assert_eq!((config.num_scenes, config.width, config.height, config.specular), (3, 24, 8, 0.9));
+    }
+
+    #[test]
+    fn look_is_a_key_of_the_scenes() {
+        let config = |line: &str| config(&<Parsed as clap::Parser>::parse_from(line.split(' ')).synth);
+        assert_eq!(config("synth out").unwrap().look, Look::Rooms);
+        assert_eq!(config("synth out --look real --size 16x8").unwrap().look, Look::Real);
+        let error = config("synth out --look real --set fov_deg=50").unwrap_err();
+        assert_eq!(crate::exit_code::exit_code(&error), crate::exit_code::USAGE);
+        assert!(error.to_string().contains("look = \"real\" does not use it"), "{error}");
     }
 
     #[test]
