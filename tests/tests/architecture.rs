@@ -9,7 +9,7 @@ type Crate = (&'static str, &'static str, &'static str);
 
 const CRATES: [Crate; 8] = [
     ("clift-kernels", "", "simd primitives attention cluster_attention gelu head_transform layer_norm linear"),
-    ("clift-model", "clift-kernels", "error names files device ops views tokens network cost weights scene"),
+    ("clift-model", "clift-kernels", "error names files device ops views tokens network cost weights codec scene"),
     (
         "clift-data",
         "",
