@@ -1,6 +1,8 @@
 //! The codec of a model: tokens to words and back.
 // N patches of the context views, S tokens, D width
 
+use std::path::Path;
+
 use crate::codec::entropy::{Decoder, Encoder, decode_ids, encode_ids};
 use crate::codec::file::codec_hash;
 use crate::codec::histogram::Distributions;
@@ -10,6 +12,7 @@ use crate::codec::transform::Transform;
 use crate::error::ModelError;
 use crate::network::config::ModelConfig;
 use crate::tokens::kind::TokenKind;
+use crate::weights::trained_model::TrainedModel;
 
 /// Squared steps that a bit is worth: the slope of distortion against rate of a fine uniform quantizer, `2 ln 2 / 12`.
 const BIT_VALUE: f32 = 0.1155;
@@ -58,6 +61,23 @@ impl TokenCodec {
             Self { model, kind, renderer_hash, transform, distributions, rates: rates.new()?, hash: String::new() };
         codec.hash = codec_hash(&codec)?;
         Ok(codec)
+    }
+
+    /// Reads the codec beside the weights of a model; `None` without a codec.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read), and [`ModelError::CodecFile`] for a codec of other weights.
+    pub fn beside(weights: &Path, model: &TrainedModel) -> Result<Option<Self>, ModelError> {
+        let path = Self::path_of(weights);
+        if !path.exists() {
+            return Ok(None);
+        }
+        let codec = Self::read(&path)?;
+        if codec.renderer_hash == model.renderer_hash() {
+            return Ok(Some(codec));
+        }
+        let reason = "the codec was fitted to other weights".into();
+        Err(ModelError::CodecFile { action: "reading", reason, path })
     }
 
     /// Rounds tokens `[S, D]` to coefficients of whole `step`s, as writing and reading a file does.

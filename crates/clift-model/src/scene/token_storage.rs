@@ -42,6 +42,12 @@ impl Default for CodedLoss {
 }
 
 impl TokenStorage {
+    /// Plain 32-bit floats.
+    pub const F32: Self = Self::Plain(TokenFormat::F32);
+    /// Plain 16-bit floats.
+    pub const F16: Self = Self::Plain(TokenFormat::F16);
+    /// Plain 8-bit integers.
+    pub const INT8: Self = Self::Plain(TokenFormat::Int8);
     /// The names for messages and help texts.
     pub const NAMES: &str = "f32, f16, int8, coded, coded-DB";
 }
