@@ -19,7 +19,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift-eval",
         "clift-kernels clift-model clift-data",
-        "error system config metrics upload statistics encode sweep figures report evaluator",
+        "error system config metrics upload statistics encode sweep figures report evaluator codec",
     ),
     (
         "clift-train",
