@@ -25,9 +25,14 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 const MAX_BASIS_ERROR: f32 = 1e-3;
 
 impl TokenCodec {
-    /// Returns the path of the codec of a weight file. The file need not exist.
+    /// Returns the path of the codec of a weight file: `codec*.safetensors` beside `model*.safetensors`,
+    /// `NAME.codec.safetensors` beside another file. The file need not exist.
     pub fn path_of(weights: &Path) -> PathBuf {
-        weights.with_file_name("codec.safetensors")
+        let name = weights.file_name().unwrap_or_default().to_string_lossy();
+        match name.strip_prefix("model").filter(|rest| rest.ends_with(".safetensors")) {
+            Some(rest) => weights.with_file_name(format!("codec{rest}")),
+            None => weights.with_extension("codec.safetensors"),
+        }
     }
 
     /// Writes the codec.

@@ -143,11 +143,11 @@ impl<'a> Validation<'a> {
 }
 
 /// Reports the progress of an evaluation as events of a run.
-struct EvalEvents<'a> {
-    stop: &'a AtomicBool,
-    sink: &'a mut dyn Sink,
+pub(crate) struct EvalEvents<'a> {
+    pub stop: &'a AtomicBool,
+    pub sink: &'a mut dyn Sink,
     /// Whether scenes are counted: in an evaluation, not in a validation.
-    is_stage: bool,
+    pub is_stage: bool,
 }
 
 impl Progress for EvalEvents<'_> {
