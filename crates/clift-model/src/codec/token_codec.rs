@@ -108,7 +108,10 @@ impl TokenCodec {
     }
 
     /// Encodes tokens `[S, D]` of ascending `ids`, patches below `num_patches`.
-    pub(crate) fn encode(
+    ///
+    /// # Errors
+    /// As [`round`](Self::round).
+    pub fn encode(
         &self,
         tokens: &[f32],
         ids: &[u32],
@@ -125,8 +128,20 @@ impl TokenCodec {
     /// Decodes tokens and their ids, which may be damaged or hostile: memory is bounded by the number of words.
     ///
     /// # Errors
-    /// The problem of the words.
-    pub(crate) fn decode(
+    /// [`ModelError::BadConfig`] for words that no encoder writes.
+    pub fn decode(
+        &self,
+        words: Vec<u32>,
+        num_tokens: usize,
+        num_patches: usize,
+        step: f32,
+    ) -> Result<(Vec<u32>, Vec<f32>), ModelError> {
+        let decoded = self.decode_words(words, num_tokens, num_patches, step);
+        decoded.map_err(|fix| ModelError::BadConfig { key: "tokens", value: "coded".into(), fix })
+    }
+
+    /// As [`decode`](Self::decode). Errors name the problem of the words.
+    pub(crate) fn decode_words(
         &self,
         words: Vec<u32>,
         num_tokens: usize,
@@ -212,3 +227,6 @@ fn cheapest_level(value: f32, table: &Table) -> i32 {
     let smaller = nearest - nearest.signum();
     if cost(smaller) < cost(nearest) { smaller } else { nearest }
 }
+
+#[cfg(test)]
+pub(crate) mod tests;

@@ -146,7 +146,7 @@ pub(crate) fn from_coded_bytes(
         scene.context_frames.push(u32::from_le_bytes(view.as_chunks::<4>().0[16]));
     }
     let num_patches = scene.check_views()?;
-    (scene.token_ids, scene.tokens) = codec.decode(words, num_tokens, num_patches, step)?;
+    (scene.token_ids, scene.tokens) = codec.decode_words(words, num_tokens, num_patches, step)?;
     scene.check()?;
     Ok((scene, step))
 }
@@ -158,3 +158,6 @@ fn pose(rows: impl Iterator<Item = f64>) -> [f64; 16] {
     pose[15] = 1.0;
     pose
 }
+
+#[cfg(test)]
+mod tests;
