@@ -144,7 +144,7 @@ fn compare_results(case: BenchCase, context: &BenchContext) -> Result<PrecisionR
     let batch = micro_batch(context, stage)?;
     let results = [Precision::F32, Precision::F16].map(|precision| -> Result<_, TrainError> {
         let _scope = precision.scope();
-        let device_batch = DeviceBatch::upload(&batch, &context.device.clone().autodiff())?;
+        let device_batch = DeviceBatch::upload(&batch.clips, &context.device.clone().autodiff())?;
         let (loss, grads) = gradients(&model, &batch, device_batch)?;
         let factor = loss_factor();
         Ok((loss, flat_gradient(&model, &grads).into_iter().map(|value| value / factor).collect::<Vec<_>>()))

@@ -86,6 +86,30 @@ pub enum DataError {
         /// Camera file or image file.
         path: PathBuf,
     },
+    /// The end of an image file is missing.
+    #[error("bad scene: the image is truncated: its {num_bytes} bytes have no end marker: {path}", path = path.display())]
+    TruncatedImage {
+        /// Bytes of the file.
+        num_bytes: u64,
+        /// Image file.
+        path: PathBuf,
+    },
+    /// An image has another aspect ratio than its camera.
+    #[error(
+        "bad scene: the image is {width}x{height}, aspect ratio {:.3}, but its camera has {camera_aspect:.3}; the image may \
+         have been rotated or cropped after the calibration: {path}",
+        *width as f64 / *height as f64, path = path.display()
+    )]
+    WrongAspect {
+        /// Columns of the image.
+        width: usize,
+        /// Rows of the image.
+        height: usize,
+        /// Aspect ratio of the camera.
+        camera_aspect: f64,
+        /// Image file.
+        path: PathBuf,
+    },
     /// A file of camera poses is malformed.
     #[error("bad poses: {what}: {path}", path = path.display())]
     BadPoses {

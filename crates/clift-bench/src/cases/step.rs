@@ -146,10 +146,10 @@ pub(crate) fn update_error(
             }
         }
     }
-    let (loss, result) = gradients(model, batch, DeviceBatch::upload(batch, &device.clone().autodiff())?)?;
+    let (loss, result) = gradients(model, batch, DeviceBatch::upload(&batch.clips, &device.clone().autodiff())?)?;
     let copy = module_in_f64(model, reference).train();
     let reference = reference.clone().autodiff();
-    let device_batch = DeviceBatch::upload(batch, &reference)?.in_f64(&reference);
+    let device_batch = DeviceBatch::upload(&batch.clips, &reference)?.in_f64(&reference);
     let (expected, reference) = gradients(&copy, batch, device_batch)?;
     let mut pairs = Pairs { result: &result, reference: &reference, found: Vec::new() };
     model.visit(&mut pairs);

@@ -130,7 +130,7 @@ pub fn update_rates(config: &Config, stage: Stage, typical: &TypicalStep) -> Res
         context.sync()?;
         Ok(state)
     })?;
-    let device_batch = DeviceBatch::upload(&batch, &state.device)?;
+    let device_batch = DeviceBatch::upload(&batch.clips, &state.device)?;
     let mut optimizer_s = f64::INFINITY;
     for _ in 0..REPEATS[0] {
         let loss = render_loss(&state.model, &device_batch, &batch.tokens, &state.loss)?.total;

@@ -136,8 +136,7 @@ pub(crate) fn check_end(path: &Path, limit: u64) -> Result<(), DataError> {
     if has_end(&bytes, image::guess_format(&bytes).unwrap_or(ImageFormat::Jpeg)) {
         return Ok(());
     }
-    let what = format!("the image is truncated: its {num_bytes} bytes have no end marker");
-    Err(DataError::BadScene { what, path: path.to_owned() })
+    Err(DataError::TruncatedImage { num_bytes, path: path.to_owned() })
 }
 
 /// Returns whether the JPEG data has its end marker. The decoder fills the missing part of a truncated JPEG with gray.

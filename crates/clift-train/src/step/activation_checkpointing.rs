@@ -179,7 +179,7 @@ mod tests {
             ..ModelConfig::default()
         };
         let model = freeze(stage, seeded_model(&config, 3, device));
-        let device_batch = DeviceBatch::upload(batch, &device.clone().autodiff()).expect("valid");
+        let device_batch = DeviceBatch::upload(&batch.clips, &device.clone().autodiff()).expect("valid");
         let plain_loss = render_loss(&model, &device_batch, &batch.tokens, loss).expect("valid").total;
         let plain = GradientsParams::from_grads(plain_loss.clone().mul_scalar(0.5).backward(), &model);
         let mut accumulator = GradientsAccumulator::new();

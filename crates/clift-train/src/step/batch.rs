@@ -29,8 +29,8 @@ pub enum TokenSelection {
 }
 
 impl StageBatch {
-    /// Splits the batch into `count` micro-batches of nearly equal size.
-    pub(crate) fn parts(&self, count: usize) -> impl Iterator<Item = Self> + '_ {
+    /// Splits the batch into `count` micro-batches of nearly equal size: clips and tokens.
+    pub(crate) fn parts(&self, count: usize) -> impl Iterator<Item = (&[Clip], TokenSelection)> {
         let batch_size = self.clips.len();
         (0..count).map(move |part| {
             let range = part * batch_size / count..(part + 1) * batch_size / count;
@@ -39,7 +39,7 @@ impl StageBatch {
                 TokenSelection::All => TokenSelection::All,
                 TokenSelection::Clusters(clusters) => TokenSelection::Clusters(clusters[range.clone()].to_vec()),
             };
-            Self { clips: self.clips[range].to_vec(), tokens, skipped: Vec::new() }
+            (&self.clips[range], tokens)
         })
     }
 }

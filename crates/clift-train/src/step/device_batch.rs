@@ -2,11 +2,12 @@
 // B scenes, T target views, N tokens, D width
 
 use burn::tensor::{Device, Tensor};
+use clift_data::Clip;
 use clift_eval::{upload_cameras, upload_images, upload_views};
 use clift_model::{Cameras, Clift, SceneModel, Views};
 
 use crate::error::TrainError;
-use crate::step::batch::{StageBatch, TokenSelection};
+use crate::step::batch::TokenSelection;
 use crate::step::loss::{Loss, LossParts};
 
 /// The views of a batch on a device.
@@ -20,13 +21,13 @@ pub struct DeviceBatch {
 }
 
 impl DeviceBatch {
-    /// Copies the views of a batch to a device.
+    /// Copies the views of clips to a device.
     ///
     /// # Errors
     /// Those of [`upload_views`] for views of different sizes.
-    pub fn upload(batch: &StageBatch, device: &Device) -> Result<Self, TrainError> {
-        let contexts: Vec<_> = batch.clips.iter().map(|clip| &clip.context).collect();
-        let targets: Vec<_> = batch.clips.iter().map(|clip| &clip.target).collect();
+    pub fn upload(clips: &[Clip], device: &Device) -> Result<Self, TrainError> {
+        let contexts: Vec<_> = clips.iter().map(|clip| &clip.context).collect();
+        let targets: Vec<_> = clips.iter().map(|clip| &clip.target).collect();
         Ok(Self {
             context: upload_views(&contexts, device)?,
             targets: upload_cameras(&targets, device)?,

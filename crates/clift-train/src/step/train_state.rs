@@ -85,20 +85,20 @@ impl TrainState {
         let factor = loss_scale.map_or(1.0, |scale| scale.factor());
         let mut accumulator = GradientsAccumulator::<Clift>::new();
         let mut read = HostReads::default();
-        for part in batch.parts(accumulate) {
-            let share = part.clips.len() as f64 / batch.clips.len() as f64;
-            let device_batch = DeviceBatch::upload(&part, &device)?;
+        for (clips, tokens) in batch.parts(accumulate) {
+            let share = clips.len() as f64 / batch.clips.len() as f64;
+            let device_batch = DeviceBatch::upload(clips, &device)?;
             let parts = if activation_checkpointing {
                 activation_checkpointing::backward(
                     &model,
                     &device_batch,
-                    &part.tokens,
+                    &tokens,
                     &loss,
                     share * factor,
                     &mut accumulator,
                 )?
             } else {
-                let LossParts { total, mse } = render_loss(&model, &device_batch, &part.tokens, &loss)?;
+                let LossParts { total, mse } = render_loss(&model, &device_batch, &tokens, &loss)?;
                 let grads = total.clone().mul_scalar(share * factor).backward();
                 accumulator.accumulate(&model, GradientsParams::from_grads(grads, &model));
                 LossParts { total: total.inner(), mse: mse.inner() }

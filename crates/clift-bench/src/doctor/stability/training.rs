@@ -41,7 +41,7 @@ fn losses(mut model: Clift, batch: &StageBatch, device: &Device, in_f64: bool) -
     let device = device.clone().autodiff();
     let mut losses = Vec::new();
     for _ in 0..STEPS {
-        let device_batch = DeviceBatch::upload(batch, &device)?;
+        let device_batch = DeviceBatch::upload(&batch.clips, &device)?;
         let device_batch = if in_f64 { device_batch.in_f64(&device) } else { device_batch };
         let loss = render_loss(&model, &device_batch, &batch.tokens, &Loss::default())?.total;
         losses.push(values(loss.clone().inner())[0]);

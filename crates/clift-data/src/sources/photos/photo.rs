@@ -142,11 +142,7 @@ impl Photo {
         if tag.to_exif() >= 5 && fits(1.0 / shape) {
             return Ok(tag);
         }
-        let what = format!(
-            "the image is {width}x{height}, aspect ratio {shape:.3}, but its camera has {expected:.3}; the image may have \
-             been rotated or cropped after the calibration"
-        );
-        Err(DataError::BadScene { what, path: self.path.clone() })
+        Err(DataError::WrongAspect { width, height, camera_aspect: expected, path: self.path.clone() })
     }
 }
 

@@ -183,10 +183,8 @@ fn examine(folder: &SceneFolder, options: &PhotoSourceOptions) -> Result<Finding
             Err(error) => {
                 let name = photo.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 let reason = match &error {
-                    DataError::BadScene { what, .. } if what.contains("rotated or cropped") => {
-                        "whose image has another aspect ratio than its camera"
-                    }
-                    DataError::BadScene { what, .. } if what.contains("truncated") => "whose image is truncated",
+                    DataError::WrongAspect { .. } => "whose image has another aspect ratio than its camera",
+                    DataError::TruncatedImage { .. } => "whose image is truncated",
                     _ => "whose image cannot be read",
                 };
                 missing.push(MissingPhoto { name, reason: reason.into() });
