@@ -1,9 +1,9 @@
 """Decodes a scene file with coded tokens (version 3), as docs/reference/files.md describes it.
 
-usage: decode_scene.py SCENE.clift CODEC.safetensors [REFERENCE.npy]
+usage: decode_scene.py SCENE.clift CODEC.safetensors [--write FILE | --check FILE]
 
-Prints the shape of the tokens and their patches; with a reference, compares tokens `[tokens, dim]` and exits with 1 if any
-differs by more than 1e-4 of the largest.
+Prints the shape of the tokens and their patches. `--write` writes the tokens as 32-bit floats; `--check` compares them with
+such a file and exits with 1 if any differs by more than 1e-5 of the largest.
 """
 
 import json
@@ -96,8 +96,9 @@ def decode(scene_path, codec_path):
 if __name__ == "__main__":
     ids, tokens = decode(*sys.argv[1:3])
     print(f"{tokens.shape[0]} tokens of width {tokens.shape[1]}, patches {ids[:8]} ..")
-    if len(sys.argv) > 3:
-        reference = np.load(sys.argv[3])
-        error = np.abs(tokens - reference).max() / np.abs(reference).max()
+    if sys.argv[3:4] == ["--write"]:
+        tokens.astype("<f4").tofile(sys.argv[4])
+    elif sys.argv[3:4] == ["--check"]:
+        error = np.abs(tokens - np.fromfile(sys.argv[4], "<f4").reshape(tokens.shape)).max() / np.abs(tokens).max()
         print(f"largest difference: {error:.1e} of the largest value")
-        sys.exit(error > 1e-4)
+        sys.exit(error > 1e-5)

@@ -104,7 +104,7 @@ pub use weights::trained_model::TrainedModel;
 // The coder of tokens in scene files
 pub use codec::histogram::{Distributions, Histograms};
 pub use codec::rates::RateTable;
-pub use codec::token_codec::TokenCodec;
+pub use codec::token_codec::{LevelCounts, TokenCodec};
 pub use codec::transform::{Moments, Transform};
 // Scene files, and rendering from them
 pub use scene::check::MAX_SIDE_PX;

@@ -112,7 +112,7 @@ Examples:
     /// weights and prints the losses.
     #[command(after_help = "\
 Examples:
-  clift codec runs/tiny
+  clift codec runs/tiny --force
   clift codec models/re10k /data/re10k --set eval.num_context=4")]
     Codec(CodecArgs),
     /// Render a scene file along a camera path

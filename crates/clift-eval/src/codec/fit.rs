@@ -1,12 +1,16 @@
-//! Fits the token codec of a model on training scenes: the transform on second moments, the distributions in a second pass,
-//! then bits and loss of every count and step on renderings.
+//! Fits the token codec of a model on training scenes: the transform on second moments and on how much renderings change
+//! with every direction, the distributions in a second pass, then bits and loss of every count and step on renderings.
 // N encoder tokens, S stored tokens, D width
 
+use std::ops::Range;
+
 use burn::tensor::Tensor;
-use clift_data::{Clip, ClipReader, EvaluationItem, derive_seed, mean};
+use clift_data::{Clip, ClipReader, EvaluationItem, derive_seed, item_rng, mean};
 use clift_model::{
-    Histograms, KMeans, Moments, RateTable, SceneModel, TokenCodec, TokenCount, TokenKind, Tokens, TrainedModel,
+    Cameras, Histograms, KMeans, LevelCounts, Moments, RateTable, SceneModel, TokenCodec, TokenCount, TokenKind,
+    Tokens, TrainedModel, Transform,
 };
+use rand::RngExt;
 
 use crate::error::EvalError;
 use crate::evaluator::evaluator::Progress;
@@ -18,7 +22,12 @@ const MAX_FITTED_SCENES: usize = 64;
 /// Most scenes whose renderings are measured, with every count and step.
 const MAX_MEASURED_SCENES: usize = 8;
 /// Measured steps, as factors of the root mean square deviation of a value.
-const STEPS: [f64; 6] = [0.125, 0.25, 0.5, 1.0, 2.0, 4.0];
+const STEPS: [f64; 6] = [0.0625, 0.125, 0.25, 0.5, 1.0, 2.0];
+/// Variance of the noise whose effect on renderings is measured, as a factor of the mean variance of a value; a token has
+/// this much, along few directions.
+const NOISE: f64 = 2.0;
+/// Least weight of a direction, squared, as a share of the largest.
+const MIN_WEIGHT: f64 = 1e-4;
 /// Mean squared error that an exact rendering counts as: 100 dB.
 const MIN_ERROR: f64 = 1e-10;
 
@@ -61,7 +70,7 @@ pub fn fit_codec(
 ) -> Result<FittedCodec, EvalError> {
     let num_fitted = items.len().min(MAX_FITTED_SCENES);
     let measured = &items[..items.len().min(MAX_MEASURED_SCENES)];
-    let total = 2 * num_fitted + measured.len();
+    let total = 2 * (num_fitted + measured.len());
     let mut fit = Fit { model, reader, options, progress, done: 0, total };
     fit.progress.done(0, total);
 
@@ -76,15 +85,21 @@ pub fn fit_codec(
     if num_scenes == 0 {
         return Err(EvalError::NoScenes { reason: "no training scene for the token codec is readable".into() });
     }
-    let transform = moments.transform();
+    let mut transform = moments.transform();
+    let mut effects = vec![Vec::new(); direction_groups(model.config.dim).len()];
+    for (i, item) in measured.iter().enumerate() {
+        if let Some(clip) = fit.read(item)? {
+            fit.add_effects(&clip, i, &transform, &mut effects)?;
+        }
+    }
+    transform.weigh(&direction_weights(model.config.dim, &effects));
     let mut histograms = Histograms::new(model.config.dim);
     for (i, item) in items[..num_fitted].iter().enumerate() {
         if let Some(clip) = fit.read(item)? {
             histograms.add(&transform, &fit.tokens(&clip, i)?);
         }
     }
-    let variances: Vec<f64> = transform.deviations.iter().map(|&deviation| f64::from(deviation).powi(2)).collect();
-    let deviation = mean(&variances).unwrap_or_default().sqrt();
+    let deviation = mean_variance(&transform).sqrt();
     let steps: Vec<f64> = STEPS.iter().map(|factor| factor * deviation).collect();
 
     let kind = if model.has_condenser { TokenKind::Clift } else { TokenKind::Kmeans };
@@ -105,7 +120,9 @@ pub fn fit_codec(
     }
     let table = rates.table()?;
     let codec = TokenCodec::new(network, codec.transform, codec.distributions, table)?;
-    let Measured { totals: stream_and_entropy_bits, num_values, .. } = rates;
+    let Measured { stream_bits, levels, num_values, .. } = rates;
+    let entropies = levels.iter().map(LevelCounts::entropy_bits);
+    let stream_and_entropy_bits = stream_bits.into_iter().zip(entropies).map(<[f64; 2]>::from).collect();
     Ok(FittedCodec { codec, stream_and_entropy_bits, num_values, num_scenes })
 }
 
@@ -144,7 +161,9 @@ impl Fit<'_> {
     fn stored(&self, lift: &Tokens, count: TokenCount, clip: &Clip) -> Result<Tokens, EvalError> {
         let [_, num_tokens, _] = lift.dims();
         let seed = derive_seed(self.options.seed, &clip.key);
-        let fit = self.options.kmeans.fit(lift.values.clone(), count.of(num_tokens)?, &[seed])?;
+        // A scene of fewer tokens stores all of them.
+        let count = count.of(num_tokens).unwrap_or(num_tokens);
+        let fit = self.options.kmeans.fit(lift.values.clone(), count, &[seed])?;
         let clusters = fit.clusters.upload(&self.model.device);
         Ok(if self.model.has_condenser {
             self.model.network.compress(lift.clone(), &clusters)
@@ -153,16 +172,50 @@ impl Fit<'_> {
         })
     }
 
+    /// Renders the targets of a clip, `[V, height, width, 3]`.
+    fn render(&self, tokens: Tokens, cameras: &Cameras) -> Result<Vec<f32>, EvalError> {
+        let images: Tensor<5> = self.model.network.render(tokens, cameras); // [1, V, H, W, 3]
+        images.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
+    }
+
+    /// Adds the mean squared change of renderings of a scene, at one of the counts, by noise along each group of directions.
+    fn add_effects(
+        &self,
+        clip: &Clip,
+        index: usize,
+        transform: &Transform,
+        effects: &mut [Vec<f64>],
+    ) -> Result<(), EvalError> {
+        let device = &self.model.device;
+        let lift = self.model.network.encode(&upload_views(&[&clip.context], device)?);
+        let cameras = upload_cameras(&[&clip.target], device)?;
+        let tokens = self.stored(&lift, self.options.counts[index % self.options.counts.len()], clip)?;
+        let (values, exact) = (host_values(&tokens)?, self.render(tokens.clone(), &cameras)?);
+        let dim = transform.mean.len();
+        let mut rng = item_rng(self.options.seed, index as u64, 0, 0, "codec noise");
+        for (group, effects) in direction_groups(dim).into_iter().zip(effects) {
+            let deviation = (NOISE * mean_variance(transform) / group.len() as f64).sqrt();
+            let mut noisy = values.clone();
+            for token in noisy.chunks_exact_mut(dim) {
+                for direction in group.clone() {
+                    // Even noise, of this deviation.
+                    let noise = (rng.random_range(-1.0..1.0) * deviation * 3.0_f64.sqrt()) as f32;
+                    token.iter_mut().zip(transform.direction(direction)).for_each(|(value, x)| *value += noise * x);
+                }
+            }
+            let changed = self.render(with_values(tokens.clone(), noisy), &cameras)?;
+            effects.push(view_errors(&changed, &exact, exact.len())[0]);
+        }
+        Ok(())
+    }
+
     /// Adds bits and losses of a scene at every count and step.
     fn measure(&self, clip: &Clip, codec: &TokenCodec, rates: &mut Measured) -> Result<(), EvalError> {
         let device = &self.model.device;
         let lift = self.model.network.encode(&upload_views(&[&clip.context], device)?);
         let cameras = upload_cameras(&[&clip.target], device)?;
         let truth: Vec<f32> = clip.target.images.iter().map(|&value| f32::from(value) / 255.0).collect();
-        let render = |tokens: Tokens| -> Result<Vec<f32>, EvalError> {
-            let images: Tensor<5> = self.model.network.render(tokens, &cameras); // [1, V, H, W, 3]
-            images.into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
-        };
+        let render = |tokens: Tokens| self.render(tokens, &cameras);
         let view_len = truth.len() / clip.target.num_views();
         for (c, &count) in self.options.counts.iter().enumerate() {
             let tokens = self.stored(&lift, count, clip)?;
@@ -174,16 +227,38 @@ impl Fit<'_> {
             rates.psnr[c].push(mean(&psnr).unwrap_or_default());
             for k in 0..rates.steps.len() {
                 let step = rates.steps[k] as f32;
-                let bits = codec.count_bits(&values, step)?;
+                let bits = codec.count_bits(&values, step, &mut rates.levels[k])?;
                 let rounded = render(with_values(tokens.clone(), codec.round(&values, step)?))?;
                 rates.loss[c][k].push(loss(&exact, &rounded, &errors));
-                rates.bits[c][k].push(bits[0] / num_tokens as f64);
-                rates.totals[k] = [0, 1].map(|i| rates.totals[k][i] + bits[i]);
+                rates.bits[c][k].push(bits / num_tokens as f64);
+                rates.stream_bits[k] += bits;
             }
             rates.num_values += values.len();
         }
         Ok(())
     }
+}
+
+/// Returns the groups of neighbouring directions that noise is added to: single ones, then two per doubling.
+fn direction_groups(dim: usize) -> Vec<Range<usize>> {
+    let starts = (0..).map(|i: u32| if i < 4 { i as usize } else { (2 + i as usize % 2) << (i / 2 - 1) });
+    let starts: Vec<usize> = starts.take_while(|start| *start < dim).chain([dim]).collect();
+    starts.windows(2).map(|pair| pair[0]..pair[1]).collect()
+}
+
+/// Returns the weight of every direction: the root of its group's mean effect, 1 for the largest.
+fn direction_weights(dim: usize, effects: &[Vec<f64>]) -> Vec<f32> {
+    let means: Vec<f64> = effects.iter().map(|effects| mean(effects).unwrap_or(1.0)).collect();
+    let largest = means.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
+    let weight = |effect: f64| (effect / largest).max(MIN_WEIGHT).sqrt() as f32;
+    let groups = direction_groups(dim).into_iter().zip(means);
+    groups.flat_map(|(group, effect)| vec![weight(effect); group.len()]).collect()
+}
+
+/// Mean variance of a coefficient.
+fn mean_variance(transform: &Transform) -> f64 {
+    let variances: Vec<f64> = transform.deviations.iter().map(|&deviation| f64::from(deviation).powi(2)).collect();
+    mean(&variances).unwrap_or_default()
 }
 
 /// Mean squared error of every view, at least [`MIN_ERROR`].
@@ -212,7 +287,8 @@ struct Measured {
     psnr: Vec<Vec<f64>>,
     bits: Vec<Vec<Vec<f64>>>,
     loss: Vec<Vec<Vec<f64>>>,
-    totals: Vec<[f64; 2]>,
+    stream_bits: Vec<f64>,
+    levels: Vec<LevelCounts>,
     num_values: usize,
 }
 
@@ -224,7 +300,8 @@ impl Measured {
             psnr: vec![Vec::new(); counts],
             bits: empty(),
             loss: empty(),
-            totals: vec![[0.0; 2]; steps.len()],
+            stream_bits: vec![0.0; steps.len()],
+            levels: vec![LevelCounts::default(); steps.len()],
             num_values: 0,
             steps,
         }
@@ -251,6 +328,17 @@ impl Measured {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn groups_cover_all_directions_and_weights_follow_effects() {
+        let groups = direction_groups(40);
+        let starts: Vec<usize> = groups.iter().map(|group| group.start).collect();
+        assert_eq!(starts, [0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32]);
+        assert_eq!(groups.last().unwrap().end, 40);
+        assert_eq!(direction_groups(1), [0..1]);
+        let weights = direction_weights(3, &[vec![0.5, 0.3], vec![0.1], vec![0.0]]);
+        assert_eq!(weights, [1.0, 0.5, 0.01]);
+    }
 
     #[test]
     fn losses_add_independent_errors() {

@@ -64,8 +64,11 @@ pub fn step_for_bytes(scene: &Scene, codec: &TokenCodec, bytes: u64) -> Result<(
     let mut best = coded(high)?;
     if best.len() as u64 > bytes {
         let kb = |bytes: u64| format!("{:.3}", bytes as f64 / 1e3);
-        let fix =
-            format!("the least size of {} tokens of this scene is {} kB; store fewer tokens, or ask for more", scene.num_tokens(), kb(best.len() as u64));
+        let fix = format!(
+            "the least size of {} tokens of this scene is {} kB; store fewer tokens, or ask for more",
+            scene.num_tokens(),
+            kb(best.len() as u64)
+        );
         return Err(ModelError::BadConfig { key: "--size-kb", value: kb(bytes), fix }.into());
     }
     for _ in 0..SIZE_SEARCH {

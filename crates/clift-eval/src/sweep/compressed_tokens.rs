@@ -4,7 +4,8 @@
 use burn::tensor::{Tensor, TensorData};
 use clift_data::{Clip, Pose, item_rng};
 use clift_model::{
-    Scene, SceneModel, SceneNormalization, TokenCodec, TokenFormat, TokenStorage, Tokens, TrainedModel, scene_file_bytes,
+    Scene, SceneModel, SceneNormalization, TokenCodec, TokenFormat, TokenStorage, Tokens, TrainedModel,
+    scene_file_bytes,
 };
 use rand::Rng;
 use rand::seq::SliceRandom;

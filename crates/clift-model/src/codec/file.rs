@@ -21,8 +21,6 @@ const FORMAT: &str = "clift-codec";
 const VERSION: &str = "1";
 /// Largest accepted file: a codec of width 4,096 takes a tenth of it.
 const MAX_FILE_BYTES: u64 = 1 << 30;
-/// Largest difference of the basis from an orthonormal one.
-const MAX_BASIS_ERROR: f32 = 1e-3;
 
 impl TokenCodec {
     /// Returns the path of the codec of a weight file: `codec*.safetensors` beside `model*.safetensors`,
@@ -169,13 +167,12 @@ fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
 }
 
 fn check_transform(transform: &Transform) -> Result<(), String> {
-    if let Some(d) = transform.deviations.iter().position(|deviation| !(*deviation > 0.0)) {
+    if let Some(d) = transform.deviations.iter().position(|deviation| *deviation <= 0.0) {
         return Err(format!("deviation {} of direction {d}, expected a positive number", transform.deviations[d]));
     }
-    let length = |row: &[f32]| row.iter().map(|value| value * value).sum::<f32>();
-    let rows = transform.basis.chunks_exact(transform.mean.len());
-    match rows.map(length).position(|length| (length - 1.0).abs() > MAX_BASIS_ERROR) {
-        Some(d) => Err(format!("direction {d} is no unit vector")),
+    let length = |d: usize| transform.direction(d).iter().map(|value| value * value).sum::<f32>();
+    match (0..transform.mean.len()).find(|&d| !length(d).is_normal()) {
+        Some(d) => Err(format!("direction {d} has no length")),
         None => Ok(()),
     }
 }

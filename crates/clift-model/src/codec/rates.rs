@@ -36,7 +36,14 @@ impl RateTable {
         let all = [&self.shares, &self.steps, &self.bits, &self.loss, &self.psnr];
         let is_finite = all.iter().all(|values| values.iter().all(|value| value.is_finite()));
         let is_positive = self.shares.iter().chain(&self.steps).all(|value| *value > 0.0);
-        if counts == 0 || steps < 2 || !sizes || !is_finite || !is_positive || !ascending(&self.shares) || !ascending(&self.steps) {
+        if counts == 0
+            || steps < 2
+            || !sizes
+            || !is_finite
+            || !is_positive
+            || !ascending(&self.shares)
+            || !ascending(&self.steps)
+        {
             let value = format!("{counts} counts and {steps} steps");
             return Err(ModelError::BadConfig { key: "rates", value, fix: "fit the codec again".into() });
         }

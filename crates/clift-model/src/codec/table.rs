@@ -93,7 +93,7 @@ impl Table {
         }
         encoder.push(self.interval(self.escape()));
         let beyond = self.beyond(level);
-        let count = 31 - beyond.leading_zeros();
+        let count = beyond.ilog2();
         encoder.push_bits(u32::from(level < 0), 1);
         encoder.push_bits((1 << (count + 1)) - 2, count + 1);
         encoder.push_bits(beyond, count);

@@ -1,6 +1,7 @@
 //! The codec of a model: tokens to words and back.
 // N patches of the context views, S tokens, D width
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use crate::codec::entropy::{Decoder, Encoder, decode_ids, encode_ids};
@@ -46,6 +47,25 @@ pub(crate) struct Levels {
     pub num_tokens: usize,
 }
 
+/// Counts of the levels of every direction.
+#[derive(Clone, Debug, Default)]
+pub struct LevelCounts(BTreeMap<(usize, i32), u64>);
+
+impl LevelCounts {
+    /// Returns the bits of all counted levels by their entropy, the bound of every coder that codes a level by its
+    /// direction alone.
+    pub fn entropy_bits(&self) -> f64 {
+        let mut totals = BTreeMap::<usize, u64>::new();
+        for (&(direction, _), count) in &self.0 {
+            *totals.entry(direction).or_default() += count;
+        }
+        let bits = |(&(direction, _), &count): (&(usize, i32), &u64)| {
+            count as f64 * (totals[&direction] as f64 / count as f64).log2()
+        };
+        self.0.iter().map(bits).sum()
+    }
+}
+
 impl TokenCodec {
     /// Makes the codec of a fitted transform.
     ///
@@ -89,35 +109,27 @@ impl TokenCodec {
         Ok(self.dequantize(&levels, step))
     }
 
-    /// Returns the bits of tokens `[S, D]`: in the stream, and by the entropy of the levels of every direction, the bound
-    /// of every coder that codes each level by its direction alone.
+    /// Returns the bits of tokens `[S, D]` in a stream of their own, and counts their levels.
     ///
     /// # Errors
     /// As [`round`](Self::round).
-    pub fn count_bits(&self, tokens: &[f32], step: f32) -> Result<[f64; 2], ModelError> {
+    pub fn count_bits(&self, tokens: &[f32], step: f32, counts: &mut LevelCounts) -> Result<f64, ModelError> {
         let levels = self.quantize(tokens, step)?;
+        for (direction, levels) in levels.of_direction.iter().enumerate() {
+            for &level in levels {
+                *counts.0.entry((direction, level)).or_default() += 1;
+            }
+        }
         let mut encoder = Encoder::default();
         self.encode_levels(&levels, step, &mut encoder);
-        let entropy = |levels: &Vec<i32>| {
-            let mut sorted = levels.clone();
-            sorted.sort_unstable();
-            let runs = sorted.chunk_by(|a, b| a == b).map(|run| run.len() as f64);
-            runs.map(|count| count * (levels.len() as f64 / count).log2()).sum::<f64>()
-        };
-        Ok([encoder.finish().len() as f64 * 32.0, levels.of_direction.iter().map(entropy).sum()])
+        Ok(encoder.finish().len() as f64 * 32.0)
     }
 
     /// Encodes tokens `[S, D]` of ascending `ids`, patches below `num_patches`.
     ///
     /// # Errors
     /// As [`round`](Self::round).
-    pub fn encode(
-        &self,
-        tokens: &[f32],
-        ids: &[u32],
-        num_patches: usize,
-        step: f32,
-    ) -> Result<Vec<u32>, ModelError> {
+    pub fn encode(&self, tokens: &[f32], ids: &[u32], num_patches: usize, step: f32) -> Result<Vec<u32>, ModelError> {
         let levels = self.quantize(tokens, step)?;
         let mut encoder = Encoder::default();
         encode_ids(&mut encoder, ids, num_patches);
@@ -155,7 +167,10 @@ impl TokenCodec {
         let dim = self.transform.mean.len();
         let most = (words.len() as f64 + 1.0) * 32.0 / MIN_BITS;
         if num_tokens as f64 * dim as f64 > most {
-            return Err(format!("{num_tokens} tokens of width {dim} in {} words, expected at most {most:.0} values", words.len()));
+            return Err(format!(
+                "{num_tokens} tokens of width {dim} in {} words, expected at most {most:.0} values",
+                words.len()
+            ));
         }
         let mut decoder = Decoder::new(words).ok_or("the last word of the tokens is 0")?;
         let ids = decode_ids(&mut decoder, num_tokens, num_patches);
@@ -190,8 +205,8 @@ impl TokenCodec {
             let mut levels = Vec::with_capacity(num_tokens);
             for token in 0..num_tokens {
                 let value = coefficients[token * dim + direction] / step;
-                // Not `>`: a coefficient may be NaN after an overflow.
-                if !(value.abs() < MAX_LEVEL) {
+                // A coefficient may be NaN after an overflow.
+                if value.is_nan() || value.abs() >= MAX_LEVEL {
                     let fix = format!("token {token} has a coefficient of {value} steps; write a larger step, or f32");
                     return Err(bad(fix));
                 }
@@ -209,7 +224,9 @@ impl TokenCodec {
     fn encode_levels(&self, levels: &Levels, step: f32, encoder: &mut Encoder) {
         for (direction, levels) in levels.of_direction.iter().enumerate() {
             let table = self.table(direction, step);
-            levels.iter().for_each(|&level| table.encode(level, encoder));
+            for &level in levels {
+                table.encode(level, encoder);
+            }
         }
     }
 }

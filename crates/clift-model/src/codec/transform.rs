@@ -1,4 +1,5 @@
-//! Karhunen-Loeve transform of tokens: mean and orthonormal basis by descending variance.
+//! Karhunen-Loeve transform of tokens: mean and orthogonal directions by descending variance. A direction that renderings
+//! depend on less is longer, so that one step for all coefficients is coarser along it.
 // S tokens, D width
 
 use burn::linalg::svd;
@@ -68,19 +69,37 @@ impl Moments {
 pub struct Transform {
     /// `[D]`
     pub mean: Vec<f32>,
-    /// Orthonormal directions, `[D, D]`, a row each.
+    /// Orthogonal directions, `[D, D]`, a row each.
     pub basis: Vec<f32>,
-    /// Standard deviation along every direction, positive, `[D]`.
+    /// Standard deviation of the coefficient of every direction, positive, `[D]`.
     pub deviations: Vec<f32>,
 }
 
 impl Transform {
+    /// Returns one direction, `[D]`.
+    pub fn direction(&self, index: usize) -> &[f32] {
+        let dim = self.mean.len();
+        &self.basis[index * dim..(index + 1) * dim]
+    }
+
+    /// Multiplies the coefficients of every direction by a positive weight, and divides the direction by the weight.
+    pub fn weigh(&mut self, weights: &[f32]) {
+        let dim = self.mean.len();
+        for ((row, deviation), weight) in self.basis.chunks_exact_mut(dim).zip(&mut self.deviations).zip(weights) {
+            row.iter_mut().for_each(|value| *value /= weight);
+            *deviation *= weight;
+        }
+    }
+
     /// Returns the coefficients of tokens along the directions, `[S, D]`.
     pub fn forward(&self, tokens: &[f32]) -> Vec<f32> {
         let dim = self.mean.len();
+        let squares: Vec<f32> =
+            self.basis.chunks_exact(dim).map(|row| row.iter().map(|value| value * value).sum()).collect();
         let centered: Vec<f32> =
             tokens.chunks_exact(dim).flat_map(|token| token.iter().zip(&self.mean).map(|(x, mean)| x - mean)).collect();
-        let columns: Vec<f32> = (0..dim * dim).map(|i| self.basis[i % dim * dim + i / dim]).collect();
+        let columns: Vec<f32> =
+            (0..dim * dim).map(|i| self.basis[i % dim * dim + i / dim] / squares[i % dim]).collect();
         let mut coefficients = vec![0.0; tokens.len()];
         linear_forward([tokens.len() / dim, dim, dim], [&centered, &columns, &vec![0.0; dim]], &mut coefficients);
         coefficients
@@ -140,6 +159,24 @@ mod tests {
             assert!((got - expected).abs() < 2e-3, "{got} against {expected}");
         }
         assert_eq!(transform.inverse(&[vec![], vec![], vec![]], 1.0, 2), [&transform.mean[..]; 2].concat());
+    }
+
+    #[test]
+    fn weights_scale_coefficients_and_keep_tokens() {
+        let mut moments = Moments::new(3);
+        moments.add(&tokens());
+        let plain = moments.transform();
+        let mut weighed = plain.clone();
+        weighed.weigh(&[2.0, 1.0, 0.25]);
+        assert_eq!(weighed.deviations[0], 2.0 * plain.deviations[0]);
+        let (before, after) = (plain.forward(&tokens()), weighed.forward(&tokens()));
+        assert!(before.chunks(3).zip(after.chunks(3)).all(|(a, b)| (2.0 * a[0] - b[0]).abs() < 1e-5), "{after:?}");
+        let levels = |coefficients: &[f32]| -> Vec<Vec<i32>> {
+            (0..3).map(|d| (0..4).map(|row| (coefficients[row * 3 + d] * 1e4).round() as i32).collect()).collect()
+        };
+        for (a, b) in weighed.inverse(&levels(&after), 1e-4, 4).iter().zip(tokens()) {
+            assert!((a - b).abs() < 1e-3, "{a} against {b}");
+        }
     }
 
     #[test]

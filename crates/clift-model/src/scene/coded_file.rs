@@ -15,6 +15,7 @@
 //! [`TokenCodec`]. `docs/reference/files.md` has a decoder.
 // N patches of the context views, S tokens, V context views
 
+use std::fmt::Write as _;
 use std::path::Path;
 
 use crate::codec::token_codec::TokenCodec;
@@ -73,7 +74,7 @@ impl Scene {
             ("views", &counts[2]),
             ("tokens", &counts[3]),
         ]);
-        header.push_str(&format!(",\"scene\":{{\"dtype\":\"U8\",\"shape\":[{length}],\"data_offsets\":[0,{length}]}}}}"));
+        let _ = write!(header, ",\"scene\":{{\"dtype\":\"U8\",\"shape\":[{length}],\"data_offsets\":[0,{length}]}}}}");
         let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
         bytes.extend(header.bytes());
         bytes.extend(body);
@@ -87,8 +88,7 @@ impl Scene {
     /// # Errors
     /// As [`coded_bytes`](Self::coded_bytes) and [`write`](Self::write).
     pub fn write_coded(&self, path: &Path, codec: &TokenCodec, step: f32) -> Result<(), ModelError> {
-        let refuse =
-            |reason, fix| ModelError::SceneFile { action: "write", reason, fix, path: path.into() };
+        let refuse = |reason, fix| ModelError::SceneFile { action: "write", reason, fix, path: path.into() };
         self.check().map_err(|reason| refuse(reason, "encode other views or fewer tokens"))?;
         let bytes = self.coded_bytes(codec, step)?;
         check_output_path(path)?;

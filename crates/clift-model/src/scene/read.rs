@@ -11,9 +11,7 @@ use crate::network::config::ModelConfig;
 use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
-use crate::scene::scene::{
-    CODED_VERSION, FORMAT, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name,
-};
+use crate::scene::scene::{CODED_VERSION, FORMAT, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name};
 use crate::scene::token_format::TokenFormat;
 use crate::scene::token_storage::{CodedLoss, TokenStorage};
 use crate::views::camera::ViewCamera;

@@ -117,6 +117,9 @@ mod tests {
         }
         let json = serde_json::to_string(&"coded-0.1".parse::<TokenStorage>().unwrap()).unwrap();
         assert_eq!(json, "\"coded-0.1\"");
-        assert!(serde_json::from_str::<TokenStorage>(&json).is_ok() && serde_json::from_str::<TokenStorage>("\"f8\"").is_err());
+        assert!(
+            serde_json::from_str::<TokenStorage>(&json).is_ok()
+                && serde_json::from_str::<TokenStorage>("\"f8\"").is_err()
+        );
     }
 }

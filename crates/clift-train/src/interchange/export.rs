@@ -39,7 +39,7 @@ pub struct Exported {
 /// [`TrainError::BadConfig`] if `out` exists or the network has camera-relative attention, [`TrainError::BadFile`] if the weight file does not fit the config, and those of
 /// reading and writing.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
-    let codecs = [&model.weights, out].map(|weights| TokenCodec::path_of(weights));
+    let codecs = [&model.weights, out].map(TokenCodec::path_of);
     let codec = codecs[0].exists().then(|| TokenCodec::read(&codecs[0])).transpose()?;
     require_absent(out)?;
     if codec.is_some() {

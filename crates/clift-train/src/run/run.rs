@@ -12,7 +12,8 @@ use clift_data::{
 };
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, LPIPS_COMMAND, Summary, write_skip_report};
 use clift_model::{
-    Clift, ModelError, ModelPath, TokenCodec, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
+    Clift, ModelError, ModelPath, TokenCodec, TrainedModel, check_heads, load_part, save_part, save_weights,
+    weights_hash,
 };
 
 use crate::cluster_cache::builder::ClusterBuilder;

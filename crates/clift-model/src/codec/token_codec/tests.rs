@@ -51,7 +51,9 @@ fn streams_take_the_bits_of_their_entropy() {
     let codec = small();
     let unseen = tokens(4000, DIM, 99);
     for step in [0.2, 1.0, 4.0] {
-        let [stream, entropy] = codec.count_bits(&unseen, step).unwrap();
+        let mut counts = LevelCounts::default();
+        let stream = codec.count_bits(&unseen, step, &mut counts).unwrap();
+        let entropy = counts.entropy_bits();
         assert!(stream < 1.02 * entropy + 64.0, "step {step}: {stream} bits, entropy {entropy}");
         assert!(stream > 0.99 * entropy, "step {step}: {stream} bits, entropy {entropy}");
     }
@@ -94,7 +96,8 @@ fn tokens_unlike_all_training_tokens_are_coded() {
 fn hostile_words_are_refused_in_bounded_memory() {
     let codec = small();
     let words = codec.encode(&tokens(40, DIM, 7), &ids(40), 120, 0.5).unwrap();
-    let refuse = |words: &[u32], count, patches, step| codec.decode_words(words.to_vec(), count, patches, step).unwrap_err();
+    let refuse =
+        |words: &[u32], count, patches, step| codec.decode_words(words.to_vec(), count, patches, step).unwrap_err();
     assert!(refuse(&words, 0, 120, 0.5).contains("0 tokens, expected 1 to 120"));
     assert!(refuse(&words, 121, 120, 0.5).contains("121 tokens"));
     assert!(refuse(&words, 1 << 20, 1 << 20, 0.5).contains("expected at most"));
@@ -119,7 +122,10 @@ fn codecs_survive_their_file_and_damage_is_found() {
     let codec = small();
     codec.write(&path).unwrap();
     assert_eq!(TokenCodec::read(&path).unwrap(), codec);
-    assert_eq!(TokenCodec::path_of("run/model-9-steps.safetensors".as_ref()).to_str(), Some("run/codec-9-steps.safetensors"));
+    assert_eq!(
+        TokenCodec::path_of("run/model-9-steps.safetensors".as_ref()).to_str(),
+        Some("run/codec-9-steps.safetensors")
+    );
     assert_eq!(TokenCodec::path_of("re10k.ckpt".as_ref()).to_str(), Some("re10k.codec.safetensors"));
     let bytes = std::fs::read(&path).unwrap();
     let text = |from: &str, to: &str| {
@@ -146,7 +152,7 @@ fn codecs_survive_their_file_and_damage_is_found() {
         assert!(message.contains(expected), "{message}");
     };
     damaged(&|codec| codec.transform.deviations[3] = 0.0, "deviation 0 of direction 3");
-    damaged(&|codec| codec.transform.basis[0] = 7.0, "direction 0 is no unit vector");
+    damaged(&|codec| codec.transform.basis[..DIM].fill(0.0), "direction 0 has no length");
     damaged(&|codec| codec.transform.mean[0] = f32::NAN, "`mean` contains NaN");
     damaged(&|codec| codec.distributions.knots[1] = 90.0, "the knots are no ascending numbers");
     damaged(&|codec| codec.distributions.cumulative[7] = 0.9, "the probabilities of direction 0");

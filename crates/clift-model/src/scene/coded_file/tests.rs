@@ -76,7 +76,10 @@ fn coded_scenes_come_back_ordered_and_rounded() {
     for (new, old) in [0, 2, 3, 4, 1].into_iter().enumerate() {
         assert_eq!(back.tokens[new * dim..][..dim], expected[old * dim..][..dim], "token {new}");
     }
-    assert_eq!((&back.key, &back.model, &back.renderer_hash), (&original.key, &original.model, &original.renderer_hash));
+    assert_eq!(
+        (&back.key, &back.model, &back.renderer_hash),
+        (&original.key, &original.model, &original.renderer_hash)
+    );
     assert_eq!((back.world, &back.context_frames), (original.world, &original.context_frames));
     for (got, expected) in back.context.iter().zip(&original.context) {
         let values = |camera: &ViewCamera| [&camera.c2w[..], &camera.intrinsics].concat();
@@ -85,7 +88,9 @@ fn coded_scenes_come_back_ordered_and_rounded() {
     // Another model is given, or none is found.
     let moved = folder.0.path().join("elsewhere");
     std::fs::rename(folder.0.path().join("runs"), &moved).unwrap();
-    assert!(Scene::read(&folder.path()).unwrap_err().to_string().contains("give the run it was encoded with (--model RUN)"));
+    assert!(
+        Scene::read(&folder.path()).unwrap_err().to_string().contains("give the run it was encoded with (--model RUN)")
+    );
     assert_eq!(Scene::read_for(&folder.path(), Some(&moved.join("tiny"))).unwrap().0, back);
 }
 
@@ -159,4 +164,31 @@ fn codecs_of_other_models_are_refused() {
     let message = other.write_coded(&folder.path(), &folder.1, STEP).unwrap_err().to_string();
     assert!(message.contains("the codec is of another model"), "{message}");
     assert!(!folder.path().exists());
+}
+
+/// `CLIFT_UPDATE=1` writes scene and codec again; then `scripts/check/decode_scene.py .. --write` must write the tokens.
+#[test]
+fn fixture_has_the_tokens_of_the_python_decoder() {
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/coded");
+    let [room, model] = ["room.clift", "runs/tiny"].map(|name| fixture.join(name));
+    if std::env::var_os("CLIFT_UPDATE").is_some() {
+        let Scene { model: sizes, kind, renderer_hash, .. } = scene();
+        let codec = codec(sizes, kind, renderer_hash);
+        std::fs::create_dir_all(&model).unwrap();
+        std::fs::write(model.join("model.safetensors"), "").unwrap();
+        std::fs::write(model.join("config.toml"), "").unwrap();
+        codec.write(&model.join("codec.safetensors")).unwrap();
+        let mut unusual = scene();
+        unusual.tokens[10] = -1e3; // escapes
+        unusual.write_coded(&room, &codec, STEP).unwrap();
+    }
+    let (scene, _) = Scene::read(&room).unwrap();
+    assert_eq!(scene.token_ids, [0, 3, 7, 8, 11]);
+    let bytes = std::fs::read(fixture.join("tokens.f32")).unwrap();
+    let expected: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+    assert_eq!(scene.tokens.len(), expected.len());
+    for (got, expected) in scene.tokens.iter().zip(&expected) {
+        assert!((got - expected).abs() < 1e-2, "{got} against {expected}");
+    }
+    assert!(expected.iter().any(|value| *value < -900.0), "a value far beyond the tables");
 }

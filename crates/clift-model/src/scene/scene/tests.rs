@@ -151,7 +151,11 @@ fn invalid_headers_are_refused() {
     for (from, to, expected) in [
         (r#""format":"clift-scene""#, r#""format":"clift-1""#, "its header lacks the scene format; give a file"),
         (r#"{"__metadata__""#, r#"{"__metadata__"#, unreadable),
-        (r#""version":"2""#, r#""version":"9""#, r#"file version "9", expected "1", "2" or "3"; use the version of clift that"#),
+        (
+            r#""version":"2""#,
+            r#""version":"9""#,
+            r#"file version "9", expected "1", "2" or "3"; use the version of clift that"#,
+        ),
         (r#""kind":"clift""#, r#""kind":"nerf""#, r#"unknown kind of tokens "nerf""#),
         (r#""width":"24""#, r#""width":"-24""#, r#"width "-24", expected a number of pixels"#),
         (r#""renderer":"0123"#, r#""renderer":"zz23"#, "expected 64 hexadecimal digits"),
