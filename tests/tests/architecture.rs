@@ -9,7 +9,7 @@ type Crate = (&'static str, &'static str, &'static str);
 
 const CRATES: [Crate; 8] = [
     ("clift-kernels", "", "simd primitives attention cluster_attention gelu head_transform layer_norm linear"),
-    ("clift-model", "clift-kernels", "error names files device ops views tokens network cost weights scene"),
+    ("clift-model", "clift-kernels", "error names files device ops views tokens network cost weights codec scene"),
     (
         "clift-data",
         "",
@@ -19,7 +19,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift-eval",
         "clift-kernels clift-model clift-data",
-        "error system config metrics upload statistics encode sweep figures report evaluator",
+        "error system config metrics upload statistics encode sweep figures report evaluator codec",
     ),
     (
         "clift-train",

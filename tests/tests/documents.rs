@@ -93,7 +93,7 @@ fn every_documented_command_runs() {
         }
     }
     assert!(failures.is_empty(), "{} of {count} commands fail:\n{}", failures.len(), failures.join("\n"));
-    let expected = "compare completions data doctor encode eval export flops import metrics plan render train";
+    let expected = "codec compare completions data doctor encode eval export flops import metrics plan render train";
     assert_eq!(names.into_iter().collect::<Vec<_>>().join(" "), expected, "commands with an example");
 }
 

@@ -14,6 +14,7 @@ use serde::Serialize;
 
 use crate::cases::case::BenchCase;
 use crate::cases::clustering::KMeansCase;
+use crate::cases::coding::CodingCase;
 use crate::cases::context::{BenchContext, BenchOptions};
 use crate::cases::forward;
 use crate::cases::selection::SelectionCase;
@@ -112,6 +113,8 @@ pub(crate) fn prepare(case: BenchCase, context: &BenchContext) -> Result<Box<dyn
         BenchCase::Condense => Box::new(forward::condense(context)?),
         BenchCase::ClusterAttention => Box::new(forward::attention_in_clusters(context)?),
         BenchCase::Select => Box::new(SelectionCase::new(context)?),
+        BenchCase::CodeTokens => Box::new(CodingCase::new(context, false)?),
+        BenchCase::DecodeTokens => Box::new(CodingCase::new(context, true)?),
         BenchCase::Render => Box::new(forward::render(context, 1)?),
         BenchCase::Render8Views => Box::new(forward::render(context, 8)?),
         BenchCase::Stage1Step => Box::new(StepCase::new(context, Stage::Stage1)?),

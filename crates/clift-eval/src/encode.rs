@@ -43,6 +43,26 @@ pub struct EncodedScene {
     pub clusters: SceneClusters,
 }
 
+impl EncodedScene {
+    /// Orders the tokens by their patches, as files with coded tokens do.
+    ///
+    /// # Errors
+    /// The errors of the clusters, which stay valid.
+    pub fn sort_tokens(&mut self) -> Result<(), EvalError> {
+        let (ids, dim) = (&self.scene.token_ids, self.scene.model.dim);
+        let mut order: Vec<usize> = (0..ids.len()).collect();
+        order.sort_by_key(|&token| ids[token]);
+        let mut place = vec![0; ids.len()];
+        order.iter().enumerate().for_each(|(new, &old)| place[old] = new as u32);
+        let assignment = self.clusters.assignment().iter().map(|&cluster| place[cluster as usize]).collect();
+        let tokens = order.iter().flat_map(|&old| &self.scene.tokens[old * dim..(old + 1) * dim]).copied().collect();
+        self.scene.token_ids = order.iter().map(|&old| ids[old]).collect();
+        self.scene.tokens = tokens;
+        self.clusters = SceneClusters::new(assignment, self.scene.token_ids.clone())?;
+        Ok(())
+    }
+}
+
 /// Encodes a scene of `reader`. The clusters equal those of `clift eval` for the same contexts and count.
 ///
 /// # Errors

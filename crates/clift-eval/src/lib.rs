@@ -20,6 +20,7 @@
 //!
 //! The example `encode_and_render` encodes a folder of photos and renders a view.
 
+mod codec;
 mod config;
 mod encode;
 mod error;
@@ -46,6 +47,10 @@ pub use metrics::image_metrics::{psnr, ssim};
 pub use metrics::lpips::{LPIPS_COMMAND, LPIPS_MIN_SIZE_PX, Lpips};
 pub use metrics::perceptual::{PERCEPTUAL_COMMAND, PERCEPTUAL_MIN_SIZE_PX, Perceptual};
 pub use metrics::vgg::VggShape;
+
+// The token codec of a model.
+pub use codec::fit::{CodecOptions, FittedCodec, fit_codec};
+pub use codec::step_choice::{expected_step, step_for_bytes, step_for_loss};
 
 // Settings of an evaluation.
 pub use config::eval_config::EvalConfig;

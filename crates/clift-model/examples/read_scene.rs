@@ -13,7 +13,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("{} {} tokens of width {} in {format}", scene.num_tokens(), scene.kind.name(), scene.model.dim);
     println!(
         "{} bytes; {} context views of {} x {}",
-        scene.file_bytes(format),
+        std::fs::metadata(&path)?.len(),
         scene.context.len(),
         scene.width,
         scene.height

@@ -108,6 +108,25 @@ pub enum ModelError {
         /// The weight file.
         path: PathBuf,
     },
+    /// Failure to read or write the token codec of a model.
+    #[error(
+        "{action} the token codec failed: {reason}; fit it again with `clift codec`: {path}",
+        path = path.display()
+    )]
+    CodecFile {
+        /// The operation: `reading` or `writing`.
+        action: &'static str,
+        /// The cause.
+        reason: String,
+        /// The file.
+        path: PathBuf,
+    },
+    /// Model without a token codec.
+    #[error("no token codec at {path}; fit it with `clift codec RUN`", path = path.display())]
+    NoCodec {
+        /// The expected file.
+        path: PathBuf,
+    },
     /// Path without the weights of a trained model.
     #[error("no trained model at {path}; run `clift train` first", path = path.display())]
     NoModel {

@@ -27,6 +27,7 @@
 //! # Ok::<(), clift_model::ModelError>(())
 //! ```
 
+mod codec;
 mod cost;
 mod device;
 mod error;
@@ -100,10 +101,16 @@ pub use weights::published_keys::{
 };
 pub use weights::published_sizes::{InferredConfig, infer_config};
 pub use weights::trained_model::TrainedModel;
+// The coder of tokens in scene files
+pub use codec::histogram::{Distributions, Histograms};
+pub use codec::rates::RateTable;
+pub use codec::token_codec::{LevelCounts, TokenCodec};
+pub use codec::transform::{Moments, Transform};
 // Scene files, and rendering from them
 pub use scene::check::MAX_SIDE_PX;
 pub use scene::render_budget::RenderBudget;
 pub use scene::scene::{Scene, SceneNormalization, scene_file_bytes};
 pub use scene::scene_renderer::{RenderedView, SceneRenderer, frames_per_call, load_renderer};
 pub use scene::token_format::TokenFormat;
+pub use scene::token_storage::{CodedLoss, TokenStorage};
 pub use scene::write::check_output_path;

@@ -45,6 +45,7 @@ pub use events::{Event, Sink, Stage, StepEvent};
 pub use run::eval_folder::EvalFolder;
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::{Run, RunOptions};
+pub use run::token_codec::fit_token_codec;
 pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
 // One update

@@ -3,6 +3,7 @@
 use clap::{Parser, Subcommand};
 
 use crate::commands::bench::cases::BenchArgs;
+use crate::commands::codec::CodecArgs;
 use crate::commands::compare::CompareArgs;
 use crate::commands::completions::CompletionsArgs;
 use crate::commands::data::command::DataCommand;
@@ -101,8 +102,19 @@ Examples:
   clift encode runs/tiny --scene synthetic-0-test-00000 -o room.clift
   clift encode runs/re10k captures/attic -o attic.clift
   clift encode runs/re10k /data/re10k --scene 5aca87f95a9412c6 --storage 1/8 -o room.clift
-  clift encode runs/re10k /data/re10k/test --storage 256 --tokens int8 -o room.clift")]
+  clift encode runs/re10k /data/re10k/test --storage 256 --tokens coded -o room.clift
+  clift encode runs/re10k captures/attic --size-kb 20 -o attic.clift")]
     Encode(EncodeArgs),
+    /// Fit the token codec of a model, for coded scene files
+    ///
+    /// Training fits the codec after stage 2. This command fits that of an imported model or of an earlier run, on training
+    /// scenes: transform, probabilities, and the loss of PSNR at every count and step. Writes codec.safetensors beside the
+    /// weights and prints the losses.
+    #[command(after_help = "\
+Examples:
+  clift codec runs/tiny --force
+  clift codec models/re10k /data/re10k --set eval.num_context=4")]
+    Codec(CodecArgs),
     /// Render a scene file along a camera path
     ///
     /// Writes frame-00000.png and so on, animation.png (an animated PNG for browsers) and render.json (token

@@ -78,11 +78,12 @@ fn eval_exit_code(error: &EvalError) -> u8 {
 
 fn model_exit_code(error: &clift_model::ModelError) -> u8 {
     use clift_model::ModelError::{
-        BadConfig, BadTokenCount, NoConfig, NoDevice, NoModel, NotDivisible, NotImported, OtherRenderer,
+        BadConfig, BadTokenCount, NoCodec, NoConfig, NoDevice, NoModel, NotDivisible, NotImported, OtherRenderer,
     };
     match error {
         BadConfig { .. }
         | BadTokenCount { .. }
+        | NoCodec { .. }
         | NoConfig { .. }
         | NoDevice { .. }
         | NoModel { .. }

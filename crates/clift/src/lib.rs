@@ -24,7 +24,7 @@ use crate::cli::{Args, Command};
 use crate::commands::bench::cases::{BenchArgs, BenchCommand};
 use crate::commands::data::command::DataCommand;
 use crate::commands::{
-    bench, compare, completions, data, doctor, encode, eval, export, flops, import, metrics, plan, render, train,
+    bench, codec, compare, completions, data, doctor, encode, eval, export, flops, import, metrics, plan, render, train,
 };
 use crate::exit_code::{DONE, error_message, exit_code};
 use crate::output::stdout;
@@ -40,6 +40,7 @@ pub fn main() -> ExitCode {
         Command::Compare(args) => compare::run(&args),
         Command::Completions(args) => completions::run(&args, Args::command()),
         Command::Flops(args) => flops::run(&args),
+        Command::Codec(args) => codec::run(&args),
         Command::Encode(args) => encode::run(&args),
         Command::Render(args) => render::run::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),

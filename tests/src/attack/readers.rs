@@ -9,7 +9,7 @@ use clift_data::{
     ChunkSource, DatasetRoot, EvaluationIndex, Pickle, RgbImage, SceneFilters, SceneSource, SourceOptions, Split,
     TestScenes, decode_image, encode_jpeg, encode_png, open_source,
 };
-use clift_model::{Clift, CliftVariant, Scene, load_part};
+use clift_model::{Clift, CliftVariant, Scene, TokenCodec, load_part};
 use clift_train::{
     CheckpointConfig, Checkpoints, ClusterCache, Config, ImportOptions, OptimizerConfig, Run, TrainState, import,
     read_checked_config,
@@ -105,6 +105,10 @@ pub fn config(setup: &Setup, name: &'static str) -> Read {
 
 pub fn scene_file(setup: &Setup, name: &'static str) -> Read {
     file(setup, name, |path| done(Scene::read(path)))
+}
+
+pub fn token_codec(setup: &Setup, name: &'static str) -> Read {
+    file(setup, name, |path| done(TokenCodec::read(path)))
 }
 
 pub fn test_scenes(setup: &Setup, _: &'static str) -> Read {

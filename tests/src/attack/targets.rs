@@ -59,6 +59,12 @@ pub const TARGETS: &[Target] = &[
     target("evaluation-index", INDEX, fixtures, readers::evaluation_index, words::JSON),
     target("config", "config.toml", configs, readers::config, words::TOML),
     target("scene-file", "room.clift", rooms, readers::scene_file, words::SAFETENSORS),
+    target("coded-scene", "coded.clift", coded_rooms, readers::scene_file, words::SAFETENSORS),
+    Target {
+        repair: scene_checksum,
+        ..target("coded-scene-checked", "checked.clift", coded_rooms, readers::scene_file, words::SAFETENSORS)
+    },
+    target("token-codec", "stage2/codec.safetensors", of_run, readers::token_codec, words::SAFETENSORS),
     target("weights", "stage1/model.safetensors", of_run, readers::weights, words::SAFETENSORS),
     checkpoint("checkpoint-model", "model.bpk", words::SAFETENSORS),
     checkpoint("checkpoint-optimizer", "optimizer.bpk", words::SAFETENSORS),
@@ -101,8 +107,19 @@ fn rooms(setup: &Setup, _: &'static str) -> Vec<Vec<u8>> {
     ["f32", "f16", "int8"].map(|name| read(&setup.at(&format!("room-{name}.clift")))).into()
 }
 
+fn coded_rooms(setup: &Setup, _: &'static str) -> Vec<Vec<u8>> {
+    vec![read(&setup.at("room-coded.clift"))]
+}
+
 fn test_scenes(_: &Setup, file: &'static str) -> Vec<Vec<u8>> {
     vec![fixture(file), b"[\"a\", \"b\"]".to_vec(), b"a\nb\n".to_vec()]
+}
+
+/// Writes the checksum of a coded scene.
+fn scene_checksum(bytes: &mut [u8]) {
+    if let Some((checked, checksum)) = bytes.split_last_chunk_mut::<4>() {
+        *checksum = crc32fast::hash(checked).to_le_bytes();
+    }
 }
 
 /// Writes the checksum of every block of a PNG, as far as its blocks can be followed.

@@ -1,6 +1,7 @@
 //! Evaluations and what they write, scene files, published checkpoints.
 
 mod checkpoints;
+mod coded;
 pub mod eval;
 mod report;
 mod scene_files;

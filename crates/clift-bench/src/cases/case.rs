@@ -18,6 +18,10 @@ pub enum BenchCase {
     ClusterAttention,
     /// Algorithm 1: half of one scene's stored tokens for one view.
     Select,
+    /// One scene's stored tokens to the words of a coded scene file.
+    CodeTokens,
+    /// The words of a coded scene file to tokens.
+    DecodeTokens,
     /// Renderer: one view of one scene from all its tokens.
     Render,
     /// Renderer: eight views of one scene in one call, with shared tokens; seconds are per view.

@@ -7,10 +7,12 @@
 //! - `forward`: rows without gradient
 //! - `step`: rows of whole updates
 //! - `clustering`: the K-means row
+//! - `coding`: the rows of the token coder
 //! - `selection`: the token-selection row
 
 pub(crate) mod case;
 pub(crate) mod clustering;
+pub(crate) mod coding;
 pub(crate) mod context;
 pub(crate) mod forward;
 pub(crate) mod reference;

@@ -41,6 +41,10 @@ impl Experiment {
         };
         let shares = |shares: &[f64]| shares.iter().map(|&share| TokenCount::Share(share)).collect();
         (eval.storage, eval.render, eval.variants) = (shares(storage), shares(render), methods.into());
+        if self == Self::Main {
+            // The size axis: plain numbers, and the codec at two losses.
+            eval.tokens = ["f16", "coded", "coded-0.1"].map(|name| name.parse().expect("a storage")).into();
+        }
         if self == Self::Budget {
             // As in the published table: no momentum, no count per cell.
             eval.selection = Selection::Preset(SelectionPreset::Global);

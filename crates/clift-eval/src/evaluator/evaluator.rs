@@ -4,7 +4,7 @@ use std::path::Path;
 
 use burn::tensor::Device;
 use clift_data::{ClipReader, EvaluationItem, SkipReport, plural, replace_file};
-use clift_model::ModelError;
+use clift_model::{ModelError, TokenStorage};
 
 use crate::config::eval_config::EvalConfig;
 use crate::config::method::Method;
@@ -93,6 +93,7 @@ impl Evaluator {
         let lpips = self.lpips(progress)?;
         let methods = self.methods(models)?;
         let sweep = Sweep {
+            tokens: self.storages(models, progress)?,
             methods,
             lpips: lpips.clone().ok(),
             external_methods: external_methods.to_vec(),
@@ -174,6 +175,22 @@ impl Evaluator {
             progress.done(i + 1, total);
         }
         Ok((measured, skip_report))
+    }
+
+    /// Returns the storages of tokens, without coded ones if the model has no codec.
+    fn storages(&self, models: &EvalModels, progress: &mut dyn Progress) -> Result<Vec<TokenStorage>, EvalError> {
+        let mut tokens = self.eval.tokens.clone();
+        let is_coded = |tokens: &TokenStorage| matches!(tokens, TokenStorage::Coded(_));
+        if let Some(coded) = tokens.iter().copied().find(is_coded).filter(|_| models.codec.is_none()) {
+            let fix = "the model has no token codec: fit it with `clift codec RUN`";
+            tokens.retain(|tokens| !is_coded(tokens));
+            if tokens.is_empty() {
+                let (value, fix) = (coded.to_string(), fix.into());
+                return Err(ModelError::BadConfig { key: "eval.tokens", value, fix }.into());
+            }
+            progress.note(&format!("{coded} tokens are left out: {fix}"));
+        }
+        Ok(tokens)
     }
 
     /// Loads LPIPS, or returns the reason why LPIPS is not measured.

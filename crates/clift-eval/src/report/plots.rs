@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clift_model::TokenFormat;
+use clift_model::TokenStorage;
 
 use crate::config::method::Method;
 use crate::report::axis::{Scale, milliseconds};
@@ -61,20 +61,21 @@ fn has_formats(summary: &Summary) -> bool {
 
 fn series(summary: &Summary, is_joined: bool, mark: impl Fn(&SummaryPoint) -> Option<Mark>) -> Vec<Series> {
     let has_formats = has_formats(summary);
-    let mut lines: BTreeMap<(Method, Option<TokenFormat>), Vec<Mark>> = BTreeMap::new();
+    let formats: BTreeSet<TokenStorage> = summary.points.iter().filter_map(|point| point.key.tokens).collect();
+    let mut lines: BTreeMap<(Method, Option<TokenStorage>), Vec<Mark>> = BTreeMap::new();
     for point in &summary.points {
         if let Some(mark) = mark(point) {
             lines.entry((point.key.method, point.key.tokens.filter(|_| has_formats))).or_default().push(mark);
         }
     }
-    let line = |((method, tokens), marks): ((Method, Option<TokenFormat>), Vec<Mark>)| {
+    let line = |((method, tokens), marks): ((Method, Option<TokenStorage>), Vec<Mark>)| {
         let mut look = look(summary, method);
         let mut name = method.name().to_owned();
         if let Some(tokens) = tokens.filter(|_| method != Method::Random) {
             // Colour of the method, marker of the format.
-            let format = TokenFormat::ALL.iter().position(|format| *format == tokens).unwrap_or_default();
-            look.marker = Look::ALL[format].marker;
-            name = format!("{name}, {}", tokens.name());
+            let format = formats.iter().position(|format| *format == tokens).unwrap_or_default();
+            look.marker = Look::ALL[format % Look::ALL.len()].marker;
+            name = format!("{name}, {tokens}");
         }
         Series { name, look, is_joined, marks }
     };
@@ -97,7 +98,7 @@ fn mark(point: &SummaryPoint, x: f64) -> Option<Mark> {
         (_, true) => format!(", {stored} tokens"),
         (_, false) => format!(", {rendered} of {stored} tokens"),
     };
-    let format = point.key.tokens.map(|tokens| format!(" in {}", tokens.name())).unwrap_or_default();
+    let format = point.key.tokens.map(|tokens| format!(" in {tokens}")).unwrap_or_default();
     let error = point.psnr_stderr.map(|error| format!(" \u{b1} {error:.2}")).unwrap_or_default();
     let time = point.frame_median_s.map(|s| format!(", {} ms per frame", milliseconds(s))).unwrap_or_default();
     let title = format!("{}{tokens}{format}: {y:.2}{error} dB{time}", point.key.method.name());

@@ -1,7 +1,7 @@
 //! The tables of the page.
 
 use clift_data::SkipReport;
-use clift_model::TokenFormat;
+use clift_model::TokenStorage;
 use maud::{Markup, html};
 
 use crate::report::axis::{grouped, milliseconds};
@@ -101,7 +101,7 @@ fn cells(point: &SummaryPoint) -> [String; 17] {
     [
         tokens(point.key.num_storage_tokens),
         tokens(point.key.num_render_tokens),
-        point.key.tokens.map_or(DASH, TokenFormat::name).to_owned(),
+        storage_name(point.key.tokens),
         number(point.psnr, 2),
         number(point.psnr_stderr, 2),
         number(point.ssim, 3),
@@ -136,7 +136,7 @@ pub fn differences(differences: &[PairedDifference]) -> Markup {
                                 td { (row.method.name()) }
                                 td { (row.against.name()) }
                                 td { (count(row.num_storage_tokens)) }
-                                td { (row.tokens.map_or(DASH, TokenFormat::name)) }
+                                td { (storage_name(row.tokens)) }
                                 td { (count(row.num_scenes)) }
                                 td { (grouped(row.psnr, 2)) }
                                 td { (number(row.psnr_stderr, 2)) }
@@ -186,4 +186,8 @@ pub fn machine(device: &str, command: &str) -> Markup {
             }
         }
     }
+}
+
+fn storage_name(tokens: Option<TokenStorage>) -> String {
+    tokens.map_or_else(|| DASH.to_owned(), |tokens| tokens.to_string())
 }

@@ -41,7 +41,7 @@ pub fn write_views(results: &EvalResults, path: &Path) -> Result<(), EvalError> 
                 text(view.lpips_vgg),
                 text(view.render_s),
                 text(view.select_s),
-                key.format_name().into(),
+                key.format_name(),
             ]
         })
     });
@@ -60,7 +60,7 @@ pub fn write_scenes(results: &EvalResults, path: &Path) -> Result<(), EvalError>
                 key.method.name().into(),
                 key.num_storage_tokens.to_string(),
                 key.num_render_tokens.to_string(),
-                key.format_name().into(),
+                key.format_name(),
                 views.len().to_string(),
                 mean_of(|view| Some(view.capped_psnr())),
                 mean_of(|view| view.ssim),

@@ -29,6 +29,8 @@ pub struct EvalResults {
     views: BTreeMap<EvalKey, SceneViews>,
     /// Cost of every key of which a warm-up view was rendered, and of external methods.
     pub(crate) costs: BTreeMap<EvalKey, Cost>,
+    /// Sizes of the scene files of every key.
+    scene_bytes: BTreeMap<EvalKey, Vec<u64>>,
     pub(crate) skipped: BTreeSet<String>,
     pub(crate) not_measured: Vec<NotMeasured>,
     pub(crate) missing: BTreeMap<MethodName, BTreeSet<String>>,
@@ -77,10 +79,12 @@ impl EvalResults {
         self.views.get(&key)
     }
 
-    /// Records the size of a scene file. The largest size counts, since scenes can have different numbers of context views.
+    /// Records the size of a scene file. The cost of a key has the mean over scenes.
     pub fn add_scene_bytes(&mut self, key: EvalKey, bytes: u64) {
-        let cost = self.costs.entry(key).or_default();
-        cost.scene_bytes = cost.scene_bytes.max(Some(bytes));
+        let sizes = self.scene_bytes.entry(key).or_default();
+        sizes.push(bytes);
+        let mean = sizes.iter().sum::<u64>() as f64 / sizes.len() as f64;
+        self.costs.entry(key).or_default().scene_bytes = Some(mean.round() as u64);
     }
 
     /// Records why a metric is not measured.

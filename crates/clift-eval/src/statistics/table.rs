@@ -2,8 +2,6 @@
 
 use std::fmt;
 
-use clift_model::TokenFormat;
-
 use crate::config::method::Method;
 use crate::statistics::paired::PairedDifference;
 use crate::statistics::summary::{Quality, Summary};
@@ -60,7 +58,7 @@ impl fmt::Display for Summary {
             let cells = [
                 count(point.key.num_storage_tokens),
                 count(point.key.num_render_tokens),
-                point.key.tokens.map_or("-", TokenFormat::name).to_owned(),
+                point.key.tokens.map_or_else(|| "-".to_owned(), |tokens| tokens.to_string()),
                 cell(point.psnr, 2),
                 cell(point.psnr_stderr, 2),
                 cell(point.ssim, 3),
@@ -94,7 +92,7 @@ impl fmt::Display for Summary {
             writeln!(f, "\nPSNR differences on the same scenes, with standard errors")?;
         }
         for PairedDifference { method, against, num_storage_tokens, tokens, psnr, psnr_stderr, .. } in differences {
-            let (error, format) = (cell(*psnr_stderr, 2), tokens.map_or("", TokenFormat::name));
+            let (error, format) = (cell(*psnr_stderr, 2), tokens.map_or_else(String::new, |tokens| tokens.to_string()));
             let names = format!("{} - {}", method.name(), against.name());
             writeln!(f, "{names:<24} {num_storage_tokens:>6} tokens {format:<4} {psnr:>+7.2} +- {error} dB")?;
         }
@@ -117,7 +115,7 @@ fn cell(value: Option<f64>, decimals: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenFormat;
+    use clift_model::TokenStorage;
 
     use crate::config::method::{Method, MethodName};
     use crate::statistics::eval_results::EvalResults;
@@ -128,7 +126,7 @@ mod tests {
     #[test]
     fn table_columns_are_aligned() {
         let mut views = EvalResults::default();
-        let key = EvalKey { tokens: Some(TokenFormat::Int8), ..CLIFT };
+        let key = EvalKey { tokens: Some(TokenStorage::INT8), ..CLIFT };
         for (scene, psnr, ms) in [("a", 20.0, 1.0), ("b", 21.0, 2.0)] {
             let measured = ViewMetrics {
                 render_s: Some(ms * 1e-3),

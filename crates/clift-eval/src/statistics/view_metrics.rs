@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use clift_model::TokenFormat;
+use clift_model::TokenStorage;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
@@ -18,8 +18,8 @@ pub struct EvalKey {
     pub num_storage_tokens: usize,
     /// Tokens of a rendering; 0 for a baseline.
     pub num_render_tokens: usize,
-    /// Number format of the stored tokens; `None` without tokens.
-    pub tokens: Option<TokenFormat>,
+    /// Storage of the tokens; `None` without tokens.
+    pub tokens: Option<TokenStorage>,
 }
 
 impl EvalKey {
@@ -28,9 +28,9 @@ impl EvalKey {
         Self { method, num_storage_tokens: 0, num_render_tokens: 0, tokens: None }
     }
 
-    /// Returns the name of the number format; empty without tokens.
-    pub fn format_name(self) -> &'static str {
-        self.tokens.map_or("", TokenFormat::name)
+    /// Returns the name of the tokens' storage; empty without tokens.
+    pub fn format_name(self) -> String {
+        self.tokens.map_or_else(String::new, |tokens| tokens.to_string())
     }
 
     /// Returns whether views are rendered from all stored tokens.
@@ -95,7 +95,7 @@ impl ViewMetrics {
 pub struct Cost {
     /// Billions of multiply-accumulates per rendered view, attention included.
     pub gflops: Option<f64>,
-    /// Bytes of a scene file, or the given data size of an external method.
+    /// Mean bytes of a scene file, or the given data size of an external method.
     pub scene_bytes: Option<u64>,
     /// Peak resident memory of the process, weights included, while a view was rendered; on CPUs only.
     pub peak_bytes: Option<u64>,

@@ -2,8 +2,11 @@
 // N encoder tokens, S stored tokens, R rendered tokens, D width
 
 use burn::tensor::{Tensor, TensorData};
-use clift_data::item_rng;
-use clift_model::{SceneModel, TokenFormat, Tokens, TrainedModel};
+use clift_data::{Clip, Pose, item_rng};
+use clift_model::{
+    Scene, SceneModel, SceneNormalization, TokenCodec, TokenFormat, TokenStorage, Tokens, TrainedModel,
+    scene_file_bytes,
+};
 use rand::Rng;
 use rand::seq::SliceRandom;
 
@@ -11,6 +14,7 @@ use crate::config::method::Method;
 use crate::error::EvalError;
 use crate::sweep::eval_models::EvalModels;
 use crate::sweep::lazy_clusters::LazyClusters;
+use crate::upload::view_cameras;
 
 pub(crate) struct CompressedTokens<'a> {
     /// `[1, S, D]`
@@ -18,6 +22,8 @@ pub(crate) struct CompressedTokens<'a> {
     /// The patch of the context views of every token, `[S]`.
     pub ids: Vec<u32>,
     pub model: &'a TrainedModel,
+    /// Size of the scene file; `None` for random subsets, which have no file.
+    pub file_bytes: Option<u64>,
 }
 
 impl<'a> CompressedTokens<'a> {
@@ -25,14 +31,14 @@ impl<'a> CompressedTokens<'a> {
     pub fn new(
         method: Method,
         models: &'a EvalModels,
-        lift: &Tokens,
-        index: &LazyClusters,
-        storage: TokenFormat,
+        (lift, index): (&Tokens, &LazyClusters),
+        storage: TokenStorage,
+        (clip, model_path): (&Clip, &str),
     ) -> Result<Self, EvalError> {
         let model = models.for_method(method).ok_or(EvalError::NoModel { method: method.name() })?;
         if method == Method::Random {
             let ids = random_subset(lift.dims()[1], index.num_clusters, item_rng(index.seed, 0, 0, 0, "random subset"));
-            return Ok(Self { tokens: lift.select(&ids), ids, model });
+            return Ok(Self { tokens: lift.select(&ids), ids, model, file_bytes: None });
         }
         let is_tiled = matches!(method, Method::Patch | Method::PatchClift);
         let clusters = if is_tiled { index.tiles()? } else { index.clusters()? };
@@ -42,7 +48,22 @@ impl<'a> CompressedTokens<'a> {
             _ => lift.centroids(&uploaded),
         };
         let ids = clusters.scenes()[0].centroid_index().to_vec();
-        Ok(Self { tokens: rounded(tokens, storage)?, ids, model })
+        let (num_tokens, num_views) = (ids.len(), clip.context.num_views());
+        let (tokens, bytes) = match storage {
+            TokenStorage::Plain(format) => {
+                let bytes = scene_file_bytes(num_tokens, model.config.dim, num_views, format);
+                (rounded(tokens, format)?, bytes)
+            }
+            TokenStorage::Coded(loss) => {
+                let codec = models.codec.as_ref().ok_or(EvalError::NoModel { method: "coded tokens" })?;
+                let share = num_tokens as f64 / lift.dims()[1] as f64;
+                let step = codec.rates.step_for_loss(share, loss.db()) as f32;
+                let scene = scene_of(clip, codec, &ids, host_values(&tokens)?, model_path);
+                let bytes = scene.coded_bytes(codec, step)?.len() as u64;
+                (with_values(tokens, codec.round(&scene.tokens, step)?), bytes)
+            }
+        };
+        Ok(Self { tokens, ids, model, file_bytes: Some(bytes) })
     }
 }
 
@@ -56,15 +77,41 @@ pub(crate) fn random_subset(num_tokens: usize, count: usize, mut rng: impl Rng) 
 }
 
 /// Rounds tokens `[1, S, D]` like a scene file of the format.
-fn rounded(tokens: Tokens, storage: TokenFormat) -> Result<Tokens, EvalError> {
-    if storage == TokenFormat::F32 {
+fn rounded(tokens: Tokens, format: TokenFormat) -> Result<Tokens, EvalError> {
+    if format == TokenFormat::F32 {
         return Ok(tokens);
     }
+    let values = format.round(&host_values(&tokens)?, tokens.dims()[2])?;
+    Ok(with_values(tokens, values))
+}
+
+/// Returns the values of tokens, `[1, S, D]`, on the host.
+pub(crate) fn host_values(tokens: &Tokens) -> Result<Vec<f32>, EvalError> {
+    tokens.values.clone().into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)
+}
+
+/// Returns tokens of other values.
+pub(crate) fn with_values(tokens: Tokens, values: Vec<f32>) -> Tokens {
     let (shape, device) = (tokens.dims(), tokens.values.device());
-    let values: Vec<f32> =
-        tokens.values.clone().into_data().convert::<f32>().try_to_vec().map_err(EvalError::tensor)?;
-    let values = storage.round(&values, shape[2])?;
-    Ok(tokens.with_values(Tensor::from_data(TensorData::new(values, shape), &device)))
+    tokens.with_values(Tensor::from_data(TensorData::new(values, shape), &device))
+}
+
+/// Returns the scene of stored tokens. Its normalization is that of no capture, which does not change the size of a file.
+fn scene_of(clip: &Clip, codec: &TokenCodec, ids: &[u32], tokens: Vec<f32>, model_path: &str) -> Scene {
+    Scene {
+        key: clip.key.clone(),
+        kind: codec.kind,
+        model: codec.model.clone(),
+        renderer_hash: codec.renderer_hash.clone(),
+        model_path: model_path.into(),
+        height: clip.context.height,
+        width: clip.context.width,
+        context: view_cameras(&clip.context),
+        context_frames: clip.context.frame_index.iter().map(|&frame| frame as u32).collect(),
+        world: SceneNormalization { mean_c2w: Pose::IDENTITY.to_matrix_f64(), scale: 1.0 },
+        token_ids: ids.into(),
+        tokens,
+    }
 }
 
 #[cfg(test)]

@@ -1,6 +1,8 @@
 //! The trained models of an evaluation, one per rendering method.
 
-use clift_model::{Grouping, TrainedModel};
+use std::sync::Arc;
+
+use clift_model::{Grouping, TokenCodec, TrainedModel};
 
 use crate::config::method::Method;
 
@@ -13,12 +15,14 @@ pub struct EvalModels {
     pub stage2: Option<TrainedModel>,
     /// Condenses and renders tiles.
     pub stage2_tiles: Option<TrainedModel>,
+    /// Codec of the tokens of `stage2`.
+    pub codec: Option<Arc<TokenCodec>>,
 }
 
 impl EvalModels {
     /// Starts with the model of stage 1.
     pub fn new(stage1: TrainedModel) -> Self {
-        Self { stage1, stage2: None, stage2_tiles: None }
+        Self { stage1, stage2: None, stage2_tiles: None, codec: None }
     }
 
     /// Sets a model of stage 2, trained on such groups of tokens and on the encoder of stage 1.

@@ -5,7 +5,7 @@ use std::collections::btree_map::Entry;
 use std::time::Instant;
 
 use clift_data::{Clip, derive_seed, median};
-use clift_model::{Cameras, FlopConvention, SceneModel, Tokens, TrainedModel, scene_file_bytes};
+use clift_model::{Cameras, FlopConvention, SceneModel, Tokens, TrainedModel};
 
 use crate::config::method::Method;
 use crate::error::EvalError;
@@ -49,7 +49,7 @@ pub fn evaluate_scene(
         .map(|(method, network)| (method, network.normalize(features.clone())))
         .collect();
     let lift = stage1.normalize(features); // [1, N, D]
-    let [_, num_tokens, dim] = lift.dims();
+    let [_, num_tokens, _] = lift.dims();
     let seed = derive_seed(sweep.seed, &clip.key);
     let grid = [clip.context.height, clip.context.width].map(|side| side / sweep.model.patch_size);
     let views = (clip.context.num_views(), grid);
@@ -76,9 +76,9 @@ pub fn evaluate_scene(
         for &method in &sweep.methods {
             let own = own_norm.iter().find(|(of, ..)| *of == method);
             let (lift, index) = own.map_or((&lift, &index), |(_, lift, index)| (*lift, index));
-            for (i, &tokens) in sweep.formats(method).iter().enumerate() {
+            for (i, tokens) in sweep.formats(method).into_iter().enumerate() {
                 let kept_views = if i == 0 { &kept_views[..] } else { &[] };
-                let stored = CompressedTokens::new(method, models, lift, index, tokens)?;
+                let stored = CompressedTokens::new(method, models, (lift, index), tokens, (clip, &sweep.model_path))?;
                 let whole =
                     EvalKey { method, num_storage_tokens, num_render_tokens: num_storage_tokens, tokens: Some(tokens) };
                 let first = jobs.len();
@@ -101,8 +101,7 @@ pub fn evaluate_scene(
                     renderer.warm_up(&some, metrics)?;
                     jobs.push(some);
                 }
-                if method != Method::Random {
-                    let bytes = scene_file_bytes(num_storage_tokens, dim, clip.context.num_views(), tokens);
+                if let Some(bytes) = stored.file_bytes {
                     jobs[first..].iter().for_each(|job| metrics.add_scene_bytes(job.key, bytes));
                 }
             }

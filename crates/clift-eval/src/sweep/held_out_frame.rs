@@ -1,13 +1,12 @@
 //! A check of an encoded scene: a frame that is no context, rendered and compared with the nearest context view.
 
-use burn::tensor::{Tensor, TensorData};
 use clift_data::{ClipReader, Pose, PoseNormalization, ViewIndices};
-use clift_model::{Scene, SceneModel, TrainedModel};
+use clift_model::{Scene, SceneRenderer, SelectionPreset, TrainedModel, ViewCamera};
 
 use crate::error::EvalError;
 use crate::metrics::image_metrics::psnr;
 use crate::sweep::baselines::{nearest_image, view_image};
-use crate::upload::upload_cameras;
+use crate::upload::view_cameras;
 
 /// Largest number of frames that are tried: images may be unreadable.
 const MAX_TRIES: usize = 3;
@@ -35,30 +34,80 @@ impl HeldOutFrame {
         index: usize,
         scene: &Scene,
     ) -> Result<Option<Self>, EvalError> {
+        let Some(CheckViews { frames, cameras, truth, size, nearest }) = CheckViews::read(reader, index, scene, 1)?
+        else {
+            return Ok(None);
+        };
+        let pixels = render_scene(model, scene, &cameras, size)?.concat();
+        let nearest_psnr = psnr(&nearest[0], &truth)?;
+        Ok(Some(Self { frame: frames[0], psnr: psnr(&pixels, &truth)?, nearest_psnr }))
+    }
+}
+
+/// Frames of a scene with true images, in the poses of its file.
+pub(crate) struct CheckViews {
+    pub frames: Vec<usize>,
+    pub cameras: Vec<ViewCamera>,
+    /// RGB in `[0, 1]` of all frames, `[V, height, width, 3]`.
+    pub truth: Vec<f32>,
+    /// Height and width.
+    pub size: [usize; 2],
+    /// The context view nearest to every frame.
+    pub nearest: Vec<Vec<f32>>,
+}
+
+impl CheckViews {
+    /// Reads up to `count` frames that are no contexts, the farthest from the contexts first; `None` if none is readable.
+    pub fn read(reader: &ClipReader, index: usize, scene: &Scene, count: usize) -> Result<Option<Self>, EvalError> {
+        let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
+        let frames = candidates(&context, reader.source.cameras(index)?.len());
+        for frames in frames.chunks(count).take(MAX_TRIES) {
+            if let Ok(views) = Self::of_frames(reader, index, scene, frames) {
+                return Ok(Some(views));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Reads the contexts.
+    pub fn contexts(reader: &ClipReader, index: usize, scene: &Scene) -> Result<Self, EvalError> {
+        let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
+        Self::of_frames(reader, index, scene, &context)
+    }
+
+    fn of_frames(reader: &ClipReader, index: usize, scene: &Scene, frames: &[usize]) -> Result<Self, EvalError> {
         let context: Vec<usize> = scene.context_frames.iter().map(|&frame| frame as usize).collect();
         let cameras = reader.source.cameras(index)?;
         let normalization =
             PoseNormalization { mean_c2w: Pose::from_matrix(&scene.world.mean_c2w)?, scale: scene.world.scale };
-        for frame in candidates(&context, cameras.len()).into_iter().take(MAX_TRIES) {
-            let Ok(mut clip) = reader.read(index, &ViewIndices { context: context.clone(), target: vec![frame] })
-            else {
-                continue;
-            };
-            // The poses of the scene file: `reader` may normalize by the target too.
-            for views in [&mut clip.context, &mut clip.target] {
-                views.c2w = views.frame_index.iter().map(|&i| normalization.normalize(cameras[i].c2w)).collect();
-            }
-            let shape = [1, scene.num_tokens(), scene.tokens.len() / scene.num_tokens().max(1)];
-            let tokens: Tensor<3> = Tensor::from_data(TensorData::new(scene.tokens.clone(), shape), &model.device);
-            let image = model.network.render(tokens, &upload_cameras(&[&clip.target], &model.device)?);
-            let pixels = image.into_data().convert::<f32>().try_to_vec::<f32>().map_err(EvalError::tensor)?;
-            let target = view_image(&clip.target, 0);
-            let nearest = nearest_image(&clip.context, clip.target.c2w[0])?;
-            let nearest_psnr = psnr(&nearest, &target)?;
-            return Ok(Some(Self { frame, psnr: psnr(&pixels, &target)?, nearest_psnr }));
+        let mut clip = reader.read(index, &ViewIndices { context, target: frames.to_vec() })?;
+        // The poses of the scene file: `reader` may normalize by the target too.
+        for views in [&mut clip.context, &mut clip.target] {
+            views.c2w = views.frame_index.iter().map(|&i| normalization.normalize(cameras[i].c2w)).collect();
         }
-        Ok(None)
+        let nearest: Result<Vec<_>, _> =
+            clip.target.c2w.iter().map(|&pose| nearest_image(&clip.context, pose)).collect();
+        Ok(Self {
+            frames: frames.to_vec(),
+            cameras: view_cameras(&clip.target),
+            truth: (0..frames.len()).flat_map(|view| view_image(&clip.target, view)).collect(),
+            size: [clip.target.height, clip.target.width],
+            nearest: nearest?,
+        })
     }
+}
+
+/// Renders views of a scene from all its tokens, `[height, width, 3]` each.
+pub(crate) fn render_scene(
+    model: &TrainedModel,
+    scene: &Scene,
+    views: &[ViewCamera],
+    [height, width]: [usize; 2],
+) -> Result<Vec<Vec<f32>>, EvalError> {
+    let rules = SelectionPreset::Paper.rules();
+    let mut renderer = SceneRenderer::new(scene, model.network.renderer.clone(), rules, &model.device)?;
+    let rendered = renderer.render(views, height, width, scene.num_tokens())?;
+    Ok(rendered.into_iter().map(|view| view.pixels).collect())
 }
 
 /// Returns the frames that are no contexts: those between the contexts first, the farthest from a context first.

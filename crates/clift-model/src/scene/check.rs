@@ -16,24 +16,7 @@ const MAX_ROTATION_ERROR: f64 = 1e-2;
 impl Scene {
     /// Returns a message about the first invalid field.
     pub(crate) fn check(&self) -> Result<(), String> {
-        self.model.validate().map_err(|error| error.to_string())?;
-        let views = self.context.len();
-        if !(1..=MAX_VIEWS).contains(&views) || self.context_frames.len() != views {
-            let frames = self.context_frames.len();
-            return Err(format!(
-                "{views} context cameras and {frames} frame numbers, expected equal numbers from 1 to {MAX_VIEWS}"
-            ));
-        }
-        if self.height.max(self.width) > MAX_SIDE_PX {
-            return Err(format!(
-                "context views of {} x {} pixels, expected at most {MAX_SIDE_PX} a side",
-                self.width, self.height
-            ));
-        }
-        let num_patches = self.model.num_tokens(views, self.height, self.width).map_err(|error| error.to_string())?;
-        if num_patches > MAX_PATCHES {
-            return Err(format!("{num_patches} patches of context views, expected at most {MAX_PATCHES}"));
-        }
+        let num_patches = self.check_views()?;
         self.check_tokens(num_patches)?;
         for (view, camera) in self.context.iter().enumerate() {
             check_camera(camera).map_err(|reason| format!("context camera {view}: {reason}"))?;
@@ -53,6 +36,29 @@ impl Scene {
             ));
         }
         Ok(())
+    }
+
+    /// Returns the number of patches, or a message about invalid sizes and numbers of views.
+    pub(crate) fn check_views(&self) -> Result<usize, String> {
+        self.model.validate().map_err(|error| error.to_string())?;
+        let views = self.context.len();
+        if !(1..=MAX_VIEWS).contains(&views) || self.context_frames.len() != views {
+            let frames = self.context_frames.len();
+            return Err(format!(
+                "{views} context cameras and {frames} frame numbers, expected equal numbers from 1 to {MAX_VIEWS}"
+            ));
+        }
+        if self.height.max(self.width) > MAX_SIDE_PX {
+            return Err(format!(
+                "context views of {} x {} pixels, expected at most {MAX_SIDE_PX} a side",
+                self.width, self.height
+            ));
+        }
+        let num_patches = self.model.num_tokens(views, self.height, self.width).map_err(|error| error.to_string())?;
+        if num_patches > MAX_PATCHES {
+            return Err(format!("{num_patches} patches of context views, expected at most {MAX_PATCHES}"));
+        }
+        Ok(num_patches)
     }
 
     fn check_tokens(&self, num_patches: usize) -> Result<(), String> {

@@ -1,10 +1,13 @@
 //! The scene file, and rendering from it.
 //!
 //! `scene` holds a stored scene and documents the bytes of its file; `check` the rules of a valid scene; `read` and
-//! `write` the file itself, with the tokens in a `token_format`; `model_place` the path of its model. `scene_renderer` renders frames of a scene on a device,
+//! `write` the file itself, with its `header` and the tokens in a `token_format`; `coded_file` the file with coded tokens;
+//! `token_storage` the names of both ways; `model_place` the path of its model. `scene_renderer` renders frames of a scene on a device,
 //! and `render_budget` measures how many tokens a time per frame allows.
 
 pub(crate) mod check;
+pub(crate) mod coded_file;
+pub(crate) mod header;
 pub(crate) mod model_place;
 pub(crate) mod read;
 pub(crate) mod render_budget;
@@ -12,4 +15,5 @@ pub(crate) mod render_budget;
 pub(crate) mod scene;
 pub(crate) mod scene_renderer;
 pub(crate) mod token_format;
+pub(crate) mod token_storage;
 pub(crate) mod write;

@@ -23,10 +23,14 @@ impl Scene {
     /// Returns the path of the model of the scene that was read from `file`: beside the file, else in the current folder, as in
     /// files of earlier versions. The path need not exist.
     pub fn find_model(&self, file: &Path) -> PathBuf {
-        let beside = folder(file).join(&self.model_path);
-        let here = PathBuf::from(&self.model_path);
-        if !beside.exists() && here.exists() { here } else { beside }
+        find_model(&self.model_path, file)
     }
+}
+
+pub(crate) fn find_model(model_path: &str, file: &Path) -> PathBuf {
+    let beside = folder(file).join(model_path);
+    let here = PathBuf::from(model_path);
+    if !beside.exists() && here.exists() { here } else { beside }
 }
 
 fn folder(file: &Path) -> &Path {

@@ -1,18 +1,23 @@
 //! Reads scene files, which may be damaged or hostile: sizes are checked before memory is allocated.
 
-use std::collections::HashMap;
 use std::path::Path;
 
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 
+use crate::codec::token_codec::TokenCodec;
 use crate::error::ModelError;
 use crate::names::parse;
 use crate::network::config::ModelConfig;
-use crate::scene::scene::{FORMAT, Scene, SceneNormalization, VERSION, dtype_name};
+use crate::scene::coded_file::from_coded_bytes;
+use crate::scene::header::{Fields, Refusal, refusal};
+use crate::scene::model_place::find_model;
+use crate::scene::scene::{CODED_VERSION, FORMAT, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name};
 use crate::scene::token_format::TokenFormat;
+use crate::scene::token_storage::{CodedLoss, TokenStorage};
 use crate::views::camera::ViewCamera;
+use crate::weights::model_path::ModelPath;
 
-/// Longest accepted header; headers of this version have 2048 bytes.
+/// Longest accepted header; headers of version 2 have 2048 bytes.
 const MAX_HEADER_BYTES: u64 = 1 << 16;
 /// Largest accepted file: 65,536 tokens of width 768 in f32 take a fifth of it.
 const MAX_FILE_BYTES: u64 = 1 << 30;
@@ -21,36 +26,36 @@ const RAY_TOLERANCE: f64 = 1e-4;
 
 const GIVE_ANOTHER: &str = "give a file that `clift encode` wrote";
 const COPY_AGAIN: &str = "copy it again, or encode the scene again";
+const GIVE_MODEL: &str = "give the run it was encoded with (--model RUN)";
 const OTHER_VERSION: &str = "use the version of clift that wrote it, or encode the scene again";
 
-struct Refusal {
-    reason: String,
-    fix: &'static str,
-}
-
-impl From<String> for Refusal {
-    fn from(reason: String) -> Self {
-        Self { reason, fix: "encode the scene again" }
-    }
-}
-
-fn refusal(reason: impl Into<String>, fix: &'static str) -> Refusal {
-    Refusal { reason: reason.into(), fix }
-}
-
 impl Scene {
-    /// Reads and checks a scene file.
+    /// Reads and checks a scene file. Coded tokens need the codec of the scene's model, see [`find_model`](Self::find_model).
     ///
     /// # Errors
-    /// [`ModelError::SceneFile`] for a file that is no scene, has another version, is truncated or inconsistent.
-    pub fn read(path: &Path) -> Result<(Self, TokenFormat), ModelError> {
+    /// [`ModelError::SceneFile`] for a file that is no scene, has another version, is truncated or inconsistent, and for
+    /// coded tokens without their codec.
+    pub fn read(path: &Path) -> Result<(Self, TokenStorage), ModelError> {
+        Self::read_for(path, None)
+    }
+
+    /// Reads a scene file with the codec of `model` in place of that of the scene's model path.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read).
+    pub fn read_for(path: &Path, model: Option<&Path>) -> Result<(Self, TokenStorage), ModelError> {
         let read = || {
             let size = std::fs::metadata(path).map_err(|error| refusal(error.to_string(), GIVE_ANOTHER))?.len();
             if size > MAX_FILE_BYTES {
                 let reason = format!("the file has {size} bytes, a scene at most {MAX_FILE_BYTES}");
                 return Err(refusal(reason, GIVE_ANOTHER));
             }
-            from_bytes(&std::fs::read(path).map_err(|error| refusal(error.to_string(), GIVE_ANOTHER))?)
+            let bytes = std::fs::read(path).map_err(|error| refusal(error.to_string(), GIVE_ANOTHER))?;
+            from_bytes(&bytes, &|model_path| {
+                let model = model.map_or_else(|| find_model(model_path, path), Path::to_owned);
+                let weights = ModelPath::find(&model).map_err(|error| error.to_string())?.weights;
+                TokenCodec::read(&TokenCodec::path_of(&weights)).map_err(|error| error.to_string())
+            })
         };
         read().map_err(|Refusal { reason, fix }| ModelError::SceneFile {
             action: "use",
@@ -61,7 +66,11 @@ impl Scene {
     }
 }
 
-fn from_bytes(bytes: &[u8]) -> Result<(Scene, TokenFormat), Refusal> {
+/// Reads a scene; `find_codec` returns the codec of a model path.
+fn from_bytes(
+    bytes: &[u8],
+    find_codec: &dyn Fn(&str) -> Result<TokenCodec, String>,
+) -> Result<(Scene, TokenStorage), Refusal> {
     check_length(bytes)?;
     let file = SafeTensors::deserialize(bytes).map_err(|error| match error {
         SafeTensorError::MetadataIncompleteBuffer => {
@@ -75,8 +84,17 @@ fn from_bytes(bytes: &[u8]) -> Result<(Scene, TokenFormat), Refusal> {
         return Err(refusal("the file is no scene: its header lacks the scene format", GIVE_ANOTHER));
     }
     let version = fields.get("version")?;
-    if version != VERSION {
-        return Err(refusal(format!("scene file version {version:?}, expected {VERSION:?}"), OTHER_VERSION));
+    if version == CODED_VERSION {
+        let body = file.tensor("scene").map_err(|_| "no tensor `scene`".to_owned())?.data();
+        let codec = find_codec(fields.get("model_path")?).map_err(|reason| refusal(reason, GIVE_MODEL))?;
+        let (scene, step) = from_coded_bytes(bytes, body, &fields, &codec)?;
+        let num_patches = scene.model.num_tokens(scene.context.len(), scene.height, scene.width).unwrap_or(1);
+        let loss = codec.rates.loss(scene.num_tokens() as f64 / num_patches as f64, f64::from(step));
+        return Ok((scene, TokenStorage::Coded(CodedLoss::from_db(loss))));
+    }
+    if ![VERSION, FORMER_VERSION].contains(&version) {
+        let reason = format!("scene file version {version:?}, expected \"1\", {VERSION:?} or {CODED_VERSION:?}");
+        return Err(refusal(reason, OTHER_VERSION));
     }
     let kind = fields.get("kind")?;
     let kind = parse(kind).ok_or_else(|| format!("unknown kind of tokens {kind:?}"))?;
@@ -107,7 +125,7 @@ fn from_bytes(bytes: &[u8]) -> Result<(Scene, TokenFormat), Refusal> {
     };
     scene.check()?;
     check_rays(&scene, &tensors.f32s("token_rays", &[num_tokens, 6])?)?;
-    Ok((scene, format))
+    Ok((scene, format.into()))
 }
 
 /// Checks the length of the header before the header is parsed.
@@ -137,20 +155,6 @@ fn check_rays(scene: &Scene, rays: &[f32]) -> Result<(), String> {
         }
     }
     Ok(())
-}
-
-/// The metadata of a header.
-struct Fields(HashMap<String, String>);
-
-impl Fields {
-    fn get(&self, name: &str) -> Result<&str, String> {
-        self.0.get(name).map(String::as_str).ok_or_else(|| format!("no `{name}` in the header"))
-    }
-
-    fn side(&self, name: &str) -> Result<usize, String> {
-        let value = self.get(name)?;
-        value.parse().map_err(|_| format!("{name} {value:?}, expected a number of pixels"))
-    }
 }
 
 /// The tensors of a file, looked up by name, type and shape.

@@ -1,7 +1,7 @@
 //! A compressed scene: its tokens, and the cameras and sizes that rendering needs besides the weights.
 //!
-//! A `.clift` file is safetensors with a header of fixed length, so that its size is known in advance
-//! ([`scene_file_bytes`]):
+//! A `.clift` file with plain tokens is safetensors with a header of fixed length, so that its size is known in advance
+//! ([`scene_file_bytes`]); `coded_file` has the layout of a file with coded tokens:
 //!
 //! | part | type | shape |
 //! |---|---|---|
@@ -31,8 +31,12 @@ use crate::views::camera::ViewCamera;
 pub const HEADER_BYTES: usize = 2048;
 
 pub(crate) const FORMAT: &str = "clift-scene";
-/// The renderer hash of version 1 did not include the number of heads.
+/// The version of files with plain tokens.
 pub(crate) const VERSION: &str = "2";
+/// Files like version 2, whose renderer hash does not include the number of heads.
+pub(crate) const FORMER_VERSION: &str = "1";
+/// The version of files with coded tokens.
+pub(crate) const CODED_VERSION: &str = "3";
 
 /// Normalization of camera positions: `R^T (c - t) * scale`, where `[R | t]` is the mean pose.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -16,7 +16,8 @@ use crate::tokens::selection::rules::SelectionRules;
 use crate::tokens::selection::selector::Selector;
 use crate::views::camera::ViewCamera;
 use crate::views::upload::Cameras;
-use crate::weights::hash::renderer_hash;
+use crate::weights::hash::{renderer_hash, weights_hash};
+use crate::weights::model_path::check_heads;
 use crate::weights::trained_model::open_renderer;
 
 /// Most frames of one call with all tokens, where frames share keys and values.
@@ -37,7 +38,11 @@ pub fn frames_per_call(num_patches: usize) -> usize {
 pub fn load_renderer(scene: &Scene, weights: &Path, device: &Device) -> Result<Renderer, ModelError> {
     let renderer = open_renderer(&scene.model, weights, device)?;
     let got = renderer_hash(&renderer, &scene.model);
-    if got != scene.renderer_hash {
+    let is_former = got != scene.renderer_hash && weights_hash(&renderer) == scene.renderer_hash;
+    if is_former {
+        // The hash of a scene file of version 1 does not include the heads.
+        weights.ancestors().skip(1).take(2).try_for_each(|dir| check_heads(&scene.model, dir))?;
+    } else if got != scene.renderer_hash {
         return Err(ModelError::OtherRenderer { expected: scene.renderer_hash.clone(), got, path: weights.into() });
     }
     Ok(renderer)

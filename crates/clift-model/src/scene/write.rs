@@ -1,4 +1,4 @@
-//! Writes scene files.
+//! Writes scene files with plain tokens, version 2.
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -7,6 +7,7 @@ use std::path::Path;
 
 use crate::error::ModelError;
 use crate::files::{folder_of, replace};
+use crate::scene::header::write_fields;
 use crate::scene::scene::{FORMAT, HEADER_BYTES, Scene, VERSION, dtype_name};
 use crate::scene::token_format::TokenFormat;
 
@@ -39,7 +40,7 @@ fn is_scene(path: &Path) -> bool {
     read.is_ok() && start.windows(field.len()).any(|part| part == field.as_bytes())
 }
 
-const WRITABLE_FOLDER: &str = "choose a folder that exists and can be written to";
+pub(crate) const WRITABLE_FOLDER: &str = "choose a folder that exists and can be written to";
 const OTHER_NAME: &str = "choose another name";
 
 impl Scene {
@@ -122,12 +123,9 @@ impl Scene {
         Ok(bytes)
     }
 
-    /// Returns the header up to the first tensor. Equal scenes must be equal files, and the safetensors crate writes metadata
-    /// in random order.
     fn metadata(&self) -> Result<String, String> {
-        let json = |text: &str| serde_json::to_string(text).map_err(|error| error.to_string());
         let model = serde_json::to_string(&self.model).map_err(|error| error.to_string())?;
-        let fields = [
+        Ok(write_fields(&[
             ("format", FORMAT),
             ("version", VERSION),
             ("key", &self.key),
@@ -137,13 +135,6 @@ impl Scene {
             ("model_path", &self.model_path),
             ("height", &self.height.to_string()),
             ("width", &self.width.to_string()),
-        ];
-        let mut header = String::from("{\"__metadata__\":{");
-        for (i, (name, value)) in fields.into_iter().enumerate() {
-            let comma = if i == 0 { "" } else { "," };
-            let _ = write!(header, "{comma}\"{name}\":{}", json(value)?);
-        }
-        header.push('}');
-        Ok(header)
+        ]))
     }
 }

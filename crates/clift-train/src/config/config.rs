@@ -66,6 +66,7 @@ impl Config {
             selection: eval.selection,
             tokens: eval.tokens.clone(),
             methods,
+            model_path: self.run_dir.display().to_string(),
             kmeans: clusters.kmeans.clone(),
             model: model.clone(),
             lpips: None,

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use clift_data::{replace_file, write_state_dict};
-use clift_model::{CameraEncoding, ModelConfig, ModelPath, PREFIX, PROJECTIONS, published_tensors};
+use clift_model::{CameraEncoding, ModelConfig, ModelPath, PREFIX, PROJECTIONS, TokenCodec, published_tensors};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
@@ -39,7 +39,12 @@ pub struct Exported {
 /// [`TrainError::BadConfig`] if `out` exists or the network has camera-relative attention, [`TrainError::BadFile`] if the weight file does not fit the config, and those of
 /// reading and writing.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
+    let codecs = [&model.weights, out].map(TokenCodec::path_of);
+    let codec = codecs[0].exists().then(|| TokenCodec::read(&codecs[0])).transpose()?;
     require_absent(out)?;
+    if codec.is_some() {
+        require_absent(&codecs[1])?;
+    }
     config.model.validate()?;
     if config.model.camera_encoding != CameraEncoding::Plucker {
         let fix = "published networks have plain attention; only runs with \"plucker\" are exported";
@@ -86,6 +91,7 @@ pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Pa
             replace_file(out, &bytes).map_err(TrainError::io("writing the weights", out))?;
         }
     }
+    codec.map_or(Ok(()), |codec| codec.write(&codecs[1]))?;
     Ok(exported)
 }
 

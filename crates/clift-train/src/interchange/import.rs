@@ -73,7 +73,7 @@ pub fn import(
         passed_over: state.skipped_objects.clone(),
     };
     let config = model_dir::evaluation_config(model, out);
-    model_dir::write_model_dir(out, &config, &parameters, &imported, stop)?;
+    model_dir::write_model_dir(out, &config, &parameters, (&imported, file), stop)?;
     Ok((config, imported))
 }
 

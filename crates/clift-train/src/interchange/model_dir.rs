@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::{PoseRotation, PoseScale, SourceKind, TEMPORARY, publish_folder, replace_file};
-use clift_model::{CliftVariant, ModelConfig, ModelPath, TrainedModel, sorted_header};
+use clift_model::{CliftVariant, ModelConfig, ModelPath, TokenCodec, TrainedModel, sorted_header};
 use safetensors::tensor::{Dtype, TensorView};
 
 use crate::config::config::Config;
@@ -55,7 +55,7 @@ pub(crate) fn write_model_dir(
     folder: &Path,
     config: &Config,
     parameters: &[HostTensor],
-    imported: &ImportRecord,
+    (imported, file): (&ImportRecord, &Path),
     stop: &AtomicBool,
 ) -> Result<(), TrainError> {
     if folder.file_name().is_none() {
@@ -85,7 +85,10 @@ pub(crate) fn write_model_dir(
     write("import.json", &import_text)?;
 
     let written = ModelPath { dir: temporary.path().into(), weights: temporary.path().join("model.safetensors") };
-    TrainedModel::open(&written, &config.model, &config.device.open()?)?;
+    let model = TrainedModel::open(&written, &config.model, &config.device.open()?)?;
+    if let Some(codec) = TokenCodec::beside(file, &model)? {
+        codec.write(&TokenCodec::path_of(&written.weights))?;
+    }
     check_stop(stop)?;
     require_absent(folder)?;
     publish_folder(temporary.path(), folder).map_err(TrainError::io(writing, folder))?;

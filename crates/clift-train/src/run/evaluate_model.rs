@@ -1,10 +1,11 @@
 //! Evaluation of a model without a run: an imported model or a weight file.
 
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use clift_data::{ClipReader, open_dataset};
 use clift_eval::{EvalFrames, EvalModels, Method, Summary};
-use clift_model::{ModelPath, TrainedModel};
+use clift_model::{ModelPath, TokenCodec, TrainedModel};
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
@@ -50,6 +51,7 @@ pub fn evaluate_model(
         }
     }
     if last.has_condenser {
+        models.codec = TokenCodec::beside(&model.weights, &last)?.map(Arc::new);
         models.set_stage2(config.clusters.grouping, last);
     }
     let split = request.split;

@@ -6,6 +6,7 @@
 
 use std::path::Path;
 
+use clift_model::TokenCodec;
 use serde::{Deserialize, Serialize};
 
 use crate::checkpoint::checkpoints::Checkpoints;
@@ -56,6 +57,11 @@ impl StepExtension {
             }
             // Before the new number is written: a process killed in between makes these weights again.
             let kept = own.join(format!("model-{from}-steps.safetensors"));
+            let codecs = [weights.as_path(), &kept].map(TokenCodec::path_of);
+            if codecs[0].exists() {
+                std::fs::rename(&codecs[0], &codecs[1])
+                    .map_err(TrainError::io("renaming the former codec", &codecs[0]))?;
+            }
             std::fs::rename(&weights, &kept).map_err(TrainError::io("renaming the former weights", &weights))?;
             sink.event(&Event::Message(format!("kept the weights of {from} steps as {}", kept.display())));
         }

@@ -12,7 +12,8 @@ use clift_data::{
 };
 use clift_eval::{EvalFrames, EvalModels, EvalSplit, LPIPS_COMMAND, Summary, write_skip_report};
 use clift_model::{
-    Clift, ModelError, ModelPath, TrainedModel, check_heads, load_part, save_part, save_weights, weights_hash,
+    Clift, ModelError, ModelPath, TokenCodec, TrainedModel, check_heads, load_part, save_part, save_weights,
+    weights_hash,
 };
 
 use crate::cluster_cache::builder::ClusterBuilder;
@@ -28,6 +29,7 @@ use crate::run::init_from::init_from;
 use crate::run::lock::{LockedFolder, RunLock};
 use crate::run::run_file::{RunFile, compare_settings, require_run, write_config};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
+use crate::run::token_codec::ensure_codec;
 use crate::run::training_data::TrainingData;
 use crate::run::validation::{EvalRequest, Validation};
 use crate::stage::stage1_batches::Stage1Batches;
@@ -161,6 +163,7 @@ impl Run {
         }
         self.report_opening(Split::Train, sink);
         let opened = open_training_dataset(&self.config.data, self.config.stage1.steps)?;
+        let frames = EvalFrames::new(&opened, Split::Train, self.config.data.hold_out, true);
         let reader = self.reader(opened, Split::Train, sink)?;
         let validation = self.validation(Split::Test, sink)?;
 
@@ -175,6 +178,9 @@ impl Run {
             if train_stage2 {
                 self.train_stage2(&reader, cache, &validation, stage1, stop, sink)?;
             }
+        }
+        if wanted(Stage::Stage2) {
+            ensure_codec(&self.config, &self.weights(Stage::Stage2), &self.device, (&reader, frames), stop, sink)?;
         }
         if only.is_some() {
             return Ok(None);
@@ -219,7 +225,9 @@ impl Run {
         let path = ModelPath { dir: self.config.run_dir.clone(), weights };
         let mut models = EvalModels::new(TrainedModel::open(&path, &self.config.model, &self.device)?);
         if self.weights(Stage::Stage2).exists() {
-            models.set_stage2(self.config.clusters.grouping, self.open_stage2(&self.config, &models.stage1)?);
+            let stage2 = self.open_stage2(&self.config, &models.stage1)?;
+            models.codec = TokenCodec::beside(&self.weights(Stage::Stage2), &stage2)?.map(Arc::new);
+            models.set_stage2(self.config.clusters.grouping, stage2);
         } else {
             sink.event(&Event::Message("stage 2 has not run: evaluating only the weights of stage 1".into()));
         }

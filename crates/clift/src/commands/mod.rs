@@ -3,6 +3,7 @@
 //! Shared by the commands: `parse` (argument values), `shared_args` (options), `splits` (data sets).
 
 pub(crate) mod bench;
+pub(crate) mod codec;
 pub(crate) mod compare;
 pub(crate) mod completions;
 pub(crate) mod data;

@@ -71,6 +71,18 @@ pub(crate) fn parse_budget_ms(text: &str) -> Result<f64, String> {
     budget.ok_or_else(|| "write milliseconds per frame, more than 0".into())
 }
 
+/// Parses a loss of PSNR in dB.
+pub(crate) fn parse_loss(text: &str) -> Result<f64, String> {
+    let loss = text.parse().ok().filter(|loss: &f64| (1e-3..=1e3).contains(loss));
+    loss.ok_or_else(|| "write a loss in dB, 0.001 or more".into())
+}
+
+/// Parses a size in kB.
+pub(crate) fn parse_kb(text: &str) -> Result<f64, String> {
+    let kb = text.parse().ok().filter(|kb: &f64| *kb > 0.0 && *kb <= 1e9);
+    kb.ok_or_else(|| "write kilobytes, more than 0".into())
+}
+
 /// Parses a replacement in parameter names, as `attn.qn=attn.q_norm`.
 pub(crate) fn parse_rename(text: &str) -> Result<(String, String), String> {
     match text.split_once('=') {

@@ -86,7 +86,7 @@ fn scenes_survive_a_file_whose_size_is_the_formula() {
         let expected = 8 + 2048 + 136 + 164 * 2 + 5 * (28 + format.bytes_per_token(DIM));
         assert_eq!((bytes.len(), scene().file_bytes(format)), (expected, expected as u64), "{format}");
         let (back, found) = Scene::read(&folder.path()).expect("reads");
-        assert_eq!(found, format);
+        assert_eq!(found, format.into());
         assert_eq!(back, Scene { tokens: format.round(&scene().tokens, DIM).expect("in range"), ..scene() });
         assert_eq!(folder.bytes(format), bytes, "equal scenes are equal files");
         assert!(format != TokenFormat::F32 || back == scene(), "f32 is exact");
@@ -151,7 +151,11 @@ fn invalid_headers_are_refused() {
     for (from, to, expected) in [
         (r#""format":"clift-scene""#, r#""format":"clift-1""#, "its header lacks the scene format; give a file"),
         (r#"{"__metadata__""#, r#"{"__metadata__"#, unreadable),
-        (r#""version":"2""#, r#""version":"1""#, r#"file version "1", expected "2"; use the version of clift that"#),
+        (
+            r#""version":"2""#,
+            r#""version":"9""#,
+            r#"file version "9", expected "1", "2" or "3"; use the version of clift that"#,
+        ),
         (r#""kind":"clift""#, r#""kind":"nerf""#, r#"unknown kind of tokens "nerf""#),
         (r#""width":"24""#, r#""width":"-24""#, r#"width "-24", expected a number of pixels"#),
         (r#""renderer":"0123"#, r#""renderer":"zz23"#, "expected 64 hexadecimal digits"),

@@ -308,7 +308,7 @@ fn an_interrupted_import_leaves_nothing() {
     // While it writes, too.
     let kept = place.path().join("kept");
     let (config, imported) = import(&fixture("checkpoints/re10k.ckpt"), &kept, &re10k()).unwrap();
-    let stopped = model_dir::write_model_dir(&folder, &config, &[], &imported, &stop);
+    let stopped = model_dir::write_model_dir(&folder, &config, &[], (&imported, "re10k.ckpt".as_ref()), &stop);
     assert!(matches!(stopped, Err(TrainError::Abandoned { .. })));
     let left: Vec<_> = std::fs::read_dir(place.path()).unwrap().map(|item| item.unwrap().file_name()).collect();
     assert_eq!(left, ["kept"]);

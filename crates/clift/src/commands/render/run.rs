@@ -44,7 +44,7 @@ struct Report {
 }
 
 pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
-    let (scene, _) = Scene::read(&args.scene)?;
+    let (scene, _) = Scene::read_for(&args.scene, args.model.as_deref())?;
     let [width, height] = args.size.unwrap_or([scene.width, scene.height]);
     let device = args.device.unwrap_or_default();
     check_size(&scene, [width, height], args.render.is_some(), device)?;

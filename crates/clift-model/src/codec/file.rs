@@ -1,0 +1,191 @@
+//! `codec.safetensors`: the codec of a model, beside its weights.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use safetensors::tensor::{Dtype, TensorView};
+use safetensors::{SafeTensors, serialize};
+use sha2::{Digest, Sha256};
+
+use crate::codec::histogram::Distributions;
+use crate::codec::rates::RateTable;
+use crate::codec::token_codec::TokenCodec;
+use crate::codec::transform::Transform;
+use crate::error::ModelError;
+use crate::files::replace;
+use crate::names::parse;
+use crate::network::config::ModelConfig;
+use crate::weights::file::sorted_header;
+
+const FORMAT: &str = "clift-codec";
+const VERSION: &str = "1";
+/// Largest accepted file: a codec of width 4,096 takes a tenth of it.
+const MAX_FILE_BYTES: u64 = 1 << 30;
+
+impl TokenCodec {
+    /// Returns the path of the codec of a weight file: `codec*.safetensors` beside `model*.safetensors`,
+    /// `NAME.codec.safetensors` beside another file. The file need not exist.
+    pub fn path_of(weights: &Path) -> PathBuf {
+        let name = weights.file_name().unwrap_or_default().to_string_lossy();
+        match name.strip_prefix("model").filter(|rest| rest.ends_with(".safetensors")) {
+            Some(rest) => weights.with_file_name(format!("codec{rest}")),
+            None => weights.with_extension("codec.safetensors"),
+        }
+    }
+
+    /// Writes the codec.
+    ///
+    /// # Errors
+    /// [`ModelError::CodecFile`].
+    pub fn write(&self, path: &Path) -> Result<(), ModelError> {
+        let written = to_bytes(self).and_then(|bytes| replace(path, &bytes).map_err(|error| error.to_string()));
+        written.map_err(|reason| ModelError::CodecFile { action: "writing", reason, path: path.into() })
+    }
+
+    /// Reads and checks a codec.
+    ///
+    /// # Errors
+    /// [`ModelError::NoCodec`] without the file, [`ModelError::CodecFile`] for a file that is no codec, is damaged or
+    /// inconsistent.
+    pub fn read(path: &Path) -> Result<Self, ModelError> {
+        let size = match std::fs::metadata(path) {
+            Ok(found) if found.is_file() => found.len(),
+            _ => return Err(ModelError::NoCodec { path: path.into() }),
+        };
+        let read = || {
+            if size > MAX_FILE_BYTES {
+                return Err(format!("the file has {size} bytes, a codec at most {MAX_FILE_BYTES}"));
+            }
+            from_bytes(&std::fs::read(path).map_err(|error| error.to_string())?)
+        };
+        read().map_err(|reason| ModelError::CodecFile { action: "reading", reason, path: path.into() })
+    }
+}
+
+/// Returns the first 16 hexadecimal digits of the SHA-256 of a codec's file.
+pub(crate) fn codec_hash(codec: &TokenCodec) -> Result<String, ModelError> {
+    let bad = |fix| ModelError::BadConfig { key: "codec", value: codec.renderer_hash.clone(), fix };
+    Ok(hash(&to_bytes(codec).map_err(bad)?))
+}
+
+fn hash(bytes: &[u8]) -> String {
+    hex::encode(&Sha256::digest(bytes)[..8])
+}
+
+fn to_bytes(codec: &TokenCodec) -> Result<Vec<u8>, String> {
+    let TokenCodec { model, kind, renderer_hash, transform, distributions, rates, .. } = codec;
+    let (dim, knots) = (transform.mean.len(), distributions.knots.len());
+    let (counts, steps) = (rates.shares.len(), rates.steps.len());
+    let f32s = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+    let f64s = |values: &[f64]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+    let tensors = [
+        ("mean", Dtype::F32, vec![dim], f32s(&transform.mean)),
+        ("basis", Dtype::F32, vec![dim, dim], f32s(&transform.basis)),
+        ("deviations", Dtype::F32, vec![dim], f32s(&transform.deviations)),
+        ("knots", Dtype::F32, vec![knots], f32s(&distributions.knots)),
+        ("cumulative", Dtype::F32, vec![dim, knots], f32s(&distributions.cumulative)),
+        ("rate_shares", Dtype::F64, vec![counts], f64s(&rates.shares)),
+        ("rate_steps", Dtype::F64, vec![steps], f64s(&rates.steps)),
+        ("rate_bits", Dtype::F64, vec![counts, steps], f64s(&rates.bits)),
+        ("rate_loss", Dtype::F64, vec![counts, steps], f64s(&rates.loss)),
+        ("rate_psnr", Dtype::F64, vec![counts], f64s(&rates.psnr)),
+    ];
+    let views: Result<Vec<_>, _> = tensors
+        .iter()
+        .map(|(name, dtype, shape, data)| Ok((*name, TensorView::new(*dtype, shape.clone(), data)?)))
+        .collect();
+    let metadata = HashMap::from([
+        ("format".to_owned(), FORMAT.to_owned()),
+        ("version".to_owned(), VERSION.to_owned()),
+        ("kind".to_owned(), kind.name().to_owned()),
+        ("model".to_owned(), serde_json::to_string(model).map_err(|error| error.to_string())?),
+        ("renderer".to_owned(), renderer_hash.clone()),
+    ]);
+    let bytes = views.and_then(|views| serialize(views, Some(metadata))).map_err(|error| error.to_string())?;
+    sorted_header(bytes).map_err(|error| error.to_string())
+}
+
+fn from_bytes(bytes: &[u8]) -> Result<TokenCodec, String> {
+    let text = |error: safetensors::SafeTensorError| error.to_string();
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(text)?;
+    let file = SafeTensors::deserialize(bytes).map_err(text)?;
+    let metadata = header.metadata().clone().unwrap_or_default();
+    let field = |name: &str| metadata.get(name).ok_or_else(|| format!("no `{name}` in the header"));
+    for (name, expected) in [("format", FORMAT), ("version", VERSION)] {
+        let found = field(name)?;
+        if found != expected {
+            return Err(format!("{name} {found:?}, expected {expected:?}"));
+        }
+    }
+    let model: ModelConfig =
+        serde_json::from_str(field("model")?).map_err(|error| format!("unreadable `model` ({error})"))?;
+    model.validate().map_err(|error| error.to_string())?;
+    let kind = field("kind")?;
+    let kind = parse(kind).ok_or_else(|| format!("unknown kind of tokens {kind:?}"))?;
+    let data = |name: &str, dtype: Dtype, shape: &[usize]| {
+        let view = file.tensor(name).map_err(|_| format!("no tensor `{name}`"))?;
+        if view.dtype() != dtype || view.shape() != shape {
+            return Err(format!("`{name}` is {:?} {:?}, expected {dtype:?} {shape:?}", view.dtype(), view.shape()));
+        }
+        Ok(view.data().to_vec())
+    };
+    let length = |name: &str| match file.tensor(name).map(|view| view.shape().to_vec()).as_deref() {
+        Ok(&[length]) => Ok(length),
+        _ => Err(format!("no tensor `{name}` of one dimension")),
+    };
+    let f32s = |name: &str, shape: &[usize]| -> Result<Vec<f32>, String> {
+        let values: Vec<f32> =
+            data(name, Dtype::F32, shape)?.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        match values.iter().find(|value| !value.is_finite()) {
+            Some(value) => Err(format!("`{name}` contains {value}")),
+            None => Ok(values),
+        }
+    };
+    let f64s = |name: &str, shape: &[usize]| -> Result<Vec<f64>, String> {
+        Ok(data(name, Dtype::F64, shape)?.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect())
+    };
+    let (dim, knots, counts, steps) = (model.dim, length("knots")?, length("rate_shares")?, length("rate_steps")?);
+    let transform = Transform {
+        mean: f32s("mean", &[dim])?,
+        basis: f32s("basis", &[dim, dim])?,
+        deviations: f32s("deviations", &[dim])?,
+    };
+    let distributions =
+        Distributions { knots: f32s("knots", &[knots])?, cumulative: f32s("cumulative", &[dim, knots])? };
+    check_transform(&transform)?;
+    check_distributions(&distributions)?;
+    let rates = RateTable {
+        shares: f64s("rate_shares", &[counts])?,
+        steps: f64s("rate_steps", &[steps])?,
+        bits: f64s("rate_bits", &[counts, steps])?,
+        loss: f64s("rate_loss", &[counts, steps])?,
+        psnr: f64s("rate_psnr", &[counts])?,
+    };
+    let rates = rates.new().map_err(|error| error.to_string())?;
+    let renderer_hash = field("renderer")?.clone();
+    Ok(TokenCodec { model, kind, renderer_hash, transform, distributions, rates, hash: hash(bytes) })
+}
+
+fn check_transform(transform: &Transform) -> Result<(), String> {
+    if let Some(d) = transform.deviations.iter().position(|deviation| *deviation <= 0.0) {
+        return Err(format!("deviation {} of direction {d}, expected a positive number", transform.deviations[d]));
+    }
+    let length = |d: usize| transform.direction(d).iter().map(|value| value * value).sum::<f32>();
+    match (0..transform.mean.len()).find(|&d| !length(d).is_normal()) {
+        Some(d) => Err(format!("direction {d} has no length")),
+        None => Ok(()),
+    }
+}
+
+fn check_distributions(distributions: &Distributions) -> Result<(), String> {
+    let Distributions { knots, cumulative } = distributions;
+    if knots.len() < 2 || !knots.windows(2).all(|pair| pair[0] < pair[1]) {
+        return Err("the knots are no ascending numbers".into());
+    }
+    let is_distribution =
+        |row: &[f32]| row[0] == 0.0 && row[row.len() - 1] == 1.0 && row.windows(2).all(|pair| pair[0] <= pair[1]);
+    match cumulative.chunks_exact(knots.len()).position(|row| !is_distribution(row)) {
+        Some(d) => Err(format!("the probabilities of direction {d} do not ascend from 0 to 1")),
+        None => Ok(()),
+    }
+}

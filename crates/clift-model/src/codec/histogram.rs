@@ -1,0 +1,65 @@
+//! The distribution of every coefficient, in units of its standard deviation.
+// D width, K knots
+
+use crate::codec::transform::Transform;
+
+/// Knots of one sign: from 1/32 to 32 standard deviations, four per octave.
+const KNOTS_PER_SIDE: usize = 41;
+/// Share of an even distribution over the bins: a value of no training scene has a probability, too.
+const EVEN_SHARE: f64 = 1e-4;
+
+/// Cumulative distributions of coefficients.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Distributions {
+    /// Ascending, in standard deviations, `[K]`.
+    pub knots: Vec<f32>,
+    /// Probability below every knot, from 0 to 1, `[D, K]`.
+    pub cumulative: Vec<f32>,
+}
+
+/// Counts of coefficients between the knots, weighted by scene.
+#[derive(Clone, Debug)]
+pub struct Histograms {
+    knots: Vec<f32>,
+    /// `[D, K - 1]`
+    weights: Vec<f64>,
+}
+
+impl Histograms {
+    /// Starts with no coefficients of `dim` directions.
+    pub fn new(dim: usize) -> Self {
+        let side = |k: usize| (k as f64 / 4.0 - 5.0).exp2() as f32;
+        let knots: Vec<f32> =
+            (0..KNOTS_PER_SIDE).rev().map(|k| -side(k)).chain((0..KNOTS_PER_SIDE).map(side)).collect();
+        Self { weights: vec![0.0; dim * (knots.len() - 1)], knots }
+    }
+
+    /// Adds the tokens of a scene, `[S, D]`. Values beyond the last knots count in the last bins.
+    pub fn add(&mut self, transform: &Transform, tokens: &[f32]) {
+        let (dim, bins) = (transform.mean.len(), self.knots.len() - 1);
+        let weight = dim as f64 / tokens.len() as f64;
+        for row in transform.forward(tokens).chunks_exact(dim) {
+            for (d, (value, deviation)) in row.iter().zip(&transform.deviations).enumerate() {
+                let above = self.knots.partition_point(|knot| *knot <= value / deviation);
+                self.weights[d * bins + above.clamp(1, bins) - 1] += weight;
+            }
+        }
+    }
+
+    /// Returns the distributions of all tokens.
+    pub fn distributions(&self) -> Distributions {
+        let bins = self.knots.len() - 1;
+        let mut cumulative = Vec::with_capacity(self.weights.len() / bins * self.knots.len());
+        for weights in self.weights.chunks_exact(bins) {
+            let total: f64 = weights.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+            let mut below = 0.0;
+            cumulative.push(0.0);
+            for weight in &weights[..bins - 1] {
+                below += (1.0 - EVEN_SHARE) * weight / total + EVEN_SHARE / bins as f64;
+                cumulative.push((below as f32).min(1.0));
+            }
+            cumulative.push(1.0);
+        }
+        Distributions { knots: self.knots.clone(), cumulative }
+    }
+}

@@ -1,0 +1,194 @@
+//! Coded scene files: round trips, sizes, and refused files.
+
+use std::path::PathBuf;
+
+use safetensors::SafeTensors;
+
+use super::*;
+use crate::codec::token_codec::tests::codec;
+use crate::scene::scene::tests::scene;
+use crate::scene::token_storage::TokenStorage;
+
+const STEP: f32 = 0.25;
+
+/// A folder with a model's codec, whose model path is that of the scene.
+struct Folder(tempfile::TempDir, TokenCodec);
+
+impl Folder {
+    fn new() -> Self {
+        let (folder, Scene { model, kind, renderer_hash, .. }) = (tempfile::tempdir().expect("a folder"), scene());
+        let model_dir = folder.path().join("runs/tiny");
+        std::fs::create_dir_all(&model_dir).expect("a folder");
+        std::fs::write(model_dir.join("model.safetensors"), "").expect("writes");
+        std::fs::write(model_dir.join("config.toml"), "").expect("writes");
+        let codec = codec(model, kind, renderer_hash);
+        codec.write(&model_dir.join("codec.safetensors")).expect("writes");
+        Self(folder, codec)
+    }
+
+    fn path(&self) -> PathBuf {
+        self.0.path().join("room.clift")
+    }
+
+    fn write(&self) -> Vec<u8> {
+        scene().write_coded(&self.path(), &self.1, STEP).expect("writes");
+        std::fs::read(self.path()).expect("reads")
+    }
+
+    fn refusal_of(&self, bytes: &[u8]) -> String {
+        std::fs::write(self.path(), bytes).expect("writes");
+        let error = Scene::read(&self.path()).expect_err("an invalid file");
+        assert!(matches!(error, ModelError::SceneFile { .. }), "{error:?}");
+        error.to_string()
+    }
+}
+
+/// The bytes with a valid checksum.
+fn checked(mut bytes: Vec<u8>) -> Vec<u8> {
+    let end = bytes.len() - 4;
+    let checksum = crc32fast::hash(&bytes[..end]);
+    bytes[end..].copy_from_slice(&checksum.to_le_bytes());
+    bytes
+}
+
+/// The header with `from` replaced, and a checksum that fits.
+fn with_header(bytes: &[u8], from: &str, to: &str) -> Vec<u8> {
+    let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    let header = String::from_utf8(bytes[8..8 + length].to_vec()).unwrap();
+    assert!(header.contains(from), "{header}");
+    let header = header.replace(from, to);
+    let start = (header.len() as u64).to_le_bytes();
+    checked([&start[..], header.as_bytes(), &bytes[8 + length..]].concat())
+}
+
+#[test]
+fn coded_scenes_come_back_ordered_and_rounded() {
+    let folder = Folder::new();
+    let bytes = folder.write();
+    assert_eq!(folder.write(), bytes, "equal scenes are equal files");
+    assert!(SafeTensors::deserialize(&bytes).is_ok(), "the header is readable by other programs");
+    let (back, storage) = Scene::read(&folder.path()).expect("reads");
+    assert!(matches!(storage, TokenStorage::Coded(_)), "{storage}");
+    let original = scene();
+    assert_eq!(back.token_ids, [0, 3, 7, 8, 11]);
+    let dim = original.model.dim;
+    let expected = folder.1.round(&original.tokens, STEP).unwrap();
+    for (new, old) in [0, 2, 3, 4, 1].into_iter().enumerate() {
+        assert_eq!(back.tokens[new * dim..][..dim], expected[old * dim..][..dim], "token {new}");
+    }
+    assert_eq!(
+        (&back.key, &back.model, &back.renderer_hash),
+        (&original.key, &original.model, &original.renderer_hash)
+    );
+    assert_eq!((back.world, &back.context_frames), (original.world, &original.context_frames));
+    for (got, expected) in back.context.iter().zip(&original.context) {
+        let values = |camera: &ViewCamera| [&camera.c2w[..], &camera.intrinsics].concat();
+        assert!(values(got).iter().zip(values(expected)).all(|(a, b)| (a - b).abs() < 1e-6), "{got:?}");
+    }
+    // Another model is given, or none is found.
+    let moved = folder.0.path().join("elsewhere");
+    std::fs::rename(folder.0.path().join("runs"), &moved).unwrap();
+    assert!(
+        Scene::read(&folder.path()).unwrap_err().to_string().contains("give the run it was encoded with (--model RUN)")
+    );
+    assert_eq!(Scene::read_for(&folder.path(), Some(&moved.join("tiny"))).unwrap().0, back);
+}
+
+#[test]
+fn every_flipped_bit_and_every_cut_is_found() {
+    let folder = Folder::new();
+    let bytes = folder.write();
+    for at in 0..bytes.len() {
+        let mut damaged = bytes.clone();
+        damaged[at] ^= 1 << (at % 8);
+        std::fs::write(folder.path(), damaged).unwrap();
+        // A model path that leads nowhere is found before the checksum.
+        assert!(Scene::read(&folder.path()).is_err(), "byte {at}");
+    }
+    for length in 0..bytes.len() {
+        folder.refusal_of(&bytes[..length]);
+    }
+    let mut damaged = bytes.clone();
+    let last = damaged.len() - 6;
+    damaged[last] ^= 1;
+    assert!(folder.refusal_of(&damaged).contains("the file is damaged: checksum"));
+}
+
+#[test]
+fn hostile_files_with_valid_checksums_are_refused() {
+    let folder = Folder::new();
+    let bytes = folder.write();
+    let hash = &folder.1.hash;
+    for (from, to, expected) in [
+        ("\"tokens\":\"5\"", "\"tokens\":\"0\"", "0 tokens, expected 1 to 12"),
+        ("\"tokens\":\"5\"", "\"tokens\":\"13\"", "13 tokens, expected 1 to 12"),
+        ("\"tokens\":\"5\"", "\"tokens\":\"x\"", "tokens \"x\", expected a number"),
+        ("\"tokens\":\"5\"", "\"tokens\":\"4\"", "words are left"),
+        ("\"views\":\"2\"", "\"views\":\"18446744073709551615\"", "views and coded tokens"),
+        ("\"views\":\"2\"", "\"views\":\"0\"", "0 context cameras"),
+        ("\"views\":\"2\"", "\"views\":\"7\"", "views and coded tokens"),
+        ("\"width\":\"24\"", "\"width\":\"1048576\"", "expected at most 16384 a side"),
+        ("\"height\":\"16\"", "\"height\":\"17\"", "does not divide into patches"),
+        (hash.as_str(), "0123456789abcdef", "the scene was coded with the codec 0123456789abcdef"),
+        ("\"codec\"", "\"coder\"", "no `codec` in the header"),
+        ("\"scene\":{", "\"scenf\":{", "no tensor `scene`"),
+        ("\"version\":\"3\"", "\"version\":\"4\"", "version \"4\", expected \"1\", \"2\" or \"3\""),
+    ] {
+        let message = folder.refusal_of(&with_header(&bytes, from, to));
+        assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
+    }
+    // Many tokens that a small file claims.
+    let many = with_header(&bytes, "\"height\":\"16\",\"width\":\"24\"", "\"height\":\"4096\",\"width\":\"4096\"");
+    let many = with_header(&many, "\"tokens\":\"5\"", "\"tokens\":\"524288\"");
+    assert!(folder.refusal_of(&many).contains("expected at most"), "bounded memory");
+    let start = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    for (at, value, expected) in [
+        (0, &f32::NAN.to_le_bytes()[..], "step NaN"),
+        (0, &(-1.0_f32).to_le_bytes(), "step -1"),
+        (4, &f64::NAN.to_le_bytes(), "mean pose: the pose contains NaN"),
+        (4 + 96, &(-1.0_f64).to_le_bytes(), "pose scale -1"),
+        (4 + 104, &9.0_f32.to_le_bytes(), "context camera 0: the rotation differs"),
+        (4 + 104 + 48, &(-1.0_f32).to_le_bytes(), "context camera 0: intrinsics [-1.0"),
+    ] {
+        let mut damaged = bytes.clone();
+        damaged[start + at..][..value.len()].copy_from_slice(value);
+        let message = folder.refusal_of(&checked(damaged));
+        assert!(message.contains(expected), "{message}\ndoes not contain\n{expected}");
+    }
+}
+
+#[test]
+fn codecs_of_other_models_are_refused() {
+    let folder = Folder::new();
+    let other = Scene { renderer_hash: "f".repeat(64), ..scene() };
+    let message = other.write_coded(&folder.path(), &folder.1, STEP).unwrap_err().to_string();
+    assert!(message.contains("the codec is of another model"), "{message}");
+    assert!(!folder.path().exists());
+}
+
+/// `CLIFT_UPDATE=1` writes scene and codec again; then `scripts/check/decode_scene.py .. --write` must write the tokens.
+#[test]
+fn fixture_has_the_tokens_of_the_python_decoder() {
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data-fixtures/coded");
+    let [room, model] = ["room.clift", "runs/tiny"].map(|name| fixture.join(name));
+    if std::env::var_os("CLIFT_UPDATE").is_some() {
+        let Scene { model: sizes, kind, renderer_hash, .. } = scene();
+        let codec = codec(sizes, kind, renderer_hash);
+        std::fs::create_dir_all(&model).unwrap();
+        std::fs::write(model.join("model.safetensors"), "").unwrap();
+        std::fs::write(model.join("config.toml"), "").unwrap();
+        codec.write(&model.join("codec.safetensors")).unwrap();
+        let mut unusual = scene();
+        unusual.tokens[10] = -1e3; // escapes
+        unusual.write_coded(&room, &codec, STEP).unwrap();
+    }
+    let (scene, _) = Scene::read(&room).unwrap();
+    assert_eq!(scene.token_ids, [0, 3, 7, 8, 11]);
+    let bytes = std::fs::read(fixture.join("tokens.f32")).unwrap();
+    let expected: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+    assert_eq!(scene.tokens.len(), expected.len());
+    for (got, expected) in scene.tokens.iter().zip(&expected) {
+        assert!((got - expected).abs() < 1e-2, "{got} against {expected}");
+    }
+    assert!(expected.iter().any(|value| *value < -900.0), "a value far beyond the tables");
+}

@@ -1,0 +1,51 @@
+//! The metadata of a scene file's header, and why a file is refused.
+
+use std::collections::HashMap;
+use std::fmt::Write as _;
+
+/// The cause and the remedy.
+pub(crate) struct Refusal {
+    pub reason: String,
+    pub fix: &'static str,
+}
+
+impl From<String> for Refusal {
+    fn from(reason: String) -> Self {
+        Self { reason, fix: "encode the scene again" }
+    }
+}
+
+pub(crate) fn refusal(reason: impl Into<String>, fix: &'static str) -> Refusal {
+    Refusal { reason: reason.into(), fix }
+}
+
+/// Metadata of a header that was read.
+pub(crate) struct Fields(pub HashMap<String, String>);
+
+impl Fields {
+    pub fn get(&self, name: &str) -> Result<&str, String> {
+        self.0.get(name).map(String::as_str).ok_or_else(|| format!("no `{name}` in the header"))
+    }
+
+    pub fn side(&self, name: &str) -> Result<usize, String> {
+        let value = self.get(name)?;
+        value.parse().map_err(|_| format!("{name} {value:?}, expected a number of pixels"))
+    }
+
+    pub fn count(&self, name: &str) -> Result<usize, String> {
+        let value = self.get(name)?;
+        value.parse().map_err(|_| format!("{name} {value:?}, expected a number"))
+    }
+}
+
+/// Returns a header up to the first tensor. Equal scenes must be equal files, and the safetensors crate writes metadata in
+/// random order.
+pub(crate) fn write_fields(fields: &[(&str, &str)]) -> String {
+    let mut header = String::from("{\"__metadata__\":{");
+    for (i, (name, value)) in fields.iter().enumerate() {
+        let comma = if i == 0 { "" } else { "," };
+        let _ = write!(header, "{comma}\"{name}\":{}", serde_json::Value::from(*value));
+    }
+    header.push('}');
+    header
+}

@@ -1,0 +1,73 @@
+//! The token codec of a run or model, fitted after stage 2 or on demand.
+
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use burn::tensor::Device;
+use clift_data::{ClipReader, derive_seed};
+use clift_eval::{CodecOptions, EvalConfig, EvalError, EvalFrames, FittedCodec, evaluation_items, fit_codec};
+use clift_model::{Grouping, ModelPath, TokenCodec, TrainedModel};
+
+use crate::config::config::Config;
+use crate::error::{TrainError, bad};
+use crate::events::{Event, Sink};
+use crate::run::validation::EvalEvents;
+
+/// Fits the token codec of a model on training scenes, with the token counts and views of `config.eval`, and writes the
+/// codec beside the weights.
+///
+/// # Errors
+/// [`TrainError::BadConfig`] for a run on tiles, whose tokens no scene file stores; those of the fit.
+pub fn fit_token_codec(
+    config: &Config,
+    model: (&TrainedModel, &Path),
+    (reader, frames): (&ClipReader, EvalFrames),
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<FittedCodec, TrainError> {
+    let (model, weights) = model;
+    if config.clusters.grouping != Grouping::Kmeans {
+        return Err(bad("clusters.grouping", "\"tile\"", "scene files have K-means tokens: choose a run on K-means"));
+    }
+    let eval = EvalConfig { index: None, num_scenes: 0, ..config.eval.clone() };
+    let (items, ..) = evaluation_items(&eval, reader, frames)?;
+    let options = CodecOptions {
+        counts: eval.storage,
+        kmeans: config.clusters.kmeans.clone(),
+        seed: derive_seed(config.seed, "codec"),
+    };
+    let mut progress = EvalEvents { stop, sink, is_stage: false };
+    let fitted = fit_codec(model, reader, &items, &options, &mut progress)?;
+    fitted.codec.write(&TokenCodec::path_of(weights))?;
+    Ok(fitted)
+}
+
+/// Fits the codec of a run that has none of its weights. Scenes without views leave the run without a codec.
+pub(crate) fn ensure_codec(
+    config: &Config,
+    weights: &Path,
+    device: &Device,
+    data: (&ClipReader, EvalFrames),
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<(), TrainError> {
+    let path = ModelPath { dir: config.run_dir.clone(), weights: weights.into() };
+    if config.clusters.grouping != Grouping::Kmeans || !weights.exists() {
+        return Ok(());
+    }
+    let model = TrainedModel::open(&path, &config.model, device)?;
+    if matches!(TokenCodec::beside(weights, &model), Ok(Some(_))) {
+        return Ok(());
+    }
+    match fit_token_codec(config, (&model, weights), data, stop, sink) {
+        Ok(FittedCodec { num_scenes, .. }) => {
+            sink.event(&Event::Message(format!("token codec: fitted on {num_scenes} training scenes")));
+            Ok(())
+        }
+        Err(TrainError::Eval(EvalError::NoScenes { reason })) => {
+            sink.event(&Event::Warning(format!("the token codec is not fitted: {reason}; fit it with `clift codec`")));
+            Ok(())
+        }
+        Err(error) => Err(error),
+    }
+}

@@ -1,0 +1,118 @@
+//! Coded scene files through the command line: fitted, encoded, evaluated, exported.
+
+use clift_model::{Scene, TokenCodec, TokenStorage};
+
+use crate::support::{Place, STAGE_1, Shared, WHOLE, list, number};
+
+/// A run whose renderings depend on the tokens.
+static LONGER: Shared = Shared::new("run", &["stage1.steps=60", "stage2.steps=20"]);
+
+const KEY: &str = "synthetic-0-test-00000";
+const CODEC: &str = "run/stage2/codec.safetensors";
+
+/// Encodes the first test scene, with the contexts of `clift eval`, into `room.clift`.
+fn encode(place: &Place, flags: &str) -> crate::support::Ran {
+    place.clift(&format!("encode DIR/run --scene {KEY} --context 0,7 --out DIR/room.clift --force {flags}"))
+}
+
+#[test]
+fn coded_files_have_the_size_and_quality_of_the_evaluation() {
+    let place = Place::with(&LONGER);
+    place.eval("run --tokens f32,coded,coded-1 --set eval.num_scenes=1 --out DIR/coded").ok();
+    let points = place.points("coded");
+    let of = |tokens: &str, count: usize| {
+        let is_it = |point: &&serde_json::Value| {
+            point["variant"] == "clift" && point["tokens"] == tokens && point["num_storage_tokens"] == count
+        };
+        points.iter().find(is_it).unwrap_or_else(|| panic!("no {tokens}, {count}: {points:?}"))
+    };
+    for tokens in ["coded", "coded-1"] {
+        for count in [4, 8] {
+            encode(&place, &format!("--storage {count} --tokens {tokens}")).ok().prints("(clift, coded, expected loss");
+            let bytes = place.bytes("room.clift").len() as u64;
+            assert_eq!(of(tokens, count)["scene_bytes"], bytes, "{tokens}, {count}");
+            let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
+            assert!(scene.num_tokens() == count && matches!(storage, TokenStorage::Coded(_)), "{storage}");
+            let (plain, coded) = (number(of("f32", count), "psnr"), number(of(tokens, count), "psnr"));
+            assert!((plain - coded).abs() < 1.5, "{tokens}, {count}: {coded} dB, {plain} without rounding");
+        }
+        assert!(number(of(tokens, 8), "scene_bytes") < 0.5 * number(of("f32", 8), "scene_bytes"));
+    }
+    assert!(number(of("coded-1", 8), "scene_bytes") < number(of("coded", 8), "scene_bytes"));
+    assert!(points.iter().all(|point| point["variant"] == "clift" || point["tokens"] != "coded"));
+    place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/out").ok();
+}
+
+#[test]
+fn steps_are_chosen_for_a_loss_or_a_size() {
+    let place = Place::with(&LONGER);
+    let mut last = usize::MAX;
+    for loss in ["0.001", "0.1", "3"] {
+        encode(&place, &format!("--storage 8 --quality {loss} --save-clusters DIR/clusters.json"))
+            .ok()
+            .prints("measured loss");
+        let size = place.bytes("room.clift").len();
+        assert!(size < last, "{loss} dB: {size} bytes");
+        last = size;
+    }
+    // The clusters are those of the file, in the order of its tokens.
+    let centroids: Vec<u32> =
+        list(&place.json("clusters.json")["centroids"]).iter().map(|id| id.as_u64().unwrap() as u32).collect();
+    assert_eq!(centroids, Scene::read(&place.at("room.clift")).unwrap().0.token_ids);
+    for (kb, flags) in [("0.9", ""), ("0.75", ""), ("0.8", "--storage 8")] {
+        encode(&place, &format!("--size-kb {kb} {flags}")).ok();
+        let (size, asked) = (place.bytes("room.clift").len() as f64, 1e3 * kb.parse::<f64>().unwrap());
+        assert!(size <= asked && size >= 0.95 * asked, "{size} bytes of {asked}");
+    }
+    encode(&place, "--size-kb 0.2").fails_with(2, &["`--size-kb` = 0.200", "the least size of"]);
+    for flags in
+        ["--size-kb 1 --quality 1", "--tokens f16 --quality 1", "--quality 0", "--size-kb -1", "--tokens coded-0"]
+    {
+        encode(&place, flags).fails(2);
+    }
+}
+
+#[test]
+fn codecs_are_fitted_again_alike_and_models_without_one_have_a_remedy() {
+    let place = Place::with(&WHOLE);
+    let codec = place.bytes(CODEC);
+    place.clift("codec DIR/run").fails_with(2, &["codec.safetensors exists", "--force"]);
+    place.clift("codec DIR/run --force").ok().prints("fitted on 8 scenes").prints("entropy");
+    assert_eq!(place.bytes(CODEC), codec, "equal weights and scenes give equal codecs");
+    // Training goes on where it was killed: after the weights, before the codec.
+    std::fs::remove_file(place.at(CODEC)).unwrap();
+    std::fs::remove_dir_all(place.at("run/eval")).unwrap();
+    encode(&place, "--tokens coded").fails_with(2, &["no token codec at ", "fit it with `clift codec"]);
+    place
+        .eval("run --tokens coded --out DIR/none")
+        .fails_with(2, &["`eval.tokens` = coded: the model has no token codec"]);
+    place.eval("run --preset main --out DIR/main").ok().notes("coded tokens are left out");
+    place.train("run", &[]).ok();
+    assert_eq!(place.bytes(CODEC), codec);
+    // A codec of other weights.
+    let mut other = TokenCodec::read(&place.at(CODEC)).unwrap();
+    other.renderer_hash = "0".repeat(64);
+    other.write(&place.at(CODEC)).unwrap();
+    encode(&place, "--tokens coded").fails_with(1, &["the codec was fitted to other weights; fit it again"]);
+
+    let place = Place::with(&STAGE_1);
+    assert!(!place.at("run/stage1/codec.safetensors").exists());
+    place.clift("codec DIR/run").ok();
+    encode(&place, "--tokens coded").ok().prints("(kmeans, coded");
+    place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/out").ok();
+}
+
+#[test]
+fn codecs_are_exported_and_imported() {
+    let place = Place::with(&WHOLE);
+    encode(&place, "--tokens coded").ok();
+    place.clift("export DIR/run --format pytorch -o DIR/micro.ckpt").ok();
+    assert_eq!(place.bytes("micro.codec.safetensors"), place.bytes(CODEC));
+    place.clift("import DIR/micro.ckpt --variant paper -o DIR/imported").ok();
+    assert_eq!(place.bytes("imported/codec.safetensors"), place.bytes(CODEC));
+    place.clift("render DIR/room.clift --path orbit --frames 2 --model DIR/imported -o DIR/out").ok();
+    // Scenes of the codec that is replaced.
+    place.clift("codec DIR/run --force --set eval.storage=[0.5]").ok();
+    let expected = ["the scene was coded with the codec ", "give the run it was encoded with"];
+    place.clift("render DIR/room.clift --path orbit --frames 2 -o DIR/again").fails_with(1, &expected);
+}
