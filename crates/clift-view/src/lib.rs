@@ -1,7 +1,7 @@
 //! A scene in a browser: the server and the page of `clift view`.
 //!
 //! [`ViewServer`] binds a port, then renders for the browsers that open its URL. The thread that calls
-//! [`ViewServer::run`] owns the device and renders; a second thread serves HTTP and WebSockets.
+//! [`ViewServer::run`] owns the device and renders; a second thread serves HTTP and web sockets.
 //!
 //! ```no_run
 //! use clift_model::{DeviceName, Scene, load_renderer};

@@ -105,7 +105,7 @@ fn render_export(browser: &mut Chromium, place: &Place, num_frames: usize) -> im
     browser.evaluate("document.getElementById('export').click()");
     let started = Instant::now();
     while !place.at("poses.json").exists() {
-        assert!(started.elapsed() < Duration::from_secs(60), "no download");
+        assert!(started.elapsed() < Duration::from_mins(1), "no download");
         std::thread::sleep(Duration::from_millis(20));
     }
     let commands = browser.evaluate("document.getElementById('command').textContent");

@@ -1,4 +1,4 @@
-//! Headless Chromium, driven through its DevTools socket.
+//! Headless Chromium, driven through its debugging socket.
 
 use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
@@ -52,7 +52,7 @@ impl Chromium {
         };
         let host = url.trim_start_matches("ws://").split('/').next().expect("a host");
         let stream = TcpStream::connect(host).expect("the browser listens");
-        stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a socket");
+        stream.set_read_timeout(Some(Duration::from_mins(1))).expect("a socket");
         let (socket, _) = tungstenite::client(url.into_client_request().expect("a URL"), stream).expect("DevTools");
         let (session, problems) = (Value::Null, Vec::new());
         let mut browser = Self { child, socket, session, next_id: 0, problems, _stderr: stderr };
@@ -108,7 +108,7 @@ impl Chromium {
     pub fn wait_for(&mut self, expression: &str) {
         let started = Instant::now();
         while self.evaluate(expression) != json!(true) {
-            assert!(started.elapsed() < Duration::from_secs(60), "{expression} is not true within a minute");
+            assert!(started.elapsed() < Duration::from_mins(1), "{expression} is not true within a minute");
             std::thread::sleep(Duration::from_millis(20));
         }
     }

@@ -8,6 +8,12 @@ import { CameraPath, PATH_FPS, poseFile } from "./path.js";
 
 /** Milliseconds without a change after which the camera rests. */
 const REST_MS = 160;
+/** Small pictures fill the stage less: pixels of the picture have at most this many of the screen .. */
+const LARGEST_PIXEL = 9;
+/** .. unless the picture would take less than this share of the stage. */
+const SMALLEST_SHARE = 0.66;
+/** Milliseconds between pictures that belong to one movement. */
+const MOVING_MS = 400;
 /** Pictures whose times make the displayed rate. */
 const RATE_PICTURES = 20;
 
@@ -155,9 +161,9 @@ async function onFrame(header, [bits, bytes]) {
   picture.getContext("2d").drawImage(image, 0, 0);
   image.close();
   layout();
-  drawnAt = [...drawnAt.slice(1 - RATE_PICTURES), now];
+  drawnAt = now - drawnAt.at(-1) < MOVING_MS ? [...drawnAt.slice(1 - RATE_PICTURES), now] : [now];
   const seconds = (now - drawnAt[0]) / 1000;
-  if (!header.rest) $("fps").textContent = drawnAt.length > 2 ? Math.round((drawnAt.length - 1) / seconds) : "–";
+  if (!header.rest && drawnAt.length > 4) $("fps").textContent = Math.round((drawnAt.length - 1) / seconds);
   $("ms").textContent = fixed(header.select_ms + header.render_ms);
   if (started) $("latency").textContent = fixed(now - started);
   $("used").textContent = `${header.tokens} of ${header.stored}`;
@@ -172,6 +178,10 @@ async function onComparison(header, parts) {
   const former = view.comparison?.frame === header.frame ? view.comparison.image : null;
   view.comparison = { frame: header.frame, image: image ?? former };
   $("nearest").textContent = header.camera.frame;
+  if (view.compareFrame === null) {
+    $("frame").value = header.frame;
+    updateLabels();
+  }
   $("psnr").textContent = `${header.psnr.toFixed(2)} dB`;
   if (view.compareFrame !== header.frame || !image) return;
   [truth.width, truth.height] = [image.width, image.height];
@@ -189,7 +199,8 @@ async function onComparison(header, parts) {
 function layout() {
   const stage = $("stage");
   const [width, height] = view.scene?.size ?? [1, 1];
-  const unit = Math.min(stage.clientWidth / width, stage.clientHeight / height) * 0.96;
+  const fitting = Math.min(stage.clientWidth / width, stage.clientHeight / height) * 0.96;
+  const unit = Math.min(fitting, Math.max(LARGEST_PIXEL, SMALLEST_SHARE * fitting));
   for (const canvas of [picture, truth]) {
     canvas.style.width = `${Math.round(width * unit)}px`;
     canvas.style.height = `${Math.round(height * unit)}px`;

@@ -52,13 +52,12 @@ impl OpenScene {
         name: DeviceName,
     ) -> Result<Self, ViewError> {
         let mut renderer = SceneRenderer::new(&scene, renderer, SelectionPreset::default().rules(), device)?;
-        let context_images = match origin.context_images.take() {
-            Some(images) => images,
-            None => {
-                let views = renderer.render(&scene.context, scene.height, scene.width, scene.num_tokens())?;
-                let images = views.iter().map(|view| Canvas::from_unit(&view.pixels, scene.height, scene.width));
-                images.collect::<Result<_, _>>()?
-            }
+        let context_images = if let Some(images) = origin.context_images.take() {
+            images
+        } else {
+            let views = renderer.render(&scene.context, scene.height, scene.width, scene.num_tokens())?;
+            let images = views.iter().map(|view| Canvas::from_unit(&view.pixels, scene.height, scene.width));
+            images.collect::<Result<_, _>>()?
         };
         Ok(Self { sizes: sizes(&scene, name), scene, renderer, origin, context_images })
     }

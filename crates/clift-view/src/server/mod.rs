@@ -1,9 +1,9 @@
-//! HTTP and WebSockets.
+//! HTTP and web sockets.
 //!
 //! - `access`: who may connect: token, cookie, Host and Origin
 //! - `page`: the files of the page and their headers
 //! - `rate_limit`: messages per second of a socket
-//! - `socket`: one WebSocket
+//! - `socket`: one web socket
 //! - `view_server`: the port, the connections, the two threads
 
 pub(crate) mod access;
