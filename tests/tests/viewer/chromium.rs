@@ -67,6 +67,10 @@ impl Chromium {
 
     /// Calls a method and returns its result.
     pub fn call(&mut self, method: &str, params: Value) -> Value {
+        self.try_call(method, params).unwrap_or_else(|error| panic!("{method}: {error}"))
+    }
+
+    fn try_call(&mut self, method: &str, params: Value) -> Result<Value, Value> {
         self.next_id += 1;
         let mut message = json!({"id": self.next_id, "method": method, "params": params});
         if !self.session.is_null() {
@@ -77,8 +81,8 @@ impl Chromium {
             let text = self.socket.read().expect("an answer within a minute").into_text().expect("text");
             let mut answer: Value = serde_json::from_str(&text).expect("JSON");
             if answer["id"] == self.next_id {
-                assert!(answer["error"].is_null(), "{method}: {}", answer["error"]);
-                return answer["result"].take();
+                let error = answer["error"].take();
+                return if error.is_null() { Ok(answer["result"].take()) } else { Err(error) };
             }
             self.note_problem(&answer);
         }
@@ -103,17 +107,21 @@ impl Chromium {
         result["result"]["value"].take()
     }
 
-    /// Waits until an expression is true.
+    /// Waits until an expression is true; while a page loads, there may be nothing to evaluate it.
     #[track_caller]
     pub fn wait_for(&mut self, expression: &str) {
         let started = Instant::now();
-        while self.evaluate(expression) != json!(true) {
+        let params = json!({"expression": expression, "returnByValue": true});
+        let is_true = |result: Value| result["result"]["value"] == true;
+        while !self.try_call("Runtime.evaluate", params.clone()).is_ok_and(is_true) {
             assert!(started.elapsed() < Duration::from_mins(1), "{expression} is not true within a minute");
             std::thread::sleep(Duration::from_millis(20));
         }
     }
 
     pub fn open(&mut self, url: &str) {
+        // The page before is still there for a moment.
+        self.evaluate("delete document.documentElement.dataset.picture");
         self.call("Page.navigate", json!({"url": url}));
     }
 

@@ -1,9 +1,9 @@
 //! Messages per second of a socket.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Messages per second; a page sends at most one camera per screen refresh and one acknowledgement per frame.
-const PER_SECOND: f64 = 500.0;
+const PER_SECOND: f64 = 1000.0;
 /// Messages at once after a pause.
 const BURST: f64 = 1000.0;
 
@@ -19,30 +19,28 @@ impl RateLimit {
         Self { allowed: BURST, filled: now }
     }
 
-    /// Counts a message; `false` for one too many.
-    pub fn accepts(&mut self, now: Instant) -> bool {
+    /// Counts a message and returns how long to wait before the next one is read.
+    pub fn wait(&mut self, now: Instant) -> Duration {
         let passed_s = now.saturating_duration_since(self.filled).as_secs_f64();
         self.allowed = (self.allowed + PER_SECOND * passed_s).min(BURST) - 1.0;
         self.filled = now;
-        self.allowed >= 0.0
+        Duration::from_secs_f64((-self.allowed).max(0.0) / PER_SECOND)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use super::*;
 
     #[test]
-    fn bursts_pass_and_floods_do_not() {
+    fn bursts_pass_and_floods_wait() {
         let start = Instant::now();
         let mut limit = RateLimit::new(start);
-        assert!((0..1000).all(|_| limit.accepts(start)));
-        assert!(!limit.accepts(start));
+        assert!((0..1000).all(|_| limit.wait(start).is_zero()));
+        assert_eq!(limit.wait(start), Duration::from_millis(1));
+        assert_eq!(limit.wait(start), Duration::from_millis(2));
+        assert!(limit.wait(start + Duration::from_millis(4)).is_zero());
         let mut limit = RateLimit::new(start);
-        assert!((0..3000).all(|i| limit.accepts(start + Duration::from_millis(4 * i))), "250 per second");
-        let mut limit = RateLimit::new(start);
-        assert!(!(0..3000).all(|i| limit.accepts(start + Duration::from_millis(i))), "1000 per second");
+        assert!((0..5000).all(|i| limit.wait(start + Duration::from_millis(2 * i)).is_zero()), "500 per second");
     }
 }

@@ -12,9 +12,8 @@ use crate::session::clients::Clients;
 
 /// Longest time for one message to leave.
 const SEND_TIMEOUT: Duration = Duration::from_secs(10);
-/// Close codes of RFC 6455: invalid payload, policy violation, try again later.
+/// Close codes of RFC 6455: invalid payload, try again later.
 const INVALID: u16 = 1007;
-const POLICY: u16 = 1008;
 const FULL: u16 = 1013;
 
 /// Serves a socket until it closes, sends an invalid message or takes no message for ten seconds.
@@ -43,10 +42,6 @@ pub async fn serve(mut socket: WebSocket, clients: Arc<Clients>, hello: Bytes) {
                     }
                     Some(Ok(Message::Close(_)) | Err(_)) | None => break,
                 };
-                if !rate.accepts(Instant::now()) {
-                    close(&mut socket, POLICY, "too many messages").await;
-                    break;
-                }
                 match serde_json::from_str::<Request>(&text) {
                     Ok(request) => clients.post(id, request),
                     Err(_) if text.is_empty() => {}
@@ -54,6 +49,11 @@ pub async fn serve(mut socket: WebSocket, clients: Arc<Clients>, hello: Bytes) {
                         close(&mut socket, INVALID, "invalid request").await;
                         break;
                     }
+                }
+                // Unread messages of a flood stay with their sender.
+                let wait = rate.wait(Instant::now());
+                if !wait.is_zero() {
+                    tokio::time::sleep(wait).await;
                 }
             }
             message = messages.recv() => match message {
