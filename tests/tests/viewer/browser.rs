@@ -122,7 +122,7 @@ fn render_export(browser: &mut Chromium, place: &Place, num_frames: usize) -> im
     image::open(place.at(&format!("frames/frame-{:05}.png", num_frames - 1))).expect("PNG").to_rgb8()
 }
 
-/// Writes the pictures of the documents and of every layout:
+/// Writes the picture of the documents, of the scene `CLIFT_VIEW_NUMBER` in the list, and one of every layout:
 /// `CLIFT_VIEW_SCENE=runs/tiny CLIFT_VIEW_OUT=shots cargo test --release --workspace viewer_screenshots -- --ignored`.
 #[test]
 #[ignore = "writes pictures"]
@@ -175,5 +175,24 @@ fn viewer_screenshots() {
             browser.screenshot(&out.join(format!("{name}-panel.png")));
         }
     }
+    // The picture of the documents: true image beside rendering, from most of all tokens.
+    browser.emulate([1240, 760], 1.0, false, "light");
+    browser.open(&viewer.url);
+    rest_after(&mut browser, 0);
+    let number = std::env::var("CLIFT_VIEW_NUMBER").unwrap_or_else(|_| "0".into());
+    for (id, value) in [("scene", number.as_str()), ("stored", "stored.max"), ("render", "render.max - 1")] {
+        browser.evaluate(&format!(
+            "{id}.value = {value}; for (const type of ['input', 'change']) {id}.dispatchEvent(new Event(type))"
+        ));
+        std::thread::sleep(Duration::from_secs(3));
+    }
+    browser.evaluate("document.querySelector('#overlay [data-value=selected]').click()");
+    browser.evaluate("document.getElementById('compare').click()");
+    for i in 0..40 {
+        browser.evaluate("document.getElementById('size').dispatchEvent(new Event('change'))");
+        std::thread::sleep(Duration::from_millis(10 + i % 2));
+    }
+    std::thread::sleep(Duration::from_secs(2));
+    browser.screenshot(&out.join("viewer.png"));
     assert_eq!(browser.problems, [""; 0], "errors of the page");
 }
