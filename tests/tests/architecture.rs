@@ -31,7 +31,7 @@ const CRATES: [Crate; 8] = [
         "clift-kernels clift-model clift-data clift-eval clift-train",
         "cases data_reading runner precision doctor plan",
     ),
-    ("clift-view", "clift-kernels clift-model clift-data clift-eval", "session server"),
+    ("clift-view", "clift-kernels clift-model clift-data clift-eval", "error protocol scenes session server"),
     (
         "clift",
         "clift-kernels clift-model clift-data clift-eval clift-train clift-bench clift-view",

@@ -9,6 +9,7 @@ use serde_json::json;
 
 use crate::evaluation::eval::write_vgg;
 use crate::support::{BINARY, Place, copy_folder, finish, repository, sources, start};
+use crate::viewer::tab::Viewer;
 
 /// The key of the test scene of `re10k-mini`, for the keys of the documents.
 const KEY: &str = "00000000000000b1";
@@ -82,6 +83,13 @@ fn every_documented_command_runs() {
             names.insert(args[0].clone());
             make_room(&folder, &args);
             shrink(&mut args);
+            count += 1;
+            if args[0] == "view" {
+                // It serves without end; `Viewer` reads its first line, the URL.
+                let words: Vec<&str> = args[1..].iter().map(String::as_str).collect();
+                drop(Viewer::start(&words, &folder));
+                continue;
+            }
             let ran = finish(start(Command::new(BINARY).args(&args).current_dir(&folder)));
             // A check with a flagged scene is a result.
             let is_flagged =
@@ -89,11 +97,11 @@ fn every_documented_command_runs() {
             if ran.code != Some(0) && !is_flagged {
                 failures.push(format!("{document}: {line}\n  ran {args:?}\n{}", ran.stderr));
             }
-            count += 1;
         }
     }
     assert!(failures.is_empty(), "{} of {count} commands fail:\n{}", failures.len(), failures.join("\n"));
-    let expected = "codec compare completions data doctor encode eval export flops import metrics plan render train";
+    let expected =
+        "codec compare completions data doctor encode eval export flops import metrics plan render train view";
     assert_eq!(names.into_iter().collect::<Vec<_>>().join(" "), expected, "commands with an example");
 }
 
@@ -178,6 +186,7 @@ fn shrink(args: &mut Vec<String>) {
             }
         }
         ("render", _) if !args.iter().any(|arg| arg == "poses.json") => default(args, "--frames", "2"),
+        ("view", _) => default(args, "--port", "0"),
         ("data", Some("synth")) => {
             default(args, "--scenes", "2");
             default(args, "--frames", "8");

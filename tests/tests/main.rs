@@ -1,9 +1,9 @@
 //! Whole runs through the command line: arguments in, files and exit codes out.
 //!
 //! `training` runs the stages, stops them and resumes them; `evaluation` measures, encodes and renders; `data` converts and
-//! checks data sets; `input` is wrong or damaged input; `bench` times the cases. `architecture`, `links` and `old_names` read
-//! the sources instead, `licences` reads the dependencies, and `documents`
-//! runs every command of the documents.
+//! checks data sets; `input` is wrong or damaged input; `bench` times the cases; `viewer` opens scenes in a
+//! browser. `architecture`, `links` and `old_names` read the sources instead, `licences` reads the dependencies, and
+//! `documents` runs every command of the documents.
 
 mod architecture;
 mod bench;
@@ -16,3 +16,4 @@ mod links;
 mod old_names;
 mod support;
 mod training;
+mod viewer;

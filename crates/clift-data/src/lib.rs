@@ -69,7 +69,7 @@ pub use sampling::view_sampler::{ViewSampler, sample_targets};
 
 // Cameras and poses.
 pub use geometry::camera::{Camera, Intrinsics, IntrinsicsNorm};
-pub use geometry::camera_path::{PathView, interpolate_path, mean_intrinsics, orbit_path, read_poses};
+pub use geometry::camera_path::{PathView, focus_distance, interpolate_path, mean_intrinsics, orbit_path, read_poses};
 pub use geometry::lens::Lens;
 pub use geometry::normalization::{MAX_COORDINATE, PoseNormalization, PoseRotation, PoseScale};
 pub use geometry::overlap::overlap;

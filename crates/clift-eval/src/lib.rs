@@ -82,6 +82,7 @@ pub use statistics::summary::Summary;
 pub use figures::animation::Animation;
 pub use figures::canvas::Canvas;
 pub use figures::scene_figure::SceneFigures;
+pub use figures::video::Video;
 
 // The machine, for reports.
 pub use system::machine::machine_rows;

@@ -17,6 +17,7 @@ use crate::commands::metrics::MetricsArgs;
 use crate::commands::plan::PlanArgs;
 use crate::commands::render::args::RenderArgs;
 use crate::commands::train::TrainArgs;
+use crate::commands::view::ViewArgs;
 use crate::output::verbosity::Verbosity;
 
 /// Train, compress, render and evaluate scenes of compressive light-field tokens
@@ -118,7 +119,7 @@ Examples:
     /// Render a scene file along a camera path
     ///
     /// Writes frame-00000.png and so on, animation.png (an animated PNG for browsers) and render.json (token
-    /// counts, times and the tokens of each frame) to a folder.
+    /// counts, times and the tokens of each frame) to a folder. --video also writes an MP4 through `ffmpeg`.
     #[command(after_help = "\
 Paths:
   interpolate   through the context views
@@ -132,8 +133,20 @@ Examples:
   clift render room.clift --path interpolate -o out
   clift render room.clift --path orbit --size 512x512 --frames 120 -o out
   clift render room.clift --path poses.json --render 256 --selection global -o out
-  clift render room.clift --path orbit --budget-ms 30 -o out")]
+  clift render room.clift --path orbit --budget-ms 30 -o out
+  clift render room.clift --path orbit --video orbit.mp4 -o out")]
     Render(RenderArgs),
+    /// Walk through scenes in a browser
+    ///
+    /// Serves one page on this machine and prints its URL, which holds the token of the session, as the first line. In the
+    /// page: orbit and fly, numbers of rendered and stored tokens, a frame rate to hold, the tokens of each picture on the
+    /// context views, camera paths for `clift render --path` and, for a run, true images beside the renderings.
+    #[command(after_help = "\
+Examples:
+  clift view room.clift
+  clift view runs/tiny
+  clift view room.clift --no-open --port 8080")]
+    View(ViewArgs),
     /// Create, inspect, check, convert and index data sets
     Data {
         /// Command for data sets.

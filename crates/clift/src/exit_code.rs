@@ -2,6 +2,7 @@
 
 use clift_eval::EvalError;
 use clift_train::TrainError;
+use clift_view::ViewError;
 
 use crate::interrupt;
 
@@ -45,6 +46,9 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> u8 {
     if let Some(error) = error.downcast_ref::<EvalError>() {
         return eval_exit_code(error);
     }
+    if let Some(error) = error.downcast_ref::<ViewError>() {
+        return view_exit_code(error);
+    }
     error.downcast_ref::<TrainError>().map_or(FAILED, train_exit_code)
 }
 
@@ -72,6 +76,16 @@ fn eval_exit_code(error: &EvalError) -> u8 {
         BadMethodName { .. } | BadWeights { .. } | NoPredictions { .. } | NotComparable { .. } => USAGE,
         EvalError::Data(error) => data_exit_code(error),
         EvalError::Model(error) => model_exit_code(error),
+        _ => FAILED,
+    }
+}
+
+fn view_exit_code(error: &ViewError) -> u8 {
+    match error {
+        ViewError::Bind { .. } => USAGE,
+        ViewError::Data(error) => data_exit_code(error),
+        ViewError::Eval(error) => eval_exit_code(error),
+        ViewError::Model(error) => model_exit_code(error),
         _ => FAILED,
     }
 }

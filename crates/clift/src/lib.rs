@@ -24,7 +24,8 @@ use crate::cli::{Args, Command};
 use crate::commands::bench::cases::{BenchArgs, BenchCommand};
 use crate::commands::data::command::DataCommand;
 use crate::commands::{
-    bench, codec, compare, completions, data, doctor, encode, eval, export, flops, import, metrics, plan, render, train,
+    bench, codec, compare, completions, data, doctor, encode, eval, export, flops, import, metrics, plan, render,
+    train, view,
 };
 use crate::exit_code::{DONE, error_message, exit_code};
 use crate::output::stdout;
@@ -43,6 +44,7 @@ pub fn main() -> ExitCode {
         Command::Codec(args) => codec::run(&args),
         Command::Encode(args) => encode::run(&args),
         Command::Render(args) => render::run::run(&args),
+        Command::View(args) => view::run(&args),
         Command::Data { command: DataCommand::Synth(args) } => data::synth::run(&args),
         Command::Data { command: DataCommand::Info(args) } => data::info::run(&args),
         Command::Data { command: DataCommand::Check(args) } => data::check::run(&args),

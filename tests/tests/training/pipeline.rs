@@ -23,8 +23,13 @@ const POINT_KEYS: &str = "\
 #[test]
 fn a_run_writes_every_documented_file() {
     let place = Place::new();
-    let ran = place.train("run", &[]).ok().prints("nearest_view").prints("clift ").prints("run/eval/report.html\n");
-    assert!(ran.stdout.lines().count() <= 6, "{}", ran.stdout);
+    let ran = place
+        .train("run", &[])
+        .ok()
+        .prints("nearest_view")
+        .prints("clift ")
+        .prints("run/eval/report.html\nscenes: clift view ");
+    assert!(ran.stdout.lines().count() <= 7, "{}", ran.stdout);
     // What differs from the file is printed.
     ran.notes(&format!("--set run_dir: \"runs/micro\" -> {:?}\n", place.at("run")));
     let config = place.text("run/config.toml");

@@ -85,7 +85,7 @@ pub fn mean_intrinsics(context: &[PathView]) -> Option<Intrinsics> {
 }
 
 /// Returns the distance along the mean view's axis of the point nearest to the axes of all views (least squares).
-fn focus_distance(context: &[PathView]) -> f64 {
+pub fn focus_distance(context: &[PathView]) -> f64 {
     let (mut numerator, mut denominator) = (0.0, 0.0);
     for view in context {
         let axis = view.c2w.rotation.z_axis;

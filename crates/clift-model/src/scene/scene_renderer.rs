@@ -61,8 +61,9 @@ pub struct RenderedView {
     pub render_s: f64,
 }
 
-/// A scene's tokens and renderer on a device, and the token selection of the previous frame.
-#[derive(Debug)]
+/// A scene's tokens and renderer on a device, and the token selection of the previous frame. Clones share the tensors and
+/// select on their own.
+#[derive(Clone, Debug)]
 pub struct SceneRenderer {
     renderer: Renderer,
     /// Keys and values of all storage tokens.
@@ -101,6 +102,11 @@ impl SceneRenderer {
     /// Resets token selection: the next frame does not depend on earlier frames.
     pub fn reset(&mut self) {
         self.selector.reset();
+    }
+
+    /// Replaces the rules of token selection and resets it.
+    pub fn set_rules(&mut self, rules: SelectionRules) {
+        self.selector.set_rules(rules);
     }
 
     /// Renders the next frames of a path, each from its own selection of `num_render_tokens` tokens, or from all tokens if

@@ -20,3 +20,4 @@ pub(crate) mod render;
 pub(crate) mod shared_args;
 pub(crate) mod splits;
 pub(crate) mod train;
+pub(crate) mod view;

@@ -1,5 +1,7 @@
 //! Parsers of argument values.
 
+use std::path::PathBuf;
+
 use clift_data::Split;
 use clift_eval::MethodFilter;
 use clift_train::{ExportFormat, Stage};
@@ -47,6 +49,13 @@ pub(crate) fn parse_stage(text: &str) -> Result<Stage, String> {
 
 pub(crate) fn parse_count(text: &str) -> Result<usize, String> {
     text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "write a number of at least 1".into())
+}
+
+/// Parses the path of a video, whose extension is `mp4`.
+pub(crate) fn parse_video(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    let is_mp4 = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("mp4"));
+    if is_mp4 { Ok(path) } else { Err("write a file name that ends with .mp4".into()) }
 }
 
 /// Parses `[width, height]` in pixels, as `64x48`.

@@ -24,7 +24,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let run = Run::open(config, &options, sink.as_mut())?;
     let summary = run.train(args.only, &stop, sink.as_mut())?;
     drop(sink);
-    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir.join("eval")))
+    summary.map_or(Ok(()), |summary| print_run(&summary, &run_dir))
 }
 
 #[derive(Debug, clap::Args)]

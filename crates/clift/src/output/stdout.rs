@@ -15,9 +15,11 @@ pub fn print_result(text: &str) -> anyhow::Result<()> {
     write_result(std::io::stdout().lock(), text)
 }
 
-/// Writes the result of a run and the path of its report, which has the whole table: six lines for a small terminal.
-pub fn print_run(summary: &Summary, folder: &Path) -> anyhow::Result<()> {
-    print_result(&format!("{}\nreport: {}", summary.headline(), folder.join("report.html").display()))
+/// Writes the result of a run, the path of its report, which has the whole table, and the command that shows its scenes:
+/// seven lines for a small terminal.
+pub fn print_run(summary: &Summary, run: &Path) -> anyhow::Result<()> {
+    let report = run.join("eval").join("report.html");
+    print_result(&format!("{}\nreport: {}\nscenes: clift view {}", summary.headline(), report.display(), run.display()))
 }
 
 /// Writes the table of an evaluation and the paths of its report and files.

@@ -80,6 +80,12 @@ impl Selector {
         self.forward = None;
     }
 
+    /// Replaces the rules and forgets the previous frame.
+    pub fn set_rules(&mut self, rules: SelectionRules) {
+        self.rules = rules;
+        self.reset();
+    }
+
     /// Selects exactly `min(num_render_tokens, num_storage_tokens)` tokens for the next frame, a view of `height` by
     /// `width` pixels, and returns their ids in ascending order. A frame of another size than the previous frame starts
     /// without momentum.

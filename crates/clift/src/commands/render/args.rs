@@ -8,7 +8,7 @@ use std::str::FromStr;
 use clap::builder::RangedU64ValueParser;
 use clift_model::{DeviceName, Precision, SelectionPreset, TokenCount};
 
-use crate::commands::parse::{parse_budget_ms, parse_size};
+use crate::commands::parse::{parse_budget_ms, parse_size, parse_video};
 
 #[derive(Debug, clap::Args)]
 pub struct RenderArgs {
@@ -45,6 +45,11 @@ pub struct RenderArgs {
     /// Frames per second of the animation
     #[arg(long, value_name = "F", default_value_t = 20, value_parser = clap::value_parser!(u16).range(1..))]
     pub fps: u16,
+    /// Also write an MP4 (H.264) of the path, through `ffmpeg` on the PATH
+    ///
+    /// Without `ffmpeg` a warning says so, and the animated PNG is the only animation.
+    #[arg(long, value_name = "FILE.mp4", value_parser = parse_video)]
+    pub video: Option<PathBuf>,
     /// Device: flex, ndarray or wgpu [default: flex]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceName>,

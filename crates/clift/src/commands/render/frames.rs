@@ -5,13 +5,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
 use clift_data::{is_empty_folder, median};
-use clift_eval::{Animation, Canvas};
+use clift_eval::{Animation, Canvas, Video};
 use clift_model::{SceneRenderer, ViewCamera};
 use clift_train::TrainError;
 use serde::Serialize;
 
 use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
+use crate::output::stdout::print_warning;
 
 /// Median seconds per frame.
 #[derive(Debug, Serialize)]
@@ -29,11 +30,13 @@ pub struct Rendered {
 }
 
 /// Settings of all frames.
-pub struct Frames {
+pub struct Frames<'a> {
     pub height: usize,
     pub width: usize,
     pub num_render_tokens: usize,
     pub fps: u16,
+    /// MP4 to write beside the frames.
+    pub video: Option<&'a Path>,
 }
 
 /// File of the path, token counts and times of the frames.
@@ -71,12 +74,19 @@ pub fn remove_later_frames(out: &Path, num_frames: usize) -> std::io::Result<()>
 pub fn write_frames(
     renderer: &mut SceneRenderer,
     views: &[ViewCamera],
-    frames: &Frames,
+    frames: &Frames<'_>,
     folder: &Path,
     stop: &AtomicBool,
 ) -> anyhow::Result<Rendered> {
-    let &Frames { height, width, num_render_tokens, fps } = frames;
+    let &Frames { height, width, num_render_tokens, fps, video } = frames;
     let mut animation = Animation::new(&folder.join("animation.png"), width, height, views.len(), fps)?;
+    let mut writer = match video {
+        Some(path) => Video::start(path, width, height, fps)?,
+        None => None,
+    };
+    if video.is_some() && writer.is_none() {
+        print_warning("no `ffmpeg` on the PATH: no video is written, the animation is animation.png");
+    }
     let mut counter = Counter::new("frames", views.len() as u64);
     let (mut select_s, mut render_s, mut tokens) = (Vec::new(), Vec::new(), Vec::new());
     for some in views.chunks(renderer.frames_per_call(height, width)) {
@@ -90,6 +100,9 @@ pub fn write_frames(
             let image = Canvas::from_unit(&view.pixels, height, width)?;
             image.write_png(&folder.join(format!("frame-{:05}.png", render_s.len())))?;
             animation.add(&image)?;
+            if let Some(video) = &mut writer {
+                video.add(&image)?;
+            }
             select_s.push(view.select_s);
             render_s.push(view.render_s);
             tokens.push(view.tokens);
@@ -97,6 +110,9 @@ pub fn write_frames(
         counter.set(render_s.len() as u64);
     }
     animation.finish()?;
+    if let Some(video) = writer {
+        video.finish()?;
+    }
     let timing = Timing { select_s: median(&select_s), render_s: median(&render_s) };
     Ok(Rendered { timing, tokens: tokens.into_iter().collect() })
 }

@@ -1,5 +1,7 @@
 //! `clift render`.
 
+use std::path::{Path, PathBuf};
+
 use anyhow::Context;
 use clift_data::{
     Intrinsics, PathView, Pose, PoseNormalization, StagedDir, interpolate_path, mean_intrinsics, orbit_path, read_poses,
@@ -55,14 +57,11 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         ));
     }
     frames::check_out(&args.out, args.force)?;
-    let views = path_cameras(&scene, args, height, width)?;
-    let model = args.model.clone().unwrap_or_else(|| scene.find_model(&args.scene));
-    let weights = ModelPath::for_tokens(&model, scene.kind);
-    if args.model.is_none() && !weights.exists() {
-        // The path comes from an untrusted file: control characters must not reach the terminal.
-        let path = weights.display().to_string();
-        usage_bail!("the weights of the scene are not found at {}; set --model RUN", path.escape_debug());
+    if let Some(video) = args.video.as_deref().filter(|video| !args.force && video.exists()) {
+        usage_bail!("the file {} exists; replace it with --force or choose another name", video.display());
     }
+    let views = path_cameras(&scene, args, height, width)?;
+    let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
     let stop = interrupt::flag()?;
     let opened = device.open()?;
     args.precision.check("--precision", &opened)?;
@@ -72,7 +71,7 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
     let (num_render_tokens, calibration) = token_count(&scene, args, &mut renderer, &views[0], height, width)?;
     let creating = || format!("creating {}", args.out.display());
     let files = StagedDir::new(&args.out).with_context(creating)?;
-    let frames = Frames { height, width, num_render_tokens, fps: args.fps };
+    let frames = Frames { height, width, num_render_tokens, fps: args.fps, video: args.video.as_deref() };
     let Rendered { timing, tokens } = frames::write_frames(&mut renderer, &views, &frames, files.path(), &stop)?;
     let Timing { select_s, render_s } = timing;
     let report = Report {
@@ -102,6 +101,18 @@ pub fn run(args: &RenderArgs) -> anyhow::Result<()> {
         1e3 * select_s,
         1e3 * render_s,
     ))
+}
+
+/// Returns the weight file of the scene that was read from `file`: that of `model`, or of the scene's own model.
+pub fn scene_weights(scene: &Scene, file: &Path, model: Option<&Path>) -> anyhow::Result<PathBuf> {
+    let path = model.map_or_else(|| scene.find_model(file), Path::to_path_buf);
+    let weights = ModelPath::for_tokens(&path, scene.kind);
+    if model.is_none() && !weights.exists() {
+        // The path comes from an untrusted file: control characters must not reach the terminal.
+        let path = weights.display().to_string();
+        usage_bail!("the weights of the scene are not found at {}; set --model RUN", path.escape_debug());
+    }
+    Ok(weights)
 }
 
 /// Refuses sizes that are not multiples of the patch, exceed the limit of images or exceed the available memory.

@@ -1,0 +1,159 @@
+//! Messages of the page: JSON text, checked before they reach the render thread.
+
+use std::str::FromStr;
+
+use clift_data::{Intrinsics, IntrinsicsNorm, MAX_COORDINATE, Pose};
+use clift_model::{Precision, SelectionPreset, ViewCamera};
+use serde::de::{Deserialize, Deserializer, Error};
+
+/// Largest accepted message in bytes. The page's largest has about 700.
+pub const MAX_REQUEST_BYTES: usize = 4096;
+/// Accepted focal lengths over width and height, and the largest distance of the principal point, as in pose files.
+const FOCAL_RANGE: [f64; 2] = [1e-3, 1e3];
+
+/// A message of the page.
+#[derive(Clone, Debug, PartialEq, serde::Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub enum Request {
+    /// Opens a scene.
+    Open(OpenRequest),
+    /// Renders a camera.
+    View(ViewRequest),
+    /// Compares a true frame with its rendering.
+    Compare(CompareRequest),
+    /// Acknowledges a rendered frame.
+    Ack(AckRequest),
+}
+
+/// Position of a scene in the list, and its number of stored tokens.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OpenRequest {
+    pub scene: usize,
+    /// One of the offered counts; the nearest offered count otherwise. `None` for the default.
+    pub stored: Option<usize>,
+}
+
+/// A camera and the settings of its rendering.
+#[derive(Clone, Debug, PartialEq, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ViewRequest {
+    pub seq: u64,
+    /// First three rows of the camera-to-world matrix in the normalized frame, OpenCV axes.
+    #[serde(deserialize_with = "pose_of_rows")]
+    pub c2w: Pose,
+    /// `fx, fy, cx, cy` over width and height.
+    #[serde(deserialize_with = "intrinsics_of_numbers")]
+    pub intrinsics: IntrinsicsNorm,
+    /// Rendered tokens, at most all stored tokens are used.
+    pub tokens: usize,
+    #[serde(deserialize_with = "parsed")]
+    pub selection: SelectionPreset,
+    pub precision: Precision,
+    /// Position in the list of sizes.
+    pub size: usize,
+    /// Milliseconds per frame while the camera moves; `None` without limit.
+    pub budget_ms: Option<f64>,
+    /// Whether the camera rests: a lossless picture with all settings as requested.
+    pub rest: bool,
+    /// Whether the reply lists the selected tokens.
+    pub list_tokens: bool,
+}
+
+/// A true frame, and the settings of the rendering beside it.
+#[derive(Clone, Debug, PartialEq, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CompareRequest {
+    /// Position in the list of true frames.
+    pub frame: usize,
+    pub tokens: usize,
+    #[serde(deserialize_with = "parsed")]
+    pub selection: SelectionPreset,
+    pub precision: Precision,
+    /// Whether the reply holds the true image.
+    pub image: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AckRequest {
+    /// `seq` of the received frame.
+    pub seq: u64,
+}
+
+impl ViewRequest {
+    /// Returns the camera for an image of `width` by `height` pixels.
+    pub fn camera(&self, [width, height]: [usize; 2]) -> ViewCamera {
+        let Intrinsics { fx, fy, cx, cy } = self.intrinsics.to_pixels(width, height);
+        ViewCamera { c2w: self.c2w.to_matrix_f64(), intrinsics: [fx, fy, cx, cy] }
+    }
+}
+
+fn pose_of_rows<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Pose, D::Error> {
+    let values = <[f64; 12]>::deserialize(deserializer)?;
+    let rows = [0, 1, 2].map(|row| [0, 1, 2, 3].map(|column| values[row * 4 + column]));
+    let pose = Pose::from_rows(&rows).map_err(D::Error::custom)?;
+    if pose.translation.abs().max_element() > MAX_COORDINATE {
+        return Err(D::Error::custom(format!("the camera is more than {MAX_COORDINATE} units away")));
+    }
+    Ok(pose)
+}
+
+fn intrinsics_of_numbers<'de, D: Deserializer<'de>>(deserializer: D) -> Result<IntrinsicsNorm, D::Error> {
+    let [fx, fy, cx, cy] = <[f64; 4]>::deserialize(deserializer)?;
+    let [least, most] = FOCAL_RANGE;
+    let is_valid = [fx, fy].iter().all(|f| (least..=most).contains(f)) && [cx, cy].iter().all(|c| c.abs() <= most);
+    if is_valid { Ok(IntrinsicsNorm { fx, fy, cx, cy }) } else { Err(D::Error::custom("intrinsics out of range")) }
+}
+
+fn parsed<'de, D: Deserializer<'de>, T: FromStr<Err: std::fmt::Display>>(deserializer: D) -> Result<T, D::Error> {
+    String::deserialize(deserializer)?.parse().map_err(D::Error::custom)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    fn view() -> Value {
+        json!({
+            "type": "view", "seq": 7, "c2w": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, -2], "intrinsics": [1, 1.2, 0.5, 0.5],
+            "tokens": 16, "selection": "scaled", "precision": "f32", "size": 1, "budget_ms": null, "rest": false,
+            "list_tokens": true,
+        })
+    }
+
+    #[test]
+    fn views_have_cameras_in_pixels() {
+        let Request::View(request) = serde_json::from_value(view()).unwrap() else { panic!("a view") };
+        let camera = request.camera([32, 24]);
+        assert_eq!(camera.origin(), [0.5, 0.0, -2.0]);
+        for (got, expected) in camera.intrinsics.into_iter().zip([32.0, 28.8, 16.0, 12.0]) {
+            assert!((got - expected).abs() < 1e-12, "{got} is not {expected}");
+        }
+    }
+
+    #[test]
+    fn invalid_requests_are_refused() {
+        for (key, value) in [
+            ("c2w", json!([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 2, 0])),
+            ("c2w", json!([1, 0, 0, 1e4, 0, 1, 0, 0, 0, 0, 1, 0])),
+            ("c2w", json!([1, 0, 0])),
+            ("intrinsics", json!([0, 1, 0.5, 0.5])),
+            ("intrinsics", json!([1, 1, 0.5, 1e9])),
+            ("selection", json!("../../etc/passwd")),
+            ("precision", json!("f8")),
+            ("tokens", json!(-1)),
+            ("size", json!(0.5)),
+            ("path", json!("/etc/passwd")),
+            ("type", json!("shell")),
+        ] {
+            let mut message = view();
+            message[key] = value.clone();
+            assert!(serde_json::from_value::<Request>(message).is_err(), "{key} = {value}");
+        }
+        assert!(serde_json::from_str::<Request>(&"[".repeat(MAX_REQUEST_BYTES)).is_err());
+        assert!(serde_json::from_str::<Request>(&view().to_string().replace("-2", "1e999")).is_err());
+    }
+}

@@ -1,0 +1,149 @@
+//! A scene ready to render, with all that the page shows of it.
+
+use burn::tensor::Device;
+use clift_data::{Intrinsics, PathView, Pose, focus_distance, mean_intrinsics};
+use clift_eval::{Canvas, available_bytes};
+use clift_model::{DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenFormat, ViewCamera, render_bytes};
+
+use crate::error::ViewError;
+use crate::protocol::reply::{OpenedScene, Reply, SceneCamera};
+use crate::scenes::true_frames::TrueFrame;
+
+/// Offered sizes over the size of the context views.
+const SIZE_FACTORS: [f64; 5] = [0.5, 0.75, 1.0, 2.0, 4.0];
+const MAX_SIDE_PX: usize = 1024;
+
+/// Origin of a scene's images, clusters and counts.
+#[derive(Debug)]
+pub struct SceneOrigin {
+    /// Position in the list of scenes.
+    pub index: usize,
+    pub format: TokenFormat,
+    /// Context images; rendered from all tokens if `None`.
+    pub context_images: Option<Vec<Canvas>>,
+    /// Token of each patch.
+    pub clusters: Option<Vec<u32>>,
+    pub frames: Vec<TrueFrame>,
+    /// Offered numbers of stored tokens, ascending.
+    pub storage_counts: Vec<usize>,
+    pub encode_command: Option<String>,
+    pub render_command: String,
+}
+
+/// A scene on a device.
+#[derive(Debug)]
+pub struct OpenScene {
+    pub scene: Scene,
+    /// Cloned for each client, who selects tokens on their own.
+    pub renderer: SceneRenderer,
+    /// Offered `[width, height]`, ascending.
+    pub sizes: Vec<[usize; 2]>,
+    pub origin: SceneOrigin,
+    context_images: Vec<Canvas>,
+}
+
+impl OpenScene {
+    /// Copies a scene to a device, and renders its context views if it has no images.
+    pub fn new(
+        scene: Scene,
+        renderer: Renderer,
+        mut origin: SceneOrigin,
+        device: &Device,
+        name: DeviceName,
+    ) -> Result<Self, ViewError> {
+        let mut renderer = SceneRenderer::new(&scene, renderer, SelectionPreset::default().rules(), device)?;
+        let context_images = if let Some(images) = origin.context_images.take() {
+            images
+        } else {
+            let views = renderer.render(&scene.context, scene.height, scene.width, scene.num_tokens())?;
+            let images = views.iter().map(|view| Canvas::from_unit(&view.pixels, scene.height, scene.width));
+            images.collect::<Result<_, _>>()?
+        };
+        Ok(Self { sizes: sizes(&scene, name), scene, renderer, origin, context_images })
+    }
+
+    /// Returns the message that shows the scene to the page.
+    pub fn reply(&self, has_true_images: bool) -> Result<Vec<u8>, ViewError> {
+        let Self { scene, origin, sizes, .. } = self;
+        let images: Vec<Vec<u8>> = self.context_images.iter().map(png).collect::<Result<_, _>>()?;
+        let size = [scene.width, scene.height];
+        let context: Vec<PathView> = scene.context.iter().map(path_view).collect::<Result<_, _>>()?;
+        // The intrinsics of a frame are known when its image is read; until then, the mean of the contexts.
+        let mean = mean_intrinsics(&context).unwrap_or(Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0 });
+        let of_frame = |frame: &TrueFrame| {
+            let camera =
+                ViewCamera { c2w: frame.c2w.to_matrix_f64(), intrinsics: [mean.fx, mean.fy, mean.cx, mean.cy] };
+            scene_camera(frame.frame, &camera, size)
+        };
+        let context_frames = scene.context.iter().zip(&scene.context_frames);
+        let reply = OpenedScene {
+            scene: origin.index,
+            key: &scene.key,
+            size,
+            sizes,
+            default_size: sizes.iter().position(|one| *one == size).unwrap_or_default(),
+            patch: scene.model.patch_size,
+            stored: scene.num_tokens(),
+            storage_counts: &origin.storage_counts,
+            num_patches: scene.model.num_tokens(scene.context.len(), scene.height, scene.width)?,
+            bytes: scene.file_bytes(origin.format),
+            tokens: format!("{}, {}", scene.kind, origin.format),
+            token_ids: &scene.token_ids,
+            clusters: origin.clusters.as_deref(),
+            context: context_frames.map(|(camera, &frame)| scene_camera(frame as usize, camera, size)).collect(),
+            has_true_images,
+            frames: origin.frames.iter().map(of_frame).collect(),
+            focus: focus_distance(&context),
+            mean_c2w: scene.world.mean_c2w,
+            scale: scene.world.scale,
+            encode_command: origin.encode_command.clone(),
+            render_command: origin.render_command.clone(),
+        };
+        Ok(Reply::Scene(Box::new(reply)).to_bytes(&images.iter().map(Vec::as_slice).collect::<Vec<_>>()))
+    }
+}
+
+/// Returns a camera for the page, of an image of `[width, height]` pixels.
+pub fn scene_camera(frame: usize, camera: &ViewCamera, [width, height]: [usize; 2]) -> SceneCamera {
+    let (width, height) = (width as f64, height as f64);
+    let [fx, fy, cx, cy] = camera.intrinsics;
+    let mut c2w = [0.0; 12];
+    c2w.copy_from_slice(&camera.c2w[..12]);
+    SceneCamera { frame, c2w, intrinsics: [fx / width, fy / height, cx / width, cy / height] }
+}
+
+/// Encodes an image as PNG.
+pub fn png(image: &Canvas) -> Result<Vec<u8>, ViewError> {
+    let rgb = image.as_rgb8().to_vec();
+    let image = clift_data::RgbImage { width: image.width(), height: image.height(), rgb };
+    Ok(clift_data::encode_png(&image)?)
+}
+
+fn path_view(camera: &ViewCamera) -> Result<PathView, ViewError> {
+    let [fx, fy, cx, cy] = camera.intrinsics;
+    Ok(PathView { c2w: Pose::from_matrix(&camera.c2w)?, intrinsics: Intrinsics { fx, fy, cx, cy } })
+}
+
+/// Returns the sizes of whole patches that fit into half of the memory.
+fn sizes(scene: &Scene, device: DeviceName) -> Vec<[usize; 2]> {
+    let own = [scene.width, scene.height];
+    let patch = scene.model.patch_size;
+    let mut sizes: Vec<[usize; 2]> = SIZE_FACTORS
+        .iter()
+        .map(|factor| own.map(|side| ((side as f64 * factor / patch as f64).round() as usize).max(1) * patch))
+        .filter(|size| *size == own || (is_similar(*size, own) && size.iter().all(|side| *side <= MAX_SIDE_PX)))
+        .filter(|size| {
+            let num_patches = size[0] / patch * (size[1] / patch);
+            let needed = render_bytes(&scene.model, scene.num_tokens(), num_patches);
+            *size == own || available_bytes(device).is_none_or(|available| needed <= available / 2)
+        })
+        .collect();
+    sizes.dedup();
+    sizes
+}
+
+/// Whether rounding to whole patches keeps the proportions within 5 %.
+fn is_similar([width, height]: [usize; 2], own: [usize; 2]) -> bool {
+    let ratio = (width * own[1]) as f64 / (height * own[0]) as f64;
+    (0.95..1.05).contains(&ratio)
+}

@@ -1,0 +1,164 @@
+//! A scene file, or the test scenes of a run.
+
+use burn::tensor::Device;
+use clift_data::{ClipReader, EvaluationItem};
+use clift_eval::{EncodeOptions, EncodedScene, encode};
+use clift_model::{DeviceName, Renderer, Scene, TokenCount, TokenFormat, TrainedModel};
+
+use crate::error::ViewError;
+use crate::protocol::request::OpenRequest;
+use crate::scenes::open_scene::{OpenScene, SceneOrigin};
+use crate::scenes::true_frames::{self, TrueImage};
+
+/// The scenes that a viewer offers.
+#[derive(Debug)]
+pub enum SceneSet {
+    /// One scene file.
+    File(Box<SceneFile>),
+    /// Scenes of a run's data, encoded when they are opened.
+    Run(Box<RunScenes>),
+}
+
+/// A scene file and its renderer.
+#[derive(Debug)]
+pub struct SceneFile {
+    /// The scene.
+    pub scene: Scene,
+    /// Number format of the file's tokens.
+    pub format: TokenFormat,
+    /// The renderer, from [`load_renderer`](clift_model::load_renderer).
+    pub renderer: Renderer,
+    /// Words after `clift render` that name the file, its model and its device.
+    pub render_args: Vec<String>,
+}
+
+/// Scenes of a run's data.
+pub struct RunScenes {
+    /// The trained model.
+    pub model: TrainedModel,
+    /// The data of the run.
+    pub reader: ClipReader,
+    /// The offered scenes with their context frames, at least one.
+    pub items: Vec<EvaluationItem>,
+    /// Settings of the encoding; the context frames and the number of stored tokens are replaced.
+    pub options: EncodeOptions,
+    /// Offered numbers of stored tokens.
+    pub storage: Vec<TokenCount>,
+    /// Words after `clift encode` that name the run and its settings.
+    pub encode_args: Vec<String>,
+    /// Further words of `clift render` for a scene of the run, such as its device.
+    pub render_args: Vec<String>,
+}
+
+impl std::fmt::Debug for RunScenes {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("RunScenes").field("items", &self.items).field("options", &self.options).finish_non_exhaustive()
+    }
+}
+
+/// Number format of the scenes of a run, the default of `clift encode`.
+const RUN_FORMAT: TokenFormat = TokenFormat::F16;
+
+impl SceneSet {
+    /// Returns the keys of the scenes.
+    pub(crate) fn keys(&self) -> Vec<String> {
+        match self {
+            Self::File(file) => vec![file.scene.key.clone()],
+            Self::Run(run) => run.items.iter().map(|item| run.reader.source.key(item.scene).to_owned()).collect(),
+        }
+    }
+
+    /// Whether frames and contexts have true images.
+    pub(crate) fn has_true_images(&self) -> bool {
+        matches!(self, Self::Run(_))
+    }
+
+    /// Opens a scene on the device of its model.
+    pub(crate) fn open(&self, request: OpenRequest, device: &Device, name: DeviceName) -> Result<OpenScene, ViewError> {
+        match self {
+            Self::File(file) => {
+                check_position("scene", request.scene, 1)?;
+                let SceneFile { scene, format, renderer, render_args } = &**file;
+                let origin = SceneOrigin {
+                    index: 0,
+                    format: *format,
+                    context_images: None,
+                    clusters: None,
+                    frames: Vec::new(),
+                    storage_counts: vec![scene.num_tokens()],
+                    encode_command: None,
+                    render_command: command("clift render", render_args),
+                };
+                OpenScene::new(scene.clone(), renderer.clone(), origin, device, name)
+            }
+            Self::Run(run) => run.open(request, device, name),
+        }
+    }
+
+    /// Reads a true frame of an open scene, by its position in the list.
+    pub(crate) fn true_image(&self, open: &OpenScene, frame: usize) -> Result<TrueImage, ViewError> {
+        check_position("frame", frame, open.origin.frames.len())?;
+        let Self::Run(run) = self else { return Err(ViewError::NoScene) };
+        let index = run.items[open.origin.index].scene;
+        true_frames::read(&run.reader, index, &open.scene, open.origin.frames[frame])
+    }
+}
+
+impl RunScenes {
+    fn open(&self, request: OpenRequest, device: &Device, name: DeviceName) -> Result<OpenScene, ViewError> {
+        check_position("scene", request.scene, self.items.len())?;
+        let EvaluationItem { scene: index, views } = &self.items[request.scene];
+        let clift_data::ClipOptions { width, height, .. } = self.reader.options;
+        let num_patches = self.model.config.num_tokens(views.context.len(), height, width)?;
+        let counts = self.storage_counts(num_patches);
+        // Without a request, the count nearest to that of `clift encode`, a quarter.
+        let wanted = request.stored.unwrap_or(num_patches / 4);
+        let stored = counts.iter().copied().min_by_key(|count| count.abs_diff(wanted)).unwrap_or(num_patches);
+        let options = EncodeOptions {
+            context: Some(views.context.clone()),
+            storage: TokenCount::Count(stored),
+            ..self.options.clone()
+        };
+        let EncodedScene { mut scene, clusters, .. } = encode(&self.model, &self.reader, *index, &options)?;
+        scene.tokens = RUN_FORMAT.round(&scene.tokens, scene.model.dim)?;
+        // The key comes from data: as a file name it must not lead to another folder.
+        let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
+        let file: String = scene.key.chars().map(|c| if is_plain(c) { c } else { '_' }).take(80).collect();
+        let file = format!("{file}.clift");
+        let frames = views.context.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
+        let stored = stored.to_string();
+        let scene_args = ["--scene", &scene.key, "--context", &frames, "--storage", &stored, "-o", &file];
+        let encode_args: Vec<String> = self.encode_args.iter().cloned().chain(scene_args.map(str::to_owned)).collect();
+        let render_args: Vec<String> = [file.clone()].into_iter().chain(self.render_args.clone()).collect();
+        let origin = SceneOrigin {
+            index: request.scene,
+            format: RUN_FORMAT,
+            context_images: Some(true_frames::read_context(&self.reader, *index, &scene)?),
+            clusters: Some(clusters.assignment().to_vec()),
+            frames: true_frames::list(&self.reader, *index, &scene)?,
+            storage_counts: counts,
+            encode_command: Some(command("clift encode", &encode_args)),
+            render_command: command("clift render", &render_args),
+        };
+        OpenScene::new(scene, self.model.network.renderer.clone(), origin, device, name)
+    }
+
+    /// Returns the offered counts of a scene, ascending; all tokens are always offered.
+    fn storage_counts(&self, num_patches: usize) -> Vec<usize> {
+        let mut counts: Vec<usize> = self.storage.iter().filter_map(|count| count.of(num_patches).ok()).collect();
+        counts.push(num_patches);
+        counts.sort_unstable();
+        counts.dedup();
+        counts
+    }
+}
+
+fn check_position(name: &'static str, value: usize, count: usize) -> Result<(), ViewError> {
+    if value < count { Ok(()) } else { Err(ViewError::OutOfRange { name, value, last: count.saturating_sub(1) }) }
+}
+
+/// Returns a command line for a shell. A word with a NUL, which no shell accepts, is left out.
+fn command(start: &str, args: &[String]) -> String {
+    let quoted = args.iter().filter_map(|arg| shlex::try_quote(arg).ok());
+    [start.into()].into_iter().chain(quoted).collect::<Vec<_>>().join(" ")
+}

@@ -1,0 +1,184 @@
+//! The thread that owns the device: opens scenes, renders views, compares true frames.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use burn::tensor::Device;
+use clift_data::{RgbImage, encode_jpeg, encode_png};
+use clift_eval::{Canvas, psnr};
+use clift_model::{DeviceName, SceneRenderer, SelectionPreset};
+
+use crate::error::ViewError;
+use crate::protocol::reply::{Comparison, Failure, Frame, Reply};
+use crate::protocol::request::{CompareRequest, OpenRequest, ViewRequest};
+use crate::scenes::open_scene::{OpenScene, png, scene_camera};
+use crate::scenes::scene_set::SceneSet;
+use crate::scenes::true_frames::TrueImage;
+use crate::session::clients::{ClientId, Clients, Job, SentFrame};
+use crate::session::frame_budget::{FrameBudget, FrameSettings, QUALITIES};
+
+/// Scenes that stay on the device without a client.
+const KEPT_SCENES: usize = 3;
+/// True images that stay decoded.
+const KEPT_IMAGES: usize = 16;
+
+/// The scenes of all clients.
+pub struct RenderLoop {
+    scenes: SceneSet,
+    device: Device,
+    name: DeviceName,
+    /// The scenes opened last, the latest at the end.
+    open: Vec<Arc<OpenScene>>,
+    /// True images read last, by scene and position of the frame.
+    true_images: Vec<([usize; 2], TrueImage)>,
+    views: HashMap<ClientId, ClientView>,
+}
+
+/// The scene of a client, and the token selection of its previous frame.
+struct ClientView {
+    scene: Arc<OpenScene>,
+    renderer: SceneRenderer,
+    selection: SelectionPreset,
+}
+
+impl RenderLoop {
+    pub fn new(scenes: SceneSet, device: Device, name: DeviceName) -> Self {
+        Self { scenes, device, name, open: Vec::new(), true_images: Vec::new(), views: HashMap::new() }
+    }
+
+    /// Works until the clients are closed.
+    pub fn run(mut self, clients: &Clients) {
+        while let Some((id, job)) = clients.next_job() {
+            let started = Instant::now();
+            let result = match job {
+                Job::Forget => {
+                    self.views.remove(&id);
+                    continue;
+                }
+                Job::Open(request) => self.open(id, request).map(|message| (message, None)),
+                Job::View(request, budget) => {
+                    self.view(id, &request, budget).map(|(message, frame)| (message, Some(frame)))
+                }
+                Job::Compare(request) => self.compare(id, &request).map(|message| (message, None)),
+            };
+            let (message, frame) = result
+                .unwrap_or_else(|error| (Reply::Failure(Failure { message: error.to_string() }).to_bytes(&[]), None));
+            clients.finish(id, started.elapsed().as_secs_f64(), message, frame);
+        }
+    }
+
+    fn open(&mut self, id: ClientId, request: OpenRequest) -> Result<Vec<u8>, ViewError> {
+        let is_wanted = |open: &Arc<OpenScene>| {
+            open.origin.index == request.scene && request.stored.is_none_or(|stored| stored == open.scene.num_tokens())
+        };
+        let scene = match self.open.iter().position(is_wanted) {
+            Some(position) => self.open.remove(position),
+            None => Arc::new(self.scenes.open(request, &self.device, self.name)?),
+        };
+        if self.open.len() >= KEPT_SCENES {
+            self.open.remove(0);
+        }
+        self.open.push(scene.clone());
+        let message = scene.reply(self.scenes.has_true_images())?;
+        let (renderer, selection) = (scene.renderer.clone(), SelectionPreset::default());
+        self.views.insert(id, ClientView { scene, renderer, selection });
+        Ok(message)
+    }
+
+    fn view(
+        &mut self,
+        id: ClientId,
+        request: &ViewRequest,
+        budget: FrameBudget,
+    ) -> Result<(Vec<u8>, SentFrame), ViewError> {
+        let ClientView { scene, renderer, selection } = self.views.get_mut(&id).ok_or(ViewError::NoScene)?;
+        let stored = scene.scene.num_tokens();
+        let size = request.size.min(scene.sizes.len() - 1);
+        let tokens = request.tokens.clamp(1, stored);
+        let budget_s = request.budget_ms.filter(|_| !request.rest).map(|ms| ms.max(1.0) / 1e3);
+        let full = FrameSettings { tokens, quality: QUALITIES[0], size };
+        let FrameSettings { tokens, quality, size } = budget_s.map_or(full, |_| budget.settings(tokens, size));
+        if *selection != request.selection {
+            *selection = request.selection;
+            renderer.set_rules(selection.rules());
+        }
+        if request.rest {
+            // The picture at rest depends on the camera alone, like the first frame of `clift render`.
+            renderer.reset();
+        }
+        let [width, height] = scene.sizes[size];
+        let _precision = request.precision.scope();
+        let view = renderer.render(&[request.camera([width, height])], height, width, tokens)?.remove(0);
+        let started = Instant::now();
+        let rgb = Canvas::from_unit(&view.pixels, height, width)?.as_rgb8().to_vec();
+        let image = RgbImage { width, height, rgb };
+        let picture = if request.rest { encode_png(&image)? } else { encode_jpeg(&image, quality)? };
+        let frame = Frame {
+            seq: request.seq,
+            rest: request.rest,
+            format: if request.rest { "png" } else { "jpeg" },
+            size: [width, height],
+            tokens,
+            stored,
+            quality: if request.rest { 100 } else { quality },
+            select_ms: 1e3 * view.select_s,
+            render_ms: 1e3 * view.render_s,
+            encode_ms: 1e3 * started.elapsed().as_secs_f64(),
+        };
+        let bits = if request.list_tokens { token_bits(view.tokens.as_deref(), stored) } else { Vec::new() };
+        let sent = SentFrame { seq: request.seq, budget: budget_s.map(|budget_s| (budget_s, request.size)) };
+        Ok((Reply::Frame(frame).to_bytes(&[&bits, &picture]), sent))
+    }
+
+    fn compare(&mut self, id: ClientId, request: &CompareRequest) -> Result<Vec<u8>, ViewError> {
+        let scene = self.views.get(&id).ok_or(ViewError::NoScene)?.scene.clone();
+        let key = [scene.origin.index, request.frame];
+        let image = match self.true_images.iter().position(|(one, _)| *one == key) {
+            Some(position) => self.true_images.remove(position).1,
+            None => self.scenes.true_image(&scene, request.frame)?,
+        };
+        if self.true_images.len() >= KEPT_IMAGES {
+            self.true_images.remove(0);
+        }
+        let [width, height] = [scene.scene.width, scene.scene.height];
+        let tokens = request.tokens.clamp(1, scene.scene.num_tokens());
+        let mut renderer = scene.renderer.clone();
+        renderer.set_rules(request.selection.rules());
+        let _precision = request.precision.scope();
+        let view = renderer.render(&[image.camera], height, width, tokens)?.remove(0);
+        let target: Vec<f32> = image.image.as_rgb8().iter().map(|&value| f32::from(value) / 255.0).collect();
+        let comparison = Comparison {
+            frame: request.frame,
+            camera: scene_camera(scene.origin.frames[request.frame].frame, &image.camera, [width, height]),
+            tokens,
+            // Infinity is no JSON.
+            psnr: psnr(&view.pixels, &target)?.min(100.0),
+        };
+        let true_png = if request.image { vec![png(&image.image)?] } else { Vec::new() };
+        let parts: Vec<&[u8]> = true_png.iter().map(Vec::as_slice).collect();
+        self.true_images.push((key, image));
+        Ok(Reply::Comparison(comparison).to_bytes(&parts))
+    }
+}
+
+/// Returns one bit per stored token, the lowest first; all ones for all tokens.
+fn token_bits(tokens: Option<&[u32]>, stored: usize) -> Vec<u8> {
+    let Some(tokens) = tokens else { return vec![0xff; stored.div_ceil(8)] };
+    let mut bits = vec![0; stored.div_ceil(8)];
+    for &token in tokens {
+        bits[token as usize / 8] |= 1 << (token % 8);
+    }
+    bits
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn selected_tokens_are_bits() {
+        assert_eq!(token_bits(Some(&[0, 9, 10]), 11), [1, 6]);
+        assert_eq!(token_bits(None, 11), [0xff, 0xff]);
+    }
+}

@@ -1,0 +1,108 @@
+//! Latency, frame rates, idle and closed tabs, shares of two tabs.
+
+use std::time::{Duration, Instant};
+
+use clift_data::{median, p95};
+
+use crate::support::{Place, WHOLE};
+use crate::viewer::tab::{Picture, Tab, Viewer};
+
+/// Measures a scene: `CLIFT_VIEW_SCENE=room.clift cargo test --release --workspace viewer_speed -- --ignored --nocapture`.
+#[test]
+#[ignore = "a measurement"]
+fn viewer_speed() {
+    let scene = std::env::var("CLIFT_VIEW_SCENE").expect("CLIFT_VIEW_SCENE names a scene file or run");
+    let viewer = Viewer::start(&[&scene], &std::env::current_dir().expect("a folder"));
+    let mut tab = Tab::open(&viewer);
+    let stored = tab.scene["stored"].as_u64().expect("a count");
+    println!("{} of {}, {stored} tokens", tab.scene["key"], tab.scene["size"]);
+    println!("tokens  fps    latency ms: median  p95    render ms: median  p95    latency - render, p95");
+    for tokens in [stored, (stored / 4).max(1)] {
+        drop(pictures(&mut tab, tokens, 50));
+        let rate = tab.frame_rate(tokens, 5.0);
+        let all = pictures(&mut tab, tokens, 500);
+        let latency: Vec<f64> = all.iter().map(|one| one.latency_ms).collect();
+        let render: Vec<f64> = all.iter().map(Picture::render_ms).collect();
+        let over: Vec<f64> = latency.iter().zip(&render).map(|(a, b)| a - b).collect();
+        let numbers = [median(&latency), p95(&latency), median(&render), p95(&render), p95(&over)];
+        println!(
+            "{tokens:>6}  {rate:>5.0}  {:>18.2} {:>6.2} {:>18.2} {:>6.2} {:>22.2}",
+            numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+        );
+    }
+}
+
+fn pictures(tab: &mut Tab, tokens: u64, count: usize) -> Vec<Picture> {
+    (0..count).map(|_| tab.picture(tokens)).collect()
+}
+
+#[test]
+fn pictures_follow_cameras_and_token_counts_at_once() {
+    let place = Place::with(&WHOLE);
+    let viewer = Viewer::start(&["run"], &place.at(""));
+    let mut tab = Tab::open(&viewer);
+    let stored = tab.scene["stored"].as_u64().expect("a count");
+    let mut over = Vec::new();
+    for i in 0..200 {
+        let tokens = 1 + i % stored;
+        let picture = tab.picture(tokens);
+        assert_eq!(picture.header["tokens"], tokens, "the next frame has the new count");
+        over.push(picture.latency_ms - picture.render_ms());
+    }
+    // The 95th percentile is a measurement of `viewer_speed`; here other tests share the cores.
+    assert!(median(&over) < 15.0, "{over:?}");
+}
+
+#[test]
+fn idle_and_closed_tabs_cost_nothing() {
+    let place = Place::with(&WHOLE);
+    let viewer = Viewer::start(&["run"], &place.at(""));
+    let used = |viewer: &Viewer, seconds: f64| {
+        let before = viewer.cpu_s();
+        std::thread::sleep(Duration::from_secs_f64(seconds));
+        viewer.cpu_s() - before
+    };
+    let mut tab = Tab::open(&viewer);
+    drop(tab.picture(1));
+    assert!(used(&viewer, 2.0) <= 0.02, "an idle tab");
+    // Cameras without end, and a tab that goes away in the middle.
+    tab.frame_rate(1, 0.5);
+    tab.send_view(1, false);
+    drop(tab);
+    std::thread::sleep(Duration::from_secs(1));
+    assert!(used(&viewer, 2.0) <= 0.02, "a closed tab");
+}
+
+#[test]
+fn two_tabs_get_equal_shares() {
+    let place = Place::with(&WHOLE);
+    let viewer = Viewer::start(&["run"], &place.at(""));
+    let rates: Vec<f64> = std::thread::scope(|scope| {
+        let threads: Vec<_> = (0..2)
+            .map(|_| {
+                let mut tab = Tab::open(&viewer);
+                scope.spawn(move || tab.frame_rate(1, 2.0))
+            })
+            .collect();
+        threads.into_iter().map(|thread| thread.join().expect("frames")).collect()
+    });
+    let ratio = rates[0] / rates[1];
+    assert!((0.6..1.7).contains(&ratio), "{rates:?} frames per second");
+}
+
+#[test]
+fn a_stalled_tab_gets_two_frames() {
+    let place = Place::with(&WHOLE);
+    let viewer = Viewer::start(&["run"], &place.at(""));
+    let mut tab = Tab::open(&viewer);
+    for _ in 0..50 {
+        tab.send_view(1, false);
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    let seqs = [tab.reply().0, tab.reply().0].map(|header| header["seq"].as_u64().expect("a number"));
+    assert!(seqs[0] < seqs[1] && seqs[1] < 50, "{seqs:?}");
+    let started = Instant::now();
+    tab.send(&serde_json::json!({"type": "ack", "seq": seqs[0]}));
+    assert_eq!(tab.reply().0["seq"], 50, "the latest camera");
+    assert!(started.elapsed() < Duration::from_secs(5));
+}

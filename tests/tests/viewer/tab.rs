@@ -1,0 +1,178 @@
+//! A running viewer, and one tab of it without a browser.
+
+use std::io::{BufRead, BufReader};
+use std::net::TcpStream;
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use tungstenite::client::IntoClientRequest;
+use tungstenite::{Message, WebSocket};
+
+use crate::support::BINARY;
+
+/// A viewer that ends with this value.
+pub struct Viewer {
+    pub child: Child,
+    pub url: String,
+    /// `127.0.0.1:port`.
+    pub host: String,
+    pub token: String,
+    _stdout: BufReader<ChildStdout>,
+}
+
+impl Viewer {
+    /// Starts `clift view` with these words in a folder, by default on a free port and without a browser.
+    pub fn start(words: &[&str], folder: &std::path::Path) -> Self {
+        let mut command = Command::new(BINARY);
+        command.arg("view").args(words).current_dir(folder);
+        if !words.contains(&"--no-open") {
+            command.arg("--no-open");
+        }
+        let mut child =
+            command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::inherit()).spawn().expect("it starts");
+        let mut stdout = BufReader::new(child.stdout.take().expect("piped"));
+        let mut url = String::new();
+        stdout.read_line(&mut url).expect("the first line is the URL");
+        let url = url.trim().to_owned();
+        let (host, token) = url.strip_prefix("http://").and_then(|rest| rest.split_once("/?token=")).expect(&url);
+        let (host, token) = (host.to_owned(), token.to_owned());
+        Self { child, url, host, token, _stdout: stdout }
+    }
+
+    /// Opens a socket with the headers of a request; `None` where the server refuses it.
+    pub fn socket(&self, host: &str, origin: &str, token: &str) -> Option<WebSocket<TcpStream>> {
+        let stream = TcpStream::connect(&self.host).expect("it listens");
+        stream.set_nodelay(true).expect("a socket");
+        stream.set_read_timeout(Some(Duration::from_secs(20))).expect("a socket");
+        let mut request = format!("ws://{}/socket?token={token}", self.host).into_client_request().expect("a URL");
+        for (name, value) in [("host", host), ("origin", origin)] {
+            request.headers_mut().insert(name, value.parse().expect("a header"));
+        }
+        tungstenite::client(request, stream).ok().map(|(socket, _)| socket)
+    }
+
+    /// CPU seconds of the process.
+    pub fn cpu_s(&self) -> f64 {
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).expect("Linux");
+        let fields: Vec<&str> = stat.rsplit_once(") ").expect("a name").1.split(' ').collect();
+        let ticks: f64 = [11, 12].map(|i| fields[i].parse::<f64>().expect("a number")).iter().sum();
+        ticks / 100.0
+    }
+
+    /// Largest resident memory so far, in bytes.
+    pub fn peak_bytes(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("Linux");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).expect("a peak");
+        1024 * line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number")
+    }
+}
+
+impl Drop for Viewer {
+    fn drop(&mut self) {
+        drop(self.child.kill());
+        drop(self.child.wait());
+    }
+}
+
+/// A tab: an open scene, and a camera that moves.
+pub struct Tab {
+    socket: WebSocket<TcpStream>,
+    pub scene: Value,
+    pub seq: u64,
+}
+
+/// A rendered frame and the time from its camera to its bytes.
+pub struct Picture {
+    pub header: Value,
+    pub latency_ms: f64,
+}
+
+impl Picture {
+    pub fn render_ms(&self) -> f64 {
+        ["select_ms", "render_ms"].iter().map(|key| self.header[*key].as_f64().expect("a time")).sum()
+    }
+}
+
+impl Tab {
+    pub fn open(viewer: &Viewer) -> Self {
+        let origin = format!("http://{}", viewer.host);
+        let socket = viewer.socket(&viewer.host, &origin, &viewer.token).expect("the page's own request is accepted");
+        let mut tab = Self { socket, scene: Value::Null, seq: 0 };
+        assert_eq!(tab.reply().0["type"], "hello");
+        tab.send(&json!({"type": "open", "scene": 0, "stored": null}));
+        tab.scene = tab.reply().0;
+        assert_eq!(tab.scene["type"], "scene", "{}", tab.scene);
+        tab
+    }
+
+    pub fn send(&mut self, message: &Value) {
+        self.socket.send(Message::text(message.to_string())).expect("the socket is open");
+    }
+
+    /// Receives a reply: header and bytes after it.
+    pub fn reply(&mut self) -> (Value, Vec<u8>) {
+        let message = self.socket.read().expect("a reply within the time limit").into_data();
+        let (length, rest) = message.split_first_chunk::<4>().expect("a length");
+        let (header, parts) = rest.split_at(u32::from_le_bytes(*length) as usize);
+        (serde_json::from_slice(header).expect("JSON"), parts.to_vec())
+    }
+
+    pub fn send_view(&mut self, tokens: u64, is_rest: bool) {
+        self.seq += 1;
+        let context = &self.scene["context"][0];
+        let mut c2w: Vec<f64> = context["c2w"].as_array().expect("rows").iter().filter_map(Value::as_f64).collect();
+        c2w[3] += 0.001 * (self.seq % 100) as f64;
+        let view = json!({
+            "type": "view", "seq": self.seq, "c2w": c2w, "intrinsics": context["intrinsics"], "tokens": tokens,
+            "selection": "scaled", "precision": "f32", "size": self.scene["default_size"], "budget_ms": null,
+            "rest": is_rest, "list_tokens": false,
+        });
+        self.send(&view);
+    }
+
+    pub fn acknowledge(&mut self, header: &Value) {
+        self.send(&json!({"type": "ack", "seq": header["seq"]}));
+    }
+
+    /// Moves the camera and waits for its picture.
+    pub fn picture(&mut self, tokens: u64) -> Picture {
+        let started = Instant::now();
+        self.send_view(tokens, false);
+        let (header, _) = self.reply();
+        let latency_ms = 1e3 * started.elapsed().as_secs_f64();
+        assert_eq!(header["type"], "frame", "{header}");
+        assert_eq!(header["seq"], self.seq);
+        self.acknowledge(&header);
+        Picture { header, latency_ms }
+    }
+
+    /// Frames per second of a tab that always has another camera, over `seconds`.
+    pub fn frame_rate(&mut self, tokens: u64, seconds: f64) -> f64 {
+        let started = Instant::now();
+        let mut count = 0;
+        self.send_view(tokens, false);
+        self.send_view(tokens, false);
+        while started.elapsed().as_secs_f64() < seconds {
+            let (header, _) = self.reply();
+            count += 1;
+            self.acknowledge(&header);
+            self.send_view(tokens, false);
+        }
+        let rate = f64::from(count) / started.elapsed().as_secs_f64();
+        self.drain();
+        rate
+    }
+
+    /// Receives the frames that are still under way.
+    fn drain(&mut self) {
+        let last = self.seq;
+        loop {
+            let (header, _) = self.reply();
+            self.acknowledge(&header);
+            if header["seq"] == last {
+                return;
+            }
+        }
+    }
+}
