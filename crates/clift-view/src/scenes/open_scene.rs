@@ -3,7 +3,9 @@
 use burn::tensor::Device;
 use clift_data::{Intrinsics, PathView, Pose, focus_distance, mean_intrinsics};
 use clift_eval::{Canvas, available_bytes};
-use clift_model::{DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenFormat, ViewCamera, render_bytes};
+use clift_model::{
+    DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenStorage, ViewCamera, render_bytes,
+};
 
 use crate::error::ViewError;
 use crate::protocol::reply::{OpenedScene, Reply, SceneCamera};
@@ -18,7 +20,9 @@ const MAX_SIDE_PX: usize = 1024;
 pub struct SceneOrigin {
     /// Position in the list of scenes.
     pub index: usize,
-    pub format: TokenFormat,
+    pub storage: TokenStorage,
+    /// Bytes of the scene's file.
+    pub file_bytes: u64,
     /// Context images; rendered from all tokens if `None`.
     pub context_images: Option<Vec<Canvas>>,
     /// Token of each patch.
@@ -86,8 +90,8 @@ impl OpenScene {
             stored: scene.num_tokens(),
             storage_counts: &origin.storage_counts,
             num_patches: scene.model.num_tokens(scene.context.len(), scene.height, scene.width)?,
-            bytes: scene.file_bytes(origin.format),
-            tokens: format!("{}, {}", scene.kind, origin.format),
+            bytes: origin.file_bytes,
+            tokens: format!("{}, {}", scene.kind, origin.storage),
             token_ids: &scene.token_ids,
             clusters: origin.clusters.as_deref(),
             context: context_frames.map(|(camera, &frame)| scene_camera(frame as usize, camera, size)).collect(),

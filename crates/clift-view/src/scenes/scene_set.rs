@@ -3,7 +3,7 @@
 use burn::tensor::Device;
 use clift_data::{ClipReader, EvaluationItem};
 use clift_eval::{EncodeOptions, EncodedScene, encode};
-use clift_model::{DeviceName, Renderer, Scene, TokenCount, TokenFormat, TrainedModel};
+use clift_model::{DeviceName, Renderer, Scene, TokenCount, TokenFormat, TokenStorage, TrainedModel};
 
 use crate::error::ViewError;
 use crate::protocol::request::OpenRequest;
@@ -24,8 +24,10 @@ pub enum SceneSet {
 pub struct SceneFile {
     /// The scene.
     pub scene: Scene,
-    /// Number format of the file's tokens.
-    pub format: TokenFormat,
+    /// How the file stores the tokens.
+    pub storage: TokenStorage,
+    /// Bytes of the file.
+    pub file_bytes: u64,
     /// The renderer, from [`load_renderer`](clift_model::load_renderer).
     pub renderer: Renderer,
     /// Words after `clift render` that name the file, its model and its device.
@@ -78,10 +80,11 @@ impl SceneSet {
         match self {
             Self::File(file) => {
                 check_position("scene", request.scene, 1)?;
-                let SceneFile { scene, format, renderer, render_args } = &**file;
+                let SceneFile { scene, storage, file_bytes, renderer, render_args } = &**file;
                 let origin = SceneOrigin {
                     index: 0,
-                    format: *format,
+                    storage: *storage,
+                    file_bytes: *file_bytes,
                     context_images: None,
                     clusters: None,
                     frames: Vec::new(),
@@ -132,7 +135,8 @@ impl RunScenes {
         let render_args: Vec<String> = [file.clone()].into_iter().chain(self.render_args.clone()).collect();
         let origin = SceneOrigin {
             index: request.scene,
-            format: RUN_FORMAT,
+            storage: RUN_FORMAT.into(),
+            file_bytes: scene.file_bytes(RUN_FORMAT),
             context_images: Some(true_frames::read_context(&self.reader, *index, &scene)?),
             clusters: Some(clusters.assignment().to_vec()),
             frames: true_frames::list(&self.reader, *index, &scene)?,

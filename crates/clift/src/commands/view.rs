@@ -64,7 +64,8 @@ fn open_file(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
     if !args.overrides.set.is_empty() {
         usage_bail!("--set changes the config of a run; {} is a scene file", args.scene.display());
     }
-    let (scene, format) = Scene::read(&args.scene)?;
+    let (scene, storage) = Scene::read_for(&args.scene, args.model.as_deref())?;
+    let file_bytes = std::fs::metadata(&args.scene).map_or(0, |file| file.len());
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
     let device = args.overrides.device.unwrap_or_default();
     let renderer = load_renderer(&scene, &weights, &device.open()?)?;
@@ -73,7 +74,7 @@ fn open_file(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
         render_args.extend(["--model".into(), text(model)]);
     }
     render_args.extend(device_args(args.overrides.device));
-    Ok((SceneSet::File(Box::new(SceneFile { scene, format, renderer, render_args })), device))
+    Ok((SceneSet::File(Box::new(SceneFile { scene, storage, file_bytes, renderer, render_args })), device))
 }
 
 fn open_run(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
