@@ -3,7 +3,7 @@
 
 Stage 1 with the sizes and rates of the config at --config: AdamW, cosine decay, a random share of the tokens. All frames
 are decoded before the first step, so that reading costs no time. Writes metrics.jsonl and validation.jsonl as
-`clift train` does, for scripts/tools/plot_psnr.py.
+`clift train` does, for scripts/tools/plot_runs.py.
 
     clift data synth runs/rooms-32 --scenes 4096 --size 32x32
     python3 scripts/bench/train_twin.py runs/rooms-32 --steps 2000 --out runs/twin

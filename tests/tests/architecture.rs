@@ -24,7 +24,7 @@ const CRATES: [Crate; 8] = [
     (
         "clift-train",
         "clift-kernels clift-model clift-data clift-eval",
-        "error events config distributed step cluster_cache interchange stage checkpoint footprint run",
+        "error events config distributed step cluster_cache interchange stage checkpoint footprint token_codec run",
     ),
     (
         "clift-bench",

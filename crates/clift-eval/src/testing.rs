@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use clift_data::{ClipViews, Intrinsics, Pose};
-use clift_model::TokenStorage;
+use clift_model::TokenCoding;
 use safetensors::{Dtype, SafeTensors};
 
 use crate::config::method::Method;
@@ -12,10 +12,10 @@ use crate::statistics::view_metrics::EvalKey;
 
 /// A key with half of the stored tokens rendered.
 pub const CLIFT: EvalKey =
-    EvalKey { method: Method::Clift, num_storage_tokens: 64, num_render_tokens: 32, tokens: Some(TokenStorage::F16) };
+    EvalKey { method: Method::Clift, num_storage_tokens: 64, num_render_tokens: 32, tokens: Some(TokenCoding::F16) };
 
 pub fn f32_key(method: Method, num_storage_tokens: usize, num_render_tokens: usize) -> EvalKey {
-    EvalKey { method, num_storage_tokens, num_render_tokens, tokens: Some(TokenStorage::F32) }
+    EvalKey { method, num_storage_tokens, num_render_tokens, tokens: Some(TokenCoding::F32) }
 }
 
 /// Channels of the narrow networks in the fixtures.

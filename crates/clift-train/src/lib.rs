@@ -31,6 +31,7 @@ mod stage;
 mod step;
 #[cfg(test)]
 mod testing;
+mod token_codec;
 
 // Configuration
 pub use config::config::{
@@ -45,9 +46,9 @@ pub use events::{Event, Sink, Stage, StepEvent};
 pub use run::eval_folder::EvalFolder;
 pub use run::evaluate_model::evaluate_model;
 pub use run::run::{Run, RunOptions};
-pub use run::token_codec::fit_token_codec;
 pub use run::validation::EvalRequest;
 pub use stage::settings::{StageSettings, freeze};
+pub use token_codec::fit_token_codec;
 // One update
 pub use step::batch::{StageBatch, TokenSelection};
 pub use step::device_batch::{DeviceBatch, render_loss};

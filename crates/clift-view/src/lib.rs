@@ -8,10 +8,11 @@
 //! use clift_view::{SceneFile, SceneSet, ServerOptions, ViewServer};
 //!
 //! let device = DeviceName::Flex.open()?;
-//! let (scene, format) = Scene::read("room.clift".as_ref())?;
+//! let (scene, coding) = Scene::read("room.clift".as_ref())?;
+//! let file_bytes = std::fs::metadata("room.clift")?.len();
 //! let renderer = load_renderer(&scene, "runs/tiny/stage2/model.safetensors".as_ref(), &device)?;
 //! let render_args = vec!["room.clift".into()];
-//! let scenes = SceneSet::File(Box::new(SceneFile { scene, format, renderer, render_args }));
+//! let scenes = SceneSet::File(Box::new(SceneFile { scene, coding, file_bytes, renderer, render_args }));
 //! let server = ViewServer::bind(&ServerOptions::default())?;
 //! println!("{}", server.url());
 //! server.run(scenes, DeviceName::Flex)?;

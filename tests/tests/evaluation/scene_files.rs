@@ -4,7 +4,7 @@ use std::process::Command;
 
 use clift_data::{Clip, ClipReader, Split, ViewIndices, even_views, open_dataset};
 use clift_eval::{Canvas, psnr, ssim, view_cameras};
-use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenFormat, TokenKind, TokenStorage, load_renderer};
+use clift_model::{Scene, SceneRenderer, SelectionPreset, TokenCoding, TokenFormat, TokenKind, load_renderer};
 use clift_train::{Config, read_config};
 use serde_json::{Value, json};
 
@@ -86,7 +86,7 @@ fn scene_files_reproduce_the_evaluation() {
         // The file's size is that of the formula, and of the evaluation's summary.
         let format: TokenFormat = storage.parse().unwrap();
         let (scene, found) = Scene::read(&place.at(&name)).unwrap();
-        assert_eq!((scene.num_tokens(), scene.kind, found), (count, TokenKind::Clift, TokenStorage::Plain(format)));
+        assert_eq!((scene.num_tokens(), scene.kind, found), (count, TokenKind::Clift, TokenCoding::Plain(format)));
         assert_eq!(scene.context_frames, [0, 7]);
         let bytes = place.bytes(&name).len() as u64;
         assert_eq!(bytes, 8 + 2048 + 136 + 164 * 2 + (count * (28 + format.bytes_per_token(16))) as u64);
@@ -150,7 +150,7 @@ fn paths_render_to_frames_and_animation_by_count() {
     let place = Place::with(&WHOLE);
     place.clift(&format!("{ENCODE} DIR/room.clift --storage 1.0")).ok();
     let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
-    assert_eq!((scene.num_tokens(), storage), (8, TokenStorage::F16));
+    assert_eq!((scene.num_tokens(), storage), (8, TokenCoding::F16));
     assert_eq!(scene.context_frames.len(), 2, "as many contexts as in training");
     for (out, size, flags, num_render_tokens) in [
         ("all", (16, 16), "--path interpolate", 8),

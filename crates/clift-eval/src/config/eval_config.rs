@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use clift_model::{Precision, TokenCount, TokenStorage};
+use clift_model::{Precision, TokenCoding, TokenCount};
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::config::method::Method;
@@ -25,7 +25,7 @@ pub struct EvalConfig {
     /// Storage of the tokens, as in a scene file: one of `f32`, `f16`, `int8`, `coded` (at most 0.02 dB of loss as
     /// measured when the codec was fitted) and `coded-DB`, or a list of them to compare.
     #[serde(deserialize_with = "one_or_more")]
-    pub tokens: Vec<TokenStorage>,
+    pub tokens: Vec<TokenCoding>,
     /// LPIPS weights, converted by `scripts/tools/convert_vgg.py`. LPIPS is not measured without weights.
     pub lpips_weights: Option<PathBuf>,
     /// Evaluation index with the context and target frames of every scene. Without an index, contexts are spread evenly
@@ -59,12 +59,12 @@ impl EvalConfig {
 }
 
 /// Reads a format or a list of formats, without duplicates.
-fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TokenStorage>, D::Error> {
+fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TokenCoding>, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged, expecting = "a storage (\"f32\", \"f16\", \"int8\", \"coded\") or a list of them")]
     enum Written {
-        One(TokenStorage),
-        More(Vec<TokenStorage>),
+        One(TokenCoding),
+        More(Vec<TokenCoding>),
     }
     let mut formats = match Written::deserialize(deserializer)? {
         Written::One(format) => vec![format],
@@ -87,7 +87,7 @@ impl Default for EvalConfig {
             render: Vec::new(),
             selection: Selection::default(),
             variants: Vec::new(),
-            tokens: vec![TokenStorage::F32],
+            tokens: vec![TokenCoding::F32],
             lpips_weights: None,
             index: None,
             drop_context_targets: false,
@@ -110,8 +110,8 @@ mod tests {
     #[test]
     fn formats_are_a_name_or_a_list() {
         let tokens = |text: &str| serde_json::from_str::<EvalConfig>(text).map(|config| config.tokens);
-        assert_eq!(tokens(r#"{"tokens": "f16"}"#).unwrap(), [TokenStorage::F16]);
-        assert_eq!(tokens(r#"{"tokens": ["int8", "f32", "int8"]}"#).unwrap(), [TokenStorage::INT8, TokenStorage::F32]);
+        assert_eq!(tokens(r#"{"tokens": "f16"}"#).unwrap(), [TokenCoding::F16]);
+        assert_eq!(tokens(r#"{"tokens": ["int8", "f32", "int8"]}"#).unwrap(), [TokenCoding::INT8, TokenCoding::F32]);
         assert!(tokens(r#"{"tokens": []}"#).unwrap_err().to_string().contains("at least one"));
         assert!(tokens(r#"{"tokens": "f64"}"#).unwrap_err().to_string().contains("int8"));
     }

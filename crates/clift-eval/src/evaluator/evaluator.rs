@@ -4,7 +4,7 @@ use std::path::Path;
 
 use burn::tensor::Device;
 use clift_data::{ClipReader, EvaluationItem, SkipReport, plural, replace_file};
-use clift_model::{ModelError, TokenStorage};
+use clift_model::{ModelError, TokenCoding};
 
 use crate::config::eval_config::EvalConfig;
 use crate::config::method::Method;
@@ -178,9 +178,9 @@ impl Evaluator {
     }
 
     /// Returns the storages of tokens, without coded ones if the model has no codec.
-    fn storages(&self, models: &EvalModels, progress: &mut dyn Progress) -> Result<Vec<TokenStorage>, EvalError> {
+    fn storages(&self, models: &EvalModels, progress: &mut dyn Progress) -> Result<Vec<TokenCoding>, EvalError> {
         let mut tokens = self.eval.tokens.clone();
-        let is_coded = |tokens: &TokenStorage| matches!(tokens, TokenStorage::Coded(_));
+        let is_coded = |tokens: &TokenCoding| matches!(tokens, TokenCoding::Coded(_));
         if let Some(coded) = tokens.iter().copied().find(is_coded).filter(|_| models.codec.is_none()) {
             let fix = "the model has no token codec: fit it with `clift codec RUN`";
             tokens.retain(|tokens| !is_coded(tokens));

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clift_model::TokenStorage;
+use clift_model::TokenCoding;
 
 use crate::config::method::Method;
 use crate::report::axis::{Scale, milliseconds};
@@ -61,14 +61,14 @@ fn has_formats(summary: &Summary) -> bool {
 
 fn series(summary: &Summary, is_joined: bool, mark: impl Fn(&SummaryPoint) -> Option<Mark>) -> Vec<Series> {
     let has_formats = has_formats(summary);
-    let formats: BTreeSet<TokenStorage> = summary.points.iter().filter_map(|point| point.key.tokens).collect();
-    let mut lines: BTreeMap<(Method, Option<TokenStorage>), Vec<Mark>> = BTreeMap::new();
+    let formats: BTreeSet<TokenCoding> = summary.points.iter().filter_map(|point| point.key.tokens).collect();
+    let mut lines: BTreeMap<(Method, Option<TokenCoding>), Vec<Mark>> = BTreeMap::new();
     for point in &summary.points {
         if let Some(mark) = mark(point) {
             lines.entry((point.key.method, point.key.tokens.filter(|_| has_formats))).or_default().push(mark);
         }
     }
-    let line = |((method, tokens), marks): ((Method, Option<TokenStorage>), Vec<Mark>)| {
+    let line = |((method, tokens), marks): ((Method, Option<TokenCoding>), Vec<Mark>)| {
         let mut look = look(summary, method);
         let mut name = method.name().to_owned();
         if let Some(tokens) = tokens.filter(|_| method != Method::Random) {

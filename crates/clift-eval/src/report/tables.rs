@@ -1,7 +1,7 @@
 //! The tables of the page.
 
 use clift_data::SkipReport;
-use clift_model::TokenStorage;
+use clift_model::TokenCoding;
 use maud::{Markup, html};
 
 use crate::report::axis::{grouped, milliseconds};
@@ -188,6 +188,6 @@ pub fn machine(device: &str, command: &str) -> Markup {
     }
 }
 
-fn storage_name(tokens: Option<TokenStorage>) -> String {
+fn storage_name(tokens: Option<TokenCoding>) -> String {
     tokens.map_or_else(|| DASH.to_owned(), |tokens| tokens.to_string())
 }

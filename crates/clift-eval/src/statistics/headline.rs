@@ -68,7 +68,7 @@ fn decibels(psnr: Option<f64>) -> String {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenStorage;
+    use clift_model::TokenCoding;
 
     use super::*;
     use crate::statistics::eval_results::EvalResults;
@@ -78,7 +78,7 @@ mod tests {
         let mut results = EvalResults::default();
         for (method, better) in [(Method::Clift, 1.5), (Method::Kmeans, 1.0), (Method::Random, 0.0)] {
             for count in counts.clone() {
-                for (tokens, loss) in [(TokenStorage::F32, 0.0), (TokenStorage::INT8, 0.5)] {
+                for (tokens, loss) in [(TokenCoding::F32, 0.0), (TokenCoding::INT8, 0.5)] {
                     let tokens = Some(tokens);
                     let key = EvalKey { method, num_storage_tokens: count, num_render_tokens: count, tokens };
                     let psnr = 10.0 + better + count as f64 / 8.0 - loss;

@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use clift_data::{mean, standard_error};
-use clift_model::TokenStorage;
+use clift_model::TokenCoding;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
@@ -33,7 +33,7 @@ pub struct PairedDifference {
     /// Tokens in the scene file, for both methods.
     pub num_storage_tokens: usize,
     /// Number format of the stored tokens of `method`; random subsets are always f32.
-    pub tokens: Option<TokenStorage>,
+    pub tokens: Option<TokenCoding>,
     /// Scenes measured with both methods.
     pub num_scenes: usize,
     /// Mean over scenes of `method` minus `against`, in dB; positive in agreement with the paper.
@@ -47,7 +47,7 @@ pub fn differences(results: &EvalResults) -> Vec<PairedDifference> {
     let mut differences = Vec::new();
     for [method, against] in ORDERINGS {
         for (key, better) in results.views().filter(|(key, _)| key.method == method && key.is_whole()) {
-            let tokens = if against == Method::Random { Some(TokenStorage::F32) } else { key.tokens };
+            let tokens = if against == Method::Random { Some(TokenCoding::F32) } else { key.tokens };
             let Some(other) = results.of(EvalKey { method: against, tokens, ..key }) else { continue };
             let per_scene = scene_differences(better, other);
             differences.extend(mean(&per_scene).map(|psnr| PairedDifference {

@@ -288,7 +288,7 @@ fn mark_fronts(points: &mut [SummaryPoint]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clift_model::TokenStorage;
+    use clift_model::TokenCoding;
 
     use crate::testing::CLIFT;
 
@@ -383,8 +383,7 @@ mod tests {
     fn equal_computations_share_their_times() {
         let mut views = EvalResults::default();
         let timed = |ms: f64, psnr| ViewMetrics { render_s: Some(ms * 1e-3), ..ViewMetrics::quality(psnr, None) };
-        let [f16, int8] =
-            [TokenStorage::F16, TokenStorage::INT8].map(|tokens| EvalKey { tokens: Some(tokens), ..CLIFT });
+        let [f16, int8] = [TokenCoding::F16, TokenCoding::INT8].map(|tokens| EvalKey { tokens: Some(tokens), ..CLIFT });
         let random = EvalKey { method: Method::Random, ..f16 };
         let all = EvalKey { num_storage_tokens: 32, ..f16 };
         for frame in 0..8 {

@@ -115,7 +115,7 @@ fn cell(value: Option<f64>, decimals: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use clift_model::TokenStorage;
+    use clift_model::TokenCoding;
 
     use crate::config::method::{Method, MethodName};
     use crate::statistics::eval_results::EvalResults;
@@ -126,7 +126,7 @@ mod tests {
     #[test]
     fn table_columns_are_aligned() {
         let mut views = EvalResults::default();
-        let key = EvalKey { tokens: Some(TokenStorage::INT8), ..CLIFT };
+        let key = EvalKey { tokens: Some(TokenCoding::INT8), ..CLIFT };
         for (scene, psnr, ms) in [("a", 20.0, 1.0), ("b", 21.0, 2.0)] {
             let measured = ViewMetrics {
                 render_s: Some(ms * 1e-3),

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use clift_model::TokenStorage;
+use clift_model::TokenCoding;
 use serde::{Deserialize, Serialize};
 
 use crate::config::method::Method;
@@ -19,7 +19,7 @@ pub struct EvalKey {
     /// Tokens of a rendering; 0 for a baseline.
     pub num_render_tokens: usize,
     /// Storage of the tokens; `None` without tokens.
-    pub tokens: Option<TokenStorage>,
+    pub tokens: Option<TokenCoding>,
 }
 
 impl EvalKey {

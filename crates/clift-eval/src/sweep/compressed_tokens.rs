@@ -4,8 +4,7 @@
 use burn::tensor::{Tensor, TensorData};
 use clift_data::{Clip, Pose, item_rng};
 use clift_model::{
-    Scene, SceneModel, SceneNormalization, TokenCodec, TokenFormat, TokenStorage, Tokens, TrainedModel,
-    scene_file_bytes,
+    Scene, SceneModel, SceneNormalization, TokenCodec, TokenCoding, TokenFormat, Tokens, TrainedModel, scene_file_bytes,
 };
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -32,7 +31,7 @@ impl<'a> CompressedTokens<'a> {
         method: Method,
         models: &'a EvalModels,
         (lift, index): (&Tokens, &LazyClusters),
-        storage: TokenStorage,
+        storage: TokenCoding,
         (clip, model_path): (&Clip, &str),
     ) -> Result<Self, EvalError> {
         let model = models.for_method(method).ok_or(EvalError::NoModel { method: method.name() })?;
@@ -50,11 +49,11 @@ impl<'a> CompressedTokens<'a> {
         let ids = clusters.scenes()[0].centroid_index().to_vec();
         let (num_tokens, num_views) = (ids.len(), clip.context.num_views());
         let (tokens, bytes) = match storage {
-            TokenStorage::Plain(format) => {
+            TokenCoding::Plain(format) => {
                 let bytes = scene_file_bytes(num_tokens, model.config.dim, num_views, format);
                 (rounded(tokens, format)?, bytes)
             }
-            TokenStorage::Coded(loss) => {
+            TokenCoding::Coded(loss) => {
                 let codec = models.codec.as_ref().ok_or(EvalError::NoModel { method: "coded tokens" })?;
                 let share = num_tokens as f64 / lift.dims()[1] as f64;
                 let step = codec.rates.step_for_loss(share, loss.db()) as f32;

@@ -1,6 +1,6 @@
 //! Settings of a sweep over methods and token counts.
 
-use clift_model::{KMeans, ModelConfig, TokenCount, TokenStorage};
+use clift_model::{KMeans, ModelConfig, TokenCoding, TokenCount};
 
 use crate::config::method::Method;
 use crate::config::token_selection::Selection;
@@ -19,7 +19,7 @@ pub struct Sweep {
     pub selection: Selection,
     /// Number formats of the stored tokens, as in a scene file, each measured. Random subsets stay f32. Images are kept of
     /// the first format.
-    pub tokens: Vec<TokenStorage>,
+    pub tokens: Vec<TokenCoding>,
     /// Rendered methods: all of [`EvalModels::methods`](crate::sweep::eval_models::EvalModels::methods), or fewer.
     pub methods: Vec<Method>,
     /// Path of the model in scene files, for the size of a coded file.
@@ -50,14 +50,14 @@ impl Sweep {
     }
 
     /// Returns the storages of a method: random tokens have no file, and the codec is that of condensed tokens.
-    pub(crate) fn formats(&self, method: Method) -> Vec<TokenStorage> {
-        let is_plain = |tokens: &TokenStorage| matches!(tokens, TokenStorage::Plain(_));
-        let formats: Vec<TokenStorage> = match method {
+    pub(crate) fn formats(&self, method: Method) -> Vec<TokenCoding> {
+        let is_plain = |tokens: &TokenCoding| matches!(tokens, TokenCoding::Plain(_));
+        let formats: Vec<TokenCoding> = match method {
             Method::Clift => self.tokens.clone(),
             Method::Random => Vec::new(),
             _ => self.tokens.iter().copied().filter(is_plain).collect(),
         };
-        if formats.is_empty() { vec![TokenStorage::F32] } else { formats }
+        if formats.is_empty() { vec![TokenCoding::F32] } else { formats }
     }
 }
 

@@ -15,6 +15,7 @@ use crate::error::ModelError;
 use crate::files::replace;
 use crate::names::parse;
 use crate::network::config::ModelConfig;
+use crate::tokens::kind::TokenKind;
 use crate::weights::file::sorted_header;
 
 const FORMAT: &str = "clift-codec";
@@ -23,6 +24,22 @@ const VERSION: &str = "1";
 const MAX_FILE_BYTES: u64 = 1 << 30;
 
 impl TokenCodec {
+    /// Makes the codec of a fitted transform.
+    ///
+    /// # Errors
+    /// [`ModelError::BadConfig`] for a codec that cannot be stored.
+    pub fn new(
+        (model, kind, renderer_hash): (ModelConfig, TokenKind, String),
+        transform: Transform,
+        distributions: Distributions,
+        rates: RateTable,
+    ) -> Result<Self, ModelError> {
+        let mut codec =
+            Self { model, kind, renderer_hash, transform, distributions, rates: rates.new()?, hash: String::new() };
+        codec.hash = hash_of(&codec)?;
+        Ok(codec)
+    }
+
     /// Returns the path of the codec of a weight file: `codec*.safetensors` beside `model*.safetensors`,
     /// `NAME.codec.safetensors` beside another file. The file need not exist.
     pub fn path_of(weights: &Path) -> PathBuf {
@@ -63,7 +80,7 @@ impl TokenCodec {
 }
 
 /// Returns the first 16 hexadecimal digits of the SHA-256 of a codec's file.
-pub(crate) fn codec_hash(codec: &TokenCodec) -> Result<String, ModelError> {
+fn hash_of(codec: &TokenCodec) -> Result<String, ModelError> {
     let bad = |fix| ModelError::BadConfig { key: "codec", value: codec.renderer_hash.clone(), fix };
     Ok(hash(&to_bytes(codec).map_err(bad)?))
 }

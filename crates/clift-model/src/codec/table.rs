@@ -159,12 +159,17 @@ mod tests {
             let edge = table.levels;
             let levels = [0, 1, -1, edge, -edge, edge + 1, -edge - 1, edge + 2, edge + 77, i32::MAX, -i32::MAX];
             let mut encoder = Encoder::default();
-            levels.iter().for_each(|&level| table.encode(level, &mut encoder));
+            for level in levels {
+                table.encode(level, &mut encoder);
+            }
             let bits: f32 = levels.iter().map(|&level| table.bits(level)).sum();
             let words = encoder.finish();
-            assert!((words.len() as f32 * 32.0 - bits).abs() <= 33.0, "{} words, {bits} bits", words.len());
+            // The last state takes up to two words.
+            assert!((words.len() as f32 * 32.0 - bits).abs() <= 64.0, "{} words, {bits} bits", words.len());
             let mut decoder = Decoder::new(words).unwrap();
-            levels.iter().for_each(|&level| assert_eq!(table.decode(&mut decoder), Some(level)));
+            for level in levels {
+                assert_eq!(table.decode(&mut decoder), Some(level));
+            }
             assert!(decoder.is_finished());
         }
     }

@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use crate::codec::entropy::{Decoder, Encoder, decode_ids, encode_ids};
-use crate::codec::file::codec_hash;
 use crate::codec::histogram::Distributions;
 use crate::codec::rates::RateTable;
 use crate::codec::table::{MIN_BITS, Table};
@@ -67,22 +66,6 @@ impl LevelCounts {
 }
 
 impl TokenCodec {
-    /// Makes the codec of a fitted transform.
-    ///
-    /// # Errors
-    /// [`ModelError::BadConfig`] for a codec that cannot be stored.
-    pub fn new(
-        (model, kind, renderer_hash): (ModelConfig, TokenKind, String),
-        transform: Transform,
-        distributions: Distributions,
-        rates: RateTable,
-    ) -> Result<Self, ModelError> {
-        let mut codec =
-            Self { model, kind, renderer_hash, transform, distributions, rates: rates.new()?, hash: String::new() };
-        codec.hash = codec_hash(&codec)?;
-        Ok(codec)
-    }
-
     /// Reads the codec beside the weights of a model; `None` without a codec.
     ///
     /// # Errors

@@ -86,7 +86,9 @@ impl Transform {
     pub fn weigh(&mut self, weights: &[f32]) {
         let dim = self.mean.len();
         for ((row, deviation), weight) in self.basis.chunks_exact_mut(dim).zip(&mut self.deviations).zip(weights) {
-            row.iter_mut().for_each(|value| *value /= weight);
+            for value in row {
+                *value /= weight;
+            }
             *deviation *= weight;
         }
     }

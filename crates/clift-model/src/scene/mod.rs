@@ -2,7 +2,7 @@
 //!
 //! `scene` holds a stored scene and documents the bytes of its file; `check` the rules of a valid scene; `read` and
 //! `write` the file itself, with its `header` and the tokens in a `token_format`; `coded_file` the file with coded tokens;
-//! `token_storage` the names of both ways; `model_place` the path of its model. `scene_renderer` renders frames of a scene on a device,
+//! `token_coding` the names of both ways; `model_place` the path of its model. `scene_renderer` renders frames of a scene on a device,
 //! and `render_budget` measures how many tokens a time per frame allows.
 
 pub(crate) mod check;
@@ -14,6 +14,6 @@ pub(crate) mod render_budget;
 #[allow(clippy::module_inception)] // the file of the type `Scene`
 pub(crate) mod scene;
 pub(crate) mod scene_renderer;
+pub(crate) mod token_coding;
 pub(crate) mod token_format;
-pub(crate) mod token_storage;
 pub(crate) mod write;

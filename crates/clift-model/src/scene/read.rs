@@ -12,8 +12,8 @@ use crate::scene::coded_file::from_coded_bytes;
 use crate::scene::header::{Fields, Refusal, refusal};
 use crate::scene::model_place::find_model;
 use crate::scene::scene::{CODED_VERSION, FORMAT, FORMER_VERSION, Scene, SceneNormalization, VERSION, dtype_name};
+use crate::scene::token_coding::{CodedLoss, TokenCoding};
 use crate::scene::token_format::TokenFormat;
-use crate::scene::token_storage::{CodedLoss, TokenStorage};
 use crate::views::camera::ViewCamera;
 use crate::weights::model_path::ModelPath;
 
@@ -35,7 +35,7 @@ impl Scene {
     /// # Errors
     /// [`ModelError::SceneFile`] for a file that is no scene, has another version, is truncated or inconsistent, and for
     /// coded tokens without their codec.
-    pub fn read(path: &Path) -> Result<(Self, TokenStorage), ModelError> {
+    pub fn read(path: &Path) -> Result<(Self, TokenCoding), ModelError> {
         Self::read_for(path, None)
     }
 
@@ -43,7 +43,7 @@ impl Scene {
     ///
     /// # Errors
     /// As [`read`](Self::read).
-    pub fn read_for(path: &Path, model: Option<&Path>) -> Result<(Self, TokenStorage), ModelError> {
+    pub fn read_for(path: &Path, model: Option<&Path>) -> Result<(Self, TokenCoding), ModelError> {
         let read = || {
             let size = std::fs::metadata(path).map_err(|error| refusal(error.to_string(), GIVE_ANOTHER))?.len();
             if size > MAX_FILE_BYTES {
@@ -70,7 +70,7 @@ impl Scene {
 fn from_bytes(
     bytes: &[u8],
     find_codec: &dyn Fn(&str) -> Result<TokenCodec, String>,
-) -> Result<(Scene, TokenStorage), Refusal> {
+) -> Result<(Scene, TokenCoding), Refusal> {
     check_length(bytes)?;
     let file = SafeTensors::deserialize(bytes).map_err(|error| match error {
         SafeTensorError::MetadataIncompleteBuffer => {
@@ -90,7 +90,7 @@ fn from_bytes(
         let (scene, step) = from_coded_bytes(bytes, body, &fields, &codec)?;
         let num_patches = scene.model.num_tokens(scene.context.len(), scene.height, scene.width).unwrap_or(1);
         let loss = codec.rates.loss(scene.num_tokens() as f64 / num_patches as f64, f64::from(step));
-        return Ok((scene, TokenStorage::Coded(CodedLoss::from_db(loss))));
+        return Ok((scene, TokenCoding::Coded(CodedLoss::from_db(loss))));
     }
     if ![VERSION, FORMER_VERSION].contains(&version) {
         let reason = format!("scene file version {version:?}, expected \"1\", {VERSION:?} or {CODED_VERSION:?}");

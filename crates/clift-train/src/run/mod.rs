@@ -11,7 +11,6 @@
 //! - `stage_plan`: settings, batches and folder of a stage
 //! - `validation`: validation and evaluation
 //! - `train_loop`: resume or start a stage; step, save, validate
-//! - `token_codec`: fit the token codec of a model
 //! - `init_from`: initial weights of stage 1
 //! - `evaluate_model`: evaluate a model without a run
 //! - `run`: a run: open, train, evaluate
@@ -26,7 +25,6 @@ pub(crate) mod logs;
 pub(crate) mod run;
 pub(crate) mod run_file;
 pub(crate) mod stage_plan;
-pub(crate) mod token_codec;
 pub(crate) mod train_loop;
 pub(crate) mod training_curves;
 pub(crate) mod training_data;

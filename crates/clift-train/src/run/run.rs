@@ -1,6 +1,6 @@
 //! A run: its directory, resumption, and the order of its stages.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -27,13 +27,13 @@ use crate::footprint::scene_sizes::PARTS;
 use crate::run::eval_folder::{EvalFolder, SUMMARY};
 use crate::run::init_from::init_from;
 use crate::run::lock::{LockedFolder, RunLock};
-use crate::run::run_file::{RunFile, compare_settings, require_run, write_config};
+use crate::run::run_file::{RunFile, compare_settings, free_name, require_run, write_config};
 use crate::run::stage_plan::{MakeBatch, StagePlan};
-use crate::run::token_codec::ensure_codec;
 use crate::run::training_data::TrainingData;
 use crate::run::validation::{EvalRequest, Validation};
 use crate::stage::stage1_batches::Stage1Batches;
 use crate::stage::stage2_batches::Stage2Batches;
+use crate::token_codec::ensure_codec;
 
 /// Options of a run beside its config.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -387,18 +387,5 @@ impl Run {
 
     fn weights(&self, stage: Stage) -> PathBuf {
         self.folder(stage.name()).join("model.safetensors")
-    }
-}
-
-/// Returns the first free name of `runs/tiny.1`, `runs/tiny.2`, .. for `runs/tiny`.
-fn free_name(folder: &Path) -> PathBuf {
-    let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    let mut number = 1;
-    loop {
-        let moved = folder.with_file_name(format!("{name}.{number}"));
-        if !moved.exists() {
-            return moved;
-        }
-        number += 1;
     }
 }

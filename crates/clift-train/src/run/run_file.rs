@@ -1,7 +1,7 @@
 //! `run.json`, and the comparison of a config with that of an existing run.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use clift_data::replace_file;
 use serde::{Deserialize, Serialize};
@@ -152,6 +152,19 @@ fn flatten(table: toml::Table) -> BTreeMap<String, String> {
         }
     }
     flat
+}
+
+/// Returns the first free name of `runs/tiny.1`, `runs/tiny.2`, .. for `runs/tiny`.
+pub fn free_name(folder: &Path) -> PathBuf {
+    let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let mut number = 1;
+    loop {
+        let moved = folder.with_file_name(format!("{name}.{number}"));
+        if !moved.exists() {
+            return moved;
+        }
+        number += 1;
+    }
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@ use clift_eval::{
     EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, Progress, RunDescription,
     SceneFigures, SceneLimits, Summary, Sweep, stage2_method,
 };
-use clift_model::{Clift, TokenCount, TokenStorage, TrainedModel};
+use clift_model::{Clift, TokenCoding, TokenCount, TrainedModel};
 
 use crate::config::config::Config;
 use crate::error::TrainError;
@@ -99,7 +99,7 @@ impl<'a> Validation<'a> {
         let sweep = Sweep {
             storage: vec![storage],
             render: Vec::new(),
-            tokens: vec![TokenStorage::F32],
+            tokens: vec![TokenCoding::F32],
             methods: vec![method],
             ..all.clone()
         };
@@ -143,11 +143,11 @@ impl<'a> Validation<'a> {
 }
 
 /// Reports the progress of an evaluation as events of a run.
-pub(crate) struct EvalEvents<'a> {
-    pub stop: &'a AtomicBool,
-    pub sink: &'a mut dyn Sink,
+struct EvalEvents<'a> {
+    stop: &'a AtomicBool,
+    sink: &'a mut dyn Sink,
     /// Whether scenes are counted: in an evaluation, not in a validation.
-    pub is_stage: bool,
+    is_stage: bool,
 }
 
 impl Progress for EvalEvents<'_> {

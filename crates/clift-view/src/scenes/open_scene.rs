@@ -3,9 +3,7 @@
 use burn::tensor::Device;
 use clift_data::{Intrinsics, PathView, Pose, focus_distance, mean_intrinsics};
 use clift_eval::{Canvas, available_bytes};
-use clift_model::{
-    DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenStorage, ViewCamera, render_bytes,
-};
+use clift_model::{DeviceName, Renderer, Scene, SceneRenderer, SelectionPreset, TokenCoding, ViewCamera, render_bytes};
 
 use crate::error::ViewError;
 use crate::protocol::reply::{OpenedScene, Reply, SceneCamera};
@@ -20,7 +18,7 @@ const MAX_SIDE_PX: usize = 1024;
 pub struct SceneOrigin {
     /// Position in the list of scenes.
     pub index: usize,
-    pub storage: TokenStorage,
+    pub coding: TokenCoding,
     /// Bytes of the scene's file.
     pub file_bytes: u64,
     /// Context images; rendered from all tokens if `None`.
@@ -91,7 +89,7 @@ impl OpenScene {
             storage_counts: &origin.storage_counts,
             num_patches: scene.model.num_tokens(scene.context.len(), scene.height, scene.width)?,
             bytes: origin.file_bytes,
-            tokens: format!("{}, {}", scene.kind, origin.storage),
+            tokens: format!("{}, {}", scene.kind, origin.coding),
             token_ids: &scene.token_ids,
             clusters: origin.clusters.as_deref(),
             context: context_frames.map(|(camera, &frame)| scene_camera(frame as usize, camera, size)).collect(),

@@ -3,7 +3,7 @@
 use burn::tensor::Device;
 use clift_data::{ClipReader, EvaluationItem};
 use clift_eval::{EncodeOptions, EncodedScene, encode};
-use clift_model::{DeviceName, Renderer, Scene, TokenCount, TokenFormat, TokenStorage, TrainedModel};
+use clift_model::{DeviceName, Renderer, Scene, TokenCoding, TokenCount, TokenFormat, TrainedModel};
 
 use crate::error::ViewError;
 use crate::protocol::request::OpenRequest;
@@ -25,7 +25,7 @@ pub struct SceneFile {
     /// The scene.
     pub scene: Scene,
     /// How the file stores the tokens.
-    pub storage: TokenStorage,
+    pub coding: TokenCoding,
     /// Bytes of the file.
     pub file_bytes: u64,
     /// The renderer, from [`load_renderer`](clift_model::load_renderer).
@@ -80,10 +80,10 @@ impl SceneSet {
         match self {
             Self::File(file) => {
                 check_position("scene", request.scene, 1)?;
-                let SceneFile { scene, storage, file_bytes, renderer, render_args } = &**file;
+                let SceneFile { scene, coding, file_bytes, renderer, render_args } = &**file;
                 let origin = SceneOrigin {
                     index: 0,
-                    storage: *storage,
+                    coding: *coding,
                     file_bytes: *file_bytes,
                     context_images: None,
                     clusters: None,
@@ -135,7 +135,7 @@ impl RunScenes {
         let render_args: Vec<String> = [file.clone()].into_iter().chain(self.render_args.clone()).collect();
         let origin = SceneOrigin {
             index: request.scene,
-            storage: RUN_FORMAT.into(),
+            coding: RUN_FORMAT.into(),
             file_bytes: scene.file_bytes(RUN_FORMAT),
             context_images: Some(true_frames::read_context(&self.reader, *index, &scene)?),
             clusters: Some(clusters.assignment().to_vec()),

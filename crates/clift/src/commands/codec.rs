@@ -7,9 +7,9 @@ use clift_eval::{EvalFrames, EvalSplit, FittedCodec};
 use clift_model::{ModelPath, TokenCodec, TrainedModel};
 use clift_train::fit_token_codec;
 
+use crate::commands::args::parse::parse_split;
+use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::commands::encode::open_folder;
-use crate::commands::parse::parse_split;
-use crate::commands::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::bar::progress_sink;
@@ -51,13 +51,12 @@ pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
         config.data.root.clone_from(&args.data);
     }
     config.validate()?;
-    let (source, hold_out) = match &args.data {
-        Some(folder) => (open_folder(folder, args.split, &config, &overrides)?, 0),
-        None => {
-            let opened = open_dataset(&config.data, args.split)?;
-            let hold_out = if opened.shares_scenes { config.data.hold_out } else { 0 };
-            (opened.source, hold_out)
-        }
+    let (source, hold_out) = if let Some(folder) = &args.data {
+        (open_folder(folder, args.split, &config, &overrides)?, 0)
+    } else {
+        let opened = open_dataset(&config.data, args.split)?;
+        let hold_out = if opened.shares_scenes { config.data.hold_out } else { 0 };
+        (opened.source, hold_out)
     };
     let reader = ClipReader { source, options: config.data.clip_options() };
     let model = TrainedModel::open(&path, &config.model, &config.device.open()?)?;

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use clift_eval::{Comparison, Evaluation, MethodFilter};
 
-use crate::commands::parse::parse_methods;
-use crate::commands::shared_args::JsonArg;
+use crate::commands::args::parse::parse_methods;
+use crate::commands::args::shared_args::JsonArg;
 use crate::output::stdout::print_result;
 
 pub fn run(args: &CompareArgs) -> anyhow::Result<()> {

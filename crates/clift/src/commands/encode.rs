@@ -9,13 +9,13 @@ use clift_data::{
 };
 use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode, expected_step, step_for_bytes, step_for_loss};
 use clift_model::{
-    ModelError, ModelPath, Scene, TokenCodec, TokenCount, TokenFormat, TokenStorage, TrainedModel, check_output_path,
+    ModelError, ModelPath, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TrainedModel, check_output_path,
 };
 use clift_train::{Config, Override};
 use serde::Serialize;
 
-use crate::commands::parse::{parse_kb, parse_loss, parse_split};
-use crate::commands::shared_args::{ConfigArgs, read_config};
+use crate::commands::args::parse::{parse_kb, parse_loss, parse_split};
+use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::{UsageError, usage_bail};
 use crate::output::json::write_json;
 use crate::output::stdout::{print_note, print_result};
@@ -57,7 +57,7 @@ pub struct EncodeArgs {
     /// `coded` needs the token codec of the model, which training fits (`clift codec` for other models). Its step is the
     /// one that lost 0.02 dB on training scenes, or DB with `coded-DB`.
     #[arg(long, value_name = "FORMAT", default_value = "f16", conflicts_with_all = ["quality", "size_kb"])]
-    pub tokens: TokenStorage,
+    pub tokens: TokenCoding,
     /// Code the tokens with at most this loss of PSNR in dB, measured on this scene
     #[arg(long, value_name = "DB", value_parser = parse_loss, conflicts_with = "size_kb")]
     pub quality: Option<f64>,
@@ -212,8 +212,8 @@ impl Coding {
         Ok(match (args.quality, args.size_kb, args.tokens) {
             (Some(loss), ..) => Self::Measured(codec()?, loss),
             (_, Some(kb), _) => Self::Bytes(codec()?, (kb * 1e3) as u64),
-            (.., TokenStorage::Plain(format)) => Self::Plain(format),
-            (.., TokenStorage::Coded(loss)) => Self::Expected(codec()?, loss.db()),
+            (.., TokenCoding::Plain(format)) => Self::Plain(format),
+            (.., TokenCoding::Coded(loss)) => Self::Expected(codec()?, loss.db()),
         })
     }
 

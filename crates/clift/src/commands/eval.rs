@@ -4,11 +4,11 @@ use std::path::{Path, PathBuf};
 
 use clift_data::{SourceKind, Split};
 use clift_eval::{Experiment, ExternalMethod, MethodName, Selection};
-use clift_model::{ModelPath, TokenCount, TokenStorage};
+use clift_model::{ModelPath, TokenCoding, TokenCount};
 use clift_train::{Config, EvalFolder, EvalRequest, Run, evaluate_model};
 
-use crate::commands::parse::{parse_bytes, parse_split};
-use crate::commands::shared_args::{ConfigArgs, read_config};
+use crate::commands::args::parse::{parse_bytes, parse_split};
+use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::bar::progress_sink;
@@ -139,7 +139,7 @@ pub struct EvalArgs {
     pub selection: Option<Selection>,
     /// Storage of the tokens: f32, f16, int8, coded, or coded-DB, e.g. f16,coded-0.1
     #[arg(long, value_delimiter = ',', value_name = "FORMAT")]
-    pub tokens: Vec<TokenStorage>,
+    pub tokens: Vec<TokenCoding>,
     /// Also score the target images of an external method; repeatable
     #[arg(long, value_name = "DIR")]
     pub predictions: Vec<PathBuf>,

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clift_model::ModelPath;
 use clift_train::{Config, ExportFormat, export, read_config, require_absent};
 
-use crate::commands::parse::parse_format;
+use crate::commands::args::parse::parse_format;
 use crate::output::stdout::print_result;
 
 #[derive(Debug, clap::Args)]

@@ -7,7 +7,7 @@ use clift_model::{FlopConvention, Macs, ModelConfig, TokenCount};
 use clift_train::Config;
 use serde::Serialize;
 
-use crate::commands::shared_args::{JsonArg, read_config};
+use crate::commands::args::shared_args::{JsonArg, read_config};
 use crate::output::stdout::print_result;
 use crate::output::table::table;
 

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clift_model::CliftVariant;
 use clift_train::{ImportOptions, ImportRecord, import};
 
-use crate::commands::parse::parse_rename;
+use crate::commands::args::parse::parse_rename;
 use crate::interrupt;
 use crate::output::stdout::print_result;
 

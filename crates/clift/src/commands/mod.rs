@@ -1,7 +1,8 @@
 //! One file or folder per command, named after the command: its arguments, the call, the printed result.
 //!
-//! Shared by the commands: `parse` (argument values), `shared_args` (options), `splits` (data sets).
+//! Shared by the commands: the folder `args`.
 
+pub(crate) mod args;
 pub(crate) mod bench;
 pub(crate) mod codec;
 pub(crate) mod compare;
@@ -14,10 +15,7 @@ pub(crate) mod export;
 pub(crate) mod flops;
 pub(crate) mod import;
 pub(crate) mod metrics;
-pub(crate) mod parse;
 pub(crate) mod plan;
 pub(crate) mod render;
-pub(crate) mod shared_args;
-pub(crate) mod splits;
 pub(crate) mod train;
 pub(crate) mod view;

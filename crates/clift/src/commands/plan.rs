@@ -6,7 +6,7 @@ use clift_bench::{PartPlan, Plan, check_plan, missing_weights, plan};
 use clift_model::max_tensor_bytes;
 use clift_train::{Config, LargestTensor, PARTS, largest_tensor, memory_warning};
 
-use crate::commands::shared_args::{ConfigArgs, JsonArg};
+use crate::commands::args::shared_args::{ConfigArgs, JsonArg};
 use crate::output::stdout::{print_result, print_warning};
 use crate::output::table::table;
 use crate::output::units::{duration, memory_size, seconds};

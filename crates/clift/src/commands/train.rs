@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clift_eval::available_bytes;
 use clift_train::{Config, Run, RunOptions, Stage, memory_warning};
 
-use crate::commands::parse::{parse_count, parse_stage};
-use crate::commands::shared_args::ConfigArgs;
+use crate::commands::args::parse::{parse_count, parse_stage};
+use crate::commands::args::shared_args::ConfigArgs;
 use crate::interrupt;
 use crate::output::bar::progress_sink;
 use crate::output::stdout::{print_run, print_warning};

@@ -9,9 +9,9 @@ use clift_eval::{EncodeOptions, EvalFrames, evaluation_items};
 use clift_model::{DeviceName, ModelPath, Scene, TrainedModel, load_renderer};
 use clift_view::{RunScenes, SceneFile, SceneSet, ServerOptions, ViewServer};
 
-use crate::commands::parse::parse_split;
+use crate::commands::args::parse::parse_split;
+use crate::commands::args::shared_args::{ConfigArgs, read_config};
 use crate::commands::render::run::scene_weights;
-use crate::commands::shared_args::{ConfigArgs, read_config};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result, print_warning};
 
@@ -64,7 +64,7 @@ fn open_file(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
     if !args.overrides.set.is_empty() {
         usage_bail!("--set changes the config of a run; {} is a scene file", args.scene.display());
     }
-    let (scene, storage) = Scene::read_for(&args.scene, args.model.as_deref())?;
+    let (scene, coding) = Scene::read_for(&args.scene, args.model.as_deref())?;
     let file_bytes = std::fs::metadata(&args.scene).map_or(0, |file| file.len());
     let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
     let device = args.overrides.device.unwrap_or_default();
@@ -74,7 +74,7 @@ fn open_file(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
         render_args.extend(["--model".into(), text(model)]);
     }
     render_args.extend(device_args(args.overrides.device));
-    Ok((SceneSet::File(Box::new(SceneFile { scene, storage, file_bytes, renderer, render_args })), device))
+    Ok((SceneSet::File(Box::new(SceneFile { scene, coding, file_bytes, renderer, render_args })), device))
 }
 
 fn open_run(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {

@@ -1,4 +1,4 @@
-use clift_model::{SceneClusters, TokenStorage};
+use clift_model::{SceneClusters, TokenCoding};
 
 use super::*;
 use crate::config::method::{Method, MethodName};
@@ -211,7 +211,7 @@ fn several_formats_have_lines_of_their_own() {
     assert!(!page(&several).contains("clift, f32"), "a single format is not named");
     let points = several.summary.points.clone();
     let coarse = points.into_iter().filter(|point| point.key.method == Method::Clift).map(|mut point| {
-        point.key.tokens = Some(TokenStorage::INT8);
+        point.key.tokens = Some(TokenCoding::INT8);
         point.cost.scene_bytes = point.cost.scene_bytes.map(|bytes| bytes / 4);
         point
     });

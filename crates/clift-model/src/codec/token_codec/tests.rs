@@ -30,10 +30,14 @@ pub(crate) fn codec(model: ModelConfig, kind: TokenKind, renderer_hash: String) 
     let dim = model.dim;
     let scenes: Vec<Vec<f32>> = (0..20).map(|seed| tokens(256, dim, seed)).collect();
     let mut moments = Moments::new(dim);
-    scenes.iter().for_each(|scene| moments.add(scene));
+    for scene in &scenes {
+        moments.add(scene);
+    }
     let transform = moments.transform();
     let mut histograms = Histograms::new(dim);
-    scenes.iter().for_each(|scene| histograms.add(&transform, scene));
+    for scene in &scenes {
+        histograms.add(&transform, scene);
+    }
     TokenCodec::new((model, kind, renderer_hash), transform, histograms.distributions(), rates()).expect("valid")
 }
 

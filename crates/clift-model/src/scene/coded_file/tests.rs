@@ -7,7 +7,7 @@ use safetensors::SafeTensors;
 use super::*;
 use crate::codec::token_codec::tests::codec;
 use crate::scene::scene::tests::scene;
-use crate::scene::token_storage::TokenStorage;
+use crate::scene::token_coding::TokenCoding;
 
 const STEP: f32 = 0.25;
 
@@ -68,7 +68,7 @@ fn coded_scenes_come_back_ordered_and_rounded() {
     assert_eq!(folder.write(), bytes, "equal scenes are equal files");
     assert!(SafeTensors::deserialize(&bytes).is_ok(), "the header is readable by other programs");
     let (back, storage) = Scene::read(&folder.path()).expect("reads");
-    assert!(matches!(storage, TokenStorage::Coded(_)), "{storage}");
+    assert!(matches!(storage, TokenCoding::Coded(_)), "{storage}");
     let original = scene();
     assert_eq!(back.token_ids, [0, 3, 7, 8, 11]);
     let dim = original.model.dim;

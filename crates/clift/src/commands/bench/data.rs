@@ -7,9 +7,9 @@ use clift_data::{ClipOptions, FileOptions, PoseRotation, PoseScale};
 use clift_eval::{peak_bytes, start_peak};
 use serde::Serialize;
 
-use crate::commands::parse::{parse_size, parse_views};
-use crate::commands::shared_args::JsonArg;
-use crate::commands::splits::{Splits, open_splits};
+use crate::commands::args::parse::{parse_size, parse_views};
+use crate::commands::args::shared_args::JsonArg;
+use crate::commands::args::splits::{Splits, open_splits};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::print_result;
 use crate::output::table::table;

@@ -3,8 +3,8 @@
 use clift_bench::{BenchCase, BenchOptions};
 use clift_model::TokenCount;
 
-use crate::commands::parse::parse_count;
-use crate::commands::shared_args::{ConfigArgs, JsonArg};
+use crate::commands::args::parse::parse_count;
+use crate::commands::args::shared_args::{ConfigArgs, JsonArg};
 
 /// What is timed, and how often.
 #[derive(Debug, clap::Args)]

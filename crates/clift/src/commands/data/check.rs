@@ -10,8 +10,8 @@ use clift_data::{
 };
 use serde::Serialize;
 
-use crate::commands::shared_args::JsonArg;
-use crate::commands::splits::{SourceArgs, SplitSource, Splits};
+use crate::commands::args::shared_args::JsonArg;
+use crate::commands::args::splits::{SourceArgs, SplitSource, Splits};
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};
 use crate::output::table::table;

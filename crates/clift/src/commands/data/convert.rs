@@ -10,9 +10,9 @@ use clift_data::{
     UnreadableImage, plural,
 };
 
-use crate::commands::parse::parse_count;
-use crate::commands::shared_args::ChunkArgs;
-use crate::commands::splits::{SourceArgs, SplitSource, Splits, open_splits};
+use crate::commands::args::parse::parse_count;
+use crate::commands::args::shared_args::ChunkArgs;
+use crate::commands::args::splits::{SourceArgs, SplitSource, Splits, open_splits};
 use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_note, print_result};

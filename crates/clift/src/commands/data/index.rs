@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use clift_data::{OverlapOptions, SceneSource, plural, write_overlap_index};
 
-use crate::commands::parse::parse_distance;
-use crate::commands::splits::{SourceArgs, Splits};
+use crate::commands::args::parse::parse_distance;
+use crate::commands::args::splits::{SourceArgs, Splits};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result};
 

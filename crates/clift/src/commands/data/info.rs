@@ -12,9 +12,9 @@ use clift_data::{
 use clift_eval::{EvalFrames, evaluation_items};
 use clift_train::Config;
 
+use crate::commands::args::shared_args::{JsonArg, read_config};
+use crate::commands::args::splits::{Splits, present_splits, read_all_options};
 use crate::commands::data::info_report::{EvaluationReport, Report, SplitReport};
-use crate::commands::shared_args::{JsonArg, read_config};
-use crate::commands::splits::{Splits, present_splits, read_all_options};
 use crate::exit_code::usage_bail;
 use crate::output::stdout::print_result;
 

@@ -12,9 +12,9 @@ use clift_eval::EvalConfig;
 use clift_model::ModelConfig;
 use clift_train::parse_config;
 
-use crate::commands::parse::parse_size;
-use crate::commands::shared_args::ChunkArgs;
-use crate::commands::splits::Splits;
+use crate::commands::args::parse::parse_size;
+use crate::commands::args::shared_args::ChunkArgs;
+use crate::commands::args::splits::Splits;
 use crate::exit_code::usage_bail;
 use crate::output::counter::Counter;
 use crate::output::stdout::{print_result, print_warning};

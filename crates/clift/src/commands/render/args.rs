@@ -8,7 +8,7 @@ use std::str::FromStr;
 use clap::builder::RangedU64ValueParser;
 use clift_model::{DeviceName, Precision, SelectionPreset, TokenCount};
 
-use crate::commands::parse::{parse_budget_ms, parse_size, parse_video};
+use crate::commands::args::parse::{parse_budget_ms, parse_size, parse_video};
 
 #[derive(Debug, clap::Args)]
 pub struct RenderArgs {

@@ -11,7 +11,7 @@ use crate::scene::token_format::TokenFormat;
 /// Storage of tokens in configs, tables and on the command line: `f32`, `f16`, `int8`, `coded` or `coded-DB`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
-pub enum TokenStorage {
+pub enum TokenCoding {
     /// Numbers of one format.
     Plain(TokenFormat),
     /// Coded with the step that the model's codec measured for a loss.
@@ -41,7 +41,7 @@ impl Default for CodedLoss {
     }
 }
 
-impl TokenStorage {
+impl TokenCoding {
     /// Plain 32-bit floats.
     pub const F32: Self = Self::Plain(TokenFormat::F32);
     /// Plain 16-bit floats.
@@ -52,13 +52,13 @@ impl TokenStorage {
     pub const NAMES: &str = "f32, f16, int8, coded, coded-DB";
 }
 
-impl From<TokenFormat> for TokenStorage {
+impl From<TokenFormat> for TokenCoding {
     fn from(format: TokenFormat) -> Self {
         Self::Plain(format)
     }
 }
 
-impl fmt::Display for TokenStorage {
+impl fmt::Display for TokenCoding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Plain(format) => f.write_str(format.name()),
@@ -68,7 +68,7 @@ impl fmt::Display for TokenStorage {
     }
 }
 
-impl FromStr for TokenStorage {
+impl FromStr for TokenCoding {
     type Err = ModelError;
 
     fn from_str(name: &str) -> Result<Self, ModelError> {
@@ -87,7 +87,7 @@ impl FromStr for TokenStorage {
     }
 }
 
-impl TryFrom<String> for TokenStorage {
+impl TryFrom<String> for TokenCoding {
     type Error = ModelError;
 
     fn try_from(name: String) -> Result<Self, ModelError> {
@@ -95,8 +95,8 @@ impl TryFrom<String> for TokenStorage {
     }
 }
 
-impl From<TokenStorage> for String {
-    fn from(storage: TokenStorage) -> Self {
+impl From<TokenCoding> for String {
+    fn from(storage: TokenCoding) -> Self {
         storage.to_string()
     }
 }
@@ -108,18 +108,18 @@ mod tests {
     #[test]
     fn names_parse_and_others_are_refused() {
         for name in ["f32", "f16", "int8", "coded", "coded-0.1", "coded-2"] {
-            assert_eq!(name.parse::<TokenStorage>().unwrap().to_string(), name);
+            assert_eq!(name.parse::<TokenCoding>().unwrap().to_string(), name);
         }
-        assert_eq!("coded-0.02".parse::<TokenStorage>().unwrap().to_string(), "coded");
+        assert_eq!("coded-0.02".parse::<TokenCoding>().unwrap().to_string(), "coded");
         for name in ["coded-", "coded-0", "coded-nan", "coded-1e9", "coded0.1", "f64", ""] {
-            let message = name.parse::<TokenStorage>().unwrap_err().to_string();
+            let message = name.parse::<TokenCoding>().unwrap_err().to_string();
             assert!(message.starts_with(&format!("`tokens` = {name}: write ")), "{message}");
         }
-        let json = serde_json::to_string(&"coded-0.1".parse::<TokenStorage>().unwrap()).unwrap();
+        let json = serde_json::to_string(&"coded-0.1".parse::<TokenCoding>().unwrap()).unwrap();
         assert_eq!(json, "\"coded-0.1\"");
         assert!(
-            serde_json::from_str::<TokenStorage>(&json).is_ok()
-                && serde_json::from_str::<TokenStorage>("\"f8\"").is_err()
+            serde_json::from_str::<TokenCoding>(&json).is_ok()
+                && serde_json::from_str::<TokenCoding>("\"f8\"").is_err()
         );
     }
 }
