@@ -204,7 +204,9 @@ pub(crate) mod tests {
             for row in &report.rows {
                 // Blocks of f32 as in the tests of the model: outputs to 1e-5, gradients to 5e-5.
                 let close = row.max_rel_error.map(|error| error < 1e-4);
-                assert_eq!(close, (row.case != BenchCase::Select).then_some(true), "{device}: {row:?}");
+                let is_on_host =
+                    matches!(row.case, BenchCase::Select | BenchCase::CodeTokens | BenchCase::DecodeTokens);
+                assert_eq!(close, (!is_on_host).then_some(true), "{device}: {row:?}");
                 assert_eq!(row.samples_s.len(), 2);
                 assert!(row.samples_s.iter().all(|sample| (0.0..=row.p95_s).contains(sample)));
                 assert_eq!(row.inertia.is_some(), row.case == BenchCase::Kmeans);
