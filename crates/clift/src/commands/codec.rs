@@ -51,13 +51,12 @@ pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
         config.data.root.clone_from(&args.data);
     }
     config.validate()?;
-    let (source, hold_out) = match &args.data {
-        Some(folder) => (open_folder(folder, args.split, &config, &overrides)?, 0),
-        None => {
-            let opened = open_dataset(&config.data, args.split)?;
-            let hold_out = if opened.shares_scenes { config.data.hold_out } else { 0 };
-            (opened.source, hold_out)
-        }
+    let (source, hold_out) = if let Some(folder) = &args.data {
+        (open_folder(folder, args.split, &config, &overrides)?, 0)
+    } else {
+        let opened = open_dataset(&config.data, args.split)?;
+        let hold_out = if opened.shares_scenes { config.data.hold_out } else { 0 };
+        (opened.source, hold_out)
     };
     let reader = ClipReader { source, options: config.data.clip_options() };
     let model = TrainedModel::open(&path, &config.model, &config.device.open()?)?;
