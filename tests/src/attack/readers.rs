@@ -107,8 +107,8 @@ pub fn scene_file(setup: &Setup, name: &'static str) -> Read {
     file(setup, name, |path| done(Scene::read(path)))
 }
 
-pub fn token_codec(setup: &Setup, name: &'static str) -> Read {
-    file(setup, name, |path| done(TokenCodec::read(path)))
+pub fn token_codec(setup: &Setup, _: &'static str) -> Read {
+    file(setup, "codec.safetensors", |path| done(TokenCodec::read(path)))
 }
 
 pub fn test_scenes(setup: &Setup, _: &'static str) -> Read {
