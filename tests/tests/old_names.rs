@@ -8,7 +8,7 @@ use crate::support::sources;
 const OLD_NAMES: &str = "Accumulator Adaptive Attended BadInstructionSet BadStep BoundedSampler CheckpointTensor \
     ClusterJob Disjoint Drawn Exhibit Extended FrameSkip GeluSlope GroupsOnce HalfRow HeldOut HostViews Imported InF64 Judge LayoutOptions \
     Learner Ledger PictureFolders Projected ReadOnce RendererOnly SceneFrame SceneMemory SystemName TokenChoice \
-    TokenCoding Trained Unfinished WorldFrame WrongUsage";
+    TokenStorage Trained Unfinished WorldFrame WrongUsage";
 
 #[test]
 fn replaced_names_are_gone() {
