@@ -177,6 +177,12 @@ fn shrink(args: &mut Vec<String>) {
         ("eval", _) if args.iter().any(|arg| arg == "--checkpoint") => {
             set(args, &["data.width=24", "data.height=16"]);
         }
+        ("codec", Some("models/re10k")) => {
+            // The scenes of re10k-mini are short.
+            args.retain(|arg| arg != "--set" && arg != "eval.num_context=4");
+            set(args, &["eval.num_context=2"]);
+            set(args, &["data.width=24", "data.height=16"]);
+        }
         ("import", _) => {
             // The shapes of the DL3DV network determine its heads.
             if !args.iter().any(|arg| arg == "released-dl3dv") {
