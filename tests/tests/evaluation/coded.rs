@@ -26,6 +26,7 @@ fn coded_files_have_the_size_and_quality_of_the_evaluation() {
         };
         points.iter().find(is_it).unwrap_or_else(|| panic!("no {tokens}, {count}: {points:?}"))
     };
+    encode(&place, "").ok().prints("(clift, coded, expected loss 0.02 dB)");
     for tokens in ["coded", "coded-1"] {
         for count in [4, 8] {
             encode(&place, &format!("--storage {count} --tokens {tokens}")).ok().prints("(clift, coded, expected loss");

@@ -170,7 +170,7 @@ fn video_is_written_by_ffmpeg_or_a_warning_says_why_not() {
 #[test]
 fn paths_render_to_frames_and_animation_by_count() {
     let place = Place::with(&WHOLE);
-    place.clift(&format!("{ENCODE} DIR/room.clift --storage 1.0")).ok();
+    place.clift(&format!("{ENCODE} DIR/room.clift --storage 1.0 --tokens f16")).ok();
     let (scene, storage) = Scene::read(&place.at("room.clift")).unwrap();
     assert_eq!((scene.num_tokens(), storage), (8, TokenCoding::F16));
     assert_eq!(scene.context_frames.len(), 2, "as many contexts as in training");
@@ -226,7 +226,7 @@ fn paths_render_to_frames_and_animation_by_count() {
 fn what_cannot_be_drawn_says_what_to_do() {
     let place = Place::with(&WHOLE);
     place.train("other --only stage1", &["seed=1"]).ok();
-    place.clift(&format!("{ENCODE} DIR/room.clift")).ok();
+    place.clift(&format!("{ENCODE} DIR/room.clift --tokens f16")).ok();
     let render = |flags: &str| place.clift(&format!("render DIR/room.clift --out DIR/out {flags}"));
     let orbit = "--path orbit --frames 2";
     let no_path = "--path interpolated: no such file; write interpolate, orbit or";

@@ -58,7 +58,7 @@ impl std::fmt::Debug for RunScenes {
     }
 }
 
-/// Number format of the scenes of a run, the default of `clift encode`.
+/// Number format of the scenes of a run.
 const RUN_FORMAT: TokenFormat = TokenFormat::F16;
 
 impl SceneSet {
@@ -130,7 +130,18 @@ impl RunScenes {
         let file = format!("{file}.clift");
         let frames = views.context.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
         let stored = stored.to_string();
-        let scene_args = ["--scene", &scene.key, "--context", &frames, "--storage", &stored, "-o", &file];
+        let scene_args = [
+            "--scene",
+            &scene.key,
+            "--context",
+            &frames,
+            "--storage",
+            &stored,
+            "--tokens",
+            RUN_FORMAT.name(),
+            "-o",
+            &file,
+        ];
         let encode_args: Vec<String> = self.encode_args.iter().cloned().chain(scene_args.map(str::to_owned)).collect();
         let render_args: Vec<String> = [file.clone()].into_iter().chain(self.render_args.clone()).collect();
         let origin = SceneOrigin {

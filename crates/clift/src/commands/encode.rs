@@ -9,7 +9,8 @@ use clift_data::{
 };
 use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode, expected_step, step_for_bytes, step_for_loss};
 use clift_model::{
-    ModelError, ModelPath, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TrainedModel, check_output_path,
+    CodedLoss, ModelError, ModelPath, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TrainedModel,
+    check_output_path,
 };
 use clift_train::{Config, Override};
 use serde::Serialize;
@@ -52,12 +53,12 @@ pub struct EncodeArgs {
     /// Tokens to store, as a number or a share [default: 1/4; the best for --size-kb]
     #[arg(long, value_name = "COUNT")]
     pub storage: Option<TokenCount>,
-    /// Storage of the tokens: f32, f16, int8, coded, or coded-DB
+    /// Storage: f32, f16, int8, coded or coded-DB [default: coded with a codec, else f16]
     ///
     /// `coded` needs the token codec of the model, which training fits (`clift codec` for other models). Its step is the
     /// one that lost 0.02 dB on training scenes, or DB with `coded-DB`.
-    #[arg(long, value_name = "FORMAT", default_value = "f16", conflicts_with_all = ["quality", "size_kb"])]
-    pub tokens: TokenCoding,
+    #[arg(long, value_name = "FORMAT", conflicts_with_all = ["quality", "size_kb"])]
+    pub tokens: Option<TokenCoding>,
     /// Code the tokens with at most this loss of PSNR in dB, measured on this scene
     #[arg(long, value_name = "DB", value_parser = parse_loss, conflicts_with = "size_kb")]
     pub quality: Option<f64>,
@@ -197,23 +198,27 @@ fn frame_positions(
 /// How the tokens are stored.
 enum Coding {
     Plain(TokenFormat),
-    /// At most this loss in dB by the rates of the model, measured on the scene, or at most this number of bytes.
+    /// Coded with at most this loss in dB by the rates of the model.
     Expected(TokenCodec, f64),
+    /// Coded with at most this loss in dB, measured on the scene.
     Measured(TokenCodec, f64),
+    /// Coded into at most this number of bytes.
     Bytes(TokenCodec, u64),
 }
 
 impl Coding {
     fn new(args: &EncodeArgs, weights: &Path, model: &TrainedModel) -> anyhow::Result<Self> {
-        let codec = || -> anyhow::Result<TokenCodec> {
-            let path = TokenCodec::path_of(weights);
-            Ok(TokenCodec::beside(weights, model)?.ok_or(ModelError::NoCodec { path })?)
-        };
+        let found = || TokenCodec::beside(weights, model);
+        let codec = || found()?.ok_or_else(|| ModelError::NoCodec { path: TokenCodec::path_of(weights) });
         Ok(match (args.quality, args.size_kb, args.tokens) {
             (Some(loss), ..) => Self::Measured(codec()?, loss),
             (_, Some(kb), _) => Self::Bytes(codec()?, (kb * 1e3) as u64),
-            (.., TokenCoding::Plain(format)) => Self::Plain(format),
-            (.., TokenCoding::Coded(loss)) => Self::Expected(codec()?, loss.db()),
+            (.., Some(TokenCoding::Plain(format))) => Self::Plain(format),
+            (.., Some(TokenCoding::Coded(loss))) => Self::Expected(codec()?, loss.db()),
+            (.., None) => match found()? {
+                Some(codec) => Self::Expected(codec, CodedLoss::default().db()),
+                None => Self::Plain(TokenFormat::F16),
+            },
         })
     }
 
