@@ -159,6 +159,10 @@ impl OptimizerConfig {
                 return Err(bad(&format!("{stage}.optimizer.{key}"), value, "write a positive number"));
             }
         }
+        if !self.betas.iter().all(|beta| (0.0..1.0).contains(beta)) {
+            let value = format!("{:?}", self.betas);
+            return Err(bad(&format!("{stage}.optimizer.betas"), value, "write two numbers of at least 0, below 1"));
+        }
         if !(self.weight_decay >= 0.0 && self.weight_decay.is_finite()) {
             let key = format!("{stage}.optimizer.weight_decay");
             return Err(bad(&key, self.weight_decay, "write 0 or a positive number"));

@@ -151,6 +151,8 @@ pub struct OptimizerConfig {
     pub learning_rate: f64,
     /// Steps until this rate is reached.
     pub warm_up_steps: u64,
+    /// Decay rates of AdamW's first and second moment.
+    pub betas: [f64; 2],
     /// Decoupled weight decay, on every parameter as in the reference.
     pub weight_decay: f64,
     /// Gradients are scaled down to this global norm.
@@ -169,6 +171,7 @@ impl Default for OptimizerConfig {
             schedule: Schedule::Cosine,
             learning_rate: 4e-4,
             warm_up_steps: 2500,
+            betas: [0.9, 0.95],
             weight_decay: 0.05,
             max_grad_norm: 1.0,
             // Training of `tiny.toml` stays below 2 times the median loss and 4.3 times the median gradient norm.
@@ -322,6 +325,9 @@ mod tests {
         config.data.views.min_context = 4;
         config.stage1.optimizer.weight_decay = f64::NAN;
         assert!(config.validate().unwrap_err().to_string().starts_with("`stage1.optimizer.weight_decay` = NaN"));
+        config.stage1.optimizer.betas = [0.9, 1.0];
+        let message = config.validate().unwrap_err().to_string();
+        assert!(message.starts_with("`stage1.optimizer.betas` = [0.9, 1.0]: write two numbers"), "{message}");
     }
 
     #[test]

@@ -7,7 +7,7 @@ use burn::tensor::Tensor;
 
 use crate::config::config::{Algorithm, OptimizerConfig};
 
-/// Makes the optimizer of a config: AdamW with the moments (0.9, 0.95) and epsilon 1e-8 of the reference, and, if the config
+/// Makes the optimizer of a config: AdamW with epsilon 1e-8 of the reference, and, if the config
 /// names Muon, Muon for the weight matrices of the transformer blocks. Weight decay applies to every parameter.
 ///
 /// Muon's updates are scaled to the size of AdamW's (`0.2 sqrt(max(rows, columns))`, arXiv 2502.16982), so that both
@@ -17,8 +17,9 @@ use crate::config::config::{Algorithm, OptimizerConfig};
 /// Never: the pattern of the paths is valid.
 pub fn make_optimizer(config: &OptimizerConfig) -> ModuleOptimizer {
     let weight_decay = config.weight_decay as f32;
-    let adamw =
-        AdamWConfig::new().with_beta_1(0.9).with_beta_2(0.95).with_epsilon(1e-8).with_weight_decay(weight_decay);
+    let [beta_1, beta_2] = config.betas.map(|beta| beta as f32);
+    let adamw = AdamWConfig::new().with_beta_1(beta_1).with_beta_2(beta_2).with_epsilon(1e-8);
+    let adamw = adamw.with_weight_decay(weight_decay);
     match config.algorithm {
         Algorithm::Adamw => adamw.init(),
         Algorithm::Muon => {
@@ -106,6 +107,24 @@ mod tests {
         Toy {
             a: Param::from_tensor(fixture.tensor("input.param_a", device)),
             b: Param::from_tensor(fixture.tensor("input.param_b", device)),
+        }
+    }
+
+    #[test]
+    fn betas_of_zero_leave_the_sign_of_the_gradient() {
+        let fixture = Reference::open("reference/adamw");
+        let device = Device::flex();
+        let mut model = toy(&fixture, &device.clone().autodiff());
+        let config = OptimizerConfig { betas: [0.0, 0.0], weight_decay: 0.0, ..OptimizerConfig::default() };
+        let mut optimizer = make_optimizer(&config);
+        let grads_a: Tensor<3> = fixture.tensor("input.grad_a", &device);
+        for step in 0..2 {
+            let grad = grads_a.clone().narrow(0, step, 1).squeeze_dim::<2>(0);
+            let expected = model.a.val().inner() - grad.clone().sign().mul_scalar(0.1);
+            let mut grads = GradientsParams::new();
+            grads.register(model.a.id, grad);
+            model = optimizer.step(0.1, model, grads);
+            assert_close(model.a.val().inner(), expected, 1e-5);
         }
     }
 
