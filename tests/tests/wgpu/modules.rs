@@ -3,8 +3,9 @@
 use burn::nn::{LayerNorm, Linear};
 use burn::tensor::Tensor;
 use clift_model::{
-    Activation, CliftVariant, DecoderBlock, Encoder, EncoderBlock, FeedForward, LiftNorm, RenderTokens, Renderer,
-    SelfAttention, cross_sdpa, gelu_linear, linear, norm_linear, patchify, plucker, self_sdpa, unpatchify,
+    Activation, CameraEncoding, CliftVariant, DecoderBlock, Encoder, EncoderBlock, FeedForward, LiftNorm, ModelConfig,
+    RenderTokens, Renderer, SelfAttention, cross_sdpa, gelu_linear, linear, norm_linear, patchify, plucker, self_sdpa,
+    unpatchify,
 };
 use clift_train::mse;
 
@@ -74,17 +75,20 @@ pub const CASES: &[Case] = &[
     ),
     BLOCK.case("encoder block", |place| {
         let block = place.module(|init| EncoderBlock::new(&network(CliftVariant::Paper), init));
-        place.differentiate(&block, [place.tokens(1)], |block, [x]| block.forward(x))
+        place.differentiate(&block, [place.tokens(1)], |block, [x]| block.forward(x, None))
     }),
     BLOCK.case("decoder block, two views of a scene", |place| decoder_block(place, CliftVariant::Paper)),
     BLOCK.case("decoder block with norms of queries and keys", |place| {
         decoder_block(place, CliftVariant::ReleasedDl3dv)
     }),
-    BLOCK.because("sums of 576 products, rays of their own, and a block").case("encoder, from images", |place| {
-        let encoder = place.module(|init| Encoder::new(&network(CliftVariant::Paper), init));
-        let context = place.context();
-        place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context))
-    }),
+    BLOCK
+        .because("sums of 576 products, rays of their own, and a block")
+        .case("encoder, from images", |place| encode(place, &network(CliftVariant::Paper))),
+    BLOCK
+        .because("the same, and heads transformed by cameras and patches")
+        .case("encoder with camera-relative attention", |place| {
+            encode(place, &ModelConfig { camera_encoding: CameraEncoding::Gta, ..network(CliftVariant::Paper) })
+        }),
     BLOCK
         .because("sums of 384 products, a block and a sigmoid")
         .case("renderer, to images", |place| render(place, RenderTokens::from)),
@@ -119,13 +123,20 @@ fn feed_forward(place: &Place, activation: Activation) -> Values {
 
 fn self_attention(place: &Place, variant: CliftVariant) -> Values {
     let layers = place.module(|init| (init.layer_norm(DIM), SelfAttention::new(&network(variant), init)));
-    place.differentiate(&layers, [place.tokens(1)], |(norm, attention), [x]| attention.forward(norm, x))
+    place.differentiate(&layers, [place.tokens(1)], |(norm, attention), [x]| attention.forward(norm, x, None))
 }
 
 fn decoder_block(place: &Place, variant: CliftVariant) -> Values {
     let block = place.module(|init| DecoderBlock::new(&network(variant), init));
     let inputs = [place.random([BATCH * VIEWS, 6, DIM], 1), place.tokens(2)];
-    place.differentiate(&block, inputs, |block, [x, tokens]| block.forward(x, block.project_tokens(tokens)))
+    place
+        .differentiate(&block, inputs, |block, [x, tokens]| block.forward(x, block.project_tokens(tokens.into()), None))
+}
+
+fn encode(place: &Place, network: &ModelConfig) -> Values {
+    let encoder = place.module(|init| Encoder::new(network, init));
+    let context = place.context();
+    place.differentiate(&encoder, [], |encoder, []| encoder.forward(&context).values)
 }
 
 fn render(place: &Place, choose: impl Fn(Tensor<3>) -> RenderTokens) -> Values {

@@ -1,6 +1,5 @@
 //! Whole updates by the code of training: loss, gradient, AdamW.
 
-use burn::module::Module;
 use clift_eval::upload_images;
 use clift_model::{Clift, Clusters, RenderTokens, SceneModel};
 use clift_train::{Loss, OptimizerConfig, Stage, StageBatch, TokenSelection, TrainState, freeze};
