@@ -93,7 +93,7 @@ pub use cost::parameters::Parameters;
 pub use cost::scene_sizes::SceneSizes;
 pub use network::layers::Part;
 // Weight files and trained models
-pub use weights::file::{first_not_f32, load_part, save_part, save_weights, sorted_header};
+pub use weights::file::{first_not_f32, load_part, save_part, save_part_f16, save_weights, sorted_header};
 pub use weights::hash::weights_hash;
 pub use weights::model_path::{ModelPath, check_heads, refuse_checkpoint};
 pub use weights::published_keys::{

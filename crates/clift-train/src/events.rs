@@ -1,7 +1,9 @@
 //! Events of a run, which sinks print or write to files.
 
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
 
+use clift_eval::Progress;
 use serde::{Deserialize, Serialize};
 
 /// One part of a run.
@@ -118,5 +120,36 @@ pub trait Sink {
 impl<F: FnMut(&Event)> Sink for F {
     fn event(&mut self, event: &Event) {
         self(event);
+    }
+}
+
+/// Reports the progress of an evaluation as events of a run.
+pub(crate) struct EvalEvents<'a> {
+    pub stop: &'a AtomicBool,
+    pub sink: &'a mut dyn Sink,
+    /// Whether scenes are counted: in an evaluation, not in a validation or the fit of a codec.
+    pub is_stage: bool,
+}
+
+impl Progress for EvalEvents<'_> {
+    fn done(&mut self, scenes: usize, total: usize) {
+        let (stage, done, total) = (Stage::Eval, scenes as u64, total as u64);
+        match (self.is_stage, done) {
+            (false, _) => {}
+            (true, 0) => self.sink.event(&Event::StageStarted { stage, done, num_steps: total }),
+            (true, _) => self.sink.event(&Event::Progress { stage, done, total }),
+        }
+    }
+
+    fn note(&mut self, text: &str) {
+        self.sink.event(&Event::Message(text.into()));
+    }
+
+    fn skipped(&mut self, key: &str, reason: &str) {
+        self.sink.event(&Event::Skipped { key: key.into(), reason: reason.into() });
+    }
+
+    fn is_interrupted(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
     }
 }

@@ -1,16 +1,16 @@
 //! The token codec of a run or model, fitted after stage 2 or on demand.
 
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use burn::tensor::Device;
 use clift_data::{ClipReader, derive_seed};
-use clift_eval::{CodecOptions, EvalConfig, EvalError, EvalFrames, FittedCodec, Progress, evaluation_items, fit_codec};
+use clift_eval::{CodecOptions, EvalConfig, EvalError, EvalFrames, FittedCodec, evaluation_items, fit_codec};
 use clift_model::{Grouping, ModelPath, TokenCodec, TrainedModel};
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
-use crate::events::{Event, Sink};
+use crate::events::{EvalEvents, Event, Sink};
 
 /// Fits the token codec of a model on training scenes, with the token counts and views of `config.eval`, and writes the
 /// codec beside the weights.
@@ -35,7 +35,7 @@ pub fn fit_token_codec(
         kmeans: config.clusters.kmeans.clone(),
         seed: derive_seed(config.seed, "codec"),
     };
-    let mut progress = FitEvents { stop, sink };
+    let mut progress = EvalEvents { stop, sink, is_stage: false };
     let fitted = fit_codec(model, reader, &items, &options, &mut progress)?;
     fitted.codec.write(&TokenCodec::path_of(weights))?;
     Ok(fitted)
@@ -68,27 +68,5 @@ pub(crate) fn ensure_codec(
             Ok(())
         }
         Err(error) => Err(error),
-    }
-}
-
-/// Passes notes and skipped scenes of a fit to the sink.
-struct FitEvents<'a> {
-    stop: &'a AtomicBool,
-    sink: &'a mut dyn Sink,
-}
-
-impl Progress for FitEvents<'_> {
-    fn done(&mut self, _scenes: usize, _total: usize) {}
-
-    fn note(&mut self, text: &str) {
-        self.sink.event(&Event::Message(text.into()));
-    }
-
-    fn skipped(&mut self, key: &str, reason: &str) {
-        self.sink.event(&Event::Skipped { key: key.into(), reason: reason.into() });
-    }
-
-    fn is_interrupted(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
     }
 }

@@ -100,6 +100,7 @@ Examples:
     /// file contains everything for rendering except the weights.
     #[command(after_help = "\
 Examples:
+  clift encode captures/attic -o attic.clift
   clift encode runs/tiny --scene synthetic-0-test-00000 -o room.clift
   clift encode runs/re10k captures/attic -o attic.clift
   clift encode runs/re10k /data/re10k --scene 5aca87f95a9412c6 --storage 1/8 -o room.clift
@@ -143,8 +144,10 @@ Examples:
     /// context views, camera paths for `clift render --path` and, for a run, true images beside the renderings.
     #[command(after_help = "\
 Examples:
+  clift view
   clift view room.clift
   clift view runs/tiny
+  clift view captures/attic
   clift view room.clift --no-open --port 8080")]
     View(ViewArgs),
     /// Create, inspect, check, convert and index data sets
@@ -192,11 +195,12 @@ Examples:
   clift import last.ckpt --variant released-re10k -o models/re10k
   clift eval --checkpoint models/re10k --data /data/re10k --index evaluation_index_re10k_context4.json")]
     Import(ImportArgs),
-    /// Export weights to a PyTorch or safetensors file, with published names
+    /// Export weights with published names, for PyTorch, or in f16
     #[command(after_help = "\
 Examples:
   clift export models/re10k --format pytorch -o re10k.ckpt
-  clift export runs/tiny/stage1/model.safetensors --format safetensors -o tiny.safetensors")]
+  clift export runs/tiny/stage1/model.safetensors --format safetensors -o tiny.safetensors
+  clift export runs/rooms --format f16 -o models/rooms")]
     Export(ExportArgs),
     /// Print the completion script of a shell
     #[command(after_help = "\

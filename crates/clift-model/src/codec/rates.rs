@@ -70,7 +70,7 @@ impl RateTable {
 
     /// Returns the largest step with at most `loss_db` of expected loss.
     pub fn step_for_loss(&self, share: f64, loss_db: f64) -> f64 {
-        self.largest_step(|step| self.loss(share, step) <= loss_db)
+        self.boundary(|step| self.loss(share, step) <= loss_db)[0]
     }
 
     /// Returns the share of tokens of the highest expected PSNR whose `num_patches` times share tokens take `bytes`.
@@ -81,7 +81,7 @@ impl RateTable {
             if self.bits(*share, coarsest) > bits {
                 return f64::NEG_INFINITY; // beyond what was measured
             }
-            let finest = self.smallest_step(|step| self.bits(*share, step) <= bits);
+            let [_, finest] = self.boundary(|step| self.bits(*share, step) > bits);
             psnr - self.loss(*share, finest)
         };
         let qualities: Vec<f64> = self.shares.iter().zip(&self.psnr).map(quality).collect();
@@ -94,30 +94,14 @@ impl RateTable {
         [self.steps[0] / STEP_MARGIN, self.steps[self.steps.len() - 1] * STEP_MARGIN]
     }
 
-    fn largest_step(&self, is_allowed: impl Fn(f64) -> bool) -> f64 {
+    /// Returns steps close to each other, of which `is_low` holds for the first and not for the second.
+    fn boundary(&self, is_low: impl Fn(f64) -> bool) -> [f64; 2] {
         let [mut low, mut high] = self.step_range();
         for _ in 0..SEARCH_STEPS {
             let middle = (low * high).sqrt();
-            if is_allowed(middle) {
-                low = middle;
-            } else {
-                high = middle;
-            }
+            *(if is_low(middle) { &mut low } else { &mut high }) = middle;
         }
-        low
-    }
-
-    fn smallest_step(&self, is_allowed: impl Fn(f64) -> bool) -> f64 {
-        let [mut low, mut high] = self.step_range();
-        for _ in 0..SEARCH_STEPS {
-            let middle = (low * high).sqrt();
-            if is_allowed(middle) {
-                high = middle;
-            } else {
-                low = middle;
-            }
-        }
-        high
+        [low, high]
     }
 
     /// Interpolates in the logarithms of share and step; beyond the steps the line goes on, beyond the shares it is constant.

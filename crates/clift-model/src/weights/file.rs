@@ -6,8 +6,10 @@ use std::io::{Cursor, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use burn::module::Module;
+use burn::store::burn_pack::Tensor as PackTensor;
 use burn::store::{
-    ApplyError, BurnToPyTorchAdapter, ModuleSnapshot, PathFilter, PyTorchToBurnAdapter, SafetensorsStore,
+    ApplyError, BurnToPyTorchAdapter, FloatCastAdapter, ModuleAdapter, ModuleContext, ModuleSnapshot, PathFilter,
+    PyTorchToBurnAdapter, SafetensorsStore,
 };
 use burn::tensor::{DType, TensorData};
 
@@ -61,6 +63,33 @@ pub fn save_weights<M: Module>(module: &M, path: &Path) -> Result<(), ModelError
 /// # Errors
 /// As [`save_weights`].
 pub fn save_part<M: Module>(module: &M, part: &PathFilter, path: &Path) -> Result<(), ModelError> {
+    write(module, part, BurnToPyTorchAdapter, path)
+}
+
+/// Writes parameters as [`save_part`], rounded to f16: half of the bytes.
+///
+/// # Errors
+/// As [`save_weights`], also for a value beyond the range of f16.
+pub fn save_part_f16<M: Module>(module: &M, part: &PathFilter, path: &Path) -> Result<(), ModelError> {
+    let beyond = find(module, |name, data| {
+        let beyond = data.iter::<f32>().any(|value| value.abs() >= F16_LIMIT);
+        (beyond && part.matches(name)).then(|| format!("{name} contains values beyond the range of f16"))
+    });
+    if let Some(reason) = beyond {
+        return Err(ModelError::Weights { action: "writing", reason, path: path.into() });
+    }
+    write(module, part, BurnToPyTorchAdapter.chain(FloatCastAdapter::to(DType::F16)), path)
+}
+
+/// The least value that is rounded to infinity in f16.
+const F16_LIMIT: f32 = 65_520.0;
+
+fn write<M: Module>(
+    module: &M,
+    part: &PathFilter,
+    adapter: impl ModuleAdapter + 'static,
+    path: &Path,
+) -> Result<(), ModelError> {
     let error = |reason: String| ModelError::Weights { action: "writing", reason, path: path.into() };
     // The store's own temporary files survive a kill. In a temporary folder, they are deleted on errors, and leftovers are
     // recognised by its name.
@@ -68,7 +97,7 @@ pub fn save_part<M: Module>(module: &M, part: &PathFilter, path: &Path) -> Resul
     let folder = folder.map_err(|e| error(e.to_string()))?;
     let temporary = folder.path().join("model.safetensors");
     let mut store = SafetensorsStore::from_file(&temporary)
-        .with_to_adapter(BurnToPyTorchAdapter)
+        .with_to_adapter(adapter)
         .filter(part.clone())
         .overwrite(true)
         .metadata("format", "clift-1");
@@ -104,11 +133,11 @@ pub fn sorted_header(mut bytes: Vec<u8>) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads the parameters whose paths match `part`, as [`save_weights`] and [`save_part`] write them, into a module. Other
-/// tensors of the file are unused.
+/// Reads the parameters whose paths match `part`, as [`save_weights`], [`save_part`] and [`save_part_f16`] write them, into
+/// a module as f32. Other tensors of the file are unused.
 ///
 /// # Errors
-/// [`ModelError::Weights`] if the file cannot be read, a shape differs, or a value is not finite or no 32-bit float.
+/// [`ModelError::Weights`] if the file cannot be read, a shape differs, or a value is not finite or wider than f32.
 pub fn load_part<M: Module>(module: &mut M, part: &PathFilter, path: &Path) -> Result<LoadReport, ModelError> {
     read(module, SafetensorsStore::from_file(path).filter(part.clone()), part, path)
 }
@@ -129,7 +158,7 @@ fn read<M: Module>(
     if !path.is_file() {
         return Err(error("no such file".into()));
     }
-    let mut store = store.with_from_adapter(PyTorchToBurnAdapter).validate(false).allow_partial(true);
+    let mut store = store.with_from_adapter(PyTorchToBurnAdapter.chain(Widen)).validate(false).allow_partial(true);
     let result = module.load_from(&mut store).map_err(|e| error(e.to_string()))?;
     if let Some(first) = result.errors.first() {
         return Err(error(describe(first)));
@@ -149,6 +178,23 @@ fn read<M: Module>(
     unused.extend(result.skipped.iter().map(|name| name_in_file(name)));
     unused.sort();
     Ok(LoadReport { applied: result.applied, missing, unused })
+}
+
+/// Converts f16 and bf16 to f32, which is exact; other types keep theirs.
+#[derive(Clone, Debug)]
+struct Widen;
+
+impl ModuleAdapter for Widen {
+    fn adapt(&self, tensor: PackTensor, context: ModuleContext<'_>) -> PackTensor {
+        match tensor.dtype {
+            DType::F16 | DType::BF16 => FloatCastAdapter::to(DType::F32).adapt(tensor, context),
+            _ => tensor,
+        }
+    }
+
+    fn clone_box(&self) -> Box<dyn ModuleAdapter> {
+        Box::new(self.clone())
+    }
 }
 
 /// Returns the name of a parameter in a file. Burn names the parameters of norms differently.
@@ -191,7 +237,8 @@ fn find<M: Module, T>(module: &M, f: impl Fn(&str, &TensorData) -> Option<T>) ->
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::Device;
+    use burn::module::Param;
+    use burn::tensor::{Device, Tensor};
 
     use super::*;
     use crate::network::architecture::CliftVariant;
@@ -230,6 +277,38 @@ mod tests {
         File::create(&plain).expect("writes");
         let permissions = |path: &Path| std::fs::metadata(path).expect("there").permissions();
         assert_eq!(permissions(&paths[0]), permissions(&plain));
+    }
+
+    #[test]
+    fn f16_files_take_half_the_bytes_and_read_as_the_rounded_values() {
+        let folder = tempfile::tempdir().unwrap();
+        let [full, half] = ["full", "half"].map(|name| folder.path().join(name));
+        let module = model(1);
+        save_weights(&module, &full).unwrap();
+        save_part_f16(&module, &PathFilter::all(), &half).unwrap();
+        let [full_bytes, half_bytes] = [&full, &half].map(|path| std::fs::metadata(path).unwrap().len());
+        assert!(half_bytes < full_bytes * 6 / 10, "{half_bytes} of {full_bytes}");
+
+        let mut read = model(2);
+        load(&mut read, &half).unwrap().require_all(&half).unwrap();
+        let values = |module: &Clift| {
+            let mut values = Vec::new();
+            visit(module, |_, _, data| values.extend(data.iter::<f32>()));
+            values
+        };
+        let rounded: Vec<f32> = values(&module).iter().map(|value| half::f16::from_f32(*value).to_f32()).collect();
+        assert_eq!(values(&read), rounded);
+        assert_ne!(values(&read), values(&module));
+
+        // 65,504 is the largest value of f16, which 65,519 is rounded to.
+        let mut layer = burn::nn::LinearConfig::new(1, 1).init(&Device::flex());
+        let mut save = |value: f32| {
+            layer.weight = Param::from_tensor(Tensor::full([1, 1], value, &Device::flex()));
+            save_part_f16(&layer, &PathFilter::all(), &half).map_err(|error| error.to_string())
+        };
+        save(65_519.0).unwrap();
+        let message = save(-65_520.0).unwrap_err();
+        assert!(message.contains("weight contains values beyond the range of f16"), "{message}");
     }
 
     #[test]

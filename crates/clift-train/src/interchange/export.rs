@@ -1,16 +1,21 @@
-//! Exports a model under the names of published checkpoints, for PyTorch.
+//! Exports a model under the names of published checkpoints, for PyTorch, or as a model directory of half the size.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
+use burn::store::PathFilter;
 use clift_data::{replace_file, write_state_dict};
-use clift_model::{CameraEncoding, ModelConfig, ModelPath, PREFIX, PROJECTIONS, TokenCodec, published_tensors};
+use clift_model::{
+    CameraEncoding, Clift, DeviceName, ModelConfig, ModelPath, PREFIX, PROJECTIONS, TokenCodec, TrainedModel,
+    published_tensors, save_part_f16,
+};
+use half::f16;
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
 use crate::config::config::Config;
 use crate::error::{TrainError, bad};
-use crate::interchange::model_dir::{HostTensor, require_absent, to_safetensors};
+use crate::interchange::model_dir::{HostTensor, publish_model_dir, require_absent, to_safetensors, write_file};
 use crate::interchange::record::ImportRecord;
 
 /// Format of an exported file.
@@ -20,6 +25,8 @@ pub enum ExportFormat {
     Pytorch,
     /// The same keys in a safetensors file, the sizes in its metadata.
     Safetensors,
+    /// A model directory with this project's keys and weights rounded to f16.
+    F16,
 }
 
 /// Summary of an export.
@@ -33,12 +40,32 @@ pub struct Exported {
     pub has_condenser: bool,
 }
 
-/// Writes a model's weights under the keys of a published checkpoint, `transformer.` before each.
+/// Writes a model's weights in one of the formats. Those of [`ExportFormat::Pytorch`] and [`ExportFormat::Safetensors`] have
+/// the keys of published checkpoints, `transformer.` before each, and the token codec beside them.
 ///
 /// # Errors
-/// [`TrainError::BadConfig`] if `out` exists or the network has camera-relative attention, [`TrainError::BadFile`] if the weight file does not fit the config, and those of
-/// reading and writing.
+/// [`TrainError::BadConfig`] if `out` exists or a network with camera-relative attention has no published keys,
+/// [`TrainError::BadFile`] if the weight file does not fit the config, and those of reading and writing.
 pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Path) -> Result<Exported, TrainError> {
+    match format {
+        ExportFormat::F16 => export_f16(config, model, out),
+        ExportFormat::Pytorch => {
+            export_published(config, model, out, |tensors| Ok(write_state_dict(out, tensors, &sizes(&config.model))?))
+        }
+        ExportFormat::Safetensors => export_published(config, model, out, |tensors| {
+            let metadata = sizes(&config.model).map(|(name, size)| (name.to_owned(), size.to_string()));
+            let bytes = to_safetensors(tensors, HashMap::from(metadata), out)?;
+            replace_file(out, &bytes).map_err(TrainError::io("writing the weights", out))
+        }),
+    }
+}
+
+fn export_published(
+    config: &Config,
+    model: &ModelPath,
+    out: &Path,
+    write: impl FnOnce(&[HostTensor]) -> Result<(), TrainError>,
+) -> Result<Exported, TrainError> {
     let codecs = [&model.weights, out].map(TokenCodec::path_of);
     let codec = codecs[0].exists().then(|| TokenCodec::read(&codecs[0])).transpose()?;
     require_absent(out)?;
@@ -83,16 +110,34 @@ pub fn export(config: &Config, model: &ModelPath, format: ExportFormat, out: &Pa
         num_values: tensors.iter().map(|(_, _, values)| values.len()).sum(),
         has_condenser,
     };
-    match format {
-        ExportFormat::Pytorch => write_state_dict(out, &tensors, &sizes(&config.model))?,
-        ExportFormat::Safetensors => {
-            let metadata = sizes(&config.model).map(|(name, size)| (name.to_owned(), size.to_string()));
-            let bytes = to_safetensors(&tensors, HashMap::from(metadata), out)?;
-            replace_file(out, &bytes).map_err(TrainError::io("writing the weights", out))?;
-        }
-    }
+    write(&tensors)?;
     codec.map_or(Ok(()), |codec| codec.write(&codecs[1]))?;
     Ok(exported)
+}
+
+/// Writes a model directory with weights in f16. The token codec of the model belongs to the weights before rounding and is
+/// not copied.
+fn export_f16(config: &Config, model: &ModelPath, folder: &Path) -> Result<Exported, TrainError> {
+    require_absent(folder)?;
+    let trained = TrainedModel::open(model, &config.model, &DeviceName::default().open()?)?;
+    let part = if trained.has_condenser { PathFilter::all() } else { Clift::stage1_part() };
+    publish_model_dir(folder, |written| {
+        save_part_f16(&trained.network, &part, &written.weights)?;
+        for name in ["config.toml", "import.json"] {
+            let path = model.dir.join(name);
+            if path.exists() {
+                let bytes = std::fs::read(&path).map_err(TrainError::io("reading the model directory", &path))?;
+                write_file(&written.dir.join(name), &bytes)?;
+            }
+        }
+        Ok(())
+    })?;
+    let parameters = read_parameters(&folder.join("model.safetensors"))?;
+    Ok(Exported {
+        num_tensors: parameters.len(),
+        num_values: parameters.values().map(|(_, values)| values.len()).sum(),
+        has_condenser: trained.has_condenser,
+    })
 }
 
 /// Returns the sizes to store: tensor shapes do not determine the number of heads.
@@ -115,11 +160,15 @@ fn read_parameters(path: &Path) -> Result<Parameters, TrainError> {
     let file = SafeTensors::deserialize(&bytes).map_err(TrainError::bad_file("weight file", path))?;
     let mut found = BTreeMap::new();
     for (name, view) in file.tensors() {
-        if view.dtype() != Dtype::F32 {
-            let reason = format!("{name} is {:?}, expected F32", view.dtype());
-            return Err(TrainError::bad_file("weight file", path)(reason));
-        }
-        let values = view.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        let data = view.data();
+        let values = match view.dtype() {
+            Dtype::F32 => data.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect(),
+            Dtype::F16 => data.as_chunks::<2>().0.iter().map(|bytes| f16::from_le_bytes(*bytes).to_f32()).collect(),
+            other => {
+                let reason = format!("{name} is {other:?}, expected F32 or F16");
+                return Err(TrainError::bad_file("weight file", path)(reason));
+            }
+        };
         found.insert(name, (view.shape().to_vec(), values));
     }
     Ok(found)

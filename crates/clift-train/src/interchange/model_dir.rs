@@ -49,8 +49,7 @@ pub fn require_absent(path: &Path) -> Result<(), TrainError> {
     Err(bad("-o", path.display(), "the path exists and is not overwritten; write another one"))
 }
 
-/// Writes a model directory under a temporary name, opens the model to check it, and renames the directory. Removes all
-/// files if `stop` is set before.
+/// Writes the model directory of an import and opens the model to check it. Removes all files if `stop` is set before.
 pub(crate) fn write_model_dir(
     folder: &Path,
     config: &Config,
@@ -58,42 +57,51 @@ pub(crate) fn write_model_dir(
     (imported, file): (&ImportRecord, &Path),
     stop: &AtomicBool,
 ) -> Result<(), TrainError> {
+    publish_model_dir(folder, |written| {
+        let bytes = to_safetensors(parameters, HashMap::new(), folder)?;
+        check_stop(stop)?;
+        write_file(&written.weights, &bytes)?;
+        drop(bytes);
+        check_stop(stop)?;
+        let config_text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", folder))?;
+        write_file(&written.dir.join("config.toml"), config_text.as_bytes())?;
+        let import_text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", folder))?;
+        write_file(&written.dir.join("import.json"), &import_text)?;
+        let model = TrainedModel::open(written, &config.model, &config.device.open()?)?;
+        if let Some(codec) = TokenCodec::beside(file, &model)? {
+            codec.write(&TokenCodec::path_of(&written.weights))?;
+        }
+        check_stop(stop)
+    })
+}
+
+const WRITING: &str = "writing the model directory";
+
+/// Makes a directory under a temporary name, has `fill` write its files, and renames it. Removes it on errors.
+pub(crate) fn publish_model_dir(
+    folder: &Path,
+    fill: impl FnOnce(&ModelPath) -> Result<(), TrainError>,
+) -> Result<(), TrainError> {
     if folder.file_name().is_none() {
         return Err(bad("-o", folder.display(), "write the name of a directory"));
     }
     let above = folder.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let writing = "writing the model directory";
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY);
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
     // Removed on drop.
     let temporary = std::fs::create_dir_all(above).and_then(|()| builder.tempdir_in(above));
-    let temporary = temporary.map_err(TrainError::io(writing, above))?;
-    let write = |name: &str, bytes: &[u8]| {
-        let path = temporary.path().join(name);
-        replace_file(&path, bytes).map_err(TrainError::io(writing, &path))
-    };
-    let bytes = to_safetensors(parameters, HashMap::new(), folder)?;
-    check_stop(stop)?;
-    write("model.safetensors", &bytes)?;
-    drop(bytes);
-    check_stop(stop)?;
-    let config_text = toml::to_string_pretty(config).map_err(TrainError::bad_file("config", folder))?;
-    write("config.toml", config_text.as_bytes())?;
-    let import_text = serde_json::to_vec_pretty(imported).map_err(TrainError::bad_file("import.json", folder))?;
-    write("import.json", &import_text)?;
-
-    let written = ModelPath { dir: temporary.path().into(), weights: temporary.path().join("model.safetensors") };
-    let model = TrainedModel::open(&written, &config.model, &config.device.open()?)?;
-    if let Some(codec) = TokenCodec::beside(file, &model)? {
-        codec.write(&TokenCodec::path_of(&written.weights))?;
-    }
-    check_stop(stop)?;
+    let temporary = temporary.map_err(TrainError::io(WRITING, above))?;
+    fill(&ModelPath { dir: temporary.path().into(), weights: temporary.path().join("model.safetensors") })?;
     require_absent(folder)?;
-    publish_folder(temporary.path(), folder).map_err(TrainError::io(writing, folder))?;
+    publish_folder(temporary.path(), folder).map_err(TrainError::io(WRITING, folder))?;
     let _ = temporary.keep(); // the directory was renamed
     Ok(())
+}
+
+pub(crate) fn write_file(path: &Path, bytes: &[u8]) -> Result<(), TrainError> {
+    replace_file(path, bytes).map_err(TrainError::io(WRITING, path))
 }
 
 pub(crate) fn to_safetensors(

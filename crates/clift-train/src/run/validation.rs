@@ -1,20 +1,20 @@
 //! Validation during training, and evaluation after it.
 
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use burn::tensor::Device;
 use clift_data::{ClipReader, Split};
 use clift_eval::{
-    EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, Progress, RunDescription,
-    SceneFigures, SceneLimits, Summary, Sweep, stage2_method,
+    EvalConfig, EvalError, EvalFrames, EvalModels, Evaluator, ExternalMethod, Method, RunDescription, SceneFigures,
+    SceneLimits, Summary, Sweep, stage2_method,
 };
 use clift_model::{Clift, TokenCoding, TokenCount, TrainedModel};
 
 use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::events::{Event, Sink, Stage};
+use crate::events::{EvalEvents, Event, Sink, Stage};
 use crate::footprint::largest_tensor;
 use crate::run::eval_folder::EvalFolder;
 use crate::run::training_curves::training_curves;
@@ -139,36 +139,5 @@ impl<'a> Validation<'a> {
             self.evaluator.evaluate(models, request.external, training, request.folder.path(), &mut progress)?;
         sink.event(&Event::StageFinished { stage: Stage::Eval, elapsed_s: started.elapsed().as_secs_f64() });
         Ok(summary)
-    }
-}
-
-/// Reports the progress of an evaluation as events of a run.
-struct EvalEvents<'a> {
-    stop: &'a AtomicBool,
-    sink: &'a mut dyn Sink,
-    /// Whether scenes are counted: in an evaluation, not in a validation.
-    is_stage: bool,
-}
-
-impl Progress for EvalEvents<'_> {
-    fn done(&mut self, scenes: usize, total: usize) {
-        let (stage, done, total) = (Stage::Eval, scenes as u64, total as u64);
-        match (self.is_stage, done) {
-            (false, _) => {}
-            (true, 0) => self.sink.event(&Event::StageStarted { stage, done, num_steps: total }),
-            (true, _) => self.sink.event(&Event::Progress { stage, done, total }),
-        }
-    }
-
-    fn note(&mut self, text: &str) {
-        self.sink.event(&Event::Message(text.into()));
-    }
-
-    fn skipped(&mut self, key: &str, reason: &str) {
-        self.sink.event(&Event::Skipped { key: key.into(), reason: reason.into() });
-    }
-
-    fn is_interrupted(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
     }
 }

@@ -2,14 +2,14 @@
 
 use std::path::PathBuf;
 
-use clift_data::{ClipReader, SourceKind, Split, open_dataset};
+use clift_data::{ClipReader, Split};
 use clift_eval::{EvalFrames, EvalSplit, FittedCodec};
-use clift_model::{ModelPath, TokenCodec, TrainedModel};
+use clift_model::TokenCodec;
 use clift_train::fit_token_codec;
 
+use crate::commands::args::model_args::ModelArgs;
 use crate::commands::args::parse::parse_split;
-use crate::commands::args::shared_args::{ConfigArgs, read_config};
-use crate::commands::encode::open_folder;
+use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::usage_bail;
 use crate::interrupt;
 use crate::output::bar::progress_sink;
@@ -36,34 +36,21 @@ pub struct CodecArgs {
 
 /// Fits the codec of a model and prints its rates.
 pub fn run(args: &CodecArgs) -> anyhow::Result<()> {
-    let path = ModelPath::find(&args.model)?;
+    let model_args = ModelArgs::new(&args.model, args.data.as_deref(), &args.overrides)?;
+    let ModelArgs { path, config, .. } = &model_args;
     let out = TokenCodec::path_of(&path.weights);
     if !args.force && out.exists() {
         usage_bail!("the codec {} exists; scenes coded with it need it; replace it with --force", out.display());
     }
-    let (mut config, overrides) = read_config(&path.dir.join("config.toml"), &args.overrides.set, |_| Ok(()))?;
-    if config.model != path.config()? {
-        usage_bail!("--set model: the weights were trained with another network; remove the override");
-    }
-    config.device = args.overrides.device.unwrap_or(config.device);
-    if args.data.is_some() {
-        config.data.source = SourceKind::Auto;
-        config.data.root.clone_from(&args.data);
-    }
-    config.validate()?;
-    let (source, hold_out) = if let Some(folder) = &args.data {
-        (open_folder(folder, args.split, &config, &overrides)?, 0)
-    } else {
-        let opened = open_dataset(&config.data, args.split)?;
-        let hold_out = if opened.shares_scenes { config.data.hold_out } else { 0 };
-        (opened.source, hold_out)
-    };
-    let reader = ClipReader { source, options: config.data.clip_options() };
-    let model = TrainedModel::open(&path, &config.model, &config.device.open()?)?;
+    let opened = model_args.open_data(args.split)?;
+    let is_shared = args.data.is_none() && opened.shares_scenes;
+    let hold_out = if is_shared { config.data.hold_out } else { 0 };
+    let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
+    let model = model_args.open()?;
     let frames = EvalFrames { split: EvalSplit::Train, hold_out };
     let mut sink = progress_sink();
     let stop = interrupt::flag()?;
-    let fitted = fit_token_codec(&config, (&model, &path.weights), (&reader, frames), &stop, sink.as_mut())?;
+    let fitted = fit_token_codec(config, (&model, &path.weights), (&reader, frames), &stop, sink.as_mut())?;
     drop(sink);
     print_result(&describe(&fitted, &out.display().to_string()))
 }

@@ -1,22 +1,17 @@
 //! `clift encode`.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use clift_data::{
-    ClipReader, DataError, DatasetRoot, FileOptions, OpenedSource, SAME_SCENES, SceneSource, SourceKind, SourceOptions,
-    Split, open_dataset, open_source, plural,
-};
+use clift_data::{ClipReader, DataError, SceneSource, Split, plural};
 use clift_eval::{EncodeOptions, EncodedScene, HeldOutFrame, encode, expected_step, step_for_bytes, step_for_loss};
 use clift_model::{
-    CodedLoss, ModelError, ModelPath, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TrainedModel,
-    check_output_path,
+    CodedLoss, ModelError, Scene, TokenCodec, TokenCoding, TokenCount, TokenFormat, TrainedModel, check_output_path,
 };
-use clift_train::{Config, Override};
 use serde::Serialize;
 
+use crate::commands::args::model_args::ModelArgs;
 use crate::commands::args::parse::{parse_kb, parse_loss, parse_split};
-use crate::commands::args::shared_args::{ConfigArgs, read_config};
+use crate::commands::args::shared_args::ConfigArgs;
 use crate::exit_code::{UsageError, usage_bail};
 use crate::output::json::write_json;
 use crate::output::stdout::{print_note, print_result};
@@ -26,8 +21,11 @@ const MAX_LISTED_KEYS: usize = 8;
 
 #[derive(Debug, clap::Args)]
 pub struct EncodeArgs {
-    /// Run or model directory, or model.safetensors in one of them
-    #[arg(value_name = "RUN|MODEL")]
+    /// Run or model directory, or model.safetensors in one of them; photos alone use models/rooms
+    ///
+    /// `clift encode DIR` encodes a capture with the model that ships with clift, which is trained on synthetic scenes. The
+    /// environment variable `CLIFT_MODEL` names another.
+    #[arg(value_name = "RUN|MODEL|DIR")]
     pub model: PathBuf,
     /// Capture or data set in any layout [default: the data of the run]
     #[arg(value_name = "DIR")]
@@ -111,23 +109,9 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
             usage_bail!("the file {} exists; replace it with --force or choose another name", path.display());
         }
     }
-    let model = ModelPath::find(&args.model)?;
-    let (mut config, overrides) = read_config(&model.dir.join("config.toml"), &args.overrides.set, |_| Ok(()))?;
-    // Tensor shapes do not determine the number of heads: a wrong one would silently change the tokens.
-    if config.model != model.config()? {
-        usage_bail!("--set model: the weights were trained with another network; remove the override");
-    }
-    config.device = args.overrides.device.unwrap_or(config.device);
-    // The config of an imported model has no data set.
-    if args.data.is_some() {
-        config.data.source = SourceKind::Auto;
-        config.data.root.clone_from(&args.data);
-    }
-    config.validate()?;
-    let source = match &args.data {
-        Some(folder) => open_folder(folder, args.split, &config, &overrides)?,
-        None => open_dataset(&config.data, args.split)?.source,
-    };
+    let model_args = ModelArgs::find(&args.model, args.data.as_deref(), &args.overrides)?;
+    let ModelArgs { given, path, config, .. } = &model_args;
+    let source = model_args.open_data(args.split)?.source;
     let scene = find_scene(source.as_ref(), args.scene.as_deref())?;
     let context = frame_positions(&args.context, || source.frame_names(scene))?;
     let reader = ClipReader { source, options: config.data.clip_options() };
@@ -138,11 +122,10 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
-        model_path: Scene::model_path_for(&args.model, &args.out),
+        model_path: Scene::model_path_for(given, &args.out),
     };
-    let weights = &model.weights;
-    let model = TrainedModel::open(&model, &config.model, &config.device.open()?)?;
-    let coding = Coding::new(args, weights, &model)?;
+    let model = model_args.open()?;
+    let coding = Coding::new(args, &path.weights, &model)?;
     let storage = coding.storage(args, &options, &reader);
     let mut encoded = encode(&model, &reader, scene, &EncodeOptions { storage, ..options })?;
     let written = coding.write(&mut encoded, args, (&model, &reader, scene))?;
@@ -150,7 +133,7 @@ pub fn run(args: &EncodeArgs) -> anyhow::Result<()> {
         write_json(&ClustersFile::of(&encoded), path)?;
     }
     print_result(&describe(&encoded, &written, &args.out))?;
-    print_check(HeldOutFrame::render(&model, &reader, scene, &encoded.scene)?, &args.model)
+    print_check(HeldOutFrame::render(&model, &reader, scene, &encoded.scene)?, given)
 }
 
 /// Prints how a frame that is no context is rendered, with a warning if a copy of a context view is nearer to it.
@@ -285,25 +268,6 @@ fn describe(encoded: &EncodedScene, stored: &str, path: &Path) -> String {
         scene.width,
         scene.height,
     )
-}
-
-/// The `data.files` keys of the run describe another data set: they apply only if `--set` sets one of them.
-pub(crate) fn open_folder(
-    folder: &Path,
-    split: Split,
-    config: &Config,
-    overrides: &[Override],
-) -> anyhow::Result<Arc<dyn SceneSource>> {
-    let has_files = overrides.iter().any(|change| change.key.starts_with("data.files"));
-    let files = if has_files { config.data.files.clone() } else { FileOptions::default() };
-    // The filters are for training scenes; the user chooses this scene by its key.
-    let options = SourceOptions { files, ..SourceOptions::default() };
-    let OpenedSource { source, mut report, .. } = open_source(&DatasetRoot::find(folder)?, split, &options)?;
-    report.notes.retain(|note| note != SAME_SCENES);
-    if report.has_content() {
-        print_note(&format!("{}: {report}", folder.display()));
-    }
-    Ok(source)
 }
 
 /// Returns the index of the scene with this key, or of the only scene.

@@ -13,11 +13,14 @@ pub struct ExportArgs {
     /// Model directory, run directory, or model.safetensors in one of them
     #[arg(value_name = "MODEL|RUN")]
     pub model: PathBuf,
-    /// Format of the file: pytorch (for torch.load) or safetensors
+    /// Format: pytorch (for torch.load), safetensors, or f16
+    ///
+    /// The first two have the names of published checkpoints. `f16` writes a model directory with the weights rounded to
+    /// f16, which every command reads; fit its token codec with `clift codec`.
     #[arg(long, value_name = "FORMAT", value_parser = parse_format)]
     pub format: ExportFormat,
-    /// File to write
-    #[arg(long, short, value_name = "FILE")]
+    /// File to write; a directory for f16
+    #[arg(long, short, value_name = "FILE|DIR")]
     pub out: PathBuf,
 }
 

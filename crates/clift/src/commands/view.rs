@@ -4,13 +4,14 @@ use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use clift_data::{ClipReader, OpenedSource, Split, open_dataset};
+use clift_data::{ClipReader, Split};
 use clift_eval::{EncodeOptions, EvalFrames, evaluation_items};
-use clift_model::{DeviceName, ModelPath, Scene, TrainedModel, load_renderer};
+use clift_model::{DeviceName, Scene, load_renderer};
 use clift_view::{RunScenes, SceneFile, SceneSet, ServerOptions, ViewServer};
 
+use crate::commands::args::model_args::{ModelArgs, is_data, shipped_model};
 use crate::commands::args::parse::parse_split;
-use crate::commands::args::shared_args::{ConfigArgs, read_config};
+use crate::commands::args::shared_args::ConfigArgs;
 use crate::commands::render::run::scene_weights;
 use crate::exit_code::usage_bail;
 use crate::output::stdout::{print_note, print_result, print_warning};
@@ -20,9 +21,12 @@ const MAX_SCENES: usize = 200;
 
 #[derive(Debug, clap::Args)]
 pub struct ViewArgs {
-    /// Scene file, or a run or model directory, whose test scenes are listed
-    #[arg(value_name = "SCENE|RUN")]
-    pub scene: PathBuf,
+    /// Scene file; run or model, whose test scenes are listed; or photos, with models/rooms [default: models/rooms]
+    #[arg(value_name = "SCENE|RUN|DIR")]
+    pub scene: Option<PathBuf>,
+    /// Capture or data set in any layout [default: the data of the run]
+    #[arg(value_name = "DIR")]
+    pub data: Option<PathBuf>,
     /// Run or weight file of a scene file [default: the one the scene was encoded with]
     #[arg(long, value_name = "RUN|MODEL")]
     pub model: Option<PathBuf>,
@@ -44,7 +48,9 @@ pub struct ViewArgs {
 
 /// Serves scenes until the process ends.
 pub fn run(args: &ViewArgs) -> anyhow::Result<()> {
-    let (scenes, device) = if args.scene.is_dir() { open_run(args)? } else { open_file(args)? };
+    let scene = args.scene.clone().map_or_else(shipped_model, Ok)?;
+    let is_run = scene.is_dir() || args.data.is_some() || is_data(&scene);
+    let (scenes, device) = if is_run { open_run(&scene, args)? } else { open_file(&scene, args)? };
     let server = ViewServer::bind(&ServerOptions { listen: args.listen, port: args.port })?;
     let (url, port) = (server.url(), server.address().port());
     print_result(&url)?;
@@ -60,16 +66,16 @@ pub fn run(args: &ViewArgs) -> anyhow::Result<()> {
     Ok(server.run(scenes, device)?)
 }
 
-fn open_file(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
+fn open_file(file: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
     if !args.overrides.set.is_empty() {
-        usage_bail!("--set changes the config of a run; {} is a scene file", args.scene.display());
+        usage_bail!("--set changes the config of a run; {} is a scene file", file.display());
     }
-    let (scene, coding) = Scene::read_for(&args.scene, args.model.as_deref())?;
-    let file_bytes = std::fs::metadata(&args.scene).map_or(0, |file| file.len());
-    let weights = scene_weights(&scene, &args.scene, args.model.as_deref())?;
+    let (scene, coding) = Scene::read_for(file, args.model.as_deref())?;
+    let file_bytes = std::fs::metadata(file).map_or(0, |file| file.len());
+    let weights = scene_weights(&scene, file, args.model.as_deref())?;
     let device = args.overrides.device.unwrap_or_default();
     let renderer = load_renderer(&scene, &weights, &device.open()?)?;
-    let mut render_args = vec![text(&args.scene)];
+    let mut render_args = vec![text(file)];
     if let Some(model) = &args.model {
         render_args.extend(["--model".into(), text(model)]);
     }
@@ -77,20 +83,15 @@ fn open_file(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
     Ok((SceneSet::File(Box::new(SceneFile { scene, coding, file_bytes, renderer, render_args })), device))
 }
 
-fn open_run(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
+fn open_run(scene: &Path, args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
     if args.model.is_some() {
-        usage_bail!("--model is for scene files; {} is a directory and has its own weights", args.scene.display());
+        usage_bail!("--model is for scene files; {} is a directory and has its own weights", scene.display());
     }
-    let model = ModelPath::find(&args.scene)?;
-    let (mut config, _) = read_config(&model.dir.join("config.toml"), &args.overrides.set, |_| Ok(()))?;
-    // Tensor shapes do not determine the number of heads: a wrong one would silently change the tokens.
-    if config.model != model.config()? {
-        usage_bail!("--set model: the weights were trained with another network; remove the override");
-    }
-    config.device = args.overrides.device.unwrap_or(config.device);
-    config.validate()?;
-    let opened: OpenedSource = open_dataset(&config.data, args.split)?;
-    let frames = EvalFrames::new(&opened, args.split, config.data.hold_out, true);
+    let model_args = ModelArgs::find(scene, args.data.as_deref(), &args.overrides)?;
+    let opened = model_args.open_data(args.split)?;
+    let model = model_args.open()?;
+    let ModelArgs { given, mut config, folder, .. } = model_args;
+    let frames = EvalFrames::new(&opened, args.split, config.data.hold_out, folder.is_none());
     let reader = ClipReader { source: opened.source, options: config.data.clip_options() };
     if config.eval.num_scenes == 0 {
         config.eval.num_scenes = MAX_SCENES;
@@ -106,14 +107,13 @@ fn open_run(args: &ViewArgs) -> anyhow::Result<(SceneSet, DeviceName)> {
         grouping: config.clusters.grouping,
         kmeans: config.clusters.kmeans.clone(),
         seed: config.seed,
-        model_path: text(&args.scene),
+        model_path: text(&given),
     };
-    let mut encode_args = vec![text(&args.scene)];
+    let mut encode_args: Vec<String> = std::iter::once(&given).chain(&folder).map(|path| text(path)).collect();
     encode_args.extend(args.overrides.set.iter().flat_map(|set| ["--set".into(), set.clone()]));
     if args.split == Split::Train {
         encode_args.extend(["--split".into(), args.split.to_string()]);
     }
-    let model = TrainedModel::open(&model, &config.model, &config.device.open()?)?;
     let scenes = RunScenes {
         model,
         reader,

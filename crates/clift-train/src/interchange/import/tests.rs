@@ -8,6 +8,7 @@ use clift_model::{
     Cameras, Clift, CliftVariant, Clusters, DeviceName, ModelPath, PREFIX, SceneClusters, SceneModel, TrainedModel,
     Views, save_weights,
 };
+use half::f16;
 use safetensors::SafeTensors;
 
 use super::*;
@@ -135,11 +136,26 @@ fn checkpoints_compute_as_the_twin_and_round_trip() {
         let third = place.path().join("third.safetensors");
         export(&config, &model, ExportFormat::Safetensors, &third).unwrap();
         assert!(std::fs::read(&third).unwrap() == bytes, "equal weights are equal files");
-        let tensors = SafeTensors::deserialize(&bytes).unwrap().tensors().into_iter();
-        let values =
-            |data: &[u8]| data.as_chunks().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect::<Vec<u32>>();
-        let written = tensors.map(|(key, view)| (key, (view.shape().to_vec(), values(view.data())))).collect();
-        assert!(original == written, "{name}: the safetensors file differs");
+        let read = |bytes: &[u8]| {
+            let tensors = SafeTensors::deserialize(bytes).unwrap().tensors().into_iter();
+            let values =
+                |data: &[u8]| data.as_chunks().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect::<Vec<u32>>();
+            tensors.map(|(key, view)| (key, (view.shape().to_vec(), values(view.data())))).collect::<BTreeMap<_, _>>()
+        };
+        assert!(original == read(&bytes), "{name}: the safetensors file differs");
+
+        // A model directory in f16, exported again, has the rounded values.
+        let half = place.path().join("half");
+        let from_half = place.path().join("half.safetensors");
+        let summary = export(&config, &model, ExportFormat::F16, &half).unwrap();
+        assert_eq!(summary.has_condenser, imported.has_condenser);
+        export(&config, &ModelPath::find(&half).unwrap(), ExportFormat::Safetensors, &from_half).unwrap();
+        let round = |bits: &mut u32| *bits = f16::from_f32(f32::from_bits(*bits)).to_f32().to_bits();
+        let mut rounded = original;
+        for (_, values) in rounded.values_mut() {
+            values.iter_mut().for_each(round);
+        }
+        assert!(rounded == read(&std::fs::read(&from_half).unwrap()), "{name}: the values in f16 differ");
     }
 }
 

@@ -33,7 +33,8 @@ pub(crate) fn parse_format(text: &str) -> Result<ExportFormat, String> {
     match text {
         "pytorch" => Ok(ExportFormat::Pytorch),
         "safetensors" => Ok(ExportFormat::Safetensors),
-        _ => Err("write pytorch or safetensors".into()),
+        "f16" => Ok(ExportFormat::F16),
+        _ => Err("write pytorch, safetensors or f16".into()),
     }
 }
 
