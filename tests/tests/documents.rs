@@ -285,6 +285,11 @@ fn prepare(base: &Path) {
         copy(&base.join("runs/tiny"), name);
     }
     clift(&["import", "last.ckpt", "--variant", "released-re10k", "--num-heads", "3", "-o", "models/re10k"]);
+    let mut rooms = ["train", "configs/rooms.toml"].map(str::to_owned).to_vec();
+    shrink(&mut rooms);
+    rooms.extend(["--set", "run_dir=runs/rooms"].map(str::to_owned));
+    clift(&rooms.iter().map(String::as_str).collect::<Vec<_>>());
+    clift(&["export", "runs/rooms", "--format", "f16", "-o", "models/rooms"]);
     let tiny = ["encode", "runs/tiny", "--scene", "synthetic-0-test-00000", "-o", "room.clift"];
     clift(&tiny);
 }

@@ -1,6 +1,8 @@
 //! Scenes in other layouts than chunks, through the command line.
 
-use crate::support::{Place, repository};
+use std::process::Command;
+
+use crate::support::{BINARY, Place, finish, repository, start};
 
 /// Keys that put the micro run on six frames of 32 x 18.
 fn data(source: &str, layout: &str, more: &str) -> String {
@@ -23,6 +25,15 @@ fn captures_train_and_render_and_name_missing_frames() {
     place.clift(encode).ok().prints("scene attic, 2 views of 16 x 16");
     let render = "render DIR/attic.clift --path interpolate --frames 2 -o DIR/frames";
     place.clift(render).ok().prints("2 frames of 16 x 16");
+
+    let with_model = |model: &str| {
+        let mut command = Command::new(BINARY);
+        command.args(["encode", "-o"]).arg(place.at(&format!("{model}.clift")));
+        command.arg(repository("data-fixtures/layouts/colmap_txt/attic")).env("CLIFT_MODEL", place.at(model));
+        finish(start(&mut command))
+    };
+    with_model("run").ok().prints("scene attic, 2 views of 16 x 16").notes("model: ");
+    with_model("none").fails_with(2, &["no trained model at "]);
 }
 
 #[test]

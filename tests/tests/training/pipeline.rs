@@ -1,5 +1,7 @@
 //! A complete run and every file of its directory.
 
+use std::collections::BTreeMap;
+
 use serde_json::Value;
 
 use crate::support::{Place, STAGE_1, WHOLE, list, number};
@@ -218,4 +220,19 @@ fn runs_start_from_weights_of_other_runs() {
     let set = [&format!("stage1.init_from={first:?}"), "model.dim=8"];
     place.train("third --only stage1", &set).fails_with(1, &[&file]);
     place.train("fourth", &["stage1.init_from=no/such/run.safetensors"]).fails_with(1, &["no/such/run.safetensors"]);
+
+    // The condenser of a run's stage 2; without one, before stage 1 is trained.
+    let from_first = format!("stage2.init_from={first:?}");
+    place.train("fifth", &[&from_first]).fails_with(1, &["first/stage2/model.safetensors", "no such file"]);
+    assert!(!place.at("fifth/stage1").exists());
+    let from_file = format!("stage2.init_from={file:?}");
+    place.train("sixth", &[&from_file]).fails_with(1, &["stage2.init_from", "no condenser"]);
+    place.train("first", &["seed=7"]).ok();
+    place.train("seventh", &[&from_first, "stage2.steps=0"]).ok();
+    let condenser = |run: &str| {
+        let weights = place.weights(run, "stage2").0.into_iter();
+        weights.filter(|(name, _)| name.starts_with("condenser.")).collect::<BTreeMap<_, _>>()
+    };
+    assert!(!condenser("first").is_empty());
+    assert_eq!(condenser("seventh"), condenser("first"));
 }

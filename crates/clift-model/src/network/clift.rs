@@ -45,6 +45,11 @@ impl Clift {
     pub fn stage1_part() -> PathFilter {
         PathFilter::from_predicate(|path, _| !is_condenser(path))
     }
+
+    /// Matches the condenser's parameters.
+    pub fn condenser_part() -> PathFilter {
+        PathFilter::from_predicate(|path, _| is_condenser(path))
+    }
 }
 
 /// Whether the parameter at `path` belongs to the condenser.

@@ -193,7 +193,7 @@ pub struct Stage1Config {
     pub accumulate: usize,
     /// Smallest and largest share of the tokens that the renderer receives; the share is sampled every step.
     pub keep_tokens: [f64; 2],
-    /// Run directory or `model.safetensors` of the initial weights.
+    /// Run or model directory, or `model.safetensors`, of the initial weights.
     pub init_from: Option<PathBuf>,
     /// Settings of the optimizer.
     pub optimizer: OptimizerConfig,
@@ -255,6 +255,8 @@ pub struct Stage2Config {
     pub accumulate: usize,
     /// Learning rate of the renderer, as a factor of the condenser's.
     pub renderer_lr_factor: f64,
+    /// Run or model directory, or `model.safetensors`, of the initial condenser.
+    pub init_from: Option<PathBuf>,
     /// Settings of the optimizer.
     pub optimizer: OptimizerConfig,
 }
@@ -266,6 +268,7 @@ impl Default for Stage2Config {
             batch_size: 80,
             accumulate: 1,
             renderer_lr_factor: 0.1,
+            init_from: None,
             optimizer: OptimizerConfig::default(),
         }
     }

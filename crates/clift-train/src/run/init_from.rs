@@ -1,34 +1,43 @@
-//! Initial weights of stage 1 from another model.
+//! Initial weights of a stage from another model.
 
 use std::path::Path;
 
-use clift_model::{Clift, ModelConfig, ModelPath, check_heads, load_part, refuse_checkpoint};
+use clift_model::{Clift, ModelPath, check_heads, load_part, refuse_checkpoint};
 
+use crate::config::config::Config;
 use crate::error::TrainError;
-use crate::events::{Event, Sink};
+use crate::events::{Event, Sink, Stage};
 
-/// Loads the weights of stage 1 of another run, of a model directory or of a weight file, and reports which parameters
-/// were loaded.
+/// Loads the initial weights that the config names for a stage: all of stage 1, or the condenser for stage 2. They come from
+/// the same stage of another run, from a model directory or from a weight file. Reports which parameters were loaded.
 pub(crate) fn init_from(
-    model: &mut Clift,
-    config: &ModelConfig,
-    from: &Path,
+    mut model: Clift,
+    config: &Config,
+    stage: Stage,
     sink: &mut dyn Sink,
-) -> Result<(), TrainError> {
-    let in_folder = ["stage1/model.safetensors", "model.safetensors"].map(|file| from.join(file));
+) -> Result<Clift, TrainError> {
+    let (from, part, what, lack) = if stage == Stage::Stage1 {
+        let lack = "no tensor of the file fits this model";
+        (&config.stage1.init_from, Clift::stage1_part(), "weight file for stage1.init_from", lack)
+    } else {
+        let lack = "the file has no condenser";
+        (&config.stage2.init_from, Clift::condenser_part(), "weight file for stage2.init_from", lack)
+    };
+    let Some(from) = from else { return Ok(model) };
+    let in_folder = [from.join(stage.name()), from.clone()].map(|folder| folder.join("model.safetensors"));
     let [run, _] = &in_folder;
-    let path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
+    let path: &Path = if from.is_dir() { in_folder.iter().find(|file| file.exists()).unwrap_or(run) } else { from };
     refuse_checkpoint(path)?;
     // The number of heads of a weight file without a config is unknown.
     if let Ok(found) = ModelPath::find(path) {
-        check_heads(config, &found.dir)?;
+        check_heads(&config.model, &found.dir)?;
     }
-    let loaded = load_part(model, &Clift::stage1_part(), path)?;
+    let mut loaded = load_part(&mut model, &part, path)?;
     if loaded.applied.is_empty() {
-        let reason = "no tensor of the file fits this model".to_owned();
-        return Err(TrainError::bad_file("weight file for stage1.init_from", path)(reason));
+        return Err(TrainError::bad_file(what, path)(lack));
     }
     let list = |names: &[String]| if names.is_empty() { "none".into() } else { names.join(", ") };
+    loaded.unused.retain(|name| part.matches(name));
     sink.event(&Event::Message(format!(
         "loaded {} parameters from {}; initialized, not in the file: {}; unused in the file: {}",
         loaded.applied.len(),
@@ -36,5 +45,5 @@ pub(crate) fn init_from(
         list(&loaded.missing),
         list(&loaded.unused)
     )));
-    Ok(())
+    Ok(model)
 }

@@ -11,7 +11,7 @@
 //! - `stage_plan`: settings, batches and folder of a stage
 //! - `validation`: validation and evaluation
 //! - `train_loop`: resume or start a stage; step, save, validate
-//! - `init_from`: initial weights of stage 1
+//! - `init_from`: initial weights of a stage
 //! - `evaluate_model`: evaluate a model without a run
 //! - `run`: a run: open, train, evaluate
 

@@ -167,12 +167,16 @@ impl Run {
         let reader = self.reader(opened, Split::Train, sink)?;
         let validation = self.validation(Split::Test, sink)?;
 
+        let train_stage2 = wanted(Stage::Stage2) && !self.weights(Stage::Stage2).exists();
+        if train_stage2 {
+            // A wrong `stage2.init_from` is found before stage 1 takes its time.
+            init_from(self.new_model(), &self.config, Stage::Stage2, &mut |_: &Event| {})?;
+        }
         let stage1 = if wanted(Stage::Stage1) && !self.weights(Stage::Stage1).exists() {
             self.train_stage1(&reader, &validation, stop, sink)?
         } else {
             self.load_stage1(only)?
         };
-        let train_stage2 = wanted(Stage::Stage2) && !self.weights(Stage::Stage2).exists();
         if only == Some(Stage::Clusters) || train_stage2 {
             let cache = self.clusters(only, &reader, &stage1, stop, sink)?;
             if train_stage2 {
@@ -278,13 +282,7 @@ impl Run {
     ) -> Result<Clift, TrainError> {
         let batches = Stage1Batches::new(&self.config, reader)?;
         let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
-        let start = |sink: &mut dyn Sink| {
-            let mut model = self.new_model();
-            if let Some(from) = &self.config.stage1.init_from {
-                init_from(&mut model, &self.config.model, from, sink)?;
-            }
-            Ok(model)
-        };
+        let start = |sink: &mut dyn Sink| init_from(self.new_model(), &self.config, Stage::Stage1, sink);
         let model = self.plan(Stage::Stage1, batches).train(start, validation, stop, sink)?;
         save_part(&model, &Clift::stage1_part(), &self.weights(Stage::Stage1))?;
         Ok(model)
@@ -302,7 +300,10 @@ impl Run {
         let batches = Stage2Batches::new(&self.config, reader, Arc::new(cache))?;
         let batches: Arc<MakeBatch> = Arc::new(move |step| batches.batch(step));
         // The condenser of stage 1 takes no gradient.
-        let start = |_: &mut dyn Sink| Ok(Clift { condenser: self.new_model().condenser, ..stage1 });
+        let start = |sink: &mut dyn Sink| {
+            let initial = init_from(self.new_model(), &self.config, Stage::Stage2, sink)?;
+            Ok(Clift { condenser: initial.condenser, ..stage1 })
+        };
         let model = self.plan(Stage::Stage2, batches).train(start, validation, stop, sink)?;
         Ok(save_weights(&model, &self.weights(Stage::Stage2))?)
     }

@@ -21,7 +21,7 @@ const MAX_LISTED_KEYS: usize = 8;
 
 #[derive(Debug, clap::Args)]
 pub struct EncodeArgs {
-    /// Run or model directory, or model.safetensors in one of them; photos alone use models/rooms
+    /// Run, model or model.safetensors; or photos, encoded with models/rooms
     ///
     /// `clift encode DIR` encodes a capture with the model that ships with clift, which is trained on synthetic scenes. The
     /// environment variable `CLIFT_MODEL` names another.

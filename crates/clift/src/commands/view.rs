@@ -21,7 +21,9 @@ const MAX_SCENES: usize = 200;
 
 #[derive(Debug, clap::Args)]
 pub struct ViewArgs {
-    /// Scene file; run or model, whose test scenes are listed; or photos, with models/rooms [default: models/rooms]
+    /// Scene file; run or model, whose test scenes are listed; or photos [default: models/rooms]
+    ///
+    /// Photos are encoded with models/rooms, which ships with clift, or with the model that `CLIFT_MODEL` names.
     #[arg(value_name = "SCENE|RUN|DIR")]
     pub scene: Option<PathBuf>,
     /// Capture or data set in any layout [default: the data of the run]
